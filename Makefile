@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+PYTHON ?= python3
+ARGS ?=
+
+# $(call with,EXTRA): set $python to the environment's Python, making the environment first.
+with = python=$$(PYTHON='$(PYTHON)' sh scripts/environment.sh $(1))
+
+.PHONY: help demo test lint bench clean
+.NOTPARALLEL:
+
+help:
+	@echo 'make demo    run plant and estimator for 20 s, draw what was estimated'
+	@echo 'make test    check style and types, run the tests'
+	@echo 'make lint    check style and types only'
+	@echo 'make bench   measure speed'
+	@echo 'make clean   remove environments, builds and caches'
+	@echo
+	@echo "Pass options on with ARGS: make demo ARGS='--help', make test ARGS='-k fuzzy'."
+	@echo 'Choose the interpreter with PYTHON: make demo PYTHON=python3.12'
+
+# exec: the command is then make's own child, so Ctrl-C and exit codes pass through no shell.
+demo:
+	@$(call with) && exec "$$python" -m fhaosmo_ros demo $(ARGS)
+
+lint:
+	@$(call with,test) && set -x && \
+	"$$python" -m ruff check --output-format concise . && \
+	"$$python" -m ruff format --check . && \
+	"$$python" -m mypy && \
+	"$${python%/*}/lint-imports" --no-logo
+
+test: lint
+	@$(call with,test) && exec "$$python" -m pytest -n 2 --dist loadfile $(ARGS)
+
+bench:
+	@$(call with) && exec "$$python" benchmark/run.py $(ARGS)
+
+clean:
+	rm -rf .venv .venv-ros build install log *.egg-info .coverage .hypothesis \
+	    .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	find . -name .git -prune -o -name __pycache__ -type d -exec rm -rf {} +

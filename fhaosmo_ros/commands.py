@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The package's commands, declared once: for `ros2 run` (setup.py) and `python -m fhaosmo_ros`.
+
+Import nothing heavy here: setup.py reads this file before any dependency is installed.
+"""
+
+# name: (module whose main(argv) runs it, one line of help)
+COMMANDS = {
+    'estimator': ('fhaosmo_ros.nodes.estimator', 'node: estimate states and unknown input of y'),
+    'plant': ('fhaosmo_ros.nodes.plant', 'node: simulate a plant and publish y and the truth'),
+    'demo': ('fhaosmo_ros.tools.demo', 'run plant and estimator, record, report, draw a figure'),
+}

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From checked parameters to what the kernel reads; here values are checked as a set."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fhaosmo_ros.core import kernels
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.fuzzy import KNOTS, curve, terms_of_level
+from fhaosmo_ros.core.model import TriangularModel
+from fhaosmo_ros.core.parameter import Parameter
+from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS
+
+
+class ObserverConfiguration:
+    """A valid set of observer parameters and the compiled law that it stands for.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Values by name; defaults for the rest.
+
+    Raises
+    ------
+    ConfigurationError
+        An unknown name, a bad value, or values that do not fit together.
+    """
+
+    def __init__(self, parameters: Mapping[str, Any]) -> None:
+        values = OBSERVER_PARAMETERS.defaults() | OBSERVER_PARAMETERS.coerce(parameters)
+        self.parameters: dict[str, Any] = values
+        self.model = TriangularModel(self.parameters['phi'], self.parameters['order'])
+        self._complete()
+
+    def changed(self, changes: Mapping[str, Any]) -> 'ObserverConfiguration':
+        """Return a configuration with some live parameters changed.
+
+        Raises
+        ------
+        ConfigurationError
+            As the constructor, or a change of a parameter that can't change live.
+        """
+        changes = OBSERVER_PARAMETERS.coerce(changes)
+        for name, value in changes.items():
+            if not OBSERVER_PARAMETERS[name].live and value != self.parameters[name]:
+                raise ConfigurationError(
+                    f"parameter '{name}': can't change in a running observer "
+                    f'(it is {self.parameters[name]!r}), got {value!r}'
+                )
+        other = object.__new__(ObserverConfiguration)
+        other.parameters = self.parameters | changes
+        other.model = self.model
+        other._complete()
+        return other
+
+    def _complete(self) -> None:
+        p = self.parameters
+        if p['gamma_min'] > p['gamma_max']:
+            raise ConfigurationError(
+                f"parameter 'gamma_min': expected at most gamma_max = {p['gamma_max']}, "
+                f'got {p["gamma_min"]}'
+            )
+        if not p['gamma_min'] <= p['gamma_initial'] <= p['gamma_max']:
+            raise ConfigurationError(
+                f"parameter 'gamma_initial': expected gamma_min <= gamma_initial <= gamma_max "
+                f'({p["gamma_min"]} to {p["gamma_max"]}), got {p["gamma_initial"]}'
+            )
+        self.levels = self.model.order + int(p['unknown_input'])
+        self.initial_estimate = self._per_level('initial_estimate')
+        self.initial_internal = self._per_level('initial_internal')
+        self.start_from_measurement = bool(p['start_from_measurement'])
+        self.internal = p['estimate_from'] == 'internal'
+        self.law = self._law()
+
+    def _per_level(self, name: str) -> np.ndarray:
+        return per_level(OBSERVER_PARAMETERS[name], self.parameters[name], self.levels)
+
+    def _law(self) -> kernels.Law:
+        p, levels = self.parameters, self.levels
+        widths = p['fuzzy_widths']
+        if len(widths) > levels:
+            raise OBSERVER_PARAMETERS['fuzzy_widths'].error(
+                widths, f'1 to {levels} values (N = {levels} levels)'
+            )
+        widths = [widths[min(i, len(widths) - 1)] for i in range(levels)]
+        flags = np.zeros(3, dtype=np.int64)
+        flags[kernels.SIGN] = p['variant'] == 'sign'
+        flags[kernels.IMPLICIT] = p['scheme'] == 'implicit'
+        flags[kernels.ADAPTIVE] = p['variant'] == 'fuzzy_adaptive'
+        if flags[kernels.SIGN]:  # the kernel does not read them
+            curves = np.ones((levels, KNOTS))
+        else:
+            curves = np.array([
+                curve(terms_of_level(i + 1), p['fuzzy_shape'], p['fuzzy_normalise'])
+                for i in range(levels)
+            ])
+        gains = [self._per_level('lambda'), self._per_level('alpha'), 1.0 / np.array(widths)]
+        scalars = np.zeros(kernels.SCALARS)
+        scalars[kernels.EPSILON] = p['epsilon']
+        scalars[kernels.GAMMA_INITIAL] = p['gamma_initial']
+        scalars[kernels.RATE] = p['gamma_rate']
+        scalars[kernels.MIN] = p['gamma_min']
+        scalars[kernels.MAX] = p['gamma_max']
+        scalars[kernels.DEAD_ZONE] = p['gamma_dead_zone']
+        scalars[kernels.LEAKAGE] = p['gamma_leakage']
+        return kernels.Law(
+            flags, np.array(gains), curves, scalars, self.model.tape, self.model.offsets
+        )
+
+
+def per_level(parameter: Parameter, values: list[float], count: int) -> np.ndarray:
+    """Return one value a level from a list of 1 or `count` values, or raise."""
+    if len(values) not in (1, count):
+        raise parameter.error(values, f'1 or {count} values')
+    return np.broadcast_to(np.array(values, dtype=np.float64), count).copy()

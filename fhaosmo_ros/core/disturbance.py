@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Unknown inputs d(t) that the simulated plant can be given."""
+
+import math
+
+from numba import njit
+
+from fhaosmo_ros.core.tape import Floats
+
+KINDS = ('none', 'sine', 'step', 'square', 'chirp')
+NONE, SINE, STEP, SQUARE, CHIRP = range(5)
+NAMES = ('amplitude', 'omega', 'phase', 'offset', 'start', 'omega_end', 'sweep_time')
+AMPLITUDE, OMEGA, PHASE, OFFSET, START, OMEGA_END, SWEEP_TIME = range(7)
+
+
+@njit(cache=True, error_model='numpy')
+def disturbance(kind: int, c: Floats, t: float) -> float:
+    """Return d(t).
+
+    Parameters
+    ----------
+    kind : int
+        Index into `KINDS`.
+    c : (7,) array
+        Values in the order of `NAMES` (rad/s, rad, s).
+    t : float
+        Time since the plant's start, in seconds.
+    """
+    if kind == NONE:
+        return 0.0
+    if kind == STEP:
+        return c[OFFSET] + (c[AMPLITUDE] if t >= c[START] else 0.0)
+    angle = c[OMEGA] * t
+    if kind == CHIRP:
+        swept = min(t, c[SWEEP_TIME])
+        rate = (c[OMEGA_END] - c[OMEGA]) / c[SWEEP_TIME]
+        angle = c[OMEGA] * swept + 0.5 * rate * swept * swept + c[OMEGA_END] * (t - swept)
+    wave = math.sin(angle + c[PHASE])
+    if kind == SQUARE:
+        wave = 1.0 if wave >= 0.0 else -1.0
+    return c[OFFSET] + c[AMPLITUDE] * wave

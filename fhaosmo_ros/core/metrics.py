@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How good an estimate is, in numbers."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Series = NDArray[np.float64]
+
+
+def rms(error: Series) -> float:
+    """Return the root mean square of a series; NaN for an empty one."""
+    return float(np.sqrt(np.mean(np.square(error)))) if len(error) else float('nan')
+
+
+def settling_time(t: Series, error: Series, band: float) -> float:
+    """Return the time after which |error| stays within `band` to the end.
+
+    Parameters
+    ----------
+    t, error : (K,) arrays
+        Times (s) and the error at these times.
+    band : float
+        Half-width of the band, > 0, in the error's unit.
+
+    Returns
+    -------
+    float
+        Seconds since ``t[0]``; 0 if it never leaves the band, infinity if it ends outside.
+    """
+    outside = np.flatnonzero(~(np.abs(error) <= band))
+    if not len(outside):
+        return 0.0
+    last = outside[-1]
+    return float(t[last + 1] - t[0]) if last + 1 < len(t) else float('inf')
+
+
+def total_variation(x: Series) -> float:
+    """Return the sum of |x[k + 1] - x[k]|."""
+    return float(np.sum(np.abs(np.diff(x))))
+
+
+def chatter(estimate: Series, truth: Series) -> float:
+    """Return the total variation of the estimate over that of the truth.
+
+    About 1 for an estimate that moves as the truth does; chatter makes it large.
+    """
+    reference = total_variation(truth)
+    return total_variation(estimate) / reference if reference > 0.0 else float('inf')

@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The observer: one sample at a time, or arrays of samples, by the same compiled recursion."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fhaosmo_ros.core import kernels, layout
+from fhaosmo_ros.core.configuration import ObserverConfiguration
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.status import LEVEL_SHIFT, Status, flags, open_levels
+
+FIXED_GAMMA = 0.5
+"""Power of the variants that do not adapt (paper eq. triangularObserver, fuzzysuper)."""
+
+
+class Estimate(NamedTuple):
+    """What the observer knows after a sample.
+
+    Attributes
+    ----------
+    z : (n,) array
+        Estimated states; z[0] is z_hat_1, the others follow `estimate_from`.
+    unknown_input : float
+        Estimated d.
+    gamma : float
+        Power gamma in use.
+    innovation : (N,) array
+        eps_i = m_i - z_hat_i.
+    word : int
+        Status word; see `status` and `open_levels`.
+    """
+
+    z: NDArray[np.float64]
+    unknown_input: float
+    gamma: float
+    innovation: NDArray[np.float64]
+    word: int
+
+    @property
+    def status(self) -> Status:
+        """Flags of the step."""
+        return flags(self.word)
+
+    @property
+    def open_levels(self) -> int:
+        """Number of levels that run (the paper's E_i)."""
+        return open_levels(self.word)
+
+
+class Trajectory(NamedTuple):
+    """Estimates of a run; row k belongs to ``t[k]``. Attributes as in `Estimate`.
+
+    Attributes
+    ----------
+    t : (K,) array
+        Times as given.
+    z : (K, n) array
+    unknown_input, gamma : (K,) arrays
+    innovation : (K, N) array
+    status, open_levels : (K,) integer arrays
+        Where `every` > 1, a row's flags are those of all samples since the row before it.
+    z_hat, z_tilde : (K, N) arrays
+        Filtered and internal states; z_tilde[:, i] belongs to z_{i+2}.
+    """
+
+    t: NDArray[Any]
+    z: NDArray[np.float64]
+    unknown_input: NDArray[np.float64]
+    gamma: NDArray[np.float64]
+    innovation: NDArray[np.float64]
+    status: NDArray[np.int64]
+    open_levels: NDArray[np.int64]
+    z_hat: NDArray[np.float64]
+    z_tilde: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ObserverState:
+    """All that an observer remembers; a copy, safe to keep.
+
+    Attributes
+    ----------
+    levels : (4, N) array
+    memory : (3,) array
+        See `fhaosmo_ros.core.layout`.
+    t : float or int or None
+        Time of the last sample of `Observer.run`, in its unit (s, or ns for integers).
+    """
+
+    levels: NDArray[np.float64]
+    memory: NDArray[np.float64]
+    t: float | int | None = None
+
+
+class Observer:
+    """Fuzzy-based super-twisting adaptive-order sliding mode observer.
+
+    Parameters
+    ----------
+    parameters : mapping, optional
+        Values for the parameters in docs/parameters.md; defaults for the rest.
+
+    Raises
+    ------
+    ConfigurationError
+        An unknown name, a bad value, or values that do not fit together.
+
+    Examples
+    --------
+    >>> observer = Observer({'order': 2, 'phi': ['0', '-z2'], 'lambda': 15, 'alpha': 30})
+    >>> observer.start(0.1).z
+    array([0.1, 0. ])
+    >>> observer.step(0.1, dt=0.001).status
+    <Status.OK: 0>
+    """
+
+    def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
+        self._configuration = ObserverConfiguration(parameters or {})
+        self._law = self._configuration.law
+        count = self._configuration.levels
+        self._levels = np.zeros((layout.ROWS, count))
+        self._memory = np.zeros(layout.SCALARS)
+        self._work = kernels.make_work(count, self._configuration.model.depth)
+        self._eps = np.zeros((1, count))
+        self._t: float | int | None = None
+        self.reset()
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """All parameters with their present values; a copy."""
+        return dict(self._configuration.parameters)
+
+    @property
+    def order(self) -> int:
+        """Number of states n."""
+        return self._configuration.model.order
+
+    @property
+    def levels(self) -> int:
+        """Number of levels N."""
+        return self._configuration.levels
+
+    @property
+    def uses_input(self) -> bool:
+        """True if the model uses the known input u."""
+        return self._configuration.model.uses_input
+
+    @property
+    def started(self) -> bool:
+        """True once a sample has arrived."""
+        return not np.isnan(self._memory[layout.Y])
+
+    @property
+    def state(self) -> ObserverState:
+        """Snapshot of the state."""
+        return ObserverState(self._levels.copy(), self._memory.copy(), self._t)
+
+    def restore(self, state: ObserverState) -> None:
+        """Go back to a snapshot, of this observer or of another one of the same size.
+
+        Raises
+        ------
+        ConfigurationError
+            The snapshot is of an observer with another number of levels.
+        """
+        if state.levels.shape != self._levels.shape:
+            raise ConfigurationError(
+                f'state: expected {self.levels} levels, got {state.levels.shape[-1]}'
+            )
+        self._levels[:] = state.levels
+        self._memory[:] = state.memory
+        self._t = state.t
+
+    def check(self, changes: Mapping[str, Any]) -> None:
+        """Raise what `configure` would raise, and change nothing."""
+        self._configuration.changed(changes)
+
+    def configure(self, changes: Mapping[str, Any]) -> None:
+        """Change parameters from the next sample on, without a jump of the estimate.
+
+        All or nothing: where anything is wrong, nothing has changed.
+
+        Raises
+        ------
+        ConfigurationError
+            As the constructor, or a change of a parameter that fixes the observer's size.
+        """
+        self._adopt(self._configuration.changed(changes))
+
+    def _adopt(self, configuration: ObserverConfiguration) -> None:
+        was_adaptive = self._law.flags[kernels.ADAPTIVE]
+        self._configuration = configuration
+        self._law = law = configuration.law
+        if not law.flags[kernels.ADAPTIVE]:
+            self._memory[layout.GAMMA] = FIXED_GAMMA
+        else:
+            c = law.scalars
+            self._memory[layout.GAMMA] = np.clip(
+                self._memory[layout.GAMMA], c[kernels.MIN], c[kernels.MAX]
+            )
+            if not was_adaptive:  # they were not carried along
+                self._levels[layout.HAT_SENSITIVITY :] = 0.0
+
+    def reset(self) -> None:
+        """Go back to the initial state; the next sample is the first."""
+        self._levels[:] = 0.0
+        self._levels[layout.HAT] = self._configuration.initial_estimate
+        self._levels[layout.TILDE] = self._configuration.initial_internal
+        self._memory[:] = 0.0
+        self._memory[layout.Y] = np.nan
+        self._t = None
+        law = self._law
+        self._memory[layout.GAMMA] = (
+            law.scalars[kernels.GAMMA_INITIAL] if law.flags[kernels.ADAPTIVE] else FIXED_GAMMA
+        )
+
+    def start(self, y: float) -> Estimate:
+        """Take the first sample: time has not passed yet, so nothing is integrated."""
+        word = 0
+        if not np.isfinite(y):
+            word = int(Status.REJECTED_MEASUREMENT)
+        else:
+            self._memory[layout.Y] = y
+            self._memory[layout.PENDING] = 0.0
+            if self._configuration.start_from_measurement:
+                self._levels[layout.HAT, 0] = y
+        count = kernels.innovations(
+            self._law.scalars, self._levels, self._memory[layout.Y], self._eps, 0
+        )
+        return self._estimate(word | count << LEVEL_SHIFT)
+
+    def step(self, y: float, dt: float, u: float = 0.0) -> Estimate:
+        """Advance by `dt` to the sample `y`.
+
+        The explicit scheme integrates over the interval with the sample at its beginning, as
+        forward Euler does, so that `y` acts from the next step on; the implicit scheme uses `y`.
+
+        Parameters
+        ----------
+        y : float
+            Measured output at the end of the interval.
+        dt : float
+            Time since the previous call, in seconds, > 0.
+        u : float
+            Known input during the interval.
+
+        Returns
+        -------
+        Estimate
+            Bad data does not raise: `Estimate.status` says what was rejected, the state stays as
+            it was, and the time of a rejected sample is added to the next step.
+        """
+        if not self.started and np.isfinite(y):
+            self.start(y)
+        word = kernels.step_once(
+            *self._law, *self._work, self._levels, self._memory,
+            float(y), float(dt), float(u), self._eps,
+        )  # fmt: skip
+        return self._estimate(word)
+
+    def _estimate(self, word: int) -> Estimate:
+        z, d = self._select(self._levels)
+        gamma = float(self._memory[layout.GAMMA])
+        return Estimate(z, float(d), gamma, self._eps[0].copy(), word)
+
+    def _select(self, levels: NDArray[np.float64]) -> tuple[NDArray[np.float64], Any]:
+        """Return copies of the estimates of z and d from arrays of shape (..., rows, N)."""
+        n = self.order
+        hat, tilde = levels[..., layout.HAT, :], levels[..., layout.TILDE, :]
+        z = hat[..., :n].copy()
+        if self._configuration.internal:
+            z[..., 1:] = tilde[..., : n - 1]
+            return z, tilde[..., n - 1].copy()
+        return z, (hat[..., n] if self.levels > n else tilde[..., n - 1]).copy()
+
+    def run(
+        self, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0, every: int = 1
+    ) -> Trajectory:
+        """Step through arrays; the state goes on from where it is, so a run can be split.
+
+        Parameters
+        ----------
+        t : (K,) array
+            Sample times, in seconds, or in nanoseconds if integers. A sample that does not lie
+            after all samples before it is rejected.
+        y : (K,) array
+            Samples.
+        u : (K,) array or float
+            Known input during the interval that ends at each sample.
+        every : int
+            Record every `every`-th sample only.
+
+        Returns
+        -------
+        Trajectory
+            Row k is the estimate after sample ``(k + 1) * every - 1``. A fresh observer takes
+            the first sample as `start` does, else time goes on from the last sample of the last run.
+
+        Raises
+        ------
+        ConfigurationError
+            Arrays whose shapes do not fit, or `every` < 1.
+        """
+        t, y = np.asarray(t), np.ascontiguousarray(y, dtype=np.float64)
+        if t.ndim != 1 or y.shape != t.shape:
+            raise ConfigurationError(
+                f'run: expected t and y with one dimension and equal length, '
+                f'got shapes {t.shape} and {y.shape}'
+            )
+        if every < 1:
+            raise ConfigurationError(f'run: expected every >= 1, got {every}')
+        u = np.ascontiguousarray(np.broadcast_to(np.asarray(u, dtype=np.float64), y.shape))
+        first = 0
+        while not self.started and first < len(y):
+            self._t = None
+            self.start(y[first])
+            first += 1
+        return self._run(t, y, u, first, every)
+
+    def _run(
+        self, t: NDArray[Any], y: NDArray[Any], u: NDArray[Any], first: int, every: int
+    ) -> Trajectory:
+        rows, n = len(y) // every, self.levels
+        out, eps = np.empty((rows, 2, n)), np.empty((rows + 1, n))
+        gamma, words = np.empty(rows), np.empty(rows, dtype=np.int64)
+        kernels.run(
+            *self._law, *self._work, self._levels, self._memory,
+            y, self._periods(t, first), u, out, gamma, eps, words, first, every,
+        )  # fmt: skip
+        z, d = self._select(out)
+        return Trajectory(
+            t[every - 1 :: every], z, d, gamma, eps[:rows],
+            words & ((1 << LEVEL_SHIFT) - 1), words >> LEVEL_SHIFT,
+            out[:, layout.HAT], out[:, layout.TILDE],
+        )  # fmt: skip
+
+    def _periods(self, t: NDArray[Any], first: int) -> NDArray[np.float64]:
+        """Return the time of each sample since the latest sample before it, in seconds."""
+        if not len(t):
+            return np.zeros(0)
+        integers = np.issubdtype(t.dtype, np.integer)
+        t = t.astype(np.int64 if integers else np.float64)
+        start = self._t if self._t is not None else t[max(first - 1, 0)]
+        latest = np.fmax.accumulate(np.concatenate([[start], t]).astype(t.dtype))
+        self._t = latest[-1].item()
+        h = t - latest[:-1]
+        return h * 1e-9 if integers else h

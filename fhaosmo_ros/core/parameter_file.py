@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS 2 parameter files, read and checked without ROS."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+import re
+from typing import Any
+
+import yaml
+
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.parameter import ParameterTable, unknown_parameter
+from fhaosmo_ros.core.parameters import NODE_TABLES
+
+BUILT_IN = ('use_sim_time', 'start_type_description_service')
+"""Parameters that rclpy declares itself."""
+
+
+def is_built_in(name: str) -> bool:
+    """Return True for a parameter that is rclpy's, not ours."""
+    return name in BUILT_IN or name.startswith('qos_overrides.')
+
+
+def load(path: str | Path, node: str) -> dict[str, Any]:
+    """Return what a parameter file sets for a node of this package.
+
+    Sections that match the node's name are merged in the order of the file, as rcl does. One
+    ``/**`` section may serve both nodes, so a name that another node of the package declares is
+    passed over.
+
+    Parameters
+    ----------
+    path : path
+        A YAML file of the form ``name: {ros__parameters: {...}}``.
+    node : str
+        'estimator' or 'plant', or a full name such as '/rig/estimator'.
+
+    Returns
+    -------
+    dict
+        Values by name, checked and in the parameters' own types.
+
+    Raises
+    ------
+    ConfigurationError
+        No such file, not YAML, no ``ros__parameters``, an unknown name or a bad value; the
+        message begins with the path.
+    """
+    try:
+        values: dict[str, Any] = {}
+        for section, parameters in _sections(path).items():
+            if _matches(section, node):
+                values |= parameters
+        return select(values, NODE_TABLES[node.rsplit('/', 1)[-1]])
+    except ConfigurationError as error:
+        raise ConfigurationError(f'{path}: {error}') from None
+
+
+def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
+    """Check `values` and return those of `table`, leaving out other nodes' and rclpy's own.
+
+    Raises
+    ------
+    ConfigurationError
+        A name that no node of the package declares, or a bad value.
+    """
+    everybody = {name for other in NODE_TABLES.values() for name in other}
+    for name in values:
+        if name not in everybody and not is_built_in(name):
+            raise unknown_parameter(name, everybody)
+    return dict(table.coerce({k: v for k, v in values.items() if k in table}))
+
+
+def _sections(path: str | Path) -> dict[str, dict[str, Any]]:
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except OSError as error:
+        raise ConfigurationError(f'expected a readable file, got: {error.strerror}') from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        text = ' '.join(str(error).split())
+        raise ConfigurationError(f'expected YAML, got: {text}') from None
+    sections: dict[str, dict[str, Any]] = {}
+    if isinstance(content, Mapping):
+        _collect(content, '', sections)
+    if not sections:
+        raise ConfigurationError(
+            "expected 'NODE: {ros__parameters: {...}}' (NODE is a node's name or /**), "
+            f'got {str(content)[:80]!r}'
+        )
+    return sections
+
+
+def _collect(content: Mapping[Any, Any], name: str, out: dict[str, dict[str, Any]]) -> None:
+    for key, value in content.items():
+        if key == 'ros__parameters':
+            if not isinstance(value, Mapping):
+                raise ConfigurationError(
+                    f"section '{name}': expected parameters below ros__parameters, got {value!r}"
+                )
+            out.setdefault(name, {}).update(_flat(value, ''))
+        elif isinstance(value, Mapping):
+            _collect(value, f'{name}/{key}', out)
+        else:
+            raise ConfigurationError(
+                f"expected ros__parameters below '{name or key}', got {key!r}: {value!r}"
+            )
+
+
+def _flat(values: Mapping[Any, Any], prefix: str) -> Iterable[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f'{prefix}{key}.')
+        else:
+            yield f'{prefix}{key}', value
+
+
+def _matches(section: str, node: str) -> bool:
+    """Return True if a section's name covers a node: * is one name, ** any number of them."""
+    pattern = '/' + '/'.join(part for part in section.split('/') if part)
+    expression = re.escape(pattern).replace(r'/\*\*', '(/[^/]+)*').replace(r'\*', '[^/]+')
+    return re.fullmatch(expression, '/' + node.lstrip('/')) is not None

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every parameter of the package, declared once.
+
+YAML checks, ROS descriptors, docs/parameters.md and error messages derive from these tables.
+"""
+
+from fhaosmo_ros.core.parameter import Parameter, ParameterTable
+
+MAX_ORDER = 12
+PER_LEVEL = '1 (used for every level) or one a level'
+
+MODEL = (
+    Parameter(
+        'order', 3, 'Number n of states of the triangular model.',
+        lower=1, upper=MAX_ORDER, live=False,
+    ),
+    Parameter(
+        'phi', ['0', '0', '-z3'],
+        "The functions Phi_1 .. Phi_n of z_i' = z_{i+1} + Phi_i. Phi_i may use z1 .. zi, the "
+        'known input u, numbers, + - * / **, sin cos tan exp log sqrt abs tanh sign.',
+        live=False, lengths='n (order)',
+    ),
+)  # fmt: skip
+
+OBSERVER = (
+    Parameter(
+        'unknown_input', True,
+        'Estimate the unknown input d as one more level (N = n + 1 levels instead of N = n; '
+        'without it d is the internal state theta of level n).',
+        live=False,
+    ),
+    Parameter(
+        'variant', 'fuzzy_adaptive',
+        'sign: discontinuous injection, gamma = 1/2. fuzzy: fuzzy curve instead of sign. '
+        'fuzzy_adaptive: fuzzy curve and adapted gamma.',
+        choices=('sign', 'fuzzy', 'fuzzy_adaptive'),
+    ),
+    Parameter(
+        'scheme', 'implicit',
+        'explicit: forward Euler (the paper). implicit: backward Euler, without the chatter that '
+        'a digital step makes.',
+        choices=('explicit', 'implicit'),
+    ),
+    Parameter(
+        'lambda', [15.0], 'Correction factors lambda_i of the injection |eps|^gamma psi(eps).',
+        lower=0.0, lower_open=True, upper=1e6, lengths=PER_LEVEL,
+    ),
+    Parameter(
+        'alpha', [30.0], 'Gains alpha_i of the internal states.',
+        lower=0.0, lower_open=True, upper=1e9, lengths=PER_LEVEL,
+    ),
+    Parameter(
+        'epsilon', 0.025,
+        'A level runs while |eps_j| <= epsilon for every level j before it (unit of y, '
+        'and of the derivatives for the later levels).',
+        lower=0.0, lower_open=True, upper=1e12,
+    ),
+    Parameter(
+        'fuzzy_widths', [0.02],
+        'Half-widths of the fuzzy input universes of levels 1, 2, ...; the last one serves the '
+        'levels that follow. Beyond its half-width psi is +-1.',
+        lower=1e-12, upper=1e12, lengths='1 to N; the last one serves the levels that follow',
+    ),
+    Parameter(
+        'fuzzy_shape', 'triangle', 'Shape of the membership functions.',
+        choices=('triangle', 'gaussian'),
+    ),
+    Parameter(
+        'fuzzy_normalise', True,
+        'Scale psi to saturate at +-1 as sign does. A centroid alone saturates at about 0.83 '
+        '(5 terms), which silently cuts every gain.',
+    ),
+    Parameter(
+        'gamma_initial', 0.5, 'Power gamma at the start of fuzzy_adaptive.',
+        lower=0.0, lower_open=True, upper=1.0,
+    ),
+    Parameter(
+        'gamma_rate', 0.004, "Learning rate Gamma of gamma' = -Gamma dL/dgamma; 0 holds gamma.",
+        lower=0.0, upper=1e6,
+    ),
+    Parameter(
+        'gamma_min', 0.3, 'Lower bound of gamma, not above gamma_max.',
+        lower=0.0, lower_open=True, upper=1.0,
+    ),
+    Parameter(
+        'gamma_max', 0.8, 'Upper bound of gamma.', lower=0.0, lower_open=True, upper=1.0,
+    ),
+    Parameter(
+        'gamma_dead_zone', 0.0,
+        'Adaptation rests while the norm of the innovations is at most this (set it to the '
+        'norm that measurement noise alone gives).',
+        lower=0.0, upper=1e12,
+    ),
+    Parameter(
+        'gamma_leakage', 0.0, 'Rate that draws gamma back to gamma_initial; 0 for none.',
+        unit='1/s', lower=0.0, upper=1e3,
+    ),
+    Parameter(
+        'initial_estimate', [0.0], 'Filtered estimates z_hat_1 .. z_hat_N at the start.',
+        lower=-1e12, upper=1e12, lengths=PER_LEVEL,
+    ),
+    Parameter(
+        'initial_internal', [0.0],
+        'Internal states z_tilde_2 .. z_tilde_{N+1} at the start (the last one is theta).',
+        lower=-1e12, upper=1e12, lengths=PER_LEVEL,
+    ),
+    Parameter(
+        'start_from_measurement', True,
+        'Start z_hat_1 at the first sample of y instead of at initial_estimate[0].',
+    ),
+    Parameter(
+        'estimate_from', 'internal',
+        'Which variables are the published estimates of z_2 .. z_n and d: internal (z_tilde, '
+        'no lag) or filtered (z_hat, smoother). z_1 is always z_hat_1.',
+        choices=('internal', 'filtered'),
+    ),
+)  # fmt: skip
+
+SAMPLING = (
+    Parameter(
+        'sampling', 'source_stamp',
+        "Sampling period of y: from the source time stamps of the middleware's messages, from "
+        'the node clock at reception (the choice with use_sim_time), or nominal_period.',
+        choices=('source_stamp', 'clock', 'nominal'),
+    ),
+    Parameter(
+        'nominal_period', 0.001, 'Sampling period with sampling = nominal.',
+        unit='s', lower=1e-6, upper=10.0,
+    ),
+    Parameter(
+        'max_gap', 0.5,
+        'A longer time between two samples, or a stamp that lies further back, restarts the '
+        'observer from the new sample.',
+        unit='s', lower=1e-6, upper=3600.0,
+    ),
+)  # fmt: skip
+
+ESTIMATOR_NODE = (
+    Parameter(
+        'publish_rate', 100.0, 'Rate of the timer that publishes the estimates.',
+        unit='Hz', lower=0.1, upper=5000.0,
+    ),
+)  # fmt: skip
+
+PLANT_MODEL = (
+    Parameter(
+        'initial_state', [0.2], 'States z_1 .. z_n of the plant at its start.',
+        lower=-1e12, upper=1e12, live=False, lengths='1 (used for every state) or n',
+    ),
+    Parameter(
+        'integration_step', 1e-4,
+        'Fixed step of the Runge-Kutta integration, independent of sample_rate.',
+        unit='s', lower=1e-6, upper=0.1, live=False,
+    ),
+    Parameter(
+        'disturbance', 'sine',
+        'The unknown input d(t): none (0), sine (amplitude sin(omega t + phase) + offset), step '
+        '(offset, from start on offset + amplitude), square (sign of the sine), chirp (sine whose '
+        'angular frequency goes from omega to omega_end within sweep_time and stays there).',
+        choices=('none', 'sine', 'step', 'square', 'chirp'),
+    ),
+    Parameter(
+        'disturbance_amplitude', 0.1, 'Amplitude of d.', lower=-1e9, upper=1e9,
+    ),
+    Parameter(
+        'disturbance_omega', 1.0, 'Angular frequency of d.', unit='rad/s', lower=0.0, upper=1e5,
+    ),
+    Parameter(
+        'disturbance_phase', 0.0, 'Phase of d.', unit='rad', lower=-1e3, upper=1e3,
+    ),
+    Parameter(
+        'disturbance_offset', 0.0, 'Constant part of d.', lower=-1e9, upper=1e9,
+    ),
+    Parameter(
+        'disturbance_start', 1.0, 'Time of the step.', unit='s', lower=0.0, upper=1e9,
+    ),
+    Parameter(
+        'disturbance_omega_end', 10.0, 'Angular frequency at the end of the chirp.',
+        unit='rad/s', lower=0.0, upper=1e5,
+    ),
+    Parameter(
+        'disturbance_sweep_time', 20.0, 'Duration of the sweep of the chirp.',
+        unit='s', lower=1e-3, upper=1e9,
+    ),
+    Parameter(
+        'noise_std', 0.0, 'Standard deviation of the white Gaussian noise on y (unit of y).',
+        lower=0.0, upper=1e9,
+    ),
+    Parameter(
+        'noise_seed', 1, 'Seed of the noise; setting it starts the noise sequence again.',
+        lower=0, upper=2**31 - 1,
+    ),
+)  # fmt: skip
+
+PLANT_NODE = (
+    Parameter(
+        'sample_rate', 1000.0, 'Rate at which y and the truth are published.',
+        unit='Hz', lower=0.1, upper=5000.0,
+    ),
+)  # fmt: skip
+
+OBSERVER_PARAMETERS = ParameterTable(MODEL, OBSERVER)
+ONLINE_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING)
+ESTIMATOR_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, ESTIMATOR_NODE)
+PLANT_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL)
+PLANT_NODE_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL, PLANT_NODE)
+NODE_TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}

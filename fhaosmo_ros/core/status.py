@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a step reports beside its estimate: one integer, readable as flags and a level count."""
+
+from enum import IntFlag
+
+LEVEL_SHIFT = 8
+"""Bits from here on hold the number of open levels."""
+
+
+class Status(IntFlag):
+    """Flags of a step. The number of open levels is kept apart: see `open_levels`.
+
+    A rejected sample leaves the state as it was; the time it stood for is added to the next step.
+    """
+
+    OK = 0
+    REJECTED_MEASUREMENT = 1  # y is NaN or infinite
+    REJECTED_PERIOD = 2  # dt is not a positive finite number
+    REJECTED_INPUT = 4  # u is NaN or infinite
+    REJECTED_STEP = 8  # the step would have left the finite numbers
+    GAMMA_AT_MIN = 16
+    GAMMA_AT_MAX = 32
+    SENSITIVITY_RESET = 64  # the sensitivities grew beyond use and start again at 0
+
+    @property
+    def rejected(self) -> bool:
+        """True if the sample was not used."""
+        return bool(self & REJECTED)
+
+
+REJECTED = (
+    Status.REJECTED_MEASUREMENT
+    | Status.REJECTED_PERIOD
+    | Status.REJECTED_INPUT
+    | Status.REJECTED_STEP
+)
+
+
+def flags(word: int) -> Status:
+    """Return the flags of a step's status word."""
+    return Status(word & ((1 << LEVEL_SHIFT) - 1))
+
+
+def open_levels(word: int) -> int:
+    """Return how many levels run: level i is open if |eps_j| <= epsilon for every j < i."""
+    return word >> LEVEL_SHIFT

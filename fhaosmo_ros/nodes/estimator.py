@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The estimator node: y in; states, unknown input and gamma out, at the rate of a timer."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Float64, Float64MultiArray
+from std_srvs.srv import Trigger
+
+from fhaosmo_ros.core.observer import Observer
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
+from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher
+from fhaosmo_ros.nodes.messages import fill, labelled
+from fhaosmo_ros.nodes.parameters import declare, on_change
+from fhaosmo_ros.nodes.spin import run_node
+from fhaosmo_ros.nodes.subscription import subscribe_with_info
+
+SENSOR_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Best effort matches every publisher; the depth holds a second at 1 kHz."""
+
+
+class EstimatorNode(Node):
+    """Subscribes ``y`` (and ``u``), steps the observer on each sample, publishes on a timer.
+
+    Raises
+    ------
+    ConfigurationError
+        Parameters that can't be used; nothing has been subscribed or published then.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(
+            'estimator', automatically_declare_parameters_from_overrides=True, **options
+        )
+        values = declare(self, ESTIMATOR_PARAMETERS, lambda v: OnlineEstimator(_online(v)))
+        self.estimator = OnlineEstimator(_online(values))
+        self._compile()
+        self._clock_stamps = values['sampling'] == 'clock'
+        self._max_gap = float(values['max_gap'])
+        self._sequence = 0
+        self._lost = 0
+        self._arrival: int | None = None
+        self._stale = True
+
+        observer = self.estimator.observer
+        self._state = labelled([f'z{i + 1}' for i in range(observer.order)])
+        self._innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
+        self._publish_state = self.create_publisher(Float64MultiArray, '~/state', 10).publish
+        self._publish_d = self.create_publisher(Float64, '~/unknown_input', 10).publish
+        self._publish_gamma = self.create_publisher(Float64, '~/gamma', 10).publish
+        self._publish_innovation = self.create_publisher(
+            Float64MultiArray, '~/innovation', 10
+        ).publish
+        self._publish_stamp = self.create_publisher(Time, '~/stamp', 10).publish
+        self._diagnostics = DiagnosticsPublisher(self, self._report)
+        self.create_service(Trigger, '~/reset', self._reset)
+        self._timer = self._start_timer(values['publish_rate'])
+        on_change(self, ESTIMATOR_PARAMETERS, self._check, self._configure)
+        if observer.uses_input:
+            self.create_subscription(Float64, 'u', self._on_input, SENSOR_QOS)
+        self._y = subscribe_with_info(self, Float64, 'y', self._on_sample, SENSOR_QOS)
+        parameters = observer.parameters
+        self.get_logger().info(
+            f'estimating {observer.order} states and the unknown input from {self._y.topic_name} '
+            f'({parameters["variant"]}, {parameters["scheme"]})'
+        )
+
+    def _compile(self) -> None:
+        """Compile before the first sample arrives; cached on disk after the first start."""
+        trial = Observer(self.estimator.observer.parameters)
+        trial.start(0.0)
+        trial.step(0.0, 1e-3)
+
+    def _on_sample(self, message: Float64, info: Mapping[str, Any]) -> None:
+        if self._clock_stamps:
+            stamp = self.get_clock().now().nanoseconds
+        else:
+            stamp = info['source_timestamp']
+        self._count_lost(info.get('publication_sequence_number'))
+        estimator = self.estimator
+        restarts = estimator.counters.restarts
+        estimate = estimator.update(stamp, message.data)
+        self._arrival = stamp
+        if estimator.counters.restarts != restarts:
+            self.get_logger().warning(
+                'time jumped by more than max_gap between two samples: restarted from the new one'
+            )
+        if estimate.status.rejected:
+            self.get_logger().warning(
+                f'rejected a sample: {estimate.status.name}, y = {message.data} '
+                f'({estimator.counters.rejected} rejected so far)',
+                throttle_duration_sec=5.0,
+            )
+
+    def _count_lost(self, sequence: int | None) -> None:
+        """Count the samples between the publisher's last sequence number and this one."""
+        if sequence:
+            if self._sequence and sequence > self._sequence + 1:
+                self._lost += sequence - self._sequence - 1
+            self._sequence = sequence
+
+    def _on_input(self, message: Float64) -> None:
+        if not self.estimator.set_input(message.data):
+            self.get_logger().warning(
+                f'rejected u = {message.data}: expected a finite number; the last one is held',
+                throttle_duration_sec=5.0,
+            )
+
+    def _publish(self) -> None:
+        estimator = self.estimator
+        estimate = estimator.estimate
+        if estimate is None or self._is_stale():
+            return
+        self._publish_state(fill(self._state, estimate.z))
+        self._publish_d(Float64(data=estimate.unknown_input))
+        self._publish_gamma(Float64(data=estimate.gamma))
+        self._publish_innovation(fill(self._innovation, estimate.innovation))
+        seconds, nanoseconds = divmod(estimator.stamp, 1_000_000_000)
+        self._publish_stamp(Time(sec=seconds, nanosec=nanoseconds))
+
+    def _is_stale(self) -> bool:
+        """Return True, and say it once, while no sample has come for max_gap."""
+        if self._arrival is not None:
+            self._arrival = None
+            self._silent_since = self.get_clock().now().nanoseconds
+            self._stale = False
+        elif not self._stale:
+            silence = (self.get_clock().now().nanoseconds - self._silent_since) * 1e-9
+            if silence > self._max_gap:
+                self._stale = True
+                self.get_logger().warning(
+                    f'no sample on {self._y.topic_name} for {silence:.2g} s: not publishing '
+                    'until one comes'
+                )
+        return self._stale
+
+    def _start_timer(self, rate: float) -> Any:
+        return self.create_timer(1.0 / rate, self._publish)
+
+    def _check(self, changes: Mapping[str, Any]) -> None:
+        self.estimator.check(_online(changes))
+
+    def _configure(self, changes: Mapping[str, Any]) -> None:
+        self.estimator.configure(_online(changes))
+        self._max_gap = float(changes.get('max_gap', self._max_gap))
+        if 'sampling' in changes:
+            self._clock_stamps = changes['sampling'] == 'clock'
+            self.estimator.forget_stamp()
+        if 'publish_rate' in changes:
+            self.destroy_timer(self._timer)
+            self._timer = self._start_timer(changes['publish_rate'])
+
+    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.estimator.reset()
+        response.success = True
+        response.message = 'the observer starts afresh with the next sample'
+        self.get_logger().info(f'reset: {response.message}')
+        return response
+
+    def _report(self) -> dict[str, Any]:
+        """Return what diagnostics show."""
+        counters = self.estimator.counters
+        estimate = self.estimator.estimate
+        return {
+            'samples accepted': counters.accepted,
+            'samples lost': self._lost,
+            'rejected measurements': counters.rejected_measurements,
+            'rejected stamps': counters.rejected_stamps,
+            'rejected inputs': counters.rejected_inputs,
+            'rejected steps': counters.rejected_steps,
+            'restarts': counters.restarts,
+            'open levels': estimate.open_levels if estimate else 0,
+            'gamma': estimate.gamma if estimate else float('nan'),
+        }
+
+
+def _online(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters of the update path among the node's."""
+    return {name: value for name, value in values.items() if name in ONLINE_PARAMETERS}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the estimator node."""
+    return run_node('estimator', EstimatorNode, argv)

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Subscriptions that also deliver a message's source time stamp."""
+
+from collections.abc import Callable
+import inspect
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+
+def subscribe_with_info(
+    node: Node,
+    message_type: Any,
+    topic: str,
+    callback: Callable[[Any, dict[str, int]], None],
+    qos: QoSProfile,
+    raw: bool = False,
+) -> Any:
+    """Subscribe with a callback that takes the message and its info.
+
+    rclpy decides from the callback's signature whether to deliver the info. The events executor
+    of rclpy 7.1 then passes both as one tuple, the other executors as two arguments: this takes
+    either.
+    """
+
+    def adapter(*arguments: Any) -> None:
+        message, info = arguments[0] if len(arguments) == 1 else arguments
+        callback(message, info)
+
+    adapter.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
+    return node.create_subscription(message_type, topic, adapter, qos, raw=raw)

@@ -1,0 +1,102 @@
+#!/bin/sh
+# SPDX-License-Identifier: Apache-2.0
+# Print the path of a Python that can run this checkout, after making its environment if need be.
+#
+#   sh scripts/environment.sh [--print-plan] [EXTRA ...]    EXTRA of setup.py, such as: test
+#
+# Where a ROS 2 is sourced, its own rclpy is used (.venv-ros sees the system's packages and
+# PYTHONPATH); elsewhere community wheels of Jazzy are installed (.venv). Never both: two builds
+# of one library in one process crash.
+#
+# Only the dependencies are installed, not the package: an editable install leaves egg-info in
+# the tree and stale copies of the data files in the venv. A .pth file names the checkout instead.
+set -eu
+cd "$(dirname "$0")/.."
+root=$(pwd)
+python=${PYTHON:-python3}
+other='name another, as in: make demo PYTHON=python3.12'
+
+say() { printf '%s\n' "$*" >&2; }
+fail() { say "error: $*"; exit 1; }
+
+command -v "$python" >/dev/null || fail "no $python here: install Python 3.11 or later, or $other"
+"$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
+    fail "Python 3.11 or later is needed, $python is $("$python" -V 2>&1): $other"
+
+if [ -n "${ROS_DISTRO:-}" ] && "$python" -c 'import rclpy' 2>/dev/null; then
+    venv=.venv-ros options=--system-site-packages wheels=no distribution=$ROS_DISTRO
+    cost='up to a minute and 500 MB'
+    [ "$ROS_DISTRO" = jazzy ] || say "warning: only ROS 2 Jazzy is tested, sourced is $ROS_DISTRO"
+elif [ -n "${ROS_DISTRO:-}" ] && [ -n "${AMENT_PREFIX_PATH:-}" ]; then
+    fail "ROS 2 $ROS_DISTRO is sourced but $python ($("$python" -V)) cannot import rclpy:" \
+        "use the Python ROS was built for (make demo PYTHON=/usr/bin/python3)" \
+        "or a shell without ROS"
+else
+    venv=.venv options='' wheels=yes distribution=''
+    cost='about a minute and 750 MB'
+fi
+if [ "${1:-}" = --print-plan ]; then
+    printf 'venv: %s\nwheels: %s\n' "$venv" "$wheels"
+    exit
+fi
+
+bin=$root/$venv/bin
+# What an environment was made from; when this changes, it is made anew.
+interpreter=$("$python" -c 'import sys; print(sys.base_prefix, sys.version)')
+origin="$root $interpreter $distribution $(cksum <setup.py)"
+
+current() { [ -x "$bin/python" ] && [ "$(cat "$venv/made-$1" 2>/dev/null)" = "$origin" ]; }
+
+make_venv() {
+    # --clear, not rm: $python may be the one of this very environment, activated.
+    if "$python" -c 'import ensurepip; ensurepip.version()' 2>/dev/null; then
+        "$python" -m venv --clear $options "$venv"
+    elif "$python" -m pip --version >/dev/null 2>&1; then
+        # Debian splits ensurepip off into python3-venv; the pip outside can fill a bare venv.
+        "$python" -m venv --clear --without-pip $options "$venv"
+        "$python" -m pip --python "$bin/python" install -qq pip
+    else
+        fail "$python has neither ensurepip nor pip: install one (Debian: apt install python3-venv)"
+    fi
+    # To read setup.py with (below); no venv has it from Python 3.12 on.
+    "$bin/python" -m pip install -qq 'setuptools>=68,<80' ||
+        fail "pip could not install setuptools (see above); is there a network?"
+    # ROS's compiled modules want the numpy they were built against; the wheels' venv has none yet.
+    "$bin/python" -c 'import numpy; print("numpy==" + numpy.__version__)' \
+        >"$venv/constraints.txt" 2>/dev/null || :
+    "$bin/python" -c '
+import sys, sysconfig
+with open(sysconfig.get_path("purelib") + "/fhaosmo_ros.pth", "w") as file:
+    print(sys.argv[1], file=file)' "$root"
+}
+
+install() { # install run: the requirements of setup.py; install EXTRA: those of an extra
+    "$bin/python" -c '
+import sys, setuptools
+from distutils.core import run_setup
+setup = run_setup("setup.py", stop_after="init")
+name = sys.argv[1]
+print(*setup.install_requires if name == "run" else setup.extras_require[name], sep="\n")
+' "$1" >"$venv/requirements-$1.txt"
+    "$bin/python" -m pip install -qq --disable-pip-version-check \
+        -r "$venv/requirements-$1.txt" -c "$venv/constraints.txt" ||
+        fail "pip could not install what $venv/requirements-$1.txt lists (see above);" \
+            "the ROS 2 wheels are for Linux on x86-64, elsewhere source a ROS 2 Jazzy"
+}
+
+if ! current run; then
+    say "Making the environment $venv, once; this takes $cost ..."
+    make_venv
+    install run
+    [ $wheels = no ] || install ros
+    "$bin/python" -c 'import rclpy' || fail "rclpy cannot be imported in $venv (see above)"
+    printf '%s' "$origin" >"$venv/made-run"
+fi
+for extra; do
+    if ! current "$extra"; then
+        say "Adding the packages of [$extra] to $venv, once ..."
+        install "$extra"
+        printf '%s' "$origin" >"$venv/made-$extra"
+    fi
+done
+printf '%s\n' "$bin/python"

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What colcon installs, what the launch file starts, which environment make chooses."""
+
+import importlib.util
+import os
+from pathlib import Path
+import runpy
+import shutil
+import subprocess
+import sys
+from types import ModuleType
+from xml.etree import ElementTree
+
+import fhaosmo_ros
+from fhaosmo_ros.__main__ import main
+from fhaosmo_ros.commands import COMMANDS
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+NAME = 'fhaosmo_ros'
+# A sourced ROS or overlay would leak into the builds and plans below.
+SOURCED = ('AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'ROS_DISTRO')
+
+
+def clean_environment(**extra: str) -> dict[str, str]:
+    return {k: v for k, v in os.environ.items() if k not in SOURCED} | extra
+
+
+def run(*command: object, **options) -> str:
+    """Run a command, fail with its output if it fails, return what it printed."""
+    done = subprocess.run(
+        [str(part) for part in command], capture_output=True, text=True, **options
+    )
+    assert done.returncode == 0, f'{command}:\n{done.stdout}\n{done.stderr}'
+    return done.stdout
+
+
+# colcon
+
+
+@pytest.fixture(scope='module')
+def checkout(tmp_path_factory) -> Path:
+    """Return a copy of this tree's own files, so that building leaves no trace in it."""
+    if shutil.which('git') is None or not (ROOT / '.git').exists():
+        pytest.skip('not a git checkout: no list of the files that belong to it')
+    listing = run('git', '-C', ROOT, 'ls-files', '-co', '--exclude-standard', '-z')
+    copy = tmp_path_factory.mktemp('workspace') / 'src' / NAME
+    for name in filter(None, listing.split('\0')):
+        if (ROOT / name).is_file():
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, copy / name)
+    return copy
+
+
+@pytest.fixture(scope='module', params=['copied', 'symlinked'])
+def installed(request, checkout, tmp_path_factory) -> Path:
+    """Build with colcon and return the install folder."""
+    if importlib.util.find_spec('colcon_core') is None:
+        pytest.skip('colcon is not installed (pip install colcon-common-extensions)')
+    base = tmp_path_factory.mktemp(request.param)
+    options = ['--symlink-install'] if request.param == 'symlinked' else []
+    # fmt: off
+    run(
+        sys.executable, '-m', 'colcon', '--log-base', base / 'log', 'build', *options,
+        '--base-paths', checkout, '--build-base', base / 'build', '--install-base',
+        base / 'install', cwd=base, env=clean_environment(),
+    )
+    # fmt: on
+    return base / 'install'
+
+
+def test_colcon_installs_executables_and_data(installed, checkout):
+    prefix = installed / NAME
+    for command in COMMANDS:
+        assert os.access(prefix / 'lib' / NAME / command, os.X_OK)
+    share = prefix / 'share' / NAME
+    for pattern in ('config/**/*.yaml', 'launch/*.py', 'package.xml'):
+        expected = {path.relative_to(checkout) for path in checkout.glob(pattern)}
+        assert {path.relative_to(share) for path in share.glob(pattern)} == expected
+    assert (share / 'launch' / 'demo.launch.py').is_file()
+    assert (prefix / 'share/ament_index/resource_index/packages' / NAME).is_file()
+
+
+def test_sourcing_sets_the_ament_prefix(installed):
+    """Unset, it means that colcon took the package for plain Python, not ament_python."""
+    if shutil.which('bash') is None:
+        pytest.skip('bash is not installed')
+    script = f'. {installed}/setup.bash && echo "$AMENT_PREFIX_PATH"'
+    printed = run('bash', '-c', script, env=clean_environment())
+    assert str(installed / NAME) in printed.strip().split(':')
+
+
+def test_sourced_package_is_the_built_one(installed, checkout, tmp_path):
+    """--symlink-install must run the sources themselves, so that an edit takes effect."""
+    if shutil.which('bash') is None:
+        pytest.skip('bash is not installed')
+    query = f'import {NAME}; print({NAME}.__file__)'
+    script = f'. {installed}/setup.bash && {sys.executable} -c "{query}"'
+    printed = run('bash', '-c', script, env=clean_environment(), cwd=tmp_path)
+    imported = Path(printed.strip())
+    assert imported.is_relative_to(installed.parent) or imported.is_relative_to(checkout)
+    symlinked = installed.parent.name.startswith('symlinked')
+    assert imported.resolve().is_relative_to(checkout if symlinked else installed)
+
+
+def test_executable_starts_with_only_the_overlay_sourced(installed, tmp_path):
+    """An executable that cannot find its package or its interpreter fails here."""
+    if not (ROOT / NAME / 'tools' / 'demo.py').exists():
+        pytest.skip('fhaosmo_ros.tools.demo does not exist')
+    script = f'. {installed}/setup.bash && {installed}/{NAME}/lib/{NAME}/demo --help'
+    assert '--duration' in run('bash', '-c', script, env=clean_environment(), cwd=tmp_path)
+
+
+# package.xml
+
+
+def test_package_xml():
+    package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    assert package.get('format') == '3'
+    assert package.findtext('name') == NAME
+    assert package.findtext('version') == fhaosmo_ros.__version__
+    assert package.findtext('license') == 'Apache-2.0'
+    assert package.findtext('export/build_type') == 'ament_python'
+    needed = {tag.text for tag in package.findall('exec_depend')}
+    assert {'rclpy', 'std_msgs', 'std_srvs', 'launch_ros', 'python3-numba'} <= needed
+    assert 'python3-pytest' in {tag.text for tag in package.findall('test_depend')}
+
+
+def test_package_xml_is_valid_for_ros_tools():
+    catkin_pkg = pytest.importorskip('catkin_pkg.package', reason='catkin_pkg is not installed')
+    warnings: list[str] = []
+    package = catkin_pkg.parse_package(str(ROOT / 'package.xml'), warnings=warnings)
+    package.validate(warnings=warnings)
+    assert warnings == []
+
+
+# launch
+
+
+class Recorded:
+    """Stands for any class of the launch packages: keeps what it was made with."""
+
+    def __init__(self, *args, **kwargs):
+        self.args, self.kwargs = args, kwargs
+
+
+def stub(monkeypatch, module: str, *names: str) -> None:
+    """Put a module into sys.modules whose classes record; PyPI has no `launch` to test with."""
+    fake = ModuleType(module)
+    fake.__path__ = []
+    for name in names:
+        setattr(fake, name, type(name, (Recorded,), {}))
+    monkeypatch.setitem(sys.modules, module, fake)
+
+
+def test_launch_file_starts_both_nodes(monkeypatch):
+    stub(monkeypatch, 'launch', 'LaunchDescription')
+    stub(monkeypatch, 'launch.actions', 'DeclareLaunchArgument', 'Shutdown')
+    stub(monkeypatch, 'launch.substitutions', 'LaunchConfiguration', 'PathJoinSubstitution')
+    stub(monkeypatch, 'launch_ros')
+    stub(monkeypatch, 'launch_ros.actions', 'Node')
+    stub(monkeypatch, 'launch_ros.parameter_descriptions', 'ParameterValue')
+    stub(monkeypatch, 'launch_ros.substitutions', 'FindPackageShare')
+
+    script = runpy.run_path(str(ROOT / 'launch' / 'demo.launch.py'))
+    (entities,) = script['generate_launch_description']().args
+    arguments = {e.args[0]: e for e in entities if type(e).__name__ == 'DeclareLaunchArgument'}
+    nodes = {e.kwargs['executable']: e.kwargs for e in entities if type(e).__name__ == 'Node'}
+
+    assert set(arguments) == {'params_file', 'namespace', 'use_sim_time', 'log_level'}
+    ((share, *path),) = arguments['params_file'].kwargs['default_value'].args
+    assert share.args == (NAME,)
+    assert path == ['config', 'demo.yaml']
+
+    assert set(nodes) == {'plant', 'estimator'}
+    assert set(nodes) <= set(COMMANDS)
+    for node in nodes.values():
+        assert node['package'] == NAME
+        assert node['namespace'].args == ('namespace',)
+        params_file, overrides = node['parameters']
+        assert params_file.args == ('params_file',)
+        # A bare substitution would reach the node as a string.
+        assert overrides['use_sim_time'].kwargs == {'value_type': bool}
+        assert node['ros_arguments'][0] == '--log-level'
+        assert type(node['on_exit']).__name__ == 'Shutdown'
+
+
+# scripts/environment.sh
+
+
+def plan(python: object = sys.executable, **environment: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        ['sh', ROOT / 'scripts' / 'environment.sh', '--print-plan'],
+        env=clean_environment(PYTHON=str(python), **environment),
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.fixture
+def fake_ros(tmp_path) -> Path:
+    """Return a folder with an importable rclpy, as PYTHONPATH has it where ROS is sourced."""
+    (tmp_path / 'rclpy').mkdir()
+    (tmp_path / 'rclpy' / '__init__.py').touch()
+    return tmp_path
+
+
+def test_plan_without_ros_takes_the_wheels():
+    assert plan().stdout == 'venv: .venv\nwheels: yes\n'
+
+
+def test_plan_with_sourced_jazzy_takes_its_rclpy(fake_ros):
+    done = plan(ROS_DISTRO='jazzy', PYTHONPATH=str(fake_ros))
+    assert done.stdout == 'venv: .venv-ros\nwheels: no\n'
+    assert done.stderr == ''
+
+
+def test_plan_with_another_distribution_warns(fake_ros):
+    done = plan(ROS_DISTRO='kilted', PYTHONPATH=str(fake_ros))
+    assert done.stdout == 'venv: .venv-ros\nwheels: no\n'
+    assert 'only ROS 2 Jazzy is tested, sourced is kilted' in done.stderr
+
+
+def test_plan_with_ros_for_another_python_is_an_error(tmp_path):
+    (tmp_path / 'rclpy.py').write_text('raise ImportError("built for another Python")')
+    done = plan(ROS_DISTRO='jazzy', AMENT_PREFIX_PATH='/opt', PYTHONPATH=str(tmp_path))
+    assert done.returncode == 1
+    assert done.stdout == ''
+    assert 'cannot import rclpy' in done.stderr
+
+
+def test_plan_with_an_old_python_is_an_error(tmp_path):
+    old = tmp_path / 'python3'
+    old.write_text('#!/bin/sh\n[ "$1" = -V ] && echo Python 3.10.1\nexit 1\n')
+    old.chmod(0o755)
+    done = plan(old)
+    assert done.returncode == 1
+    assert 'Python 3.11 or later is needed' in done.stderr
+    assert 'Python 3.10.1' in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+# python -m fhaosmo_ros
+
+
+def test_unknown_command_names_the_closest(capsys):
+    assert main(['estimater']) == 2
+    message = capsys.readouterr().err
+    assert "no command 'estimater'" in message
+    assert "did you mean 'estimator'?" in message
+    assert all(command in message for command in COMMANDS)
+    assert len(message.splitlines()) == 1
+
+
+def test_no_command_lists_all(capsys):
+    assert main([]) == 2
+    message = capsys.readouterr().err
+    assert all(command in message for command in COMMANDS)
+
+
+@pytest.mark.parametrize('flag', ['-h', '--help'])
+def test_help(capsys, flag):
+    assert main([flag]) == 0
+    message = capsys.readouterr().out
+    assert all(command in message for command in COMMANDS)
+
+
+def test_command_gets_its_arguments_and_returns_its_code(monkeypatch):
+    fake = ModuleType('fake_command')
+    fake.main = len
+    monkeypatch.setitem(sys.modules, 'fake_command', fake)
+    monkeypatch.setitem(COMMANDS, 'fake', ('fake_command', ''))
+    assert main(['fake', 'one', '--two']) == 2
+
+
+def test_missing_dependency_is_named(monkeypatch, capsys):
+    monkeypatch.setitem(COMMANDS, 'fake', ('no_such_module_here', ''))
+    assert main(['fake']) == 1
+    assert "'no_such_module_here'" in capsys.readouterr().err
+
+
+def test_module_exit_code():
+    done = subprocess.run(
+        [sys.executable, '-m', NAME, 'nonsense'], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stdout == ''
