@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays that compiled code uses without counting references.
+"""
+Arrays that compiled code uses without counting references.
 
 numba counts references atomically each time an array is handed from function to function, which
 costs more than the arithmetic of a step. A compiled function whose caller keeps its arrays alive
@@ -11,8 +12,7 @@ from typing import Any
 from numba.extending import intrinsic
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def borrowed(typing_context: Any, array: Any) -> Any:
+def _borrowed(typing_context: Any, array: Any) -> Any:
     """Return the same array without an owner; valid while the caller's array lives."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -21,3 +21,6 @@ def borrowed(typing_context: Any, array: Any) -> Any:
         return view._getvalue()
 
     return array(array), generate
+
+
+borrowed: Any = intrinsic(_borrowed)

@@ -4,18 +4,18 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from fhaosmo_ros.core import kernels
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.fuzzy import KNOTS, curve, terms_of_level
+from fhaosmo_ros.core.fuzzy import curve, KNOTS, terms_of_level
 from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.core.parameter import Parameter
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS
+import numpy as np
 
 
 class ObserverConfiguration:
-    """A valid set of observer parameters and the compiled law that it stands for.
+    """
+    A valid set of observer parameters and the compiled law that it stands for.
 
     Parameters
     ----------
@@ -26,6 +26,7 @@ class ObserverConfiguration:
     ------
     ConfigurationError
         An unknown name, a bad value, or values that do not fit together.
+
     """
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
@@ -35,12 +36,14 @@ class ObserverConfiguration:
         self._complete()
 
     def changed(self, changes: Mapping[str, Any]) -> 'ObserverConfiguration':
-        """Return a configuration with some live parameters changed.
+        """
+        Return a configuration with some live parameters changed.
 
         Raises
         ------
         ConfigurationError
             As the constructor, or a change of a parameter that can't change live.
+
         """
         changes = OBSERVER_PARAMETERS.coerce(changes)
         for name, value in changes.items():
@@ -92,10 +95,12 @@ class ObserverConfiguration:
         if flags[kernels.SIGN]:  # the kernel does not read them
             curves = np.ones((levels, KNOTS))
         else:
-            curves = np.array([
-                curve(terms_of_level(i + 1), p['fuzzy_shape'], p['fuzzy_normalise'])
-                for i in range(levels)
-            ])
+            curves = np.array(
+                [
+                    curve(terms_of_level(i + 1), p['fuzzy_shape'], p['fuzzy_normalise'])
+                    for i in range(levels)
+                ]
+            )
         gains = [self._per_level('lambda'), self._per_level('alpha'), 1.0 / np.array(widths)]
         scalars = np.zeros(kernels.SCALARS)
         scalars[kernels.EPSILON] = p['epsilon']

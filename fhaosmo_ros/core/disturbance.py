@@ -3,9 +3,8 @@
 
 import math
 
-from numba import njit
-
 from fhaosmo_ros.core.tape import Floats
+from numba import njit
 
 KINDS = ('none', 'sine', 'step', 'square', 'chirp')
 NONE, SINE, STEP, SQUARE, CHIRP = range(5)
@@ -15,7 +14,8 @@ AMPLITUDE, OMEGA, PHASE, OFFSET, START, OMEGA_END, SWEEP_TIME = range(7)
 
 @njit(cache=True, error_model='numpy')
 def disturbance(kind: int, c: Floats, t: float) -> float:
-    """Return d(t).
+    """
+    Return d(t).
 
     Parameters
     ----------
@@ -25,11 +25,12 @@ def disturbance(kind: int, c: Floats, t: float) -> float:
         Values in the order of `NAMES` (rad/s, rad, s).
     t : float
         Time since the plant's start, in seconds.
+
     """
     if kind == NONE:
         return 0.0
     if kind == STEP:
-        return c[OFFSET] + (c[AMPLITUDE] if t >= c[START] else 0.0)
+        return float(c[OFFSET] + (c[AMPLITUDE] if t >= c[START] else 0.0))
     angle = c[OMEGA] * t
     if kind == CHIRP:
         swept = min(t, c[SWEEP_TIME])
@@ -38,4 +39,4 @@ def disturbance(kind: int, c: Floats, t: float) -> float:
     wave = math.sin(angle + c[PHASE])
     if kind == SQUARE:
         wave = 1.0 if wave >= 0.0 else -1.0
-    return c[OFFSET] + c[AMPLITUDE] * wave
+    return float(c[OFFSET] + c[AMPLITUDE] * wave)

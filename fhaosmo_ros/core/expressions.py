@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Expressions from outside, parsed by a whitelist into tapes.
+"""
+Expressions from outside, parsed by a whitelist into tapes.
 
 Python's own parser reads the text (as syntax only); every node that is not on the list is refused.
 Nothing is evaluated by Python, so an expression can't run anything.
@@ -9,11 +10,10 @@ import ast
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from fhaosmo_ros.core import tape
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter import suggestion
+import numpy as np
 
 MAX_LENGTH = 500
 MAX_NESTING = 50
@@ -46,7 +46,8 @@ class Instruction(NamedTuple):
 
 
 def parse(text: str, level: int) -> list[Instruction]:
-    """Parse Phi_level.
+    """
+    Parse Phi_level.
 
     Parameters
     ----------
@@ -64,6 +65,7 @@ def parse(text: str, level: int) -> list[Instruction]:
     ------
     ConfigurationError
         Anything that is not on the whitelist.
+
     """
     if len(text) > MAX_LENGTH:
         raise _error(level, text[:40] + '...', f'{len(text)} characters, at most {MAX_LENGTH}')

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the paper's rule bases to curves psi that a step reads in constant time.
+"""
+From the paper's rule bases to curves psi that a step reads in constant time.
 
 psi_1 has 5 terms (NB NS ZR PS PB), psi_2 and psi_3 have 7 (NBB .. PBB); rule k maps term k of the
 input to term k of the output (paper, section 3). scikit-fuzzy makes the membership functions and
@@ -9,11 +10,10 @@ half-width scales the input, so a width can change without a new inference.
 
 from functools import lru_cache
 
-import numpy as np
-import skfuzzy
-from numpy.typing import NDArray
-
 from fhaosmo_ros.core.errors import ConfigurationError
+import numpy as np
+from numpy.typing import NDArray
+import skfuzzy
 
 TERMS = {5: ('NB', 'NS', 'ZR', 'PS', 'PB'), 7: ('NBB', 'NB', 'NS', 'ZR', 'PS', 'PB', 'PBB')}
 KNOTS = 257
@@ -30,7 +30,8 @@ def terms_of_level(level: int) -> int:
 
 
 def memberships(universe: Curve, terms: int, shape: str) -> Curve:
-    """Return the membership functions of evenly spaced terms on [-1, 1].
+    """
+    Return the membership functions of evenly spaced terms on [-1, 1].
 
     Parameters
     ----------
@@ -45,6 +46,7 @@ def memberships(universe: Curve, terms: int, shape: str) -> Curve:
     -------
     (terms, K) array
         One row a term, from the most negative to the most positive.
+
     """
     peaks = np.linspace(-1.0, 1.0, terms)
     gap = peaks[1] - peaks[0]
@@ -61,7 +63,8 @@ def memberships(universe: Curve, terms: int, shape: str) -> Curve:
 
 
 def infer(x: float, terms: int, shape: str) -> float:
-    """Mamdani inference with rule k: term k -> term k; minimum, maximum, centroid.
+    """
+    Mamdani inference with rule k: term k -> term k; minimum, maximum, centroid.
 
     Parameters
     ----------
@@ -72,6 +75,7 @@ def infer(x: float, terms: int, shape: str) -> float:
     -------
     float
         The crisp output, not normalised.
+
     """
     activation = memberships(np.array([x]), terms, shape)
     clipped = np.minimum(activation, _output_terms(terms, shape))
@@ -80,7 +84,8 @@ def infer(x: float, terms: int, shape: str) -> float:
 
 @lru_cache(maxsize=32)
 def curve(terms: int, shape: str, normalise: bool) -> Curve:
-    """Return psi at `KNOTS` evenly spaced points of [0, 1] (it is odd), read-only.
+    """
+    Return psi at `KNOTS` evenly spaced points of [0, 1] (it is odd), read-only.
 
     Parameters
     ----------
@@ -91,6 +96,7 @@ def curve(terms: int, shape: str, normalise: bool) -> Curve:
     -------
     (KNOTS,) array
         0 at 0, non-decreasing.
+
     """
     psi = np.array([infer(x, terms, shape) for x in np.linspace(0.0, 1.0, KNOTS)])
     psi[0] = 0.0  # the rules are symmetric; the centroid leaves rounding errors

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled recursion: every variant, both schemes, and the exact sensitivity to gamma.
+"""
+The compiled recursion: every variant, both schemes, and the exact sensitivity to gamma.
 
 Equations are cited as P (paper: label of the equation) and D (number in docs/mathematics.md).
 The state's layout is described in layout.py.
@@ -7,9 +8,6 @@ The state's layout is described in layout.py.
 
 import math
 from typing import NamedTuple
-
-import numpy as np
-from numba import njit
 
 from fhaosmo_ros.core.borrowed import borrowed
 from fhaosmo_ros.core.layout import (
@@ -22,8 +20,11 @@ from fhaosmo_ros.core.layout import (
     TILDE_SENSITIVITY,
     Y,
 )
-from fhaosmo_ros.core.status import LEVEL_SHIFT, REJECTED as REJECTED_FLAGS, Status
-from fhaosmo_ros.core.tape import Floats, Ints, evaluate
+from fhaosmo_ros.core.status import LEVEL_SHIFT, Status
+from fhaosmo_ros.core.status import REJECTED as REJECTED_FLAGS
+from fhaosmo_ros.core.tape import evaluate, Floats, Ints
+from numba import njit
+import numpy as np
 
 # Plain integers: numba reads them as constants.
 REJECTED_MEASUREMENT = int(Status.REJECTED_MEASUREMENT)
@@ -44,7 +45,8 @@ TINY = 1e-300
 
 
 class Law(NamedTuple):
-    """What the kernels read of a configuration; their first arguments, in this order.
+    """
+    What the kernels read of a configuration; their first arguments, in this order.
 
     Attributes
     ----------
@@ -58,6 +60,7 @@ class Law(NamedTuple):
         `EPSILON` .. `LEAKAGE`.
     tape, offsets : arrays
         Phi_1 .. Phi_N; see tape.py.
+
     """
 
     flags: Ints
@@ -69,7 +72,8 @@ class Law(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Scratch memory of the kernels; their next arguments, in this order.
+    """
+    Scratch memory of the kernels; their next arguments, in this order.
 
     Attributes
     ----------
@@ -79,6 +83,7 @@ class Work(NamedTuple):
         Measurements m_i of the levels and their sensitivities dm_i / dgamma.
     stack : (2, depth) array
         Of the expression tapes.
+
     """
 
     x: Floats
@@ -94,7 +99,7 @@ SCALARS = 7
 
 @njit(cache=True, error_model='numpy', forceinline=True)
 def psi(flags: Ints, gains: Floats, curves: Floats, level: int, a: float) -> tuple[float, float]:
-    """Return psi(a) and psi'(a) for a = |eps| > 0; psi is odd, so that is all of it."""
+    """Return the fuzzy sign at a = |eps| > 0, and its slope; it is odd, so that is all of it."""
     if flags[SIGN]:
         return 1.0, 0.0
     last = curves.shape[1] - 1
@@ -111,12 +116,14 @@ def psi(flags: Ints, gains: Floats, curves: Floats, level: int, a: float) -> tup
 def root(
     flags: Ints, gains: Floats, curves: Floats, level: int, b: float, h: float, gamma: float
 ) -> tuple[float, float]:
-    """Solve eps + h lambda |eps|^gamma s + h^2 alpha s = b, s in psi(eps), for b >= 0 (D 9).
+    """
+    Solve eps + h lambda |eps|^gamma s + h^2 alpha s = b, s in psi(eps), for b >= 0 (D 9).
 
     Returns
     -------
     (float, float)
         eps >= 0 and s. The left side increases with eps, so there is one root in [0, b].
+
     """
     damping = h * gains[LAMBDA, level]
     stiffness = h * h * gains[ALPHA, level]
@@ -144,13 +151,12 @@ def root(
         else:
             low = e
         slope = 1.0 + damping * (gamma * power / e * s + power * ds) + stiffness * ds
-        trial = e - f / slope
-        if not low < trial < high:
-            trial = 0.5 * (low + high)
-        change = abs(trial - e)
-        e = trial
-        if change <= NEWTON_TOLERANCE * e:
+        change = f / slope
+        trial = e - change
+        if abs(change) <= NEWTON_TOLERANCE * e:
+            e = trial
             break
+        e = trial if low < trial < high else 0.5 * (low + high)
     s, _ = psi(flags, gains, curves, level, e)
     return e, s
 
@@ -159,8 +165,9 @@ def root(
 def explicit(
     flags: Ints, gains: Floats, curves: Floats, scalars: Floats, tape: Floats, offsets: Ints,
     x: Floats, m: Floats, stack: Floats, gamma: float, y: float, h: float, u: float,
-) -> tuple[float, float]:
-    """Forward Euler of P adaptivesupertwistingobserverfuzzymodified, in place.
+) -> tuple[float, float]:  # fmt: skip
+    """
+    Forward Euler of P adaptivesupertwistingobserverfuzzymodified, in place.
 
     With psi = sign and gamma = 1/2 it is P triangularObserver, with gamma = 1/2 P fuzzysuper.
 
@@ -173,6 +180,7 @@ def explicit(
     -------
     (float, float)
         L and dL/dgamma at the interval's beginning.
+
     """
     n = gains.shape[1]
     loss, gradient = 0.0, 0.0
@@ -220,8 +228,9 @@ def explicit(
 def implicit(
     flags: Ints, gains: Floats, curves: Floats, scalars: Floats, tape: Floats, offsets: Ints,
     x: Floats, m: Floats, stack: Floats, gamma: float, y: float, h: float, u: float,
-) -> tuple[float, float]:
-    """Backward Euler of the same equations in place, one scalar equation a level (D 9).
+) -> tuple[float, float]:  # fmt: skip
+    """
+    Backward Euler of the same equations in place, one scalar equation a level (D 9).
 
     Parameters
     ----------
@@ -232,6 +241,7 @@ def implicit(
     -------
     (float, float)
         L and dL/dgamma at the interval's end.
+
     """
     n = gains.shape[1]
     loss, gradient = 0.0, 0.0
@@ -295,13 +305,15 @@ def step(
     flags: Ints, gains: Floats, curves: Floats, scalars: Floats, tape: Floats, offsets: Ints,
     x: Floats, m: Floats, stack: Floats,
     levels: Floats, memory: Floats, y: float, h: float, u: float, eps: Floats, row: int,
-) -> int:
-    """Advance a state in place to the sample `y` that lies `h` seconds after the last call.
+) -> int:  # fmt: skip
+    """
+    Advance a state in place to the sample `y` that lies `h` seconds after the last call.
 
     Returns
     -------
     int
         Status word (see status.py). A rejected sample changes nothing but the pending time.
+
     """
     n = gains.shape[1]
     word = 0
@@ -347,7 +359,8 @@ def step(
 def adapt(
     c: Floats, x: Floats, gamma: float, h: float, loss: float, gradient: float
 ) -> tuple[float, int]:
-    """Return the next gamma (P adaptationlawgamma) and its status flags.
+    """
+    Return the next gamma (P adaptationlawgamma) and its status flags.
 
     Projection on [gamma_min, gamma_max], dead zone and leakage are ours (D 8).
     """
@@ -379,7 +392,7 @@ def step_once(
     flags: Ints, gains: Floats, curves: Floats, scalars: Floats, tape: Floats, offsets: Ints,
     x: Floats, m: Floats, stack: Floats,
     levels: Floats, memory: Floats, y: float, h: float, u: float, eps: Floats,
-) -> int:
+) -> int:  # fmt: skip
     """Advance by one sample; see `step`. The innovations go to eps[0]."""
     return step(
         flags, gains, curves, scalars, tape, offsets, x, m, stack,
@@ -393,8 +406,9 @@ def run(
     x: Floats, m: Floats, stack: Floats,
     levels: Floats, memory: Floats, y: Floats, h: Floats, u: Floats,
     out: Floats, gamma: Floats, eps: Floats, words: Ints, first: int, every: int,
-) -> None:
-    """Step through arrays of samples from index `first` on, recording every `every`-th one.
+) -> None:  # fmt: skip
+    """
+    Step through arrays of samples from index `first` on, recording every `every`-th one.
 
     Row r of `out` (rows, 2, N), `gamma`, `eps` and `words` is the state after sample
     (r + 1) * every - 1; `eps` has one row more, for the samples after the last such one.

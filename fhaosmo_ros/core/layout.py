@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where each quantity of the observer lives: a (4, N) array of levels and a (3,) array beside it.
+"""
+Where each quantity of the observer lives: a (4, N) array of levels and a (3,) array beside it.
 
 Rows of the level array, column i - 1 for level i:
 

@@ -13,7 +13,8 @@ def rms(error: Series) -> float:
 
 
 def settling_time(t: Series, error: Series, band: float) -> float:
-    """Return the time after which |error| stays within `band` to the end.
+    """
+    Return the time after which |error| stays within `band` to the end.
 
     Parameters
     ----------
@@ -26,6 +27,7 @@ def settling_time(t: Series, error: Series, band: float) -> float:
     -------
     float
         Seconds since ``t[0]``; 0 if it never leaves the band, infinity if it ends outside.
+
     """
     outside = np.flatnonzero(~(np.abs(error) <= band))
     if not len(outside):
@@ -40,7 +42,8 @@ def total_variation(x: Series) -> float:
 
 
 def chatter(estimate: Series, truth: Series) -> float:
-    """Return the total variation of the estimate over that of the truth.
+    """
+    Return the total variation of the estimate over that of the truth.
 
     About 1 for an estimate that moves as the truth does; chatter makes it large.
     """

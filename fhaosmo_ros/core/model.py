@@ -4,15 +4,15 @@
 from collections.abc import Sequence
 from itertools import pairwise
 
-import numpy as np
-
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.expressions import as_array, parse
-from fhaosmo_ros.core.tape import INPUT, evaluate
+from fhaosmo_ros.core.tape import evaluate, INPUT
+import numpy as np
 
 
 class TriangularModel:
-    """The functions Phi_1 .. Phi_n of a triangular system, from expressions.
+    """
+    The functions Phi_1 .. Phi_n of a triangular system, from expressions.
 
     Parameters
     ----------
@@ -37,6 +37,7 @@ class TriangularModel:
     ------
     ConfigurationError
         A wrong number of expressions, or one that is not allowed.
+
     """
 
     def __init__(self, phi: Sequence[str], order: int | None = None) -> None:

@@ -5,20 +5,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
 from fhaosmo_ros.core import kernels, layout
 from fhaosmo_ros.core.configuration import ObserverConfiguration
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.status import LEVEL_SHIFT, Status, flags, open_levels
+from fhaosmo_ros.core.status import flags, LEVEL_SHIFT, open_levels, Status
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 FIXED_GAMMA = 0.5
 """Power of the variants that do not adapt (paper eq. triangularObserver, fuzzysuper)."""
 
 
 class Estimate(NamedTuple):
-    """What the observer knows after a sample.
+    """
+    What the observer knows after a sample.
 
     Attributes
     ----------
@@ -32,6 +32,7 @@ class Estimate(NamedTuple):
         eps_i = m_i - z_hat_i.
     word : int
         Status word; see `status` and `open_levels`.
+
     """
 
     z: NDArray[np.float64]
@@ -52,7 +53,8 @@ class Estimate(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """Estimates of a run; row k belongs to ``t[k]``. Attributes as in `Estimate`.
+    """
+    Estimates of a run; row k belongs to ``t[k]``. Attributes as in `Estimate`.
 
     Attributes
     ----------
@@ -65,6 +67,7 @@ class Trajectory(NamedTuple):
         Where `every` > 1, a row's flags are those of all samples since the row before it.
     z_hat, z_tilde : (K, N) arrays
         Filtered and internal states; z_tilde[:, i] belongs to z_{i+2}.
+
     """
 
     t: NDArray[Any]
@@ -80,7 +83,8 @@ class Trajectory(NamedTuple):
 
 @dataclass(frozen=True)
 class ObserverState:
-    """All that an observer remembers; a copy, safe to keep.
+    """
+    All that an observer remembers; a copy, safe to keep.
 
     Attributes
     ----------
@@ -89,6 +93,7 @@ class ObserverState:
         See `fhaosmo_ros.core.layout`.
     t : float or int or None
         Time of the last sample of `Observer.run`, in its unit (s, or ns for integers).
+
     """
 
     levels: NDArray[np.float64]
@@ -97,7 +102,8 @@ class ObserverState:
 
 
 class Observer:
-    """Fuzzy-based super-twisting adaptive-order sliding mode observer.
+    """
+    Fuzzy-based super-twisting adaptive-order sliding mode observer.
 
     Parameters
     ----------
@@ -116,6 +122,7 @@ class Observer:
     array([0.1, 0. ])
     >>> observer.step(0.1, dt=0.001).status
     <Status.OK: 0>
+
     """
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
@@ -160,12 +167,14 @@ class Observer:
         return ObserverState(self._levels.copy(), self._memory.copy(), self._t)
 
     def restore(self, state: ObserverState) -> None:
-        """Go back to a snapshot, of this observer or of another one of the same size.
+        """
+        Go back to a snapshot, of this observer or of another one of the same size.
 
         Raises
         ------
         ConfigurationError
             The snapshot is of an observer with another number of levels.
+
         """
         if state.levels.shape != self._levels.shape:
             raise ConfigurationError(
@@ -180,7 +189,8 @@ class Observer:
         self._configuration.changed(changes)
 
     def configure(self, changes: Mapping[str, Any]) -> None:
-        """Change parameters from the next sample on, without a jump of the estimate.
+        """
+        Change parameters from the next sample on, without a jump of the estimate.
 
         All or nothing: where anything is wrong, nothing has changed.
 
@@ -188,6 +198,7 @@ class Observer:
         ------
         ConfigurationError
             As the constructor, or a change of a parameter that fixes the observer's size.
+
         """
         self._adopt(self._configuration.changed(changes))
 
@@ -234,7 +245,8 @@ class Observer:
         return self._estimate(word | count << LEVEL_SHIFT)
 
     def step(self, y: float, dt: float, u: float = 0.0) -> Estimate:
-        """Advance by `dt` to the sample `y`.
+        """
+        Advance by `dt` to the sample `y`.
 
         The explicit scheme integrates over the interval with the sample at its beginning, as
         forward Euler does, so that `y` acts from the next step on; the implicit scheme uses `y`.
@@ -253,6 +265,7 @@ class Observer:
         Estimate
             Bad data does not raise: `Estimate.status` says what was rejected, the state stays as
             it was, and the time of a rejected sample is added to the next step.
+
         """
         if not self.started and np.isfinite(y):
             self.start(y)
@@ -280,7 +293,8 @@ class Observer:
     def run(
         self, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0, every: int = 1
     ) -> Trajectory:
-        """Step through arrays; the state goes on from where it is, so a run can be split.
+        """
+        Step through arrays; the state goes on from where it is, so a run can be split.
 
         Parameters
         ----------
@@ -298,12 +312,13 @@ class Observer:
         -------
         Trajectory
             Row k is the estimate after sample ``(k + 1) * every - 1``. A fresh observer takes
-            the first sample as `start` does, else time goes on from the last sample of the last run.
+            the first sample as `start` does, else time goes on from the last run's last sample.
 
         Raises
         ------
         ConfigurationError
             Arrays whose shapes do not fit, or `every` < 1.
+
         """
         t, y = np.asarray(t), np.ascontiguousarray(y, dtype=np.float64)
         if t.ndim != 1 or y.shape != t.shape:

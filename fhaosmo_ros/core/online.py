@@ -5,11 +5,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from fhaosmo_ros.core.observer import Estimate, Observer
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
 from fhaosmo_ros.core.status import REJECTED, Status
+import numpy as np
 
 NANOSECONDS = 1e-9
 
@@ -37,7 +36,8 @@ class Counters:
 
 
 class OnlineEstimator:
-    """An observer fed with time-stamped samples.
+    """
+    An observer fed with time-stamped samples.
 
     The policy of time: dt is the difference of two samples' stamps (integer nanoseconds,
     subtracted before they become seconds), or `nominal_period`. A sample that is not later than
@@ -53,6 +53,7 @@ class OnlineEstimator:
     ------
     ConfigurationError
         An unknown name, a bad value, or values that do not fit together.
+
     """
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
@@ -78,12 +79,14 @@ class OnlineEstimator:
         self.observer.check({k: v for k, v in values.items() if k in OBSERVER_PARAMETERS})
 
     def configure(self, changes: Mapping[str, Any]) -> None:
-        """Change live parameters from the next sample on, without a jump; all or nothing.
+        """
+        Change live parameters from the next sample on, without a jump; all or nothing.
 
         Raises
         ------
         ConfigurationError
             An unknown name, a bad value, or a parameter that can't change live.
+
         """
         values = ONLINE_PARAMETERS.coerce(changes)
         self.observer.configure({k: v for k, v in values.items() if k in OBSERVER_PARAMETERS})
@@ -113,7 +116,8 @@ class OnlineEstimator:
         return True
 
     def update(self, stamp: int, y: float) -> Estimate:
-        """Take one sample.
+        """
+        Take one sample.
 
         Parameters
         ----------
@@ -126,6 +130,7 @@ class OnlineEstimator:
         -------
         Estimate
             Of this sample, or the previous state's with the reason of the rejection.
+
         """
         observer = self.observer
         if not observer.started:

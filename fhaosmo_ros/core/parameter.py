@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a parameter is: declared once, checked everywhere by the same rules."""
 
-import difflib
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+import difflib
+import math
 from typing import Any, TypeAlias
 
+from fhaosmo_ros.core.errors import ConfigurationError
 import numpy as np
 import yaml
-
-from fhaosmo_ros.core.errors import ConfigurationError
 
 Value: TypeAlias = bool | int | float | str | list[float] | list[str]
 
@@ -26,7 +25,8 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter: the only place where its name, default, unit, bounds and text stand.
+    """
+    One parameter: the only place where its name, default, unit, bounds and text stand.
 
     Attributes
     ----------
@@ -48,6 +48,7 @@ class Parameter:
         False where it can't change in a running node (read-only in ROS).
     lengths : str
         Allowed numbers of values of a list, in words, for the documentation.
+
     """
 
     name: str
@@ -87,7 +88,8 @@ class Parameter:
         return text + (f' [{self.unit}]' if self.unit else '')
 
     def coerce(self, value: Any) -> Value:
-        """Return `value` in the parameter's own type, or raise.
+        """
+        Return `value` in the parameter's own type, or raise.
 
         An integer is accepted where a number is meant, and so is a list that a command line
         delivered as text because it mixes both (``"[15, 15.5]"``).
@@ -96,6 +98,7 @@ class Parameter:
         ------
         ConfigurationError
             Wrong type, out of bounds, not finite or not one of the choices.
+
         """
         original = value
         if isinstance(value, str) and self.kind in ('double_array', 'string_array'):
@@ -150,7 +153,8 @@ class Parameter:
 
     def error(self, value: Any, allowed: str | None = None) -> ConfigurationError:
         """Build the error for `value`: what was wrong, what is allowed, what arrived."""
-        message = f"parameter '{self.name}': expected {allowed or self.allowed}, got {_show(value)}"
+        expected = allowed or self.allowed
+        message = f"parameter '{self.name}': expected {expected}, got {_show(value)}"
         if self.choices and isinstance(value, str):
             message += suggestion(value, self.choices)
         return ConfigurationError(message)
@@ -171,18 +175,22 @@ class ParameterTable(Mapping[str, Parameter]):
     def __len__(self) -> int:
         return len(self._by_name)
 
-    def defaults(self) -> dict[str, Value]:
+    def defaults(self) -> dict[str, Any]:
         """Return a fresh dictionary of the defaults."""
-        return {p.name: list(p.default) if isinstance(p.default, list) else p.default  # type: ignore[misc]
-                for p in self.values()}
+        return {
+            p.name: list(p.default) if isinstance(p.default, list) else p.default
+            for p in self.values()
+        }
 
-    def coerce(self, values: Mapping[str, Any]) -> dict[str, Value]:
-        """Check names, types and bounds of `values`; what is absent stays absent.
+    def coerce(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """
+        Check names, types and bounds of `values`; what is absent stays absent.
 
         Raises
         ------
         ConfigurationError
             An unknown name (with the closest known one), or a bad value.
+
         """
         for name in values:
             if name not in self:

@@ -6,11 +6,10 @@ from pathlib import Path
 import re
 from typing import Any
 
-import yaml
-
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter import ParameterTable, unknown_parameter
 from fhaosmo_ros.core.parameters import NODE_TABLES
+import yaml
 
 BUILT_IN = ('use_sim_time', 'start_type_description_service')
 """Parameters that rclpy declares itself."""
@@ -22,7 +21,8 @@ def is_built_in(name: str) -> bool:
 
 
 def load(path: str | Path, node: str) -> dict[str, Any]:
-    """Return what a parameter file sets for a node of this package.
+    """
+    Return what a parameter file sets for a node of this package.
 
     Sections that match the node's name are merged in the order of the file, as rcl does. One
     ``/**`` section may serve both nodes, so a name that another node of the package declares is
@@ -45,6 +45,7 @@ def load(path: str | Path, node: str) -> dict[str, Any]:
     ConfigurationError
         No such file, not YAML, no ``ros__parameters``, an unknown name or a bad value; the
         message begins with the path.
+
     """
     try:
         values: dict[str, Any] = {}
@@ -57,12 +58,14 @@ def load(path: str | Path, node: str) -> dict[str, Any]:
 
 
 def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
-    """Check `values` and return those of `table`, leaving out other nodes' and rclpy's own.
+    """
+    Check `values` and return those of `table`, leaving out other nodes' and rclpy's own.
 
     Raises
     ------
     ConfigurationError
         A name that no node of the package declares, or a bad value.
+
     """
     everybody = {name for other in NODE_TABLES.values() for name in other}
     for name in values:

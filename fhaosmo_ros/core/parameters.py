@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every parameter of the package, declared once.
+"""
+Every parameter of the package, declared once.
 
 YAML checks, ROS descriptors, docs/parameters.md and error messages derive from these tables.
 """

@@ -4,20 +4,20 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
-from numba import njit
-from numpy.typing import ArrayLike, NDArray
-
 from fhaosmo_ros.core.configuration import per_level
-from fhaosmo_ros.core.disturbance import KINDS, NAMES, disturbance
+from fhaosmo_ros.core.disturbance import disturbance, KINDS, NAMES
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.core.parameters import PLANT_PARAMETERS
-from fhaosmo_ros.core.tape import Floats, Ints, evaluate
+from fhaosmo_ros.core.tape import evaluate, Floats, Ints
+from numba import njit
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 
 class Truth(NamedTuple):
-    """The plant at one time, or at many (arrays with a leading axis).
+    """
+    The plant at one time, or at many (arrays with a leading axis).
 
     Attributes
     ----------
@@ -27,6 +27,7 @@ class Truth(NamedTuple):
         States.
     unknown_input : float or (K,) array
         d.
+
     """
 
     y: Any
@@ -79,7 +80,8 @@ def _rk4(system: _System, work: _Work, z: Floats, t: float, h: float, u: float) 
 def _advance(
     system: _System, work: _Work, z: Floats, at: Floats, step: int, t: float, h: float, u: float
 ) -> int:
-    """Bring the grid state `z` (at time step * h) up to `t`, and `at` to `t` itself.
+    """
+    Bring the grid state `z` (at time step * h) up to `t`, and `at` to `t` itself.
 
     Only whole steps of the fixed grid change `z`; the rest of the way to `t` is taken on a copy,
     so that the trajectory doesn't depend on the times at which somebody looks.
@@ -98,7 +100,7 @@ def _advance(
 def _simulate(
     system: _System, work: _Work, z: Floats, step: int, t: Floats, h: float, u: Floats,
     states: Floats, d: Floats,
-) -> int:
+) -> int:  # fmt: skip
     for k in range(t.shape[0]):
         step = _advance(system, work, z, states[k], step, t[k], h, u[k])
         d[k] = disturbance(system.kind, system.wave, t[k])
@@ -106,7 +108,8 @@ def _simulate(
 
 
 class Plant:
-    """A triangular system driven by an unknown input, on a clock that starts at 0.
+    """
+    A triangular system driven by an unknown input, on a clock that starts at 0.
 
     Parameters
     ----------
@@ -117,6 +120,7 @@ class Plant:
     ------
     ConfigurationError
         An unknown name, a bad value, or values that do not fit together.
+
     """
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
@@ -130,9 +134,7 @@ class Plant:
         self._z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], n)
         self._at = self._z.copy()
         self._step = 0
-        self._work = _Work(
-            np.zeros((2, n)), np.zeros((4, n)), np.zeros((2, self._model.depth))
-        )
+        self._work = _Work(np.zeros((2, n)), np.zeros((4, n)), np.zeros((2, self._model.depth)))
         self._random = np.random.default_rng(p['noise_seed'])
         self._system = self._make_system()
 
@@ -152,12 +154,14 @@ class Plant:
         return self._model.uses_input
 
     def configure(self, changes: Mapping[str, Any]) -> None:
-        """Change live parameters from now on; all or nothing.
+        """
+        Change live parameters from now on; all or nothing.
 
         Raises
         ------
         ConfigurationError
             An unknown name, a bad value, or a parameter that can't change live.
+
         """
         changes = self.check(changes)
         self._parameters |= changes
@@ -195,7 +199,8 @@ class Plant:
         return Truth(float(self._at[0]) + self._noise(), self._at.copy(), float(d))
 
     def simulate(self, t: ArrayLike, u: ArrayLike | float = 0.0) -> Truth:
-        """Measure at many times.
+        """
+        Measure at many times.
 
         Parameters
         ----------
@@ -208,13 +213,12 @@ class Plant:
         -------
         Truth
             Arrays with K rows.
+
         """
         t = np.ascontiguousarray(t, dtype=np.float64)
         u = np.ascontiguousarray(np.broadcast_to(np.asarray(u, dtype=np.float64), t.shape))
         z, d = np.empty((len(t), self.order)), np.empty(len(t))
-        self._step = _simulate(
-            self._system, self._work, self._z, self._step, t, self._h, u, z, d
-        )
+        self._step = _simulate(self._system, self._work, self._z, self._step, t, self._h, u, z, d)
         noise = self._parameters['noise_std'] * self._random.standard_normal(len(t))
         return Truth(z[:, 0] + noise, z, d)
 

@@ -8,7 +8,8 @@ LEVEL_SHIFT = 8
 
 
 class Status(IntFlag):
-    """Flags of a step. The number of open levels is kept apart: see `open_levels`.
+    """
+    Flags of a step. The number of open levels is kept apart: see `open_levels`.
 
     A rejected sample leaves the state as it was; the time it stood for is added to the next step.
     """

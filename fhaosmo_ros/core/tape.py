@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled evaluation of expression tapes: value and exact directional derivative in one pass.
+"""
+Compiled evaluation of expression tapes: value and exact directional derivative in one pass.
 
 A tape is plain data (operation codes and numbers in postfix order), so a model from a YAML file
 needs no code generation: nothing is compiled when a node starts, and nothing from outside is ever
@@ -8,8 +9,8 @@ executed. The derivative along dz is carried by forward-mode differentiation (du
 
 import math
 
-import numpy as np
 from numba import njit
+import numpy as np
 from numpy.typing import NDArray
 
 CONST, STATE, INPUT = 0, 1, 2
@@ -24,7 +25,8 @@ Ints = NDArray[np.int64]
 def evaluate(
     tape: Floats, start: int, stop: int, z: Floats, u: float, stack: Floats
 ) -> tuple[float, float]:
-    """Evaluate one expression and its derivative along dz.
+    """
+    Evaluate one expression and its derivative along dz.
 
     Parameters
     ----------
@@ -43,6 +45,7 @@ def evaluate(
     -------
     (float, float)
         Phi(z, u) and dPhi/dz . dz. Outside its domain an operation gives NaN or infinity.
+
     """
     top = -1
     for k in range(start, stop):

@@ -37,6 +37,7 @@ class PlantNode(Node):
         self._u = 0.0
         self._origin: int | None = None
         self._now = 0
+        self._y = Float64()
         self._state = labelled([f'z{i + 1}' for i in range(self.plant.order)])
         self._publish_y = self.create_publisher(Float64, 'y', 10).publish
         self._publish_state = self.create_publisher(Float64MultiArray, '~/state', 10).publish
@@ -51,10 +52,18 @@ class PlantNode(Node):
         )
 
     def _tick(self) -> None:
-        """Bring the simulation to the clock's present time and publish; y first."""
-        now = self.get_clock().now().nanoseconds
-        truth = self.plant.sample(self._plant_time(now), self._u)
-        self._publish_y(Float64(data=truth.y))
+        """
+        Bring the simulation to the clock's present time and publish; y first.
+
+        The middleware stamps y when it is published, and every microsecond between the clock's
+        reading and that moment acts as noise on y. So the long way is integrated first, and the
+        clock is read again for the little that is left.
+        """
+        clock = self.get_clock()
+        self.plant.advance(self._plant_time(clock.now().nanoseconds), self._u)
+        truth = self.plant.sample(self._plant_time(clock.now().nanoseconds), self._u)
+        self._y.data = truth.y
+        self._publish_y(self._y)
         self._publish_state(fill(self._state, truth.z))
         self._publish_d(Float64(data=truth.unknown_input))
 

@@ -2,6 +2,7 @@
 """Starting, spinning and stopping a node: what both nodes' `main` share."""
 
 from collections.abc import Callable
+import gc
 import os
 import signal
 import sys
@@ -96,6 +97,8 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
         _check_arguments(name, argv)
         rclpy.init(args=[name, *argv], signal_handler_options=SignalHandlerOptions.NO)
         node = factory()
+        gc.collect()
+        gc.freeze()  # what lives now lives to the end: later collections need not visit it
         with Spinner(node, on_end=ended.set) as spinner:
             ended.wait()
         if spinner.error is not None:

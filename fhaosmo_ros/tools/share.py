@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the files that ship with the package lie."""
+
+import os
+from pathlib import Path
+import sys
+
+from fhaosmo_ros.core.errors import ConfigurationError
+
+PACKAGE = 'fhaosmo_ros'
+
+
+def shipped(relative: str) -> Path:
+    """Return the path of a shipped file, such as 'config/demo.yaml'.
+
+    Looked for beside the sources (a checkout, colcon build --symlink-install), then in the
+    prefixes of a sourced workspace, then in the Python environment (pip install).
+
+    Raises
+    ------
+    ConfigurationError
+        It is in none of these places.
+    """
+    prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    places = [Path(__file__).resolve().parents[2]]
+    places += [Path(prefix) / 'share' / PACKAGE for prefix in [*prefixes, sys.prefix]]
+    for place in places:
+        if (place / relative).is_file():
+            return place / relative
+    raise ConfigurationError(
+        f'{relative}: expected it in one of {", ".join(map(str, places))}, found it in none'
+    )

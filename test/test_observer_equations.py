@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The compiled recursion against the paper's equations, written down a second time.
+
+The reference below is plain Python on dual numbers (value and derivative to gamma), made from the
+paper and from design.md, not from the kernels: scipy's brentq solves the implicit equations, and
+the sensitivities come out of the arithmetic instead of out of variational equations.
+"""
+
+from dataclasses import dataclass
+import math
+
+from fhaosmo_ros.core import Observer
+from fhaosmo_ros.core.fuzzy import curve, terms_of_level
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+
+@dataclass(frozen=True)
+class Dual:
+    """A number that knows its derivative to gamma."""
+
+    value: float
+    slope: float = 0.0
+
+    def __add__(self, other):
+        other = dual(other)
+        return Dual(self.value + other.value, self.slope + other.slope)
+
+    def __mul__(self, other):
+        other = dual(other)
+        slope = self.slope * other.value + self.value * other.slope
+        return Dual(self.value * other.value, slope)
+
+    def __neg__(self):
+        return Dual(-self.value, -self.slope)
+
+    def __sub__(self, other):
+        return self + -dual(other)
+
+    def __rsub__(self, other):
+        return dual(other) - self
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+
+def dual(x):
+    return x if isinstance(x, Dual) else Dual(x)
+
+
+def sin(x):
+    return Dual(math.sin(x.value), math.cos(x.value) * x.slope)
+
+
+def tanh(x):
+    return Dual(math.tanh(x.value), x.slope / math.cosh(x.value) ** 2)
+
+
+def abs_power(x, gamma):
+    """Return |x|^gamma, x != 0."""
+    a = abs(x.value)
+    value = a**gamma.value
+    to_x = gamma.value * a ** (gamma.value - 1.0) * math.copysign(1.0, x.value)
+    return Dual(value, value * math.log(a) * gamma.slope + to_x * x.slope)
+
+
+# Expressions for the observer, and the same functions for the reference.
+PHI = {
+    1: (['-0.5*z1 + u'], [lambda z, u: -0.5 * z[0] + u]),
+    2: (
+        ['sin(z1)', '-z2*z2*z1 - 0.3*u'],
+        [lambda z, u: sin(z[0]), lambda z, u: -z[1] * z[1] * z[0] - 0.3 * u],
+    ),
+    3: (
+        ['0', 'u*sin(z2)', '-z3 - z1*tanh(z3)'],
+        [
+            lambda z, u: Dual(0.0),
+            lambda z, u: u * sin(z[1]),
+            lambda z, u: -z[2] - z[0] * tanh(z[2]),
+        ],
+    ),
+    4: (
+        ['0.1*z1', '0', '-0.2*z1*z3', 'tanh(z4)*z2 - u*z3'],
+        [
+            lambda z, u: 0.1 * z[0],
+            lambda z, u: Dual(0.0),
+            lambda z, u: -0.2 * z[0] * z[2],
+            lambda z, u: tanh(z[3]) * z[1] - u * z[2],
+        ],
+    ),
+}
+
+
+class Reference:
+    """Plain recursion of design.md, section 2."""
+
+    def __init__(self, p, phi, y):
+        self.p, self.phi = p, phi
+        self.N = p['order'] + p['unknown_input']
+        self.phi = [*phi, lambda z, u: Dual(0.0)]  # z_{n+1}' = eta: no Phi
+        self.hat = [Dual(v) for v in p['initial_estimate']]
+        self.tilde = [Dual(v) for v in p['initial_internal']]  # tilde[i] is z_tilde_{i+2}
+        if p['start_from_measurement']:
+            self.hat[0] = Dual(y)
+        self.gamma = p['gamma_initial'] if p['variant'] == 'fuzzy_adaptive' else 0.5
+        self.y = y
+        self.curves = [
+            curve(terms_of_level(i + 1), p['fuzzy_shape'], p['fuzzy_normalise'])
+            for i in range(self.N)
+        ]
+
+    def psi(self, i, x):
+        if self.p['variant'] == 'sign':
+            return Dual(float(np.sign(x.value)))
+        widths = self.p['fuzzy_widths']
+        width = widths[min(i, len(widths) - 1)]
+        grid = np.linspace(0.0, width, len(self.curves[i]))
+        a = abs(x.value)
+        value = math.copysign(np.interp(a, grid, self.curves[i]), x.value)
+        if a >= width:
+            return Dual(value)
+        k = int(np.searchsorted(grid, a, side='right')) - 1
+        rise = (self.curves[i][k + 1] - self.curves[i][k]) / (grid[k + 1] - grid[k])
+        return Dual(value, rise * x.slope)
+
+    def injection(self, i, eps, gamma):
+        """Return |eps|^gamma psi(eps), 0 at 0."""
+        if eps.value == 0.0:
+            return Dual(0.0)
+        return abs_power(eps, gamma) * self.psi(i, eps)
+
+    def step(self, y, h, u):
+        getattr(self, self.p['scheme'])(y, h, u)
+        self.y = y
+
+    def explicit(self, y, h, u):
+        """Forward Euler: everything at the interval's beginning, y of the sample before."""
+        p, gamma = self.p, Dual(self.gamma, 1.0)
+        m = [Dual(self.y), *self.tilde[: self.N - 1]]
+        eps = [m[i] - self.hat[i] for i in range(self.N)]
+        hat, tilde = list(self.hat), list(self.tilde)
+        for i in range(self.N):
+            if any(abs(e.value) > p['epsilon'] for e in eps[:i]):
+                continue
+            rate = self.tilde[i] + p['lambda'][i] * self.injection(i, eps[i], gamma)
+            hat[i] = self.hat[i] + h * (rate + self.phi[i](m[: i + 1], u))
+            tilde[i] = self.tilde[i] + h * p['alpha'][i] * self.psi(i, eps[i])
+        self.hat, self.tilde = hat, tilde
+        self.adapt(eps, h)
+
+    def implicit(self, y, h, u):
+        """Backward Euler: level after level, everything at the interval's end."""
+        p, gamma = self.p, Dual(self.gamma, 1.0)
+        eps, m = [], []
+        for i in range(self.N):
+            m.append(Dual(y) if i == 0 else self.tilde[i - 1])
+            if any(abs(e.value) > p['epsilon'] for e in eps):
+                eps.append(m[i] - self.hat[i])
+                continue
+            b = m[i] - self.hat[i] - h * (self.tilde[i] + self.phi[i](m, u))
+            e, s = self.solve(i, b, h, gamma)
+            eps.append(e)
+            self.tilde[i] = self.tilde[i] + h * p['alpha'][i] * s
+            self.hat[i] = m[i] - e
+        self.adapt(eps, h)
+
+    def solve(self, i, b, h, gamma):
+        stiffness = h * h * self.p['alpha'][i]
+        if self.p['variant'] == 'sign' and abs(b.value) <= stiffness:
+            return Dual(0.0), Dual(b.value / stiffness)
+
+        def balance(e, gamma, b):
+            injection = h * self.p['lambda'][i] * self.injection(i, e, gamma)
+            return e + injection + stiffness * self.psi(i, e) - b
+
+        # Orders of magnitude below the tolerance, and brentq can't do much better.
+        a = brentq(
+            lambda a: balance(math.copysign(1.0, b.value) * Dual(a), gamma, b).value,
+            0.0 if self.p['variant'] != 'sign' else 1e-300,
+            abs(b.value),
+            xtol=1e-300,
+            rtol=4 * np.finfo(float).eps,
+        )
+        e = math.copysign(a, b.value)
+        to_e = balance(Dual(e, 1.0), Dual(self.gamma), Dual(b.value)).slope
+        to_gamma = balance(Dual(e), gamma, b).slope
+        eps = Dual(e, -to_gamma / to_e)  # implicit function theorem
+        return eps, self.psi(i, eps)
+
+    def adapt(self, eps, h):
+        p = self.p
+        if p['variant'] != 'fuzzy_adaptive':
+            return
+        loss = sum((e * e for e in eps), Dual(0.0))
+        gamma = self.gamma
+        if loss.value > p['gamma_dead_zone'] ** 2:
+            gamma -= h * p['gamma_rate'] * loss.slope
+        gamma -= h * p['gamma_leakage'] * (gamma - p['gamma_initial'])
+        self.gamma = min(max(gamma, p['gamma_min']), p['gamma_max'])
+
+    def open(self):
+        m = [self.y, *(v.value for v in self.tilde[: self.N - 1])]
+        closed = [abs(m[i] - self.hat[i].value) > self.p['epsilon'] for i in range(self.N - 1)]
+        return 1 + next((i for i, c in enumerate(closed) if c), self.N - 1)
+
+
+def parameters(n, extra, **others):
+    rng = np.random.default_rng(n)
+    levels = n + extra
+    return {
+        'order': n,
+        'phi': PHI[n][0],
+        'unknown_input': extra,
+        'lambda': list(3.0 + 2.0 * rng.random(levels)),
+        'alpha': list(4.0 + 3.0 * rng.random(levels)),
+        'epsilon': 0.2,
+        'fuzzy_widths': [0.05, 0.3][:levels],
+        'fuzzy_shape': 'triangle',
+        'fuzzy_normalise': True,
+        'gamma_initial': 0.5,
+        'gamma_rate': 0.5,  # fast, so that gamma matters within the horizon
+        'gamma_min': 0.2,
+        'gamma_max': 0.9,
+        'gamma_dead_zone': 0.0,
+        'gamma_leakage': 0.0,
+        'initial_estimate': list(rng.uniform(-0.2, 0.2, levels)),
+        'initial_internal': list(rng.uniform(-0.2, 0.2, levels)),
+        'start_from_measurement': False,
+    } | others
+
+
+def signals(steps=300):
+    """Jittered times, a smooth y with bumps that close gates, and a known input."""
+    rng = np.random.default_rng(7)
+    t = np.concatenate([[0.0], np.cumsum(4e-3 * rng.uniform(0.5, 1.5, steps))])
+    y = 0.3 * np.sin(2.0 * t) + 0.6 * np.exp(-(((t - 0.6) / 0.02) ** 2))
+    return t, y, np.cos(3.0 * t)
+
+
+def compare(p, rtol=1e-9, steps=300):
+    t, y, u = signals(steps)
+    observer = Observer(p)
+    result = observer.run(t, y, u)
+    reference = Reference(p, PHI[p['order']][1], y[0])
+    hat, tilde, gamma, opened = [], [], [], []
+    for k in range(len(t)):
+        if k > 0:
+            reference.step(y[k], t[k] - t[k - 1], u[k])
+        hat.append([v.value for v in reference.hat])
+        tilde.append([v.value for v in reference.tilde])
+        gamma.append(reference.gamma)
+        opened.append(reference.open())
+    assert not result.status[1:].any() or p['variant'] == 'fuzzy_adaptive'
+    np.testing.assert_allclose(result.z_hat, hat, rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(result.z_tilde, tilde, rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(result.gamma, gamma, rtol=rtol)
+    np.testing.assert_array_equal(result.open_levels, opened)
+    return observer, reference, result
+
+
+@pytest.mark.parametrize('extra', [False, True], ids=['N=n', 'N=n+1'])
+@pytest.mark.parametrize('n', [1, 2, 3, 4])
+@pytest.mark.parametrize('variant', ['sign', 'fuzzy', 'fuzzy_adaptive'])
+@pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
+def test_run_follows_the_equations(scheme, variant, n, extra):
+    p = parameters(n, extra, scheme=scheme, variant=variant)
+    _, _, result = compare(p)
+    assert np.ptp(result.z_hat, axis=0).min() > 1e-3  # every level moved
+    if n + extra > 1:
+        assert len(set(result.open_levels)) > 1  # and gates opened and closed
+    if variant == 'fuzzy_adaptive':
+        assert np.ptp(result.gamma) > 1e-3
