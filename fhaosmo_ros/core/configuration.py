@@ -83,7 +83,7 @@ class ObserverConfiguration:
     def _law(self) -> kernels.Law:
         p, levels = self.parameters, self.levels
         widths = p['fuzzy_widths']
-        if len(widths) > levels:
+        if len(widths) > levels and widths != OBSERVER_PARAMETERS['fuzzy_widths'].default:
             raise OBSERVER_PARAMETERS['fuzzy_widths'].error(
                 widths, f'1 to {levels} values (N = {levels} levels)'
             )

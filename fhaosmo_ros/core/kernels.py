@@ -269,7 +269,7 @@ def implicit(
             if a > 0.0:
                 log_a = math.log(a)
                 power = math.exp(gamma * log_a)
-                deps = (db - math.copysign(damping * power * log_a * s, b)) / (
+                deps = (db - math.copysign(damping * power * s, b) * log_a) / (
                     1.0 + damping * power * (gamma * s / a + slope) + stiffness * slope
                 )
                 dpsi = slope * deps

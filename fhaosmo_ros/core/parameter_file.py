@@ -15,12 +15,36 @@ BUILT_IN = ('use_sim_time', 'start_type_description_service')
 """Parameters that rclpy declares itself."""
 
 
+class _Loader(yaml.SafeLoader):
+    """Reads 1e-3 as a number, as rcl does; YAML 1.1 takes it for a text."""
+
+
+_Loader.add_implicit_resolver(
+    'tag:yaml.org,2002:float',
+    re.compile(r'[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$'),
+    list('-+.0123456789'),
+)
+
+
+def parse(text: str) -> Any:
+    """
+    Return the content of a YAML text.
+
+    Raises
+    ------
+    yaml.YAMLError
+        The text is not YAML.
+
+    """
+    return yaml.load(text, Loader=_Loader)
+
+
 def is_built_in(name: str) -> bool:
     """Return True for a parameter that is rclpy's, not ours."""
     return name in BUILT_IN or name.startswith('qos_overrides.')
 
 
-def load(path: str | Path, node: str) -> dict[str, Any]:
+def load(path: str | Path, node: str, table: ParameterTable | None = None) -> dict[str, Any]:
     """
     Return what a parameter file sets for a node of this package.
 
@@ -34,6 +58,8 @@ def load(path: str | Path, node: str) -> dict[str, Any]:
         A YAML file of the form ``name: {ros__parameters: {...}}``.
     node : str
         'estimator' or 'plant', or a full name such as '/rig/estimator'.
+    table : ParameterTable, optional
+        What the node declares; without it, that of the last part of its name.
 
     Returns
     -------
@@ -52,7 +78,7 @@ def load(path: str | Path, node: str) -> dict[str, Any]:
         for section, parameters in _sections(path).items():
             if _matches(section, node):
                 values |= parameters
-        return select(values, NODE_TABLES[node.rsplit('/', 1)[-1]])
+        return select(values, table or NODE_TABLES[node.rsplit('/', 1)[-1]])
     except ConfigurationError as error:
         raise ConfigurationError(f'{path}: {error}') from None
 
@@ -67,7 +93,7 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
         A name that no node of the package declares, or a bad value.
 
     """
-    everybody = {name for other in NODE_TABLES.values() for name in other}
+    everybody = dict.fromkeys(name for other in NODE_TABLES.values() for name in other)
     for name in values:
         if name not in everybody and not is_built_in(name):
             raise unknown_parameter(name, everybody)
@@ -76,7 +102,7 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
 
 def _sections(path: str | Path) -> dict[str, dict[str, Any]]:
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        content = parse(Path(path).read_text(encoding='utf-8'))
     except OSError as error:
         raise ConfigurationError(f'expected a readable file, got: {error.strerror}') from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -114,7 +140,18 @@ def _flat(values: Mapping[Any, Any], prefix: str) -> Iterable[tuple[str, Any]]:
         if isinstance(value, Mapping):
             yield from _flat(value, f'{prefix}{key}.')
         else:
+            check_one_type(f'{prefix}{key}', value)
             yield f'{prefix}{key}', value
+
+
+def check_one_type(name: str, value: Any) -> None:
+    """Refuse what rcl refuses, in words that help."""
+    if isinstance(value, list) and len({type(item) for item in value}) > 1:
+        kinds = ' and '.join(sorted({type(item).__name__ for item in value}))
+        raise ConfigurationError(
+            f"parameter '{name}': expected a list of one type (write 15.0, or quote '0'), "
+            f'got {kinds} mixed: {value!r}'
+        )
 
 
 def _matches(section: str, node: str) -> bool:

@@ -43,21 +43,21 @@ OBSERVER = (
         choices=('explicit', 'implicit'),
     ),
     Parameter(
-        'lambda', [15.0], 'Correction factors lambda_i of the injection |eps|^gamma psi(eps).',
+        'lambda', [740.0], 'Correction factors lambda_i of the injection |eps|^gamma psi(eps).',
         lower=0.0, lower_open=True, upper=1e6, lengths=PER_LEVEL,
     ),
     Parameter(
-        'alpha', [30.0], 'Gains alpha_i of the internal states.',
+        'alpha', [155.0], 'Gains alpha_i of the internal states.',
         lower=0.0, lower_open=True, upper=1e9, lengths=PER_LEVEL,
     ),
     Parameter(
-        'epsilon', 0.025,
+        'epsilon', 80.0,
         'A level runs while |eps_j| <= epsilon for every level j before it (unit of y, '
         'and of the derivatives for the later levels).',
         lower=0.0, lower_open=True, upper=1e12,
     ),
     Parameter(
-        'fuzzy_widths', [0.02],
+        'fuzzy_widths', [0.1, 1.4],
         'Half-widths of the fuzzy input universes of levels 1, 2, ...; the last one serves the '
         'levels that follow. Beyond its half-width psi is +-1.',
         lower=1e-12, upper=1e12, lengths='1 to N; the last one serves the levels that follow',
@@ -72,7 +72,7 @@ OBSERVER = (
         '(5 terms), which silently cuts every gain.',
     ),
     Parameter(
-        'gamma_initial', 0.5, 'Power gamma at the start of fuzzy_adaptive.',
+        'gamma_initial', 0.67, 'Power gamma at the start of fuzzy_adaptive.',
         lower=0.0, lower_open=True, upper=1.0,
     ),
     Parameter(
@@ -80,11 +80,11 @@ OBSERVER = (
         lower=0.0, upper=1e6,
     ),
     Parameter(
-        'gamma_min', 0.3, 'Lower bound of gamma, not above gamma_max.',
+        'gamma_min', 0.1, 'Lower bound of gamma, not above gamma_max.',
         lower=0.0, lower_open=True, upper=1.0,
     ),
     Parameter(
-        'gamma_max', 0.8, 'Upper bound of gamma.', lower=0.0, lower_open=True, upper=1.0,
+        'gamma_max', 1.0, 'Upper bound of gamma.', lower=0.0, lower_open=True, upper=1.0,
     ),
     Parameter(
         'gamma_dead_zone', 0.0,

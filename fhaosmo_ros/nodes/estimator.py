@@ -63,6 +63,11 @@ class EstimatorNode(Node):
         if observer.uses_input:
             self.create_subscription(Float64, 'u', self._on_input, SENSOR_QOS)
         self._y = subscribe_with_info(self, Float64, 'y', self._on_sample, SENSOR_QOS)
+        if self.get_parameter('use_sim_time').value and values['sampling'] == 'source_stamp':
+            self.get_logger().warning(
+                "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing of "
+                "/clock, so dt is in the host's time; set sampling to clock for simulation time"
+            )
         parameters = observer.parameters
         self.get_logger().info(
             f'estimating {observer.order} states and the unknown input from {self._y.topic_name} '

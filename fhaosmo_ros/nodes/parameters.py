@@ -12,10 +12,11 @@ from rcl_interfaces.msg import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
+import yaml
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter import Parameter, ParameterTable
-from fhaosmo_ros.core.parameter_file import is_built_in, select
+from fhaosmo_ros.core.parameter_file import is_built_in, parse, select
 
 TYPES = {
     'bool': RosParameter.Type.BOOL,
@@ -112,6 +113,9 @@ def on_change(
             check(_values(parameters, table))
         except ConfigurationError as error:
             node.get_logger().warning(f'rejected: {error}')
+            for p in parameters:
+                if p.name in table:  # rclpy has already put the rejected type there
+                    node.describe_parameter(p.name).type = TYPES[table[p.name].kind].value
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
@@ -138,7 +142,17 @@ def _converted(parameter: RosParameter, table: ParameterTable) -> RosParameter:
     if declared is None:
         return parameter
     try:
-        value = declared.coerce(parameter.value)
+        value = declared.coerce(_read(parameter.value, declared))
     except ConfigurationError:
         return parameter  # the check that follows says why
     return RosParameter(parameter.name, TYPES[declared.kind], value)
+
+
+def _read(value: Any, declared: Parameter) -> Any:
+    """Return the numbers in a text: `ros2 param set` sends 1e-3 as one."""
+    if isinstance(value, str) and declared.kind in ('double', 'double_array'):
+        try:
+            return parse(value)
+        except yaml.YAMLError:
+            pass
+    return value

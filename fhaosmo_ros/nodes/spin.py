@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starting, spinning and stopping a node: what both nodes' `main` share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import gc
 import os
+import re
 import signal
 import sys
 import threading
@@ -15,10 +16,11 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
+import yaml
 
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.parameter import suggestion
-from fhaosmo_ros.core.parameter_file import is_built_in, load
+from fhaosmo_ros.core.parameter import Parameter, suggestion
+from fhaosmo_ros.core.parameter_file import check_one_type, is_built_in, load, parse
 from fhaosmo_ros.core.parameters import NODE_TABLES
 
 try:
@@ -120,19 +122,43 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
 
 def _check_arguments(name: str, argv: list[str]) -> None:
     """Check what rcl would pass over in silence, or refuse without naming what is wrong."""
-    rest = remove_ros_args([name, *argv])[1:]
-    if rest:
-        raise ConfigurationError(f'unexpected argument {rest[0]!r}; {_usage(name)}')
     table = NODE_TABLES[name]
-    for flag, word in zip(argv, argv[1:], strict=False):
+    options = list(zip(argv, argv[1:], strict=False))
+    for flag, word in options:
         if flag == '--params-file':
-            load(os.path.expanduser(word), name)
-        elif flag in ('-p', '--param'):
-            parameter = word.split(':=', 1)[0].rsplit(':', 1)[-1]
+            load(os.path.expanduser(word), _full_name(name, options), table)
+        elif flag in ('-p', '--param') and ':=' in word:
+            target, text = word.split(':=', 1)
+            parameter = target.rsplit(':', 1)[-1]
             if parameter not in table and not is_built_in(parameter):
                 raise ConfigurationError(
                     f"unknown parameter '{parameter}'{suggestion(parameter, table)}"
                 )
+            _check_text(parameter, text, table)
+    rest = remove_ros_args([name, *argv])[1:]
+    if rest:
+        raise ConfigurationError(f'unexpected argument {rest[0]!r}; {_usage(name)}')
+
+
+def _full_name(name: str, options: list[tuple[str, str]]) -> str:
+    """Return the node's name after the renaming that the command line asks for."""
+    parts = {'name': name, 'ns': ''}
+    for flag, word in options:
+        rule = re.fullmatch(r'(?:[^:]+:)?__(node|name|ns):=(.+)', word)
+        if flag in ('-r', '--remap') and rule:
+            parts['ns' if rule[1] == 'ns' else 'name'] = rule[2]
+    return f'{parts["ns"].rstrip("/")}/{parts["name"]}'
+
+
+def _check_text(name: str, text: str, table: Mapping[str, Parameter]) -> None:
+    """Check the lists that rcl or rclpy would refuse without naming the parameter."""
+    try:
+        value = parse(text)
+    except yaml.YAMLError:
+        return  # rcl quotes the whole rule
+    check_one_type(name, value)
+    if value == [] and name in table:
+        raise table[name].error(value)
 
 
 def _usage(name: str) -> str:
@@ -143,4 +169,7 @@ def _usage(name: str) -> str:
 
 
 def _one_line(error: BaseException) -> str:
-    return ' '.join(str(error).split())
+    text = ' '.join(str(error).split())
+    if type(error).__name__ == 'UnknownROSArgsError':
+        return f'unknown ROS arguments {text}'
+    return re.sub(r', at \S+:\d+', '', text)  # rcl's own source lines

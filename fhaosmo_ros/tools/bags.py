@@ -32,7 +32,8 @@ OFFERED_QOS = Qos(
 
 
 class BagWriter:
-    """Writes serialised messages to an mcap bag in the format of Jazzy's rosbag2.
+    """
+    Writes serialised messages to an mcap bag in the format of Jazzy's rosbag2.
 
     Parameters
     ----------
@@ -40,6 +41,7 @@ class BagWriter:
         Folder to make; it must not exist.
     topics : dict of str to str
         Message type by topic, such as 'std_msgs/msg/Float64'.
+
     """
 
     def __init__(self, path: Path, topics: dict[str, str]) -> None:
@@ -69,7 +71,8 @@ class BagWriter:
 
 
 class Series(NamedTuple):
-    """A topic's messages as arrays.
+    """
+    A topic's messages as arrays.
 
     Attributes
     ----------
@@ -79,6 +82,7 @@ class Series(NamedTuple):
         Numbers of a Float64, a Float64MultiArray, or a Time (in nanoseconds, as integers).
     labels : list of str
         Names of the n columns, where the messages have a label.
+
     """
 
     stamps: NDArray[np.int64]

@@ -10,8 +10,6 @@ import sys
 import threading
 import time
 
-from tqdm import tqdm
-
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter_file import load
 from fhaosmo_ros.nodes.recorder import Recorder
@@ -22,6 +20,7 @@ from fhaosmo_ros.tools.output import OutputFolder
 from fhaosmo_ros.tools.processes import NodeProcesses
 from fhaosmo_ros.tools.run_report import read_run, table
 from fhaosmo_ros.tools.share import shipped
+from tqdm import tqdm
 
 START_DEADLINE = 90.0
 """Seconds for a node to appear: the very first start compiles."""
@@ -32,17 +31,21 @@ class Interrupted(Exception):
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the demonstration.
+    """
+    Run the demonstration.
 
     Returns
     -------
     int
         0 if there is a report (also of a run that Ctrl-C ended early), 130 if it was interrupted
         before, 2 for a bad configuration.
+
     """
     arguments = _parser().parse_args(argv)
     stop = threading.Event()
-    previous = {s: signal.signal(s, lambda *_: stop.set()) for s in (signal.SIGINT, signal.SIGTERM)}
+    previous = {
+        s: signal.signal(s, lambda *_: stop.set()) for s in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         return _demo(arguments, stop)
     except ConfigurationError as error:

@@ -7,12 +7,11 @@ import matplotlib
 
 matplotlib.use('Agg')
 
-from matplotlib.axes import Axes  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
-import numpy as np  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
-
-from fhaosmo_ros.tools.run_report import Run  # noqa: E402
+from fhaosmo_ros.tools.run_report import Run
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
 
 TRUTH = {'color': '#0072B2', 'linewidth': 2.2, 'label': 'true'}
 ESTIMATE = {'color': '#D55E00', 'linewidth': 1.1, 'linestyle': '--', 'label': 'estimated'}

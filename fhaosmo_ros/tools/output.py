@@ -9,7 +9,8 @@ from fhaosmo_ros.core.errors import ConfigurationError
 
 
 class OutputFolder:
-    """A folder that is filled under another name and gets its own once it is complete.
+    """
+    A folder that is filled under another name and gets its own once it is complete.
 
     Parameters
     ----------
@@ -25,6 +26,7 @@ class OutputFolder:
     ------
     ConfigurationError
         The folder is in use or can't be made.
+
     """
 
     def __init__(self, final: Path) -> None:
@@ -35,9 +37,7 @@ class OutputFolder:
         final = self._final
         if final.exists() and (not final.is_dir() or any(final.iterdir())):
             kind = 'a folder that is not empty' if final.is_dir() else 'a file'
-            raise ConfigurationError(
-                f'output {final}: expected a new or empty folder, got {kind}'
-            )
+            raise ConfigurationError(f'output {final}: expected a new or empty folder, got {kind}')
         try:
             shutil.rmtree(self.path, ignore_errors=True)  # of a run that was killed
             self.path.mkdir(parents=True)

@@ -14,12 +14,14 @@ GRACE = 5.0
 
 
 class NodeProcesses:
-    """Starts nodes with ``python -m fhaosmo_ros``, logs to files, stops all of them at the end.
+    """
+    Starts nodes with ``python -m fhaosmo_ros``, logs to files, stops all of them at the end.
 
     Parameters
     ----------
     log_folder : path
         Each node's output goes to ``<name>.log`` there.
+
     """
 
     def __init__(self, log_folder: Path) -> None:

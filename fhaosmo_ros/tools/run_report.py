@@ -4,19 +4,19 @@
 from pathlib import Path
 from typing import NamedTuple
 
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.metrics import chatter, rms, settling_time
+from fhaosmo_ros.tools.bags import messages, series
 import numpy as np
 from numpy.typing import NDArray
 
-from fhaosmo_ros.core.metrics import chatter, rms, settling_time
-from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.tools.bags import messages, series
-
-BAND = 0.05
+BAND = 0.1
 """Half-width of the settling band, as a part of the truth's range."""
 
 
 class Run(NamedTuple):
-    """Estimates beside the truth at the time of the sample that each was computed from.
+    """
+    Estimates beside the truth at the time of the sample that each was computed from.
 
     Attributes
     ----------
@@ -31,6 +31,7 @@ class Run(NamedTuple):
         Samples of y a second, as published.
     counters : dict of str to str
         What the estimator reported last in its diagnostics.
+
     """
 
     t: NDArray[np.float64]
@@ -43,7 +44,8 @@ class Run(NamedTuple):
 
 
 def read_run(bag: Path, plant: str = '/plant', estimator: str = '/estimator') -> Run:
-    """Read a bag that holds a plant's and an estimator's topics.
+    """
+    Read a bag that holds a plant's and an estimator's topics.
 
     Each estimate is compared with the truth of the sample behind it (``~/stamp``), not with that
     of the moment at which it was published.
@@ -52,6 +54,7 @@ def read_run(bag: Path, plant: str = '/plant', estimator: str = '/estimator') ->
     ------
     ConfigurationError
         The bag holds no estimate with its truth.
+
     """
     y = series(bag, '/y')
     stamp = series(bag, f'{estimator}/stamp')

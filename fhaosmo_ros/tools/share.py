@@ -11,7 +11,8 @@ PACKAGE = 'fhaosmo_ros'
 
 
 def shipped(relative: str) -> Path:
-    """Return the path of a shipped file, such as 'config/demo.yaml'.
+    """
+    Return the path of a shipped file, such as 'config/demo.yaml'.
 
     Looked for beside the sources (a checkout, colcon build --symlink-install), then in the
     prefixes of a sourced workspace, then in the Python environment (pip install).
@@ -20,6 +21,7 @@ def shipped(relative: str) -> Path:
     ------
     ConfigurationError
         It is in none of these places.
+
     """
     prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
     places = [Path(__file__).resolve().parents[2]]

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One step of the core, beside the same step in C."""
+
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
+
+from fhaosmo_ros.core.observer import Observer
+import numpy as np
+from reference import assert_agreement, CASE, compile_reference, in_c, in_numba, output, PERIOD
+from table import CannotMeasureError, Row
+from tqdm import tqdm
+
+BAR = 1.5
+VARIANTS = ('sign', 'fuzzy', 'fuzzy_adaptive')
+SCHEMES = ('explicit', 'implicit')
+
+
+def measure(quick: bool) -> list[Row]:
+    """Return the ratio to C, and nanoseconds a step of every variant and scheme."""
+    samples, rounds, calls = (40_000, 5, 2_000) if quick else (400_000, 15, 20_000)
+    y = output(samples + 1)
+    total = rounds + len(VARIANTS) * len(SCHEMES) + len(SCHEMES) + 1
+    with tqdm(total=total, desc='core', unit='round', leave=False) as progress:
+        rows = [_against_c(y, rounds, progress)]
+        for variant, scheme in product(VARIANTS, SCHEMES):
+            step = in_numba(CASE | {'variant': variant, 'scheme': scheme}, y)
+            step()
+            best = min(_seconds(step) for _ in range(3)) / samples
+            rows.append(Row(f'core step, {variant}, {scheme}', best * 1e9, 'ns'))
+            progress.update()
+        rows.append(_recorded(y))
+        progress.update()
+        for scheme in SCHEMES:
+            rows.append(_live(CASE | {'scheme': scheme}, y[:calls]))
+            progress.update()
+    return rows
+
+
+def _against_c(y: np.ndarray, rounds: int, progress: tqdm) -> Row:
+    name, samples = 'core step / same step in C (-O3)', len(y) - 1
+    try:
+        with TemporaryDirectory() as folder:
+            library = compile_reference(Path(folder))
+        assert_agreement(library, y)
+    except CannotMeasureError as error:
+        tqdm.write(f'core: {error}')
+        progress.update(rounds)
+        return Row(name, None, bar=BAR, note=str(error))
+    except AssertionError as error:
+        reason = ' '.join(str(error).split())
+        raise CannotMeasureError(f'reference.c is not the same recursion: {reason}') from None
+    ours, c = in_numba(CASE, y), in_c(library, y)
+    times = np.empty((rounds, 2))
+    for k in range(rounds):
+        times[k] = _seconds(ours), _seconds(c)
+        progress.update()
+    times *= 1e9 / samples
+    median, best = np.median(times, axis=0), times.min(axis=0)
+    note = (
+        f'N = 4, fuzzy_adaptive, explicit: {median[0]:.1f} / {median[1]:.1f} ns median, '
+        f'{best[0]:.1f} / {best[1]:.1f} ns min ({best[0] / best[1]:.2f})'
+    )
+    return Row(name, float(np.median(times[:, 0] / times[:, 1])), bar=BAR, note=note)
+
+
+def _recorded(y: np.ndarray) -> Row:
+    t = np.arange(len(y)) * PERIOD
+    seconds = min(_seconds(lambda: Observer(CASE).run(t, y)) for _ in range(3))
+    note = 'fuzzy_adaptive, explicit; every sample recorded, arrays made included'
+    return Row('Observer.run, per sample', seconds / len(y) * 1e9, 'ns', note=note)
+
+
+def _live(parameters: dict[str, Any], y: np.ndarray) -> Row:
+    samples = y.tolist()
+    observer = Observer(parameters)
+    observer.step(samples[0], PERIOD)
+
+    def run() -> None:
+        for sample in samples:
+            observer.step(sample, PERIOD)
+
+    seconds = min(_seconds(run) for _ in range(3))
+    name = f'Observer.step, one call, {parameters["scheme"]}'
+    return Row(name, seconds / len(samples) * 1e6, 'us', note='fuzzy_adaptive')
+
+
+def _seconds(run: Callable[[], object]) -> float:
+    start = perf_counter()
+    run()
+    return perf_counter() - start

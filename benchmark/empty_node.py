@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A node with the estimator's subscription, timer, publishers and executor that computes nothing.
+
+It publishes messages that were made once. What an estimator costs more than this is ours; what
+this costs is the middleware's.
+"""
+
+import argparse
+import contextlib
+import signal
+import threading
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher
+from fhaosmo_ros.nodes.estimator import SENSOR_QOS
+from fhaosmo_ros.nodes.messages import labelled
+from fhaosmo_ros.nodes.spin import Spinner
+from fhaosmo_ros.nodes.subscription import subscribe_with_info
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Float64
+
+NAME = 'empty_node'
+READY = 'computing nothing'
+
+
+class EmptyNode(Node):
+    """
+    Counts samples of ``y`` and publishes constants.
+
+    Parameters
+    ----------
+    rate : float
+        Rate of the timer, in Hz.
+
+    """
+
+    def __init__(self, rate: float) -> None:
+        super().__init__(NAME)
+        self._count = 0
+        messages = {
+            'state': labelled(['z1', 'z2', 'z3']),
+            'unknown_input': Float64(),
+            'gamma': Float64(),
+            'innovation': labelled(['eps1', 'eps2', 'eps3', 'eps4']),
+            'stamp': Time(),
+        }
+        self._outputs = [
+            (self.create_publisher(type(message), f'~/{name}', 10).publish, message)
+            for name, message in messages.items()
+        ]
+        self._diagnostics = DiagnosticsPublisher(self, self._report)
+        self._timer = self.create_timer(1.0 / rate, self._publish)
+        self._y = subscribe_with_info(self, Float64, 'y', self._on_sample, SENSOR_QOS)
+        self.get_logger().info(READY)
+
+    def _on_sample(self, _: Float64, __: dict[str, int]) -> None:
+        self._count += 1
+
+    def _publish(self) -> None:
+        for publish, message in self._outputs:
+            publish(message)
+
+    def _report(self) -> dict[str, Any]:
+        """Return as many values as the estimator's report has."""
+        zeros = {f'rejected {k}': 0 for k in range(5)}
+        return {'samples accepted': self._count, 'samples lost': 0, **zeros, 'restarts': 0, 'x': 0}
+
+
+def main() -> None:
+    """Run the node until SIGINT."""
+    parser = argparse.ArgumentParser(description='A node that computes nothing.')
+    parser.add_argument('--rate', type=float, default=100.0, help='rate of the timer, in Hz')
+    parser.add_argument('--plain', action='store_true', help='spin with rclpy.spin')
+    arguments = parser.parse_args()
+    ended = threading.Event()
+    if arguments.plain:
+        rclpy.init()
+        with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+            rclpy.spin(EmptyNode(arguments.rate))
+        return
+    signal.signal(signal.SIGINT, lambda *_: ended.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = EmptyNode(arguments.rate)
+    with Spinner(node, on_end=ended.set):
+        ended.wait()
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    main()

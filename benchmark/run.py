@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Measure speed as ratios within one run, and say which bars are met (`make bench`).
+
+Exit code 0 if all bars are met, 1 if one is missed, 130 after Ctrl-C.
+"""
+
+import argparse
+import os
+import platform
+import signal
+import sys
+
+import core_step
+import cpu
+import simulation
+import startup
+from table import CannotMeasureError, render, Row
+
+PARTS = {
+    'core': core_step.measure,
+    'simulation': simulation.measure,
+    'cpu': cpu.measure,
+    'startup': startup.measure,
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure and print; see the top of this file for the exit code."""
+    parser = argparse.ArgumentParser(prog='make bench', description='Measure speed.')
+    parser.add_argument(
+        '--quick', action='store_true', help='small sizes, and missed bars do not fail'
+    )
+    parser.add_argument('--only', choices=PARTS, help='one part only')
+    arguments = parser.parse_args(argv)
+    # A job in the background starts with SIGINT ignored; SIGTERM must end the children as well.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+    rows = []
+    try:
+        for part in [arguments.only] if arguments.only else PARTS:
+            rows += _measure(part, arguments.quick)
+    except KeyboardInterrupt:
+        print('interrupted', file=sys.stderr)
+        return 130
+    load = os.getloadavg()[0]
+    print(
+        f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, '
+        f'load {load:.1f}\n\n{render(rows)}'
+    )
+    missed = [row.name for row in rows if row.missed]
+    if missed:
+        print(f'\n{len(missed)} of the bars missed: {"; ".join(missed)}')
+    return 1 if missed and not arguments.quick else 0
+
+
+def _measure(part: str, quick: bool) -> list[Row]:
+    try:
+        return PARTS[part](quick)
+    except CannotMeasureError as error:
+        print(f'{part}: {error}', file=sys.stderr)
+        return [Row(part, None, bar=0.0, note=str(error))]
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What was measured, beside what is allowed."""
+
+from typing import NamedTuple
+
+
+class CannotMeasureError(Exception):
+    """Something that a measurement needs is missing; the message is one line."""
+
+
+class Row(NamedTuple):
+    """
+    One line of the result.
+
+    Attributes
+    ----------
+    name : str
+        What was measured.
+    value : float or None
+        None if it could not be measured; then a bar counts as missed.
+    unit : str
+    bar : float or None
+        Highest allowed value, None where there is no bar.
+    note : str
+        The numbers behind the value.
+
+    """
+
+    name: str
+    value: float | None
+    unit: str = ''
+    bar: float | None = None
+    note: str = ''
+
+    @property
+    def missed(self) -> bool:
+        """True if there is a bar and the value is not within it."""
+        return self.bar is not None and (self.value is None or not self.value <= self.bar)
+
+
+def render(rows: list[Row]) -> str:
+    """Return the rows as an aligned table."""
+    cells = [('', 'measured', 'bar', '', '')]
+    for row in rows:
+        value = '-' if row.value is None else f'{_short(row.value)} {row.unit}'.strip()
+        bar = '' if row.bar is None else f'<= {row.bar:g}'
+        verdict = '' if row.bar is None else ('MISSED' if row.missed else 'pass')
+        cells.append((row.name, value, bar, verdict, row.note))
+    widths = [max(len(line[k]) for line in cells) for k in range(len(cells[0]))]
+    return '\n'.join(
+        f'{name:<{widths[0]}}  {value:>{widths[1]}}  {bar:<{widths[2]}}  '
+        f'{verdict:<{widths[3]}}  {note}'.rstrip()
+        for name, value, bar, verdict, note in cells
+    )
+
+
+def _short(value: float) -> str:
+    return f'{value:.0f}' if abs(value) >= 100.0 else f'{value:.3g}'

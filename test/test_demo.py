@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demonstration as a newcomer meets it, in short."""
+
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
+
+from fhaosmo_ros.core.parameter_file import load
+from fhaosmo_ros.nodes.topics import RUN_TOPICS
+from fhaosmo_ros.tools.run_report import read_run
+from rosbags.highlevel import AnyReader
+
+pytestmark = pytest.mark.ros
+ROOT = Path(__file__).resolve().parents[1]
+COMMAND = [sys.executable, '-m', 'fhaosmo_ros', 'demo']
+
+
+def environment():
+    return {**os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])}
+
+
+def run(*arguments):
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=180,
+        env=environment(), check=False,
+    )  # fmt: skip
+
+
+def nodes_of(folder):
+    """List the processes whose command line mentions a folder."""
+    found = []
+    for entry in Path('/proc').glob('[0-9]*/cmdline'):
+        try:
+            if str(folder).encode() in entry.read_bytes():
+                found.append(entry.parent.name)
+        except OSError:
+            continue
+    return [pid for pid in found if int(pid) != os.getpid()]
+
+
+@pytest.fixture(scope='module')
+def parameters(tmp_path_factory):
+    """A copy of the demo's parameters, so that its processes can be told by its path."""
+    path = tmp_path_factory.mktemp('demo') / 'demo.yaml'
+    path.write_text((ROOT / 'config' / 'demo.yaml').read_text())
+    return path
+
+
+@pytest.fixture(scope='module')
+def finished(parameters):
+    folder = parameters.parent / 'out'
+    return run('--duration', 8, '--output', folder, '--params-file', parameters), folder
+
+
+def test_it_succeeds_and_leaves_no_process(finished, parameters):
+    result, _ = finished
+    assert result.returncode == 0, result.stderr
+    assert nodes_of(parameters) == []
+
+
+def test_table_names_every_quantity(finished):
+    result, folder = finished
+    for word in ('z1', 'z2', 'z3', 'd  ', 'RMS error', 'settling', 'sample rate held', 'dropped'):
+        assert word in result.stdout
+    assert (folder / 'report.txt').read_text().strip() in result.stdout
+
+
+def test_bag_holds_every_topic_and_can_be_read(finished):
+    _, folder = finished
+    with AnyReader([folder / 'bag']) as reader:
+        topics = {c.topic: c for c in reader.connections}
+        assert set(topics) == set(RUN_TOPICS)
+        assert all(c.digest.startswith('RIHS01_') for c in topics.values())
+        assert topics['/y'].msgcount > 1000
+
+
+def test_estimate_is_near_the_truth(finished):
+    _, folder = finished
+    run_ = read_run(folder / 'bag')
+    late = run_.t > 4.0
+    assert late.any()
+    error = run_.estimate[late] - run_.truth[late]
+    # Loose: other tests load the machine meanwhile, and its stamps jitter then.
+    assert abs(error[:, -1]).mean() < 0.1
+    assert abs(error[:, 0]).max() < 0.01
+
+
+def test_figure_is_a_picture(finished):
+    _, folder = finished
+    assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
+
+
+def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(parameters):
+    folder = parameters.parent / 'interrupted'
+    process = subprocess.Popen(
+        [*COMMAND, '--duration', '600', '--output', folder, '--params-file', parameters],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(),
+        start_new_session=True,
+    )  # fmt: skip
+    part = folder.with_name('.interrupted.part') / 'bag' / 'bag.mcap'
+    deadline = time.monotonic() + 120
+    while not (part.exists() and part.stat().st_size > 300_000):
+        assert time.monotonic() < deadline, 'nothing was recorded'
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.05)
+    # As a terminal does: to the whole group; and twice, as an impatient user does.
+    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert 'Traceback' not in err
+    assert 'stopped early' in out
+    assert (folder / 'demo.png').exists()
+    assert nodes_of(parameters) == []
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['--duration', '0'], ('--duration', '1 to 3600', '0')),
+        (['--params-file', '/nowhere.yaml'], ('/nowhere.yaml', 'No such file')),
+    ],
+)
+def test_bad_arguments_are_said_in_one_line(arguments, words, tmp_path):
+    result = run('--output', tmp_path / 'out', *arguments)
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert all(word in result.stderr for word in words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_busy_output_folder_is_refused(tmp_path):
+    (tmp_path / 'precious.txt').write_text('mine')
+    result = run('--output', tmp_path)
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert str(tmp_path) in result.stderr
+    assert 'new or empty' in result.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ['precious.txt']
+
+
+def test_an_unusable_parameter_is_said_before_anything_starts(tmp_path):
+    text = (ROOT / 'config' / 'demo.yaml').read_text()
+    bad = tmp_path / 'bad.yaml'
+    bad.write_text(text.replace('lambda: [33.0, 22.0,', 'lambda: [33.0,'))
+    assert bad.read_text() != text
+    assert 'lambda' in load(bad, 'estimator')
+    result = run('--output', tmp_path / 'out', '--params-file', bad)
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert 'lambda' in result.stderr
+    assert '1 or 4 values' in result.stderr
+    assert not (tmp_path / 'out').exists()
