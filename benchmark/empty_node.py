@@ -8,6 +8,7 @@ this costs is the middleware's.
 
 import argparse
 import contextlib
+import gc
 import signal
 import threading
 from typing import Any
@@ -86,6 +87,8 @@ def main() -> None:
     signal.signal(signal.SIGINT, lambda *_: ended.set())
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = EmptyNode(arguments.rate)
+    gc.collect()
+    gc.freeze()  # as run_node does
     with Spinner(node, on_end=ended.set):
         ended.wait()
     node.destroy_node()

@@ -42,6 +42,8 @@ def main(argv: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 1
+    except KeyboardInterrupt:  # while it loads; later the command itself sees to signals
+        return 130
     return int(module.main(rest))
 
 

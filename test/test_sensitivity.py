@@ -11,8 +11,8 @@ MODELS = {
     'paper': (['0', '0', '-z3'], 0.0),
     'nonlinear': (['-0.3*z1**3', 'sin(z2)*z1 + u', '-tanh(z3) - 0.2*z1*z2*z3*u'], 1.0),
 }
-DELTA = 3e-9
-# Central differences: rounding is 1e-16 / DELTA, some times amplified over the run. A smaller DELTA
+DELTA = 1e-8
+# Central differences: rounding is 1e-16 / DELTA, amplified some times over the run. A small DELTA
 # makes it rarer that the two runs are on different straight pieces of psi's curve.
 TOLERANCE = 1e-5
 

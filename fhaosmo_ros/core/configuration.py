@@ -73,7 +73,6 @@ class ObserverConfiguration:
         self.levels = self.model.order + int(p['unknown_input'])
         self.initial_estimate = self._per_level('initial_estimate')
         self.initial_internal = self._per_level('initial_internal')
-        self.start_from_measurement = bool(p['start_from_measurement'])
         self.internal = p['estimate_from'] == 'internal'
         self.law = self._law()
 
@@ -88,10 +87,11 @@ class ObserverConfiguration:
                 widths, f'1 to {levels} values (N = {levels} levels)'
             )
         widths = [widths[min(i, len(widths) - 1)] for i in range(levels)]
-        flags = np.zeros(3, dtype=np.int64)
+        flags = np.zeros(kernels.FLAGS, dtype=np.int64)
         flags[kernels.SIGN] = p['variant'] == 'sign'
         flags[kernels.IMPLICIT] = p['scheme'] == 'implicit'
         flags[kernels.ADAPTIVE] = p['variant'] == 'fuzzy_adaptive'
+        flags[kernels.FROM_MEASUREMENT] = p['start_from_measurement']
         if flags[kernels.SIGN]:  # the kernel does not read them
             curves = np.ones((levels, KNOTS))
         else:

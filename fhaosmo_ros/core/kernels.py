@@ -40,6 +40,8 @@ SENSITIVITY_LIMIT = 1e9
 NEWTON_STEPS = 60
 NEWTON_TOLERANCE = 1e-9
 """Relative change that ends the iteration; its square, about 1e-18, is what is left then."""
+HEADROOM = 1e8
+"""A number counts as infinite if this many times it would be: differences then stay finite."""
 TINY = 1e-300
 """Below this an innovation counts as 0: its powers would underflow."""
 
@@ -50,8 +52,8 @@ class Law(NamedTuple):
 
     Attributes
     ----------
-    flags : (3,) array
-        `SIGN`, `IMPLICIT`, `ADAPTIVE`: 0 or 1.
+    flags : (4,) array
+        `SIGN` .. `FROM_MEASUREMENT`: 0 or 1.
     gains : (3, N) array
         lambda_i, alpha_i, 1 / half-width_i.
     curves : (N, K) array
@@ -91,7 +93,8 @@ class Work(NamedTuple):
     stack: Floats
 
 
-SIGN, IMPLICIT, ADAPTIVE = range(3)
+SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT = range(4)
+FLAGS = 4
 LAMBDA, ALPHA, INVERSE_WIDTH = range(3)
 EPSILON, GAMMA_INITIAL, RATE, MIN, MAX, DEAD_ZONE, LEAKAGE = range(7)
 SCALARS = 7
@@ -301,6 +304,30 @@ def innovations(scalars: Floats, levels: Floats, y: float, eps: Floats, row: int
 
 
 @njit(cache=True, error_model='numpy', forceinline=True)
+def start(
+    flags: Ints, scalars: Floats, levels: Floats, memory: Floats, y: float, eps: Floats, row: int
+) -> int:
+    """
+    Take `y` as the first sample if it is one: time has not passed, nothing is integrated.
+
+    Returns
+    -------
+    int
+        Status word (see status.py).
+
+    """
+    word = 0
+    if math.isfinite(HEADROOM * y):
+        memory[Y] = y
+        memory[PENDING] = 0.0
+        if flags[FROM_MEASUREMENT]:
+            levels[HAT, 0] = y
+    else:
+        word = REJECTED_MEASUREMENT
+    return word | (innovations(scalars, levels, memory[Y], eps, row) << LEVEL_SHIFT)
+
+
+@njit(cache=True, error_model='numpy', forceinline=True)
 def step(
     flags: Ints, gains: Floats, curves: Floats, scalars: Floats, tape: Floats, offsets: Ints,
     x: Floats, m: Floats, stack: Floats,
@@ -317,11 +344,11 @@ def step(
     """
     n = gains.shape[1]
     word = 0
-    if not math.isfinite(y):
+    if not math.isfinite(HEADROOM * y):
         word |= REJECTED_MEASUREMENT
     if not math.isfinite(u):
         word |= REJECTED_INPUT
-    if not (h > 0.0 and math.isfinite(h)):
+    if not (h > 0.0 and math.isfinite(HEADROOM * h)):
         word |= REJECTED_PERIOD
     if not word:
         for r in range(ROWS):
@@ -339,9 +366,15 @@ def step(
             )  # fmt: skip
         zero = 0.0
         for i in range(n):
-            zero += (x[HAT, i] - x[HAT, i]) + (x[TILDE, i] - x[TILDE, i])
+            hat, tilde = HEADROOM * x[HAT, i], HEADROOM * x[TILDE, i]
+            zero += (hat - hat) + (tilde - tilde)
         if zero != 0.0:  # a difference of equals is 0, and NaN if they are not finite
             word = REJECTED_STEP
+            # Nothing of the sample may make the next step fail as well: not its time, and not
+            # the y at the interval's beginning, which is what fails explicitly.
+            memory[PENDING] = 0.0
+            if not flags[IMPLICIT]:
+                memory[Y] = y
         else:
             if flags[ADAPTIVE]:
                 memory[GAMMA], word = adapt(scalars, x, gamma, whole, loss, gradient)
@@ -350,7 +383,7 @@ def step(
                     levels[r, i] = x[r, i]
             memory[Y] = y
             memory[PENDING] = 0.0
-    if word & REJECTED and not word & REJECTED_PERIOD:
+    if word & (REJECTED_MEASUREMENT | REJECTED_INPUT) and not word & REJECTED_PERIOD:
         memory[PENDING] += h
     return word | (innovations(scalars, levels, memory[Y], eps, row) << LEVEL_SHIFT)
 
@@ -377,8 +410,8 @@ def adapt(
                 x[r, i] = 0.0
     elif loss > c[DEAD_ZONE] * c[DEAD_ZONE]:
         gamma -= h * c[RATE] * gradient  # P adaptationlawgamma
-    gamma -= h * c[LEAKAGE] * (gamma - c[GAMMA_INITIAL])
-    if gamma <= c[MIN]:
+    gamma -= min(h * c[LEAKAGE], 1.0) * (gamma - c[GAMMA_INITIAL])
+    if not gamma > c[MIN]:  # also for NaN, from an infinite gradient step
         gamma = c[MIN]
         word |= AT_MIN
     elif gamma >= c[MAX]:
@@ -408,7 +441,7 @@ def run(
     out: Floats, gamma: Floats, eps: Floats, words: Ints, first: int, every: int,
 ) -> None:  # fmt: skip
     """
-    Step through arrays of samples from index `first` on, recording every `every`-th one.
+    Start with the samples before index `first`, step from it on; record every `every`-th one.
 
     Row r of `out` (rows, 2, N), `gamma`, `eps` and `words` is the state after sample
     (r + 1) * every - 1; `eps` has one row more, for the samples after the last such one.
@@ -426,10 +459,8 @@ def run(
                 flags, gains, curves, scalars, tape, offsets, x, m, stack,
                 levels, memory, y[k], h[k], u[k], eps, row,
             )  # fmt: skip
-        else:  # before and at the first sample there is nothing to integrate
-            word = innovations(scalars, levels, memory[Y], eps, row) << LEVEL_SHIFT
-            if not math.isfinite(y[k]):
-                word |= REJECTED_MEASUREMENT
+        else:
+            word = start(flags, scalars, levels, memory, y[k], eps, row)
         seen |= word & ((1 << LEVEL_SHIFT) - 1)
         if (k + 1) % every == 0:
             for i in range(levels.shape[1]):

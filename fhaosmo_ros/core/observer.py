@@ -183,6 +183,7 @@ class Observer:
         self._levels[:] = state.levels
         self._memory[:] = state.memory
         self._t = state.t
+        self._fit_gamma()
 
     def check(self, changes: Mapping[str, Any]) -> None:
         """Raise what `configure` would raise, and change nothing."""
@@ -205,16 +206,18 @@ class Observer:
     def _adopt(self, configuration: ObserverConfiguration) -> None:
         was_adaptive = self._law.flags[kernels.ADAPTIVE]
         self._configuration = configuration
-        self._law = law = configuration.law
-        if not law.flags[kernels.ADAPTIVE]:
-            self._memory[layout.GAMMA] = FIXED_GAMMA
-        else:
-            c = law.scalars
-            self._memory[layout.GAMMA] = np.clip(
-                self._memory[layout.GAMMA], c[kernels.MIN], c[kernels.MAX]
-            )
-            if not was_adaptive:  # they were not carried along
-                self._levels[layout.HAT_SENSITIVITY :] = 0.0
+        self._law = configuration.law
+        self._fit_gamma()
+        if not was_adaptive:  # they were not carried along
+            self._levels[layout.HAT_SENSITIVITY :] = 0.0
+
+    def _fit_gamma(self) -> None:
+        c, gamma = self._law.scalars, self._memory[layout.GAMMA]
+        self._memory[layout.GAMMA] = (
+            np.clip(gamma, c[kernels.MIN], c[kernels.MAX])
+            if self._law.flags[kernels.ADAPTIVE]
+            else FIXED_GAMMA
+        )
 
     def reset(self) -> None:
         """Go back to the initial state; the next sample is the first."""
@@ -231,18 +234,11 @@ class Observer:
 
     def start(self, y: float) -> Estimate:
         """Take the first sample: time has not passed yet, so nothing is integrated."""
-        word = 0
-        if not np.isfinite(y):
-            word = int(Status.REJECTED_MEASUREMENT)
-        else:
-            self._memory[layout.Y] = y
-            self._memory[layout.PENDING] = 0.0
-            if self._configuration.start_from_measurement:
-                self._levels[layout.HAT, 0] = y
-        count = kernels.innovations(
-            self._law.scalars, self._levels, self._memory[layout.Y], self._eps, 0
+        law = self._law
+        word = kernels.start(
+            law.flags, law.scalars, self._levels, self._memory, float(y), self._eps, 0
         )
-        return self._estimate(word | count << LEVEL_SHIFT)
+        return self._estimate(word)
 
     def step(self, y: float, dt: float, u: float = 0.0) -> Estimate:
         """
@@ -328,12 +324,18 @@ class Observer:
             )
         if every < 1:
             raise ConfigurationError(f'run: expected every >= 1, got {every}')
-        u = np.ascontiguousarray(np.broadcast_to(np.asarray(u, dtype=np.float64), y.shape))
+        u = np.asarray(u, dtype=np.float64)
+        if u.shape not in ((), y.shape):
+            raise ConfigurationError(
+                f'run: expected u to be a number or an array as long as y, got shapes {u.shape} '
+                f'and {y.shape}'
+            )
+        u = np.ascontiguousarray(np.broadcast_to(u, y.shape))
         first = 0
-        while not self.started and first < len(y):
+        if not self.started:
             self._t = None
-            self.start(y[first])
-            first += 1
+            good = np.flatnonzero(np.isfinite(kernels.HEADROOM * y))
+            first = good[0] + 1 if len(good) else len(y)
         return self._run(t, y, u, first, every)
 
     def _run(
@@ -355,12 +357,16 @@ class Observer:
 
     def _periods(self, t: NDArray[Any], first: int) -> NDArray[np.float64]:
         """Return the time of each sample since the latest sample before it, in seconds."""
-        if not len(t):
-            return np.zeros(0)
         integers = np.issubdtype(t.dtype, np.integer)
         t = t.astype(np.int64 if integers else np.float64)
-        start = self._t if self._t is not None else t[max(first - 1, 0)]
-        latest = np.fmax.accumulate(np.concatenate([[start], t]).astype(t.dtype))
+        known = t if integers else np.where(np.isfinite(t), t, np.nan)
+        # Times before the first sample do not count.
+        known = known[max(first - 1, 0) :]
+        if not len(known):
+            return np.zeros(len(t))
+        start = self._t if self._t is not None else known[0]
+        latest = np.fmax.accumulate(np.concatenate([[start], known]).astype(t.dtype))
         self._t = latest[-1].item()
-        h = t - latest[:-1]
+        h = np.zeros(len(t))
+        h[len(t) - len(known) :] = t[len(t) - len(known) :] - latest[:-1]
         return h * 1e-9 if integers else h

@@ -9,13 +9,15 @@ from rclpy.node import Node
 
 
 class DiagnosticsPublisher:
-    """Publishes a node's report: WARN if a counter of bad events grew since the last one.
+    """
+    Publishes a node's report: WARN if a counter of bad events grew since the last one.
 
     Parameters
     ----------
     report : callable
         Returns values by name; those named 'rejected ...', 'restarts' and 'samples lost' count
         bad events.
+
     """
 
     def __init__(self, node: Node, report: Callable[[], dict[str, Any]]) -> None:

@@ -5,11 +5,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from std_msgs.msg import Float64, Float64MultiArray
-from std_srvs.srv import Trigger
-
 from fhaosmo_ros.core.observer import Observer
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
@@ -18,18 +13,24 @@ from fhaosmo_ros.nodes.messages import fill, labelled
 from fhaosmo_ros.nodes.parameters import declare, on_change
 from fhaosmo_ros.nodes.spin import run_node
 from fhaosmo_ros.nodes.subscription import subscribe_with_info
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Float64, Float64MultiArray
+from std_srvs.srv import Trigger
 
 SENSOR_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort matches every publisher; the depth holds a second at 1 kHz."""
 
 
 class EstimatorNode(Node):
-    """Subscribes ``y`` (and ``u``), steps the observer on each sample, publishes on a timer.
+    """
+    Subscribes ``y`` (and ``u``), steps the observer on each sample, publishes on a timer.
 
     Raises
     ------
     ConfigurationError
         Parameters that can't be used; nothing has been subscribed or published then.
+
     """
 
     def __init__(self, **options: Any) -> None:
@@ -65,8 +66,8 @@ class EstimatorNode(Node):
         self._y = subscribe_with_info(self, Float64, 'y', self._on_sample, SENSOR_QOS)
         if self.get_parameter('use_sim_time').value and values['sampling'] == 'source_stamp':
             self.get_logger().warning(
-                "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing of "
-                "/clock, so dt is in the host's time; set sampling to clock for simulation time"
+                "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing "
+                "of /clock, so dt is in the host's time; set sampling to clock for simulation time"
             )
         parameters = observer.parameters
         self.get_logger().info(

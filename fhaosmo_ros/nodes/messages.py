@@ -16,6 +16,6 @@ def labelled(names: list[str]) -> Float64MultiArray:
 
 
 def fill(message: Float64MultiArray, values: NDArray) -> Float64MultiArray:
-    """Put `values` into a message; an array.array is what rclpy takes without a copy by element."""
+    """Put `values` into a message; rclpy takes an array.array without looking at each element."""
     message.data = array('d', values.tobytes())
     return message

@@ -4,6 +4,9 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.parameter import Parameter, ParameterTable
+from fhaosmo_ros.core.parameter_file import is_built_in, parse, select
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -13,10 +16,6 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 import yaml
-
-from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.parameter import Parameter, ParameterTable
-from fhaosmo_ros.core.parameter_file import is_built_in, parse, select
 
 TYPES = {
     'bool': RosParameter.Type.BOOL,
@@ -29,7 +28,8 @@ TYPES = {
 
 
 def descriptor(parameter: Parameter) -> ParameterDescriptor:
-    """Return the ROS descriptor of a declared parameter.
+    """
+    Return the ROS descriptor of a declared parameter.
 
     Typing is dynamic so that a wrong type reaches our own check, whose message names the
     parameter; the check lets no other type through.
@@ -59,7 +59,8 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
 def declare(
     node: Node, table: ParameterTable, check: Callable[[Mapping[str, Any]], None]
 ) -> dict[str, Any]:
-    """Declare a table's parameters on a node and return their values.
+    """
+    Declare a table's parameters on a node and return their values.
 
     Parameters
     ----------
@@ -75,6 +76,7 @@ def declare(
     ------
     ConfigurationError
         An unknown name or a bad value among the overrides.
+
     """
     overrides = {name: p.value for name, p in node.get_parameters_by_prefix('').items()}
     values: dict[str, Any] = table.defaults() | select(overrides, table)
@@ -83,9 +85,7 @@ def declare(
         if not is_built_in(name):  # declared as it came, without a descriptor
             node.undeclare_parameter(name)
     for name, parameter in table.items():
-        node.declare_parameter(
-            name, values[name], descriptor(parameter), ignore_override=True
-        )
+        node.declare_parameter(name, values[name], descriptor(parameter), ignore_override=True)
     return values
 
 
@@ -95,7 +95,8 @@ def on_change(
     check: Callable[[Mapping[str, Any]], None],
     apply: Callable[[Mapping[str, Any]], None],
 ) -> None:
-    """Connect live changes: values are brought into their type, checked as a set, applied.
+    """
+    Connect live changes: values are brought into their type, checked as a set, applied.
 
     Parameters
     ----------
@@ -103,6 +104,7 @@ def on_change(
         Gets the changes; raises ConfigurationError and changes nothing.
     apply : callable
         Gets the same changes once ROS has accepted all of them.
+
     """
 
     def convert(parameters: list[RosParameter]) -> list[RosParameter]:

@@ -5,32 +5,31 @@ from collections.abc import Mapping
 import math
 from typing import Any
 
-from rclpy.node import Node
-from std_msgs.msg import Float64, Float64MultiArray
-
 from fhaosmo_ros.core.parameters import PLANT_NODE_PARAMETERS, PLANT_PARAMETERS
 from fhaosmo_ros.core.plant import Plant
 from fhaosmo_ros.nodes.messages import fill, labelled
 from fhaosmo_ros.nodes.parameters import declare, on_change
 from fhaosmo_ros.nodes.spin import run_node
+from rclpy.node import Node
+from std_msgs.msg import Float64, Float64MultiArray
 
 MAX_PAUSE = 1_000_000_000
 """Clock jumps beyond this many nanoseconds are not simulated through."""
 
 
 class PlantNode(Node):
-    """Publishes ``y``, ``~/state`` and ``~/unknown_input`` at `sample_rate`.
+    """
+    Publishes ``y``, ``~/state`` and ``~/unknown_input`` at `sample_rate`.
 
     Raises
     ------
     ConfigurationError
         Parameters that can't be used; nothing has been published then.
+
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(
-            'plant', automatically_declare_parameters_from_overrides=True, **options
-        )
+        super().__init__('plant', automatically_declare_parameters_from_overrides=True, **options)
         values = declare(self, PLANT_NODE_PARAMETERS, lambda v: Plant(_plant(v)))
         self.plant = Plant(_plant(values))
         self.plant.sample(0.0)  # compiles, or loads what an earlier start compiled

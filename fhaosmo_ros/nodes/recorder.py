@@ -5,20 +5,20 @@ from collections.abc import Callable, Mapping
 import threading
 from typing import Any
 
+from fhaosmo_ros.nodes.spin import Spinner
+from fhaosmo_ros.nodes.subscription import subscribe_with_info
 import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from fhaosmo_ros.nodes.spin import Spinner
-from fhaosmo_ros.nodes.subscription import subscribe_with_info
-
 QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Recorder:
-    """A node in a context of its own that records while it is open.
+    """
+    A node in a context of its own that records while it is open.
 
     Parameters
     ----------
@@ -27,11 +27,10 @@ class Recorder:
     sink : callable
         Called as ``sink(topic, stamp, data)`` with the source time stamp in nanoseconds and the
         message in CDR, from the executor's thread.
+
     """
 
-    def __init__(
-        self, topics: Mapping[str, Any], sink: Callable[[str, int, bytes], None]
-    ) -> None:
+    def __init__(self, topics: Mapping[str, Any], sink: Callable[[str, int, bytes], None]) -> None:
         self.counts = dict.fromkeys(topics, 0)
         self._arrived = threading.Condition()
         self._context = Context()

@@ -3,13 +3,18 @@
 
 from collections.abc import Callable, Mapping
 import gc
+from itertools import pairwise
 import os
 import re
-import signal
 import sys
 import threading
 from typing import Any
 
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.parameter import Parameter, suggestion
+from fhaosmo_ros.core.parameter_file import check_one_type, is_built_in, load, parse
+from fhaosmo_ros.core.parameters import NODE_TABLES
+from fhaosmo_ros.stop_signals import stop_on_signals
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -17,11 +22,6 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 import yaml
-
-from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.parameter import Parameter, suggestion
-from fhaosmo_ros.core.parameter_file import check_one_type, is_built_in, load, parse
-from fhaosmo_ros.core.parameters import NODE_TABLES
 
 try:
     from rclpy.experimental import EventsExecutor
@@ -33,7 +33,8 @@ FOREVER = 3600.0
 
 
 def make_executor(context: Any) -> Any:
-    """Return the events executor where rclpy has it, else the single-threaded one.
+    """
+    Return the events executor where rclpy has it, else the single-threaded one.
 
     At 1 kHz the events executor needs about a fifth of the single-threaded one's CPU.
     """
@@ -42,7 +43,8 @@ def make_executor(context: Any) -> Any:
 
 
 class Spinner:
-    """Runs an executor in a thread of its own.
+    """
+    Runs an executor in a thread of its own.
 
     Python's signal handlers run in the main thread only, which the executor must not block.
     """
@@ -80,20 +82,21 @@ class Spinner:
 
 
 def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> int:
-    """Run a node until SIGINT or SIGTERM.
+    """
+    Run a node until SIGINT or SIGTERM.
 
     Returns
     -------
     int
         Exit code: 0 after a signal, 1 if a callback failed, 2 for a bad configuration (said in
         one line on stderr).
+
     """
     argv = sys.argv[1:] if argv is None else argv
     if any(word in ('-h', '--help') for word in argv):
         print(_usage(name))
         return 0
-    ended = threading.Event()
-    previous = {s: signal.signal(s, lambda *_: ended.set()) for s in (signal.SIGINT, signal.SIGTERM)}
+    ended = stop_on_signals()
     node = None
     try:
         _check_arguments(name, argv)
@@ -111,19 +114,15 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
         print(f'{name}: error: {_one_line(error)}', file=sys.stderr)
         return 2
     finally:
-        for number in previous:
-            signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C must not cut the clean-up
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _check_arguments(name: str, argv: list[str]) -> None:
     """Check what rcl would pass over in silence, or refuse without naming what is wrong."""
     table = NODE_TABLES[name]
-    options = list(zip(argv, argv[1:], strict=False))
+    options = list(pairwise(argv))
     for flag, word in options:
         if flag == '--params-file':
             load(os.path.expanduser(word), _full_name(name, options), table)

@@ -17,7 +17,8 @@ def subscribe_with_info(
     qos: QoSProfile,
     raw: bool = False,
 ) -> Any:
-    """Subscribe with a callback that takes the message and its info.
+    """
+    Subscribe with a callback that takes the message and its info.
 
     rclpy decides from the callback's signature whether to deliver the info. The events executor
     of rclpy 7.1 then passes both as one tuple, the other executors as two arguments: this takes

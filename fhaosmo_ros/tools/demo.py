@@ -5,7 +5,6 @@ import argparse
 from collections.abc import Callable
 import os
 from pathlib import Path
-import signal
 import sys
 import threading
 import time
@@ -14,6 +13,7 @@ from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter_file import load
 from fhaosmo_ros.nodes.recorder import Recorder
 from fhaosmo_ros.nodes.topics import RUN_TOPICS, type_name
+from fhaosmo_ros.stop_signals import stop_on_signals
 from fhaosmo_ros.tools.bags import BagWriter
 from fhaosmo_ros.tools.figures import save_run
 from fhaosmo_ros.tools.output import OutputFolder
@@ -42,10 +42,7 @@ def main(argv: list[str] | None = None) -> int:
 
     """
     arguments = _parser().parse_args(argv)
-    stop = threading.Event()
-    previous = {
-        s: signal.signal(s, lambda *_: stop.set()) for s in (signal.SIGINT, signal.SIGTERM)
-    }
+    stop = stop_on_signals()
     try:
         return _demo(arguments, stop)
     except ConfigurationError as error:
@@ -54,9 +51,6 @@ def main(argv: list[str] | None = None) -> int:
     except Interrupted:
         print('demo: interrupted before the first estimate, nothing written', file=sys.stderr)
         return 130
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -93,7 +87,6 @@ def _demo(arguments: argparse.Namespace, stop: threading.Event) -> int:
     with OutputFolder(arguments.output or _default_output()) as folder:
         _record(folder.path, parameters, arguments.duration, stop)
         if stop.is_set():
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C: the report is near
             print('stopped early: reporting what has been recorded')
         run = read_run(folder.path / 'bag')
         save_run(run, folder.path / 'demo.png')

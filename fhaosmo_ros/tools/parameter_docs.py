@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes docs/parameters.md from the declarations: `python -m fhaosmo_ros.tools.parameter_docs`."""
+"""`python -m fhaosmo_ros.tools.parameter_docs` writes docs/parameters.md."""
 
 from pathlib import Path
 import sys
