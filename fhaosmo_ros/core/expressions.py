@@ -69,6 +69,8 @@ def parse(text: str, level: int) -> list[Instruction]:
     """
     if len(text) > MAX_LENGTH:
         raise _error(level, text[:40] + '...', f'{len(text)} characters, at most {MAX_LENGTH}')
+    if not text.isascii():  # Python would read some letters as the ones that they look like
+        raise _error(level, text, 'only ASCII characters can be used')
     try:
         body = ast.parse(text.strip(), mode='eval').body
     except (SyntaxError, ValueError, RecursionError, MemoryError):
@@ -107,7 +109,8 @@ class _Parser:
                     raise self.error(f"unknown function '{name}'{suggestion(name, FUNCTIONS)}")
                 inner = self.emit(argument, nesting + 1)
                 return self.fold([*inner, Instruction(FUNCTIONS[name])])
-        raise self.error(f"'{ast.unparse(node)[:60]}' is not allowed")
+        part = ast.get_source_segment(self.text.strip(), node) or ''
+        raise self.error(f'{part[:60]!r} is not allowed')
 
     def constant(self, number: float) -> Instruction:
         try:

@@ -21,7 +21,7 @@ from fhaosmo_ros.core.layout import (
     Y,
 )
 from fhaosmo_ros.core.status import LEVEL_SHIFT, Status
-from fhaosmo_ros.core.status import REJECTED as REJECTED_FLAGS
+from fhaosmo_ros.core.status import REJECTED
 from fhaosmo_ros.core.tape import evaluate, Floats, Ints
 from numba import njit
 import numpy as np
@@ -31,7 +31,6 @@ REJECTED_MEASUREMENT = int(Status.REJECTED_MEASUREMENT)
 REJECTED_PERIOD = int(Status.REJECTED_PERIOD)
 REJECTED_INPUT = int(Status.REJECTED_INPUT)
 REJECTED_STEP = int(Status.REJECTED_STEP)
-REJECTED = int(REJECTED_FLAGS)
 AT_MIN = int(Status.GAMMA_AT_MIN)
 AT_MAX = int(Status.GAMMA_AT_MAX)
 SENSITIVITY_RESET = int(Status.SENSITIVITY_RESET)

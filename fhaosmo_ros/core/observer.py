@@ -134,6 +134,7 @@ class Observer:
         self._work = kernels.make_work(count, self._configuration.model.depth)
         self._eps = np.zeros((1, count))
         self._t: float | int | None = None
+        self._word = 0
         self.reset()
 
     @property
@@ -159,7 +160,8 @@ class Observer:
     @property
     def started(self) -> bool:
         """True once a sample has arrived."""
-        return not np.isnan(self._memory[layout.Y])
+        y = self._memory[layout.Y]
+        return bool(y == y)  # NaN before the first sample
 
     @property
     def state(self) -> ObserverState:
@@ -235,10 +237,10 @@ class Observer:
     def start(self, y: float) -> Estimate:
         """Take the first sample: time has not passed yet, so nothing is integrated."""
         law = self._law
-        word = kernels.start(
+        self._word = kernels.start(
             law.flags, law.scalars, self._levels, self._memory, float(y), self._eps, 0
         )
-        return self._estimate(word)
+        return self._estimate(self._word)
 
     def step(self, y: float, dt: float, u: float = 0.0) -> Estimate:
         """
@@ -263,13 +265,23 @@ class Observer:
             it was, and the time of a rejected sample is added to the next step.
 
         """
+        word = self.advance(y, dt, u)
+        return self._estimate(word)
+
+    def advance(self, y: float, dt: float, u: float = 0.0) -> int:
+        """Do what `step` does and return only the status word; see `estimate`."""
         if not self.started and np.isfinite(y):
             self.start(y)
-        word = kernels.step_once(
+        self._word = kernels.step_once(
             *self._law, *self._work, self._levels, self._memory,
             float(y), float(dt), float(u), self._eps,
         )  # fmt: skip
-        return self._estimate(word)
+        return self._word
+
+    @property
+    def estimate(self) -> Estimate:
+        """Estimate of the present state, with the status of the last step."""
+        return self._estimate(self._word)
 
     def _estimate(self, word: int) -> Estimate:
         z, d = self._select(self._levels)

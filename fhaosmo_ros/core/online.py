@@ -41,8 +41,8 @@ class OnlineEstimator:
 
     The policy of time: dt is the difference of two samples' stamps (integer nanoseconds,
     subtracted before they become seconds), or `nominal_period`. A sample that is not later than
-    the one before is rejected. After a gap longer than `max_gap`, or a jump back by more than it,
-    the observer starts afresh from the new sample.
+    the one before is rejected. After a gap between usable samples longer than `max_gap`, or a jump
+    back by more than it, the observer starts afresh from the new sample.
 
     Parameters
     ----------
@@ -61,11 +61,10 @@ class OnlineEstimator:
         self.observer = Observer({k: v for k, v in values.items() if k in OBSERVER_PARAMETERS})
         self._set_sampling(values)
         self.counters = Counters()
-        self.estimate: Estimate | None = None
-        """The latest estimate, None before the first sample."""
         self.stamp: int | None = None
         """Stamp of the sample behind the latest estimate, in nanoseconds."""
         self._latest: int | None = None
+        self._unused = 0  # nanoseconds that rejected samples have left to the next step
         self._u = 0.0
 
     @property
@@ -95,13 +94,14 @@ class OnlineEstimator:
     def _set_sampling(self, values: Mapping[str, Any]) -> None:
         self._sampling = {k: v for k, v in values.items() if k not in OBSERVER_PARAMETERS}
         self._nominal = self._sampling['sampling'] == 'nominal'
-        self._period = float(self._sampling['nominal_period'])
+        self._period = round(float(self._sampling['nominal_period']) / NANOSECONDS)
         self._max_gap = round(float(self._sampling['max_gap']) / NANOSECONDS)
 
     def reset(self) -> None:
         """Start afresh: the next sample is the first. Counters go on."""
         self.observer.reset()
-        self._latest = self.stamp = self.estimate = None
+        self._latest = self.stamp = None
+        self._unused = 0
 
     def forget_stamp(self) -> None:
         """Expect stamps of another clock: the next sample takes the nominal period."""
@@ -132,34 +132,44 @@ class OnlineEstimator:
             Of this sample, or the previous state's with the reason of the rejection.
 
         """
+        self.advance(stamp, y)
+        return self.observer.estimate
+
+    def advance(self, stamp: int, y: float) -> int:
+        """Do what `update` does and return only the status word; see `estimate`."""
         observer = self.observer
         if not observer.started:
-            estimate = observer.start(y)
-            self._latest = stamp
-        elif self._nominal or self._latest is None:
-            self._latest = stamp
-            estimate = observer.step(y, self._period, self._u)
+            word = observer.start(y).word
+            self._latest, self._unused = stamp, 0
         else:
-            elapsed = stamp - self._latest
-            if abs(elapsed) > self._max_gap:
+            nominal = self._nominal or self._latest is None
+            elapsed = self._period if nominal else stamp - (self._latest or 0)
+            gap = abs(elapsed) + self._unused
+            if gap > self._max_gap and (self._unused or not nominal):
                 observer.reset()
                 self.counters.restarts += 1
-                estimate = observer.start(y)
-                self._latest = stamp
+                word = observer.start(y).word
+                self._latest, self._unused = stamp, 0
             else:
-                estimate = observer.step(y, elapsed * NANOSECONDS, self._u)
-                if elapsed > 0:
+                word = observer.advance(y, elapsed * NANOSECONDS, self._u)
+                if nominal or elapsed > 0:
                     self._latest = stamp
-        self._count(estimate.word)
-        if not estimate.word & REJECTED:
-            self.stamp, self.estimate = stamp, estimate
-        return estimate
+                    self._unused = gap if word & REJECTED else 0
+        if word & REJECTED:
+            self._count_rejected(word)
+        else:
+            self.counters.accepted += 1
+            self.stamp = stamp
+        return word
 
-    def _count(self, word: int) -> None:
+    @property
+    def estimate(self) -> Estimate | None:
+        """The latest estimate, None before the first sample."""
+        return None if self.stamp is None else self.observer.estimate
+
+    def _count_rejected(self, word: int) -> None:
         counters = self.counters
-        if not word & REJECTED:
-            counters.accepted += 1
-        elif word & Status.REJECTED_MEASUREMENT:
+        if word & Status.REJECTED_MEASUREMENT:
             counters.rejected_measurements += 1
         elif word & Status.REJECTED_PERIOD:
             counters.rejected_stamps += 1

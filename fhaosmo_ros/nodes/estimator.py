@@ -8,6 +8,7 @@ from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.observer import Observer
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
+from fhaosmo_ros.core.status import REJECTED, Status
 from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher
 from fhaosmo_ros.nodes.messages import fill, labelled
 from fhaosmo_ros.nodes.parameters import declare, on_change
@@ -44,12 +45,14 @@ class EstimatorNode(Node):
         self._max_gap = float(values['max_gap'])
         self._sequence = 0
         self._lost = 0
-        self._arrival: int | None = None
+        self._arrived = False
         self._stale = True
+        self._silent_since = 0
 
         observer = self.estimator.observer
         self._state = labelled([f'z{i + 1}' for i in range(observer.order)])
         self._innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
+        self._d, self._gamma, self._stamp = Float64(), Float64(), Time()
         self._publish_state = self.create_publisher(Float64MultiArray, '~/state', 10).publish
         self._publish_d = self.create_publisher(Float64, '~/unknown_input', 10).publish
         self._publish_gamma = self.create_publisher(Float64, '~/gamma', 10).publish
@@ -89,15 +92,16 @@ class EstimatorNode(Node):
         self._count_lost(info.get('publication_sequence_number'))
         estimator = self.estimator
         restarts = estimator.counters.restarts
-        estimate = estimator.update(stamp, message.data)
-        self._arrival = stamp
+        word = estimator.advance(stamp, message.data)
         if estimator.counters.restarts != restarts:
             self.get_logger().warning(
-                'time jumped by more than max_gap between two samples: restarted from the new one'
+                'more than max_gap between two usable samples: restarted from the new one'
             )
-        if estimate.status.rejected:
+        if not word & REJECTED:
+            self._arrived = True
+        else:
             self.get_logger().warning(
-                f'rejected a sample: {estimate.status.name}, y = {message.data} '
+                f'rejected a sample: {_reason(word, message.data)} '
                 f'({estimator.counters.rejected} rejected so far)',
                 throttle_duration_sec=5.0,
             )
@@ -118,20 +122,24 @@ class EstimatorNode(Node):
 
     def _publish(self) -> None:
         estimator = self.estimator
+        if self._is_stale():
+            return
         estimate = estimator.estimate
-        if estimate is None or self._is_stale():
+        if estimate is None:  # reset, and no sample since
             return
         self._publish_state(fill(self._state, estimate.z))
-        self._publish_d(Float64(data=estimate.unknown_input))
-        self._publish_gamma(Float64(data=estimate.gamma))
+        self._d.data = estimate.unknown_input
+        self._publish_d(self._d)
+        self._gamma.data = estimate.gamma
+        self._publish_gamma(self._gamma)
         self._publish_innovation(fill(self._innovation, estimate.innovation))
-        seconds, nanoseconds = divmod(estimator.stamp, 1_000_000_000)
-        self._publish_stamp(Time(sec=seconds, nanosec=nanoseconds))
+        self._stamp.sec, self._stamp.nanosec = divmod(estimator.stamp, 1_000_000_000)
+        self._publish_stamp(self._stamp)
 
     def _is_stale(self) -> bool:
         """Return True, and say it once, while no sample has come for max_gap."""
-        if self._arrival is not None:
-            self._arrival = None
+        if self._arrived:
+            self._arrived = False
             self._silent_since = self.get_clock().now().nanoseconds
             self._stale = False
         elif not self._stale:
@@ -139,8 +147,8 @@ class EstimatorNode(Node):
             if silence > self._max_gap:
                 self._stale = True
                 self.get_logger().warning(
-                    f'no sample on {self._y.topic_name} for {silence:.2g} s: not publishing '
-                    'until one comes'
+                    f'no usable sample on {self._y.topic_name} for {silence:.2g} s: not '
+                    'publishing until one comes'
                 )
         return self._stale
 
@@ -187,6 +195,14 @@ class EstimatorNode(Node):
 def _online(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parameters of the update path among the node's."""
     return {name: value for name, value in values.items() if name in ONLINE_PARAMETERS}
+
+
+def _reason(word: int, y: float) -> str:
+    if word & Status.REJECTED_PERIOD:
+        return 'expected a stamp later than the one before'
+    if word & Status.REJECTED_MEASUREMENT:
+        return f'expected a finite y, got {y}'
+    return f'y = {y} would have made the estimate infinite'
 
 
 def main(argv: list[str] | None = None) -> int:
