@@ -52,9 +52,9 @@ class Child:
     def wait_for(self, text: str) -> float:
         """Wait until `text` is in the output; return the seconds since the start."""
         deadline = monotonic() + READY
-        while text not in self._log.read_text(errors='replace'):
+        while text not in self.output():
             if self._process.poll() is not None:
-                lines = self._log.read_text(errors='replace').splitlines()
+                lines = self.output().splitlines()
                 raise CannotMeasureError(
                     f'{self._log.stem} ended with exit code {self._process.returncode}: '
                     f'{" / ".join(lines[-2:]) or "without a word"}'
@@ -65,6 +65,10 @@ class Child:
                 )
             sleep(POLL)
         return perf_counter() - self.started
+
+    def output(self) -> str:
+        """Return what the child has said so far."""
+        return self._log.read_text(errors='replace')
 
     def cpu_seconds(self) -> float:
         """Return the CPU time used so far, in user and kernel mode, of all threads."""

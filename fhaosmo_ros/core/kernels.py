@@ -21,7 +21,6 @@ from fhaosmo_ros.core.layout import (
     Y,
 )
 from fhaosmo_ros.core.status import LEVEL_SHIFT, Status
-from fhaosmo_ros.core.status import REJECTED
 from fhaosmo_ros.core.tape import evaluate, Floats, Ints
 from numba import njit
 import numpy as np

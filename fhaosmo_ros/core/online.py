@@ -147,6 +147,7 @@ class OnlineEstimator:
             gap = abs(elapsed) + self._unused
             if gap > self._max_gap and (self._unused or not nominal):
                 observer.reset()
+                self.stamp = None
                 self.counters.restarts += 1
                 word = observer.start(y).word
                 self._latest, self._unused = stamp, 0

@@ -8,6 +8,7 @@ import math
 from typing import Any, TypeAlias
 
 from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.yaml_text import parse
 import numpy as np
 import yaml
 
@@ -103,7 +104,7 @@ class Parameter:
         original = value
         if isinstance(value, str) and self.kind in ('double_array', 'string_array'):
             try:
-                value = yaml.safe_load(value)
+                value = parse(value)
             except yaml.YAMLError:
                 raise self.error(original) from None
         if isinstance(value, np.ndarray | np.generic):

@@ -9,34 +9,11 @@ from typing import Any
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter import ParameterTable, unknown_parameter
 from fhaosmo_ros.core.parameters import NODE_TABLES
+from fhaosmo_ros.core.yaml_text import parse
 import yaml
 
 BUILT_IN = ('use_sim_time', 'start_type_description_service')
 """Parameters that rclpy declares itself."""
-
-
-class _Loader(yaml.SafeLoader):
-    """Reads 1e-3 as a number, as rcl does; YAML 1.1 takes it for a text."""
-
-
-_Loader.add_implicit_resolver(
-    'tag:yaml.org,2002:float',
-    re.compile(r'[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$'),
-    list('-+.0123456789'),
-)
-
-
-def parse(text: str) -> Any:
-    """
-    Return the content of a YAML text.
-
-    Raises
-    ------
-    yaml.YAMLError
-        The text is not YAML.
-
-    """
-    return yaml.load(text, Loader=_Loader)
 
 
 def is_built_in(name: str) -> bool:

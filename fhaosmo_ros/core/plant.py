@@ -2,6 +2,7 @@
 """The simulated plant (paper eq. newsimpledynamics): triangular system, unknown input, noise."""
 
 from collections.abc import Mapping
+import math
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.configuration import per_level
@@ -187,7 +188,17 @@ class Plant:
         return _System(model.tape, model.offsets, kind, wave)
 
     def advance(self, t: float, u: float = 0.0) -> None:
-        """Integrate up to the time `t` (s since the start), with the known input `u` held."""
+        """
+        Integrate up to the time `t` (s since the start), with the known input `u` held.
+
+        Raises
+        ------
+        ConfigurationError
+            A time that is not finite.
+
+        """
+        if not math.isfinite(t):
+            raise ConfigurationError(f'plant: expected a finite time, got {t}')
         self._step = _advance(
             self._system, self._work, self._z, self._at, self._step, float(t), self._h, float(u)
         )
@@ -214,8 +225,15 @@ class Plant:
         Truth
             Arrays with K rows.
 
+        Raises
+        ------
+        ConfigurationError
+            A time that is not finite.
+
         """
         t = np.ascontiguousarray(t, dtype=np.float64)
+        if not np.all(np.isfinite(t)):
+            raise ConfigurationError('plant: expected finite times, got some that are not')
         u = np.ascontiguousarray(np.broadcast_to(np.asarray(u, dtype=np.float64), t.shape))
         z, d = np.empty((len(t), self.order)), np.empty(len(t))
         self._step = _simulate(self._system, self._work, self._z, self._step, t, self._h, u, z, d)

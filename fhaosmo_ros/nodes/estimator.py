@@ -47,7 +47,7 @@ class EstimatorNode(Node):
         self._lost = 0
         self._arrived = False
         self._stale = True
-        self._silent_since = 0
+        self._silent_since: int | None = None
 
         observer = self.estimator.observer
         self._state = labelled([f'z{i + 1}' for i in range(observer.order)])
@@ -139,15 +139,16 @@ class EstimatorNode(Node):
     def _is_stale(self) -> bool:
         """Return True, and say it once, while no sample has come for max_gap."""
         if self._arrived:
-            self._arrived = False
-            self._silent_since = self.get_clock().now().nanoseconds
-            self._stale = False
+            self._arrived = self._stale = False
+            self._silent_since = None
         elif not self._stale:
-            silence = (self.get_clock().now().nanoseconds - self._silent_since) * 1e-9
-            if silence > self._max_gap:
+            now = self.get_clock().now().nanoseconds
+            if self._silent_since is None:  # the clock is not read while samples come
+                self._silent_since = now
+            elif now - self._silent_since > self._max_gap * 1e9:
                 self._stale = True
                 self.get_logger().warning(
-                    f'no usable sample on {self._y.topic_name} for {silence:.2g} s: not '
+                    f'no usable sample on {self._y.topic_name} for {self._max_gap:g} s: not '
                     'publishing until one comes'
                 )
         return self._stale

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.parameter import Parameter, ParameterTable
+from fhaosmo_ros.core.parameter import Parameter, ParameterTable, suggestion
 from fhaosmo_ros.core.parameter_file import is_built_in, parse, select
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -13,6 +13,7 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 import yaml
@@ -108,6 +109,9 @@ def on_change(
     """
 
     def convert(parameters: list[RosParameter]) -> list[RosParameter]:
+        for p in parameters:
+            if not node.has_parameter(p.name):  # rclpy 7.1 refuses it too, but loses the name
+                raise ParameterNotDeclaredException(f"'{p.name}'{suggestion(p.name, table)}")
         return [_converted(p, table) for p in parameters]
 
     def validate(parameters: list[RosParameter]) -> SetParametersResult:

@@ -118,7 +118,7 @@ def _record(folder: Path, parameters: Path, duration: float, stop: threading.Eve
         options = ('--ros-args', '--params-file', str(parameters))
         nodes.start('estimator', *options)
         _wait(
-            'the estimator (the first start compiles, about 20 s)',
+            'the estimator (the first start compiles, some 10 s)',
             lambda: recorder.publishers('/estimator/state') and recorder.subscribers('/y') >= 2,
             nodes, stop,
         )  # fmt: skip
