@@ -337,7 +337,7 @@ def step(
     Returns
     -------
     int
-        Status word (see status.py). A rejected sample changes nothing but the pending time.
+        Status word (see status.py). A rejected sample changes no level; see `Status`.
 
     """
     n = gains.shape[1]

@@ -262,7 +262,7 @@ class Observer:
         -------
         Estimate
             Bad data does not raise: `Estimate.status` says what was rejected, the state stays as
-            it was, and the time of a rejected sample is added to the next step.
+            it was, and the time of a rejected sample is added to the next step (see `Status`).
 
         """
         word = self.advance(y, dt, u)

@@ -11,7 +11,9 @@ class Status(IntFlag):
     """
     Flags of a step. The number of open levels is kept apart: see `open_levels`.
 
-    A rejected sample leaves the state as it was; the time it stood for is added to the next step.
+    A rejected sample leaves the state as it was. The time it stood for is added to the next step,
+    except for `REJECTED_STEP`, which drops it, so that what could not be stepped over does not
+    come back.
     """
 
     OK = 0

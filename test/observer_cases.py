@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Observers and samples that several tests share."""
+
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+# Every number that a test relies on; the defaults may change.
+SMALL = {'order': 2, 'phi': ['0', '-z2*z2*z1 + u'], 'lambda': 3.0, 'alpha': 4.0}
+SMALL |= {'epsilon': 0.025, 'fuzzy_widths': [0.02], 'unknown_input': True}
+SMALL |= {'gamma_initial': 0.5, 'gamma_min': 0.3, 'gamma_max': 0.8, 'gamma_rate': 0.004}
+SMALL |= {'gamma_dead_zone': 0.0, 'gamma_leakage': 0.0, 'start_from_measurement': True}
+LAWS = [
+    {'scheme': scheme, 'variant': variant}
+    for scheme in ('explicit', 'implicit')
+    for variant in ('sign', 'fuzzy', 'fuzzy_adaptive')
+]
+laws = pytest.mark.parametrize('law', LAWS, ids=lambda law: '-'.join(law.values()))
+any_law = st.sampled_from(LAWS)
+
+
+def samples(count=200, seed=1):
+    """Return t, y, u with NaNs, duplicate and backward stamps, and a first sample that is bad."""
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(rng.uniform(0.5e-3, 2e-3, count))
+    y = np.sin(3.0 * t) + 1e-3 * rng.standard_normal(count)
+    u = rng.uniform(-1.0, 1.0, count)
+    t[60], t[61], t[90] = t[59], t[58], t[70]
+    y[[0, 1, 30, 31, 100]] = np.nan
+    y[120], u[140] = np.inf, np.nan
+    return t, y, u
+
+
+def concatenated(runs):
+    return [np.concatenate(parts) for parts in zip(*runs, strict=True)]
+
+
+def assert_same_state(one, other):
+    for field in ('levels', 'memory'):
+        np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
+    np.testing.assert_equal(one.t, other.t)

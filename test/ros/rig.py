@@ -1,0 +1,361 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes as a user starts them, and a client that waits for what they send."""
+
+import contextlib
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import NamedTuple
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+import fhaosmo_ros
+from fhaosmo_ros.nodes.spin import Spinner
+from fhaosmo_ros.nodes.subscription import subscribe_with_info
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Float64, Float64MultiArray
+from std_srvs.srv import Trigger
+
+ROOT = Path(fhaosmo_ros.__file__).parents[1]
+DEADLINE = 30.0
+QOS = QoSProfile(depth=1000)
+ESTIMATES = {
+    'state': Float64MultiArray,
+    'unknown_input': Float64,
+    'gamma': Float64,
+    'innovation': Float64MultiArray,
+    'stamp': Time,
+}
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, '-m', 'fhaosmo_ros', *map(str, arguments)]
+
+
+def parameters(**values: object) -> list[str]:
+    """Return `-p` arguments, and those for a `namespace`."""
+    words = ['--ros-args']
+    namespace = values.pop('namespace', None)
+    if namespace:
+        words += ['-r', f'__ns:={namespace}']
+    for name, value in values.items():
+        words += ['-p', f'{name.rstrip("_")}:={value}']
+    return words
+
+
+class Process:
+    """A node in a process of its own; its output is kept in files."""
+
+    def __init__(self, folder: Path, *arguments: object) -> None:
+        self._paths = folder / 'stdout', folder / 'stderr'
+        with self._paths[0].open('wb') as out, self._paths[1].open('wb') as err:
+            self._process = subprocess.Popen(
+                command(*arguments), cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err
+            )
+
+    @property
+    def output(self) -> str:
+        return ''.join(path.read_text(errors='replace') for path in self._paths)
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def send(self, number: int) -> None:
+        self._process.send_signal(number)
+
+    def wait(self, timeout: float = DEADLINE) -> int:
+        return self._process.wait(timeout)
+
+    def kill(self) -> None:
+        """End it the hard way, if it has not ended yet."""
+        if self.running:
+            self._process.kill()
+            self._process.wait()
+
+    def end(self) -> None:
+        if self.running:
+            self.send(signal.SIGINT)
+        try:
+            self.wait()
+        except subprocess.TimeoutExpired:
+            self.kill()
+            raise
+
+
+@contextlib.contextmanager
+def node_process(folder: Path, *arguments: object):
+    """Run a node; at the end it must have lived, end well and have said nothing terrible."""
+    process = Process(folder, *arguments)
+    try:
+        yield process
+        alive = process.running
+    finally:
+        process.end()
+    assert alive, f'the node ended by itself:\n{process.output}'
+    assert process.wait() == 0, process.output
+    assert 'Traceback' not in process.output, process.output
+
+
+class Published(NamedTuple):
+    """Message with its source time stamp in nanoseconds."""
+
+    stamp: int
+    message: object
+
+
+class Estimate(NamedTuple):
+    """What one tick of the estimator's timer published."""
+
+    stamp: int
+    z: list[float]
+    unknown_input: float
+    gamma: float
+    innovation: list[float]
+
+
+class Client:
+    """A node of the test's own, with a thread that receives."""
+
+    def __init__(self) -> None:
+        self._context = Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node('test_client', context=self._context, use_global_arguments=False)
+        self._changed = threading.Condition()
+        self._services: dict[str, object] = {}
+        self._spinner = Spinner(self.node)
+
+    def __enter__(self) -> 'Client':
+        self._spinner.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._spinner.__exit__()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def record(self, topic: str, message_type: type) -> list[Published]:
+        """Return a list that grows with the messages of a topic."""
+        messages: list[Published] = []
+
+        def receive(message: object, info: dict) -> None:
+            with self._changed:
+                messages.append(Published(info['source_timestamp'], message))
+                self._changed.notify_all()
+
+        subscribe_with_info(self.node, message_type, topic, receive, QOS)
+        return messages
+
+    def publisher(self, topic: str, message_type: type = Float64):
+        """Return a function that publishes a value once somebody else listens."""
+        publisher = self.node.create_publisher(message_type, topic, QOS)
+
+        def publish(value: object) -> None:
+            publisher.publish(message_type(data=value) if message_type is Float64 else value)
+
+        publish.matched = publisher.get_subscription_count
+        return publish
+
+    def wait(self, condition, what: str, timeout: float = DEADLINE) -> None:
+        """Wait until `condition` holds; it is looked at on every message, and now and then."""
+        end = time.monotonic() + timeout
+        with self._changed:
+            while not condition():
+                if time.monotonic() > end:
+                    raise AssertionError(f'no {what} within {timeout} s')
+                self._changed.wait(0.05)
+
+    def call(self, service: str, service_type: type, request: object):
+        client = self._services.get(service)
+        if client is None:
+            client = self._services[service] = self.node.create_client(service_type, service)
+        self.wait(client.service_is_ready, f'service {service}')
+        future = client.call_async(request)
+        done = threading.Event()
+        future.add_done_callback(lambda _: done.set())
+        assert done.wait(DEADLINE), f'no answer from {service}'
+        return future.result()
+
+
+class Parameters:
+    """The parameter services of a node, as the `ros2 param` commands use them."""
+
+    def __init__(self, client: Client, node: str) -> None:
+        self._client = client
+        self._node = node
+
+    def names(self) -> set[str]:
+        request = ListParameters.Request()
+        answer = self._call('list_parameters', ListParameters, request)
+        return set(answer.result.names)
+
+    def describe(self, *names: str) -> dict:
+        request = DescribeParameters.Request(names=names)
+        answer = self._call('describe_parameters', DescribeParameters, request)
+        return {d.name: d for d in answer.descriptors}
+
+    def messages(self, *names: str) -> list:
+        request = GetParameters.Request(names=names)
+        return list(self._call('get_parameters', GetParameters, request).values)
+
+    def get(self, name: str) -> object:
+        value = parameter_value_to_python(self.messages(name)[0])
+        return list(value) if not isinstance(value, bool | int | float | str) else value
+
+    def set(self, **values: object) -> list:
+        """Set one after the other; return the results."""
+        request = SetParameters.Request(parameters=_messages(values))
+        return list(self._call('set_parameters', SetParameters, request).results)
+
+    def set_text(self, name: str, text: str):
+        """Set from a text, as `ros2 param set` does."""
+        message = ParameterMessage(name=name, value=get_parameter_value(text))
+        request = SetParameters.Request(parameters=[message])
+        return self._call('set_parameters', SetParameters, request).results[0]
+
+    def set_atomically(self, **values: object):
+        request = SetParametersAtomically.Request(parameters=_messages(values))
+        return self._call('set_parameters_atomically', SetParametersAtomically, request).result
+
+    def _call(self, service: str, service_type: type, request: object):
+        return self._client.call(f'{self._node}/{service}', service_type, request)
+
+
+def _messages(values: dict[str, object]) -> list[ParameterMessage]:
+    # 'lambda' is a keyword in Python, so the tests write lambda_
+    return [Parameter(n.rstrip('_'), value=v).to_parameter_msg() for n, v in values.items()]
+
+
+class EstimatorRig:
+    """
+    Feeds an estimator, by default with samples of its own, and collects what it publishes.
+
+    A namespace serves one rig only: a second one would take the first one's subscription of y for
+    the estimator's.
+    """
+
+    def __init__(
+        self, client: Client, namespace: str = '', feed: bool = True, greet: bool = True
+    ) -> None:
+        self.client = client
+        name = f'{namespace}/estimator'
+        self.parameters = Parameters(client, name)
+        self.topics = {t: client.record(f'{name}/{t}', kind) for t, kind in ESTIMATES.items()}
+        self.diagnostics = client.record('/diagnostics', DiagnosticArray)
+        self.y = client.record(f'{namespace}/y', Float64)
+        self._name = name.lstrip('/')
+        self._estimates: list[Estimate] = []
+        self._next = dict.fromkeys(self.topics, 0)
+        self._ticks = 0
+        self._before = 0
+        topics = [f'{name}/{t}' for t in ESTIMATES]
+        client.wait(
+            lambda: all(client.node.count_publishers(t) for t in topics), 'estimator publisher'
+        )
+        if feed:
+            self._publish = client.publisher(f'{namespace}/y')
+            if greet:
+                self._greet()
+
+    def _greet(self) -> None:
+        """Publish samples until the estimator hears them, then have it start afresh."""
+        self.client.wait(lambda: self._publish.matched() >= 2, 'subscription of y')
+        end = time.monotonic() + DEADLINE
+        while not self.estimates:
+            assert time.monotonic() < end, f'{self._name} does not answer to samples'
+            self.send(0.0)
+            with contextlib.suppress(AssertionError):
+                self.client.wait(lambda: self.estimates, 'estimate', timeout=0.2)
+        self.reset()
+
+    def reset(self):
+        return self.client.call(f'/{self._name}/reset', Trigger, Trigger.Request())
+
+    @property
+    def estimates(self) -> list[Estimate]:
+        """What has been published, grouped by tick: a tick publishes `stamp` last."""
+        stamps = self.topics['stamp']
+        while self._ticks < len(stamps):
+            published, stamp = stamps[self._ticks]
+            parts = {}
+            for topic, messages in self.topics.items():
+                k = self._next[topic]
+                while k + 1 < len(messages) and messages[k + 1].stamp <= published:
+                    k += 1
+                if k >= len(messages):
+                    return self._estimates  # a message is still on its way
+                self._next[topic] = k
+                if self._before < messages[k].stamp <= published:
+                    parts[topic] = messages[k].message
+            if len(parts) == len(self.topics):  # else one was sent before this client listened
+                self._estimates.append(
+                    Estimate(
+                        stamp.sec * 10**9 + stamp.nanosec,
+                        list(parts['state'].data), parts['unknown_input'].data,
+                        parts['gamma'].data, list(parts['innovation'].data),
+                    )
+                )  # fmt: skip
+                for topic in parts:
+                    self._next[topic] += 1
+            self._before = published
+            self._ticks += 1
+        return self._estimates
+
+    def send(self, y: float) -> int:
+        """Publish one sample and return its source stamp."""
+        before = len(self.y)
+        self._publish(y)
+        self.client.wait(lambda: len(self.y) > before, 'own sample')
+        return self.y[-1].stamp
+
+    def feed(self, y: float) -> Estimate:
+        """Publish one sample, wait for the estimate that belongs to it and return it."""
+        stamp = self.send(y)
+        return self.wait_estimate(lambda e: e.stamp == stamp, f'estimate for y = {y}')
+
+    def wait_estimate(self, condition, what: str) -> Estimate:
+        found: list[Estimate] = []
+
+        def look() -> bool:
+            found[:] = [e for e in self.estimates[-50:] if condition(e)]
+            return bool(found)
+
+        self.client.wait(look, what)
+        return found[-1]
+
+    def count(self, key: str) -> int:
+        """Return a counter of the latest diagnostics."""
+        for published in reversed(self.diagnostics):
+            for status in published.message.status:
+                if status.name == self._name:
+                    return int({v.key: v.value for v in status.values}[key])
+        return -1
+
+    def wait_count(self, key: str, value: int) -> None:
+        self.client.wait(lambda: self.count(key) >= value, f'{key!r} of {value} in diagnostics')
+
+
+def one_line_error(name: str, text: str) -> str:
+    """Return the message if `text` is exactly one line of error from a node."""
+    lines = text.splitlines()
+    assert len(lines) == 1, text
+    match = re.fullmatch(rf'{name}: error: (.+)', lines[0])
+    assert match, text
+    return match[1]

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plant and estimator as two processes; the estimator alone against a replay of its samples."""
+
+import math
+
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
+pytestmark = pytest.mark.ros
+
+from rig import EstimatorRig, node_process, parameters  # noqa: E402
+from std_msgs.msg import Float64, Float64MultiArray  # noqa: E402
+
+RATE = 50.0
+
+
+@pytest.fixture(scope='module')
+def pair(client, start):
+    """Plant and estimator that have run until a hundred estimates came."""
+    start('plant', *parameters(sample_rate=500.0))
+    start('estimator', *parameters(publish_rate=RATE))
+    rig = EstimatorRig(client, feed=False)
+    truth = (
+        client.record('/plant/state', Float64MultiArray),
+        client.record('/plant/unknown_input', Float64),
+    )
+    client.wait(lambda: truth[0] and truth[1], 'truth of the plant')
+    client.wait(lambda: len(rig.topics['stamp']) >= 5 * RATE, 'estimates')
+    return rig, truth
+
+
+def test_rate_is_the_timers(pair):
+    rig, _ = pair
+    for messages in rig.topics.values():
+        stamps = [m.stamp for m in messages[-100:]]
+        assert np.median(np.diff(stamps)) * 1e-9 == pytest.approx(1.0 / RATE, rel=0.1)
+
+
+def test_state_is_labelled_and_sized(pair):
+    rig, truth = pair
+    for messages in (rig.topics['state'], truth[0]):
+        message = messages[-1].message
+        (dimension,) = message.layout.dim
+        assert (dimension.label, dimension.size, dimension.stride) == ('z1,z2,z3', 3, 3)
+        assert len(message.data) == 3
+        assert message.layout.data_offset == 0
+    innovation = rig.topics['innovation'][-1].message
+    assert innovation.layout.dim[0].label == 'eps1,eps2,eps3,eps4'
+    assert len(innovation.data) == 4
+
+
+def test_stamp_is_a_samples_source_stamp(pair):
+    rig, _ = pair
+    ours = [m.stamp for m in list(rig.y)]
+    stamps = [e.stamp for e in rig.estimates if ours[0] <= e.stamp <= ours[-1]]
+    assert len(stamps) > RATE
+    assert set(stamps) <= set(ours)
+    assert stamps == sorted(stamps)
+
+
+def test_estimates_are_finite_and_close(pair):
+    rig, (states, inputs) = pair
+    estimates = rig.estimates
+    last = estimates[-int(RATE) :]
+    z_at = {m.stamp: m.message.data for m in list(states)}
+    d_at = {m.stamp: m.message.data for m in list(inputs)}
+
+    def nearest(values, stamp):
+        return values[min(values, key=lambda s: abs(s - stamp))]
+
+    for e in estimates:
+        assert all(map(math.isfinite, [*e.z, e.unknown_input, e.gamma, *e.innovation]))
+        low = ESTIMATOR_PARAMETERS['gamma_min'].default
+        high = ESTIMATOR_PARAMETERS['gamma_max'].default
+        assert low <= e.gamma <= high
+    z = np.array([[e.z, nearest(z_at, e.stamp)] for e in last])
+    d = np.array([[e.unknown_input, nearest(d_at, e.stamp)] for e in last])
+    rms = np.sqrt(np.mean((z[:, 0] - z[:, 1]) ** 2, axis=0))
+    assert (rms < [0.005, 0.05, 0.1]).all(), rms
+    rms_d = np.sqrt(np.mean((d[:, 0] - d[:, 1]) ** 2))
+    assert rms_d < 0.1, rms_d
+
+
+@pytest.mark.parametrize(
+    ('namespace', 'options'),
+    [
+        ('/plain', {}),
+        ('/paper', {'variant': 'sign', 'scheme': 'explicit', 'estimate_from': 'filtered'}),
+        ('/input', {'order': 2, 'phi': "['u', '-z2 + sin(z1)']", 'lambda': '[15.0, 10.0, 5.0]'}),
+    ],
+)
+def test_equals_a_replay_of_the_same_samples(client, folder, namespace, options):
+    arguments = parameters(namespace=namespace, publish_rate=500.0, **options)
+    with node_process(folder(), 'estimator', *arguments):
+        rig = EstimatorRig(client, namespace)
+        replay = OnlineEstimator(
+            options
+            | ({'phi': ['u', '-z2 + sin(z1)'], 'lambda': [15, 10, 5]} if 'phi' in options else {})
+        )
+        for k in range(100):
+            estimate = rig.feed(0.2 + 0.1 * math.sin(0.1 * k))
+            expected = replay.update(estimate.stamp, rig.y[-1].message.data)
+            for name in ('z', 'unknown_input', 'gamma', 'innovation'):
+                np.testing.assert_allclose(
+                    getattr(estimate, name), getattr(expected, name), rtol=0.0, atol=1e-12
+                )
+        # A burst, faster than the timer: every sample counts, whichever estimates are published.
+        burst = [(rig.send(0.2 + 0.001 * k), 0.2 + 0.001 * k) for k in range(100)]
+        rig.wait_estimate(lambda e: e.stamp == burst[-1][0], 'estimate of the last sample')
+        expected = {stamp: replay.update(stamp, y) for stamp, y in burst}
+        compared = [e for e in rig.estimates if e.stamp in expected]
+        assert compared[-1].stamp == burst[-1][0]
+        for e in compared:
+            np.testing.assert_allclose(e.z, expected[e.stamp].z, rtol=0.0, atol=1e-12)
+            np.testing.assert_allclose(
+                e.unknown_input, expected[e.stamp].unknown_input, rtol=0.0, atol=1e-12
+            )

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples that no sensor should send: rejected, reported, and without harm to what follows."""
+
+from fhaosmo_ros.core import Observer, Status
+from fhaosmo_ros.core.layout import GAMMA, HAT, PENDING, Y
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+from observer_cases import any_law, assert_same_state, laws, SMALL
+import pytest
+
+USABLE = 1e-8 * np.finfo(float).max
+"""Beyond this, numbers count as infinite."""
+wild = st.floats() | st.sampled_from([0.0, 1e-320, 1e-300, 1e150, 1e300, 1.797e308, -1.797e308])
+wild_sample = st.tuples(wild, st.floats(1e-6, 0.1) | wild, st.floats(-1.0, 1.0) | wild)
+
+
+@given(any_law, st.lists(wild_sample, max_size=8))
+def test_state_stays_finite_and_rejected_samples_leave_it_alone(law, inputs):
+    observer = Observer(SMALL | law)
+    observer.start(0.3)
+    for y, dt, u in inputs:
+        before = observer.state
+        estimate = observer.step(y, dt, u)
+        after = observer.state
+        assert np.all(np.isfinite(after.levels))
+        assert np.all(np.isfinite(after.memory))
+        assert np.all(np.isfinite(estimate.z))
+        assert np.all(np.isfinite(estimate.innovation))
+        assert np.isfinite(estimate.unknown_input)
+        assert 1 <= estimate.open_levels <= 3
+        status = estimate.status
+        assert bool(status & Status.REJECTED_PERIOD) == (not 0.0 < dt < USABLE)
+        assert bool(status & Status.REJECTED_INPUT) == (not np.isfinite(u))
+        assert bool(status & Status.REJECTED_MEASUREMENT) == (not abs(y) < USABLE)
+        if status.rejected:
+            np.testing.assert_array_equal(after.levels, before.levels)
+            assert after.memory[GAMMA] == before.memory[GAMMA]
+        else:
+            assert after.memory[Y] == y
+            assert after.memory[PENDING] == 0.0
+
+
+@given(any_law, st.lists(wild_sample, max_size=8))
+def test_observer_recovers_from_wild_data(law, inputs):
+    observer = Observer(SMALL | law)
+    observer.start(0.3)
+    for y, dt, u in inputs:
+        levels = observer.state.levels
+        # A wild sample that is accepted is the truth, and the state goes where it leads: what is
+        # tested here is that one that is not accepted leaves no trap behind.
+        if not observer.step(y, dt, u).status.rejected:
+            observer.restore(type(observer.state)(levels, observer.state.memory))
+    observer.step(0.3, 1e-3)
+    assert not observer.step(0.3, 1e-3).status.rejected
+
+
+@pytest.mark.parametrize('spike', [1e60, 1e150, 1e307, -1e307])
+@laws
+def test_spike_that_the_model_cannot_digest_is_rejected_once(law, spike):
+    observer = Observer({'order': 1, 'phi': ['-z1**7'], 'unknown_input': False} | law)
+    observer.start(0.1)
+    words = [observer.step(y, 1e-3).status for y in (0.1, spike, 0.1, 0.1, 0.1)]
+    assert sum(word.rejected for word in words) == 1
+    assert abs(observer.state.levels[HAT, 0]) < 1.0
+
+
+@laws
+def test_time_of_a_rejected_sample_is_carried_over(law):
+    one, other = Observer(SMALL | law), Observer(SMALL | law)
+    for observer in (one, other):
+        observer.start(0.3)
+        observer.step(0.31, 1e-3)
+    assert one.step(np.nan, 1e-3).status == Status.REJECTED_MEASUREMENT
+    assert one.step(-np.inf, 2e-3).status == Status.REJECTED_MEASUREMENT
+    assert one.step(0.35, 1e-3, np.nan).status == Status.REJECTED_INPUT
+    assert one.step(0.35, -1.0).status == Status.REJECTED_PERIOD
+    assert one.step(np.nan, np.nan, np.inf).status == (
+        Status.REJECTED_MEASUREMENT | Status.REJECTED_PERIOD | Status.REJECTED_INPUT
+    )
+    np.testing.assert_allclose(one.state.memory[PENDING], 4e-3)
+    one.step(0.4, 2e-3)
+    other.step(0.4, 1e-3 + 2e-3 + 1e-3 + 2e-3)
+    np.testing.assert_allclose(one.state.levels, other.state.levels, rtol=1e-12)
+    assert one.state.memory[PENDING] == 0.0
+
+
+@pytest.mark.parametrize('dt', [0.0, -0.0, -1e-3, np.nan, np.inf, -np.inf])
+def test_period_that_is_not_positive_is_rejected(dt):
+    observer = Observer(SMALL)
+    observer.start(0.3)
+    before = observer.state
+    estimate = observer.step(0.3, dt)
+    assert estimate.status == Status.REJECTED_PERIOD
+    assert estimate.status.rejected
+    assert_same_state(observer.state, before)
+
+
+def test_samples_before_the_first_good_one():
+    observer = Observer(SMALL | {'initial_estimate': [0.5, 0.1, 0.0]})
+    assert observer.start(np.nan).status == Status.REJECTED_MEASUREMENT
+    assert observer.step(np.inf, 1e-3).status == Status.REJECTED_MEASUREMENT
+    assert not observer.started
+    result = observer.run([0.0, 0.1, 0.2], [np.nan, 2.0, 2.0])
+    np.testing.assert_array_equal(result.z[:2, 0], [0.5, 2.0])  # not before it has come
+    assert result.status[0] == Status.REJECTED_MEASUREMENT
+    assert not result.status[1] & Status.REJECTED_MEASUREMENT
+    assert observer.started
+
+
+@laws
+def test_time_that_no_step_can_take_is_dropped(law):
+    observer = Observer({'order': 1, 'phi': ['-z1**7'], 'unknown_input': False} | law)
+    observer.start(5.0)
+    assert observer.step(np.nan, 1e299).status == Status.REJECTED_MEASUREMENT
+    # Implicitly, sign slides over any time: its step exists.
+    slides = law == {'scheme': 'implicit', 'variant': 'sign'}
+    assert observer.step(5.0, 1e-3).status == (Status.OK if slides else Status.REJECTED_STEP)
+    assert observer.state.memory[PENDING] == 0.0
+    assert not observer.step(5.0, 1e-3).status.rejected

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Expressions from outside: what is accepted, what is refused, and how that is said."""
+
+import ast
+import math
+
+from fhaosmo_ros.core import ConfigurationError, TriangularModel
+from fhaosmo_ros.core.expressions import FUNCTIONS, MAX_LENGTH, MAX_NESTING, parse
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+Z, U = np.array([0.7, -1.3, 2.1]), 0.4
+NAMES = {'z1': Z[0], 'z2': Z[1], 'z3': Z[2], 'u': U} | {
+    name: getattr(np, name) for name in FUNCTIONS
+}
+
+ACCEPTED = [
+    '0', '-0', '1', '1.5e-3', '.5', '5.', '1_000', '0x10', '-z3', '+z1', 'u', '--z1', ' z1 ',
+    'z1 + z2 - z3*u', 'z1/z2/z3', 'z1 - z2 - z3', '-z1**2', '(-z1)**2', '2**3**0.5', 'z1**-2',
+    '-0.5*z2 - sin(z1)', 'sin(cos(tan(z1)))', 'exp(-z1**2)', 'log(abs(z2))', 'sqrt(z1**2 + 1)',
+    'tanh(u)*sign(z2)', '(z1 + z2)*(z1 - z2)', '(z1\n+ z2)', 'z1  # a comment', 'abs(-z1)',
+    '1/(1 + exp(-z3))', '3.7*sin(2*u) - 0.1*z3*abs(z3)', '*'.join(['z1'] * 40),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize('text', ACCEPTED)
+def test_value_is_that_of_python_and_numpy(text):
+    expected = eval(text.strip(), {'__builtins__': {}}, NAMES)  # noqa: S307  our own list
+    got = TriangularModel(['0', '0', text]).evaluate(Z, U)
+    np.testing.assert_allclose(got, [0.0, 0.0, expected], rtol=1e-14)
+
+
+REFUSED = {
+    # code
+    'import': "__import__('os').system('true')",
+    'import statement': 'import os',
+    'attribute': 'z1.__class__',
+    'attributes': '().__class__.__bases__[0].__subclasses__()',
+    'long attribute chain': 'z1' + '.a' * 240,
+    'method': 'z1.real()',
+    'function of a module': 'math.sin(z1)',
+    'builtin': 'eval(z1)',
+    'builtin of text': "open('/etc/passwd')",
+    'lambda': 'lambda: 1',
+    'called lambda': '(lambda x: x)(z1)',
+    'list comprehension': '[z1 for z1 in (1, 2)]',
+    'generator': 'sum(z1 for _ in u)',
+    'f-string': "f'{z1}'",
+    'text': "'z1'",
+    'bytes': "b'z1'",
+    'walrus': '(z1 := 2)',
+    'assignment': 'z1 = 2',
+    'two statements': 'z1; z2',
+    'two lines': 'z1\nz2',
+    'subscript': 'z1[0]',
+    'slice': 'z1[1:2]',
+    'list': '[z1]',
+    'tuple': 'z1, z2',
+    'set': '{z1}',
+    'dictionary': '{z1: z2}',
+    'condition': 'z1 if z2 else z3',
+    'comparison': 'z1 < z2',
+    'and': 'z1 and z2',
+    'not': 'not z1',
+    'invert': '~z1',
+    'modulo': 'z1 % z2',
+    'floor division': 'z1 // z2',
+    'matrix product': 'z1 @ z2',
+    'shift': 'z1 << 2',
+    'exclusive or': 'z1 ^ 2',
+    'await': 'await z1',
+    'yield': '(yield z1)',
+    'star': '*z1',
+    'ellipsis': '...',
+    'none': 'None',
+    # calls
+    'no argument': 'sin()',
+    'two arguments': 'sin(z1, z2)',
+    'starred argument': 'sin(*z1)',
+    'keyword': 'sin(x=z1)',
+    'keywords': 'sin(**z1)',
+    'function as a value': 'sin',
+    'function of a function': 'sin(cos)',
+    'call of a call': 'sin(z1)(z2)',
+    'call of a number': '2(z1)',
+    'unknown function': 'sinh(z1)',
+    # names
+    'z0': 'z0',
+    'z1_': 'z1_',
+    'z01': 'z01',
+    'z without a number': 'z',
+    'z4 of 3': 'z4',
+    'z999999999999': 'z999999999999',
+    'capital': 'Z1',
+    'unknown name': 'x',
+    'dunder': '__builtins__',
+    'pi': 'pi',
+    'true': 'True',
+    'false': '-False',
+    # numbers
+    'complex': '1j',
+    'complex sum': 'z1 + 2j',
+    'infinity': 'inf',
+    'not a number': 'nan',
+    'overflow': '1e999',
+    'long integer': '9' * 400,
+    'huge power': '9**9**9**9',
+    'huge powers': '10**400',
+    'division by zero': '1/0',
+    'constant part': 'z1 + 0/0',
+    'logarithm of 0': 'log(0)',
+    'root of -1': 'sqrt(-1)',
+    'power of 0': '0**-1',
+    # text
+    'empty': '',
+    'blank': '   ',
+    'comment only': '# z1',
+    'half': 'z1 +',
+    'open parenthesis': '(z1',
+    'implicit product': '2 z1',
+    'juxtaposed product': '2z1',
+    'null byte': 'z1\0',
+    'null byte within': 'z\x001',
+    'surrogate': 'z1\ud800',
+    'full-width name': '\uff5a\uff11',  # Python reads these two as z1
+    'full-width function': '\uff53in(z1)',
+    'mathematical letters': '\U0001d42c\U0001d422\U0001d427(z1)',
+    'Cyrillic letter': 'ta\u043dh(z1)',
+    'Arabic digit': 'z\u0663',
+    'superscript': 'z1\u00b2',
+    'minus sign': '\u2212z1',
+    'zero-width space': 'z1\u200b+z2',
+    # size
+    'too long': '0' + '+0' * MAX_LENGTH,
+    'very long': 'z1+' * 1_000_000 + 'z1',
+    'deep parentheses': '(' * 240 + 'z1' + ')' * 240,
+    'deep signs': '-' * 490 + 'z1',
+    'deep calls': 'abs(' * 90 + 'z1' + ')' * 90,
+    'deep sum': '+'.join(['z1'] * 120),
+    'deep brackets': '[' * 190 + ']' * 190,
+}
+
+
+@pytest.mark.parametrize('text', REFUSED.values(), ids=REFUSED.keys())
+def test_anything_else_is_refused_in_one_line(text):
+    with pytest.raises(ConfigurationError) as error:
+        TriangularModel(['0', '0', text])
+    message = str(error.value)
+    assert message.startswith("parameter 'phi': Phi_3 = ")
+    assert repr(text)[1:30].rstrip("'") in message  # what arrived
+    assert 'allowed are z1..z3, u, numbers, + - * / ** and sin cos' in message
+    assert message.isprintable()  # so it is one line
+    assert len(message) < MAX_LENGTH * 4 + 400
+    assert error.value.__suppress_context__ or error.value.__context__ is None
+
+
+@pytest.mark.parametrize(
+    ('text', 'reason'),
+    [
+        ('z4 + z1', 'z4 comes after z3: the model would not be triangular'),
+        ('snh(z1)', "unknown function 'snh'; did you mean"),
+        ('tanhh(z1)', "did you mean 'tanh'?"),
+        ('z1 + sin', 'sin needs one argument'),
+        ('z1.real', "'z1.real' is not allowed"),
+        ('True', 'True is not a number'),
+        ('1e400', 'a number is too large'),
+        ('z1/(1 - 1)*0 + 1/0', 'a constant part of it is not a finite number'),
+        ('2 z1', 'this is not an arithmetic expression'),
+        ('-' * (MAX_NESTING + 1) + 'z1', f'nested deeper than {MAX_NESTING}'),
+        ('z1' * MAX_LENGTH, f'{2 * MAX_LENGTH} characters, at most {MAX_LENGTH}'),
+    ],
+)
+def test_message_gives_the_reason(text, reason):
+    with pytest.raises(ConfigurationError) as error:
+        TriangularModel(['0', '0', text])
+    assert reason in str(error.value)
+
+
+def test_what_is_just_within_the_limits_is_accepted():
+    parse('-' * MAX_NESTING + 'z1', 1)
+    parse('z1' + ' ' * (MAX_LENGTH - 4) + '+1', 1)
+
+
+@pytest.mark.parametrize(('level', 'later'), [(1, 2), (1, 3), (2, 3), (1, 12)])
+def test_later_state_is_refused(level, later):
+    phi = ['0', '0', '0']
+    phi[level - 1] = f'z1 + z{later}'
+    with pytest.raises(ConfigurationError, match=f'Phi_{level} .*z{later} comes after z{level}'):
+        TriangularModel(phi)
+
+
+@pytest.mark.parametrize(('phi', 'order'), [(['0'], 2), (['0', '0', '0'], 2), ([], 1)])
+def test_wrong_number_of_expressions_is_refused(phi, order):
+    with pytest.raises(ConfigurationError) as error:
+        TriangularModel(phi, order)
+    message = str(error.value)
+    assert message.startswith(f"parameter 'phi': expected {order} expressions")
+    assert f'got {len(phi)}' in message
+
+
+@given(st.text() | st.text('z1u23+-*/().e sincoexplgqrtab', max_size=40))
+def test_any_text_is_either_an_expression_or_an_error(text):
+    try:
+        tape = parse(text, 3)
+    except ConfigurationError as refusal:
+        message = str(refusal)
+    else:
+        message = ''
+        allowed = (ast.Expression, ast.BinOp, ast.UnaryOp, ast.Constant, ast.Name, ast.Call)
+        allowed += (ast.operator, ast.unaryop, ast.expr_context)
+        assert all(isinstance(n, allowed) for n in ast.walk(ast.parse(text.strip(), mode='eval')))
+        assert all(math.isfinite(i.operand) for i in tape)
+    assert message.isprintable()
+
+
+def test_known_input_is_noticed():
+    assert TriangularModel(['0', 'sin(u)']).uses_input
+    assert not TriangularModel(['0', 'sin(z1)']).uses_input
+    assert not TriangularModel(['0']).uses_input
+
+
+def test_outside_its_domain_a_function_gives_no_finite_number():
+    model = TriangularModel(['log(z1)', 'sqrt(z1)', '1/(z1 + 1)', 'z1**0.5'])
+    with np.errstate(all='ignore'):
+        assert not np.any(np.isfinite(model.evaluate(np.array([-1.0, 0.0, 0.0, 0.0]))))

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every declared parameter, by the rules that all of them share."""
+
+from array import array
+
+from fhaosmo_ros.core import ConfigurationError, Observer
+from fhaosmo_ros.core.parameter import KINDS, Parameter, ParameterTable
+from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, NODE_TABLES, PLANT_NODE_PARAMETERS
+import numpy as np
+import pytest
+
+ALL = {**ESTIMATOR_PARAMETERS, **PLANT_NODE_PARAMETERS}
+every = pytest.mark.parametrize('parameter', ALL.values(), ids=ALL.keys())
+NUMBERS = [p for p in ALL.values() if p.kind in ('int', 'double', 'double_array')]
+DOUBLES = [p for p in NUMBERS if p.kind != 'int']
+LISTS = [p for p in ALL.values() if p.kind.endswith('array')]
+
+
+def some(parameters):
+    return pytest.mark.parametrize('parameter', parameters, ids=lambda p: p.name)
+
+
+def shaped(parameter, item):
+    return [item] if parameter.kind.endswith('array') else item
+
+
+def refused(parameter, value):
+    """Check the message for a refused value and return it."""
+    with pytest.raises(ConfigurationError) as error:
+        parameter.coerce(value)
+    message = str(error.value)
+    assert message.isprintable()
+    assert message.startswith(f"parameter '{parameter.name}': expected {parameter.allowed}, got ")
+    assert len(message) < 600
+    return message
+
+
+@every
+def test_default_is_a_valid_value(parameter):
+    assert parameter.coerce(parameter.default) == parameter.default
+    assert type(parameter.coerce(parameter.default)) is type(parameter.default)
+
+
+@every
+def test_declaration_is_complete(parameter):
+    assert parameter.kind in KINDS
+    assert parameter.text.endswith('.')
+    assert parameter.name == parameter.name.lower()
+    assert parameter.name.isidentifier()
+    if parameter.kind.endswith('array'):
+        assert parameter.lengths
+    else:
+        assert not parameter.lengths
+    if parameter.choices:
+        assert parameter.default in parameter.choices
+        assert all(choice in parameter.allowed for choice in parameter.choices)
+
+
+@some(NUMBERS)
+def test_number_has_bounds_and_says_so(parameter):
+    assert parameter.lower is not None
+    assert parameter.upper is not None
+    assert parameter.lower < parameter.upper
+    sign = '>' if parameter.lower_open else '>='
+    assert f'{sign} {parameter.lower:g} and <= {parameter.upper:g}' in parameter.allowed
+    if parameter.unit:
+        assert f'[{parameter.unit}]' in parameter.allowed
+
+
+@some(NUMBERS)
+def test_bounds_hold(parameter):
+    whole = int if parameter.kind == 'int' else float
+    parameter.coerce(shaped(parameter, whole(parameter.upper)))
+    low = shaped(parameter, whole(parameter.lower))
+    if parameter.lower_open:
+        refused(parameter, low)
+    else:
+        parameter.coerce(low)
+    for beyond in (parameter.lower - 1, parameter.upper * 2 + 1):
+        message = refused(parameter, shaped(parameter, whole(beyond)))
+        assert repr(whole(beyond)) in message
+
+
+@some(DOUBLES)
+def test_integer_is_accepted_where_a_number_is_meant(parameter):
+    candidates = (1, 0, int(parameter.upper))
+    value = next(v for v in candidates if parameter.lower < v <= parameter.upper or v == 0)
+    if not parameter.lower < value <= parameter.upper:
+        pytest.skip('no integer within the bounds')
+    got = parameter.coerce(shaped(parameter, value))
+    number = got[0] if isinstance(got, list) else got
+    assert type(number) is float
+    assert number == value
+    # A numpy scalar too, and what rclpy delivers for a list.
+    assert parameter.coerce(shaped(parameter, np.float64(value))) == got
+    if isinstance(got, list):
+        assert parameter.coerce(array('d', [value])) == got
+        assert parameter.coerce(np.array([value])) == got
+        assert parameter.coerce((value,)) == got
+        assert parameter.coerce(value) == got  # one number for every level
+        assert parameter.coerce(f'[{value}]') == got  # from a command line
+        assert parameter.coerce(f'[{value}, {value}.0]') == got * 2
+
+
+@some(DOUBLES)
+@pytest.mark.parametrize(
+    'item', [float('nan'), float('inf'), -float('inf'), True, None, '1', [1.0]]
+)
+def test_what_is_not_a_finite_number_is_refused(parameter, item):
+    message = refused(parameter, shaped(parameter, item))
+    assert repr(item) in message
+
+
+@some(DOUBLES)
+def test_integer_too_long_for_a_double_is_refused(parameter):
+    refused(parameter, shaped(parameter, 10**400))
+
+
+@every
+@pytest.mark.parametrize('value', [None, {}, {'a': 1}, object, [], '', b'0', 1j, [None]], ids=repr)
+def test_value_of_another_kind_is_refused(parameter, value):
+    if value == '' and parameter.kind == 'string' and not parameter.choices:
+        pytest.skip('any text')
+    refused(parameter, value)
+
+
+@some([p for p in ALL.values() if p.kind == 'bool'])
+@pytest.mark.parametrize('value', [0, 1, 'true', 'yes', 1.0])
+def test_bool_is_true_or_false_only(parameter, value):
+    refused(parameter, value)
+    assert parameter.coerce(True) is True
+    assert parameter.coerce(np.bool_(False)) is False
+
+
+@some([p for p in ALL.values() if p.kind == 'int'])
+@pytest.mark.parametrize('value', [1.0, 1.5, '1', True, [1]])
+def test_integer_is_an_integer_only(parameter, value):
+    refused(parameter, value)
+    assert type(parameter.coerce(np.int64(2))) is int
+
+
+@some([p for p in ALL.values() if p.choices])
+def test_unknown_choice_gets_the_closest_one(parameter):
+    choice = parameter.choices[-1]
+    for wrong in (choice + 'x', choice[:-1]):
+        assert f"did you mean '{choice}'?" in refused(parameter, wrong)
+    assert 'did you mean' not in refused(parameter, 'qqqqqq')
+
+
+@some(LISTS)
+@pytest.mark.parametrize('text', ['[', '[1, 2', 'a: b', '{1: 2}', '[[1]]', '!!python/x', '[~]'])
+def test_text_that_is_no_list_is_refused(parameter, text):
+    refused(parameter, text)
+
+
+def test_numbers_in_a_list_of_expressions_become_text():
+    phi = ALL['phi']
+    assert phi.coerce([0, 0.5, '-z3']) == ['0', '0.5', '-z3']
+    assert phi.coerce('[0, 0.5, -z3]') == ['0', '0.5', '-z3']
+    assert phi.coerce(('0', 'u*z1')) == ['0', 'u*z1']
+    for value in (['0', True], ['0', None], ['0', ['z1']], 5, '[0, true]'):
+        refused(phi, value)
+
+
+@pytest.mark.parametrize('number', ['1e-3', '1E3', '-2e+2', '.5e1', '1.e2'])
+def test_exponent_without_a_point_is_a_number(number):
+    # As in C and in rcl; YAML 1.1 itself would take it for text.
+    parameter = Parameter('p', [0.0], 'A list.')
+    assert parameter.coerce(f'[{number}, 1]') == [float(number), 1.0]
+
+
+def test_unknown_names_get_the_closest_match():
+    for table in NODE_TABLES.values():
+        for name in table:
+            wrong = name + 'x'
+            with pytest.raises(ConfigurationError, match=f"unknown parameter '{wrong}'.*{name}"):
+                table.coerce({wrong: 1.0})
+        with pytest.raises(ConfigurationError) as error:
+            table.coerce({'qqqq': 1})
+        assert all(name in str(error.value) for name in table)
+
+
+def test_defaults_are_fresh():
+    first = ESTIMATOR_PARAMETERS.defaults()
+    first['lambda'].append(1.0)
+    first['phi'].append('0')
+    assert ESTIMATOR_PARAMETERS.defaults() == {
+        n: p.default for n, p in ESTIMATOR_PARAMETERS.items()
+    }
+
+
+def test_absent_stays_absent():
+    table = ParameterTable([Parameter('a', 1.0, 'A.'), Parameter('b', 2.0, 'B.')])
+    assert table.coerce({'b': 3}) == {'b': 3.0}
+    assert table.coerce({}) == {}
+    assert list(table) == ['a', 'b']
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'allowed'),
+    [
+        ('lambda', [1.0, 2.0], '1 or 4 values'),
+        ('alpha', [1.0] * 5, '1 or 4 values'),
+        ('initial_estimate', [0.0] * 3, '1 or 4 values'),
+        ('initial_internal', [0.0] * 2, '1 or 4 values'),
+        ('fuzzy_widths', [1.0] * 5, '1 to 4 values'),
+        ('phi', ['0', '0'], '3 expressions'),
+    ],
+)
+def test_list_of_the_wrong_length_is_refused(name, value, allowed):
+    for changes in ({name: value}, {name: str(value)}, {name: np.array(value)}):
+        with pytest.raises(ConfigurationError) as error:
+            Observer(changes)
+        message = str(error.value)
+        assert message.isprintable()
+        for part in (f"'{name}'", allowed, repr(value) if name != 'phi' else 'got 2'):
+            assert part in message
