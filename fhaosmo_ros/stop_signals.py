@@ -1,27 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ending by Ctrl-C or SIGTERM without losing the clean-up."""
 
+import atexit
 import contextlib
-import queue
+import select
 import signal
+import socket
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stop:
     """
-    An event that a signal handler may set.
+    An event that a signal, or any thread, may set.
 
-    The lock of threading.Event is not reentrant: a handler that interrupts a `wait` or another
-    handler's `set` at the wrong moment waits for itself. SimpleQueue.put is reentrant.
+    Not a threading.Event: its lock is not reentrant, so a handler that interrupts a wait can wait
+    for itself; and no lock at all, because the system may deliver a signal to one of the
+    middleware's threads, and then nothing interrupts the main thread's wait. Python writes each
+    signal into the wake-up socket from whichever thread it comes in.
     """
 
     def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
         self._set = False
+
+    def wake_on_signals(self) -> None:
+        """Let signals end a wait; in the main thread only."""
+        signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
 
     def set(self) -> None:
         """End all waiting, from any thread or signal handler."""
         self._set = True
-        self._queue.put(None)
+        with contextlib.suppress(BlockingIOError):  # full: the wait ends anyway
+            self._writer.send(b'\0')
 
     def is_set(self) -> bool:
         """Return True once `set` has been called."""
@@ -29,9 +41,11 @@ class Stop:
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait for `set`, at most `timeout` seconds; return `is_set`. For one thread only."""
-        if not self._set:
-            with contextlib.suppress(queue.Empty):
-                self._queue.get(timeout=timeout)
+        while not self._set:
+            ready, _, _ = select.select([self._reader], [], [], timeout)
+            if not ready:
+                break
+            self._reader.recv(1)  # a signal's byte; its handler runs before the next look
         return self._set
 
 
@@ -42,6 +56,14 @@ def stop_on_signals() -> Stop:
     They raise nothing, so a second Ctrl-C can't cut the clean-up that the first one began.
     """
     stop = Stop()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in SIGNALS:
         signal.signal(number, lambda *_: stop.set())
+    stop.wake_on_signals()
+    atexit.register(_ignore)
     return stop
+
+
+def _ignore() -> None:
+    """Python takes its handlers away before the process ends; a late signal would kill it."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)

@@ -6,14 +6,13 @@ from collections.abc import Callable
 import os
 from pathlib import Path
 import sys
-import threading
 import time
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter_file import load
 from fhaosmo_ros.nodes.recorder import Recorder
 from fhaosmo_ros.nodes.topics import RUN_TOPICS, type_name
-from fhaosmo_ros.stop_signals import stop_on_signals
+from fhaosmo_ros.stop_signals import Stop, stop_on_signals
 from fhaosmo_ros.tools.bags import BagWriter
 from fhaosmo_ros.tools.figures import save_run
 from fhaosmo_ros.tools.output import OutputFolder
@@ -71,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _demo(arguments: argparse.Namespace, stop: threading.Event) -> int:
+def _demo(arguments: argparse.Namespace, stop: Stop) -> int:
     if not 1.0 <= arguments.duration <= 3600.0:
         raise ConfigurationError(
             f'--duration: expected 1 to 3600 seconds, got {arguments.duration:g}'
@@ -108,7 +107,7 @@ def _default_output() -> Path:
     return Path('demo_output') / time.strftime('%Y-%m-%d_%H-%M-%S')
 
 
-def _record(folder: Path, parameters: Path, duration: float, stop: threading.Event) -> None:
+def _record(folder: Path, parameters: Path, duration: float, stop: Stop) -> None:
     types = {topic: type_name(kind) for topic, kind in RUN_TOPICS.items()}
     with (
         BagWriter(folder / 'bag', types) as bag,
@@ -127,9 +126,7 @@ def _record(folder: Path, parameters: Path, duration: float, stop: threading.Eve
         _watch(recorder, nodes, duration, stop)
 
 
-def _wait(
-    what: str, ready: Callable[[], object], nodes: NodeProcesses, stop: threading.Event
-) -> None:
+def _wait(what: str, ready: Callable[[], object], nodes: NodeProcesses, stop: Stop) -> None:
     deadline = time.monotonic() + START_DEADLINE
     print(f'waiting for {what} ...', flush=True)
     while not ready():
@@ -140,9 +137,7 @@ def _wait(
             raise ConfigurationError(f'waited {START_DEADLINE:g} s for {what}, in vain')
 
 
-def _watch(
-    recorder: Recorder, nodes: NodeProcesses, duration: float, stop: threading.Event
-) -> None:
+def _watch(recorder: Recorder, nodes: NodeProcesses, duration: float, stop: Stop) -> None:
     """Show a progress bar until the time is over or the user has seen enough."""
     begin = time.monotonic()
     with tqdm(
