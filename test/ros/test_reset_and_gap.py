@@ -183,11 +183,21 @@ class SimulatedTime:
                 self._rig.client.wait(condition, what, timeout=0.1)
 
     def feed(self, y: float) -> Estimate:
-        """Publish a sample and return the estimate that belongs to it."""
+        """
+        Publish a sample and return the estimate that belongs to it.
+
+        Waits until two ticks have published it: then the node's clock is past the sample's stamp,
+        and the next sample can't get the same one.
+        """
         rig = self._rig
         before = rig.estimates[-1].stamp if rig.estimates else None
         rig.send(y)
-        self.until(lambda: rig.estimates and rig.estimates[-1].stamp != before, 'estimate')
+        self.until(
+            lambda: rig.estimates
+            and rig.estimates[-1].stamp != before
+            and rig.estimates[-1].stamp == rig.estimates[-2].stamp,
+            'estimate, twice',
+        )
         return rig.estimates[-1]
 
 
@@ -206,6 +216,9 @@ def test_node_clock_sampling_follows_simulated_time(client, folder):
 
         simulated.until(heard, 'first estimate')
         rig.reset()
+        # Past the last greeting's stamp, so that the next sample's is another one.
+        reports = len(rig.diagnostics)
+        simulated.until(lambda: len(rig.diagnostics) > reports, 'diagnostics', step=500 * MS)
         replay = OnlineEstimator()
         for k in range(30):
             y = 0.2 + 0.1 * math.sin(0.1 * k)
