@@ -193,9 +193,11 @@ class SimulatedTime:
         before = rig.estimates[-1].stamp if rig.estimates else None
         rig.send(y)
         self.until(
-            lambda: rig.estimates
-            and rig.estimates[-1].stamp != before
-            and rig.estimates[-1].stamp == rig.estimates[-2].stamp,
+            lambda: (
+                rig.estimates
+                and rig.estimates[-1].stamp != before
+                and rig.estimates[-1].stamp == rig.estimates[-2].stamp
+            ),
             'estimate, twice',
         )
         return rig.estimates[-1]
