@@ -5,10 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fhaosmo_ros.core.observer import Estimate, Observer
+from fhaosmo_ros.core import kernels
+from fhaosmo_ros.core.observer import Estimate, Observer, Trajectory
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
-from fhaosmo_ros.core.status import REJECTED, Status
+from fhaosmo_ros.core.status import LEVEL_SHIFT, REJECTED, Status
 import numpy as np
+from numpy.typing import NDArray
 
 NANOSECONDS = 1e-9
 
@@ -154,6 +156,101 @@ class OnlineEstimator:
         if not estimate.word & REJECTED:
             self.stamp, self.estimate = stamp, estimate
         return estimate
+
+    def run(
+        self, stamps: NDArray[np.int64], y: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> list[Trajectory]:
+        """
+        Take many samples, bit for bit as `update` would take one after the other.
+
+        Parameters
+        ----------
+        stamps : (K,) array of int
+            Times of the samples in nanoseconds.
+        y : (K,) array
+            Samples.
+        u : (K,) array of finite numbers
+            Known input of the interval that ends at each sample.
+
+        Returns
+        -------
+        list of Trajectory
+            Pieces between restarts, in order; together a row for every sample, whose status says
+            whether it was rejected. ``t`` holds the stamps.
+
+        """
+        pieces = []
+        while len(y):
+            fresh = not self.observer.started
+            first, h = self._periods(stamps, y)
+            jumps = np.flatnonzero(np.isnan(h))
+            end = int(jumps[0]) if len(jumps) else len(y)
+            if end:
+                pieces.append(
+                    self.observer.advance(stamps[:end], y[:end], h[:end], u[:end], min(first, end))
+                )
+                self._remember(pieces[-1], fresh)
+                self._u = float(u[end - 1])
+            if end < len(y):
+                self.observer.reset()
+                self.counters.restarts += 1
+            stamps, y, u = stamps[end:], y[end:], u[end:]
+        return pieces
+
+    def _periods(
+        self, stamps: NDArray[np.int64], y: NDArray[np.float64]
+    ) -> tuple[int, NDArray[np.float64]]:
+        """Return how many samples start the observer, and periods: NaN where time jumps."""
+        h, first = np.full(len(y), self._period), 0
+        if not self.observer.started:
+            good = np.flatnonzero(np.isfinite(kernels.HEADROOM * y))
+            first = int(good[0]) + 1 if len(good) else len(y)
+            h[:first] = 0.0
+        if not self._nominal and first < len(y):
+            if first:
+                known, rest = int(stamps[first - 1]), first
+            elif self._latest is None:  # this one takes the nominal period
+                known, rest = int(stamps[0]), 1
+            else:
+                known, rest = self._latest, 0
+            latest = np.maximum.accumulate(np.concatenate([[known], stamps[rest:]]))
+            elapsed = stamps[rest:] - latest[:-1]
+            h[rest:] = elapsed * NANOSECONDS
+            h[rest:][np.abs(elapsed) > self._max_gap] = np.nan
+        return first, h
+
+    def _remember(self, piece: Trajectory, fresh: bool) -> None:
+        """Count the samples of a piece without a jump, and keep its last estimate and stamp."""
+        rejected = piece.status & REJECTED
+        accepted = np.flatnonzero(rejected == 0)
+        counters = self.counters
+        counters.accepted += len(accepted)
+        measurement = (rejected & Status.REJECTED_MEASUREMENT) != 0
+        period = ~measurement & ((rejected & Status.REJECTED_PERIOD) != 0)
+        counters.rejected_measurements += int(measurement.sum())
+        counters.rejected_stamps += int(period.sum())
+        counters.rejected_steps += int(((rejected != 0) & ~measurement & ~period).sum())
+        self._latest = self._last_stamp(piece.t, accepted, fresh)
+        if len(accepted):
+            k = int(accepted[-1])
+            word = int(piece.open_levels[k] << LEVEL_SHIFT | piece.status[k])
+            self.stamp = int(piece.t[k])
+            self.estimate = Estimate(
+                piece.z[k].copy(), float(piece.unknown_input[k]), float(piece.gamma[k]),
+                piece.innovation[k].copy(), word,
+            )  # fmt: skip
+
+    def _last_stamp(
+        self, stamps: NDArray[np.int64], accepted: NDArray[np.intp], fresh: bool
+    ) -> int:
+        """Return the stamp from which the next sample's period counts."""
+        if self._nominal or (fresh and not len(accepted)):
+            return int(stamps[-1])
+        if fresh:
+            return int(stamps[accepted[0] :].max())
+        if self._latest is None:
+            return int(stamps.max())
+        return max(self._latest, int(stamps.max()))
 
     def _count(self, word: int) -> None:
         counters = self.counters
