@@ -10,4 +10,5 @@ COMMANDS = {
     'estimator': ('fhaosmo_ros.nodes.estimator', 'node: estimate states and unknown input of y'),
     'plant': ('fhaosmo_ros.nodes.plant', 'node: simulate a plant and publish y and the truth'),
     'demo': ('fhaosmo_ros.tools.demo', 'run plant and estimator, record, report, draw a figure'),
+    'replay': ('fhaosmo_ros.tools.replay', 'estimate offline from a bag, as the live node would'),
 }
