@@ -3,6 +3,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+import struct
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
-from rosbags.rosbag2.storage_mcap import decompress, McapReader
+from rosbags.rosbag2.storage_mcap import ChunkInfo, decompress, McapReader
 
 try:
     from compression import zstd
@@ -170,6 +171,21 @@ class BagReader:
                 except Exception as error:
                     raise _unreadable(self.path, error) from None
                 yield storage, following, data, records
+
+    def index_chunks(self, offsets: list[int]) -> None:
+        """Take the chunks at these places of an mcap file that has lost its index."""
+        storage = self._storages[0]
+        channels = {c.id: 1 for c in storage.connections}
+        for offset in offsets:
+            storage.bio.seek(offset)
+            head = storage.bio.read(9 + 32)
+            _, size, first, last, plain, _, letters = struct.unpack('<BQQQQII', head)
+            compression = storage.bio.read(letters).decode()
+            packed = int.from_bytes(storage.bio.read(8), 'little')
+            info = ChunkInfo(
+                first, last, offset, 9 + size, {}, 0, compression, packed, plain, channels
+            )
+            storage.chunks.append(info)
 
     def _fast(self, topic: str, field: Field, use_header: bool) -> Iterator[Block]:
         rest = None

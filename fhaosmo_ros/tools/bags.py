@@ -92,6 +92,11 @@ class BagWriter:
         self._writer.write(self._connections[topic], stamp, data)
 
     @property
+    def count(self) -> int:
+        """Number of messages so far."""
+        return sum(self._writer.counts.values())
+
+    @property
     def takes_chunks(self) -> bool:
         """True for an mcap bag."""
         return self._writer.storage_plugin == StoragePlugin.MCAP
@@ -147,11 +152,24 @@ class BagWriter:
         trace: TracebackType | None,
     ) -> None:
         self.flush()
-        if not sum(self._writer.counts.values()):  # an empty bag begins and ends at 0
+        if not self.count:  # an empty bag begins and ends at 0
             self._writer.min_timestamp = self._writer.max_timestamp = 0
             if self.takes_chunks:
                 self._writer.storage.message_start_time = 0
         self._writer.close()
+
+
+def make_qos(
+    history: str, depth: int, reliability: str, durability: str, deadline: int, lifespan: int,
+    liveliness: str, liveliness_lease_duration: int,
+) -> Qos:  # fmt: skip
+    """Return a QoS from its policies' names and its durations in nanoseconds."""
+    return Qos(
+        QosHistory.__members__.get(history, QosHistory.UNKNOWN), depth,
+        QosReliability[reliability], QosDurability[durability],
+        QosTime(*divmod(deadline, 10**9)), QosTime(*divmod(lifespan, 10**9)),
+        QosLiveliness[liveliness], QosTime(*divmod(liveliness_lease_duration, 10**9)), False,
+    )  # fmt: skip
 
 
 def serialise(message_type: str, **fields: Any) -> bytes:
