@@ -12,4 +12,5 @@ COMMANDS = {
     'demo': ('fhaosmo_ros.tools.demo', 'run plant and estimator, record, report, draw a figure'),
     'record': ('fhaosmo_ros.tools.record', "record y and the estimator's topics to a bag"),
     'replay': ('fhaosmo_ros.tools.replay', 'estimate offline from a bag, as the live node would'),
+    'plot': ('fhaosmo_ros.tools.plot', 'draw the estimates in bags, print their metrics'),
 }
