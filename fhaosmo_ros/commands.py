@@ -13,4 +13,5 @@ COMMANDS = {
     'record': ('fhaosmo_ros.tools.record', "record y and the estimator's topics to a bag"),
     'replay': ('fhaosmo_ros.tools.replay', 'estimate offline from a bag, as the live node would'),
     'plot': ('fhaosmo_ros.tools.plot', 'draw the estimates in bags, print their metrics'),
+    'play': ('fhaosmo_ros.tools.play', "publish a bag's topics in its own time, with /clock"),
 }

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 import shutil
 import signal as signals
+import sqlite3
 import struct
 import subprocess
 import sys
@@ -264,6 +265,60 @@ def test_stamps_that_go_back_are_rejected_as_live_if_asked(tmp_path, capsys):
     assert run(*arguments, '--backwards', 'reject') == 0
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(shown, y))
     assert '1 rejected' in capsys.readouterr().out
+
+
+def test_sqlite_bag_of_humble_is_read(tmp_path):
+    """No type definitions, no hashes, metadata of version 5."""
+    stamps, y = files.signal(500)
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    with sqlite3.connect(bag / 'bag_0.db3') as database:
+        database.executescript("""
+            CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
+                serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL);
+            CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,
+                timestamp INTEGER NOT NULL, data BLOB NOT NULL);
+            INSERT INTO topics VALUES (1, '/y', 'std_msgs/msg/Float64', 'cdr', '');
+            INSERT INTO topics VALUES (2, '/odd', 'my_rig_msgs/msg/Odd', 'cdr', '');
+            INSERT INTO messages VALUES (1, 2, 1, x'0001000000');
+        """)
+        rows = [(1, stamp, data) for _, _, stamp, data in files.floats(stamps, y)]
+        database.executemany(
+            'INSERT INTO messages(topic_id, timestamp, data) VALUES (?,?,?)', rows
+        )
+    database.close()
+    topics = ''.join(
+        f"""
+  - topic_metadata:
+      name: {name}
+      type: {kind}
+      serialization_format: cdr
+      offered_qos_profiles: ""
+    message_count: {count}"""
+        for name, kind, count in (
+            ('/y', 'std_msgs/msg/Float64', 500),
+            ('/odd', 'my_rig_msgs/msg/Odd', 1),
+        )
+    )
+    (bag / 'metadata.yaml').write_text(f"""rosbag2_bagfile_information:
+  version: 5
+  storage_identifier: sqlite3
+  duration: {{nanoseconds: {stamps[-1] - 1}}}
+  starting_time: {{nanoseconds_since_epoch: 1}}
+  message_count: 501
+  topics_with_message_count:{topics}
+  compression_format: ""
+  compression_mode: ""
+  relative_file_paths: [bag_0.db3]
+  files:
+  - path: bag_0.db3
+    starting_time: {{nanoseconds_since_epoch: 1}}
+    duration: {{nanoseconds: {stamps[-1] - 1}}}
+    message_count: 501
+""")
+    assert run(bag, '-o', tmp_path / 'o.npz', '-o', tmp_path / 'o') == 0
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y))
+    assert len(series(tmp_path / 'o', '/y').values) == 500
 
 
 # Wrong input
