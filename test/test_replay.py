@@ -15,7 +15,8 @@ import time
 import bag_files as files
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.tools import replay
-from fhaosmo_ros.tools.bags import series
+from fhaosmo_ros.tools.bag_reader import BagReader
+from fhaosmo_ros.tools.bags import BagWriter, series
 from fhaosmo_ros.tools.chunks import scan
 import lz4.frame
 import numpy as np
@@ -319,6 +320,19 @@ def test_sqlite_bag_of_humble_is_read(tmp_path):
     assert run(bag, '-o', tmp_path / 'o.npz', '-o', tmp_path / 'o') == 0
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y))
     assert len(series(tmp_path / 'o', '/y').values) == 500
+
+
+def test_types_of_a_sourced_workspace_go_into_the_bag(tmp_path, monkeypatch):
+    share = tmp_path / 'prefix' / 'share' / 'rig_msgs' / 'msg'
+    share.mkdir(parents=True)
+    (share / 'Inner.msg').write_text('float32 force\n')
+    (share / 'Outer.msg').write_text('std_msgs/Header header\nrig_msgs/Inner[2] inner\n')
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'/nowhere:{tmp_path / "prefix"}')
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.add('/rig', 'rig_msgs/msg/Outer')
+        bag.write('/rig', 5, b'\0\1\0\0' + bytes(13) + b'\0\0\0' + bytes(8))
+    with BagReader(tmp_path / 'bag') as reader:
+        assert reader.field('/rig', 'inner[1].force').kind == np.float32
 
 
 # Wrong input

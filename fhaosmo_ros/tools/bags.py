@@ -3,7 +3,9 @@
 
 from collections.abc import Iterator, Sequence
 from io import BytesIO
+import os
 from pathlib import Path
+import re
 import struct
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -22,7 +24,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 FOREVER = QosTime(sec=9223372036, nsec=854775807)
@@ -32,9 +34,6 @@ OFFERED_QOS = Qos(
     FOREVER, FOREVER, QosLiveliness.AUTOMATIC, FOREVER, False,
 )  # fmt: skip
 """What this package's nodes offer; `ros2 bag play` publishes with it again."""
-
-
-UNKNOWN_DIGEST = 'RIHS01_' + 64 * '0'
 
 
 class BagWriter:
@@ -76,11 +75,15 @@ class BagWriter:
     ) -> int:
         """Add a topic, and return its channel number; once for each topic."""
         if topic not in self._connections:
-            if message_type in types.fielddefs:
-                definition = types.generate_msgdef(message_type, ros_version=2)[0]
-                digest = digest or types.hash_rihs01(message_type)
-            else:  # an old bag that does not say what its messages look like
-                definition, digest = '', digest or UNKNOWN_DIGEST
+            if message_type not in types.fielddefs and types is TYPES:
+                learn(message_type)
+            if message_type not in types.fielddefs:
+                # An old bag that does not say what its messages look like. Readers compare the
+                # hash with the definition, so it is that of a message without fields.
+                types, digest = get_typestore(Stores.EMPTY), ''
+                types.register(get_types_from_msg('', message_type))
+            definition = types.generate_msgdef(message_type, ros_version=2)[0]
+            digest = digest or types.hash_rihs01(message_type)
             self._connections[topic] = self._writer.add_connection(
                 topic, message_type, msgdef=definition, rihs01=digest,
                 offered_qos_profiles=list(qos),
@@ -157,6 +160,22 @@ class BagWriter:
             if self.takes_chunks:
                 self._writer.storage.message_start_time = 0
         self._writer.close()
+
+
+def learn(message_type: str) -> bool:
+    """Add a type of the sourced workspaces, and those that it uses, to `TYPES` if it is there."""
+    if message_type in TYPES.fielddefs:
+        return True
+    package, kind, name = message_type.split('/')
+    for prefix in filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)):
+        path = Path(prefix, 'share', package, kind, f'{name}.msg')
+        if path.is_file():
+            found = get_types_from_msg(path.read_text(encoding='utf-8'), message_type)
+            names = re.findall(r"\(<Nodetype.NAME: 2>, '([^']+)'\)", repr(found[message_type]))
+            if all(learn(other) for other in names):
+                TYPES.register(found)
+                return True
+    return False
 
 
 def make_qos(
