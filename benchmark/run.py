@@ -13,6 +13,7 @@ import sys
 
 import core_step
 import cpu
+import replay
 import simulation
 import startup
 from table import CannotMeasureError, render, Row
@@ -22,6 +23,7 @@ PARTS = {
     'simulation': simulation.measure,
     'cpu': cpu.measure,
     'startup': startup.measure,
+    'replay': replay.measure,
 }
 
 

@@ -10,4 +10,8 @@ COMMANDS = {
     'estimator': ('fhaosmo_ros.nodes.estimator', 'node: estimate states and unknown input of y'),
     'plant': ('fhaosmo_ros.nodes.plant', 'node: simulate a plant and publish y and the truth'),
     'demo': ('fhaosmo_ros.tools.demo', 'run plant and estimator, record, report, draw a figure'),
+    'record': ('fhaosmo_ros.tools.record', "record y and the estimator's topics to a bag"),
+    'replay': ('fhaosmo_ros.tools.replay', 'estimate offline from a bag, as the live node would'),
+    'plot': ('fhaosmo_ros.tools.plot', 'draw the estimates in bags, print their metrics'),
+    'play': ('fhaosmo_ros.tools.play', "publish a bag's topics in its own time, with /clock"),
 }

@@ -348,18 +348,41 @@ class Observer:
             self._t = None
             good = np.flatnonzero(np.isfinite(kernels.HEADROOM * y))
             first = good[0] + 1 if len(good) else len(y)
-        return self._run(t, y, u, first, every)
+        return self.step_through(t, y, self._periods(t, first), u, first, every)
 
-    def _run(
-        self, t: NDArray[Any], y: NDArray[Any], u: NDArray[Any], first: int, every: int
-    ) -> Trajectory:
+    def step_through(
+        self, t: NDArray[Any], y: NDArray[np.float64], h: NDArray[np.float64],
+        u: NDArray[np.float64], first: int, every: int = 1,
+    ) -> Trajectory:  # fmt: skip
+        """
+        Step through arrays whose periods are known: what `run` and a replay have in common.
+
+        Bit for bit what `start` does with the samples before index `first`, and `step` with those
+        from it on.
+
+        Parameters
+        ----------
+        t : (K,) array
+            Goes to the trajectory as it is.
+        y, h, u : (K,) contiguous arrays
+            Samples, the time (s) and the known input of the interval that ends at each.
+        first : int
+            Number of samples that are taken before any time passes.
+        every : int
+            As in `run`.
+
+        """
         rows, n = len(y) // every, self.levels
         out, eps = np.empty((rows, 2, n)), np.empty((rows + 1, n))
         gamma, words = np.empty(rows), np.empty(rows, dtype=np.int64)
         kernels.run(
             *self._law, *self._work, self._levels, self._memory,
-            y, self._periods(t, first), u, out, gamma, eps, words, first, every,
+            y, h, u, out, gamma, eps, words, first, every,
         )  # fmt: skip
+        if rows:
+            self._word = int(words[-1])
+        y_last = self._memory[layout.Y]
+        kernels.innovations(self._law.scalars, self._levels, y_last, self._eps, 0)
         z, d = self._select(out)
         return Trajectory(
             t[every - 1 :: every], z, d, gamma, eps[:rows],

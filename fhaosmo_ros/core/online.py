@@ -5,10 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fhaosmo_ros.core.observer import Estimate, Observer
+from fhaosmo_ros.core import layout
+from fhaosmo_ros.core.observer import Estimate, Observer, Trajectory
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
-from fhaosmo_ros.core.status import REJECTED, Status
+from fhaosmo_ros.core.status import LEVEL_SHIFT, REJECTED, Status
 import numpy as np
+from numpy.typing import NDArray
 
 NANOSECONDS = 1e-9
 
@@ -162,6 +164,82 @@ class OnlineEstimator:
             self.counters.accepted += 1
             self.stamp = stamp
         return word
+
+    def run(
+        self, stamps: NDArray[np.int64], y: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> list[Trajectory]:
+        """
+        Take many samples, bit for bit as `update` would take one after the other.
+
+        Samples that bring nothing to decide (all finite, in time) go through the kernel at once.
+        Where one of them is rejected all the same, or one does not fit, the block is taken again
+        from where it began, sample by sample: so there is one policy of time, that of `advance`.
+
+        Parameters
+        ----------
+        stamps : (K,) array of int
+            Times of the samples in nanoseconds.
+        y : (K,) array
+            Samples.
+        u : (K,) array of finite numbers
+            Known input of the interval that ends at each sample.
+
+        Returns
+        -------
+        list of Trajectory
+            In order; together a row for every sample, whose status says whether it was rejected.
+            ``t`` holds the stamps.
+
+        """
+        pieces = []
+        if not self.observer.started and len(y) > 1:
+            pieces.append(self._one_by_one(stamps[:1], y[:1], u[:1]))
+            stamps, y, u = stamps[1:], y[1:], u[1:]
+        if len(y):
+            pieces.append(self._at_once(stamps, y, u) or self._one_by_one(stamps, y, u))
+        return pieces
+
+    def _at_once(
+        self, stamps: NDArray[np.int64], y: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> Trajectory | None:
+        """Take samples that are all accepted, or return None and change nothing."""
+        if not self.observer.started or self._latest is None or self._unused:
+            return None
+        if self._nominal:
+            elapsed = np.full(len(y), self._period)
+        else:
+            elapsed = np.diff(stamps, prepend=self._latest)
+            if elapsed.min() <= 0 or elapsed.max() > self._max_gap:
+                return None
+        if not np.isfinite(y).all():
+            return None
+        before = self.observer.state
+        piece = self.observer.step_through(stamps, y, elapsed * NANOSECONDS, u, first=0)
+        if (piece.status & REJECTED).any():
+            self.observer.restore(before)
+            return None
+        self.counters.accepted += len(y)
+        self._latest = self.stamp = int(stamps[-1])
+        self._u = float(u[-1])
+        return piece
+
+    def _one_by_one(
+        self, stamps: NDArray[np.int64], y: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> Trajectory:
+        estimates, states = [], []
+        for stamp, sample, known in zip(stamps.tolist(), y.tolist(), u.tolist(), strict=True):
+            self.set_input(known)
+            estimates.append(self.update(stamp, sample))
+            states.append(self.observer.state.levels)
+        z, d, gamma, innovation, words = (
+            np.array(column) for column in zip(*estimates, strict=True)
+        )
+        levels = np.array(states)
+        return Trajectory(
+            stamps, z, d, gamma, innovation,
+            words & ((1 << LEVEL_SHIFT) - 1), words >> LEVEL_SHIFT,
+            levels[:, layout.HAT], levels[:, layout.TILDE],
+        )  # fmt: skip
 
     @property
     def estimate(self) -> Estimate | None:

@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures: the only module that imports matplotlib. It draws on Axes that it is given."""
 
+import importlib.util
+import os
 from pathlib import Path
+import sys
 
 import matplotlib
 
 matplotlib.use('Agg')
 
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.tools.plot_data import Curves
 from fhaosmo_ros.tools.run_report import Run
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -48,3 +53,117 @@ def save_run(run: Run, path: Path) -> None:
     axes[-1].set_xlim(run.t[0], run.t[-1])
     figure.suptitle('States and unknown input, estimated live from y = z1')
     figure.savefig(path, dpi=150)
+
+
+COLOURS = ('#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
+"""Okabe-Ito, without the truth's blue; each curve also has dashes of its own."""
+DASHES = ('-', '--', '-.', ':')
+
+
+def _limits(axes: Axes, rows: list[NDArray[np.float64]]) -> None:
+    """Fit the picture to what comes after the transient."""
+    late = np.concatenate([row[len(row) // 10 :] for row in rows])
+    late = late[np.isfinite(late)]
+    if len(late):
+        margin = 0.1 * float(np.ptp(late)) or 0.1 * abs(float(late[0])) or 1.0
+        axes.set_ylim(late.min() - margin, late.max() + margin)
+
+
+def draw_innovations(axes: Axes, t: NDArray[np.float64], eps: NDArray[np.float64]) -> None:
+    """Draw |eps_1| .. |eps_N| on a logarithmic scale."""
+    for k in range(eps.shape[1]):
+        axes.plot(t, np.abs(eps[:, k]) + 1e-300, linewidth=0.8, label=f'ε{k + 1}')
+    axes.set_yscale('log')
+    size = np.abs(eps)[np.abs(eps) > 0.0]
+    if len(size):
+        axes.set_ylim(np.percentile(size, 1) / 3.0, size.max() * 3.0)
+
+
+def save_curves(curves: list[Curves], epsilon: float | None, path: Path, show: bool) -> None:
+    """
+    Write a figure of several estimates laid one over another.
+
+    Parameters
+    ----------
+    curves : list of Curves
+    epsilon : float or None
+        Threshold of the gates; drawn, and the gates with it, if known.
+    path : path
+        Its suffix names the format.
+    show : bool
+        Open a window as well.
+
+    """
+    names = max((c.names for c in curves), key=len)
+    extra = 2 if epsilon is None else 3
+    rows = len(names) + extra
+    size = (8.5, 1.45 * rows + 0.9)
+    if show:
+        import matplotlib.pyplot as plt
+
+        plt.switch_backend(_window_backend())
+        figure = plt.figure(figsize=size, layout='constrained')
+    else:
+        figure = Figure(figsize=size, layout='constrained')
+    axes = figure.subplots(rows, 1, sharex=True)
+    origin = min(c.stamps[0] for c in curves)
+    for number, c in enumerate(curves):
+        style = {
+            'color': COLOURS[number % len(COLOURS)], 'linestyle': DASHES[number % len(DASHES)],
+            'linewidth': 1.2, 'label': c.label,
+        }  # fmt: skip
+        t = (c.stamps - origin) * 1e-9
+        for k in range(len(c.names)):
+            row = axes[len(names) - 1 if c.names[k] == 'd' else k]
+            if c.truth is not None and number == 0:
+                row.plot(t, c.truth[:, k], **TRUTH)
+            row.plot(t, c.estimate[:, k], **style)
+        axes[len(names)].plot(t, c.gamma, **style)
+        if epsilon is not None:
+            gates = (np.abs(c.innovation) <= epsilon)[:, :-1]
+            levels = 1 + np.cumprod(gates, axis=1).sum(axis=1)
+            axes[-1].step(t, levels, where='post', **style)
+    for k, name in enumerate(names):
+        shown = [c.estimate[:, c.names.index(name)] for c in curves if name in c.names]
+        _limits(axes[k], shown)
+        axes[k].set_ylabel('unknown\ninput d' if name == 'd' else name)
+    axes[len(names)].set_ylabel('power γ')
+    first = curves[0]
+    row = axes[len(names) + 1]
+    draw_innovations(row, (first.stamps - origin) * 1e-9, first.innovation)
+    row.set_ylabel('|innovation|' if len(curves) == 1 else '|innovation|\n(first)')
+    if epsilon is not None:
+        low, high = row.get_ylim()
+        row.set_ylim(low, max(high, 3.0 * epsilon))
+        row.axhspan(low, epsilon, color='grey', alpha=0.15, label='band ε')
+        axes[-1].set_ylabel('open levels')
+        axes[-1].set_yticks(range(1, first.innovation.shape[1] + 1))
+    row.legend(loc='upper right', ncols=5, fontsize='small')
+    for one in axes:
+        one.grid(alpha=0.3)
+    axes[-1].set_xlabel('time since the first estimate [s]')
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside upper center', ncols=2, fontsize='small')
+    figure.savefig(path, dpi=150)
+    if show:
+        plt.show()
+
+
+def _window_backend() -> str:
+    """
+    Return a backend that opens windows here.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no display, or no toolkit.
+
+    """
+    if sys.platform.startswith('linux') and not (
+        os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
+    ):
+        raise ConfigurationError('--show: expected a display (DISPLAY is not set), got none')
+    for module, backend in (('PyQt6', 'QtAgg'), ('PyQt5', 'QtAgg'), ('tkinter', 'TkAgg')):
+        if importlib.util.find_spec(module):
+            return backend
+    raise ConfigurationError('--show: expected PyQt or tkinter to open a window, got neither')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Output folders that are complete or absent."""
+"""Output that is complete or absent."""
 
 from pathlib import Path
 import shutil
@@ -60,3 +60,56 @@ class OutputFolder:
         trace: TracebackType | None,
     ) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
+
+
+class Output:
+    """
+    A file or folder that is made in a hidden folder beside its place, and moved once complete.
+
+    Parameters
+    ----------
+    final : path
+        Must be absent, unless `force`; what is there stays until the new one is complete.
+
+    Attributes
+    ----------
+    path : path
+        Where to write meanwhile; has the final name, and does not exist yet.
+
+    Raises
+    ------
+    ConfigurationError
+        The path is in use or can't be made.
+
+    """
+
+    def __init__(self, final: Path, force: bool = False) -> None:
+        self._final, self._force = final, force
+        self._folder = final.with_name(f'.{final.name}.part')
+        self.path = self._folder / final.name
+
+    def __enter__(self) -> 'Output':
+        if self._final.exists() and not self._force:
+            kind = 'folder' if self._final.is_dir() else 'file'
+            raise ConfigurationError(
+                f'output {self._final}: expected a new name (or --force to replace it), '
+                f'got an existing {kind}'
+            )
+        try:
+            shutil.rmtree(self._folder, ignore_errors=True)  # of a run that was killed
+            self._folder.mkdir(parents=True)
+        except OSError as error:
+            raise ConfigurationError(
+                f'output {self._final}: expected a place that can be written, '
+                f'got: {error.strerror}'
+            ) from None
+        return self
+
+    def keep(self) -> Path:
+        """Give it its final name and return that."""
+        if self._final.exists():
+            self._final.rename(self._folder / 'replaced')
+        return self.path.rename(self._final)
+
+    def __exit__(self, *_: object) -> None:
+        shutil.rmtree(self._folder, ignore_errors=True)

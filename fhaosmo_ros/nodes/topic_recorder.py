@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Subscribes topics as they appear, with the QoS of their publishers, and queues what comes."""
+
+from collections.abc import Callable, Mapping
+import importlib
+from queue import SimpleQueue
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.nodes.spin import Spinner
+from fhaosmo_ros.nodes.subscription import subscribe_with_info
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+DEPTH = 5000
+DISCOVERY_PERIOD = 0.2
+
+
+class NewTopic(NamedTuple):
+    """A topic that is recorded from now on, with the QoS of each of its publishers."""
+
+    topic: str
+    message_type: str
+    offered: list[dict[str, Any]]
+
+
+class Sample(NamedTuple):
+    """A message in CDR with its source time stamp in nanoseconds."""
+
+    topic: str
+    stamp: int
+    data: bytes
+
+
+class TopicRecorder:
+    """
+    A node in a context of its own that records while it is open.
+
+    Parameters
+    ----------
+    wanted : callable
+        Says of a topic's name whether to record it.
+
+    Attributes
+    ----------
+    queue : SimpleQueue
+        `NewTopic`, then the topic's `Sample`; the executor's thread fills it.
+    problems : SimpleQueue
+        Lines that say why a topic can't be recorded.
+
+    """
+
+    def __init__(self, wanted: Callable[[str], bool]) -> None:
+        self.queue: SimpleQueue[NewTopic | Sample] = SimpleQueue()
+        self.problems: SimpleQueue[str] = SimpleQueue()
+        self._wanted = wanted
+        self._known: set[str] = set()
+        self._context = Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = Node('fhaosmo_recorder', context=self._context, use_global_arguments=False)
+        self._node.create_timer(DISCOVERY_PERIOD, self._discover)
+        self._spinner = Spinner(self._node)
+
+    def __enter__(self) -> 'TopicRecorder':
+        self._discover()
+        self._spinner.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._spinner.__exit__()
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def _discover(self) -> None:
+        for topic, types in self._node.get_topic_names_and_types():
+            if topic in self._known or not self._wanted(topic):
+                continue
+            publishers = self._node.get_publishers_info_by_topic(topic)
+            publishers = [p for p in publishers if p.node_name != self._node.get_name()]
+            if not publishers:
+                continue
+            self._known.add(topic)
+            try:
+                message_class = _message_class(types[0])
+            except (ImportError, AttributeError, ValueError):
+                self.problems.put(
+                    f'{topic}: expected a message type that is installed here, got {types[0]}'
+                )
+                continue
+            profiles = [p.qos_profile for p in publishers]
+            self.queue.put(NewTopic(topic, types[0], [_plain(p) for p in profiles]))
+            subscribe_with_info(
+                self._node, message_class, topic, self._callback(topic), _matching(profiles),
+                raw=True,
+            )  # fmt: skip
+
+    def _callback(self, topic: str) -> Any:
+        put = self.queue.put
+
+        def receive(data: bytes, info: Mapping[str, int]) -> None:
+            put(Sample(topic, info['source_timestamp'] or info['received_timestamp'], data))
+
+        return receive
+
+
+def _message_class(message_type: str) -> Any:
+    package, kind, name = message_type.split('/')
+    return getattr(importlib.import_module(f'{package}.{kind}'), name)
+
+
+def _matching(profiles: list[QoSProfile]) -> QoSProfile:
+    """Return the strictest QoS that every publisher offers."""
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+    local = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+    return QoSProfile(
+        depth=DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if local else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _plain(profile: QoSProfile) -> dict[str, Any]:
+    """Return a QoS as names and numbers."""
+    return {
+        'history': profile.history.name,
+        'depth': profile.depth,
+        'reliability': profile.reliability.name,
+        'durability': profile.durability.name,
+        'deadline': profile.deadline.nanoseconds,
+        'lifespan': profile.lifespan.nanoseconds,
+        'liveliness': profile.liveliness.name,
+        'liveliness_lease_duration': profile.liveliness_lease_duration.nanoseconds,
+    }

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recorded known input u, held between its samples as the node holds it."""
+
+from fhaosmo_ros.core.online import Counters
+from fhaosmo_ros.tools.bag_reader import BagReader
+import numpy as np
+from numpy.typing import NDArray
+
+
+class HeldInput:
+    """
+    Gives u at given times; to be called with times that go on.
+
+    Raises
+    ------
+    ConfigurationError
+        The bag has no such topic or field.
+
+    """
+
+    def __init__(
+        self, reader: BagReader, topic: str, field: str | None, counters: Counters
+    ) -> None:
+        self._blocks = reader.blocks(topic, reader.field(topic, field), use_header=False)
+        self._counters = counters
+        self._times = np.zeros(0, dtype=np.int64)
+        self._values = np.zeros(0)
+        self._held = 0.0
+
+    def __call__(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return u at each time (of the bag): the last finite one that is not later, or 0."""
+        while not len(self._times) or self._times[-1] <= times[-1]:
+            block = next(self._blocks, None)
+            if block is None:
+                break
+            good = np.isfinite(block.values)
+            self._counters.rejected_inputs += int((~good).sum())
+            self._times = np.concatenate([self._times, block.times[good]])
+            self._values = np.concatenate([self._values, block.values[good]])
+        last = np.searchsorted(self._times, times, side='right')
+        u = np.concatenate([[self._held], self._values])[last]
+        self._held = float(u[-1])
+        self._times, self._values = self._times[last[-1] :], self._values[last[-1] :]
+        return u

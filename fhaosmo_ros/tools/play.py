@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publish a bag's topics in its own time, with /clock, where there is no `ros2 bag`."""
+
+import argparse
+from itertools import count
+from pathlib import Path
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.stop_signals import Stop, stop_on_signals
+from fhaosmo_ros.tools.bag_reader import BagReader
+from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from fhaosmo_ros.nodes.player import Player
+
+CLOCK_PERIOD = 1_000_000
+"""Nanoseconds of the bag's time between two messages on /clock, at most."""
+NEVER_PLAYED = ('/clock', '/rosout', '/parameter_events')
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return 0 at the end or after Ctrl-C, 2 for wrong input."""
+    arguments = _parser().parse_args(argv)
+    stop = stop_on_signals()
+    try:
+        _play(arguments, stop)
+    except ConfigurationError as error:
+        print(f'play: error: {error}', file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='play', description="Publish a bag's topics, and /clock."
+    )
+    add = parser.add_argument
+    add('bag', type=Path)
+    add('--topics', nargs='+', metavar='TOPIC', help='these only (default: all)')
+    add('--exclude', nargs='+', default=[], metavar='NAME', help='not those below these names')
+    add('--rate', type=float, default=1.0, help='times real time (default: %(default)g)')
+    add('--loop', action='store_true', help='begin again at the end, until Ctrl-C')
+    add(
+        '--wait', nargs='*', default=[], metavar='TOPIC',
+        help='begin once each of these has a subscriber',
+    )  # fmt: skip
+    return parser
+
+
+def _play(arguments: argparse.Namespace, stop: Stop) -> None:
+    if not 1e-3 <= arguments.rate <= 1e3:
+        raise ConfigurationError(f'--rate: expected 0.001 to 1000, got {arguments.rate:g}')
+    from fhaosmo_ros.nodes.player import Player  # here, so that --help needs no ROS
+
+    with BagReader(arguments.bag) as reader:
+        for topic in arguments.topics or []:
+            reader.message_type(topic)
+        below = tuple(f'{name.rstrip("/")}/' for name in arguments.exclude)
+        topics = {
+            c.topic: (c.msgtype, any(q.durability.name == 'TRANSIENT_LOCAL' for q in _qos(c)))
+            for c in reader.connections
+            if c.topic in (arguments.topics or [c.topic])
+            and c.topic not in (*NEVER_PLAYED, *arguments.exclude)
+            and not c.topic.startswith(below)
+        }
+        if not topics or not sum(reader.count(topic) for topic in topics):
+            raise ConfigurationError(f'bag {arguments.bag}: expected a message to play, got none')
+        with Player(topics) as player:
+            for topic in player.missing:
+                print(f'play: not played: {topic}: {topics[topic][0]} is not installed here')
+            print(
+                f'playing {len(topics) - len(player.missing)} topics; Ctrl-C ends it', flush=True
+            )
+            while not all(player.subscribers(topic) for topic in arguments.wait):
+                if stop.wait(0.05):
+                    return
+            for turn in count(1):
+                _once(reader, player, list(topics), arguments.rate, turn, stop)
+                if stop.is_set() or not arguments.loop:
+                    return
+
+
+def _qos(connection):
+    return connection.ext.offered_qos_profiles
+
+
+def _once(
+    reader: BagReader, player: 'Player', topics: list[str], rate: float, turn: int,
+    stop: Stop,
+) -> None:  # fmt: skip
+    begin, now = time.monotonic_ns(), None
+    total = sum(reader.count(topic) for topic in topics)
+    with tqdm(total=total, unit='message', desc=f'play {turn}', unit_scale=True) as bar:
+        for topic, stamp, data in reader.messages(topics):
+            if now is None:
+                first = now = stamp
+                player.tick(now)
+            while now < stamp:  # the clock goes on between the messages
+                now = min(now + CLOCK_PERIOD * max(1, round(rate)), stamp)
+                pause = (now - first) / rate - (time.monotonic_ns() - begin)
+                if pause > 0 and stop.wait(pause * 1e-9):
+                    return
+                player.tick(now)
+            if stop.is_set():
+                return
+            player.publish(topic, data)
+            bar.update()

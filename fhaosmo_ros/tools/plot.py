@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plot the estimates of one bag or of several: PNG, SVG or PDF, and a table of metrics."""
+
+import argparse
+from pathlib import Path
+import sys
+
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.stop_signals import stop_on_signals
+from fhaosmo_ros.tools.figures import save_curves
+from fhaosmo_ros.tools.options import add_parameter_options, online_parameters
+from fhaosmo_ros.tools.output import Output
+from fhaosmo_ros.tools.plot_data import metrics, read_curves
+
+SUFFIXES = ('.png', '.svg', '.pdf')
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return 0, or 2 for wrong input, with nothing written."""
+    arguments = _parser().parse_args(argv)
+    stop_on_signals()
+    try:
+        _plot(arguments)
+    except ConfigurationError as error:
+        print(f'plot: error: {error}', file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='plot', description='Draw the estimates in bags: live and replayed, one over another.'
+    )
+    add = parser.add_argument
+    add('bags', type=Path, nargs='+', metavar='BAG')
+    add(
+        '-o', '--output', type=Path, metavar='FILE',
+        help='.png, .svg or .pdf (default: BAG.png in the current folder)',
+    )  # fmt: skip
+    add('--force', action='store_true', help='replace an output that exists')
+    add('--show', action='store_true', help='open a window too')
+    add('--names', nargs='+', metavar='NAME', help='estimators (default: all in the bags)')
+    add('--plant', default='/plant', help='whose topics are the truth (default: %(default)s)')
+    add_parameter_options(parser)
+    return parser
+
+
+def _plot(arguments: argparse.Namespace) -> None:
+    path = arguments.output or Path(f'{arguments.bags[0].resolve().stem}.png')
+    if path.suffix not in SUFFIXES:
+        raise ConfigurationError(
+            f'--output: expected a name that ends in {", ".join(SUFFIXES)}, got {path}'
+        )
+    values = online_parameters(arguments)
+    curves = [
+        c for bag in arguments.bags for c in read_curves(bag, arguments.names, arguments.plant)
+    ]
+    with Output(path, arguments.force) as output:
+        save_curves(curves, values.get('epsilon'), output.path, arguments.show)
+        final = output.keep()
+    print(f'{metrics(curves)}\nfigure: {final}')

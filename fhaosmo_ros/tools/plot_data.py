@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The estimates in a bag, of one estimator name, with the truth where the bag has it."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.metrics import chatter, rms
+from fhaosmo_ros.tools.bag_reader import BagReader
+from fhaosmo_ros.tools.bags import series
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Curves(NamedTuple):
+    """
+    Estimates over the time of the samples behind them.
+
+    Attributes
+    ----------
+    label : str
+        Bag and estimator.
+    stamps : (K,) array of int
+        In nanoseconds.
+    names : list of str
+        z1 .. zn and d.
+    estimate : (K, n + 1) array
+    gamma : (K,) array
+    innovation : (K, N) array
+    truth : (K, n + 1) array or None
+
+    """
+
+    label: str
+    stamps: NDArray[np.int64]
+    names: list[str]
+    estimate: NDArray[np.float64]
+    gamma: NDArray[np.float64]
+    innovation: NDArray[np.float64]
+    truth: NDArray[np.float64] | None
+
+
+def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]:
+    """
+    Read the estimates of some estimators, or of all that a bag holds.
+
+    Raises
+    ------
+    ConfigurationError
+        Not a bag, or one without estimates.
+
+    """
+    with BagReader(path) as reader:
+        topics = {c.topic for c in reader.connections if c.msgcount}
+    parts = ('state', 'unknown_input', 'gamma', 'innovation', 'stamp')
+    found = sorted(t.removesuffix('/gamma') for t in topics if t.endswith('/gamma'))
+    found = [name for name in found if all(f'{name}/{part}' in topics for part in parts)]
+    for name in names or []:
+        if name not in found:
+            raise ConfigurationError(
+                f'bag {path}: expected estimates of one of {", ".join(found) or "none"}, '
+                f'got {name!r}'
+            )
+    if not found:
+        raise ConfigurationError(
+            f'bag {path}: expected the topics of an estimator ({", ".join(parts)} below its '
+            f'name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
+        )
+    has_truth = {f'{plant}/state', f'{plant}/unknown_input'} <= topics
+    return [_curves(path, name, plant if has_truth else None) for name in names or found]
+
+
+def _curves(path: Path, name: str, plant: str | None) -> Curves:
+    state, d, gamma, innovation, stamp = (
+        series(path, f'{name}/{part}')
+        for part in ('state', 'unknown_input', 'gamma', 'innovation', 'stamp')
+    )
+    # The five topics of one tick are published together; a recording may lack the last of them.
+    count = min(len(s.stamps) for s in (state, d, gamma, innovation, stamp))
+    when = stamp.values[:count]
+    estimate = np.column_stack([state.values[:count], d.values[:count]])
+    truth = None
+    if plant is not None:
+        z, true_d = series(path, f'{plant}/state'), series(path, f'{plant}/unknown_input')
+        rows = [np.searchsorted(s.stamps, when).clip(0, len(s.stamps) - 1) for s in (z, true_d)]
+        truth = np.column_stack([z.values[rows[0]], true_d.values[rows[1]]])
+        if truth.shape != estimate.shape:  # another model than the plant's
+            truth = None
+    labels = state.labels or [f'z{i + 1}' for i in range(estimate.shape[1] - 1)]
+    return Curves(
+        f'{path.resolve().name} {name}', when, [*labels, 'd'], estimate, gamma.values[:count],
+        innovation.values[:count], truth,
+    )  # fmt: skip
+
+
+def metrics(curves: list[Curves]) -> str:
+    """Return a table: a row for each state and d of each estimator, over the second half."""
+    width = max(len(c.label) for c in curves)
+    lines = [f'{"2nd half":{width}}  {"":4}{"RMS":>12}{"RMS error":>12}{"chatter":>10}']
+    for c in curves:
+        half = slice(len(c.stamps) // 2, None)
+        for k, name in enumerate(c.names):
+            estimate = c.estimate[half, k]
+            line = f'{c.label:{width}}  {name:4}{rms(estimate):12.3g}'
+            if c.truth is not None:
+                truth = c.truth[half, k]
+                line += f'{rms(estimate - truth):12.3g}{chatter(estimate, truth):10.3g}'
+            lines.append(line)
+    return '\n'.join(lines)

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Record y and the estimator's topics to a bag, or save a bag that was cut short."""
+
+import argparse
+from pathlib import Path
+import re
+import shutil
+import sys
+import time
+
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.stop_signals import Stop, stop_on_signals
+from fhaosmo_ros.tools.bags import BagWriter, make_qos, TYPES
+from fhaosmo_ros.tools.repair import repair
+from fhaosmo_ros.tools.sinks import TOPICS
+from tqdm import tqdm
+
+FLUSH_PERIOD = 0.5
+"""Seconds after which a kill can't take back what has been written."""
+EXTRA = ('/y', '/u', '/diagnostics', '/rosout', '/parameter_events')
+
+
+def main(argv: list[str] | None = None) -> int:
+    """
+    Run the command.
+
+    Returns
+    -------
+    int
+        0 if there is a valid bag, 2 for wrong arguments or if nothing was recorded.
+
+    """
+    arguments = _parser().parse_args(argv)
+    stop = stop_on_signals()
+    try:
+        if arguments.repair:
+            final = arguments.output or Path(f'{arguments.repair.resolve().stem}_repaired')
+            count = repair(arguments.repair, final, arguments.force, arguments.storage)
+            print(f'saved {count} messages: {final}')
+        else:
+            _record(arguments, stop)
+    except ConfigurationError as error:
+        print(f'record: error: {error}', file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='record',
+        description="Record y, the estimator's and the plant's topics to a bag until Ctrl-C.",
+    )
+    add = parser.add_argument
+    add('-o', '--output', type=Path, metavar='BAG', help='new folder (default: bag_TIME)')
+    add('--force', action='store_true', help='replace an output that exists')
+    add('--storage', choices=('mcap', 'sqlite3'), default='mcap', help='default: %(default)s')
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument('--topics', nargs='+', metavar='TOPIC', help='these topics only')
+    choice.add_argument('--all', action='store_true', help='every topic that has a publisher')
+    choice.add_argument(
+        '--repair', type=Path, metavar='BAG',
+        help='record nothing: save what is whole of a bag that was cut short',
+    )  # fmt: skip
+    add(
+        '--names', nargs='+', default=['/estimator', '/plant'], metavar='NAME',
+        help='nodes whose topics to record beside y and u (default: /estimator /plant)',
+    )  # fmt: skip
+    add('--duration', type=float, metavar='SECONDS', help='stop by itself')
+    return parser
+
+
+def _record(arguments: argparse.Namespace, stop: Stop) -> None:
+    if arguments.duration is not None and not arguments.duration > 0.0:
+        raise ConfigurationError(f'--duration: expected > 0 s, got {arguments.duration:g}')
+    path = arguments.output or Path(time.strftime('bag_%Y-%m-%d_%H-%M-%S'))
+    if path.exists():
+        if not arguments.force:
+            raise ConfigurationError(
+                f'output {path}: expected a new name (or --force to replace it), got an existing '
+                f'{"folder" if path.is_dir() else "file"}'
+            )
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    if arguments.topics:
+        for topic in arguments.topics:
+            if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', topic):
+                raise ConfigurationError(f'--topics: expected a name such as /y, got {topic!r}')
+    # Here, so that --help and --repair need no ROS.
+    from fhaosmo_ros.nodes.topic_recorder import TopicRecorder
+
+    wanted = _wanted(arguments)
+    try:
+        with BagWriter(path, storage=arguments.storage) as bag, TopicRecorder(wanted) as recorder:
+            # Signals that it listens: nobody need guess when to start what is to be recorded.
+            print(f'recording to {path}; Ctrl-C ends it', flush=True)
+            count = _drain(recorder, bag, arguments.duration, stop)
+    except OSError as error:
+        raise ConfigurationError(
+            f'output {path}: expected a place that can be written, got: {error.strerror}'
+        ) from None
+    if not count:
+        shutil.rmtree(path)
+        raise ConfigurationError('nothing was published on these topics: no bag kept')
+    print(f'{count} messages: {path}')
+
+
+def _wanted(arguments: argparse.Namespace):
+    if arguments.all:
+        return lambda topic: True
+    if arguments.topics:
+        names = {'/' + topic.lstrip('/') for topic in arguments.topics}
+        return lambda topic: topic in names
+    names = {f'{name.rstrip("/")}/{topic}' for name in arguments.names for topic in TOPICS}
+    return lambda topic: topic in names or topic in EXTRA
+
+
+def _drain(recorder, bag: BagWriter, duration: float | None, stop: Stop) -> int:
+    """Write what arrives until the end; return how many messages there were."""
+    begin = flushed = time.monotonic()
+    count = 0
+    bar_format = '{desc}: {n_fmt} messages, {elapsed}'
+    with tqdm(desc='record', unit='message', bar_format=bar_format) as bar:
+        ended = False
+        while not ended:
+            ended = stop.wait(0.05) or (
+                duration is not None and time.monotonic() - begin >= duration
+            )
+            for _ in range(recorder.queue.qsize()):
+                item = recorder.queue.get()
+                if hasattr(item, 'offered'):
+                    qos = [make_qos(**profile) for profile in item.offered]
+                    bag.add(item.topic, item.message_type, qos=_different(qos))
+                    if item.message_type not in TYPES.fielddefs:
+                        tqdm.write(f'{item.topic}: the bag will lack the definition of its type')
+                else:
+                    bag.write(item.topic, item.stamp, item.data)
+                    count += 1
+            while not recorder.problems.empty():
+                tqdm.write(f'record: not recorded: {recorder.problems.get()}', file=sys.stderr)
+            if time.monotonic() - flushed >= FLUSH_PERIOD:
+                bag.flush()
+                flushed = time.monotonic()
+            bar.update(count - bar.n)
+    return count
+
+
+def _different(profiles: list) -> list:
+    return [p for k, p in enumerate(profiles) if p not in profiles[:k]]

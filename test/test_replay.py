@@ -1,0 +1,472 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag replayed is the observer's own result; input that is wrong is said in one line."""
+
+import csv
+import os
+from pathlib import Path
+import shutil
+import signal as signals
+import sqlite3
+import struct
+import subprocess
+import sys
+import time
+
+import bag_files as files
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.tools import replay
+from fhaosmo_ros.tools.bag_reader import BagReader
+from fhaosmo_ros.tools.bags import BagWriter, series
+from fhaosmo_ros.tools.chunks import scan
+import lz4.frame
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import storage_mcap
+
+ROOT = Path(__file__).resolve().parents[1]
+COUNT = 5000
+STORAGES = [
+    ('mcap', None), ('sqlite3', None), ('mcap', 'storage'), ('mcap', 'file'),
+    ('mcap', 'message'), ('sqlite3', 'file'), ('sqlite3', 'message'), ('mcap', 'lz4'),
+]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _signals():
+    """The command sets handlers for the process that it takes for its own."""
+    numbers = (signals.SIGINT, signals.SIGTERM)
+    before = [signals.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signals.signal(number, handler)
+
+
+def expected(stamps, y, parameters=None, u=None):
+    """What a node would estimate: one sample after the other."""
+    estimator = OnlineEstimator(parameters)
+    rows = []
+    for k, (stamp, sample) in enumerate(zip(stamps.tolist(), y.tolist(), strict=True)):
+        if u is not None:
+            estimator.set_input(u[k])
+        e = estimator.update(stamp, sample)
+        if not e.status.rejected:
+            rows.append([*e.z, e.unknown_input, e.gamma])
+    return np.array(rows)
+
+
+def table(path):
+    with np.load(path) as arrays:
+        names = [f'z{i + 1}' for i in range(9) if f'z{i + 1}' in arrays]
+        return np.column_stack([arrays[n] for n in [*names, 'unknown_input', 'gamma']])
+
+
+def run(*arguments):
+    return replay.main([str(a) for a in arguments])
+
+
+@pytest.mark.parametrize(('storage', 'compression'), STORAGES, ids=str)
+def test_every_storage_and_compression_gives_the_nodes_result(
+    storage, compression, tmp_path, monkeypatch
+):
+    stamps, y = files.signal(COUNT)
+    messages = files.floats(stamps, y) + files.floats(stamps, -y, '/other')
+    messages.sort(key=lambda m: m[2])
+    bag = tmp_path / 'bag'
+    if compression == 'lz4':  # what rosbag2 writes with the preset for speed
+
+        class Lz4Writer(storage_mcap.McapWriter):
+            def __init__(self, path, mode):
+                super().__init__(path, mode)
+                self.compression, self.compressor = 'lz4', lz4.frame.compress
+
+        monkeypatch.setitem(files.Writer.STORAGE_PLUGINS, files.StoragePlugin.MCAP, Lz4Writer)
+        files.write(bag, messages)
+        monkeypatch.undo()
+    elif compression:
+        files.write_compressed(bag, messages, storage, compression)
+    else:
+        files.write(bag, messages, storage)
+    assert run(bag, '-o', tmp_path / 'out.npz', '-o', tmp_path / 'out') == 0
+    np.testing.assert_array_equal(table(tmp_path / 'out.npz'), expected(stamps, y))
+    with AnyReader([tmp_path / 'out']) as reader:  # the input's topics are kept
+        for topic, values in (('/y', y), ('/other', -y)):
+            chosen = [c for c in reader.connections if c.topic == topic]
+            got = [
+                (stamp, reader.deserialize(data, c.msgtype).data)
+                for c, stamp, data in reader.messages(connections=chosen)
+            ]
+            assert got == list(zip(stamps.tolist(), values.tolist(), strict=True))
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_output_bag_holds_the_estimators_topics(storage, tmp_path):
+    stamps, y = files.signal(300)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+    out = tmp_path / 'out'
+    assert run(bag, '-o', out, '--storage', storage, '-p', 'order:=2', '-p', 'phi:=["0","0"]') == 0
+    rows = expected(stamps, y, {'order': 2, 'phi': ['0', '0']})
+    state = series(out, '/estimator/state')
+    np.testing.assert_array_equal(state.values, rows[:, :2])
+    assert state.labels == ['z1', 'z2']
+    np.testing.assert_array_equal(state.stamps, stamps)
+    np.testing.assert_array_equal(series(out, '/estimator/unknown_input').values, rows[:, 2])
+    np.testing.assert_array_equal(series(out, '/estimator/gamma').values, rows[:, 3])
+    np.testing.assert_array_equal(series(out, '/estimator/stamp').values, stamps)
+    assert series(out, '/estimator/innovation').labels == ['eps1', 'eps2', 'eps3']
+    with AnyReader([out]) as reader:
+        assert all(c.digest.startswith('RIHS01_') for c in reader.connections)
+        assert {c.msgcount for c in reader.connections} == {300}
+    # A bag that has estimates gets the replayed ones beside them.
+    again = tmp_path / 'again'
+    assert run(out, '-o', again, '--every', 7) == 0
+    assert len(series(again, '/replay/estimator/state').stamps) == 300 // 7
+    assert len(series(again, '/estimator/state').stamps) == 300
+
+
+def test_csv_reads_back_as_the_same_numbers(tmp_path):
+    stamps, y = files.signal(200)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+    assert run(bag, '-o', tmp_path / 'out.csv') == 0
+    with (tmp_path / 'out.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row['stamp_ns']) for row in rows] == stamps.tolist()
+    got = [[float(row[n]) for n in ('z1', 'z2', 'z3', 'unknown_input', 'gamma')] for row in rows]
+    np.testing.assert_array_equal(got, expected(stamps, y))
+
+
+def test_parameters_of_file_and_command_line(tmp_path):
+    stamps, y = files.signal(300)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+    (tmp_path / 'p.yaml').write_text(
+        '/**: {ros__parameters: {variant: sign, alpha: 30, lambda: 15, publish_rate: 50.0}}'
+    )
+    arguments = ['--params-file', tmp_path / 'p.yaml', '-p', 'lambda:=[20, 15.5, 15, 1e1]']
+    assert run(bag, '-o', tmp_path / 'o.npz', *arguments) == 0
+    values = {'variant': 'sign', 'alpha': 30, 'lambda': [20, 15.5, 15, 10]}
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y, values))
+
+
+def joint_state(stamp, value):
+    return files.cdr(
+        'sensor_msgs/msg/JointState', header=files.header(stamp), name=['a', 'bcd', 'e'],
+        position=np.array([1.0, 2.0, value]), velocity=np.zeros(0), effort=np.zeros(0),
+    )  # fmt: skip
+
+
+def imu(stamp, value):
+    types, zeros = files.TYPES.types, np.zeros(9)
+    vector, turn = types['geometry_msgs/msg/Vector3'], types['geometry_msgs/msg/Quaternion']
+    return files.cdr(
+        'sensor_msgs/msg/Imu', header=files.header(stamp, 'i'),
+        orientation=turn(0.0, 0.0, 0.0, 1.0),
+        orientation_covariance=zeros, angular_velocity=vector(0.0, 0.0, value),
+        angular_velocity_covariance=zeros, linear_acceleration=vector(0.0, 0.0, 9.8),
+        linear_acceleration_covariance=zeros,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('kind', 'field', 'make', 'rounding'),
+    [
+        ('sensor_msgs/msg/JointState', 'position[2]', joint_state, np.float64),
+        ('sensor_msgs/msg/Imu', 'angular_velocity.z', imu, np.float64),
+        ('std_msgs/msg/Float32', None,
+         lambda _, v: files.cdr('std_msgs/msg/Float32', data=v), np.float32),
+        ('geometry_msgs/msg/Twist', 'angular.y', lambda _, v: files.cdr(
+            'geometry_msgs/msg/Twist',
+            linear=files.TYPES.types['geometry_msgs/msg/Vector3'](1.0, 2.0, 3.0),
+            angular=files.TYPES.types['geometry_msgs/msg/Vector3'](1.0, v, 3.0)), np.float64),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_any_number_of_any_type(kind, field, make, rounding, storage, tmp_path):
+    stamps, y = files.signal(400)
+    late = stamps + 3_000_000  # the bag's own stamps, not those of the headers
+    messages = [
+        ('/sensor', kind, at, make(stamp, value))
+        for at, stamp, value in zip(late.tolist(), stamps.tolist(), y.tolist(), strict=True)
+    ]
+    bag = files.write(tmp_path / 'bag', messages, storage)
+    choice = ['--field', field] if field else []
+    assert run(bag, '--topic', '/sensor', *choice, '-o', tmp_path / 'o.npz') == 0
+    used = stamps if b'header' in repr(files.TYPES.fielddefs[kind]).encode() else late
+    y = y.astype(rounding).astype(np.float64)
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(used, y))
+    assert run(
+        bag, '--topic', '/sensor', *choice, '--stamp', 'bag', '-o', tmp_path / 'b.npz'
+    ) == 0  # fmt: skip
+    np.testing.assert_array_equal(table(tmp_path / 'b.npz'), expected(late, y))
+
+
+def test_known_input_is_held_between_its_samples(tmp_path):
+    stamps, y = files.signal(1000)
+    u_stamps = stamps[100::250] + 1
+    u_values = np.array([0.5, -0.25, np.nan, 1.0])
+    messages = files.floats(stamps, y) + files.floats(u_stamps, u_values, '/force')
+    bag = files.write(tmp_path / 'bag', sorted(messages, key=lambda m: m[2]))
+    parameters = {'phi': ['0', '0', 'u - z3']}
+    arguments = ['-p', "phi:=['0', '0', 'u - z3']", '--input-topic', '/force']
+    assert run(bag, *arguments, '-o', tmp_path / 'o.npz') == 0
+    u = np.concatenate([[0.0], [0.5, -0.25, -0.25, 1.0]])[np.searchsorted(u_stamps, stamps)]
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y, parameters, u))
+
+
+def test_chunks_that_overlap_are_put_in_order(tmp_path, monkeypatch):
+    stamps, y = files.signal(3000)
+    order = np.argsort(np.arange(3000) + np.random.default_rng(3).uniform(0, 700, 3000))
+    messages = files.floats(stamps, y)
+    close = storage_mcap.McapWriter.close_chunk
+
+    def write(self, *arguments):
+        original(self, *arguments)
+        if self.chunk.bio.tell() > 20_000:
+            close(self)
+
+    original = storage_mcap.McapWriter.write
+    monkeypatch.setattr(storage_mcap.McapWriter, 'write', write)
+    bag = files.write(tmp_path / 'bag', [messages[k] for k in order])
+    monkeypatch.undo()
+    assert run(bag, '-o', tmp_path / 'o.npz') == 0
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y))
+
+
+def test_bag_whose_qos_differs_from_its_storage_is_read(tmp_path):
+    """rosbags finds no message then."""
+    stamps, y = files.signal(50)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+    text = (bag / 'metadata.yaml').read_text()
+    qos = '[{history: keep_last, depth: 3, reliability: reliable, durability: volatile, '
+    zero = '{sec: 0, nsec: 0}'
+    qos += f'deadline: {zero}, lifespan: {zero}, liveliness: automatic, '
+    qos += f'liveliness_lease_duration: {zero}, avoid_ros_namespace_conventions: false}}]'
+    assert 'offered_qos_profiles: []' in text
+    (bag / 'metadata.yaml').write_text(
+        text.replace('offered_qos_profiles: []', f'offered_qos_profiles: {qos}')
+    )
+    assert run(bag, '-o', tmp_path / 'o.npz') == 0
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y))
+
+
+def test_stamps_that_go_back_are_rejected_as_live_if_asked(tmp_path, capsys):
+    stamps, y = files.signal(200)
+    shown = stamps.copy()
+    shown[100] -= 5_000_000
+    messages = [
+        ('/j', 'sensor_msgs/msg/JointState', at, joint_state(s, v))
+        for at, s, v in zip(stamps.tolist(), shown.tolist(), y.tolist(), strict=True)
+    ]
+    bag = files.write(tmp_path / 'bag', messages)
+    arguments = [bag, '--topic', '/j', '--field', 'position[2]', '-o', tmp_path / 'o.npz']
+    assert run(*arguments) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert str(shown[100]) in error
+    assert 'sample 101' in error
+    assert not (tmp_path / 'o.npz').exists()
+    assert run(*arguments, '--backwards', 'reject') == 0
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(shown, y))
+    assert '1 rejected' in capsys.readouterr().out
+
+
+def test_sqlite_bag_of_humble_is_read(tmp_path):
+    """No type definitions, no hashes, metadata of version 5."""
+    stamps, y = files.signal(500)
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    with sqlite3.connect(bag / 'bag_0.db3') as database:
+        database.executescript("""
+            CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
+                serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL);
+            CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,
+                timestamp INTEGER NOT NULL, data BLOB NOT NULL);
+            INSERT INTO topics VALUES (1, '/y', 'std_msgs/msg/Float64', 'cdr', '');
+            INSERT INTO topics VALUES (2, '/odd', 'my_rig_msgs/msg/Odd', 'cdr', '');
+            INSERT INTO messages VALUES (1, 2, 1, x'0001000000');
+        """)
+        rows = [(1, stamp, data) for _, _, stamp, data in files.floats(stamps, y)]
+        database.executemany(
+            'INSERT INTO messages(topic_id, timestamp, data) VALUES (?,?,?)', rows
+        )
+    database.close()
+    topics = ''.join(
+        f"""
+  - topic_metadata:
+      name: {name}
+      type: {kind}
+      serialization_format: cdr
+      offered_qos_profiles: ""
+    message_count: {count}"""
+        for name, kind, count in (
+            ('/y', 'std_msgs/msg/Float64', 500),
+            ('/odd', 'my_rig_msgs/msg/Odd', 1),
+        )
+    )
+    (bag / 'metadata.yaml').write_text(f"""rosbag2_bagfile_information:
+  version: 5
+  storage_identifier: sqlite3
+  duration: {{nanoseconds: {stamps[-1] - 1}}}
+  starting_time: {{nanoseconds_since_epoch: 1}}
+  message_count: 501
+  topics_with_message_count:{topics}
+  compression_format: ""
+  compression_mode: ""
+  relative_file_paths: [bag_0.db3]
+  files:
+  - path: bag_0.db3
+    starting_time: {{nanoseconds_since_epoch: 1}}
+    duration: {{nanoseconds: {stamps[-1] - 1}}}
+    message_count: 501
+""")
+    assert run(bag, '-o', tmp_path / 'o.npz', '-o', tmp_path / 'o') == 0
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y))
+    assert len(series(tmp_path / 'o', '/y').values) == 500
+
+
+def test_types_of_a_sourced_workspace_go_into_the_bag(tmp_path, monkeypatch):
+    share = tmp_path / 'prefix' / 'share' / 'rig_msgs' / 'msg'
+    share.mkdir(parents=True)
+    (share / 'Inner.msg').write_text('float32 force\n')
+    (share / 'Outer.msg').write_text('std_msgs/Header header\nrig_msgs/Inner[2] inner\n')
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'/nowhere:{tmp_path / "prefix"}')
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.add('/rig', 'rig_msgs/msg/Outer')
+        bag.write('/rig', 5, b'\0\1\0\0' + bytes(13) + b'\0\0\0' + bytes(8))
+    with BagReader(tmp_path / 'bag') as reader:
+        assert reader.field('/rig', 'inner[1].force').kind == np.float32
+
+
+# Wrong input
+
+
+@pytest.fixture(name='bag')
+def _bag(tmp_path):
+    stamps, y = files.signal(3000)
+    return files.write(tmp_path / 'bag', files.floats(stamps, y))
+
+
+def cut(bag):
+    path = next(bag.glob('*.mcap'))
+    path.write_bytes(path.read_bytes()[:-2000])
+
+
+def spoil(bag):
+    path = next(bag.glob('*.mcap'))
+    data = bytearray(path.read_bytes())
+    data[5000:5060] = b'\xff' * 60  # longer than a record
+    path.write_bytes(data)
+
+
+def lose_metadata(bag):
+    (bag / 'metadata.yaml').unlink()
+
+
+@pytest.mark.parametrize(
+    ('harm', 'arguments', 'words'),
+    [
+        (None, ['/no/such/bag'], ['/no/such/bag', 'does not exist']),
+        (None, ['BAG', '--topic', '/yy'], ["'/yy'", '(/y)', "did you mean '/y'?"]),
+        (None, ['BAG', '--field', 'date'], ["'date'", "did you mean 'data'?"]),
+        (None, ['BAG', '--field', 'data..x'], ["'data..x'", 'one of data']),
+        (None, ['BAG', '--stamp', 'header'], ['--stamp header', 'std_msgs/msg/Float64']),
+        (None, ['BAG', '-p', 'order=3'], ['NAME:=VALUE', "'order=3'"]),
+        (None, ['BAG', '-p', 'lamda:=3'], ["'lamda'", "did you mean 'lambda'?"]),
+        (None, ['BAG', '-p', 'epsilon:=-3'], ["'epsilon'", '> 0', '-3']),
+        (None, ['BAG', '-p', "phi:=['0','0','u']"], ["'/u'", '(/y)']),
+        (None, ['BAG', '--every', '0'], ['--every', '>= 1', '0']),
+        (None, ['BAG', '--params-file', '/no.yaml'], ['/no.yaml', 'No such file']),
+        (cut, ['BAG'], ['whole bag', 'record --repair']),
+        (spoil, ['BAG'], ['whole bag']),
+        (lose_metadata, ['BAG'], ['metadata.yaml', 'bag.mcap']),
+    ],
+)
+def test_wrong_input_is_said_in_one_line_and_leaves_nothing(
+    harm, arguments, words, bag, tmp_path, capsys
+):
+    if harm:
+        harm(bag)
+    before = sorted(tmp_path.iterdir())
+    code = run(*[bag if a == 'BAG' else a for a in arguments], '-o', tmp_path / 'out')
+    error = capsys.readouterr().err
+    lines = [line for line in error.splitlines() if line.startswith('replay: error: ')]
+    assert code == 2
+    assert len(lines) == 1, error
+    assert 'Traceback' not in error
+    for word in words:
+        assert word in lines[0]
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_sqlite_without_metadata_names_the_file(tmp_path, capsys):
+    stamps, y = files.signal(20)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y), 'sqlite3')
+    lose_metadata(bag)
+    assert run(bag, '-o', tmp_path / 'o.npz') == 2
+    assert 'bag.db3: name that file' in capsys.readouterr().err
+    assert run(bag / 'bag.db3', '-o', tmp_path / 'o.npz') == 0
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y))
+
+
+def test_empty_topic(tmp_path, capsys):
+    bag = files.write(tmp_path / 'bag', [('/x', 'std_msgs/msg/Float64', 5, files.float64(1.0))])
+    folder = tmp_path / 'empty'
+    with files.Writer(folder, version=9, storage_plugin=files.StoragePlugin.MCAP) as writer:
+        writer.add_connection('/y', 'std_msgs/msg/Float64', typestore=files.TYPES)
+        x = writer.add_connection('/x', 'std_msgs/msg/Float64', typestore=files.TYPES)
+        writer.write(x, 5, files.float64(1.0))
+    assert bag.exists()
+    assert run(folder, '-o', tmp_path / 'o.npz') == 2
+    assert "expected messages on topic '/y', got none" in capsys.readouterr().err
+
+
+def test_list_that_is_too_short(tmp_path, capsys):
+    bag = files.write(
+        tmp_path / 'bag', [('/y', 'sensor_msgs/msg/JointState', 5, joint_state(5, 1.0))]
+    )
+    assert run(bag, '--field', 'position[3]', '-o', tmp_path / 'o.npz') == 2
+    assert 'position[3]' in (error := capsys.readouterr().err)
+    assert '3 in one message' in error
+    assert run(bag, '-o', tmp_path / 'o.npz') == 2
+    assert 'position[i]' in capsys.readouterr().err
+
+
+def test_existing_output_stays_without_force(bag, tmp_path, capsys):
+    (tmp_path / 'out').mkdir()
+    (tmp_path / 'out' / 'precious').write_text('mine')
+    assert run(bag, '-o', tmp_path / 'out') == 2
+    assert '--force' in capsys.readouterr().err
+    assert (tmp_path / 'out' / 'precious').read_text() == 'mine'
+    assert run(bag, '--topic', '/no', '-o', tmp_path / 'out', '--force') == 2
+    assert (tmp_path / 'out' / 'precious').read_text() == 'mine'
+    assert run(bag, '-o', tmp_path / 'out', '--force') == 0
+    assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == ['metadata.yaml', 'out.mcap']
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['bag', 'out']
+
+
+def test_record_beyond_its_chunk_is_refused():
+    data = np.frombuffer(bytes([5]) + struct.pack('<Q', 100) + bytes(40), dtype=np.uint8)
+    with pytest.raises(ValueError, match='beyond the end'):
+        scan(data, [1])
+
+
+def test_ctrl_c_leaves_nothing(tmp_path):
+    stamps, y = files.signal(200_000)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y), 'sqlite3')
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'fhaosmo_ros', 'replay', bag, '-o', tmp_path / 'out',
+         '--storage', 'sqlite3'],
+        stderr=subprocess.PIPE, text=True, cwd=ROOT,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)}, start_new_session=True,
+    )  # fmt: skip
+    part = tmp_path / '.out.part' / 'out' / 'out.db3'
+    deadline = time.monotonic() + 60
+    while not part.exists():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.killpg(process.pid, signals.SIGINT)
+    os.killpg(process.pid, signals.SIGINT)
+    _, error = process.communicate(timeout=30)
+    assert process.returncode == 130, error
+    assert 'Traceback' not in error
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['bag']
+    shutil.rmtree(bag)
