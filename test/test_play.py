@@ -42,7 +42,7 @@ def test_estimator_restarts_where_the_loop_begins_again(tmp_path):
     def read():
         for line in estimator.stdout:
             lines.append(line)
-            if 'time jumped' in line:
+            if 'restarted from the new one' in line:
                 jumped.set()
 
     reader = threading.Thread(target=read)

@@ -204,7 +204,7 @@ def test_kill_loses_at_most_the_last_second(storage, live, tmp_path):
 
 
 def test_all_topics(live, tmp_path):
-    result = run('record', '-o', tmp_path / 'bag', '--all', '--duration', '3')
+    result = run('record', '-o', tmp_path / 'bag', '--all', '--duration', '10')
     assert result.returncode == 0, result.stderr
     with BagReader(tmp_path / 'bag') as reader:
         topics = {c.topic for c in reader.connections}
