@@ -10,4 +10,5 @@ COMMANDS = {
     'estimator': ('fhaosmo_ros.nodes.estimator', 'node: estimate states and unknown input of y'),
     'plant': ('fhaosmo_ros.nodes.plant', 'node: simulate a plant and publish y and the truth'),
     'demo': ('fhaosmo_ros.tools.demo', 'run plant and estimator, record, report, draw a figure'),
+    'paper': ('fhaosmo_ros.tools.paper', "reproduce the paper's figures and judge its findings"),
 }
