@@ -5,11 +5,12 @@ ARGS ?=
 # $(call with,EXTRA): set $python to the environment's Python, making the environment first.
 with = python=$$(PYTHON='$(PYTHON)' sh scripts/environment.sh $(1))
 
-.PHONY: help demo test lint bench clean
+.PHONY: help demo paper test lint bench clean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    run plant and estimator for 20 s, draw what was estimated'
+	@echo 'make paper   reproduce the paper, rewrite docs/paper.md and its figures'
 	@echo 'make test    check style and types, run the tests'
 	@echo 'make lint    check style and types only'
 	@echo 'make bench   measure speed'
@@ -21,6 +22,9 @@ help:
 # exec: the command is then make's own child, so Ctrl-C and exit codes pass through no shell.
 demo:
 	@$(call with) && exec "$$python" -m fhaosmo_ros demo $(ARGS)
+
+paper:
+	@$(call with) && exec "$$python" -m fhaosmo_ros paper $(ARGS)
 
 lint:
 	@$(call with,test) && set -x && \

@@ -49,3 +49,23 @@ def chatter(estimate: Series, truth: Series) -> float:
     """
     reference = total_variation(truth)
     return total_variation(estimate) / reference if reference > 0.0 else float('inf')
+
+
+def high_passed(x: Series, window: int) -> float:
+    """
+    Return the RMS of what a centred moving average leaves: chatter without the signal below it.
+
+    Parameters
+    ----------
+    x : (K,) array
+    window : int
+        Samples that are averaged, rounded up to an odd number, at most K.
+
+    """
+    window |= 1
+    if len(x) < window:
+        return float('nan')
+    total = np.cumsum(np.concatenate([[0.0], x]))
+    mean = (total[window:] - total[:-window]) / window
+    half = window // 2
+    return rms(x[half : len(x) - half] - mean)

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reproduce every simulation of the paper, judge its findings, and look where it stops."""
+
+import argparse
+import json
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.ode import SOLVERS
+from fhaosmo_ros.tools import paper_beyond as beyond
+from fhaosmo_ros.tools import paper_cases as cases
+from fhaosmo_ros.tools import paper_document as document
+from fhaosmo_ros.tools import paper_figures as figures
+from fhaosmo_ros.tools import paper_findings as findings
+from fhaosmo_ros.tools import paper_tables as tables
+from tqdm import tqdm
+
+DOCS = Path(__file__).resolve().parents[2] / 'docs'
+FOLDER, RESULTS = 'paper', 'results.json'
+QUICK_WIDTHS = 3
+QUICK_LONG = 300.0
+ZOOM = 0.1
+"""Seconds that figure sim1 enlarges."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """
+    Run the command.
+
+    Returns
+    -------
+    int
+        0, 2 for a bad argument or output, 130 if it was interrupted.
+
+    """
+    arguments = _parser().parse_args(argv)
+    try:
+        _paper(arguments.output or _default_output(arguments.quick), arguments.quick)
+    except (ConfigurationError, OSError) as error:
+        print(f'paper: error: {error}', file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print('paper: interrupted', file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='paper', description=__doc__)
+    parser.add_argument(
+        '--quick', action='store_true',
+        help='a coarse search and a short long run, for a first look and for tests',
+    )  # fmt: skip
+    parser.add_argument(
+        '--output', type=Path, metavar='FOLDER',
+        help='folder for paper.md and paper/ (default: docs of this checkout; '
+        'paper_output with --quick or without a checkout)',
+    )  # fmt: skip
+    return parser
+
+
+def _default_output(quick: bool) -> Path:
+    return DOCS if not quick and (DOCS / 'paper.md').is_file() else Path('paper_output')
+
+
+def measure(solvers: tuple[str, ...], tick: Any) -> dict[str, findings.Scores]:
+    """Return the scores of the paper's four observers by solver."""
+    scores: dict[str, findings.Scores] = {}
+    for solver in solvers:
+        scores[solver] = {}
+        for name in cases.OBSERVERS:
+            for omega in cases.FREQUENCIES:
+                scores[solver][name, omega] = findings.measure(name, omega, solver)
+            tick()
+    return scores
+
+
+def choose_solver(scores: dict[str, findings.Scores]) -> str:
+    """
+    Return the solver that reproduces the paper best.
+
+    Its figures show sign at 1e-5 s chattering around the truth: the one whose estimate of d is
+    closest to it, over both frequencies.
+    """
+    return min(
+        scores,
+        key=lambda solver: sum(
+            scores[solver][findings.FINE, omega]['rms_d'] for omega in cases.FREQUENCIES
+        ),
+    )
+
+
+def findings_texts(scores: dict[str, findings.Scores], solver: str) -> dict[str, str]:
+    """Return the parts of the document that follow from the scores of the four observers."""
+    return {
+        'solvers': tables.solver_table(scores, findings.FINE, solver),
+        'findings': tables.findings_table(scores, solver),
+        'observers': tables.observers_table(scores),
+        'bar': tables.bar_table(scores),
+    }
+
+
+def dump(scores: dict[str, findings.Scores]) -> list[dict[str, Any]]:
+    """Return scores as plain rows, for a file."""
+    return [
+        {'solver': solver, 'observer': name, 'omega': omega} | score
+        for solver, by_case in scores.items()
+        for (name, omega), score in by_case.items()
+    ]
+
+
+def undump(rows: list[dict[str, Any]]) -> dict[str, findings.Scores]:
+    """Undo `dump`."""
+    scores: dict[str, findings.Scores] = {}
+    for row in rows:
+        score = dict(row)
+        case = scores.setdefault(score.pop('solver'), {})
+        case[score.pop('observer'), score.pop('omega')] = score
+    return scores
+
+
+def _paper(output: Path, quick: bool) -> None:
+    begin = time.monotonic()
+    folder = output / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    every = QUICK_WIDTHS if quick else 1
+    hours = QUICK_LONG if quick else beyond.HOURS
+    rows_of_map = len(findings.WIDTHS[::every])
+    # The bar counts the parts by about what they cost.
+    total = len(SOLVERS) * len(cases.OBSERVERS) + rows_of_map + 3 + len(beyond.NOISES) + 4 + 4
+    with tqdm(total=total, unit='part', desc='paper') as bar:
+        scores = measure(SOLVERS, bar.update)
+        solver = choose_solver(scores)
+        signs = {w: scores[solver][findings.FINE, w] for w in cases.FREQUENCIES}
+        widths = findings.width_map(signs, solver, every, bar.update)
+        sampled = beyond.schemes(bar.update)
+        noisy = beyond.noises(bar.update)
+        long_runs = []
+        for scheme in ('explicit', 'implicit'):
+            for omega in cases.FREQUENCIES:
+                long_runs.append(beyond.long_run(scheme, omega, hours))
+                bar.update()
+        preset = cases.preset().observer
+        texts = findings_texts(scores, solver) | {
+            'widths': tables.map_text(widths, preset['fuzzy_widths'], every),
+            'schemes': tables.beyond_table(sampled),
+            'noise': tables.beyond_table(noisy),
+            'long': tables.long_table(long_runs),
+        }
+        _draw(folder, solver, preset, bar)
+        figures.save(figures.half_widths(widths, preset['fuzzy_widths']), folder, 'widths')
+        figures.save(figures.long_runs(long_runs), folder, 'long')
+        figures.save(figures.noise(noisy), folder, 'noise')
+        bar.update()
+    document.write(output / 'paper.md', texts)
+    text = json.dumps({'solver': solver, 'scores': dump(scores)}, indent=1)
+    (folder / RESULTS).write_text(text + '\n', encoding='utf-8')
+    print(f'\n{texts["findings"]}\n\n{texts["widths"]}\n')
+    print(f'document: {output / "paper.md"}, figures: {folder} ({time.monotonic() - begin:.0f} s)')
+
+
+def _draw(folder: Path, solver: str, preset: dict[str, Any], bar: Any) -> None:
+    """Draw the paper's own four figures."""
+    first = cases.first_observer(1e-5, solver, cases.DURATION, every=5)
+    figures.save(figures.sim1(first, ZOOM), folder, 'sim1')
+    bar.update()
+    figures.save(
+        figures.fuzzy_systems(
+            preset['fuzzy_widths'], preset['fuzzy_shape'], preset['fuzzy_normalise']
+        ),
+        folder,
+        'fuzzysystems',
+    )
+    bar.update()
+    runs = {
+        name: [cases.joint(variant, w, step, solver) for w in cases.FREQUENCIES]
+        for name, (variant, step) in cases.OBSERVERS.items()
+    }
+    adaptive = runs.pop(findings.ADAPTIVE)
+    figures.save(figures.simz(list(runs.items()), cases.FREQUENCIES), folder, 'simz')
+    figures.save(figures.simu(adaptive, cases.FREQUENCIES), folder, 'simu')
+    bar.update()
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's simulations and ours beside them: what is run, and how it is judged."""
+
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core import Observer, Plant
+from fhaosmo_ros.core.joint import JointRun, simulate
+from fhaosmo_ros.core.metrics import chatter, high_passed, rms, settling_time
+from fhaosmo_ros.core.parameter_file import load
+from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, PLANT_PARAMETERS
+from fhaosmo_ros.tools.share import shipped
+import numpy as np
+
+FREQUENCIES = (1.0, 5.0)
+"""Low (the paper's own) and high; the paper does not print its high one. rad/s."""
+DURATION = 20.0
+CONVERGED = 10.0
+"""Errors and chatter are measured from here on, in seconds."""
+GRID = 1e-3
+"""Everything is recorded this many seconds apart (or at its own step, if that is longer)."""
+HIGH_PASS = 0.05
+"""Window of the moving average that the high-passed part is the rest of, in seconds."""
+SETTLED = 0.02
+"""Half-width of the settling band of d: a tenth of the range of d."""
+OBSERVERS = {
+    'sign, 1e-5 s': ('sign', 1e-5),
+    'sign, 1e-3 s': ('sign', 1e-3),
+    'fuzzy, 1e-3 s': ('fuzzy', 1e-3),
+    'fuzzy adaptive, 1e-3 s': ('fuzzy_adaptive', 1e-3),
+}
+"""The four observers of the paper's section 3 and 4, by name: variant and step."""
+
+Score = dict[str, float]
+"""What a run is judged by: see `score`."""
+
+
+class Preset(NamedTuple):
+    """Parameters of config/paper.yaml; the observer's with the defaults of the rest."""
+
+    observer: dict[str, Any]
+    plant: dict[str, Any]
+
+
+def preset() -> Preset:
+    """Read the paper's numbers from the shipped configuration."""
+    path = shipped('config/paper.yaml')
+    observer, plant = load(path, 'estimator'), load(path, 'plant')
+    return Preset(
+        OBSERVER_PARAMETERS.defaults()
+        | {k: v for k, v in observer.items() if k in OBSERVER_PARAMETERS},
+        {k: v for k, v in plant.items() if k in PLANT_PARAMETERS},
+    )
+
+
+def joint(
+    variant: str,
+    omega: float,
+    step: float,
+    solver: str,
+    duration: float = DURATION,
+    **changes: Any,
+) -> JointRun:
+    """Simulate as the paper does: plant and observer together."""
+    numbers = preset()
+    return simulate(
+        numbers.observer | {'variant': variant} | changes,
+        numbers.plant | {'disturbance_omega': omega},
+        solver, step, DURATION, max(1, round(GRID / step)),
+    )  # fmt: skip
+
+
+def sampled(
+    variant: str, omega: float, step: float, scheme: str, noise: float = 0.0,
+    duration: float = DURATION, **changes: Any,
+) -> JointRun:  # fmt: skip
+    """Simulate as a node runs: samples of a plant, one observer step a sample."""
+    numbers = preset()
+    plant = Plant(
+        numbers.plant
+        | {'disturbance_omega': omega, 'noise_std': noise, 'integration_step': min(step, 1e-3)}
+    )
+    t = np.arange(round(duration / step) + 1) * step
+    truth = plant.simulate(t)
+    observer = Observer(numbers.observer | {'variant': variant, 'scheme': scheme} | changes)
+    run = observer.run(t, truth.y)
+    return JointRun(t, truth.z, truth.unknown_input, run.z_hat, run.z_tilde, run.gamma)
+
+
+def first_observer(step: float, solver: str, duration: float, every: int) -> JointRun:
+    """Simulate figure sim1: sign, n = 3, no model of Phi_3, theta estimates eta = -z3 + d."""
+    numbers = preset()
+    three = {k: numbers.observer[k][:3] for k in ('lambda', 'alpha')}
+    observer = numbers.observer | three | {
+        'variant': 'sign', 'unknown_input': False, 'phi': ['0', '0', '0'],
+        'initial_estimate': [0.05, 0.0, 0.05], 'initial_internal': [0.05, 0.0, 0.05],
+    }  # fmt: skip
+    return simulate(observer, numbers.plant, solver, step, duration, every)
+
+
+def score(run: JointRun, start: float = CONVERGED) -> Score:
+    """
+    Judge the filtered estimates (the paper's 'estimated state') from `start` on.
+
+    Returns
+    -------
+    dict
+        rms_z1 .. rms_zn, rms_d: RMS errors. bias_d: mean error of d. settling: time from which
+        the error of d stays within `SETTLED` (s). variation: total variation of the estimate of
+        d over that of d. high_pass: RMS of its high-passed part. gamma: at the end.
+
+    """
+    late = run.t >= start
+    n = run.z.shape[1]
+    d, estimate = run.unknown_input, run.z_hat[:, n]
+    errors = run.z_hat[late, :n] - run.z[late]
+    result = {f'rms_z{i + 1}': rms(errors[:, i]) for i in range(n)}
+    return result | {
+        'rms_d': rms((estimate - d)[late]),
+        'bias_d': float(np.mean((estimate - d)[late])),
+        'settling': settling_time(run.t, estimate - d, SETTLED),
+        'variation': chatter(estimate[late], d[late]),
+        'high_pass': high_passed(estimate[late], max(1, round(HIGH_PASS / run.t[1]))),
+        'gamma': float(run.gamma[-1]),
+    }
