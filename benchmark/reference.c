@@ -8,7 +8,7 @@
  */
 #include <math.h>
 
-enum { N = 4, SIZE = 4 * N + 3, KNOTS = 257 };
+enum { N = 4, SIZE = 4 * N + 3, KNOTS = 193 };
 
 struct law {
     double lambda[N], alpha[N], inverse_width[N];

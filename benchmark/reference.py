@@ -81,9 +81,9 @@ def in_c(library: ctypes.CDLL, y: NDArray[np.float64]) -> Callable[[], tuple[Sta
 
     """
     law = ObserverConfiguration(CASE).law
-    if law.curves.shape != (4, KNOTS) or KNOTS != 257:
+    if law.curves.shape != (4, KNOTS) or KNOTS != 193:
         raise CannotMeasureError(
-            f'reference.c expects 4 levels and 257 knots, the core has {law.curves.shape}'
+            f'reference.c expects 4 levels and 193 knots, the core has {law.curves.shape}'
         )
     packed = np.concatenate([law.gains.ravel(), law.curves[:2].ravel(), law.scalars])
     start = first_state(CASE, y[0])

@@ -58,17 +58,14 @@ def test_curve_agrees_with_a_control_system_of_scikit_fuzzy(terms, shape):
     level = 0 if terms == 5 else 1
     curves = law((1.0,), fuzzy_shape=shape, fuzzy_normalise=False)
     simulation = oracle(terms, shape)
-    # Knots are h = 1/256 apart. A smooth curve leaves the straight line between two of them by
+    # Knots are h = 1/192 apart, and every corner of a triangle's curve is one. A smooth curve leaves the straight line between two of them by
     # h^2 / 8 times its curvature, some 10, hence 2e-5; triangles are steeper beside their peaks.
-    # At its peaks (thirds, with 7 terms) a triangle's curve has kinks, its slope jumps by about
-    # 2, and thirds are no knots: h / 4 times the jump. Halves are (5 terms), and bells are smooth.
-    tolerance = 2e-3 if (terms, shape) == (7, 'triangle') else 1e-4
     for x in INPUTS:
         for sign in (1.0, -1.0):
             simulation.input['eps'] = sign * x
             simulation.compute()
             np.testing.assert_allclose(
-                psi(curves, level, sign * x), simulation.output['psi'], atol=tolerance
+                psi(curves, level, sign * x), simulation.output['psi'], atol=1e-4
             )
 
 

@@ -60,15 +60,10 @@ class ObserverConfiguration:
 
     def _complete(self) -> None:
         p = self.parameters
-        if p['gamma_min'] > p['gamma_max']:
-            raise ConfigurationError(
-                f"parameter 'gamma_min': expected at most gamma_max = {p['gamma_max']}, "
-                f'got {p["gamma_min"]}'
-            )
         if not p['gamma_min'] <= p['gamma_initial'] <= p['gamma_max']:
             raise ConfigurationError(
-                f"parameter 'gamma_initial': expected gamma_min <= gamma_initial <= gamma_max "
-                f'({p["gamma_min"]} to {p["gamma_max"]}), got {p["gamma_initial"]}'
+                "parameters 'gamma_min', 'gamma_initial', 'gamma_max': expected each at most the "
+                f'next one, got {p["gamma_min"]}, {p["gamma_initial"]}, {p["gamma_max"]}'
             )
         self.levels = self.model.order + int(p['unknown_input'])
         self.initial_estimate = self._per_level('initial_estimate')

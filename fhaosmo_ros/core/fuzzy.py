@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 import skfuzzy
 
 TERMS = {5: ('NB', 'NS', 'ZR', 'PS', 'PB'), 7: ('NBB', 'NB', 'NS', 'ZR', 'PS', 'PB', 'PBB')}
-KNOTS = 257
-"""Samples of a curve on [0, 1]; the kernel interpolates between them."""
+KNOTS = 193
+"""Samples of a curve on [0, 1]: halves, thirds and quarters, where it has corners, are knots."""
 UNIVERSE = np.linspace(-1.0, 1.0, 2049)
 """Output universe; its grid holds every peak of 5 terms, and 0 and +-1 of 7."""
 

@@ -145,7 +145,7 @@ class EstimatorNode(Node):
             now = self.get_clock().now().nanoseconds
             if self._silent_since is None:  # the clock is not read while samples come
                 self._silent_since = now
-            elif now - self._silent_since > self._max_gap * 1e9:
+            elif not 0 <= now - self._silent_since <= self._max_gap * 1e9:  # or it jumped back
                 self._stale = True
                 self.get_logger().warning(
                     f'no usable sample on {self._y.topic_name} for {self._max_gap:g} s: not '
