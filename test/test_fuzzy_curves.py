@@ -58,8 +58,9 @@ def test_curve_agrees_with_a_control_system_of_scikit_fuzzy(terms, shape):
     level = 0 if terms == 5 else 1
     curves = law((1.0,), fuzzy_shape=shape, fuzzy_normalise=False)
     simulation = oracle(terms, shape)
-    # Knots are h = 1/192 apart, and every corner of a triangle's curve is one. A smooth curve leaves the straight line between two of them by
-    # h^2 / 8 times its curvature, some 10, hence 2e-5; triangles are steeper beside their peaks.
+    # Knots are h = 1/192 apart, and every corner of a triangle's curve is one. A smooth curve
+    # leaves the straight line between two of them by h^2 / 8 times its curvature, some 10, hence
+    # 4e-5; triangles are steeper beside their peaks.
     for x in INPUTS:
         for sign in (1.0, -1.0):
             simulation.input['eps'] = sign * x

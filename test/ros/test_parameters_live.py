@@ -140,7 +140,7 @@ def test_every_live_parameter_of_the_estimator_changes_without_a_jump(rig, name)
     was = p.get(name)
     assert was != OTHER[name]
     before = rig.feed(0.2)
-    restarts = rig.count('restarts')
+    restarts = max(rig.count('restarts'), 0)  # -1 before the first report
     for value in (OTHER[name], was):
         (result,) = p.set(**{name: value})
         assert result.successful, result.reason
@@ -158,7 +158,7 @@ def test_every_live_parameter_of_the_estimator_changes_without_a_jump(rig, name)
         assert abs(after.unknown_input - before.unknown_input) <= bound
         assert all(map(math.isfinite, [*after.z, after.unknown_input, after.gamma]))
         before = after
-    assert rig.count('restarts') == restarts
+    assert max(rig.count('restarts'), 0) == restarts
 
 
 def test_a_change_acts_on_the_next_sample_as_in_a_replay(rig):
