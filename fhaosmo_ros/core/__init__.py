@@ -4,6 +4,7 @@
 from fhaosmo_ros.core.compile_cache import compile_cache
 
 with compile_cache():
+    from fhaosmo_ros.core import joint
     from fhaosmo_ros.core.errors import ConfigurationError
     from fhaosmo_ros.core.model import TriangularModel
     from fhaosmo_ros.core.observer import Estimate, Observer, ObserverState, Trajectory
@@ -19,4 +20,5 @@ __all__ = [
     'Status',
     'Trajectory',
     'TriangularModel',
+    'joint',
 ]
