@@ -84,7 +84,8 @@ def live():
 def test_bag_is_complete_after_ctrl_c(storage, live, tmp_path):
     bag = tmp_path / 'bag'
     process = start('record', '-o', bag, '--storage', storage)
-    wait(lambda: size(bag) > 400_000, process, 'messages')
+    # Some ten seconds: the estimator may be discovered later than the plant.
+    wait(lambda: size(bag) > 2_000_000, process, 'messages')
     process.send_signal(signal.SIGINT if storage == 'mcap' else signal.SIGTERM)
     out, error = process.communicate(timeout=30)
     assert process.returncode == 0, error
@@ -121,6 +122,7 @@ def test_replay_gives_the_live_estimates_sample_for_sample(tmp_path):
         with Source(int(APART)) as source:
             # NaN starts no observer: it only shows that everybody listens, from either side.
             wait(lambda: source.send(float('nan')) and source.rejected, estimator, 'estimator')
+            wait(lambda: source.send(float('nan')) and source.listeners >= 2, recorder, 'both')
             before = size(bag)
             wait(lambda: source.send(float('nan')) and size(bag) > before, recorder, 'recorder')
             for k in range(3000):
@@ -153,6 +155,10 @@ class Source:
         for pair in message.status[0].values:
             if pair.key == 'rejected measurements':
                 self.rejected = int(pair.value)
+
+    @property
+    def listeners(self):
+        return self._publisher.get_subscription_count()
 
     def send(self, value):
         self._publisher.publish(Float64(data=float(value)))
