@@ -22,7 +22,7 @@ class Heartbeat:
             values = {item.key: item.value for item in status.values}
             if 'samples accepted' in values:
                 report = (stamp, int(values['samples accepted']))
-                self._reports.setdefault(status.name, []).append(report)
+                self._reports.setdefault(status.name.split(':')[0], []).append(report)
 
     def samples(self, name: str) -> int:
         """Return how many samples a node had taken at its last report."""
