@@ -166,7 +166,8 @@ def test_cycles_leave_nothing_behind(client, unconfigured):
     for transition in ('configure', 'activate'):
         assert node.change(transition)
     client.wait(lambda: topics(client) == len(ESTIMATES), 'one publisher for each topic')
-    assert client.node.count_subscribers('/managed/y') == 1
+    listeners = client.node.get_subscriptions_info_by_topic('/managed/y')
+    assert [x.node_name for x in listeners if x.node_name != 'test_client'] == ['estimator']
     assert client.node.count_services('/managed/estimator/reset') == 1
 
 
