@@ -42,7 +42,11 @@ class EstimatorNode(ManagedNode):
         )
         on_change(self, ESTIMATOR_PARAMETERS, self._check, self._adopt)
         if values['autostart']:
-            self.start()
+            try:
+                self.start()
+            except Exception:
+                self.destroy_node()
+                raise
         else:
             self.get_logger().info('waiting to be configured, for instance by ros2 lifecycle set')
 

@@ -104,11 +104,12 @@ class Health:
         }
         for text in publishers.unheard.values():
             report.find(WARN if names else ERROR, text)
+        silence = ERROR if publishers.unheard and not names else STALE
         if stale:
             since = f'for {age:.3g} s' if age == age else 'yet'
-            report.find(STALE, f'no usable sample {since}')
-        if not publishers.heard:
-            report.find(STALE, f'no publisher of {topic}')
+            report.find(silence, f'no usable sample {since}')
+        if not names:
+            report.find(silence, f'no publisher of {topic} that can be heard')
         elif len(publishers.heard) > 1:
             report.find(WARN, f'{len(publishers.heard)} publishers, their samples mix')
         bad = {k: n for k, n in news.items() if n and _is_bad(k)}

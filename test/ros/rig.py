@@ -163,14 +163,15 @@ class Client:
         subscribe_with_info(self.node, message_type, topic, receive, QOS)
         return messages
 
-    def publisher(self, topic: str, message_type: type = Float64):
+    def publisher(self, topic: str, message_type: type = Float64, qos: QoSProfile = QOS):
         """Return a function that publishes a value once somebody else listens."""
-        publisher = self.node.create_publisher(message_type, topic, QOS)
+        publisher = self.node.create_publisher(message_type, topic, qos)
 
         def publish(value: object) -> None:
             publisher.publish(message_type(data=value) if message_type is Float64 else value)
 
         publish.matched = publisher.get_subscription_count
+        publish.destroy = lambda: self.node.destroy_publisher(publisher)
         return publish
 
     def wait(self, condition, what: str, timeout: float = DEADLINE) -> None:
