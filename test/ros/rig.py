@@ -373,9 +373,13 @@ class EstimatorRig:
                 if status.name.startswith(f'{self._name}: '):
                     yield status
 
-    def wait_status(self, task: str, level: bytes, *words: str):
-        """Wait for a new status of a task with this level and these words in its message."""
-        start = len(self.diagnostics)
+    def wait_status(self, task: str, level: bytes, *words: str, start: int | None = None):
+        """
+        Wait for a status of a task with this level and these words in its message.
+
+        Of those that come from now on, or from the `start`-th message on.
+        """
+        start = len(self.diagnostics) if start is None else start
         found = []
 
         def look() -> bool:
