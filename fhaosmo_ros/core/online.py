@@ -1,5 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The update path of time-stamped samples, shared by the node and by replays of bags."""
+"""
+The update path of time-stamped samples, shared by the node and by replays of bags.
+
+Being built on this branch (this note goes when it is done); what others can count on:
+
+- The whole policy of time and data is one compiled function per sample, `policy.take` (core/
+  policy.py), over plain arrays: node, replay (`run`) and channels.py call the same one. It takes
+  ``(*law, *work, levels, memory, eps, settings, reals, stamp, y, u, row)`` (details in policy.py).
+- `Counters` becomes the NamedTuple of core/counters.py, a snapshot: read its fields, do not write.
+- The status word that `advance` returns gains flags (status.py): REJECTED_SPIKE, REJECTED_STUCK,
+  GAP (bridged in sub-steps), RESTARTED (new start after a gap or a jump of the clock), DIVERGED
+  (seeded again from y). A caller that wants to log looks at the word, not at the counters.
+  After a gap longer than `max_gap` the first sample is held (rejected, counted in far_stamps) and
+  the second one restarts: so one wrong stamp does no harm.
+- New live parameters: max_step, spike_gate, spike_gate_samples, stuck_time, divergence_time,
+  divergence_limit (parameters.py, group SAMPLING).
+- `OnlineEstimator.freeze(held: bool)`, `.frozen`: hold gamma without touching parameters.
+- `OnlineEstimator.seed(z, unknown_input)`: put the estimate there at once; time goes on.
+- `OnlineEstimator.period`, `.jitter` (s): running mean of dt and of its deviation, for diagnostics.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
