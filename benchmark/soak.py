@@ -66,22 +66,20 @@ def run(seed: int, seconds: float):
     from soak_watch import SoakWatch
 
     with Children() as children, SoakWatch() as watch, SoakClient() as client:
-        own = {'plant': ('-p', f'sample_rate:={RATE}', '-r', 'y:=clean_y'), 'estimator': ()}
-        nodes = {
-            name: children.start(name, '-m', 'fhaosmo_ros', name, *PARAMETERS, *words)
-            for name, words in own.items()
-        }
-        nodes['plant'].wait_for('simulating')
-        nodes['estimator'].wait_for('estimating')
-        faults = children.start(
-            'faults', 'benchmark/soak_faults.py', '--seed', str(seed), '--seconds', str(seconds)
-        )
-        faults.wait_for('injecting')
+        estimator = children.start('estimator', '-m', 'fhaosmo_ros', 'estimator', *PARAMETERS)
+        plant = children.start(
+            'plant', 'benchmark/soak_faults.py', '--seed', str(seed), '--seconds', str(seconds),
+            *PARAMETERS, '-p', f'sample_rate:={RATE}', '-r', 'y:=clean_y',
+        )  # fmt: skip
+        estimator.wait_for('estimating')
+        plant.wait_for('injecting')
         client.learn()
-        memory, windows = _follow(seed, seconds, nodes, faults, watch, client)
-        faults.interrupt()
-        faults.wait_for('}')
-        counts = Counter(json.loads(faults.output().splitlines()[-1]))
+        memory, windows = _follow(
+            seed, seconds, {'estimator': estimator, 'plant': plant}, watch, client
+        )
+        plant.interrupt()
+        plant.wait_for('}')
+        counts = Counter(json.loads(plant.output().splitlines()[-1]))
         ended, deadline = time_ns(), monotonic() + MATCHED
         while int(watch.report.get('received', 0)) < ended + 500_000_000:
             if monotonic() > deadline:
@@ -94,16 +92,18 @@ def run(seed: int, seconds: float):
         )  # fmt: skip
 
 
-def _follow(seed, seconds, nodes: dict[str, Child], faults: Child, watch, client):
+def _follow(seed, seconds, nodes: dict[str, Child], watch, client):
     """Make the scheduled calls; return memory by process and the judged windows."""
     calls = [event for event in schedule(seed, seconds) if event.kind in CALLS][::-1]
     memory: dict[str, list[tuple[float, float]]] = defaultdict(list)
     windows, restored, judging, second = [], 0, False, 0
     start = monotonic()
-    with tqdm(total=round(seconds), desc='soak', unit='s', mininterval=1.0) as progress:
+    with tqdm(
+        total=round(seconds), desc='soak', unit='s', mininterval=1.0, disable=None
+    ) as progress:
         while (now := monotonic() - start) < seconds:
             sleep(0.02)
-            for child in (*nodes.values(), faults):
+            for child in nodes.values():
                 child.check()
             cycle, phase = divmod(now, CYCLE)
             if calls and calls[-1].time <= now:

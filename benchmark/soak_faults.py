@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Passes ``clean_y`` on as ``y`` with the faults of a schedule, and counts what it does."""
+"""
+The plant, with the faults of a schedule between it and its topic ``y``; counts what it does.
+
+Not a node between plant and estimator: that would stamp y anew, and on a busy machine the jitter
+of one more hop makes an error in d that hides the drift which a soak is to find.
+"""
 
 import argparse
 from collections import Counter
 from collections.abc import Iterator
 import json
 import signal
+import sys
 import threading
 from time import monotonic
-from typing import Any
 
+from fhaosmo_ros.nodes.plant import PlantNode
 from fhaosmo_ros.nodes.spin import Spinner
-from fhaosmo_ros.nodes.subscription import subscribe_with_info
 import rclpy
-from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from soak_schedule import schedule, STREAM
 from std_msgs.msg import Float64
@@ -25,9 +28,9 @@ SETTLE = 0.5
 """Seconds from the match of a new publisher, as seen from here, to its first sample."""
 
 
-class FaultInjector(Node):
+class FaultyPlant(PlantNode):
     """
-    The pass-through node.
+    A plant whose y goes through faults.
 
     Parameters
     ----------
@@ -38,26 +41,19 @@ class FaultInjector(Node):
     """
 
     def __init__(self, seed: int, seconds: float) -> None:
-        super().__init__('faults')
         self.counts: Counter[str] = Counter()
         self._events = [e for e in schedule(seed, seconds) if e.kind in STREAM][::-1]
         self._active: dict[str, int] = {}
         self._held: list[float] = []
         self._last = 0.0
         self._origin: float | None = None
-        self._sequence = 0
-        self._publisher = self.create_publisher(Float64, 'y', 10)
         self._matched: float | None = None
         self._message = Float64()
-        self._clean = subscribe_with_info(
-            self, Float64, 'clean_y', self._on_sample, QoSProfile(depth=1000)
-        )
+        super().__init__()
+        self._faulty_y = self.create_publisher(Float64, 'y', 10)
+        self._publish_y = self._pass_on
 
-    def _on_sample(self, message: Float64, info: dict[str, Any]) -> None:
-        sequence = info['publication_sequence_number']
-        if self._sequence and sequence > self._sequence + 1:
-            self.counts['lost before the faults'] += sequence - self._sequence - 1
-        self._sequence = sequence
+    def _pass_on(self, message: Float64) -> None:
         if not self._is_matched():
             self.counts['held back for discovery'] += 1
             return
@@ -71,20 +67,20 @@ class FaultInjector(Node):
             self.counts[f'event: {event.kind}'] += 1
         for y in self._faulty(message.data):
             self._message.data = y
-            self._publisher.publish(self._message)
+            self._faulty_y.publish(self._message)
             self.counts['published'] += 1
 
     def _is_matched(self) -> bool:
         """Return True once a new publisher has had its subscriber for a while."""
-        if self._matched is None and self._publisher.get_subscription_count():
+        if self._matched is None and self._faulty_y.get_subscription_count():
             self._matched = monotonic()
         return self._matched is not None and monotonic() - self._matched > SETTLE
 
     def _faulty(self, y: float) -> Iterator[float]:
         """Return what is published in place of `y`."""
         if self._take('publisher restart'):
-            self.destroy_publisher(self._publisher)
-            self._publisher = self.create_publisher(Float64, 'y', 10)
+            self.destroy_publisher(self._faulty_y)
+            self._faulty_y = self.create_publisher(Float64, 'y', 10)
             self._matched = None
             self.counts['held back for discovery'] += 1
             return
@@ -119,22 +115,22 @@ class FaultInjector(Node):
 
 
 def main() -> None:
-    """Run until SIGINT, then print the counts as one line of JSON."""
-    parser = argparse.ArgumentParser(description='Injects faults into y.')
+    """Run until SIGINT, then print the counts as one line of JSON; end with the second SIGINT."""
+    parser = argparse.ArgumentParser(description='A plant that injects faults into y.')
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--seconds', type=float, default=120.0)
-    arguments = parser.parse_args()
+    arguments, rest = parser.parse_known_args()
     ended = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: ended.set())
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = FaultInjector(arguments.seed, arguments.seconds)
+    rclpy.init(args=[sys.argv[0], *rest], signal_handler_options=SignalHandlerOptions.NO)
+    node = FaultyPlant(arguments.seed, arguments.seconds)
     with Spinner(node, on_end=ended.set) as spinner:
         ended.wait()
     if spinner.error:
         raise spinner.error
     ended.clear()
     print(json.dumps(node.counts), flush=True)
-    ended.wait()  # a second signal: the last samples are taken before their writer leaves
+    ended.wait()  # the last samples are taken before their writer leaves
     node.destroy_node()
     rclpy.try_shutdown()
 

@@ -16,7 +16,7 @@ MEMORY = 2.0
 ERROR_RATIO = 2.0
 """What the error of the last third may be of the first third's."""
 ERROR = 0.05
-"""Largest RMS error of d in any judged window: half of d's amplitude."""
+"""Largest median error of d in any judged window: half of d's amplitude."""
 GAMMA = 0.02
 """What gamma may move between the first and the last third."""
 
@@ -30,7 +30,7 @@ class Course(NamedTuple):
     memory : dict of str to (K, 2) array
         Seconds and MB (resident) of each process.
     windows : (W, 3) array
-        Of each judged window: seconds, RMS error of d, median of gamma.
+        Of each judged window: seconds, median error of d, median of gamma.
     outputs, not_finite : int
         Values published, and those that were NaN or infinite.
     published, taken, lost : int
@@ -72,7 +72,7 @@ def verdict(course: Course) -> list[Row]:
     rows.append(Row('outputs that are not finite', course.not_finite, bar=0.0, note=note))
     _, error, gamma = course.windows.T
     first, last = (part.mean() for part in (_third(error, 0), _third(error, 2)))
-    note = f'{first:.2g} to {last:.2g}, mean RMS of d, first and last third'
+    note = f'{first:.2g} to {last:.2g}, first and last third of the windows'
     rows.append(Row('error of d, last / first', last / first, bar=ERROR_RATIO, note=note))
     note = f'{len(error)} windows, median {np.median(error):.2g}'
     rows.append(Row('error of d, worst window', error.max(), bar=ERROR, note=note))
@@ -104,7 +104,7 @@ def draw(course: Course, path: Path) -> None:
     axes[1].set_ylabel('γ, median of a window')
     axes[2].semilogy(t / 60.0, error, 'o-', markersize=3)
     axes[2].axhline(ERROR, color='tab:red', linewidth=0.8, label='limit')
-    axes[2].set_ylabel('RMS error of d')
+    axes[2].set_ylabel('error of d, median of a window')
     axes[2].legend(loc='center right')
     axes[2].set_xlabel('minutes')
     figure.savefig(path, dpi=110)

@@ -87,7 +87,8 @@ class SoakWatch:
         Returns
         -------
         (float, float)
-            RMS error of d and the median of gamma; NaN without estimates.
+            Medians of the absolute error of d (a busy machine delays single samples) and of gamma;
+            NaN without estimates.
 
         """
         with self._lock:
@@ -102,9 +103,8 @@ class SoakWatch:
         origin = at[0]
         t = (stamps[after] - origin)[paired]
         d_true = np.interp(t, np.array(at) - origin, truth)
-        error = np.array(d)[paired] - d_true
-        gamma = np.median([value for _, value in kept[GAMMA]])
-        return float(np.sqrt(np.mean(error**2))), float(gamma)
+        error = np.median(np.abs(np.array(d)[paired] - d_true))
+        return float(error), float(np.median([value for _, value in kept[GAMMA]]))
 
     def __enter__(self) -> 'SoakWatch':
         self._recorder.__enter__()
