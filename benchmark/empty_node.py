@@ -16,10 +16,9 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher
-from fhaosmo_ros.nodes.estimator import SENSOR_QOS
 from fhaosmo_ros.nodes.messages import labelled
 from fhaosmo_ros.nodes.spin import Spinner
-from fhaosmo_ros.nodes.subscription import subscribe_with_info
+from fhaosmo_ros.nodes.subscription import SENSOR_QOS, subscribe_with_info
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node

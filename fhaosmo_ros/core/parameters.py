@@ -138,6 +138,12 @@ SAMPLING = (
 
 ESTIMATOR_NODE = (
     Parameter(
+        'autostart', True,
+        'Configure and activate by itself at the start. false: wait for a lifecycle manager, or '
+        'for `ros2 lifecycle set`.',
+        live=False,
+    ),
+    Parameter(
         'publish_rate', 100.0, 'Rate of the timer that publishes the estimates.',
         unit='Hz', lower=0.1, upper=5000.0,
     ),

@@ -14,6 +14,7 @@ from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter import Parameter, suggestion
 from fhaosmo_ros.core.parameter_file import check_one_type, is_built_in, load, parse
 from fhaosmo_ros.core.parameters import NODE_TABLES
+from fhaosmo_ros.nodes.lifecycle import ManagedNode
 from fhaosmo_ros.stop_signals import stop_on_signals
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -115,6 +116,8 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
         return 2
     finally:
         if node is not None:
+            if isinstance(node, ManagedNode):
+                node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
 

@@ -6,7 +6,10 @@ import inspect
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+SENSOR_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Best effort matches every publisher; the depth holds a second at 1 kHz."""
 
 
 def subscribe_with_info(
