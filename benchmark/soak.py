@@ -66,10 +66,12 @@ def run(seed: int, seconds: float):
     from soak_watch import SoakWatch
 
     with Children() as children, SoakWatch() as watch, SoakClient() as client:
-        estimator = children.start('estimator', '-m', 'fhaosmo_ros', 'estimator', *PARAMETERS)
+        estimator = children.start(
+            'estimator', '-m', 'fhaosmo_ros', 'estimator', *PARAMETERS, '-r', 'y:=faulty_y'
+        )
         plant = children.start(
             'plant', 'benchmark/soak_faults.py', '--seed', str(seed), '--seconds', str(seconds),
-            *PARAMETERS, '-p', f'sample_rate:={RATE}', '-r', 'y:=clean_y',
+            *PARAMETERS, '-p', f'sample_rate:={RATE}',
         )  # fmt: skip
         estimator.wait_for('estimating')
         plant.wait_for('injecting')

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The plant, with the faults of a schedule between it and its topic ``y``; counts what it does.
+The plant, with the faults of a schedule on its topic ``faulty_y``; counts what it does.
 
 Not a node between plant and estimator: that would stamp y anew, and on a busy machine the jitter
 of one more hop makes an error in d that hides the drift which a soak is to find.
@@ -23,6 +23,7 @@ from soak_schedule import schedule, STREAM
 from std_msgs.msg import Float64
 
 READY = 'injecting'
+TOPIC = 'faulty_y'
 SPIKE = 1e3
 SETTLE = 0.5
 """Seconds from the match of a new publisher, as seen from here, to its first sample."""
@@ -50,7 +51,7 @@ class FaultyPlant(PlantNode):
         self._matched: float | None = None
         self._message = Float64()
         super().__init__()
-        self._faulty_y = self.create_publisher(Float64, 'y', 10)
+        self._faulty_y = self.create_publisher(Float64, TOPIC, 10)
         self._publish_y = self._pass_on
 
     def _pass_on(self, message: Float64) -> None:
@@ -80,7 +81,7 @@ class FaultyPlant(PlantNode):
         """Return what is published in place of `y`."""
         if self._take('publisher restart'):
             self.destroy_publisher(self._faulty_y)
-            self._faulty_y = self.create_publisher(Float64, 'y', 10)
+            self._faulty_y = self.create_publisher(Float64, TOPIC, 10)
             self._matched = None
             self.counts['held back for discovery'] += 1
             return
