@@ -12,10 +12,9 @@ import contextlib
 import gc
 import signal
 import threading
-from typing import Any
 
 from builtin_interfaces.msg import Time
-from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher
+from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher, Report
 from fhaosmo_ros.nodes.messages import labelled
 from fhaosmo_ros.nodes.spin import Spinner
 from fhaosmo_ros.nodes.subscription import SENSOR_QOS, subscribe_with_info
@@ -56,7 +55,7 @@ class EmptyNode(Node):
             (self.create_publisher(type(message), f'~/{name}', 10).publish, message)
             for name, message in messages.items()
         ]
-        self._diagnostics = DiagnosticsPublisher(self, self._report)
+        self._diagnostics = DiagnosticsPublisher(self, self._reports)
         self._timer = self.create_timer(1.0 / rate, self._publish)
         self._y = subscribe_with_info(self, Float64, 'y', self._on_sample, SENSOR_QOS)
         self.get_logger().info(READY)
@@ -72,10 +71,11 @@ class EmptyNode(Node):
         for publish, message in self._outputs:
             publish(message)
 
-    def _report(self) -> dict[str, Any]:
-        """Return as many values as the estimator's report has."""
-        zeros = {f'rejected {k}': 0 for k in range(5)}
-        return {'samples accepted': self._count, 'samples lost': 0, **zeros, 'restarts': 0, 'x': 0}
+    def _reports(self) -> list[Report]:
+        """Return as many values as the estimator's reports have."""
+        report = Report('input')
+        report.values = {'samples accepted': self._count, **{f'value {k}': 0 for k in range(30)}}
+        return [report]
 
 
 def main() -> None:

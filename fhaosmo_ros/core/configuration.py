@@ -4,7 +4,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from fhaosmo_ros.core import kernels
+from fhaosmo_ros.core import kernels, layout
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.fuzzy import curve, KNOTS, terms_of_level
 from fhaosmo_ros.core.model import TriangularModel
@@ -69,6 +69,9 @@ class ObserverConfiguration:
         self.initial_estimate = self._per_level('initial_estimate')
         self.initial_internal = self._per_level('initial_internal')
         self.internal = p['estimate_from'] == 'internal'
+        n = self.model.order
+        filtered = not self.internal and self.levels > n
+        self.unknown_input_at = (layout.HAT, n) if filtered else (layout.TILDE, n - 1)
         self.law = self._law()
 
     def _per_level(self, name: str) -> np.ndarray:

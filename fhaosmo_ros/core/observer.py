@@ -283,6 +283,11 @@ class Observer:
         """Estimate of the present state, with the status of the last step."""
         return self._estimate(self._word)
 
+    @property
+    def unknown_input(self) -> float:
+        """The estimate's unknown input alone, which costs less."""
+        return float(self._levels[self._configuration.unknown_input_at])
+
     def _estimate(self, word: int) -> Estimate:
         z, d = self._select(self._levels)
         gamma = float(self._memory[layout.GAMMA])
@@ -295,8 +300,7 @@ class Observer:
         z = hat[..., :n].copy()
         if self._configuration.internal:
             z[..., 1:] = tilde[..., : n - 1]
-            return z, tilde[..., n - 1].copy()
-        return z, (hat[..., n] if self.levels > n else tilde[..., n - 1]).copy()
+        return z, levels[(..., *self._configuration.unknown_input_at)].copy()
 
     def run(
         self, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0, every: int = 1

@@ -154,6 +154,58 @@ ESTIMATOR_NODE = (
         'publish_rate', 100.0, 'Rate of the timer that publishes the estimates.',
         unit='Hz', lower=0.1, upper=5000.0,
     ),
+    Parameter(
+        'input_reliability', 'best_effort',
+        'QoS of the subscriptions of y and u. best_effort hears every publisher; reliable has '
+        'lost samples sent again, and hears reliable publishers only.',
+        choices=('best_effort', 'reliable'), live=False,
+    ),
+    Parameter(
+        'input_durability', 'volatile',
+        'QoS of the subscriptions of y and u. transient_local also hears what was published '
+        'before, of transient_local publishers only.',
+        choices=('volatile', 'transient_local'), live=False,
+    ),
+    Parameter(
+        'input_depth', 1000, 'Samples of y that wait while the node is busy; older ones are lost.',
+        lower=1, upper=100_000, live=False,
+    ),
+)  # fmt: skip
+
+DIAGNOSTICS = (
+    Parameter(
+        'diagnostics_period', 1.0, 'Time between two reports on /diagnostics, in host time.',
+        unit='s', lower=0.1, upper=60.0,
+    ),
+    Parameter(
+        'hardware_id', 'none', 'hardware_id of the reports: the sensor behind y.',
+    ),
+    Parameter(
+        'warn_rate_below', 0.0, 'WARN if the sample rate of y is lower; 0 for never.',
+        unit='Hz', lower=0.0, upper=1e5,
+    ),
+    Parameter(
+        'warn_jitter_above', 0.5,
+        'WARN if the standard deviation of the sampling period over its mean is higher.',
+        lower=0.0, upper=1e6,
+    ),
+    Parameter(
+        'warn_delay_above', 0.1,
+        'WARN if a sample is taken later than this after its source stamp: this host is too slow, '
+        "or its clock and the publisher's differ.",
+        unit='s', lower=0.0, upper=1e6,
+    ),
+    Parameter(
+        'warn_chatter_above', 0.0,
+        'WARN if the estimate of d chatters more (RMS of what a moving average of 5 samples '
+        'leaves, unit of d); 0 for never.',
+        lower=0.0, upper=1e12,
+    ),
+    Parameter(
+        'error_bad_share_above', 0.5,
+        'ERROR if a larger share of the samples was lost or rejected; any at all is a WARN.',
+        lower=0.0, upper=1.0,
+    ),
 )  # fmt: skip
 
 PLANT_MODEL = (
@@ -215,7 +267,7 @@ PLANT_NODE = (
 
 OBSERVER_PARAMETERS = ParameterTable(MODEL, OBSERVER)
 ONLINE_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING)
-ESTIMATOR_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, ESTIMATOR_NODE)
+ESTIMATOR_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, ESTIMATOR_NODE, DIAGNOSTICS)
 PLANT_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL)
 PLANT_NODE_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL, PLANT_NODE)
 NODE_TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}

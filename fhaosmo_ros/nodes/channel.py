@@ -2,36 +2,42 @@
 """One channel of an estimator node: y (and u) in, one observer, estimates out on a timer."""
 
 from collections.abc import Mapping
+from time import perf_counter, time_ns
 from typing import Any
 
-from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.observer import Observer
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
 from fhaosmo_ros.core.status import REJECTED, Status
-from fhaosmo_ros.nodes.messages import fill, labelled
-from fhaosmo_ros.nodes.subscription import SENSOR_QOS, subscribe_with_info
+from fhaosmo_ros.nodes.diagnostics import Report, WARN
+from fhaosmo_ros.nodes.health import Health
+from fhaosmo_ros.nodes.messages import read_double
+from fhaosmo_ros.nodes.outputs import Outputs
+from fhaosmo_ros.nodes.publishers import PublisherWatch
+from fhaosmo_ros.nodes.subscription import input_qos, subscribe_with_info
 from rclpy.node import Node
-from std_msgs.msg import Float64, Float64MultiArray
-from std_srvs.srv import Trigger
+from std_msgs.msg import Float64
+from std_srvs.srv import SetBool, Trigger
 
 
 class Channel:
     """
     Subscribes ``y`` (and ``u``), steps the observer on each sample, publishes on a timer.
 
-    It is made inactive: its subscriptions and publishers exist, samples are dropped, nothing is
-    published.
+    It is made inactive: its topics and services exist, samples are dropped, nothing is published.
 
     Parameters
     ----------
     node : Node
-        Owns the topics, the service and the timer.
+        Owns the topics, the services and the timer.
     values : mapping
         All parameters of the estimator.
     inputs, outputs : str
         What stands before the names of the topics read (y, u) and of those written and the
         service (state, ..., reset).
+
+    name : str
+        What stands before the names of its reports.
 
     Raises
     ------
@@ -41,9 +47,11 @@ class Channel:
     """
 
     def __init__(
-        self, node: Node, values: Mapping[str, Any], inputs: str = '', outputs: str = '~/'
-    ) -> None:
+        self, node: Node, values: Mapping[str, Any],
+        inputs: str = '', outputs: str = '~/', name: str = '',
+    ) -> None:  # fmt: skip
         self._node = node
+        self._name = name
         self._clock = node.get_clock()
         self._logger = node.get_logger()
         self.estimator = OnlineEstimator(online(values))
@@ -53,34 +61,26 @@ class Channel:
         self._rate = float(values['publish_rate'])
         self._timer: Any = None
         self._forget()
-        self._sequence = 0
-        self._lost = 0
-
         observer = self.estimator.observer
-        self._state = labelled([f'z{i + 1}' for i in range(observer.order)])
-        self._innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
-        self._d, self._gamma, self._stamp = Float64(), Float64(), Time()
-        publishers = [
-            node.create_publisher(kind, outputs + name, 10)
-            for name, kind in (
-                ('state', Float64MultiArray), ('unknown_input', Float64), ('gamma', Float64),
-                ('innovation', Float64MultiArray), ('stamp', Time),
-            )
-        ]  # fmt: skip
-        (
-            self._publish_state, self._publish_d, self._publish_gamma,
-            self._publish_innovation, self._publish_stamp,
-        ) = (p.publish for p in publishers)  # fmt: skip
-        service = node.create_service(Trigger, outputs + 'reset', self._reset)
-        self._y = subscribe_with_info(node, Float64, inputs + 'y', self._on_sample, SENSOR_QOS)
-        self._owned = [
-            *((node.destroy_publisher, p) for p in publishers),
-            (node.destroy_service, service),
-            (node.destroy_subscription, self._y),
-        ]
+        self._outputs = Outputs(node, outputs, observer.order, observer.levels)
+        self._health = Health(self.estimator, values)
+        qos = input_qos(values)
+        self._y = subscribe_with_info(node, Float64, inputs + 'y', self._on_sample, qos, raw=True)
+        subscriptions = [self._y]
         if observer.uses_input:
-            u = node.create_subscription(Float64, inputs + 'u', self._on_input, SENSOR_QOS)
-            self._owned.append((node.destroy_subscription, u))
+            subscriptions.append(
+                subscribe_with_info(node, Float64, inputs + 'u', self._on_input, qos, raw=True)
+            )
+        services = [
+            node.create_service(Trigger, outputs + 'reset', self._reset),
+        ]
+        if hasattr(self.estimator, 'freeze'):
+            services.append(node.create_service(SetBool, outputs + 'freeze', self._freeze))
+        self._owned = [
+            *((node.destroy_subscription, s) for s in subscriptions),
+            *((node.destroy_service, s) for s in services),
+        ]
+        self._watches = [PublisherWatch(node, s) for s in subscriptions]
 
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
@@ -100,11 +100,12 @@ class Channel:
             self._timer = None
 
     def destroy(self) -> None:
-        """Take the topics and the service away."""
+        """Take the topics and the services away."""
         self.deactivate()
         for destroy, entity in self._owned:
             destroy(entity)
         self._owned = []
+        self._outputs.destroy()
 
     def check(self, changes: Mapping[str, Any]) -> None:
         """Raise what `configure` would raise, and change nothing."""
@@ -113,6 +114,7 @@ class Channel:
     def configure(self, changes: Mapping[str, Any]) -> None:
         """Change live parameters from the next sample on."""
         self.estimator.configure(online(changes))
+        self._health.configure(changes)
         self._max_gap = float(changes.get('max_gap', self._max_gap))
         if 'sampling' in changes:
             self._clock_stamps = changes['sampling'] == 'clock'
@@ -123,21 +125,15 @@ class Channel:
                 self._node.destroy_timer(self._timer)
                 self._timer = self._start_timer()
 
-    def report(self) -> dict[str, Any]:
-        """Return what diagnostics show."""
-        counters = self.estimator.counters
-        estimate = self.estimator.estimate
-        return {
-            'samples accepted': counters.accepted,
-            'samples lost': self._lost,
-            'rejected measurements': counters.rejected_measurements,
-            'rejected stamps': counters.rejected_stamps,
-            'rejected inputs': counters.rejected_inputs,
-            'rejected steps': counters.rejected_steps,
-            'restarts': counters.restarts,
-            'open levels': estimate.open_levels if estimate else 0,
-            'gamma': estimate.gamma if estimate else float('nan'),
-        }
+    def reports(self) -> list[Report]:
+        """Return the reports for /diagnostics, on the time since the last ones."""
+        publishers, *of_input = [watch.look() for watch in self._watches]
+        self._mixed = len(publishers.heard) > 1
+        reports = self._health.reports(self._y.topic_name, publishers, self._stale, self._name)
+        for found in of_input:
+            for text in found.unheard.values() or ([] if found.heard else ['no publisher of u']):
+                reports[0].find(WARN, text)
+        return reports
 
     def _compile(self) -> None:
         """Compile before the first sample arrives; cached on disk after the first start."""
@@ -149,39 +145,52 @@ class Channel:
         self._arrived = False
         self._stale = True
         self._silent_since: int | None = None
+        self._sequence = 0
+        self._mixed = False
 
-    def _on_sample(self, message: Float64, info: Mapping[str, Any]) -> None:
+    def _on_sample(self, data: bytes, info: Mapping[str, Any]) -> None:
         if self._timer is None:
             return
-        stamp = self._clock.now().nanoseconds if self._clock_stamps else info['source_timestamp']
-        self._count_lost(info.get('publication_sequence_number'))
-        estimator = self.estimator
+        begin = perf_counter()
+        health, estimator, source = self._health, self.estimator, info['source_timestamp']
+        stamp = self._clock.now().nanoseconds if self._clock_stamps else source
+        sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
+        if sequence != self._sequence + 1:
+            self._count_lost(sequence)
+        self._sequence = sequence
+        y = read_double(data)
         restarts = estimator.counters.restarts
-        word = estimator.advance(stamp, message.data)
+        word = estimator.advance(stamp, y)
         if estimator.counters.restarts != restarts:
             self._logger.warning(
                 'more than max_gap between two usable samples: restarted from the new one'
             )
         if not word & REJECTED:
             self._arrived = True
+            health.latest = begin
+            health.stamps.append(stamp)
+            health.unknown_inputs.append(estimator.observer.unknown_input)
         else:
             self._logger.warning(
-                f'rejected a sample: {_reason(word, message.data)} '
+                f'rejected a sample: {_reason(word, y)} '
                 f'({estimator.counters.rejected} rejected so far)',
                 throttle_duration_sec=5.0,
             )
+        health.delays.append(time_ns() - source)
+        health.durations.append(perf_counter() - begin)
 
-    def _count_lost(self, sequence: int | None) -> None:
+    def _count_lost(self, sequence: int) -> None:
         """Count the samples between the publisher's last sequence number and this one."""
-        if sequence:
-            if self._sequence and sequence > self._sequence + 1:
-                self._lost += sequence - self._sequence - 1
-            self._sequence = sequence
+        if 0 < sequence <= self._sequence:  # another publisher's
+            self._mixed = True  # until `reports` has looked how many there are
+        elif sequence and self._sequence and not self._mixed:
+            self._health.lost += sequence - self._sequence - 1
 
-    def _on_input(self, message: Float64) -> None:
-        if not self.estimator.set_input(message.data):
+    def _on_input(self, data: bytes, _: Mapping[str, Any]) -> None:
+        u = read_double(data)
+        if not self.estimator.set_input(u):
             self._logger.warning(
-                f'rejected u = {message.data}: expected a finite number; the last one is held',
+                f'rejected u = {u}: expected a finite number; the last one is held',
                 throttle_duration_sec=5.0,
             )
 
@@ -195,14 +204,7 @@ class Channel:
         estimate = estimator.estimate
         if estimate is None:  # reset, and no sample since
             return
-        self._publish_state(fill(self._state, estimate.z))
-        self._d.data = estimate.unknown_input
-        self._publish_d(self._d)
-        self._gamma.data = estimate.gamma
-        self._publish_gamma(self._gamma)
-        self._publish_innovation(fill(self._innovation, estimate.innovation))
-        self._stamp.sec, self._stamp.nanosec = divmod(estimator.stamp, 1_000_000_000)
-        self._publish_stamp(self._stamp)
+        self._outputs.publish(estimate, estimator.stamp)
 
     def _is_stale(self) -> bool:
         """Return True, and say it once, while no sample has come for max_gap."""
@@ -226,6 +228,13 @@ class Channel:
         response.success = True
         response.message = 'the observer starts afresh with the next sample'
         self._logger.info(f'reset: {response.message}')
+        return response
+
+    def _freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self.estimator.freeze(request.data)
+        response.success = True
+        response.message = 'gamma is held' if request.data else 'gamma adapts again'
+        self._logger.info(f'freeze: {response.message}')
         return response
 
 

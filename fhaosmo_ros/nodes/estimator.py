@@ -8,7 +8,7 @@ from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.nodes.channel import Channel, online
-from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher
+from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher, ERROR, OK, Report, STALE
 from fhaosmo_ros.nodes.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.parameters import declare, on_change, values_of
 from fhaosmo_ros.nodes.spin import run_node
@@ -37,10 +37,18 @@ class EstimatorNode(ManagedNode):
             self, ESTIMATOR_PARAMETERS, lambda v: OnlineEstimator(online(v)), fixed=['autostart']
         )
         self._channels: list[Channel] = []
-        self._diagnostics = DiagnosticsPublisher(self, self._report)
-        on_change(self, ESTIMATOR_PARAMETERS, self._check, self._configure)
+        self._diagnostics = DiagnosticsPublisher(
+            self, self._reports, values['diagnostics_period'], values['hardware_id']
+        )
+        on_change(self, ESTIMATOR_PARAMETERS, self._check, self._adopt)
         if values['autostart']:
-            self.start()
+            try:
+                self.start()
+            except Exception:
+                self.destroy_node()
+                raise
+        else:
+            self.get_logger().info('waiting to be configured, for instance by ros2 lifecycle set')
 
     def configure(self) -> None:
         """Make the channel from the present parameters."""
@@ -82,12 +90,22 @@ class EstimatorNode(ManagedNode):
         for channel in self._channels:
             channel.check(changes)
 
-    def _configure(self, changes: Mapping[str, Any]) -> None:
+    def _adopt(self, changes: Mapping[str, Any]) -> None:
         for channel in self._channels:
             channel.configure(changes)
+        if 'diagnostics_period' in changes:
+            self._diagnostics.set_period(changes['diagnostics_period'])
+        self._diagnostics.hardware_id = changes.get('hardware_id', self._diagnostics.hardware_id)
 
-    def _report(self) -> dict[str, Any]:
-        return self._channels[0].report() if self._channels else {}
+    def _reports(self) -> list[Report]:
+        state = Report('state')
+        active = self.state == 'active'
+        state.find(OK if active else STALE, self.state)
+        if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
+            state.find(ERROR, 'use_sim_time, but nothing on /clock yet')
+        if not active:
+            return [state]
+        return [state, *(r for channel in self._channels for r in channel.reports())]
 
 
 def main(argv: list[str] | None = None) -> int:
