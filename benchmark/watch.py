@@ -46,7 +46,10 @@ class Watch:
         for status in deserialize_message(data, DiagnosticArray).status:
             values = {item.key: item.value for item in status.values}
             if 'samples accepted' in values:
-                self._reports[status.name] = published, int(values['samples accepted'])
+                self._reports[status.name.split(':')[0]] = (
+                    published,
+                    int(values['samples accepted']),
+                )
 
     def report(self, name: str) -> tuple[int, int]:
         """Return when a node reported last, in nanoseconds, and how many samples it had taken."""

@@ -21,9 +21,12 @@ class Channels:
 
     def advance(
         self, channel: Sequence[int], stamps: Sequence[int], y: Sequence[float], u: Sequence[float]
-    ) -> list[int]:
-        words = []
+    ) -> tuple[list[int], list[float]]:
+        """Take samples in order; return the status word, and the estimate of d, after each."""
+        words, unknown_inputs = [], []
         for c, stamp, value, known in zip(channel, stamps, y, u, strict=True):
-            self._estimators[c]._u = known
-            words.append(self._estimators[c].advance(stamp, value))
-        return words
+            estimator = self._estimators[c]
+            estimator.set_input(known)
+            words.append(estimator.advance(stamp, value))
+            unknown_inputs.append(estimator.observer.unknown_input)
+        return words, unknown_inputs

@@ -109,6 +109,11 @@ class OnlineEstimator:
         """Expect stamps of another clock: the next sample takes the nominal period."""
         self._latest = None
 
+    @property
+    def input(self) -> float:
+        """The known input u that is held."""
+        return self._u
+
     def set_input(self, u: float) -> bool:
         """Hold `u` as the known input from now on; return False if it is not finite."""
         if not np.isfinite(u):
