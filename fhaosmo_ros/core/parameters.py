@@ -130,9 +130,45 @@ SAMPLING = (
     ),
     Parameter(
         'max_gap', 0.5,
-        'A longer time between two samples, or a stamp that lies further back, restarts the '
-        'observer from the new sample.',
+        'A longer time between two usable samples, or a stamp that lies further back, restarts '
+        'the observer from the new samples, once a second one confirms the jump.',
         unit='s', lower=1e-6, upper=3600.0,
+    ),
+    Parameter(
+        'max_step', 0.0,
+        'A longer interval, up to max_gap, is bridged: y in between is predicted by the model and '
+        'bent to the new sample, and the observer takes steps of at most this long. 0: intervals '
+        'of more than twice the mean are bridged, in steps of about the mean interval.',
+        unit='s', lower=0.0, upper=3600.0,
+    ),
+    Parameter(
+        'spike_gate', 0.0,
+        'A sample that lies further than this from what the model predicts from the one before '
+        'is rejected (unit of y); 0 for no gate.',
+        lower=0.0, upper=1e12,
+    ),
+    Parameter(
+        'spike_gate_samples', 5,
+        'So many samples in a row may be rejected by spike_gate; the next one is believed: a '
+        'step of y is not a spike.',
+        lower=1, upper=1_000_000,
+    ),
+    Parameter(
+        'stuck_time', 0.0,
+        'Samples are rejected while y has not changed at all for longer than this; 0 for never.',
+        unit='s', lower=0.0, upper=3600.0,
+    ),
+    Parameter(
+        'divergence_time', 1.0,
+        '|eps_1| above epsilon, or steps that leave the finite numbers, for longer than this: the '
+        'observer has lost y and starts afresh from it; 0 for never.',
+        unit='s', lower=0.0, upper=3600.0,
+    ),
+    Parameter(
+        'divergence_limit', 1e12,
+        'A sample of larger magnitude is rejected, and an observer with a larger state starts '
+        'afresh from y.',
+        lower=1.0, upper=1e100,
     ),
 )  # fmt: skip
 
