@@ -289,6 +289,12 @@ class Observer:
         return float(self._levels[self._configuration.unknown_input_at])
 
     @property
+    def unknown_input_address(self) -> int:
+        """Where `unknown_input` lies in memory, for compiled functions; until `configure`."""
+        row, column = self._configuration.unknown_input_at
+        return int(self._levels[row, column:].ctypes.data)
+
+    @property
     def arguments(self) -> tuple[Any, ...]:
         """
         Arrays that compiled functions work on: law, scratch, levels, memory.

@@ -54,6 +54,19 @@ class OnlineEstimator:
         self._adopt(values)
 
     @property
+    def arguments(self) -> tuple[NDArray[Any], ...]:
+        """
+        Arrays that `policy.take_once` works on, in its order.
+
+        Always the same tuple until `configure`, which makes another one.
+        """
+        return self._arguments
+
+    def taken(self, word: int) -> None:
+        """Remember the status word of a sample that `policy.take_once` was given by others."""
+        self._word = word
+
+    @property
     def uses_stamps(self) -> bool:
         """True if dt comes from the samples' stamps."""
         return not self._ints[at.NOMINAL]
@@ -119,7 +132,7 @@ class OnlineEstimator:
         self.observer.restore(state)
         size = fresh.levels.size + fresh.memory.size
         reals[at.STATES : at.STATES + size] = np.concatenate([fresh.levels.ravel(), fresh.memory])
-        self._arguments = (ints, reals, *self.observer.arguments)
+        self._arguments = (self._eps, ints, reals, *self.observer.arguments)
         *_, self._levels, self._memory = self._arguments
 
     def reset(self) -> None:
@@ -173,6 +186,11 @@ class OnlineEstimator:
         """Expect stamps of another clock: the next sample takes the usual period."""
         self._ints[at.TIMED] = self._ints[at.TICK_COUNT] = 0
 
+    @property
+    def input(self) -> float:
+        """The known input u that is held."""
+        return self._u
+
     def set_input(self, u: float) -> bool:
         """Hold `u` as the known input from now on; return False if it is not finite."""
         if not np.isfinite(u):
@@ -207,10 +225,10 @@ class OnlineEstimator:
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
         try:
-            word: int = policy.take_once(stamp, float(y), self._u, self._eps, *self._arguments)
+            word: int = policy.take_once(stamp, float(y), self._u, *self._arguments)
         except OverflowError:  # beyond 64 bits
             limit = LARGEST_STAMP if stamp > 0 else -LARGEST_STAMP
-            word = policy.take_once(limit, float(y), self._u, self._eps, *self._arguments)
+            word = policy.take_once(limit, float(y), self._u, *self._arguments)
         self._word = word
         return word
 
@@ -246,7 +264,7 @@ class OnlineEstimator:
         policy.run(
             np.ascontiguousarray(stamps, dtype=np.int64),
             np.ascontiguousarray(y, dtype=np.float64),
-            u, out, gamma, words, eps, *self._arguments,
+            u, out, gamma, words, eps, *self._arguments[1:],
         )  # fmt: skip
         if count:
             self._u, self._word, self._eps[0] = float(u[-1]), int(words[-1]), eps[-1]

@@ -174,6 +174,13 @@ SAMPLING = (
 
 ESTIMATOR_NODE = (
     Parameter(
+        'channels', [''],
+        'Names of the outputs that one process estimates from. Channel hip reads hip/y, publishes '
+        '~/hip/state and so on, and takes each parameter of the model, the observer and the '
+        "sampling from hip.NAME where that is set, else from NAME. ['']: one channel, no prefix.",
+        live=False, lengths='any',
+    ),
+    Parameter(
         'autostart', True,
         'Configure and activate by itself at the start. false: wait for a lifecycle manager, or '
         'for `ros2 lifecycle set`.',

@@ -62,6 +62,7 @@ class Channel:
         self._max_gap = float(values['max_gap'])
         self._rate = float(values['publish_rate'])
         self._timer: Any = None
+        self._active = False
         self._forget()
         observer = self.estimator.observer
         self._outputs = Outputs(node, outputs, observer.order, observer.levels)
@@ -74,8 +75,8 @@ class Channel:
                 subscribe_with_info(node, Float64, inputs + 'u', self._on_input, qos, raw=True)
             )
         services = [
-            node.create_service(Trigger, outputs + 'reset', self._reset),
-            node.create_service(SetBool, outputs + 'freeze', self._freeze),
+            node.create_service(Trigger, outputs + 'reset', self.reset),
+            node.create_service(SetBool, outputs + 'freeze', self.freeze),
         ]
         self._owned = [
             *((node.destroy_subscription, s) for s in subscriptions),
@@ -87,7 +88,8 @@ class Channel:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
         self.estimator.reset()
         self._forget()
-        self._timer = self._start_timer()
+        self._active = True
+        self._start_timer()
         parameters = self.estimator.observer.parameters
         self._logger.info(
             f'estimating {parameters["order"]} states and the unknown input from '
@@ -96,9 +98,8 @@ class Channel:
 
     def deactivate(self) -> None:
         """Drop samples and publish nothing from now on."""
-        if self._timer is not None:
-            self._node.destroy_timer(self._timer)
-            self._timer = None
+        self._active = False
+        self._stop_timer()
 
     def destroy(self) -> None:
         """Take the topics and the services away."""
@@ -121,9 +122,9 @@ class Channel:
             self._clock_stamps = changes['sampling'] == 'clock'
         if 'publish_rate' in changes:
             self._rate = float(changes['publish_rate'])
-            if self._timer is not None:
-                self._node.destroy_timer(self._timer)
-                self._timer = self._start_timer()
+            if self._active:
+                self._stop_timer()
+                self._start_timer()
 
     def reports(self) -> list[Report]:
         """Return the reports for /diagnostics, on the time since the last ones."""
@@ -143,26 +144,51 @@ class Channel:
         self._mixed = False
 
     def _on_sample(self, data: bytes, info: Mapping[str, Any]) -> None:
-        if self._timer is None:
+        if not self._active:
             return
-        begin = perf_counter()
-        health, estimator, source = self._health, self.estimator, info['source_timestamp']
+        source = info['source_timestamp']
         stamp = self._clock.now().nanoseconds if self._clock_stamps else source
         sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
         if sequence != self._sequence + 1:
             self._count_lost(sequence)
         self._sequence = sequence
         y = read_double(data)
+        self._health.delays.append(time_ns() - source)
+        self._take(stamp, y)
+
+    def _take(self, stamp: int, y: float) -> None:
+        """Step the observer to a sample."""
+        begin, estimator = perf_counter(), self.estimator
         word = estimator.advance(stamp, y)
+        self.taken(word, stamp, y, estimator.observer.unknown_input, perf_counter() - begin)
+
+    def taken(
+        self, word: int, stamp: int, y: float, unknown_input: float, duration: float
+    ) -> None:
+        """
+        Remember, and tell, what became of a sample.
+
+        Parameters
+        ----------
+        word : int
+            Status word of its step.
+        stamp, y
+            The sample.
+        unknown_input : float
+            Estimate of d after it.
+        duration : float
+            Time that the step took, in seconds.
+
+        """
+        self._health.durations.append(duration)
         if not word & REJECTED:
+            health = self._health
             self._arrived = True
-            health.latest = begin
+            health.latest = perf_counter()
             health.stamps.append(stamp)
-            health.unknown_inputs.append(estimator.observer.unknown_input)
+            health.unknown_inputs.append(unknown_input)
         if word & TOLD:
             self._tell(word, y)
-        health.delays.append(time_ns() - source)
-        health.durations.append(perf_counter() - begin)
 
     def _tell(self, word: int, y: float) -> None:
         if word & Status.RESTARTED:
@@ -195,10 +221,16 @@ class Channel:
                 throttle_duration_sec=5.0,
             )
 
-    def _start_timer(self) -> Any:
-        return self._node.create_timer(1.0 / self._rate, self._publish)
+    def _start_timer(self) -> None:
+        self._timer = self._node.create_timer(1.0 / self._rate, self.publish)
 
-    def _publish(self) -> None:
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+            self._timer = None
+
+    def publish(self) -> None:
+        """Publish the latest estimate, unless samples have stopped coming."""
         estimator = self.estimator
         if self._is_stale():
             return
@@ -224,14 +256,16 @@ class Channel:
                 )
         return self._stale
 
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Start the observer afresh."""
         self.estimator.reset()
         response.success = True
         response.message = 'the observer starts afresh with the next sample'
         self._logger.info(f'reset: {response.message}')
         return response
 
-    def _freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    def freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        """Hold gamma, or let it adapt again."""
         self.estimator.freeze(request.data)
         response.success = True
         response.message = 'gamma is held' if request.data else 'gamma adapts again'

@@ -1,26 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator node: a managed node that keeps a channel alive from y to the estimates."""
+"""The estimator node: a managed node that keeps channels alive from y to the estimates."""
 
 from collections.abc import Mapping
 from typing import Any
 
+from fhaosmo_ros.core.channel_parameters import (
+    channel_names,
+    CHANNELS,
+    of_channel,
+    UNNAMED,
+    with_channels,
+)
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameter_file import select
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.nodes.channel import Channel, online
+from fhaosmo_ros.nodes.channel_group import ChannelGroup, of
 from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher, ERROR, OK, Report, STALE
+from fhaosmo_ros.nodes.following import Following
 from fhaosmo_ros.nodes.lifecycle import ManagedNode
-from fhaosmo_ros.nodes.parameters import declare, on_change, values_of
+from fhaosmo_ros.nodes.outputs import check_overrides
+from fhaosmo_ros.nodes.parameters import declare, on_change, overrides_of, values_of
 from fhaosmo_ros.nodes.spin import run_node
 
 
 class EstimatorNode(ManagedNode):
     """
-    A managed node around a channel.
+    A managed node around a channel, or many.
 
     configure reads the parameters and makes the channel; activate lets it take samples and
     publish; deactivate stops that; cleanup takes the channel away, and then every parameter can
-    be set.
+    be set, except the names of the channels.
 
     Raises
     ------
@@ -33,14 +44,19 @@ class EstimatorNode(ManagedNode):
         super().__init__(
             'estimator', automatically_declare_parameters_from_overrides=True, **options
         )
-        values = declare(
-            self, ESTIMATOR_PARAMETERS, lambda v: OnlineEstimator(online(v)), fixed=['autostart']
+        overrides = overrides_of(self)
+        self._names = channel_names(overrides)
+        common = select(
+            {n: v for n, v in overrides.items() if n in ESTIMATOR_PARAMETERS}, ESTIMATOR_PARAMETERS
         )
-        self._channels: list[Channel] = []
+        self._table = with_channels(ESTIMATOR_PARAMETERS, self._names, common)
+        values = declare(self, self._table, self._check_all, fixed=['autostart', CHANNELS])
+        self._channels: Channel | ChannelGroup | None = None
+        self._following = Following(self._names, overrides)
         self._diagnostics = DiagnosticsPublisher(
             self, self._reports, values['diagnostics_period'], values['hardware_id']
         )
-        on_change(self, ESTIMATOR_PARAMETERS, self._check, self._adopt)
+        on_change(self, self._table, self._check, self._adopt, self._following.complete)
         if values['autostart']:
             try:
                 self.start()
@@ -51,9 +67,13 @@ class EstimatorNode(ManagedNode):
             self.get_logger().info('waiting to be configured, for instance by ros2 lifecycle set')
 
     def configure(self) -> None:
-        """Make the channel from the present parameters."""
-        values = values_of(self, ESTIMATOR_PARAMETERS)
-        self._channels.append(Channel(self, values))
+        """Make the channel, or channels, from the present parameters."""
+        values = values_of(self, self._table)
+        check_overrides(self, [f'~/{name}/' if name else '~/' for name in self._names])
+        if self._names == UNNAMED:
+            self._channels = Channel(self, values)
+        else:
+            self._channels = ChannelGroup(self, values, self._names)
         if self.get_parameter('use_sim_time').value and values['sampling'] == 'source_stamp':
             self.get_logger().warning(
                 "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing "
@@ -62,24 +82,31 @@ class EstimatorNode(ManagedNode):
 
     def activate(self) -> None:
         """Take samples and publish."""
-        for channel in self._channels:
-            channel.activate()
+        assert self._channels is not None
+        self._channels.activate()
 
     def deactivate(self) -> None:
         """Stop that."""
-        for channel in self._channels:
-            channel.deactivate()
+        if self._channels is not None:
+            self._channels.deactivate()
 
     def cleanup(self) -> None:
-        """Take the channel away."""
-        while self._channels:
-            self._channels.pop().destroy()
+        """Take the channels away."""
+        if self._channels is not None:
+            self._channels.destroy()
+            self._channels = None
+
+    def _check_all(self, values: Mapping[str, Any]) -> None:
+        """Raise if a channel can't be made of these values."""
+        for name in self._names:
+            with of(name):
+                OnlineEstimator(online(of_channel(values, name)))
 
     def _check(self, changes: Mapping[str, Any]) -> None:
-        if not self._channels:  # each value by itself; together they are checked by configure
+        if self._channels is None:  # each value by itself; together they are checked by configure
             return
         for name, value in changes.items():
-            parameter = ESTIMATOR_PARAMETERS[name]
+            parameter = self._table[name]
             if not parameter.live:
                 now = parameter.coerce(self.get_parameter(name).value)
                 if value != now:
@@ -87,12 +114,12 @@ class EstimatorNode(ManagedNode):
                         f"parameter '{name}': read when the node is configured (it is {now!r}), "
                         f'got {value!r}; set it after the transition cleanup'
                     )
-        for channel in self._channels:
-            channel.check(changes)
+        self._channels.check(changes)
 
     def _adopt(self, changes: Mapping[str, Any]) -> None:
-        for channel in self._channels:
-            channel.configure(changes)
+        self._following.adopted(changes)
+        if self._channels is not None:
+            self._channels.configure(changes)
         if 'diagnostics_period' in changes:
             self._diagnostics.set_period(changes['diagnostics_period'])
         self._diagnostics.hardware_id = changes.get('hardware_id', self._diagnostics.hardware_id)
@@ -103,9 +130,9 @@ class EstimatorNode(ManagedNode):
         state.find(OK if active else STALE, self.state)
         if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
             state.find(ERROR, 'use_sim_time, but nothing on /clock yet')
-        if not active:
+        if not active or self._channels is None:
             return [state]
-        return [state, *(r for channel in self._channels for r in channel.reports())]
+        return [state, *self._channels.reports()]
 
 
 def main(argv: list[str] | None = None) -> int:

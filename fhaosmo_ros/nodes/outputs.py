@@ -41,16 +41,10 @@ class Outputs:
     order, levels : int
         Numbers of states and of innovations.
 
-    Raises
-    ------
-    ConfigurationError
-        QoS overrides that can't be used.
-
     """
 
     def __init__(self, node: Node, prefix: str, order: int, levels: int) -> None:
         self._node = node
-        _check_overrides(node, [node.resolve_topic_name(prefix + name) for name in TOPICS])
         self._publishers = [
             node.create_publisher(
                 kind, prefix + name, QoSProfile(depth=DEPTH),
@@ -79,8 +73,23 @@ class Outputs:
             self._node.destroy_publisher(self._publishers.pop())
 
 
-def _check_overrides(node: Node, topics: list[str]) -> None:
-    """Raise for overrides that rclpy would pass over, or refuse in words of its own."""
+def check_overrides(node: Node, prefixes: list[str]) -> None:
+    """
+    Raise for QoS overrides that rclpy would pass over, or refuse in words of its own.
+
+    Parameters
+    ----------
+    node : Node
+    prefixes : list of str
+        Of all outputs of the node.
+
+    Raises
+    ------
+    ConfigurationError
+        A topic that is none of the outputs, or a policy or value that can't be set.
+
+    """
+    topics = [node.resolve_topic_name(p + name) for p in prefixes for name in TOPICS]
     policies = {policy.name.lower(): allowed for policy, allowed in POLICIES.items()}
     for name, parameter in node.get_parameters_by_prefix('qos_overrides').items():
         if name.startswith(OF_RCLPY):

@@ -57,6 +57,11 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     return result
 
 
+def overrides_of(node: Node) -> dict[str, Any]:
+    """Return what files and the command line set, before it is declared."""
+    return {name: p.value for name, p in node.get_parameters_by_prefix('').items()}
+
+
 def declare(
     node: Node,
     table: ParameterTable,
@@ -84,7 +89,7 @@ def declare(
         An unknown name or a bad value among the overrides.
 
     """
-    overrides = {name: p.value for name, p in node.get_parameters_by_prefix('').items()}
+    overrides = overrides_of(node)
     values: dict[str, Any] = table.defaults() | select(overrides, table)
     check(values)
     for name in overrides:
@@ -108,6 +113,7 @@ def on_change(
     table: ParameterTable,
     check: Callable[[Mapping[str, Any]], None],
     apply: Callable[[Mapping[str, Any]], None],
+    complete: Callable[[list[RosParameter]], list[RosParameter]] = list,
 ) -> None:
     """
     Connect live changes: values are brought into their type, checked as a set, applied.
@@ -118,6 +124,8 @@ def on_change(
         Gets the changes; raises ConfigurationError and changes nothing.
     apply : callable
         Gets the same changes once ROS has accepted all of them.
+    complete : callable
+        Gets what somebody wants to set; returns it with what is to change along.
 
     """
 
@@ -125,7 +133,7 @@ def on_change(
         for p in parameters:
             if not node.has_parameter(p.name):  # rclpy 7.1 refuses it too, but loses the name
                 raise ParameterNotDeclaredException(f"'{p.name}'{suggestion(p.name, table)}")
-        return [_converted(p, table) for p in parameters]
+        return complete([_converted(p, table) for p in parameters])
 
     def validate(parameters: list[RosParameter]) -> SetParametersResult:
         try:

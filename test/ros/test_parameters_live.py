@@ -81,7 +81,7 @@ OTHER = {
 """A valid value for every live parameter, different from the one the node starts with."""
 
 READ_ONLY = {
-    'estimator': ['autostart'],  # the rest can be set while the node is unconfigured
+    'estimator': ['autostart', 'channels'],  # the rest can be set while the node is unconfigured
     'plant': [name for name, p in PLANT_NODE_PARAMETERS.items() if not p.live],
 }
 LIVE = {node: [name for name, p in table.items() if p.live] for node, table in TABLES.items()}
