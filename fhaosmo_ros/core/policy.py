@@ -13,13 +13,13 @@ from fhaosmo_ros.core.policy_data import has_diverged, is_spike, is_stuck
 from fhaosmo_ros.core.policy_time import (
     clock_time,
     difference,
-    ENOUGH,
     forget,
     refresh,
     restore,
     save,
     settle,
     update_mean,
+    WINDOW,
 )
 from fhaosmo_ros.core.prediction import advance, ahead, estimates
 from fhaosmo_ros.core.status import LEVEL_SHIFT, REJECTED, Status
@@ -122,7 +122,8 @@ def take(
     elif word & REJECTED_STEP:
         ints[at.REJECTED_STEPS] += 1
     else:
-        word |= innovations(scalars, levels, memory[Y], eps, row) << LEVEL_SHIFT
+        last = memory[Y] if memory[Y] == memory[Y] else levels[HAT, 0]
+        word |= innovations(scalars, levels, last, eps, row) << LEVEL_SHIFT
     return word
 
 
@@ -142,7 +143,7 @@ def step_over(
     if ints[at.MAX_STEP]:
         if elapsed > ints[at.MAX_STEP]:
             count = min(-(-elapsed // ints[at.MAX_STEP]), MOST_SUB_STEPS)
-    elif ints[at.INTERVALS] >= ENOUGH and elapsed > GAP_RATIO * reals[at.INTERVAL]:
+    elif ints[at.INTERVALS] == WINDOW and elapsed > GAP_RATIO * reals[at.INTERVAL]:
         count = int(min(elapsed / reals[at.INTERVAL] + 0.5, MOST_SUB_STEPS))
     h = elapsed * NANOSECONDS / count
     gamma, word, bend, modelled, z = memory[GAMMA], 0, 0.0, True, x[0]
