@@ -57,7 +57,7 @@ CHANGES = {
 
 
 def stream(first: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return samples at 1 kHz with a little of all: jitter, a gap, a spike, a step, a dead stretch."""
+    """Return samples at 1 kHz: jitter, a gap, a spike, a step, a dead stretch."""
     rng = np.random.default_rng(first)
     k = np.arange(first, first + count)
     steps = 10**6 + rng.integers(-100_000, 100_000, count)

@@ -8,7 +8,7 @@ from fhaosmo_ros.core import Observer, Plant
 from fhaosmo_ros.core.layout import ROWS, SCALARS, TILDE, Y
 from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.policy import MOST_SUB_STEPS
+from fhaosmo_ros.core.policy_step import MOST_SUB_STEPS
 from fhaosmo_ros.core.prediction import ahead
 from fhaosmo_ros.core.status import REJECTED, Status
 import numpy as np

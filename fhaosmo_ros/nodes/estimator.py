@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from fhaosmo_ros.core.observer import Observer
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
 from fhaosmo_ros.core.status import REJECTED, Status
@@ -80,9 +79,9 @@ class EstimatorNode(Node):
 
     def _compile(self) -> None:
         """Compile before the first sample arrives; cached on disk after the first start."""
-        trial = Observer(self.estimator.observer.parameters)
-        trial.start(0.0)
-        trial.step(0.0, 1e-3)
+        trial = OnlineEstimator(self.estimator.parameters)
+        for stamp in (1, 1_000_001):
+            trial.update(stamp, 0.0)
 
     def _on_sample(self, message: Float64, info: Mapping[str, Any]) -> None:
         if self._clock_stamps:
