@@ -75,7 +75,9 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            f'{command} = {module}:main' for command, (module, _) in COMMANDS.items()
+            # Not the module's own main: what it imports takes a second, and signals come sooner.
+            f'{command} = fhaosmo_ros.__main__:{command}'
+            for command in COMMANDS
         ],
     },
 )
