@@ -31,7 +31,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        *files('config/**/*.yaml', 'launch/*.py'),
+        *files('config/**/*.yaml', 'config/*.xml', 'launch/*.py'),
     ],
     zip_safe=False,
     install_requires=[

@@ -29,7 +29,8 @@ class Counters(NamedTuple):
     zero_stamps: int = 0
     """The stamp was 0: no time yet (use_sim_time before the first /clock, an unset header)."""
     far_stamps: int = 0
-    """The stamp lay more than max_gap from the one before: held until the next sample decides."""
+    """The stamp lay more than max_gap from the one before: held until the next sample decides;
+    where that one confirms the jump, the observer starts from the held sample after all."""
     rejected_inputs: int = 0
     """u was NaN or infinite; the one before is held."""
 
@@ -38,7 +39,7 @@ class Counters(NamedTuple):
     sub_steps: int = 0
     """Steps that these took."""
     withdrawn_gaps: int = 0
-    """Bridged gaps that the next stamp disproved: taken back, with the sample that made them."""
+    """Bridged gaps that the next stamp disproved: taken back, with the sample that ended them."""
     spread_stamps: int = 0
     """Samples that came at the same clock time as the one before (sampling = clock): spread."""
     bursts: int = 0
@@ -56,8 +57,14 @@ class Counters(NamedTuple):
 
     @property
     def rejected_stamps(self) -> int:
-        """Samples that were not used because of their stamp."""
-        return self.duplicate_stamps + self.backward_stamps + self.zero_stamps + self.far_stamps
+        """Samples that were not used, or not in the end, because of their stamp."""
+        return (
+            self.duplicate_stamps
+            + self.backward_stamps
+            + self.zero_stamps
+            + self.far_stamps
+            + self.withdrawn_gaps
+        )
 
     @property
     def rejected(self) -> int:
