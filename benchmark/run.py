@@ -11,6 +11,7 @@ import platform
 import signal
 import sys
 
+import channels
 import core_step
 import rates
 import replay
@@ -22,6 +23,7 @@ PARTS = {
     'core': core_step.measure,
     'simulation': simulation.measure,
     'rates': rates.measure,
+    'channels': channels.measure,
     'startup': startup.measure,
     'replay': replay.measure,
 }

@@ -14,6 +14,7 @@ import sys
 from time import monotonic, sleep, time_ns
 
 from children import Child, Children, ROOT
+from fhaosmo_ros.core.counters import Counters
 import numpy as np
 from rates import isolate
 from soak_schedule import CALLS, CYCLE, JUDGED, RESTORE, schedule
@@ -22,6 +23,8 @@ from tqdm import tqdm
 
 RATE = 500.0
 PARAMETERS = ('--ros-args', '--params-file', str(ROOT / 'config' / 'demo.yaml'))
+ESTIMATOR = ('-r', 'y:=faulty_y', '-p', 'spike_gate:=1.0', '-p', 'gamma_leakage:=1.0')
+"""What docs/operation.md advises for a node that nobody looks after."""
 MATCHED = 30.0
 
 
@@ -67,7 +70,7 @@ def run(seed: int, seconds: float):
 
     with Children() as children, SoakWatch() as watch, SoakClient() as client:
         estimator = children.start(
-            'estimator', '-m', 'fhaosmo_ros', 'estimator', *PARAMETERS, '-r', 'y:=faulty_y'
+            'estimator', '-m', 'fhaosmo_ros', 'estimator', *PARAMETERS, *ESTIMATOR
         )
         plant = children.start(
             'plant', 'benchmark/soak_faults.py', '--seed', str(seed), '--seconds', str(seconds),
@@ -133,11 +136,10 @@ def _follow(seed, seconds, nodes: dict[str, Child], watch, client):
 
 def _taken(report: dict[str, str]) -> int:
     """Return the samples of y that the estimator has used or rejected."""
-    return int(report['samples accepted']) + sum(
-        int(value)
-        for key, value in report.items()
-        if key.startswith('rejected') and key != 'rejected inputs'
-    )
+    names = {name: name.replace('_', ' ') for name in Counters._fields}
+    names['accepted'] = 'samples accepted'
+    counters = Counters(**{name: int(report[key]) for name, key in names.items()})
+    return counters.accepted + counters.rejected
 
 
 if __name__ == '__main__':
