@@ -2,6 +2,7 @@
 """Starting, spinning and stopping a node: what both nodes' `main` share."""
 
 from collections.abc import Callable, Mapping
+import contextlib
 import gc
 from itertools import pairwise
 import os
@@ -10,10 +11,12 @@ import sys
 import threading
 from typing import Any
 
+from fhaosmo_ros.core.channel_parameters import channel_names, CHANNELS, with_channels
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter import Parameter, suggestion
-from fhaosmo_ros.core.parameter_file import check_one_type, is_built_in, load, parse
+from fhaosmo_ros.core.parameter_file import check_one_type, is_built_in, load, parse, read
 from fhaosmo_ros.core.parameters import NODE_TABLES
+from fhaosmo_ros.nodes.lifecycle import ManagedNode
 from fhaosmo_ros.stop_signals import stop_on_signals
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -115,17 +118,20 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
         return 2
     finally:
         if node is not None:
+            if isinstance(node, ManagedNode):
+                node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
 
 
 def _check_arguments(name: str, argv: list[str]) -> None:
     """Check what rcl would pass over in silence, or refuse without naming what is wrong."""
-    table = NODE_TABLES[name]
     options = list(pairwise(argv))
+    full_name = _full_name(name, options)
+    table = with_channels(NODE_TABLES[name], _channels(options, full_name))
     for flag, word in options:
         if flag == '--params-file':
-            load(os.path.expanduser(word), _full_name(name, options), table)
+            load(os.path.expanduser(word), full_name, table)
         elif flag in ('-p', '--param') and ':=' in word:
             target, text = word.split(':=', 1)
             parameter = target.rsplit(':', 1)[-1]
@@ -137,6 +143,21 @@ def _check_arguments(name: str, argv: list[str]) -> None:
     rest = remove_ros_args([name, *argv])[1:]
     if rest:
         raise ConfigurationError(f'unexpected argument {rest[0]!r}; {_usage(name)}')
+
+
+def _channels(options: list[tuple[str, str]], full_name: str) -> list[str]:
+    """Return the channels that the arguments declare, wherever they do."""
+    values: dict[str, Any] = {}
+    for flag, word in options:
+        if flag == '--params-file':
+            with contextlib.suppress(ConfigurationError):  # `load` says it
+                values |= read(os.path.expanduser(word), full_name)
+    for flag, word in options:
+        target, _, text = word.partition(':=')
+        if flag in ('-p', '--param') and target.rsplit(':', 1)[-1] == CHANNELS:
+            with contextlib.suppress(yaml.YAMLError):  # rcl quotes the whole rule
+                values[CHANNELS] = parse(text)
+    return channel_names(values)
 
 
 def _full_name(name: str, options: list[tuple[str, str]]) -> str:

@@ -87,7 +87,7 @@ def _counters(bag: Path) -> dict[str, str]:
     for _, message in messages(bag, '/diagnostics'):
         for status in message.status:
             if 'estimator' in status.name:
-                last = {pair.key: pair.value for pair in status.values}
+                last |= {pair.key: pair.value for pair in status.values}
     return last
 
 

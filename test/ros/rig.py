@@ -163,14 +163,15 @@ class Client:
         subscribe_with_info(self.node, message_type, topic, receive, QOS)
         return messages
 
-    def publisher(self, topic: str, message_type: type = Float64):
+    def publisher(self, topic: str, message_type: type = Float64, qos: QoSProfile = QOS):
         """Return a function that publishes a value once somebody else listens."""
-        publisher = self.node.create_publisher(message_type, topic, QOS)
+        publisher = self.node.create_publisher(message_type, topic, qos)
 
         def publish(value: object) -> None:
             publisher.publish(message_type(data=value) if message_type is Float64 else value)
 
         publish.matched = publisher.get_subscription_count
+        publish.destroy = lambda: self.node.destroy_publisher(publisher)
         return publish
 
     def wait(self, condition, what: str, timeout: float = DEADLINE) -> None:
@@ -342,11 +343,40 @@ class EstimatorRig:
 
     def count(self, key: str) -> int:
         """Return a counter of the latest diagnostics."""
+        value = self.value(key)
+        return -1 if value is None else int(value)
+
+    def value(self, key: str) -> str | None:
+        """Return a value of the latest diagnostics that has it."""
+        for status in self.statuses():
+            for pair in status.values:
+                if pair.key == key:
+                    return pair.value
+        return None
+
+    def statuses(self):
+        """Return the estimator's statuses, latest first."""
         for published in reversed(self.diagnostics):
             for status in published.message.status:
-                if status.name == self._name:
-                    return int({v.key: v.value for v in status.values}[key])
-        return -1
+                if status.name.startswith(f'{self._name}: '):
+                    yield status
+
+    def wait_status(self, task: str, level: bytes, *words: str):
+        """Wait for a new status of a task with this level and these words in its message."""
+        start = len(self.diagnostics)
+        found = []
+
+        def look() -> bool:
+            for published in self.diagnostics[start:]:
+                found.extend(
+                    s for s in published.message.status
+                    if s.name == f'{self._name}: {task}' and s.level == level
+                    and all(word in s.message for word in words)
+                )  # fmt: skip
+            return bool(found)
+
+        self.client.wait(look, f'{task} with level {level} and {words}')
+        return found[-1]
 
     def wait_count(self, key: str, value: int) -> None:
         self.client.wait(lambda: self.count(key) >= value, f'{key!r} of {value} in diagnostics')
