@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fhaosmo_ros.core import layout
-from fhaosmo_ros.core.observer import Estimate, Observer, Trajectory
+from fhaosmo_ros.core.observer import Estimate, Observer, ObserverState, Trajectory
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
 from fhaosmo_ros.core.status import LEVEL_SHIFT, REJECTED, Status
 import numpy as np
@@ -28,8 +28,10 @@ class Counters:
     """u was NaN or infinite."""
     rejected_steps: int = 0
     """The step would have left the finite numbers."""
+    starts: int = 0
+    """Samples from which the observer started afresh."""
     restarts: int = 0
-    """Starts from a new sample after a gap or a jump of time."""
+    """Those of them that followed a gap or a jump of time."""
 
     @property
     def rejected(self) -> int:
@@ -105,6 +107,20 @@ class OnlineEstimator:
         self._latest = self.stamp = None
         self._unused = 0
 
+    def resume(self, stamp: int, state: ObserverState) -> None:
+        """
+        Go on from the observer's state after an accepted sample with this stamp.
+
+        Raises
+        ------
+        ConfigurationError
+            The state is of an observer with another number of levels.
+
+        """
+        self.observer.restore(state)
+        self._latest = self.stamp = stamp
+        self._unused = 0
+
     def forget_stamp(self) -> None:
         """Expect stamps of another clock: the next sample takes the nominal period."""
         self._latest = None
@@ -140,7 +156,8 @@ class OnlineEstimator:
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
         observer = self.observer
-        if not observer.started:
+        fresh = not observer.started
+        if fresh:
             word = observer.start(y).word
             self._latest, self._unused = stamp, 0
         else:
@@ -151,6 +168,7 @@ class OnlineEstimator:
                 observer.reset()
                 self.stamp = None
                 self.counters.restarts += 1
+                fresh = True
                 word = observer.start(y).word
                 self._latest, self._unused = stamp, 0
             else:
@@ -162,6 +180,7 @@ class OnlineEstimator:
             self._count_rejected(word)
         else:
             self.counters.accepted += 1
+            self.counters.starts += fresh
             self.stamp = stamp
         return word
 
