@@ -12,6 +12,7 @@ from fhaosmo_ros.core.status import REJECTED, Status
 from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher
 from fhaosmo_ros.nodes.messages import fill, labelled
 from fhaosmo_ros.nodes.parameters import declare, on_change
+from fhaosmo_ros.nodes.snapshots import SnapshotPublisher
 from fhaosmo_ros.nodes.spin import run_node
 from fhaosmo_ros.nodes.subscription import subscribe_with_info
 from rclpy.node import Node
@@ -60,6 +61,7 @@ class EstimatorNode(Node):
             Float64MultiArray, '~/innovation', 10
         ).publish
         self._publish_stamp = self.create_publisher(Time, '~/stamp', 10).publish
+        self._snapshots = SnapshotPublisher(self, self.estimator)
         self._diagnostics = DiagnosticsPublisher(self, self._report)
         self.create_service(Trigger, '~/reset', self._reset)
         self._timer = self._start_timer(values['publish_rate'])
@@ -99,6 +101,7 @@ class EstimatorNode(Node):
             )
         if not word & REJECTED:
             self._arrived = True
+            self._snapshots.accepted()
         else:
             self.get_logger().warning(
                 f'rejected a sample: {_reason(word, message.data)} '
@@ -161,6 +164,7 @@ class EstimatorNode(Node):
 
     def _configure(self, changes: Mapping[str, Any]) -> None:
         self.estimator.configure(_online(changes))
+        self._snapshots.changed()
         self._max_gap = float(changes.get('max_gap', self._max_gap))
         if 'sampling' in changes:
             self._clock_stamps = changes['sampling'] == 'clock'
