@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A replay begins, restarts and changes parameters where the live estimator in the bag did."""
 
-import signal as signals
-
 import bag_files as files
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.snapshot import Flag, labels, pack, Snapshot
@@ -15,15 +13,6 @@ COUNT = 4000
 PARAMETERS = {'variant': 'fuzzy_adaptive', 'epsilon': 3.0}
 OPTIONS = ['-p', 'variant:=fuzzy_adaptive']
 ARRAY, EVENT = 'std_msgs/msg/Float64MultiArray', 'rcl_interfaces/msg/ParameterEvent'
-
-
-@pytest.fixture(autouse=True)
-def _signals():
-    numbers = (signals.SIGINT, signals.SIGTERM)
-    before = [signals.getsignal(number) for number in numbers]
-    yield
-    for number, handler in zip(numbers, before, strict=True):
-        signals.signal(number, handler)
 
 
 class Live:

@@ -112,6 +112,9 @@ def test_bag_is_complete_after_ctrl_c(storage, live, tmp_path):
         metadata = topic['topic_metadata']
         assert metadata['type_description_hash'].startswith('RIHS01_')
         assert metadata['offered_qos_profiles'][0]['reliability'] == 'reliable'
+        latched = metadata['name'] in ('/estimator/snapshot', '/rosout')
+        durability = metadata['offered_qos_profiles'][0]['durability']
+        assert durability == ('transient_local' if latched else 'volatile'), metadata['name']
     with AnyReader([bag]) as reader:
         read = {c.topic: 0 for c in reader.connections}
         for connection, _, data in reader.messages():

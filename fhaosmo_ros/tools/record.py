@@ -10,7 +10,8 @@ import time
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals
-from fhaosmo_ros.tools.bags import BagWriter, make_qos, TYPES
+from fhaosmo_ros.tools.bag_writer import BagWriter
+from fhaosmo_ros.tools.bags import make_qos, TYPES
 from fhaosmo_ros.tools.repair import repair
 from tqdm import tqdm
 

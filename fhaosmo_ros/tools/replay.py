@@ -12,7 +12,7 @@ from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals
 from fhaosmo_ros.tools.bag_copy import copy_topics
 from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.bags import BagWriter
+from fhaosmo_ros.tools.bag_writer import BagWriter
 from fhaosmo_ros.tools.live_run import find_estimator, LiveRun, read_events
 from fhaosmo_ros.tools.options import add_parameter_options, named, online_parameters
 from fhaosmo_ros.tools.output import Output
