@@ -39,9 +39,10 @@ setup(
         'networkx',  # this, packaging and scipy: scikit-fuzzy imports them but declares nothing
         'numba',
         'numpy',
+        'orjson',
         'packaging',
         'pyyaml',
-        'rosbags',
+        'rosbags>=0.11.9,<0.12',  # tools/bag_reader.py and bag_writer.py know its insides
         'scikit-fuzzy',
         'scipy',
         'setuptools',
@@ -64,6 +65,8 @@ setup(
             'colcon-common-extensions',
             'hypothesis',
             'import-linter',
+            'mcap',
+            'mcap-ros2-support',
             'mypy',
             'pytest',
             'pytest-xdist',

@@ -14,7 +14,7 @@ PACKAGE = ROOT / 'fhaosmo_ros'
 # What: where it may be imported (folders end with /).
 ALLOWED = {
     'rclpy': ['nodes/'],
-    'rosbags': ['tools/bags.py', 'tools/bag_reader.py'],
+    'rosbags': ['tools/bags.py', 'tools/bag_reader.py', 'tools/bag_writer.py'],
     'matplotlib': ['tools/figures.py', 'tools/paper_figures.py'],
     'skfuzzy': ['core/fuzzy.py'],
 }

@@ -1,21 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A figure and a table from the estimates in bags."""
 
-import signal
-
 import bag_files as files
 from fhaosmo_ros.tools import plot, replay
 import pytest
 
 MAGIC = {'png': b'\x89PNG\r\n\x1a\n', 'svg': b'<?xml', 'pdf': b'%PDF-'}
-
-
-@pytest.fixture(autouse=True)
-def _signals():
-    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    yield
-    for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
-        signal.signal(number, handler)
 
 
 @pytest.fixture(name='bag')

@@ -14,9 +14,10 @@ import time
 
 import bag_files as files
 from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.tools import replay
+from fhaosmo_ros.tools import replay, sinks
 from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.bags import BagWriter, series
+from fhaosmo_ros.tools.bag_writer import BagWriter
+from fhaosmo_ros.tools.bags import series
 from fhaosmo_ros.tools.chunks import scan
 import lz4.frame
 import numpy as np
@@ -30,16 +31,6 @@ STORAGES = [
     ('mcap', None), ('sqlite3', None), ('mcap', 'storage'), ('mcap', 'file'),
     ('mcap', 'message'), ('sqlite3', 'file'), ('sqlite3', 'message'), ('mcap', 'lz4'),
 ]  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def _signals():
-    """The command sets handlers for the process that it takes for its own."""
-    numbers = (signals.SIGINT, signals.SIGTERM)
-    before = [signals.getsignal(number) for number in numbers]
-    yield
-    for number, handler in zip(numbers, before, strict=True):
-        signals.signal(number, handler)
 
 
 def expected(stamps, y, parameters=None, u=None):
@@ -124,7 +115,10 @@ def test_output_bag_holds_the_estimators_topics(storage, tmp_path):
     assert len(series(again, '/estimator/state').stamps) == 300
 
 
-def test_csv_reads_back_as_the_same_numbers(tmp_path):
+@pytest.mark.parametrize('fast', [True, False])
+def test_csv_reads_back_as_the_same_numbers(fast, tmp_path, monkeypatch):
+    if not fast:
+        monkeypatch.setattr(sinks, 'orjson', None)
     stamps, y = files.signal(200)
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
     assert run(bag, '-o', tmp_path / 'out.csv') == 0

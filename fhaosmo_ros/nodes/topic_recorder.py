@@ -49,12 +49,16 @@ class TopicRecorder:
         `NewTopic`, then the topic's `Sample`; the executor's thread fills it.
     problems : SimpleQueue
         Lines that say why a topic can't be recorded.
+    lost : dict of str to int
+        Messages by topic that were published but did not arrive; only of topics with one
+        publisher, whose messages are numbered.
 
     """
 
     def __init__(self, wanted: Callable[[str], bool]) -> None:
         self.queue: SimpleQueue[NewTopic | Sample] = SimpleQueue()
         self.problems: SimpleQueue[str] = SimpleQueue()
+        self.lost: dict[str, int] = {}
         self._wanted = wanted
         self._known: set[str] = set()
         self._context = Context()
@@ -98,8 +102,17 @@ class TopicRecorder:
 
     def _callback(self, topic: str) -> Any:
         put = self.queue.put
+        latest = 0
 
         def receive(data: bytes, info: Mapping[str, int]) -> None:
+            nonlocal latest
+            number = info.get('publication_sequence_number') or 0
+            if latest and number > latest + 1:
+                self.lost[topic] = self.lost.get(topic, 0) + number - latest - 1
+            elif 0 < number <= latest:  # another publisher: its numbers tell nothing
+                self.lost.pop(topic, None)
+                number = 2**63
+            latest = max(latest, number)
             put(Sample(topic, info['source_timestamp'] or info['received_timestamp'], data))
 
         return receive

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from fhaosmo_ros.tools import chunks
 from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.bags import BagWriter
+from fhaosmo_ros.tools.bag_writer import BagWriter
 import numpy as np
 
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading bags as a stream: all storages, compressions and message types that rosbags knows."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from operator import itemgetter
 from pathlib import Path
 import struct
 from types import TracebackType
@@ -136,6 +137,30 @@ class BagReader:
                         yield connection.topic, stamp, plain
         except Exception as error:
             raise _unreadable(self.path, error) from None
+
+    def few(self, topics: Collection[str]) -> list[tuple[str, int, Any]]:
+        """Return topic, stamp (ns) and message of topics that have few of them, by stamp."""
+        types = {c.topic: str(c.msgtype) for c in self.connections if c.topic in topics}
+        if self.has_chunks:  # most chunks hold none of them: rosbags would look at every message
+            found = [
+                (names[channel], time, data[start + chunks.DATA_AT : end].tobytes())
+                for names, data, r in self._chunks_of(list(types))
+                for time, channel, start, end in zip(*(x.tolist() for x in r), strict=True)
+            ]
+        else:
+            found = list(self.messages(list(types)))
+        found.sort(key=itemgetter(1))
+        try:
+            return [
+                (topic, time, self._reader.deserialize(data, types[topic]))
+                for topic, time, data in found
+            ]
+        except Exception as error:
+            raise _unreadable(self.path, error) from None
+
+    def _chunks_of(self, topics: list[str]) -> Iterator[tuple[dict[int, str], Any, Any]]:
+        for storage, _, data, records in self.chunk_records(topics):
+            yield {c.id: c.topic for c in storage.connections}, data, records
 
     def field(self, topic: str, text: str | None) -> Field:
         """Find a numeric field of a topic; see `find_field`."""

@@ -13,7 +13,7 @@ from fhaosmo_ros.core.parameter_file import load
 from fhaosmo_ros.nodes.recorder import Recorder
 from fhaosmo_ros.nodes.topics import RUN_TOPICS, type_name
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals
-from fhaosmo_ros.tools.bags import BagWriter
+from fhaosmo_ros.tools.bag_writer import BagWriter
 from fhaosmo_ros.tools.figures import save_run
 from fhaosmo_ros.tools.output import OutputFolder
 from fhaosmo_ros.tools.processes import NodeProcesses

@@ -37,6 +37,17 @@ def online_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for path in arguments.params_file:
         values |= load(path, 'estimator')
+    values |= _on_command_line(arguments)
+    return {name: value for name, value in values.items() if name in ONLINE_PARAMETERS}
+
+
+def named(arguments: argparse.Namespace) -> list[str]:
+    """Return the parameters that -p sets."""
+    return list(_on_command_line(arguments))
+
+
+def _on_command_line(arguments: argparse.Namespace) -> dict[str, Any]:
+    values: dict[str, Any] = {}
     for rule in arguments.param:
         name, separator, text = rule.partition(':=')
         if not separator:
@@ -48,4 +59,4 @@ def online_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
         except yaml.YAMLError:
             value = text
         values[name] = ESTIMATOR_PARAMETERS[name].coerce(value)
-    return {name: value for name, value in values.items() if name in ONLINE_PARAMETERS}
+    return values

@@ -10,9 +10,9 @@ import time
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals
-from fhaosmo_ros.tools.bags import BagWriter, make_qos, TYPES
+from fhaosmo_ros.tools.bag_writer import BagWriter
+from fhaosmo_ros.tools.bags import make_qos, TYPES
 from fhaosmo_ros.tools.repair import repair
-from fhaosmo_ros.tools.sinks import TOPICS
 from tqdm import tqdm
 
 FLUSH_PERIOD = 0.5
@@ -93,6 +93,7 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
             # Signals that it listens: nobody need guess when to start what is to be recorded.
             print(f'recording to {path}; Ctrl-C ends it', flush=True)
             count = _drain(recorder, bag, arguments.duration, stop)
+            lost = dict(recorder.lost)
     except OSError as error:
         raise ConfigurationError(
             f'output {path}: expected a place that can be written, got: {error.strerror}'
@@ -100,6 +101,12 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     if not count:
         shutil.rmtree(path)
         raise ConfigurationError('nothing was published on these topics: no bag kept')
+    for topic, number in sorted(lost.items()):
+        print(
+            f'record: {topic}: {number} messages were lost on their way here (a busy machine or '
+            'network; a deeper queue of the publisher helps)',
+            file=sys.stderr,
+        )
     print(f'{count} messages: {path}')
 
 
@@ -109,8 +116,8 @@ def _wanted(arguments: argparse.Namespace):
     if arguments.topics:
         names = {'/' + topic.lstrip('/') for topic in arguments.topics}
         return lambda topic: topic in names
-    names = {f'{name.rstrip("/")}/{topic}' for name in arguments.names for topic in TOPICS}
-    return lambda topic: topic in names or topic in EXTRA
+    below = tuple(f'/{name.strip("/")}/' for name in arguments.names)
+    return lambda topic: topic.startswith(below) or topic in EXTRA
 
 
 def _drain(recorder, bag: BagWriter, duration: float | None, stop: Stop) -> int:
