@@ -29,7 +29,8 @@ class Counters(NamedTuple):
     zero_stamps: int = 0
     """The stamp was 0: no time yet (use_sim_time before the first /clock, an unset header)."""
     far_stamps: int = 0
-    """The stamp lay more than max_gap from the one before: held until the next sample decides."""
+    """The stamp lay more than max_gap from the one before: held until the next sample decides;
+    where that one confirms the jump, the observer starts from the held sample after all."""
     rejected_inputs: int = 0
     """u was NaN or infinite; the one before is held."""
 
@@ -38,7 +39,7 @@ class Counters(NamedTuple):
     sub_steps: int = 0
     """Steps that these took."""
     withdrawn_gaps: int = 0
-    """Bridged gaps that the next stamp disproved: taken back, with the sample that made them."""
+    """Bridged gaps that the next stamp disproved: taken back, with the sample that ended them."""
     spread_stamps: int = 0
     """Samples that came at the same clock time as the one before (sampling = clock): spread."""
     bursts: int = 0
@@ -56,21 +57,28 @@ class Counters(NamedTuple):
 
     @property
     def rejected_stamps(self) -> int:
-        """Samples that were not used because of their stamp."""
-        return self.duplicate_stamps + self.backward_stamps + self.zero_stamps + self.far_stamps
+        """Samples that were not used, or not in the end, because of their stamp."""
+        return (
+            self.duplicate_stamps
+            + self.backward_stamps
+            + self.zero_stamps
+            + self.far_stamps
+            + self.withdrawn_gaps
+        )
 
     @property
     def rejected(self) -> int:
         """Samples of y that were not used."""
-        return (
-            self.rejected_measurements
-            + self.rejected_spikes
-            + self.rejected_stuck
-            + self.rejected_steps
-            + self.rejected_stamps
-        )
+        return sum(getattr(self, name) for name in UNUSED_SAMPLES)
 
     @property
     def restarts(self) -> int:
         """Starts from a new sample after a gap or a jump of time."""
         return self.restarts_forward + self.restarts_backward
+
+
+UNUSED_SAMPLES = (
+    'rejected_measurements', 'rejected_spikes', 'rejected_stuck', 'rejected_steps',
+    'duplicate_stamps', 'backward_stamps', 'zero_stamps', 'far_stamps',
+)  # fmt: skip
+"""Counters that together are `Counters.rejected`."""

@@ -72,6 +72,11 @@ class OnlineEstimator:
         return not self._ints[at.NOMINAL]
 
     @property
+    def parameters(self) -> dict[str, Any]:
+        """All parameters with their present values; a copy."""
+        return self.observer.parameters | self._sampling
+
+    @property
     def counters(self) -> Counters:
         """What has happened to the samples so far."""
         return Counters(*self._ints[at.COUNTERS :].tolist())

@@ -42,7 +42,7 @@ CHANGED = 25  # since when y is what it is
 STUCK = 26  # 1: it is stuck
 LOST = 27  # 1: eps_1 is above epsilon, or steps fail
 LOST_SINCE = 28
-INTERVALS = 29  # number of intervals in the mean, up to ENOUGH
+INTERVALS = 29  # number of intervals in the mean, up to WINDOW
 COUNTERS = 30
 
 (

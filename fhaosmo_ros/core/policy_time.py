@@ -12,8 +12,8 @@ REJECTED_PERIOD = int(Status.REJECTED_PERIOD)
 HELD = int(Status.HELD)
 RESTARTED = int(Status.RESTARTED)
 
-ENOUGH = 16
-"""Intervals after which their mean is trusted."""
+WINDOW = 32
+"""Intervals that a running mean remembers; before it has so many, none is called long or short."""
 FAR = 4 * 10**18
 """Stands for every difference (ns) that an integer may not hold."""
 
@@ -129,15 +129,15 @@ def settled(ints: Ints, stamp: int) -> None:
 
 @njit(cache=True, error_model='numpy', forceinline=True)
 def update_mean(ints: Ints, reals: Floats, elapsed: int) -> None:
-    """Take an interval into the running means; a gap weighs no more than three of them."""
+    """Take an interval into the running means; a gap can't do more than double them."""
     dt, mean = float(elapsed), reals[at.INTERVAL]
-    if ints[at.INTERVALS] < ENOUGH:
+    if ints[at.INTERVALS] < WINDOW:
         ints[at.INTERVALS] += 1
     elif dt < 0.1 * mean:
         ints[at.BURSTS] += 1
-    else:
-        dt = min(dt, 3.0 * mean)
     change = dt - mean
+    if ints[at.INTERVALS] == WINDOW:
+        change = min(change, WINDOW * mean)
     reals[at.INTERVAL] += change / ints[at.INTERVALS]
     if ints[at.INTERVALS] > 1:
         reals[at.JITTER] += (abs(change) - reals[at.JITTER]) / ints[at.INTERVALS]

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from time import perf_counter, time_ns
 from typing import Any
 
-from fhaosmo_ros.core.observer import Observer
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
 from fhaosmo_ros.core.status import REJECTED, Status
@@ -20,7 +19,8 @@ from rclpy.node import Node
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
-RESTARTED = int(Status.RESTARTED)  # flags are slow in a path that runs at 1 kHz
+TOLD = REJECTED | int(Status.RESTARTED | Status.DIVERGED)
+"""Flags of a step that are logged."""
 
 
 class Channel:
@@ -58,7 +58,7 @@ class Channel:
         self._clock = node.get_clock()
         self._logger = node.get_logger()
         self.estimator = OnlineEstimator(online(values))
-        self._compile()
+        _compile(values)
         self._clock_stamps = values['sampling'] == 'clock'
         self._max_gap = float(values['max_gap'])
         self._rate = float(values['publish_rate'])
@@ -125,7 +125,6 @@ class Channel:
         self._max_gap = float(changes.get('max_gap', self._max_gap))
         if 'sampling' in changes:
             self._clock_stamps = changes['sampling'] == 'clock'
-            self.estimator.forget_stamp()
         if 'publish_rate' in changes:
             self._rate = float(changes['publish_rate'])
             if self._active:
@@ -141,12 +140,6 @@ class Channel:
             for text in found.unheard.values() or ([] if found.heard else ['no publisher of u']):
                 reports[0].find(WARN, text)
         return reports
-
-    def _compile(self) -> None:
-        """Compile before the first sample arrives; cached on disk after the first start."""
-        trial = Observer(self.estimator.observer.parameters)
-        trial.start(0.0)
-        trial.step(0.0, 1e-3)
 
     def _forget(self) -> None:
         self._arrived = False
@@ -193,10 +186,6 @@ class Channel:
 
         """
         self._health.durations.append(duration)
-        if word & RESTARTED:
-            self._logger.warning(
-                'more than max_gap between two usable samples: restarted from the new one'
-            )
         if not word & REJECTED:
             health = self._health
             self._arrived = True
@@ -205,7 +194,19 @@ class Channel:
             health.unknown_inputs.append(unknown_input)
             if self._snapshots.due:
                 self._snapshots.publish()
-        else:
+        if word & TOLD:
+            self._tell(word, y)
+
+    def _tell(self, word: int, y: float) -> None:
+        if word & Status.RESTARTED:
+            self._logger.warning(
+                'more than max_gap between two usable samples: restarted from the new one'
+            )
+        if word & Status.DIVERGED:
+            self._logger.error(
+                'the observer had lost y and started again from it; its gains do not fit'
+            )
+        if word & REJECTED:
             self._logger.warning(
                 f'rejected a sample: {_reason(word, y)} '
                 f'({self.estimator.counters.rejected} rejected so far)',
@@ -287,9 +288,22 @@ def online(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name in ONLINE_PARAMETERS}
 
 
+def _compile(values: Mapping[str, Any]) -> None:
+    """Compile before the first sample arrives; cached on disk after the first start."""
+    trial = OnlineEstimator(online(values))
+    for k in range(3):
+        trial.advance(k * 1_000_000 + 1, 0.0)
+
+
 def _reason(word: int, y: float) -> str:
+    if word & Status.HELD:
+        return 'its stamp lies more than max_gap from the one before; the next one decides'
     if word & Status.REJECTED_PERIOD:
         return 'expected a stamp later than the one before'
+    if word & Status.REJECTED_SPIKE:
+        return f'y = {y} lies beyond spike_gate'
+    if word & Status.REJECTED_STUCK:
+        return f'y = {y} has not changed for stuck_time'
     if word & Status.REJECTED_MEASUREMENT:
-        return f'expected a finite y, got {y}'
+        return f'expected a finite y of at most divergence_limit, got {y}'
     return f'y = {y} would have made the estimate infinite'

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from time import perf_counter
 from typing import Any
 
+from fhaosmo_ros.core.counters import UNUSED_SAMPLES
 from fhaosmo_ros.core.metrics import high_passed
 from fhaosmo_ros.core.observer import Observer
 from fhaosmo_ros.core.online import OnlineEstimator
@@ -19,6 +20,14 @@ LIMIT = 20_000
 WINDOW = 5
 """Samples in the moving average that separates chatter from the signal."""
 NANOSECONDS = 1e-9
+
+
+def _words(name: str) -> str:
+    return name.replace('_', ' ')
+
+
+UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
+"""Counters of samples that the observer has not taken."""
 
 
 class Health:
@@ -112,13 +121,13 @@ class Health:
             report.find(silence, f'no publisher of {topic} that can be heard')
         elif len(publishers.heard) > 1:
             report.find(WARN, f'{len(publishers.heard)} publishers, their samples mix')
-        bad = {k: n for k, n in news.items() if n and _is_bad(k)}
+        bad = {key: news[key] for key in UNUSED if news[key]}
         if bad:
             share = sum(bad.values()) / (sum(bad.values()) + news['samples accepted'])
             level = ERROR if share > limits['error_bad_share_above'] else WARN
             report.find(level, ', '.join(f'{key} {n}' for key, n in bad.items()))
-        for key in ('restarts', 'restarts forward', 'restarts backward'):
-            if news.get(key):
+        for key in ('restarts', 'stuck'):
+            if news[key]:
                 report.find(WARN, f'{key} {news[key]}')
         if mean * limits['warn_rate_below'] > 1.0:
             report.find(WARN, f'sample rate {1.0 / mean:.4g} Hz')
@@ -153,7 +162,7 @@ class Health:
         elif estimate is not None and estimate.open_levels < observer.levels:
             first = estimate.open_levels + 1
             report.find(WARN, f'levels from {first} on hold: an innovation is above epsilon')
-        if news.get('divergences'):
+        if news['divergences']:
             report.find(ERROR, f'diverged and started again from y, {news["divergences"]} times')
         if overruns:
             report.find(WARN, f'{overruns} steps took longer than the sampling period')
@@ -162,15 +171,13 @@ class Health:
 
     def _counts(self) -> dict[str, int]:
         counters = self._estimator.counters
-        fields = counters._asdict() if hasattr(counters, '_asdict') else vars(counters)
-        counts = {name.replace('_', ' '): int(n) for name, n in fields.items()}
-        accepted = counts.pop('accepted')
-        return {'samples accepted': accepted, 'samples lost': self.lost, **counts}
-
-
-def _is_bad(key: str) -> bool:
-    """Return True for a counter of samples that were not used."""
-    return key == 'samples lost' or key.startswith('rejected') or key.endswith(' stamps')
+        return {
+            'samples accepted': counters.accepted,
+            'samples lost': self.lost,
+            'samples rejected': counters.rejected,
+            **{_words(name): n for name, n in counters._asdict().items() if name != 'accepted'},
+            'restarts': counters.restarts,
+        }
 
 
 def _bound(observer: Observer, status: Status) -> str:

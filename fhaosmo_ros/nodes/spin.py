@@ -9,6 +9,7 @@ import os
 import re
 import sys
 import threading
+import traceback
 from typing import Any
 
 from fhaosmo_ros.core.channel_parameters import channel_names, CHANNELS, with_channels
@@ -17,7 +18,7 @@ from fhaosmo_ros.core.parameter import Parameter, suggestion
 from fhaosmo_ros.core.parameter_file import check_one_type, is_built_in, load, parse, read
 from fhaosmo_ros.core.parameters import NODE_TABLES
 from fhaosmo_ros.nodes.lifecycle import ManagedNode
-from fhaosmo_ros.stop_signals import stop_on_signals
+from fhaosmo_ros.stop_signals import stop_on_signals, Stopped
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -31,6 +32,8 @@ try:
 except ImportError:  # an older rclpy
     EventsExecutor = None
 
+GRACE = 0.5
+"""Seconds that a callback has to end."""
 FOREVER = 3600.0
 """The events executor never runs a callback without a finite timeout."""
 
@@ -68,8 +71,14 @@ class Spinner:
     def __exit__(self, *_: object) -> None:
         self._stop.set_result(None)
         self._executor.wake()
-        self._thread.join(timeout=5.0)
-        self._executor.shutdown()
+        self._thread.join(timeout=GRACE)
+        if not self.stuck:
+            self._executor.shutdown()
+
+    @property
+    def stuck(self) -> bool:
+        """True if a callback runs still, after the end of the block."""
+        return self._thread.is_alive()
 
     def _spin(self) -> None:
         try:
@@ -102,16 +111,23 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
     ended = stop_on_signals()
     node = None
     try:
-        _check_arguments(name, argv)
-        rclpy.init(args=[name, *argv], signal_handler_options=SignalHandlerOptions.NO)
-        node = factory()
+        with ended.raising():  # the start may compile for seconds
+            _check_arguments(name, argv)
+            rclpy.init(args=[name, *argv], signal_handler_options=SignalHandlerOptions.NO)
+            node = factory()
         gc.collect()
         gc.freeze()  # what lives now lives to the end: later collections need not visit it
         with Spinner(node, on_end=ended.set) as spinner:
             ended.wait()
+        if spinner.stuck:  # for instance compiling; a node has nothing to save
+            print(f'{name}: ended while a callback was running', file=sys.stderr, flush=True)
+            os._exit(0)
         if spinner.error is not None:
-            print(f'{name}: error: {spinner.error!r}', file=sys.stderr)
+            print(f'{name}: error: a callback failed', file=sys.stderr)
+            traceback.print_exception(spinner.error)
             return 1
+        return 0
+    except Stopped:
         return 0
     except (ConfigurationError, RuntimeError) as error:
         print(f'{name}: error: {_one_line(error)}', file=sys.stderr)

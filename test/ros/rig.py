@@ -2,6 +2,7 @@
 """Nodes as a user starts them, and a client that waits for what they send."""
 
 import contextlib
+import os
 from pathlib import Path
 import re
 import signal
@@ -63,12 +64,16 @@ def parameters(**values: object) -> list[str]:
 class Process:
     """A node in a process of its own; its output is kept in files."""
 
-    def __init__(self, folder: Path, *arguments: object) -> None:
+    def __init__(
+        self, folder: Path, *arguments: object, code: str = '', **environment: object
+    ) -> None:
         self._paths = folder / 'stdout', folder / 'stderr'
+        words = [sys.executable, '-c', code] if code else command(*arguments)
         with self._paths[0].open('wb') as out, self._paths[1].open('wb') as err:
             self._process = subprocess.Popen(
-                command(*arguments), cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err
-            )
+                words, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err,
+                env=os.environ | {name: str(value) for name, value in environment.items()},
+            )  # fmt: skip
 
     @property
     def output(self) -> str:
@@ -183,12 +188,16 @@ class Client:
                     raise AssertionError(f'no {what} within {timeout} s')
                 self._changed.wait(0.05)
 
-    def call(self, service: str, service_type: type, request: object):
+    def call_later(self, service: str, service_type: type, request: object):
+        """Send a request and return the future of its answer."""
         client = self._services.get(service)
         if client is None:
             client = self._services[service] = self.node.create_client(service_type, service)
         self.wait(client.service_is_ready, f'service {service}')
-        future = client.call_async(request)
+        return client.call_async(request)
+
+    def call(self, service: str, service_type: type, request: object):
+        future = self.call_later(service, service_type, request)
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
         assert done.wait(DEADLINE), f'no answer from {service}'
@@ -220,10 +229,13 @@ class Parameters:
         value = parameter_value_to_python(self.messages(name)[0])
         return list(value) if not isinstance(value, bool | int | float | str) else value
 
+    def request(self, **values: object):
+        """Return type and request of the service that sets one after the other."""
+        return SetParameters, SetParameters.Request(parameters=_messages(values))
+
     def set(self, **values: object) -> list:
         """Set one after the other; return the results."""
-        request = SetParameters.Request(parameters=_messages(values))
-        return list(self._call('set_parameters', SetParameters, request).results)
+        return list(self._call('set_parameters', *self.request(**values)).results)
 
     def set_text(self, name: str, text: str):
         """Set from a text, as `ros2 param set` does."""
@@ -361,9 +373,13 @@ class EstimatorRig:
                 if status.name.startswith(f'{self._name}: '):
                     yield status
 
-    def wait_status(self, task: str, level: bytes, *words: str):
-        """Wait for a new status of a task with this level and these words in its message."""
-        start = len(self.diagnostics)
+    def wait_status(self, task: str, level: bytes, *words: str, start: int | None = None):
+        """
+        Wait for a status of a task with this level and these words in its message.
+
+        Of those that come from now on, or from the `start`-th message on.
+        """
+        start = len(self.diagnostics) if start is None else start
         found = []
 
         def look() -> bool:
