@@ -15,9 +15,11 @@ import sys
 import threading
 from time import monotonic
 
+from fhaosmo_ros.nodes.messages import double_encoder, read_double
 from fhaosmo_ros.nodes.plant import PlantNode
 from fhaosmo_ros.nodes.spin import Spinner
 import rclpy
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from soak_schedule import schedule, STREAM
 from std_msgs.msg import Float64
@@ -29,32 +31,34 @@ SETTLE = 0.5
 """Seconds from the match of a new publisher, as seen from here, to its first sample."""
 
 
-class FaultyPlant(PlantNode):
+class Faults:
     """
-    A plant whose y goes through faults.
+    What stands between a plant and its topic.
 
     Parameters
     ----------
+    node : Node
+        Owns the publisher.
     seed : int
     seconds : float
         Arguments of `schedule`; its time begins with the first sample.
 
     """
 
-    def __init__(self, seed: int, seconds: float) -> None:
+    def __init__(self, node: Node, seed: int, seconds: float) -> None:
         self.counts: Counter[str] = Counter()
+        self._node = node
         self._events = [e for e in schedule(seed, seconds) if e.kind in STREAM][::-1]
         self._active: dict[str, int] = {}
         self._held: list[float] = []
         self._last = 0.0
         self._origin: float | None = None
         self._matched: float | None = None
-        self._message = Float64()
-        super().__init__()
-        self._faulty_y = self.create_publisher(Float64, TOPIC, 10)
-        self._publish_y = self._pass_on
+        self._encode = double_encoder()
+        self._publisher = node.create_publisher(Float64, TOPIC, 10)
 
-    def _pass_on(self, message: Float64) -> None:
+    def pass_on(self, data: bytes) -> None:
+        """Publish what faults leave, or make, of a sample."""
         if not self._is_matched():
             self.counts['held back for discovery'] += 1
             return
@@ -66,22 +70,21 @@ class FaultyPlant(PlantNode):
             event = self._events.pop()
             self._active[event.kind] = event.size
             self.counts[f'event: {event.kind}'] += 1
-        for y in self._faulty(message.data):
-            self._message.data = y
-            self._faulty_y.publish(self._message)
+        for y in self._faulty(read_double(data)):
+            self._publisher.publish(self._encode(y))
             self.counts['published'] += 1
 
     def _is_matched(self) -> bool:
         """Return True once a new publisher has had its subscriber for a while."""
-        if self._matched is None and self._faulty_y.get_subscription_count():
+        if self._matched is None and self._publisher.get_subscription_count():
             self._matched = monotonic()
         return self._matched is not None and monotonic() - self._matched > SETTLE
 
     def _faulty(self, y: float) -> Iterator[float]:
         """Return what is published in place of `y`."""
         if self._take('publisher restart'):
-            self.destroy_publisher(self._faulty_y)
-            self._faulty_y = self.create_publisher(Float64, TOPIC, 10)
+            self._node.destroy_publisher(self._publisher)
+            self._publisher = self._node.create_publisher(Float64, TOPIC, 10)
             self._matched = None
             self.counts['held back for discovery'] += 1
             return
@@ -115,6 +118,15 @@ class FaultyPlant(PlantNode):
         return True
 
 
+class FaultyPlant(PlantNode):
+    """A plant whose y goes through faults; arguments of `Faults`."""
+
+    def __init__(self, seed: int, seconds: float) -> None:
+        super().__init__()
+        self.faults = Faults(self, seed, seconds)
+        self._publish_y = self.faults.pass_on
+
+
 def main() -> None:
     """Run until SIGINT, then print the counts as one line of JSON; end with the second SIGINT."""
     parser = argparse.ArgumentParser(description='A plant that injects faults into y.')
@@ -130,7 +142,7 @@ def main() -> None:
     if spinner.error:
         raise spinner.error
     ended.clear()
-    print(json.dumps(node.counts), flush=True)
+    print(json.dumps(node.faults.counts), flush=True)
     ended.wait()  # the last samples are taken before their writer leaves
     node.destroy_node()
     rclpy.try_shutdown()

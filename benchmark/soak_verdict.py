@@ -13,8 +13,9 @@ from table import Row
 
 MEMORY = 2.0
 """MB that memory may grow by over the run."""
-ERROR_RATIO = 2.0
-"""What the error of the last third may be of the first third's."""
+ERROR_GROWTH = 0.01
+"""What the error of d may grow by between the first and the last third: a tenth of d's amplitude.
+Not a ratio: that of two errors near the noise tells how busy the machine was."""
 ERROR = 0.05
 """Largest median error of d in any judged window: half of d's amplitude."""
 GAMMA = 0.02
@@ -71,9 +72,9 @@ def verdict(course: Course) -> list[Row]:
     note = f'of {course.outputs:,} messages'
     rows.append(Row('outputs that are not finite', course.not_finite, bar=0.0, note=note))
     _, error, gamma = course.windows.T
-    first, last = (part.mean() for part in (_third(error, 0), _third(error, 2)))
-    note = f'{first:.2g} to {last:.2g}, first and last third of the windows'
-    rows.append(Row('error of d, last / first', last / first, bar=ERROR_RATIO, note=note))
+    first, last = (np.median(part) for part in (_third(error, 0), _third(error, 2)))
+    note = f'{first:.2g} to {last:.2g}, medians of the first and the last third of the windows'
+    rows.append(Row('error of d, growth', last - first, bar=ERROR_GROWTH, note=note))
     note = f'{len(error)} windows, median {np.median(error):.2g}'
     rows.append(Row('error of d, worst window', error.max(), bar=ERROR, note=note))
     first, last = (np.median(part) for part in (_third(gamma, 0), _third(gamma, 2)))

@@ -78,7 +78,7 @@ def windows(error=0.004, gamma=0.5):
         ('samples unaccounted for', {'taken': 901}),
         ('samples lost, by sequence number', {'lost': 1}),
         ('outputs that are not finite', {'not_finite': 1}),
-        ('error of d, last / first', {'windows': windows(error=np.linspace(0.004, 0.04, 90))}),
+        ('error of d, growth', {'windows': windows(error=np.linspace(0.004, 0.04, 90))}),
         ('error of d, worst window', {'windows': windows(error=0.06)}),
         ('error of d, worst window', {'windows': windows(error=float('nan'))}),
         ('gamma, drift', {'windows': windows(gamma=np.linspace(0.5, 0.6, 90))}),

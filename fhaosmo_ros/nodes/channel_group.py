@@ -9,21 +9,30 @@ from typing import Any
 from fhaosmo_ros.core.channel_parameters import of_channel
 from fhaosmo_ros.core.channels import Channels
 from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
 from fhaosmo_ros.nodes.channel import Channel
 from fhaosmo_ros.nodes.diagnostics import Report
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
+MOST_WAITING = 1000
+"""So many samples are stepped before the timer: bounds memory, and the work at once."""
+
 
 class Queue:
     """
     Samples in the order in which they came: channel, stamp, y and the known input of each.
 
-    A timer that is late finds more of them; none is dropped.
+    Attributes
+    ----------
+    step : callable
+        Steps all channels through what waits.
+
     """
 
-    def __init__(self) -> None:
+    def __init__(self, step: Callable[[], None]) -> None:
+        self.step = step
         self.clear()
 
     def clear(self) -> None:
@@ -61,6 +70,17 @@ class QueuedChannel(Channel):
         self._index = index
         self._queue = queue
         super().__init__(node, values, f'{name}/', f'~/{name}/', f'{name} ')
+        self._logger = node.get_logger().get_child(name)
+
+    def reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Start the observer afresh; samples that wait come before it."""
+        self._queue.step()
+        return super().reset(request, response)
+
+    def freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        """Hold gamma, or let it adapt again; samples that wait come before it."""
+        self._queue.step()
+        return super().freeze(request, response)
 
     def _take(self, stamp: int, y: float) -> None:
         if self._snapshots.due:  # what is wanted is the state right after this sample
@@ -72,6 +92,8 @@ class QueuedChannel(Channel):
         queue.stamps.append(stamp)
         queue.y.append(y)
         queue.u.append(self.estimator.input)
+        if len(queue.y) >= MOST_WAITING:
+            queue.step()
 
     def reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start the observer afresh; samples that wait count as before it."""
@@ -107,7 +129,7 @@ class ChannelGroup:
 
     def __init__(self, node: Node, values: Mapping[str, Any], names: list[str]) -> None:
         self._node = node
-        self._queue = Queue()
+        self._queue = Queue(self._step)
         self._rate = float(values['publish_rate'])
         self._timer: Any = None
         self._services: list[Any] = []
@@ -126,6 +148,7 @@ class ChannelGroup:
             self.destroy()
             raise
         self._together = Channels([channel.estimator for channel in self._channels])
+        Channels([OnlineEstimator()]).advance([0], [1], [0.0], [0.0])  # compiles
 
     def activate(self) -> None:
         """Take samples and publish from now on."""
@@ -184,9 +207,8 @@ class ChannelGroup:
             queue.channel, queue.stamps, queue.y, queue.u
         )
         share = (perf_counter() - begin) / len(queue.y)
-        for index, *sample in zip(
-            queue.channel, words, queue.stamps, queue.y, unknown_inputs, strict=True
-        ):
+        columns = words.tolist(), queue.stamps, queue.y, unknown_inputs.tolist()
+        for index, *sample in zip(queue.channel, *columns, strict=True):
             self._channels[index].taken(*sample, share)
         queue.clear()
 
