@@ -40,7 +40,7 @@ class Block(NamedTuple):
         Stamps that the bag keeps with the messages, in nanoseconds.
     stamps : (K,) array of int
         Stamps in the messages' headers, or `times` where they have none.
-    values : (K,) array
+    values : (K,) or (K, width) array
 
     """
 
@@ -160,6 +160,11 @@ class BagReader:
         except Exception as error:
             raise _unreadable(self.path, error) from None
 
+    def first(self, topic: str) -> Any:
+        """Return the first message of a topic that has one."""
+        _, _, data = next(self.messages([topic]))
+        return self._reader.deserialize(data, self.message_type(topic))
+
     def _chunks_of(self, topics: list[str]) -> Iterator[tuple[dict[int, str], Any, Any]]:
         for storage, _, data, records in self.chunk_records(topics):
             yield {c.id: c.topic for c in storage.connections}, data, records
@@ -168,10 +173,16 @@ class BagReader:
         """Find a numeric field of a topic; see `find_field`."""
         return find_field(self.types.fielddefs, self.message_type(topic), text)
 
-    def blocks(self, topic: str, field: Field, use_header: bool) -> Iterator[Block]:
-        """Yield a field's samples in order, in blocks; memory does not grow with the bag."""
+    def blocks(
+        self, topic: str, field: Field, use_header: bool = False, width: int = 1
+    ) -> Iterator[Block]:
+        """
+        Yield a field's samples in order, in blocks; memory does not grow with the bag.
+
+        With `width`, so many neighbours in a list, from the field on.
+        """
         read = self._by_chunk if self.has_chunks else self._by_message
-        yield from read(topic, field, use_header)
+        yield from read(topic, field, use_header, width)
 
     @property
     def has_chunks(self) -> bool:
@@ -212,11 +223,11 @@ class BagReader:
             )
             storage.chunks.append(info)
 
-    def _by_chunk(self, topic: str, field: Field, use_header: bool) -> Iterator[Block]:
+    def _by_chunk(self, topic: str, field: Field, use_header: bool, width: int) -> Iterator[Block]:
         rest = None
         for _, following, data, records in self.chunk_records([topic]):
             at = records.starts + chunks.DATA_AT
-            block = self._block(records.times, data, at, records.ends, field, use_header)
+            block = self._block(records.times, data, at, records.ends, field, use_header, width)
             if rest is not None:
                 block = Block(*(np.concatenate(pair) for pair in zip(rest, block, strict=True)))
             order = np.argsort(block.times, kind='stable')
@@ -226,21 +237,24 @@ class BagReader:
         if rest is not None and len(rest.times):
             yield rest
 
-    def _by_message(self, topic: str, field: Field, use_header: bool) -> Iterator[Block]:
+    def _by_message(
+        self, topic: str, field: Field, use_header: bool, width: int
+    ) -> Iterator[Block]:
         found = self.messages([topic])
         while rows := list(islice(found, BLOCK)):
             _, times, texts = zip(*rows, strict=True)
             data = np.frombuffer(b''.join(texts), dtype=np.uint8)
             ends = np.cumsum([len(text) for text in texts])
             starts = np.concatenate([[0], ends[:-1]])
-            yield self._block(np.array(times, np.int64), data, starts, ends, field, use_header)
+            times = np.array(times, np.int64)
+            yield self._block(times, data, starts, ends, field, use_header, width)
 
     def _block(
         self, times: NDArray[np.int64], data: NDArray[np.uint8], starts: NDArray[np.int64],
-        ends: NDArray[np.int64], field: Field, use_header: bool,
+        ends: NDArray[np.int64], field: Field, use_header: bool, width: int,
     ) -> Block:  # fmt: skip
         try:
-            values, stamps = numbers(field, data, starts, ends)
+            values, stamps = numbers(field, data, starts, ends, width)
         except Exception as error:
             raise _unreadable(self.path, error) from None
         return Block(times, stamps if use_header else times, values)

@@ -43,9 +43,9 @@ class Layout(NamedTuple):
     order: str
 
 
-def locate(field: Field, data: bytes) -> Layout:
+def locate(field: Field, data: bytes, width: int = 1) -> Layout:
     """
-    Find a field in a message.
+    Find a field, the first of `width` neighbours, in a message.
 
     Raises
     ------
@@ -57,12 +57,12 @@ def locate(field: Field, data: bytes) -> Layout:
     """
     if len(data) < HEADER:
         raise ValueError('a message is shorter than its type')
-    walk = _Walk(field, data)
+    walk = _Walk(field, data, width)
     try:
         offset = walk.to_number()
     except (struct.error, IndexError):
         offset = len(data)
-    if offset + field.kind.itemsize > len(data):
+    if offset + width * field.kind.itemsize > len(data):
         raise ValueError('a message is shorter than its type')
     return Layout(offset, [(0, data[:HEADER]), *walk.words], walk.order)
 
@@ -70,8 +70,8 @@ def locate(field: Field, data: bytes) -> Layout:
 class _Walk:
     """Goes through a message; positions count from behind its first four bytes."""
 
-    def __init__(self, field: Field, data: bytes) -> None:
-        self._field, self._data = field, data
+    def __init__(self, field: Field, data: bytes, width: int) -> None:
+        self._field, self._data, self._width = field, data, width
         self.order = '<' if data[1] & 1 else '>'
         self.words: list[tuple[int, bytes]] = []
 
@@ -89,10 +89,11 @@ class _Walk:
                 count = node[1][1]
                 if node[0] == SEQUENCE:
                     count, position = self._length(position)
-                if step >= count:
+                last = step + self._width - 1
+                if last >= count:
                     raise ConfigurationError(
                         f'field {self._field.text!r}: expected an index below the number of '
-                        f'elements, {count} in one message, got {step}'
+                        f'elements, {count} in one message, got {last}'
                     )
                 node = node[1][0]
                 position = self._past_many(node, step, position)
@@ -138,8 +139,9 @@ def _aligned(position: int, size: int) -> int:
 
 
 def numbers(
-    field: Field, data: NDArray[np.uint8], starts: NDArray[np.int64], ends: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    field: Field, data: NDArray[np.uint8], starts: NDArray[np.int64], ends: NDArray[np.int64],
+    width: int = 1,
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
     """
     Return a field's values, and the stamps (ns) in the headers, zeros where there are none.
 
@@ -150,6 +152,8 @@ def numbers(
         Holds the messages.
     starts, ends : (K,) arrays
         Where each begins and ends.
+    width : int
+        Number of neighbours in a list, from the field on: the values then are a (K, width) array.
 
     Raises
     ------
@@ -157,22 +161,24 @@ def numbers(
         As `locate`.
 
     """
-    values, stamps = np.empty(len(starts)), np.zeros(len(starts), dtype=np.int64)
+    values = np.empty((len(starts), width))
+    stamps = np.zeros(len(starts), dtype=np.int64)
     left, groups = np.arange(len(starts)), 0
     while len(left):
         groups += 1
         k = left[0]
-        layout = locate(field, data[starts[k] : ends[k]].tobytes())
+        layout = locate(field, data[starts[k] : ends[k]].tobytes(), width)
         kind = field.kind.newbyteorder(layout.order)
         same = left if groups <= GROUPS else left[:1]
-        same = same[ends[same] - starts[same] >= layout.offset + kind.itemsize]
+        same = same[ends[same] - starts[same] >= layout.offset + width * kind.itemsize]
         for at, word in layout.words:
             same = same[gather(data, starts[same] + at, WORD) == np.frombuffer(word, WORD)]
         at = starts[same]
-        values[same] = gather(data, at + layout.offset, kind)
+        for k in range(width):
+            values[same, k] = gather(data, at + layout.offset + k * kind.itemsize, kind)
         if field.has_header:
             seconds = gather(data, at + HEADER, np.dtype(f'{layout.order}i4')).astype(np.int64)
             rest = gather(data, at + HEADER + 4, np.dtype(f'{layout.order}u4'))
             stamps[same] = seconds * 1_000_000_000 + rest
         left = np.setdiff1d(left, same, assume_unique=True) if len(same) < len(left) else []
-    return values, stamps
+    return values if width > 1 else values[:, 0], stamps
