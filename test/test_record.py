@@ -18,8 +18,8 @@ pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.nodes.spin import Spinner
 from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.bags import series
 from fhaosmo_ros.tools.plot_data import PARTS
+from fhaosmo_ros.tools.series import series
 from fhaosmo_ros.tools.ticks import read_ticks
 import numpy as np
 import rclpy

@@ -17,8 +17,8 @@ from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.tools import replay, sinks
 from fhaosmo_ros.tools.bag_reader import BagReader
 from fhaosmo_ros.tools.bag_writer import BagWriter
-from fhaosmo_ros.tools.bags import series
 from fhaosmo_ros.tools.chunks import scan
+from fhaosmo_ros.tools.series import series
 import lz4.frame
 import numpy as np
 import pytest

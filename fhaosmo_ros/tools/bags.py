@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What bags are made of: types, QoS, messages in CDR; and topics of numbers read whole."""
+"""What bags are made of: types, QoS, messages in CDR."""
 
-from collections.abc import Iterator
 import os
 from pathlib import Path
 import re
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -72,48 +70,3 @@ def labelled_array(names: list[str], values: NDArray[np.float64]) -> bytes:
     )
     layout = types['std_msgs/msg/MultiArrayLayout'](dim=[dimension], data_offset=0)
     return serialise('std_msgs/msg/Float64MultiArray', layout=layout, data=values)
-
-
-class Series(NamedTuple):
-    """
-    A topic's messages as arrays.
-
-    Attributes
-    ----------
-    stamps : (K,) array of int
-        Stamps in nanoseconds.
-    values : (K,) or (K, n) array
-        Numbers of a Float64, a Float64MultiArray, or a Time (in nanoseconds, as integers).
-    labels : list of str
-        Names of the n columns, where the messages have a label.
-
-    """
-
-    stamps: NDArray[np.int64]
-    values: NDArray[Any]
-    labels: list[str]
-
-
-def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
-    """Yield a topic's stamps (ns) and messages in the order of the bag."""
-    with AnyReader([path], default_typestore=TYPES) as reader:
-        connections = [c for c in reader.connections if c.topic == topic]
-        if not connections:
-            return
-        for connection, stamp, data in reader.messages(connections=connections):
-            yield stamp, reader.deserialize(data, connection.msgtype)
-
-
-def series(path: Path, topic: str) -> Series:
-    """Read a topic of numbers; empty arrays if it has no message."""
-    stamps, values, labels = [], [], []
-    for stamp, message in messages(path, topic):
-        stamps.append(stamp)
-        if hasattr(message, 'nanosec'):
-            values.append(message.sec * 1_000_000_000 + message.nanosec)
-        else:
-            values.append(message.data)
-            layout = getattr(message, 'layout', None)
-            if layout is not None and layout.dim:
-                labels = layout.dim[0].label.split(',')
-    return Series(np.array(stamps, dtype=np.int64), np.array(values), labels)

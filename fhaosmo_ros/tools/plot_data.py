@@ -7,7 +7,7 @@ from typing import NamedTuple
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.metrics import chatter, rms
 from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.bags import series
+from fhaosmo_ros.tools.series import series
 from fhaosmo_ros.tools.ticks import read_ticks
 import numpy as np
 from numpy.typing import NDArray

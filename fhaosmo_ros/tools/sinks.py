@@ -138,7 +138,6 @@ class BagSink:
 
     def __init__(self, bag: BagWriter, name: str, order: int, levels: int) -> None:
         self._bag = bag
-        self._topics = [f'{name}/{topic}' for topic in TOPICS]
         ids = [bag.add(f'{name}/{topic}', kind) for topic, kind in TOPICS.items()]
         state = [f'z{i + 1}' for i in range(order)]
         innovation = [f'eps{i + 1}' for i in range(levels)]
@@ -188,9 +187,17 @@ class BagSink:
                 (shift + self._starts).reshape(-1), (shift + self._ends).reshape(-1),
             ))  # fmt: skip
             return
-        for line, time in zip(data, rows.times.tolist(), strict=True):
-            for topic, start, end in zip(self._topics, self._starts, self._ends, strict=True):
-                self._bag.write(topic, time, line[start + DATA_AT : end].tobytes())
+        text, width = data.tobytes(), self._template.size
+        places = list(zip(self._starts.tolist(), self._ends.tolist(), strict=True))
+        self._bag.write_many(
+            self._ids.tolist() * count,
+            np.repeat(rows.times, len(self._ids)).tolist(),
+            [
+                text[at + start + DATA_AT : at + end]
+                for at in range(0, count * width, width)
+                for start, end in places
+            ],
+        )
 
     def close(self) -> None:
         """Leave the bag open: it is its owner's."""

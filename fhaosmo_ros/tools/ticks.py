@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fhaosmo_ros.tools.bags import Series, series
+from fhaosmo_ros.tools.series import Series, series
 import numpy as np
 from numpy.typing import NDArray
 
