@@ -56,17 +56,13 @@ class QueuedChannel(Channel):
     index : int
         Its number in the queue.
     queue : Queue
-    flush : callable
-        Steps all channels through the samples that wait.
 
     """
 
     def __init__(
-        self, node: Node, values: Mapping[str, Any], name: str, index: int, queue: Queue,
-        flush: Callable[[], None],
-    ) -> None:  # fmt: skip
+        self, node: Node, values: Mapping[str, Any], name: str, index: int, queue: Queue
+    ) -> None:
         self.name = name
-        self._flush = flush
         self._index = index
         self._queue = queue
         super().__init__(node, values, f'{name}/', f'~/{name}/', f'{name} ')
@@ -84,7 +80,7 @@ class QueuedChannel(Channel):
 
     def _take(self, stamp: int, y: float) -> None:
         if self._snapshots.due:  # what is wanted is the state right after this sample
-            self._flush()
+            self._queue.step()
             super()._take(stamp, y)
             return
         queue = self._queue
@@ -94,16 +90,6 @@ class QueuedChannel(Channel):
         queue.u.append(self.estimator.input)
         if len(queue.y) >= MOST_WAITING:
             queue.step()
-
-    def reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Start the observer afresh; samples that wait count as before it."""
-        self._flush()
-        return super().reset(request, response)
-
-    def freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        """Hold gamma, or let it adapt again, after the samples that wait."""
-        self._flush()
-        return super().freeze(request, response)
 
     def _start_timer(self) -> None:
         """Do nothing: the group's timer serves all of its channels."""
@@ -138,7 +124,7 @@ class ChannelGroup:
             for index, name in enumerate(names):
                 with of(name):
                     own = of_channel(values, name)
-                    channel = QueuedChannel(node, own, name, index, self._queue, self._step)
+                    channel = QueuedChannel(node, own, name, index, self._queue)
                 self._channels.append(channel)
             self._services = [
                 node.create_service(Trigger, '~/reset', self._reset),

@@ -185,4 +185,4 @@ def _bound(observer: Observer, status: Status) -> str:
         return 'gamma_min'
     if status & Status.GAMMA_AT_MAX:
         return 'gamma_max'
-    return 'neither bound' if observer.parameters['variant'] == 'fuzzy_adaptive' else 'fixed'
+    return 'neither bound' if observer.parameters['variant'].endswith('_adaptive') else 'fixed'
