@@ -236,7 +236,7 @@ class Source:
         self._spinner = Spinner(self._node)
 
     def _on_report(self, message):
-        for pair in message.status[0].values:
+        for pair in (pair for status in message.status for pair in status.values):
             if pair.key == 'rejected measurements':
                 self.rejected = int(pair.value)
 
