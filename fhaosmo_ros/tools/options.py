@@ -5,9 +5,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from fhaosmo_ros.core.channel_parameters import channel_names, of_channel
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.parameter import unknown_parameter
-from fhaosmo_ros.core.parameter_file import load, parse
+from fhaosmo_ros.core.parameter_file import load, parse, select
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
 import yaml
 
@@ -21,6 +21,10 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
         help='set one parameter; wins over the file',
+    )  # fmt: skip
+    parser.add_argument(
+        '--channel', default='', metavar='NAME',
+        help="take the parameters of this one of the node's channels",
     )  # fmt: skip
 
 
@@ -41,11 +45,16 @@ def online_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
         name, separator, text = rule.partition(':=')
         if not separator:
             raise ConfigurationError(f'-p: expected NAME:=VALUE, got {rule!r}')
-        if name not in ESTIMATOR_PARAMETERS:
-            raise unknown_parameter(name, ESTIMATOR_PARAMETERS)
         try:
-            value = parse(text)
+            values[name] = parse(text)
         except yaml.YAMLError:
-            value = text
-        values[name] = ESTIMATOR_PARAMETERS[name].coerce(value)
-    return {name: value for name, value in values.items() if name in ONLINE_PARAMETERS}
+            values[name] = text
+    values = select(values, ESTIMATOR_PARAMETERS)
+    names = channel_names(values)
+    if arguments.channel not in names:
+        raise ConfigurationError(
+            f'--channel: expected {" or ".join(repr(name) for name in names)}, got '
+            f'{arguments.channel!r}'
+        )
+    own = of_channel(values, arguments.channel)
+    return {name: value for name, value in own.items() if name in ONLINE_PARAMETERS}
