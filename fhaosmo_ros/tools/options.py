@@ -5,9 +5,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from fhaosmo_ros.core.channel_parameters import channel_names, of_channel
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.parameter import unknown_parameter
-from fhaosmo_ros.core.parameter_file import load, parse
+from fhaosmo_ros.core.parameter_file import load, parse, select
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
 import yaml
 
@@ -21,6 +21,10 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
         help='set one parameter; wins over the file',
+    )  # fmt: skip
+    parser.add_argument(
+        '--channel', default='', metavar='NAME',
+        help="take the parameters of this one of the node's channels",
     )  # fmt: skip
 
 
@@ -37,26 +41,25 @@ def online_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for path in arguments.params_file:
         values |= load(path, 'estimator')
-    values |= _on_command_line(arguments)
-    return {name: value for name, value in values.items() if name in ONLINE_PARAMETERS}
-
-
-def named(arguments: argparse.Namespace) -> list[str]:
-    """Return the parameters that -p sets."""
-    return list(_on_command_line(arguments))
-
-
-def _on_command_line(arguments: argparse.Namespace) -> dict[str, Any]:
-    values: dict[str, Any] = {}
     for rule in arguments.param:
         name, separator, text = rule.partition(':=')
         if not separator:
             raise ConfigurationError(f'-p: expected NAME:=VALUE, got {rule!r}')
-        if name not in ESTIMATOR_PARAMETERS:
-            raise unknown_parameter(name, ESTIMATOR_PARAMETERS)
         try:
-            value = parse(text)
+            values[name] = parse(text)
         except yaml.YAMLError:
-            value = text
-        values[name] = ESTIMATOR_PARAMETERS[name].coerce(value)
-    return values
+            values[name] = text
+    values = select(values, ESTIMATOR_PARAMETERS)
+    names = channel_names(values)
+    if arguments.channel not in names:
+        raise ConfigurationError(
+            f'--channel: expected {" or ".join(repr(name) for name in names)}, got '
+            f'{arguments.channel!r}'
+        )
+    own = of_channel(values, arguments.channel)
+    return {name: value for name, value in own.items() if name in ONLINE_PARAMETERS}
+
+
+def named(arguments: argparse.Namespace) -> list[str]:
+    """Return the parameters that -p sets."""
+    return [rule.partition(':=')[0] for rule in arguments.param]
