@@ -141,6 +141,36 @@ def test_parameters_of_file_and_command_line(tmp_path):
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y, values))
 
 
+def test_parameters_for_a_named_node(tmp_path):
+    stamps, y = files.signal(100)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+    (tmp_path / 'p.yaml').write_text(
+        'rig: {left: {ros__parameters: {epsilon: 3.0}}}\nestimator: {ros__parameters: {}}'
+    )
+    rules = ['-p', 'plant:order:=7', '-p', 'rig/left:variant:=sign', '-p', '/rig/left:alpha:=30']
+    arguments = ['--params-file', tmp_path / 'p.yaml', *rules, '--node', '/rig/left']
+    assert run(bag, '-o', tmp_path / 'o.npz', *arguments) == 0
+    values = {'variant': 'sign', 'alpha': 30, 'epsilon': 3.0}
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y, values))
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('estimater: {ros__parameters: {}}', ["'estimator' or '/**'", "mean 'estimater'"]),
+        ('estimator: {ros__parameters: {lambda: [1.0, 2.0]}}', ["'lambda'", '[1.0, 2.0]']),
+        ('estimator: {ros__parameters: {lamda: 1.0}}', ["'lamda'", "mean 'lambda'"]),
+    ],
+)
+def test_wrong_file_is_named(text, words, bag, tmp_path, capsys):
+    path = tmp_path / 'p.yaml'
+    path.write_text(text)
+    assert run(bag, '-o', tmp_path / 'o.npz', '--params-file', path) == 2
+    error = capsys.readouterr().err.strip()
+    assert error.startswith(f'replay: error: {path}: ')
+    assert all(word in error for word in words), error
+
+
 def joint_state(stamp, value):
     return files.cdr(
         'sensor_msgs/msg/JointState', header=files.header(stamp), name=['a', 'bcd', 'e'],

@@ -8,7 +8,6 @@ import sys
 import time
 from typing import Any
 
-from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.ode import SOLVERS
 from fhaosmo_ros.tools import paper_beyond as beyond
 from fhaosmo_ros.tools import paper_cases as cases
@@ -16,6 +15,7 @@ from fhaosmo_ros.tools import paper_document as document
 from fhaosmo_ros.tools import paper_figures as figures
 from fhaosmo_ros.tools import paper_findings as findings
 from fhaosmo_ros.tools import paper_tables as tables
+from fhaosmo_ros.tools.command import run_computation
 from tqdm import tqdm
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
@@ -27,25 +27,12 @@ ZOOM = 0.1
 
 
 def main(argv: list[str] | None = None) -> int:
-    """
-    Run the command.
+    """Run the command; return 0, 2 for a bad argument or output, 130 if it was interrupted."""
 
-    Returns
-    -------
-    int
-        0, 2 for a bad argument or output, 130 if it was interrupted.
-
-    """
-    arguments = _parser().parse_args(argv)
-    try:
+    def body(arguments: argparse.Namespace) -> None:
         _paper(arguments.output or _default_output(arguments.quick), arguments.quick)
-    except (ConfigurationError, OSError) as error:
-        print(f'paper: error: {error}', file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print('paper: interrupted', file=sys.stderr)
-        return 130
-    return 0
+
+    return run_computation(_parser(), argv, body)
 
 
 def _parser() -> argparse.ArgumentParser:

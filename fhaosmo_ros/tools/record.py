@@ -9,9 +9,10 @@ import sys
 import time
 
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.stop_signals import Stop, stop_on_signals
+from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bag_writer import BagWriter
 from fhaosmo_ros.tools.bags import make_qos, TYPES
+from fhaosmo_ros.tools.command import run_command
 from fhaosmo_ros.tools.repair import repair
 from tqdm import tqdm
 
@@ -21,28 +22,17 @@ EXTRA = ('/y', '/u', '/diagnostics', '/rosout', '/parameter_events')
 
 
 def main(argv: list[str] | None = None) -> int:
-    """
-    Run the command.
+    """Run the command; return 0 if there is a valid bag, 2 also if nothing was recorded."""
+    return run_command(_parser(), argv, _run)
 
-    Returns
-    -------
-    int
-        0 if there is a valid bag, 2 for wrong arguments or if nothing was recorded.
 
-    """
-    arguments = _parser().parse_args(argv)
-    stop = stop_on_signals()
-    try:
-        if arguments.repair:
-            final = arguments.output or Path(f'{arguments.repair.resolve().stem}_repaired')
-            count = repair(arguments.repair, final, arguments.force, arguments.storage)
-            print(f'saved {count} messages: {final}')
-        else:
-            _record(arguments, stop)
-    except ConfigurationError as error:
-        print(f'record: error: {error}', file=sys.stderr)
-        return 2
-    return 0
+def _run(arguments: argparse.Namespace, stop: Stop) -> None:
+    if arguments.repair:
+        final = arguments.output or Path(f'{arguments.repair.resolve().stem}_repaired')
+        count = repair(arguments.repair, final, arguments.force, arguments.storage)
+        print(f'saved {count} messages: {final}')
+    else:
+        _record(arguments, stop)
 
 
 def _parser() -> argparse.ArgumentParser:

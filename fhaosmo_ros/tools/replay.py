@@ -4,15 +4,15 @@
 import argparse
 from contextlib import ExitStack
 from pathlib import Path
-import sys
 from time import perf_counter
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.stop_signals import Stop, stop_on_signals
+from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bag_copy import copy_topics
 from fhaosmo_ros.tools.bag_reader import BagReader
 from fhaosmo_ros.tools.bag_writer import BagWriter
+from fhaosmo_ros.tools.command import Interrupted, run_command
 from fhaosmo_ros.tools.live_run import find_estimator, LiveRun, read_events
 from fhaosmo_ros.tools.options import add_parameter_options, named, online_parameters
 from fhaosmo_ros.tools.output import Output
@@ -21,34 +21,9 @@ from fhaosmo_ros.tools.sinks import BagSink, CsvSink, NpzSink, Sink, TOPICS
 from tqdm import tqdm
 
 
-class Interrupted(Exception):
-    """The user asked to stop; nothing is kept."""
-
-
 def main(argv: list[str] | None = None) -> int:
-    """
-    Run the command.
-
-    Returns
-    -------
-    int
-        0 if the output is complete, 130 after Ctrl-C, 2 for wrong input; then there is none.
-
-    """
-    arguments = _parser().parse_args(argv)
-    stop = stop_on_signals()
-    try:
-        _replay(arguments, stop)
-    except ConfigurationError as error:
-        print(f'replay: error: {error}', file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f'replay: error: output: {error.strerror}: {error.filename}', file=sys.stderr)
-        return 1
-    except Interrupted:
-        print('replay: interrupted, nothing written', file=sys.stderr)
-        return 130
-    return 0
+    """Run the command; return 0 if the output is complete, else there is none."""
+    return run_command(_parser(), argv, _replay)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -173,4 +148,4 @@ def _write(
 
 def _check_stop(stop: Stop) -> None:
     if stop.is_set():
-        raise Interrupted
+        raise Interrupted('nothing written')
