@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 PYTHON ?= python3
 ARGS ?=
+MINUTES ?= 2
 
 # $(call with,EXTRA): set $python to the environment's Python, making the environment first.
 with = python=$$(PYTHON='$(PYTHON)' sh scripts/environment.sh $(1))
 
-.PHONY: help demo paper test lint bench clean
+.PHONY: help demo paper test lint bench soak clean
 .NOTPARALLEL:
 
 help:
@@ -14,6 +15,7 @@ help:
 	@echo 'make test    check style and types, run the tests'
 	@echo 'make lint    check style and types only'
 	@echo 'make bench   measure speed'
+	@echo 'make soak    run with faults for MINUTES=2, judge memory, losses and drift'
 	@echo 'make clean   remove environments, builds and caches'
 	@echo
 	@echo "Pass options on with ARGS: make demo ARGS='--help', make test ARGS='-k fuzzy'."
@@ -38,6 +40,9 @@ test: lint
 
 bench:
 	@$(call with) && exec "$$python" benchmark/run.py $(ARGS)
+
+soak:
+	@$(call with) && exec "$$python" benchmark/soak.py --minutes $(MINUTES) $(ARGS)
 
 clean:
 	rm -rf .venv .venv-ros build install log *.egg-info .coverage .hypothesis \

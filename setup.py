@@ -31,7 +31,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        *files('config/**/*.yaml', 'launch/*.py'),
+        *files('config/**/*.yaml', 'config/*.xml', 'launch/*.py'),
     ],
     zip_safe=False,
     install_requires=[
@@ -78,7 +78,9 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            f'{command} = {module}:main' for command, (module, _) in COMMANDS.items()
+            # Not the module's own main: what it imports takes a second, and signals come sooner.
+            f'{command} = fhaosmo_ros.__main__:{command}'
+            for command in COMMANDS
         ],
     },
 )

@@ -53,18 +53,22 @@ class Child:
         """Wait until `text` is in the output; return the seconds since the start."""
         deadline = monotonic() + READY
         while text not in self.output():
-            if self._process.poll() is not None:
-                lines = self.output().splitlines()
-                raise CannotMeasureError(
-                    f'{self._log.stem} ended with exit code {self._process.returncode}: '
-                    f'{" / ".join(lines[-2:]) or "without a word"}'
-                )
+            self.check()
             if monotonic() > deadline:
                 raise CannotMeasureError(
                     f"{self._log.stem} did not say '{text}' within {READY:g} s"
                 )
             sleep(POLL)
         return perf_counter() - self.started
+
+    def check(self) -> None:
+        """Raise if the child has ended."""
+        if self._process.poll() is not None:
+            lines = self.output().splitlines()
+            raise CannotMeasureError(
+                f'{self._log.stem} ended with exit code {self._process.returncode}: '
+                f'{" / ".join(lines[-2:]) or "without a word"}'
+            )
 
     def output(self) -> str:
         """Return what the child has said so far."""
@@ -74,6 +78,11 @@ class Child:
         """Return the CPU time used so far, in user and kernel mode, of all threads."""
         fields = Path(f'/proc/{self.pid}/stat').read_text().rpartition(')')[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+    def resident_megabytes(self) -> float:
+        """Return the memory that the child occupies now."""
+        pages = int(Path(f'/proc/{self.pid}/statm').read_text().split()[1])
+        return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
 
     def interrupt(self) -> None:
         """Ask the child to end."""

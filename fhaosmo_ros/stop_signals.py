@@ -2,12 +2,17 @@
 """Ending by Ctrl-C or SIGTERM without losing the clean-up."""
 
 import atexit
+from collections.abc import Iterator
 import contextlib
 import select
 import signal
 import socket
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stopped(BaseException):
+    """Raised by a signal within `Stop.raising`."""
 
 
 class Stop:
@@ -24,6 +29,7 @@ class Stop:
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         self._set = False
+        self._raises = False
 
     def wake_on_signals(self) -> None:
         """Let signals end a wait; in the main thread only."""
@@ -34,6 +40,24 @@ class Stop:
         self._set = True
         with contextlib.suppress(BlockingIOError):  # full: the wait ends anyway
             self._writer.send(b'\0')
+
+    def signal(self) -> None:
+        """Take a signal: `set`, and within `raising` raise, but once only."""
+        raises = self._raises and not self._set
+        self.set()
+        if raises:
+            raise Stopped
+
+    @contextlib.contextmanager
+    def raising(self) -> Iterator[None]:
+        """Let the first signal cut the block, for what is long and leaves nothing behind."""
+        self._raises = True
+        try:
+            if self._set:
+                raise Stopped
+            yield
+        finally:
+            self._raises = False
 
     def is_set(self) -> bool:
         """Return True once `set` has been called."""
@@ -53,11 +77,12 @@ def stop_on_signals() -> Stop:
     """
     Make SIGINT and SIGTERM set the returned event, from now to the process's end.
 
-    They raise nothing, so a second Ctrl-C can't cut the clean-up that the first one began.
+    They raise nothing (but see `Stop.raising`), so a second Ctrl-C can't cut the clean-up that the
+    first one began.
     """
     stop = Stop()
     for number in SIGNALS:
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, lambda *_: stop.signal())
     stop.wake_on_signals()
     atexit.register(_ignore)
     return stop

@@ -59,6 +59,24 @@ def test_quick_core():
     assert 'core step / same step in C' in done.stdout
 
 
+@pytest.mark.ros
+def test_quick_rates():
+    pytest.importorskip('rclpy')
+    done = subprocess.run(
+        [sys.executable, BENCHMARK / 'run.py', '--quick', '--only', 'rates'],
+        capture_output=True, text=True, cwd=BENCHMARK.parent, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert 'CPU, estimator / empty node, y 1000 Hz, estimates 1000 Hz' in done.stdout
+    table = [line.split() for line in done.stdout.splitlines() if line.startswith('1000  ')]
+    assert [line[2] for line in table] == ['estimator', 'empty']
+    for line in table:
+        cpu, lost, sent, *times = (float(word.replace(',', '')) for word in line[3:])
+        assert cpu > 0
+        assert 0 <= lost < sent
+        assert all(time > 0 for time in times)
+
+
 def test_rows_without_value_miss_their_bar(monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARK)
     table = importlib.import_module('table')

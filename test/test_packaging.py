@@ -74,7 +74,7 @@ def test_colcon_installs_executables_and_data(installed, checkout):
     for command in COMMANDS:
         assert os.access(prefix / 'lib' / NAME / command, os.X_OK)
     share = prefix / 'share' / NAME
-    for pattern in ('config/**/*.yaml', 'launch/*.py', 'package.xml'):
+    for pattern in ('config/**/*.yaml', 'config/*.xml', 'launch/*.py', 'package.xml'):
         expected = {path.relative_to(checkout) for path in checkout.glob(pattern)}
         assert {path.relative_to(share) for path in share.glob(pattern)} == expected
     assert (share / 'launch' / 'demo.launch.py').is_file()

@@ -5,17 +5,21 @@ from fhaosmo_ros.core.compile_cache import compile_cache
 
 with compile_cache():
     from fhaosmo_ros.core import joint
+    from fhaosmo_ros.core.counters import Counters
     from fhaosmo_ros.core.errors import ConfigurationError
     from fhaosmo_ros.core.model import TriangularModel
     from fhaosmo_ros.core.observer import Estimate, Observer, ObserverState, Trajectory
+    from fhaosmo_ros.core.online import OnlineEstimator
     from fhaosmo_ros.core.plant import Plant
     from fhaosmo_ros.core.status import Status
 
 __all__ = [
     'ConfigurationError',
+    'Counters',
     'Estimate',
     'Observer',
     'ObserverState',
+    'OnlineEstimator',
     'Plant',
     'Status',
     'Trajectory',

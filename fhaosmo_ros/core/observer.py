@@ -278,6 +278,36 @@ class Observer:
         """Estimate of the present state, with the status of the last step."""
         return self._estimate(self._word)
 
+    @property
+    def unknown_input(self) -> float:
+        """The estimate's unknown input alone, which costs less."""
+        return float(self._levels[self._configuration.unknown_input_at])
+
+    @property
+    def unknown_input_address(self) -> int:
+        """Where `unknown_input` lies in memory, for compiled functions; until `configure`."""
+        row, column = self._configuration.unknown_input_at
+        return int(self._levels[row, column:].ctypes.data)
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """
+        Arrays that compiled functions work on: law, scratch, levels, memory.
+
+        For the policy, which steps this observer itself; valid until the next `configure`.
+        """
+        return (*self._law, *self._work, self._levels, self._memory)
+
+    @property
+    def innovations(self) -> NDArray[np.float64]:
+        """Innovations of the last step, (1, N); not a copy."""
+        return self._eps
+
+    def report(self, word: int) -> Estimate:
+        """Return the estimate of the present state after steps that ended with `word`."""
+        self._word = word
+        return self._estimate(word)
+
     def _estimate(self, word: int) -> Estimate:
         z, d = self._select(self._levels)
         gamma = float(self._memory[layout.GAMMA])
@@ -290,8 +320,7 @@ class Observer:
         z = hat[..., :n].copy()
         if self._configuration.internal:
             z[..., 1:] = tilde[..., : n - 1]
-            return z, tilde[..., n - 1].copy()
-        return z, (hat[..., n] if self.levels > n else tilde[..., n - 1]).copy()
+        return z, levels[(..., *self._configuration.unknown_input_at)].copy()
 
     def run(
         self, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0, every: int = 1
@@ -374,14 +403,20 @@ class Observer:
             *self._law, *self._work, self._levels, self._memory,
             y, h, u, out, gamma, eps, words, first, every,
         )  # fmt: skip
-        if rows:
-            self._word = int(words[-1])
         y_last = self._memory[layout.Y]
         kernels.innovations(self._law.scalars, self._levels, y_last, self._eps, 0)
+        return self.trajectory(t[every - 1 :: every], out, gamma, eps[:rows], words)
+
+    def trajectory(
+        self, t: NDArray[Any], out: NDArray[np.float64], gamma: NDArray[np.float64],
+        eps: NDArray[np.float64], words: NDArray[np.int64],
+    ) -> Trajectory:  # fmt: skip
+        """Return what a compiled run has recorded; the last row is where this observer stands."""
+        if len(words):
+            self._word = int(words[-1])
         z, d = self._select(out)
         return Trajectory(
-            t[every - 1 :: every], z, d, gamma, eps[:rows],
-            words & ((1 << LEVEL_SHIFT) - 1), words >> LEVEL_SHIFT,
+            t, z, d, gamma, eps, words & ((1 << LEVEL_SHIFT) - 1), words >> LEVEL_SHIFT,
             out[:, layout.HAT], out[:, layout.TILDE],
         )  # fmt: skip
 

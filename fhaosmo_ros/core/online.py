@@ -2,56 +2,38 @@
 """The update path of time-stamped samples, shared by the node and by replays of bags."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
-from fhaosmo_ros.core import layout
-from fhaosmo_ros.core.observer import Estimate, Observer, ObserverState, Trajectory
+from fhaosmo_ros.core import layout, policy, policy_time
+from fhaosmo_ros.core import policy_layout as at
+from fhaosmo_ros.core.counters import Counters
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.observer import Estimate, Observer, Trajectory
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
-from fhaosmo_ros.core.status import LEVEL_SHIFT, REJECTED, Status
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 NANOSECONDS = 1e-9
-
-
-@dataclass
-class Counters:
-    """What has happened to the samples so far."""
-
-    accepted: int = 0
-    rejected_measurements: int = 0
-    """y was NaN or infinite."""
-    rejected_stamps: int = 0
-    """The stamp was not later than that of the sample before."""
-    rejected_inputs: int = 0
-    """u was NaN or infinite."""
-    rejected_steps: int = 0
-    """The step would have left the finite numbers."""
-    starts: int = 0
-    """Samples from which the observer started afresh."""
-    restarts: int = 0
-    """Those of them that followed a gap or a jump of time."""
-
-    @property
-    def rejected(self) -> int:
-        """Samples of y that were not used."""
-        return self.rejected_measurements + self.rejected_stamps + self.rejected_steps
+LARGEST_STAMP = 2**63 - 1
 
 
 class OnlineEstimator:
     """
     An observer fed with time-stamped samples.
 
-    The policy of time: dt is the difference of two samples' stamps (integer nanoseconds,
-    subtracted before they become seconds), or `nominal_period`. A sample that is not later than
-    the one before is rejected. After a gap between usable samples longer than `max_gap`, or a jump
-    back by more than it, the observer starts afresh from the new sample.
+    Bad data does not raise and never makes an estimate that is not finite: it is rejected or
+    survived, counted, and told by the status word. The policy, case by case, is in
+    docs/operation.md; it is compiled (policy.py), and this class holds its memory.
 
     Parameters
     ----------
     parameters : mapping, optional
         Values for the observer's and the sampling parameters in docs/parameters.md.
+
+    Attributes
+    ----------
+    observer : Observer
+        To read parameters, sizes and state from; samples go through this class.
 
     Raises
     ------
@@ -62,24 +44,61 @@ class OnlineEstimator:
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
         values = ONLINE_PARAMETERS.defaults() | ONLINE_PARAMETERS.coerce(parameters or {})
-        self.observer = Observer({k: v for k, v in values.items() if k in OBSERVER_PARAMETERS})
-        self._set_sampling(values)
-        self.counters = Counters()
-        self.stamp: int | None = None
-        """Stamp of the sample behind the latest estimate, in nanoseconds."""
-        self._latest: int | None = None
-        self._unused = 0  # nanoseconds that rejected samples have left to the next step
+        self.observer = Observer(_observer(values))
+        state = self.observer.state
+        self._ints, self._reals = at.make_policy(state.levels.size, state.memory.size)
+        self._eps = self.observer.innovations
         self._u = 0.0
+        self._word = 0
+        self._sampling: dict[str, Any] = {}
+        self._adopt(values)
+
+    @property
+    def arguments(self) -> tuple[NDArray[Any], ...]:
+        """
+        Arrays that `policy.take_once` works on, in its order.
+
+        Always the same tuple until `configure`, which makes another one.
+        """
+        return self._arguments
+
+    def taken(self, word: int) -> None:
+        """Remember the status word of a sample that `policy.take_once` was given by others."""
+        self._word = word
 
     @property
     def uses_stamps(self) -> bool:
         """True if dt comes from the samples' stamps."""
-        return not self._nominal
+        return not self._ints[at.NOMINAL]
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """All parameters with their present values; a copy."""
+        return self.observer.parameters | self._sampling
+
+    @property
+    def counters(self) -> Counters:
+        """What has happened to the samples so far."""
+        return Counters(*self._ints[at.COUNTERS :].tolist())
+
+    @property
+    def stamp(self) -> int | None:
+        """Stamp of the sample behind the latest estimate, in nanoseconds."""
+        return int(self._ints[at.STAMP]) if self._ints[at.VALID] else None
+
+    @property
+    def period(self) -> float:
+        """Running mean of the intervals between samples, in seconds; 0 before there are any."""
+        return float(self._reals[at.INTERVAL]) * NANOSECONDS
+
+    @property
+    def jitter(self) -> float:
+        """Running mean of the intervals' distance from their mean, in seconds."""
+        return float(self._reals[at.JITTER]) * NANOSECONDS
 
     def check(self, changes: Mapping[str, Any]) -> None:
         """Raise what `configure` would raise, and change nothing."""
-        values = ONLINE_PARAMETERS.coerce(changes)
-        self.observer.check({k: v for k, v in values.items() if k in OBSERVER_PARAMETERS})
+        self.observer.check(_observer(ONLINE_PARAMETERS.coerce(changes)))
 
     def configure(self, changes: Mapping[str, Any]) -> None:
         """
@@ -92,46 +111,102 @@ class OnlineEstimator:
 
         """
         values = ONLINE_PARAMETERS.coerce(changes)
-        self.observer.configure({k: v for k, v in values.items() if k in OBSERVER_PARAMETERS})
-        self._set_sampling(self._sampling | values)
+        self.observer.configure(_observer(values))
+        self._adopt(values)
 
-    def _set_sampling(self, values: Mapping[str, Any]) -> None:
-        self._sampling = {k: v for k, v in values.items() if k not in OBSERVER_PARAMETERS}
-        self._nominal = self._sampling['sampling'] == 'nominal'
-        self._period = round(float(self._sampling['nominal_period']) / NANOSECONDS)
-        self._max_gap = round(float(self._sampling['max_gap']) / NANOSECONDS)
+    def _adopt(self, values: Mapping[str, Any]) -> None:
+        """Write what the compiled policy reads."""
+        before = self._sampling.get('sampling')
+        self._sampling |= {k: v for k, v in values.items() if k not in OBSERVER_PARAMETERS}
+        p, ints, reals = self._sampling, self._ints, self._reals
+        ints[at.NOMINAL] = p['sampling'] == 'nominal'
+        ints[at.CLOCK] = p['sampling'] == 'clock'
+        for index, name in (
+            (at.PERIOD, 'nominal_period'), (at.MAX_GAP, 'max_gap'), (at.MAX_STEP, 'max_step'),
+            (at.STUCK_TIME, 'stuck_time'), (at.DIVERGENCE_TIME, 'divergence_time'),
+        ):  # fmt: skip
+            ints[index] = round(p[name] / NANOSECONDS)
+        ints[at.GATE_SAMPLES] = p['spike_gate_samples']
+        reals[at.GATE] = p['spike_gate']
+        reals[at.LIMIT] = p['divergence_limit']
+        if p['sampling'] != before:
+            self.forget_stamp()
+        state = self.observer.state
+        self.observer.reset()
+        fresh = self.observer.state
+        self.observer.restore(state)
+        size = fresh.levels.size + fresh.memory.size
+        reals[at.STATES : at.STATES + size] = np.concatenate([fresh.levels.ravel(), fresh.memory])
+        self._arguments = (self._eps, ints, reals, *self.observer.arguments)
+        *_, self._levels, self._memory = self._arguments
 
     def reset(self) -> None:
-        """Start afresh: the next sample is the first. Counters go on."""
-        self.observer.reset()
-        self._latest = self.stamp = None
-        self._unused = 0
+        """Start afresh: the next sample is the first. Counters go on, and so does `freeze`."""
+        policy_time.refresh(self._ints, self._reals, self._levels, self._memory)
+        self._ints[at.VALID] = 0
+        self._ints[at.TICK_COUNT] = self._ints[at.SPACING] = 0
 
-    def resume(self, stamp: int, state: ObserverState) -> None:
+    def seed(self, z: ArrayLike, unknown_input: float) -> None:
         """
-        Go on from the observer's state after an accepted sample with this stamp.
+        Put the estimate there at once, as if the observer had converged; time and gamma go on.
+
+        Before the first sample, or after `reset`, it is where the observer starts from; with
+        start_from_measurement the first sample still sets z_1.
+
+        Parameters
+        ----------
+        z : (n,) array
+            States z_1 .. z_n.
+        unknown_input : float
+            d.
 
         Raises
         ------
         ConfigurationError
-            The state is of an observer with another number of levels.
+            A wrong number of values, or one that is not finite or beyond divergence_limit.
 
         """
-        self.observer.restore(state)
-        self._latest = self.stamp = stamp
-        self._unused = 0
+        n, limit = self.observer.order, self._sampling['divergence_limit']
+        values = np.append(np.asarray(z, dtype=np.float64), unknown_input)
+        if values.shape != (n + 1,) or not (np.abs(values) <= limit).all():
+            raise ConfigurationError(
+                f'seed: expected {n} states and an unknown input, finite and of at most '
+                f'{limit:g} (divergence_limit), got {z!r} and {unknown_input!r}'
+            )
+        self._levels[:] = 0.0
+        self._levels[layout.HAT] = values[: self.observer.levels]
+        self._levels[layout.TILDE, :n] = values[1:]
+        self._ints[at.BRIDGED] = 0
+
+    def freeze(self, held: bool) -> None:
+        """Hold gamma where it is, or let it adapt again; no parameter changes."""
+        self._ints[at.FROZEN] = held
+
+    @property
+    def frozen(self) -> bool:
+        """True while gamma is held."""
+        return bool(self._ints[at.FROZEN])
 
     def forget_stamp(self) -> None:
-        """Expect stamps of another clock: the next sample takes the nominal period."""
-        self._latest = None
+        """Expect stamps of another clock: the next sample takes the usual period."""
+        self._ints[at.TIMED] = self._ints[at.TICK_COUNT] = 0
+
+    @property
+    def input(self) -> float:
+        """The known input u that is held."""
+        return self._u
 
     def set_input(self, u: float) -> bool:
         """Hold `u` as the known input from now on; return False if it is not finite."""
         if not np.isfinite(u):
-            self.counters.rejected_inputs += 1
+            self.reject_inputs(1)
             return False
         self._u = float(u)
         return True
+
+    def reject_inputs(self, count: int) -> None:
+        """Count values of u that were not finite."""
+        self._ints[at.REJECTED_INPUTS] += count
 
     def update(self, stamp: int, y: float) -> Estimate:
         """
@@ -150,49 +225,23 @@ class OnlineEstimator:
             Of this sample, or the previous state's with the reason of the rejection.
 
         """
-        self.advance(stamp, y)
-        return self.observer.estimate
+        return self.observer.report(self.advance(int(stamp), y))
 
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
-        observer = self.observer
-        fresh = not observer.started
-        if fresh:
-            word = observer.start(y).word
-            self._latest, self._unused = stamp, 0
-        else:
-            nominal = self._nominal or self._latest is None
-            elapsed = self._period if nominal else stamp - (self._latest or 0)
-            gap = abs(elapsed) + self._unused
-            if gap > self._max_gap and (self._unused or not nominal):
-                observer.reset()
-                self.stamp = None
-                self.counters.restarts += 1
-                fresh = True
-                word = observer.start(y).word
-                self._latest, self._unused = stamp, 0
-            else:
-                word = observer.advance(y, elapsed * NANOSECONDS, self._u)
-                if nominal or elapsed > 0:
-                    self._latest = stamp
-                    self._unused = gap if word & REJECTED else 0
-        if word & REJECTED:
-            self._count_rejected(word)
-        else:
-            self.counters.accepted += 1
-            self.counters.starts += fresh
-            self.stamp = stamp
+        try:
+            word: int = policy.take_once(stamp, float(y), self._u, *self._arguments)
+        except OverflowError:  # beyond 64 bits
+            limit = LARGEST_STAMP if stamp > 0 else -LARGEST_STAMP
+            word = policy.take_once(limit, float(y), self._u, *self._arguments)
+        self._word = word
         return word
 
     def run(
         self, stamps: NDArray[np.int64], y: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> list[Trajectory]:
+    ) -> Trajectory:
         """
         Take many samples, bit for bit as `update` would take one after the other.
-
-        Samples that bring nothing to decide (all finite, in time) go through the kernel at once.
-        Where one of them is rejected all the same, or one does not fit, the block is taken again
-        from where it began, sample by sample: so there is one policy of time, that of `advance`.
 
         Parameters
         ----------
@@ -200,76 +249,37 @@ class OnlineEstimator:
             Times of the samples in nanoseconds.
         y : (K,) array
             Samples.
-        u : (K,) array of finite numbers
+        u : (K,) array
             Known input of the interval that ends at each sample.
 
         Returns
         -------
-        list of Trajectory
-            In order; together a row for every sample, whose status says whether it was rejected.
-            ``t`` holds the stamps.
+        Trajectory
+            A row for every sample, whose status says whether it was rejected. ``t`` holds the
+            stamps.
 
         """
-        pieces = []
-        if not self.observer.started and len(y) > 1:
-            pieces.append(self._one_by_one(stamps[:1], y[:1], u[:1]))
-            stamps, y, u = stamps[1:], y[1:], u[1:]
-        if len(y):
-            pieces.append(self._at_once(stamps, y, u) or self._one_by_one(stamps, y, u))
-        return pieces
-
-    def _at_once(
-        self, stamps: NDArray[np.int64], y: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> Trajectory | None:
-        """Take samples that are all accepted, or return None and change nothing."""
-        if not self.observer.started or self._latest is None or self._unused:
-            return None
-        if self._nominal:
-            elapsed = np.full(len(y), self._period)
-        else:
-            elapsed = np.diff(stamps, prepend=self._latest)
-            if elapsed.min() <= 0 or elapsed.max() > self._max_gap:
-                return None
-        if not np.isfinite(y).all():
-            return None
-        before = self.observer.state
-        piece = self.observer.step_through(stamps, y, elapsed * NANOSECONDS, u, first=0)
-        if (piece.status & REJECTED).any():
-            self.observer.restore(before)
-            return None
-        self.counters.accepted += len(y)
-        self._latest = self.stamp = int(stamps[-1])
-        self._u = float(u[-1])
-        return piece
-
-    def _one_by_one(
-        self, stamps: NDArray[np.int64], y: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> Trajectory:
-        estimates, states = [], []
-        for stamp, sample, known in zip(stamps.tolist(), y.tolist(), u.tolist(), strict=True):
-            self.set_input(known)
-            estimates.append(self.update(stamp, sample))
-            states.append(self.observer.state.levels)
-        z, d, gamma, innovation, words = (
-            np.array(column) for column in zip(*estimates, strict=True)
-        )
-        levels = np.array(states)
-        return Trajectory(
-            stamps, z, d, gamma, innovation,
-            words & ((1 << LEVEL_SHIFT) - 1), words >> LEVEL_SHIFT,
-            levels[:, layout.HAT], levels[:, layout.TILDE],
+        count, n = len(y), self.observer.levels
+        u = np.array(u, dtype=np.float64)
+        for k in np.flatnonzero(~np.isfinite(u)):
+            u[k] = u[k - 1] if k else self._u
+            self.reject_inputs(1)
+        out, eps = np.empty((count, 2, n)), np.empty((count, n))
+        gamma, words = np.empty(count), np.empty(count, dtype=np.int64)
+        policy.run(
+            np.ascontiguousarray(stamps, dtype=np.int64),
+            np.ascontiguousarray(y, dtype=np.float64),
+            u, out, gamma, words, eps, *self._arguments[1:],
         )  # fmt: skip
+        if count:
+            self._u, self._word, self._eps[0] = float(u[-1]), int(words[-1]), eps[-1]
+        return self.observer.trajectory(stamps, out, gamma, eps, words)
 
     @property
     def estimate(self) -> Estimate | None:
         """The latest estimate, None before the first sample."""
-        return None if self.stamp is None else self.observer.estimate
+        return self.observer.report(self._word) if self._ints[at.VALID] else None
 
-    def _count_rejected(self, word: int) -> None:
-        counters = self.counters
-        if word & Status.REJECTED_MEASUREMENT:
-            counters.rejected_measurements += 1
-        elif word & Status.REJECTED_PERIOD:
-            counters.rejected_stamps += 1
-        else:
-            counters.rejected_steps += 1
+
+def _observer(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if name in OBSERVER_PARAMETERS}

@@ -144,7 +144,7 @@ class Parameter:
             return not self.choices or item in self.choices
         if isinstance(item, bool):
             return True
-        if not math.isfinite(item):
+        if isinstance(item, float) and not math.isfinite(item):
             return False
         if self.lower is not None and (
             item < self.lower or (self.lower_open and item == self.lower)

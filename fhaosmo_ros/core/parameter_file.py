@@ -6,6 +6,7 @@ from pathlib import Path
 import re
 from typing import Any
 
+from fhaosmo_ros.core.channel_parameters import channel_names, CHANNELS, with_channels
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter import ParameterTable, suggestion, unknown_parameter
 from fhaosmo_ros.core.parameters import NODE_TABLES
@@ -55,20 +56,25 @@ def load(
 
     """
     try:
-        values: dict[str, Any] = {}
-        sections = _sections(path)
-        ours = [section for section in sections if _matches(section, node)]
-        if strict and not ours:
-            names = [section.lstrip('/') for section in sections]
-            raise ConfigurationError(
-                f"expected a section '{node}' or '/**', got {', '.join(names)}"
-                f'{suggestion(node, names)}'
-            )
-        for section in ours:
-            values |= sections[section]
-        return select(values, table or NODE_TABLES[node.rsplit('/', 1)[-1]])
+        return select(read(path, node, strict), table or NODE_TABLES[node.rsplit('/', 1)[-1]])
     except ConfigurationError as error:
         raise ConfigurationError(f'{path}: {error}') from None
+
+
+def read(path: str | Path, node: str, strict: bool = False) -> dict[str, Any]:
+    """Return what a file sets for a node, unchecked; see `load`."""
+    values: dict[str, Any] = {}
+    sections = _sections(path)
+    ours = [section for section in sections if _matches(section, node)]
+    if strict and not ours:
+        names = [section.lstrip('/') for section in sections]
+        raise ConfigurationError(
+            f"expected a section '{node}' or '/**', got {', '.join(names)}"
+            f'{suggestion(node, names)}'
+        )
+    for section in ours:
+        values |= sections[section]
+    return values
 
 
 def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
@@ -81,7 +87,11 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
         A name that no node of the package declares, or a bad value.
 
     """
-    everybody = dict.fromkeys(name for other in NODE_TABLES.values() for name in other)
+    names = channel_names(values)
+    if CHANNELS in table:
+        table = with_channels(table, names)
+    tables = [table, *(with_channels(other, names) for other in NODE_TABLES.values())]
+    everybody = dict.fromkeys(name for other in tables for name in other)
     for name in values:
         if name not in everybody and not is_built_in(name):
             raise unknown_parameter(name, everybody)

@@ -150,16 +150,117 @@ SAMPLING = (
     ),
     Parameter(
         'max_gap', 0.5,
-        'A longer time between two samples, or a stamp that lies further back, restarts the '
-        'observer from the new sample.',
+        'A longer time between two usable samples, or a stamp that lies further back, restarts '
+        'the observer from the new samples, once a second one confirms the jump.',
         unit='s', lower=1e-6, upper=3600.0,
+    ),
+    Parameter(
+        'max_step', 0.0,
+        'A longer interval, up to max_gap, is bridged: y in between is predicted by the model and '
+        'bent to the new sample, and the observer takes steps of at most this long. 0: intervals '
+        'of more than twice the mean are bridged, in steps of about the mean interval.',
+        unit='s', lower=0.0, upper=3600.0,
+    ),
+    Parameter(
+        'spike_gate', 0.0,
+        'A sample that lies further than this from what the model predicts from the one before '
+        'is rejected (unit of y); 0 for no gate.',
+        lower=0.0, upper=1e12,
+    ),
+    Parameter(
+        'spike_gate_samples', 5,
+        'So many samples in a row may be rejected by spike_gate; the next one is believed: a '
+        'step of y is not a spike.',
+        lower=1, upper=1_000_000,
+    ),
+    Parameter(
+        'stuck_time', 0.0,
+        'Samples are rejected while y has not changed at all for longer than this; 0 for never.',
+        unit='s', lower=0.0, upper=3600.0,
+    ),
+    Parameter(
+        'divergence_time', 1.0,
+        '|eps_1| above epsilon, or steps that leave the finite numbers, for longer than this: the '
+        'observer has lost y and starts afresh from it; 0 for never.',
+        unit='s', lower=0.0, upper=3600.0,
+    ),
+    Parameter(
+        'divergence_limit', 1e12,
+        'A sample of larger magnitude is rejected, and an observer with a larger state starts '
+        'afresh from y.',
+        lower=1.0, upper=1e100,
     ),
 )  # fmt: skip
 
 ESTIMATOR_NODE = (
     Parameter(
+        'channels', [''],
+        'Names of the outputs that one process estimates from. Channel hip reads hip/y, publishes '
+        '~/hip/state and so on, and takes each parameter of the model, the observer and the '
+        "sampling from hip.NAME where that is set, else from NAME. ['']: one channel, no prefix.",
+        live=False, lengths='any',
+    ),
+    Parameter(
+        'autostart', True,
+        'Configure and activate by itself at the start. false: wait for a lifecycle manager, or '
+        'for `ros2 lifecycle set`.',
+        live=False,
+    ),
+    Parameter(
         'publish_rate', 100.0, 'Rate of the timer that publishes the estimates.',
         unit='Hz', lower=0.1, upper=5000.0,
+    ),
+    Parameter(
+        'input_reliability', 'best_effort',
+        'QoS of the subscriptions of y and u. best_effort hears every publisher; reliable has '
+        'lost samples sent again, and hears reliable publishers only.',
+        choices=('best_effort', 'reliable'), live=False,
+    ),
+    Parameter(
+        'input_durability', 'volatile',
+        'QoS of the subscriptions of y and u. transient_local also hears what was published '
+        'before, of transient_local publishers only.',
+        choices=('volatile', 'transient_local'), live=False,
+    ),
+    Parameter(
+        'input_depth', 1000, 'Samples of y that wait while the node is busy; older ones are lost.',
+        lower=1, upper=100_000, live=False,
+    ),
+)  # fmt: skip
+
+DIAGNOSTICS = (
+    Parameter(
+        'diagnostics_period', 1.0, 'Time between two reports on /diagnostics, in host time.',
+        unit='s', lower=0.1, upper=60.0,
+    ),
+    Parameter(
+        'hardware_id', 'none', 'hardware_id of the reports: the sensor behind y.',
+    ),
+    Parameter(
+        'warn_rate_below', 0.0, 'WARN if the sample rate of y is lower; 0 for never.',
+        unit='Hz', lower=0.0, upper=1e5,
+    ),
+    Parameter(
+        'warn_jitter_above', 0.5,
+        'WARN if the standard deviation of the sampling period over its mean is higher.',
+        lower=0.0, upper=1e6,
+    ),
+    Parameter(
+        'warn_delay_above', 0.1,
+        'WARN if a sample is taken later than this after its source stamp: this host is too slow, '
+        "or its clock and the publisher's differ.",
+        unit='s', lower=0.0, upper=1e6,
+    ),
+    Parameter(
+        'warn_chatter_above', 0.0,
+        'WARN if the estimate of d chatters more (RMS of what a moving average of 5 samples '
+        'leaves, unit of d); 0 for never.',
+        lower=0.0, upper=1e12,
+    ),
+    Parameter(
+        'error_bad_share_above', 0.5,
+        'ERROR if a larger share of the samples was lost or rejected; any at all is a WARN.',
+        lower=0.0, upper=1.0,
     ),
 )  # fmt: skip
 
@@ -222,7 +323,7 @@ PLANT_NODE = (
 
 OBSERVER_PARAMETERS = ParameterTable(MODEL, OBSERVER)
 ONLINE_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING)
-ESTIMATOR_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, ESTIMATOR_NODE)
+ESTIMATOR_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, ESTIMATOR_NODE, DIAGNOSTICS)
 PLANT_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL)
 PLANT_NODE_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL, PLANT_NODE)
 NODE_TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}

@@ -3,7 +3,7 @@
 
 from enum import IntFlag
 
-LEVEL_SHIFT = 8
+LEVEL_SHIFT = 16
 """Bits from here on hold the number of open levels."""
 
 
@@ -13,7 +13,7 @@ class Status(IntFlag):
 
     A rejected sample leaves the state as it was. The time it stood for is added to the next step,
     except for `REJECTED_STEP`, which drops it, so that what could not be stepped over does not
-    come back.
+    come back. The flags after `SENSITIVITY_RESET` come from the policy (policy.py) only.
     """
 
     OK = 0
@@ -24,6 +24,12 @@ class Status(IntFlag):
     GAMMA_AT_MIN = 16
     GAMMA_AT_MAX = 32
     SENSITIVITY_RESET = 64  # the sensitivities grew beyond use and start again at 0
+    REJECTED_SPIKE = 128  # y is further than spike_gate from its prediction
+    REJECTED_STUCK = 256  # y has not changed for stuck_time
+    HELD = 512  # with REJECTED_PERIOD: a jump of the stamp; the next sample decides
+    GAP = 1024  # a long interval was bridged in sub-steps
+    RESTARTED = 2048  # started afresh after a gap or a jump of the clock
+    DIVERGED = 4096  # had left y behind, and was seeded again from y
 
     @property
     def rejected(self) -> bool:
@@ -36,6 +42,8 @@ REJECTED = int(
     | Status.REJECTED_PERIOD
     | Status.REJECTED_INPUT
     | Status.REJECTED_STEP
+    | Status.REJECTED_SPIKE
+    | Status.REJECTED_STUCK
 )
 """Mask of the flags that reject; an int, because flags are slow in a path that runs at 1 kHz."""
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recorded known input u, held between its samples as the node holds it."""
 
-from fhaosmo_ros.core.online import Counters
+from collections.abc import Callable
+
 from fhaosmo_ros.tools.bag_reader import BagReader
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,10 @@ class HeldInput:
     """
 
     def __init__(
-        self, reader: BagReader, topic: str, field: str | None, counters: Counters
+        self, reader: BagReader, topic: str, field: str | None, reject: Callable[[int], None]
     ) -> None:
         self._blocks = reader.blocks(topic, reader.field(topic, field), use_header=False)
-        self._counters = counters
+        self._reject = reject
         self._times = np.zeros(0, dtype=np.int64)
         self._values = np.zeros(0)
         self._held = 0.0
@@ -34,7 +35,7 @@ class HeldInput:
             if block is None:
                 break
             good = np.isfinite(block.values)
-            self._counters.rejected_inputs += int((~good).sum())
+            self._reject(int((~good).sum()))
             self._times = np.concatenate([self._times, block.times[good]])
             self._values = np.concatenate([self._values, block.values[good]])
         last = np.searchsorted(self._times, times, side='right')

@@ -6,6 +6,7 @@ import sys
 
 from fhaosmo_ros.core.parameter import Parameter
 from fhaosmo_ros.core.parameters import (
+    DIAGNOSTICS,
     ESTIMATOR_NODE,
     MODEL,
     OBSERVER,
@@ -21,13 +22,16 @@ Generated from `fhaosmo_ros/core/parameters.py` by `python -m fhaosmo_ros.tools.
 NOTE = """
 A list takes one value for every level, or one a level, where it says so. An integer is accepted
 where a number is meant. "live" parameters change in a running node with `ros2 param set`, from the
-next sample on and without a jump of the estimate; the others are fixed when a node starts.
+next sample on and without a jump of the estimate. The others are read when the estimator is
+configured, and can be set while it is unconfigured (`ros2 lifecycle set /estimator cleanup`);
+the plant, and `autostart`, read them at the start.
 """
 GROUPS = (
     ('Model (estimator and plant)', MODEL),
     ('Observer (estimator)', OBSERVER),
     ('Sampling (estimator)', SAMPLING),
-    ('Publishing (estimator)', ESTIMATOR_NODE),
+    ('Node (estimator)', ESTIMATOR_NODE),
+    ('Diagnostics (estimator)', DIAGNOSTICS),
     ('Simulation (plant)', PLANT_MODEL),
     ('Publishing (plant)', PLANT_NODE),
 )

@@ -35,7 +35,7 @@ class Samples:
         self._input = None
         if estimator.observer.uses_input:
             self._input = HeldInput(
-                reader, arguments.input_topic, arguments.input_field, estimator.counters
+                reader, arguments.input_topic, arguments.input_field, estimator.reject_inputs
             )
         self._first: int | None = None
         self._latest: int | None = None
@@ -92,15 +92,12 @@ class Samples:
             yield from self._estimate(Block(*(column[part] for column in block)), u[part])
 
     def _estimate(self, block: Block, u: np.ndarray) -> Iterator[Rows]:
-        position = 0
-        for piece in self.estimator.run(block.stamps, block.values, u):
-            keep = np.flatnonzero((piece.status & REJECTED) == 0)
-            count = len(keep)
-            keep = keep[(self._every - 1 - self._seen) % self._every :: self._every]
-            self._seen += count
-            part = slice(position, position + len(piece.t))
-            position = part.stop
-            if len(keep):
-                whole = len(keep) == len(piece.t)
-                estimates = piece if whole else type(piece)(*(a[keep] for a in piece))
-                yield Rows(block.times[part][keep], block.values[part][keep], estimates)
+        estimates = self.estimator.run(block.stamps, block.values, u)
+        keep = np.flatnonzero((estimates.status & REJECTED) == 0)
+        count = len(keep)
+        keep = keep[(self._every - 1 - self._seen) % self._every :: self._every]
+        self._seen += count
+        if len(keep):
+            if len(keep) < len(block.times):
+                estimates = type(estimates)(*(a[keep] for a in estimates))
+            yield Rows(block.times[keep], block.values[keep], estimates)

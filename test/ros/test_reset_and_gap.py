@@ -1,124 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of time: resets, gaps, stamps that stand still or go backwards, another clock."""
+"""Faults of time at the node: resets, gaps, a clock that jumps back."""
 
 import contextlib
-import itertools
 import math
 import time
 
 from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.status import Status
 import numpy as np
 import pytest
 
 MS = 1_000_000
-START = 1_700_000_000 * 10**9
-
-
-def run(estimator: OnlineEstimator, count: int, start: int = START, step: int = MS) -> int:
-    """Feed samples of a sine; return the last stamp."""
-    for k in range(count):
-        estimator.update(start + k * step, 0.2 + 0.1 * math.sin(0.01 * k))
-    return start + (count - 1) * step
-
-
-# The update path itself: stamps that a middleware can't be made to deliver.
-
-
-def test_duplicate_stamp_is_rejected_and_changes_nothing():
-    estimator = OnlineEstimator()
-    last = run(estimator, 50)
-    before, state = estimator.estimate, estimator.observer.state
-    assert estimator.update(last, 5.0).status & Status.REJECTED_PERIOD
-    assert estimator.counters.rejected_stamps == 1
-    np.testing.assert_array_equal(estimator.estimate.z, before.z)
-    np.testing.assert_array_equal(estimator.observer.state.levels, state.levels)
-
-
-def test_backward_stamp_is_rejected_and_the_next_one_counts_from_the_latest():
-    estimator, other = OnlineEstimator(), OnlineEstimator()
-    last = run(estimator, 50)
-    run(other, 50)
-    assert estimator.update(last - 3 * MS, 5.0).status & Status.REJECTED_PERIOD
-    np.testing.assert_array_equal(
-        estimator.update(last + MS, 0.21).z, other.update(last + MS, 0.21).z
-    )
-    assert estimator.counters.restarts == 0
-
-
-@pytest.mark.parametrize('jump', [600 * MS, -600 * MS, 10**18, -(10**18)])
-def test_jump_beyond_max_gap_restarts_from_the_new_sample(jump):
-    estimator, fresh = OnlineEstimator(), OnlineEstimator()
-    last = run(estimator, 50)
-    for k, y in enumerate((0.3, 0.31, 0.32)):
-        stamp = last + jump + k * MS
-        np.testing.assert_array_equal(estimator.update(stamp, y).z, fresh.update(stamp, y).z)
-    assert estimator.counters.restarts == 1
-    assert estimator.counters.accepted == 53
-
-
-def test_gap_of_exactly_max_gap_is_stepped_over():
-    estimator = OnlineEstimator({'max_gap': 0.3})
-    last = run(estimator, 50)
-    estimator.update(last + 300 * MS, 0.2)
-    assert estimator.counters.restarts == 0
-
-
-@pytest.mark.parametrize('sampling', ['source_stamp', 'nominal'])
-def test_bad_samples_for_longer_than_max_gap_restart_too(sampling):
-    estimator = OnlineEstimator({'sampling': sampling, 'max_gap': 0.5})
-    fresh = OnlineEstimator({'sampling': sampling})
-    last = run(estimator, 50)
-    for k in range(1, 2001):
-        estimator.update(last + k * MS, math.nan)
-    assert estimator.counters.rejected_measurements == 2000
-    stamps = (last + 2001 * MS, last + 2002 * MS)
-    for stamp in stamps:
-        np.testing.assert_array_equal(estimator.update(stamp, 0.5).z, fresh.update(stamp, 0.5).z)
-    assert estimator.counters.restarts == 1
-
-
-def test_time_of_a_few_bad_samples_is_added_to_the_next_step():
-    estimator, other = OnlineEstimator(), OnlineEstimator()
-    last = run(estimator, 50)
-    run(other, 50)
-    estimator.update(last + MS, math.nan)
-    estimator.update(last + 2 * MS, math.inf)
-    np.testing.assert_allclose(
-        estimator.update(last + 3 * MS, 0.21).z,
-        other.update(last + 3 * MS, 0.21).z,
-        rtol=0.0,
-        atol=1e-12,
-    )
-
-
-def test_nominal_sampling_ignores_stamps():
-    options = {'sampling': 'nominal', 'nominal_period': 0.002}
-    nominal, stamped = OnlineEstimator(options), OnlineEstimator()
-    for k, wild in enumerate(itertools.islice(itertools.cycle((0, 10**15, -5, 7)), 100)):
-        y = 0.2 + 0.1 * math.sin(0.01 * k)
-        np.testing.assert_allclose(
-            nominal.update(wild, y).z,
-            stamped.update(START + k * 2 * MS, y).z,
-            rtol=0.0,
-            atol=1e-12,
-        )
-    assert nominal.counters.rejected == nominal.counters.restarts == 0
-
-
-def test_change_of_clock_takes_the_nominal_period_once():
-    estimator = OnlineEstimator()
-    other = OnlineEstimator()
-    last = run(estimator, 50)
-    run(other, 50)
-    estimator.forget_stamp()
-    for k in range(1, 4):
-        np.testing.assert_array_equal(
-            estimator.update(k * MS, 0.21).z, other.update(last + k * MS, 0.21).z
-        )
-
-
-# The node.
 
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
@@ -157,6 +48,7 @@ def test_gap_stops_the_output_and_restarts_the_observer(rig):
     reports, ticks = len(rig.diagnostics), len(rig.topics['stamp'])
     rig.client.wait(lambda: len(rig.diagnostics) >= reports + 2, 'diagnostics')
     assert len(rig.topics['stamp']) <= ticks + 1  # one may have been on its way
+    rig.send(4.0)  # held: one stamp far away may be wrong
     estimate = rig.feed(4.0)
     assert estimate.z == [4.0, 0.0, 0.0]
     assert rig.feed(4.0).stamp > estimate.stamp
@@ -236,10 +128,11 @@ def test_node_clock_sampling_follows_simulated_time(client, folder):
             lambda: any(
                 m.message.header.stamp.sec < 50
                 for m in rig.diagnostics
-                if m.message.header.stamp.sec and m.message.status[0].name == 'sim/estimator'
+                if m.message.header.stamp.sec and 'sim/' in m.message.status[0].name
             ),
             'diagnostics in the new time',
             step=500 * MS,
         )
+        rig.send(2.0)  # held: one stamp far away may be wrong
         assert simulated.feed(2.0).z == [2.0, 0.0, 0.0]
         assert 'restarted from the new one' in process.output

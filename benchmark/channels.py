@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a channel costs in one process of many, over what a process for it alone costs."""
+
+from time import monotonic, sleep
+
+from children import Child, Children
+import numpy as np
+from rates import isolate
+from table import Row
+from tqdm import tqdm
+
+BAR = 0.2
+RATE = 100.0
+"""Of each y, and of the estimates, in Hz."""
+CHANNELS = 32
+SINGLES = 4
+"""Processes with a channel each, on the samples of the first channels."""
+WARM_UP = 2.0
+
+
+def measure(quick: bool) -> list[Row]:
+    """Return the ratios, without and with a listener to the estimates."""
+    isolate()
+    channels, seconds, repetitions = (4, 2.0, 1) if quick else (CHANNELS, 10.0, 3)
+    plan = [listen for _ in range(repetitions) for listen in (False, True)]
+    runs: dict[bool, list[tuple[float, float]]] = {False: [], True: []}
+    for listen in tqdm(plan, desc='channels', unit='run', leave=False):
+        runs[listen].append(observe(channels, seconds, listen))
+    rows = []
+    for listen, costs in runs.items():
+        ratios = [many / channels / single for many, single in costs]
+        many, single = np.median(costs, axis=0)
+        name = 'estimates of d heard by one listener' if listen else 'nobody listens'
+        rows.append(Row(
+            f'CPU, a channel of {channels} / a process each, {RATE:g} Hz, {name}',
+            float(np.median(ratios)), bar=None if quick else BAR,
+            note=f'{many:.1%} / {channels} and {single:.2%}; ratios '
+            f'{", ".join(f"{r:.3f}" for r in ratios)}',
+        ))  # fmt: skip
+    return rows
+
+
+def observe(channels: int, seconds: float, listen: bool) -> tuple[float, float]:
+    """Return the CPU of the process with all channels, and of one process for one, over time."""
+    names = [f'c{k}' for k in range(channels)]
+    singles = names[: min(SINGLES, channels)]
+    publish = ('-p', f'publish_rate:={RATE}')
+    with Children() as children:
+        many = children.start(
+            'many', '-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-r', '__node:=many', *publish,
+            '-p', f'channels:=[{", ".join(names)}]',
+        )  # fmt: skip
+        alone = [
+            children.start(
+                f'single_{name}', '-m', 'fhaosmo_ros', 'estimator', '--ros-args',
+                '-r', f'__node:=single_{name}', '-r', f'y:={name}/y', *publish,
+            )
+            for name in singles
+        ]  # fmt: skip
+        for node in (many, *alone):
+            node.wait_for('estimating')
+        if listen:
+            topics = [f'many/{name}/unknown_input' for name in names]
+            topics += [f'single_{name}/unknown_input' for name in singles]
+            children.start('listener', 'benchmark/listener.py', *topics).wait_for('listening')
+        source = children.start(
+            'source', 'benchmark/source.py', '--rate', str(RATE),
+            '--topics', *(f'{name}/y' for name in names),
+        )  # fmt: skip
+        source.wait_for('publishing')
+        sleep(WARM_UP)
+        before, start = _used(many, alone), monotonic()
+        sleep(seconds)
+        used, elapsed = _used(many, alone) - before, monotonic() - start
+        return float(used[0] / elapsed), float(used[1] / elapsed)
+
+
+def _used(many: Child, alone: list[Child]) -> np.ndarray:
+    return np.array([many.cpu_seconds(), np.mean([node.cpu_seconds() for node in alone])])

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever samples, stamps and parameters come: nothing raises, all that is shown is finite."""
+
+import string
+
+from fhaosmo_ros.core import ConfigurationError
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameter import Parameter
+from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from observer_cases import SMALL
+import pytest
+
+START = 1_700_000_000 * 10**9
+WILD = [0.0, -0.0, 1e-320, 1e11, -1e12, 1e150, 1e308, -1e308, float('nan'), float('inf')]
+JUMPS = [0, 1, -1, 1000, 10**6, -(10**6), 10**7, 3 * 10**8, 6 * 10**8, -(10**9), 3600 * 10**9]
+ABSOLUTE = [0, 1, -1, START, 2**63 - 1, -(2**63), 2**63, -(10**30), 10**30]
+
+
+def valid(parameter: Parameter, rng: np.random.Generator):
+    """Return a random value that the parameter alone allows."""
+    if parameter.choices:
+        return str(rng.choice(parameter.choices))
+    if parameter.kind == 'bool':
+        return bool(rng.integers(2))
+    low, high = parameter.lower, parameter.upper
+    if parameter.kind == 'int':
+        return int(rng.choice([low, high, rng.integers(low, min(high, low + 20), endpoint=True)]))
+    scale = 10.0 ** rng.uniform(-6, np.log10(high))
+    value = float(np.clip(scale * (rng.choice([-1, 1]) if low < 0 else 1), low, high))
+    value = [value, high, value if parameter.lower_open else low][rng.choice(3, p=[0.8, 0.1, 0.1])]
+    if parameter.kind == 'double_array':
+        return [value] * int(rng.choice([1, 1, 3, 4]))
+    return value
+
+
+def invalid(parameter: Parameter, rng: np.random.Generator):
+    """Return a random value of any kind that the parameter does not allow."""
+    tries = [None, {}, 'x', '', [], [None], float('nan'), float('inf'), -1e300, 1e300, 10**400]
+    tries += [b'1', [0.1, 'a'], True, -1, [[1.0]], ''.join(rng.choice([*string.printable], 9))]
+    while True:
+        value = tries[rng.integers(len(tries))]
+        try:
+            parameter.coerce(value)
+        except ConfigurationError:
+            return value
+
+
+FIXED = {name for name, p in ONLINE_PARAMETERS.items() if not p.live}
+
+
+def changes(rng: np.random.Generator, bad: float) -> dict:
+    """Return values for some parameters, each with probability `bad` not allowed."""
+    live = [name for name in ONLINE_PARAMETERS if name not in FIXED]
+    names = rng.choice(live, size=rng.integers(1, 7), replace=False).tolist()
+    return {
+        name: (invalid if rng.random() < bad else valid)(ONLINE_PARAMETERS[name], rng)
+        for name in names
+    }
+
+
+def finite(estimate) -> bool:
+    numbers = [*estimate.z, estimate.unknown_input, estimate.gamma, *estimate.innovation]
+    return bool(np.isfinite(numbers).all())
+
+
+stamps = st.one_of(
+    st.tuples(st.just('ahead'), st.sampled_from(JUMPS)),
+    st.tuples(st.just('ahead'), st.just(10**6)),
+    st.tuples(st.just('at'), st.sampled_from(ABSOLUTE)),
+)
+samples = st.one_of(st.sampled_from(WILD), st.floats(), st.floats(-1.0, 1.0))
+event = st.one_of(
+    st.tuples(st.just('y'), stamps, samples),
+    st.tuples(st.just('y'), stamps, samples),
+    st.tuples(st.just('set'), st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.0, 0.3])),
+    st.tuples(st.just('u'), samples, st.none()),
+    st.tuples(st.just('do'), st.sampled_from(['reset', 'freeze', 'thaw', 'forget']), st.none()),
+)
+
+
+@settings(max_examples=400)
+@given(st.lists(event, max_size=60), st.integers(0, 2**32 - 1))
+def test_nothing_raises_and_everything_shown_is_finite(events, seed):
+    rng = np.random.default_rng(seed)
+    estimator = OnlineEstimator(SMALL)
+    try_to_configure(estimator, changes(rng, 0.0))
+    now, fed = START, 0
+    for kind, first, second in events:
+        if kind == 'y':
+            how, value = first
+            now = now + value if how == 'ahead' else value
+            assert finite(estimator.update(now, second))
+            fed += 1
+        elif kind == 'set':
+            try_to_configure(estimator, changes(np.random.default_rng(first), second))
+        elif kind == 'u':
+            estimator.set_input(first)
+        else:
+            {
+                'reset': estimator.reset,
+                'freeze': lambda: estimator.freeze(True),
+                'thaw': lambda: estimator.freeze(False),
+                'forget': estimator.forget_stamp,
+            }[first]()
+        if estimator.estimate is not None:
+            assert finite(estimator.estimate)
+        counters = estimator.counters
+        assert min(counters) >= 0
+        assert counters.accepted + counters.rejected == fed
+
+
+def try_to_configure(estimator: OnlineEstimator, values: dict) -> bool:
+    """Configure; where it is refused, check that the reason names a value and nothing changed."""
+    before = estimator.parameters
+    try:
+        estimator.check(values)
+    except ConfigurationError as error:
+        reason = str(error)
+        assert any(f"'{name}'" in reason for name in values), reason
+        assert 'expected' in reason
+        assert '\n' not in reason
+        with pytest.raises(ConfigurationError) as again:
+            estimator.configure(values)
+        assert str(again.value) == reason
+        assert estimator.parameters == before
+        return False
+    estimator.configure(values)
+    return True
+
+
+def test_ten_thousand_parameter_sets():
+    rng = np.random.default_rng(1)
+    estimator = OnlineEstimator(SMALL)
+    accepted, now = 0, START
+    for k in range(10_000):
+        accepted += try_to_configure(estimator, changes(rng, 0.15))
+        for y in (0.3, rng.normal(), 0.3 + 0.1 * np.sin(0.01 * k)):
+            now += 10**6
+            assert finite(estimator.update(now, y))
+    assert 1000 < accepted < 9000  # both happen
+
+
+@pytest.mark.parametrize('name', sorted(FIXED))
+def test_fixed_parameter_says_that_it_is_fixed(name):
+    estimator = OnlineEstimator(SMALL)
+    other = {'order': 3, 'phi': ['0', '0'], 'unknown_input': False}[name]
+    with pytest.raises(ConfigurationError, match=f"'{name}': can't change in a running observer"):
+        estimator.check({name: other, 'max_gap': 1.0})
+    with pytest.raises(ConfigurationError, match=f"'{name}'"):
+        estimator.configure({'max_gap': 1.0, name: other})
+    assert estimator.parameters['max_gap'] == ONLINE_PARAMETERS['max_gap'].default

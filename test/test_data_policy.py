@@ -1,0 +1,320 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Faults of values: each case of docs/operation.md and its counter; freezing and seeding."""
+
+import math
+
+from fhaosmo_ros.core import ConfigurationError
+from fhaosmo_ros.core.layout import HAT
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
+from fhaosmo_ros.core.status import Status
+import numpy as np
+from observer_cases import laws
+import pytest
+
+MS = 1_000_000
+START = 1_700_000_000 * 10**9
+
+
+class Feed:
+    """Feeds samples at 1 kHz."""
+
+    def __init__(self, **parameters) -> None:
+        self.estimator = OnlineEstimator(parameters)
+        self.count = 0
+
+    def __call__(self, *values: float) -> list[Status]:
+        result = []
+        for y in values:
+            result.append(self.estimator.update(START + self.count * MS, y).status)
+            self.count += 1
+        return result
+
+    def sine(self, count: int) -> list[Status]:
+        return self(
+            *(0.2 + 0.1 * math.sin(1e-3 * k) for k in range(self.count, self.count + count))
+        )
+
+    @property
+    def events(self) -> dict[str, int]:
+        counters = self.estimator.counters._asdict().items()
+        return {k: v for k, v in counters if v and k not in ('accepted', 'gaps', 'sub_steps')}
+
+
+# Values that are none
+
+
+@pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf, 2e12, -1.7e308])
+def test_bad_value_is_rejected_and_as_if_it_had_not_come(bad):
+    feed, other = Feed(), Feed()
+    for f in (feed, other):
+        f.sine(100)
+    before = feed.estimator.estimate
+    assert feed(bad) == [Status.REJECTED_MEASUREMENT]
+    np.testing.assert_array_equal(feed.estimator.estimate.z, before.z)
+    other.count += 1
+    for f in (feed, other):
+        f(0.21)
+    np.testing.assert_array_equal(
+        feed.estimator.observer.state.levels, other.estimator.observer.state.levels
+    )
+    assert feed.events == {'rejected_measurements': 1}
+
+
+def test_bad_input_is_not_held():
+    estimator = OnlineEstimator({'phi': ['0', '0', 'u']})
+    assert estimator.set_input(2.0)
+    assert not estimator.set_input(math.nan)
+    assert not estimator.set_input(-math.inf)
+    assert estimator.counters.rejected_inputs == 2
+    assert estimator.counters.rejected == 0
+    assert estimator.update(START, 0.2).status == Status.OK
+    assert estimator.update(START + MS, 0.2).status == Status.OK
+
+
+# Spikes
+
+
+def test_spike_is_rejected_and_changes_nothing():
+    feed, other = Feed(spike_gate=0.05), Feed()
+    for f in (feed, other):
+        f.sine(100)
+    assert feed(0.5) == [Status.REJECTED_SPIKE]
+    other.count += 1
+    for f in (feed, other):
+        f.sine(5)
+    np.testing.assert_array_equal(
+        feed.estimator.observer.state.levels, other.estimator.observer.state.levels
+    )
+    assert feed.events == {'rejected_spikes': 1}
+
+
+def test_real_step_of_y_is_believed_after_so_many_samples():
+    feed = Feed(spike_gate=0.05, spike_gate_samples=4)
+    feed.sine(100)
+    words = feed(*[5.0] * 50)
+    assert [bool(w & Status.REJECTED_SPIKE) for w in words] == [True] * 4 + [False] * 46
+    assert feed.events == {'rejected_spikes': 4, 'spikes_believed': 1}
+
+
+def test_spikes_are_counted_in_a_row():
+    feed = Feed(spike_gate=0.05, spike_gate_samples=2)
+    feed.sine(100)
+    for _ in range(10):
+        words = feed(5.0, -5.0, 0.21)
+        assert [w.rejected for w in words] == [True, True, False]
+    assert feed.events == {'rejected_spikes': 20}
+
+
+def test_gate_is_around_the_prediction_not_around_the_last_sample():
+    # 10 units a second: after 100 ms of silence y is 1 further, and no spike.
+    feed = Feed(spike_gate=0.05, phi=['0', '0', '0'])
+    feed.estimator.seed([0.0, 10.0, 0.0], 0.0)
+    ramp = [0.01 * k for k in range(200)]
+    assert not any(w.rejected for w in feed(*ramp[:100]))
+    feed.count += 100
+    (word,) = feed(0.01 * feed.count)
+    assert word & Status.GAP
+    (word,) = feed(0.01 * 99)
+    assert word == Status.REJECTED_SPIKE
+
+
+# A stuck sensor
+
+
+def test_stuck_sensor_is_rejected_until_it_moves():
+    feed = Feed(stuck_time=0.1)
+    feed.sine(100)
+    words = feed(*[0.25] * 300)
+    assert [w.rejected for w in words] == [False] * 101 + [True] * 199
+    assert words[-1] == Status.REJECTED_STUCK
+    held = feed.estimator.stamp
+    assert held == START + 200 * MS
+    (word,) = feed(0.26)
+    assert word & Status.GAP
+    assert feed.events == {'stuck': 1, 'rejected_stuck': 199}
+
+
+def test_sensor_stuck_for_longer_than_max_gap_restarts_the_observer():
+    feed = Feed(stuck_time=0.1)
+    feed.sine(100)
+    feed(*[0.25] * 800)
+    feed.sine(10)
+    assert feed.events['stuck'] == feed.events['restarts_forward'] == 1
+    feed(*[0.25] * 150)
+    assert feed.events['stuck'] == 2
+
+
+def test_silence_is_not_a_stuck_sensor():
+    feed = Feed(stuck_time=1.0)
+    feed(0.2, 0.2)
+    feed.count += 5000
+    assert not any(w & Status.REJECTED_STUCK for w in feed(0.2, 0.2, 0.2))
+
+
+# Divergence
+
+
+BAD_GAINS = {'scheme': 'explicit', 'variant': 'fuzzy_adaptive', 'lambda': 1e6, 'alpha': 1e9}
+BAD_GAINS |= {'gamma_min': 1.0, 'gamma_initial': 1.0}
+
+
+def test_bad_live_gains_are_noticed_and_survived():
+    good = {k: ONLINE_PARAMETERS[k].default for k in BAD_GAINS}
+    feed = Feed(epsilon=0.5, divergence_time=0.05)
+    feed.sine(1000)
+    before = feed.estimator.estimate
+    feed.estimator.configure(BAD_GAINS)
+    words = feed.sine(1000)
+    assert any(w & Status.DIVERGED for w in words)
+    estimate = feed.estimator.estimate
+    assert np.isfinite([*estimate.z, estimate.unknown_input, *estimate.innovation]).all()
+    feed.estimator.configure(good)
+    seen = feed.estimator.counters.divergences
+    feed.sine(3000)
+    assert feed.estimator.counters.divergences <= seen + 1
+    np.testing.assert_allclose(feed.estimator.estimate.z[:2], before.z[:2], atol=0.2)
+
+
+@laws
+def test_wild_sample_does_not_spoil_the_rest(law):
+    # One accepted sample of 1e11: without a second start, sign at these gains needs a day back.
+    feed = Feed(**law, divergence_time=0.1, **{'lambda': 15.0, 'alpha': 30.0, 'epsilon': 1.0})
+    feed.sine(200)
+    feed(1e11)
+    feed.sine(1000)
+    assert abs(feed.estimator.estimate.z[0] - 0.2) < 0.2
+    assert feed.estimator.counters.divergences == 1
+
+
+def test_state_beyond_the_limit_starts_afresh_at_once():
+    feed = Feed(divergence_limit=100.0)
+    feed.sine(10)
+    feed.estimator.seed([0.2, 99.99999, 99.99999], 99.99999)
+    words = feed.sine(20)
+    assert sum(bool(w & Status.DIVERGED) for w in words) == 1
+    assert feed.events == {'divergences': 1}
+
+
+@laws
+def test_steps_that_always_fail_start_afresh_and_never_end_in_nan(law):
+    feed = Feed(order=1, phi=['log(z1)'], divergence_time=0.01, **law)
+    words = feed(*[-1.0] * 100)
+    assert any(w & Status.DIVERGED for w in words)
+    assert feed.estimator.estimate.z[0] == -1.0
+    assert feed.estimator.counters.rejected_steps > 50
+
+
+def test_divergence_time_zero_never_starts_afresh():
+    feed = Feed(divergence_time=0.0, epsilon=1e-9)
+    feed.sine(3000)
+    assert feed.events == {}
+
+
+# Gamma, and where an observer starts
+
+
+def test_frozen_gamma_stays_and_the_rest_goes_on():
+    feed, other = Feed(gamma_rate=0.5), Feed(gamma_rate=0.5)
+    for f in (feed, other):
+        f.sine(50)
+    gamma = feed.estimator.estimate.gamma
+    feed.estimator.freeze(True)
+    assert feed.estimator.frozen
+    for f in (feed, other):
+        f.sine(50)
+        f.count += 1000  # a restart
+        f.sine(50)
+    assert feed.estimator.estimate.gamma == gamma
+    assert other.estimator.estimate.gamma != gamma
+    assert feed.estimator.counters.restarts == 1
+    feed.estimator.freeze(False)
+    feed.sine(50)
+    assert feed.estimator.estimate.gamma != gamma
+
+
+def test_frozen_gamma_holds_against_leakage_and_in_gaps():
+    feed = Feed(gamma_rate=0.5, gamma_leakage=10.0)
+    feed.sine(50)
+    gamma = feed.estimator.estimate.gamma
+    feed.estimator.freeze(True)
+    feed.count += 100
+    (word,) = feed.sine(1)
+    assert word & Status.GAP
+    assert feed.estimator.estimate.gamma == gamma
+
+
+def test_seed_in_the_middle_of_a_run():
+    feed = Feed()
+    feed.sine(100)
+    feed.estimator.seed([0.2, 1.0, 2.0], 3.0)
+    estimate = feed.estimator.estimate
+    np.testing.assert_array_equal(estimate.z, [0.2, 1.0, 2.0])
+    assert estimate.unknown_input == 3.0
+    assert not any(w.rejected for w in feed.sine(10))
+
+
+@pytest.mark.parametrize('estimate_from', ['internal', 'filtered'])
+@pytest.mark.parametrize('unknown_input', [True, False])
+def test_seed_is_what_is_shown(estimate_from, unknown_input):
+    estimator = OnlineEstimator({'estimate_from': estimate_from, 'unknown_input': unknown_input})
+    estimator.seed([0.1, 1.0, 2.0], 3.0)
+    estimate = estimator.update(START, 0.2)
+    np.testing.assert_array_equal(estimate.z, [0.2, 1.0, 2.0])  # z_1 from the measurement
+    assert estimate.unknown_input == 3.0
+
+
+def test_seed_is_where_an_observer_starts_after_a_reset():
+    feed = Feed(start_from_measurement=False)
+    feed.sine(100)
+    feed.estimator.reset()
+    assert feed.estimator.estimate is None
+    feed.estimator.seed([0.5, 1.0, 2.0], 3.0)
+    feed.sine(1)
+    np.testing.assert_array_equal(feed.estimator.estimate.z, [0.5, 1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ('z', 'd'), [([0.1], 0.0), ([0.1] * 4, 0.0), ([0.1, math.nan, 0.0], 0.0), ([0.1] * 3, 1e13)]
+)
+def test_seed_that_does_not_fit_is_refused(z, d):
+    feed = Feed()
+    feed.sine(10)
+    before = feed.estimator.observer.state.levels
+    with pytest.raises(ConfigurationError, match='seed: expected 3 states'):
+        feed.estimator.seed(z, d)
+    np.testing.assert_array_equal(feed.estimator.observer.state.levels, before)
+
+
+@pytest.mark.parametrize('from_measurement', [True, False])
+def test_parameters_and_a_reset_seed_the_start(from_measurement):
+    feed = Feed()
+    feed.sine(100)
+    feed.estimator.configure(
+        {
+            'initial_estimate': [0.5, 1.0, 2.0, 3.0],
+            'initial_internal': [1.0, 2.0, 3.0, 0.0],
+            'start_from_measurement': from_measurement,
+        }
+    )
+    feed.estimator.reset()
+    estimate = feed.estimator.update(START + 100 * MS, 0.7)
+    np.testing.assert_array_equal(estimate.z, [0.7 if from_measurement else 0.5, 1.0, 2.0])
+    assert estimate.unknown_input == 3.0
+    assert feed.estimator.observer.state.levels[HAT, 0] == estimate.z[0]
+
+
+def test_reset_keeps_counters_and_forgets_the_rest():
+    feed, fresh = Feed(), Feed()
+    feed.sine(100)
+    feed(math.nan)
+    feed.estimator.reset()
+    assert feed.estimator.estimate is None
+    assert feed.estimator.stamp is None
+    assert feed.estimator.period == 0.0
+    assert feed.events == {'rejected_measurements': 1}
+    fresh.count = feed.count = 7  # stamps before those of the time before
+    for f in (feed, fresh):
+        f.sine(50)
+    np.testing.assert_array_equal(feed.estimator.estimate.z, fresh.estimator.estimate.z)
+    assert feed.events == {'rejected_measurements': 1}

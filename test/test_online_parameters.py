@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every live parameter of the update path changes what it does, and none moves the estimate."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
+import numpy as np
+import pytest
+
+START = 1_700_000_000 * 10**9
+LIVE = [name for name, parameter in ONLINE_PARAMETERS.items() if parameter.live]
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of one parameter, and what has to be so before for it to matter."""
+
+    value: Any
+    base: dict[str, Any] = field(default_factory=dict)
+    prepared: dict[str, Any] = field(default_factory=dict)
+    """Set after the first half."""
+    reset: bool = False
+
+
+SEED = [0.0, 1.0, 2.0, 3.0]
+CHANGES = {
+    'variant': Change('sign'),
+    'scheme': Change('explicit'),
+    'lambda': Change(500.0),
+    'alpha': Change([10.0, 20.0, 30.0, 40.0]),
+    'epsilon': Change(1e-4),
+    'fuzzy_widths': Change(0.02),
+    'fuzzy_shape': Change('gaussian'),
+    'fuzzy_normalise': Change(False),
+    'gamma_initial': Change(0.9, {'gamma_leakage': 5.0}),
+    'gamma_rate': Change(0.5),
+    'gamma_min': Change(0.6, {'gamma_initial': 0.2}, {'gamma_initial': 0.67}),
+    'gamma_max': Change(0.7, {'gamma_initial': 0.9}, {'gamma_initial': 0.67}),
+    'gamma_dead_zone': Change(1e6),
+    'gamma_leakage': Change(5.0, prepared={'gamma_initial': 0.9}),
+    'initial_estimate': Change(SEED, reset=True),
+    'initial_internal': Change(SEED, reset=True),
+    'start_from_measurement': Change(False, reset=True),
+    'estimate_from': Change('filtered'),
+    'sampling': Change('nominal'),
+    'nominal_period': Change(0.003, {'sampling': 'nominal'}),
+    'max_gap': Change(0.1),
+    'max_step': Change(0.05),
+    'spike_gate': Change(0.05),
+    'spike_gate_samples': Change(1, {'spike_gate': 0.05}),
+    'stuck_time': Change(0.005),
+    'divergence_time': Change(0.005, {'epsilon': 1e-4}),
+    'divergence_limit': Change(1.0),
+}
+
+
+def stream(first: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return samples at 1 kHz: jitter, a gap, a spike, a step, a dead stretch."""
+    rng = np.random.default_rng(first)
+    k = np.arange(first, first + count)
+    steps = 10**6 + rng.integers(-100_000, 100_000, count)
+    steps[100] += 300 * 10**6
+    y = 0.2 + 0.1 * np.sin(0.01 * k) + 1e-3 * rng.standard_normal(count)
+    y[50] += 0.3
+    y[150:] += 1.0
+    y[180:200] = 1.2
+    return START + 3 * first * 10**6 + np.cumsum(steps), y, np.zeros(count)
+
+
+def outputs(change: Change, name: str | None) -> np.ndarray:
+    """Return the estimates after a run in whose middle `name` changes, or nothing."""
+    estimator = OnlineEstimator(change.base)
+    estimator.run(*stream(0, 250))
+    estimator.configure(change.prepared)
+    if name:
+        before = estimator.estimate
+        estimator.configure({name: change.value})
+        after = estimator.estimate
+        if name != 'estimate_from':  # which shows other variables from then on
+            np.testing.assert_array_equal(after.z, before.z)
+            assert after.unknown_input == before.unknown_input
+        np.testing.assert_array_equal(after.innovation, before.innovation)
+        assert estimator.parameters[name] == ONLINE_PARAMETERS[name].coerce(change.value)
+    if change.reset:
+        estimator.reset()
+    result = estimator.run(*stream(250, 250))
+    return np.column_stack([result.z, result.unknown_input])
+
+
+def test_every_live_parameter_is_tried():
+    assert list(CHANGES) == LIVE
+
+
+@pytest.mark.parametrize('name', LIVE)
+def test_live_change_has_an_effect_and_makes_no_jump(name):
+    change = CHANGES[name]
+    one, other = outputs(change, None), outputs(change, name)
+    assert np.isfinite(other).all()
+    assert not np.array_equal(one, other)
+    np.testing.assert_array_equal(one, outputs(change, None))  # nothing else differs

@@ -1,0 +1,364 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Faults of time: each case of docs/operation.md, its effect and its counter."""
+
+import itertools
+import math
+
+from fhaosmo_ros.core import Observer, Plant
+from fhaosmo_ros.core.layout import ROWS, SCALARS, TILDE, Y
+from fhaosmo_ros.core.model import TriangularModel
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.policy_step import MOST_SUB_STEPS
+from fhaosmo_ros.core.prediction import ahead
+from fhaosmo_ros.core.status import REJECTED, Status
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+MS = 1_000_000
+START = 1_700_000_000 * 10**9
+HOUR = 3600 * 10**9
+
+# A model without unknown input's own level, and gains that lock on within a second.
+QUICK = {'variant': 'sign', 'lambda': 15.0, 'alpha': 30.0, 'epsilon': 0.025}
+
+
+def sample(k: float) -> float:
+    return 0.2 + 0.1 * math.sin(0.01 * k)
+
+
+def run(estimator: OnlineEstimator, count: int = 50, start: int = START, step: int = MS) -> int:
+    """Feed samples of a sine; return the last stamp."""
+    for k in range(count):
+        estimator.update(start + k * step, sample(k))
+    return start + (count - 1) * step
+
+
+def only(estimator: OnlineEstimator, **expected: int) -> None:
+    """Assert that these counters, and no others but accepted, are not 0."""
+    found = {k: v for k, v in estimator.counters._asdict().items() if v and k != 'accepted'}
+    assert found == expected
+
+
+def same(estimator: OnlineEstimator, other: OnlineEstimator) -> None:
+    np.testing.assert_array_equal(estimator.observer.state.levels, other.observer.state.levels)
+    assert estimator.estimate.gamma == other.estimate.gamma
+
+
+# Stamps
+
+
+@pytest.mark.parametrize('back', [1, 3 * MS, 499 * MS])
+def test_late_sample_is_rejected_and_the_next_one_counts_from_the_latest(back):
+    estimator, other = OnlineEstimator(), OnlineEstimator()
+    last = run(estimator)
+    run(other)
+    assert estimator.update(last - back, 5.0).status & Status.REJECTED_PERIOD
+    only(estimator, backward_stamps=1)
+    for e in (estimator, other):
+        e.update(last + MS, 0.21)
+    same(estimator, other)
+
+
+def test_duplicate_stamp_is_rejected_and_changes_nothing():
+    estimator, other = OnlineEstimator(), OnlineEstimator()
+    last = run(estimator)
+    run(other)
+    assert estimator.update(last, 5.0).status & Status.REJECTED_PERIOD
+    only(estimator, duplicate_stamps=1)
+    same(estimator, other)
+
+
+@pytest.mark.parametrize('sampling', ['source_stamp', 'clock'])
+def test_stamp_zero_is_no_time(sampling):
+    estimator = OnlineEstimator({'sampling': sampling})
+    for _ in range(3):
+        assert estimator.update(0, 0.2).status & Status.REJECTED_PERIOD
+    assert estimator.estimate is None
+    last = run(estimator)
+    estimator.update(0, 0.2)
+    estimator.update(last + MS, 0.2)
+    only(estimator, zero_stamps=4)
+    assert estimator.counters.accepted == 51
+
+
+@pytest.mark.parametrize('jump', [HOUR, -HOUR, 10**18, -(10**18), 7 * 10**18, 2**63, 10**30])
+def test_one_stamp_far_away_is_dropped_and_time_goes_on(jump):
+    estimator, other = OnlineEstimator(), OnlineEstimator()
+    last = run(estimator)
+    run(other)
+    status = estimator.update(START + jump, 5.0).status
+    assert status & Status.REJECTED_PERIOD
+    assert status & Status.HELD
+    for e in (estimator, other):
+        e.update(last + 2 * MS, 0.21)
+        e.update(last + 3 * MS, 0.22)
+    same(estimator, other)
+    only(estimator, far_stamps=1)
+
+
+@pytest.mark.parametrize('jump', [600 * MS, -600 * MS, 10**18, -(10**18)])
+def test_second_sample_beyond_max_gap_restarts_from_both(jump):
+    estimator, fresh = OnlineEstimator(), OnlineEstimator()
+    last = run(estimator)
+    held, second, third = ((last + jump + k * MS, 0.3 + 0.01 * k) for k in range(3))
+    before = estimator.estimate
+    np.testing.assert_array_equal(estimator.update(*held).z, before.z)
+    assert estimator.stamp == last
+    status = estimator.update(*second).status
+    assert status & Status.RESTARTED
+    assert not status.rejected
+    assert not estimator.update(*third).status & Status.RESTARTED
+    for one in (held, second, third):
+        fresh.update(*one)
+    same(estimator, fresh)
+    assert estimator.stamp == third[0]
+    direction = 'restarts_forward' if jump > 0 else 'restarts_backward'
+    only(estimator, far_stamps=1, **{direction: 1})
+    assert estimator.counters.restarts == 1
+
+
+def test_two_far_stamps_that_do_not_fit_each_other_restart_from_the_second():
+    estimator, fresh = OnlineEstimator(), OnlineEstimator()
+    last = run(estimator)
+    estimator.update(last + HOUR, 3.0)
+    for e in (estimator, fresh):
+        e.update(last + 5 * HOUR, 0.4)
+        e.update(last + 5 * HOUR + MS, 0.4)
+    same(estimator, fresh)
+
+
+@pytest.mark.parametrize('ahead', [3 * MS, 30 * MS, 499 * MS])
+def test_one_stamp_ahead_by_less_than_max_gap_is_taken_back(ahead):
+    estimator, other = OnlineEstimator(), OnlineEstimator()
+    last = run(estimator)
+    run(other)
+    assert estimator.update(last + ahead, 0.23).status & Status.GAP
+    for e in (estimator, other):
+        for k in range(2, 5):
+            e.update(last + k * MS // 2, sample(50 + k))
+    same(estimator, other)
+    assert estimator.counters.withdrawn_gaps == 1
+    assert estimator.counters.backward_stamps == 0
+    assert estimator.counters.accepted + estimator.counters.rejected == 54
+
+
+def test_clock_set_back_a_little_holds_until_it_has_caught_up():
+    estimator = OnlineEstimator()
+    last = run(estimator)
+    words = [estimator.update(last - 100 * MS + k * MS, 0.2).word for k in range(1, 150)]
+    assert [bool(w & REJECTED) for w in words] == [True] * 100 + [False] * 49
+    only(estimator, backward_stamps=99, duplicate_stamps=1)
+
+
+def test_bag_loop_restarts_once_a_round():
+    estimator = OnlineEstimator()
+    for _ in range(4):
+        run(estimator, 2000)
+    only(estimator, far_stamps=3, restarts_backward=3)
+
+
+# Gaps
+
+
+def test_gap_of_exactly_max_gap_is_bridged():
+    estimator = OnlineEstimator({'max_gap': 0.3})
+    last = run(estimator)
+    assert estimator.update(last + 300 * MS, 0.2).status & Status.GAP
+    only(estimator, gaps=1, sub_steps=300)
+
+
+def test_prediction_is_the_plant_to_second_order():
+    model = TriangularModel(['u - z1', 'sin(z1)', '-z3*z2'])
+    start, u, d = np.array([0.4, -0.3, 0.8]), 0.7, 0.5
+
+    def slope(_, z):
+        return [z[1] + u - z[0], z[2] + np.sin(z[0]), d - z[2] * z[1]]
+
+    truth = solve_ivp(slope, (0.0, 0.5), start, rtol=1e-12, atol=1e-12).y[0, -1]
+    levels, memory = np.zeros((ROWS, 4)), np.zeros(SCALARS)
+    memory[Y], levels[TILDE] = start[0], [start[1], start[2], d, 9.9]
+    m, stack, z = np.zeros((2, 4)), np.zeros((2, model.depth)), np.zeros(4)
+    errors = [
+        abs(ahead(model.tape, model.offsets, m, stack, levels, memory, z, 0.5 / n, u, n) - truth)
+        for n in (50, 100, 200)
+    ]
+    assert errors[-1] < 1e-6
+    np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 4.0, rtol=0.1)
+
+
+@pytest.mark.parametrize('omega', [1.0, 5.0])
+@pytest.mark.parametrize('gap', [30, 100, 300])
+def test_bridge_is_better_than_one_step(omega, gap):
+    t = np.arange(0.0, 10.0, 1e-3)
+    truth = Plant({'disturbance_omega': omega, 'integration_step': 1e-3}).simulate(t)
+    keep = np.r_[:8000, 8000 + gap : 9000 + gap]
+    stamps = START + np.round(t[keep] * 1e9).astype(np.int64)
+    error = {}
+    for max_step in (0.0, 1.0):
+        estimator = OnlineEstimator(QUICK | {'max_step': max_step})
+        d = estimator.run(stamps, truth.y[keep], np.zeros(len(keep))).unknown_input
+        error[max_step] = np.sqrt(np.mean((d - truth.unknown_input[keep])[8000:] ** 2))
+    assert error[0.0] < 0.7 * error[1.0]
+
+
+def test_slow_sensor_is_not_cut_up_and_a_fast_one_is():
+    for step in (MS, 20 * MS, 400 * MS):
+        estimator = OnlineEstimator()
+        run(estimator, 100, step=step)
+        only(estimator)
+        assert estimator.period == pytest.approx(step * 1e-9)
+        assert estimator.jitter == 0.0
+
+
+def test_max_step_cuts_every_longer_interval():
+    estimator = OnlineEstimator({'max_step': 0.004})
+    run(estimator, 20, step=10 * MS)
+    only(estimator, gaps=19, sub_steps=19 * 3)
+
+
+def test_bridge_ends_where_steps_at_the_predicted_samples_end():
+    # Phi = 0 and no motion: the model predicts the last sample, so y is a line to the new one.
+    law = {'order': 1, 'phi': ['0'], 'scheme': 'implicit', 'variant': 'fuzzy'}
+    estimator = OnlineEstimator(law | {'max_step': 0.01})
+    observer = Observer(law)
+    estimator.update(START, 0.5)
+    observer.start(0.5)
+    estimator.update(START + 40 * MS, 0.9)
+    for y in (0.6, 0.7, 0.8, 0.9):
+        observer.step(y, 0.01)
+    np.testing.assert_allclose(estimator.observer.state.levels, observer.state.levels, atol=1e-12)
+
+
+def test_model_that_has_no_prediction_is_bridged_in_a_straight_line():
+    law = {'order': 1, 'phi': ['log(z1)*0'], 'scheme': 'explicit', 'variant': 'fuzzy'}
+    estimator = OnlineEstimator(law | {'max_step': 0.01})
+    estimator.update(START, 0.5)
+    estimator.seed([0.5], -1e9)  # drives the prediction out of the logarithm's domain
+    assert estimator.update(START + 40 * MS, 0.9).status & Status.GAP
+    assert np.isfinite(estimator.estimate.z).all()
+
+
+def test_number_of_sub_steps_is_bounded():
+    estimator = OnlineEstimator({'max_gap': 3600.0, 'max_step': 1e-6})
+    estimator.update(START, 0.2)
+    estimator.update(START + HOUR, 0.2)
+    only(estimator, gaps=1, sub_steps=MOST_SUB_STEPS)
+
+
+@pytest.mark.parametrize('sampling', ['source_stamp', 'nominal'])
+def test_bad_samples_for_longer_than_max_gap_restart_too(sampling):
+    estimator = OnlineEstimator({'sampling': sampling, 'max_gap': 0.5})
+    fresh = OnlineEstimator({'sampling': sampling})
+    last = run(estimator)
+    for k in range(1, 2001):
+        estimator.update(last + k * MS, math.nan)
+    for k in (2001, 2002):
+        for e in (estimator, fresh):
+            e.update(last + k * MS, 0.5)
+    same(estimator, fresh)
+    held = {'far_stamps': 1} if sampling == 'source_stamp' else {}
+    only(estimator, rejected_measurements=2000, restarts_forward=1, **held)
+
+
+def test_time_of_a_bad_sample_is_added_to_the_next_step():
+    estimator, other = OnlineEstimator(), OnlineEstimator()
+    last = run(estimator)
+    run(other)
+    estimator.update(last + MS, math.nan)
+    for e in (estimator, other):
+        e.update(last + 2 * MS, 0.21)
+    same(estimator, other)
+
+
+# Sampling
+
+
+def test_nominal_sampling_ignores_stamps():
+    options = {'sampling': 'nominal', 'nominal_period': 0.002}
+    nominal, stamped = OnlineEstimator(options), OnlineEstimator()
+    for k, wild in enumerate(itertools.islice(itertools.cycle((0, 10**15, -5, 7)), 100)):
+        nominal.update(wild, sample(k))
+        stamped.update(START + k * 2 * MS, sample(k))
+        assert nominal.stamp == wild
+    same(nominal, stamped)
+    only(nominal)
+
+
+def test_nominal_period_longer_than_max_gap_is_no_gap():
+    estimator = OnlineEstimator({'sampling': 'nominal', 'nominal_period': 2.0})
+    run(estimator)
+    only(estimator)
+
+
+def test_change_of_clock_takes_the_usual_period_once():
+    estimator, other = OnlineEstimator(), OnlineEstimator()
+    last = run(estimator)
+    run(other)
+    estimator.configure({'sampling': 'clock'})
+    for k in range(1, 4):
+        estimator.update(k * MS, 0.21)
+        other.update(last + k * MS, 0.21)
+    same(estimator, other)
+    only(estimator)
+
+
+def test_clock_that_ticks_slower_than_samples_come_spreads_them():
+    # 1 kHz on a clock of 40 Hz: from the third tick on as if it had true stamps.
+    ticked, true = OnlineEstimator({'sampling': 'clock'}), OnlineEstimator()
+    ticked.update(START, sample(0))
+    true.update(START, sample(0))
+    for k in range(25, 2500):
+        ticked.update(START + k // 25 * 25 * MS, sample(k))
+        true.update(START + k * MS, sample(k))
+        if k > 100:
+            assert abs(ticked.stamp - true.stamp) <= 13 * MS
+    assert ticked.period == pytest.approx(1e-3, rel=0.1)
+    np.testing.assert_allclose(ticked.estimate.z, true.estimate.z, atol=0.05)
+    counters = ticked.counters
+    assert counters.spread_stamps > 2300
+    assert counters.restarts == counters.far_stamps == counters.backward_stamps == 0
+
+
+def test_clock_that_stands_still_never_runs_ahead_of_its_next_tick():
+    estimator = OnlineEstimator({'sampling': 'clock'})
+    for tick in range(3):
+        for _ in range(5):
+            estimator.update(START + tick * 10 * MS, 0.2)
+    for _ in range(1000):  # paused: samples go on
+        estimator.update(START + 20 * MS, 0.2)
+    assert estimator.stamp < START + 30 * MS
+    assert not estimator.update(START + 30 * MS, 0.2).status.rejected
+
+
+def test_samples_of_a_clock_that_jumps_back_restart_within_one_tick():
+    estimator = OnlineEstimator({'sampling': 'clock'})
+    for k in range(500):
+        estimator.update(START + k // 25 * 25 * MS, sample(k))
+    for k in range(50):
+        estimator.update(10 * MS + k // 25 * 25 * MS, sample(k))
+    counters = estimator.counters
+    assert counters.restarts_backward == counters.restarts == 1
+    assert 0 < estimator.stamp < 100 * MS
+
+
+def test_jitter_of_half_a_period_needs_no_policy():
+    rng = np.random.default_rng(1)
+    stamps = START + MS * np.arange(5000) + rng.integers(-MS // 2, MS // 2, 5000)
+    estimator = OnlineEstimator()
+    estimator.run(stamps, np.full(5000, 0.2), np.zeros(5000))
+    c = estimator.counters
+    assert c.accepted + c.duplicate_stamps == 5000
+    assert c.gaps < 50  # where two far ends meet
+    assert estimator.period == pytest.approx(1e-3, rel=0.3)
+    assert estimator.jitter == pytest.approx(1e-3 / 3, rel=0.6)  # mean |u - v| of uniforms
+
+
+def test_bursts_are_counted_and_used():
+    estimator = OnlineEstimator()
+    late = START + np.arange(2000) // 10 * 10 * MS + np.arange(2000) % 10 * 5000
+    estimator.run(late, np.full(2000, 0.2), np.zeros(2000))
+    assert estimator.counters.accepted == 2000
+    assert estimator.counters.bursts > 1700
+    assert estimator.period == pytest.approx(1e-3, rel=0.3)
+    assert estimator.counters.sub_steps < 200 * 25  # the mean does not shrink to the burst's
