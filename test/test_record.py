@@ -4,6 +4,7 @@
 import os
 from pathlib import Path
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -316,6 +317,45 @@ def test_wrong_arguments_are_said_in_one_line(arguments, words, tmp_path):
     assert len(lines) == 1
     assert all(word in lines[0] for word in words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_force_replaces_an_output(live, tmp_path):
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    (bag / 'old').write_text('not wanted')
+    process = start('record', '-o', bag, '--force', '--topics', '/y')
+    wait(lambda: size(bag) > 10_000, process, 'messages')
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=30)
+    assert process.returncode == 0, error
+    assert sorted(p.name for p in bag.iterdir()) == ['bag.mcap', 'metadata.yaml']
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_full_disk_leaves_what_was_recorded(storage, live, tmp_path):
+    """The system refuses to make a file larger than 300 kB."""
+    command = ['record', '-o', str(tmp_path / 'bag'), '--topics', '/y', '--storage', storage]
+    limited = f'ulimit -f 600; exec {" ".join(map(shlex.quote, [*COMMAND, *command]))}'
+    result = subprocess.run(
+        ['sh', '-c', limited], capture_output=True, text=True, timeout=120, env=environment(),
+        check=False,
+    )  # fmt: skip
+    assert result.returncode == 2, result.stderr
+    assert 'Traceback' not in result.stderr
+    assert f'record --repair {tmp_path / "bag"} saves what is there' in result.stderr
+    result = run('record', '--repair', tmp_path / 'bag', '-o', tmp_path / 'saved')
+    assert result.returncode == 0, result.stderr
+    assert len(series(tmp_path / 'saved', '/y').values) > 3000
+
+
+def test_what_is_there_stays_if_nothing_comes(tmp_path):
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    (bag / 'old').write_text('wanted')
+    arguments = ['--force', '--topics', '/nobody', '--duration', '0.5']
+    result = run('record', '-o', bag, *arguments)
+    assert result.returncode == 2
+    assert [p.name for p in bag.iterdir()] == ['old']
 
 
 def test_existing_output_is_refused(tmp_path):

@@ -430,6 +430,22 @@ def test_sqlite_without_metadata_names_the_file(tmp_path, capsys):
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y))
 
 
+@pytest.mark.parametrize('output', ['o.npz', 'o'])
+def test_sqlite_that_was_cut_is_refused(output, tmp_path, capsys):
+    """In the middle, or at a page, where all pages that are left are whole."""
+    stamps, y = files.signal(20_000)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y), 'sqlite3')
+    whole = (bag / 'bag.db3').read_bytes()
+    for size in (len(whole) // 2 + 77, len(whole) // 2 // 4096 * 4096, 4096, 100, 0):
+        (bag / 'bag.db3').write_bytes(whole[:size])
+        assert run(bag, '-o', tmp_path / output) == 2, size
+        error = capsys.readouterr().err.strip().splitlines()
+        said = [line for line in error if line.startswith('replay: error: ')]
+        assert len(said) == 1, error
+        assert f'bag {bag}: expected a whole bag' in said[0]
+        assert sorted(p.name for p in tmp_path.iterdir()) == ['bag']
+
+
 def test_empty_topic(tmp_path, capsys):
     bag = files.write(tmp_path / 'bag', [('/x', 'std_msgs/msg/Float64', 5, files.float64(1.0))])
     folder = tmp_path / 'empty'

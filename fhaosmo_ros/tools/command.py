@@ -46,18 +46,17 @@ def run_computation(
 ) -> int:  # fmt: skip
     """Run a command as `run_command` does, whose body the first signal ends wherever it is."""
 
-    def interruptible(arguments: argparse.Namespace, _: Stop) -> int | None:
+    def interruptible(arguments: argparse.Namespace, stop: Stop) -> int | None:
+        def interrupt(*_: object) -> None:
+            if not stop.is_set():  # a second one must not cut the clean-up
+                stop.set()
+                raise KeyboardInterrupt
+
         for number in SIGNALS:
-            signal.signal(number, _interrupt)
+            signal.signal(number, interrupt)
         return body(arguments)
 
     return run_command(parser, argv, interruptible)
-
-
-def _interrupt(*_: object) -> None:
-    for number in SIGNALS:  # the next one must not cut the clean-up
-        signal.signal(number, signal.SIG_IGN)
-    raise KeyboardInterrupt
 
 
 def _say(parser: argparse.ArgumentParser, text: str, code: int) -> int:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.tools.command import run_computation
-from fhaosmo_ros.tools.figures import save_curves
+from fhaosmo_ros.tools.figures import save_curves, show
 from fhaosmo_ros.tools.options import add_parameter_options, online_parameters
 from fhaosmo_ros.tools.output import Output
 from fhaosmo_ros.tools.plot_data import metrics, read_curves
@@ -50,4 +50,6 @@ def _plot(arguments: argparse.Namespace) -> None:
     with Output(path, arguments.force) as output:
         save_curves(curves, values.get('epsilon'), output.path, arguments.show)
         final = output.keep()
-    print(f'{metrics(curves)}\nfigure: {final}')
+    print(f'{metrics(curves)}\nfigure: {final}', flush=True)
+    if arguments.show:
+        show()

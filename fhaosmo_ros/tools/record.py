@@ -5,6 +5,7 @@ import argparse
 from pathlib import Path
 import re
 import shutil
+import sqlite3
 import sys
 import time
 
@@ -63,13 +64,11 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.duration is not None and not arguments.duration > 0.0:
         raise ConfigurationError(f'--duration: expected > 0 s, got {arguments.duration:g}')
     path = arguments.output or Path(time.strftime('bag_%Y-%m-%d_%H-%M-%S'))
-    if path.exists():
-        if not arguments.force:
-            raise ConfigurationError(
-                f'output {path}: expected a new name (or --force to replace it), got an existing '
-                f'{"folder" if path.is_dir() else "file"}'
-            )
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    if path.exists() and not arguments.force:
+        raise ConfigurationError(
+            f'output {path}: expected a new name (or --force to replace it), got an existing '
+            f'{"folder" if path.is_dir() else "file"}'
+        )
     if arguments.topics:
         for topic in arguments.topics:
             if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', topic):
@@ -78,19 +77,25 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     from fhaosmo_ros.nodes.topic_recorder import TopicRecorder
 
     wanted = _wanted(arguments)
+    old = _put_aside(path)
     try:
+        # Signals that it listens: nobody need guess when to start what is to be recorded.
         with BagWriter(path, storage=arguments.storage) as bag, TopicRecorder(wanted) as recorder:
-            # Signals that it listens: nobody need guess when to start what is to be recorded.
             print(f'recording to {path}; Ctrl-C ends it', flush=True)
             count = _drain(recorder, bag, arguments.duration, stop)
             lost = dict(recorder.lost)
-    except OSError as error:
+    except (OSError, sqlite3.Error) as error:
+        hint = f'; record --repair {path} saves what is there' if path.exists() else ''
         raise ConfigurationError(
-            f'output {path}: expected a place that can be written, got: {error.strerror}'
+            f'output {path}: expected a place that can be written, got: '
+            f'{getattr(error, "strerror", None) or error}{hint}'
         ) from None
     if not count:
         shutil.rmtree(path)
+        if old.exists():
+            old.rename(path)
         raise ConfigurationError('nothing was published on these topics: no bag kept')
+    _remove(old)
     for topic, number in sorted(lost.items()):
         print(
             f'record: {topic}: {number} messages were lost on their way here (a busy machine or '
@@ -98,6 +103,22 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
             file=sys.stderr,
         )
     print(f'{count} messages: {path}')
+
+
+def _put_aside(path: Path) -> Path:
+    """Rename what is there, until there is something to replace it; return its other name."""
+    old = path.with_name(f'.{path.name}.old')
+    if path.exists():
+        _remove(old)  # of a run that was killed
+        path.rename(old)
+    return old
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _wanted(arguments: argparse.Namespace):
