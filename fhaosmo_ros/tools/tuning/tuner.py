@@ -19,7 +19,8 @@ from fhaosmo_ros.tools.tuning.theory import candidates, effective_noise
 from tqdm import tqdm
 
 DIGITS = 4
-"""Of the gains that are written; what is judged is what is written."""
+"""Of the gains that are written, unless rounding makes them worse by more than `LOSS`."""
+LOSS = 1e-3
 
 
 class Found(NamedTuple):
@@ -169,4 +170,6 @@ class Tuner:
                 result.front, key=lambda point: point.values[0] + weight * point.values[1]
             ).parameters
         rounded = {key: float(f'{value:.{DIGITS}g}') for key, value in best.items()}
-        return Found(rounded, result, time.monotonic() - begin, pareto)
+        if self.judge(rounded)[0] <= (1.0 + LOSS) * self.judge(best)[0]:
+            best = rounded
+        return Found(best, result, time.monotonic() - begin, pareto)
