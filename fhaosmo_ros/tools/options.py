@@ -2,6 +2,7 @@
 """Command-line options that several commands share."""
 
 import argparse
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 import re
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from fhaosmo_ros.core.channel_parameters import channel_names, of_channel
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameter import ParameterTable, unknown_parameter
 from fhaosmo_ros.core.parameter_file import load, parse, select
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
 import yaml
@@ -76,17 +78,38 @@ def named(arguments: argparse.Namespace) -> list[str]:
     return [name.removeprefix(prefix) for name in _on_command_line(arguments)]
 
 
+def assigned(rules: Sequence[str], table: ParameterTable) -> dict[str, Any]:
+    """
+    Return the values that NAME:=VALUE rules set, checked by a table.
+
+    Raises
+    ------
+    ConfigurationError
+        A rule that is none, an unknown name, or a bad value.
+
+    """
+    values = dict(_rules(rules))
+    for name in values:
+        if name not in table:
+            raise unknown_parameter(name, table)
+    return dict(table.coerce(values))
+
+
 def _on_command_line(arguments: argparse.Namespace) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    for rule in arguments.param:
-        target, separator, text = rule.partition(':=')
+    for target, value in _rules(arguments.param):
+        node, _, name = target.rpartition(':')
+        if not node or node.strip('/') == arguments.node.strip('/'):
+            values[name] = value  # not another node's, as on a command line of ROS
+    return values
+
+
+def _rules(rules: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    for rule in rules:
+        name, separator, text = rule.partition(':=')
         if not separator:
             raise ConfigurationError(f'-p: expected NAME:=VALUE, got {rule!r}')
-        node, _, name = target.rpartition(':')
-        if node and node.strip('/') != arguments.node.strip('/'):
-            continue  # another node's, as on a command line of ROS
         try:
-            values[name] = parse(text)
+            yield name, parse(text)
         except yaml.YAMLError:
-            values[name] = text
-    return values
+            yield name, text
