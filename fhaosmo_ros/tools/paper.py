@@ -21,9 +21,7 @@ from tqdm import tqdm
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 FOLDER, RESULTS = 'paper', 'results.json'
 QUICK_WIDTHS = 3
-QUICK_LONG = 300.0
-QUIET = 1e-4
-"""Noise on y of the long runs that have some."""
+QUICK_LONG = 200.0
 PROTECTION_WINDOW = 20.0
 """Seconds within which errors are judged where the protections are compared."""
 ZOOM = 0.1
@@ -136,7 +134,8 @@ def _paper(output: Path, quick: bool) -> None:
     rows_of_map = len(findings.WIDTHS[::every])
     # The bar counts the parts by about what they cost.
     observers = len(cases.OBSERVERS | cases.OURS)
-    long = 4 * len(cases.FREQUENCIES) + len(beyond.PROTECTED)
+    long = len(beyond.LONG) + len(beyond.PROTECTED)
+    long += len(cases.FREQUENCIES if quick else beyond.SWEEP)
     total = len(SOLVERS) * observers + rows_of_map + 3 + len(beyond.NOISES) + long + 4
     with tqdm(total=total, unit='part', desc='paper') as bar:
         scores = measure(SOLVERS, bar.update)
@@ -146,32 +145,29 @@ def _paper(output: Path, quick: bool) -> None:
         sampled = beyond.schemes(bar.update)
         noisy = beyond.noises(bar.update)
         long_runs = []
-        for noise in (0.0, QUIET):
-            for scheme in ('explicit', 'implicit'):
-                for omega in cases.FREQUENCIES:
-                    long_runs += beyond.long_runs(
-                        beyond.LAWS, scheme, omega, noise, hours, beyond.WINDOW
-                    )
-                    bar.update()
+        for cell in beyond.LONG:
+            long_runs += beyond.long_runs(beyond.LAWS, *cell, hours, beyond.WINDOW)
+            bar.update()
         protected = []
-        for omega, noise in beyond.PROTECTED:
+        for cell in beyond.PROTECTED:
             protected.append(
-                beyond.long_runs(
-                    beyond.PROTECTIONS, 'explicit', omega, noise, minutes, PROTECTION_WINDOW
-                )
+                beyond.long_runs(beyond.PROTECTIONS, *cell, minutes, PROTECTION_WINDOW)
             )
             bar.update()
+        zones = beyond.dead_zones(cases.FREQUENCIES if quick else beyond.SWEEP, bar.update)
         preset = cases.preset().observer
         texts = findings_texts(scores, solver) | {
             'widths': tables.map_text(widths, preset['fuzzy_widths'], every),
             'schemes': tables.beyond_table(sampled),
             'noise': tables.beyond_table(noisy),
             'long': tables.long_table(long_runs),
+            'deadzone': tables.dead_zone_table(zones),
             'protection': tables.protection_table(r for runs in protected for r in runs),
         }
         _draw(folder, solver, preset, bar)
         figures.save(figures.half_widths(widths, preset['fuzzy_widths']), folder, 'widths')
-        figures.save(figures.long_runs(long_runs), folder, 'long')
+        shown = [r for r in long_runs if r.gains == 'paper']
+        figures.save(figures.long_runs(shown), folder, 'long')
         figures.save(figures.protections(protected), folder, 'protection')
         figures.save(figures.noise(noisy), folder, 'noise')
         bar.update()

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the paper stops: the implicit scheme, 2,000 s of adaptation, measurement noise."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.metrics import rms
 from fhaosmo_ros.tools.paper_cases import (
     CONVERGED,
+    DEMO,
     FREQUENCIES,
     LEVANT,
     observe,
@@ -40,6 +41,18 @@ WORSE = 1.05
 """Adaptation may be this many times worse than none."""
 LAWS: dict[str, dict[str, Any]] = {"the paper's": {}, 'default': SAFE}
 """Laws of gamma by name: what differs from config/paper.yaml."""
+GAINS: dict[str, dict[str, Any]] = {'paper': {}, 'demo': DEMO}
+"""Gains by the name of the configuration that they are from."""
+LONG = (
+    *(
+        ('paper', scheme, omega, noise)
+        for noise in (0.0, 1e-4)
+        for scheme in ('explicit', 'implicit')
+        for omega in FREQUENCIES
+    ),
+    *(('demo', 'implicit', omega, 0.0) for omega in FREQUENCIES),
+)
+"""Long runs: gains, scheme, angular frequency, noise on y."""
 PROTECTIONS: dict[str, dict[str, Any]] = {
     "the paper's": {},
     'projection on [0.45, 1]': {'gamma_min': 0.45},
@@ -48,8 +61,16 @@ PROTECTIONS: dict[str, dict[str, Any]] = {
     'default: dead zone and leakage': SAFE,
 }
 """Each protection by itself, and the default settings."""
-PROTECTED = ((1.0, 0.0), (5.0, 0.0), (1.0, 1e-3))
-"""Where they are compared: angular frequency and noise on y."""
+PROTECTED = tuple(
+    ('paper', 'explicit', omega, noise) for omega, noise in ((1.0, 0.0), (5.0, 0.0), (1.0, 1e-3))
+)
+"""Where they are compared; as in `LONG`."""
+DEAD_ZONES = (0.003, 0.004, 0.005, SAFE['gamma_dead_zone'], 0.0075, 0.01)
+SWEEP = (0.1, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0)
+"""Angular frequencies at which the dead zones are compared."""
+SWEEP_DURATION = 250.0
+THINNED = 10
+"""Long runs record every 10th sample."""
 
 
 class Row(NamedTuple):
@@ -69,7 +90,7 @@ class LongRun(NamedTuple):
 
     Attributes
     ----------
-    law, scheme, omega, noise : str, str, float, float
+    law, gains, scheme, omega, noise : str, str, str, float, float
     t, rms_d, gamma : (K,) arrays
         End of each window, RMS error of d within it, gamma at its end.
     fixed : float
@@ -78,6 +99,7 @@ class LongRun(NamedTuple):
     """
 
     law: str
+    gains: str
     scheme: str
     omega: float
     noise: float
@@ -113,7 +135,7 @@ def noises(tick: Callable[[], object]) -> list[Row]:
 
 
 def long_runs(
-    laws: Mapping[str, dict[str, Any]], scheme: str, omega: float, noise: float,
+    laws: Mapping[str, dict[str, Any]], gains: str, scheme: str, omega: float, noise: float,
     duration: float, window: float,
 ) -> list[LongRun]:  # fmt: skip
     """
@@ -121,20 +143,24 @@ def long_runs(
 
     Parameters
     ----------
+    gains : {'paper', 'demo'}
     duration, window : float
         Seconds from `CONVERGED` on, and length of the windows within which errors are judged.
 
     """
     truth = truth_of(omega, 1e-3, noise, duration + CONVERGED)
-    first, size = round(CONVERGED / 1e-3), round(window / 1e-3)
+    row = THINNED * 1e-3
+    first, size = round(CONVERGED / row), round(window / row)
 
     def windows(variant: str, changes: dict[str, Any]) -> tuple[Floats, Floats]:
-        run = observe(truth, variant, scheme, **changes)
-        error = run.z_hat[:, -1] - run.unknown_input
-        starts = range(first, len(error) - size, size)
+        run = observe(truth, variant, scheme, THINNED, **(GAINS[gains] | changes))
+        internal = GAINS[gains].get('estimate_from') == 'internal'
+        estimate = run.z_tilde[:, -2] if internal else run.z_hat[:, -1]
+        error = estimate - run.unknown_input
+        starts = range(first, len(error) - size + 1, size)
         return (
             np.array([rms(error[k : k + size]) for k in starts]),
-            np.array([run.gamma[k + size] for k in starts]),
+            np.array([run.gamma[k + size - 1] for k in starts]),
         )
 
     fixed = float(windows('fuzzy', {})[0][-1])
@@ -142,5 +168,20 @@ def long_runs(
     for law, changes in laws.items():
         rms_d, gamma = windows('fuzzy_adaptive', changes)
         t = CONVERGED + window * np.arange(1, len(rms_d) + 1)
-        runs.append(LongRun(law, scheme, omega, noise, t, rms_d, gamma, fixed))
+        runs.append(LongRun(law, gains, scheme, omega, noise, t, rms_d, gamma, fixed))
     return runs
+
+
+def dead_zones(
+    frequencies: Sequence[float], tick: Callable[[], object]
+) -> dict[tuple[float, float], list[LongRun]]:
+    """Return, by dead zone and angular frequency, runs with the default law under both schemes."""
+    laws = {f'{zone:g}': SAFE | {'gamma_dead_zone': zone} for zone in DEAD_ZONES}
+    found: dict[tuple[float, float], list[LongRun]] = {}
+    for omega in frequencies:
+        for scheme in ('explicit', 'implicit'):
+            runs = long_runs(laws, 'paper', scheme, omega, 0.0, SWEEP_DURATION, WINDOW)
+            for zone, run in zip(DEAD_ZONES, runs, strict=True):
+                found.setdefault((zone, omega), []).append(run)
+        tick()
+    return found

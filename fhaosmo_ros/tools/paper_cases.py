@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's simulations and ours beside them: what is run, and how it is judged."""
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import Observer, Plant
@@ -56,6 +57,12 @@ LEVANT = {
     if name in ('structure', 'lambda', 'fuzzy_widths')
 }
 """The second structure with gains of its own."""
+DEMO = {
+    name: value
+    for name, value in load(shipped('config/demo.yaml'), 'estimator').items()
+    if name in ('lambda', 'alpha', 'fuzzy_widths', 'epsilon', 'estimate_from')
+} | {'initial_estimate': [0.0], 'initial_internal': [0.0], 'start_from_measurement': True}
+"""The observer of config/demo.yaml: gains that were found for a noisy y over a middleware."""
 OURS = {
     'fuzzy adaptive, default law, 1e-3 s': Case('fuzzy_adaptive', 1e-3, SAFE),
     'Levant sign, 1e-3 s': Case('sign', 1e-3, LEVANT),
@@ -72,6 +79,7 @@ class Preset(NamedTuple):
     plant: dict[str, Any]
 
 
+@lru_cache
 def preset() -> Preset:
     """Read the paper's numbers from the shipped configuration."""
     path = shipped('config/paper.yaml')
@@ -120,11 +128,13 @@ def truth_of(omega: float, step: float, noise: float, duration: float) -> Truth:
     return Truth(t, truth.y, truth.z, truth.unknown_input)
 
 
-def observe(truth: Truth, variant: str, scheme: str, **changes: Any) -> JointRun:
-    """Observe it as a node does: one observer step a sample."""
+def observe(truth: Truth, variant: str, scheme: str, every: int = 1, **changes: Any) -> JointRun:
+    """Observe it as a node does, one observer step a sample; record every `every`-th one."""
     observer = Observer(preset().observer | {'variant': variant, 'scheme': scheme} | changes)
-    run = observer.run(truth.t, truth.y)
-    return JointRun(truth.t, truth.z, truth.unknown_input, run.z_hat, run.z_tilde, run.gamma)
+    run = observer.run(truth.t, truth.y, every=every)
+    rows = slice(every - 1, None, every)
+    z, d = truth.z[rows], truth.unknown_input[rows]
+    return JointRun(run.t, z, d, run.z_hat, run.z_tilde, run.gamma)
 
 
 def sampled(

@@ -197,6 +197,7 @@ def long_runs(runs: Sequence[LongRun]) -> Figure:
                 'color': LAW_COLOURS[run.law],
                 'linestyle': '-' if run.scheme == 'explicit' else '--',
                 'label': f'{run.law} law, {run.scheme}',
+                'linewidth': 1.3 if run.law == 'default' else 3.0,
             }
             column[0].plot(run.t, run.gamma, **style)
             column[1].plot(run.t, run.rms_d / run.fixed, **style)
@@ -221,10 +222,7 @@ def protections(cells: Sequence[Sequence[LongRun]]) -> Figure:
             top.plot(run.t, run.gamma, **line)
             bottom.plot(run.t, run.rms_d, **line)
         bottom.axhline(runs[0].fixed, color='#999999', linewidth=1.0)
-        bottom.annotate(
-            'γ = 1/2', (1.0, runs[0].fixed), xycoords=('axes fraction', 'data'),
-            ha='right', va='bottom', fontsize=8, color='#666666',
-        )  # fmt: skip
+        top.axhline(0.5, color='#999999', linewidth=1.0, label='γ = 1/2, not adapted')
         top.set_title(f'ω = {runs[0].omega:g} rad/s, noise {runs[0].noise:g}', fontsize=10)
         bottom.set_xlabel(TIME)
         for axes in (top, bottom):

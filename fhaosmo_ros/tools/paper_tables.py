@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The generated parts of docs/paper.md, as Markdown."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 
 from fhaosmo_ros.tools.paper_beyond import LongRun, Row, WORSE
 from fhaosmo_ros.tools.paper_cases import OBSERVERS, OURS, Score
@@ -130,13 +130,13 @@ def long_table(runs: Iterable[LongRun]) -> str:
         better = 'yes' if last <= first else 'no'
         bar = 'yes' if last <= WORSE * r.fixed else 'no'
         rows.append(
-            f'| {r.law} | {r.scheme} | {r.omega:g} | {r.noise:g} | {r.gamma[0]:.3f} | '
+            f'| {r.gains} | {r.law} | {r.scheme} | {r.omega:g} | {r.noise:g} | {r.gamma[0]:.3f} | '
             f'{r.gamma[-1]:.3f} | {_number(first)} | {_number(last)} | {_number(r.fixed)} | '
             f'{better} | {bar} |'
         )
     return _table(
-        '| law of γ | scheme | ω [rad/s] | noise on y | γ after the first 100 s | γ at the end '
-        '| RMS d, first 100 s | RMS d, last 100 s | the same, γ = 1/2 '
+        '| gains | law of γ | scheme | ω [rad/s] | noise on y | γ after the first 100 s '
+        '| γ at the end | RMS d, first 100 s | RMS d, last 100 s | the same, γ = 1/2 '
         '| last no worse than first | within 5 % of γ = 1/2 |',
         rows,
     )
@@ -154,3 +154,19 @@ def protection_table(runs: Iterable[LongRun]) -> str:
         '| the same / that of γ = 1/2 |',
         rows,
     )
+
+
+def dead_zone_table(runs: Mapping[tuple[float, float], Sequence[LongRun]]) -> str:
+    """Return the worse ratio to gamma = 1/2 of both schemes, by dead zone and frequency."""
+    zones = list(dict.fromkeys(zone for zone, _ in runs))
+    frequencies = list(dict.fromkeys(omega for _, omega in runs))
+    rows = []
+    for zone in zones:
+        cells = []
+        for omega in frequencies:
+            found = runs[zone, omega]
+            ratio = max(r.rms_d[-1] / r.fixed for r in found)
+            met = ratio <= WORSE and all(r.rms_d[-1] <= r.rms_d[0] for r in found)
+            cells.append(f'{ratio:.3f}' if met else f'**{ratio:.3f}**')
+        rows.append(f'| {zone:g} | {" | ".join(cells)} |')
+    return _table(f'| dead zone | {" | ".join(f"ω = {w:g}" for w in frequencies)} |', rows)
