@@ -47,6 +47,7 @@ OTHER = {
     'gamma_max': 0.7,
     'gamma_dead_zone': 0.01,
     'gamma_leakage': 0.1,
+    'gamma_leakage_delay': 2.0,
     'initial_estimate': [0.1, 0.0, 0.0, 0.0],
     'initial_internal': [0.1, 0.0, 0.0, 0.0],
     'start_from_measurement': False,
