@@ -60,6 +60,10 @@ class Watch:
         for pairs in self._pairs.values():
             pairs.clear()
 
+    def count(self, name: str) -> int:
+        """Return how many estimates a node has published since `forget`."""
+        return len(self._pairs[f'/{name}/stamp'])
+
     def jitter(self, name: str, rate: float) -> Quantiles:
         """Return the deviation of the time between two publications from 1 / rate."""
         return _quantiles(np.diff(self._columns(name)[0]) * NANOSECONDS - 1.0 / rate)

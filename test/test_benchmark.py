@@ -69,12 +69,23 @@ def test_quick_rates():
     assert done.returncode == 0, done.stderr
     assert 'CPU, estimator / empty node, y 1000 Hz, estimates 1000 Hz' in done.stdout
     table = [line.split() for line in done.stdout.splitlines() if line.startswith('1000  ')]
-    assert [line[2] for line in table] == ['estimator', 'empty']
+    assert [line[3] for line in table] == ['estimator', 'empty']
     for line in table:
-        cpu, lost, sent, *times = (float(word.replace(',', '')) for word in line[3:])
+        cpu, lost, sent, *times = (float(word.replace(',', '')) for word in line[4:])
         assert cpu > 0
         assert 0 <= lost < sent
         assert all(time > 0 for time in times)
+
+
+def test_quick_tune():
+    pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
+    done = subprocess.run(
+        [sys.executable, BENCHMARK / 'run.py', '--quick', '--only', 'tune'],
+        capture_output=True, text=True, cwd=BENCHMARK.parent, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert 'trials a minute' in done.stdout
+    assert 'efficiency' in done.stdout
 
 
 def test_rows_without_value_miss_their_bar(monkeypatch):
