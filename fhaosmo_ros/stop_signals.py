@@ -7,7 +7,11 @@ import contextlib
 import select
 import signal
 import socket
+import threading
+from types import FrameType
 
+RETRY = 0.02
+"""Seconds after which a signal that came at a bad moment comes again."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -41,9 +45,12 @@ class Stop:
         with contextlib.suppress(BlockingIOError):  # full: the wait ends anyway
             self._writer.send(b'\0')
 
-    def signal(self) -> None:
+    def signal(self, number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
         """Take a signal: `set`, and within `raising` raise, but once only."""
         raises = self._raises and not self._set
+        if raises and _called_by_compiler(frame):
+            threading.Timer(RETRY, signal.raise_signal, (number,)).start()
+            return
         self.set()
         if raises:
             raise Stopped
@@ -73,6 +80,15 @@ class Stop:
         return self._set
 
 
+def _called_by_compiler(frame: FrameType | None) -> bool:
+    """Return True within what C calls: an exception would be printed there, and lost."""
+    while frame is not None:
+        if 'llvmlite' in frame.f_code.co_filename:
+            return True
+        frame = frame.f_back
+    return False
+
+
 def stop_on_signals() -> Stop:
     """
     Make SIGINT and SIGTERM set the returned event, from now to the process's end.
@@ -82,7 +98,7 @@ def stop_on_signals() -> Stop:
     """
     stop = Stop()
     for number in SIGNALS:
-        signal.signal(number, lambda *_: stop.signal())
+        signal.signal(number, stop.signal)
     stop.wake_on_signals()
     atexit.register(_ignore)
     return stop

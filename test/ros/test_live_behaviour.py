@@ -50,6 +50,8 @@ class Case(NamedTuple):
 
 
 CASES = {
+    'unknown_input_decay': Case(500.0),
+    'structure': Case('levant'),
     'variant': Case('sign'),
     'scheme': Case('explicit'),
     'lambda': Case([100.0]),
@@ -64,6 +66,11 @@ CASES = {
     'gamma_max': Case(0.5, {'gamma_initial': 0.7}, prepare={'gamma_initial': 0.5}),
     'gamma_dead_zone': Case(1e6, QUICK_GAMMA),
     'gamma_leakage': Case(1e3, {'gamma_initial': 0.7}, prepare={'gamma_initial': 0.5}),
+    'gamma_leakage_delay': Case(
+        0.0,
+        {'gamma_initial': 0.7, 'gamma_leakage': 1e3, 'gamma_dead_zone': 1e-9},
+        prepare={'gamma_initial': 0.5, 'gamma_dead_zone': 1e6},
+    ),
     'initial_estimate': Case([0.5], reset=True),
     'initial_internal': Case([0.5], reset=True),
     'start_from_measurement': Case(False, reset=True),
@@ -109,10 +116,10 @@ def test_change_acts_as_in_a_replay_and_differs_from_none(rig, name):
     rig.reset()
     with_change, without = OnlineEstimator(values), OnlineEstimator(values)
     samples = [(rig.send(wave(k)), wave(k)) for k in range(FIRST)]
-    for changes in (case.prepare, {name: case.value}):
-        if changes:
-            (result,) = rig.parameters.set(**changes)
-            assert result.successful, result.reason
+    if case.prepare:
+        assert rig.parameters.set_atomically(**case.prepare).successful
+    (result,) = rig.parameters.set(**{name: case.value})
+    assert result.successful, result.reason
     if case.reset:
         rig.reset()
     y = case.y or wave

@@ -2,6 +2,7 @@
 """Signals end a node cleanly, whenever they come."""
 
 import signal
+import sys
 import time
 
 from fhaosmo_ros.stop_signals import Stop, Stopped
@@ -110,6 +111,11 @@ def test_a_signal_cuts_only_what_may_be_cut_and_only_once():
     assert stop.is_set()
     with pytest.raises(Stopped), stop.raising():
         raise AssertionError('the signal came before')
+    while_called_by_c = Stop()
+    with while_called_by_c.raising():
+        code = compile('stop.signal(0, sys._getframe())', '/llvmlite/x.py', 'exec')
+        exec(code, {'stop': while_called_by_c, 'sys': sys})  # noqa: S102
+        assert not while_called_by_c.is_set()  # it comes again later
     quiet = Stop()
     quiet.signal()
     assert quiet.wait(0.0)
