@@ -23,13 +23,13 @@ def measure(quick: bool) -> list[Row]:
     isolate()
     channels, seconds, repetitions = (4, 2.0, 1) if quick else (CHANNELS, 10.0, 3)
     plan = [listen for _ in range(repetitions) for listen in (False, True)]
-    runs: dict[bool, list[tuple[float, float]]] = {False: [], True: []}
+    runs: dict[bool, list[np.ndarray]] = {False: [], True: []}
     for listen in tqdm(plan, desc='channels', unit='run', leave=False):
         runs[listen].append(observe(channels, seconds, listen))
     rows = []
     for listen, costs in runs.items():
-        ratios = [many / channels / single for many, single in costs]
-        many, single = np.median(costs, axis=0)
+        ratios = [many / channels / single for (many, single), _ in costs]
+        (many, single), memory = np.median(costs, axis=0)
         name = 'estimates of d heard by one listener' if listen else 'nobody listens'
         rows.append(Row(
             f'CPU, a channel of {channels} / a process each, {RATE:g} Hz, {name}',
@@ -37,11 +37,14 @@ def measure(quick: bool) -> list[Row]:
             note=f'{many:.1%} / {channels} and {single:.2%}; ratios '
             f'{", ".join(f"{r:.3f}" for r in ratios)}',
         ))  # fmt: skip
+    note = f'{memory[0]:.0f} MB / {channels} and {memory[1]:.0f} MB'
+    rows.append(Row(f'memory, a channel of {channels} / a process each',
+                    memory[0] / channels / memory[1], note=note))  # fmt: skip
     return rows
 
 
-def observe(channels: int, seconds: float, listen: bool) -> tuple[float, float]:
-    """Return the CPU of the process with all channels, and of one process for one, over time."""
+def observe(channels: int, seconds: float, listen: bool) -> np.ndarray:
+    """Return CPU over time, and MB, of the process with all channels and of one for one."""
     names = [f'c{k}' for k in range(channels)]
     singles = names[: min(SINGLES, channels)]
     publish = ('-p', f'publish_rate:={RATE}')
@@ -72,7 +75,8 @@ def observe(channels: int, seconds: float, listen: bool) -> tuple[float, float]:
         before, start = _used(many, alone), monotonic()
         sleep(seconds)
         used, elapsed = _used(many, alone) - before, monotonic() - start
-        return float(used[0] / elapsed), float(used[1] / elapsed)
+        memory = [many.resident_megabytes(), alone[0].resident_megabytes()]
+        return np.array([used / elapsed, memory])
 
 
 def _used(many: Child, alone: list[Child]) -> np.ndarray:

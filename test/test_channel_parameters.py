@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of many channels: common values, and a channel's own in their place."""
 
+import argparse
+
 from fhaosmo_ros.core.channel_parameters import (
     channel_names,
     followers,
@@ -15,6 +17,7 @@ from fhaosmo_ros.core.parameters import (
     ONLINE_PARAMETERS,
     PLANT_NODE_PARAMETERS,
 )
+from fhaosmo_ros.tools.options import add_parameter_options, online_parameters
 import pytest
 
 NAMES = ['hip', 'knee_2']
@@ -89,3 +92,24 @@ def test_one_file_serves_channels_and_plant(tmp_path):
     )
     assert load(path, 'estimator') == {'channels': ['hip'], 'hip.lambda': [4.0]}
     assert load(path, 'plant', PLANT_NODE_PARAMETERS) == {'sample_rate': 50.0}
+
+
+def replayed(*words):
+    parser = argparse.ArgumentParser()
+    add_parameter_options(parser)
+    return online_parameters(parser.parse_args(words))
+
+
+def test_a_replay_takes_the_parameters_of_one_channel(tmp_path):
+    path = tmp_path / 'rig.yaml'
+    path.write_text(
+        '/**:\n  ros__parameters:\n    channels: [hip, knee]\n    epsilon: 5.0\n'
+        '    hip:\n      epsilon: 7.0\n'
+    )
+    words = ['--params-file', str(path), '-p', 'knee.lambda:=3']
+    assert replayed(*words, '--channel', 'hip') == {'epsilon': 7.0}
+    assert replayed(*words, '--channel', 'knee') == {'epsilon': 5.0, 'lambda': [3.0]}
+    with pytest.raises(ConfigurationError, match="--channel: expected 'hip' or 'knee', got ''"):
+        replayed(*words)
+    with pytest.raises(ConfigurationError, match="--channel: expected '', got 'hip'"):
+        replayed('--channel', 'hip')

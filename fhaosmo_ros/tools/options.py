@@ -6,10 +6,10 @@ from pathlib import Path
 import re
 from typing import Any
 
+from fhaosmo_ros.core.channel_parameters import channel_names, of_channel
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameter import unknown_parameter
-from fhaosmo_ros.core.parameter_file import load, parse
+from fhaosmo_ros.core.parameter_file import load, parse, select
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
 import yaml
 
@@ -27,6 +27,10 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--node', default='estimator', metavar='NAME',
         help='whose sections of the files to take, such as /rig/estimator (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--channel', default='', metavar='NAME',
+        help="take the parameters of this one of the node's channels",
     )  # fmt: skip
 
 
@@ -47,21 +51,30 @@ def online_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
         values |= of_file
         origin |= dict.fromkeys(of_file, path)
     on_command_line = _on_command_line(arguments)
-    values |= on_command_line
+    values = select(values | on_command_line, ESTIMATOR_PARAMETERS)
     origin |= dict.fromkeys(on_command_line)
-    values = {name: value for name, value in values.items() if name in ONLINE_PARAMETERS}
+    names = channel_names(values)
+    if arguments.channel not in names:
+        raise ConfigurationError(
+            f'--channel: expected {" or ".join(repr(name) for name in names)}, got '
+            f'{arguments.channel!r}'
+        )
+    own = of_channel(values, arguments.channel)
+    own = {name: value for name, value in own.items() if name in ONLINE_PARAMETERS}
     try:
-        OnlineEstimator(values)
+        OnlineEstimator(own)
     except ConfigurationError as error:
-        named = re.match(r"parameter '([^']+)'", str(error))
-        path = origin.get(named[1]) if named else None
+        found = re.match(r"parameter '([^']+)'", str(error))
+        name = found[1] if found else ''
+        path = origin.get(f'{arguments.channel}.{name}', origin.get(name))
         raise ConfigurationError(f'{path}: {error}' if path else str(error)) from None
-    return values
+    return own
 
 
 def named(arguments: argparse.Namespace) -> list[str]:
-    """Return the parameters that -p sets."""
-    return list(_on_command_line(arguments))
+    """Return the parameters of the update path that -p sets."""
+    names = [name.removeprefix(f'{arguments.channel}.') for name in _on_command_line(arguments)]
+    return [name for name in names if name in ONLINE_PARAMETERS]
 
 
 def _on_command_line(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -73,11 +86,8 @@ def _on_command_line(arguments: argparse.Namespace) -> dict[str, Any]:
         node, _, name = target.rpartition(':')
         if node and node.strip('/') != arguments.node.strip('/'):
             continue  # another node's, as on a command line of ROS
-        if name not in ESTIMATOR_PARAMETERS:
-            raise unknown_parameter(name, ESTIMATOR_PARAMETERS)
         try:
-            value = parse(text)
+            values[name] = parse(text)
         except yaml.YAMLError:
-            value = text
-        values[name] = ESTIMATOR_PARAMETERS[name].coerce(value)
+            values[name] = text
     return values
