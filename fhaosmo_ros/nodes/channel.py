@@ -13,6 +13,7 @@ from fhaosmo_ros.nodes.health import Health
 from fhaosmo_ros.nodes.messages import read_double
 from fhaosmo_ros.nodes.outputs import Outputs
 from fhaosmo_ros.nodes.publishers import PublisherWatch
+from fhaosmo_ros.nodes.snapshots import SnapshotPublisher
 from fhaosmo_ros.nodes.subscription import input_qos, subscribe_with_info
 from rclpy.node import Node
 from std_msgs.msg import Float64
@@ -66,6 +67,7 @@ class Channel:
         self._forget()
         observer = self.estimator.observer
         self._outputs = Outputs(node, outputs, observer.order, observer.levels)
+        self._snapshots = SnapshotPublisher(node, self.estimator, outputs)
         self._health = Health(self.estimator, values)
         qos = input_qos(values)
         self._y = subscribe_with_info(node, Float64, inputs + 'y', self._on_sample, qos, raw=True)
@@ -87,6 +89,7 @@ class Channel:
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
         self.estimator.reset()
+        self._snapshots.reset()
         self._forget()
         self._active = True
         self._start_timer()
@@ -108,6 +111,7 @@ class Channel:
             destroy(entity)
         self._owned = []
         self._outputs.destroy()
+        self._snapshots.destroy()
 
     def check(self, changes: Mapping[str, Any]) -> None:
         """Raise what `configure` would raise, and change nothing."""
@@ -116,6 +120,7 @@ class Channel:
     def configure(self, changes: Mapping[str, Any]) -> None:
         """Change live parameters from the next sample on."""
         self.estimator.configure(online(changes))
+        self._snapshots.changed()
         self._health.configure(changes)
         self._max_gap = float(changes.get('max_gap', self._max_gap))
         if 'sampling' in changes:
@@ -184,6 +189,7 @@ class Channel:
         if not word & REJECTED:
             health = self._health
             self._arrived = True
+            self._snapshots.accepted(stamp)
             health.latest = perf_counter()
             health.stamps.append(stamp)
             health.unknown_inputs.append(unknown_input)
@@ -259,6 +265,7 @@ class Channel:
     def reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start the observer afresh."""
         self.estimator.reset()
+        self._snapshots.reset()
         response.success = True
         response.message = 'the observer starts afresh with the next sample'
         self._logger.info(f'reset: {response.message}')
@@ -267,6 +274,7 @@ class Channel:
     def freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         """Hold gamma, or let it adapt again."""
         self.estimator.freeze(request.data)
+        self._snapshots.changed()
         response.success = True
         response.message = 'gamma is held' if request.data else 'gamma adapts again'
         self._logger.info(f'freeze: {response.message}')

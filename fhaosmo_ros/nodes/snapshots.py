@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator's state on ~/snapshot, so that a replay can follow a live run exactly."""
+"""What an estimator remembers, on a topic: so that a replay can follow a live run exactly."""
 
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.snapshot import Flag, labels, pack, Snapshot
-from fhaosmo_ros.nodes.messages import fill, labelled
+from fhaosmo_ros.nodes.messages import array_encoder
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Float64MultiArray
@@ -15,38 +15,51 @@ LATE = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 class SnapshotPublisher:
     """
-    Publishes after a start, after a live change and once a second, each at the next sample.
+    Publishes once a second, after the first sample, and after each live change and reset.
 
-    At a sample that was accepted nothing is left over from rejected ones, so the observer's state
-    is all there is to know.
+    Parameters
+    ----------
+    node : Node
+    estimator : OnlineEstimator
+    prefix : str
+        Stands before the topic's name.
+
     """
 
-    def __init__(self, node: Node, estimator: OnlineEstimator) -> None:
-        self._estimator = estimator
-        self._starts = estimator.counters.starts
-        self._due = False
-        self._flags = Flag(0)
-        self._message = labelled(labels(estimator.observer.levels))
-        self._publish = node.create_publisher(Float64MultiArray, '~/snapshot', LATE).publish
-        node.create_timer(PERIOD, self._request)
+    def __init__(self, node: Node, estimator: OnlineEstimator, prefix: str) -> None:
+        self._node, self._estimator = node, estimator
+        self._due, self._first = True, True
+        self._encode = array_encoder(labels(estimator.observer.levels))
+        self._publisher = node.create_publisher(Float64MultiArray, prefix + 'snapshot', LATE)
+        self._timer = node.create_timer(PERIOD, self._request)
 
     def _request(self) -> None:
         self._due = True
 
-    def changed(self) -> None:
-        """Say that parameters changed: the next sample is the first that is taken with them."""
-        self._due = True
-        self._flags |= Flag.CHANGED
+    def accepted(self, stamp: int) -> None:
+        """Publish if it is time to; to be called for each sample that was accepted."""
+        if self._due:
+            # In a queue the observer may be samples ahead of this one.
+            begins = self._first and stamp == self._estimator.latest
+            self._publish(Flag.STARTED if begins else Flag(0))
 
-    def accepted(self) -> None:
-        """Publish if it is time to; to be called after each sample that was accepted."""
-        starts = self._estimator.counters.starts
-        if starts != self._starts:
-            self._starts = starts
-            self._flags |= Flag.STARTED
-        elif not self._due:
-            return
-        state = self._estimator.observer.state
-        snapshot = Snapshot(self._estimator.stamp or 0, self._flags, state)
-        self._publish(fill(self._message, pack(snapshot)))
-        self._due, self._flags = False, Flag(0)
+    def changed(self) -> None:
+        """Tell that something is different after the latest sample: parameters, or `freeze`."""
+        self._publish(Flag.CHANGED)
+
+    def reset(self) -> None:
+        """Tell that the next sample is the first again."""
+        self._publish(Flag.RESET)
+        self._due = self._first = True
+
+    def _publish(self, flags: Flag) -> None:
+        stamp = self._estimator.latest
+        if stamp is not None:
+            snapshot = Snapshot(stamp, flags, self._estimator.memory)
+            self._publisher.publish(self._encode(pack(snapshot)))
+            self._due = self._first = False
+
+    def destroy(self) -> None:
+        """Take the topic away."""
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_publisher(self._publisher)
