@@ -8,7 +8,6 @@ from typing import Any
 
 from fhaosmo_ros.core.counters import UNUSED_SAMPLES
 from fhaosmo_ros.core.metrics import high_passed
-from fhaosmo_ros.core.observer import Observer
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.status import Status
 from fhaosmo_ros.nodes.diagnostics import ERROR, Report, STALE, WARN
@@ -147,7 +146,7 @@ class Health:
         report.values = {
             'open levels': f'{estimate.open_levels if estimate else 0} of {observer.levels}',
             'gamma': estimate.gamma if estimate else float('nan'),
-            'gamma at': _bound(observer, estimate.status if estimate else Status.OK),
+            'gamma at': _bound(self._estimator, estimate.status if estimate else Status.OK),
             'unknown input': estimate.unknown_input if estimate else float('nan'),
             'chatter of the unknown input': chatter,
             'chatter index (0 smooth, 1 nothing but chatter)': (
@@ -180,9 +179,11 @@ class Health:
         }
 
 
-def _bound(observer: Observer, status: Status) -> str:
+def _bound(estimator: OnlineEstimator, status: Status) -> str:
+    if not estimator.observer.parameters['variant'].endswith('_adaptive'):
+        return 'a fixed value'
+    if estimator.frozen:
+        return 'the value that ~/freeze holds'
     if status & Status.GAMMA_AT_MIN:
         return 'gamma_min'
-    if status & Status.GAMMA_AT_MAX:
-        return 'gamma_max'
-    return 'neither bound' if observer.parameters['variant'] == 'fuzzy_adaptive' else 'fixed'
+    return 'gamma_max' if status & Status.GAMMA_AT_MAX else 'neither bound'

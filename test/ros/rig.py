@@ -68,7 +68,7 @@ class Process:
         self, folder: Path, *arguments: object, code: str = '', **environment: object
     ) -> None:
         self._paths = folder / 'stdout', folder / 'stderr'
-        words = [sys.executable, '-c', code] if code else command(*arguments)
+        words = [sys.executable, '-c', code, *arguments] if code else command(*arguments)
         with self._paths[0].open('wb') as out, self._paths[1].open('wb') as err:
             self._process = subprocess.Popen(
                 words, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err,

@@ -9,6 +9,7 @@ rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2
 pytestmark = pytest.mark.ros
 
 from rig import EstimatorRig, node_process, Parameters, parameters  # noqa: E402
+from std_srvs.srv import SetBool  # noqa: E402
 
 OK, WARN, ERROR, STALE = b'\0', b'\1', b'\2', b'\3'
 RATE = 200.0
@@ -121,9 +122,17 @@ def test_gamma_at_a_bound_is_said(rig):
     assert rig.parameters.set_atomically(**was).successful
     assert rig.parameters.set(variant='sign')[0].successful
     rig.client.wait(
-        lambda: numbers(rig.wait_status('observer', OK))['gamma at'] == 'fixed', 'fixed gamma'
+        lambda: numbers(rig.wait_status('observer', OK))['gamma at'] == 'a fixed value', 'it'
     )
     assert rig.parameters.set(variant='fuzzy_adaptive')[0].successful
+
+
+def test_a_forgotten_freeze_is_said(rig):
+    for data, word in ((True, 'the value that ~/freeze holds'), (False, 'neither bound')):
+        rig.client.call('/d/estimator/freeze', SetBool, SetBool.Request(data=data))
+        rig.client.wait(
+            lambda word=word: numbers(rig.wait_status('observer', OK))['gamma at'] == word, word
+        )
 
 
 def test_silence_is_stale(client, folder):
