@@ -8,6 +8,7 @@ Run plant, fault injector and estimator for a long time, and say what grew, drif
 import argparse
 from collections import Counter, defaultdict
 import json
+import os
 from pathlib import Path
 import signal
 import sys
