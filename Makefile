@@ -6,12 +6,13 @@ MINUTES ?= 2
 # $(call with,EXTRA): set $python to the environment's Python, making the environment first.
 with = python=$$(PYTHON='$(PYTHON)' sh scripts/environment.sh $(1))
 
-.PHONY: help demo paper test lint bench soak clean
+.PHONY: help demo paper tune test lint bench soak clean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    run plant and estimator for 20 s, draw what was estimated'
 	@echo 'make paper   reproduce the paper, rewrite docs/paper.md and its figures'
+	@echo 'make tune    find gains that fit a sensor: ARGS="--params-file my.yaml", or --bag run'
 	@echo 'make test    check style and types, run the tests'
 	@echo 'make lint    check style and types only'
 	@echo 'make bench   measure speed'
@@ -28,6 +29,9 @@ demo:
 paper:
 	@$(call with) && exec "$$python" -m fhaosmo_ros paper $(ARGS)
 
+tune:
+	@$(call with,tune) && exec "$$python" -m fhaosmo_ros tune $(ARGS)
+
 lint:
 	@$(call with,test) && set -x && \
 	"$$python" -m ruff check --output-format concise . && \
@@ -39,7 +43,7 @@ test: lint
 	@$(call with,test) && exec "$$python" -m pytest -n 2 --dist loadfile $(ARGS)
 
 bench:
-	@$(call with) && exec "$$python" benchmark/run.py $(ARGS)
+	@$(call with,tune) && exec "$$python" benchmark/run.py $(ARGS)
 
 soak:
 	@$(call with) && exec "$$python" benchmark/soak.py --minutes $(MINUTES) $(ARGS)

@@ -8,6 +8,7 @@ from fhaosmo_ros.commands import COMMANDS
 from setuptools import find_packages, setup
 
 NAME = 'fhaosmo_ros'
+TUNE = ['cmaes', 'optuna>=4,<6']
 
 
 def files(*patterns):
@@ -39,9 +40,10 @@ setup(
         'networkx',  # this, packaging and scipy: scikit-fuzzy imports them but declares nothing
         'numba',
         'numpy',
+        'orjson',
         'packaging',
         'pyyaml',
-        'rosbags',
+        'rosbags>=0.11.9,<0.12',  # tools/bag_reader.py and bag_writer.py know its insides
         'scikit-fuzzy',
         'scipy',
         'setuptools',
@@ -60,10 +62,14 @@ setup(
             'ros-jazzy-std-msgs',
             'ros-jazzy-std-srvs',
         ],
+        'tune': TUNE,
         'test': [
+            *TUNE,
             'colcon-common-extensions',
             'hypothesis',
             'import-linter',
+            'mcap',
+            'mcap-ros2-support',
             'mypy',
             'pytest',
             'pytest-xdist',

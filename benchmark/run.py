@@ -18,6 +18,7 @@ import replay
 import simulation
 import startup
 from table import CannotMeasureError, render, Row, Table
+import tune
 
 PARTS = {
     'core': core_step.measure,
@@ -26,6 +27,7 @@ PARTS = {
     'channels': channels.measure,
     'startup': startup.measure,
     'replay': replay.measure,
+    'tune': tune.measure,
 }
 
 

@@ -8,7 +8,7 @@ from fhaosmo_ros.core import layout, policy, policy_time
 from fhaosmo_ros.core import policy_layout as at
 from fhaosmo_ros.core.counters import Counters
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.observer import Estimate, Observer, Trajectory
+from fhaosmo_ros.core.observer import Estimate, Observer, ObserverState, Trajectory
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -186,6 +186,36 @@ class OnlineEstimator:
     def frozen(self) -> bool:
         """True while gamma is held."""
         return bool(self._ints[at.FROZEN])
+
+    @property
+    def timing(self) -> NDArray[np.float64]:
+        """What is remembered of the intervals: how many, their mean and its jitter (ns)."""
+        return np.array(
+            [self._ints[at.INTERVALS], self._reals[at.INTERVAL], self._reals[at.JITTER]]
+        )
+
+    def resume(self, stamp: int, state: ObserverState, timing: ArrayLike = (0, 0.0, 0.0)) -> None:
+        """
+        Go on from the observer's state after an accepted sample with this stamp.
+
+        Parameters
+        ----------
+        stamp : int
+            In nanoseconds.
+        state : ObserverState
+        timing : (3,) array
+            See `timing`.
+
+        Raises
+        ------
+        ConfigurationError
+            The state is of an observer with another number of levels.
+
+        """
+        self.observer.restore(state)
+        ints = self._ints
+        policy_time.settled(ints, stamp)
+        ints[at.INTERVALS], self._reals[at.INTERVAL], self._reals[at.JITTER] = np.asarray(timing)
 
     def forget_stamp(self) -> None:
         """Expect stamps of another clock: the next sample takes the usual period."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from fhaosmo_ros.core.channel_parameters import channel_names, CHANNELS, with_channels
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.parameter import ParameterTable, unknown_parameter
+from fhaosmo_ros.core.parameter import ParameterTable, suggestion, unknown_parameter
 from fhaosmo_ros.core.parameters import NODE_TABLES
 from fhaosmo_ros.core.yaml_text import parse
 import yaml
@@ -22,7 +22,9 @@ def is_built_in(name: str) -> bool:
     return name in BUILT_IN or name.startswith('qos_overrides.')
 
 
-def load(path: str | Path, node: str, table: ParameterTable | None = None) -> dict[str, Any]:
+def load(
+    path: str | Path, node: str, table: ParameterTable | None = None, strict: bool = False
+) -> dict[str, Any]:
     """
     Return what a parameter file sets for a node of this package.
 
@@ -38,6 +40,8 @@ def load(path: str | Path, node: str, table: ParameterTable | None = None) -> di
         'estimator' or 'plant', or a full name such as '/rig/estimator'.
     table : ParameterTable, optional
         What the node declares; without it, that of the last part of its name.
+    strict : bool
+        Raise if no section is the node's; ROS passes over such a file.
 
     Returns
     -------
@@ -52,18 +56,22 @@ def load(path: str | Path, node: str, table: ParameterTable | None = None) -> di
 
     """
     try:
-        return select(read(path, node), table or NODE_TABLES[node.rsplit('/', 1)[-1]])
+        return select(read(path, node, strict), table or NODE_TABLES[node.rsplit('/', 1)[-1]])
     except ConfigurationError as error:
         raise ConfigurationError(f'{path}: {error}') from None
 
 
-def read(path: str | Path, node: str) -> dict[str, Any]:
+def read(path: str | Path, node: str, strict: bool = False) -> dict[str, Any]:
     """Return what a file sets for a node, unchecked; see `load`."""
-    values: dict[str, Any] = {}
-    for section, parameters in _sections(path).items():
-        if _matches(section, node):
-            values |= parameters
-    return values
+    sections = _sections(path)
+    ours = [section for section in sections if _matches(section, node)]
+    if strict and not ours:
+        names = [section.lstrip('/') for section in sections]
+        raise ConfigurationError(
+            f"expected a section '{node}' or '/**', got {', '.join(names)}"
+            f'{suggestion(node, names)}'
+        )
+    return {name: value for section in ours for name, value in sections[section].items()}
 
 
 def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 """The policy's rules for values (see policy.py), each a small compiled function."""
 
 from fhaosmo_ros.core import policy_layout as at
-from fhaosmo_ros.core.kernels import EPSILON
+from fhaosmo_ros.core.law import EPSILON
 from fhaosmo_ros.core.layout import HAT, TILDE
 from fhaosmo_ros.core.policy_time import difference
 from fhaosmo_ros.core.tape import Floats, Ints

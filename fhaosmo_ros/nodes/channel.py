@@ -13,6 +13,7 @@ from fhaosmo_ros.nodes.health import Health
 from fhaosmo_ros.nodes.messages import read_double
 from fhaosmo_ros.nodes.outputs import Outputs
 from fhaosmo_ros.nodes.publishers import PublisherWatch
+from fhaosmo_ros.nodes.snapshots import Snapshots
 from fhaosmo_ros.nodes.subscription import input_qos, subscribe_with_info
 from rclpy.node import Node
 from std_msgs.msg import Float64
@@ -66,6 +67,7 @@ class Channel:
         self._forget()
         observer = self.estimator.observer
         self._outputs = Outputs(node, outputs, observer.order, observer.levels)
+        self._snapshots = Snapshots(node, outputs, self.estimator)
         self._health = Health(self.estimator, values)
         qos = input_qos(values)
         self._y = subscribe_with_info(node, Float64, inputs + 'y', self._on_sample, qos, raw=True)
@@ -87,6 +89,7 @@ class Channel:
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
         self.estimator.reset()
+        self._snapshots.started()
         self._forget()
         self._active = True
         self._start_timer()
@@ -108,6 +111,7 @@ class Channel:
             destroy(entity)
         self._owned = []
         self._outputs.destroy()
+        self._snapshots.destroy()
 
     def check(self, changes: Mapping[str, Any]) -> None:
         """Raise what `configure` would raise, and change nothing."""
@@ -116,6 +120,7 @@ class Channel:
     def configure(self, changes: Mapping[str, Any]) -> None:
         """Change live parameters from the next sample on."""
         self.estimator.configure(online(changes))
+        self._snapshots.changed()
         self._health.configure(changes)
         self._max_gap = float(changes.get('max_gap', self._max_gap))
         if 'sampling' in changes:
@@ -187,6 +192,8 @@ class Channel:
             health.latest = perf_counter()
             health.stamps.append(stamp)
             health.unknown_inputs.append(unknown_input)
+            if self._snapshots.due:
+                self._snapshots.publish()
         if word & TOLD:
             self._tell(word, y)
 
@@ -232,6 +239,7 @@ class Channel:
     def publish(self) -> None:
         """Publish the latest estimate, unless samples have stopped coming."""
         estimator = self.estimator
+        self._snapshots.tick()
         if self._is_stale():
             return
         estimate = estimator.estimate
@@ -259,6 +267,7 @@ class Channel:
     def reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start the observer afresh."""
         self.estimator.reset()
+        self._snapshots.started()
         response.success = True
         response.message = 'the observer starts afresh with the next sample'
         self._logger.info(f'reset: {response.message}')
@@ -267,6 +276,7 @@ class Channel:
     def freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         """Hold gamma, or let it adapt again."""
         self.estimator.freeze(request.data)
+        self._snapshots.changed()
         response.success = True
         response.message = 'gamma is held' if request.data else 'gamma adapts again'
         self._logger.info(f'freeze: {response.message}')

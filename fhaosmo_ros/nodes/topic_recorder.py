@@ -4,15 +4,11 @@
 from collections.abc import Callable, Mapping
 import importlib
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
-from fhaosmo_ros.nodes.spin import Spinner
+from fhaosmo_ros.nodes.private_node import PrivateNode
 from fhaosmo_ros.nodes.subscription import subscribe_with_info
-import rclpy
-from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 
 DEPTH = 5000
 DISCOVERY_PERIOD = 0.2
@@ -34,9 +30,9 @@ class Sample(NamedTuple):
     data: bytes
 
 
-class TopicRecorder:
+class TopicRecorder(PrivateNode):
     """
-    A node in a context of its own that records while it is open.
+    A node that records while it is open.
 
     Parameters
     ----------
@@ -49,36 +45,31 @@ class TopicRecorder:
         `NewTopic`, then the topic's `Sample`; the executor's thread fills it.
     problems : SimpleQueue
         Lines that say why a topic can't be recorded.
+    lost : dict of str to int
+        Messages by topic that were published but did not arrive; only of topics with one
+        publisher, whose messages are numbered.
 
     """
 
     def __init__(self, wanted: Callable[[str], bool]) -> None:
         self.queue: SimpleQueue[NewTopic | Sample] = SimpleQueue()
         self.problems: SimpleQueue[str] = SimpleQueue()
+        self.lost: dict[str, int] = {}
         self._wanted = wanted
         self._known: set[str] = set()
-        self._context = Context()
-        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = Node('fhaosmo_recorder', context=self._context, use_global_arguments=False)
-        self._node.create_timer(DISCOVERY_PERIOD, self._discover)
-        self._spinner = Spinner(self._node)
+        super().__init__('fhaosmo_recorder')
+        self.node.create_timer(DISCOVERY_PERIOD, self._discover)
 
-    def __enter__(self) -> 'TopicRecorder':
+    def __enter__(self) -> Self:
         self._discover()
-        self._spinner.__enter__()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._spinner.__exit__()
-        self._node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        return super().__enter__()
 
     def _discover(self) -> None:
-        for topic, types in self._node.get_topic_names_and_types():
+        for topic, types in self.node.get_topic_names_and_types():
             if topic in self._known or not self._wanted(topic):
                 continue
-            publishers = self._node.get_publishers_info_by_topic(topic)
-            publishers = [p for p in publishers if p.node_name != self._node.get_name()]
+            publishers = self.node.get_publishers_info_by_topic(topic)
+            publishers = [p for p in publishers if p.node_name != self.node.get_name()]
             if not publishers:
                 continue
             self._known.add(topic)
@@ -92,14 +83,23 @@ class TopicRecorder:
             profiles = [p.qos_profile for p in publishers]
             self.queue.put(NewTopic(topic, types[0], [_plain(p) for p in profiles]))
             subscribe_with_info(
-                self._node, message_class, topic, self._callback(topic), _matching(profiles),
+                self.node, message_class, topic, self._callback(topic), _matching(profiles),
                 raw=True,
             )  # fmt: skip
 
     def _callback(self, topic: str) -> Any:
         put = self.queue.put
+        latest = 0
 
         def receive(data: bytes, info: Mapping[str, int]) -> None:
+            nonlocal latest
+            number = info.get('publication_sequence_number') or 0
+            if latest and number > latest + 1:
+                self.lost[topic] = self.lost.get(topic, 0) + number - latest - 1
+            elif 0 < number <= latest:  # another publisher: its numbers tell nothing
+                self.lost.pop(topic, None)
+                number = 2**63
+            latest = max(latest, number)
             put(Sample(topic, info['source_timestamp'] or info['received_timestamp'], data))
 
         return receive

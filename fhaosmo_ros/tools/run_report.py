@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.metrics import chatter, rms, settling_time
-from fhaosmo_ros.tools.bags import messages, series
+from fhaosmo_ros.tools.series import messages, series
 import numpy as np
 from numpy.typing import NDArray
 

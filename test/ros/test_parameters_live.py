@@ -31,6 +31,8 @@ STARTED_WITH = {
 }
 
 OTHER = {
+    'unknown_input_decay': 2.0,
+    'structure': 'levant',
     'variant': 'fuzzy',
     'scheme': 'explicit',
     'lambda': [12.0, 13.0, 14.0, 16.0],
@@ -45,6 +47,7 @@ OTHER = {
     'gamma_max': 0.7,
     'gamma_dead_zone': 0.01,
     'gamma_leakage': 0.1,
+    'gamma_leakage_delay': 2.0,
     'initial_estimate': [0.1, 0.0, 0.0, 0.0],
     'initial_internal': [0.1, 0.0, 0.0, 0.0],
     'start_from_measurement': False,
