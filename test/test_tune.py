@@ -23,6 +23,12 @@ from fhaosmo_ros.tools.tuning.theory import candidates
 import numpy as np
 import pytest
 
+pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
+pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
+
+from fhaosmo_ros.tools.tuning.study import Point
+from fhaosmo_ros.tools.tuning.tuner import front
+
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = {'duration': 4.0, 'integration_step': 1e-3, 'sample_rate': 200.0}
 TUNING = TUNE_PARAMETERS.defaults() | SHORT | {'settled': 1.0}
@@ -31,12 +37,6 @@ QUICK = [f'-p{name}:={value}' for name, value in SHORT.items()] + [
     '--jobs=2',
 ]  # fmt: skip
 FILES = ['estimates.png', 'gains.yaml', 'report.md', 'sensitivity.png', 'study.journal']
-
-
-@pytest.fixture(autouse=True)
-def _needed():
-    pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
-    pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
 
 
 def command(*arguments, **options):
@@ -111,6 +111,13 @@ def test_front_of_error_and_chatter(tmp_path):
     assert main([*QUICK, '--pareto', '--trials=60', '-o', str(out)]) == 0
     assert (out / 'pareto.png').stat().st_size > 10_000
     assert '(pareto.png)' in (out / 'report.md').read_text()
+
+
+def test_front_drops_what_is_beaten():
+    pairs = [(2.0, 3.0), (1.0, 5.0), (4.0, 1.0), (2.0, 2.0), (3.0, 2.0)]
+    points = [Point({}, (0.0, 0.0, error, chatter, 9.0)) for error, chatter in pairs]
+    found = [(mark.error, mark.chatter) for mark in front(points, 'chatter')]
+    assert found == [(1.0, 5.0), (2.0, 2.0), (4.0, 1.0)]
 
 
 def test_sections_of_a_file(tmp_path):
