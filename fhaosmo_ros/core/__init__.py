@@ -6,6 +6,7 @@ from fhaosmo_ros.core.compile_cache import compile_cache
 with compile_cache():
     from fhaosmo_ros.core import joint
     from fhaosmo_ros.core.errors import ConfigurationError
+    from fhaosmo_ros.core.family import Family, Recording
     from fhaosmo_ros.core.model import TriangularModel
     from fhaosmo_ros.core.observer import Estimate, Observer, ObserverState, Trajectory
     from fhaosmo_ros.core.plant import Plant
@@ -14,9 +15,11 @@ with compile_cache():
 __all__ = [
     'ConfigurationError',
     'Estimate',
+    'Family',
     'Observer',
     'ObserverState',
     'Plant',
+    'Recording',
     'Status',
     'Trajectory',
     'TriangularModel',

@@ -70,7 +70,8 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
         A name that no node of the package declares, or a bad value.
 
     """
-    everybody = dict.fromkeys(name for other in NODE_TABLES.values() for name in other)
+    tables = (table, *NODE_TABLES.values())
+    everybody = dict.fromkeys(name for other in tables for name in other)
     for name in values:
         if name not in everybody and not is_built_in(name):
             raise unknown_parameter(name, everybody)
