@@ -251,5 +251,9 @@ class Plant:
     def _measured(self, z1: Floats) -> Floats:
         p = self._parameters
         y = z1 + p['noise_std'] * self._random.standard_normal(len(z1))
-        step = p['quantisation']
-        return np.round(y / step) * step if step > 0.0 else y
+        return quantised(y, p['quantisation'])
+
+
+def quantised(y: Floats, step: float) -> Floats:
+    """Return y rounded to multiples of `step`, or as it is for 0."""
+    return np.round(y / step) * step if step > 0.0 else y

@@ -9,6 +9,7 @@ from fhaosmo_ros.core.family import Family, Recording
 from fhaosmo_ros.core.family_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.core.parameter_file import load
+from fhaosmo_ros.core.parameters import PLANT_PARAMETERS
 from fhaosmo_ros.core.plant import Plant
 from fhaosmo_ros.tools.comparison.methods import Setting
 from fhaosmo_ros.tools.share import shipped
@@ -172,7 +173,7 @@ class Sensor(NamedTuple):
 @lru_cache
 def plant_values(file: str) -> dict[str, Any]:
     """Return the plant's parameters in a YAML of config/models."""
-    return load(shipped(f'config/models/{file}.yaml'), 'plant')
+    return load(shipped(f'config/models/{file}.yaml'), 'plant', PLANT_PARAMETERS)
 
 
 @lru_cache

@@ -30,19 +30,19 @@ class Estimates(NamedTuple):
 
 class Scores(NamedTuple):
     """
-    Scores of one method in one cell, averaged over the recordings.
+    Scores of one method in one cell.
 
     Attributes
     ----------
     d : float
-        RMS error of d, in d's unit.
+        RMS error of d over the RMS of d, after the transient.
     states : float
         RMS error of z_2 .. z_n, each over the RMS of the state itself, averaged.
     settling : float
-        Seconds until the RMS error of d over `WINDOW` stays below half the RMS of d; infinite if
-        it never does.
+        Seconds until the RMS error of d over the next half second is first below half the RMS
+        of d; infinite if it never is.
     chatter : float
-        RMS of what a moving average leaves of the error of d, in d's unit.
+        RMS of what a moving average leaves of the error of d, over the RMS of d.
 
     """
 
@@ -61,34 +61,33 @@ def objective(recording: Recording, estimates: Estimates) -> float:
 
 
 def scores(recordings: Sequence[Recording], estimates: Sequence[Estimates]) -> Scores:
-    """Return the averages over recordings: of squares for RMS errors, the median of settling."""
-    rows = np.array([_one(r, e) for r, e in zip(recordings, estimates, strict=True)])
-    d, states, chatter = np.sqrt(np.mean(np.square(rows[:, [0, 1, 3]]), axis=0))
+    """Return the scores over recordings: RMS of the errors, median of the settling times."""
+    with np.errstate(over='ignore', invalid='ignore'):
+        rows = np.array([_one(r, e) for r, e in zip(recordings, estimates, strict=True)])
+        d, states, chatter = np.sqrt(np.mean(np.square(rows[:, [0, 1, 3]]), axis=0))
     return Scores(float(d), float(states), float(np.median(rows[:, 2])), float(chatter))
 
 
 def _one(recording: Recording, estimates: Estimates) -> tuple[float, float, float, float]:
     late = recording.t >= JUDGED_FROM
-    error = estimates.d - recording.d
+    error, size = estimates.d - recording.d, rms(recording.d[late])
     relative = [
         rms(estimates.z[late, i] - recording.z[late, i]) / rms(recording.z[late, i])
         for i in range(1, recording.z.shape[1])
     ]
     per_second = (len(recording.t) - 1) / (recording.t[-1] - recording.t[0])
-    chatter = high_passed(error[late], max(3, round(CHATTER_WINDOW * per_second)))
+    chatter = high_passed(error[late], max(3, round(CHATTER_WINDOW * per_second))) / size
+    settling = _settling(recording, error, round(WINDOW * per_second))
     # A diverged estimate is infinitely wrong, not NaN.
-    d, states = rms(error[late]), float(np.sqrt(np.mean(np.square(relative))))
-    finite = [x if np.isfinite(x) else float('inf') for x in (d, states, chatter)]
-    return finite[0], finite[1], settling(recording, error, round(WINDOW * per_second)), finite[2]
+    d, states, chatter = (
+        x if np.isfinite(x) else float('inf')
+        for x in (rms(error[late]) / size, float(np.mean(relative)), chatter)
+    )
+    return d, states, settling, chatter
 
 
-def settling(recording: Recording, error: Floats, window: int) -> float:
-    """Return the time from which on the averaged error is below the threshold; see `Scores`."""
+def _settling(recording: Recording, error: Floats, window: int) -> float:
     total = np.concatenate([[0.0], np.cumsum(np.square(error))])
-    with np.errstate(invalid='ignore'):
-        moving = np.sqrt(np.maximum(total[window:] - total[:-window], 0.0) / window)
-    outside = np.flatnonzero(~(moving <= SETTLED * rms(recording.d)))
-    if not len(outside):
-        return 0.0
-    last = outside[-1] + window
-    return float(recording.t[last]) if last < len(recording.t) else float('inf')
+    moving = np.sqrt(np.maximum(total[window:] - total[:-window], 0.0) / window)
+    inside = np.flatnonzero(moving <= SETTLED * rms(recording.d))
+    return float(recording.t[inside[0]]) if len(inside) else float('inf')

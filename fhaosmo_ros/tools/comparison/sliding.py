@@ -17,8 +17,9 @@ import numpy as np
 
 Parameters = Callable[[Setting, Values], Mapping[str, Any]]
 
-LEVANT = {2: (1.5, 1.1), 3: (2.0, 2.12, 1.1), 4: (3.0, 4.16, 3.06, 1.1), 5: (5.0, 9.3, 10.03, 6.75, 1.1)}
-"""Levant's gains of the non-recursive differentiator for a Lipschitz constant of 1, by levels."""
+OURS = 'ours'
+RECURSIVE = (1.1, 1.5, 2.0, 3.0, 5.0, 7.0)
+"""Levant's lambda_0 .. lambda_5 of the recursive form, for a Lipschitz constant of 1."""
 
 
 def _prepare(parameters: Parameters) -> Callable[[Setting, Values], Run]:
@@ -45,29 +46,106 @@ def _prepare(parameters: Parameters) -> Callable[[Setting, Values], Run]:
 
 @lru_cache
 def _paper() -> dict[str, Any]:
+    """Return the paper's numbers that fit any plant: all but the model and the initial values."""
     values = load(shipped('config/paper.yaml'), 'estimator')
-    names = ('epsilon', 'fuzzy_widths', 'fuzzy_shape', 'gamma_rate', 'gamma_initial', 'gamma_min')
-    return {name: values[name] for name in (*names, 'gamma_max')}
+    left_out = ('order', 'phi', 'variant', 'initial_estimate', 'initial_internal')
+    kept = {k: v for k, v in values.items() if k in OBSERVER_PARAMETERS and k not in left_out}
+    return kept | {name: kept[name][:1] for name in ('lambda', 'alpha')}
 
 
 def _papers_gains(variant: str) -> Parameters:
     def parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
-        gains = {name: values for name, values in (('lambda', [15.0]), ('alpha', [30.0]))}
-        return _paper() | gains | {'variant': variant, 'scheme': 'explicit'}
+        del setting, values
+        return _paper() | {'variant': variant, 'start_from_measurement': True}
 
     return parameters
 
 
 def _levant(scheme: str) -> Parameters:
     def parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
+        """Non-recursive form: kappa_i = lambda_i kappa_{i+1}^(i / (i+1)) L^((N-i) / N)."""
         levels = setting.model.order + 1
-        gains = [
-            k * values['lipschitz'] ** ((i + 1) / levels) for i, k in enumerate(LEVANT[levels])
-        ]
+        gains, kappa = [], 1.0
+        for i in reversed(range(levels)):
+            kappa = RECURSIVE[i] * kappa ** (i / (i + 1))
+            gains.append(kappa * values['lipschitz'] ** ((levels - i) / levels))
         return {'structure': 'levant', 'variant': 'sign', 'scheme': scheme, 'lambda': gains}
 
     return parameters
 
 
-def _levant_space(setting: Setting) -> tuple[Dimension, ...]:
-    return (Dimension('lipschitz', 1e-3 * setting.size, 1e6 * setting.size, setting.size),)
+def _levant_space(setting: Setting) -> list[Dimension]:
+    return [Dimension('lipschitz', 1e-4 * setting.size, 1e8 * setting.size, 10.0 * setting.size)]
+
+
+def _cascade_space(setting: Setting) -> list[Dimension]:
+    levels = setting.model.order + 1
+    names = [f'{name}_{i + 1}' for name in ('lambda', 'alpha', 'width') for i in range(levels)]
+    return [
+        Dimension('speed', 0.05, 5.0 / setting.period, 10.0),
+        *(Dimension(name, 1e-3, 1e3, 1.0) for name in names),
+        Dimension('epsilon', 1e-2, 1e4, 100.0),
+        Dimension('gamma', 0.1, 1.0, 0.5),
+    ]
+
+
+def _cascade(scheme: str) -> Parameters:
+    def parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
+        """
+        Gains in units that make all plants alike.
+
+        With d of size D and a speed w, z_i is of size U_i = D / w^(N - i): then w U_i^(1 - gamma)
+        is the unit of lambda_i, w U_{i+1} of alpha_i and U_i of the half-widths.
+        """
+        speed, gamma = values['speed'], values['gamma']
+        levels = setting.model.order + 1
+        unit = setting.size * speed ** np.arange(1.0 - levels, 2.0)
+
+        def series(name: str) -> np.ndarray:
+            return np.array([values[f'{name}_{i + 1}'] for i in range(levels)])
+
+        return {
+            'variant': 'fuzzy_adaptive',
+            'gamma_rate': 0.0,
+            'gamma_initial': gamma,
+            'scheme': scheme,
+            'lambda': (series('lambda') * speed * unit[:-1] ** (1.0 - gamma)).clip(1e-12, 1e6),
+            'alpha': (series('alpha') * speed * unit[1:]).clip(1e-12, 1e9),
+            'fuzzy_widths': (series('width') * unit[:-1]).clip(1e-12, 1e12),
+            'epsilon': values['epsilon'] * setting.size,
+        }
+
+    return parameters
+
+
+def _none(setting: Setting) -> list[Dimension]:
+    del setting
+    return []
+
+
+SLIDING = (
+    Method(
+        'Levant, explicit', "Levant's robust exact differentiator with Phi, explicit Euler",
+        False, _levant_space, _prepare(_levant('explicit')),
+    ),
+    Method(
+        'Levant, implicit', 'the same, implicit Euler', False, _levant_space,
+        _prepare(_levant('implicit')),
+    ),
+    Method(
+        'paper: sign', "sign observer with the paper's gains", False, _none,
+        _prepare(_papers_gains('sign')),
+    ),
+    Method(
+        'paper: fuzzy', "fuzzy observer with the paper's gains", False, _none,
+        _prepare(_papers_gains('fuzzy')),
+    ),
+    Method(
+        'paper: adaptive', "fuzzy observer with adapted gamma and the paper's gains", False, _none,
+        _prepare(_papers_gains('fuzzy_adaptive')),
+    ),
+    Method(
+        OURS, "the paper's cascade, fuzzy and explicit, every gain tuned", False, _cascade_space,
+        _prepare(_cascade('explicit')),
+    ),
+)  # fmt: skip
