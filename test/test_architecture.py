@@ -15,7 +15,7 @@ PACKAGE = ROOT / 'fhaosmo_ros'
 ALLOWED = {
     'rclpy': ['nodes/'],
     'rosbags': ['tools/bags.py', 'tools/bag_reader.py'],
-    'matplotlib': ['tools/figures.py', 'tools/paper_figures.py'],
+    'matplotlib': ['tools/comparison/figures.py', 'tools/figures.py', 'tools/paper_figures.py'],
     'skfuzzy': ['core/fuzzy.py'],
 }
 FORBIDDEN_IN_CORE = ['rclpy', 'rosbags', 'matplotlib', 'fhaosmo_ros.nodes', 'fhaosmo_ros.tools']

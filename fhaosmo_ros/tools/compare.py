@@ -64,7 +64,9 @@ def main(argv: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='compare', description=__doc__)
     parser.add_argument(
-        '--quick', action='store_true', help='a few cells and trials, for a first look and for tests'
+        '--quick',
+        action='store_true',
+        help='a few cells and trials, for a first look and for tests',
     )
     parser.add_argument(
         '--trials', type=_positive, metavar='N',
@@ -101,7 +103,9 @@ def run(chosen: list[Sensor], trials: int, training: int, jobs: int) -> Results:
         for task, entry in _evaluated(tasks, trials, training, jobs):
             entries[task] = entry
             bar.update()
-    seconds = {name: seconds_a_sample(name, entries[chosen[0], name].tuned, chosen[0]) for name in METHODS}
+    seconds = {
+        name: seconds_a_sample(name, entries[chosen[0], name].tuned, chosen[0]) for name in METHODS
+    }
     return Results([entries[task] for task in tasks], seconds, trials, training)
 
 
@@ -132,7 +136,7 @@ def _evaluated(
 
 
 def _ignore_interrupt() -> None:
-    """The parent ends its children."""
+    """Leave Ctrl-C to the parent, which ends its children."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

@@ -35,9 +35,7 @@ def filled(document: str, texts: Mapping[str, str]) -> str:
     return PATTERN.sub(lambda match: PART.format(match['name'], texts[match['name']]), document)
 
 
-def write(
-    path: Path, texts: Mapping[str, str], title: str = 'The paper, reproduced'
-) -> None:
+def write(path: Path, texts: Mapping[str, str], title: str = 'The paper, reproduced') -> None:
     """Rewrite the generated parts of the document at `path`, or write them alone if it is new."""
     if path.exists():
         text = filled(path.read_text(encoding='utf-8'), texts)

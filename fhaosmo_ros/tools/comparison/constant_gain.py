@@ -63,9 +63,7 @@ def run(
                     for i in range(size):
                         slope = work[0, i + 1] if i + 1 < size else 0.0
                         if i < order and offsets[i + 1] > offsets[i]:
-                            phi, _ = evaluate(
-                                tape, offsets[i], offsets[i + 1], work, u[k], stack
-                            )
+                            phi, _ = evaluate(tape, offsets[i], offsets[i + 1], work, u[k], stack)
                             slope += phi
                         work[2 + stage, i] = slope
                 for i in range(size):

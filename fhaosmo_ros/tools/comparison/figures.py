@@ -49,7 +49,9 @@ def noise(table: Table) -> Figure:
     even = [cell for cell in table if cell.sensor.timing == 'even']
     columns = list(dict.fromkeys((c.sensor.plant, c.disturbance) for c in even))
     rates = sorted({c.sensor.rate for c in even}, reverse=True)
-    figure = Figure(figsize=(2.1 * len(columns) + 1.0, 3.2 * len(rates) + 1.0), layout='constrained')
+    figure = Figure(
+        figsize=(2.1 * len(columns) + 1.0, 3.2 * len(rates) + 1.0), layout='constrained'
+    )
     panels = figure.subplots(len(rates), len(columns), sharex=True, sharey=True, squeeze=False)
     places = {level: i for i, level in enumerate(NOISES)}
     for row, rate in zip(panels, rates, strict=True):
@@ -64,13 +66,13 @@ def noise(table: Table) -> Figure:
         row[0].set_ylabel(f'{rate:g} Hz\nRMS error of d / RMS of d')
     panels[0, 0].set_ylim(FLOOR, CEILING)
     for axes in panels[-1]:
-        axes.set_xticks(range(len(NOISES)), ['0', *(f'$10^{{{round(log10(x))}}}$' for x in NOISES[1:])])
+        axes.set_xticks(
+            range(len(NOISES)), ['0', *(f'$10^{{{round(log10(x))}}}$' for x in NOISES[1:])]
+        )
     figure.supxlabel("standard deviation of the noise on y (pendulum, motor: over y's amplitude)")
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside upper center', ncols=5, fontsize=9)
     return figure
-
-
 
 
 def _errors(axes: Axes, cells: list[tuple[int, dict]]) -> None:
@@ -111,7 +113,7 @@ def ratios(table: Table) -> Figure:
         axes.grid(alpha=0.3)
         axes.set_title(v.bar.claim, fontsize=9)
         axes.legend(fontsize=8)
-    panels[-1].set_xlabel('our RMS error of d over the rival\'s')
+    panels[-1].set_xlabel("our RMS error of d over the rival's")
     return figure
 
 

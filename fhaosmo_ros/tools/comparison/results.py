@@ -114,9 +114,7 @@ def load(path: Path) -> Results:
         tuned = Tuned(row['values'], row['readout'], _number(row['training']))
         judged = [Scores(*(_number(s[k]) for k in Scores._fields)) for s in row['scores']]
         entries.append(Entry(sensor, row['method'], tuned, judged))
-    return Results(
-        entries, data['seconds_a_sample'], data['trials'], data['training_recordings']
-    )
+    return Results(entries, data['seconds_a_sample'], data['trials'], data['training_recordings'])
 
 
 def _number(x: float | None) -> float:

@@ -33,9 +33,7 @@ def texts(results: Results) -> dict[str, str]:
         'better': _better(table),
         'ratios': _ratios(judged),
     }
-    return parts | {
-        name: _scores(table, title, read) for name, (title, read) in MEASURES.items()
-    }
+    return parts | {name: _scores(table, title, read) for name, (title, read) in MEASURES.items()}
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -135,7 +133,9 @@ def _ratios(judged: list[Verdict]) -> str:
             [*_names(cell), f'**{r:.2f}**' if r <= v.bar.limit else f'{r:.2f}']
             for cell, r in v.ratios.items()
         ]
-        blocks.append(f'{v.bar.claim[0].upper()}{v.bar.claim[1:]}:\n\n' + _table([*HEAD, 'ratio'], rows))
+        blocks.append(
+            f'{v.bar.claim[0].upper()}{v.bar.claim[1:]}:\n\n' + _table([*HEAD, 'ratio'], rows)
+        )
     return '\n\n'.join(blocks)
 
 
