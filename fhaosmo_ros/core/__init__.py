@@ -11,6 +11,7 @@ with compile_cache():
     from fhaosmo_ros.core.observer import Estimate, Observer, ObserverState, Trajectory
     from fhaosmo_ros.core.plant import Plant
     from fhaosmo_ros.core.status import Status
+    from fhaosmo_ros.core.trial import Trial
 
 __all__ = [
     'ConfigurationError',
@@ -22,6 +23,7 @@ __all__ = [
     'Recording',
     'Status',
     'Trajectory',
+    'Trial',
     'TriangularModel',
     'joint',
 ]

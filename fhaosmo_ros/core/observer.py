@@ -131,7 +131,7 @@ class Observer:
         count = self._configuration.levels
         self._levels = np.zeros((layout.ROWS, count))
         self._memory = np.zeros(layout.SCALARS)
-        self._work = kernels.make_work(count, self._configuration.model.depth)
+        self._work = self.make_work()
         self._eps = np.zeros((1, count))
         self._t: float | int | None = None
         self._word = 0
@@ -151,6 +151,15 @@ class Observer:
     def levels(self) -> int:
         """Number of levels N."""
         return self._configuration.levels
+
+    @property
+    def law(self) -> kernels.Law:
+        """What the kernels read of the parameters."""
+        return self._law
+
+    def make_work(self) -> kernels.Work:
+        """Return scratch memory for the kernels."""
+        return kernels.make_work(self.levels, self._configuration.model.depth)
 
     @property
     def uses_input(self) -> bool:
@@ -284,11 +293,11 @@ class Observer:
         return self._estimate(self._word)
 
     def _estimate(self, word: int) -> Estimate:
-        z, d = self._select(self._levels)
+        z, d = self.select(self._levels)
         gamma = float(self._memory[layout.GAMMA])
         return Estimate(z, float(d), gamma, self._eps[0].copy(), word)
 
-    def _select(self, levels: NDArray[np.float64]) -> tuple[NDArray[np.float64], Any]:
+    def select(self, levels: NDArray[Any]) -> tuple[NDArray[Any], Any]:
         """Return copies of the estimates of z and d from arrays of shape (..., rows, N)."""
         n = self.order
         hat, tilde = levels[..., layout.HAT, :], levels[..., layout.TILDE, :]
@@ -383,7 +392,7 @@ class Observer:
             self._word = int(words[-1])
         y_last = self._memory[layout.Y]
         kernels.innovations(self._law.scalars, self._levels, y_last, self._eps, 0)
-        z, d = self._select(out)
+        z, d = self.select(out)
         return Trajectory(
             t[every - 1 :: every], z, d, gamma, eps[:rows],
             words & ((1 << LEVEL_SHIFT) - 1), words >> LEVEL_SHIFT,
