@@ -31,6 +31,7 @@ STARTED_WITH = {
 }
 
 OTHER = {
+    'structure': 'levant',
     'variant': 'fuzzy',
     'scheme': 'explicit',
     'lambda': [12.0, 13.0, 14.0, 16.0],
