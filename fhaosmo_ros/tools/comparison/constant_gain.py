@@ -2,26 +2,24 @@
 """
 The compiled recursion of every observer with a constant gain: predict by the model, correct by y.
 
-    z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d,   d' = d_1, ..., d_{m-1}' = 0
+    z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d,   d' = d_1, ..., d_{m-1}' = -decay d_{m-1}
     x(t_k) = prediction(t_k) + K (y_k - prediction_1(t_k))
 
-The prediction is one Runge-Kutta step of the whole (nonlinear) model, so these observers know Phi
-exactly as ours does; for a linear Phi it equals the zero-order-hold discretisation but for terms
-of order h^5. Each estimate uses the sample of its own time.
+The prediction integrates the whole (nonlinear) model by Runge-Kutta steps, so these observers know
+Phi exactly as ours does; for a linear Phi it equals the zero-order-hold discretisation but for an
+error that the longest step makes as small as wanted. Each estimate uses the sample of its own time.
 """
 
 from fhaosmo_ros.core.borrowed import borrowed
 from fhaosmo_ros.core.tape import evaluate, Floats, Ints
 from numba import njit
 
-LONGEST_STEP = 1.5
-"""A gap longer than this many nominal periods is predicted in several steps."""
-
 
 @njit(cache=True, error_model='numpy')
 def run(
     tape: Floats, offsets: Ints, work: Floats, stack: Floats, order: int,
-    gain: Floats, x: Floats, y: Floats, h: Floats, u: Floats, period: float, out: Floats,
+    gain: Floats, decay: float, x: Floats,
+    y: Floats, h: Floats, u: Floats, longest: float, out: Floats,
 ) -> None:  # fmt: skip
     """
     Estimate from samples; row k of `out` belongs to ``y[k]``.
@@ -34,13 +32,17 @@ def run(
         Scratch memory.
     order : int
         Number of states n.
-    gain, x : (n + m,) arrays
-        K, and the state z, d, d_1 .. at ``y[0]``.
+    gain : (n + m,) array
+        K.
+    decay : float
+        See above; 0 for a random walk.
+    x : (n + m,) array
+        State z, d, d_1 .. at ``y[0]``; in place.
     y, h, u : (K,) arrays
         Samples, the time (s) and the known input of the interval that ends at each; ``h[0]`` is
         not used.
-    period : float
-        Nominal sampling period in seconds.
+    longest : float
+        Longest step of the prediction in seconds; a longer interval takes several.
     out : (K, n + m) array
 
     """
@@ -49,9 +51,7 @@ def run(
     # Rows of `work`: 0 and 1 the stage's point and its tangent (always 0), 2 .. 5 the slopes.
     for k in range(y.shape[0]):
         if k > 0:
-            steps = 1
-            if h[k] > LONGEST_STEP * period:
-                steps = int(h[k] / period) + 1
+            steps = int(h[k] / longest) + 1
             step = h[k] / steps
             for _ in range(steps):
                 for stage in range(4):
@@ -61,7 +61,7 @@ def run(
                         if stage > 0:
                             work[0, i] += reach * work[1 + stage, i]
                     for i in range(size):
-                        slope = work[0, i + 1] if i + 1 < size else 0.0
+                        slope = work[0, i + 1] if i + 1 < size else -decay * work[0, i]
                         if i < order and offsets[i + 1] > offsets[i]:
                             phi, _ = evaluate(tape, offsets[i], offsets[i + 1], work, u[k], stack)
                             slope += phi

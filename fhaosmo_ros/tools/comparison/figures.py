@@ -20,6 +20,7 @@ BLACK, BLUE, ORANGE, GREEN, SKY, PINK, YELLOW, GREY = (
 STYLES: dict[str, tuple[str, str, str]] = {
     'Kalman': (BLUE, 'o', '-'),
     'Kalman, ramp': (SKY, 'D', '--'),
+    'Kalman, decaying': (BLUE, 'h', ':'),
     'ESO': (GREEN, '^', '-.'),
     'Luenberger': (GREEN, 'v', ':'),
     'Levant, explicit': (PINK, 's', '--'),

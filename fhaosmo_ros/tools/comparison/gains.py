@@ -33,24 +33,36 @@ class SampledModel:
         1: d is constant between samples; 2: its derivative is.
     integrators_only : bool
         Take Phi = 0, as the gains of an extended state observer do.
+    decay : float
+        Rate (1/s) at which the chain's last state decays.
 
     Attributes
     ----------
     a : (N, N) array
         Transition over a period, in scaled states x_i * period^(i - 1).
+    resolution : float
+        Runge-Kutta steps (s) up to this one are exact to about 1e-7 of the state.
 
     """
 
     def __init__(
-        self, model: TriangularModel, period: float, chain: int = 1, integrators_only: bool = False
+        self,
+        model: TriangularModel,
+        period: float,
+        chain: int = 1,
+        integrators_only: bool = False,
+        decay: float = 0.0,
     ) -> None:
         self.size = model.order + chain
         self.period = period
         self._scale = period ** np.arange(self.size)
         self._rates = np.eye(self.size, k=1)
+        self._rates[-1, -1] = -decay
+        jacobian = model.jacobian(np.zeros(model.order))
+        fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(model.order, k=1))))
+        self.resolution = 0.1 / max(float(fastest), 1e-9)
         if not integrators_only:
-            n = model.order
-            self._rates[:n, :n] += model.jacobian(np.zeros(n))
+            self._rates[: model.order, : model.order] += jacobian
         self.a = self._scaled(expm(self._rates * period))
         self._c = np.eye(self.size)[:1]
 

@@ -16,14 +16,16 @@ import numpy as np
 with compile_cache():
     from fhaosmo_ros.tools.comparison.constant_gain import run
 
+LONGEST = 1.5
+"""Nominal periods that one step of a prediction may take."""
 Gain = Callable[[SampledModel, Values], np.ndarray]
 
 
 @lru_cache(maxsize=64)
 def _sampled(
-    phi: tuple[str, ...], period: float, chain: int, integrators_only: bool
+    phi: tuple[str, ...], period: float, chain: int, integrators_only: bool, decay: float
 ) -> SampledModel:
-    return SampledModel(TriangularModel(phi), period, chain, integrators_only)
+    return SampledModel(TriangularModel(phi), period, chain, integrators_only, decay)
 
 
 def _bandwidth(name: str, setting: Setting) -> Dimension:
@@ -40,17 +42,21 @@ def _prepare(
 ) -> Callable[[Setting, Values], Run]:
     def prepare(setting: Setting, values: Values) -> Run:
         model = setting.model
-        sampled = _sampled(model.phi, setting.period, chain, integrators_only)
+        decay = values.get('decay', 0.0)
+        sampled = _sampled(model.phi, setting.period, chain, integrators_only, decay)
         k = gain(sampled, values)
         size, n = model.order + chain, model.order
         offsets = np.concatenate([model.offsets, np.repeat(model.offsets[-1:], chain)])
         work, stack = np.zeros((7, size)), np.zeros((2, model.depth))
+        longest = min(LONGEST * setting.period, sampled.resolution)
 
         def estimate(r: Recording) -> dict[str, Estimates]:
             x, out = np.zeros(size), np.empty((len(r.y), size))
             x[0] = r.y[0]
             h = np.diff(r.t, prepend=r.t[0])
-            run(model.tape, offsets, work, stack, n, k, x, r.y, h, r.u, setting.period, out)
+            run(
+                model.tape, offsets, work, stack, n, k, decay, x, r.y, h, r.u, longest, out
+            )  # fmt: skip
             return {'filtered': Estimates(out[:, :n], out[:, n])}
 
         return estimate
@@ -102,6 +108,11 @@ LINEAR = (
         'Kalman, ramp', 'steady-state Kalman filter, d and its derivative random walks', True,
         lambda s: (_bandwidth('bandwidth', s), _bandwidth('drift_bandwidth', s)),
         _prepare(2, _kalman_ramp),
+    ),
+    Method(
+        'Kalman, decaying', 'steady-state Kalman filter, d a random walk that decays', True,
+        lambda s: (_bandwidth('bandwidth', s), Dimension('decay', 1e-3, 1e2, 0.3)),
+        _prepare(1, _kalman),
     ),
     Method(
         'ESO', 'high-gain (extended state) observer, all poles at one place', True,

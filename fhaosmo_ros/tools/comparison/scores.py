@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 JUDGED_FROM = 5.0
 """Seconds of each recording that are the transient."""
-WINDOW = 0.5
+WINDOW = 0.25
 """Seconds over which the error of d is averaged for the settling time."""
 SETTLED = 0.5
 """Fraction of d's RMS below which that average has settled."""
@@ -39,7 +39,7 @@ class Scores(NamedTuple):
     states : float
         RMS error of z_2 .. z_n, each over the RMS of the state itself, averaged.
     settling : float
-        Seconds until the RMS error of d over the next half second is first below half the RMS
+        Seconds until the RMS error of d over `WINDOW` is first below half the RMS
         of d; infinite if it never is.
     chatter : float
         RMS of what a moving average leaves of the error of d, over the RMS of d.
