@@ -2,12 +2,13 @@
 """
 The compiled recursion of every observer with a constant gain: predict by the model, correct by y.
 
-    z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d,   d' = d_1, ..., d_{m-1}' = -decay d_{m-1}
+    z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d
+    d' = d_1, ..., d_{m-1}' = -decay d_{m-1}
     x(t_k) = prediction(t_k) + K (y_k - prediction_1(t_k))
 
 The prediction integrates the whole (nonlinear) model by Runge-Kutta steps, so these observers know
 Phi exactly as ours does; for a linear Phi it equals the zero-order-hold discretisation but for an
-error that the longest step makes as small as wanted. Each estimate uses the sample of its own time.
+error that the longest step makes as small as wanted. Each estimate uses the sample of its time.
 """
 
 from fhaosmo_ros.core.borrowed import borrowed
