@@ -83,36 +83,42 @@ def _cascade_space(setting: Setting) -> list[Dimension]:
     names = [f'{name}_{i + 1}' for name in ('lambda', 'alpha', 'width') for i in range(levels)]
     return [
         Dimension('speed', 0.05, 5.0 / setting.period, 10.0),
-        *(Dimension(name, 1e-3, 1e3, 1.0) for name in names),
-        Dimension('epsilon', 1e-2, 1e4, 100.0),
+        Dimension('kappa', 1e-3, 1e3, 3.0),
+        Dimension('damping', 0.1, 10.0, 1.0),
         Dimension('gamma', 0.1, 1.0, 0.5),
+        Dimension('epsilon', 1.0, 1e4, 100.0),
+        *(Dimension(name, 0.03, 30.0, 1.0) for name in names),
     ]
 
 
 def _cascade(scheme: str) -> Parameters:
     def parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
         """
-        Gains in units that make all plants alike.
+        Gains by the rules of tools/tuning/theory.py, and a factor to each of them.
 
-        With d of size D and a speed w, z_i is of size U_i = D / w^(N - i): then w U_i^(1 - gamma)
-        is the unit of lambda_i, w U_{i+1} of alpha_i and U_i of the half-widths.
+        A half-width covers, kappa times, what noise leaves in m_i and what lag leaves of it:
+        with d of size D and a speed w that is noise sqrt(h w^(2i-1)) + D / w^(N-i).
         """
         speed, gamma = values['speed'], values['gamma']
         levels = setting.model.order + 1
-        unit = setting.size * speed ** np.arange(1.0 - levels, 2.0)
+        level = np.arange(1, levels + 1)
 
         def series(name: str) -> np.ndarray:
-            return np.array([values[f'{name}_{i + 1}'] for i in range(levels)])
+            return np.array([values[f'{name}_{i}'] for i in level])
 
+        left = setting.noise * np.sqrt(setting.period * speed ** (2.0 * level - 1.0))
+        left[0] = setting.noise
+        width = values['kappa'] * (left + 0.1 * setting.size * speed ** (level - float(levels)))
+        gain = 2.0 * values['damping'] * speed * width / (width / 3.0) ** gamma
         return {
             'variant': 'fuzzy_adaptive',
             'gamma_rate': 0.0,
             'gamma_initial': gamma,
             'scheme': scheme,
-            'lambda': (series('lambda') * speed * unit[:-1] ** (1.0 - gamma)).clip(1e-12, 1e6),
-            'alpha': (series('alpha') * speed * unit[1:]).clip(1e-12, 1e9),
-            'fuzzy_widths': (series('width') * unit[:-1]).clip(1e-12, 1e12),
-            'epsilon': values['epsilon'] * setting.size,
+            'lambda': (series('lambda') * gain).clip(1e-12, 1e6),
+            'alpha': (series('alpha') * speed**2 * width).clip(1e-12, 1e9),
+            'fuzzy_widths': (series('width') * width).clip(1e-12, 1e12),
+            'epsilon': values['epsilon'] * float(width.max()),
         }
 
     return parameters
