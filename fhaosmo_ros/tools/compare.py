@@ -5,10 +5,12 @@ import argparse
 from collections.abc import Iterator
 from concurrent.futures import as_completed, ProcessPoolExecutor
 import multiprocessing
+import multiprocessing.connection
 import os
 from pathlib import Path
 import signal
 import sys
+import threading
 import time
 
 from fhaosmo_ros.core.errors import ConfigurationError
@@ -112,20 +114,17 @@ def run(chosen: list[Sensor], trials: int, training: int, jobs: int) -> Results:
 def _evaluated(
     tasks: list[tuple[Sensor, str]], trials: int, training: int, jobs: int
 ) -> Iterator[tuple[tuple[Sensor, str], Entry]]:
-    if jobs == 1:
-        for sensor, name in tasks:
-            yield (sensor, name), _task(sensor, name, trials, training)
-        return
-    # One thread each for linear algebra: the processes already use all cores.
+    # One thread each for linear algebra: for matrices as small as these more only wait for each
+    # other, and the processes already use all cores.
     for variable in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
         os.environ.setdefault(variable, '1')
     context = multiprocessing.get_context('spawn')
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_ignore_interrupt)
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_end_with_parent)
     try:
-        futures = {
-            pool.submit(_task, sensor, name, trials, training): (sensor, name)
-            for sensor, name in tasks
-        }
+        # The children inherit this: Ctrl-C reaches them too, and is the parent's business.
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        futures = {pool.submit(_task, *task, trials, training): task for task in tasks}
+        signal.signal(signal.SIGINT, handler)
         for future in as_completed(futures):
             yield futures[future], future.result()
     finally:
@@ -135,9 +134,15 @@ def _evaluated(
         pool.shutdown(cancel_futures=True)
 
 
-def _ignore_interrupt() -> None:
-    """Leave Ctrl-C to the parent, which ends its children."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _end_with_parent() -> None:
+    """End this child when its parent has been killed, instead of waiting for work for ever."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _task(sensor: Sensor, name: str, trials: int, training: int) -> Entry:
@@ -148,9 +153,10 @@ def _task(sensor: Sensor, name: str, trials: int, training: int) -> Entry:
 def write(found: Results, output: Path) -> None:
     """Write document, figures and results."""
     folder = output / FOLDER
-    figures.save_all(found, folder)
     results.save(found, folder / RESULTS)
-    document.write(output / 'comparison.md', tables.texts(found), 'Comparison')
+    rounded = results.load(folder / RESULTS)  # so that the document is a function of the file
+    figures.save_all(rounded, folder)
+    document.write(output / 'comparison.md', tables.texts(rounded), 'Comparison')
 
 
 if __name__ == '__main__':
