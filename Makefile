@@ -5,12 +5,13 @@ ARGS ?=
 # $(call with,EXTRA): set $python to the environment's Python, making the environment first.
 with = python=$$(PYTHON='$(PYTHON)' sh scripts/environment.sh $(1))
 
-.PHONY: help demo paper test lint bench clean
+.PHONY: help demo paper tune test lint bench clean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    run plant and estimator for 20 s, draw what was estimated'
 	@echo 'make paper   reproduce the paper, rewrite docs/paper.md and its figures'
+	@echo 'make tune    find gains that fit a sensor: ARGS="--params-file my.yaml", or --bag run'
 	@echo 'make test    check style and types, run the tests'
 	@echo 'make lint    check style and types only'
 	@echo 'make bench   measure speed'
@@ -25,6 +26,9 @@ demo:
 
 paper:
 	@$(call with) && exec "$$python" -m fhaosmo_ros paper $(ARGS)
+
+tune:
+	@$(call with,tune) && exec "$$python" -m fhaosmo_ros tune $(ARGS)
 
 lint:
 	@$(call with,test) && set -x && \

@@ -8,6 +8,7 @@ from fhaosmo_ros.commands import COMMANDS
 from setuptools import find_packages, setup
 
 NAME = 'fhaosmo_ros'
+TUNE = ['cmaes', 'optuna>=4,<6']
 
 
 def files(*patterns):
@@ -60,7 +61,9 @@ setup(
             'ros-jazzy-std-msgs',
             'ros-jazzy-std-srvs',
         ],
+        'tune': TUNE,
         'test': [
+            *TUNE,
             'colcon-common-extensions',
             'hypothesis',
             'import-linter',

@@ -87,26 +87,31 @@ class Objective:
                 'recordings: expected a truth that is not 0 throughout where its weight is not 0, '
                 f'got RMS values {self.scale.tolist()}'
             )
-        self._weights = np.where(weighted, weights, 0.0) / np.sum(weights)
-        self._inverse = np.where(weighted, 1.0 / np.where(weighted, self.scale, 1.0), 0.0)
+        self._weighted = np.flatnonzero(weighted)
+        self._weights = np.array(weights)[weighted] / np.sum(weights)
         self._truth_varies = np.maximum(self.trial.variation, self.scale[-1] or 1.0)
         chosen = dict(fixed).get('estimate_from', CHOICES[0])
         self._choices = (0, 1) if choose else (CHOICES.index(chosen),)
 
     def __call__(self, parameters: Mapping[str, Any]) -> Verdict:
-        """Judge the fixed parameters with these."""
+        """Judge the fixed parameters with these; `estimate_from` among them leaves no choice."""
         scores = self.trial(parameters)
+        choices = self._choices
+        if 'estimate_from' in parameters:
+            choices = (CHOICES.index(parameters['estimate_from']),)
         return min(
-            (self._verdict(scores, choice) for choice in self._choices),
+            (self._verdict(scores, choice) for choice in choices),
             key=lambda verdict: verdict.objective,
         )
 
     def _verdict(self, scores: Scores, choice: int) -> Verdict:
-        relative = scores.error[:, choice] * self._inverse
-        each = np.sqrt(np.square(relative) @ self._weights)
+        # An estimate that left the finite numbers is infinitely wrong, not undefined.
+        wrong = np.nan_to_num(scores.error[:, choice, self._weighted], nan=np.inf)
+        with np.errstate(over='ignore'):
+            each = np.sqrt(np.square(wrong / self.scale[self._weighted]) @ self._weights)
         error = float(np.exp(np.mean(np.log(np.maximum(each, SMALLEST)))))
         tenfold = np.log10(np.maximum(scores.variation[:, choice] / self._truth_varies, 1.0))
-        chatter = float(np.mean(tenfold))
+        chatter = float(np.mean(np.nan_to_num(tenfold, nan=np.inf)))
         settled = self._tuning['settled']
         settling = float(np.mean(scores.transient[:, choice]) / settled) if settled > 0.0 else 0.0
         objective = (

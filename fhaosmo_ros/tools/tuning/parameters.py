@@ -11,7 +11,7 @@ TUNING = (
         live=False,
     ),
     Parameter(
-        'held_out', 10, 'Number of other recordings, with other seeds, that only the report sees.',
+        'held_out', 12, 'Number of other recordings, with other seeds, that only the report sees.',
         lower=1, upper=10_000, live=False,
     ),
     Parameter(

@@ -26,6 +26,7 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 import math
 import os
 from typing import Any, NamedTuple
+import warnings
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.tools.tuning.study import Desk, Point
@@ -152,7 +153,7 @@ def minimise(
             desk.report(on_trial)
 
     def work() -> None:
-        while desk.count < trials and not stopped():
+        while desk.begun < trials and not stopped():
             evaluate()
 
     if not desk.count and not stopped() and trials:
@@ -177,10 +178,13 @@ def make_sampler(
     if objectives > 1:
         return NSGAIISampler(seed=seed, population_size=population or 50)
     if kind == 'cmaes':
-        return CmaEsSampler(
-            x0={d.name: d.start for d in space}, sigma0=SIGMA, seed=seed, popsize=population,
-            warn_independent_sampling=False,
-        )  # fmt: skip
+        with warnings.catch_warnings():
+            # x0 and sigma0 go with Optuna 6, which setup.py excludes.
+            warnings.simplefilter('ignore', FutureWarning)
+            return CmaEsSampler(
+                x0={d.name: d.start for d in space}, sigma0=SIGMA, seed=seed, popsize=population,
+                warn_independent_sampling=False,
+            )  # fmt: skip
     if kind == 'tpe':
         return TPESampler(seed=seed, multivariate=True)
     if kind == 'random':

@@ -45,6 +45,8 @@ def make_space(
         if not _used(name, start):
             continue
         low, high, log = _bounds(rule, rest, parameter)
+        if name == 'gamma_initial' and low is None:
+            low, high = start['gamma_min'], start['gamma_max']
         values = start[name] if isinstance(start[name], list) else [start[name]]
         if parameter.kind == 'double_array':
             values = [values[min(k, len(values) - 1)] for k in range(levels)]

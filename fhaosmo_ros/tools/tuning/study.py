@@ -29,7 +29,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 EXCHANGE = 0.1
 """Seconds between two looks at what the others have published."""
-WINDOW = 1500
+WINDOW = 1000
 """Trials that stay in the proposing memory: a sampler's cost grows with them."""
 WORKER = 'worker'
 
@@ -84,7 +84,7 @@ class Desk:
         self._worker = f'{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:8]}'
         self._memory, self._publishing = Lock(), Lock()
         self._read, self._count, self._best = 0, 0, float('inf')
-        self._looked = 0.0
+        self._looked, self._running = 0.0, 0
         self._shared, begun = _open_study(open_storage(storage), name, self._directions)
         self._sampler = make_sampler(0 if begun else 1 + uuid.uuid4().int % 2**30)
         self._study = self._proposing([])
@@ -96,12 +96,18 @@ class Desk:
         """Finished trials in the study, as far as is known here."""
         return self._count
 
+    @property
+    def begun(self) -> int:
+        """As `count`, with the trials that run here."""
+        return self._count + self._running
+
     def ask(self, fixed: dict[str, float] | None = None) -> Trial:
         """Return a trial to evaluate; `fixed` gives its parameters."""
         if time.monotonic() - self._looked > EXCHANGE:
             with self._publishing:
                 self._exchange()
         with self._memory:
+            self._running += 1
             kept = self._study.get_trials(deepcopy=False)
             if len(kept) > 2 * WINDOW and len(self._directions) == 1:
                 finished = [trial for trial in kept[-WINDOW:] if trial.state.is_finished()]
@@ -121,6 +127,7 @@ class Desk:
         with self._publishing:
             self._shared.add_trial(done)
             self._count += 1
+            self._running -= 1
             self._best = min(self._best, values[0])
 
     def report(self, listener: Callable[[int, float], None]) -> None:
