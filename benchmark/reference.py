@@ -27,7 +27,7 @@ CASE = {'variant': 'fuzzy_adaptive', 'scheme': 'explicit', 'fuzzy_widths': [0.1]
 """Wide fuzzy sets: no chatter, so that rounding does not grow and both end at the same state."""
 
 State = NDArray[np.float64]
-"""HAT, TILDE and their sensitivities (4 N), then gamma, y, pending; see core/layout.py."""
+"""HAT, TILDE and their sensitivities (4 N), then gamma, y, pending, wait; see core/layout.py."""
 
 
 def find_compiler() -> list[str]:

@@ -39,7 +39,7 @@ def test_new_run_agrees_with_the_document(documented, fresh):
     assert set(fresh) == set(scores[solver])
     for (name, omega), score in fresh.items():
         # The sign observer's trajectories depend on the last bit, so on the machine.
-        factor = 1.5 if name.startswith('sign') else 1.05
+        factor = 1.5 if name.startswith(('sign', 'Levant')) else 1.05
         for key in ('rms_z1', 'rms_z2', 'rms_z3', 'rms_d'):
             ratio = score[key] / scores[solver][name, omega][key]
             assert 1 / factor < ratio < factor, f'{name}, {omega}, {key}: {REWRITE}'
@@ -61,7 +61,7 @@ def test_shipped_half_widths_lie_inside_the_region(documented):
             s |= {(paper_findings.COARSE, w): signs[w] for w in signs}
             for w in signs:
                 for name in (paper_findings.FUZZY, paper_findings.ADAPTIVE):
-                    variant, step = paper_cases.OBSERVERS[name]
+                    variant, step, _ = paper_cases.OBSERVERS[name]
                     run = paper_cases.joint(variant, w, step, solver, fuzzy_widths=[first, later])
                     s[name, w] = paper_cases.score(run)
             failed = [v.name for v in paper_findings.verdicts(s) if not v.holds]

@@ -119,6 +119,7 @@ class ObserverConfiguration:
         scalars[law.MAX] = p['gamma_max']
         scalars[law.DEAD_ZONE] = p['gamma_dead_zone']
         scalars[law.LEAKAGE] = p['gamma_leakage']
+        scalars[law.DELAY] = p['gamma_leakage_delay']
         return law.Law(
             flags, np.array(gains), curves, scalars, self.model.tape, self.model.offsets
         )

@@ -21,8 +21,8 @@ class Law(NamedTuple):
         lambda_i, alpha_i, 1 / half-width_i.
     curves : (N, K) array
         psi of each level at K points of [0, half-width].
-    scalars : (7,) array
-        `EPSILON` .. `LEAKAGE`.
+    scalars : (8,) array
+        `EPSILON` .. `DELAY`.
     tape, offsets : arrays
         Phi_1 .. Phi_N; see tape.py.
 
@@ -59,8 +59,8 @@ class Work(NamedTuple):
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT = range(5)
 FLAGS = 5
 LAMBDA, ALPHA, INVERSE_WIDTH = range(3)
-EPSILON, GAMMA_INITIAL, RATE, MIN, MAX, DEAD_ZONE, LEAKAGE = range(7)
-SCALARS = 7
+EPSILON, GAMMA_INITIAL, RATE, MIN, MAX, DEAD_ZONE, LEAKAGE, DELAY = range(8)
+SCALARS = 8
 
 NEWTON_STEPS = 60
 NEWTON_TOLERANCE = 1e-9

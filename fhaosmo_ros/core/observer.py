@@ -87,7 +87,7 @@ class ObserverState:
     Attributes
     ----------
     levels : (4, N) array
-    memory : (3,) array
+    memory : (4,) array
         See `fhaosmo_ros.core.layout`.
     t : float or int or None
         Time of the last sample of `Observer.run`, in its unit (s, or ns for integers).

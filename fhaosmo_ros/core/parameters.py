@@ -98,14 +98,22 @@ OBSERVER = (
         'gamma_max', 1.0, 'Upper bound of gamma.', lower=0.0, lower_open=True, upper=1.0,
     ),
     Parameter(
-        'gamma_dead_zone', 0.0,
-        'Adaptation rests while the norm of the innovations is at most this (set it to the '
-        'norm that measurement noise alone gives).',
+        'gamma_dead_zone', 0.006,
+        'Adaptation rests while the norm of the innovations is at most this (their unit; set it '
+        'below the norm at which the estimate has become good enough). 0: it never rests.',
         lower=0.0, upper=1e12,
     ),
     Parameter(
-        'gamma_leakage', 0.0, 'Rate that draws gamma back to gamma_initial; 0 for none.',
+        'gamma_leakage', 0.05,
+        'Rate that draws gamma back to gamma_initial once the innovations have stayed within the '
+        'dead zone for gamma_leakage_delay; without a dead zone always. 0 for none.',
         unit='1/s', lower=0.0, upper=1e3,
+    ),
+    Parameter(
+        'gamma_leakage_delay', 5.0,
+        'Leakage waits for this time after innovations beyond the dead zone. Not used where the '
+        'dead zone is 0.',
+        unit='s', lower=0.0, upper=1e6,
     ),
     Parameter(
         'initial_estimate', [0.0], 'Filtered estimates z_hat_1 .. z_hat_N at the start.',

@@ -22,6 +22,10 @@ DOCS = Path(__file__).resolve().parents[2] / 'docs'
 FOLDER, RESULTS = 'paper', 'results.json'
 QUICK_WIDTHS = 3
 QUICK_LONG = 300.0
+QUIET = 1e-4
+"""Noise on y of the long runs that have some."""
+PROTECTION_WINDOW = 20.0
+"""Seconds within which errors are judged where the protections are compared."""
 ZOOM = 0.1
 """Seconds that figure sim1 enlarges."""
 
@@ -67,11 +71,11 @@ def _default_output(quick: bool) -> Path:
 
 
 def measure(solvers: tuple[str, ...], tick: Any) -> dict[str, findings.Scores]:
-    """Return the scores of the paper's four observers by solver."""
+    """Return the scores of the paper's four observers and of ours by solver."""
     scores: dict[str, findings.Scores] = {}
     for solver in solvers:
         scores[solver] = {}
-        for name in cases.OBSERVERS:
+        for name in cases.OBSERVERS | cases.OURS:
             for omega in cases.FREQUENCIES:
                 scores[solver][name, omega] = findings.measure(name, omega, solver)
             tick()
@@ -128,9 +132,12 @@ def _paper(output: Path, quick: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     every = QUICK_WIDTHS if quick else 1
     hours = QUICK_LONG if quick else beyond.HOURS
+    minutes = hours / 4.0
     rows_of_map = len(findings.WIDTHS[::every])
     # The bar counts the parts by about what they cost.
-    total = len(SOLVERS) * len(cases.OBSERVERS) + rows_of_map + 3 + len(beyond.NOISES) + 4 + 4
+    observers = len(cases.OBSERVERS | cases.OURS)
+    long = 4 * len(cases.FREQUENCIES) + len(beyond.PROTECTED)
+    total = len(SOLVERS) * observers + rows_of_map + 3 + len(beyond.NOISES) + long + 4
     with tqdm(total=total, unit='part', desc='paper') as bar:
         scores = measure(SOLVERS, bar.update)
         solver = choose_solver(scores)
@@ -139,20 +146,33 @@ def _paper(output: Path, quick: bool) -> None:
         sampled = beyond.schemes(bar.update)
         noisy = beyond.noises(bar.update)
         long_runs = []
-        for scheme in ('explicit', 'implicit'):
-            for omega in cases.FREQUENCIES:
-                long_runs.append(beyond.long_run(scheme, omega, hours))
-                bar.update()
+        for noise in (0.0, QUIET):
+            for scheme in ('explicit', 'implicit'):
+                for omega in cases.FREQUENCIES:
+                    long_runs += beyond.long_runs(
+                        beyond.LAWS, scheme, omega, noise, hours, beyond.WINDOW
+                    )
+                    bar.update()
+        protected = []
+        for omega, noise in beyond.PROTECTED:
+            protected.append(
+                beyond.long_runs(
+                    beyond.PROTECTIONS, 'explicit', omega, noise, minutes, PROTECTION_WINDOW
+                )
+            )
+            bar.update()
         preset = cases.preset().observer
         texts = findings_texts(scores, solver) | {
             'widths': tables.map_text(widths, preset['fuzzy_widths'], every),
             'schemes': tables.beyond_table(sampled),
             'noise': tables.beyond_table(noisy),
             'long': tables.long_table(long_runs),
+            'protection': tables.protection_table(r for runs in protected for r in runs),
         }
         _draw(folder, solver, preset, bar)
         figures.save(figures.half_widths(widths, preset['fuzzy_widths']), folder, 'widths')
         figures.save(figures.long_runs(long_runs), folder, 'long')
+        figures.save(figures.protections(protected), folder, 'protection')
         figures.save(figures.noise(noisy), folder, 'noise')
         bar.update()
     document.write(output / 'paper.md', texts)
@@ -177,7 +197,7 @@ def _draw(folder: Path, solver: str, preset: dict[str, Any], bar: Any) -> None:
     bar.update()
     runs = {
         name: [cases.joint(variant, w, step, solver) for w in cases.FREQUENCIES]
-        for name, (variant, step) in cases.OBSERVERS.items()
+        for name, (variant, step, _) in cases.OBSERVERS.items()
     }
     adaptive = runs.pop(findings.ADAPTIVE)
     figures.save(figures.simz(list(runs.items()), cases.FREQUENCIES), folder, 'simz')
