@@ -10,8 +10,8 @@ import sys
 
 from fhaosmo_ros.core import Family
 from fhaosmo_ros.core.family import Recording
-from fhaosmo_ros.tools import compare, paper_document
-from fhaosmo_ros.tools.comparison import cells, results, tables
+from fhaosmo_ros.tools import paper_document
+from fhaosmo_ros.tools.comparison import cells, command, results, tables
 from fhaosmo_ros.tools.comparison.cells import HELD_OUT, PLANTS, Sensor, sensors
 from fhaosmo_ros.tools.comparison.evaluation import evaluate, judge, METHODS, trial, tune, Tuned
 from fhaosmo_ros.tools.comparison.results import Cell, Entry, Results
@@ -224,7 +224,7 @@ def test_document_is_about_all_cells(documented):
 
 def test_quick_run_writes_everything(tmp_path, capsys):
     out = tmp_path / 'out'
-    assert compare.main(['--quick', '--trials', '3', '--output', str(out)]) == 0
+    assert command.main(['--quick', '--trials', '3', '--output', str(out)]) == 0
     assert 'reached' in capsys.readouterr().out
     written = {path.name for path in (out / 'comparison').iterdir()}
     assert written == {
@@ -256,6 +256,6 @@ def test_ctrl_c_ends_cleanly_and_writes_nothing(tmp_path):
 @pytest.mark.parametrize('arguments', [['--trials', '0'], ['--jobs', 'x']])
 def test_bad_argument_is_refused(arguments, capsys):
     with pytest.raises(SystemExit) as error:
-        compare.main(arguments)
+        command.main(arguments)
     assert error.value.code == 2
     assert arguments[0] in capsys.readouterr().err

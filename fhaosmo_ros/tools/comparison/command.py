@@ -22,7 +22,7 @@ from fhaosmo_ros.tools.comparison.results import Entry, Results
 from fhaosmo_ros.tools.comparison.verdicts import verdicts
 from tqdm import tqdm
 
-DOCS = Path(__file__).resolve().parents[2] / 'docs'
+DOCS = Path(__file__).resolve().parents[3] / 'docs'
 FOLDER, RESULTS = 'comparison', 'results.json'
 TRIALS, QUICK_TRIALS = 300, 15
 TRAINING, QUICK_TRAINING = 4, 1
