@@ -86,7 +86,7 @@ def in_c(library: ctypes.CDLL, y: NDArray[np.float64]) -> Callable[[], tuple[Sta
         raise CannotMeasureError(
             f'reference.c expects 4 levels and 193 knots, the core has {law.curves.shape}'
         )
-    packed = np.concatenate([law.gains.ravel(), law.curves[:2].ravel(), law.scalars])
+    packed = np.concatenate([law.gains[:3].ravel(), law.curves[:2].ravel(), law.scalars])
     start = first_state(CASE, y[0])
     rest, eps = np.ascontiguousarray(y[1:]), np.empty(4)
 

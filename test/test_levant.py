@@ -46,7 +46,7 @@ def parameters(n, **others):
     p = {'structure': 'levant', 'order': n, 'phi': PHI[n][0], 'lambda': gains(n + 1, 3.0)}
     p |= {'fuzzy_widths': WIDTHS, 'gamma_initial': 0.7, 'gamma_rate': 0.0, 'gamma_leakage': 0.0}
     p |= {'initial_estimate': list(np.linspace(0.1, -0.2, n + 1))}
-    return p | {'start_from_measurement': False} | others
+    return p | {'start_from_measurement': False, 'unknown_input_decay': 0.0} | others
 
 
 def signals(steps=300):
@@ -62,6 +62,7 @@ class Reference:
         self.n = p['order']
         self.N = self.n + 1
         self.gains, self.gamma = p['lambda'], gamma
+        self.decay = p['unknown_input_decay']
         self.sign = p['variant'].startswith('sign')
         self.phi = PHI[self.n][1]
         self.z = np.array(p['initial_estimate'])
@@ -80,7 +81,7 @@ class Reference:
 
     def known(self, y, u):
         point = [y, *self.z[1:]]
-        return np.array([*(f(point, u) for f in self.phi), 0.0])
+        return np.array([*(f(point, u) for f in self.phi), -self.decay * self.z[-1]])
 
     def explicit(self, y, h, u):
         rate = np.append(self.z[1:], 0.0) + self.known(y, u) + self.injections(y - self.z[0])
@@ -107,11 +108,12 @@ class Reference:
         self.z = state(self.injections(e))
 
 
+@pytest.mark.parametrize('decay', [0.0, 5.0])
 @pytest.mark.parametrize('n', [1, 3])
 @pytest.mark.parametrize('variant', VARIANTS)
 @pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
-def test_run_follows_the_equations(scheme, variant, n):
-    p = parameters(n, scheme=scheme, variant=variant)
+def test_run_follows_the_equations(scheme, variant, n, decay):
+    p = parameters(n, scheme=scheme, variant=variant, unknown_input_decay=decay)
     t, y, u = signals()
     result = Observer(p).run(t, y, u)
     reference = Reference(p, 0.7 if variant.endswith('adaptive') else 0.5)

@@ -9,6 +9,7 @@ from observer_cases import assert_same_state, laws, samples, SMALL, VARIANTS
 import pytest
 
 CHANGES = {
+    'unknown_input_decay': [5.0],
     'structure': ['cascade', 'levant'],
     'variant': list(VARIANTS),
     'scheme': ['explicit', 'implicit'],

@@ -101,7 +101,10 @@ class Reference:
         self.p, self.phi = p, phi
         self.N = p['order'] + p['unknown_input']
         self.sign = p['variant'].startswith('sign')
-        self.phi = [*phi, lambda z, u: Dual(0.0)]  # z_{n+1}' = eta: no Phi
+        kappa = p['unknown_input_decay']
+        # z_{n+1}' = -kappa z_{n+1} + eta
+        self.phi = [*phi, lambda z, u: -kappa * z[p['order']]]
+        self.decay = [kappa if i == p['order'] - 1 else 0.0 for i in range(p['order'] + 1)]
         self.hat = [Dual(v) for v in p['initial_estimate']]
         self.tilde = [Dual(v) for v in p['initial_internal']]  # tilde[i] is z_tilde_{i+2}
         if p['start_from_measurement']:
@@ -148,7 +151,8 @@ class Reference:
                 continue
             rate = self.tilde[i] + p['lambda'][i] * self.injection(i, eps[i], gamma)
             hat[i] = self.hat[i] + h * (rate + self.phi[i](m[: i + 1], u))
-            tilde[i] = self.tilde[i] + h * p['alpha'][i] * self.psi(i, eps[i])
+            forced = p['alpha'][i] * self.psi(i, eps[i])
+            tilde[i] = self.tilde[i] + h * (forced - self.decay[i] * self.tilde[i])
         self.hat, self.tilde = hat, tilde
         self.adapt(eps, h)
 
@@ -161,15 +165,16 @@ class Reference:
             if any(abs(e.value) > p['epsilon'] for e in eps):
                 eps.append(m[i] - self.hat[i])
                 continue
-            b = m[i] - self.hat[i] - h * (self.tilde[i] + self.phi[i](m, u))
+            kept = 1.0 / (1.0 + h * self.decay[i])
+            b = m[i] - self.hat[i] - h * (kept * self.tilde[i] + self.phi[i](m, u))
             e, s = self.solve(i, b, h, gamma)
             eps.append(e)
-            self.tilde[i] = self.tilde[i] + h * p['alpha'][i] * s
+            self.tilde[i] = kept * (self.tilde[i] + h * p['alpha'][i] * s)
             self.hat[i] = m[i] - e
         self.adapt(eps, h)
 
     def solve(self, i, b, h, gamma):
-        stiffness = h * h * self.p['alpha'][i]
+        stiffness = h * h * self.p['alpha'][i] / (1.0 + h * self.decay[i])
         if self.sign and abs(b.value) <= stiffness:
             return Dual(0.0), b * (1.0 / stiffness)
 
@@ -215,6 +220,7 @@ def parameters(n, extra, **others):
         'order': n,
         'phi': PHI[n][0],
         'unknown_input': extra,
+        'unknown_input_decay': 0.0,
         'lambda': list(3.0 + 2.0 * rng.random(levels)),
         'alpha': list(4.0 + 3.0 * rng.random(levels)),
         'epsilon': 0.2,
@@ -286,11 +292,14 @@ def test_run_follows_the_equations(scheme, variant, n, extra):
         {'fuzzy_shape': 'gaussian', 'fuzzy_normalise': False},
         {'start_from_measurement': True, 'fuzzy_widths': [0.02]},
         {'epsilon': 1e3},
+        {'unknown_input_decay': 5.0},
+        {'unknown_input_decay': 5.0, 'unknown_input': False, 'epsilon': 1e3},
     ],
     ids=lambda options: '-'.join(options),
 )
 def test_options_follow_the_equations(scheme, options):
-    compare(parameters(3, True, scheme=scheme, variant='fuzzy_adaptive', **options))
+    extra = options.get('unknown_input', True)
+    compare(parameters(3, extra, scheme=scheme, variant='fuzzy_adaptive') | options)
 
 
 def test_explicit_step_acts_on_the_sample_at_the_beginning_of_the_interval():

@@ -10,6 +10,7 @@ import math
 from fhaosmo_ros.core.law import (
     ADAPTIVE,
     ALPHA,
+    DECAY,
     EPSILON,
     LAMBDA,
     NEWTON_STEPS,
@@ -24,11 +25,17 @@ from numba import njit
 
 
 @njit(cache=True, error_model='numpy', forceinline=True)
+def kept(gains: Floats, level: int, h: float) -> float:
+    """Return the factor by which a backward Euler step shrinks an internal state (D 16)."""
+    return 1.0 / (1.0 + h * gains[DECAY, level]) if gains[DECAY, level] > 0.0 else 1.0
+
+
+@njit(cache=True, error_model='numpy', forceinline=True)
 def root(
     flags: Ints, gains: Floats, curves: Floats, level: int, b: float, h: float, gamma: float
 ) -> tuple[float, float]:
     """
-    Solve eps + h lambda |eps|^gamma s + h^2 alpha s = b, s in psi(eps), for b >= 0 (D 9).
+    Solve eps + h lambda |eps|^gamma s + h^2 alpha s = b, s in psi(eps), for b >= 0 (D 9, D 16).
 
     Returns
     -------
@@ -37,7 +44,7 @@ def root(
 
     """
     damping = h * gains[LAMBDA, level]
-    stiffness = h * h * gains[ALPHA, level]
+    stiffness = h * h * gains[ALPHA, level] * kept(gains, level, h)
     if b < TINY:
         return 0.0, 0.0
     if flags[SIGN] and b <= stiffness:
@@ -138,9 +145,12 @@ def explicit(
             _, slope = psi(flags, gains, curves, i, 0.0)
         if flags[ADAPTIVE]:
             x[HAT_SENSITIVITY, i] += h * (x[TILDE_SENSITIVITY, i] + dinjection + dphi)
-            x[TILDE_SENSITIVITY, i] += h * gains[ALPHA, i] * slope * s
+            x[TILDE_SENSITIVITY, i] += h * (
+                gains[ALPHA, i] * slope * s - gains[DECAY, i] * x[TILDE_SENSITIVITY, i]
+            )
         x[HAT, i] += h * (x[TILDE, i] + injection + phi)  # P: z_hat_i'
-        x[TILDE, i] += h * gains[ALPHA, i] * direction  # P: z_tilde_{i+1}'
+        # P: z_tilde_{i+1}', and D 15
+        x[TILDE, i] += h * (gains[ALPHA, i] * direction - gains[DECAY, i] * x[TILDE, i])
         running = a <= scalars[EPSILON]
     return loss, gradient
 
@@ -180,12 +190,15 @@ def implicit(
         phi, dphi = 0.0, 0.0
         if offsets[i + 1] > offsets[i]:
             phi, dphi = evaluate(tape, offsets[i], offsets[i + 1], m, u, stack)
+        keep = kept(gains, i, h)
+        x[TILDE, i] *= keep
         b = m[0, i] - x[HAT, i] - h * (x[TILDE, i] + phi)
         a, s = root(flags, gains, curves, i, abs(b), h, gamma)
         loss += a * a  # P lossfunction
         if flags[ADAPTIVE]:  # D 10: implicit function theorem on the equation of `root`
+            x[TILDE_SENSITIVITY, i] *= keep
             db = m[1, i] - x[HAT_SENSITIVITY, i] - h * (x[TILDE_SENSITIVITY, i] + dphi)
-            damping, stiffness = h * gains[LAMBDA, i], h * h * gains[ALPHA, i]
+            damping, stiffness = h * gains[LAMBDA, i], h * h * gains[ALPHA, i] * keep
             _, slope = psi(flags, gains, curves, i, a)
             if a > 0.0:
                 log_a = math.log(a)
@@ -199,10 +212,10 @@ def implicit(
             else:
                 deps = db / (1.0 + stiffness * slope)
                 dpsi = slope * deps
-            x[TILDE_SENSITIVITY, i] += h * gains[ALPHA, i] * dpsi
+            x[TILDE_SENSITIVITY, i] += h * keep * gains[ALPHA, i] * dpsi
             x[HAT_SENSITIVITY, i] = m[1, i] - deps
             gradient += 2.0 * math.copysign(a, b) * deps
-        x[TILDE, i] += h * gains[ALPHA, i] * math.copysign(s, b)
+        x[TILDE, i] += h * keep * gains[ALPHA, i] * math.copysign(s, b)
         x[HAT, i] = m[0, i] - math.copysign(a, b)
         running = a <= scalars[EPSILON]  # P Eifunction
     return loss, gradient

@@ -110,7 +110,16 @@ class ObserverConfiguration:
                     for i in range(levels)
                 ]
             )
-        gains = [self._per_level('lambda'), self._per_level('alpha'), 1.0 / np.array(widths)]
+        gains = np.zeros((law.GAINS, levels))
+        gains[law.LAMBDA] = self._per_level('lambda')
+        gains[law.ALPHA] = self._per_level('alpha')
+        gains[law.INVERSE_WIDTH] = 1.0 / np.array(widths)
+        tape, offsets = self.model.tape, self.model.offsets
+        decay = p['unknown_input_decay']
+        if decay > 0.0:  # D 15, in the internal state and in the level that follow d
+            gains[law.DECAY, self.model.order - 1] = decay
+            if p['unknown_input']:
+                tape, offsets = self.model.with_decay(decay)
         scalars = np.zeros(law.SCALARS)
         scalars[law.EPSILON] = np.inf if self.levant else p['epsilon']  # no gates
         scalars[law.GAMMA_INITIAL] = p['gamma_initial']
@@ -120,9 +129,7 @@ class ObserverConfiguration:
         scalars[law.DEAD_ZONE] = p['gamma_dead_zone']
         scalars[law.LEAKAGE] = p['gamma_leakage']
         scalars[law.DELAY] = p['gamma_leakage_delay']
-        return law.Law(
-            flags, np.array(gains), curves, scalars, self.model.tape, self.model.offsets
-        )
+        return law.Law(flags, gains, curves, scalars, tape, offsets)
 
 
 def per_level(parameter: Parameter, values: list[float], count: int) -> np.ndarray:

@@ -17,8 +17,9 @@ class Law(NamedTuple):
     ----------
     flags : (5,) array
         `SIGN` .. `LEVANT`: 0 or 1.
-    gains : (3, N) array
-        lambda_i, alpha_i, 1 / half-width_i.
+    gains : (4, N) array
+        lambda_i, alpha_i, 1 / half-width_i, and the decay of the internal state (0 but for the
+        one that stands for the unknown input).
     curves : (N, K) array
         psi of each level at K points of [0, half-width].
     scalars : (8,) array
@@ -58,7 +59,8 @@ class Work(NamedTuple):
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT = range(5)
 FLAGS = 5
-LAMBDA, ALPHA, INVERSE_WIDTH = range(3)
+LAMBDA, ALPHA, INVERSE_WIDTH, DECAY = range(4)
+GAINS = 4
 EPSILON, GAMMA_INITIAL, RATE, MIN, MAX, DEAD_ZONE, LEAKAGE, DELAY = range(8)
 SCALARS = 8
 

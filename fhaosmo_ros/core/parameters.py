@@ -31,6 +31,13 @@ OBSERVER = (
         live=False,
     ),
     Parameter(
+        'unknown_input_decay', 0.0,
+        "Rate kappa of the observer's model of the unknown input, d' = -kappa d + what the "
+        'innovations say; 0 assumes nothing. Greater where d comes and goes around 0: the '
+        'estimate follows noise less, but is too small where d stays. Explicit: below 2 / dt.',
+        unit='1/s', lower=0.0, upper=1e3,
+    ),
+    Parameter(
         'structure', 'cascade',
         "cascade: the paper's levels, each with an innovation of its own. levant: Levant's "
         'arbitrary-order differentiator, every level driven by y - z_hat_1; it needs '

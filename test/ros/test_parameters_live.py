@@ -31,6 +31,7 @@ STARTED_WITH = {
 }
 
 OTHER = {
+    'unknown_input_decay': 2.0,
     'structure': 'levant',
     'variant': 'fuzzy',
     'scheme': 'explicit',
