@@ -14,9 +14,9 @@ from fhaosmo_ros.tools import paper_document
 from fhaosmo_ros.tools.comparison import cells, command, results, tables
 from fhaosmo_ros.tools.comparison.cells import HELD_OUT, PLANTS, Sensor, sensors
 from fhaosmo_ros.tools.comparison.evaluation import evaluate, judge, METHODS, trial, tune, Tuned
+from fhaosmo_ros.tools.comparison.ours import OURS
 from fhaosmo_ros.tools.comparison.results import Cell, Entry, Results
 from fhaosmo_ros.tools.comparison.scores import Estimates, objective, Scores, scores
-from fhaosmo_ros.tools.comparison.sliding import OURS
 from fhaosmo_ros.tools.comparison.verdicts import BARS, KALMAN, LINEAR, verdicts
 import numpy as np
 import pytest

@@ -10,13 +10,14 @@ from fhaosmo_ros.core.family import Recording
 from fhaosmo_ros.tools.comparison.cells import Sensor
 from fhaosmo_ros.tools.comparison.linear import LINEAR
 from fhaosmo_ros.tools.comparison.methods import Method, Setting, Values
+from fhaosmo_ros.tools.comparison.ours import OUR_METHOD
 from fhaosmo_ros.tools.comparison.scores import Estimates, objective, Scores, scores
 from fhaosmo_ros.tools.comparison.sliding import SLIDING
 from fhaosmo_ros.tools.tuning.search import minimise
 import numpy as np
 
 REPEATS = 5
-METHODS: dict[str, Method] = {method.name: method for method in (*LINEAR, *SLIDING)}
+METHODS: dict[str, Method] = {method.name: method for method in (*LINEAR, *SLIDING, OUR_METHOD)}
 
 
 class Tuned(NamedTuple):

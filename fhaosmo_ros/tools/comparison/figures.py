@@ -6,8 +6,8 @@ from pathlib import Path
 
 from fhaosmo_ros.tools.comparison.cells import NOISES, PLANTS, Sensor
 from fhaosmo_ros.tools.comparison.evaluation import estimates, METHODS
+from fhaosmo_ros.tools.comparison.ours import OURS
 from fhaosmo_ros.tools.comparison.results import Cell, Results, Table
-from fhaosmo_ros.tools.comparison.sliding import OURS
 from fhaosmo_ros.tools.comparison.verdicts import KALMAN, verdicts
 from matplotlib import rcParams
 from matplotlib.axes import Axes

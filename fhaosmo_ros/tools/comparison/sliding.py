@@ -17,12 +17,13 @@ import numpy as np
 
 Parameters = Callable[[Setting, Values], Mapping[str, Any]]
 
-OURS = 'ours'
 RECURSIVE = (1.1, 1.5, 2.0, 3.0, 5.0, 7.0)
 """Levant's lambda_0 .. lambda_5 of the recursive form, for a Lipschitz constant of 1."""
 
 
-def _prepare(parameters: Parameters) -> Callable[[Setting, Values], Run]:
+def prepared(parameters: Parameters) -> Callable[[Setting, Values], Run]:
+    """Return a `Method.prepare` for parameters of the core's Observer."""
+
     def prepare(setting: Setting, values: Values) -> Run:
         model = setting.model
         observer = Observer(
@@ -78,52 +79,6 @@ def _levant_space(setting: Setting) -> list[Dimension]:
     return [Dimension('lipschitz', 1e-4 * setting.size, 1e8 * setting.size, 10.0 * setting.size)]
 
 
-def _cascade_space(setting: Setting) -> list[Dimension]:
-    levels = setting.model.order + 1
-    names = [f'{name}_{i + 1}' for name in ('lambda', 'alpha', 'width') for i in range(levels)]
-    return [
-        Dimension('speed', 0.05, 5.0 / setting.period, 10.0),
-        Dimension('kappa', 1e-3, 1e3, 3.0),
-        Dimension('damping', 0.1, 10.0, 1.0),
-        Dimension('gamma', 0.1, 1.0, 0.5),
-        Dimension('epsilon', 1.0, 1e4, 100.0),
-        *(Dimension(name, 0.03, 30.0, 1.0) for name in names),
-    ]
-
-
-def _cascade(scheme: str) -> Parameters:
-    def parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
-        """
-        Gains by the rules of tools/tuning/theory.py, and a factor to each of them.
-
-        A half-width covers, kappa times, what noise leaves in m_i and what lag leaves of it:
-        with d of size D and a speed w that is noise sqrt(h w^(2i-1)) + D / w^(N-i).
-        """
-        speed, gamma = values['speed'], values['gamma']
-        levels = setting.model.order + 1
-        level = np.arange(1, levels + 1)
-
-        def series(name: str) -> np.ndarray:
-            return np.array([values[f'{name}_{i}'] for i in level])
-
-        left = setting.noise * np.sqrt(setting.period * speed ** (2.0 * level - 1.0))
-        left[0] = setting.noise
-        width = values['kappa'] * (left + 0.1 * setting.size * speed ** (level - float(levels)))
-        gain = 2.0 * values['damping'] * speed * width / (width / 3.0) ** gamma
-        return {
-            'variant': 'fuzzy_adaptive',
-            'gamma_rate': 0.0,
-            'gamma_initial': gamma,
-            'scheme': scheme,
-            'lambda': (series('lambda') * gain).clip(1e-12, 1e6),
-            'alpha': (series('alpha') * speed**2 * width).clip(1e-12, 1e9),
-            'fuzzy_widths': (series('width') * width).clip(1e-12, 1e12),
-            'epsilon': values['epsilon'] * float(width.max()),
-        }
-
-    return parameters
-
-
 def _none(setting: Setting) -> list[Dimension]:
     del setting
     return []
@@ -132,26 +87,22 @@ def _none(setting: Setting) -> list[Dimension]:
 SLIDING = (
     Method(
         'Levant, explicit', "Levant's robust exact differentiator with Phi, explicit Euler",
-        False, _levant_space, _prepare(_levant('explicit')),
+        False, _levant_space, prepared(_levant('explicit')),
     ),
     Method(
         'Levant, implicit', 'the same, implicit Euler', False, _levant_space,
-        _prepare(_levant('implicit')),
+        prepared(_levant('implicit')),
     ),
     Method(
         'paper: sign', "sign observer with the paper's gains", False, _none,
-        _prepare(_papers_gains('sign')),
+        prepared(_papers_gains('sign')),
     ),
     Method(
         'paper: fuzzy', "fuzzy observer with the paper's gains", False, _none,
-        _prepare(_papers_gains('fuzzy')),
+        prepared(_papers_gains('fuzzy')),
     ),
     Method(
         'paper: adaptive', "fuzzy observer with adapted gamma and the paper's gains", False, _none,
-        _prepare(_papers_gains('fuzzy_adaptive')),
-    ),
-    Method(
-        OURS, "the paper's cascade, fuzzy and explicit, every gain tuned", False, _cascade_space,
-        _prepare(_cascade('explicit')),
+        prepared(_papers_gains('fuzzy_adaptive')),
     ),
 )  # fmt: skip

@@ -7,9 +7,9 @@ import math
 from statistics import geometric_mean
 
 from fhaosmo_ros.tools.comparison.evaluation import METHODS
+from fhaosmo_ros.tools.comparison.ours import OURS
 from fhaosmo_ros.tools.comparison.results import Cell, Results, Table
 from fhaosmo_ros.tools.comparison.scores import Scores
-from fhaosmo_ros.tools.comparison.sliding import OURS
 from fhaosmo_ros.tools.comparison.verdicts import Verdict, verdicts
 
 USELESS = 1.0

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from fhaosmo_ros.tools.comparison.evaluation import METHODS
+from fhaosmo_ros.tools.comparison.ours import OURS
 from fhaosmo_ros.tools.comparison.results import Cell, Table
 from fhaosmo_ros.tools.comparison.scores import Scores
-from fhaosmo_ros.tools.comparison.sliding import OURS
 
 KALMAN = 'Kalman'
 LINEAR = [name for name, method in METHODS.items() if method.linear]
