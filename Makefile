@@ -45,7 +45,7 @@ test: lint
 	@$(call with,test) && exec "$$python" -m pytest -n 2 --dist loadfile $(ARGS)
 
 bench:
-	@$(call with) && exec "$$python" benchmark/run.py $(ARGS)
+	@$(call with,tune) && exec "$$python" benchmark/run.py $(ARGS)
 
 clean:
 	rm -rf .venv .venv-ros build install log *.egg-info .coverage .hypothesis \

@@ -17,6 +17,7 @@ import replay
 import simulation
 import startup
 from table import CannotMeasureError, render, Row
+import tune
 
 PARTS = {
     'core': core_step.measure,
@@ -24,6 +25,7 @@ PARTS = {
     'cpu': cpu.measure,
     'startup': startup.measure,
     'replay': replay.measure,
+    'tune': tune.measure,
 }
 
 

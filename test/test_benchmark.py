@@ -59,6 +59,17 @@ def test_quick_core():
     assert 'core step / same step in C' in done.stdout
 
 
+def test_quick_tune():
+    pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
+    done = subprocess.run(
+        [sys.executable, BENCHMARK / 'run.py', '--quick', '--only', 'tune'],
+        capture_output=True, text=True, cwd=BENCHMARK.parent, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert 'trials a minute' in done.stdout
+    assert 'efficiency' in done.stdout
+
+
 def test_rows_without_value_miss_their_bar(monkeypatch):
     monkeypatch.syspath_prepend(BENCHMARK)
     table = importlib.import_module('table')

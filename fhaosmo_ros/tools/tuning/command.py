@@ -2,6 +2,7 @@
 """Find gains of the estimator that fit a sensor, a plant and a family of disturbances."""
 
 import argparse
+from importlib.util import find_spec
 import os
 from pathlib import Path
 import shlex
@@ -17,10 +18,10 @@ from fhaosmo_ros.tools.options import assigned
 from fhaosmo_ros.tools.output import Output
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.source import BagChoice, Data, from_bag, simulated
-from fhaosmo_ros.tools.tuning.tuner import Interrupted, Tuner
-from fhaosmo_ros.tools.tuning.writer import write
 
 TRIALS = 2500
+NEEDED = ('optuna', 'cmaes')
+"""Only this command needs them, so a robot may lack them."""
 BOTH = ParameterTable(TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values())
 
 
@@ -38,18 +39,22 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     stop = stop_on_signals()
     given = sys.argv[1:] if argv is None else argv
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        print(
+            f'tune: error: {" and ".join(missing)} not installed: make tune does it, or '
+            "python3 -m pip install 'optuna>=4,<6' cmaes",
+            file=sys.stderr,
+        )
+        return 1
     try:
-        _tune(arguments, shlex.join(['tune', *given]), stop)
+        return _tune(arguments, shlex.join(['tune', *given]), stop)
     except ConfigurationError as error:
         print(f'tune: error: {error}', file=sys.stderr)
         return 2
     except OSError as error:
         print(f'tune: error: output: {error.strerror}: {error.filename}', file=sys.stderr)
         return 1
-    except Interrupted:
-        print('tune: interrupted before the first trial, nothing written', file=sys.stderr)
-        return 130
-    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -103,7 +108,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _tune(arguments: argparse.Namespace, command: str, stop: Stop) -> None:
+def _tune(arguments: argparse.Namespace, command: str, stop: Stop) -> int:
+    from fhaosmo_ros.tools.tuning.tuner import Tuner
+    from fhaosmo_ros.tools.tuning.writer import write
+
     if arguments.trials < 1 or (arguments.jobs or 1) < 1 or arguments.seed < 0:
         raise ConfigurationError(
             'expected --trials >= 1, --jobs >= 1 and --seed >= 0, got '
@@ -118,10 +126,15 @@ def _tune(arguments: argparse.Namespace, command: str, stop: Stop) -> None:
         )
         tuner = Tuner(data, estimator, TUNE_PARAMETERS.defaults() | tuning, arguments.seed)
         storage = arguments.storage or f'{arguments.output}.journal'
+        if arguments.storage is None and Path(storage).exists():
+            print(f'{storage}: of a run that was cut short; goes on where it asked the same')
         result = tuner.search(
             arguments.trials, arguments.jobs or os.cpu_count() or 1, storage,
             arguments.sampler, arguments.pareto, stop.is_set,
         )  # fmt: skip
+        if result is None:
+            print('tune: interrupted before the first trial, nothing written', file=sys.stderr)
+            return 130
         text = write(output.path, tuner, result, command)
         if arguments.storage is None:
             # Complete: it belongs to the output now, and the next run begins anew.
@@ -131,6 +144,7 @@ def _tune(arguments: argparse.Namespace, command: str, stop: Stop) -> None:
     print(f'\n{text}\n')
     print(f'output: {final}/gains.yaml, report.md, figures')
     print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {final}/gains.yaml')
+    return 0
 
 
 def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:

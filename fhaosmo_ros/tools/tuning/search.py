@@ -156,7 +156,7 @@ def minimise(
         while desk.begun < trials and not stopped():
             evaluate()
 
-    if not desk.count and not stopped() and trials:
+    if not desk.count:  # whatever comes, there is a result
         evaluate({d.name: d.start for d in space})
     with ThreadPoolExecutor(jobs) as pool:
         running = [pool.submit(work) for _ in range(jobs)]
@@ -165,8 +165,6 @@ def minimise(
         for future in done:
             future.result()
     points = desk.points()
-    if not points:
-        raise ConfigurationError('search: expected at least one trial, got none')
     best = min(points, key=lambda point: point.values[0])
     return Result(best.parameters, best.values[0], points, pareto(points))
 

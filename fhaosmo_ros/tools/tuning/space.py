@@ -55,7 +55,7 @@ def make_space(
             space.append(_dimension(label, value, low, high, log, decades, parameter))
     if not space:
         raise ConfigurationError(
-            f"parameter 'search': expected a parameter that the variant {start['variant']} uses, "
+            f"parameter 'search': expected one that the variant {start['variant']} uses, "
             f'got {list(search)!r}'
         )
     return space
@@ -94,6 +94,8 @@ def _numeric(name: str) -> Parameter:
 
 def _used(name: str, start: Mapping[str, Any]) -> bool:
     variant = str(start['variant'])
+    if start['structure'] == 'levant' and name in ('alpha', 'epsilon', 'initial_internal'):
+        return False
     if name.startswith('fuzzy_'):
         return variant.startswith('fuzzy')
     if name.startswith('gamma_'):

@@ -22,10 +22,6 @@ DIGITS = 4
 """Of the gains that are written; what is judged is what is written."""
 
 
-class Interrupted(Exception):
-    """The user asked to stop before there was anything to keep."""
-
-
 class Found(NamedTuple):
     """
     The outcome of a search.
@@ -108,7 +104,7 @@ class Tuner:
         recordings = self.data.training
         several = candidates(recordings, levels, effective_noise(recordings))
         chosen = ({k: v for k, v in gains.items() if k in names} for gains in several)
-        return min(chosen, key=lambda gains: self.training(gains).objective)
+        return min(chosen, key=lambda gains: self._judge(gains)[0])
 
     @property
     def study_name(self) -> str:
@@ -123,9 +119,12 @@ class Tuner:
 
     def judge(self, values: Values, pareto: str | None = None) -> tuple[float, ...]:
         """Return the objective, or the two, of the training at a point of the space."""
+        return self._judge(changes(values), pareto)
+
+    def _judge(self, gains: Mapping[str, Any], pareto: str | None = None) -> tuple[float, ...]:
         try:
-            verdict = self.training(changes(values))
-        except ConfigurationError:  # values that are good one by one and not together
+            verdict = self.training(gains)
+        except ConfigurationError:  # out of a parameter's bounds, or not good together
             return (math.inf,) if pareto is None else (math.inf, math.inf)
         if pareto is None:
             return (verdict.objective,)
@@ -134,20 +133,18 @@ class Tuner:
     def search(
         self, trials: int, jobs: int, storage: str, sampler: str, pareto: str | None,
         stopped: Callable[[], bool],
-    ) -> Found:  # fmt: skip
+    ) -> Found | None:  # fmt: skip
         """
-        Search until the study holds `trials`, or `stopped` says so.
+        Search until the study holds `trials`, or `stopped` says so; None if it says so at once.
 
         Raises
         ------
-        Interrupted
-            Stopped before the first trial.
         ConfigurationError
             A storage that can't be used.
 
         """
         if stopped():
-            raise Interrupted
+            return None
         begin = time.monotonic()
 
         name = self.study_name + (f'-{pareto}' if pareto else '')
