@@ -108,4 +108,4 @@ def variant(structure: str, scheme: str) -> Method:
     )
 
 
-OUR_METHOD = variant('cascade', 'explicit')
+OUR_METHOD = variant('levant', 'implicit')
