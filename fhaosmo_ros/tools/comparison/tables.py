@@ -14,6 +14,14 @@ from fhaosmo_ros.tools.comparison.verdicts import Verdict, verdicts
 
 USELESS = 1.0
 """From here on an estimate of d is no better than 0."""
+FIGURES = {
+    'verdicts': ["![Our error over the rival's, for each bar and cell](comparison/ratios.svg)"],
+    'rms_d': [
+        '![Error of d against the noise](comparison/noise.svg)',
+        '![True and estimated d](comparison/estimates.svg)',
+    ],
+}
+"""Figures below the generated parts."""
 MEASURES: dict[str, tuple[str, Callable[[Scores], float]]] = {
     'rms_d': ('RMS error of d over the RMS of d', lambda s: s.d),
     'rms_states': ('RMS errors of z2 .. zn over the RMS of each', lambda s: s.states),
