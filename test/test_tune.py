@@ -305,7 +305,7 @@ def test_missing_optuna_says_how_to_install_it(monkeypatch, capsys):
         {'noise_std': 1e-2, 'sample_rate': 100.0},
         {'noise_std': 1e-3, 'stamp_jitter': 1e-4},
         {'noise_std': 1e-3, 'dropout': 0.1, 'dropout_length': 4.0},
-        {'noise_std': 1e-3, 'quantum': 1e-3},
+        {'noise_std': 1e-3, 'quantisation': 1e-3},
         {'noise_std': 1e-3, 'disturbances': ['steps'], 'rms_of_d': 5.0},
     ],
 )
@@ -315,7 +315,7 @@ def test_sensor_is_identified(truth):
     sensor = identify(t, r.y)._asdict()
     assert sensor.pop('noise_std') == pytest.approx(truth['noise_std'], rel=0.1)
     assert sensor['sample_rate'] == pytest.approx(truth.get('sample_rate', 1000.0), rel=0.01)
-    assert sensor['quantum'] == pytest.approx(truth.get('quantum', 0.0), rel=1e-3)
+    assert sensor['quantisation'] == pytest.approx(truth.get('quantisation', 0.0), rel=1e-3)
     assert sensor['stamp_jitter'] == pytest.approx(
         truth.get('stamp_jitter', 0.0), rel=0.1, abs=1e-9
     )
