@@ -58,9 +58,9 @@ static int step(const struct law *law, double *state, double y, double h, double
                 + law->lambda[i] * power * s * (gamma * fabs(direction) / a + slope);
         }
         x[2 * N + i] += h * (x[3 * N + i] + dinjection + dphi);
-        x[3 * N + i] += h * law->alpha[i] * slope * s;
+        x[3 * N + i] += h * (law->alpha[i] * slope * s);
         x[i] += h * (x[N + i] + injection + phi);
-        x[N + i] += h * law->alpha[i] * direction;
+        x[N + i] += h * (law->alpha[i] * direction);
         running = a <= law->epsilon;
     }
     x[4 * N + 1] = y;

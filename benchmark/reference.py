@@ -13,6 +13,7 @@ from typing import Any
 from fhaosmo_ros.core import kernels
 from fhaosmo_ros.core.configuration import ObserverConfiguration
 from fhaosmo_ros.core.fuzzy import KNOTS
+from fhaosmo_ros.core.law import make_work
 from fhaosmo_ros.core.observer import Observer, ObserverState
 from fhaosmo_ros.core.plant import Plant
 import numpy as np
@@ -85,7 +86,7 @@ def in_c(library: ctypes.CDLL, y: NDArray[np.float64]) -> Callable[[], tuple[Sta
         raise CannotMeasureError(
             f'reference.c expects 4 levels and 193 knots, the core has {law.curves.shape}'
         )
-    packed = np.concatenate([law.gains.ravel(), law.curves[:2].ravel(), law.scalars])
+    packed = np.concatenate([law.gains[:3].ravel(), law.curves[:2].ravel(), law.scalars])
     start = first_state(CASE, y[0])
     rest, eps = np.ascontiguousarray(y[1:]), np.empty(4)
 
@@ -106,7 +107,7 @@ def in_numba(
     """Return the same of the kernel behind `Observer.run`, for any parameters."""
     configuration = ObserverConfiguration(parameters)
     count, levels = len(y), configuration.levels
-    work = kernels.make_work(levels, configuration.model.depth)
+    work = make_work(levels, configuration.model.depth)
     start = first_state(parameters, y[0])
     h, u = np.full(count, PERIOD), np.zeros(count)
     out, eps = np.empty((1, 2, levels)), np.empty((2, levels))

@@ -10,10 +10,12 @@ SMALL = {'order': 2, 'phi': ['0', '-z2*z2*z1 + u'], 'lambda': 3.0, 'alpha': 4.0}
 SMALL |= {'epsilon': 0.025, 'fuzzy_widths': [0.02], 'unknown_input': True}
 SMALL |= {'gamma_initial': 0.5, 'gamma_min': 0.3, 'gamma_max': 0.8, 'gamma_rate': 0.004}
 SMALL |= {'gamma_dead_zone': 0.0, 'gamma_leakage': 0.0, 'start_from_measurement': True}
+VARIANTS = ('sign', 'fuzzy', 'fuzzy_adaptive', 'sign_adaptive')
 LAWS = [
-    {'scheme': scheme, 'variant': variant}
+    {'structure': structure, 'scheme': scheme, 'variant': variant}
+    for structure in ('cascade', 'levant')
     for scheme in ('explicit', 'implicit')
-    for variant in ('sign', 'fuzzy', 'fuzzy_adaptive')
+    for variant in VARIANTS
 ]
 laws = pytest.mark.parametrize('law', LAWS, ids=lambda law: '-'.join(law.values()))
 any_law = st.sampled_from(LAWS)

@@ -11,6 +11,7 @@ import pytest
 
 USABLE = 1e-8 * np.finfo(float).max
 """Beyond this, numbers count as infinite."""
+STEEP = {'order': 1, 'phi': ['-z1**7']}
 wild = st.floats() | st.sampled_from([0.0, 1e-320, 1e-300, 1e150, 1e300, 1.797e308, -1.797e308])
 wild_sample = st.tuples(wild, st.floats(1e-6, 0.1) | wild, st.floats(-1.0, 1.0) | wild)
 
@@ -58,7 +59,7 @@ def test_observer_recovers_from_wild_data(law, inputs):
 @pytest.mark.parametrize('spike', [1e60, 1e150, 1e307, -1e307])
 @laws
 def test_spike_that_the_model_cannot_digest_is_rejected_once(law, spike):
-    observer = Observer({'order': 1, 'phi': ['-z1**7'], 'unknown_input': False} | law)
+    observer = Observer(STEEP | law | {'unknown_input': law['structure'] == 'levant'})
     observer.start(0.1)
     words = [observer.step(y, 1e-3).status for y in (0.1, spike, 0.1, 0.1, 0.1)]
     assert sum(word.rejected for word in words) == 1
@@ -110,11 +111,12 @@ def test_samples_before_the_first_good_one():
 
 @laws
 def test_time_that_no_step_can_take_is_dropped(law):
-    observer = Observer({'order': 1, 'phi': ['-z1**7'], 'unknown_input': False} | law)
+    observer = Observer(STEEP | law | {'unknown_input': law['structure'] == 'levant'})
     observer.start(5.0)
     assert observer.step(np.nan, 1e299).status == Status.REJECTED_MEASUREMENT
-    # Implicitly, sign slides over any time: its step exists.
-    slides = law == {'scheme': 'implicit', 'variant': 'sign'}
-    assert observer.step(5.0, 1e-3).status == (Status.OK if slides else Status.REJECTED_STEP)
+    # Implicitly, sign slides over any time and levant's gains grow with it: their step exists.
+    levant, sign = law['structure'] == 'levant', law['variant'].startswith('sign')
+    slides = law['scheme'] == 'implicit' and (sign or levant)
+    assert bool(observer.step(5.0, 1e-3).status & Status.REJECTED_STEP) != slides
     assert observer.state.memory[PENDING] == 0.0
     assert not observer.step(5.0, 1e-3).status.rejected

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The curves psi against scikit-fuzzy's own control system, and what they promise."""
 
-from fhaosmo_ros.core import ConfigurationError, kernels
+from fhaosmo_ros.core import ConfigurationError
 from fhaosmo_ros.core.configuration import ObserverConfiguration
 from fhaosmo_ros.core.fuzzy import curve, infer, KNOTS, TERMS, terms_of_level
+from fhaosmo_ros.core.law import INVERSE_WIDTH
+from fhaosmo_ros.core.law import psi as read_psi
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -26,7 +28,7 @@ def law(level_widths=(0.02,), **options):
 
 def psi(law, level, x):
     """Return psi of a signed x, as the kernels read it."""
-    value, _ = kernels.psi(law.flags, law.gains, law.curves, level, abs(x))
+    value, _ = read_psi(law.flags, law.gains, law.curves, level, abs(x))
     return np.copysign(value, x)
 
 
@@ -121,7 +123,7 @@ def test_level_1_has_5_terms_and_the_others_7():
 
 
 def test_last_width_serves_the_levels_that_follow():
-    inverse = law((0.1, 0.4)).gains[kernels.INVERSE_WIDTH]
+    inverse = law((0.1, 0.4)).gains[INVERSE_WIDTH]
     np.testing.assert_array_equal(inverse, [10.0, 2.5, 2.5, 2.5])
 
 
@@ -149,19 +151,19 @@ def test_psi_is_bounded_and_monotone(law, level, a, b):
 @given(any_law, levels, inputs, inputs)
 def test_psi_is_continuous(law, level, a, b):
     # Lipschitz: the steepest piece of the curve is less than 4 times steeper than the diagonal.
-    steepest = 4.0 * law.gains[kernels.INVERSE_WIDTH, level]
+    steepest = 4.0 * law.gains[INVERSE_WIDTH, level]
     difference = abs(psi(law, level, a) - psi(law, level, b))
     assert difference <= steepest * abs(a - b) + 1e-12
 
 
 @given(any_law, levels, st.floats(1e-6, 2.0))
 def test_slope_is_that_of_psi(law, level, share):
-    width = 1.0 / law.gains[kernels.INVERSE_WIDTH, level]
+    width = 1.0 / law.gains[INVERSE_WIDTH, level]
     position = share * (KNOTS - 1)
     if abs(position - round(position)) < 1e-3:
         return  # two pieces meet
     a, step = share * width, 1e-6 * width
-    _, slope = kernels.psi(law.flags, law.gains, law.curves, level, a)
+    _, slope = read_psi(law.flags, law.gains, law.curves, level, a)
     rise = psi(law, level, a + step) - psi(law, level, a - step)
     np.testing.assert_allclose(slope, rise / (2.0 * step), rtol=1e-6, atol=1e-6 / width)
 
@@ -179,6 +181,6 @@ def test_width_scales_the_input(options, level, share, width):
 def test_sign_is_the_limit_of_a_narrow_psi(level, a):
     narrow = law((1e-12,))
     sign = law(variant='sign')
-    assert kernels.psi(sign.flags, sign.gains, sign.curves, level, a) == (1.0, 0.0)
+    assert read_psi(sign.flags, sign.gains, sign.curves, level, a) == (1.0, 0.0)
     if a >= 1e-12:
         np.testing.assert_allclose(psi(narrow, level, a), 1.0, rtol=1e-12)

@@ -5,11 +5,13 @@ from fhaosmo_ros.core import ConfigurationError, Observer
 from fhaosmo_ros.core.layout import TILDE, Y
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS
 import numpy as np
-from observer_cases import assert_same_state, laws, samples, SMALL
+from observer_cases import assert_same_state, laws, samples, SMALL, VARIANTS
 import pytest
 
 CHANGES = {
-    'variant': ['sign', 'fuzzy', 'fuzzy_adaptive'],
+    'unknown_input_decay': [5.0],
+    'structure': ['cascade', 'levant'],
+    'variant': list(VARIANTS),
     'scheme': ['explicit', 'implicit'],
     'lambda': [2.0, [3.0, 4.0, 5.0]],
     'alpha': [2, [3, 4, 5]],

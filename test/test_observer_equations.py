@@ -13,6 +13,7 @@ import math
 from fhaosmo_ros.core import Observer
 from fhaosmo_ros.core.fuzzy import curve, terms_of_level
 import numpy as np
+from observer_cases import VARIANTS
 import pytest
 from scipy.optimize import brentq
 
@@ -99,12 +100,16 @@ class Reference:
     def __init__(self, p, phi, y):
         self.p, self.phi = p, phi
         self.N = p['order'] + p['unknown_input']
-        self.phi = [*phi, lambda z, u: Dual(0.0)]  # z_{n+1}' = eta: no Phi
+        self.sign = p['variant'].startswith('sign')
+        kappa = p['unknown_input_decay']
+        # z_{n+1}' = -kappa z_{n+1} + eta
+        self.phi = [*phi, lambda z, u: -kappa * z[p['order']]]
+        self.decay = [kappa if i == p['order'] - 1 else 0.0 for i in range(p['order'] + 1)]
         self.hat = [Dual(v) for v in p['initial_estimate']]
         self.tilde = [Dual(v) for v in p['initial_internal']]  # tilde[i] is z_tilde_{i+2}
         if p['start_from_measurement']:
             self.hat[0] = Dual(y)
-        self.gamma = p['gamma_initial'] if p['variant'] == 'fuzzy_adaptive' else 0.5
+        self.gamma = p['gamma_initial'] if p['variant'].endswith('_adaptive') else 0.5
         self.y = y
         self.curves = [
             curve(terms_of_level(i + 1), p['fuzzy_shape'], p['fuzzy_normalise'])
@@ -112,7 +117,7 @@ class Reference:
         ]
 
     def psi(self, i, x):
-        if self.p['variant'] == 'sign':
+        if self.sign:
             return Dual(float(np.sign(x.value)))
         widths = self.p['fuzzy_widths']
         width = widths[min(i, len(widths) - 1)]
@@ -146,7 +151,8 @@ class Reference:
                 continue
             rate = self.tilde[i] + p['lambda'][i] * self.injection(i, eps[i], gamma)
             hat[i] = self.hat[i] + h * (rate + self.phi[i](m[: i + 1], u))
-            tilde[i] = self.tilde[i] + h * p['alpha'][i] * self.psi(i, eps[i])
+            forced = p['alpha'][i] * self.psi(i, eps[i])
+            tilde[i] = self.tilde[i] + h * (forced - self.decay[i] * self.tilde[i])
         self.hat, self.tilde = hat, tilde
         self.adapt(eps, h)
 
@@ -159,17 +165,18 @@ class Reference:
             if any(abs(e.value) > p['epsilon'] for e in eps):
                 eps.append(m[i] - self.hat[i])
                 continue
-            b = m[i] - self.hat[i] - h * (self.tilde[i] + self.phi[i](m, u))
+            kept = 1.0 / (1.0 + h * self.decay[i])
+            b = m[i] - self.hat[i] - h * (kept * self.tilde[i] + self.phi[i](m, u))
             e, s = self.solve(i, b, h, gamma)
             eps.append(e)
-            self.tilde[i] = self.tilde[i] + h * p['alpha'][i] * s
+            self.tilde[i] = kept * (self.tilde[i] + h * p['alpha'][i] * s)
             self.hat[i] = m[i] - e
         self.adapt(eps, h)
 
     def solve(self, i, b, h, gamma):
-        stiffness = h * h * self.p['alpha'][i]
-        if self.p['variant'] == 'sign' and abs(b.value) <= stiffness:
-            return Dual(0.0), Dual(b.value / stiffness)
+        stiffness = h * h * self.p['alpha'][i] / (1.0 + h * self.decay[i])
+        if self.sign and abs(b.value) <= stiffness:
+            return Dual(0.0), b * (1.0 / stiffness)
 
         def balance(e, gamma, b):
             injection = h * self.p['lambda'][i] * self.injection(i, e, gamma)
@@ -178,7 +185,7 @@ class Reference:
         # To the last bit: what is left must not grow to the tolerance within the run.
         a = brentq(
             lambda a: balance(math.copysign(1.0, b.value) * Dual(a), gamma, b).value,
-            0.0 if self.p['variant'] != 'sign' else 1e-300,
+            1e-300 if self.sign else 0.0,
             abs(b.value),
             xtol=1e-300,
             rtol=4 * np.finfo(float).eps,
@@ -191,7 +198,7 @@ class Reference:
 
     def adapt(self, eps, h):
         p = self.p
-        if p['variant'] != 'fuzzy_adaptive':
+        if not p['variant'].endswith('_adaptive'):
             return
         loss = sum((e * e for e in eps), Dual(0.0))
         gamma = self.gamma
@@ -213,6 +220,7 @@ def parameters(n, extra, **others):
         'order': n,
         'phi': PHI[n][0],
         'unknown_input': extra,
+        'unknown_input_decay': 0.0,
         'lambda': list(3.0 + 2.0 * rng.random(levels)),
         'alpha': list(4.0 + 3.0 * rng.random(levels)),
         'epsilon': 0.2,
@@ -260,7 +268,7 @@ def compare(p, rtol=1e-9):
 
 @pytest.mark.parametrize('extra', [False, True], ids=['N=n', 'N=n+1'])
 @pytest.mark.parametrize('n', [1, 2, 3, 4])
-@pytest.mark.parametrize('variant', ['sign', 'fuzzy', 'fuzzy_adaptive'])
+@pytest.mark.parametrize('variant', VARIANTS)
 @pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
 def test_run_follows_the_equations(scheme, variant, n, extra):
     p = parameters(n, extra, scheme=scheme, variant=variant)
@@ -268,7 +276,7 @@ def test_run_follows_the_equations(scheme, variant, n, extra):
     assert np.ptp(result.z_hat, axis=0).min() > 1e-3  # every level moved
     if n + extra > 1:
         assert len(set(result.open_levels)) > 1  # and gates opened and closed
-    if variant == 'fuzzy_adaptive':
+    if variant.endswith('_adaptive'):
         assert np.ptp(result.gamma) > 1e-3
 
 
@@ -284,11 +292,14 @@ def test_run_follows_the_equations(scheme, variant, n, extra):
         {'fuzzy_shape': 'gaussian', 'fuzzy_normalise': False},
         {'start_from_measurement': True, 'fuzzy_widths': [0.02]},
         {'epsilon': 1e3},
+        {'unknown_input_decay': 5.0},
+        {'unknown_input_decay': 5.0, 'unknown_input': False, 'epsilon': 1e3},
     ],
     ids=lambda options: '-'.join(options),
 )
 def test_options_follow_the_equations(scheme, options):
-    compare(parameters(3, True, scheme=scheme, variant='fuzzy_adaptive', **options))
+    extra = options.get('unknown_input', True)
+    compare(parameters(3, extra, scheme=scheme, variant='fuzzy_adaptive') | options)
 
 
 def test_explicit_step_acts_on_the_sample_at_the_beginning_of_the_interval():

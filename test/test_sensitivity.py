@@ -11,18 +11,22 @@ MODELS = {
     'paper': (['0', '0', '-z3'], 0.0),
     'nonlinear': (['-0.3*z1**3', 'sin(z2)*z1 + u', '-tanh(z3) - 0.2*z1*z2*z3*u'], 1.0),
 }
+# Of (s + 4)^N.
+LEVANT_GAINS = {1: [8.0, 16.0], 3: [16.0, 96.0, 256.0, 256.0]}
 DELTA = 1e-8
 # Central differences: rounding is 1e-16 / DELTA, amplified some times over the run. A small DELTA
 # makes it rarer that the two runs are on different straight pieces of psi's curve.
 TOLERANCE = 1e-5
 
 
-def make(model, scheme, gamma, **others):
+def make(model, scheme, gamma, structure='cascade', **others):
     phi, _ = MODELS[model]
     p = {'order': len(phi), 'phi': phi, 'scheme': scheme, 'variant': 'fuzzy_adaptive'}
     p |= {'lambda': 4.0, 'alpha': 6.0, 'epsilon': 0.3, 'fuzzy_widths': [0.05, 0.2]}
     p |= {'gamma_initial': gamma, 'gamma_rate': 0.0, 'gamma_min': 0.1, 'gamma_max': 1.0}
     p |= {'initial_internal': 0.1, 'start_from_measurement': False}
+    if structure == 'levant':
+        p |= {'structure': 'levant', 'lambda': LEVANT_GAINS[len(phi)], 'fuzzy_widths': [0.05]}
     return Observer(p | others)
 
 
@@ -35,37 +39,56 @@ def signals(model, steps=400):
 
 cases = pytest.mark.parametrize('model', MODELS)
 schemes = pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
+structures = pytest.mark.parametrize('structure', ['cascade', 'levant'])
 gammas = pytest.mark.parametrize('gamma', [0.35, 0.5, 0.8])
 
 
 @cases
-@schemes
+@pytest.mark.parametrize(
+    ('scheme', 'variant'),
+    [
+        ('explicit', 'fuzzy_adaptive'),
+        ('implicit', 'fuzzy_adaptive'),
+        ('implicit', 'sign_adaptive'),  # explicitly the sensitivities of sign run away
+    ],
+)
+@structures
 @gammas
-def test_sensitivities_are_the_derivatives_of_the_states(model, scheme, gamma):
-    observers = [make(model, scheme, g) for g in (gamma, gamma - DELTA, gamma + DELTA)]
+def test_sensitivities_are_the_derivatives_of_the_states(model, scheme, variant, structure, gamma):
+    powers = (gamma, gamma - DELTA, gamma + DELTA)
+    observers = [make(model, scheme, g, structure, variant=variant) for g in powers]
     t, y, u = signals(model)
-    opened = set()
+    # Close to eps = 0 the powers of sign bend much within DELTA.
+    close = {'rtol': TOLERANCE, 'atol': TOLERANCE}
+    if variant.startswith('sign'):
+        close = {'rtol': 5e-3, 'atol': 5e-3}
+    opened, moved = set(), np.zeros(observers[0].levels)
     for part in np.array_split(np.arange(len(t)), 40):
         runs = [observer.run(t[part], y[part], u[part]) for observer in observers]
         middle, below, above = (observer.state.levels for observer in observers)
         p = (above[HAT] - below[HAT]) / (2.0 * DELTA)
         q = (above[TILDE] - below[TILDE]) / (2.0 * DELTA)
-        np.testing.assert_allclose(middle[HAT_SENSITIVITY], p, TOLERANCE, TOLERANCE)
-        np.testing.assert_allclose(middle[TILDE_SENSITIVITY], q, TOLERANCE, TOLERANCE)
+        np.testing.assert_allclose(middle[HAT_SENSITIVITY], p, **close)
+        np.testing.assert_allclose(middle[TILDE_SENSITIVITY], q, **close)
+        moved = np.maximum(moved, np.abs(p))
         opened |= set(runs[0].open_levels)
-    assert np.abs(p).min() > 1e-4  # there was something to compare, at every level
-    assert len(opened) > 1 or model == 'integrator' or scheme == 'implicit'
+    # There was something to compare, at every level (levant's last one has no power: off the
+    # surface its sign does not feel gamma).
+    assert moved[: -1 if close['rtol'] > TOLERANCE else None].min() > 1e-4
+    gates = structure == 'cascade' and model != 'integrator' and scheme == 'explicit'
+    assert len(opened) > 1 or not gates
 
 
 @cases
 @schemes
+@structures
 @gammas
-def test_gamma_moves_down_the_gradient_of_the_loss(model, scheme, gamma):
+def test_gamma_moves_down_the_gradient_of_the_loss(model, scheme, structure, gamma):
     t, y, u = signals(model)
     rate = 1e-3
     for k in (20, 120, 245, 400):
         # gamma_rate acts in the last step only.
-        adaptive = make(model, scheme, gamma)
+        adaptive = make(model, scheme, gamma, structure)
         adaptive.run(t[:k], y[:k], u[:k])
         adaptive.configure({'gamma_rate': rate})
         adaptive.run(t[k : k + 1], y[k : k + 1], u[k : k + 1])
@@ -74,7 +97,7 @@ def test_gamma_moves_down_the_gradient_of_the_loss(model, scheme, gamma):
         # Explicit: L at the beginning of the interval, as everything in forward Euler.
         at = k if scheme == 'implicit' else k - 1
         below, above = (
-            np.sum(make(model, scheme, g).run(t, y, u).innovation[at] ** 2)
+            np.sum(make(model, scheme, g, structure).run(t, y, u).innovation[at] ** 2)
             for g in (gamma - DELTA, gamma + DELTA)
         )
         gradient = (above - below) / (2.0 * DELTA)

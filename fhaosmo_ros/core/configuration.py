@@ -4,13 +4,16 @@
 from collections.abc import Mapping
 from typing import Any
 
-from fhaosmo_ros.core import kernels
+from fhaosmo_ros.core import law
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.fuzzy import curve, KNOTS, terms_of_level
 from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.core.parameter import Parameter
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS
 import numpy as np
+
+FIXED_GAMMA = 0.5
+"""Power of the variants that do not adapt (paper eq. triangularObserver, fuzzysuper)."""
 
 
 class ObserverConfiguration:
@@ -65,16 +68,26 @@ class ObserverConfiguration:
                 "parameters 'gamma_min', 'gamma_initial', 'gamma_max': expected each at most the "
                 f'next one, got {p["gamma_min"]}, {p["gamma_initial"]}, {p["gamma_max"]}'
             )
+        self.levant = p['structure'] == 'levant'
+        if self.levant and not p['unknown_input']:
+            raise ConfigurationError(
+                "parameters 'structure', 'unknown_input': levant estimates the unknown input as "
+                'its last level, expected unknown_input = true, got false'
+            )
+        self.adaptive = p['variant'].endswith('_adaptive')
+        self.gamma_initial = p['gamma_initial'] if self.adaptive else FIXED_GAMMA
         self.levels = self.model.order + int(p['unknown_input'])
         self.initial_estimate = self._per_level('initial_estimate')
         self.initial_internal = self._per_level('initial_internal')
+        if self.levant:
+            self.initial_internal = np.append(self.initial_estimate[1:], 0.0)
         self.internal = p['estimate_from'] == 'internal'
-        self.law = self._law()
+        self.law = self._make_law()
 
     def _per_level(self, name: str) -> np.ndarray:
         return per_level(OBSERVER_PARAMETERS[name], self.parameters[name], self.levels)
 
-    def _law(self) -> kernels.Law:
+    def _make_law(self) -> law.Law:
         p, levels = self.parameters, self.levels
         widths = p['fuzzy_widths']
         if len(widths) > levels and widths != OBSERVER_PARAMETERS['fuzzy_widths'].default:
@@ -82,12 +95,13 @@ class ObserverConfiguration:
                 widths, f'1 to {levels} values (N = {levels} levels)'
             )
         widths = [widths[min(i, len(widths) - 1)] for i in range(levels)]
-        flags = np.zeros(kernels.FLAGS, dtype=np.int64)
-        flags[kernels.SIGN] = p['variant'] == 'sign'
-        flags[kernels.IMPLICIT] = p['scheme'] == 'implicit'
-        flags[kernels.ADAPTIVE] = p['variant'] == 'fuzzy_adaptive'
-        flags[kernels.FROM_MEASUREMENT] = p['start_from_measurement']
-        if flags[kernels.SIGN]:  # the kernel does not read them
+        flags = np.zeros(law.FLAGS, dtype=np.int64)
+        flags[law.SIGN] = p['variant'].startswith('sign')
+        flags[law.IMPLICIT] = p['scheme'] == 'implicit'
+        flags[law.ADAPTIVE] = self.adaptive
+        flags[law.FROM_MEASUREMENT] = p['start_from_measurement']
+        flags[law.LEVANT] = self.levant
+        if flags[law.SIGN]:  # the kernel does not read them
             curves = np.ones((levels, KNOTS))
         else:
             curves = np.array(
@@ -96,18 +110,25 @@ class ObserverConfiguration:
                     for i in range(levels)
                 ]
             )
-        gains = [self._per_level('lambda'), self._per_level('alpha'), 1.0 / np.array(widths)]
-        scalars = np.zeros(kernels.SCALARS)
-        scalars[kernels.EPSILON] = p['epsilon']
-        scalars[kernels.GAMMA_INITIAL] = p['gamma_initial']
-        scalars[kernels.RATE] = p['gamma_rate']
-        scalars[kernels.MIN] = p['gamma_min']
-        scalars[kernels.MAX] = p['gamma_max']
-        scalars[kernels.DEAD_ZONE] = p['gamma_dead_zone']
-        scalars[kernels.LEAKAGE] = p['gamma_leakage']
-        return kernels.Law(
-            flags, np.array(gains), curves, scalars, self.model.tape, self.model.offsets
-        )
+        gains = np.zeros((law.GAINS, levels))
+        gains[law.LAMBDA] = self._per_level('lambda')
+        gains[law.ALPHA] = self._per_level('alpha')
+        gains[law.INVERSE_WIDTH] = 1.0 / np.array(widths)
+        tape, offsets = self.model.tape, self.model.offsets
+        decay = p['unknown_input_decay']
+        if decay > 0.0:  # D 15, in the internal state and in the level that follow d
+            gains[law.DECAY, self.model.order - 1] = decay
+            if p['unknown_input']:
+                tape, offsets = self.model.with_decay(decay)
+        scalars = np.zeros(law.SCALARS)
+        scalars[law.EPSILON] = np.inf if self.levant else p['epsilon']  # no gates
+        scalars[law.GAMMA_INITIAL] = p['gamma_initial']
+        scalars[law.RATE] = p['gamma_rate']
+        scalars[law.MIN] = p['gamma_min']
+        scalars[law.MAX] = p['gamma_max']
+        scalars[law.DEAD_ZONE] = p['gamma_dead_zone']
+        scalars[law.LEAKAGE] = p['gamma_leakage']
+        return law.Law(flags, gains, curves, scalars, tape, offsets)
 
 
 def per_level(parameter: Parameter, values: list[float], count: int) -> np.ndarray:

@@ -9,7 +9,6 @@ from fhaosmo_ros.core.configuration import ObserverConfiguration, per_level
 from fhaosmo_ros.core.disturbance import disturbance, KINDS, NAMES
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.model import TriangularModel
-from fhaosmo_ros.core.observer import FIXED_GAMMA
 from fhaosmo_ros.core.ode import solve, SOLVERS, unpack
 from fhaosmo_ros.core.parameters import PLANT_PARAMETERS
 import numpy as np
@@ -87,15 +86,24 @@ def simulate(
     levels = np.zeros((layout.ROWS, configuration.levels))
     levels[layout.HAT] = configuration.initial_estimate
     levels[layout.TILDE] = configuration.initial_internal
-    o = configuration.parameters
-    if o['start_from_measurement']:
+    if configuration.parameters['start_from_measurement']:
         levels[layout.HAT, 0] = z[0]
-    gamma = o['gamma_initial'] if o['variant'] == 'fuzzy_adaptive' else FIXED_GAMMA
     wave = np.array([p[f'disturbance_{name}'] for name in NAMES], dtype=np.float64)
     system = (model.tape, model.offsets, KINDS.index(p['disturbance']), wave)
     count = round(duration / step) // every + 1
     depth = max(model.depth, configuration.model.depth)
-    rows = solve(configuration.law, depth, system, z, levels, gamma, solver, step, every, count)
+    rows = solve(
+        configuration.law,
+        depth,
+        system,
+        z,
+        levels,
+        configuration.gamma_initial,
+        solver,
+        step,
+        every,
+        count,
+    )
     t = np.arange(count, dtype=np.float64) * (every * step)
     d = np.array([disturbance(system[2], wave, time) for time in t])
     truth, *estimate = unpack(rows, model.order)

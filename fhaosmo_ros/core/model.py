@@ -9,6 +9,9 @@ from fhaosmo_ros.core.expressions import as_array, parse
 from fhaosmo_ros.core.tape import evaluate, INPUT
 import numpy as np
 
+ROOM_FOR_DECAY = 4
+"""Stack size that is enough for the expression in `TriangularModel.with_decay`."""
+
 
 class TriangularModel:
     """
@@ -31,7 +34,7 @@ class TriangularModel:
         Phi_i occupies ``offsets[i - 1]:offsets[i]``; the last part is empty, for the level of the
         unknown input (whose Phi is 0).
     depth : int
-        Stack size that the tapes need.
+        Stack size that the tapes need, that of `with_decay` included.
 
     Raises
     ------
@@ -51,12 +54,20 @@ class TriangularModel:
         tapes = [parse(text, i + 1) for i, text in enumerate(self.phi)]
         self.tape = as_array([i for part in tapes for i in part])
         self.offsets = np.cumsum([0, *(len(part) for part in tapes), 0], dtype=np.int64)
-        self.depth = max([1, *(len(part) for part in tapes)])
+        self.depth = max([ROOM_FOR_DECAY, *(len(part) for part in tapes)])
 
     @property
     def uses_input(self) -> bool:
         """True if a Phi uses the known input u."""
         return bool(np.any(self.tape[:, 0] == INPUT))
+
+    def with_decay(self, rate: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return tape and offsets with Phi_{n+1} = -rate z_{n+1} for the unknown input (D 15)."""
+        level = self.order + 1
+        part = as_array(parse(f'-{rate!r} * z{level}', level))
+        offsets = self.offsets.copy()
+        offsets[level] += len(part)
+        return np.concatenate([self.tape, part]), offsets
 
     def evaluate(self, z: np.ndarray, u: float = 0.0) -> np.ndarray:
         """Return Phi(z, u), shape (n,)."""

@@ -5,15 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core import kernels, layout
-from fhaosmo_ros.core.configuration import ObserverConfiguration
+from fhaosmo_ros.core import kernels, law, layout
+from fhaosmo_ros.core.configuration import FIXED_GAMMA, ObserverConfiguration
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.status import flags, LEVEL_SHIFT, open_levels, Status
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-FIXED_GAMMA = 0.5
-"""Power of the variants that do not adapt (paper eq. triangularObserver, fuzzysuper)."""
 
 
 class Estimate(NamedTuple):
@@ -131,7 +128,7 @@ class Observer:
         count = self._configuration.levels
         self._levels = np.zeros((layout.ROWS, count))
         self._memory = np.zeros(layout.SCALARS)
-        self._work = kernels.make_work(count, self._configuration.model.depth)
+        self._work = law.make_work(count, self._configuration.model.depth)
         self._eps = np.zeros((1, count))
         self._t: float | int | None = None
         self._word = 0
@@ -206,18 +203,19 @@ class Observer:
         self._adopt(self._configuration.changed(changes))
 
     def _adopt(self, configuration: ObserverConfiguration) -> None:
-        was_adaptive = self._law.flags[kernels.ADAPTIVE]
+        before = self._law.flags
         self._configuration = configuration
         self._law = configuration.law
         self._fit_gamma()
-        if not was_adaptive:  # they were not carried along
-            self._levels[layout.HAT_SENSITIVITY :] = 0.0
+        after = self._law.flags
+        if not before[law.ADAPTIVE] or before[law.LEVANT] != after[law.LEVANT]:
+            self._levels[layout.HAT_SENSITIVITY :] = 0.0  # they were not carried along
 
     def _fit_gamma(self) -> None:
         c, gamma = self._law.scalars, self._memory[layout.GAMMA]
         self._memory[layout.GAMMA] = (
-            np.clip(gamma, c[kernels.MIN], c[kernels.MAX])
-            if self._law.flags[kernels.ADAPTIVE]
+            np.clip(gamma, c[law.MIN], c[law.MAX])
+            if self._law.flags[law.ADAPTIVE]
             else FIXED_GAMMA
         )
 
@@ -229,16 +227,13 @@ class Observer:
         self._memory[:] = 0.0
         self._memory[layout.Y] = np.nan
         self._t = None
-        law = self._law
-        self._memory[layout.GAMMA] = (
-            law.scalars[kernels.GAMMA_INITIAL] if law.flags[kernels.ADAPTIVE] else FIXED_GAMMA
-        )
+        self._memory[layout.GAMMA] = self._configuration.gamma_initial
 
     def start(self, y: float) -> Estimate:
         """Take the first sample: time has not passed yet, so nothing is integrated."""
-        law = self._law
+        flags, scalars = self._law.flags, self._law.scalars
         self._word = kernels.start(
-            law.flags, law.scalars, self._levels, self._memory, float(y), self._eps, 0
+            flags, scalars, self._levels, self._memory, float(y), self._eps, 0
         )
         return self._estimate(self._word)
 

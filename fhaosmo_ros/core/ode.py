@@ -8,10 +8,21 @@ the solvers are those a fixed-step simulation offers: `ode1` (Euler), `ode3` (Bo
 `ode4` (classical Runge-Kutta).
 """
 
-from fhaosmo_ros.core import kernels, layout
+from fhaosmo_ros.core import cascade, layout, levant
 from fhaosmo_ros.core.borrowed import borrowed
 from fhaosmo_ros.core.disturbance import disturbance
-from fhaosmo_ros.core.kernels import explicit, Law
+from fhaosmo_ros.core.law import (
+    ADAPTIVE,
+    DEAD_ZONE,
+    GAMMA_INITIAL,
+    Law,
+    LEAKAGE,
+    LEVANT,
+    make_work,
+    MAX,
+    MIN,
+    RATE,
+)  # fmt: skip
 from fhaosmo_ros.core.layout import HAT, ROWS, TILDE
 from fhaosmo_ros.core.tape import evaluate, Floats, Ints
 from numba import njit
@@ -39,7 +50,7 @@ def rates(
     Parameters
     ----------
     x, m, stack : arrays
-        Scratch memory of the kernels.
+        Scratch memory of the recursion.
     plant_tape, plant_offsets, kind, wave : arrays and int
         The plant's Phi and its d(t); the observer's model need not be the plant's.
     point : (2, n) array
@@ -58,18 +69,23 @@ def rates(
             x[r, i] = state[n + r * levels + i]
     gamma = state[n + ROWS * levels]
     # A forward Euler step of length 1 moves the state by its rate.
-    loss, gradient = explicit(
-        flags, gains, curves, scalars, tape, offsets, x, m, stack, gamma, state[0], 1.0, 0.0
-    )
+    if flags[LEVANT]:
+        loss, gradient = levant.explicit(
+            flags, gains, curves, tape, offsets, x, m, stack, gamma, state[0], 1.0, 0.0
+        )
+    else:
+        loss, gradient = cascade.explicit(
+            flags, gains, curves, scalars, tape, offsets, x, m, stack, gamma, state[0], 1.0, 0.0
+        )
     for r in range(ROWS):
         for i in range(levels):
             k = n + r * levels + i
             out[stage, k] = x[r, i] - state[k]
     slope = 0.0
-    if flags[kernels.ADAPTIVE]:
-        if loss > scalars[kernels.DEAD_ZONE] * scalars[kernels.DEAD_ZONE]:
-            slope = -scalars[kernels.RATE] * gradient  # P adaptationlawgamma
-        slope -= scalars[kernels.LEAKAGE] * (gamma - scalars[kernels.GAMMA_INITIAL])
+    if flags[ADAPTIVE]:
+        if loss > scalars[DEAD_ZONE] * scalars[DEAD_ZONE]:
+            slope = -scalars[RATE] * gradient  # P adaptationlawgamma
+        slope -= scalars[LEAKAGE] * (gamma - scalars[GAMMA_INITIAL])
     out[stage, n + ROWS * levels] = slope
 
 
@@ -127,8 +143,8 @@ def integrate(
         for i in range(size):
             for stage in range(stages):
                 now[i] += h * weights[stage] * slopes[stage, i]
-        if flags[kernels.ADAPTIVE]:  # projection (D 8)
-            now[size - 1] = min(max(now[size - 1], scalars[kernels.MIN]), scalars[kernels.MAX])
+        if flags[ADAPTIVE]:  # projection (D 8)
+            now[size - 1] = min(max(now[size - 1], scalars[MIN]), scalars[MAX])
         if (k + 1) % every == 0:
             for i in range(size):
                 rows[(k + 1) // every, i] = now[i]
@@ -160,7 +176,7 @@ def solve(
     rows = np.empty((count, state.shape[1]))
     tape, offsets, kind, wave = system
     integrate(
-        *law, *kernels.make_work(levels.shape[1], depth),
+        *law, *make_work(levels.shape[1], depth),
         tape, offsets, kind, wave, np.zeros((2, len(z))), state, np.zeros((4, state.shape[1])),
         int(STAGES[index]), NODES[index], WEIGHTS[index], h, every, rows,
     )  # fmt: skip

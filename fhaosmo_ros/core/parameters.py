@@ -31,10 +31,24 @@ OBSERVER = (
         live=False,
     ),
     Parameter(
+        'unknown_input_decay', 0.0,
+        "Rate kappa of the observer's model of the unknown input, d' = -kappa d + what the "
+        'innovations say; 0 assumes nothing. Greater where d comes and goes around 0: the '
+        'estimate follows noise less, but is too small where d stays. Explicit: below 2 / dt.',
+        unit='1/s', lower=0.0, upper=1e3,
+    ),
+    Parameter(
+        'structure', 'cascade',
+        "cascade: the paper's levels, each with an innovation of its own. levant: Levant's "
+        'arbitrary-order differentiator, every level driven by y - z_hat_1; it needs '
+        'unknown_input and other gains than the cascade (docs/mathematics.md).',
+        choices=('cascade', 'levant'),
+    ),
+    Parameter(
         'variant', 'fuzzy_adaptive',
         'sign: discontinuous injection, gamma = 1/2. fuzzy: fuzzy curve instead of sign. '
-        'fuzzy_adaptive: fuzzy curve and adapted gamma.',
-        choices=('sign', 'fuzzy', 'fuzzy_adaptive'),
+        'sign_adaptive, fuzzy_adaptive: the same with adapted gamma.',
+        choices=('sign', 'fuzzy', 'fuzzy_adaptive', 'sign_adaptive'),
     ),
     Parameter(
         'scheme', 'implicit',
@@ -43,23 +57,27 @@ OBSERVER = (
         choices=('explicit', 'implicit'),
     ),
     Parameter(
-        'lambda', [740.0], 'Correction factors lambda_i of the injection |eps|^gamma psi(eps).',
+        'lambda', [740.0],
+        'Correction factors lambda_i of the injection: |eps_i|^gamma psi_i(eps_i); levant: '
+        '|eps_1|^(2 gamma (N - i) / N) psi_i(eps_1).',
         lower=0.0, lower_open=True, upper=1e6, lengths=PER_LEVEL,
     ),
     Parameter(
-        'alpha', [155.0], 'Gains alpha_i of the internal states.',
+        'alpha', [155.0],
+        'Gains alpha_i of the internal states. Not used by levant, which has none.',
         lower=0.0, lower_open=True, upper=1e9, lengths=PER_LEVEL,
     ),
     Parameter(
         'epsilon', 80.0,
         'A level runs while |eps_j| <= epsilon for every level j before it (unit of y, '
-        'and of the derivatives for the later levels).',
+        'and of the derivatives for the later levels). Not used by levant: all levels run.',
         lower=0.0, lower_open=True, upper=1e12,
     ),
     Parameter(
         'fuzzy_widths', [0.1, 1.4],
         'Half-widths of the fuzzy input universes of levels 1, 2, ...; the last one serves the '
-        'levels that follow. Beyond its half-width psi is +-1.',
+        'levels that follow. Beyond its half-width psi is +-1. In the unit of the innovation '
+        'eps_i; levant: of y at every level.',
         lower=1e-12, upper=1e12, lengths='1 to N; the last one serves the levels that follow',
     ),
     Parameter(
@@ -72,7 +90,7 @@ OBSERVER = (
         '(5 terms), which silently cuts every gain.',
     ),
     Parameter(
-        'gamma_initial', 0.67, 'Power gamma at the start of fuzzy_adaptive.',
+        'gamma_initial', 0.67, 'Power gamma at the start of an adaptive variant.',
         lower=0.0, lower_open=True, upper=1.0,
     ),
     Parameter(
@@ -102,7 +120,8 @@ OBSERVER = (
     ),
     Parameter(
         'initial_internal', [0.0],
-        'Internal states z_tilde_2 .. z_tilde_{N+1} at the start (the last one is theta).',
+        'Internal states z_tilde_2 .. z_tilde_{N+1} at the start (the last one is theta). Not '
+        'used by levant, which has none.',
         lower=-1e12, upper=1e12, lengths=PER_LEVEL,
     ),
     Parameter(
@@ -112,7 +131,8 @@ OBSERVER = (
     Parameter(
         'estimate_from', 'internal',
         'Which variables are the published estimates of z_2 .. z_n and d: internal (z_tilde, '
-        'no lag) or filtered (z_hat, smoother). z_1 is always z_hat_1.',
+        'no lag) or filtered (z_hat, smoother). z_1 is always z_hat_1. The same for levant, '
+        'which has only z_hat.',
         choices=('internal', 'filtered'),
     ),
 )  # fmt: skip

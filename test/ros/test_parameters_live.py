@@ -31,6 +31,8 @@ STARTED_WITH = {
 }
 
 OTHER = {
+    'unknown_input_decay': 2.0,
+    'structure': 'levant',
     'variant': 'fuzzy',
     'scheme': 'explicit',
     'lambda': [12.0, 13.0, 14.0, 16.0],

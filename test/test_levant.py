@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The second structure, against its equations written down a second time, and its theorems.
+
+The reference is plain Python made from docs/mathematics.md, not from the kernels: scipy's brentq
+solves the implicit equation. The sensitivities are tested in test_sensitivity.py.
+"""
+
+import math
+
+from fhaosmo_ros.core import ConfigurationError, Observer
+from fhaosmo_ros.core.configuration import ObserverConfiguration
+from fhaosmo_ros.core.fuzzy import curve, terms_of_level
+from fhaosmo_ros.core.joint import simulate
+from fhaosmo_ros.core.law import LAMBDA, psi
+from fhaosmo_ros.core.levant import root
+from fhaosmo_ros.core.metrics import rms
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from observer_cases import VARIANTS
+import pytest
+from scipy.optimize import brentq
+
+PHI = {
+    1: (['-0.5*z1 + u'], [lambda z, u: -0.5 * z[0] + u]),
+    3: (
+        ['sin(z1)', 'u*z2', '-z3 - z1*tanh(z3)'],
+        [
+            lambda z, u: math.sin(z[0]),
+            lambda z, u: u * z[1],
+            lambda z, u: -z[2] - z[0] * math.tanh(z[2]),
+        ],
+    ),
+}
+# Levant's gains for a last derivative bounded by L: lambda_i = C_i L^(i / N).
+COEFFICIENTS = {2: (1.5, 1.1), 4: (3.0, 4.16, 3.06, 1.1)}
+WIDTHS = [0.3, 0.05]
+
+
+def gains(levels, bound):
+    return [c * bound ** ((i + 1) / levels) for i, c in enumerate(COEFFICIENTS[levels])]
+
+
+def parameters(n, **others):
+    p = {'structure': 'levant', 'order': n, 'phi': PHI[n][0], 'lambda': gains(n + 1, 3.0)}
+    p |= {'fuzzy_widths': WIDTHS, 'gamma_initial': 0.7, 'gamma_rate': 0.0, 'gamma_leakage': 0.0}
+    p |= {'initial_estimate': list(np.linspace(0.1, -0.2, n + 1))}
+    return p | {'start_from_measurement': False, 'unknown_input_decay': 0.0} | others
+
+
+def signals(steps=300):
+    rng = np.random.default_rng(7)
+    t = np.concatenate([[0.0], np.cumsum(4e-3 * rng.uniform(0.5, 1.5, steps))])
+    return t, 0.3 * np.sin(2.0 * t) + 0.2 * np.sign(np.sin(9.0 * t)), np.cos(3.0 * t)
+
+
+class Reference:
+    """z_hat_i' = z_hat_{i+1} + Phi_i + lambda_i |eps|^(2 gamma (N - i) / N) psi_i(eps)."""
+
+    def __init__(self, p, gamma):
+        self.n = p['order']
+        self.N = self.n + 1
+        self.gains, self.gamma = p['lambda'], gamma
+        self.decay = p['unknown_input_decay']
+        self.sign = p['variant'].startswith('sign')
+        self.phi = PHI[self.n][1]
+        self.z = np.array(p['initial_estimate'])
+
+    def psi(self, i, e):
+        if self.sign:
+            return np.sign(e)
+        values = curve(terms_of_level(i + 1), 'triangle', True)
+        grid = np.linspace(0.0, WIDTHS[min(i, 1)], len(values))
+        return math.copysign(np.interp(abs(e), grid, values), e)
+
+    def injections(self, e):
+        powers = [2.0 * self.gamma * (self.N - i) / self.N for i in range(1, self.N + 1)]
+        terms = zip(self.gains, powers, strict=True)
+        return np.array([g * abs(e) ** p * self.psi(i, e) for i, (g, p) in enumerate(terms)])
+
+    def known(self, y, u):
+        point = [y, *self.z[1:]]
+        return np.array([*(f(point, u) for f in self.phi), -self.decay * self.z[-1]])
+
+    def explicit(self, y, h, u):
+        rate = np.append(self.z[1:], 0.0) + self.known(y, u) + self.injections(y - self.z[0])
+        self.z = self.z + h * rate
+
+    def implicit(self, y, h, u):
+        """Solve (1 - h shift) z = old + h (Phi + injections(y - z_1)) for z."""
+        chain = np.eye(self.N) - h * np.eye(self.N, k=1)
+        drift = self.z + h * self.known(y, u)
+
+        def state(injections):
+            return np.linalg.solve(chain, drift + h * injections)
+
+        def gap(e):  # decreases with e
+            return y - state(self.injections(e))[0] - e
+
+        b = y - state(np.zeros(self.N))[0]
+        last = np.eye(self.N)[-1] * self.gains[-1]
+        reach = y - state(last * np.sign(b))[0]
+        if self.sign and b * reach <= 0.0:  # the set-valued last sign can take it all
+            self.z = state(last * b / (self.gains[-1] * h**self.N))
+            return
+        e = brentq(gap, math.copysign(1e-300, b), b, xtol=1e-300, rtol=4 * np.finfo(float).eps)
+        self.z = state(self.injections(e))
+
+
+@pytest.mark.parametrize('decay', [0.0, 5.0])
+@pytest.mark.parametrize('n', [1, 3])
+@pytest.mark.parametrize('variant', VARIANTS)
+@pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
+def test_run_follows_the_equations(scheme, variant, n, decay):
+    p = parameters(n, scheme=scheme, variant=variant, unknown_input_decay=decay)
+    t, y, u = signals()
+    result = Observer(p).run(t, y, u)
+    reference = Reference(p, 0.7 if variant.endswith('adaptive') else 0.5)
+    z = [reference.z]
+    for k in range(1, len(t)):
+        # Explicit: the sample at the interval's beginning.
+        sample = y[k] if scheme == 'implicit' else y[k - 1]
+        getattr(reference, scheme)(sample, t[k] - t[k - 1], u[k])
+        z.append(reference.z)
+    np.testing.assert_allclose(result.z_hat, z, rtol=1e-7, atol=1e-7)
+    assert np.ptp(result.z_hat, axis=0).min() > 0.1  # every level moved
+    np.testing.assert_array_equal(result.z_tilde[1:, :-1], result.z_hat[1:, 1:])
+    np.testing.assert_array_equal(result.z, result.z_hat[:, :n])
+    np.testing.assert_array_equal(result.unknown_input, result.z_hat[:, n])
+    np.testing.assert_allclose(result.innovation[:, 0], y - result.z_hat[:, 0])
+    np.testing.assert_array_equal(result.innovation[1:, 1:], 0.0)
+
+
+@pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
+def test_two_levels_are_the_super_twisting_pair(scheme):
+    """With psi = sign: the first level of the paper's cascade, with alpha_1 = lambda_2."""
+    t, y, u = signals()
+    p = {'order': 1, 'phi': ['0'], 'variant': 'sign', 'scheme': scheme}
+    pair = Observer(p | {'structure': 'levant', 'lambda': [4.0, 6.0]}).run(t, y, u)
+    level = Observer(p | {'unknown_input': False, 'lambda': 4.0, 'alpha': 6.0}).run(t, y, u)
+    np.testing.assert_allclose(pair.z, level.z, atol=1e-9)
+    np.testing.assert_allclose(pair.unknown_input, level.unknown_input, atol=1e-9)
+
+
+@pytest.mark.parametrize('h', [1e-3, 1e-2])
+def test_polynomial_of_the_observers_degree_is_followed_exactly(h):
+    """Its fourth derivative is 0, which is less than any bound L > 0: nothing is left."""
+    p = {'structure': 'levant', 'order': 3, 'phi': ['0'] * 3, 'variant': 'sign'}
+    t = np.arange(round(20.0 / h)) * h
+    polynomial = np.polynomial.Polynomial([0.5, -0.3, 0.04, 0.005])
+    run = Observer(p | {'scheme': 'implicit', 'lambda': gains(4, 1.0)}).run(t, polynomial(t))
+    late = t > 15.0
+    # Backward differences are exact but for the step: an error of order h in the derivatives.
+    for i in range(4):
+        error = run.z_hat[late, i] - polynomial.deriv(i)(t[late])
+        assert np.abs(error).max() < (1e-12 if i == 0 else 2.0 * h)
+    # The last derivative is a constant and does not chatter: what is left is the rounding of y.
+    rounding = 10.0 * np.finfo(float).eps * polynomial(t[-1]) / h**3
+    assert np.abs(run.z_hat[late, 3] - 6 * 0.005).max() < rounding
+
+
+@pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
+@pytest.mark.parametrize('level', [0, 1, 2, 3])
+def test_errors_shrink_with_the_step_as_levants_theorem_says(scheme, level):
+    """|error of z_i| <= mu_i L^(..) h^(N - i + 1), explicitly; implicitly at least order 1."""
+    p = {'structure': 'levant', 'order': 3, 'phi': ['0'] * 3, 'variant': 'sign'}
+    steps, errors = [8e-3, 4e-3, 2e-3], []
+    for h in steps:
+        t = np.arange(round(20.0 / h)) * h
+        run = Observer(p | {'scheme': scheme, 'lambda': gains(4, 1.5)}).run(t, np.sin(t))
+        truth = np.array([np.sin, np.cos, lambda t: -np.sin(t), lambda t: -np.cos(t)][level](t))
+        errors.append(rms((run.z_hat[:, level] - truth)[t > 10.0]))
+    if max(errors) > 1e-12:
+        slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+        assert slope > 0.8
+
+
+@given(st.floats(1e-3, 1e3), st.sampled_from(['explicit', 'implicit']))
+def test_sign_is_homogeneous(scale, scheme):
+    """Time scaled by k, y by k^N: z_hat_i scales by k^(N - i + 1) (degree -1)."""
+    p = {'structure': 'levant', 'order': 3, 'phi': ['0'] * 3, 'scheme': scheme}
+    p |= {'variant': 'sign', 'lambda': gains(4, 3.0)}
+    t, y, _ = signals(50)
+    one = Observer(p).run(t, y).z_hat
+    other = Observer(p).run(scale * t, scale**4 * y).z_hat
+    weights = scale ** np.arange(4.0, 0.0, -1.0)
+    np.testing.assert_allclose(other / weights, one, rtol=1e-6, atol=1e-6 * np.abs(one).max())
+
+
+def powers(low, high):
+    return st.floats(low, high).map(lambda x: 10.0**x)
+
+
+@settings(max_examples=1000)
+@given(
+    st.sampled_from(VARIANTS), powers(-20.0, 6.0), powers(-6.0, 0.5), powers(-3.0, 0.0),
+    st.lists(powers(-6.0, 6.0), min_size=4, max_size=4), powers(-9.0, 6.0),
+)  # fmt: skip
+def test_root(variant, b, h, gamma, lambdas, width):
+    p = {'structure': 'levant', 'variant': variant, 'lambda': lambdas, 'fuzzy_widths': width}
+    law = ObserverConfiguration(p).law
+    weights = np.zeros((2, 4))
+    weights[0] = law.gains[LAMBDA] * h ** np.arange(1, 5)
+    curves = law.flags, law.gains, law.curves
+    eps, w, top = root(*curves, weights, b, gamma)
+    s = np.array([psi(*curves, i, eps)[0] for i in range(4)]) if eps > 0.0 else np.zeros(4)
+    if eps > 0.0:
+        assert s[3] == top
+        if eps > 1e-299:
+            np.testing.assert_allclose(w, eps ** (gamma / 2.0), rtol=1e-12)
+    s[3] = top
+    assert np.all((s >= 0.0) & (s <= 1.0))
+    terms = np.append(weights[0] * w ** np.arange(3, -1, -1) * s, eps)
+    np.testing.assert_allclose(terms.sum(), b, rtol=1e-11)
+
+
+def test_structure_changes_live_without_a_jump():
+    p = {'lambda': 8.0, 'alpha': 9.0, 'epsilon': 10.0, 'fuzzy_widths': 0.5, 'phi': ['0'] * 3}
+    p |= {'estimate_from': 'filtered'}
+    t, y, _ = signals()
+    observer = Observer(p | {'scheme': 'implicit'})
+    for structure in ('levant', 'cascade'):
+        observer.run(t, y)
+        before = observer.estimate.z
+        observer.configure({'structure': structure})
+        h = 1e-9
+        after = observer.step(float(y[-1]), h).z
+        np.testing.assert_allclose(after, before, atol=1e-4)
+        t = t + 2.0 * t[-1]
+
+
+def test_without_its_last_level_it_is_refused():
+    with pytest.raises(ConfigurationError, match='unknown_input = true'):
+        Observer({'structure': 'levant', 'unknown_input': False})
+
+
+@pytest.mark.parametrize('variant', VARIANTS)
+def test_euler_of_the_joint_system_is_the_explicit_scheme(variant):
+    p = {'structure': 'levant', 'variant': variant, 'lambda': gains(4, 3.0), 'scheme': 'explicit'}
+    p |= {'fuzzy_widths': WIDTHS, 'gamma_initial': 0.6, 'gamma_rate': 0.1}
+    run = simulate(p, {}, 'ode1', 1e-3, duration=0.3)
+    sampled = Observer(p).run(run.t, run.z[:, 0])
+    np.testing.assert_allclose(run.z_hat, sampled.z_hat, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(run.z_tilde, sampled.z_tilde, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(run.gamma, sampled.gamma, rtol=1e-9)
