@@ -6,13 +6,14 @@ MINUTES ?= 2
 # $(call with,EXTRA): set $python to the environment's Python, making the environment first.
 with = python=$$(PYTHON='$(PYTHON)' sh scripts/environment.sh $(1))
 
-.PHONY: help demo paper tune test lint bench soak clean
+.PHONY: help demo paper tune compare test lint bench soak clean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    run plant and estimator for 20 s, draw what was estimated'
 	@echo 'make paper   reproduce the paper, rewrite docs/paper.md and its figures'
 	@echo 'make tune    find gains that fit a sensor: ARGS="--params-file my.yaml", or --bag run'
+	@echo 'make compare tune other observers by the same rules, rewrite docs/comparison.md'
 	@echo 'make test    check style and types, run the tests'
 	@echo 'make lint    check style and types only'
 	@echo 'make bench   measure speed'
@@ -31,6 +32,9 @@ paper:
 
 tune:
 	@$(call with,tune) && exec "$$python" -m fhaosmo_ros tune $(ARGS)
+
+compare:
+	@$(call with,compare) && exec "$$python" -m fhaosmo_ros compare $(ARGS)
 
 lint:
 	@$(call with,test) && set -x && \

@@ -9,6 +9,7 @@ from setuptools import find_packages, setup
 
 NAME = 'fhaosmo_ros'
 TUNE = ['cmaes', 'optuna>=4,<6']
+COMPARE = [*TUNE, 'control']
 
 
 def files(*patterns):
@@ -63,8 +64,9 @@ setup(
             'ros-jazzy-std-srvs',
         ],
         'tune': TUNE,
+        'compare': COMPARE,
         'test': [
-            *TUNE,
+            *COMPARE,
             'colcon-common-extensions',
             'hypothesis',
             'import-linter',

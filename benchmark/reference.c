@@ -104,7 +104,7 @@ static int step(const struct law *law, double *state, double y, double h, double
         levels += running;
         running = running && fabs(eps[i]) <= law->epsilon;
     }
-    return word | levels << 8;
+    return word | levels << LEVEL_SHIFT;
 }
 
 /* Step through `count` samples of period `h`; `eps` and the last status word are the result. */

@@ -8,6 +8,7 @@ Run plant, fault injector and estimator for a long time, and say what grew, drif
 import argparse
 from collections import Counter, defaultdict
 import json
+import os
 from pathlib import Path
 import signal
 import sys
@@ -54,7 +55,10 @@ def main(argv: list[str] | None = None) -> int:
     draw(course, arguments.output / 'soak.png')
     rows = verdict(course)
     faults = ', '.join(f'{n:,} {k}' for k, n in sorted(course.faults.items()))
-    text = f'{arguments.minutes:g} minutes, seed {arguments.seed}: {faults}\n\n{render(rows)}\n'
+    text = (
+        f'{arguments.minutes:g} minutes, seed {arguments.seed}, {os.cpu_count()} cores, load '
+        f'{os.getloadavg()[1]:.1f}: {faults}\n\n{render(rows)}\n'
+    )
     (arguments.output / 'soak.txt').write_text(text)
     print(f'{text}\nFigure: {arguments.output / "soak.png"}')
     missed = [row.name for row in rows if row.missed]
@@ -79,7 +83,7 @@ def run(seed: int, seconds: float):
         estimator.wait_for('estimating')
         plant.wait_for('injecting')
         client.learn()
-        memory, windows = _follow(
+        memory, windows, lost = _follow(
             seed, seconds, {'estimator': estimator, 'plant': plant}, watch, client
         )
         plant.interrupt()
@@ -93,15 +97,16 @@ def run(seed: int, seconds: float):
         return Course(
             memory, windows, watch.outputs, watch.not_finite,
             counts['published'], _taken(watch.report), int(watch.report['samples lost']),
+            np.count_nonzero(np.diff(lost)),
             counts, client.counts,
         )  # fmt: skip
 
 
 def _follow(seed, seconds, nodes: dict[str, Child], watch, client):
-    """Make the scheduled calls; return memory by process and the judged windows."""
+    """Make the scheduled calls; return memory by process, judged windows, losses by second."""
     calls = [event for event in schedule(seed, seconds) if event.kind in CALLS][::-1]
     memory: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    windows, restored, judging, second = [], 0, False, 0
+    windows, lost, restored, judging, second = [], [], 0, False, 0
     start = monotonic()
     with tqdm(
         total=round(seconds), desc='soak', unit='s', mininterval=1.0, disable=None
@@ -125,13 +130,14 @@ def _follow(seed, seconds, nodes: dict[str, Child], watch, client):
             if now >= second + 1:
                 second = int(now)
                 progress.update(second - progress.n)
+                lost.append(int(watch.report.get('samples lost', 0)))
                 if now > CYCLE:
                     for name, node in nodes.items():
                         memory[name].append((now, node.resident_megabytes()))
                 progress.set_postfix_str(
                     f'{memory["estimator"][-1][1]:.1f} MB' if memory['estimator'] else 'warm-up'
                 )
-    return {name: np.array(course) for name, course in memory.items()}, np.array(windows)
+    return {name: np.array(course) for name, course in memory.items()}, np.array(windows), lost
 
 
 def _taken(report: dict[str, str]) -> int:

@@ -37,6 +37,8 @@ class Course(NamedTuple):
     published, taken, lost : int
         Samples that left the fault injector, that the estimator used or rejected, and that it
         missed in the sequence numbers.
+    stalls : int
+        Seconds in which it missed any.
     faults, calls : Counter
         What was injected, what was called.
 
@@ -49,6 +51,7 @@ class Course(NamedTuple):
     published: int
     taken: int
     lost: int
+    stalls: int
     faults: Counter[str]
     calls: Counter[str]
 
@@ -68,7 +71,8 @@ def verdict(course: Course) -> list[Row]:
     unaccounted = course.published - course.taken
     note = f'{course.published:,} published, {course.taken:,} used or rejected'
     rows.append(Row('samples unaccounted for', abs(unaccounted), bar=0.0, note=note))
-    rows.append(Row('samples lost, by sequence number', course.lost, bar=0.0))
+    note = f'in {course.stalls} of the seconds'
+    rows.append(Row('samples lost, by sequence number', course.lost, bar=0.0, note=note))
     note = f'of {course.outputs:,} messages'
     rows.append(Row('outputs that are not finite', course.not_finite, bar=0.0, note=note))
     _, error, gamma = course.windows.T

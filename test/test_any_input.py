@@ -131,6 +131,7 @@ def try_to_configure(estimator: OnlineEstimator, values: dict) -> bool:
     return True
 
 
+@pytest.mark.slow
 def test_ten_thousand_parameter_sets():
     rng = np.random.default_rng(1)
     estimator = OnlineEstimator(SMALL)

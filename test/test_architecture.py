@@ -15,7 +15,13 @@ PACKAGE = ROOT / 'fhaosmo_ros'
 ALLOWED = {
     'rclpy': ['nodes/'],
     'rosbags': ['tools/bags.py', 'tools/bag_reader.py', 'tools/bag_writer.py'],
-    'matplotlib': ['tools/figures.py', 'tools/paper_figures.py', 'tools/tuning/figures.py'],
+    'control': ['tools/comparison/gains.py'],
+    'matplotlib': [
+        'tools/comparison/figures.py',
+        'tools/figures.py',
+        'tools/paper_figures.py',
+        'tools/tuning/figures.py',
+    ],
     'optuna': ['tools/tuning/search.py', 'tools/tuning/study.py'],
     'skfuzzy': ['core/fuzzy.py'],
 }

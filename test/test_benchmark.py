@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 
+from fhaosmo_ros.core.status import open_levels
 import numpy as np
 import pytest
 
@@ -29,7 +30,7 @@ def test_c_reference_takes_the_same_steps(reference, tmp_path):
     y = reference.output(20_001)
     reference.assert_agreement(reference.compile_reference(tmp_path), y)
     state, word = reference.in_numba(reference.CASE, y)()
-    assert word >> 8 == 4
+    assert open_levels(word) == 4
     assert not np.isclose(state[16], 0.5)
 
 

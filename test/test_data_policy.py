@@ -205,6 +205,16 @@ def test_steps_that_always_fail_start_afresh_and_never_end_in_nan(law):
     assert feed.estimator.counters.rejected_steps > 50
 
 
+def test_spikes_beyond_epsilon_are_no_divergence_while_y_is_found_again():
+    feed = Feed(epsilon=0.3, divergence_time=0.05)
+    feed.sine(1000)
+    for _ in range(20):
+        feed(2.0)
+        assert abs(feed.estimator.estimate.innovation[0]) > 0.3
+        feed.sine(20)
+    assert feed.events == {}
+
+
 def test_divergence_time_zero_never_starts_afresh():
     feed = Feed(divergence_time=0.0, epsilon=1e-9)
     feed.sine(3000)
@@ -242,6 +252,17 @@ def test_frozen_gamma_holds_against_leakage_and_in_gaps():
     (word,) = feed.sine(1)
     assert word & Status.GAP
     assert feed.estimator.estimate.gamma == gamma
+
+
+def test_seed_after_a_gap_is_not_taken_back_with_the_gap():
+    feed = Feed()
+    feed.sine(100)
+    feed.count += 100
+    feed.sine(1)
+    feed.estimator.seed([0.2, 50.0, 60.0], 70.0)
+    feed.count -= 50  # a late sample from inside the gap
+    assert feed.sine(1)[0].rejected
+    assert feed.estimator.estimate.unknown_input == 70.0
 
 
 def test_seed_in_the_middle_of_a_run():

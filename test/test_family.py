@@ -64,7 +64,7 @@ def test_known_input_is_held_during_the_interval_that_ends_at_its_sample():
     np.testing.assert_allclose(z[:, 0], np.cumsum(u * np.diff(t, prepend=0.0)), atol=1e-12)
 
 
-def test_noise_quantum_jitter_and_dropouts_are_as_asked():
+def test_noise_quantisation_jitter_and_dropouts_are_as_asked():
     family = Family(
         {'noise_std': 2e-3, 'period_jitter': 1e-4, 'stamp_jitter': 2e-4, 'dropout': 0.2,
          'dropout_length': 5.0, 'integration_step': 1e-3, 'duration': 60.0}
@@ -77,7 +77,7 @@ def test_noise_quantum_jitter_and_dropouts_are_as_asked():
     assert 3.0 < np.mean(runs) < 9.0
     off = r.t - np.round(r.t / 1e-3) * 1e-3
     np.testing.assert_allclose(np.std(off), np.hypot(1e-4, 2e-4), rtol=0.1)
-    y = Family(SHORT | {'quantum': 0.01}).recording(0).y
+    y = Family(SHORT | {'quantisation': 0.01}).recording(0).y
     np.testing.assert_allclose(y / 0.01, np.round(y / 0.01), atol=1e-9)
 
 

@@ -22,7 +22,7 @@ class Live:
         self.name = name
         self.estimator = OnlineEstimator(parameters)
         self.messages, self.rows = [], {}
-        self._flags = Flag.STARTED
+        self._begins = True
 
     def run(self, stamps, y, begin, end):
         for k in range(begin, end):
@@ -30,24 +30,28 @@ class Live:
             if estimate.status.rejected:
                 continue
             self.rows[int(stamps[k])] = [*estimate.z, estimate.unknown_input, estimate.gamma]
-            if self._flags or k % 500 == 499:
-                state = self.estimator.observer.state
-                timing = self.estimator.timing
-                vector = pack(Snapshot(int(stamps[k]), self._flags, timing, state))
-                data = labelled_array(labels(self.estimator.observer.levels), vector)
-                self.messages.append(
-                    (f'{self.name}/snapshot', ARRAY, int(stamps[k]) + 90_000, data)
-                )
-                self._flags = Flag(0)
+            if self._begins or k % 500 == 499:
+                self._tell(Flag.STARTED if self._begins else Flag(0), 90_000)
+                self._begins = False
         return self
+
+    def _tell(self, flags, delay):
+        estimator = self.estimator
+        vector = pack(Snapshot(estimator.latest, flags, estimator.memory))
+        data = labelled_array(labels(estimator.observer.levels), vector)
+        self.messages.append((f'{self.name}/snapshot', ARRAY, estimator.latest + delay, data))
 
     def reset(self):
         self.estimator.reset()
-        self._flags |= Flag.STARTED
+        self._tell(Flag.RESET, 150_000)
+        self._begins = True
+
+    def freeze(self, held):
+        self.estimator.freeze(held)
+        self._tell(Flag.CHANGED, 150_000)
 
     def change(self, stamp, name, value):
         self.estimator.configure({name: value})
-        self._flags |= Flag.CHANGED
         types, nothing = files.TYPES.types, np.zeros(0, np.int64)
         parameter = types['rcl_interfaces/msg/Parameter'](
             name=name,
@@ -63,7 +67,8 @@ class Live:
             EVENT, stamp=time, node=self.name, new_parameters=[], changed_parameters=[parameter],
             deleted_parameters=[],
         )  # fmt: skip
-        self.messages.append(('/parameter_events', EVENT, int(stamp) + 50_000, data))
+        self.messages.append(('/parameter_events', EVENT, int(stamp) + 100_000, data))
+        self._tell(Flag.CHANGED, 100_100)
 
 
 def write(path, stamps, y, *lives, begin=0, storage='mcap'):
@@ -98,7 +103,11 @@ def test_every_live_estimate_comes_again(begin, storage, tmp_path, capsys):
     live.run(stamps, y, 2000, 2300)
     live.change(stamps[2299], 'gamma_rate', 0.02)
     live.change(stamps[2299], 'epsilon', 2.0)
-    live.run(stamps, y, 2300, COUNT)
+    live.run(stamps, y, 2300, 2700)
+    live.freeze(True)
+    live.run(stamps, y, 2700, 3400)
+    live.freeze(False)
+    live.run(stamps, y, 3400, COUNT)
     bag = write(tmp_path / 'bag', stamps, y, live, begin=begin, storage=storage)
     parameters = ['-p', 'epsilon:=3.0'] if begin == 0 else []
     (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
@@ -110,13 +119,14 @@ def test_every_live_estimate_comes_again(begin, storage, tmp_path, capsys):
     code, text, _ = run(capsys, bag, '-o', out, *OPTIONS, *parameters)
     assert code == 0
     got = rows(out)
-    # The first snapshot after the begin is that of sample 123, 999 or 2999.
-    first = {0: 123, 700: 1000, 2600: 3000}[begin]
+    # The first snapshot after the begin is that of sample 123, 999 or 2699.
+    first = {0: 123, 700: 1000, 2600: 2700}[begin]
     assert list(got) == stamps[first:].tolist()
     for stamp, row in got.items():
         np.testing.assert_array_equal(row, live.rows[stamp])
     assert 'followed /estimator' in text
-    count = sum(m[0].endswith('snapshot') and m[2] >= stamps[first] for m in live.messages)
+    count = sum(m[0].endswith('snapshot') and m[2] >= stamps[begin] for m in live.messages)
+    count -= begin > 0  # where it begins there is nothing to compare
     assert f'{count} of {count} snapshots are the same' in text
 
 

@@ -15,8 +15,7 @@ import pytest
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
 pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
 
-from fhaosmo_ros.tools.tuning.search import BAD, Dimension, log_dimensions, minimise, pareto
-from fhaosmo_ros.tools.tuning.study import Point
+from fhaosmo_ros.tools.tuning.search import BAD, Dimension, log_dimensions, minimise
 
 ROOT = Path(__file__).resolve().parents[1]
 SPACE = [Dimension('a', 1e-3, 1e3, 1.0), Dimension('b', -5.0, 5.0, 0.0, log=False)]
@@ -147,22 +146,18 @@ def test_line_cut_short_by_a_kill_is_cut_off(tmp_path):
     assert len(minimise(bowl, SPACE, 20, jobs=1, storage=str(storage)).trials) == 20
 
 
-def test_front_of_two_objectives():
-    def both(values):
-        return values['b'] ** 2, (values['b'] - 2.0) ** 2
+@pytest.mark.parametrize('storage', [None, 'study.log'])
+def test_notes_are_kept_and_only_the_first_number_is_minimised(tmp_path, storage):
+    def noted(values):
+        return bowl(values), values['b'], -1e6 * values['a']
 
-    result = minimise(both, SPACE, 150, jobs=1, objectives=2, population=20)
-    errors = [point.values for point in result.front]
-    assert len(errors) > 5
-    assert errors == sorted(errors)
-    assert all(-0.1 < point.parameters['b'] < 2.1 for point in result.front)
-    second = [b for _, b in errors]
-    assert second == sorted(second, reverse=True)
-
-
-def test_pareto_drops_what_is_beaten():
-    points = [Point({}, v) for v in [(1.0, 5.0), (2.0, 2.0), (2.0, 3.0), (3.0, 2.0), (4.0, 1.0)]]
-    assert [p.values for p in pareto(points)] == [(1.0, 5.0), (2.0, 2.0), (4.0, 1.0)]
+    if storage is not None:
+        storage = str(tmp_path / storage)
+    result = minimise(noted, SPACE, 100, jobs=1, storage=storage)
+    assert result.value < 0.1
+    for point in result.trials:
+        values = point.parameters
+        assert point.values == (bowl(values), values['b'], -1e6 * values['a'])
 
 
 @pytest.mark.parametrize(

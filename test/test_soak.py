@@ -35,7 +35,7 @@ def course(judge, **changes):
         'windows': np.column_stack(
             [cycles, np.full(90, 0.004), np.full(90, 0.5)],
         ),
-        'outputs': 1000, 'not_finite': 0, 'published': 900, 'taken': 900, 'lost': 0,
+        'outputs': 1000, 'not_finite': 0, 'published': 900, 'taken': 900, 'lost': 0, 'stalls': 0,
         'faults': Counter(), 'calls': Counter({'reset': 3}),
     }  # fmt: skip
     return judge.Course(**values | changes)

@@ -97,6 +97,18 @@ def test_one_stamp_far_away_is_dropped_and_time_goes_on(jump):
     only(estimator, far_stamps=1)
 
 
+def test_far_stamps_with_good_ones_between_never_restart():
+    estimator, other = OnlineEstimator(), OnlineEstimator()
+    last = run(estimator)
+    run(other)
+    for k in range(1, 20, 2):
+        estimator.update(last + HOUR + k * MS, 5.0)
+        for e in (estimator, other):
+            e.update(last + k * MS, 0.21)
+    same(estimator, other)
+    only(estimator, far_stamps=10)
+
+
 @pytest.mark.parametrize('jump', [600 * MS, -600 * MS, 10**18, -(10**18)])
 def test_second_sample_beyond_max_gap_restarts_from_both(jump):
     estimator, fresh = OnlineEstimator(), OnlineEstimator()
@@ -141,6 +153,17 @@ def test_one_stamp_ahead_by_less_than_max_gap_is_taken_back(ahead):
     assert estimator.counters.withdrawn_gaps == 1
     assert estimator.counters.backward_stamps == 0
     assert estimator.counters.accepted + estimator.counters.rejected == 54
+
+
+def test_time_goes_on_from_before_a_withdrawn_gap_even_where_the_next_sample_is_a_spike():
+    estimator, other = (OnlineEstimator({'spike_gate': 0.1}) for _ in range(2))
+    last = run(estimator)
+    run(other)
+    estimator.update(last + 30 * MS, 0.23)
+    assert estimator.update(last + MS, 5.0).status == Status.REJECTED_SPIKE
+    for e in (estimator, other):
+        e.update(last + 2 * MS, 0.23)
+    same(estimator, other)
 
 
 def test_clock_set_back_a_little_holds_until_it_has_caught_up():
@@ -235,8 +258,20 @@ def test_model_that_has_no_prediction_is_bridged_in_a_straight_line():
     estimator = OnlineEstimator(law | {'max_step': 0.01})
     estimator.update(START, 0.5)
     estimator.seed([0.5], -1e9)  # drives the prediction out of the logarithm's domain
-    assert estimator.update(START + 40 * MS, 0.9).status & Status.GAP
-    assert np.isfinite(estimator.estimate.z).all()
+    assert estimator.update(START + 40 * MS, 0.9).status == Status.GAP
+    assert estimator.estimate.z[0] == pytest.approx(-4e7, rel=0.1)  # what the seed leads to
+
+
+def test_step_that_fails_within_a_bridge_leaves_the_state_as_it_was():
+    estimator = OnlineEstimator(
+        {'order': 1, 'phi': ['-z1**60'], 'scheme': 'explicit', 'max_step': 0.01}
+    )
+    estimator.update(START, 0.5)
+    estimator.update(START + 5 * MS, 0.6)
+    before = estimator.observer.state.levels
+    status = estimator.update(START + 45 * MS, 1e9).status
+    assert status == Status.GAP | Status.REJECTED_STEP
+    np.testing.assert_array_equal(estimator.observer.state.levels, before)
 
 
 def test_number_of_sub_steps_is_bounded():
@@ -329,6 +364,16 @@ def test_clock_that_stands_still_never_runs_ahead_of_its_next_tick():
         estimator.update(START + 20 * MS, 0.2)
     assert estimator.stamp < START + 30 * MS
     assert not estimator.update(START + 30 * MS, 0.2).status.rejected
+
+
+def test_tick_that_comes_early_makes_no_sample_late():
+    estimator = OnlineEstimator({'sampling': 'clock'})
+    ticks = np.cumsum([0, 25, 25, 25, 13, 25, 25, 12, 25])
+    for tick in ticks.tolist():
+        for k in range(25):
+            estimator.update(START + tick * MS, sample(tick + k))
+    assert estimator.counters.backward_stamps == 0
+    assert estimator.counters.accepted > 150
 
 
 def test_samples_of_a_clock_that_jumps_back_restart_within_one_tick():

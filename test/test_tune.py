@@ -23,6 +23,12 @@ from fhaosmo_ros.tools.tuning.theory import candidates
 import numpy as np
 import pytest
 
+pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
+pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
+
+from fhaosmo_ros.tools.tuning.study import Point
+from fhaosmo_ros.tools.tuning.tuner import front
+
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = {'duration': 4.0, 'integration_step': 1e-3, 'sample_rate': 200.0}
 TUNING = TUNE_PARAMETERS.defaults() | SHORT | {'settled': 1.0}
@@ -31,12 +37,6 @@ QUICK = [f'-p{name}:={value}' for name, value in SHORT.items()] + [
     '--jobs=2',
 ]  # fmt: skip
 FILES = ['estimates.png', 'gains.yaml', 'report.md', 'sensitivity.png', 'study.journal']
-
-
-@pytest.fixture(autouse=True)
-def _needed():
-    pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
-    pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
 
 
 def command(*arguments, **options):
@@ -111,6 +111,13 @@ def test_front_of_error_and_chatter(tmp_path):
     assert main([*QUICK, '--pareto', '--trials=60', '-o', str(out)]) == 0
     assert (out / 'pareto.png').stat().st_size > 10_000
     assert '(pareto.png)' in (out / 'report.md').read_text()
+
+
+def test_front_drops_what_is_beaten():
+    pairs = [(2.0, 3.0), (1.0, 5.0), (4.0, 1.0), (2.0, 2.0), (3.0, 2.0)]
+    points = [Point({}, (0.0, 0.0, error, chatter, 9.0)) for error, chatter in pairs]
+    found = [(mark.error, mark.chatter) for mark in front(points, 'chatter')]
+    assert found == [(1.0, 5.0), (2.0, 2.0), (4.0, 1.0)]
 
 
 def test_sections_of_a_file(tmp_path):
@@ -298,7 +305,7 @@ def test_missing_optuna_says_how_to_install_it(monkeypatch, capsys):
         {'noise_std': 1e-2, 'sample_rate': 100.0},
         {'noise_std': 1e-3, 'stamp_jitter': 1e-4},
         {'noise_std': 1e-3, 'dropout': 0.1, 'dropout_length': 4.0},
-        {'noise_std': 1e-3, 'quantum': 1e-3},
+        {'noise_std': 1e-3, 'quantisation': 1e-3},
         {'noise_std': 1e-3, 'disturbances': ['steps'], 'rms_of_d': 5.0},
     ],
 )
@@ -308,7 +315,7 @@ def test_sensor_is_identified(truth):
     sensor = identify(t, r.y)._asdict()
     assert sensor.pop('noise_std') == pytest.approx(truth['noise_std'], rel=0.1)
     assert sensor['sample_rate'] == pytest.approx(truth.get('sample_rate', 1000.0), rel=0.01)
-    assert sensor['quantum'] == pytest.approx(truth.get('quantum', 0.0), rel=1e-3)
+    assert sensor['quantisation'] == pytest.approx(truth.get('quantisation', 0.0), rel=1e-3)
     assert sensor['stamp_jitter'] == pytest.approx(
         truth.get('stamp_jitter', 0.0), rel=0.1, abs=1e-9
     )

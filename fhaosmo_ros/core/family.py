@@ -20,6 +20,7 @@ from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.family_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.core.parameters import PLANT_PARAMETERS
+from fhaosmo_ros.core.plant import quantised
 from fhaosmo_ros.core.response import respond
 import numpy as np
 from numpy.random import Generator
@@ -117,9 +118,7 @@ class Family:
                 f'an RMS of {p["rms_of_d"]:g}, got infinite ones (recording {number})'
             )
         y = z[:, 0] + p['noise_std'] * random.standard_normal(len(t))
-        if p['quantum'] > 0.0:
-            y = p['quantum'] * np.round(y / p['quantum'])
-        return Recording(t, y, u, z, d, shape)
+        return Recording(t, quantised(y, p['quantisation']), u, z, d, shape)
 
     def _times(self, random: Generator) -> tuple[Floats, Floats]:
         """Return the moments of sampling and the stamps of the samples that are not lost."""

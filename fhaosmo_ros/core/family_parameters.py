@@ -8,8 +8,11 @@ SHAPES = ('sines', 'steps', 'chirp')
 
 SHARED = tuple(
     PLANT_NODE_PARAMETERS[name]
-    for name in ('initial_state', 'integration_step', 'noise_std', 'noise_seed', 'sample_rate')
-)
+    for name in (
+        'initial_state', 'integration_step', 'noise_std', 'noise_seed', 'quantisation',
+        'sample_rate',
+    )
+)  # fmt: skip
 """A plant's YAML describes these for its family, too."""
 
 FAMILY = (
@@ -39,10 +42,6 @@ FAMILY = (
     Parameter(
         'rms_of_u', 1.0,
         'RMS of the known input, sines in band_of_d as well, where the model uses u.',
-        lower=0.0, upper=1e9, live=False,
-    ),
-    Parameter(
-        'quantum', 0.0, 'Resolution of y, of an encoder for example; 0 for none.',
         lower=0.0, upper=1e9, live=False,
     ),
     Parameter(

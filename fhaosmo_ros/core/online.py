@@ -10,6 +10,7 @@ from fhaosmo_ros.core.counters import Counters
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.observer import Estimate, Observer, ObserverState, Trajectory
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
+from fhaosmo_ros.core.snapshot import Memory
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -146,6 +147,46 @@ class OnlineEstimator:
         self._ints[at.VALID] = 0
         self._ints[at.TICK_COUNT] = self._ints[at.SPACING] = 0
 
+    @property
+    def latest(self) -> int | None:
+        """Stamp of the latest sample that was used, in nanoseconds; a reset does not forget it."""
+        return int(self._ints[at.STAMP]) or None
+
+    @property
+    def memory(self) -> Memory:
+        """All that it remembers; a copy."""
+        state = self.observer.state
+        size = state.levels.size + state.memory.size
+        return Memory(
+            integers=self._ints[at.FROZEN : at.COUNTERS].copy(),
+            reals=self._reals[at.INTERVAL : at.STATES].copy(),
+            before=self._reals[at.STATES + size :].copy(),
+            now=np.concatenate([state.levels.ravel(), state.memory]),
+            u=self._u,
+        )
+
+    def remember(self, memory: Memory) -> None:
+        """
+        Go on where an estimator was that had this memory; parameters and counters stay.
+
+        Raises
+        ------
+        ConfigurationError
+            The memory is of an observer with another number of levels.
+
+        """
+        size, levels = len(memory.now), self._levels
+        if size != levels.size + self._memory.size:
+            raise ConfigurationError(
+                f'memory: expected that of {self.observer.levels} levels, got {size} numbers'
+            )
+        self._ints[at.FROZEN : at.COUNTERS] = memory.integers
+        self._reals[at.INTERVAL : at.STATES] = memory.reals
+        self._reals[at.STATES + size :] = memory.before
+        state, scalars = memory.now[: levels.size], memory.now[levels.size :]
+        self.observer.restore(ObserverState(state.reshape(levels.shape), scalars))
+        self._u = memory.u
+
     def seed(self, z: ArrayLike, unknown_input: float) -> None:
         """
         Put the estimate there at once, as if the observer had converged; time and gamma go on.
@@ -186,36 +227,6 @@ class OnlineEstimator:
     def frozen(self) -> bool:
         """True while gamma is held."""
         return bool(self._ints[at.FROZEN])
-
-    @property
-    def timing(self) -> NDArray[np.float64]:
-        """What is remembered of the intervals: how many, their mean and its jitter (ns)."""
-        return np.array(
-            [self._ints[at.INTERVALS], self._reals[at.INTERVAL], self._reals[at.JITTER]]
-        )
-
-    def resume(self, stamp: int, state: ObserverState, timing: ArrayLike = (0, 0.0, 0.0)) -> None:
-        """
-        Go on from the observer's state after an accepted sample with this stamp.
-
-        Parameters
-        ----------
-        stamp : int
-            In nanoseconds.
-        state : ObserverState
-        timing : (3,) array
-            See `timing`.
-
-        Raises
-        ------
-        ConfigurationError
-            The state is of an observer with another number of levels.
-
-        """
-        self.observer.restore(state)
-        ints = self._ints
-        policy_time.settled(ints, stamp)
-        ints[at.INTERVALS], self._reals[at.INTERVAL], self._reals[at.JITTER] = np.asarray(timing)
 
     def forget_stamp(self) -> None:
         """Expect stamps of another clock: the next sample takes the usual period."""

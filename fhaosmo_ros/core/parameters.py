@@ -320,6 +320,12 @@ PLANT_MODEL = (
         'noise_seed', 1, 'Seed of the noise; setting it starts the noise sequence again.',
         lower=0, upper=2**31 - 1,
     ),
+    Parameter(
+        'quantisation', 0.0,
+        'Increment that y, noise included, is rounded to (unit of y), as an encoder does; 0 for '
+        'none.',
+        lower=0.0, upper=1e9,
+    ),
 )  # fmt: skip
 
 PLANT_NODE = (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated plant (paper eq. newsimpledynamics): triangular system, unknown input, noise."""
+"""The simulated plant (paper eq. newsimpledynamics): triangular system, unknown input, sensor."""
 
 from collections.abc import Mapping
 import math
@@ -23,7 +23,7 @@ class Truth(NamedTuple):
     Attributes
     ----------
     y : float or (K,) array
-        Measured output, with noise.
+        Measured output, with noise and quantisation.
     z : (n,) or (K, n) array
         States.
     unknown_input : float or (K,) array
@@ -213,10 +213,10 @@ class Plant:
         )
 
     def sample(self, t: float, u: float = 0.0) -> Truth:
-        """Advance to `t` and measure: y = z_1 + noise."""
+        """Advance to `t` and measure: y = z_1 + noise, quantised."""
         self.advance(t, u)
         d = disturbance(self._system.kind, self._system.wave, float(t))
-        return Truth(float(self._at[0]) + self._noise(), self._at.copy(), float(d))
+        return Truth(float(self._measured(self._at[:1])[0]), self._at.copy(), float(d))
 
     def simulate(self, t: ArrayLike, u: ArrayLike | float = 0.0) -> Truth:
         """
@@ -246,8 +246,14 @@ class Plant:
         u = np.ascontiguousarray(np.broadcast_to(np.asarray(u, dtype=np.float64), t.shape))
         z, d = np.empty((len(t), self.order)), np.empty(len(t))
         self._step = _simulate(self._system, self._work, self._z, self._step, t, self._h, u, z, d)
-        noise = self._parameters['noise_std'] * self._random.standard_normal(len(t))
-        return Truth(z[:, 0] + noise, z, d)
+        return Truth(self._measured(z[:, 0]), z, d)
 
-    def _noise(self) -> float:
-        return float(self._parameters['noise_std'] * self._random.standard_normal())
+    def _measured(self, z1: Floats) -> Floats:
+        p = self._parameters
+        y = z1 + p['noise_std'] * self._random.standard_normal(len(z1))
+        return quantised(y, p['quantisation'])
+
+
+def quantised(y: Floats, step: float) -> Floats:
+    """Return y rounded to multiples of `step`, or as it is for 0."""
+    return np.round(y / step) * step if step > 0.0 else y

@@ -59,7 +59,7 @@ def take(
     if ints[at.NOMINAL]:
         ints[at.NOW] += ints[at.PERIOD]
         now = ints[at.NOW]
-    elif ints[at.CLOCK] and stamp != 0:
+    elif ints[at.CLOCK]:
         now = clock_time(ints, stamp)
     if not abs(y) <= reals[at.LIMIT]:  # also NaN
         word = REJECTED_MEASUREMENT

@@ -116,17 +116,6 @@ def forget(ints: Ints, reals: Floats, now: int) -> None:
     ints[at.TIMED] = 1
 
 
-def settled(ints: Ints, stamp: int) -> None:
-    """Write what is remembered after an accepted sample with this stamp that followed others."""
-    ints[at.VALID] = ints[at.TIMED] = 1
-    now = ints[at.NOW] if ints[at.NOMINAL] else stamp
-    ints[at.STAMP] = stamp
-    ints[at.LATEST] = ints[at.CHANGED] = ints[at.SEEN] = now
-    ints[at.TICK] = ints[at.PLACED] = stamp
-    ints[at.TICK_COUNT] = 1
-    ints[at.HELD] = ints[at.BRIDGED] = ints[at.SPIKES] = ints[at.STUCK] = ints[at.LOST] = 0
-
-
 @njit(cache=True, error_model='numpy', forceinline=True)
 def update_mean(ints: Ints, reals: Floats, elapsed: int) -> None:
     """Take an interval into the running means; a gap can't do more than double them."""

@@ -13,7 +13,7 @@ from fhaosmo_ros.nodes.health import Health
 from fhaosmo_ros.nodes.messages import read_double
 from fhaosmo_ros.nodes.outputs import Outputs
 from fhaosmo_ros.nodes.publishers import PublisherWatch
-from fhaosmo_ros.nodes.snapshots import Snapshots
+from fhaosmo_ros.nodes.snapshots import SnapshotPublisher
 from fhaosmo_ros.nodes.subscription import input_qos, subscribe_with_info
 from rclpy.node import Node
 from std_msgs.msg import Float64
@@ -67,7 +67,7 @@ class Channel:
         self._forget()
         observer = self.estimator.observer
         self._outputs = Outputs(node, outputs, observer.order, observer.levels)
-        self._snapshots = Snapshots(node, outputs, self.estimator)
+        self._snapshots = SnapshotPublisher(node, self.estimator, outputs)
         self._health = Health(self.estimator, values)
         qos = input_qos(values)
         self._y = subscribe_with_info(node, Float64, inputs + 'y', self._on_sample, qos, raw=True)
@@ -89,7 +89,7 @@ class Channel:
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
         self.estimator.reset()
-        self._snapshots.started()
+        self._snapshots.reset()
         self._forget()
         self._active = True
         self._start_timer()
@@ -189,11 +189,10 @@ class Channel:
         if not word & REJECTED:
             health = self._health
             self._arrived = True
+            self._snapshots.accepted(stamp)
             health.latest = perf_counter()
             health.stamps.append(stamp)
             health.unknown_inputs.append(unknown_input)
-            if self._snapshots.due:
-                self._snapshots.publish()
         if word & TOLD:
             self._tell(word, y)
 
@@ -239,7 +238,6 @@ class Channel:
     def publish(self) -> None:
         """Publish the latest estimate, unless samples have stopped coming."""
         estimator = self.estimator
-        self._snapshots.tick()
         if self._is_stale():
             return
         estimate = estimator.estimate
@@ -267,7 +265,7 @@ class Channel:
     def reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start the observer afresh."""
         self.estimator.reset()
-        self._snapshots.started()
+        self._snapshots.reset()
         response.success = True
         response.message = 'the observer starts afresh with the next sample'
         self._logger.info(f'reset: {response.message}')

@@ -79,10 +79,6 @@ class QueuedChannel(Channel):
         return super().freeze(request, response)
 
     def _take(self, stamp: int, y: float) -> None:
-        if self._snapshots.due:  # what is wanted is the state right after this sample
-            self._queue.step()
-            super()._take(stamp, y)
-            return
         queue = self._queue
         queue.channel.append(self._index)
         queue.stamps.append(stamp)

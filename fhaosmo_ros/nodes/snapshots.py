@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An estimator's state on ~/snapshot, so that a replay can follow a live run exactly."""
-
-from time import perf_counter
+"""What an estimator remembers, on a topic: so that a replay can follow a live run exactly."""
 
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.snapshot import Flag, labels, pack, Snapshot
@@ -15,58 +13,53 @@ LATE = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """A recorder that comes late still gets the latest ones."""
 
 
-class Snapshots:
+class SnapshotPublisher:
     """
-    Publishes after a start, after a live change and once a second, each at the next sample.
-
-    At a sample that was accepted next to nothing is left over from rejected ones, so the
-    observer's state, the timing and the freeze are all there is to know.
+    Publishes once a second, after the first sample, and after each live change and reset.
 
     Parameters
     ----------
     node : Node
+    estimator : OnlineEstimator
     prefix : str
         Stands before the topic's name.
-    estimator : OnlineEstimator
-
-    Attributes
-    ----------
-    due : bool
-        True if `publish` has to be called at the next sample that is accepted.
 
     """
 
-    def __init__(self, node: Node, prefix: str, estimator: OnlineEstimator) -> None:
+    def __init__(self, node: Node, estimator: OnlineEstimator, prefix: str) -> None:
         self._node, self._estimator = node, estimator
-        self.due = False
-        self._flags = Flag(0)
-        self._latest = perf_counter()
+        self._due, self._first = True, True
         self._encode = array_encoder(labels(estimator.observer.levels))
-        self._publisher = node.create_publisher(Float64MultiArray, f'{prefix}snapshot', LATE)
+        self._publisher = node.create_publisher(Float64MultiArray, prefix + 'snapshot', LATE)
+        self._timer = node.create_timer(PERIOD, self._request)
 
-    def tick(self) -> None:
-        """Ask for one if the latest is old; to be called now and then."""
-        self.due = self.due or perf_counter() - self._latest >= PERIOD
+    def _request(self) -> None:
+        self._due = True
 
-    def started(self) -> None:
-        """Say that the observer starts afresh with the next sample."""
-        self.due = True
-        self._flags |= Flag.STARTED
+    def accepted(self, stamp: int) -> None:
+        """Publish if it is time to; to be called for each sample that was accepted."""
+        if self._due:
+            # In a queue the observer may be samples ahead of this one.
+            begins = self._first and stamp == self._estimator.latest
+            self._publish(Flag.STARTED if begins else Flag(0))
 
     def changed(self) -> None:
-        """Say that the next sample is the first that is taken with other parameters."""
-        self.due = True
-        self._flags |= Flag.CHANGED
+        """Tell that something is different after the latest sample: parameters, or `freeze`."""
+        self._publish(Flag.CHANGED)
 
-    def publish(self) -> None:
-        """Publish the state after the sample that was just accepted."""
-        estimator = self._estimator
-        flags = self._flags | (Flag.FROZEN if estimator.frozen else Flag(0))
-        state, timing = estimator.observer.state, estimator.timing
-        snapshot = Snapshot(estimator.stamp or 0, flags, timing, state)
-        self._publisher.publish(self._encode(pack(snapshot)))
-        self.due, self._flags, self._latest = False, Flag(0), perf_counter()
+    def reset(self) -> None:
+        """Tell that the next sample is the first again."""
+        self._publish(Flag.RESET)
+        self._due = self._first = True
+
+    def _publish(self, flags: Flag) -> None:
+        stamp = self._estimator.latest
+        if stamp is not None:
+            snapshot = Snapshot(stamp, flags, self._estimator.memory)
+            self._publisher.publish(self._encode(pack(snapshot)))
+            self._due = self._first = False
 
     def destroy(self) -> None:
         """Take the topic away."""
+        self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)

@@ -150,7 +150,9 @@ def _check_arguments(name: str, argv: list[str]) -> None:
             load(os.path.expanduser(word), full_name, table)
         elif flag in ('-p', '--param') and ':=' in word:
             target, text = word.split(':=', 1)
-            parameter = target.rsplit(':', 1)[-1]
+            node, _, parameter = target.rpartition(':')
+            if node and node != full_name.rsplit('/', 1)[-1]:
+                continue  # another node's
             if parameter not in table and not is_built_in(parameter):
                 raise ConfigurationError(
                     f"unknown parameter '{parameter}'{suggestion(parameter, table)}"

@@ -12,6 +12,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 DEPTH = 5000
 DISCOVERY_PERIOD = 0.2
+SHARED = ('/parameter_events', '/rosout', '/diagnostics', '/tf', '/tf_static')
+"""Topics of many publishers: the numbers of their messages tell nothing."""
 
 
 class NewTopic(NamedTuple):
@@ -83,17 +85,18 @@ class TopicRecorder(PrivateNode):
             profiles = [p.qos_profile for p in publishers]
             self.queue.put(NewTopic(topic, types[0], [_plain(p) for p in profiles]))
             subscribe_with_info(
-                self.node, message_class, topic, self._callback(topic), _matching(profiles),
-                raw=True,
+                self.node, message_class, topic,
+                self._callback(topic, len(publishers) == 1 and topic not in SHARED),
+                _matching(profiles), raw=True,
             )  # fmt: skip
 
-    def _callback(self, topic: str) -> Any:
+    def _callback(self, topic: str, numbered: bool) -> Any:
         put = self.queue.put
         latest = 0
 
         def receive(data: bytes, info: Mapping[str, int]) -> None:
             nonlocal latest
-            number = info.get('publication_sequence_number') or 0
+            number = info.get('publication_sequence_number') or 0 if numbered else 0
             if latest and number > latest + 1:
                 self.lost[topic] = self.lost.get(topic, 0) + number - latest - 1
             elif 0 < number <= latest:  # another publisher: its numbers tell nothing

@@ -16,7 +16,7 @@ from fhaosmo_ros.tools.bag_writer import BagWriter
 from fhaosmo_ros.tools.command import Interrupted, run_command
 from fhaosmo_ros.tools.figures import save_run
 from fhaosmo_ros.tools.output import OutputFolder
-from fhaosmo_ros.tools.processes import NodeProcesses
+from fhaosmo_ros.tools.processes import Children
 from fhaosmo_ros.tools.run_report import read_run, table
 from fhaosmo_ros.tools.share import shipped
 from tqdm import tqdm
@@ -98,21 +98,21 @@ def _record(folder: Path, parameters: Path, duration: float, stop: Stop) -> None
     with (
         BagWriter(folder / 'bag', types) as bag,
         Recorder(RUN_TOPICS, bag.write) as recorder,
-        NodeProcesses(folder) as nodes,
+        Children(folder) as nodes,
     ):
         options = ('--ros-args', '--params-file', str(parameters))
-        nodes.start('estimator', *options)
+        nodes.start_node('estimator', *options)
         _wait(
             'the estimator (the first start compiles, some 10 s)',
             lambda: recorder.publishers('/estimator/state') and recorder.subscribers('/y') >= 2,
             nodes, stop,
         )  # fmt: skip
-        nodes.start('plant', *options)
+        nodes.start_node('plant', *options)
         _wait('the first estimate', lambda: recorder.counts['/estimator/state'], nodes, stop)
         _watch(recorder, nodes, duration, stop)
 
 
-def _wait(what: str, ready: Callable[[], object], nodes: NodeProcesses, stop: Stop) -> None:
+def _wait(what: str, ready: Callable[[], object], nodes: Children, stop: Stop) -> None:
     deadline = time.monotonic() + START_DEADLINE
     print(f'waiting for {what} ...', flush=True)
     while not ready():
@@ -123,7 +123,7 @@ def _wait(what: str, ready: Callable[[], object], nodes: NodeProcesses, stop: St
             raise ConfigurationError(f'waited {START_DEADLINE:g} s for {what}, in vain')
 
 
-def _watch(recorder: Recorder, nodes: NodeProcesses, duration: float, stop: Stop) -> None:
+def _watch(recorder: Recorder, nodes: Children, duration: float, stop: Stop) -> None:
     """Show a progress bar until the time is over or the user has seen enough."""
     begin = time.monotonic()
     with tqdm(

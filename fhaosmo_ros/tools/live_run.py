@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
-from fhaosmo_ros.core.snapshot import Flag, Snapshot, unpack
+from fhaosmo_ros.core.policy_layout import FROZEN
+from fhaosmo_ros.core.snapshot import Flag, INTEGERS, Snapshot, unpack
 from fhaosmo_ros.tools.bag_reader import BagReader, Block
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ VALUE_FIELDS = {
 
 
 class Event(NamedTuple):
-    """What the live estimator told of one sample: its state, and what it did before it."""
+    """What the live estimator told of one sample: its memory, and what changed there."""
 
     time: int
     snapshot: Snapshot
@@ -69,7 +70,8 @@ def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Even
     ----------
     reader : BagReader
     name : str
-        Full name of the estimator's node.
+        What stands before the estimator's topics: the node's full name, and that of the channel
+        if it has many.
     fixed : iterable of str
         Parameters whose live changes are not to be repeated.
 
@@ -79,10 +81,9 @@ def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Even
     topics = {f'{name}/{TOPIC}', EVENTS} & {c.topic for c in reader.connections}
     for topic, time, message in reader.few(topics):
         if topic == EVENTS:
-            own = message.node == name
-            if own or name.startswith(f'{message.node}/'):  # a channel of that node
-                prefix = '' if own else name.removeprefix(f'{message.node}/') + '.'
-                changes |= _changes(message.changed_parameters, prefix, set(fixed))
+            if name == message.node or name.startswith(f'{message.node}/'):
+                channel = name.removeprefix(message.node).strip('/')
+                changes |= _changes(message.changed_parameters, channel, set(fixed))
             continue
         try:
             snapshot = unpack(message.data)
@@ -91,7 +92,7 @@ def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Even
                 f'topic {topic!r}: expected snapshots of this version ({error}); --afresh does '
                 'without them'
             ) from None
-        # The node publishes the change first, then the snapshot of the first sample after it.
+        # The node publishes the change first, then the snapshot.
         took_them = not events or snapshot.flags & (Flag.CHANGED | Flag.STARTED)
         events.append(Event(time, snapshot, changes if took_them else {}))
         if took_them:
@@ -99,12 +100,11 @@ def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Even
     return events
 
 
-def _changes(parameters: Sequence[Any], prefix: str, fixed: set[str]) -> dict[str, Any]:
+def _changes(parameters: Sequence[Any], channel: str, fixed: set[str]) -> dict[str, Any]:
     values = {}
     for parameter in parameters:
-        name = parameter.name.removeprefix(prefix)
-        known = parameter.name.startswith(prefix) and name in ONLINE_PARAMETERS
-        if known and name not in fixed:
+        of_channel, _, name = parameter.name.rpartition('.')
+        if of_channel == channel and name in ONLINE_PARAMETERS and name not in fixed:
             value = getattr(parameter.value, VALUE_FIELDS[parameter.value.type])
             values[name] = ONLINE_PARAMETERS[name].coerce(value)
     return values
@@ -134,7 +134,6 @@ class LiveRun:
         self.left_out = 0
         self._followed = self._resumed = False
         self._same = self._other = 0
-        self._largest = 0.0
 
     def begin(self, blocks: Iterator[Block]) -> Iterator[Block]:
         """Yield the samples from the one on at which the live estimator's state is known."""
@@ -164,15 +163,13 @@ class LiveRun:
         yield from chain(held, blocks)
 
     def _adopt(self, event: Event) -> bool:
-        """Return True if the state after the event's sample is now the estimator's too."""
+        """Return True if the memory after the event's sample is now the estimator's too."""
         if event.snapshot.flags & Flag.STARTED:
             return False  # the sample itself is the first
         self._configure(event)
-        self._estimator.freeze(bool(event.snapshot.flags & Flag.FROZEN))
         self._events.popleft()
         try:
-            snapshot = event.snapshot
-            self._estimator.resume(snapshot.stamp, snapshot.state, snapshot.timing)
+            self._estimator.remember(event.snapshot.memory)
         except ConfigurationError:  # an observer of another size starts there
             return False
         self._resumed = True
@@ -183,29 +180,37 @@ class LiveRun:
         position = 0
         while self._events:
             event = self._events[0]
-            found = np.flatnonzero(stamps[position:] == event.snapshot.stamp)
-            if not len(found) and event.snapshot.stamp > stamps.max():
+            stamp, flags, _ = event.snapshot
+            found = np.flatnonzero(stamps[position:] == stamp)
+            if not len(found) and stamp > stamps.max():
                 break  # in a later block
             self._events.popleft()
-            # Where the bag lacks the very sample, the next one has to do.
-            at = position + int(found[0]) if len(found) else _next(stamps, position, event)
-            if event.snapshot.flags:
+            # Where the bag lacks the very sample, it happens before the next one.
+            at = position + int(found[0]) if len(found) else _next(stamps, position, stamp)
+            if flags & Flag.STARTED:
                 if at > position:
                     yield slice(position, at)
                 position = at
-                self._repeat(event)
-            if len(found):
-                yield slice(position, at + 1)
-                position = at + 1
+                self._configure(event)
+                self._estimator.reset()
+            end = at + 1 if len(found) else at
+            if end > position:
+                yield slice(position, end)
+                position = end
+            self._repeat(event)
+            if len(found) or self._estimator.latest == stamp:
                 self._compare(event.snapshot)
         if position < len(stamps):
             yield slice(position, len(stamps))
 
     def _repeat(self, event: Event) -> None:
-        self._configure(event)
-        if event.snapshot.flags & Flag.STARTED:
+        """Do what was done after the event's sample."""
+        _, flags, memory = event.snapshot
+        if not flags & Flag.STARTED:
+            self._configure(event)
+        if flags & Flag.RESET:
             self._estimator.reset()
-        self._estimator.freeze(bool(event.snapshot.flags & Flag.FROZEN))
+        self._estimator.freeze(bool(memory.integers[INTEGERS.index(FROZEN)]))
 
     def _configure(self, event: Event) -> None:
         if not event.changes:
@@ -219,17 +224,12 @@ class LiveRun:
             ) from None
 
     def _compare(self, snapshot: Snapshot) -> None:
-        ours, theirs = self._estimator.observer.state, snapshot.state
-        if self._estimator.stamp != snapshot.stamp or ours.levels.shape != theirs.levels.shape:
-            self._other += 1
-            return
-        a = np.concatenate([ours.levels.ravel(), ours.memory])
-        b = np.concatenate([theirs.levels.ravel(), theirs.memory])
-        if np.allclose(a, b, rtol=AGREEMENT, atol=AGREEMENT):
+        ours, theirs = self._estimator.memory.now, snapshot.memory.now
+        same = self._estimator.latest == snapshot.stamp and ours.shape == theirs.shape
+        if same and np.allclose(ours, theirs, rtol=AGREEMENT, atol=AGREEMENT, equal_nan=True):
             self._same += 1
         else:
             self._other += 1
-            self._largest = max(self._largest, float(np.abs(a - b).max()))
 
     def report(self) -> str:
         """Return a line on how far the live estimator was followed."""
@@ -247,6 +247,6 @@ class LiveRun:
         return text
 
 
-def _next(stamps: NDArray[np.int64], position: int, event: Event) -> int:
-    later = np.flatnonzero(stamps[position:] > event.snapshot.stamp)
+def _next(stamps: NDArray[np.int64], position: int, stamp: int) -> int:
+    later = np.flatnonzero(stamps[position:] > stamp)
     return position + int(later[0]) if len(later) else len(stamps)

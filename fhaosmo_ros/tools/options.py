@@ -66,16 +66,17 @@ def online_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     try:
         OnlineEstimator(own)
     except ConfigurationError as error:
-        name = re.match(r"parameter '([^']+)'", str(error))
-        path = origin.get(name[1]) if name else None
+        found = re.match(r"parameter '([^']+)'", str(error))
+        name = found[1] if found else ''
+        path = origin.get(f'{arguments.channel}.{name}', origin.get(name))
         raise ConfigurationError(f'{path}: {error}' if path else str(error)) from None
     return own
 
 
 def named(arguments: argparse.Namespace) -> list[str]:
-    """Return the parameters that -p sets, by their names in the channel."""
-    prefix = f'{arguments.channel}.'
-    return [name.removeprefix(prefix) for name in _on_command_line(arguments)]
+    """Return the parameters of the update path that -p sets."""
+    names = [name.removeprefix(f'{arguments.channel}.') for name in _on_command_line(arguments)]
+    return [name for name in names if name in ONLINE_PARAMETERS]
 
 
 def assigned(rules: Sequence[str], table: ParameterTable) -> dict[str, Any]:

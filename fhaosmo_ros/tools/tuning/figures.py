@@ -95,7 +95,7 @@ def save_sensitivity(
 
 
 def save_front(
-    all_values: Floats, front: Floats, chosen: tuple[float, float], names: tuple[str, str],
+    all_values: Floats, front: Floats, chosen: Floats, names: tuple[str, str],
     path: Path,
 ) -> None:  # fmt: skip
     """Draw two objectives of all trials, the front of them, and the one that was taken."""

@@ -32,7 +32,7 @@ from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.tools.tuning.study import Desk, Point
 import optuna
 from optuna.distributions import FloatDistribution
-from optuna.samplers import BaseSampler, CmaEsSampler, NSGAIISampler, TPESampler
+from optuna.samplers import BaseSampler, CmaEsSampler, TPESampler
 
 Values = dict[str, float]
 Objective = Callable[[Values], float | Sequence[float]]
@@ -40,7 +40,7 @@ Objective = Callable[[Values], float | Sequence[float]]
 BAD = 1e9
 """Value of an objective that is not finite: worse than any, and still to be compared."""
 SIGMA = 0.1
-"""First standard deviation of CMA-ES, as a share of each dimension's range."""
+"""First standard deviation of a search, as a share of each dimension's range."""
 
 
 class Dimension(NamedTuple):
@@ -73,19 +73,16 @@ class Result(NamedTuple):
     Attributes
     ----------
     best : dict
-        Values by name with the smallest objective (of several, the first).
+        Values by name with the smallest objective.
     value : float
     trials : list of Point
         All of the study, in the order in which they were finished; by all who shared it.
-    front : list of Point
-        Those that no other one beats in every objective, by the first objective.
 
     """
 
     best: Values
     value: float
     trials: list[Point]
-    front: list[Point]
 
 
 def minimise(
@@ -98,7 +95,6 @@ def minimise(
     storage: str | None = None,
     name: str = 'study',
     sampler: str = 'cmaes',
-    objectives: int = 1,
     population: int | None = None,
     on_trial: Callable[[int, float], None] | None = None,
     stopped: Callable[[], bool] = lambda: False,
@@ -109,7 +105,8 @@ def minimise(
     Parameters
     ----------
     objective : callable
-        From values by name to a number, or to as many as `objectives` says.
+        From values by name to a number, or to several: the first is minimised, the others are
+        kept with the trial.
     space : sequence of Dimension
     trials : int
         Evaluations that the study shall hold at the end, with those that are in it already.
@@ -121,9 +118,8 @@ def minimise(
         File of a journal, or URL of a data base, that keeps and shares the study called `name`.
         In memory by default.
     sampler : {'cmaes', 'tpe', 'random'}
-        With several objectives it is NSGA-II.
     population : int, optional
-        Of a generation of CMA-ES or NSGA-II.
+        Of a generation of CMA-ES.
     on_trial : callable, optional
         Called with the number of finished trials and the best value, from any thread, one at a
         time.
@@ -139,16 +135,17 @@ def minimise(
     check_space(space)
     jobs = jobs or os.cpu_count() or 1
     desk = Desk(
-        lambda worker: make_sampler(sampler, space, seed + worker, objectives, population),
+        lambda worker: make_sampler(sampler, space, seed + worker, population),
         {d.name: FloatDistribution(d.low, d.high, log=d.log) for d in space},
-        objectives, storage, name,
+        storage, name,
     )  # fmt: skip
 
     def evaluate(fixed: Values | None = None) -> None:
         trial = desk.ask(fixed)
         values = objective(dict(trial.params))
         several = list(values) if isinstance(values, Sequence) else [values]
-        desk.tell(trial, [float(v) if math.isfinite(v) else BAD for v in several])
+        first, *notes = (float(v) if math.isfinite(v) else BAD for v in several)
+        desk.tell(trial, first, notes)
         if on_trial is not None:
             desk.report(on_trial)
 
@@ -166,15 +163,13 @@ def minimise(
             future.result()
     points = desk.points()
     best = min(points, key=lambda point: point.values[0])
-    return Result(best.parameters, best.values[0], points, pareto(points))
+    return Result(best.parameters, best.values[0], points)
 
 
 def make_sampler(
-    kind: str, space: Sequence[Dimension], seed: int, objectives: int, population: int | None
+    kind: str, space: Sequence[Dimension], seed: int, population: int | None
 ) -> BaseSampler:
     """Return an Optuna sampler."""
-    if objectives > 1:
-        return NSGAIISampler(seed=seed, population_size=population or 50)
     if kind == 'cmaes':
         with warnings.catch_warnings():
             # x0 and sigma0 go with Optuna 6, which setup.py excludes.
@@ -208,19 +203,6 @@ def check_space(space: Sequence[Dimension]) -> None:
             raise ConfigurationError(
                 f"dimension '{d.name}': expected bounds > 0 for a logarithm, got {d.low}"
             )
-
-
-def pareto(points: Sequence[Point]) -> list[Point]:
-    """Return the points that no other one beats in one objective and equals in the rest."""
-    front: list[Point] = []
-    for point in sorted(points, key=lambda p: p.values):
-        if not any(_dominates(other, point) for other in front):
-            front.append(point)
-    return front
-
-
-def _dominates(one: Point, other: Point) -> bool:
-    return all(a <= b for a, b in zip(one.values, other.values, strict=True))
 
 
 def log_dimensions(starts: Mapping[str, Any], decades: float = 3.0) -> list[Dimension]:

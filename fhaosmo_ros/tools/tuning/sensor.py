@@ -25,8 +25,8 @@ class Sensor(NamedTuple):
 
     Attributes
     ----------
-    noise_std, quantum : float
-        In the unit of y; quantum 0 for none that shows.
+    noise_std, quantisation : float
+        In the unit of y; quantisation 0 for none that shows.
     sample_rate : float
         Hz.
     stamp_jitter : float
@@ -39,7 +39,7 @@ class Sensor(NamedTuple):
     """
 
     noise_std: float
-    quantum: float
+    quantisation: float
     sample_rate: float
     stamp_jitter: float
     dropout: float

@@ -31,7 +31,8 @@ EXCHANGE = 0.1
 """Seconds between two looks at what the others have published."""
 WINDOW = 1000
 """Trials that stay in the proposing memory: a sampler's cost grows with them."""
-WORKER = 'worker'
+WORKER, NOTES = 'worker', 'notes'
+"""What is kept with a trial."""
 
 
 class Point(NamedTuple):
@@ -42,7 +43,7 @@ class Point(NamedTuple):
     ----------
     parameters : dict
     values : tuple of float
-        Of the objectives.
+        The objective, and what was noted beside it.
 
     """
 
@@ -61,8 +62,6 @@ class Desk:
         began it.
     distributions : mapping
         Of the parameters, by name.
-    objectives : int
-        Number of values of a trial.
     storage : str or None
         See `open_storage`.
     name : str
@@ -74,18 +73,16 @@ class Desk:
         self,
         make_sampler: Callable[[int], BaseSampler],
         distributions: Mapping[str, BaseDistribution],
-        objectives: int,
         storage: str | None,
         name: str,
     ) -> None:
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         self._distributions = dict(distributions)
-        self._directions = ['minimize'] * objectives
         self._worker = f'{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:8]}'
         self._memory, self._publishing = Lock(), Lock()
         self._read, self._count, self._best = 0, 0, float('inf')
         self._looked, self._running = 0.0, 0
-        self._shared, begun = _open_study(open_storage(storage), name, self._directions)
+        self._shared, begun = _open_study(open_storage(storage), name)
         self._sampler = make_sampler(0 if begun else 1 + uuid.uuid4().int % 2**30)
         self._study = self._proposing([])
         with self._publishing:
@@ -109,7 +106,7 @@ class Desk:
         with self._memory:
             self._running += 1
             kept = self._study.get_trials(deepcopy=False)
-            if len(kept) > 2 * WINDOW and len(self._directions) == 1:
+            if len(kept) > 2 * WINDOW:
                 finished = [trial for trial in kept[-WINDOW:] if trial.state.is_finished()]
                 self._study = self._proposing(finished)
             if fixed is not None:
@@ -118,20 +115,21 @@ class Desk:
             trial.set_user_attr(WORKER, self._worker)
             return trial
 
-    def tell(self, trial: Trial, values: Sequence[float]) -> None:
-        """Take a trial's values, and publish it."""
+    def tell(self, trial: Trial, value: float, notes: Sequence[float] = ()) -> None:
+        """Take a trial's value and what to keep beside it, and publish it."""
         with self._memory:
-            done = trial.study.tell(trial, values)
+            trial.set_user_attr(NOTES, list(notes))
+            done = trial.study.tell(trial, value)
             if trial.study is not self._study:  # begun before the memory was renewed
                 self._study.add_trial(done)
         with self._publishing:
             self._shared.add_trial(done)
             self._count += 1
             self._running -= 1
-            self._best = min(self._best, values[0])
+            self._best = min(self._best, value)
 
     def report(self, listener: Callable[[int, float], None]) -> None:
-        """Call with the number of finished trials and the best first value; one at a time."""
+        """Call with the number of finished trials and the best value; one at a time."""
         with self._publishing:
             listener(self._count, self._best)
 
@@ -139,12 +137,13 @@ class Desk:
         """Return the study's finished trials in order."""
         with self._publishing:
             finished = self._shared.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        return [Point(dict(trial.params), tuple(trial.values)) for trial in finished]
+        return [
+            Point(dict(trial.params), (trial.value or 0.0, *trial.user_attrs.get(NOTES, ())))
+            for trial in finished
+        ]
 
     def _proposing(self, trials: list[FrozenTrial]) -> optuna.Study:
-        study = optuna.create_study(
-            storage=InMemoryStorage(), sampler=self._sampler, directions=self._directions
-        )
+        study = optuna.create_study(storage=InMemoryStorage(), sampler=self._sampler)
         study.add_trials(trials)
         return study
 
@@ -154,7 +153,7 @@ class Desk:
         new = [t for t in trials[self._read :] if t.user_attrs.get(WORKER) != self._worker]
         self._read = self._count = len(trials)
         if new:
-            self._best = min(self._best, *(trial.values[0] for trial in new))
+            self._best = min(self._best, *(trial.value or 0.0 for trial in new))
             with self._memory:
                 self._study.add_trials(new)
         self._looked = time.monotonic()
@@ -215,11 +214,9 @@ def open_storage(text: str | None) -> BaseStorage:
         ) from None
 
 
-def _open_study(
-    storage: BaseStorage, name: str, directions: list[str]
-) -> tuple[optuna.Study, bool]:
+def _open_study(storage: BaseStorage, name: str) -> tuple[optuna.Study, bool]:
     """Return the study of this name, and whether it was made now."""
     try:
-        return optuna.create_study(storage=storage, study_name=name, directions=directions), True
+        return optuna.create_study(storage=storage, study_name=name), True
     except optuna.exceptions.DuplicatedStudyError:
         return optuna.load_study(storage=storage, study_name=name), False

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One tuning: from data and parameters to the best gains, before anything is written."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import hashlib
 import json
 import math
@@ -12,15 +12,29 @@ from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.observer import Observer
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
 from fhaosmo_ros.tools.tuning.objective import Objective
-from fhaosmo_ros.tools.tuning.search import minimise, Result, Values
+from fhaosmo_ros.tools.tuning.search import minimise, Values
 from fhaosmo_ros.tools.tuning.source import Data
 from fhaosmo_ros.tools.tuning.space import changes, make_space
+from fhaosmo_ros.tools.tuning.study import Point
 from fhaosmo_ros.tools.tuning.theory import candidates, effective_noise
 from tqdm import tqdm
 
 DIGITS = 4
 """Of the gains that are written, unless rounding makes them worse by more than `LOSS`."""
 LOSS = 1e-3
+
+
+PARETO_WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+"""Of the second objective, a search each."""
+
+
+class Marks(NamedTuple):
+    """What is kept of a trial; see `Verdict`."""
+
+    objective: float
+    error: float
+    chatter: float
+    settling: float
 
 
 class Found(NamedTuple):
@@ -31,7 +45,7 @@ class Found(NamedTuple):
     ----------
     best : dict
         Values by dimension, rounded.
-    result : Result
+    trials : list of Point
     seconds : float
     pareto : str or None
         Second objective.
@@ -39,7 +53,7 @@ class Found(NamedTuple):
     """
 
     best: Values
-    result: Result
+    trials: list[Point]
     seconds: float
     pareto: str | None
 
@@ -105,7 +119,7 @@ class Tuner:
         recordings = self.data.training
         several = candidates(recordings, levels, effective_noise(recordings))
         chosen = ({k: v for k, v in gains.items() if k in names} for gains in several)
-        return min(chosen, key=lambda gains: self._judge(gains)[0])
+        return min(chosen, key=lambda gains: self._judge(gains).objective)
 
     @property
     def study_name(self) -> str:
@@ -118,18 +132,16 @@ class Tuner:
             digest.update(recording.y.tobytes())
         return f'tune-{digest.hexdigest()[:16]}'
 
-    def judge(self, values: Values, pareto: str | None = None) -> tuple[float, ...]:
-        """Return the objective, or the two, of the training at a point of the space."""
-        return self._judge(changes(values), pareto)
+    def judge(self, values: Values) -> Marks:
+        """Return the marks of the training at a point."""
+        return self._judge(changes(values))
 
-    def _judge(self, gains: Mapping[str, Any], pareto: str | None = None) -> tuple[float, ...]:
+    def _judge(self, gains: Mapping[str, Any]) -> Marks:
         try:
             verdict = self.training(gains)
         except ConfigurationError:  # out of a parameter's bounds, or not good together
-            return (math.inf,) if pareto is None else (math.inf, math.inf)
-        if pareto is None:
-            return (verdict.objective,)
-        return verdict.error, getattr(verdict, pareto)
+            return Marks(*(math.inf,) * 4)
+        return Marks(*verdict[:4])
 
     def search(
         self, trials: int, jobs: int, storage: str, sampler: str, pareto: str | None,
@@ -137,6 +149,9 @@ class Tuner:
     ) -> Found | None:  # fmt: skip
         """
         Search until the study holds `trials`, or `stopped` says so; None if it says so at once.
+
+        For a front, one search after the other minimises error + weight * `pareto`, each from the
+        best that the ones before it have seen.
 
         Raises
         ------
@@ -147,29 +162,59 @@ class Tuner:
         if stopped():
             return None
         begin = time.monotonic()
+        weights = PARETO_WEIGHTS if pareto else (0.0,)
+        each = -(-trials // len(weights))
+        points: list[Point] = []
+        with tqdm(total=each * len(weights), unit='trial', desc='tune', smoothing=0.05) as bar:
+            for weight in weights:
+                name, value = self.study_name, _value(pareto, weight)
+                space = list(self.space)
+                if pareto:
+                    name += f'-{pareto}-{weight:g}'
+                if points:
+                    start = min(points, key=lambda p: value(marks(p))).parameters
+                    space = [d._replace(start=start[d.name]) for d in space]
 
-        name = self.study_name + (f'-{pareto}' if pareto else '')
-        with tqdm(total=trials, unit='trial', desc='tune', smoothing=0.05) as bar:
+                def objective(values: Values, value: Any = value) -> tuple[float, ...]:
+                    judged = self.judge(values)
+                    return (value(judged), *judged)
 
-            def show(count: int, best: float) -> None:
-                if not bar.n:
-                    bar.initial = count - 1
-                bar.set_postfix_str(f'best {best:.4f}', refresh=False)
-                bar.update(count - bar.n)
+                def show(count: int, best: float, done: int = len(points)) -> None:
+                    if not bar.n:
+                        bar.initial = count - 1
+                    bar.set_postfix_str(f'best {best:.4f}', refresh=False)
+                    bar.update(done + count - bar.n)
 
-            result = minimise(
-                lambda values: self.judge(values, pareto), self.space, trials, seed=self.seed,
-                jobs=jobs, storage=storage, name=name, sampler=sampler,
-                objectives=2 if pareto else 1, on_trial=show, stopped=stopped,
-            )  # fmt: skip
-        best = result.best
-        if pareto is not None:
-            # Of the front, the one that the weights prefer.
-            weight = self.tuning[f'{pareto}_weight']
-            best = min(
-                result.front, key=lambda point: point.values[0] + weight * point.values[1]
-            ).parameters
-        rounded = {key: float(f'{value:.{DIGITS}g}') for key, value in best.items()}
-        if self.judge(rounded)[0] <= (1.0 + LOSS) * self.judge(best)[0]:
+                points += minimise(
+                    objective, space, each, seed=self.seed, jobs=jobs, storage=storage, name=name,
+                    sampler=sampler, on_trial=show, stopped=stopped,
+                ).trials  # fmt: skip
+                if stopped():
+                    break
+        best = min(points, key=lambda point: marks(point).objective).parameters
+        rounded = {key: float(f'{v:.{DIGITS}g}') for key, v in best.items()}
+        if self.judge(rounded).objective <= (1.0 + LOSS) * self.judge(best).objective:
             best = rounded
-        return Found(best, result, time.monotonic() - begin, pareto)
+        return Found(best, points, time.monotonic() - begin, pareto)
+
+
+def marks(point: Point) -> Marks:
+    """Return what was noted with a trial."""
+    return Marks(*point.values[1:])
+
+
+def front(points: Sequence[Point], second: str) -> list[Marks]:
+    """Return the marks that no other ones beat in error and in `second`, by error."""
+    found: list[Marks] = []
+    best = math.inf
+    for mark in sorted(map(marks, points), key=lambda m: (m.error, getattr(m, second))):
+        if getattr(mark, second) < best:
+            best = getattr(mark, second)
+            found.append(mark)
+    return found
+
+
+def _value(pareto: str | None, weight: float) -> Callable[[Marks], float]:
+    if pareto is None:
+        return lambda mark: mark.objective
+    return lambda mark: mark.error + weight * float(getattr(mark, pareto))

@@ -11,7 +11,7 @@ from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETER
 from fhaosmo_ros.tools.tuning import figures, report
 from fhaosmo_ros.tools.tuning.search import Dimension, Values
 from fhaosmo_ros.tools.tuning.space import changes
-from fhaosmo_ros.tools.tuning.tuner import Found, Tuner
+from fhaosmo_ros.tools.tuning.tuner import Found, front, marks, Tuner
 import numpy as np
 from tqdm import tqdm
 
@@ -20,6 +20,10 @@ POINTS = 7
 REACH = 1.0
 """How far they go from the best one, in powers of ten or (linear) halves of the range."""
 SHOWN = 3
+SECOND = {
+    'chatter': 'chatter of d, powers of ten',
+    'settling': 'settling, share of the time',
+}
 
 
 def write(folder: Path, tuner: Tuner, found: Found, command: str) -> str:
@@ -57,14 +61,16 @@ def write(folder: Path, tuner: Tuner, found: Found, command: str) -> str:
         folder / 'sensitivity.png',
     )  # fmt: skip
     if found.pareto is not None:
-        values, front = (
-            np.array([p.values for p in points])
-            for points in (found.result.trials, found.result.front)
-        )
-        verdict = tuned[0].verdict
+        chosen, *lists = (
+            np.array([(mark.error, getattr(mark, found.pareto)) for mark in some])
+            for some in (
+                [tuner.judge(found.best)], map(marks, found.trials),
+                front(found.trials, found.pareto),
+            )
+        )  # fmt: skip
         figures.save_front(
-            values, front, (verdict.error, getattr(verdict, found.pareto)),
-            ('error, relative to the truth', found.pareto), folder / 'pareto.png',
+            *lists, chosen[0], ('error, relative to the truth', SECOND[found.pareto]),
+            folder / 'pareto.png',
         )  # fmt: skip
     return main
 
@@ -85,7 +91,7 @@ def _comments(tuner: Tuner, found: Found, command: str, tuned: list[report.Colum
     lines = [
         'Made by',
         f'    python -m fhaosmo_ros {command}',
-        f'({len(found.result.trials)} trials, fhaosmo_ros {__version__}) '
+        f'({len(found.trials)} trials, fhaosmo_ros {__version__}) '
         f'for: {tuner.data.origin}.',
     ]  # fmt: skip
     if not tuner.data.origin.startswith('pieces'):
@@ -106,7 +112,7 @@ def _document(tuner: Tuner, found: Found, command: str, main: str) -> str:
     parts = [
         '# Tuning',
         f'    python -m fhaosmo_ros {command}',
-        f'{len(found.result.trials)} trials in the study, {found.seconds:.0f} s in this run; '
+        f'{len(found.trials)} trials in the study, {found.seconds:.0f} s in this run; '
         f'{len(tuner.data.training)} recordings to train on, {len(tuner.data.held_out)} held out: '
         f'{tuner.data.origin}.',
         '## Result', main,
@@ -152,7 +158,7 @@ def _sensitivities(tuner: Tuner, best: Values) -> dict[str, tuple[Any, Any]]:
     curves = {}
     for d in tqdm(tuner.space, desc='sensitivity', unit='parameter', leave=False):
         x = np.unique(np.append(_around(d, best[d.name]), best[d.name]))
-        value = [tuner.judge(best | {d.name: float(v)})[0] for v in x]
+        value = [tuner.judge(best | {d.name: float(v)}).objective for v in x]
         curves[d.name] = (x, np.array(value))
     return curves
 
