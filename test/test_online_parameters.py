@@ -26,6 +26,8 @@ class Change:
 
 SEED = [0.0, 1.0, 2.0, 3.0]
 CHANGES = {
+    'unknown_input_decay': Change(50.0),
+    'structure': Change('levant'),
     'variant': Change('sign'),
     'scheme': Change('explicit'),
     'lambda': Change(500.0),

@@ -191,21 +191,20 @@ def test_gap_of_exactly_max_gap_is_bridged():
     only(estimator, gaps=1, sub_steps=300)
 
 
-def test_prediction_is_the_plant_to_second_order():
+@pytest.mark.parametrize('decay', [0.0, 3.0])
+def test_prediction_is_the_plant_to_second_order(decay):
     model = TriangularModel(['u - z1', 'sin(z1)', '-z3*z2'])
     start, u, d = np.array([0.4, -0.3, 0.8]), 0.7, 0.5
 
     def slope(_, z):
-        return [z[1] + u - z[0], z[2] + np.sin(z[0]), d - z[2] * z[1]]
+        return [z[1] + u - z[0], z[2] + np.sin(z[0]), z[3] - z[2] * z[1], -decay * z[3]]
 
-    truth = solve_ivp(slope, (0.0, 0.5), start, rtol=1e-12, atol=1e-12).y[0, -1]
+    truth = solve_ivp(slope, (0.0, 0.5), [*start, d], rtol=1e-12, atol=1e-12).y[0, -1]
     levels, memory = np.zeros((ROWS, 4)), np.zeros(SCALARS)
     memory[Y], levels[TILDE] = start[0], [start[1], start[2], d, 9.9]
     m, stack, z = np.zeros((2, 4)), np.zeros((2, model.depth)), np.zeros(4)
-    errors = [
-        abs(ahead(model.tape, model.offsets, m, stack, levels, memory, z, 0.5 / n, u, n) - truth)
-        for n in (50, 100, 200)
-    ]
+    work = (model.tape, model.offsets, m, stack, decay, levels, memory, z)
+    errors = [abs(ahead(*work, 0.5 / n, u, n) - truth) for n in (50, 100, 200)]
     assert errors[-1] < 1e-6
     np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 4.0, rtol=0.1)
 

@@ -130,6 +130,7 @@ class OnlineEstimator:
         ints[at.GATE_SAMPLES] = p['spike_gate_samples']
         reals[at.GATE] = p['spike_gate']
         reals[at.LIMIT] = p['divergence_limit']
+        reals[at.EPSILON] = self.observer.parameters['epsilon']
         if p['sampling'] != before:
             self.forget_stamp()
         state = self.observer.state

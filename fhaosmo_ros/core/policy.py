@@ -91,7 +91,7 @@ def take(
     if elapsed > 0 and not word & REJECTED_SPIKE:
         ints[at.LATEST] = now
         failed = word & REJECTED_STEP != 0
-        if has_diverged(scalars, levels, ints, reals, eps[row, 0], failed, now):
+        if has_diverged(levels, ints, reals, eps[row, 0], failed, now):
             refresh(ints, reals, levels, memory)
             levels[HAT, 0] = memory[Y] = y
             ints[at.DIVERGENCES] += 1

@@ -2,7 +2,6 @@
 """The policy's rules for values (see policy.py), each a small compiled function."""
 
 from fhaosmo_ros.core import policy_layout as at
-from fhaosmo_ros.core.law import EPSILON
 from fhaosmo_ros.core.layout import HAT, TILDE
 from fhaosmo_ros.core.policy_time import difference
 from fhaosmo_ros.core.tape import Floats, Ints
@@ -44,14 +43,13 @@ def is_spike(ints: Ints, reals: Floats, innovation: float) -> bool:
 
 @njit(cache=True, error_model='numpy', forceinline=True)
 def has_diverged(
-    scalars: Floats, levels: Floats, ints: Ints, reals: Floats,
-    innovation: float, failed: bool, now: int,
-) -> bool:  # fmt: skip
+    levels: Floats, ints: Ints, reals: Floats, innovation: float, failed: bool, now: int
+) -> bool:
     """Return True if the state is beyond divergence_limit, or y is lost for divergence_time."""
     for i in range(levels.shape[1]):
         if not max(abs(levels[HAT, i]), abs(levels[TILDE, i])) <= reals[at.LIMIT]:
             return True
-    if not failed and abs(innovation) <= scalars[EPSILON]:
+    if not failed and abs(innovation) <= reals[at.EPSILON]:
         ints[at.LOST] = 0
         return False
     if not ints[at.LOST]:

@@ -54,10 +54,11 @@ COUNTERS = 30
 
 GATE = 0
 LIMIT = 1
-INTERVAL = 2  # running mean of dt, ns
-JITTER = 3  # running mean of its deviation, ns
-HELD_Y = 4
-STATES = 5  # two copies of a state begin here
+EPSILON = 2
+INTERVAL = 3  # running mean of dt, ns
+JITTER = 4  # running mean of its deviation, ns
+HELD_Y = 5
+STATES = 6  # two copies of a state begin here
 
 
 def make_policy(levels: int, memory: int) -> tuple[Ints, Floats]:

@@ -3,6 +3,7 @@
 
 from fhaosmo_ros.core import policy_layout as at
 from fhaosmo_ros.core.kernels import innovations, step
+from fhaosmo_ros.core.law import DECAY
 from fhaosmo_ros.core.layout import GAMMA, Y
 from fhaosmo_ros.core.policy_data import is_spike
 from fhaosmo_ros.core.policy_time import restore, save, update_mean, WINDOW
@@ -41,11 +42,11 @@ def step_over(
             count = min(-(-elapsed // ints[at.MAX_STEP]), MOST_SUB_STEPS)
     elif ints[at.INTERVALS] == WINDOW and elapsed > GAP_RATIO * reals[at.INTERVAL]:
         count = int(min(elapsed / reals[at.INTERVAL] + 0.5, MOST_SUB_STEPS))
-    h = elapsed * NANOSECONDS / count
+    h, decay = elapsed * NANOSECONDS / count, gains[DECAY, offsets.shape[0] - 3]
     gamma, word, bend, modelled, z = memory[GAMMA], 0, 0.0, True, x[0]
     if count > 1 or reals[at.GATE] > 0.0:
         z = np.empty(offsets.shape[0] - 1)
-        end = ahead(tape, offsets, m, stack, levels, memory, z, h, u, count)
+        end = ahead(tape, offsets, m, stack, decay, levels, memory, z, h, u, count)
         modelled = abs(end) <= reals[at.LIMIT]  # False for NaN
         if not modelled:
             end = memory[Y]
@@ -65,7 +66,7 @@ def step_over(
         sample = y
         if k < count:
             if modelled:
-                advance(tape, offsets, m, stack, z, h, u)
+                advance(tape, offsets, m, stack, decay, z, h, u)
             sample = z[0] + k * bend
         word = word & FLAGS | step(
             flags, gains, curves, scalars, tape, offsets, x, m, stack,
