@@ -142,6 +142,15 @@ tune:
     assert 'noise_std: 0.001' in (out / 'report.md').read_text()
 
 
+def test_levant_is_tuned_without_what_it_does_not_use(tmp_path):
+    out = tmp_path / 'out'
+    assert main([*QUICK, '-pstructure:=levant', '-o', str(out)]) == 0
+    values = load(out / 'gains.yaml', 'estimator')
+    assert values['structure'] == 'levant'
+    assert not {'alpha', 'epsilon'} & set(values)
+    assert len(values['lambda']) == 4
+
+
 # bags
 
 

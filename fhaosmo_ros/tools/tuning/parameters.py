@@ -41,11 +41,14 @@ TUNING = (
     ),
     Parameter(
         'search',
-        ['lambda', 'alpha', 'fuzzy_widths', 'epsilon', 'gamma_initial'],
+        [
+            'lambda', 'alpha', 'fuzzy_widths', 'epsilon', 'gamma_initial',
+            'unknown_input_decay 0.001 100',
+        ],
         'Parameters of the estimator to search, each "NAME" or "NAME LOW HIGH", in logarithms '
         'where their scale is open and linearly where they lie between 0 and 1 ("NAME LOW HIGH '
         'log" or "... linear" says otherwise). A list is searched level by level. A parameter '
-        'that the variant does not use is passed over.',
+        'that variant or structure do not use is passed over.',
         live=False, lengths='1 or more',
     ),
     Parameter(

@@ -9,6 +9,7 @@ from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter import Parameter, unknown_parameter
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS
 from fhaosmo_ros.tools.tuning.search import Dimension, Values
+import numpy as np
 
 NUMBERS = ('double', 'double_array')
 SMALLEST = 1e-12
@@ -140,4 +141,6 @@ def _dimension(
             high = min(value * 10.0**decades, upper)
         else:
             low, high = lower + 0.05 * (upper - lower), upper
+    if log and value < low:  # such as 0, which a logarithm does not reach
+        value = float(np.sqrt(low * high))
     return Dimension(label, low, high, min(max(value, low), high), log)

@@ -9,7 +9,7 @@ import time
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.observer import Observer
+from fhaosmo_ros.core.observer import FIXED_GAMMA, Observer
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
 from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.search import minimise, Values
@@ -22,6 +22,8 @@ from tqdm import tqdm
 DIGITS = 4
 """Of the gains that are written, unless rounding makes them worse by more than `LOSS`."""
 LOSS = 1e-3
+GAMMAS = (0.25, 0.5)
+"""Powers that the start may have, where they are searched."""
 
 
 PARETO_WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
@@ -100,7 +102,7 @@ class Tuner:
         self.held_out = Objective(data.held_out, online, tuning, choose, self.training.scale)
         names = [rule.split()[0] for rule in tuning['search'] if rule.split()]
         given = {name: value for name, value in estimator.items() if name in names}
-        by_theory = self._by_theory(complete.levels, names)
+        by_theory = self._by_theory(complete, names)
         # The user's own gains count, too: a tuning never ends worse than they are.
         start = min(
             [by_theory, given] if given else [by_theory],
@@ -115,9 +117,16 @@ class Tuner:
         self.before = given or searched
         self.fixed = {k: v for k, v in self.estimator.items() if k not in searched}
 
-    def _by_theory(self, levels: int, names: list[str]) -> dict[str, Any]:
-        recordings = self.data.training
-        several = candidates(recordings, levels, effective_noise(recordings))
+    def _by_theory(self, complete: Observer, names: list[str]) -> dict[str, Any]:
+        recordings, p = self.data.training, complete.parameters
+        gammas = [FIXED_GAMMA]
+        if p['variant'].endswith('_adaptive'):
+            searched = 'gamma_initial' in names and 'gamma_initial' not in self.estimator
+            gammas = [g for g in GAMMAS if searched and p['gamma_min'] <= g <= p['gamma_max']]
+            gammas = gammas or [p['gamma_initial']]
+        several = candidates(
+            recordings, complete.levels, effective_noise(recordings), p['structure'], gammas
+        )
         chosen = ({k: v for k, v in gains.items() if k in names} for gains in several)
         return min(chosen, key=lambda gains: self._judge(gains).objective)
 
