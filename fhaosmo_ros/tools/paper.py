@@ -121,8 +121,8 @@ def _paper(output: Path, quick: bool) -> None:
     rows_of_map = len(findings.WIDTHS[::every])
     # The bar counts the parts by about what they cost.
     observers = len(cases.OBSERVERS | cases.OURS)
-    long = len(beyond.LONG) + len(beyond.PROTECTED)
-    long += len(cases.FREQUENCIES if quick else beyond.SWEEP)
+    sweep = cases.FREQUENCIES[:1] if quick else beyond.SWEEP
+    long = len(beyond.LONG) + len(beyond.PROTECTED) + len(sweep)
     total = len(SOLVERS) * observers + rows_of_map + 3 + len(beyond.NOISES) + long + 4
     with tqdm(total=total, unit='part', desc='paper') as bar:
         scores = measure(SOLVERS, bar.update)
@@ -141,7 +141,7 @@ def _paper(output: Path, quick: bool) -> None:
                 beyond.long_runs(beyond.PROTECTIONS, *cell, minutes, PROTECTION_WINDOW)
             )
             bar.update()
-        zones = beyond.dead_zones(cases.FREQUENCIES if quick else beyond.SWEEP, bar.update)
+        zones = beyond.dead_zones(sweep, bar.update)
         preset = cases.preset().observer
         texts = findings_texts(scores, solver) | {
             'widths': tables.map_text(widths, preset['fuzzy_widths'], every),
@@ -166,7 +166,7 @@ def _paper(output: Path, quick: bool) -> None:
 
 
 def _draw(folder: Path, solver: str, preset: dict[str, Any], bar: Any) -> None:
-    """Draw the paper's own four figures."""
+    """Draw the paper's own four figures, and ours beside simz."""
     first = cases.first_observer(1e-5, solver, cases.DURATION, every=5)
     figures.save(figures.sim1(first, ZOOM), folder, 'sim1')
     bar.update()
@@ -185,6 +185,7 @@ def _draw(folder: Path, solver: str, preset: dict[str, Any], bar: Any) -> None:
     adaptive = runs.pop(findings.ADAPTIVE)
     figures.save(figures.simz(list(runs.items()), cases.FREQUENCIES), folder, 'simz')
     figures.save(figures.simu(adaptive, cases.FREQUENCIES), folder, 'simu')
+    figures.save(figures.simz(beyond.shown(), cases.FREQUENCIES), folder, 'beyond')
     bar.update()
 
 

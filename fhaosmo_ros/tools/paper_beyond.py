@@ -4,6 +4,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.joint import JointRun
 from fhaosmo_ros.core.metrics import rms
 from fhaosmo_ros.tools.paper_cases import (
     CONVERGED,
@@ -113,6 +114,18 @@ def _row(name: str, scheme: str, step: float, omega: float, noise: float) -> Row
     variant, changes = OBSERVERS[name]
     run = sampled(variant, omega, step, scheme, noise, **changes)
     return Row(name, scheme, step, omega, noise, score(run))
+
+
+def shown() -> list[tuple[str, list[JointRun]]]:
+    """Return the runs that a figure shows beside the paper's: a name, and one a frequency."""
+    rows = [('sign, implicit', 'sign', 'implicit', 1e-3, {}),
+            ('sign, implicit', 'sign', 'implicit', 1e-2, {}),
+            ('Levant sign, explicit', 'sign', 'explicit', 1e-3, LEVANT),
+            ('Levant fuzzy, explicit', 'fuzzy', 'explicit', 1e-3, LEVANT)]  # fmt: skip
+    return [
+        (f'{name}, {step:g} s', [sampled(v, w, step, s, **changes) for w in FREQUENCIES])
+        for name, v, s, step, changes in rows
+    ]
 
 
 def schemes(tick: Callable[[], object]) -> list[Row]:

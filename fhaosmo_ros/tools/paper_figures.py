@@ -104,14 +104,14 @@ def fuzzy_systems(widths: Sequence[float], shape: str, normalise: bool) -> Figur
                     scale * np.linspace(-1, 1, terms)[k], 1.04, name, ha='center', fontsize=6
                 )
             axes.set_ylim(0.0, 1.18)
-            axes.set_ylabel('membership')
+            axes.set_ylabel('membership [1]')
         row[0].set_xlabel(f'ε of level {i + 1 if i < 2 else "3, 4"} [unit of the level]')
         row[1].set_xlabel(f'ψ{"₁₂₃"[i]} [1], before scaling to ±1')
         half = curve(terms, shape, normalise)
         grid = np.linspace(0.0, width, len(half))
         row[2].plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')
         row[2].plot([-width, 0, 0, width], [-1, -1, 1, 1], color='#999999', linestyle=':')
-        row[2].set_xlabel('ε')
+        row[2].set_xlabel('ε [unit of the level]')
         row[2].set_ylabel(f'ψ{"₁₂₃"[i]}(ε) [1]')
         row[2].grid(alpha=0.3)
     for axes, title in zip(panels[0], ('input', 'output', 'curve (dotted: sign)'), strict=True):
@@ -218,7 +218,8 @@ def protections(cells: Sequence[Sequence[LongRun]]) -> Figure:
     panels = figure.subplots(2, len(cells), sharex=True, squeeze=False)
     for (top, bottom), runs in zip(panels.T, cells, strict=True):
         for run, (colour, style, width) in zip(runs, PROTECTION_STYLES, strict=True):
-            line = {'color': colour, 'linestyle': style, 'linewidth': width, 'label': run.law}
+            line = {'color': colour, 'linestyle': style, 'linewidth': width}
+            line['label'] = run.law.replace("paper's", "paper's law")
             top.plot(run.t, run.gamma, **line)
             bottom.plot(run.t, run.rms_d, **line)
         bottom.axhline(runs[0].fixed, color='#999999', linewidth=1.0)
