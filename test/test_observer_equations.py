@@ -206,8 +206,10 @@ class Reference:
         if loss.value > p['gamma_dead_zone'] ** 2:
             gamma -= h * p['gamma_rate'] * loss.slope
             self.calm = 0.0
-        leaks = p['gamma_dead_zone'] == 0.0 or self.calm > p['gamma_leakage_delay'] - 1e-12
-        self.calm += h if loss.value <= p['gamma_dead_zone'] ** 2 else 0.0
+        rests = loss.value <= p['gamma_dead_zone'] ** 2
+        waited = self.calm > p['gamma_leakage_delay'] - 1e-12
+        leaks = p['gamma_dead_zone'] == 0.0 or (rests and waited)
+        self.calm += h if rests else 0.0
         if leaks:
             gamma -= h * p['gamma_leakage'] * (gamma - p['gamma_initial'])
         self.gamma = min(max(gamma, p['gamma_min']), p['gamma_max'])
