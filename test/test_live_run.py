@@ -18,8 +18,8 @@ ARRAY, EVENT = 'std_msgs/msg/Float64MultiArray', 'rcl_interfaces/msg/ParameterEv
 class Live:
     """What a node does and publishes, as messages of a bag."""
 
-    def __init__(self, name='/estimator', parameters=PARAMETERS):
-        self.name = name
+    def __init__(self, name='/estimator', parameters=PARAMETERS, node=None):
+        self.name, self.node = name, node or name
         self.estimator = OnlineEstimator(parameters)
         self.messages, self.rows = [], {}
         self._begins = True
@@ -54,7 +54,7 @@ class Live:
         self.estimator.configure({name: value})
         types, nothing = files.TYPES.types, np.zeros(0, np.int64)
         parameter = types['rcl_interfaces/msg/Parameter'](
-            name=name,
+            name=f'{self.name.removeprefix(self.node)}.{name}'.strip('/.'),
             value=types['rcl_interfaces/msg/ParameterValue'](
                 type=3, bool_value=False, integer_value=0, double_value=value, string_value='',
                 byte_array_value=np.zeros(0, np.uint8), bool_array_value=np.zeros(0, np.bool_),
@@ -64,7 +64,7 @@ class Live:
         )  # fmt: skip
         time = files.header(stamp).stamp
         data = files.cdr(
-            EVENT, stamp=time, node=self.name, new_parameters=[], changed_parameters=[parameter],
+            EVENT, stamp=time, node=self.node, new_parameters=[], changed_parameters=[parameter],
             deleted_parameters=[],
         )  # fmt: skip
         self.messages.append(('/parameter_events', EVENT, int(stamp) + 100_000, data))
@@ -206,6 +206,25 @@ def test_which_estimator_to_follow(tmp_path, capsys):
     code, text, _ = run(capsys, bag, '-o', out, '--follow', '/right', *OPTIONS)
     assert code == 0
     assert 'followed /right afresh after 500 samples' in text
+
+
+def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
+    stamps, y = files.signal(1500)
+    lives = [Live(f'/estimator/{name}', node='/estimator') for name in ('hip', 'knee')]
+    for k, live in enumerate(lives):
+        live.run(stamps, y, 0, 700)
+        live.change(stamps[699], 'epsilon', [1e-6, 0.5][k])
+        live.run(stamps, y, 700, 1500)
+    bag = write(tmp_path / 'bag', stamps, y, *lives)
+    (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
+    for live in lives:
+        out = tmp_path / f'{live.name.rpartition("/")[2]}.npz'
+        arguments = ['--follow', live.name, '--params-file', tmp_path / 'p.yaml', *OPTIONS]
+        code, text, _ = run(capsys, bag, '-o', out, *arguments)
+        assert code == 0
+        assert 'parameters differ' not in text
+        got = rows(out)
+        np.testing.assert_array_equal(list(got.values()), [live.rows[stamp] for stamp in got])
 
 
 def test_snapshot_of_another_version_is_said(tmp_path, capsys):

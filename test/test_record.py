@@ -16,7 +16,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
-from diagnostic_msgs.msg import DiagnosticArray
+from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.spin import Spinner
 from fhaosmo_ros.tools.bag_reader import BagReader
 from fhaosmo_ros.tools.plot_data import PARTS
@@ -125,30 +125,32 @@ def test_bag_is_complete_after_ctrl_c(storage, live, tmp_path):
 
 
 def test_replay_gives_the_live_estimates_sample_for_sample(tmp_path):
-    """The bag keeps the stamps that dt came from; ~/stamp says which sample an estimate is of."""
-    bag = tmp_path / 'bag'
-    recorder = start('record', '-o', bag, domain=APART)
-    estimator = start('estimator', *NODES, domain=APART)
-    try:
-        with Source(int(APART)) as source:
-            # NaN starts no observer: it only shows that everybody listens, from either side.
-            wait(lambda: source.send(float('nan')) and source.rejected, estimator, 'estimator')
-            wait(lambda: source.send(float('nan')) and source.listeners >= 2, recorder, 'both')
-            before = size(bag)
-            wait(lambda: source.send(float('nan')) and size(bag) > before, recorder, 'recorder')
-            for k in range(3000):
-                source.send(0.2 + 0.1 * np.sin(2e-3 * k))
-            wait(lambda: size(bag) > before + 3000 * 40, recorder, 'messages')
-    finally:
-        for process in (estimator, recorder):
-            process.send_signal(signal.SIGINT)
-            process.communicate(timeout=30)
+    """Whoever comes first: the bag tells with which sample the estimator began."""
+    for attempt in range(4):  # a machine under load loses samples
+        bag = tmp_path / f'bag{attempt}'
+        if 'lost' not in record_source(bag):
+            break
     out = tmp_path / 'out'
     arguments = ['--params-file', ROOT / 'config' / 'demo.yaml']
     result = run('replay', bag, '-o', out, *arguments)
     assert result.returncode == 0, result.stderr
     assert 'followed /estimator' in result.stdout
     compare(out)
+
+
+def record_source(bag):
+    recorder = start('record', '-o', bag, domain=APART)
+    estimator = start('estimator', *NODES, domain=APART)
+    try:
+        with Source(int(APART)) as source:
+            wait(lambda: source.send() and source.estimates > 100, estimator, 'estimates', 180)
+            more = size(bag) + 700_000
+            wait(lambda: source.send() and size(bag) > more, recorder, 'messages', 180)
+    finally:
+        for process in (estimator, recorder):
+            process.send_signal(signal.SIGINT)
+            _, error = process.communicate(timeout=30)
+    return error
 
 
 def test_replay_follows_a_run_that_began_before_the_recording(live, tmp_path):
@@ -225,29 +227,34 @@ class Hand:
 
 
 class Source:
-    """Publishes y at about 1 kHz, and counts what the estimator reports as rejected."""
+    """Publishes y at about 1 kHz, and counts the estimates."""
 
     def __init__(self, domain):
-        self.rejected = 0
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain)
         self._node = rclpy.create_node('source', context=self._context)
         self._publisher = self._node.create_publisher(Float64, '/y', 1000)
-        self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_report, 10)
+        self._node.create_subscription(Time, '/estimator/stamp', self._on_estimate, 10)
+        self.estimates = 0
         self._spinner = Spinner(self._node)
+        self._count = 0
 
+<<<<<<< HEAD
     def _on_report(self, message):
         for pair in (pair for status in message.status for pair in status.values):
             if pair.key == 'rejected measurements':
                 self.rejected = int(pair.value)
+=======
+    def _on_estimate(self, _):
+        self.estimates += 1
+>>>>>>> bags
 
-    @property
-    def listeners(self):
-        return self._publisher.get_subscription_count()
-
-    def send(self, value):
-        self._publisher.publish(Float64(data=float(value)))
-        time.sleep(1e-3)
+    def send(self):
+        """Publish for some time."""
+        for _ in range(100):
+            self._count += 1
+            self._publisher.publish(Float64(data=0.2 + 0.1 * np.sin(2e-3 * self._count)))
+            time.sleep(1e-3)
         return True
 
     def __enter__(self):
@@ -317,6 +324,34 @@ def test_wrong_arguments_are_said_in_one_line(arguments, words, tmp_path):
     assert len(lines) == 1
     assert all(word in lines[0] for word in words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_input_that_was_remapped_and_channels_are_recorded(tmp_path):
+    bag = tmp_path / 'bag'
+    channels = ['--ros-args', '-p', 'channels:=[hip, knee]', '-r', 'hip/y:=/force']
+    processes = [
+        start('record', '-o', bag, domain=APART),
+        start('estimator', *channels, domain=APART),
+        start('plant', '--ros-args', '-r', '/y:=/force', domain=APART),
+    ]
+    try:
+        wait(lambda: size(bag) > 400_000, processes[0], 'messages')
+    finally:
+        for process in reversed(processes):
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=30)
+    with BagReader(bag) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+    assert counts['/force'] > 1000
+    assert '/knee/y' not in counts  # nobody publishes it
+    assert counts.get('/estimator/hip/state')
+    out = tmp_path / 'out'
+    result = run(
+        'replay', bag, '--topic', '/force', '-o', out, '--follow', '/estimator/hip',
+        '--name', '/replay/hip',
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert 'followed /estimator/hip' in result.stdout
 
 
 def test_force_replaces_an_output(live, tmp_path):

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Subscribes topics as they appear, with the QoS of their publishers, and queues what comes."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 import importlib
 from queue import SimpleQueue
 from typing import Any, NamedTuple, Self
 
 from fhaosmo_ros.nodes.private_node import PrivateNode
 from fhaosmo_ros.nodes.subscription import subscribe_with_info
+from rclpy.node import NodeNameNonExistentError
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 DEPTH = 5000
@@ -40,6 +42,8 @@ class TopicRecorder(PrivateNode):
     ----------
     wanted : callable
         Says of a topic's name whether to record it.
+    listeners : sequence of str
+        Full names of nodes whose inputs to record as well, whatever their names.
 
     Attributes
     ----------
@@ -53,11 +57,11 @@ class TopicRecorder(PrivateNode):
 
     """
 
-    def __init__(self, wanted: Callable[[str], bool]) -> None:
+    def __init__(self, wanted: Callable[[str], bool], listeners: Sequence[str] = ()) -> None:
         self.queue: SimpleQueue[NewTopic | Sample] = SimpleQueue()
         self.problems: SimpleQueue[str] = SimpleQueue()
         self.lost: dict[str, int] = {}
-        self._wanted = wanted
+        self._wanted, self._listeners = wanted, listeners
         self._known: set[str] = set()
         super().__init__('fhaosmo_recorder')
         self.node.create_timer(DISCOVERY_PERIOD, self._discover)
@@ -67,8 +71,9 @@ class TopicRecorder(PrivateNode):
         return super().__enter__()
 
     def _discover(self) -> None:
+        inputs = self._inputs()
         for topic, types in self.node.get_topic_names_and_types():
-            if topic in self._known or not self._wanted(topic):
+            if topic in self._known or not (topic in inputs or self._wanted(topic)):
                 continue
             publishers = self.node.get_publishers_info_by_topic(topic)
             publishers = [p for p in publishers if p.node_name != self.node.get_name()]
@@ -89,6 +94,15 @@ class TopicRecorder(PrivateNode):
                 self._callback(topic, len(publishers) == 1 and topic not in SHARED),
                 _matching(profiles), raw=True,
             )  # fmt: skip
+
+    def _inputs(self) -> set[str]:
+        found = set()
+        for listener in self._listeners:
+            space, _, name = listener.rpartition('/')
+            with suppress(NodeNameNonExistentError):  # not there yet
+                topics = self.node.get_subscriber_names_and_types_by_node(name, space or '/')
+                found |= {topic for topic, _ in topics}
+        return found
 
     def _callback(self, topic: str, numbered: bool) -> Any:
         put = self.queue.put

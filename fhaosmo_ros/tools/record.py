@@ -54,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add(
         '--names', nargs='+', default=['/estimator', '/plant'], metavar='NAME',
-        help='nodes whose topics to record beside y and u (default: /estimator /plant)',
+        help='nodes whose topics, in and out, to record (default: /estimator /plant)',
     )  # fmt: skip
     add('--duration', type=float, metavar='SECONDS', help='stop by itself')
     return parser
@@ -77,10 +77,15 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     from fhaosmo_ros.nodes.topic_recorder import TopicRecorder
 
     wanted = _wanted(arguments)
+    names = [f'/{name.strip("/")}' for name in arguments.names]
+    listeners = [] if arguments.topics else names
     old = _put_aside(path)
     try:
         # Signals that it listens: nobody need guess when to start what is to be recorded.
-        with BagWriter(path, storage=arguments.storage) as bag, TopicRecorder(wanted) as recorder:
+        with (
+            BagWriter(path, storage=arguments.storage) as bag,
+            TopicRecorder(wanted, listeners) as recorder,
+        ):
             print(f'recording to {path}; Ctrl-C ends it', flush=True)
             count = _drain(recorder, bag, arguments.duration, stop)
             lost = dict(recorder.lost)
