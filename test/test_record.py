@@ -239,15 +239,8 @@ class Source:
         self._spinner = Spinner(self._node)
         self._count = 0
 
-<<<<<<< HEAD
-    def _on_report(self, message):
-        for pair in (pair for status in message.status for pair in status.values):
-            if pair.key == 'rejected measurements':
-                self.rejected = int(pair.value)
-=======
     def _on_estimate(self, _):
         self.estimates += 1
->>>>>>> bags
 
     def send(self):
         """Publish for some time."""
