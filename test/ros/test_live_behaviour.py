@@ -15,7 +15,7 @@ pytestmark = pytest.mark.ros
 from rig import EstimatorRig, parameters  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
-FIRST, SECOND = 12, 12
+FIRST, SECOND = 12, 40
 """Samples before and after the change."""
 QUICK_GAMMA = {'gamma_rate': 100.0, 'gamma_initial': 0.6}
 DEFAULTS = {
@@ -65,11 +65,14 @@ CASES = {
     'gamma_min': Case(0.6, {'gamma_initial': 0.5}, prepare={'gamma_initial': 0.6}),
     'gamma_max': Case(0.5, {'gamma_initial': 0.7}, prepare={'gamma_initial': 0.5}),
     'gamma_dead_zone': Case(1e6, QUICK_GAMMA),
-    'gamma_leakage': Case(1e3, {'gamma_initial': 0.7}, prepare={'gamma_initial': 0.5}),
-    'gamma_leakage_delay': Case(
+    'gamma_leakage': Case(
+        1e3, {'gamma_initial': 0.7, 'gamma_dead_zone': 0.0}, prepare={'gamma_initial': 0.5}
+    ),
+    'gamma_leakage_delay': Case(  # innovations leave the dead zone, and come back to it
         0.0,
-        {'gamma_initial': 0.7, 'gamma_leakage': 1e3, 'gamma_dead_zone': 1e-9},
-        prepare={'gamma_initial': 0.5, 'gamma_dead_zone': 1e6},
+        {'gamma_initial': 0.7, 'gamma_leakage': 1e3, 'gamma_dead_zone': 0.4},
+        prepare={'gamma_initial': 0.5},
+        y=lambda _: 2.0,
     ),
     'initial_estimate': Case([0.5], reset=True),
     'initial_internal': Case([0.5], reset=True),
