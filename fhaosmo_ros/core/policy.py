@@ -25,7 +25,7 @@ DIVERGED = int(Status.DIVERGED)
 FLAGS = (1 << LEVEL_SHIFT) - 1
 
 
-@njit(cache=True, error_model='numpy', forceinline=True)
+@njit(cache=True, error_model='numpy', inline='always')
 def take(
     stamp: int, y: float, u: float, eps: Floats, row: int, ints: Ints, reals: Floats,
     flags: Ints, gains: Floats, curves: Floats, scalars: Floats, tape: Floats, offsets: Ints,

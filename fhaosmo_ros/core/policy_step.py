@@ -24,7 +24,7 @@ MOST_SUB_STEPS = 10_000
 """Bounds what one sample may cost: a few milliseconds."""
 
 
-@njit(cache=True, error_model='numpy', forceinline=True)
+@njit(cache=True, error_model='numpy', inline='always')
 def step_over(
     flags: Ints, gains: Floats, curves: Floats, scalars: Floats, tape: Floats, offsets: Ints,
     x: Floats, m: Floats, stack: Floats, levels: Floats, memory: Floats, eps: Floats,
