@@ -73,6 +73,7 @@ def test_diverged_estimate_is_infinitely_wrong(bad):
     assert objective(RECORDING, Estimates(RECORDING.z, d)) > 1e100
 
 
+@pytest.mark.slow
 def test_no_judge_was_seen_in_training():
     for sensor in sensors():
         seen = sensor.training(2)
@@ -222,6 +223,7 @@ def test_document_is_about_all_cells(documented):
     assert all(len(s.held_out(s.disturbances[0])) == HELD_OUT for s in sensors(quick=True))
 
 
+@pytest.mark.slow
 def test_quick_run_writes_everything(tmp_path, capsys):
     out = tmp_path / 'out'
     assert command.main(['--quick', '--trials', '3', '--output', str(out)]) == 0

@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 DOCS = Path(__file__).resolve().parents[3] / 'docs'
 FOLDER, RESULTS = 'comparison', 'results.json'
-TRIALS, QUICK_TRIALS = 300, 15
+TRIALS, QUICK_TRIALS = 200, 15
 TRAINING, QUICK_TRAINING = 4, 1
 
 

@@ -9,9 +9,11 @@ from fhaosmo_ros.tools.comparison.evaluation import estimates, METHODS
 from fhaosmo_ros.tools.comparison.ours import OURS
 from fhaosmo_ros.tools.comparison.results import Cell, Results, Table
 from fhaosmo_ros.tools.comparison.verdicts import KALMAN, verdicts
+from fhaosmo_ros.tools.paper_figures import envelope
 from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 BLACK, BLUE, ORANGE, GREEN, SKY, PINK, YELLOW, GREY = (
     '#000000', '#0072B2', '#D55E00', '#009E73', '#56B4E9', '#CC79A7', '#E69F00', '#999999',
@@ -30,6 +32,9 @@ STYLES: dict[str, tuple[str, str, str]] = {
     'paper: adaptive': (GREY, '1', '--'),
     OURS: (ORANGE, '*', '-'),
 }
+TICKS = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 8.0)
+SHOWN = (('paper', 'mix'), ('paper', 'steps'), ('pendulum', 'steps'), ('motor', 'steps'))
+"""Plants and disturbances whose estimates are drawn."""
 FLOOR, CEILING = 1e-4, 10.0
 """Limits of the error's axis."""
 
@@ -46,30 +51,35 @@ def save_all(results: Results, folder: Path) -> None:
 
 
 def noise(table: Table) -> Figure:
-    """Draw the error of d against the noise: a row a rate, a column a plant and disturbance."""
+    """Draw the error of d against the noise: a panel a plant, disturbance and rate."""
     even = [cell for cell in table if cell.sensor.timing == 'even']
-    columns = list(dict.fromkeys((c.sensor.plant, c.disturbance) for c in even))
+    names = list(dict.fromkeys((c.sensor.plant, c.disturbance) for c in even))
     rates = sorted({c.sensor.rate for c in even}, reverse=True)
-    figure = Figure(
-        figsize=(2.1 * len(columns) + 1.0, 3.2 * len(rates) + 1.0), layout='constrained'
-    )
-    panels = figure.subplots(len(rates), len(columns), sharex=True, sharey=True, squeeze=False)
+    # The paper's plant, then the others; within each, a row a rate.
+    blocks = [[n for n in names if (n[0] == 'paper') == first] for first in (True, False)]
+    rows = [(rate, block) for block in blocks if block for rate in rates]
+    columns = max(len(block) for _, block in rows)
+    size = (2.1 * max(columns, 4) + 0.8, 2.5 * len(rows) + 1.2)
+    figure = Figure(figsize=size, layout='constrained')
+    panels = figure.subplots(len(rows), columns, sharex=True, sharey=True, squeeze=False)
     places = {level: i for i, level in enumerate(NOISES)}
-    for row, rate in zip(panels, rates, strict=True):
-        for axes, (plant, disturbance) in zip(row, columns, strict=True):
+    for axes_row, (rate, block) in zip(panels, rows, strict=True):
+        for axes, (plant, disturbance) in zip(axes_row, block, strict=False):
             cells = [
-                c for c in even
+                c
+                for c in even
                 if (c.sensor.plant, c.disturbance, c.sensor.rate) == (plant, disturbance, rate)
-            ]  # fmt: skip
+            ]
             _errors(axes, [(places[c.sensor.noise], table[c]) for c in cells])
-            if axes in panels[0]:
-                axes.set_title(f'{PLANTS[plant].text}\n{disturbance}', fontsize=9)
-        row[0].set_ylabel(f'{rate:g} Hz\nRMS error of d / RMS of d')
+            axes.set_title(f'{PLANTS[plant].text}, {disturbance}', fontsize=9)
+        for axes in axes_row[len(block) :]:
+            axes.set_visible(False)
+        axes_row[0].set_ylabel(f'{rate:g} Hz\nRMS error of d / RMS of d')
     panels[0, 0].set_ylim(FLOOR, CEILING)
-    for axes in panels[-1]:
-        axes.set_xticks(
-            range(len(NOISES)), ['0', *(f'$10^{{{round(log10(x))}}}$' for x in NOISES[1:])]
-        )
+    ticks = ['0', *(f'$10^{{{round(log10(x))}}}$' for x in NOISES[1:])]
+    panels[0, 0].set_xticks(range(len(NOISES)), ticks)
+    for axes in panels.flat:
+        axes.tick_params(labelbottom=True)
     figure.supxlabel("standard deviation of the noise on y (pendulum, motor: over y's amplitude)")
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside upper center', ncols=5, fontsize=9)
@@ -109,10 +119,16 @@ def ratios(table: Table) -> Figure:
             )  # fmt: skip
         axes.axvline(v.bar.limit, color=BLACK, linewidth=1.0)
         axes.set_xscale('log')
+        low, high = min([*values, v.bar.limit]), max([*values, v.bar.limit])
+        axes.set_xlim(low / 1.1, high * 1.1)
         axes.set_yticks(range(len(values)), [_name(cell) for cell in v.ratios], fontsize=7)
         axes.invert_yaxis()
         axes.grid(alpha=0.3)
-        axes.set_title(v.bar.claim, fontsize=9)
+        if high / low < 10.0:
+            axes.xaxis.set_major_locator(LogLocator(subs=TICKS))
+        axes.xaxis.set_major_formatter('{x:g}')
+        axes.xaxis.set_minor_formatter('')
+        axes.set_title(v.bar.claim, fontsize=9, loc='right')
         axes.legend(fontsize=8)
     panels[-1].set_xlabel("our RMS error of d over the rival's")
     return figure
@@ -128,7 +144,8 @@ def time_series(results: Results) -> Figure:
     """Draw d and its estimates on a held-out recording of each of some cells."""
     table = results.table(list(METHODS))
     noisy = [c for c in table if c.sensor.noise == 1e-3 and c.sensor.timing == 'even']
-    chosen = list({(c.sensor.plant, c.disturbance): c for c in noisy}.values())[:4]
+    first = {(c.sensor.plant, c.disturbance): c for c in reversed(noisy)}
+    chosen = [first[name] for name in SHOWN if name in first]
     figure = Figure(figsize=(9.0, 2.2 * len(chosen) + 0.8), layout='constrained')
     panels = figure.subplots(len(chosen), 1, sharex=True, squeeze=False)[:, 0]
     for axes, cell in zip(panels, chosen, strict=True):
@@ -143,15 +160,14 @@ def time_series(results: Results) -> Figure:
 def _estimates(axes: Axes, results: Results, sensor: Sensor, disturbance: str) -> None:
     recording = sensor.held_out(disturbance, 1)[0]
     late = recording.t >= 4.0
-    axes.plot(recording.t[late], recording.d[late], color=BLACK, linewidth=1.6, label='truth')
+    t = recording.t[late]
+    axes.plot(*envelope(t, recording.d[late]), color=BLACK, linewidth=1.6, label='truth')
     for name, colour, dashes in ((KALMAN, BLUE, '--'), (OURS, ORANGE, '-')):
         entry = results.find(sensor, name)
         if entry is not None:
             found = estimates(METHODS[name], sensor.setting(), entry.tuned, [recording])[0]
-            axes.plot(
-                recording.t[late], found.d[late], color=colour, linestyle=dashes, linewidth=1.0,
-                label=name,
-            )  # fmt: skip
+            curve = envelope(t, found.d[late])
+            axes.plot(*curve, color=colour, linestyle=dashes, linewidth=1.0, label=name)
     size = float(abs(recording.d).max())
     axes.set_ylim(-1.6 * size, 1.6 * size)
     axes.grid(alpha=0.3)

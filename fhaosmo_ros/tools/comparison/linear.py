@@ -34,7 +34,7 @@ def _bandwidth(name: str, setting: Setting) -> Dimension:
 
     From far below any disturbance here to 5 / period, where the observer is deadbeat.
     """
-    return Dimension(name, 0.05, 5.0 / setting.period, 10.0)
+    return Dimension(name, 0.05, 5.0 / setting.period, setting.speed)
 
 
 def _prepare(

@@ -35,6 +35,20 @@ class Setting(NamedTuple):
     size: float
     noise: float
 
+    @property
+    def speed(self) -> float:
+        """
+        Where searches begin: the bandwidth (rad/s) at which noise weighs as much as d.
+
+        Noise of density noise^2 period leaves noise sqrt(period w^(2 N - 1)) in the N-th level.
+        """
+        levels = self.model.order + 1
+        fastest = 0.5 / self.period
+        if self.noise <= 0.0:
+            return fastest
+        ratio = self.size / (self.noise * self.period**0.5)
+        return float(min(ratio ** (1.0 / (levels - 0.5)), fastest))
+
 
 class Method(NamedTuple):
     """

@@ -21,7 +21,7 @@ def _space(factors: tuple[str, ...], gamma: float, epsilon: bool) -> Space:
         levels = setting.model.order + 1
         names = [f'{name}_{i + 1}' for name in factors for i in range(levels)]
         general = [
-            Dimension('speed', 0.05, 5.0 / setting.period, 10.0),
+            Dimension('speed', 0.05, 5.0 / setting.period, setting.speed),
             Dimension('kappa', 1e-3, 1e3, 3.0),
             Dimension('gamma', 10.0 * SMALLEST_GAMMA, 1.0, gamma),
             Dimension('decay', 1e-3, 1e2, 0.1),

@@ -125,8 +125,8 @@ def verdict_table(judged: list[Verdict]) -> str:
         holds = '**yes**' if len(v.reached) == len(v.ratios) else '**no**'
         rows.append(
             [
-                v.bar.claim, holds, f'{len(v.reached)} of {len(v.ratios)}', f'{middle:.2f}',
-                f'{v.ratios[worst]:.2f} ({", ".join(_names(worst)[1:])})',
+                v.bar.claim, holds, f'{len(v.reached)} of {len(v.ratios)}', _number(middle),
+                f'{_number(v.ratios[worst])} ({", ".join(_names(worst)[1:])})',
             ]
         )  # fmt: skip
     head = ['bar: our RMS error of d', 'reached', 'cells', 'ratio, geometric mean', 'worst']
@@ -138,7 +138,7 @@ def _ratios(judged: list[Verdict]) -> str:
     blocks = []
     for v in judged:
         rows = [
-            [*_names(cell), f'**{r:.2f}**' if r <= v.bar.limit else f'{r:.2f}']
+            [*_names(cell), f'**{_number(r)}**' if r <= v.bar.limit else _number(r)]
             for cell, r in v.ratios.items()
         ]
         blocks.append(
@@ -168,6 +168,6 @@ def _better(table: Table) -> str:
             scores, name = table[cell], beaten[cell]
             ratio = scores[name].d / scores[OURS].d
             note = ' (all useless)' if scores[name].d >= USELESS else ''
-            rows.append([plant, disturbance, *_names(cell)[2:], name, f'{ratio:.2f}{note}'])
+            rows.append([plant, disturbance, *_names(cell)[2:], name, f'{_number(ratio)}{note}'])
     lines.append(_table([*HEAD, 'best', 'its error over ours'], rows))
     return '\n'.join(lines)
