@@ -244,11 +244,16 @@ def test_ctrl_c_ends_cleanly_and_writes_nothing(tmp_path):
         [sys.executable, '-m', 'fhaosmo_ros', 'compare', '--output', str(tmp_path / 'out')],
         stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
-    seen = ''
-    while '/' not in seen.split('compare:')[-1]:  # the progress bar: its children exist
-        seen += process.stderr.read(1)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    try:
+        seen = ' '
+        while '/' not in seen.split('compare:')[-1]:  # the progress bar: its children come up
+            character = process.stderr.read(1)
+            assert character, seen
+            seen += character
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert process.returncode == 130
     assert 'interrupted' in err
     assert 'Traceback' not in err + out
