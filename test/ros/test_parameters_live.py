@@ -78,6 +78,7 @@ OTHER = {
     'disturbance_omega_end': 5.0,
     'disturbance_sweep_time': 10.0,
     'noise_std': 0.001,
+    'quantisation': 0.002,
     'noise_seed': 7,
     'sample_rate': 300.0,
 }

@@ -121,8 +121,8 @@ def _evaluated(
     context = multiprocessing.get_context('spawn')
     pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_end_with_parent)
     try:
-        # The children inherit this: Ctrl-C reaches them too, and is the parent's business. Blocked,
-        # not ignored: one that comes meanwhile is not lost.
+        # The children inherit this: Ctrl-C reaches them too, and is the parent's business.
+        # Blocked, not ignored: one that comes meanwhile is not lost.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         futures = {pool.submit(_task, *task, trials, training): task for task in tasks}
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
