@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 PYTHON ?= python3
 ARGS ?=
+MINUTES ?= 2
 
 # $(call with,EXTRA): set $python to the environment's Python, making the environment first.
 with = python=$$(PYTHON='$(PYTHON)' sh scripts/environment.sh $(1))
 
-.PHONY: help demo paper test lint bench clean
+.PHONY: help demo paper tune compare test lint bench soak clean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    run plant and estimator for 20 s, draw what was estimated'
 	@echo 'make paper   reproduce the paper, rewrite docs/paper.md and its figures'
+	@echo 'make tune    find gains that fit a sensor: ARGS="--params-file my.yaml", or --bag run'
+	@echo 'make compare tune other observers by the same rules, rewrite docs/comparison.md'
 	@echo 'make test    check style and types, run the tests'
 	@echo 'make lint    check style and types only'
 	@echo 'make bench   measure speed'
+	@echo 'make soak    run with faults for MINUTES=2, judge memory, losses and drift'
 	@echo 'make clean   remove environments, builds and caches'
 	@echo
 	@echo "Pass options on with ARGS: make demo ARGS='--help', make test ARGS='-k fuzzy'."
@@ -26,6 +30,12 @@ demo:
 paper:
 	@$(call with) && exec "$$python" -m fhaosmo_ros paper $(ARGS)
 
+tune:
+	@$(call with,tune) && exec "$$python" -m fhaosmo_ros tune $(ARGS)
+
+compare:
+	@$(call with,compare) && exec "$$python" -m fhaosmo_ros compare $(ARGS)
+
 lint:
 	@$(call with,test) && set -x && \
 	"$$python" -m ruff check --output-format concise . && \
@@ -37,7 +47,10 @@ test: lint
 	@$(call with,test) && exec "$$python" -m pytest -n 2 --dist loadfile $(ARGS)
 
 bench:
-	@$(call with) && exec "$$python" benchmark/run.py $(ARGS)
+	@$(call with,tune) && exec "$$python" benchmark/run.py $(ARGS)
+
+soak:
+	@$(call with) && exec "$$python" benchmark/soak.py --minutes $(MINUTES) $(ARGS)
 
 clean:
 	rm -rf .venv .venv-ros build install log *.egg-info .coverage .hypothesis \

@@ -8,6 +8,8 @@ from fhaosmo_ros.commands import COMMANDS
 from setuptools import find_packages, setup
 
 NAME = 'fhaosmo_ros'
+TUNE = ['cmaes', 'optuna>=4,<6']
+COMPARE = [*TUNE, 'control']
 
 
 def files(*patterns):
@@ -31,7 +33,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        *files('config/**/*.yaml', 'launch/*.py'),
+        *files('config/**/*.yaml', 'config/*.xml', 'launch/*.py'),
     ],
     zip_safe=False,
     install_requires=[
@@ -39,9 +41,10 @@ setup(
         'networkx',  # this, packaging and scipy: scikit-fuzzy imports them but declares nothing
         'numba',
         'numpy',
+        'orjson',
         'packaging',
         'pyyaml',
-        'rosbags',
+        'rosbags>=0.11.9,<0.12',  # tools/bag_reader.py and bag_writer.py know its insides
         'scikit-fuzzy',
         'scipy',
         'setuptools',
@@ -60,10 +63,15 @@ setup(
             'ros-jazzy-std-msgs',
             'ros-jazzy-std-srvs',
         ],
+        'tune': TUNE,
+        'compare': COMPARE,
         'test': [
+            *COMPARE,
             'colcon-common-extensions',
             'hypothesis',
             'import-linter',
+            'mcap',
+            'mcap-ros2-support',
             'mypy',
             'pytest',
             'pytest-xdist',
@@ -75,7 +83,9 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            f'{command} = {module}:main' for command, (module, _) in COMMANDS.items()
+            # Not the module's own main: what it imports takes a second, and signals come sooner.
+            f'{command} = fhaosmo_ros.__main__:{command}'
+            for command in COMMANDS
         ],
     },
 )

@@ -2,8 +2,9 @@
 """
 A node with the estimator's subscription, timer, publishers and executor that computes nothing.
 
-It publishes messages that were made once. What an estimator costs more than this is ours; what
-this costs is the middleware's.
+It publishes messages that were made once, except for the stamp of the latest sample, from which
+latencies are measured. What an estimator costs more than this is ours; what this costs is the
+middleware's.
 """
 
 import argparse
@@ -11,65 +12,70 @@ import contextlib
 import gc
 import signal
 import threading
-from typing import Any
 
 from builtin_interfaces.msg import Time
-from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher
-from fhaosmo_ros.nodes.estimator import SENSOR_QOS
+from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher, Report
 from fhaosmo_ros.nodes.messages import labelled
 from fhaosmo_ros.nodes.spin import Spinner
-from fhaosmo_ros.nodes.subscription import subscribe_with_info
+from fhaosmo_ros.nodes.subscription import SENSOR_QOS, subscribe_with_info
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64
 
-NAME = 'empty_node'
 READY = 'computing nothing'
 
 
 class EmptyNode(Node):
     """
-    Counts samples of ``y`` and publishes constants.
+    Counts samples of ``y``; publishes constants, and the stamp of the latest sample.
 
     Parameters
     ----------
     rate : float
         Rate of the timer, in Hz.
+    name : str
 
     """
 
-    def __init__(self, rate: float) -> None:
-        super().__init__(NAME)
+    def __init__(self, rate: float, name: str) -> None:
+        super().__init__(name)
         self._count = 0
+        self._latest = 0
+        self._stamp = Time()
         messages = {
             'state': labelled(['z1', 'z2', 'z3']),
             'unknown_input': Float64(),
             'gamma': Float64(),
             'innovation': labelled(['eps1', 'eps2', 'eps3', 'eps4']),
-            'stamp': Time(),
+            'stamp': self._stamp,
         }
         self._outputs = [
             (self.create_publisher(type(message), f'~/{name}', 10).publish, message)
             for name, message in messages.items()
         ]
-        self._diagnostics = DiagnosticsPublisher(self, self._report)
+        self._diagnostics = DiagnosticsPublisher(self, self._reports)
         self._timer = self.create_timer(1.0 / rate, self._publish)
         self._y = subscribe_with_info(self, Float64, 'y', self._on_sample, SENSOR_QOS)
         self.get_logger().info(READY)
 
-    def _on_sample(self, _: Float64, __: dict[str, int]) -> None:
+    def _on_sample(self, _: Float64, info: dict[str, int]) -> None:
         self._count += 1
+        self._latest = info['source_timestamp']
 
     def _publish(self) -> None:
+        if not self._latest:
+            return
+        self._stamp.sec, self._stamp.nanosec = divmod(self._latest, 1_000_000_000)
         for publish, message in self._outputs:
             publish(message)
 
-    def _report(self) -> dict[str, Any]:
-        """Return as many values as the estimator's report has."""
-        zeros = {f'rejected {k}': 0 for k in range(5)}
-        return {'samples accepted': self._count, 'samples lost': 0, **zeros, 'restarts': 0, 'x': 0}
+    def _reports(self) -> list[Report]:
+        """Return as many values as the estimator's reports have."""
+        report = Report('input')
+        report.values = {'samples accepted': self._count, **{f'value {k}': 0 for k in range(30)}}
+        return [report]
 
 
 def main() -> None:
@@ -82,11 +88,11 @@ def main() -> None:
     if arguments.plain:
         rclpy.init()
         with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-            rclpy.spin(EmptyNode(arguments.rate))
+            rclpy.spin(EmptyNode(arguments.rate, 'plain'))
         return
     signal.signal(signal.SIGINT, lambda *_: ended.set())
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = EmptyNode(arguments.rate)
+    node = EmptyNode(arguments.rate, 'empty_node')
     gc.collect()
     gc.freeze()  # as run_node does
     with Spinner(node, on_end=ended.set):

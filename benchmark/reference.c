@@ -4,16 +4,16 @@
  * Phi = (0, 0, -z3), N = 4 levels, fuzzy_adaptive, explicit. It is written as one would write it
  * for speed (the model is inlined by hand), and serves the benchmark only.
  *
- * State: z_hat[4], z_tilde[4], p[4], q[4], gamma, y, pending. Same order as core/layout.py.
+ * State: z_hat[4], z_tilde[4], p[4], q[4], gamma, y, pending, wait. Same order as core/layout.py.
  */
 #include <math.h>
 
-enum { N = 4, SIZE = 4 * N + 3, KNOTS = 193 };
+enum { N = 4, SIZE = 4 * N + 4, KNOTS = 193 };
 
 struct law {
     double lambda[N], alpha[N], inverse_width[N];
     double curves[2][KNOTS];
-    double epsilon, gamma_initial, rate, min, max, dead_zone, leakage;
+    double epsilon, gamma_initial, rate, min, max, dead_zone, leakage, delay;
 };
 
 static int step(const struct law *law, double *state, double y, double h, double *eps)
@@ -73,9 +73,17 @@ static int step(const struct law *law, double *state, double y, double h, double
     if (word)
         for (int k = 2 * N; k < 4 * N; k++)
             x[k] = 0.0;
-    else if (loss > law->dead_zone * law->dead_zone)
-        g -= h * law->rate * gradient;
-    g -= h * law->leakage * (g - law->gamma_initial);
+    int leaks = law->dead_zone == 0.0;
+    if (loss <= law->dead_zone * law->dead_zone) {
+        leaks = leaks || x[4 * N + 3] <= 0.0;
+        x[4 * N + 3] = fmax(x[4 * N + 3] - h, 0.0);
+    } else {
+        x[4 * N + 3] = law->delay;
+        if (!word)
+            g -= h * law->rate * gradient;
+    }
+    if (leaks)
+        g -= fmin(h * law->leakage, 1.0) * (g - law->gamma_initial);
     if (g <= law->min) {
         g = law->min;
         word |= 16;
@@ -96,7 +104,7 @@ static int step(const struct law *law, double *state, double y, double h, double
         levels += running;
         running = running && fabs(eps[i]) <= law->epsilon;
     }
-    return word | levels << 8;
+    return word | levels << LEVEL_SHIFT;
 }
 
 /* Step through `count` samples of period `h`; `eps` and the last status word are the result. */

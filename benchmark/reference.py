@@ -16,18 +16,19 @@ from fhaosmo_ros.core.fuzzy import KNOTS
 from fhaosmo_ros.core.law import make_work
 from fhaosmo_ros.core.observer import Observer, ObserverState
 from fhaosmo_ros.core.plant import Plant
+from fhaosmo_ros.core.status import LEVEL_SHIFT
 import numpy as np
 from numpy.typing import NDArray
 from table import CannotMeasureError
 
 SOURCE = Path(__file__).with_name('reference.c')
-OPTIONS = ('-O3', '-shared', '-fPIC')
+OPTIONS = ('-O3', '-shared', '-fPIC', f'-DLEVEL_SHIFT={LEVEL_SHIFT}')
 PERIOD = 1e-3
 CASE = {'variant': 'fuzzy_adaptive', 'scheme': 'explicit', 'fuzzy_widths': [0.1]}
 """Wide fuzzy sets: no chatter, so that rounding does not grow and both end at the same state."""
 
 State = NDArray[np.float64]
-"""HAT, TILDE and their sensitivities (4 N), then gamma, y, pending; see core/layout.py."""
+"""HAT, TILDE and their sensitivities (4 N), then gamma, y, pending, wait; see core/layout.py."""
 
 
 def find_compiler() -> list[str]:

@@ -7,7 +7,7 @@ import sys
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
-from fhaosmo_ros.tools.bags import BagWriter
+from fhaosmo_ros.tools.bag_writer import BagWriter
 from fhaosmo_ros.tools.chunks import DATA_AT, Records
 import numpy as np
 from rosbags.highlevel import AnyReader

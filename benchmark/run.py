@@ -11,19 +11,23 @@ import platform
 import signal
 import sys
 
+import channels
 import core_step
-import cpu
+import rates
 import replay
 import simulation
 import startup
-from table import CannotMeasureError, render, Row
+from table import CannotMeasureError, render, Row, Table
+import tune
 
 PARTS = {
     'core': core_step.measure,
     'simulation': simulation.measure,
-    'cpu': cpu.measure,
+    'rates': rates.measure,
+    'channels': channels.measure,
     'startup': startup.measure,
     'replay': replay.measure,
+    'tune': tune.measure,
 }
 
 
@@ -38,25 +42,29 @@ def main(argv: list[str] | None = None) -> int:
     # A job in the background starts with SIGINT ignored; SIGTERM must end the children as well.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    rows = []
+    results: list[Row | Table] = []
     try:
         for part in [arguments.only] if arguments.only else PARTS:
-            rows += _measure(part, arguments.quick)
+            results += _measure(part, arguments.quick)
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
     load = os.getloadavg()[0]
+    rows = [result for result in results if isinstance(result, Row)]
     print(
         f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, '
         f'load {load:.1f}\n\n{render(rows)}'
     )
+    for table in results:
+        if isinstance(table, Table):
+            print(f'\n{table.render()}')
     missed = [row.name for row in rows if row.missed]
     if missed:
         print(f'\n{len(missed)} of the bars missed: {"; ".join(missed)}')
     return 1 if missed and not arguments.quick else 0
 
 
-def _measure(part: str, quick: bool) -> list[Row]:
+def _measure(part: str, quick: bool) -> list[Row | Table]:
     try:
         return PARTS[part](quick)
     except CannotMeasureError as error:

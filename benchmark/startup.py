@@ -4,8 +4,8 @@
 from tempfile import TemporaryDirectory
 
 from children import Children
-from cpu import isolate
 import numpy as np
+from rates import isolate
 from table import Row
 from tqdm import tqdm
 

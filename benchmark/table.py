@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What was measured, beside what is allowed."""
 
+import textwrap
 from typing import NamedTuple
 
 
@@ -36,6 +37,31 @@ class Row(NamedTuple):
     def missed(self) -> bool:
         """True if there is a bar and the value is not within it."""
         return self.bar is not None and (self.value is None or not self.value <= self.bar)
+
+
+class Table(NamedTuple):
+    """
+    Figures that are no bars.
+
+    Attributes
+    ----------
+    title : str
+        What they are, in sentences.
+    header : tuple of str
+    lines : list of tuple of str
+
+    """
+
+    title: str
+    header: tuple[str, ...]
+    lines: list[tuple[str, ...]]
+
+    def render(self) -> str:
+        """Return the title, wrapped, and the columns, aligned to the right."""
+        cells = [self.header, *self.lines]
+        widths = [max(len(line[k]) for line in cells) for k in range(len(self.header))]
+        rows = ('  '.join(f'{c:>{w}}' for c, w in zip(r, widths, strict=True)) for r in cells)
+        return '\n'.join([*textwrap.wrap(self.title, 99), '', *rows])
 
 
 def render(rows: list[Row]) -> str:

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run one of the package's commands: `python -m fhaosmo_ros COMMAND [ARGUMENTS]`."""
 
+from collections.abc import Callable
 import difflib
+from functools import partial
 import importlib
+import os
+import signal
 import sys
 
 from fhaosmo_ros.commands import COMMANDS
@@ -30,6 +34,14 @@ def main(argv: list[str] | None = None) -> int:
         known = ', '.join(COMMANDS)
         print(f'error: no command {name!r} (commands: {known}){hint}', file=sys.stderr)
         return 2
+    return run(name, rest)
+
+
+def run(name: str, arguments: list[str] | None = None) -> int:
+    """Run a command and return its exit code."""
+    if COMMANDS[name][0].startswith('fhaosmo_ros.nodes.'):
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: os._exit(0))  # while it loads nothing has begun
     # Imported only now: a node needs ROS, and the help must not wait for numba.
     try:
         module = importlib.import_module(COMMANDS[name][0])
@@ -44,7 +56,14 @@ def main(argv: list[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:  # while it loads; later the command itself sees to signals
         return 130
-    return int(module.main(rest))
+    return int(module.main(arguments))
+
+
+def __getattr__(name: str) -> Callable[[], int]:
+    """Return the function that runs a command: the entry points of `ros2 run`."""
+    if name not in COMMANDS:
+        raise AttributeError(name)
+    return partial(run, name)
 
 
 if __name__ == '__main__':

@@ -14,5 +14,10 @@ COMMANDS = {
     'replay': ('fhaosmo_ros.tools.replay', 'estimate offline from a bag, as the live node would'),
     'plot': ('fhaosmo_ros.tools.plot', 'draw the estimates in bags, print their metrics'),
     'play': ('fhaosmo_ros.tools.play', "publish a bag's topics in its own time, with /clock"),
+    'tune': ('fhaosmo_ros.tools.tuning.command', 'find gains that fit the sensor and the plant'),
+    'compare': (
+        'fhaosmo_ros.tools.comparison.command',
+        'compare with other observers, all tuned alike',
+    ),
     'paper': ('fhaosmo_ros.tools.paper', "reproduce the paper's figures and judge its findings"),
 }

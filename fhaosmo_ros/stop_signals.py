@@ -2,12 +2,21 @@
 """Ending by Ctrl-C or SIGTERM without losing the clean-up."""
 
 import atexit
+from collections.abc import Iterator
 import contextlib
 import select
 import signal
 import socket
+import threading
+from types import FrameType
 
+RETRY = 0.02
+"""Seconds after which a signal that came at a bad moment comes again."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stopped(BaseException):
+    """Raised by a signal within `Stop.raising`."""
 
 
 class Stop:
@@ -24,6 +33,7 @@ class Stop:
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         self._set = False
+        self._raises = False
 
     def wake_on_signals(self) -> None:
         """Let signals end a wait; in the main thread only."""
@@ -34,6 +44,27 @@ class Stop:
         self._set = True
         with contextlib.suppress(BlockingIOError):  # full: the wait ends anyway
             self._writer.send(b'\0')
+
+    def signal(self, number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
+        """Take a signal: `set`, and within `raising` raise, but once only."""
+        raises = self._raises and not self._set
+        if raises and _called_by_compiler(frame):
+            threading.Timer(RETRY, signal.raise_signal, (number,)).start()
+            return
+        self.set()
+        if raises:
+            raise Stopped
+
+    @contextlib.contextmanager
+    def raising(self) -> Iterator[None]:
+        """Let the first signal cut the block, for what is long and leaves nothing behind."""
+        self._raises = True
+        try:
+            if self._set:
+                raise Stopped
+            yield
+        finally:
+            self._raises = False
 
     def is_set(self) -> bool:
         """Return True once `set` has been called."""
@@ -49,15 +80,25 @@ class Stop:
         return self._set
 
 
+def _called_by_compiler(frame: FrameType | None) -> bool:
+    """Return True within what C calls: an exception would be printed there, and lost."""
+    while frame is not None:
+        if 'llvmlite' in frame.f_code.co_filename:
+            return True
+        frame = frame.f_back
+    return False
+
+
 def stop_on_signals() -> Stop:
     """
     Make SIGINT and SIGTERM set the returned event, from now to the process's end.
 
-    They raise nothing, so a second Ctrl-C can't cut the clean-up that the first one began.
+    They raise nothing (but see `Stop.raising`), so a second Ctrl-C can't cut the clean-up that the
+    first one began.
     """
     stop = Stop()
     for number in SIGNALS:
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, stop.signal)
     stop.wake_on_signals()
     atexit.register(_ignore)
     return stop

@@ -26,6 +26,12 @@ def generate_launch_description():
             description='take the time from /clock',
         ),
         DeclareLaunchArgument(
+            'autostart',
+            default_value='true',
+            choices=['true', 'false'],
+            description='false: a lifecycle manager configures and activates the estimator',
+        ),
+        DeclareLaunchArgument(
             'log_level',
             default_value='info',
             choices=['debug', 'info', 'warn', 'error', 'fatal'],
@@ -33,15 +39,18 @@ def generate_launch_description():
         ),
     ]
     # Later entries win, but only over the wildcard keys (/**) that the shipped YAML uses: a
-    # section named after a node would beat use_sim_time here.
-    use_sim_time = ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
+    # section named after a node would beat them here. The plant passes over what is not its own.
+    switches = {
+        name: ParameterValue(LaunchConfiguration(name), value_type=bool)
+        for name in ('use_sim_time', 'autostart')
+    }
     nodes = [
         Node(
             package='fhaosmo_ros',
             executable=name,
             name=name,
             namespace=LaunchConfiguration('namespace'),
-            parameters=[LaunchConfiguration('params_file'), {'use_sim_time': use_sim_time}],
+            parameters=[LaunchConfiguration('params_file'), switches],
             ros_arguments=['--log-level', LaunchConfiguration('log_level')],
             output='screen',
             emulate_tty=True,

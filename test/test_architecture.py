@@ -14,11 +14,25 @@ PACKAGE = ROOT / 'fhaosmo_ros'
 # What: where it may be imported (folders end with /).
 ALLOWED = {
     'rclpy': ['nodes/'],
-    'rosbags': ['tools/bags.py', 'tools/bag_reader.py'],
-    'matplotlib': ['tools/figures.py', 'tools/paper_figures.py'],
+    'rosbags': ['tools/bags.py', 'tools/bag_reader.py', 'tools/bag_writer.py'],
+    'control': ['tools/comparison/gains.py'],
+    'matplotlib': [
+        'tools/comparison/figures.py',
+        'tools/figures.py',
+        'tools/paper_figures.py',
+        'tools/tuning/figures.py',
+    ],
+    'optuna': ['tools/tuning/search.py', 'tools/tuning/study.py'],
     'skfuzzy': ['core/fuzzy.py'],
 }
-FORBIDDEN_IN_CORE = ['rclpy', 'rosbags', 'matplotlib', 'fhaosmo_ros.nodes', 'fhaosmo_ros.tools']
+FORBIDDEN_IN_CORE = [
+    'rclpy',
+    'rosbags',
+    'matplotlib',
+    'optuna',
+    'fhaosmo_ros.nodes',
+    'fhaosmo_ros.tools',
+]
 
 
 def imports(source, module):

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 
+from fhaosmo_ros.core.status import open_levels
 import numpy as np
 import pytest
 
@@ -29,7 +30,7 @@ def test_c_reference_takes_the_same_steps(reference, tmp_path):
     y = reference.output(20_001)
     reference.assert_agreement(reference.compile_reference(tmp_path), y)
     state, word = reference.in_numba(reference.CASE, y)()
-    assert word >> 8 == 4
+    assert open_levels(word) == 4
     assert not np.isclose(state[16], 0.5)
 
 
@@ -57,6 +58,35 @@ def test_quick_core():
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert 'core step / same step in C' in done.stdout
+
+
+@pytest.mark.ros
+def test_quick_rates():
+    pytest.importorskip('rclpy')
+    done = subprocess.run(
+        [sys.executable, BENCHMARK / 'run.py', '--quick', '--only', 'rates'],
+        capture_output=True, text=True, cwd=BENCHMARK.parent, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert 'CPU, estimator / empty node, y 1000 Hz, estimates 1000 Hz' in done.stdout
+    table = [line.split() for line in done.stdout.splitlines() if line.startswith('1000  ')]
+    assert [line[3] for line in table] == ['estimator', 'empty']
+    for line in table:
+        cpu, lost, sent, *times = (float(word.replace(',', '')) for word in line[4:])
+        assert cpu > 0
+        assert 0 <= lost < sent
+        assert all(time > 0 for time in times)
+
+
+def test_quick_tune():
+    pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
+    done = subprocess.run(
+        [sys.executable, BENCHMARK / 'run.py', '--quick', '--only', 'tune'],
+        capture_output=True, text=True, cwd=BENCHMARK.parent, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert 'trials a minute' in done.stdout
+    assert 'efficiency' in done.stdout
 
 
 def test_rows_without_value_miss_their_bar(monkeypatch):

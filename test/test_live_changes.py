@@ -25,6 +25,7 @@ CHANGES = {
     'gamma_max': [0.6],
     'gamma_dead_zone': [0.1],
     'gamma_leakage': [0.1],
+    'gamma_leakage_delay': [0.5],
     'initial_estimate': [1.0, [1.0, 2.0, 3.0]],
     'initial_internal': [1.0, [1.0, 2.0, 3.0]],
     'start_from_measurement': [False],

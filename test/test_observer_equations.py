@@ -111,6 +111,7 @@ class Reference:
             self.hat[0] = Dual(y)
         self.gamma = p['gamma_initial'] if p['variant'].endswith('_adaptive') else 0.5
         self.y = y
+        self.calm = np.inf  # how long the innovations have been within the dead zone
         self.curves = [
             curve(terms_of_level(i + 1), p['fuzzy_shape'], p['fuzzy_normalise'])
             for i in range(self.N)
@@ -204,7 +205,13 @@ class Reference:
         gamma = self.gamma
         if loss.value > p['gamma_dead_zone'] ** 2:
             gamma -= h * p['gamma_rate'] * loss.slope
-        gamma -= h * p['gamma_leakage'] * (gamma - p['gamma_initial'])
+            self.calm = 0.0
+        rests = loss.value <= p['gamma_dead_zone'] ** 2
+        waited = self.calm > p['gamma_leakage_delay'] - 1e-12
+        leaks = p['gamma_dead_zone'] == 0.0 or (rests and waited)
+        self.calm += h if rests else 0.0
+        if leaks:
+            gamma -= h * p['gamma_leakage'] * (gamma - p['gamma_initial'])
         self.gamma = min(max(gamma, p['gamma_min']), p['gamma_max'])
 
     def open(self):
@@ -233,6 +240,7 @@ def parameters(n, extra, **others):
         'gamma_max': 0.9,
         'gamma_dead_zone': 0.0,
         'gamma_leakage': 0.0,
+        'gamma_leakage_delay': 0.1,
         'initial_estimate': list(rng.uniform(-0.2, 0.2, levels)),
         'initial_internal': list(rng.uniform(-0.2, 0.2, levels)),
         'start_from_measurement': False,
@@ -287,6 +295,8 @@ def test_run_follows_the_equations(scheme, variant, n, extra):
         {'gamma_rate': 0.0, 'gamma_initial': 0.7},
         {'gamma_leakage': 2.0},
         {'gamma_dead_zone': 0.1},
+        {'gamma_dead_zone': 0.1, 'gamma_leakage': 3.0},
+        {'gamma_dead_zone': 0.1, 'gamma_leakage': 3.0, 'gamma_leakage_delay': 0.0},
         {'gamma_min': 0.499, 'gamma_max': 0.501},
         {'gamma_rate': 0.0, 'gamma_leakage': 5.0, 'gamma_initial': 0.31, 'gamma_min': 0.3},
         {'fuzzy_shape': 'gaussian', 'fuzzy_normalise': False},

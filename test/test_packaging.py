@@ -74,7 +74,7 @@ def test_colcon_installs_executables_and_data(installed, checkout):
     for command in COMMANDS:
         assert os.access(prefix / 'lib' / NAME / command, os.X_OK)
     share = prefix / 'share' / NAME
-    for pattern in ('config/**/*.yaml', 'launch/*.py', 'package.xml'):
+    for pattern in ('config/**/*.yaml', 'config/*.xml', 'launch/*.py', 'package.xml'):
         expected = {path.relative_to(checkout) for path in checkout.glob(pattern)}
         assert {path.relative_to(share) for path in share.glob(pattern)} == expected
     assert (share / 'launch' / 'demo.launch.py').is_file()
@@ -167,7 +167,9 @@ def test_launch_file_starts_both_nodes(monkeypatch):
     arguments = {e.args[0]: e for e in entities if type(e).__name__ == 'DeclareLaunchArgument'}
     nodes = {e.kwargs['executable']: e.kwargs for e in entities if type(e).__name__ == 'Node'}
 
-    assert set(arguments) == {'params_file', 'namespace', 'use_sim_time', 'log_level'}
+    assert set(arguments) == {
+        'params_file', 'namespace', 'use_sim_time', 'autostart', 'log_level',
+    }  # fmt: skip
     ((share, *path),) = arguments['params_file'].kwargs['default_value'].args
     assert share.args == (NAME,)
     assert path == ['config', 'demo.yaml']
@@ -180,7 +182,8 @@ def test_launch_file_starts_both_nodes(monkeypatch):
         params_file, overrides = node['parameters']
         assert params_file.args == ('params_file',)
         # A bare substitution would reach the node as a string.
-        assert overrides['use_sim_time'].kwargs == {'value_type': bool}
+        assert set(overrides) == {'use_sim_time', 'autostart'}
+        assert all(value.kwargs == {'value_type': bool} for value in overrides.values())
         assert node['ros_arguments'][0] == '--log-level'
         assert type(node['on_exit']).__name__ == 'Shutdown'
 

@@ -78,8 +78,16 @@ def test_noise_is_seeded_and_of_the_right_size():
     np.testing.assert_array_equal(one.z[:, 0], 0.2)  # the truth has none
 
 
-def test_samples_equal_a_simulation():
+def test_quantised_output_lies_on_the_grid_next_to_the_noisy_one():
     p = WAVE | {'noise_std': 0.1, 'disturbance': 'chirp'}
+    fine, coarse = (Plant(p | {'quantisation': q}).simulate(T) for q in (0.0, 0.25))
+    np.testing.assert_array_equal(coarse.y % 0.25, 0.0)
+    assert 0.1 < np.max(np.abs(coarse.y - fine.y)) <= 0.125
+    np.testing.assert_array_equal(coarse.z, fine.z)
+
+
+def test_samples_equal_a_simulation():
+    p = WAVE | {'noise_std': 0.1, 'disturbance': 'chirp', 'quantisation': 0.03}
     t = np.cumsum(np.random.default_rng(1).uniform(1e-5, 5e-3, 300))
     whole = Plant(p).simulate(t)
     plant = Plant(p)
@@ -131,6 +139,7 @@ def test_setting_the_seed_starts_the_noise_again():
         ({'disturbance_amplitude': float('nan')}, 'disturbance_amplitude', 'a number', 'nan'),
         ({'noise_std': -0.1}, 'noise_std', '>= 0', '-0.1'),
         ({'noise_seed': 1.5}, 'noise_seed', 'an integer', '1.5'),
+        ({'quantisation': -1.0}, 'quantisation', '>= 0', '-1.0'),
         ({'integration_step': 0.0}, 'integration_step', '>= 1e-06', '0.0'),
         ({'initial_state': [1.0, 2.0]}, 'initial_state', '1 or 3 values', '[1.0, 2.0]'),
         ({'phi': ['0', '0']}, 'phi', '3 expressions', "['0', '0']"),

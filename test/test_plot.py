@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A figure and a table from the estimates in bags."""
 
+import os
+from pathlib import Path
 import signal
+import subprocess
+import sys
+import time
 
 import bag_files as files
 from fhaosmo_ros.tools import plot, replay
 import pytest
 
+ROOT = Path(__file__).resolve().parents[1]
 MAGIC = {'png': b'\x89PNG\r\n\x1a\n', 'svg': b'<?xml', 'pdf': b'%PDF-'}
-
-
-@pytest.fixture(autouse=True)
-def _signals():
-    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    yield
-    for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
-        signal.signal(number, handler)
 
 
 @pytest.fixture(name='bag')
@@ -58,9 +56,54 @@ def test_wrong_input_is_said_in_one_line(arguments, words, bag, tmp_path, capsys
     assert not list(tmp_path.glob('*.png'))
 
 
-def test_window_needs_a_display(bag, tmp_path, capsys, monkeypatch):
-    monkeypatch.delenv('DISPLAY', raising=False)
-    monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
-    assert plot.main([str(bag), '-o', str(tmp_path / 'f.png'), '--show']) == 2
-    assert 'DISPLAY' in capsys.readouterr().err
+@pytest.mark.parametrize('backend', ['', 'Agg', 'svg', 'TkAgg', 'QtAgg'])
+def test_window_that_can_not_be_opened_is_said(backend, bag, tmp_path):
+    """In a process of its own: matplotlib keeps the backend that it has chosen."""
+    environment = {k: v for k, v in os.environ.items() if not k.endswith('DISPLAY')}
+    environment |= {'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])}
+    environment |= {'MPLBACKEND': backend} if backend else {}
+    done = subprocess.run(
+        [sys.executable, '-m', 'fhaosmo_ros', 'plot', bag, '-o', tmp_path / 'f.png', '--show'],
+        capture_output=True, text=True, env=environment, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert 'DISPLAY' in done.stderr
     assert not (tmp_path / 'f.png').exists()
+
+
+def test_figure_is_kept_before_the_window_opens(bag, tmp_path, monkeypatch):
+    """Whoever closes the window by Ctrl-C has it all the same."""
+    out = tmp_path / 'f.png'
+
+    def shown(*arguments):
+        assert out.exists()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(plot, 'save_curves', lambda c, e, path, show: path.write_bytes(b'x'))
+    monkeypatch.setattr(plot, 'show', shown)
+    assert plot.main([str(bag), '-o', str(out), '--show']) == 130
+    assert out.exists()
+
+
+def test_ctrl_c_leaves_nothing(tmp_path):
+    stamps, y = files.signal(60_000)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y), 'sqlite3')
+    assert replay.main([str(bag), '-o', str(tmp_path / 'out'), '--storage', 'sqlite3']) == 0
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'fhaosmo_ros', 'plot', tmp_path / 'out', '-o', tmp_path / 'f.pdf'],
+        stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])},
+    )  # fmt: skip
+    deadline = time.monotonic() + 90
+    while not (tmp_path / '.f.pdf.part').exists():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGTERM)
+    os.killpg(process.pid, signal.SIGINT)
+    _, error = process.communicate(timeout=30)
+    assert process.returncode == 130, error
+    assert error.strip().splitlines()[-1] == 'plot: interrupted'
+    assert 'Traceback' not in error
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['bag', 'out']

@@ -14,10 +14,11 @@ import time
 
 import bag_files as files
 from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.tools import replay
+from fhaosmo_ros.tools import replay, sinks
 from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.bags import BagWriter, series
+from fhaosmo_ros.tools.bag_writer import BagWriter
 from fhaosmo_ros.tools.chunks import scan
+from fhaosmo_ros.tools.series import series
 import lz4.frame
 import numpy as np
 import pytest
@@ -30,16 +31,6 @@ STORAGES = [
     ('mcap', None), ('sqlite3', None), ('mcap', 'storage'), ('mcap', 'file'),
     ('mcap', 'message'), ('sqlite3', 'file'), ('sqlite3', 'message'), ('mcap', 'lz4'),
 ]  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def _signals():
-    """The command sets handlers for the process that it takes for its own."""
-    numbers = (signals.SIGINT, signals.SIGTERM)
-    before = [signals.getsignal(number) for number in numbers]
-    yield
-    for number, handler in zip(numbers, before, strict=True):
-        signals.signal(number, handler)
 
 
 def expected(stamps, y, parameters=None, u=None):
@@ -124,7 +115,10 @@ def test_output_bag_holds_the_estimators_topics(storage, tmp_path):
     assert len(series(again, '/estimator/state').stamps) == 300
 
 
-def test_csv_reads_back_as_the_same_numbers(tmp_path):
+@pytest.mark.parametrize('fast', [True, False])
+def test_csv_reads_back_as_the_same_numbers(fast, tmp_path, monkeypatch):
+    if not fast:
+        monkeypatch.setattr(sinks, 'orjson', None)
     stamps, y = files.signal(200)
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
     assert run(bag, '-o', tmp_path / 'out.csv') == 0
@@ -145,6 +139,36 @@ def test_parameters_of_file_and_command_line(tmp_path):
     assert run(bag, '-o', tmp_path / 'o.npz', *arguments) == 0
     values = {'variant': 'sign', 'alpha': 30, 'lambda': [20, 15.5, 15, 10]}
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y, values))
+
+
+def test_parameters_for_a_named_node(tmp_path):
+    stamps, y = files.signal(100)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+    (tmp_path / 'p.yaml').write_text(
+        'rig: {left: {ros__parameters: {epsilon: 3.0}}}\nestimator: {ros__parameters: {}}'
+    )
+    rules = ['-p', 'plant:order:=7', '-p', 'rig/left:variant:=sign', '-p', '/rig/left:alpha:=30']
+    arguments = ['--params-file', tmp_path / 'p.yaml', *rules, '--node', '/rig/left']
+    assert run(bag, '-o', tmp_path / 'o.npz', *arguments) == 0
+    values = {'variant': 'sign', 'alpha': 30, 'epsilon': 3.0}
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y, values))
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('estimater: {ros__parameters: {}}', ["'estimator' or '/**'", "mean 'estimater'"]),
+        ('estimator: {ros__parameters: {lambda: [1.0, 2.0]}}', ["'lambda'", '[1.0, 2.0]']),
+        ('estimator: {ros__parameters: {lamda: 1.0}}', ["'lamda'", "mean 'lambda'"]),
+    ],
+)
+def test_wrong_file_is_named(text, words, bag, tmp_path, capsys):
+    path = tmp_path / 'p.yaml'
+    path.write_text(text)
+    assert run(bag, '-o', tmp_path / 'o.npz', '--params-file', path) == 2
+    error = capsys.readouterr().err.strip()
+    assert error.startswith(f'replay: error: {path}: ')
+    assert all(word in error for word in words), error
 
 
 def joint_state(stamp, value):
@@ -404,6 +428,22 @@ def test_sqlite_without_metadata_names_the_file(tmp_path, capsys):
     assert 'bag.db3: name that file' in capsys.readouterr().err
     assert run(bag / 'bag.db3', '-o', tmp_path / 'o.npz') == 0
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y))
+
+
+@pytest.mark.parametrize('output', ['o.npz', 'o'])
+def test_sqlite_that_was_cut_is_refused(output, tmp_path, capsys):
+    """In the middle, or at a page, where all pages that are left are whole."""
+    stamps, y = files.signal(20_000)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y), 'sqlite3')
+    whole = (bag / 'bag.db3').read_bytes()
+    for size in (len(whole) // 2 + 77, len(whole) // 2 // 4096 * 4096, 4096, 100, 0):
+        (bag / 'bag.db3').write_bytes(whole[:size])
+        assert run(bag, '-o', tmp_path / output) == 2, size
+        error = capsys.readouterr().err.strip().splitlines()
+        said = [line for line in error if line.startswith('replay: error: ')]
+        assert len(said) == 1, error
+        assert f'bag {bag}: expected a whole bag' in said[0]
+        assert sorted(p.name for p in tmp_path.iterdir()) == ['bag']
 
 
 def test_empty_topic(tmp_path, capsys):

@@ -25,6 +25,7 @@ def make(model, scheme, gamma, structure='cascade', **others):
     p |= {'lambda': 4.0, 'alpha': 6.0, 'epsilon': 0.3, 'fuzzy_widths': [0.05, 0.2]}
     p |= {'gamma_initial': gamma, 'gamma_rate': 0.0, 'gamma_min': 0.1, 'gamma_max': 1.0}
     p |= {'initial_internal': 0.1, 'start_from_measurement': False}
+    p |= {'gamma_dead_zone': 0.0, 'gamma_leakage': 0.0}
     if structure == 'levant':
         p |= {'structure': 'levant', 'lambda': LEVANT_GAINS[len(phi)], 'fuzzy_widths': [0.05]}
     return Observer(p | others)

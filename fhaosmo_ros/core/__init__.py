@@ -7,22 +7,27 @@ with compile_cache():
     from fhaosmo_ros.core import joint
     from fhaosmo_ros.core.counters import Counters
     from fhaosmo_ros.core.errors import ConfigurationError
+    from fhaosmo_ros.core.family import Family, Recording
     from fhaosmo_ros.core.model import TriangularModel
     from fhaosmo_ros.core.observer import Estimate, Observer, ObserverState, Trajectory
     from fhaosmo_ros.core.online import OnlineEstimator
     from fhaosmo_ros.core.plant import Plant
     from fhaosmo_ros.core.status import Status
+    from fhaosmo_ros.core.trial import Trial
 
 __all__ = [
     'ConfigurationError',
     'Counters',
     'Estimate',
+    'Family',
     'Observer',
     'ObserverState',
     'OnlineEstimator',
     'Plant',
+    'Recording',
     'Status',
     'Trajectory',
+    'Trial',
     'TriangularModel',
     'joint',
 ]

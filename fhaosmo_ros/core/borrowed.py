@@ -9,6 +9,7 @@ for the whole call can borrow them instead.
 
 from typing import Any
 
+from numba import carray, njit, types  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 
 
@@ -24,3 +25,31 @@ def _borrowed(typing_context: Any, array: Any) -> Any:
 
 
 borrowed: Any = intrinsic(_borrowed)
+
+
+def _pointer_to(kind: Any) -> Any:
+    """Return an intrinsic that makes a pointer of an address."""
+    pointer_type: Any = types.CPointer
+
+    def pointer(typing_context: Any, address: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+        return pointer_type(kind)(types.int64), generate
+
+    return intrinsic(pointer)
+
+
+_double_pointer, _integer_pointer = _pointer_to(types.float64), _pointer_to(types.int64)
+
+
+@njit(error_model='numpy', inline='always')
+def doubles_at(address: int, shape: Any) -> Any:
+    """Return the contiguous float64 array at an address, which its owner keeps alive."""
+    return carray(_double_pointer(address), shape)
+
+
+@njit(error_model='numpy', inline='always')
+def integers_at(address: int, shape: Any) -> Any:
+    """Return the contiguous int64 array at an address, which its owner keeps alive."""
+    return carray(_integer_pointer(address), shape)

@@ -14,12 +14,15 @@ import os
 from pathlib import Path
 import shutil
 import tempfile
+import time
 from typing import Any
 
 import numba
 
 KEPT = 4
 """Folders of other versions that stay."""
+UNUSED = 86_400.0
+"""Seconds after which nobody writes to a folder any more."""
 
 
 @contextmanager
@@ -55,5 +58,6 @@ def _folder() -> Path:
         return Path(tempfile.mkdtemp(prefix='fhaosmo_ros_'))
     by_age = sorted(base.iterdir(), key=lambda path: path.stat().st_mtime, reverse=True)
     for old in by_age[KEPT + 1 :]:
-        shutil.rmtree(old, ignore_errors=True)
+        if time.time() - old.stat().st_mtime > UNUSED:
+            shutil.rmtree(old, ignore_errors=True)
     return folder

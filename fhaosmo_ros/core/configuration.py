@@ -4,7 +4,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from fhaosmo_ros.core import law
+from fhaosmo_ros.core import law, layout
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.fuzzy import curve, KNOTS, terms_of_level
 from fhaosmo_ros.core.model import TriangularModel
@@ -82,6 +82,9 @@ class ObserverConfiguration:
         if self.levant:
             self.initial_internal = np.append(self.initial_estimate[1:], 0.0)
         self.internal = p['estimate_from'] == 'internal'
+        n = self.model.order
+        filtered = not self.internal and self.levels > n
+        self.unknown_input_at = (layout.HAT, n) if filtered else (layout.TILDE, n - 1)
         self.law = self._make_law()
 
     def _per_level(self, name: str) -> np.ndarray:
@@ -128,6 +131,7 @@ class ObserverConfiguration:
         scalars[law.MAX] = p['gamma_max']
         scalars[law.DEAD_ZONE] = p['gamma_dead_zone']
         scalars[law.LEAKAGE] = p['gamma_leakage']
+        scalars[law.DELAY] = p['gamma_leakage_delay']
         return law.Law(flags, gains, curves, scalars, tape, offsets)
 
 

@@ -69,15 +69,16 @@ class Counters(NamedTuple):
     @property
     def rejected(self) -> int:
         """Samples of y that were not used."""
-        return (
-            self.rejected_measurements
-            + self.rejected_spikes
-            + self.rejected_stuck
-            + self.rejected_steps
-            + self.rejected_stamps
-        )
+        return sum(getattr(self, name) for name in UNUSED_SAMPLES)
 
     @property
     def restarts(self) -> int:
         """Starts from a new sample after a gap or a jump of time."""
         return self.restarts_forward + self.restarts_backward
+
+
+UNUSED_SAMPLES = (
+    'rejected_measurements', 'rejected_spikes', 'rejected_stuck', 'rejected_steps',
+    'duplicate_stamps', 'backward_stamps', 'zero_stamps', 'far_stamps',
+)  # fmt: skip
+"""Counters that together are `Counters.rejected`."""

@@ -8,6 +8,8 @@ from numba import njit
 
 KINDS = ('none', 'sine', 'step', 'square', 'chirp')
 NONE, SINE, STEP, SQUARE, CHIRP = range(5)
+SAMPLED = 5
+"""Any d(t) as a table: c is its spacing and then its values from t = 0 on (not a plant's kind)."""
 NAMES = ('amplitude', 'omega', 'phase', 'offset', 'start', 'omega_end', 'sweep_time')
 AMPLITUDE, OMEGA, PHASE, OFFSET, START, OMEGA_END, SWEEP_TIME = range(7)
 
@@ -20,15 +22,21 @@ def disturbance(kind: int, c: Floats, t: float) -> float:
     Parameters
     ----------
     kind : int
-        Index into `KINDS`.
+        Index into `KINDS`, or `SAMPLED`.
     c : (7,) array
-        Values in the order of `NAMES` (rad/s, rad, s).
+        Values in the order of `NAMES` (rad/s, rad, s); the table of `SAMPLED`, which is
+        interpolated linearly and holds its last value.
     t : float
         Time since the plant's start, in seconds.
 
     """
     if kind == NONE:
         return 0.0
+    if kind == SAMPLED:
+        position = t / c[0]
+        j = 1 + min(int(position), c.shape[0] - 3)
+        part = min(position - (j - 1), 1.0)
+        return float(c[j] + part * (c[j + 1] - c[j]))
     if kind == STEP:
         return float(c[OFFSET] + (c[AMPLITUDE] if t >= c[START] else 0.0))
     angle = c[OMEGA] * t

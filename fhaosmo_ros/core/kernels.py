@@ -13,6 +13,7 @@ from fhaosmo_ros.core.borrowed import borrowed
 from fhaosmo_ros.core.law import (
     ADAPTIVE,
     DEAD_ZONE,
+    DELAY,
     EPSILON,
     FROM_MEASUREMENT,
     GAMMA_INITIAL,
@@ -31,6 +32,7 @@ from fhaosmo_ros.core.layout import (
     ROWS,
     TILDE,
     TILDE_SENSITIVITY,
+    WAIT,
     Y,
 )
 from fhaosmo_ros.core.status import LEVEL_SHIFT, Status
@@ -147,7 +149,9 @@ def step(
                 memory[Y] = y
         else:
             if flags[ADAPTIVE]:
-                memory[GAMMA], word = adapt(scalars, x, gamma, whole, loss, gradient)
+                memory[GAMMA], memory[WAIT], word = adapt(
+                    scalars, x, gamma, memory[WAIT], whole, loss, gradient
+                )
             for r in range(ROWS):
                 for i in range(n):
                     levels[r, i] = x[r, i]
@@ -160,10 +164,10 @@ def step(
 
 @njit(cache=True, error_model='numpy', forceinline=True)
 def adapt(
-    c: Floats, x: Floats, gamma: float, h: float, loss: float, gradient: float
-) -> tuple[float, int]:
+    c: Floats, x: Floats, gamma: float, wait: float, h: float, loss: float, gradient: float
+) -> tuple[float, float, int]:
     """
-    Return the next gamma (P adaptationlawgamma) and its status flags.
+    Return the next gamma (P adaptationlawgamma), the time to wait, and the status flags.
 
     Projection on [gamma_min, gamma_max], dead zone and leakage are ours (D 8).
     """
@@ -178,16 +182,23 @@ def adapt(
         for r in (HAT_SENSITIVITY, TILDE_SENSITIVITY):
             for i in range(x.shape[1]):
                 x[r, i] = 0.0
-    elif loss > c[DEAD_ZONE] * c[DEAD_ZONE]:
-        gamma -= h * c[RATE] * gradient  # P adaptationlawgamma
-    gamma -= min(h * c[LEAKAGE], 1.0) * (gamma - c[GAMMA_INITIAL])
+    leaks = c[DEAD_ZONE] == 0.0
+    if loss <= c[DEAD_ZONE] * c[DEAD_ZONE]:  # adaptation rests
+        leaks = leaks or wait <= 0.0
+        wait = max(wait - h, 0.0)
+    else:
+        wait = c[DELAY]
+        if not word:
+            gamma -= h * c[RATE] * gradient  # P adaptationlawgamma
+    if leaks:
+        gamma -= min(h * c[LEAKAGE], 1.0) * (gamma - c[GAMMA_INITIAL])
     if not gamma > c[MIN]:  # also for NaN, from an infinite gradient step
         gamma = c[MIN]
         word |= AT_MIN
     elif gamma >= c[MAX]:
         gamma = c[MAX]
         word |= AT_MAX
-    return gamma, word
+    return gamma, wait, word
 
 
 @njit(cache=True, error_model='numpy')

@@ -22,8 +22,8 @@ class Law(NamedTuple):
         one that stands for the unknown input).
     curves : (N, K) array
         psi of each level at K points of [0, half-width].
-    scalars : (7,) array
-        `EPSILON` .. `LEAKAGE`.
+    scalars : (8,) array
+        `EPSILON` .. `DELAY`.
     tape, offsets : arrays
         Phi_1 .. Phi_N; see tape.py.
 
@@ -61,8 +61,8 @@ SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT = range(5)
 FLAGS = 5
 LAMBDA, ALPHA, INVERSE_WIDTH, DECAY = range(4)
 GAINS = 4
-EPSILON, GAMMA_INITIAL, RATE, MIN, MAX, DEAD_ZONE, LEAKAGE = range(7)
-SCALARS = 7
+EPSILON, GAMMA_INITIAL, RATE, MIN, MAX, DEAD_ZONE, LEAKAGE, DELAY = range(8)
+SCALARS = 8
 
 NEWTON_STEPS = 60
 NEWTON_TOLERANCE = 1e-9

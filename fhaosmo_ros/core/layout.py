@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Where each quantity of the observer lives: a (4, N) array of levels and a (3,) array beside it.
+Where each quantity of the observer lives: a (4, N) array of levels and a (4,) array beside it.
 
 Rows of the level array, column i - 1 for level i:
 
@@ -18,9 +18,10 @@ Entries of the array beside it:
 | GAMMA | adaptive power gamma | 1 |
 | Y | last accepted sample of y, NaN before the first | of y |
 | PENDING | time that rejected samples stood for | s |
+| WAIT | time that the innovations have yet to stay small before gamma leaks | s |
 """
 
 HAT, TILDE, HAT_SENSITIVITY, TILDE_SENSITIVITY = range(4)
 ROWS = 4
-GAMMA, Y, PENDING = range(3)
-SCALARS = 3
+GAMMA, Y, PENDING, WAIT = range(4)
+SCALARS = 4

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core import kernels, law, layout
 from fhaosmo_ros.core.configuration import FIXED_GAMMA, ObserverConfiguration
 from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.law import Law, make_work, Work
 from fhaosmo_ros.core.status import flags, LEVEL_SHIFT, open_levels, Status
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,7 +87,7 @@ class ObserverState:
     Attributes
     ----------
     levels : (4, N) array
-    memory : (3,) array
+    memory : (4,) array
         See `fhaosmo_ros.core.layout`.
     t : float or int or None
         Time of the last sample of `Observer.run`, in its unit (s, or ns for integers).
@@ -128,7 +129,7 @@ class Observer:
         count = self._configuration.levels
         self._levels = np.zeros((layout.ROWS, count))
         self._memory = np.zeros(layout.SCALARS)
-        self._work = law.make_work(count, self._configuration.model.depth)
+        self._work = self.make_work()
         self._eps = np.zeros((1, count))
         self._t: float | int | None = None
         self._word = 0
@@ -148,6 +149,15 @@ class Observer:
     def levels(self) -> int:
         """Number of levels N."""
         return self._configuration.levels
+
+    @property
+    def law(self) -> Law:
+        """What the kernels read of the parameters."""
+        return self._law
+
+    def make_work(self) -> Work:
+        """Return scratch memory for the kernels."""
+        return make_work(self.levels, self._configuration.model.depth)
 
     @property
     def uses_input(self) -> bool:
@@ -279,6 +289,17 @@ class Observer:
         return self._estimate(self._word)
 
     @property
+    def unknown_input(self) -> float:
+        """The estimate's unknown input alone, which costs less."""
+        return float(self._levels[self._configuration.unknown_input_at])
+
+    @property
+    def unknown_input_address(self) -> int:
+        """Where `unknown_input` lies in memory, for compiled functions; until `configure`."""
+        row, column = self._configuration.unknown_input_at
+        return int(self._levels[row, column:].ctypes.data)
+
+    @property
     def arguments(self) -> tuple[Any, ...]:
         """
         Arrays that compiled functions work on: law, scratch, levels, memory.
@@ -298,19 +319,18 @@ class Observer:
         return self._estimate(word)
 
     def _estimate(self, word: int) -> Estimate:
-        z, d = self._select(self._levels)
+        z, d = self.select(self._levels)
         gamma = float(self._memory[layout.GAMMA])
         return Estimate(z, float(d), gamma, self._eps[0].copy(), word)
 
-    def _select(self, levels: NDArray[np.float64]) -> tuple[NDArray[np.float64], Any]:
+    def select(self, levels: NDArray[Any]) -> tuple[NDArray[Any], Any]:
         """Return copies of the estimates of z and d from arrays of shape (..., rows, N)."""
         n = self.order
         hat, tilde = levels[..., layout.HAT, :], levels[..., layout.TILDE, :]
         z = hat[..., :n].copy()
         if self._configuration.internal:
             z[..., 1:] = tilde[..., : n - 1]
-            return z, tilde[..., n - 1].copy()
-        return z, (hat[..., n] if self.levels > n else tilde[..., n - 1]).copy()
+        return z, levels[(..., *self._configuration.unknown_input_at)].copy()
 
     def run(
         self, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0, every: int = 1
@@ -404,7 +424,7 @@ class Observer:
         """Return what a compiled run has recorded; the last row is where this observer stands."""
         if len(words):
             self._word = int(words[-1])
-        z, d = self._select(out)
+        z, d = self.select(out)
         return Trajectory(
             t, z, d, gamma, eps, words & ((1 << LEVEL_SHIFT) - 1), words >> LEVEL_SHIFT,
             out[:, layout.HAT], out[:, layout.TILDE],

@@ -14,6 +14,7 @@ from fhaosmo_ros.core.disturbance import disturbance
 from fhaosmo_ros.core.law import (
     ADAPTIVE,
     DEAD_ZONE,
+    DELAY,
     GAMMA_INITIAL,
     Law,
     LEAKAGE,
@@ -42,8 +43,8 @@ def rates(
     flags: Ints, gains: Floats, curves: Floats, scalars: Floats, tape: Floats, offsets: Ints,
     x: Floats, m: Floats, stack: Floats,
     plant_tape: Floats, plant_offsets: Ints, kind: int, wave: Floats, point: Floats,
-    state: Floats, out: Floats, stage: int, t: float,
-) -> None:  # fmt: skip
+    state: Floats, out: Floats, stage: int, t: float, wait: float,
+) -> float:  # fmt: skip
     """
     Write d(state)/dt into a row of `out`; the state is z, then the levels row by row, then gamma.
 
@@ -55,6 +56,13 @@ def rates(
         The plant's Phi and its d(t); the observer's model need not be the plant's.
     point : (2, n) array
         Scratch memory; row 1 stays 0.
+    wait : float
+        Time (s) until gamma leaks, if the innovations stay small.
+
+    Returns
+    -------
+    float
+        L.
 
     """
     n, levels = point.shape[1], gains.shape[1]
@@ -83,10 +91,13 @@ def rates(
             out[stage, k] = x[r, i] - state[k]
     slope = 0.0
     if flags[ADAPTIVE]:
-        if loss > scalars[DEAD_ZONE] * scalars[DEAD_ZONE]:
+        rests = loss <= scalars[DEAD_ZONE] * scalars[DEAD_ZONE]
+        if not rests:
             slope = -scalars[RATE] * gradient  # P adaptationlawgamma
-        slope -= scalars[LEAKAGE] * (gamma - scalars[GAMMA_INITIAL])
+        if scalars[DEAD_ZONE] == 0.0 or (rests and wait <= 0.0):
+            slope -= scalars[LEAKAGE] * (gamma - scalars[GAMMA_INITIAL])
     out[stage, n + ROWS * levels] = slope
+    return loss
 
 
 @njit(cache=True, error_model='numpy')
@@ -128,6 +139,7 @@ def integrate(
     size, count = state.shape[1], rows.shape[0]
     for i in range(size):
         rows[0, i] = now[i]
+    wait, loss = 0.0, 0.0
     for k in range((count - 1) * every):
         t = k * h
         for stage in range(stages):
@@ -136,15 +148,19 @@ def integrate(
                 at[i] = now[i]
                 if stage > 0:
                     at[i] += step * slopes[stage - 1, i]
-            rates(
+            found = rates(
                 flags, gains, curves, scalars, tape, offsets, x, m, stack, plant_tape,
-                plant_offsets, kind, wave, point, at, slopes, stage, t + step,
+                plant_offsets, kind, wave, point, at, slopes, stage, t + step, wait,
             )  # fmt: skip
+            if stage == 0:
+                loss = found
         for i in range(size):
             for stage in range(stages):
                 now[i] += h * weights[stage] * slopes[stage, i]
         if flags[ADAPTIVE]:  # projection (D 8)
             now[size - 1] = min(max(now[size - 1], scalars[MIN]), scalars[MAX])
+            rests = loss <= scalars[DEAD_ZONE] * scalars[DEAD_ZONE]
+            wait = max(wait - h, 0.0) if rests else scalars[DELAY]
         if (k + 1) % every == 0:
             for i in range(size):
                 rows[(k + 1) // every, i] = now[i]

@@ -8,8 +8,9 @@ from fhaosmo_ros.core import layout, policy, policy_time
 from fhaosmo_ros.core import policy_layout as at
 from fhaosmo_ros.core.counters import Counters
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.observer import Estimate, Observer, Trajectory
+from fhaosmo_ros.core.observer import Estimate, Observer, ObserverState, Trajectory
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
+from fhaosmo_ros.core.snapshot import Memory
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -52,6 +53,19 @@ class OnlineEstimator:
         self._word = 0
         self._sampling: dict[str, Any] = {}
         self._adopt(values)
+
+    @property
+    def arguments(self) -> tuple[NDArray[Any], ...]:
+        """
+        Arrays that `policy.take_once` works on, in its order.
+
+        Always the same tuple until `configure`, which makes another one.
+        """
+        return self._arguments
+
+    def taken(self, word: int) -> None:
+        """Remember the status word of a sample that `policy.take_once` was given by others."""
+        self._word = word
 
     @property
     def uses_stamps(self) -> bool:
@@ -125,7 +139,7 @@ class OnlineEstimator:
         self.observer.restore(state)
         size = fresh.levels.size + fresh.memory.size
         reals[at.STATES : at.STATES + size] = np.concatenate([fresh.levels.ravel(), fresh.memory])
-        self._arguments = (ints, reals, *self.observer.arguments)
+        self._arguments = (self._eps, ints, reals, *self.observer.arguments)
         *_, self._levels, self._memory = self._arguments
 
     def reset(self) -> None:
@@ -133,6 +147,46 @@ class OnlineEstimator:
         policy_time.refresh(self._ints, self._reals, self._levels, self._memory)
         self._ints[at.VALID] = 0
         self._ints[at.TICK_COUNT] = self._ints[at.SPACING] = 0
+
+    @property
+    def latest(self) -> int | None:
+        """Stamp of the latest sample that was used, in nanoseconds; a reset does not forget it."""
+        return int(self._ints[at.STAMP]) or None
+
+    @property
+    def memory(self) -> Memory:
+        """All that it remembers; a copy."""
+        state = self.observer.state
+        size = state.levels.size + state.memory.size
+        return Memory(
+            integers=self._ints[at.FROZEN : at.COUNTERS].copy(),
+            reals=self._reals[at.INTERVAL : at.STATES].copy(),
+            before=self._reals[at.STATES + size :].copy(),
+            now=np.concatenate([state.levels.ravel(), state.memory]),
+            u=self._u,
+        )
+
+    def remember(self, memory: Memory) -> None:
+        """
+        Go on where an estimator was that had this memory; parameters and counters stay.
+
+        Raises
+        ------
+        ConfigurationError
+            The memory is of an observer with another number of levels.
+
+        """
+        size, levels = len(memory.now), self._levels
+        if size != levels.size + self._memory.size:
+            raise ConfigurationError(
+                f'memory: expected that of {self.observer.levels} levels, got {size} numbers'
+            )
+        self._ints[at.FROZEN : at.COUNTERS] = memory.integers
+        self._reals[at.INTERVAL : at.STATES] = memory.reals
+        self._reals[at.STATES + size :] = memory.before
+        state, scalars = memory.now[: levels.size], memory.now[levels.size :]
+        self.observer.restore(ObserverState(state.reshape(levels.shape), scalars))
+        self._u = memory.u
 
     def seed(self, z: ArrayLike, unknown_input: float) -> None:
         """
@@ -179,6 +233,11 @@ class OnlineEstimator:
         """Expect stamps of another clock: the next sample takes the usual period."""
         self._ints[at.TIMED] = self._ints[at.TICK_COUNT] = 0
 
+    @property
+    def input(self) -> float:
+        """The known input u that is held."""
+        return self._u
+
     def set_input(self, u: float) -> bool:
         """Hold `u` as the known input from now on; return False if it is not finite."""
         if not np.isfinite(u):
@@ -213,10 +272,10 @@ class OnlineEstimator:
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
         try:
-            word: int = policy.take_once(stamp, float(y), self._u, self._eps, *self._arguments)
+            word: int = policy.take_once(stamp, float(y), self._u, *self._arguments)
         except OverflowError:  # beyond 64 bits
             limit = LARGEST_STAMP if stamp > 0 else -LARGEST_STAMP
-            word = policy.take_once(limit, float(y), self._u, self._eps, *self._arguments)
+            word = policy.take_once(limit, float(y), self._u, *self._arguments)
         self._word = word
         return word
 
@@ -252,7 +311,7 @@ class OnlineEstimator:
         policy.run(
             np.ascontiguousarray(stamps, dtype=np.int64),
             np.ascontiguousarray(y, dtype=np.float64),
-            u, out, gamma, words, eps, *self._arguments,
+            u, out, gamma, words, eps, *self._arguments[1:],
         )  # fmt: skip
         if count:
             self._u, self._word, self._eps[0] = float(u[-1]), int(words[-1]), eps[-1]

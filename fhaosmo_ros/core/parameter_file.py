@@ -6,8 +6,9 @@ from pathlib import Path
 import re
 from typing import Any
 
+from fhaosmo_ros.core.channel_parameters import channel_names, CHANNELS, with_channels
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.parameter import ParameterTable, unknown_parameter
+from fhaosmo_ros.core.parameter import ParameterTable, suggestion, unknown_parameter
 from fhaosmo_ros.core.parameters import NODE_TABLES
 from fhaosmo_ros.core.yaml_text import parse
 import yaml
@@ -21,7 +22,9 @@ def is_built_in(name: str) -> bool:
     return name in BUILT_IN or name.startswith('qos_overrides.')
 
 
-def load(path: str | Path, node: str, table: ParameterTable | None = None) -> dict[str, Any]:
+def load(
+    path: str | Path, node: str, table: ParameterTable | None = None, strict: bool = False
+) -> dict[str, Any]:
     """
     Return what a parameter file sets for a node of this package.
 
@@ -37,6 +40,8 @@ def load(path: str | Path, node: str, table: ParameterTable | None = None) -> di
         'estimator' or 'plant', or a full name such as '/rig/estimator'.
     table : ParameterTable, optional
         What the node declares; without it, that of the last part of its name.
+    strict : bool
+        Raise if no section is the node's; ROS passes over such a file.
 
     Returns
     -------
@@ -51,13 +56,22 @@ def load(path: str | Path, node: str, table: ParameterTable | None = None) -> di
 
     """
     try:
-        values: dict[str, Any] = {}
-        for section, parameters in _sections(path).items():
-            if _matches(section, node):
-                values |= parameters
-        return select(values, table or NODE_TABLES[node.rsplit('/', 1)[-1]])
+        return select(read(path, node, strict), table or NODE_TABLES[node.rsplit('/', 1)[-1]])
     except ConfigurationError as error:
         raise ConfigurationError(f'{path}: {error}') from None
+
+
+def read(path: str | Path, node: str, strict: bool = False) -> dict[str, Any]:
+    """Return what a file sets for a node, unchecked; see `load`."""
+    sections = _sections(path)
+    ours = [section for section in sections if _matches(section, node)]
+    if strict and not ours:
+        names = [section.lstrip('/') for section in sections]
+        raise ConfigurationError(
+            f"expected a section '{node}' or '/**', got {', '.join(names)}"
+            f'{suggestion(node, names)}'
+        )
+    return {name: value for section in ours for name, value in sections[section].items()}
 
 
 def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
@@ -70,7 +84,11 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
         A name that no node of the package declares, or a bad value.
 
     """
-    everybody = dict.fromkeys(name for other in NODE_TABLES.values() for name in other)
+    names = channel_names(values)
+    if CHANNELS in table:
+        table = with_channels(table, names)
+    tables = [table, *(with_channels(other, names) for other in NODE_TABLES.values())]
+    everybody = dict.fromkeys(name for other in tables for name in other)
     for name in values:
         if name not in everybody and not is_built_in(name):
             raise unknown_parameter(name, everybody)

@@ -105,14 +105,22 @@ OBSERVER = (
         'gamma_max', 1.0, 'Upper bound of gamma.', lower=0.0, lower_open=True, upper=1.0,
     ),
     Parameter(
-        'gamma_dead_zone', 0.0,
-        'Adaptation rests while the norm of the innovations is at most this (set it to the '
-        'norm that measurement noise alone gives).',
+        'gamma_dead_zone', 0.006,
+        'Adaptation rests while the norm of the innovations is at most this (their unit; set it '
+        'below the norm at which the estimate has become good enough). 0: it never rests.',
         lower=0.0, upper=1e12,
     ),
     Parameter(
-        'gamma_leakage', 0.0, 'Rate that draws gamma back to gamma_initial; 0 for none.',
+        'gamma_leakage', 0.05,
+        'Rate that draws gamma back to gamma_initial once the innovations have stayed within the '
+        'dead zone for gamma_leakage_delay; without a dead zone always. 0 for none.',
         unit='1/s', lower=0.0, upper=1e3,
+    ),
+    Parameter(
+        'gamma_leakage_delay', 5.0,
+        'Leakage waits for this time after innovations beyond the dead zone. Not used where the '
+        'dead zone is 0.',
+        unit='s', lower=0.0, upper=1e6,
     ),
     Parameter(
         'initial_estimate', [0.0], 'Filtered estimates z_hat_1 .. z_hat_N at the start.',
@@ -194,8 +202,73 @@ SAMPLING = (
 
 ESTIMATOR_NODE = (
     Parameter(
+        'channels', [''],
+        'Names of the outputs that one process estimates from. Channel hip reads hip/y, publishes '
+        '~/hip/state and so on, and takes each parameter of the model, the observer and the '
+        "sampling from hip.NAME where that is set, else from NAME. ['']: one channel, no prefix.",
+        live=False, lengths='any',
+    ),
+    Parameter(
+        'autostart', True,
+        'Configure and activate by itself at the start. false: wait for a lifecycle manager, or '
+        'for `ros2 lifecycle set`.',
+        live=False,
+    ),
+    Parameter(
         'publish_rate', 100.0, 'Rate of the timer that publishes the estimates.',
         unit='Hz', lower=0.1, upper=5000.0,
+    ),
+    Parameter(
+        'input_reliability', 'best_effort',
+        'QoS of the subscriptions of y and u. best_effort hears every publisher; reliable has '
+        'lost samples sent again, and hears reliable publishers only.',
+        choices=('best_effort', 'reliable'), live=False,
+    ),
+    Parameter(
+        'input_durability', 'volatile',
+        'QoS of the subscriptions of y and u. transient_local also hears what was published '
+        'before, of transient_local publishers only.',
+        choices=('volatile', 'transient_local'), live=False,
+    ),
+    Parameter(
+        'input_depth', 1000, 'Samples of y that wait while the node is busy; older ones are lost.',
+        lower=1, upper=100_000, live=False,
+    ),
+)  # fmt: skip
+
+DIAGNOSTICS = (
+    Parameter(
+        'diagnostics_period', 1.0, 'Time between two reports on /diagnostics, in host time.',
+        unit='s', lower=0.1, upper=60.0,
+    ),
+    Parameter(
+        'hardware_id', 'none', 'hardware_id of the reports: the sensor behind y.',
+    ),
+    Parameter(
+        'warn_rate_below', 0.0, 'WARN if the sample rate of y is lower; 0 for never.',
+        unit='Hz', lower=0.0, upper=1e5,
+    ),
+    Parameter(
+        'warn_jitter_above', 0.5,
+        'WARN if the standard deviation of the sampling period over its mean is higher.',
+        lower=0.0, upper=1e6,
+    ),
+    Parameter(
+        'warn_delay_above', 0.1,
+        'WARN if a sample is taken later than this after its source stamp: this host is too slow, '
+        "or its clock and the publisher's differ.",
+        unit='s', lower=0.0, upper=1e6,
+    ),
+    Parameter(
+        'warn_chatter_above', 0.0,
+        'WARN if the estimate of d chatters more (RMS of what a moving average of 5 samples '
+        'leaves, unit of d); 0 for never.',
+        lower=0.0, upper=1e12,
+    ),
+    Parameter(
+        'error_bad_share_above', 0.5,
+        'ERROR if a larger share of the samples was lost or rejected; any at all is a WARN.',
+        lower=0.0, upper=1.0,
     ),
 )  # fmt: skip
 
@@ -247,6 +320,12 @@ PLANT_MODEL = (
         'noise_seed', 1, 'Seed of the noise; setting it starts the noise sequence again.',
         lower=0, upper=2**31 - 1,
     ),
+    Parameter(
+        'quantisation', 0.0,
+        'Increment that y, noise included, is rounded to (unit of y), as an encoder does; 0 for '
+        'none.',
+        lower=0.0, upper=1e9,
+    ),
 )  # fmt: skip
 
 PLANT_NODE = (
@@ -258,7 +337,7 @@ PLANT_NODE = (
 
 OBSERVER_PARAMETERS = ParameterTable(MODEL, OBSERVER)
 ONLINE_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING)
-ESTIMATOR_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, ESTIMATOR_NODE)
+ESTIMATOR_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, ESTIMATOR_NODE, DIAGNOSTICS)
 PLANT_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL)
 PLANT_NODE_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL, PLANT_NODE)
 NODE_TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}

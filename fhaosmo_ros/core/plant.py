@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated plant (paper eq. newsimpledynamics): triangular system, unknown input, noise."""
+"""The simulated plant (paper eq. newsimpledynamics): triangular system, unknown input, sensor."""
 
 from collections.abc import Mapping
 import math
@@ -23,7 +23,7 @@ class Truth(NamedTuple):
     Attributes
     ----------
     y : float or (K,) array
-        Measured output, with noise.
+        Measured output, with noise and quantisation.
     z : (n,) or (K, n) array
         States.
     unknown_input : float or (K,) array
@@ -36,17 +36,26 @@ class Truth(NamedTuple):
     unknown_input: Any
 
 
-class _System(NamedTuple):
+class System(NamedTuple):
+    """What drives the compiled integration: model tape and d(t)."""
+
     tape: Floats
     offsets: Ints
     kind: int
     wave: Floats
 
 
-class _Work(NamedTuple):
+class Work(NamedTuple):
+    """Scratch memory of the integration."""
+
     point: Floats  # (2, n): where the field is evaluated, and a tangent that stays 0
     slopes: Floats  # (4, n)
     stack: Floats  # (2, depth)
+
+
+def make_work(order: int, depth: int) -> Work:
+    """Return scratch memory for a model of this order, whose tapes need this stack depth."""
+    return Work(np.zeros((2, order)), np.zeros((4, order)), np.zeros((2, depth)))
 
 
 NODES = (0.0, 0.5, 0.5, 1.0)
@@ -54,7 +63,7 @@ WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
 
 
 @njit(cache=True, error_model='numpy')
-def _rk4(system: _System, work: _Work, z: Floats, t: float, h: float, u: float) -> None:
+def rk4(system: System, work: Work, z: Floats, t: float, h: float, u: float) -> None:
     """One classical Runge-Kutta step of paper eq. triangular, in place."""
     n = z.shape[0]
     for stage in range(4):
@@ -79,7 +88,7 @@ def _rk4(system: _System, work: _Work, z: Floats, t: float, h: float, u: float) 
 
 @njit(cache=True, error_model='numpy')
 def _advance(
-    system: _System, work: _Work, z: Floats, at: Floats, step: int, t: float, h: float, u: float
+    system: System, work: Work, z: Floats, at: Floats, step: int, t: float, h: float, u: float
 ) -> int:
     """
     Bring the grid state `z` (at time step * h) up to `t`, and `at` to `t` itself.
@@ -88,18 +97,18 @@ def _advance(
     so that the trajectory doesn't depend on the times at which somebody looks.
     """
     while (step + 1) * h <= t:
-        _rk4(system, work, z, step * h, h, u)
+        rk4(system, work, z, step * h, h, u)
         step += 1
     for i in range(z.shape[0]):
         at[i] = z[i]
     if t > step * h:
-        _rk4(system, work, at, step * h, t - step * h, u)
+        rk4(system, work, at, step * h, t - step * h, u)
     return step
 
 
 @njit(cache=True, error_model='numpy')
 def _simulate(
-    system: _System, work: _Work, z: Floats, step: int, t: Floats, h: float, u: Floats,
+    system: System, work: Work, z: Floats, step: int, t: Floats, h: float, u: Floats,
     states: Floats, d: Floats,
 ) -> int:  # fmt: skip
     for k in range(t.shape[0]):
@@ -135,7 +144,7 @@ class Plant:
         self._z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], n)
         self._at = self._z.copy()
         self._step = 0
-        self._work = _Work(np.zeros((2, n)), np.zeros((4, n)), np.zeros((2, self._model.depth)))
+        self._work = make_work(n, self._model.depth)
         self._random = np.random.default_rng(p['noise_seed'])
         self._system = self._make_system()
 
@@ -181,11 +190,11 @@ class Plant:
                 )
         return dict(changes)
 
-    def _make_system(self) -> _System:
+    def _make_system(self) -> System:
         p, model = self._parameters, self._model
         wave = np.array([p[f'disturbance_{name}'] for name in NAMES], dtype=np.float64)
         kind = KINDS.index(p['disturbance'])
-        return _System(model.tape, model.offsets, kind, wave)
+        return System(model.tape, model.offsets, kind, wave)
 
     def advance(self, t: float, u: float = 0.0) -> None:
         """
@@ -204,10 +213,10 @@ class Plant:
         )
 
     def sample(self, t: float, u: float = 0.0) -> Truth:
-        """Advance to `t` and measure: y = z_1 + noise."""
+        """Advance to `t` and measure: y = z_1 + noise, quantised."""
         self.advance(t, u)
         d = disturbance(self._system.kind, self._system.wave, float(t))
-        return Truth(float(self._at[0]) + self._noise(), self._at.copy(), float(d))
+        return Truth(float(self._measured(self._at[:1])[0]), self._at.copy(), float(d))
 
     def simulate(self, t: ArrayLike, u: ArrayLike | float = 0.0) -> Truth:
         """
@@ -237,8 +246,14 @@ class Plant:
         u = np.ascontiguousarray(np.broadcast_to(np.asarray(u, dtype=np.float64), t.shape))
         z, d = np.empty((len(t), self.order)), np.empty(len(t))
         self._step = _simulate(self._system, self._work, self._z, self._step, t, self._h, u, z, d)
-        noise = self._parameters['noise_std'] * self._random.standard_normal(len(t))
-        return Truth(z[:, 0] + noise, z, d)
+        return Truth(self._measured(z[:, 0]), z, d)
 
-    def _noise(self) -> float:
-        return float(self._parameters['noise_std'] * self._random.standard_normal())
+    def _measured(self, z1: Floats) -> Floats:
+        p = self._parameters
+        y = z1 + p['noise_std'] * self._random.standard_normal(len(z1))
+        return quantised(y, p['quantisation'])
+
+
+def quantised(y: Floats, step: float) -> Floats:
+    """Return y rounded to multiples of `step`, or as it is for 0."""
+    return np.round(y / step) * step if step > 0.0 else y

@@ -45,7 +45,7 @@ def take(
     ints, reals : arrays
         Settings and memory of the policy, see policy_layout.py.
     flags .. offsets, x .. stack : arrays
-        `Law` and `Work`, see kernels.py.
+        `Law` and `Work`, see law.py.
     levels, memory : arrays
         The observer's state, see layout.py.
 

@@ -28,4 +28,4 @@ def parse(text: str) -> Any:
         The text is not YAML.
 
     """
-    return yaml.load(text, Loader=_Loader)
+    return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)

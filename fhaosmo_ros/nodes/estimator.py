@@ -1,30 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator node: y in; states, unknown input and gamma out, at the rate of a timer."""
+"""The estimator node: a managed node that keeps channels alive from y to the estimates."""
 
 from collections.abc import Mapping
 from typing import Any
 
-from builtin_interfaces.msg import Time
+from fhaosmo_ros.core.channel_parameters import (
+    channel_names,
+    CHANNELS,
+    of_channel,
+    UNNAMED,
+    with_channels,
+)
+from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
-from fhaosmo_ros.core.status import REJECTED, Status
-from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher
-from fhaosmo_ros.nodes.messages import fill, labelled
-from fhaosmo_ros.nodes.parameters import declare, on_change
+from fhaosmo_ros.core.parameter_file import select
+from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.nodes.channel import Channel, online
+from fhaosmo_ros.nodes.channel_group import ChannelGroup, of
+from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher, ERROR, OK, Report, STALE
+from fhaosmo_ros.nodes.following import Following
+from fhaosmo_ros.nodes.lifecycle import ManagedNode
+from fhaosmo_ros.nodes.outputs import check_overrides
+from fhaosmo_ros.nodes.parameters import declare, on_change, overrides_of, values_of
 from fhaosmo_ros.nodes.spin import run_node
-from fhaosmo_ros.nodes.subscription import subscribe_with_info
-from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from std_msgs.msg import Float64, Float64MultiArray
-from std_srvs.srv import Trigger
-
-SENSOR_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Best effort matches every publisher; the depth holds a second at 1 kHz."""
 
 
-class EstimatorNode(Node):
+class EstimatorNode(ManagedNode):
     """
-    Subscribes ``y`` (and ``u``), steps the observer on each sample, publishes on a timer.
+    A managed node around a channel, or many.
+
+    configure reads the parameters and makes the channel; activate lets it take samples and
+    publish; deactivate stops that; cleanup takes the channel away, and then every parameter can
+    be set, except the names of the channels.
 
     Raises
     ------
@@ -37,172 +44,95 @@ class EstimatorNode(Node):
         super().__init__(
             'estimator', automatically_declare_parameters_from_overrides=True, **options
         )
-        values = declare(self, ESTIMATOR_PARAMETERS, lambda v: OnlineEstimator(_online(v)))
-        self.estimator = OnlineEstimator(_online(values))
-        self._compile()
-        self._clock_stamps = values['sampling'] == 'clock'
-        self._max_gap = float(values['max_gap'])
-        self._sequence = 0
-        self._lost = 0
-        self._arrived = False
-        self._stale = True
-        self._silent_since: int | None = None
+        overrides = overrides_of(self)
+        self._names = channel_names(overrides)
+        common = select(
+            {n: v for n, v in overrides.items() if n in ESTIMATOR_PARAMETERS}, ESTIMATOR_PARAMETERS
+        )
+        self._table = with_channels(ESTIMATOR_PARAMETERS, self._names, common)
+        values = declare(self, self._table, self._check_all, fixed=['autostart', CHANNELS])
+        self._channels: Channel | ChannelGroup | None = None
+        self._following = Following(self._names, overrides)
+        self._diagnostics = DiagnosticsPublisher(
+            self, self._reports, values['diagnostics_period'], values['hardware_id']
+        )
+        on_change(self, self._table, self._check, self._adopt, self._following.complete)
+        if values['autostart']:
+            try:
+                self.start()
+            except Exception:
+                self.destroy_node()
+                raise
+        else:
+            self.get_logger().info('waiting to be configured, for instance by ros2 lifecycle set')
 
-        observer = self.estimator.observer
-        self._state = labelled([f'z{i + 1}' for i in range(observer.order)])
-        self._innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
-        self._d, self._gamma, self._stamp = Float64(), Float64(), Time()
-        self._publish_state = self.create_publisher(Float64MultiArray, '~/state', 10).publish
-        self._publish_d = self.create_publisher(Float64, '~/unknown_input', 10).publish
-        self._publish_gamma = self.create_publisher(Float64, '~/gamma', 10).publish
-        self._publish_innovation = self.create_publisher(
-            Float64MultiArray, '~/innovation', 10
-        ).publish
-        self._publish_stamp = self.create_publisher(Time, '~/stamp', 10).publish
-        self._diagnostics = DiagnosticsPublisher(self, self._report)
-        self.create_service(Trigger, '~/reset', self._reset)
-        self._timer = self._start_timer(values['publish_rate'])
-        on_change(self, ESTIMATOR_PARAMETERS, self._check, self._configure)
-        if observer.uses_input:
-            self.create_subscription(Float64, 'u', self._on_input, SENSOR_QOS)
-        self._y = subscribe_with_info(self, Float64, 'y', self._on_sample, SENSOR_QOS)
+    def configure(self) -> None:
+        """Make the channel, or channels, from the present parameters."""
+        values = values_of(self, self._table)
+        check_overrides(self, [f'~/{name}/' if name else '~/' for name in self._names])
+        if self._names == UNNAMED:
+            self._channels = Channel(self, values)
+        else:
+            self._channels = ChannelGroup(self, values, self._names)
         if self.get_parameter('use_sim_time').value and values['sampling'] == 'source_stamp':
             self.get_logger().warning(
                 "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing "
                 "of /clock, so dt is in the host's time; set sampling to clock for simulation time"
             )
-        parameters = observer.parameters
-        self.get_logger().info(
-            f'estimating {observer.order} states and the unknown input from {self._y.topic_name} '
-            f'({parameters["variant"]}, {parameters["scheme"]})'
-        )
 
-    def _compile(self) -> None:
-        """Compile before the first sample arrives; cached on disk after the first start."""
-        trial = OnlineEstimator(self.estimator.parameters)
-        for stamp in (1, 1_000_001):
-            trial.update(stamp, 0.0)
+    def activate(self) -> None:
+        """Take samples and publish."""
+        assert self._channels is not None
+        self._channels.activate()
 
-    def _on_sample(self, message: Float64, info: Mapping[str, Any]) -> None:
-        if self._clock_stamps:
-            stamp = self.get_clock().now().nanoseconds
-        else:
-            stamp = info['source_timestamp']
-        self._count_lost(info.get('publication_sequence_number'))
-        estimator = self.estimator
-        restarts = estimator.counters.restarts
-        word = estimator.advance(stamp, message.data)
-        if estimator.counters.restarts != restarts:
-            self.get_logger().warning(
-                'more than max_gap between two usable samples: restarted from the new one'
-            )
-        if not word & REJECTED:
-            self._arrived = True
-        else:
-            self.get_logger().warning(
-                f'rejected a sample: {_reason(word, message.data)} '
-                f'({estimator.counters.rejected} rejected so far)',
-                throttle_duration_sec=5.0,
-            )
+    def deactivate(self) -> None:
+        """Stop that."""
+        if self._channels is not None:
+            self._channels.deactivate()
 
-    def _count_lost(self, sequence: int | None) -> None:
-        """Count the samples between the publisher's last sequence number and this one."""
-        if sequence:
-            if self._sequence and sequence > self._sequence + 1:
-                self._lost += sequence - self._sequence - 1
-            self._sequence = sequence
+    def cleanup(self) -> None:
+        """Take the channels away."""
+        if self._channels is not None:
+            self._channels.destroy()
+            self._channels = None
 
-    def _on_input(self, message: Float64) -> None:
-        if not self.estimator.set_input(message.data):
-            self.get_logger().warning(
-                f'rejected u = {message.data}: expected a finite number; the last one is held',
-                throttle_duration_sec=5.0,
-            )
-
-    def _publish(self) -> None:
-        estimator = self.estimator
-        if self._is_stale():
-            return
-        estimate = estimator.estimate
-        if estimate is None:  # reset, and no sample since
-            return
-        self._publish_state(fill(self._state, estimate.z))
-        self._d.data = estimate.unknown_input
-        self._publish_d(self._d)
-        self._gamma.data = estimate.gamma
-        self._publish_gamma(self._gamma)
-        self._publish_innovation(fill(self._innovation, estimate.innovation))
-        self._stamp.sec, self._stamp.nanosec = divmod(estimator.stamp, 1_000_000_000)
-        self._publish_stamp(self._stamp)
-
-    def _is_stale(self) -> bool:
-        """Return True, and say it once, while no sample has come for max_gap."""
-        if self._arrived:
-            self._arrived = self._stale = False
-            self._silent_since = None
-        elif not self._stale:
-            now = self.get_clock().now().nanoseconds
-            if self._silent_since is None:  # the clock is not read while samples come
-                self._silent_since = now
-            elif not 0 <= now - self._silent_since <= self._max_gap * 1e9:  # or it jumped back
-                self._stale = True
-                self.get_logger().warning(
-                    f'no usable sample on {self._y.topic_name} for {self._max_gap:g} s: not '
-                    'publishing until one comes'
-                )
-        return self._stale
-
-    def _start_timer(self, rate: float) -> Any:
-        return self.create_timer(1.0 / rate, self._publish)
+    def _check_all(self, values: Mapping[str, Any]) -> None:
+        """Raise if a channel can't be made of these values."""
+        for name in self._names:
+            with of(name):
+                OnlineEstimator(online(of_channel(values, name)))
 
     def _check(self, changes: Mapping[str, Any]) -> None:
-        self.estimator.check(_online(changes))
+        if self._channels is None:  # each value by itself; together they are checked by configure
+            return
+        for name, value in changes.items():
+            parameter = self._table[name]
+            if not parameter.live:
+                now = parameter.coerce(self.get_parameter(name).value)
+                if value != now:
+                    raise ConfigurationError(
+                        f"parameter '{name}': read when the node is configured (it is {now!r}), "
+                        f'got {value!r}; set it after the transition cleanup'
+                    )
+        self._channels.check(changes)
 
-    def _configure(self, changes: Mapping[str, Any]) -> None:
-        self.estimator.configure(_online(changes))
-        self._max_gap = float(changes.get('max_gap', self._max_gap))
-        if 'sampling' in changes:
-            self._clock_stamps = changes['sampling'] == 'clock'
-            self.estimator.forget_stamp()
-        if 'publish_rate' in changes:
-            self.destroy_timer(self._timer)
-            self._timer = self._start_timer(changes['publish_rate'])
+    def _adopt(self, changes: Mapping[str, Any]) -> None:
+        self._following.adopted(changes)
+        if self._channels is not None:
+            self._channels.configure(changes)
+        if 'diagnostics_period' in changes:
+            self._diagnostics.set_period(changes['diagnostics_period'])
+        self._diagnostics.hardware_id = changes.get('hardware_id', self._diagnostics.hardware_id)
 
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.estimator.reset()
-        response.success = True
-        response.message = 'the observer starts afresh with the next sample'
-        self.get_logger().info(f'reset: {response.message}')
-        return response
-
-    def _report(self) -> dict[str, Any]:
-        """Return what diagnostics show."""
-        counters = self.estimator.counters
-        estimate = self.estimator.estimate
-        return {
-            'samples accepted': counters.accepted,
-            'samples lost': self._lost,
-            'rejected measurements': counters.rejected_measurements,
-            'rejected stamps': counters.rejected_stamps,
-            'rejected inputs': counters.rejected_inputs,
-            'rejected steps': counters.rejected_steps,
-            'restarts': counters.restarts,
-            'open levels': estimate.open_levels if estimate else 0,
-            'gamma': estimate.gamma if estimate else float('nan'),
-        }
-
-
-def _online(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters of the update path among the node's."""
-    return {name: value for name, value in values.items() if name in ONLINE_PARAMETERS}
-
-
-def _reason(word: int, y: float) -> str:
-    if word & Status.REJECTED_PERIOD:
-        return 'expected a stamp later than the one before'
-    if word & Status.REJECTED_MEASUREMENT:
-        return f'expected a finite y, got {y}'
-    return f'y = {y} would have made the estimate infinite'
+    def _reports(self) -> list[Report]:
+        state = Report('state')
+        active = self.state == 'active'
+        state.find(OK if active else STALE, self.state)
+        if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
+            state.find(ERROR, 'use_sim_time, but nothing on /clock yet')
+        if not active or self._channels is None:
+            return [state]
+        return [state, *self._channels.reports()]
 
 
 def main(argv: list[str] | None = None) -> int:

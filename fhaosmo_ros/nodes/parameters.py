@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the declarations of the core to ROS parameters: descriptors, overrides, live changes."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from fhaosmo_ros.core.errors import ConfigurationError
@@ -28,7 +28,7 @@ TYPES = {
 }
 
 
-def descriptor(parameter: Parameter) -> ParameterDescriptor:
+def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     """
     Return the ROS descriptor of a declared parameter.
 
@@ -41,7 +41,7 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
         type=TYPES[parameter.kind].value,
         description=parameter.text,
         additional_constraints=constraints,
-        read_only=not parameter.live,
+        read_only=read_only,
         dynamic_typing=True,
     )
     if parameter.lower is not None and parameter.upper is not None:
@@ -57,8 +57,16 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
     return result
 
 
+def overrides_of(node: Node) -> dict[str, Any]:
+    """Return what files and the command line set, before it is declared."""
+    return {name: p.value for name, p in node.get_parameters_by_prefix('').items()}
+
+
 def declare(
-    node: Node, table: ParameterTable, check: Callable[[Mapping[str, Any]], None]
+    node: Node,
+    table: ParameterTable,
+    check: Callable[[Mapping[str, Any]], None],
+    fixed: Iterable[str] | None = None,
 ) -> dict[str, Any]:
     """
     Declare a table's parameters on a node and return their values.
@@ -72,6 +80,8 @@ def declare(
         What to declare.
     check : callable
         Gets all values before anything is declared; raises ConfigurationError.
+    fixed : names, optional
+        Parameters that can't change in any state of the node: by default those that are not live.
 
     Raises
     ------
@@ -79,15 +89,23 @@ def declare(
         An unknown name or a bad value among the overrides.
 
     """
-    overrides = {name: p.value for name, p in node.get_parameters_by_prefix('').items()}
+    overrides = overrides_of(node)
     values: dict[str, Any] = table.defaults() | select(overrides, table)
     check(values)
     for name in overrides:
         if not is_built_in(name):  # declared as it came, without a descriptor
             node.undeclare_parameter(name)
+    fixed = [n for n, p in table.items() if not p.live] if fixed is None else list(fixed)
     for name, parameter in table.items():
-        node.declare_parameter(name, values[name], descriptor(parameter), ignore_override=True)
+        node.declare_parameter(
+            name, values[name], descriptor(parameter, name in fixed), ignore_override=True
+        )
     return values
+
+
+def values_of(node: Node, table: ParameterTable) -> dict[str, Any]:
+    """Return the present values of a table's parameters, in their own types."""
+    return {name: p.coerce(node.get_parameter(name).value) for name, p in table.items()}
 
 
 def on_change(
@@ -95,6 +113,7 @@ def on_change(
     table: ParameterTable,
     check: Callable[[Mapping[str, Any]], None],
     apply: Callable[[Mapping[str, Any]], None],
+    complete: Callable[[list[RosParameter]], list[RosParameter]] = list,
 ) -> None:
     """
     Connect live changes: values are brought into their type, checked as a set, applied.
@@ -105,6 +124,8 @@ def on_change(
         Gets the changes; raises ConfigurationError and changes nothing.
     apply : callable
         Gets the same changes once ROS has accepted all of them.
+    complete : callable
+        Gets what somebody wants to set; returns it with what is to change along.
 
     """
 
@@ -112,7 +133,7 @@ def on_change(
         for p in parameters:
             if not node.has_parameter(p.name):  # rclpy 7.1 refuses it too, but loses the name
                 raise ParameterNotDeclaredException(f"'{p.name}'{suggestion(p.name, table)}")
-        return [_converted(p, table) for p in parameters]
+        return complete([_converted(p, table) for p in parameters])
 
     def validate(parameters: list[RosParameter]) -> SetParametersResult:
         try:

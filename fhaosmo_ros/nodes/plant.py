@@ -7,7 +7,7 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters import PLANT_NODE_PARAMETERS, PLANT_PARAMETERS
 from fhaosmo_ros.core.plant import Plant
-from fhaosmo_ros.nodes.messages import fill, labelled
+from fhaosmo_ros.nodes.messages import array_encoder, double_encoder
 from fhaosmo_ros.nodes.parameters import declare, on_change
 from fhaosmo_ros.nodes.spin import run_node
 from rclpy.node import Node
@@ -36,8 +36,8 @@ class PlantNode(Node):
         self._u = 0.0
         self._origin: int | None = None
         self._now = 0
-        self._y = Float64()
-        self._state = labelled([f'z{i + 1}' for i in range(self.plant.order)])
+        self._encode = double_encoder()
+        self._encode_state = array_encoder([f'z{i + 1}' for i in range(self.plant.order)])
         self._publish_y = self.create_publisher(Float64, 'y', 10).publish
         self._publish_state = self.create_publisher(Float64MultiArray, '~/state', 10).publish
         self._publish_d = self.create_publisher(Float64, '~/unknown_input', 10).publish
@@ -61,10 +61,9 @@ class PlantNode(Node):
         clock = self.get_clock()
         self.plant.advance(self._plant_time(clock.now().nanoseconds), self._u)
         truth = self.plant.sample(self._plant_time(clock.now().nanoseconds), self._u)
-        self._y.data = truth.y
-        self._publish_y(self._y)
-        self._publish_state(fill(self._state, truth.z))
-        self._publish_d(Float64(data=truth.unknown_input))
+        self._publish_y(self._encode(truth.y))
+        self._publish_state(self._encode_state(truth.z))
+        self._publish_d(self._encode(truth.unknown_input))
 
     def _plant_time(self, now: int) -> float:
         """Return the plant's time in seconds; it stands still while the clock jumps."""

@@ -4,12 +4,8 @@
 import importlib
 from typing import Any
 
-from fhaosmo_ros.nodes.spin import Spinner
-import rclpy
-from rclpy.context import Context
-from rclpy.node import Node
+from fhaosmo_ros.nodes.private_node import PrivateNode
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -20,9 +16,9 @@ LATCHED = QoSProfile(
 )
 
 
-class Player:
+class Player(PrivateNode):
     """
-    A node in a context of its own.
+    A node that publishes while it is open.
 
     Parameters
     ----------
@@ -38,11 +34,9 @@ class Player:
 
     def __init__(self, topics: dict[str, tuple[str, bool]]) -> None:
         self.missing: list[str] = []
-        self._context = Context()
-        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = Node('fhaosmo_player', context=self._context, use_global_arguments=False)
+        super().__init__('fhaosmo_player')
         self._publish: dict[str, Any] = {}
-        self._clock = self._node.create_publisher(Clock, '/clock', 10).publish
+        self._clock = self.node.create_publisher(Clock, '/clock', 10).publish
         for topic, (message_type, latched) in topics.items():
             package, kind, name = message_type.split('/')
             try:
@@ -51,21 +45,7 @@ class Player:
                 self.missing.append(topic)
                 continue
             qos = LATCHED if latched else QOS
-            self._publish[topic] = self._node.create_publisher(message_class, topic, qos).publish
-        self._spinner = Spinner(self._node)
-
-    def __enter__(self) -> 'Player':
-        self._spinner.__enter__()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._spinner.__exit__()
-        self._node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
-
-    def subscribers(self, topic: str) -> int:
-        """Return how many subscribers of a topic have been discovered."""
-        return int(self._node.count_subscribers(topic))
+            self._publish[topic] = self.node.create_publisher(message_class, topic, qos).publish
 
     def publish(self, topic: str, data: bytes) -> None:
         """Publish a message in CDR."""

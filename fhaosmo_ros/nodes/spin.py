@@ -2,19 +2,23 @@
 """Starting, spinning and stopping a node: what both nodes' `main` share."""
 
 from collections.abc import Callable, Mapping
+import contextlib
 import gc
 from itertools import pairwise
 import os
 import re
 import sys
 import threading
+import traceback
 from typing import Any
 
+from fhaosmo_ros.core.channel_parameters import channel_names, CHANNELS, with_channels
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter import Parameter, suggestion
-from fhaosmo_ros.core.parameter_file import check_one_type, is_built_in, load, parse
+from fhaosmo_ros.core.parameter_file import check_one_type, is_built_in, load, parse, read
 from fhaosmo_ros.core.parameters import NODE_TABLES
-from fhaosmo_ros.stop_signals import stop_on_signals
+from fhaosmo_ros.nodes.lifecycle import ManagedNode
+from fhaosmo_ros.stop_signals import stop_on_signals, Stopped
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -28,6 +32,8 @@ try:
 except ImportError:  # an older rclpy
     EventsExecutor = None
 
+GRACE = 0.5
+"""Seconds that a callback has to end."""
 FOREVER = 3600.0
 """The events executor never runs a callback without a finite timeout."""
 
@@ -65,8 +71,14 @@ class Spinner:
     def __exit__(self, *_: object) -> None:
         self._stop.set_result(None)
         self._executor.wake()
-        self._thread.join(timeout=5.0)
-        self._executor.shutdown()
+        self._thread.join(timeout=GRACE)
+        if not self.stuck:
+            self._executor.shutdown()
+
+    @property
+    def stuck(self) -> bool:
+        """True if a callback runs still, after the end of the block."""
+        return self._thread.is_alive()
 
     def _spin(self) -> None:
         try:
@@ -99,36 +111,48 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
     ended = stop_on_signals()
     node = None
     try:
-        _check_arguments(name, argv)
-        rclpy.init(args=[name, *argv], signal_handler_options=SignalHandlerOptions.NO)
-        node = factory()
+        with ended.raising():  # the start may compile for seconds
+            _check_arguments(name, argv)
+            rclpy.init(args=[name, *argv], signal_handler_options=SignalHandlerOptions.NO)
+            node = factory()
         gc.collect()
         gc.freeze()  # what lives now lives to the end: later collections need not visit it
         with Spinner(node, on_end=ended.set) as spinner:
             ended.wait()
+        if spinner.stuck:  # for instance compiling; a node has nothing to save
+            print(f'{name}: ended while a callback was running', file=sys.stderr, flush=True)
+            os._exit(0)
         if spinner.error is not None:
-            print(f'{name}: error: {spinner.error!r}', file=sys.stderr)
+            print(f'{name}: error: a callback failed', file=sys.stderr)
+            traceback.print_exception(spinner.error)
             return 1
+        return 0
+    except Stopped:
         return 0
     except (ConfigurationError, RuntimeError) as error:
         print(f'{name}: error: {_one_line(error)}', file=sys.stderr)
         return 2
     finally:
         if node is not None:
+            if isinstance(node, ManagedNode):
+                node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
 
 
 def _check_arguments(name: str, argv: list[str]) -> None:
     """Check what rcl would pass over in silence, or refuse without naming what is wrong."""
-    table = NODE_TABLES[name]
     options = list(pairwise(argv))
+    full_name = _full_name(name, options)
+    table = with_channels(NODE_TABLES[name], _channels(options, full_name))
     for flag, word in options:
         if flag == '--params-file':
-            load(os.path.expanduser(word), _full_name(name, options), table)
+            load(os.path.expanduser(word), full_name, table)
         elif flag in ('-p', '--param') and ':=' in word:
             target, text = word.split(':=', 1)
-            parameter = target.rsplit(':', 1)[-1]
+            node, _, parameter = target.rpartition(':')
+            if node and node != full_name.rsplit('/', 1)[-1]:
+                continue  # another node's
             if parameter not in table and not is_built_in(parameter):
                 raise ConfigurationError(
                     f"unknown parameter '{parameter}'{suggestion(parameter, table)}"
@@ -137,6 +161,21 @@ def _check_arguments(name: str, argv: list[str]) -> None:
     rest = remove_ros_args([name, *argv])[1:]
     if rest:
         raise ConfigurationError(f'unexpected argument {rest[0]!r}; {_usage(name)}')
+
+
+def _channels(options: list[tuple[str, str]], full_name: str) -> list[str]:
+    """Return the channels that the arguments declare, wherever they do."""
+    values: dict[str, Any] = {}
+    for flag, word in options:
+        if flag == '--params-file':
+            with contextlib.suppress(ConfigurationError):  # `load` says it
+                values |= read(os.path.expanduser(word), full_name)
+    for flag, word in options:
+        target, _, text = word.partition(':=')
+        if flag in ('-p', '--param') and target.rsplit(':', 1)[-1] == CHANNELS:
+            with contextlib.suppress(yaml.YAMLError):  # rcl quotes the whole rule
+                values[CHANNELS] = parse(text)
+    return channel_names(values)
 
 
 def _full_name(name: str, options: list[tuple[str, str]]) -> str:

@@ -1,12 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Subscriptions that also deliver a message's source time stamp."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import inspect
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+SENSOR_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Best effort matches every publisher; the depth holds a second at 1 kHz."""
+
+
+def input_qos(values: Mapping[str, Any]) -> QoSProfile:
+    """Return the QoS that the parameters input_reliability, _durability and _depth ask for."""
+    return QoSProfile(
+        depth=values['input_depth'],
+        reliability=ReliabilityPolicy[values['input_reliability'].upper()],
+        durability=DurabilityPolicy[values['input_durability'].upper()],
+    )
 
 
 def subscribe_with_info(
@@ -25,9 +38,13 @@ def subscribe_with_info(
     either.
     """
 
-    def adapter(*arguments: Any) -> None:
-        message, info = arguments[0] if len(arguments) == 1 else arguments
+    def adapter(message: Any, info: Any = None) -> None:
+        if info is None:
+            message, info = message
         callback(message, info)
 
     adapter.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
-    return node.create_subscription(message_type, topic, adapter, qos, raw=raw)
+    return node.create_subscription(
+        message_type, topic, adapter, qos, raw=raw,
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+    )  # fmt: skip

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Subscribes topics as they appear, with the QoS of their publishers, and queues what comes."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 import importlib
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
-from fhaosmo_ros.nodes.spin import Spinner
+from fhaosmo_ros.nodes.private_node import PrivateNode
 from fhaosmo_ros.nodes.subscription import subscribe_with_info
-import rclpy
-from rclpy.context import Context
-from rclpy.node import Node
+from rclpy.node import NodeNameNonExistentError
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 
 DEPTH = 5000
 DISCOVERY_PERIOD = 0.2
+SHARED = ('/parameter_events', '/rosout', '/diagnostics', '/tf', '/tf_static')
+"""Topics of many publishers: the numbers of their messages tell nothing."""
 
 
 class NewTopic(NamedTuple):
@@ -34,14 +34,16 @@ class Sample(NamedTuple):
     data: bytes
 
 
-class TopicRecorder:
+class TopicRecorder(PrivateNode):
     """
-    A node in a context of its own that records while it is open.
+    A node that records while it is open.
 
     Parameters
     ----------
     wanted : callable
         Says of a topic's name whether to record it.
+    listeners : sequence of str
+        Full names of nodes whose inputs to record as well, whatever their names.
 
     Attributes
     ----------
@@ -49,36 +51,32 @@ class TopicRecorder:
         `NewTopic`, then the topic's `Sample`; the executor's thread fills it.
     problems : SimpleQueue
         Lines that say why a topic can't be recorded.
+    lost : dict of str to int
+        Messages by topic that were published but did not arrive; only of topics with one
+        publisher, whose messages are numbered.
 
     """
 
-    def __init__(self, wanted: Callable[[str], bool]) -> None:
+    def __init__(self, wanted: Callable[[str], bool], listeners: Sequence[str] = ()) -> None:
         self.queue: SimpleQueue[NewTopic | Sample] = SimpleQueue()
         self.problems: SimpleQueue[str] = SimpleQueue()
-        self._wanted = wanted
+        self.lost: dict[str, int] = {}
+        self._wanted, self._listeners = wanted, listeners
         self._known: set[str] = set()
-        self._context = Context()
-        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = Node('fhaosmo_recorder', context=self._context, use_global_arguments=False)
-        self._node.create_timer(DISCOVERY_PERIOD, self._discover)
-        self._spinner = Spinner(self._node)
+        super().__init__('fhaosmo_recorder')
+        self.node.create_timer(DISCOVERY_PERIOD, self._discover)
 
-    def __enter__(self) -> 'TopicRecorder':
+    def __enter__(self) -> Self:
         self._discover()
-        self._spinner.__enter__()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._spinner.__exit__()
-        self._node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        return super().__enter__()
 
     def _discover(self) -> None:
-        for topic, types in self._node.get_topic_names_and_types():
-            if topic in self._known or not self._wanted(topic):
+        inputs = self._inputs()
+        for topic, types in self.node.get_topic_names_and_types():
+            if topic in self._known or not (topic in inputs or self._wanted(topic)):
                 continue
-            publishers = self._node.get_publishers_info_by_topic(topic)
-            publishers = [p for p in publishers if p.node_name != self._node.get_name()]
+            publishers = self.node.get_publishers_info_by_topic(topic)
+            publishers = [p for p in publishers if p.node_name != self.node.get_name()]
             if not publishers:
                 continue
             self._known.add(topic)
@@ -92,14 +90,33 @@ class TopicRecorder:
             profiles = [p.qos_profile for p in publishers]
             self.queue.put(NewTopic(topic, types[0], [_plain(p) for p in profiles]))
             subscribe_with_info(
-                self._node, message_class, topic, self._callback(topic), _matching(profiles),
-                raw=True,
+                self.node, message_class, topic,
+                self._callback(topic, len(publishers) == 1 and topic not in SHARED),
+                _matching(profiles), raw=True,
             )  # fmt: skip
 
-    def _callback(self, topic: str) -> Any:
+    def _inputs(self) -> set[str]:
+        found = set()
+        for listener in self._listeners:
+            space, _, name = listener.rpartition('/')
+            with suppress(NodeNameNonExistentError):  # not there yet
+                topics = self.node.get_subscriber_names_and_types_by_node(name, space or '/')
+                found |= {topic for topic, _ in topics}
+        return found
+
+    def _callback(self, topic: str, numbered: bool) -> Any:
         put = self.queue.put
+        latest = 0
 
         def receive(data: bytes, info: Mapping[str, int]) -> None:
+            nonlocal latest
+            number = info.get('publication_sequence_number') or 0 if numbered else 0
+            if latest and number > latest + 1:
+                self.lost[topic] = self.lost.get(topic, 0) + number - latest - 1
+            elif 0 < number <= latest:  # another publisher: its numbers tell nothing
+                self.lost.pop(topic, None)
+                number = 2**63
+            latest = max(latest, number)
             put(Sample(topic, info['source_timestamp'] or info['received_timestamp'], data))
 
         return receive

@@ -2,11 +2,14 @@
 """Copying the messages of a bag into another one."""
 
 from collections.abc import Iterator
+from itertools import islice
 
 from fhaosmo_ros.tools import chunks
 from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.bags import BagWriter
+from fhaosmo_ros.tools.bag_writer import BagWriter
 import numpy as np
+
+BATCH = 8192
 
 
 def copy_topics(reader: BagReader, writer: BagWriter) -> Iterator[None]:
@@ -23,7 +26,8 @@ def copy_topics(reader: BagReader, writer: BagWriter) -> Iterator[None]:
             writer.write_chunk(*chunks.copy(data, records, numbers[records.channels]))
             yield
         return
-    for count, (topic, stamp, message) in enumerate(reader.messages()):
-        writer.write(topic, stamp, message)
-        if count % 1000 == 0:
-            yield
+    found = reader.messages()
+    while rows := list(islice(found, BATCH)):
+        topics, stamps, texts = zip(*rows, strict=True)
+        writer.write_many([ids[topic] for topic in topics], stamps, texts)
+        yield

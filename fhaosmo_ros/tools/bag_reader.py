@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading bags as a stream: all storages, compressions and message types that rosbags knows."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from itertools import islice
+from operator import itemgetter
 from pathlib import Path
 import struct
 from types import TracebackType
@@ -11,6 +13,7 @@ from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter import suggestion
 from fhaosmo_ros.tools import chunks
 from fhaosmo_ros.tools.bags import TYPES
+from fhaosmo_ros.tools.cdr import numbers
 from fhaosmo_ros.tools.fields import Field, find_field
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +40,7 @@ class Block(NamedTuple):
         Stamps that the bag keeps with the messages, in nanoseconds.
     stamps : (K,) array of int
         Stamps in the messages' headers, or `times` where they have none.
-    values : (K,) array
+    values : (K,) or (K, width) array
 
     """
 
@@ -137,16 +140,49 @@ class BagReader:
         except Exception as error:
             raise _unreadable(self.path, error) from None
 
+    def few(self, topics: Collection[str]) -> list[tuple[str, int, Any]]:
+        """Return topic, stamp (ns) and message of topics that have few of them, by stamp."""
+        types = {c.topic: str(c.msgtype) for c in self.connections if c.topic in topics}
+        if self.has_chunks:  # most chunks hold none of them: rosbags would look at every message
+            found = [
+                (names[channel], time, data[start + chunks.DATA_AT : end].tobytes())
+                for names, data, r in self._chunks_of(list(types))
+                for time, channel, start, end in zip(*(x.tolist() for x in r), strict=True)
+            ]
+        else:
+            found = list(self.messages(list(types)))
+        found.sort(key=itemgetter(1))
+        try:
+            return [
+                (topic, time, self._reader.deserialize(data, types[topic]))
+                for topic, time, data in found
+            ]
+        except Exception as error:
+            raise _unreadable(self.path, error) from None
+
+    def first(self, topic: str) -> Any:
+        """Return the first message of a topic that has one."""
+        _, _, data = next(self.messages([topic]))
+        return self._reader.deserialize(data, self.message_type(topic))
+
+    def _chunks_of(self, topics: list[str]) -> Iterator[tuple[dict[int, str], Any, Any]]:
+        for storage, _, data, records in self.chunk_records(topics):
+            yield {c.id: c.topic for c in storage.connections}, data, records
+
     def field(self, topic: str, text: str | None) -> Field:
         """Find a numeric field of a topic; see `find_field`."""
         return find_field(self.types.fielddefs, self.message_type(topic), text)
 
-    def blocks(self, topic: str, field: Field, use_header: bool) -> Iterator[Block]:
-        """Yield a field's samples in order, in blocks; memory does not grow with the bag."""
-        if self.has_chunks and field.offset is not None:
-            yield from self._fast(topic, field, use_header)
-        else:
-            yield from self._slow(topic, field, use_header)
+    def blocks(
+        self, topic: str, field: Field, use_header: bool = False, width: int = 1
+    ) -> Iterator[Block]:
+        """
+        Yield a field's samples in order, in blocks; memory does not grow with the bag.
+
+        With `width`, so many neighbours in a list, from the field on.
+        """
+        read = self._by_chunk if self.has_chunks else self._by_message
+        yield from read(topic, field, use_header, width)
 
     @property
     def has_chunks(self) -> bool:
@@ -187,23 +223,11 @@ class BagReader:
             )
             storage.chunks.append(info)
 
-    def _fast(self, topic: str, field: Field, use_header: bool) -> Iterator[Block]:
+    def _by_chunk(self, topic: str, field: Field, use_header: bool, width: int) -> Iterator[Block]:
         rest = None
         for _, following, data, records in self.chunk_records([topic]):
             at = records.starts + chunks.DATA_AT
-            if len(at) and (data[at + 1] != 1).any():
-                raise ConfigurationError(
-                    f'bag {self.path}: expected little-endian CDR on {topic}, got big-endian'
-                )
-            size = chunks.DATA_AT + (field.offset or 0) + field.kind.itemsize
-            if (records.ends - records.starts < size).any():
-                raise _unreadable(self.path, ValueError('a message is shorter than its type'))
-            values = chunks.gather(data, at + field.offset, field.kind).astype(np.float64)
-            stamps = records.times
-            if use_header:
-                seconds = chunks.gather(data, at + 4, np.dtype('<i4')).astype(np.int64)
-                stamps = seconds * 1_000_000_000 + chunks.gather(data, at + 8, np.dtype('<u4'))
-            block = Block(records.times, stamps, values)
+            block = self._block(records.times, data, at, records.ends, field, use_header, width)
             if rest is not None:
                 block = Block(*(np.concatenate(pair) for pair in zip(rest, block, strict=True)))
             order = np.argsort(block.times, kind='stable')
@@ -213,28 +237,27 @@ class BagReader:
         if rest is not None and len(rest.times):
             yield rest
 
-    def _slow(self, topic: str, field: Field, use_header: bool) -> Iterator[Block]:
-        message_type, rows = self.message_type(topic), []
-        for _, time, data in self.messages([topic]):
-            try:
-                message = self._reader.deserialize(data, message_type)
-            except Exception as error:
-                raise _unreadable(self.path, error) from None
-            stamp = time
-            if use_header:
-                header = message.header.stamp
-                stamp = header.sec * 1_000_000_000 + header.nanosec
-            rows.append((time, stamp, field.get(message)))
-            if len(rows) == BLOCK:
-                yield _block(rows)
-                rows.clear()
-        if rows:
-            yield _block(rows)
+    def _by_message(
+        self, topic: str, field: Field, use_header: bool, width: int
+    ) -> Iterator[Block]:
+        found = self.messages([topic])
+        while rows := list(islice(found, BLOCK)):
+            _, times, texts = zip(*rows, strict=True)
+            data = np.frombuffer(b''.join(texts), dtype=np.uint8)
+            ends = np.cumsum([len(text) for text in texts])
+            starts = np.concatenate([[0], ends[:-1]])
+            times = np.array(times, np.int64)
+            yield self._block(times, data, starts, ends, field, use_header, width)
 
-
-def _block(rows: list[tuple[int, int, float]]) -> Block:
-    times, stamps, values = zip(*rows, strict=True)
-    return Block(np.array(times, np.int64), np.array(stamps, np.int64), np.array(values))
+    def _block(
+        self, times: NDArray[np.int64], data: NDArray[np.uint8], starts: NDArray[np.int64],
+        ends: NDArray[np.int64], field: Field, use_header: bool, width: int,
+    ) -> Block:  # fmt: skip
+        try:
+            values, stamps = numbers(field, data, starts, ends, width)
+        except Exception as error:
+            raise _unreadable(self.path, error) from None
+        return Block(times, stamps if use_header else times, values)
 
 
 def _load(storage: Any, chunk: Any) -> NDArray[np.uint8]:

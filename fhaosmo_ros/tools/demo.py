@@ -5,28 +5,24 @@ import argparse
 from collections.abc import Callable
 import os
 from pathlib import Path
-import sys
 import time
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter_file import load
 from fhaosmo_ros.nodes.recorder import Recorder
 from fhaosmo_ros.nodes.topics import RUN_TOPICS, type_name
-from fhaosmo_ros.stop_signals import Stop, stop_on_signals
-from fhaosmo_ros.tools.bags import BagWriter
+from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.tools.bag_writer import BagWriter
+from fhaosmo_ros.tools.command import Interrupted, run_command
 from fhaosmo_ros.tools.figures import save_run
 from fhaosmo_ros.tools.output import OutputFolder
-from fhaosmo_ros.tools.processes import NodeProcesses
+from fhaosmo_ros.tools.processes import Children
 from fhaosmo_ros.tools.run_report import read_run, table
 from fhaosmo_ros.tools.share import shipped
 from tqdm import tqdm
 
 START_DEADLINE = 90.0
 """Seconds for a node to appear: the very first start compiles."""
-
-
-class Interrupted(Exception):
-    """The user asked to stop before there was anything to report."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -40,16 +36,7 @@ def main(argv: list[str] | None = None) -> int:
         before, 2 for a bad configuration.
 
     """
-    arguments = _parser().parse_args(argv)
-    stop = stop_on_signals()
-    try:
-        return _demo(arguments, stop)
-    except ConfigurationError as error:
-        print(f'demo: error: {error}', file=sys.stderr)
-        return 2
-    except Interrupted:
-        print('demo: interrupted before the first estimate, nothing written', file=sys.stderr)
-        return 130
+    return run_command(_parser(), argv, _demo)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -70,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _demo(arguments: argparse.Namespace, stop: Stop) -> int:
+def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
     if not 1.0 <= arguments.duration <= 3600.0:
         raise ConfigurationError(
             f'--duration: expected 1 to 3600 seconds, got {arguments.duration:g}'
@@ -94,7 +81,6 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> int:
         print(f'\n{text}\n')
         final = folder.keep()
     print(f'figure:  {final / "demo.png"}\nbag:     {final / "bag"}')
-    return 0
 
 
 def _keep_to_this_host() -> None:
@@ -112,32 +98,32 @@ def _record(folder: Path, parameters: Path, duration: float, stop: Stop) -> None
     with (
         BagWriter(folder / 'bag', types) as bag,
         Recorder(RUN_TOPICS, bag.write) as recorder,
-        NodeProcesses(folder) as nodes,
+        Children(folder) as nodes,
     ):
         options = ('--ros-args', '--params-file', str(parameters))
-        nodes.start('estimator', *options)
+        nodes.start_node('estimator', *options)
         _wait(
             'the estimator (the first start compiles, some 10 s)',
             lambda: recorder.publishers('/estimator/state') and recorder.subscribers('/y') >= 2,
             nodes, stop,
         )  # fmt: skip
-        nodes.start('plant', *options)
+        nodes.start_node('plant', *options)
         _wait('the first estimate', lambda: recorder.counts['/estimator/state'], nodes, stop)
         _watch(recorder, nodes, duration, stop)
 
 
-def _wait(what: str, ready: Callable[[], object], nodes: NodeProcesses, stop: Stop) -> None:
+def _wait(what: str, ready: Callable[[], object], nodes: Children, stop: Stop) -> None:
     deadline = time.monotonic() + START_DEADLINE
     print(f'waiting for {what} ...', flush=True)
     while not ready():
         nodes.check()
         if stop.wait(0.02):
-            raise Interrupted
+            raise Interrupted('before the first estimate, nothing written')
         if time.monotonic() > deadline:
             raise ConfigurationError(f'waited {START_DEADLINE:g} s for {what}, in vain')
 
 
-def _watch(recorder: Recorder, nodes: NodeProcesses, duration: float, stop: Stop) -> None:
+def _watch(recorder: Recorder, nodes: Children, duration: float, stop: Stop) -> None:
     """Show a progress bar until the time is over or the user has seen enough."""
     begin = time.monotonic()
     with tqdm(

@@ -17,13 +17,11 @@ KINDS = {
     'int16': 'i2', 'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4', 'int64': 'i8', 'uint64': 'u8',
     'float32': 'f4', 'float64': 'f8',
 }  # fmt: skip
-CDR_HEADER = 4
-"""Bytes before a message's first field."""
 
 
 class Field(NamedTuple):
     """
-    Where a number lies in the messages of a topic.
+    A number in the messages of a topic.
 
     Attributes
     ----------
@@ -32,40 +30,20 @@ class Field(NamedTuple):
     steps : list of str and int
         Names of fields and indices of lists, from the message inwards.
     kind : dtype
-    offset : int or None
-        Distance from the message's first byte in CDR, where it is the same in every message.
     has_header : bool
         True if the message begins with a std_msgs/Header.
+    types : mapping
+        Definitions by type, as a rosbags typestore's ``fielddefs``.
+    message_type : str
 
     """
 
     text: str
     steps: list[str | int]
     kind: np.dtype
-    offset: int | None
     has_header: bool
-
-    def get(self, message: Any) -> float:
-        """
-        Return the number in a message.
-
-        Raises
-        ------
-        ConfigurationError
-            A list in this message is too short.
-
-        """
-        for step in self.steps:
-            if isinstance(step, str):
-                message = getattr(message, step)
-            elif step < len(message):
-                message = message[step]
-            else:
-                raise ConfigurationError(
-                    f'field {self.text!r}: expected an index below the number of elements, '
-                    f'{len(message)} in one message, got {step}'
-                )
-        return float(message)
+    types: Mapping[str, Any]
+    message_type: str
 
 
 def find_field(types: Mapping[str, Any], message_type: str, text: str | None) -> Field:
@@ -90,11 +68,8 @@ def find_field(types: Mapping[str, Any], message_type: str, text: str | None) ->
     if text is None:
         text = _only_number(types, message_type)
     steps = _steps(text)
-    kind, offset, missing = None, CDR_HEADER, steps is None
-    if steps is not None:
-        kind, offset = _walk(types, message_type, steps)
-        missing = kind is None
-    if missing or steps is None or kind is None:
+    kind = _kind(types, message_type, steps) if steps is not None else None
+    if steps is None or kind is None:
         known = list(_numbers(types, message_type))
         hint = suggestion(text, known)
         raise ConfigurationError(
@@ -103,7 +78,7 @@ def find_field(types: Mapping[str, Any], message_type: str, text: str | None) ->
         )
     fields = types[message_type][1]
     has_header = bool(fields) and fields[0][1] == (NAME, HEADER)
-    return Field(text, steps, np.dtype(kind), offset, has_header)
+    return Field(text, steps, np.dtype(kind), has_header, types, message_type)
 
 
 def _only_number(types: Mapping[str, Any], message_type: str) -> str:
@@ -138,55 +113,16 @@ def _steps(text: str) -> list[str | int] | None:
     return [int(w) if w.isdigit() else w for w in re.findall(r'\w+', text)]
 
 
-def _walk(
-    types: Mapping[str, Any], message_type: str, steps: list[str | int]
-) -> tuple[str | None, int | None]:
-    """Follow the steps; return the number's kind (None: no such field) and its offset."""
+def _kind(types: Mapping[str, Any], message_type: str, steps: list[str | int]) -> str | None:
+    """Follow the steps; return the number's kind, or None if they lead to none."""
     node: Any = (NAME, message_type)
-    position: int | None = 0
     for step in steps:
         if isinstance(step, str) and node[0] == NAME and node[1] in types:
-            for name, inner in types[node[1]][1]:
-                if name == step:
-                    node = inner
-                    break
-                position = _skip(types, inner, position)
-            else:
-                return None, None
-        elif isinstance(step, int) and node[0] == ARRAY and step < node[1][1]:
-            for _ in range(step):
-                position = _skip(types, node[1][0], position)
+            node = dict(types[node[1]][1]).get(step, (None, None))
+        elif isinstance(step, int) and (
+            node[0] == SEQUENCE or (node[0] == ARRAY and step < node[1][1])
+        ):
             node = node[1][0]
-        elif isinstance(step, int) and node[0] == SEQUENCE:
-            node, position = node[1][0], None
         else:
-            return None, None
-    if node[0] != BASE or node[1][0] not in KINDS:
-        return None, None
-    kind = KINDS[node[1][0]]
-    if position is None:
-        return kind, None
-    return kind, CDR_HEADER + _aligned(position, np.dtype(kind).itemsize)
-
-
-def _aligned(position: int, size: int) -> int:
-    return (position + size - 1) // size * size
-
-
-def _skip(types: Mapping[str, Any], node: Any, position: int | None) -> int | None:
-    """Return the position after a field, None if it depends on the message."""
-    kind, detail = node
-    if position is None or kind == SEQUENCE:
-        return None
-    if kind == BASE:
-        if detail[0] not in KINDS:
             return None
-        size = np.dtype(KINDS[detail[0]]).itemsize
-        return _aligned(position, size) + size
-    if kind == ARRAY:
-        for _ in range(detail[1]):
-            position = _skip(types, detail[0], position)
-        return position
-    for _, inner in types[detail][1]:
-        position = _skip(types, inner, position)
-    return position
+    return KINDS.get(node[1][0]) if node[0] == BASE else None

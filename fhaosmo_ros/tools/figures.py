@@ -1,23 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures: the only module that imports matplotlib. It draws on Axes that it is given."""
 
-import importlib.util
-import os
 from pathlib import Path
-import sys
-
-import matplotlib
-
-matplotlib.use('Agg')
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.tools.plot_data import Curves
 from fhaosmo_ros.tools.run_report import Run
+import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 
+WINDOWLESS = ('agg', 'cairo', 'pdf', 'pgf', 'ps', 'svg', 'template')
+"""Backends of matplotlib, in small letters."""
 TRUTH = {'color': '#0072B2', 'linewidth': 2.2, 'label': 'true'}
 ESTIMATE = {'color': '#D55E00', 'linewidth': 1.1, 'linestyle': '--', 'label': 'estimated'}
 """Blue and vermilion of the Okabe-Ito palette, told apart by dashes in grey print too."""
@@ -79,7 +75,7 @@ def draw_innovations(axes: Axes, t: NDArray[np.float64], eps: NDArray[np.float64
         axes.set_ylim(np.percentile(size, 1) / 3.0, size.max() * 3.0)
 
 
-def save_curves(curves: list[Curves], epsilon: float | None, path: Path, show: bool) -> None:
+def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window: bool) -> None:
     """
     Write a figure of several estimates laid one over another.
 
@@ -90,18 +86,18 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, show: b
         Threshold of the gates; drawn, and the gates with it, if known.
     path : path
         Its suffix names the format.
-    show : bool
-        Open a window as well.
+    window : bool
+        Make a window too, for `show`.
 
     """
     names = max((c.names for c in curves), key=len)
     extra = 2 if epsilon is None else 3
     rows = len(names) + extra
     size = (8.5, 1.45 * rows + 0.9)
-    if show:
+    if window:
         import matplotlib.pyplot as plt
 
-        plt.switch_backend(_window_backend())
+        _expect_windows()
         figure = plt.figure(figsize=size, layout='constrained')
     else:
         figure = Figure(figsize=size, layout='constrained')
@@ -145,25 +141,34 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, show: b
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside upper center', ncols=2, fontsize='small')
     figure.savefig(path, dpi=150)
-    if show:
-        plt.show()
 
 
-def _window_backend() -> str:
+def show() -> None:
+    """Wait until the user has closed the window."""
+    import matplotlib.pyplot as plt
+
+    plt.show()
+
+
+def _expect_windows() -> None:
     """
-    Return a backend that opens windows here.
+    Let matplotlib choose its backend, or take that of MPLBACKEND.
 
     Raises
     ------
     ConfigurationError
-        There is no display, or no toolkit.
+        It can't open windows here.
 
     """
-    if sys.platform.startswith('linux') and not (
-        os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY')
-    ):
-        raise ConfigurationError('--show: expected a display (DISPLAY is not set), got none')
-    for module, backend in (('PyQt6', 'QtAgg'), ('PyQt5', 'QtAgg'), ('tkinter', 'TkAgg')):
-        if importlib.util.find_spec(module):
-            return backend
-    raise ConfigurationError('--show: expected PyQt or tkinter to open a window, got neither')
+    import matplotlib.pyplot as plt
+
+    try:
+        plt.switch_backend(matplotlib.get_backend())
+        found = plt.get_backend()
+    except ImportError as error:
+        found = str(error)
+    if found.lower() in WINDOWLESS or ' ' in found:
+        raise ConfigurationError(
+            '--show: expected a display (DISPLAY or WAYLAND_DISPLAY), PyQt or tkinter, and no '
+            f'MPLBACKEND without windows, got {found}'
+        )

@@ -2,18 +2,22 @@
 """Command-line options that several commands share."""
 
 import argparse
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+import re
 from typing import Any
 
+from fhaosmo_ros.core.channel_parameters import channel_names, of_channel
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.parameter import unknown_parameter
-from fhaosmo_ros.core.parameter_file import load, parse
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameter import ParameterTable, unknown_parameter
+from fhaosmo_ros.core.parameter_file import load, parse, select
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
 import yaml
 
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
-    """Add --params-file and -p, as a node has them."""
+    """Add --params-file, -p, --node and --channel."""
     parser.add_argument(
         '--params-file', type=Path, action='append', default=[], metavar='FILE',
         help="parameters of the estimator node, as in 'ros2 run'",
@@ -21,6 +25,14 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
         help='set one parameter; wins over the file',
+    )  # fmt: skip
+    parser.add_argument(
+        '--node', default='estimator', metavar='NAME',
+        help='whose sections of the files to take, such as /rig/estimator (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--channel', default='', metavar='NAME',
+        help="take the parameters of this one of the node's channels",
     )  # fmt: skip
 
 
@@ -31,21 +43,74 @@ def online_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
     Raises
     ------
     ConfigurationError
-        A file or a value that can't be used.
+        A file or a value that can't be used, by itself or together with the others.
 
     """
     values: dict[str, Any] = {}
+    origin: dict[str, Path | None] = {}
     for path in arguments.params_file:
-        values |= load(path, 'estimator')
-    for rule in arguments.param:
+        of_file = load(path, arguments.node, ESTIMATOR_PARAMETERS, strict=True)
+        values |= of_file
+        origin |= dict.fromkeys(of_file, path)
+    on_command_line = _on_command_line(arguments)
+    values = select(values | on_command_line, ESTIMATOR_PARAMETERS)
+    origin |= dict.fromkeys(on_command_line)
+    names = channel_names(values)
+    if arguments.channel not in names:
+        raise ConfigurationError(
+            f'--channel: expected {" or ".join(repr(name) for name in names)}, got '
+            f'{arguments.channel!r}'
+        )
+    own = of_channel(values, arguments.channel)
+    own = {name: value for name, value in own.items() if name in ONLINE_PARAMETERS}
+    try:
+        OnlineEstimator(own)
+    except ConfigurationError as error:
+        found = re.match(r"parameter '([^']+)'", str(error))
+        name = found[1] if found else ''
+        path = origin.get(f'{arguments.channel}.{name}', origin.get(name))
+        raise ConfigurationError(f'{path}: {error}' if path else str(error)) from None
+    return own
+
+
+def named(arguments: argparse.Namespace) -> list[str]:
+    """Return the parameters of the update path that -p sets."""
+    names = [name.removeprefix(f'{arguments.channel}.') for name in _on_command_line(arguments)]
+    return [name for name in names if name in ONLINE_PARAMETERS]
+
+
+def assigned(rules: Sequence[str], table: ParameterTable) -> dict[str, Any]:
+    """
+    Return the values that NAME:=VALUE rules set, checked by a table.
+
+    Raises
+    ------
+    ConfigurationError
+        A rule that is none, an unknown name, or a bad value.
+
+    """
+    values = dict(_rules(rules))
+    for name in values:
+        if name not in table:
+            raise unknown_parameter(name, table)
+    return dict(table.coerce(values))
+
+
+def _on_command_line(arguments: argparse.Namespace) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for target, value in _rules(arguments.param):
+        node, _, name = target.rpartition(':')
+        if not node or node.strip('/') == arguments.node.strip('/'):
+            values[name] = value  # not another node's, as on a command line of ROS
+    return values
+
+
+def _rules(rules: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    for rule in rules:
         name, separator, text = rule.partition(':=')
         if not separator:
             raise ConfigurationError(f'-p: expected NAME:=VALUE, got {rule!r}')
-        if name not in ESTIMATOR_PARAMETERS:
-            raise unknown_parameter(name, ESTIMATOR_PARAMETERS)
         try:
-            value = parse(text)
+            yield name, parse(text)
         except yaml.YAMLError:
-            value = text
-        values[name] = ESTIMATOR_PARAMETERS[name].coerce(value)
-    return {name: value for name, value in values.items() if name in ONLINE_PARAMETERS}
+            yield name, text

@@ -8,7 +8,6 @@ import sys
 import time
 from typing import Any
 
-from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.ode import SOLVERS
 from fhaosmo_ros.tools import paper_beyond as beyond
 from fhaosmo_ros.tools import paper_cases as cases
@@ -16,36 +15,26 @@ from fhaosmo_ros.tools import paper_document as document
 from fhaosmo_ros.tools import paper_figures as figures
 from fhaosmo_ros.tools import paper_findings as findings
 from fhaosmo_ros.tools import paper_tables as tables
+from fhaosmo_ros.tools.command import run_computation
 from tqdm import tqdm
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 FOLDER, RESULTS = 'paper', 'results.json'
 QUICK_WIDTHS = 3
-QUICK_LONG = 300.0
+QUICK_LONG = 200.0
+PROTECTION_WINDOW = 20.0
+"""Seconds within which errors are judged where the protections are compared."""
 ZOOM = 0.1
 """Seconds that figure sim1 enlarges."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """
-    Run the command.
+    """Run the command; return 0, 2 for a bad argument or output, 130 if it was interrupted."""
 
-    Returns
-    -------
-    int
-        0, 2 for a bad argument or output, 130 if it was interrupted.
-
-    """
-    arguments = _parser().parse_args(argv)
-    try:
+    def body(arguments: argparse.Namespace) -> None:
         _paper(arguments.output or _default_output(arguments.quick), arguments.quick)
-    except (ConfigurationError, OSError) as error:
-        print(f'paper: error: {error}', file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print('paper: interrupted', file=sys.stderr)
-        return 130
-    return 0
+
+    return run_computation(_parser(), argv, body)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -67,11 +56,11 @@ def _default_output(quick: bool) -> Path:
 
 
 def measure(solvers: tuple[str, ...], tick: Any) -> dict[str, findings.Scores]:
-    """Return the scores of the paper's four observers by solver."""
+    """Return the scores of the paper's four observers and of ours by solver."""
     scores: dict[str, findings.Scores] = {}
     for solver in solvers:
         scores[solver] = {}
-        for name in cases.OBSERVERS:
+        for name in cases.OBSERVERS | cases.OURS:
             for omega in cases.FREQUENCIES:
                 scores[solver][name, omega] = findings.measure(name, omega, solver)
             tick()
@@ -128,9 +117,13 @@ def _paper(output: Path, quick: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     every = QUICK_WIDTHS if quick else 1
     hours = QUICK_LONG if quick else beyond.HOURS
+    minutes = hours / 4.0
     rows_of_map = len(findings.WIDTHS[::every])
     # The bar counts the parts by about what they cost.
-    total = len(SOLVERS) * len(cases.OBSERVERS) + rows_of_map + 3 + len(beyond.NOISES) + 4 + 4
+    observers = len(cases.OBSERVERS | cases.OURS)
+    sweep = cases.FREQUENCIES[:1] if quick else beyond.SWEEP
+    long = len(beyond.LONG) + len(beyond.PROTECTED) + len(sweep)
+    total = len(SOLVERS) * observers + rows_of_map + 3 + len(beyond.NOISES) + long + 4
     with tqdm(total=total, unit='part', desc='paper') as bar:
         scores = measure(SOLVERS, bar.update)
         solver = choose_solver(scores)
@@ -139,20 +132,30 @@ def _paper(output: Path, quick: bool) -> None:
         sampled = beyond.schemes(bar.update)
         noisy = beyond.noises(bar.update)
         long_runs = []
-        for scheme in ('explicit', 'implicit'):
-            for omega in cases.FREQUENCIES:
-                long_runs.append(beyond.long_run(scheme, omega, hours))
-                bar.update()
+        for cell in beyond.LONG:
+            long_runs += beyond.long_runs(beyond.LAWS, *cell, hours, beyond.WINDOW)
+            bar.update()
+        protected = []
+        for cell in beyond.PROTECTED:
+            protected.append(
+                beyond.long_runs(beyond.PROTECTIONS, *cell, minutes, PROTECTION_WINDOW)
+            )
+            bar.update()
+        zones = beyond.dead_zones(sweep, bar.update)
         preset = cases.preset().observer
         texts = findings_texts(scores, solver) | {
             'widths': tables.map_text(widths, preset['fuzzy_widths'], every),
             'schemes': tables.beyond_table(sampled),
             'noise': tables.beyond_table(noisy),
             'long': tables.long_table(long_runs),
+            'deadzone': tables.dead_zone_table(zones),
+            'protection': tables.protection_table(r for runs in protected for r in runs),
         }
         _draw(folder, solver, preset, bar)
         figures.save(figures.half_widths(widths, preset['fuzzy_widths']), folder, 'widths')
-        figures.save(figures.long_runs(long_runs), folder, 'long')
+        shown = [r for r in long_runs if r.gains == 'paper']
+        figures.save(figures.long_runs(shown), folder, 'long')
+        figures.save(figures.protections(protected), folder, 'protection')
         figures.save(figures.noise(noisy), folder, 'noise')
         bar.update()
     document.write(output / 'paper.md', texts)
@@ -163,7 +166,7 @@ def _paper(output: Path, quick: bool) -> None:
 
 
 def _draw(folder: Path, solver: str, preset: dict[str, Any], bar: Any) -> None:
-    """Draw the paper's own four figures."""
+    """Draw the paper's own four figures, and ours beside simz."""
     first = cases.first_observer(1e-5, solver, cases.DURATION, every=5)
     figures.save(figures.sim1(first, ZOOM), folder, 'sim1')
     bar.update()
@@ -177,11 +180,12 @@ def _draw(folder: Path, solver: str, preset: dict[str, Any], bar: Any) -> None:
     bar.update()
     runs = {
         name: [cases.joint(variant, w, step, solver) for w in cases.FREQUENCIES]
-        for name, (variant, step) in cases.OBSERVERS.items()
+        for name, (variant, step, _) in cases.OBSERVERS.items()
     }
     adaptive = runs.pop(findings.ADAPTIVE)
     figures.save(figures.simz(list(runs.items()), cases.FREQUENCIES), folder, 'simz')
     figures.save(figures.simu(adaptive, cases.FREQUENCIES), folder, 'simu')
+    figures.save(figures.simz(beyond.shown(), cases.FREQUENCIES), folder, 'beyond')
     bar.update()
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's simulations and ours beside them: what is run, and how it is judged."""
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import Observer, Plant
@@ -10,6 +11,9 @@ from fhaosmo_ros.core.parameter_file import load
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, PLANT_PARAMETERS
 from fhaosmo_ros.tools.share import shipped
 import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
 
 FREQUENCIES = (1.0, 5.0)
 """Low (the paper's own) and high; the paper does not print its high one. rad/s."""
@@ -22,16 +26,50 @@ HIGH_PASS = 0.05
 """Window of the moving average that the high-passed part is the rest of, in seconds."""
 SETTLED = 0.02
 """Half-width of the settling band of d: a tenth of the range of d."""
-OBSERVERS = {
-    'sign, 1e-5 s': ('sign', 1e-5),
-    'sign, 1e-3 s': ('sign', 1e-3),
-    'fuzzy, 1e-3 s': ('fuzzy', 1e-3),
-    'fuzzy adaptive, 1e-3 s': ('fuzzy_adaptive', 1e-3),
-}
-"""The four observers of the paper's section 3 and 4, by name: variant and step."""
-
 Score = dict[str, float]
 """What a run is judged by: see `score`."""
+
+
+class Case(NamedTuple):
+    """A variant, its step (s), and what differs from config/paper.yaml."""
+
+    variant: str
+    step: float
+    changes: dict[str, Any]
+
+
+OBSERVERS = {
+    'sign, 1e-5 s': Case('sign', 1e-5, {}),
+    'sign, 1e-3 s': Case('sign', 1e-3, {}),
+    'fuzzy, 1e-3 s': Case('fuzzy', 1e-3, {}),
+    'fuzzy adaptive, 1e-3 s': Case('fuzzy_adaptive', 1e-3, {}),
+}
+"""The four observers of the paper's section 3 and 4."""
+SAFE = {
+    p.name: p.default
+    for p in OBSERVER_PARAMETERS.values()
+    if p.name.startswith('gamma_') and p.name != 'gamma_initial'
+}
+"""The law of gamma with its default settings, where config/paper.yaml has the paper's."""
+LEVANT = {
+    name: value
+    for name, value in load(shipped('config/levant.yaml'), 'estimator').items()
+    if name in ('structure', 'lambda', 'fuzzy_widths')
+}
+"""The second structure with gains of its own."""
+DEMO = {
+    name: value
+    for name, value in load(shipped('config/demo.yaml'), 'estimator').items()
+    if name in ('lambda', 'alpha', 'fuzzy_widths', 'epsilon', 'estimate_from')
+} | {'initial_estimate': [0.0], 'initial_internal': [0.0], 'start_from_measurement': True}
+"""The observer of config/demo.yaml: gains that were found for a noisy y over a middleware."""
+OURS = {
+    'fuzzy adaptive, default law, 1e-3 s': Case('fuzzy_adaptive', 1e-3, SAFE),
+    'Levant sign, 1e-3 s': Case('sign', 1e-3, LEVANT),
+    'Levant fuzzy, 1e-3 s': Case('fuzzy', 1e-3, LEVANT),
+    'Levant fuzzy adaptive, 1e-3 s': Case('fuzzy_adaptive', 1e-3, LEVANT),
+}
+"""Observers beside the paper's, in the same table."""
 
 
 class Preset(NamedTuple):
@@ -41,6 +79,7 @@ class Preset(NamedTuple):
     plant: dict[str, Any]
 
 
+@lru_cache
 def preset() -> Preset:
     """Read the paper's numbers from the shipped configuration."""
     path = shipped('config/paper.yaml')
@@ -65,25 +104,44 @@ def joint(
     return simulate(
         numbers.observer | {'variant': variant} | changes,
         numbers.plant | {'disturbance_omega': omega},
-        solver, step, DURATION, max(1, round(GRID / step)),
+        solver, step, duration, max(1, round(GRID / step)),
     )  # fmt: skip
 
 
-def sampled(
-    variant: str, omega: float, step: float, scheme: str, noise: float = 0.0,
-    duration: float = DURATION, **changes: Any,
-) -> JointRun:  # fmt: skip
-    """Simulate as a node runs: samples of a plant, one observer step a sample."""
-    numbers = preset()
+class Truth(NamedTuple):
+    """Samples of a plant."""
+
+    t: Floats
+    y: Floats
+    z: Floats
+    unknown_input: Floats
+
+
+def truth_of(omega: float, step: float, noise: float, duration: float) -> Truth:
+    """Simulate the plant alone."""
     plant = Plant(
-        numbers.plant
+        preset().plant
         | {'disturbance_omega': omega, 'noise_std': noise, 'integration_step': min(step, 1e-3)}
     )
     t = np.arange(round(duration / step) + 1) * step
     truth = plant.simulate(t)
-    observer = Observer(numbers.observer | {'variant': variant, 'scheme': scheme} | changes)
-    run = observer.run(t, truth.y)
-    return JointRun(t, truth.z, truth.unknown_input, run.z_hat, run.z_tilde, run.gamma)
+    return Truth(t, truth.y, truth.z, truth.unknown_input)
+
+
+def observe(truth: Truth, variant: str, scheme: str, every: int = 1, **changes: Any) -> JointRun:
+    """Observe it as a node does, one observer step a sample; record every `every`-th one."""
+    observer = Observer(preset().observer | {'variant': variant, 'scheme': scheme} | changes)
+    run = observer.run(truth.t, truth.y, every=every)
+    rows = slice(every - 1, None, every)
+    z, d = truth.z[rows], truth.unknown_input[rows]
+    return JointRun(run.t, z, d, run.z_hat, run.z_tilde, run.gamma)
+
+
+def sampled(
+    variant: str, omega: float, step: float, scheme: str, noise: float = 0.0, **changes: Any
+) -> JointRun:
+    """Simulate as a node runs: samples of a plant, one observer step a sample."""
+    return observe(truth_of(omega, step, noise, DURATION), variant, scheme, **changes)
 
 
 def first_observer(step: float, solver: str, duration: float, every: int) -> JointRun:

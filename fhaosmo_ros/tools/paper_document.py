@@ -35,11 +35,11 @@ def filled(document: str, texts: Mapping[str, str]) -> str:
     return PATTERN.sub(lambda match: PART.format(match['name'], texts[match['name']]), document)
 
 
-def write(path: Path, texts: Mapping[str, str]) -> None:
+def write(path: Path, texts: Mapping[str, str], title: str = 'The paper, reproduced') -> None:
     """Rewrite the generated parts of the document at `path`, or write them alone if it is new."""
     if path.exists():
         text = filled(path.read_text(encoding='utf-8'), texts)
     else:
         bodies = (f'## {name}\n\n{PART.format(name, body)}\n' for name, body in texts.items())
-        text = '# The paper, reproduced\n\n' + '\n'.join(bodies)
+        text = f'# {title}\n\n' + '\n'.join(bodies)
     path.write_text(text, encoding='utf-8')

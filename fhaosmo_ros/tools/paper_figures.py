@@ -7,9 +7,8 @@ from pathlib import Path
 from fhaosmo_ros.core.fuzzy import curve, memberships, TERMS, terms_of_level
 from fhaosmo_ros.core.joint import JointRun
 from fhaosmo_ros.tools.figures import ESTIMATE, TRUTH
-from fhaosmo_ros.tools.paper_beyond import LongRun, Row, VARIANTS
+from fhaosmo_ros.tools.paper_beyond import LongRun, Row
 from fhaosmo_ros.tools.paper_findings import WidthMap
-from fhaosmo_ros.tools.paper_tables import NAMES
 from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
@@ -22,8 +21,18 @@ Floats = NDArray[np.float64]
 RED = {'color': ESTIMATE['color'], 'linewidth': 0.9, 'label': 'estimate'}
 BLUE = {'color': TRUTH['color'], 'linewidth': 1.7, 'linestyle': (0, (5, 2)), 'label': 'truth'}
 TIME = 'time [s]'
-STYLES = {'sign': ('o', '-'), 'fuzzy': ('s', '--'), 'fuzzy_adaptive': ('^', ':')}
-COLOURS = {'sign': '#000000', 'fuzzy': '#0072B2', 'fuzzy_adaptive': '#D55E00'}
+STYLES = {
+    'sign': ('#000000', 'o', '-'),
+    'fuzzy': ('#0072B2', 's', '--'),
+    'fuzzy adaptive': ('#D55E00', '^', ':'),
+    'Levant sign': ('#009E73', 'D', '-'),
+    'Levant fuzzy': ('#CC79A7', 'v', '--'),
+}
+LAW_COLOURS = {"the paper's": '#D55E00', 'default': '#0072B2'}
+PROTECTION_STYLES = (
+    ('#D55E00', '-', 2.6), ('#000000', '--', 1.2), ('#CC79A7', '-.', 1.6), ('#009E73', ':', 1.8),
+    ('#0072B2', '-', 1.4),
+)  # fmt: skip
 
 rcParams['svg.hashsalt'] = 'fhaosmo_ros'  # the same figure gives the same file
 
@@ -95,14 +104,14 @@ def fuzzy_systems(widths: Sequence[float], shape: str, normalise: bool) -> Figur
                     scale * np.linspace(-1, 1, terms)[k], 1.04, name, ha='center', fontsize=6
                 )
             axes.set_ylim(0.0, 1.18)
-            axes.set_ylabel('membership')
+            axes.set_ylabel('membership [1]')
         row[0].set_xlabel(f'ε of level {i + 1 if i < 2 else "3, 4"} [unit of the level]')
         row[1].set_xlabel(f'ψ{"₁₂₃"[i]} [1], before scaling to ±1')
         half = curve(terms, shape, normalise)
         grid = np.linspace(0.0, width, len(half))
         row[2].plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')
         row[2].plot([-width, 0, 0, width], [-1, -1, 1, 1], color='#999999', linestyle=':')
-        row[2].set_xlabel('ε')
+        row[2].set_xlabel('ε [unit of the level]')
         row[2].set_ylabel(f'ψ{"₁₂₃"[i]}(ε) [1]')
         row[2].grid(alpha=0.3)
     for axes, title in zip(panels[0], ('input', 'output', 'curve (dotted: sign)'), strict=True):
@@ -176,40 +185,71 @@ def half_widths(widths: WidthMap, preset: Sequence[float]) -> Figure:
 
 
 def long_runs(runs: Sequence[LongRun]) -> Figure:
-    """Draw gamma and the RMS error of d over a long adaptation."""
-    figure = Figure(figsize=(9.0, 5.4), layout='constrained')
-    top, bottom = figure.subplots(2, 1, sharex=True)
-    for run, style, colour in zip(
-        runs, ('-', '--', '-.', ':'), ('#0072B2', '#D55E00', '#009E73', '#000000'), strict=False
-    ):
-        label = f'{run.scheme}, ω = {run.omega:g} rad/s'
-        top.plot(run.t, run.gamma, linestyle=style, color=colour, label=label)
-        bottom.semilogy(run.t, run.rms_d, linestyle=style, color=colour)
-    top.legend(fontsize=8)
-    top.set_ylabel('γ [1]')
-    bottom.set_ylabel('RMS error of d\nin 100 s [1]')
-    bottom.set_xlabel(TIME)
-    for axes in (top, bottom):
-        axes.grid(alpha=0.3)
+    """Draw gamma and the RMS error of d over a long adaptation, relative to gamma = 1/2."""
+    cells = list(dict.fromkeys((r.noise, r.omega) for r in runs))
+    figure = Figure(figsize=(10.0, 5.4), layout='constrained')
+    panels = figure.subplots(2, len(cells), sharex=True, sharey='row', squeeze=False)
+    for column, (noise, omega) in zip(panels.T, cells, strict=True):
+        for run in runs:
+            if (run.noise, run.omega) != (noise, omega):
+                continue
+            style = {
+                'color': LAW_COLOURS[run.law],
+                'linestyle': '-' if run.scheme == 'explicit' else '--',
+                'label': f'{run.law} law, {run.scheme}',
+                'linewidth': 1.3 if run.law == 'default' else 3.0,
+            }
+            column[0].plot(run.t, run.gamma, **style)
+            column[1].plot(run.t, run.rms_d / run.fixed, **style)
+        column[0].set_title(f'ω = {omega:g} rad/s, noise {noise:g}', fontsize=10)
+        column[1].axhline(1.0, color='#999999', linewidth=1.0)
+        column[1].set_xlabel(TIME)
+        for axes in column:
+            axes.grid(alpha=0.3)
+    panels[0, 0].set_ylabel('γ [1]')
+    panels[1, 0].set_ylabel('RMS error of d in 100 s,\nover that of γ = 1/2 [1]')
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc='outside lower center', ncols=4)
+    return figure
+
+
+def protections(cells: Sequence[Sequence[LongRun]]) -> Figure:
+    """Draw gamma and the RMS error of d with each protection by itself, a column a cell."""
+    figure = Figure(figsize=(10.0, 6.0), layout='constrained')
+    panels = figure.subplots(2, len(cells), sharex=True, squeeze=False)
+    for (top, bottom), runs in zip(panels.T, cells, strict=True):
+        for run, (colour, style, width) in zip(runs, PROTECTION_STYLES, strict=True):
+            line = {'color': colour, 'linestyle': style, 'linewidth': width}
+            line['label'] = run.law.replace("paper's", "paper's law")
+            top.plot(run.t, run.gamma, **line)
+            bottom.plot(run.t, run.rms_d, **line)
+        bottom.axhline(runs[0].fixed, color='#999999', linewidth=1.0)
+        top.axhline(0.5, color='#999999', linewidth=1.0, label='γ = 1/2, not adapted')
+        top.set_title(f'ω = {runs[0].omega:g} rad/s, noise {runs[0].noise:g}', fontsize=10)
+        bottom.set_xlabel(TIME)
+        for axes in (top, bottom):
+            axes.grid(alpha=0.3)
+    panels[0, 0].set_ylabel('γ [1]')
+    panels[1, 0].set_ylabel('RMS error of d in 20 s [1]')
+    handles = panels[0, 0].get_legend_handles_labels()
+    figure.legend(*handles, loc='outside lower center', ncols=3)
     return figure
 
 
 def noise(rows: Sequence[Row]) -> Figure:
     """Draw the RMS error of d over the noise on y."""
-    figure = Figure(figsize=(9.0, 3.8), layout='constrained')
+    figure = Figure(figsize=(9.0, 4.4), layout='constrained')
     panels = figure.subplots(1, 2, sharey=True)
     for axes, scheme in zip(panels, ('explicit', 'implicit'), strict=True):
-        for variant in VARIANTS:
-            chosen = [r for r in rows if (r.variant, r.scheme) == (variant, scheme)]
-            marker, line = STYLES[variant]
+        for name, (colour, marker, line) in STYLES.items():
+            chosen = [r for r in rows if (r.name, r.scheme) == (name, scheme)]
             axes.loglog(
                 [r.noise for r in chosen], [r.score['rms_d'] for r in chosen],
-                marker=marker, linestyle=line, color=COLOURS[variant], label=NAMES[variant],
+                marker=marker, linestyle=line, color=colour, label=name,
             )  # fmt: skip
         axes.axhline(0.1 / np.sqrt(2.0), color='#999999', linewidth=1.0, label='RMS of d itself')
         axes.set_title(f'{scheme}, step 1e-3 s', fontsize=10)
         axes.set_xlabel('standard deviation of the noise on y [unit of y]')
         axes.grid(alpha=0.3)
     panels[0].set_ylabel('RMS error of d [1]')
-    panels[0].legend(fontsize=8)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc='outside lower center', ncols=3)
     return figure

@@ -4,7 +4,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-from fhaosmo_ros.tools.paper_cases import FREQUENCIES, joint, OBSERVERS, Score, score
+from fhaosmo_ros.tools.paper_cases import FREQUENCIES, joint, OBSERVERS, OURS, Score, score
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +24,7 @@ WIDTHS = (
 """Half-widths of the map, on both axes."""
 
 FINE, COARSE, FUZZY, ADAPTIVE = OBSERVERS
+DEFAULT_LAW = next(iter(OURS))
 Scores = dict[tuple[str, float], Score]
 """By observer and angular frequency."""
 
@@ -38,9 +39,9 @@ class Verdict(NamedTuple):
 
 
 def measure(name: str, omega: float, solver: str) -> Score:
-    """Simulate one of the paper's four observers and judge it."""
-    variant, step = OBSERVERS[name]
-    return score(joint(variant, omega, step, solver))
+    """Simulate one of the observers and judge it."""
+    variant, step, changes = (OBSERVERS | OURS)[name]
+    return score(joint(variant, omega, step, solver, **changes))
 
 
 def verdicts(s: Scores) -> list[Verdict]:
@@ -149,7 +150,7 @@ def width_map(
             s |= {(FINE, w): signs[w] for w in FREQUENCIES}
             for w in FREQUENCIES:
                 for name in (FUZZY, ADAPTIVE):
-                    variant, step = OBSERVERS[name]
+                    variant, step, _ = OBSERVERS[name]
                     s[name, w] = score(joint(variant, w, step, solver, **changes))
             all_verdicts = verdicts(s)
             for k, part in enumerate(('F1c', 'F2', 'F3')):

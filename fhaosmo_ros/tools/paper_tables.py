@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The generated parts of docs/paper.md, as Markdown."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 
 from fhaosmo_ros.tools.paper_beyond import LongRun, Row, WORSE
-from fhaosmo_ros.tools.paper_cases import OBSERVERS, Score
-from fhaosmo_ros.tools.paper_findings import ADAPTIVE, FUZZY, Scores, verdicts, WidthMap
+from fhaosmo_ros.tools.paper_cases import OBSERVERS, OURS, Score
+from fhaosmo_ros.tools.paper_findings import (
+    ADAPTIVE,
+    DEFAULT_LAW,
+    FUZZY,
+    Scores,
+    verdicts,
+    WidthMap,
+)  # fmt: skip
 
 RMS_HEAD = '| RMS z1 | RMS z2 | RMS z3 | RMS d | settles [s] | variation | high-passed |'
-NAMES = {'sign': 'sign', 'fuzzy': 'fuzzy', 'fuzzy_adaptive': 'fuzzy adaptive'}
 
 
 def _table(head: str, rows: Iterable[str]) -> str:
@@ -27,10 +33,10 @@ def _cells(s: Score) -> str:
 
 
 def observers_table(scores: dict[str, Scores]) -> str:
-    """Return the scores of the four observers, by frequency and solver."""
+    """Return the scores of the observers, by frequency and solver."""
     rows = [
         f'| {name} | {omega:g} | {solver} | {_cells(by_case[name, omega])} |'
-        for name in OBSERVERS
+        for name in OBSERVERS | OURS
         for solver, by_case in scores.items()
         for omega in sorted({w for _, w in by_case})
     ]
@@ -59,11 +65,17 @@ def bar_table(scores: dict[str, Scores]) -> str:
     rows = []
     for solver, s in scores.items():
         for omega in sorted({w for _, w in s}):
-            ratio = s[ADAPTIVE, omega]['rms_d'] / s[FUZZY, omega]['rms_d']
-            rows.append(
-                f'| {solver} | {omega:g} | {ratio:.3f} | {"yes" if ratio <= WORSE else "no"} |'
+            paper, default = (
+                s[name, omega]['rms_d'] / s[FUZZY, omega]['rms_d']
+                for name in (ADAPTIVE, DEFAULT_LAW)
             )
-    return _table('| solver | ω [rad/s] | adaptive / fixed | within the bar |', rows)
+            bar = 'yes' if default <= WORSE else 'no'
+            rows.append(f'| {solver} | {omega:g} | {paper:.3f} | {default:.3f} | {bar} |')
+    return _table(
+        "| solver | ω [rad/s] | the paper's law / γ = 1/2 | default law / γ = 1/2 "
+        '| default within the bar |',
+        rows,
+    )
 
 
 def solver_table(scores: dict[str, Scores], fine: str, default: str) -> str:
@@ -103,7 +115,7 @@ def beyond_table(rows: Iterable[Row]) -> str:
     return _table(
         f'| observer | scheme | step [s] | ω [rad/s] | noise on y {RMS_HEAD}',
         (
-            f'| {NAMES[r.variant]} | {r.scheme} | {r.step:g} | {r.omega:g} | {r.noise:g} | '
+            f'| {r.name} | {r.scheme} | {r.step:g} | {r.omega:g} | {r.noise:g} | '
             f'{_cells(r.score)} |'
             for r in rows
         ),
@@ -114,16 +126,47 @@ def long_table(runs: Iterable[LongRun]) -> str:
     """Return how gamma and the estimate of d fare over a long time."""
     rows = []
     for r in runs:
-        better = 'yes' if r.rms_d[-1] <= r.rms_d[0] else 'no'
-        bar = 'yes' if r.rms_d[-1] <= WORSE * r.fixed else 'no'
+        first, last = r.rms_d[0], r.rms_d[-1]
+        better = 'yes' if last <= first else 'no'
+        bar = 'yes' if last <= WORSE * r.fixed else 'no'
         rows.append(
-            f'| {r.scheme} | {r.omega:g} | {r.gamma[0]:.3f} | {r.gamma[-1]:.3f} | '
-            f'{_number(r.rms_d[0])} | {_number(r.rms_d[-1])} | {_number(r.fixed)} | '
+            f'| {r.gains} | {r.law} | {r.scheme} | {r.omega:g} | {r.noise:g} | {r.gamma[0]:.3f} | '
+            f'{r.gamma[-1]:.3f} | {_number(first)} | {_number(last)} | {_number(r.fixed)} | '
             f'{better} | {bar} |'
         )
     return _table(
-        '| scheme | ω [rad/s] | γ after the first 100 s | γ at the end | RMS d, first 100 s '
-        '| RMS d, last 100 s | RMS d, last 100 s, γ = 1/2 | last no worse than first '
-        '| adaptation within 5 % of none |',
+        '| gains | law of γ | scheme | ω [rad/s] | noise on y | γ after the first 100 s '
+        '| γ at the end | RMS d, first 100 s | RMS d, last 100 s | the same, γ = 1/2 '
+        '| last no worse than first | within 5 % of γ = 1/2 |',
         rows,
     )
+
+
+def protection_table(runs: Iterable[LongRun]) -> str:
+    """Return what each protection of gamma does by itself."""
+    rows = [
+        f'| {r.law} | {r.omega:g} | {r.noise:g} | {r.gamma[-1]:.3f} | {_number(r.rms_d[-1])} | '
+        f'{r.rms_d[-1] / r.fixed:.3f} |'
+        for r in runs
+    ]
+    return _table(
+        '| law of γ | ω [rad/s] | noise on y | γ at the end | RMS d at the end '
+        '| the same / that of γ = 1/2 |',
+        rows,
+    )
+
+
+def dead_zone_table(runs: Mapping[tuple[float, float], Sequence[LongRun]]) -> str:
+    """Return the worse ratio to gamma = 1/2 of both schemes, by dead zone and frequency."""
+    zones = list(dict.fromkeys(zone for zone, _ in runs))
+    frequencies = list(dict.fromkeys(omega for _, omega in runs))
+    rows = []
+    for zone in zones:
+        cells = []
+        for omega in frequencies:
+            found = runs[zone, omega]
+            ratio = max(r.rms_d[-1] / r.fixed for r in found)
+            met = ratio <= WORSE and all(r.rms_d[-1] <= r.rms_d[0] for r in found)
+            cells.append(f'{ratio:.3f}' if met else f'**{ratio:.3f}**')
+        rows.append(f'| {zone:g} | {" | ".join(cells)} |')
+    return _table(f'| dead zone | {" | ".join(f"ω = {w:g}" for w in frequencies)} |', rows)

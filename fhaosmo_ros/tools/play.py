@@ -4,13 +4,13 @@
 import argparse
 from itertools import count
 from pathlib import Path
-import sys
 import time
 from typing import TYPE_CHECKING
 
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.stop_signals import Stop, stop_on_signals
+from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bag_reader import BagReader
+from fhaosmo_ros.tools.command import run_command
 from tqdm import tqdm
 
 if TYPE_CHECKING:
@@ -22,15 +22,8 @@ NEVER_PLAYED = ('/clock', '/rosout', '/parameter_events')
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; return 0 at the end or after Ctrl-C, 2 for wrong input."""
-    arguments = _parser().parse_args(argv)
-    stop = stop_on_signals()
-    try:
-        _play(arguments, stop)
-    except ConfigurationError as error:
-        print(f'play: error: {error}', file=sys.stderr)
-        return 2
-    return 0
+    """Run the command; return 0 at the end or after Ctrl-C."""
+    return run_command(_parser(), argv, _play)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -3,11 +3,10 @@
 
 import argparse
 from pathlib import Path
-import sys
 
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.stop_signals import stop_on_signals
-from fhaosmo_ros.tools.figures import save_curves
+from fhaosmo_ros.tools.command import run_computation
+from fhaosmo_ros.tools.figures import save_curves, show
 from fhaosmo_ros.tools.options import add_parameter_options, online_parameters
 from fhaosmo_ros.tools.output import Output
 from fhaosmo_ros.tools.plot_data import metrics, read_curves
@@ -16,15 +15,8 @@ SUFFIXES = ('.png', '.svg', '.pdf')
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; return 0, or 2 for wrong input, with nothing written."""
-    arguments = _parser().parse_args(argv)
-    stop_on_signals()
-    try:
-        _plot(arguments)
-    except ConfigurationError as error:
-        print(f'plot: error: {error}', file=sys.stderr)
-        return 2
-    return 0
+    """Run the command; return 0 if there is a figure, else none is written."""
+    return run_computation(_parser(), argv, _plot)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -58,4 +50,6 @@ def _plot(arguments: argparse.Namespace) -> None:
     with Output(path, arguments.force) as output:
         save_curves(curves, values.get('epsilon'), output.path, arguments.show)
         final = output.keep()
-    print(f'{metrics(curves)}\nfigure: {final}')
+    print(f'{metrics(curves)}\nfigure: {final}', flush=True)
+    if arguments.show:
+        show()

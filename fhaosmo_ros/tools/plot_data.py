@@ -7,9 +7,13 @@ from typing import NamedTuple
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.metrics import chatter, rms
 from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.bags import series
+from fhaosmo_ros.tools.series import series
+from fhaosmo_ros.tools.ticks import read_ticks
 import numpy as np
 from numpy.typing import NDArray
+
+PARTS = ('state', 'unknown_input', 'gamma', 'innovation', 'stamp')
+"""Topics of an estimator, in the order in which it publishes them."""
 
 
 class Curves(NamedTuple):
@@ -52,9 +56,8 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
     """
     with BagReader(path) as reader:
         topics = {c.topic for c in reader.connections if c.msgcount}
-    parts = ('state', 'unknown_input', 'gamma', 'innovation', 'stamp')
     found = sorted(t.removesuffix('/gamma') for t in topics if t.endswith('/gamma'))
-    found = [name for name in found if all(f'{name}/{part}' in topics for part in parts)]
+    found = [name for name in found if all(f'{name}/{part}' in topics for part in PARTS)]
     for name in names or []:
         if name not in found:
             raise ConfigurationError(
@@ -63,7 +66,7 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
             )
     if not found:
         raise ConfigurationError(
-            f'bag {path}: expected the topics of an estimator ({", ".join(parts)} below its '
+            f'bag {path}: expected the topics of an estimator ({", ".join(PARTS)} below its '
             f'name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
         )
     has_truth = {f'{plant}/state', f'{plant}/unknown_input'} <= topics
@@ -71,14 +74,9 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
 
 
 def _curves(path: Path, name: str, plant: str | None) -> Curves:
-    state, d, gamma, innovation, stamp = (
-        series(path, f'{name}/{part}')
-        for part in ('state', 'unknown_input', 'gamma', 'innovation', 'stamp')
-    )
-    # The five topics of one tick are published together; a recording may lack the last of them.
-    count = min(len(s.stamps) for s in (state, d, gamma, innovation, stamp))
-    when = stamp.values[:count]
-    estimate = np.column_stack([state.values[:count], d.values[:count]])
+    ticks = read_ticks(path, name, PARTS)
+    when = ticks['stamp']
+    estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
     truth = None
     if plant is not None:
         z, true_d = series(path, f'{plant}/state'), series(path, f'{plant}/unknown_input')
@@ -86,10 +84,12 @@ def _curves(path: Path, name: str, plant: str | None) -> Curves:
         truth = np.column_stack([z.values[rows[0]], true_d.values[rows[1]]])
         if truth.shape != estimate.shape:  # another model than the plant's
             truth = None
-    labels = state.labels or [f'z{i + 1}' for i in range(estimate.shape[1] - 1)]
+    labels = series(path, f'{name}/state').labels or [
+        f'z{i + 1}' for i in range(estimate.shape[1] - 1)
+    ]
     return Curves(
-        f'{path.resolve().name} {name}', when, [*labels, 'd'], estimate, gamma.values[:count],
-        innovation.values[:count], truth,
+        f'{path.resolve().name} {name}', when, [*labels, 'd'], estimate, ticks['gamma'],
+        ticks['innovation'], truth,
     )  # fmt: skip
 
 

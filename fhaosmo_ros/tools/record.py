@@ -5,14 +5,16 @@ import argparse
 from pathlib import Path
 import re
 import shutil
+import sqlite3
 import sys
 import time
 
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.stop_signals import Stop, stop_on_signals
-from fhaosmo_ros.tools.bags import BagWriter, make_qos, TYPES
+from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.tools.bag_writer import BagWriter
+from fhaosmo_ros.tools.bags import make_qos, TYPES
+from fhaosmo_ros.tools.command import run_command
 from fhaosmo_ros.tools.repair import repair
-from fhaosmo_ros.tools.sinks import TOPICS
 from tqdm import tqdm
 
 FLUSH_PERIOD = 0.5
@@ -21,28 +23,17 @@ EXTRA = ('/y', '/u', '/diagnostics', '/rosout', '/parameter_events')
 
 
 def main(argv: list[str] | None = None) -> int:
-    """
-    Run the command.
+    """Run the command; return 0 if there is a valid bag, 2 also if nothing was recorded."""
+    return run_command(_parser(), argv, _run)
 
-    Returns
-    -------
-    int
-        0 if there is a valid bag, 2 for wrong arguments or if nothing was recorded.
 
-    """
-    arguments = _parser().parse_args(argv)
-    stop = stop_on_signals()
-    try:
-        if arguments.repair:
-            final = arguments.output or Path(f'{arguments.repair.resolve().stem}_repaired')
-            count = repair(arguments.repair, final, arguments.force, arguments.storage)
-            print(f'saved {count} messages: {final}')
-        else:
-            _record(arguments, stop)
-    except ConfigurationError as error:
-        print(f'record: error: {error}', file=sys.stderr)
-        return 2
-    return 0
+def _run(arguments: argparse.Namespace, stop: Stop) -> None:
+    if arguments.repair:
+        final = arguments.output or Path(f'{arguments.repair.resolve().stem}_repaired')
+        count = repair(arguments.repair, final, arguments.force, arguments.storage)
+        print(f'saved {count} messages: {final}')
+    else:
+        _record(arguments, stop)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -63,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add(
         '--names', nargs='+', default=['/estimator', '/plant'], metavar='NAME',
-        help='nodes whose topics to record beside y and u (default: /estimator /plant)',
+        help='nodes whose topics, in and out, to record (default: /estimator /plant)',
     )  # fmt: skip
     add('--duration', type=float, metavar='SECONDS', help='stop by itself')
     return parser
@@ -73,13 +64,11 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.duration is not None and not arguments.duration > 0.0:
         raise ConfigurationError(f'--duration: expected > 0 s, got {arguments.duration:g}')
     path = arguments.output or Path(time.strftime('bag_%Y-%m-%d_%H-%M-%S'))
-    if path.exists():
-        if not arguments.force:
-            raise ConfigurationError(
-                f'output {path}: expected a new name (or --force to replace it), got an existing '
-                f'{"folder" if path.is_dir() else "file"}'
-            )
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    if path.exists() and not arguments.force:
+        raise ConfigurationError(
+            f'output {path}: expected a new name (or --force to replace it), got an existing '
+            f'{"folder" if path.is_dir() else "file"}'
+        )
     if arguments.topics:
         for topic in arguments.topics:
             if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', topic):
@@ -88,19 +77,53 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     from fhaosmo_ros.nodes.topic_recorder import TopicRecorder
 
     wanted = _wanted(arguments)
+    names = [f'/{name.strip("/")}' for name in arguments.names]
+    listeners = [] if arguments.topics else names
+    old = _put_aside(path)
     try:
-        with BagWriter(path, storage=arguments.storage) as bag, TopicRecorder(wanted) as recorder:
-            # Signals that it listens: nobody need guess when to start what is to be recorded.
+        # Signals that it listens: nobody need guess when to start what is to be recorded.
+        with (
+            BagWriter(path, storage=arguments.storage) as bag,
+            TopicRecorder(wanted, listeners) as recorder,
+        ):
             print(f'recording to {path}; Ctrl-C ends it', flush=True)
             count = _drain(recorder, bag, arguments.duration, stop)
-    except OSError as error:
+            lost = dict(recorder.lost)
+    except (OSError, sqlite3.Error) as error:
+        hint = f'; record --repair {path} saves what is there' if path.exists() else ''
         raise ConfigurationError(
-            f'output {path}: expected a place that can be written, got: {error.strerror}'
+            f'output {path}: expected a place that can be written, got: '
+            f'{getattr(error, "strerror", None) or error}{hint}'
         ) from None
     if not count:
         shutil.rmtree(path)
+        if old.exists():
+            old.rename(path)
         raise ConfigurationError('nothing was published on these topics: no bag kept')
+    _remove(old)
+    for topic, number in sorted(lost.items()):
+        print(
+            f'record: {topic}: {number} messages were lost on their way here (a busy machine or '
+            'network; a deeper queue of the publisher helps)',
+            file=sys.stderr,
+        )
     print(f'{count} messages: {path}')
+
+
+def _put_aside(path: Path) -> Path:
+    """Rename what is there, until there is something to replace it; return its other name."""
+    old = path.with_name(f'.{path.name}.old')
+    if path.exists():
+        _remove(old)  # of a run that was killed
+        path.rename(old)
+    return old
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _wanted(arguments: argparse.Namespace):
@@ -109,8 +132,8 @@ def _wanted(arguments: argparse.Namespace):
     if arguments.topics:
         names = {'/' + topic.lstrip('/') for topic in arguments.topics}
         return lambda topic: topic in names
-    names = {f'{name.rstrip("/")}/{topic}' for name in arguments.names for topic in TOPICS}
-    return lambda topic: topic in names or topic in EXTRA
+    below = tuple(f'/{name.strip("/")}/' for name in arguments.names)
+    return lambda topic: topic.startswith(below) or topic in EXTRA
 
 
 def _drain(recorder, bag: BagWriter, duration: float | None, stop: Stop) -> int:

@@ -9,7 +9,7 @@ import struct
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.tools.bag_copy import copy_topics
 from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.bags import BagWriter
+from fhaosmo_ros.tools.bag_writer import BagWriter
 from fhaosmo_ros.tools.output import Output
 
 MAGIC = b'\x89MCAP0\r\n'

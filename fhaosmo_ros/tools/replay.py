@@ -2,55 +2,28 @@
 """Replay a recorded y through the node's update path, as fast as the machine allows."""
 
 import argparse
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-import sys
 from time import perf_counter
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.status import REJECTED
-from fhaosmo_ros.stop_signals import Stop, stop_on_signals
+from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bag_copy import copy_topics
-from fhaosmo_ros.tools.bag_reader import BagReader, Block
-from fhaosmo_ros.tools.bags import BagWriter
-from fhaosmo_ros.tools.held_input import HeldInput
-from fhaosmo_ros.tools.options import add_parameter_options, online_parameters
+from fhaosmo_ros.tools.bag_reader import BagReader
+from fhaosmo_ros.tools.bag_writer import BagWriter
+from fhaosmo_ros.tools.command import Interrupted, run_command
+from fhaosmo_ros.tools.live_run import find_estimator, LiveRun, read_events
+from fhaosmo_ros.tools.options import add_parameter_options, named, online_parameters
 from fhaosmo_ros.tools.output import Output
-from fhaosmo_ros.tools.sinks import BagSink, CsvSink, NpzSink, Rows, Sink, TOPICS
-import numpy as np
+from fhaosmo_ros.tools.samples import Samples
+from fhaosmo_ros.tools.sinks import BagSink, CsvSink, NpzSink, Sink, TOPICS
 from tqdm import tqdm
 
 
-class Interrupted(Exception):
-    """The user asked to stop; nothing is kept."""
-
-
 def main(argv: list[str] | None = None) -> int:
-    """
-    Run the command.
-
-    Returns
-    -------
-    int
-        0 if the output is complete, 130 after Ctrl-C, 2 for wrong input; then there is none.
-
-    """
-    arguments = _parser().parse_args(argv)
-    stop = stop_on_signals()
-    try:
-        _replay(arguments, stop)
-    except ConfigurationError as error:
-        print(f'replay: error: {error}', file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f'replay: error: output: {error.strerror}: {error.filename}', file=sys.stderr)
-        return 1
-    except Interrupted:
-        print('replay: interrupted, nothing written', file=sys.stderr)
-        return 130
-    return 0
+    """Run the command; return 0 if the output is complete, else there is none."""
+    return run_command(_parser(), argv, _replay)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -79,6 +52,15 @@ def _parser() -> argparse.ArgumentParser:
         '--backwards', choices=('error', 'reject'), default='error',
         help='what to do with stamps that go back; reject: as the live node does (%(default)s)',
     )  # fmt: skip
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument(
+        '--follow', metavar='NAME',
+        help='live estimator whose first sample, resets and live changes to repeat (default: the '
+        'one whose ~/snapshot the bag holds)',
+    )  # fmt: skip
+    choice.add_argument(
+        '--afresh', action='store_true', help='begin at the first sample, follow no live estimator'
+    )
     add('--every', type=int, default=1, metavar='N', help='keep every N-th estimate only')
     add(
         '--name', metavar='NAME',
@@ -98,7 +80,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     begin = perf_counter()
     with ExitStack() as stack:
         reader = stack.enter_context(BagReader(arguments.bag))
-        samples = Samples(reader, estimator, arguments)
+        live = _live(reader, estimator, arguments)
+        samples = Samples(reader, estimator, live, arguments)
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
         name = _name(reader, arguments.name)
         _write(reader, samples, outputs, name, arguments, stop)
@@ -109,85 +92,20 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         f'{c.accepted} samples used, {c.rejected} rejected, {c.restarts} restarts; '
         f'{samples.span:.1f} s of data in {seconds:.2f} s'
     )
+    if live:
+        print(live.report())
     for final in finals:
         where = '' if final.suffix in ('.csv', '.npz') else f' (estimates: {name}/...)'
         print(f'output: {final}{where}')
 
 
-class Samples:
-    """The estimates of a bag's samples, block by block."""
-
-    def __init__(
-        self, reader: BagReader, estimator: OnlineEstimator, arguments: argparse.Namespace
-    ) -> None:
-        topic = arguments.topic
-        self.estimator, self.topic = estimator, topic
-        self._reader, self._backwards = reader, arguments.backwards == 'error'
-        self._every, self._seen, self._taken = arguments.every, 0, 0
-        self._field = reader.field(topic, arguments.field)
-        self._use_header = self._field.has_header and arguments.stamp != 'bag'
-        if arguments.stamp == 'header' and not self._field.has_header:
-            raise ConfigurationError(
-                f'--stamp header: expected messages with a header on {topic}, '
-                f'got {reader.message_type(topic)}'
-            )
-        self._input = None
-        if estimator.observer.uses_input:
-            self._input = HeldInput(
-                reader, arguments.input_topic, arguments.input_field, estimator.reject_inputs
-            )
-        self._first: int | None = None
-        self._latest: int | None = None
-
-    @property
-    def total(self) -> int:
-        """Number of samples in the bag."""
-        return self._reader.count(self.topic)
-
-    @property
-    def span(self) -> float:
-        """Seconds from the first sample to the latest."""
-        return 0.0 if self._first is None else (self._latest - self._first) * 1e-9
-
-    def __iter__(self) -> Iterator[tuple[int, list[Rows]]]:
-        """Yield the number of samples taken, and their estimates."""
-        for block in self._reader.blocks(self.topic, self._field, self._use_header):
-            if not len(block.times):
-                continue
-            self._check(block)
-            u = self._input(block.times) if self._input else np.zeros(len(block.times))
-            yield len(block.times), list(self._rows(block, u))
-        if not self._taken:
-            raise ConfigurationError(
-                f'topic {self.topic!r}: expected messages, read none although the bag lists them'
-            )
-
-    def _check(self, block: Block) -> None:
-        stamps = block.stamps
-        if self._first is None:
-            self._first = self._latest = int(stamps[0])
-        previous = np.concatenate([[self._latest], stamps[:-1]])
-        back = np.flatnonzero(stamps < previous)
-        if len(back) and self._backwards and self.estimator.uses_stamps:
-            k = int(back[0])
-            raise ConfigurationError(
-                f'topic {self.topic!r}: expected stamps that never go back, got {stamps[k]} '
-                f'after {previous[k]} (sample {self._taken + k + 1}); --backwards reject treats '
-                'them as the live node does'
-            )
-        self._latest = int(stamps[-1])
-        self._taken += len(stamps)
-
-    def _rows(self, block: Block, u: np.ndarray) -> Iterator[Rows]:
-        estimates = self.estimator.run(block.stamps, block.values, u)
-        keep = np.flatnonzero((estimates.status & REJECTED) == 0)
-        count = len(keep)
-        keep = keep[(self._every - 1 - self._seen) % self._every :: self._every]
-        self._seen += count
-        if len(keep):
-            if len(keep) < len(block.times):
-                estimates = type(estimates)(*(a[keep] for a in estimates))
-            yield Rows(block.times[keep], block.values[keep], estimates)
+def _live(
+    reader: BagReader, estimator: OnlineEstimator, arguments: argparse.Namespace
+) -> LiveRun | None:
+    name = None if arguments.afresh else find_estimator(reader, arguments.follow)
+    if name is None:
+        return None
+    return LiveRun(name, read_events(reader, name, named(arguments)), estimator)
 
 
 def _name(reader: BagReader, name: str | None) -> str:
@@ -230,4 +148,4 @@ def _write(
 
 def _check_stop(stop: Stop) -> None:
     if stop.is_set():
-        raise Interrupted
+        raise Interrupted('nothing written')

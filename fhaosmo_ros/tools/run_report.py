@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.metrics import chatter, rms, settling_time
-from fhaosmo_ros.tools.bags import messages, series
+from fhaosmo_ros.tools.series import messages, series
 import numpy as np
 from numpy.typing import NDArray
 
@@ -87,7 +87,7 @@ def _counters(bag: Path) -> dict[str, str]:
     for _, message in messages(bag, '/diagnostics'):
         for status in message.status:
             if 'estimator' in status.name:
-                last = {pair.key: pair.value for pair in status.values}
+                last |= {pair.key: pair.value for pair in status.values}
     return last
 
 
@@ -109,7 +109,7 @@ def table(run: Run) -> str:
         )
     counters = run.counters
     lost, accepted = counters.get('samples lost', '?'), counters.get('samples accepted', '?')
-    rejected = sum(int(v) for k, v in counters.items() if k.startswith('rejected'))
+    rejected = counters.get('samples rejected', '?')
     lines += [
         '',
         f'sample rate held: {run.sample_rate:.1f} Hz',

@@ -2,6 +2,7 @@
 """Nodes as a user starts them, and a client that waits for what they send."""
 
 import contextlib
+import os
 from pathlib import Path
 import re
 import signal
@@ -63,12 +64,16 @@ def parameters(**values: object) -> list[str]:
 class Process:
     """A node in a process of its own; its output is kept in files."""
 
-    def __init__(self, folder: Path, *arguments: object) -> None:
+    def __init__(
+        self, folder: Path, *arguments: object, code: str = '', **environment: object
+    ) -> None:
         self._paths = folder / 'stdout', folder / 'stderr'
+        words = [sys.executable, '-c', code, *arguments] if code else command(*arguments)
         with self._paths[0].open('wb') as out, self._paths[1].open('wb') as err:
             self._process = subprocess.Popen(
-                command(*arguments), cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err
-            )
+                words, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err,
+                env=os.environ | {name: str(value) for name, value in environment.items()},
+            )  # fmt: skip
 
     @property
     def output(self) -> str:
@@ -163,14 +168,15 @@ class Client:
         subscribe_with_info(self.node, message_type, topic, receive, QOS)
         return messages
 
-    def publisher(self, topic: str, message_type: type = Float64):
+    def publisher(self, topic: str, message_type: type = Float64, qos: QoSProfile = QOS):
         """Return a function that publishes a value once somebody else listens."""
-        publisher = self.node.create_publisher(message_type, topic, QOS)
+        publisher = self.node.create_publisher(message_type, topic, qos)
 
         def publish(value: object) -> None:
             publisher.publish(message_type(data=value) if message_type is Float64 else value)
 
         publish.matched = publisher.get_subscription_count
+        publish.destroy = lambda: self.node.destroy_publisher(publisher)
         return publish
 
     def wait(self, condition, what: str, timeout: float = DEADLINE) -> None:
@@ -182,12 +188,16 @@ class Client:
                     raise AssertionError(f'no {what} within {timeout} s')
                 self._changed.wait(0.05)
 
-    def call(self, service: str, service_type: type, request: object):
+    def call_later(self, service: str, service_type: type, request: object):
+        """Send a request and return the future of its answer."""
         client = self._services.get(service)
         if client is None:
             client = self._services[service] = self.node.create_client(service_type, service)
         self.wait(client.service_is_ready, f'service {service}')
-        future = client.call_async(request)
+        return client.call_async(request)
+
+    def call(self, service: str, service_type: type, request: object):
+        future = self.call_later(service, service_type, request)
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
         assert done.wait(DEADLINE), f'no answer from {service}'
@@ -219,10 +229,13 @@ class Parameters:
         value = parameter_value_to_python(self.messages(name)[0])
         return list(value) if not isinstance(value, bool | int | float | str) else value
 
+    def request(self, **values: object):
+        """Return type and request of the service that sets one after the other."""
+        return SetParameters, SetParameters.Request(parameters=_messages(values))
+
     def set(self, **values: object) -> list:
         """Set one after the other; return the results."""
-        request = SetParameters.Request(parameters=_messages(values))
-        return list(self._call('set_parameters', SetParameters, request).results)
+        return list(self._call('set_parameters', *self.request(**values)).results)
 
     def set_text(self, name: str, text: str):
         """Set from a text, as `ros2 param set` does."""
@@ -342,11 +355,44 @@ class EstimatorRig:
 
     def count(self, key: str) -> int:
         """Return a counter of the latest diagnostics."""
+        value = self.value(key)
+        return -1 if value is None else int(value)
+
+    def value(self, key: str) -> str | None:
+        """Return a value of the latest diagnostics that has it."""
+        for status in self.statuses():
+            for pair in status.values:
+                if pair.key == key:
+                    return pair.value
+        return None
+
+    def statuses(self):
+        """Return the estimator's statuses, latest first."""
         for published in reversed(self.diagnostics):
             for status in published.message.status:
-                if status.name == self._name:
-                    return int({v.key: v.value for v in status.values}[key])
-        return -1
+                if status.name.startswith(f'{self._name}: '):
+                    yield status
+
+    def wait_status(self, task: str, level: bytes, *words: str, start: int | None = None):
+        """
+        Wait for a status of a task with this level and these words in its message.
+
+        Of those that come from now on, or from the `start`-th message on.
+        """
+        start = len(self.diagnostics) if start is None else start
+        found = []
+
+        def look() -> bool:
+            for published in self.diagnostics[start:]:
+                found.extend(
+                    s for s in published.message.status
+                    if s.name == f'{self._name}: {task}' and s.level == level
+                    and all(word in s.message for word in words)
+                )  # fmt: skip
+            return bool(found)
+
+        self.client.wait(look, f'{task} with level {level} and {words}')
+        return found[-1]
 
     def wait_count(self, key: str, value: int) -> None:
         self.client.wait(lambda: self.count(key) >= value, f'{key!r} of {value} in diagnostics')

@@ -2,6 +2,7 @@
 """Plant and estimator as two processes; the estimator alone against a replay of its samples."""
 
 import math
+import signal
 
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS
@@ -11,7 +12,7 @@ import pytest
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
-from rig import EstimatorRig, node_process, parameters  # noqa: E402
+from rig import EstimatorRig, node_process, parameters, Process  # noqa: E402
 from std_msgs.msg import Float64, Float64MultiArray  # noqa: E402
 
 RATE = 50.0
@@ -118,3 +119,27 @@ def test_equals_a_replay_of_the_same_samples(client, folder, namespace, options)
             np.testing.assert_allclose(
                 e.unknown_input, expected[e.stamp].unknown_input, rtol=0.0, atol=1e-12
             )
+
+
+FALLBACK = """
+import sys
+from fhaosmo_ros.nodes import estimator, spin
+
+spin.EventsExecutor = None  # an older rclpy
+sys.exit(estimator.main(sys.argv[1:]))
+"""
+
+
+def test_without_the_events_executor_it_works_too(client, folder):
+    arguments = parameters(namespace='/older', publish_rate=200.0, max_gap=60.0)
+    process = Process(folder(), *arguments, code=FALLBACK)
+    try:
+        rig = EstimatorRig(client, '/older')
+        for y in (0.2, 0.21, 0.22):
+            estimate = rig.feed(y)
+        assert abs(estimate.z[0] - 0.22) < 0.1
+        process.send(signal.SIGINT)
+        assert process.wait() == 0, process.output
+        assert 'Traceback' not in process.output
+    finally:
+        process.kill()

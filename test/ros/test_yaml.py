@@ -164,3 +164,11 @@ def test_a_file_reaches_a_renamed_node_in_a_namespace(client, folder, write):
         }
         assert {name: p.get(name) for name in expected} == expected
         assert 'noise_std' not in p.names()
+
+
+def test_rule_for_another_node_is_let_through():
+    """As ROS does: one command line may serve several nodes."""
+    spin = pytest.importorskip('fhaosmo_ros.nodes.spin')
+    spin._check_arguments('estimator', ['--ros-args', '-p', 'plant:noise:=0.1'])
+    with pytest.raises(ConfigurationError, match="'noise'"):
+        spin._check_arguments('estimator', ['--ros-args', '-p', 'estimator:noise:=0.1'])

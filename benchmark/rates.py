@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CPU, lost samples, jitter and latency of an estimator beside a node that computes nothing."""
+
+from collections import defaultdict
+import importlib.util
+import os
+from time import monotonic, sleep, time_ns
+from typing import NamedTuple
+
+from children import Child, Children
+import numpy as np
+from table import CannotMeasureError, Row, Table
+from tqdm import tqdm
+
+BAR = 1.2
+GOAL = 1000.0
+"""Rate in Hz of the bars."""
+CASES = ((100.0, 100.0), (500.0, 500.0), (1000.0, 100.0), (1000.0, 1000.0), (2000.0, 2000.0))
+"""Rates of y and of the estimates."""
+WARM_UP = 1.5
+HELD = 0.97
+"""A run counts for the ratio if each node published at this part of the rate at least."""
+MATCHED = 30.0
+"""Seconds that discovery may take."""
+COMMANDS = {
+    'estimator': ('-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-p', 'publish_rate:={rate}'),
+    'empty_node': ('benchmark/empty_node.py', '--rate', '{rate}'),
+    'plain': ('benchmark/empty_node.py', '--rate', '{rate}', '--plain'),
+}
+TITLES = {'estimator': 'estimator', 'empty_node': 'empty', 'plain': 'empty, rclpy.spin'}
+HEADER = (
+    'y Hz', 'out Hz', 'held', 'node', 'CPU %', 'lost', 'of',
+    'jitter p50', 'p99', 'max', 'latency p50', 'p99', 'max ms',
+)  # fmt: skip
+
+
+class Figures(NamedTuple):
+    """
+    What one node did in one run.
+
+    Attributes
+    ----------
+    cpu : float
+        CPU time over wall time.
+    held : float
+        Publications over those that the timer was to make: a starved node does, and costs, less.
+    sent, taken : int
+        Samples that were published, and that the node has taken.
+    times : (6,) tuple
+        Jitter and latency: median, 99 % and largest, in seconds.
+
+    """
+
+    cpu: float
+    held: float
+    sent: int
+    taken: int
+    times: tuple[float, ...]
+
+
+def measure(quick: bool) -> list[Row | Table]:
+    """Return the ratios of CPU, the samples lost, and a table of everything."""
+    isolate()
+    seconds, repetitions = (2.0, 1) if quick else (8.0, 3)
+    cases = [(*rates, ('estimator', 'empty_node')) for rates in CASES]
+    if quick:
+        cases = [(GOAL, GOAL, ('estimator', 'empty_node'))]
+    else:
+        cases.append((GOAL, GOAL, ('plain', 'empty_node')))
+    runs: dict[tuple[float, float, str], list[Figures]] = defaultdict(list)
+    ratios: dict[tuple[float, float], list[float]] = defaultdict(list)
+    plan = [(case, k) for k in range(repetitions) for case in cases]
+    for (rate, out, names), k in tqdm(plan, desc='rates', unit='run', leave=False):
+        figures = observe(rate, out, names if k % 2 == 0 else names[::-1], seconds)
+        if 'plain' in names:
+            runs[rate, out, 'plain'].append(figures['plain'])
+            continue
+        for name in names:
+            runs[rate, out, name].append(figures[name])
+        ratio = figures['estimator'].cpu / figures['empty_node'].cpu
+        if min(f.held for f in figures.values()) >= HELD:
+            ratios[rate, out].append(ratio)
+        else:
+            tqdm.write(f'rates: left out a run at {out:g} Hz in which a node was starved')
+    rows = [
+        _ratio(rate, out, ratios[rate, out]) for rate, out, names in cases if 'plain' not in names
+    ]
+    lost = sum(f.sent - f.taken for f in runs[GOAL, GOAL, 'estimator'])
+    sent = sum(f.sent for f in runs[GOAL, GOAL, 'estimator'])
+    note = f'of {sent:,}, over {repetitions} runs'
+    rows.append(Row(f'samples lost at {GOAL:g} Hz', lost, bar=0.0, note=note))
+    return [*rows, _table(runs, seconds, repetitions)]
+
+
+def isolate() -> None:
+    """Keep what we start away from other ROS systems; raise if there is no ROS."""
+    if importlib.util.find_spec('rclpy') is None:
+        raise CannotMeasureError('no rclpy in this Python: start it with make bench')
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+
+
+def observe(rate: float, out: float, names: tuple[str, ...], seconds: float) -> dict[str, Figures]:
+    """Start a source of y and the named nodes, all on the same samples, for `seconds`."""
+    from watch import Watch  # needs ROS
+
+    with Children() as children, Watch(sorted(names)) as watch:
+        nodes = {
+            name: children.start(name, *(word.format(rate=out) for word in COMMANDS[name]))
+            for name in names
+        }
+        for name, node in nodes.items():
+            node.wait_for('estimating' if name == 'estimator' else 'computing nothing')
+        source = children.start(
+            'source', 'benchmark/source.py',
+            '--rate', str(rate), '--subscribers', str(len(nodes)),
+        )  # fmt: skip
+        source.wait_for('publishing')
+        sleep(WARM_UP)
+        watch.forget()
+        before, start = {name: node.cpu_seconds() for name, node in nodes.items()}, monotonic()
+        sleep(seconds)
+        elapsed = monotonic() - start
+        used = {name: node.cpu_seconds() - before[name] for name, node in nodes.items()}
+        held = {name: watch.count(name) / (out * elapsed) for name in names}
+        times = {name: (*watch.jitter(name, out), *watch.latency(name)) for name in names}
+        sent = _end(source)
+        ended, taken = time_ns(), {}
+        for name in names:
+            _wait(lambda name=name: watch.report(name)[0] > ended, f'no report of {name}')
+            taken[name] = watch.report(name)[1]
+    return {
+        name: Figures(used[name] / elapsed, held[name], sent, taken[name], times[name])
+        for name in names
+    }
+
+
+def _end(source: Child) -> int:
+    source.interrupt()
+    source.end()
+    return int(source.output().split()[-1])
+
+
+def _wait(condition, complaint: str) -> None:
+    deadline = monotonic() + MATCHED
+    while not condition():
+        if monotonic() > deadline:
+            raise CannotMeasureError(f'{complaint} within {MATCHED:g} s')
+        sleep(0.02)
+
+
+def _ratio(rate: float, out: float, ratios: list[float]) -> Row:
+    return Row(
+        f'CPU, estimator / empty node, y {rate:g} Hz, estimates {out:g} Hz',
+        float(np.median(ratios)) if ratios else None,
+        bar=BAR if rate == GOAL else None,
+        note=(
+            f'ratios {", ".join(f"{r:.2f}" for r in ratios)}'
+            if ratios
+            else 'in every run a node was starved: the machine is too busy'
+        ),
+    )
+
+
+def _table(
+    runs: dict[tuple[float, float, str], list[Figures]], seconds: float, repetitions: int
+) -> Table:
+    lines = []
+    for (rate, out, name), figures in runs.items():
+        times = np.median([f.times for f in figures], axis=0)
+        times[[2, 5]] = np.max([f.times for f in figures], axis=0)[[2, 5]]
+        lines.append((
+            f'{rate:g}', f'{out:g}', f'{np.median([f.held for f in figures]):.0%}', TITLES[name],
+            f'{100.0 * np.median([f.cpu for f in figures]):.1f}',
+            f'{sum(f.sent - f.taken for f in figures)}', f'{sum(f.sent for f in figures):,}',
+            *(f'{1e3 * t:.3f}' for t in times),
+        ))  # fmt: skip
+    title = (
+        f'y from a source of its own; nodes on the same samples at the same time; {repetitions} '
+        f'runs of {seconds:g} s: medians, sums of lost, largest of max. Held: estimates published '
+        'of those asked for. Jitter: deviation of the time between two publications. Latency: '
+        'from publication of y to that of the first estimate that contains it, waiting for the '
+        'timer included.'
+    )
+    return Table(title, HEADER, lines)

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A client that changes the estimator's parameters, well and badly, and resets it."""
+
+from collections import Counter
+from time import monotonic, sleep
+from types import TracebackType
+from typing import Any
+
+from fhaosmo_ros.nodes.spin import Spinner
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import Trigger
+from table import CannotMeasureError
+
+GOOD = (
+    {'variant': 'sign'},
+    {'variant': 'fuzzy'},
+    {'variant': 'fuzzy_adaptive'},
+    {'scheme': 'explicit', 'variant': 'fuzzy'},
+    {'scheme': 'implicit'},
+    {'lambda': [15.0], 'alpha': [30.0]},
+    {'epsilon': 0.5},
+    {'publish_rate': 250.0},
+    {'estimate_from': 'filtered'},
+    {'gamma_rate': 4.0, 'gamma_min': 0.4, 'gamma_max': 0.6},
+)
+BAD = (
+    {'variant': 'fuzy'},
+    {'lambda': [-1.0]},
+    {'alpha': [1.0, 2.0]},
+    {'epsilon': float('nan')},
+    {'gamma_min': 0.9, 'gamma_max': 0.2},
+    {'order': 7},
+    {'publish_rate': 0.0},
+    {'no_such_parameter': 1.0},
+)
+ANSWERED = 10.0
+"""Seconds that an answer may take."""
+
+
+class SoakClient:
+    """
+    Calls the estimator's services while it is open.
+
+    Attributes
+    ----------
+    counts : Counter
+        Calls by kind, and 'wrong answers': a bad set that was accepted, a good one refused.
+
+    """
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._turn: Counter[str] = Counter()
+        self._context = Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = Node('soak_client', context=self._context, use_global_arguments=False)
+        self._parameters = AsyncParameterClient(self._node, '/estimator')
+        self._reset = self._node.create_client(Trigger, '/estimator/reset')
+        self._spinner = Spinner(self._node)
+        self._base: dict[str, Any] = {}
+
+    def learn(self) -> None:
+        """Remember the present parameters as those that `restore` puts back."""
+        names = sorted({name for changes in GOOD for name in changes})
+        if not self._parameters.wait_for_services(ANSWERED):
+            raise CannotMeasureError("the estimator's parameter services did not appear")
+        answer = self._wait(self._parameters.get_parameters(names))
+        for name, value in zip(names, answer.values, strict=True):
+            self._base[name] = Parameter.from_parameter_msg(_message(name, value)).value
+
+    def call(self, kind: str) -> None:
+        """Make the next call of a kind of `soak_schedule.CALLS`."""
+        turn = self._turn[kind]
+        self._turn[kind] += 1
+        if kind == 'reset':
+            right = self._wait(self._reset.call_async(Trigger.Request())).success
+        elif kind == 'good parameters':
+            right = self._set(GOOD[turn % len(GOOD)])
+        else:
+            right = not self._set(BAD[turn % len(BAD)])
+        self.counts[kind] += 1
+        self.counts['wrong answers'] += not right
+
+    def restore(self) -> None:
+        """Put the parameters back."""
+        self.counts['wrong answers'] += not self._set(self._base)
+
+    def _set(self, values: dict[str, Any]) -> bool:
+        parameters = [Parameter(name, value=value) for name, value in values.items()]
+        answer = self._wait(self._parameters.set_parameters_atomically(parameters))
+        return bool(answer.result.successful)
+
+    def _wait(self, future: Any) -> Any:
+        deadline = monotonic() + ANSWERED
+        while not future.done():
+            if monotonic() > deadline:
+                raise CannotMeasureError(f'the estimator did not answer within {ANSWERED:g} s')
+            sleep(0.002)
+        return future.result()
+
+    def __enter__(self) -> 'SoakClient':
+        self._spinner.__enter__()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._spinner.__exit__(kind, error, trace)
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+
+def _message(name: str, value: Any) -> Any:
+    from rcl_interfaces.msg import Parameter as ParameterMessage
+
+    return ParameterMessage(name=name, value=value)

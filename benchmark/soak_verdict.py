@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a soak must fulfil, and its figure."""
+
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import theilslopes
+from table import Row
+
+MEMORY = 2.0
+"""MB that memory may grow by over the run."""
+ERROR_GROWTH = 0.01
+"""What the error of d may grow by between the first and the last third: a tenth of d's amplitude.
+Not a ratio: that of two errors near the noise tells how busy the machine was."""
+ERROR = 0.05
+"""Largest median error of d in any judged window: half of d's amplitude."""
+GAMMA = 0.02
+"""What gamma may move between the first and the last third."""
+
+
+class Course(NamedTuple):
+    """
+    What was measured over time.
+
+    Attributes
+    ----------
+    memory : dict of str to (K, 2) array
+        Seconds and MB (resident) of each process.
+    windows : (W, 3) array
+        Of each judged window: seconds, median error of d, median of gamma.
+    outputs, not_finite : int
+        Values published, and those that were NaN or infinite.
+    published, taken, lost : int
+        Samples that left the fault injector, that the estimator used or rejected, and that it
+        missed in the sequence numbers.
+    stalls : int
+        Seconds in which it missed any.
+    faults, calls : Counter
+        What was injected, what was called.
+
+    """
+
+    memory: dict[str, NDArray[np.float64]]
+    windows: NDArray[np.float64]
+    outputs: int
+    not_finite: int
+    published: int
+    taken: int
+    lost: int
+    stalls: int
+    faults: Counter[str]
+    calls: Counter[str]
+
+
+def growth(memory: NDArray[np.float64]) -> float:
+    """Return by how many MB memory has grown, by the median of all slopes (Theil and Sen)."""
+    t, used = memory[:: max(1, len(memory) // 300)].T
+    return float(theilslopes(used, t).slope * (t[-1] - t[0])) if len(t) > 1 else float('nan')
+
+
+def verdict(course: Course) -> list[Row]:
+    """Return one row for each thing that a soak may fail on."""
+    rows = []
+    for name, memory in course.memory.items():
+        note = f'{memory[0, 1]:.1f} to {memory[-1, 1]:.1f} MB after warm-up'
+        rows.append(Row(f'memory of {name}, growth', growth(memory), 'MB', MEMORY, note))
+    unaccounted = course.published - course.taken
+    note = f'{course.published:,} published, {course.taken:,} used or rejected'
+    rows.append(Row('samples unaccounted for', abs(unaccounted), bar=0.0, note=note))
+    note = f'in {course.stalls} of the seconds'
+    rows.append(Row('samples lost, by sequence number', course.lost, bar=0.0, note=note))
+    note = f'of {course.outputs:,} messages'
+    rows.append(Row('outputs that are not finite', course.not_finite, bar=0.0, note=note))
+    _, error, gamma = course.windows.T
+    first, last = (np.median(part) for part in (_third(error, 0), _third(error, 2)))
+    note = f'{first:.2g} to {last:.2g}, medians of the first and the last third of the windows'
+    rows.append(Row('error of d, growth', last - first, bar=ERROR_GROWTH, note=note))
+    note = f'{len(error)} windows, median {np.median(error):.2g}'
+    rows.append(Row('error of d, worst window', error.max(), bar=ERROR, note=note))
+    first, last = (np.median(part) for part in (_third(gamma, 0), _third(gamma, 2)))
+    note = f'{first:.4f} to {last:.4f}, within {gamma.min():.4f} .. {gamma.max():.4f}'
+    rows.append(Row('gamma, drift', abs(last - first), bar=GAMMA, note=note))
+    calls = sum(course.calls.values()) - course.calls['wrong answers']
+    note = f'of {calls} calls: ' + ', '.join(
+        f'{count} {kind}' for kind, count in course.calls.items() if kind != 'wrong answers'
+    )
+    rows.append(Row('wrong answers to calls', course.calls['wrong answers'], bar=0.0, note=note))
+    return rows
+
+
+def _third(values: NDArray[np.float64], index: int) -> NDArray[np.float64]:
+    return np.array_split(values, 3)[index] if len(values) >= 3 else values
+
+
+def draw(course: Course, path: Path) -> None:
+    """Draw memory, gamma and the error over time."""
+    figure = Figure(figsize=(9.0, 7.0), layout='constrained')
+    axes = figure.subplots(3, 1, sharex=True)
+    t, error, gamma = course.windows.T
+    for name, memory in course.memory.items():
+        axes[0].plot(memory[:, 0] / 60.0, memory[:, 1], label=name)
+    axes[0].set_ylabel('resident memory, MB')
+    axes[0].legend(loc='center right')
+    axes[1].plot(t / 60.0, gamma, 'o-', markersize=3)
+    axes[1].set_ylabel('γ, median of a window')
+    axes[2].semilogy(t / 60.0, error, 'o-', markersize=3)
+    axes[2].axhline(ERROR, color='tab:red', linewidth=0.8, label='limit')
+    axes[2].set_ylabel('error of d, median of a window')
+    axes[2].legend(loc='center right')
+    axes[2].set_xlabel('minutes')
+    figure.savefig(path, dpi=110)

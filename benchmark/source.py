@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Publishes y at an exact rate, on one topic or on many, from a process of its own.
+
+Sample k is published k periods after the first one: a late one does not delay those behind it.
+Begins once every topic has its subscribers; says at its end how many samples it has published.
+"""
+
+import argparse
+import math
+import signal
+import time
+
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Float64
+
+READY = 'publishing'
+PUBLISHED = 'published'
+SETTLE = 0.5
+"""Seconds between the match as seen from here and the first sample: the other side's match."""
+
+
+def main() -> None:
+    """Publish until SIGINT."""
+    parser = argparse.ArgumentParser(description='Publishes y at an exact rate.')
+    parser.add_argument('--rate', type=float, default=1000.0, help='in Hz')
+    parser.add_argument('--topics', nargs='+', default=['y'])
+    parser.add_argument('--subscribers', type=int, default=1, help='of each topic')
+    arguments = parser.parse_args()
+    ended = False
+
+    def end(*_: object) -> None:
+        nonlocal ended
+        ended = True
+
+    signal.signal(signal.SIGINT, end)
+    context = Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = Node('source', context=context, start_parameter_services=False)
+    publishers = [node.create_publisher(Float64, topic, 10) for topic in arguments.topics]
+    while not ended and any(
+        publisher.get_subscription_count() < arguments.subscribers for publisher in publishers
+    ):
+        time.sleep(0.02)
+    time.sleep(SETTLE)
+    print(READY, flush=True)
+    message, count = Float64(), 0
+    start = time.monotonic()
+    while not ended:
+        time.sleep(max(0.0, start + count / arguments.rate - time.monotonic()))
+        message.data = 0.2 + 0.1 * math.sin(count / arguments.rate)
+        for publisher in publishers:
+            publisher.publish(message)
+        count += 1
+    time.sleep(SETTLE)  # the last samples leave before their writer does
+    print(PUBLISHED, count, flush=True)
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+if __name__ == '__main__':
+    main()

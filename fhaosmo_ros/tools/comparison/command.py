@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compare the observer with what people would use instead, all tuned by the same rules."""
+
+import argparse
+from collections.abc import Iterator
+from concurrent.futures import as_completed, ProcessPoolExecutor
+import multiprocessing
+import multiprocessing.connection
+import os
+from pathlib import Path
+import signal
+import sys
+import threading
+import time
+
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.tools import paper_document as document
+from fhaosmo_ros.tools.comparison import figures, results, tables
+from fhaosmo_ros.tools.comparison.cells import Sensor, sensors
+from fhaosmo_ros.tools.comparison.evaluation import evaluate, METHODS, seconds_a_sample
+from fhaosmo_ros.tools.comparison.results import Entry, Results
+from fhaosmo_ros.tools.comparison.verdicts import verdicts
+from tqdm import tqdm
+
+DOCS = Path(__file__).resolve().parents[3] / 'docs'
+FOLDER, RESULTS = 'comparison', 'results.json'
+TRIALS, QUICK_TRIALS = 200, 15
+TRAINING, QUICK_TRAINING = 4, 1
+
+
+def main(argv: list[str] | None = None) -> int:
+    """
+    Run the command.
+
+    Returns
+    -------
+    int
+        0, 2 for a bad argument or output, 130 if it was interrupted.
+
+    """
+    arguments = _parser().parse_args(argv)
+    quick = arguments.quick
+    output = arguments.output or _default_output(quick)
+    trials = arguments.trials or (QUICK_TRIALS if quick else TRIALS)
+    training = QUICK_TRAINING if quick else TRAINING
+    begin = time.monotonic()
+    try:
+        folder = output / FOLDER
+        folder.mkdir(parents=True, exist_ok=True)
+        found = run(sensors(quick), trials, training, arguments.jobs)
+        write(found, output)
+    except (ConfigurationError, OSError) as error:
+        print(f'compare: error: {error}', file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print('compare: interrupted, nothing was written', file=sys.stderr)
+        return 130
+    print(f'\n{tables.verdict_table(verdicts(found.table(list(METHODS))))}\n')
+    print(
+        f'document: {output / "comparison.md"}, figures: {folder} '
+        f'({time.monotonic() - begin:.0f} s)'
+    )
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='compare', description=__doc__)
+    parser.add_argument(
+        '--quick',
+        action='store_true',
+        help='a few cells and trials, for a first look and for tests',
+    )
+    parser.add_argument(
+        '--trials', type=_positive, metavar='N',
+        help=f'trials of each tuning (default: {TRIALS}, {QUICK_TRIALS} with --quick)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--jobs', type=_positive, metavar='N', default=os.cpu_count() or 1,
+        help='processes (default: one a core)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--output', type=Path, metavar='FOLDER',
+        help='folder for comparison.md and comparison/ (default: docs of this checkout; '
+        'comparison_output with --quick or without a checkout)',
+    )  # fmt: skip
+    return parser
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f'expected an integer >= 1, got {text}')
+    return value
+
+
+def _default_output(quick: bool) -> Path:
+    return DOCS if not quick and (DOCS / 'comparison.md').is_file() else Path('comparison_output')
+
+
+def run(chosen: list[Sensor], trials: int, training: int, jobs: int) -> Results:
+    """Tune and judge all methods for these sensors, in `jobs` processes."""
+    tasks = [(sensor, name) for sensor in chosen for name in METHODS]
+    entries = {}
+    with tqdm(total=len(tasks), unit='tuning', desc='compare') as bar:
+        for task, entry in _evaluated(tasks, trials, training, jobs):
+            entries[task] = entry
+            bar.update()
+    seconds = {
+        name: seconds_a_sample(name, entries[chosen[0], name].tuned, chosen[0]) for name in METHODS
+    }
+    return Results([entries[task] for task in tasks], seconds, trials, training)
+
+
+def _evaluated(
+    tasks: list[tuple[Sensor, str]], trials: int, training: int, jobs: int
+) -> Iterator[tuple[tuple[Sensor, str], Entry]]:
+    # One thread each for linear algebra: for matrices as small as these more only wait for each
+    # other, and the processes already use all cores.
+    for variable in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
+        os.environ.setdefault(variable, '1')
+    context = multiprocessing.get_context('spawn')
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_end_with_parent)
+    try:
+        # The children inherit this: Ctrl-C reaches them too, and is the parent's business. Blocked,
+        # not ignored: one that comes meanwhile is not lost.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        futures = {pool.submit(_task, *task, trials, training): task for task in tasks}
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    finally:
+        # After Ctrl-C the tunings that run are not worth waiting for.
+        for process in (pool._processes or {}).values():
+            process.terminate()
+        pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """End this child when its parent has been killed, instead of waiting for work for ever."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _task(sensor: Sensor, name: str, trials: int, training: int) -> Entry:
+    tuned, scores = evaluate(sensor, name, training, trials)
+    return Entry(sensor, name, tuned, scores)
+
+
+def write(found: Results, output: Path) -> None:
+    """Write document, figures and results."""
+    folder = output / FOLDER
+    results.save(found, folder / RESULTS)
+    rounded = results.load(folder / RESULTS)  # so that the document is a function of the file
+    figures.save_all(rounded, folder)
+    document.write(output / 'comparison.md', tables.texts(rounded), 'Comparison')
+
+
+if __name__ == '__main__':
+    sys.exit(main())

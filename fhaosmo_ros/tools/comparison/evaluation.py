@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tune a method for a sensor, and judge it on what the tuning has not seen."""
+
+from collections.abc import Sequence
+import time
+from typing import NamedTuple
+
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.family import Recording
+from fhaosmo_ros.tools.comparison.cells import Sensor
+from fhaosmo_ros.tools.comparison.linear import LINEAR
+from fhaosmo_ros.tools.comparison.methods import Method, Setting, Values
+from fhaosmo_ros.tools.comparison.ours import OUR_METHOD
+from fhaosmo_ros.tools.comparison.scores import Estimates, objective, Scores, scores
+from fhaosmo_ros.tools.comparison.sliding import SLIDING
+from fhaosmo_ros.tools.tuning.search import minimise
+import numpy as np
+
+REPEATS = 5
+METHODS: dict[str, Method] = {method.name: method for method in (*LINEAR, *SLIDING, OUR_METHOD)}
+
+
+class Tuned(NamedTuple):
+    """A method's best values on the training recordings, and which of its readouts was best."""
+
+    values: dict[str, float]
+    readout: str
+    training: float
+
+
+def trial(
+    method: Method, setting: Setting, values: Values, recordings: Sequence[Recording]
+) -> tuple[float, str]:
+    """Return the objective's average over recordings, of the best readout, and its name."""
+    try:
+        run = method.prepare(setting, values)
+    except ConfigurationError:  # values that make no observer, such as an unsolvable Riccati
+        return float('inf'), ''
+    totals: dict[str, float] = {}
+    for recording in recordings:
+        for name, estimates in run(recording).items():
+            totals[name] = totals.get(name, 0.0) + objective(recording, estimates)
+        if not np.isfinite(min(totals.values())):
+            break
+    best = min(totals, key=totals.__getitem__)
+    return totals[best] / len(recordings), best
+
+
+def tune(
+    method: Method, setting: Setting, recordings: Sequence[Recording], trials: int, seed: int
+) -> Tuned:
+    """Search a method's parameters; one without any is evaluated as it is."""
+    space = list(method.space(setting))
+    values: Values = {}
+    if space:
+        values = minimise(
+            lambda v: trial(method, setting, v, recordings)[0], space, trials, seed=seed, jobs=1
+        ).best
+    value, readout = trial(method, setting, values, recordings)
+    return Tuned(dict(values), readout or 'filtered', value)
+
+
+def judge(
+    method: Method, setting: Setting, tuned: Tuned, recordings: Sequence[Recording]
+) -> Scores:
+    """Return the scores on held-out recordings."""
+    return scores(recordings, estimates(method, setting, tuned, recordings))
+
+
+def estimates(
+    method: Method, setting: Setting, tuned: Tuned, recordings: Sequence[Recording]
+) -> list[Estimates]:
+    """Return the estimates of a tuned method."""
+    run = method.prepare(setting, tuned.values)
+    return [run(recording)[tuned.readout] for recording in recordings]
+
+
+def evaluate(sensor: Sensor, name: str, training: int, trials: int) -> tuple[Tuned, list[Scores]]:
+    """Tune a method for a sensor and return its scores for each of the sensor's disturbances."""
+    method, setting = METHODS[name], sensor.setting()
+    tuned = tune(method, setting, sensor.training(training), trials, seed=1)
+    return tuned, [
+        judge(method, setting, tuned, sensor.held_out(disturbance))
+        for disturbance in sensor.disturbances
+    ]
+
+
+def seconds_a_sample(name: str, tuned: Tuned, sensor: Sensor) -> float:
+    """Return the time that a tuned method takes for a sample; the least of some runs."""
+    recording = sensor.training(1)[0]
+    run = METHODS[name].prepare(sensor.setting(), tuned.values)
+    best = float('inf')
+    for _ in range(REPEATS):
+        begin = time.perf_counter()
+        run(recording)
+        best = min(best, time.perf_counter() - begin)
+    return best / len(recording.t)

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The linear peers: constant gains from python-control, the same model and Phi as ours."""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+from fhaosmo_ros.core.compile_cache import compile_cache
+from fhaosmo_ros.core.family import Recording
+from fhaosmo_ros.core.model import TriangularModel
+from fhaosmo_ros.tools.comparison.gains import pair, SampledModel
+from fhaosmo_ros.tools.comparison.methods import Method, Run, Setting, Values
+from fhaosmo_ros.tools.comparison.scores import Estimates
+from fhaosmo_ros.tools.tuning.search import Dimension
+import numpy as np
+
+with compile_cache():
+    from fhaosmo_ros.tools.comparison.constant_gain import run
+
+LONGEST = 1.5
+"""Nominal periods that one step of a prediction may take."""
+Gain = Callable[[SampledModel, Values], np.ndarray]
+
+
+@lru_cache(maxsize=64)
+def _sampled(
+    phi: tuple[str, ...], period: float, chain: int, integrators_only: bool, decay: float
+) -> SampledModel:
+    return SampledModel(TriangularModel(phi), period, chain, integrators_only, decay)
+
+
+def _bandwidth(name: str, setting: Setting) -> Dimension:
+    """
+    Return the range of a frequency in rad/s.
+
+    From far below any disturbance here to 5 / period, where the observer is deadbeat.
+    """
+    return Dimension(name, 0.05, 5.0 / setting.period, setting.speed)
+
+
+def _prepare(
+    chain: int, gain: Gain, integrators_only: bool = False
+) -> Callable[[Setting, Values], Run]:
+    def prepare(setting: Setting, values: Values) -> Run:
+        model = setting.model
+        decay = values.get('decay', 0.0)
+        sampled = _sampled(model.phi, setting.period, chain, integrators_only, decay)
+        k = gain(sampled, values)
+        size, n = model.order + chain, model.order
+        offsets = np.concatenate([model.offsets, np.repeat(model.offsets[-1:], chain)])
+        work, stack = np.zeros((7, size)), np.zeros((2, model.depth))
+        longest = min(LONGEST * setting.period, sampled.resolution)
+
+        def estimate(r: Recording) -> dict[str, Estimates]:
+            x, out = np.zeros(size), np.empty((len(r.y), size))
+            x[0] = r.y[0]
+            h = np.diff(r.t, prepend=r.t[0])
+            run(
+                model.tape, offsets, work, stack, n, k, decay, x, r.y, h, r.u, longest, out
+            )  # fmt: skip
+            return {'filtered': Estimates(out[:, :n], out[:, n])}
+
+        return estimate
+
+    return prepare
+
+
+def _kalman(model: SampledModel, values: Values) -> np.ndarray:
+    """Intensity of d's random walk such that the filter's speed is about `bandwidth`."""
+    return model.kalman([model.period * values['bandwidth'] ** (2 * model.size)])
+
+
+def _kalman_ramp(model: SampledModel, values: Values) -> np.ndarray:
+    drift = model.period * values['drift_bandwidth'] ** (2 * model.size)
+    walk = model.period * values['bandwidth'] ** (2 * model.size - 2)
+    return model.kalman([drift, walk])
+
+
+def _eso(model: SampledModel, values: Values) -> np.ndarray:
+    return model.placed([complex(-values['bandwidth'])] * model.size)
+
+
+def _luenberger(model: SampledModel, values: Values) -> np.ndarray:
+    poles: list[complex] = []
+    for i in range(model.size // 2):
+        poles += pair(values[f'frequency_{i + 1}'], values[f'damping_{i + 1}'])
+    if model.size % 2:
+        poles.append(complex(-values['real_pole']))
+    return model.placed(poles)
+
+
+def _luenberger_space(setting: Setting) -> tuple[Dimension, ...]:
+    size = setting.model.order + 1
+    space = []
+    for i in range(size // 2):
+        space.append(_bandwidth(f'frequency_{i + 1}', setting))
+        space.append(Dimension(f'damping_{i + 1}', 0.1, 5.0, 0.7))
+    if size % 2:
+        space.append(_bandwidth('real_pole', setting))
+    return tuple(space)
+
+
+LINEAR = (
+    Method(
+        'Kalman', 'steady-state Kalman filter, d a random walk', True,
+        lambda s: (_bandwidth('bandwidth', s),), _prepare(1, _kalman),
+    ),
+    Method(
+        'Kalman, ramp', 'steady-state Kalman filter, d and its derivative random walks', True,
+        lambda s: (_bandwidth('bandwidth', s), _bandwidth('drift_bandwidth', s)),
+        _prepare(2, _kalman_ramp),
+    ),
+    Method(
+        'Kalman, decaying', 'steady-state Kalman filter, d a random walk that decays', True,
+        lambda s: (_bandwidth('bandwidth', s), Dimension('decay', 1e-3, 1e2, 0.3)),
+        _prepare(1, _kalman),
+    ),
+    Method(
+        'ESO', 'high-gain (extended state) observer, all poles at one place', True,
+        lambda s: (_bandwidth('bandwidth', s),), _prepare(1, _eso, integrators_only=True),
+    ),
+    Method(
+        'Luenberger', 'Luenberger observer with disturbance state, all poles free', True,
+        _luenberger_space, _prepare(1, _luenberger),
+    ),
+)  # fmt: skip

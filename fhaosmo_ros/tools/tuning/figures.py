@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of a tuning: estimates before and after, sensitivity, front of two objectives."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from fhaosmo_ros.core.family import Recording
+from fhaosmo_ros.tools.figures import DASHES, TRUTH
+from fhaosmo_ros.tools.tuning.search import Dimension
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+BEFORE = {'color': '#999999', 'linewidth': 0.9, 'label': 'before'}
+AFTER = {'color': '#D55E00', 'linewidth': 1.2, 'linestyle': '--', 'label': 'tuned'}
+COLUMNS = 4
+HIGHEST = 2.0
+"""Upper end of the sensitivity's axis, in values of the best objective."""
+
+
+def save_estimates(
+    shown: Sequence[tuple[str, Recording, Floats, Floats]], settled: float, path: Path
+) -> None:
+    """
+    Draw d and its estimates.
+
+    Parameters
+    ----------
+    shown : sequence of (title, recording, estimate before, estimate after)
+    settled : float
+        From when on errors count; what comes before is shaded.
+    path : path
+
+    """
+    figure = Figure(figsize=(8.5, 2.1 * len(shown) + 0.8), layout='constrained')
+    rows = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
+    for axes, (title, recording, before, after) in zip(rows, shown, strict=True):
+        axes.plot(recording.t, before, **BEFORE)
+        axes.plot(recording.t, recording.d, **TRUTH)
+        axes.plot(recording.t, after, **AFTER)
+        late = recording.t >= settled
+        values = np.concatenate([recording.d, after[late]])
+        margin = 0.25 * float(np.ptp(values)) or 1.0
+        axes.set_ylim(values.min() - margin, values.max() + margin)
+        axes.axvspan(recording.t[0], settled, color='grey', alpha=0.12)
+        axes.set_xlim(recording.t[0], recording.t[-1])
+        axes.set_ylabel('unknown\ninput d')
+        axes.set_title(title, fontsize='medium', loc='left')
+        axes.grid(alpha=0.3)
+    rows[-1].set_xlabel('time [s] (shaded: errors do not count yet)')
+    handles, labels = rows[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside upper center', ncols=3)
+    figure.savefig(path, dpi=150)
+
+
+def save_sensitivity(
+    curves: Mapping[str, tuple[Floats, Floats]], space: Sequence[Dimension],
+    best: Mapping[str, float], objective: float, path: Path,
+) -> None:  # fmt: skip
+    """
+    Draw the objective over each parameter alone.
+
+    Parameters
+    ----------
+    curves : mapping
+        Values and objectives by the dimension's name.
+    space : sequence of Dimension
+    best : mapping
+        Values by name.
+    objective : float
+        At `best`.
+    path : path
+
+    """
+    count = len(space)
+    columns = min(COLUMNS, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(2.3 * columns + 0.6, 1.7 * rows + 0.7), layout='constrained')
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    for axes in grid.flat[count:]:
+        axes.set_axis_off()
+    for axes, d in zip(grid.flat, space, strict=False):
+        x, value = curves[d.name]
+        axes.plot(x, np.minimum(value, 10.0 * objective), color='#0072B2', marker='.', lw=1.2)
+        axes.plot([best[d.name]], [objective], color='#D55E00', marker='o', ls='none')
+        axes.set_xscale('log' if d.log else 'linear')
+        axes.set_title(d.name, fontsize='medium')
+        axes.grid(alpha=0.3)
+        axes.set_ylim(0.95 * objective, HIGHEST * objective)
+    figure.supylabel('objective (training)')
+    figure.supxlabel('value of this parameter alone; the dot is the tuned one', fontsize='medium')
+    figure.savefig(path, dpi=150)
+
+
+def save_front(
+    all_values: Floats, front: Floats, chosen: Floats, names: tuple[str, str],
+    path: Path,
+) -> None:  # fmt: skip
+    """Draw two objectives of all trials, the front of them, and the one that was taken."""
+    figure = Figure(figsize=(6.5, 4.5), layout='constrained')
+    axes: Axes = figure.subplots()
+    axes.plot(*all_values.T, color='#999999', marker='.', ls='none', ms=3, label='trials')
+    axes.step(
+        *front.T, where='post', color='#0072B2', marker='o', ms=3, ls=DASHES[0], label='front'
+    )
+    axes.plot(*chosen, color='#D55E00', marker='*', ms=14, ls='none', label='taken')
+    for k, setter in enumerate((axes.set_xlim, axes.set_ylim)):
+        low, high = front[:, k].min(), front[:, k].max()
+        margin = 0.5 * (high - low) or 0.1 * abs(high) or 1.0
+        setter(low - 0.2 * margin, high + margin)
+    axes.set_xlabel(names[0])
+    axes.set_ylabel(names[1])
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=150)

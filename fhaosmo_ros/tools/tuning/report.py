@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a tuning says: the YAML for the estimator, and a report in words and tables."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.tools.tuning.objective import Objective, Verdict
+from fhaosmo_ros.tools.tuning.search import Dimension
+from fhaosmo_ros.tools.tuning.source import Data
+import numpy as np
+import yaml
+
+OVERFITTED = 1.25
+"""Held-out error over that of the training from which on the report warns."""
+AT_BOUND = 0.02
+"""Distance to a bound, as a share of the range, that counts as being there."""
+
+
+class Column(NamedTuple):
+    """One set of gains, judged on one set of recordings."""
+
+    title: str
+    verdict: Verdict
+    objective: Objective
+
+
+def parameter_file(parameters: Mapping[str, Any], comments: Sequence[str]) -> str:
+    """Return a YAML that `estimator` loads as it is."""
+    head = ''.join(f'# {line}'.rstrip() + '\n' for line in comments)
+    content = {'/**': {'ros__parameters': dict(parameters)}}
+    return head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=99)
+
+
+def table(columns: Sequence[Column]) -> str:
+    """Return a Markdown table of the verdicts, a column each."""
+    rows = {'objective': [f'{c.verdict.objective:.4f}' for c in columns]}
+    rows['error, relative to the truth'] = [f'{c.verdict.error:.4f}' for c in columns]
+    recordings = [c.objective.trial.recordings for c in columns]
+    quantities = len(columns[0].objective.scale)
+    names = [f'z{k + 1}' for k in range(quantities - 1)] + ['d']
+    for k, name in enumerate(names):
+        rows[f'RMS error of {name}'] = [
+            f'{_pooled(c.verdict.scores.error[:, c.verdict.choice, k]):.3g}' for c in columns
+        ]
+    shapes = dict.fromkeys(r.shape for rows_ in recordings for r in rows_)
+    if len(shapes) > 1:
+        for shape in shapes:
+            rows[f'RMS error of d, {shape}'] = [_of_shape(c, shape) for c in columns]
+    rows['chatter of d, powers of ten'] = [f'{c.verdict.chatter:.2f}' for c in columns]
+    rows['settling, share of the time'] = [f'{c.verdict.settling:.2f}' for c in columns]
+    rows['estimates from'] = [c.verdict.estimate_from for c in columns]
+    head = ['', *(c.title for c in columns)]
+    lines = [f'| {" | ".join(head)} |', '|' + '---|' * len(head)]
+    lines += [f'| {" | ".join([name, *cells])} |' for name, cells in rows.items()]
+    return '\n'.join(lines)
+
+
+def _pooled(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float('nan')
+
+
+def _of_shape(column: Column, shape: str) -> str:
+    chosen = [k for k, r in enumerate(column.objective.trial.recordings) if r.shape == shape]
+    errors = column.verdict.scores.error[chosen, column.verdict.choice, -1]
+    return f'{_pooled(errors):.3g}' if chosen else '-'
+
+
+def gains_table(space: Sequence[Dimension], start: Mapping[str, float], best: Any) -> str:
+    """Return a Markdown table of what was searched."""
+    lines = ['| parameter | from | to | start | tuned |', '|---|---|---|---|---|']
+    for d in space:
+        mark = ' (at its bound)' if at_bound(d, best[d.name]) else ''
+        lines.append(
+            f'| {d.name} | {d.low:.3g} | {d.high:.3g} | {start[d.name]:.4g} | '
+            f'{best[d.name]:.4g}{mark} |'
+        )
+    return '\n'.join(lines)
+
+
+def at_bound(dimension: Dimension, value: float) -> bool:
+    """Return True if the search may have wanted to go further."""
+    low, high = dimension.low, dimension.high
+    if dimension.log:
+        low, high, value = float(np.log(low)), float(np.log(high)), float(np.log(value))
+    return not AT_BOUND < (value - low) / (high - low) < 1.0 - AT_BOUND
+
+
+def warnings(
+    space: Sequence[Dimension], best: Mapping[str, float], tuned: Sequence[Column], data: Data
+) -> list[str]:
+    """Return what a reader should know before trusting the gains."""
+    found = list(data.notes)
+    training, held_out = (column.verdict.error for column in tuned)
+    if held_out > OVERFITTED * training:
+        found.append(
+            f'The error on held-out recordings is {held_out / training:.2f} times that of the '
+            'training: more recordings, or fewer parameters to search, would help.'
+        )
+    if held_out > 0.9:
+        found.append(
+            f'An estimate that is always 0 has the error 1; this one has {held_out:.2f}: there is '
+            'hardly anything to be known about this d through this sensor.'
+        )
+    stuck = [d.name for d in space if at_bound(d, best[d.name])]
+    if stuck:
+        found.append(f'At their bounds: {", ".join(stuck)}; wider ones may give better gains.')
+    return found
+
+
+def sensor_table(data: Data) -> str:
+    """Return what a bag's y said of its sensor."""
+    if data.sensor is None:
+        return ''
+    lines = ['| estimated from y | |', '|---|---|']
+    lines += [f'| {name} | {value:.4g} |' for name, value in data.sensor._asdict().items()]
+    return '\n'.join(lines)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Gains scaled by the observer's theory: where a search begins.
+
+For |eps| well below its half-width w a fuzzy level is a second-order filter, z_tilde'' +
+2 zeta omega z_tilde' + omega^2 z_tilde = omega^2 m', with omega^2 = alpha / w and a damping
+2 zeta omega = lambda |eps|^gamma / w; above it, it is a super-twisting differentiator, which
+converges if alpha exceeds the second derivative of m (Levant 1998). So one bandwidth omega for the
+whole chain, one factor kappa and one damping zeta say everything:
+
+    s_1 = noise,  s_i = noise sqrt(h omega^(2 i - 1))        what noise leaves in m_i
+    w_i = kappa (s_i + L_i / omega^2)                        and what lag leaves of its signal
+    alpha_i = omega^2 w_i
+    lambda_i = 2 zeta omega w_i / (w_i / 3)^gamma            damped at a third of the half-width
+
+with L_i the size of m_i'' in the recordings: z_3, .., d, d', d''. A small kappa is a sliding mode,
+a large one a linear observer. The structure `levant` has one innovation and so one width,
+w = kappa (noise + D / omega^n) with D the size of d, and N poles at omega:
+
+    lambda_i = binomial(N, i) omega^i w / (w / 3)^(p_i),     p_i as in D 11
+
+Few candidates are tried and the best one is taken: noise decides omega, and no formula knows the
+trade between noise and lag that the family of d makes.
+"""
+
+from collections.abc import Iterator, Sequence
+from itertools import product
+from math import comb
+from typing import Any
+
+from fhaosmo_ros.core.family import Recording
+import numpy as np
+from numpy.typing import NDArray
+
+OMEGAS = tuple(float(w) for w in np.geomspace(2.0, 200.0, 9))
+KAPPAS = (1.0, 5.0, 25.0)
+ZETAS = (0.7, 1.5, 4.0)
+OPEN = 100.0
+"""epsilon, in the largest half-width: every level runs but for a start far away."""
+
+
+def candidates(
+    recordings: Sequence[Recording],
+    levels: int,
+    noise: float,
+    structure: str = 'cascade',
+    gammas: Sequence[float] = (0.5,),
+) -> Iterator[dict[str, Any]]:
+    """
+    Yield lambda, alpha, fuzzy_widths, epsilon and gamma_initial by the rules above.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        With their truth.
+    levels : int
+        N.
+    noise : float
+        Standard deviation of y about z_1: of everything that the stamps do not tell.
+    structure : str
+        'cascade' or 'levant'.
+    gammas : sequence of float
+        Powers to try.
+
+    """
+    size = second_derivatives(recordings, levels)
+    period = float(np.median(np.diff(recordings[0].t)))
+    noise = max(noise, size[0] * period**2)
+    level = np.arange(1, levels + 1)
+    for omega, kappa, gamma in product(OMEGAS, KAPPAS, gammas):
+        common = {'gamma_initial': gamma}
+        if structure == 'levant':
+            d = _rms(np.concatenate([r.d for r in recordings]))
+            width = kappa * (noise + d / omega ** (levels - 1))
+            poles = np.array([comb(levels, int(i)) for i in level]) * omega**level
+            power = 2.0 * gamma * (levels - level) / levels
+            yield common | {
+                'lambda': _plain(poles * width / (width / 3.0) ** power),
+                'fuzzy_widths': [width] * levels,
+            }
+            continue
+        left = noise * np.sqrt(period * omega ** (2.0 * level - 1.0))
+        left[0] = noise
+        widths = kappa * (left + size / omega**2)
+        for zeta in ZETAS:
+            yield common | {
+                'lambda': _plain(2.0 * zeta * omega * widths / (widths / 3.0) ** gamma),
+                'alpha': _plain(omega**2 * widths),
+                'fuzzy_widths': _plain(widths),
+                'epsilon': OPEN * float(widths.max()),
+            }
+
+
+def second_derivatives(recordings: Sequence[Recording], levels: int) -> NDArray[np.float64]:
+    """Return the RMS values L_1 .. L_N of z_3, .., z_n, d, d', .. over recordings."""
+    chain = np.concatenate([np.column_stack([r.z, r.d]) for r in recordings])
+    size = np.sqrt(np.mean(np.square(chain), axis=0))
+    rates = [_rms(np.diff(r.d)) / (_rms(r.d) * np.median(np.diff(r.t))) for r in recordings]
+    rate = float(np.median(rates))
+    size = np.concatenate([size, size[-1] * rate ** np.arange(1, levels + 1)])
+    return np.maximum(size[2 : 2 + levels], np.finfo(float).tiny)
+
+
+def effective_noise(recordings: Sequence[Recording]) -> float:
+    """Return the standard deviation of y about z_1 at the stamps: noise, quantum and jitter."""
+    return _rms(np.concatenate([r.y - r.z[:, 0] for r in recordings]))
+
+
+def _plain(values: NDArray[np.float64]) -> list[float]:
+    return [float(v) for v in values]
+
+
+def _rms(x: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of many channels: common values, and a channel's own in their place."""
+
+import argparse
+
+from fhaosmo_ros.core.channel_parameters import (
+    channel_names,
+    followers,
+    of_channel,
+    UNNAMED,
+    with_channels,
+)
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.parameter_file import load, select
+from fhaosmo_ros.core.parameters import (
+    ESTIMATOR_PARAMETERS,
+    ONLINE_PARAMETERS,
+    PLANT_NODE_PARAMETERS,
+)
+from fhaosmo_ros.tools.options import add_parameter_options, online_parameters
+import pytest
+
+NAMES = ['hip', 'knee_2']
+
+
+def test_no_channels_is_one_without_a_name():
+    assert channel_names({}) == UNNAMED
+    assert list(with_channels(ESTIMATOR_PARAMETERS, UNNAMED)) == list(ESTIMATOR_PARAMETERS)
+
+
+@pytest.mark.parametrize(
+    ('names', 'reason'),
+    [
+        (['hip', 'hip'], 'every name once'),
+        (['hip', ''], 'names of letters'),
+        (['2hip'], 'names of letters'),
+        (['hip/left'], 'names of letters'),
+        (['a__b'], 'names of letters'),
+        (['hip.left'], 'names of letters'),
+        (['lambda'], "names that no parameter has (there is one 'lambda')"),
+        ([], 'a list of strings'),
+    ],
+)
+def test_bad_names_are_refused(names, reason):
+    with pytest.raises(ConfigurationError, match="parameter 'channels': expected ") as error:
+        channel_names({'channels': names})
+    assert reason in str(error.value)
+
+
+def test_own_value_wins_and_the_common_one_serves_the_rest():
+    values = select(
+        {'channels': NAMES, 'epsilon': 5, 'hip.epsilon': 7, 'knee_2.lambda': 3},
+        ESTIMATOR_PARAMETERS,
+    )
+    hip, knee = (of_channel(values, name) for name in NAMES)
+    assert (hip['epsilon'], knee['epsilon']) == (7.0, 5.0)
+    assert knee['lambda'] == [3.0]
+    assert 'lambda' not in hip
+
+
+def test_own_parameters_are_checked_as_the_common_ones():
+    table = with_channels(ESTIMATOR_PARAMETERS, NAMES)
+    assert len(table) == len(ESTIMATOR_PARAMETERS) + 2 * len(ONLINE_PARAMETERS)
+    with pytest.raises(ConfigurationError, match=r"'hip.epsilon': expected a number > 0 .*got -1"):
+        table.coerce({'hip.epsilon': -1})
+    assert table['hip.order'].live == ESTIMATOR_PARAMETERS['order'].live
+
+
+def test_defaults_are_the_common_values():
+    table = with_channels(ESTIMATOR_PARAMETERS, NAMES, {'epsilon': 9.0})
+    assert table['hip.epsilon'].default == 9.0
+    assert table['hip.max_gap'].default == ESTIMATOR_PARAMETERS['max_gap'].default
+
+
+@pytest.mark.parametrize('name', ['hpi.lambda', 'hip.lamda', 'hip.publish_rate'])
+def test_unknown_names_are_told(name):
+    with pytest.raises(ConfigurationError, match=f"unknown parameter '{name}'"):
+        select({'channels': NAMES, name: 1.0}, ESTIMATOR_PARAMETERS)
+
+
+def test_a_channel_follows_what_it_has_not_of_its_own():
+    assert followers('lambda', NAMES, {'hip.lambda'}) == ['knee_2.lambda']
+    assert followers('publish_rate', NAMES, ()) == []
+    assert followers('lambda', UNNAMED, ()) == []
+
+
+def test_one_file_serves_channels_and_plant(tmp_path):
+    path = tmp_path / 'rig.yaml'
+    path.write_text(
+        '/**:\n  ros__parameters:\n    channels: [hip]\n    sample_rate: 50.0\n'
+        '    hip:\n      lambda: [4.0]\n'
+    )
+    assert load(path, 'estimator') == {'channels': ['hip'], 'hip.lambda': [4.0]}
+    assert load(path, 'plant', PLANT_NODE_PARAMETERS) == {'sample_rate': 50.0}
+
+
+def replayed(*words):
+    parser = argparse.ArgumentParser()
+    add_parameter_options(parser)
+    return online_parameters(parser.parse_args(words))
+
+
+def test_a_replay_takes_the_parameters_of_one_channel(tmp_path):
+    path = tmp_path / 'rig.yaml'
+    path.write_text(
+        '/**:\n  ros__parameters:\n    channels: [hip, knee]\n    epsilon: 5.0\n'
+        '    hip:\n      epsilon: 7.0\n'
+    )
+    words = ['--params-file', str(path), '-p', 'knee.lambda:=3']
+    assert replayed(*words, '--channel', 'hip') == {'epsilon': 7.0}
+    assert replayed(*words, '--channel', 'knee') == {'epsilon': 5.0, 'lambda': [3.0]}
+    with pytest.raises(ConfigurationError, match="--channel: expected 'hip' or 'knee', got ''"):
+        replayed(*words)
+    with pytest.raises(ConfigurationError, match="--channel: expected '', got 'hip'"):
+        replayed('--channel', 'hip')

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A replay begins, restarts and changes parameters where the live estimator in the bag did."""
+
+import bag_files as files
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.snapshot import Flag, labels, pack, Snapshot
+from fhaosmo_ros.tools import replay
+from fhaosmo_ros.tools.bags import labelled_array
+import numpy as np
+import pytest
+
+COUNT = 4000
+PARAMETERS = {'variant': 'fuzzy_adaptive', 'epsilon': 3.0}
+OPTIONS = ['-p', 'variant:=fuzzy_adaptive']
+ARRAY, EVENT = 'std_msgs/msg/Float64MultiArray', 'rcl_interfaces/msg/ParameterEvent'
+
+
+class Live:
+    """What a node does and publishes, as messages of a bag."""
+
+    def __init__(self, name='/estimator', parameters=PARAMETERS, node=None):
+        self.name, self.node = name, node or name
+        self.estimator = OnlineEstimator(parameters)
+        self.messages, self.rows = [], {}
+        self._begins = True
+
+    def run(self, stamps, y, begin, end):
+        for k in range(begin, end):
+            estimate = self.estimator.update(int(stamps[k]), float(y[k]))
+            if estimate.status.rejected:
+                continue
+            self.rows[int(stamps[k])] = [*estimate.z, estimate.unknown_input, estimate.gamma]
+            if self._begins or k % 500 == 499:
+                self._tell(Flag.STARTED if self._begins else Flag(0), 90_000)
+                self._begins = False
+        return self
+
+    def _tell(self, flags, delay):
+        estimator = self.estimator
+        vector = pack(Snapshot(estimator.latest, flags, estimator.memory))
+        data = labelled_array(labels(estimator.observer.levels), vector)
+        self.messages.append((f'{self.name}/snapshot', ARRAY, estimator.latest + delay, data))
+
+    def reset(self):
+        self.estimator.reset()
+        self._tell(Flag.RESET, 150_000)
+        self._begins = True
+
+    def freeze(self, held):
+        self.estimator.freeze(held)
+        self._tell(Flag.CHANGED, 150_000)
+
+    def change(self, stamp, name, value):
+        self.estimator.configure({name: value})
+        types, nothing = files.TYPES.types, np.zeros(0, np.int64)
+        parameter = types['rcl_interfaces/msg/Parameter'](
+            name=f'{self.name.removeprefix(self.node)}.{name}'.strip('/.'),
+            value=types['rcl_interfaces/msg/ParameterValue'](
+                type=3, bool_value=False, integer_value=0, double_value=value, string_value='',
+                byte_array_value=np.zeros(0, np.uint8), bool_array_value=np.zeros(0, np.bool_),
+                integer_array_value=nothing, double_array_value=np.zeros(0),
+                string_array_value=[],
+            ),
+        )  # fmt: skip
+        time = files.header(stamp).stamp
+        data = files.cdr(
+            EVENT, stamp=time, node=self.node, new_parameters=[], changed_parameters=[parameter],
+            deleted_parameters=[],
+        )  # fmt: skip
+        self.messages.append(('/parameter_events', EVENT, int(stamp) + 100_000, data))
+        self._tell(Flag.CHANGED, 100_100)
+
+
+def write(path, stamps, y, *lives, begin=0, storage='mcap'):
+    """Write what a recorder gets that comes at sample `begin`."""
+    messages = files.floats(stamps, y) + [m for live in lives for m in live.messages]
+    messages = [m for m in messages if m[2] >= stamps[begin]]
+    return files.write(path, sorted(messages, key=lambda m: m[2]), storage)
+
+
+def run(capsys, *arguments):
+    code = replay.main([str(a) for a in arguments])
+    out, error = capsys.readouterr()
+    return code, out, error.strip().splitlines()[-1] if error.strip() else ''
+
+
+def rows(path):
+    with np.load(path) as arrays:
+        names = ['z1', 'z2', 'z3', 'unknown_input', 'gamma']
+        values = np.column_stack([arrays[name] for name in names])
+        return dict(zip(arrays['stamp_ns'].tolist(), values.tolist(), strict=True))
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize('begin', [0, 700, 2600])
+def test_every_live_estimate_comes_again(begin, storage, tmp_path, capsys):
+    stamps, y = files.signal(COUNT)
+    live = Live()
+    live.run(stamps, y, 123, 1000)  # it discovered y later than the recorder
+    live.change(stamps[999], 'epsilon', 1e-6)
+    live.run(stamps, y, 1000, 2000)
+    live.reset()
+    live.run(stamps, y, 2000, 2300)
+    live.change(stamps[2299], 'gamma_rate', 0.02)
+    live.change(stamps[2299], 'epsilon', 2.0)
+    live.run(stamps, y, 2300, 2700)
+    live.freeze(True)
+    live.run(stamps, y, 2700, 3400)
+    live.freeze(False)
+    live.run(stamps, y, 3400, COUNT)
+    bag = write(tmp_path / 'bag', stamps, y, live, begin=begin, storage=storage)
+    parameters = ['-p', 'epsilon:=3.0'] if begin == 0 else []
+    (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
+    if begin == 2600:  # whoever records later has to know the parameters
+        parameters = ['-p', 'epsilon:=2.0', '-p', 'gamma_rate:=0.02']
+    elif begin == 700 or parameters:
+        parameters = ['--params-file', tmp_path / 'p.yaml']
+    out = tmp_path / 'o.npz'
+    code, text, _ = run(capsys, bag, '-o', out, *OPTIONS, *parameters)
+    assert code == 0
+    got = rows(out)
+    # The first snapshot after the begin is that of sample 123, 999 or 2699.
+    first = {0: 123, 700: 1000, 2600: 2700}[begin]
+    assert list(got) == stamps[first:].tolist()
+    for stamp, row in got.items():
+        np.testing.assert_array_equal(row, live.rows[stamp])
+    assert 'followed /estimator' in text
+    count = sum(m[0].endswith('snapshot') and m[2] >= stamps[begin] for m in live.messages)
+    count -= begin > 0  # where it begins there is nothing to compare
+    assert f'{count} of {count} snapshots are the same' in text
+
+
+def test_afresh_begins_at_the_first_sample(tmp_path, capsys):
+    stamps, y = files.signal(1000)
+    live = Live().run(stamps, y, 300, 1000)
+    bag = write(tmp_path / 'bag', stamps, y, live)
+    code, text, _ = run(capsys, bag, '-o', tmp_path / 'o.npz', *OPTIONS, '--afresh')
+    assert code == 0
+    assert list(rows(tmp_path / 'o.npz')) == stamps.tolist()
+    assert 'followed' not in text
+
+
+def test_fixed_parameter_stays(tmp_path, capsys):
+    stamps, y = files.signal(1500)
+    live = Live().run(stamps, y, 0, 700)
+    live.change(stamps[699], 'epsilon', 1e-6)
+    live.run(stamps, y, 700, 1500)
+    bag = write(tmp_path / 'bag', stamps, y, live)
+    out = tmp_path / 'o.npz'
+    code, text, _ = run(capsys, bag, '-o', out, *OPTIONS, '-p', 'epsilon:=3.0')
+    assert code == 0
+    assert 'parameters differ' in text
+    expected = Live().run(stamps, y, 0, 1500).rows
+    got = rows(out)
+    np.testing.assert_array_equal([got[s] for s in got], [expected[s] for s in got])
+
+
+def test_observer_of_another_size_begins_afresh(tmp_path, capsys):
+    stamps, y = files.signal(1500)
+    live = Live().run(stamps, y, 0, 1500)
+    bag = write(tmp_path / 'bag', stamps, y, live, begin=600)
+    out = tmp_path / 'o.csv'
+    code, text, _ = run(capsys, bag, '-o', out, '-p', 'order:=2', '-p', "phi:=['0','0']")
+    assert code == 0
+    assert 'afresh after 399 samples' in text
+
+
+def test_samples_of_another_clock_are_not_followed(tmp_path, capsys):
+    """As with sampling: clock, whose stamps no bag keeps."""
+    stamps, y = files.signal(1500)
+    live = Live().run(stamps + 17, y, 0, 1500)
+    bag = write(tmp_path / 'bag', stamps, y, live)
+    code, text, _ = run(capsys, bag, '-o', tmp_path / 'o.npz', *OPTIONS)
+    assert code == 0
+    assert '/estimator not followed' in text
+    assert list(rows(tmp_path / 'o.npz')) == stamps.tolist()
+
+
+def test_sample_that_the_bag_lacks_does_not_stop_the_following(tmp_path, capsys):
+    stamps, y = files.signal(2000)
+    live = Live().run(stamps, y, 0, 1000)
+    live.reset()
+    live.run(stamps, y, 1000, 2000)
+    keep = np.arange(2000) != 1000  # the one from which it started again
+    bag = write(tmp_path / 'bag', stamps[keep], y[keep], live)
+    out = tmp_path / 'o.npz'
+    code, _, _ = run(capsys, bag, '-o', out, *OPTIONS, '-p', 'epsilon:=3.0')
+    assert code == 0
+    got = rows(out)
+    np.testing.assert_array_equal(got[int(stamps[999])], live.rows[int(stamps[999])])
+    assert got[int(stamps[1001])][4] == live.rows[int(stamps[1000])][4]  # gamma began afresh too
+
+
+def test_which_estimator_to_follow(tmp_path, capsys):
+    stamps, y = files.signal(1200)
+    lives = [Live('/left').run(stamps, y, 0, 1200), Live('/right').run(stamps, y, 500, 1200)]
+    bag = write(tmp_path / 'bag', stamps, y, *lives)
+    out = tmp_path / 'o.npz'
+    code, _, error = run(capsys, bag, '-o', out)
+    assert code == 2
+    assert '/left, /right' in error
+    assert '--afresh' in error
+    code, _, error = run(capsys, bag, '-o', out, '--follow', '/middle')
+    assert code == 2
+    assert "'/middle'" in error
+    code, text, _ = run(capsys, bag, '-o', out, '--follow', '/right', *OPTIONS)
+    assert code == 0
+    assert 'followed /right afresh after 500 samples' in text
+
+
+def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
+    stamps, y = files.signal(1500)
+    lives = [Live(f'/estimator/{name}', node='/estimator') for name in ('hip', 'knee')]
+    for k, live in enumerate(lives):
+        live.run(stamps, y, 0, 700)
+        live.change(stamps[699], 'epsilon', [1e-6, 0.5][k])
+        live.run(stamps, y, 700, 1500)
+    bag = write(tmp_path / 'bag', stamps, y, *lives)
+    (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
+    for live in lives:
+        out = tmp_path / f'{live.name.rpartition("/")[2]}.npz'
+        arguments = ['--follow', live.name, '--params-file', tmp_path / 'p.yaml', *OPTIONS]
+        code, text, _ = run(capsys, bag, '-o', out, *arguments)
+        assert code == 0
+        assert 'parameters differ' not in text
+        got = rows(out)
+        np.testing.assert_array_equal(list(got.values()), [live.rows[stamp] for stamp in got])
+
+
+def test_snapshot_of_another_version_is_said(tmp_path, capsys):
+    stamps, y = files.signal(50)
+    data = labelled_array(['a', 'b'], np.zeros(2))
+    messages = [*files.floats(stamps, y), ('/e/snapshot', ARRAY, int(stamps[-1]), data)]
+    bag = files.write(tmp_path / 'bag', messages)
+    code, _, error = run(capsys, bag, '-o', tmp_path / 'o.npz')
+    assert code == 2
+    assert "'/e/snapshot'" in error
+    assert '--afresh' in error

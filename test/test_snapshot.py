@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A snapshot holds all that an estimator needs to go on bit for bit."""
+
+from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.snapshot import Flag, labels, pack, Snapshot, unpack
+import numpy as np
+import pytest
+
+ORIGIN = 1_700_000_000_123_456_789
+
+
+def feed(estimator, begin, end):
+    rng = np.random.default_rng(3)
+    jitter = rng.integers(-200_000, 200_000, 4000)
+    rows = []
+    for k in range(begin, end):
+        stamp = ORIGIN + k * 1_000_000 + int(jitter[k])
+        e = estimator.update(stamp, float(0.2 + 0.1 * np.sin(3e-3 * k)))
+        rows.append([*e.z, e.unknown_input, e.gamma, *e.innovation])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize('parameters', [
+    {'variant': 'fuzzy_adaptive'}, {'variant': 'sign', 'order': 2, 'phi': ['0', '-z2']},
+    {'scheme': 'explicit', 'variant': 'fuzzy_adaptive'},
+])  # fmt: skip
+def test_another_estimator_goes_on_bit_for_bit(parameters):
+    first, second = OnlineEstimator(parameters), OnlineEstimator(parameters)
+    feed(first, 0, 1500)
+    first.set_input(0.25)
+    kept = pack(Snapshot(first.latest, Flag.CHANGED, first.memory))
+    assert len(kept) == len(labels(first.observer.levels))
+    snapshot = unpack(kept.tolist())
+    assert snapshot.stamp == first.stamp
+    assert snapshot.flags == Flag.CHANGED
+    feed(second, 0, 100)  # whatever it was before
+    second.remember(snapshot.memory)
+    assert second.input == 0.25
+    assert second.stamp == first.stamp
+    np.testing.assert_array_equal(feed(second, 1500, 3000), feed(first, 1500, 3000))
+
+
+def test_labels_name_what_stands_there():
+    estimator = OnlineEstimator()
+    feed(estimator, 0, 700)
+    vector = pack(Snapshot(estimator.latest, Flag(0), estimator.memory))
+    entries = dict(zip(labels(estimator.observer.levels), vector.tolist(), strict=True))
+    assert len(entries) == len(vector)  # no name twice
+    state = estimator.observer.state
+    assert entries['z_hat2'] == state.levels[0, 1]
+    assert entries['z_tilde1'] == state.levels[1, 0]
+    assert entries['gamma'] == estimator.estimate.gamma
+    assert entries['y'] == state.memory[1]
+    assert int(entries['stamp_upper']) * 2**32 + int(entries['stamp_lower']) == estimator.stamp
+    assert int(entries['sec']) * 10**9 + int(entries['nanosec']) == estimator.stamp
+
+
+@pytest.mark.parametrize('integer', [0, 1, -1, 2**63 - 1, -(2**63), 1_700_000_000_123_456_789])
+def test_integers_come_back_exactly(integer):
+    memory = OnlineEstimator().memory
+    memory.integers[:] = integer
+    back = unpack(pack(Snapshot(5, Flag(0), memory)).tolist())
+    np.testing.assert_array_equal(back.memory.integers, memory.integers)
+
+
+@pytest.mark.parametrize('size', [0, 6, 8, 17, 60])
+def test_vector_of_another_length_is_refused(size):
+    with pytest.raises(ValueError, match=f'{size} entries'):
+        unpack(np.zeros(size))
+
+
+def test_memory_of_another_size_is_refused_and_changes_nothing():
+    estimator = OnlineEstimator()
+    feed(estimator, 0, 100)
+    before = estimator.memory
+    with pytest.raises(ConfigurationError, match='4 levels'):
+        estimator.remember(OnlineEstimator({'order': 2, 'phi': ['0', '0']}).memory)
+    for mine, was in zip(estimator.memory, before, strict=True):
+        np.testing.assert_array_equal(mine, was)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The compiled judgement says what the observer and the metrics say, sample for sample."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+from fhaosmo_ros.core import ConfigurationError, Family, Observer, Trial
+from fhaosmo_ros.core.metrics import rms, total_variation
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS
+import numpy as np
+import pytest
+
+GAINS = {'lambda': [3.0, 2.0, 2.0, 0.5], 'alpha': [2.0, 1.0, 2.0, 1.5], 'epsilon': 40.0,
+         'fuzzy_widths': [0.11, 0.05, 0.59, 0.34]}  # fmt: skip
+SETTLED, BAND = 2.0, 0.07
+
+
+@pytest.fixture(scope='module', name='recordings')
+def _recordings():
+    family = Family(
+        {'duration': 5.0, 'noise_std': 1e-3, 'integration_step': 1e-3, 'dropout': 0.05}
+    )
+    return family.recordings(3)
+
+
+@pytest.mark.parametrize('scheme', ['implicit', 'explicit'])
+@pytest.mark.parametrize('variant', ['sign', 'fuzzy', 'fuzzy_adaptive'])
+@pytest.mark.parametrize('unknown_input', [True, False])
+def test_scores_are_those_of_observer_and_metrics(recordings, scheme, variant, unknown_input):
+    n = 3 + unknown_input
+    fixed = {'scheme': scheme, 'variant': variant, 'unknown_input': unknown_input}
+    gains = {k: v if k == 'epsilon' else v[:n] for k, v in GAINS.items()}
+    trial = Trial(recordings, fixed, SETTLED, BAND)
+    scores = trial(gains)
+    for choice, estimate_from in enumerate(('internal', 'filtered')):
+        for k, r in enumerate(recordings):
+            observer = Observer(fixed | gains | {'estimate_from': estimate_from})
+            e = observer.run(r.t, r.y)
+            late = r.t - r.t[0] >= SETTLED
+            expected = [rms((e.z - r.z)[late, i]) for i in range(3)]
+            wrong = e.unknown_input - r.d
+            expected.append(rms(wrong[late]))
+            np.testing.assert_allclose(scores.error[k, choice], expected, rtol=1e-9)
+            np.testing.assert_allclose(
+                scores.variation[k, choice], total_variation(e.unknown_input[late]), rtol=1e-9
+            )
+            bad = r.t[~late & (np.abs(wrong) > BAND)] - r.t[0]
+            assert scores.transient[k, choice] == (bad[-1] if len(bad) else 0.0)
+
+
+def test_gap_restarts_as_in_the_node():
+    recording = Family({'duration': 5.0, 'integration_step': 1e-3}).recording(0)
+    keep = (recording.t < 2.5) | (recording.t > 3.2)
+    r = type(recording)(*(part[keep] for part in recording[:5]), recording.shape)
+    scores = Trial([r], {}, SETTLED, BAND)(GAINS)
+    online = OnlineEstimator(GAINS)
+    stamps = np.round(r.t * 1e9).astype(np.int64)
+    pieces = online.run(stamps, r.y, r.u)
+    assert online.counters.restarts == 1
+    d = np.concatenate([piece.unknown_input for piece in pieces])
+    expected = rms((d - r.d)[r.t >= SETTLED])
+    np.testing.assert_allclose(scores.error[0, 0, -1], expected, rtol=1e-6)
+    assert not np.allclose(
+        Trial([r], {'max_gap': 1.0}, SETTLED, BAND)(GAINS).error[0, 0, -1], expected
+    )
+
+
+def test_threads_do_not_disturb_one_another(recordings):
+    trial = Trial(recordings, {}, SETTLED, BAND)
+    changes = [GAINS | {'epsilon': 10.0 ** (k % 4 - 2)} for k in range(16)]
+    expected = [trial(change).error for change in changes]
+    with ThreadPoolExecutor(4) as pool:
+        actual = list(pool.map(lambda change: trial(change).error, changes))
+    np.testing.assert_array_equal(actual, expected)
+    assert not np.array_equal(expected[0], expected[3])
+
+
+def test_scale_and_variation_of_the_truth(recordings):
+    trial = Trial(recordings, {}, SETTLED, BAND)
+    late = np.concatenate([r.d[r.t - r.t[0] >= SETTLED] for r in recordings])
+    np.testing.assert_allclose(trial.scale[-1], rms(late))
+    one = recordings[1]
+    np.testing.assert_allclose(
+        trial.variation[1], total_variation(one.d[one.t - one.t[0] >= SETTLED])
+    )
+
+
+@pytest.mark.parametrize(
+    ('settled', 'parameters', 'message'),
+    [
+        (5.0, {}, 'more than 5 s'),
+        (1.0, {'order': 2, 'phi': ['0', '0']}, 'the 2 states of the model.*got 3'),
+    ],
+)
+def test_recordings_that_do_not_fit(recordings, settled, parameters, message):
+    with pytest.raises(ConfigurationError, match=message):
+        Trial(recordings, parameters, settled, BAND)
+    with pytest.raises(ConfigurationError, match='at least one recording'):
+        Trial([], {}, 1.0, BAND)
+
+
+def test_every_observer_parameter_can_be_judged(recordings):
+    """A parameter that the judgement passed over would make a search in it pointless."""
+    trial = Trial(recordings, {}, SETTLED, BAND)
+    assert set(OBSERVER_PARAMETERS) >= set(GAINS)
+    base = trial(GAINS).error
+    for name, value in [('lambda', [9.0]), ('alpha', [9.0]), ('epsilon', 1e-3),
+                        ('fuzzy_widths', [1.0]), ('gamma_initial', 0.4)]:  # fmt: skip
+        assert not np.array_equal(trial(GAINS | {name: value}).error, base), name

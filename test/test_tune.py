@@ -1,0 +1,398 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `tune`: its output, its inputs, its ends; few trials each."""
+
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+import time
+
+from fhaosmo_ros.core import ConfigurationError, Family, Observer
+from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameter_file import load
+from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
+from fhaosmo_ros.tools.bag_writer import BagWriter
+from fhaosmo_ros.tools.bags import labelled_array, serialise
+from fhaosmo_ros.tools.tuning.command import main
+from fhaosmo_ros.tools.tuning.objective import Objective
+from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.sensor import identify
+from fhaosmo_ros.tools.tuning.theory import candidates
+import numpy as np
+import pytest
+
+pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
+pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
+
+from fhaosmo_ros.tools.tuning.study import Point
+from fhaosmo_ros.tools.tuning.tuner import front
+
+ROOT = Path(__file__).resolve().parents[1]
+SHORT = {'duration': 4.0, 'integration_step': 1e-3, 'sample_rate': 200.0}
+TUNING = TUNE_PARAMETERS.defaults() | SHORT | {'settled': 1.0}
+QUICK = [f'-p{name}:={value}' for name, value in SHORT.items()] + [
+    '-psettled:=1.0', '-precordings:=2', '-pheld_out:=3', '-pscheme:=explicit', '--trials=12',
+    '--jobs=2',
+]  # fmt: skip
+FILES = ['estimates.png', 'gains.yaml', 'report.md', 'sensitivity.png', 'study.journal']
+
+
+def command(*arguments, **options):
+    return subprocess.Popen(
+        [sys.executable, '-m', 'fhaosmo_ros', 'tune', *map(str, arguments)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {'PYTHONPATH': str(ROOT)}, **options,
+    )  # fmt: skip
+
+
+def wait_for(condition, what, seconds=90.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f'no {what}'
+        time.sleep(0.02)
+
+
+def published(journal):
+    return journal.read_text().count('"worker"') if journal.exists() else 0
+
+
+# output
+
+
+def test_output_is_what_the_estimator_loads(tmp_path, capsys):
+    out = tmp_path / 'out'
+    assert main([*QUICK, '-o', str(out)]) == 0
+    assert sorted(path.name for path in out.iterdir()) == FILES
+    assert list(tmp_path.iterdir()) == [out]
+    values = load(out / 'gains.yaml', 'estimator')
+    assert len(values['lambda']) == 4
+    assert values['scheme'] == 'explicit'
+    OnlineEstimator({k: v for k, v in values.items() if k in ONLINE_PARAMETERS})
+    text = (out / 'gains.yaml').read_text()
+    assert f'python -m fhaosmo_ros tune {" ".join(QUICK)}' in text
+    report = (out / 'report.md').read_text()
+    printed = capsys.readouterr().out
+    for word in ('start, training', 'start, held out', 'tuned, training', 'tuned, held out'):
+        assert word in report
+        assert word in printed
+    # What the report says of the gains is what these very gains do.
+    judged = Objective(Family(SHORT).recordings(2, 1), values, TUNING, choose=False)(values)
+    row = next(line for line in report.splitlines() if line.startswith('| error, relative'))
+    assert f'{judged.error:.4f}' == row.split('|')[4].strip()
+
+
+def test_existing_output_stays_without_force(tmp_path, capsys):
+    out = tmp_path / 'out'
+    out.mkdir()
+    (out / 'mine').touch()
+    assert main([*QUICK, '-o', str(out)]) == 2
+    assert 'expected a new name (or --force' in capsys.readouterr().err
+    assert (out / 'mine').exists()
+    assert main([*QUICK, '-o', str(out), '--force']) == 0
+    assert sorted(path.name for path in out.iterdir()) == FILES
+
+
+def test_given_gains_are_where_it_begins_if_they_are_better(tmp_path):
+    first = tmp_path / 'first'
+    assert main([*QUICK, '--trials=60', '-o', str(first)]) == 0
+    given, out = str(first / 'gains.yaml'), tmp_path / 'out'
+    assert main([*QUICK, '--trials=1', '--params-file', given, '-o', str(out)]) == 0
+    report = (out / 'report.md').read_text()
+    row = next(line for line in report.splitlines() if line.startswith('| objective'))
+    before, _, tuned, _ = map(float, row.split('|')[2:6])
+    assert 'given, training' in report
+    assert tuned <= 1.002 * before  # rounded
+
+
+def test_front_of_error_and_chatter(tmp_path):
+    out = tmp_path / 'out'
+    assert main([*QUICK, '--pareto', '--trials=60', '-o', str(out)]) == 0
+    assert (out / 'pareto.png').stat().st_size > 10_000
+    assert '(pareto.png)' in (out / 'report.md').read_text()
+
+
+def test_front_drops_what_is_beaten():
+    pairs = [(2.0, 3.0), (1.0, 5.0), (4.0, 1.0), (2.0, 2.0), (3.0, 2.0)]
+    points = [Point({}, (0.0, 0.0, error, chatter, 9.0)) for error, chatter in pairs]
+    found = [(mark.error, mark.chatter) for mark in front(points, 'chatter')]
+    assert found == [(1.0, 5.0), (2.0, 2.0), (4.0, 1.0)]
+
+
+def test_sections_of_a_file(tmp_path):
+    """One file may hold the plant's, the estimator's and the tuning's parameters."""
+    path = tmp_path / 'all.yaml'
+    path.write_text("""
+/**:
+  ros__parameters: {order: 2, phi: ['0', '-0.5*z2'], noise_std: 0.001, disturbance: step}
+estimator:
+  ros__parameters: {variant: sign, scheme: implicit}
+tune:
+  ros__parameters: {disturbances: [steps], recordings: 2, held_out: 2, duration: 3.0,
+                    settled: 1.0, search: [lambda, alpha]}
+""")
+    out = tmp_path / 'out'
+    assert main(['--params-file', str(path), '--trials=8', '-o', str(out)]) == 0
+    values = load(out / 'gains.yaml', 'estimator')
+    assert values['phi'] == ['0', '-0.5*z2']
+    assert values['variant'] == 'sign'
+    assert len(values['alpha']) == 3
+    assert 'fuzzy_widths' not in values
+    assert 'noise_std: 0.001' in (out / 'report.md').read_text()
+
+
+def test_levant_is_tuned_without_what_it_does_not_use(tmp_path):
+    out = tmp_path / 'out'
+    assert main([*QUICK, '-pstructure:=levant', '-o', str(out)]) == 0
+    values = load(out / 'gains.yaml', 'estimator')
+    assert values['structure'] == 'levant'
+    assert not {'alpha', 'epsilon'} & set(values)
+    assert len(values['lambda']) == 4
+
+
+# bags
+
+
+def make_bag(path, truth=True, noise=1e-3):
+    family = Family(SHORT | {'duration': 9.0, 'noise_std': noise, 'dropout': 0.02})
+    r = family.recording(0)
+    with BagWriter(path) as bag:
+        bag.add('/y', 'std_msgs/msg/Float64')
+        if truth:
+            bag.add('/plant/unknown_input', 'std_msgs/msg/Float64')
+            bag.add('/plant/state', 'std_msgs/msg/Float64MultiArray')
+        for k, stamp in enumerate((10**18 + np.round(r.t * 1e9)).astype(np.int64).tolist()):
+            bag.write('/y', stamp, serialise('std_msgs/msg/Float64', data=r.y[k]))
+            if truth:
+                d = serialise('std_msgs/msg/Float64', data=r.d[k])
+                bag.write('/plant/unknown_input', stamp + 9000, d)
+                state = labelled_array(['z1', 'z2', 'z3'], r.z[k])
+                bag.write('/plant/state', stamp + 9000, state)
+    return r
+
+
+def test_bag_with_truth_is_what_it_trains_on(tmp_path):
+    make_bag(tmp_path / 'bag')
+    out = tmp_path / 'out'
+    assert main([*QUICK, '--bag', str(tmp_path / 'bag'), '-o', str(out)]) == 0
+    report = (out / 'report.md').read_text()
+    assert 'pieces of bag bag' in report
+    assert '1 recordings to train on, 1 held out' in report
+    assert 'another run as well' in report
+    assert 'simulated' not in (out / 'gains.yaml').read_text()
+
+
+def test_bag_without_truth_gives_the_sensor(tmp_path):
+    make_bag(tmp_path / 'bag', truth=False)
+    out = tmp_path / 'out'
+    quick = [rule for rule in QUICK if 'sample_rate' not in rule]
+    assert main([*quick, '--bag', str(tmp_path / 'bag'), '-o', str(out)]) == 0
+    report = (out / 'report.md').read_text()
+    assert 'simulated family with the sensor of bag bag' in report
+    rows = dict(line.strip(' |').split(' | ') for line in report.splitlines()
+                if line.startswith(('| noise_std', '| sample_rate')))  # fmt: skip
+    assert float(rows['noise_std']) == pytest.approx(1e-3, rel=0.2)
+    assert float(rows['sample_rate']) == pytest.approx(200.0, rel=0.01)
+
+
+def test_bag_that_is_too_short(tmp_path, capsys):
+    make_bag(tmp_path / 'bag')
+    arguments = [
+        *QUICK,
+        '-psettled:=8.0',
+        '--bag',
+        str(tmp_path / 'bag'),
+        '-o',
+        str(tmp_path / 'o'),
+    ]
+    assert main(arguments) == 2
+    assert 'expected at least 19.2 s with the truth' in capsys.readouterr().err
+    assert not (tmp_path / 'o').exists()
+
+
+# ends
+
+
+def test_interrupt_keeps_the_best(tmp_path):
+    out = tmp_path / 'out'
+    process = command(*QUICK, '--trials=1000000', '-o', out)
+    try:
+        wait_for(lambda: published(tmp_path / 'out.journal') > 20, 'trial')
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60.0)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == 0, err
+    assert sorted(path.name for path in out.iterdir()) == FILES
+    load(out / 'gains.yaml', 'estimator')
+
+
+def test_killed_run_goes_on(tmp_path, capsys):
+    out, journal = tmp_path / 'out', tmp_path / 'out.journal'
+    process = command(*QUICK, '--trials=1000000', '-o', out)
+    try:
+        wait_for(lambda: published(journal) > 20, 'trial')
+    finally:
+        process.kill()
+        process.wait()
+    assert not out.exists()
+    kept = published(journal)
+    assert main([*QUICK, f'--trials={kept + 5}', '-o', str(out)]) == 0
+    assert 'goes on' in capsys.readouterr().out
+    assert f'({kept + 5} trials' in (out / 'gains.yaml').read_text()
+    assert published(out / 'study.journal') == kept + 5
+    assert not journal.exists()
+
+
+def test_two_processes_share_a_study(tmp_path):
+    storage = tmp_path / 'shared.log'
+    workers = [
+        command(*QUICK, '--jobs=1', '--trials=400', '--storage', storage, '-o', tmp_path / name)
+        for name in 'ab'
+    ]
+    try:
+        results = [worker.communicate(timeout=150.0) for worker in workers]
+    finally:
+        for worker in workers:
+            worker.kill()
+            worker.wait()
+    assert [worker.returncode for worker in workers] == [0, 0], results
+    both = storage.read_text().split('"worker":"')[1:]
+    assert len({text.split('"')[0] for text in both}) == 2
+    # Each learns of the other's trials ten times a second.
+    assert 400 <= len(both) < 600
+    assert 'study.journal' not in [path.name for path in (tmp_path / 'a').iterdir()]
+
+
+# wrong input
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['-pnoise:=1'], "unknown parameter 'noise'"),
+        (['-psearch:=[lamda]'], "'lamda'; did you mean 'lambda'"),
+        (['-psearch:=["epsilon 3 1"]'], 'NAME LOW HIGH'),
+        (['-psearch:=["epsilon 0 1 log"]'], 'NAME LOW HIGH'),
+        (['-psearch:=[fuzzy_widths]', '-pvariant:=sign'], 'the variant sign uses'),
+        (['-pweights:=[1.0, 2.0]'], 'weights.*1 or 4 numbers'),
+        (['-psettled:=4.0'], 'more than 4 s'),
+        (['--trials=0'], '--trials >= 1'),
+        (['--storage', 'nodb://x'], 'storage'),
+        (['--bag', 'nothing'], 'does not exist'),
+        (['--params-file', 'nothing.yaml'], 'nothing.yaml'),
+        (['-o', '/proc/no/out'], 'output'),
+    ],
+)
+def test_wrong_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert main([*QUICK, '-o', 'out', *arguments]) == 2
+    err = capsys.readouterr().err
+    lines = [line for line in err.splitlines() if line.startswith('tune: error')]
+    assert len(lines) == 1
+    assert re.search(message, lines[0]), lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_optuna_says_how_to_install_it(monkeypatch, capsys):
+    from fhaosmo_ros.tools.tuning import command as module
+
+    monkeypatch.setattr(module, 'find_spec', lambda name: None)
+    assert main([]) == 1
+    assert "pip install 'optuna" in capsys.readouterr().err
+
+
+# parts
+
+
+@pytest.mark.parametrize(
+    'truth',
+    [
+        {'noise_std': 1e-4},
+        {'noise_std': 1e-2, 'sample_rate': 100.0},
+        {'noise_std': 1e-3, 'stamp_jitter': 1e-4},
+        {'noise_std': 1e-3, 'dropout': 0.1, 'dropout_length': 4.0},
+        {'noise_std': 1e-3, 'quantisation': 1e-3},
+        {'noise_std': 1e-3, 'disturbances': ['steps'], 'rms_of_d': 5.0},
+    ],
+)
+def test_sensor_is_identified(truth):
+    r = Family({'duration': 30.0, 'integration_step': 1e-3} | truth).recording(0)
+    t = 1e5 + r.t
+    sensor = identify(t, r.y)._asdict()
+    assert sensor.pop('noise_std') == pytest.approx(truth['noise_std'], rel=0.1)
+    assert sensor['sample_rate'] == pytest.approx(truth.get('sample_rate', 1000.0), rel=0.01)
+    assert sensor['quantisation'] == pytest.approx(truth.get('quantisation', 0.0), rel=1e-3)
+    assert sensor['stamp_jitter'] == pytest.approx(
+        truth.get('stamp_jitter', 0.0), rel=0.1, abs=1e-9
+    )
+    assert sensor['dropout'] == pytest.approx(truth.get('dropout', 0.0), rel=0.2, abs=1e-3)
+    if 'dropout' in truth:
+        assert sensor['dropout_length'] == pytest.approx(4.0, rel=0.2)
+
+
+def test_sensor_outlives_bad_samples():
+    r = Family({'noise_std': 1e-3, 'integration_step': 1e-3}).recording(0)
+    y, t = r.y.copy(), r.t.copy()
+    y[::500], y[7::700] = np.nan, 1e6
+    t[1000] = t[990]
+    assert identify(t, y).noise_std == pytest.approx(1e-3, rel=0.1)
+    with pytest.raises(ConfigurationError, match='at least 200 samples'):
+        identify(t[:100], y[:100])
+
+
+def test_theory_scales_with_the_unit_of_y():
+    """Were y, d and the noise c times as large, alpha, widths and epsilon would be, too."""
+    c = 100.0
+    small = Family(SHORT | {'noise_std': 1e-3}).recordings(2)
+    large = [r._replace(y=c * r.y, z=c * r.z, d=c * r.d) for r in small]
+    pairs = zip(candidates(small, 4, 1e-3), candidates(large, 4, c * 1e-3), strict=True)
+    for one, other in pairs:
+        np.testing.assert_allclose(other['lambda'], np.sqrt(c) * np.array(one['lambda']))
+        for name in ('alpha', 'fuzzy_widths', 'epsilon'):
+            np.testing.assert_allclose(other[name], c * np.array(one[name]))
+
+
+def test_theory_begins_below_an_estimate_of_zero():
+    family = Family({'noise_std': 1e-4, 'integration_step': 1e-3})
+    tuning = TUNE_PARAMETERS.defaults()
+    objective = Objective(family.recordings(3), {'variant': 'fuzzy'}, tuning, choose=True)
+    errors = [objective(gains).error for gains in candidates(family.recordings(3), 4, 1e-4)]
+    assert min(errors) < 0.8
+    assert max(errors) > 1.5
+
+
+def test_objective_weighs_what_it_is_told_to():
+    recordings = Family(SHORT | {'noise_std': 1e-3}).recordings(2)
+    gains = {'lambda': 5.0, 'alpha': 3.0, 'fuzzy_widths': 0.05, 'epsilon': 1.0}
+    plain = {'chatter_weight': 0.0, 'settling_weight': 0.0}
+
+    def judge(**changes):
+        return Objective(recordings, {}, TUNING | changes, choose=True)(gains)
+
+    only_d = judge(**plain)
+    assert only_d.objective == only_d.error
+    scores, choice = only_d.scores, only_d.choice
+    scale = np.sqrt(np.mean(np.concatenate([r.d[r.t >= 1.0] for r in recordings]) ** 2))
+    expected = np.exp(np.mean(np.log(scores.error[:, choice, -1] / scale)))
+    np.testing.assert_allclose(only_d.error, expected, rtol=1e-6)
+    assert judge(weights=[1.0, 0.0, 0.0, 0.0], **plain).error < 0.1 * only_d.error
+    both = judge(chatter_weight=2.0, settling_weight=3.0)
+    np.testing.assert_allclose(
+        both.objective, both.error + 2.0 * both.chatter + 3.0 * both.settling
+    )
+    assert both.settling > 0.0
+    other = Objective(recordings, {'estimate_from': 'filtered'}, TUNING | plain, choose=False)
+    assert other(gains).estimate_from == 'filtered'
+    assert other(gains).error >= only_d.error
+
+
+def test_estimate_that_left_the_finite_numbers_is_the_worst():
+    recordings = Family(SHORT).recordings(1)
+    wild = {'lambda': 1e6, 'alpha': 1e9, 'fuzzy_widths': 1e-12, 'epsilon': 1e12}
+    objective = Objective(recordings, {'scheme': 'explicit'}, TUNING, choose=True)
+    assert objective(wild).objective > 1e3
+    assert not np.isnan(objective(wild).objective)
+    assert Observer().order == 3
