@@ -7,7 +7,7 @@ from fhaosmo_ros.core.parameters import MODEL
 
 TUNING = (
     Parameter(
-        'recordings', 6, 'Number of recordings that the search sees.', lower=1, upper=10_000,
+        'recordings', 12, 'Number of recordings that the search sees.', lower=1, upper=10_000,
         live=False,
     ),
     Parameter(

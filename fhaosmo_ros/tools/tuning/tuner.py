@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 DIGITS = 4
 """Of the gains that are written, unless rounding makes them worse by more than `LOSS`."""
-LOSS = 1e-3
+LOSS = 5e-3
 GAMMAS = (0.25, 0.5)
 """Powers that the start may have, where they are searched."""
 
