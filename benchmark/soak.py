@@ -24,7 +24,8 @@ from tqdm import tqdm
 
 RATE = 500.0
 PARAMETERS = ('--ros-args', '--params-file', str(ROOT / 'config' / 'demo.yaml'))
-ESTIMATOR = ('-r', 'y:=faulty_y', '-p', 'spike_gate:=1.0', '-p', 'gamma_leakage:=1.0')
+ESTIMATOR = ('-r', 'y:=faulty_y', '-p', 'spike_gate:=1.0', '-p', 'gamma_leakage:=1.0',
+             '-p', 'gamma_dead_zone:=0.0')  # fmt: skip
 """What docs/operation.md advises for a node that nobody looks after."""
 MATCHED = 30.0
 

@@ -16,6 +16,8 @@ MEMORY = 2.0
 ERROR_GROWTH = 0.01
 """What the error of d may grow by between the first and the last third: a tenth of d's amplitude.
 Not a ratio: that of two errors near the noise tells how busy the machine was."""
+MANY = 15
+"""Windows from which on medians of thirds tell more than how busy the machine was."""
 ERROR = 0.05
 """Largest median error of d in any judged window: half of d's amplitude."""
 GAMMA = 0.02
@@ -78,7 +80,8 @@ def verdict(course: Course) -> list[Row]:
     _, error, gamma = course.windows.T
     first, last = (np.median(part) for part in (_third(error, 0), _third(error, 2)))
     note = f'{first:.2g} to {last:.2g}, medians of the first and the last third of the windows'
-    rows.append(Row('error of d, growth', last - first, bar=ERROR_GROWTH, note=note))
+    bar = ERROR_GROWTH if len(error) >= MANY else ERROR
+    rows.append(Row('error of d, growth', last - first, bar=bar, note=note))
     note = f'{len(error)} windows, median {np.median(error):.2g}'
     rows.append(Row('error of d, worst window', error.max(), bar=ERROR, note=note))
     first, last = (np.median(part) for part in (_third(gamma, 0), _third(gamma, 2)))
