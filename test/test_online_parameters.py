@@ -25,6 +25,8 @@ class Change:
 
 
 SEED = [0.0, 1.0, 2.0, 3.0]
+ALWAYS_LEAKS = {'gamma_leakage': 5.0, 'gamma_dead_zone': 0.0}
+RESTS = {'gamma_leakage': 5.0, 'gamma_dead_zone': 1e6}
 CHANGES = {
     'unknown_input_decay': Change(50.0),
     'structure': Change('levant'),
@@ -36,12 +38,13 @@ CHANGES = {
     'fuzzy_widths': Change(0.02),
     'fuzzy_shape': Change('gaussian'),
     'fuzzy_normalise': Change(False),
-    'gamma_initial': Change(0.9, {'gamma_leakage': 5.0}),
+    'gamma_initial': Change(0.9, ALWAYS_LEAKS),
     'gamma_rate': Change(0.5),
     'gamma_min': Change(0.6, {'gamma_initial': 0.2}, {'gamma_initial': 0.67}),
     'gamma_max': Change(0.7, {'gamma_initial': 0.9}, {'gamma_initial': 0.67}),
     'gamma_dead_zone': Change(1e6),
-    'gamma_leakage': Change(5.0, prepared={'gamma_initial': 0.9}),
+    'gamma_leakage': Change(0.0, ALWAYS_LEAKS, {'gamma_initial': 0.9}),
+    'gamma_leakage_delay': Change(0.01, RESTS, {'gamma_initial': 0.9}),
     'initial_estimate': Change(SEED, reset=True),
     'initial_internal': Change(SEED, reset=True),
     'start_from_measurement': Change(False, reset=True),

@@ -79,6 +79,6 @@ class Counters(NamedTuple):
 
 UNUSED_SAMPLES = (
     'rejected_measurements', 'rejected_spikes', 'rejected_stuck', 'rejected_steps',
-    'duplicate_stamps', 'backward_stamps', 'zero_stamps', 'far_stamps',
+    'duplicate_stamps', 'backward_stamps', 'zero_stamps', 'far_stamps', 'withdrawn_gaps',
 )  # fmt: skip
 """Counters that together are `Counters.rejected`."""
