@@ -15,7 +15,7 @@ from importlib import import_module
 import fhaosmo_ros.core
 for name in {MODULES!r}:
     for value in vars(import_module(name)).values():
-        if hasattr(value, 'py_func'):
+        if hasattr(value, 'py_func') and value._cache.cache_path:  # intrinsics have none
             print(value._cache.cache_path)
 """
 

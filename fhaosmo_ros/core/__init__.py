@@ -4,7 +4,7 @@
 from fhaosmo_ros.core.compile_cache import compile_cache
 
 with compile_cache():
-    from fhaosmo_ros.core import joint
+    from fhaosmo_ros.core import channels, joint
     from fhaosmo_ros.core.counters import Counters
     from fhaosmo_ros.core.errors import ConfigurationError
     from fhaosmo_ros.core.family import Family, Recording
@@ -29,5 +29,6 @@ __all__ = [
     'Trajectory',
     'Trial',
     'TriangularModel',
+    'channels',
     'joint',
 ]
