@@ -15,10 +15,11 @@ from fhaosmo_ros.core.parameter_file import load
 from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
 from fhaosmo_ros.tools.bag_writer import BagWriter
 from fhaosmo_ros.tools.bags import labelled_array, serialise
-from fhaosmo_ros.tools.tuning.command import main
+from fhaosmo_ros.tools.tuning.command import main, read_parameters
 from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.sensor import identify
+from fhaosmo_ros.tools.tuning.source import simulated
 from fhaosmo_ros.tools.tuning.theory import candidates
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
 pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
 
 from fhaosmo_ros.tools.tuning.study import Point
-from fhaosmo_ros.tools.tuning.tuner import front
+from fhaosmo_ros.tools.tuning.tuner import front, Tuner
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = {'duration': 4.0, 'integration_step': 1e-3, 'sample_rate': 200.0}
@@ -103,7 +104,7 @@ def test_given_gains_are_where_it_begins_if_they_are_better(tmp_path):
     row = next(line for line in report.splitlines() if line.startswith('| objective'))
     before, _, tuned, _ = map(float, row.split('|')[2:6])
     assert 'given, training' in report
-    assert tuned <= 1.002 * before  # rounded
+    assert tuned <= 1.006 * before  # rounded
 
 
 def test_front_of_error_and_chatter(tmp_path):
@@ -140,6 +141,18 @@ tune:
     assert len(values['alpha']) == 3
     assert 'fuzzy_widths' not in values
     assert 'noise_std: 0.001' in (out / 'report.md').read_text()
+
+
+@pytest.mark.parametrize('section', ['/**', 'estimator', 'plant', 'tune'])
+def test_model_may_stand_in_any_section(tmp_path, section):
+    path = tmp_path / 'model.yaml'
+    path.write_text(f"{section}:\n  ros__parameters: {{order: 1, phi: ['-2.0*z1']}}\n")
+    estimator, tuning = read_parameters([path], ['noise_std:=0.1'])
+    values = TUNE_PARAMETERS.defaults() | tuning | SHORT | {'settled': 1.0, 'recordings': 1}
+    tuner = Tuner(simulated(values, 1), estimator, values, 1)
+    assert tuner.fixed['phi'] == ['-2.0*z1']
+    assert sum(d.name.startswith('lambda') for d in tuner.space) == 2
+    assert values['noise_std'] == 0.1
 
 
 def test_levant_is_tuned_without_what_it_does_not_use(tmp_path):

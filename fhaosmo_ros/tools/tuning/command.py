@@ -12,7 +12,7 @@ from typing import Any
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter import ParameterTable
 from fhaosmo_ros.core.parameter_file import load
-from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals
 from fhaosmo_ros.tools.options import assigned
 from fhaosmo_ros.tools.output import Output
@@ -160,7 +160,10 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
     estimator: dict[str, Any] = {}
     tuning: dict[str, Any] = {}
     for path in files:
-        estimator |= load(path, 'estimator')
+        found = load(path, 'estimator')
+        estimator |= found
+        # Where only the estimator has a model, the plant has the same one.
+        tuning |= {p.name: found[p.name] for p in MODEL if p.name in found}
         tuning |= load(path, 'plant', TUNE_PARAMETERS) | load(path, 'tune', TUNE_PARAMETERS)
     values = assigned(rules, BOTH)
     estimator |= {name: v for name, v in values.items() if name in ESTIMATOR_PARAMETERS}

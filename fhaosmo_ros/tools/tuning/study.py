@@ -100,11 +100,11 @@ class Desk:
 
     def ask(self, fixed: dict[str, float] | None = None) -> Trial:
         """Return a trial to evaluate; `fixed` gives its parameters."""
-        if time.monotonic() - self._looked > EXCHANGE:
-            with self._publishing:
+        with self._publishing:
+            self._running += 1
+            if time.monotonic() - self._looked > EXCHANGE:
                 self._exchange()
         with self._memory:
-            self._running += 1
             kept = self._study.get_trials(deepcopy=False)
             if len(kept) > 2 * WINDOW:
                 finished = [trial for trial in kept[-WINDOW:] if trial.state.is_finished()]
@@ -155,7 +155,7 @@ class Desk:
         if new:
             self._best = min(self._best, *(trial.value or 0.0 for trial in new))
             with self._memory:
-                self._study.add_trials(new)
+                self._study.add_trials(new[-WINDOW:])
         self._looked = time.monotonic()
 
 

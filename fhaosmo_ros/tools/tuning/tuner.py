@@ -93,8 +93,8 @@ class Tuner:
         self, data: Data, estimator: Mapping[str, Any], tuning: Mapping[str, Any], seed: int
     ) -> None:
         self.data, self.tuning, self.seed = data, tuning, seed
-        model = {name: tuning[name] for name in ('order', 'phi')}
-        self.estimator = dict(estimator) | model
+        # The estimator may have a model of its own, other than the plant's.
+        self.estimator = {name: tuning[name] for name in ('order', 'phi')} | dict(estimator)
         online = {k: v for k, v in self.estimator.items() if k in ONLINE_PARAMETERS}
         complete = Observer({k: v for k, v in online.items() if k in OBSERVER_PARAMETERS})
         choose = 'estimate_from' not in estimator
@@ -102,6 +102,7 @@ class Tuner:
         self.held_out = Objective(data.held_out, online, tuning, choose, self.training.scale)
         names = [rule.split()[0] for rule in tuning['search'] if rule.split()]
         given = {name: value for name, value in estimator.items() if name in names}
+        given = given if 'lambda' in given else {}  # one number more or less is no set of gains
         by_theory = self._by_theory(complete, names)
         # The user's own gains count, too: a tuning never ends worse than they are.
         start = min(
