@@ -254,8 +254,9 @@ def test_killed_run_goes_on(tmp_path, capsys):
     kept = published(journal)
     assert main([*QUICK, f'--trials={kept + 5}', '-o', str(out)]) == 0
     assert 'goes on' in capsys.readouterr().out
-    assert f'({kept + 5} trials' in (out / 'gains.yaml').read_text()
-    assert published(out / 'study.journal') == kept + 5
+    count = published(out / 'study.journal')
+    assert 0 <= count - (kept + 5) <= 1  # of two threads each may begin a last trial
+    assert f'({count} trials' in (out / 'gains.yaml').read_text()
     assert not journal.exists()
 
 
