@@ -5,6 +5,7 @@ import math
 
 from fhaosmo_ros.core.tape import Floats
 from numba import njit
+import numpy as np
 
 KINDS = ('none', 'sine', 'step', 'square', 'chirp')
 NONE, SINE, STEP, SQUARE, CHIRP = range(5)
@@ -48,3 +49,12 @@ def disturbance(kind: int, c: Floats, t: float) -> float:
     if kind == SQUARE:
         wave = 1.0 if wave >= 0.0 else -1.0
     return float(c[OFFSET] + c[AMPLITUDE] * wave)
+
+
+@njit(cache=True, error_model='numpy')
+def disturbances(kind: int, c: Floats, t: Floats) -> Floats:
+    """Return d at many times, shape (K,)."""
+    d = np.empty(t.shape[0])
+    for k in range(t.shape[0]):
+        d[k] = disturbance(kind, c, t[k])
+    return d

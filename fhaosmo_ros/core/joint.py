@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import layout
 from fhaosmo_ros.core.configuration import ObserverConfiguration, per_level
-from fhaosmo_ros.core.disturbance import disturbance, KINDS, NAMES
+from fhaosmo_ros.core.disturbance import disturbances, KINDS, NAMES
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.core.ode import solve, SOLVERS, unpack
@@ -105,6 +105,6 @@ def simulate(
         count,
     )
     t = np.arange(count, dtype=np.float64) * (every * step)
-    d = np.array([disturbance(system[2], wave, time) for time in t])
+    d = disturbances(system[2], wave, t)
     truth, *estimate = unpack(rows, model.order)
     return JointRun(t, truth, d, *estimate)

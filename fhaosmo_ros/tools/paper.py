@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 FOLDER, RESULTS = 'paper', 'results.json'
-QUICK_WIDTHS = 3
+QUICK_WIDTHS = 4
 QUICK_LONG = 200.0
 PROTECTION_WINDOW = 20.0
 """Seconds within which errors are judged where the protections are compared."""
