@@ -8,8 +8,7 @@ from fhaosmo_ros.commands import COMMANDS
 from setuptools import find_packages, setup
 
 NAME = 'fhaosmo_ros'
-TUNE = ['cmaes', 'optuna>=4,<6']
-COMPARE = [*TUNE, 'control']
+TUNE = ['cmaes', 'control', 'optuna>=4,<6']
 
 
 def files(*patterns):
@@ -64,9 +63,9 @@ setup(
             'ros-jazzy-std-srvs',
         ],
         'tune': TUNE,
-        'compare': COMPARE,
+        'compare': TUNE,
         'test': [
-            *COMPARE,
+            *TUNE,
             'colcon-common-extensions',
             'hypothesis',
             'import-linter',

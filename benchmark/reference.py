@@ -108,7 +108,7 @@ def in_numba(
     """Return the same of the kernel behind `Observer.run`, for any parameters."""
     configuration = ObserverConfiguration(parameters)
     count, levels = len(y), configuration.levels
-    work = make_work(levels, configuration.model.depth)
+    work = make_work(configuration.law, configuration.model.depth)
     start = first_state(parameters, y[0])
     h, u = np.full(count, PERIOD), np.zeros(count)
     out, eps = np.empty((1, 2, levels)), np.empty((2, levels))

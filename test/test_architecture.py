@@ -15,7 +15,7 @@ PACKAGE = ROOT / 'fhaosmo_ros'
 ALLOWED = {
     'rclpy': ['nodes/'],
     'rosbags': ['tools/bags.py', 'tools/bag_reader.py', 'tools/bag_writer.py'],
-    'control': ['tools/comparison/gains.py'],
+    'control': ['tools/sampled_model.py'],
     'matplotlib': [
         'tools/comparison/figures.py',
         'tools/figures.py',

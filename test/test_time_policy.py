@@ -5,11 +5,11 @@ import itertools
 import math
 
 from fhaosmo_ros.core import Observer, Plant
+from fhaosmo_ros.core.flow import ahead
 from fhaosmo_ros.core.layout import ROWS, SCALARS, TILDE, Y
 from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.policy_step import MOST_SUB_STEPS
-from fhaosmo_ros.core.prediction import ahead
 from fhaosmo_ros.core.status import REJECTED, Status
 import numpy as np
 import pytest
@@ -192,7 +192,7 @@ def test_gap_of_exactly_max_gap_is_bridged():
 
 
 @pytest.mark.parametrize('decay', [0.0, 3.0])
-def test_prediction_is_the_plant_to_second_order(decay):
+def test_prediction_is_the_plant_to_fourth_order(decay):
     model = TriangularModel(['u - z1', 'sin(z1)', '-z3*z2'])
     start, u, d = np.array([0.4, -0.3, 0.8]), 0.7, 0.5
 
@@ -202,11 +202,14 @@ def test_prediction_is_the_plant_to_second_order(decay):
     truth = solve_ivp(slope, (0.0, 0.5), [*start, d], rtol=1e-12, atol=1e-12).y[0, -1]
     levels, memory = np.zeros((ROWS, 4)), np.zeros(SCALARS)
     memory[Y], levels[TILDE] = start[0], [start[1], start[2], d, 9.9]
-    m, stack, z = np.zeros((2, 4)), np.zeros((2, model.depth)), np.zeros(4)
-    work = (model.tape, model.offsets, m, stack, decay, levels, memory, z)
-    errors = [abs(ahead(*work, 0.5 / n, u, n) - truth) for n in (50, 100, 200)]
-    assert errors[-1] < 1e-6
-    np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 4.0, rtol=0.1)
+    m, stack, x = np.zeros((2, 4)), np.zeros((2, model.depth)), np.zeros((ROWS, 4))
+    tapes = model.with_unknown_input(decay, 0)
+    errors = [
+        abs(ahead(*tapes, m, stack, levels, memory, x, 0.5 / n, u, n) - truth)
+        for n in (10, 20, 40)
+    ]
+    assert errors[-1] < 1e-8
+    np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 16.0, rtol=0.2)
 
 
 @pytest.mark.parametrize('omega', [1.0, 5.0])

@@ -16,6 +16,7 @@ from fhaosmo_ros.core.law import (
     NEWTON_STEPS,
     NEWTON_TOLERANCE,
     psi,
+    SENSITIVE,
     SIGN,
     TINY,
 )  # fmt: skip
@@ -135,15 +136,16 @@ def explicit(
                 log_a = math.log(a)
                 power = math.exp(gamma * log_a)
                 injection = gains[LAMBDA, i] * power * direction
-                # D 6: explicit dependence on gamma, and the chain through eps
-                dinjection = injection * log_a + gains[LAMBDA, i] * power * s * (
-                    gamma * abs(direction) / a + slope
-                )
+                if flags[SENSITIVE]:
+                    # D 6: explicit dependence on gamma, and the chain through eps
+                    dinjection = injection * log_a + gains[LAMBDA, i] * power * s * (
+                        gamma * abs(direction) / a + slope
+                    )
             else:
                 injection = gains[LAMBDA, i] * math.sqrt(a) * direction
         elif not flags[SIGN]:
             _, slope = psi(flags, gains, curves, i, 0.0)
-        if flags[ADAPTIVE]:
+        if flags[SENSITIVE]:
             x[HAT_SENSITIVITY, i] += h * (x[TILDE_SENSITIVITY, i] + dinjection + dphi)
             x[TILDE_SENSITIVITY, i] += h * (
                 gains[ALPHA, i] * slope * s - gains[DECAY, i] * x[TILDE_SENSITIVITY, i]
@@ -195,7 +197,7 @@ def implicit(
         b = m[0, i] - x[HAT, i] - h * (x[TILDE, i] + phi)
         a, s = root(flags, gains, curves, i, abs(b), h, gamma)
         loss += a * a  # P lossfunction
-        if flags[ADAPTIVE]:  # D 10: implicit function theorem on the equation of `root`
+        if flags[SENSITIVE]:  # D 10: implicit function theorem on the equation of `root`
             x[TILDE_SENSITIVITY, i] *= keep
             db = m[1, i] - x[HAT_SENSITIVITY, i] - h * (x[TILDE_SENSITIVITY, i] + dphi)
             damping, stiffness = h * gains[LAMBDA, i], h * h * gains[ALPHA, i] * keep

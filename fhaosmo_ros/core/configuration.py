@@ -74,9 +74,23 @@ class ObserverConfiguration:
                 "parameters 'structure', 'unknown_input': levant estimates the unknown input as "
                 'its last level, expected unknown_input = true, got false'
             )
+        if p['unknown_input_derivatives'] and not p['unknown_input']:
+            raise ConfigurationError(
+                "parameters 'unknown_input_derivatives', 'unknown_input': derivatives are levels "
+                'behind that of the unknown input, expected unknown_input = true or '
+                f'unknown_input_derivatives = 0, got false and {p["unknown_input_derivatives"]}'
+            )
+        if p['scheme'] == 'predict_correct' and not self.levant:
+            raise ConfigurationError(
+                "parameters 'scheme', 'structure': predict_correct is a scheme of levant alone, "
+                "expected structure = 'levant' or another scheme (explicit, implicit), got "
+                f'{p["structure"]!r} and {p["scheme"]!r}'
+            )
         self.adaptive = p['variant'].endswith('_adaptive')
         self.gamma_initial = p['gamma_initial'] if self.adaptive else FIXED_GAMMA
-        self.levels = self.model.order + int(p['unknown_input'])
+        self.levels = self.model.order
+        if p['unknown_input']:
+            self.levels += 1 + p['unknown_input_derivatives']
         self.initial_estimate = self._per_level('initial_estimate')
         self.initial_internal = self._per_level('initial_internal')
         if self.levant:
@@ -100,8 +114,10 @@ class ObserverConfiguration:
         widths = [widths[min(i, len(widths) - 1)] for i in range(levels)]
         flags = np.zeros(law.FLAGS, dtype=np.int64)
         flags[law.SIGN] = p['variant'].startswith('sign')
-        flags[law.IMPLICIT] = p['scheme'] == 'implicit'
+        flags[law.IMPLICIT] = p['scheme'] != 'explicit'
+        flags[law.PREDICTING] = p['scheme'] == 'predict_correct'
         flags[law.ADAPTIVE] = self.adaptive
+        flags[law.SENSITIVE] = self.adaptive and p['gamma_rate'] > 0.0
         flags[law.FROM_MEASUREMENT] = p['start_from_measurement']
         flags[law.LEVANT] = self.levant
         if flags[law.SIGN]:  # the kernel does not read them
@@ -117,12 +133,11 @@ class ObserverConfiguration:
         gains[law.LAMBDA] = self._per_level('lambda')
         gains[law.ALPHA] = self._per_level('alpha')
         gains[law.INVERSE_WIDTH] = 1.0 / np.array(widths)
-        tape, offsets = self.model.tape, self.model.offsets
-        decay = p['unknown_input_decay']
-        if decay > 0.0:  # D 15, in the internal state and in the level that follow d
-            gains[law.DECAY, self.model.order - 1] = decay
-            if p['unknown_input']:
-                tape, offsets = self.model.with_decay(decay)
+        decay, n = p['unknown_input_decay'], self.model.order
+        gains[law.DECAY, n - 1 : -1 if p['unknown_input'] else None] = (
+            decay  # D 15, internal states
+        )
+        tape, offsets = self.model.with_unknown_input(decay, p['unknown_input_derivatives'])
         scalars = np.zeros(law.SCALARS)
         scalars[law.EPSILON] = np.inf if self.levant else p['epsilon']  # no gates
         scalars[law.GAMMA_INITIAL] = p['gamma_initial']
@@ -132,6 +147,8 @@ class ObserverConfiguration:
         scalars[law.DEAD_ZONE] = p['gamma_dead_zone']
         scalars[law.LEAKAGE] = p['gamma_leakage']
         scalars[law.DELAY] = p['gamma_leakage_delay']
+        scalars[law.PREDICTION_STEP] = p['prediction_step']
+        scalars[law.CORRECTION_PERIOD] = p['correction_period']
         return law.Law(flags, gains, curves, scalars, tape, offsets)
 
 

@@ -22,6 +22,7 @@ from fhaosmo_ros.core.law import (
     LEVANT,
     MAX,
     MIN,
+    PREDICTING,
     RATE,
 )  # fmt: skip
 from fhaosmo_ros.core.layout import (
@@ -119,7 +120,11 @@ def step(
                 x[r, i] = levels[r, i]
         gamma, whole = memory[GAMMA], h + memory[PENDING]
         if flags[LEVANT]:
-            if flags[IMPLICIT]:
+            if flags[PREDICTING]:
+                loss, gradient = levant.predict_correct(
+                    flags, gains, curves, scalars, tape, offsets, x, m, stack, gamma, y, whole, u
+                )
+            elif flags[IMPLICIT]:
                 loss, gradient = levant.implicit(
                     flags, gains, curves, tape, offsets, x, m, stack, gamma, y, whole, u
                 )

@@ -15,17 +15,17 @@ class Law(NamedTuple):
 
     Attributes
     ----------
-    flags : (5,) array
-        `SIGN` .. `LEVANT`: 0 or 1.
+    flags : (7,) array
+        `SIGN` .. `SENSITIVE`: 0 or 1. `IMPLICIT` means that a step uses the sample at its end.
     gains : (4, N) array
-        lambda_i, alpha_i, 1 / half-width_i, and the decay of the internal state (0 but for the
-        one that stands for the unknown input).
+        lambda_i, alpha_i, 1 / half-width_i, and the decay of the internal state (0 but for
+        those that stand for the unknown input and its derivatives).
     curves : (N, K) array
         psi of each level at K points of [0, half-width].
-    scalars : (8,) array
-        `EPSILON` .. `DELAY`.
+    scalars : (10,) array
+        `EPSILON` .. `CORRECTION_PERIOD`.
     tape, offsets : arrays
-        Phi_1 .. Phi_N; see tape.py.
+        Phi_1 .. Phi_n, and those of the model of the unknown input; see tape.py.
 
     """
 
@@ -45,7 +45,7 @@ class Work(NamedTuple):
     ----------
     x : (4, N) array
         Candidate levels.
-    m : (2, N) array
+    m : (2, n + 1 or N) array
         Measurements m_i of the levels and their sensitivities dm_i / dgamma.
     stack : (2, depth) array
         Of the expression tapes.
@@ -57,23 +57,25 @@ class Work(NamedTuple):
     stack: Floats
 
 
-SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT = range(5)
-FLAGS = 5
+SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE = range(7)
+FLAGS = 7
 LAMBDA, ALPHA, INVERSE_WIDTH, DECAY = range(4)
 GAINS = 4
 EPSILON, GAMMA_INITIAL, RATE, MIN, MAX, DEAD_ZONE, LEAKAGE, DELAY = range(8)
-SCALARS = 8
+PREDICTION_STEP, CORRECTION_PERIOD = range(8, 10)
+SCALARS = 10
 
 NEWTON_STEPS = 60
-NEWTON_TOLERANCE = 1e-9
-"""Relative change that ends the iteration; its square, about 1e-18, is what is left then."""
+NEWTON_TOLERANCE = 3e-8
+"""Relative change that ends the iteration; its square, about 1e-15, is what is left then."""
 TINY = 1e-300
 """Below this an innovation counts as 0: its powers would underflow."""
 
 
-def make_work(levels: int, depth: int) -> Work:
-    """Return scratch memory for `levels` levels and tapes of the given stack depth."""
-    return Work(np.zeros((ROWS, levels)), np.zeros((2, levels)), np.zeros((2, depth)))
+def make_work(law: Law, depth: int) -> Work:
+    """Return scratch memory for a law whose tapes need a stack of `depth`."""
+    levels, states = law.gains.shape[1], len(law.offsets) - 1
+    return Work(np.zeros((ROWS, levels)), np.zeros((2, states)), np.zeros((2, depth)))
 
 
 @njit(cache=True, error_model='numpy', forceinline=True)

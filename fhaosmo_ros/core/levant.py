@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Levant's arbitrary-order differentiator with the paper's curves and power, both schemes.
+Levant's arbitrary-order differentiator with the paper's curves and power, all three schemes.
 
 One innovation drives every level: eps = y - z_hat_1. Equations are cited by their numbers in
 docs/mathematics.md (D). The rows TILDE of the state mirror the estimates, z_tilde_{i+1} =
@@ -11,18 +11,27 @@ Not inlined, unlike the cascade: the machine code of a step stays small where th
 
 import math
 
+from fhaosmo_ros.core.differences import shares
+from fhaosmo_ros.core.flow import flow_in_steps
 from fhaosmo_ros.core.law import (
-    ADAPTIVE,
+    CORRECTION_PERIOD,
     LAMBDA,
     NEWTON_STEPS,
     NEWTON_TOLERANCE,
+    PREDICTING,
+    PREDICTION_STEP,
     psi,
+    SENSITIVE,
     SIGN,
     TINY,
 )  # fmt: skip
 from fhaosmo_ros.core.layout import HAT, HAT_SENSITIVITY, TILDE, TILDE_SENSITIVITY
 from fhaosmo_ros.core.tape import evaluate, Floats, Ints
 from numba import njit
+
+MOST_LEVELS = 16
+"""order <= 12, the unknown input, and at most 3 derivatives of it."""
+SHARES = shares(MOST_LEVELS)
 
 
 @njit(cache=True, error_model='numpy', forceinline=True)
@@ -85,7 +94,7 @@ def explicit(
         value, slope = injection(flags, gains, curves, i, a, power, gamma * dp)
         hat, dhat = x[HAT, i], x[HAT_SENSITIVITY, i]
         x[HAT, i] += h * (follower + phi + gains[LAMBDA, i] * math.copysign(value, eps))
-        if flags[ADAPTIVE]:  # D 13
+        if flags[SENSITIVE]:  # D 13
             to_gamma = math.copysign(value, eps) * log_a * dp
             x[HAT_SENSITIVITY, i] += h * (
                 dfollower + dphi + gains[LAMBDA, i] * (to_gamma + slope * s)
@@ -180,25 +189,76 @@ def implicit(
     m[0, 0], m[1, 0] = y, 0.0
     for i in range(1, n):
         m[0, i], m[1, i] = x[HAT, i], x[HAT_SENSITIVITY, i]
-    free, dfree = 0.0, 0.0  # z_hat_i at the interval's end if eps were 0
+    above, dabove = 0.0, 0.0
     for i in range(n - 1, -1, -1):
-        phi, dphi = 0.0, 0.0
         if offsets[i + 1] > offsets[i]:
             phi, dphi = evaluate(tape, offsets[i], offsets[i + 1], m, u, stack)
-        x[TILDE, i], x[TILDE_SENSITIVITY, i] = phi, dphi
-        free = x[HAT, i] + h * (free + phi)
-        dfree = x[HAT_SENSITIVITY, i] + h * (dfree + dphi)
-    b, db = y - free, -dfree
-    weight = 1.0
+            above, dabove = above + phi, dabove + dphi
+        above = x[HAT, i] + h * above
+        dabove = x[HAT_SENSITIVITY, i] + h * dabove
+        x[HAT, i], x[HAT_SENSITIVITY, i] = above, dabove
+    return correct(flags, gains, curves, x, m, gamma, y, h)
+
+
+@njit(cache=True, error_model='numpy')
+def predict_correct(
+    flags: Ints, gains: Floats, curves: Floats, scalars: Floats, tape: Floats, offsets: Ints,
+    x: Floats, m: Floats, stack: Floats, gamma: float, y: float, h: float, u: float,
+) -> tuple[float, float]:  # fmt: skip
+    """
+    Follow the model to the sample, then correct (D 18), in place.
+
+    Parameters
+    ----------
+    y : float
+        Sample at the interval's end.
+
+    Returns
+    -------
+    (float, float)
+        L and dL/dgamma at the interval's end.
+
+    """
+    flow_in_steps(tape, offsets, m, stack, x, h, scalars[PREDICTION_STEP], u)
+    if 0.0 < scalars[CORRECTION_PERIOD] < h:
+        h = scalars[CORRECTION_PERIOD]
+    return correct(flags, gains, curves, x, m, gamma, y, h)
+
+
+@njit(cache=True, error_model='numpy')
+def correct(
+    flags: Ints, gains: Floats, curves: Floats,
+    x: Floats, m: Floats, gamma: float, y: float, h: float,
+) -> tuple[float, float]:  # fmt: skip
+    """
+    Turn predicted estimates into corrected ones by the solution of D 12 or D 18, in place.
+
+    Parameters
+    ----------
+    x : (4, N) array
+        Rows HAT and HAT_SENSITIVITY: the estimates at the interval's end if eps were 0. The other
+        rows are scratch memory.
+    m : (2, N) array
+        Scratch memory.
+
+    Returns
+    -------
+    (float, float)
+        L and dL/dgamma at the interval's end.
+
+    """
+    n = gains.shape[1]
+    b, db = y - x[HAT, 0], -x[HAT_SENSITIVITY, 0]
+    weight = h
     for i in range(n):
+        m[0, i], m[1, i] = weight * gains[LAMBDA, i], weight
         weight *= h
-        m[0, i] = weight * gains[LAMBDA, i]
     a, w, top = root(flags, gains, curves, m, abs(b), gamma)
     sliding = flags[SIGN] and a == 0.0
-    log_a = math.log(a) if a > 0.0 else 0.0
-    deps = 0.0
-    if flags[ADAPTIVE] and not sliding:  # D 14: implicit function theorem on D 12
-        numerator, denominator, power = db, 1.0, 1.0
+    log_a, deps, power = 0.0, 0.0, 1.0
+    if flags[SENSITIVE] and not sliding:  # D 14: implicit function theorem
+        log_a = math.log(a) if a > 0.0 else 0.0
+        numerator, denominator = db, 1.0
         for i in range(n - 1, -1, -1):
             dp = 2.0 * (n - 1 - i) / n
             value, slope = injection(flags, gains, curves, i, a, power, gamma * dp)
@@ -206,8 +266,8 @@ def implicit(
             denominator += m[0, i] * slope
             power *= w
         deps = numerator / denominator
-    power, follower, dfollower = 1.0, 0.0, 0.0
-    for i in range(n - 1, -1, -1):
+    power = 1.0
+    for i in range(n - 1, -1, -1):  # v_i and its derivative along gamma
         dp = 2.0 * (n - 1 - i) / n
         value, slope = injection(flags, gains, curves, i, a, power, gamma * dp)
         to_gamma = math.copysign(value, b) * log_a * dp
@@ -215,19 +275,19 @@ def implicit(
             value = top
             if sliding:
                 to_gamma = db / m[0, i]
-        follower = x[HAT, i] + h * (
-            follower + x[TILDE, i] + gains[LAMBDA, i] * math.copysign(value, b)
-        )
-        x[HAT, i] = follower
-        if flags[ADAPTIVE]:
-            dfollower = x[HAT_SENSITIVITY, i] + h * (
-                dfollower + x[TILDE_SENSITIVITY, i] + gains[LAMBDA, i] * (to_gamma + slope * deps)
-            )
-            x[HAT_SENSITIVITY, i] = dfollower
+        x[TILDE, i] = gains[LAMBDA, i] * math.copysign(value, b)
+        x[TILDE_SENSITIVITY, i] = gains[LAMBDA, i] * (to_gamma + slope * deps)
         power *= w
+    for i in range(n):
+        for j in range(i, n):
+            share = m[1, j - i]
+            if flags[PREDICTING]:
+                share *= SHARES[j, i]
+            x[HAT, i] += share * x[TILDE, j]
+            x[HAT_SENSITIVITY, i] += share * x[TILDE_SENSITIVITY, j]
     # What the sum above is but for rounding.
     x[HAT, 0] = y - math.copysign(a, b)
-    if flags[ADAPTIVE]:
+    if flags[SENSITIVE]:
         x[HAT_SENSITIVITY, 0] = -deps
     mirror(x)
     return a * a, 2.0 * math.copysign(a, b) * deps

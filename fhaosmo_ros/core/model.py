@@ -10,7 +10,7 @@ from fhaosmo_ros.core.tape import evaluate, INPUT
 import numpy as np
 
 ROOM_FOR_DECAY = 4
-"""Stack size that is enough for the expression in `TriangularModel.with_decay`."""
+"""Stack size that is enough for the expression in `TriangularModel.with_unknown_input`."""
 
 
 class TriangularModel:
@@ -34,7 +34,7 @@ class TriangularModel:
         Phi_i occupies ``offsets[i - 1]:offsets[i]``; the last part is empty, for the level of the
         unknown input (whose Phi is 0).
     depth : int
-        Stack size that the tapes need, that of `with_decay` included.
+        Stack size that the tapes need, that of `with_unknown_input` included.
 
     Raises
     ------
@@ -61,13 +61,25 @@ class TriangularModel:
         """True if a Phi uses the known input u."""
         return bool(np.any(self.tape[:, 0] == INPUT))
 
-    def with_decay(self, rate: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return tape and offsets with Phi_{n+1} = -rate z_{n+1} for the unknown input (D 15)."""
-        level = self.order + 1
-        part = as_array(parse(f'-{rate!r} * z{level}', level))
-        offsets = self.offsets.copy()
-        offsets[level] += len(part)
-        return np.concatenate([self.tape, part]), offsets
+    def with_unknown_input(self, decay: float, derivatives: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return tape and offsets with the model of the unknown input behind the states.
+
+        Parameters
+        ----------
+        decay : float
+            kappa in Phi_i = -kappa z_i of every z_i with i > n (D 17).
+        derivatives : int
+            k: levels n + 1 .. n + 1 + k.
+
+        """
+        parts, offsets = [self.tape], list(self.offsets[: self.order + 1])
+        for level in range(self.order + 1, self.order + 2 + derivatives):
+            part = parse(f'-{decay!r} * z{level}', level) if decay > 0.0 else []
+            if part:
+                parts.append(as_array(part))
+            offsets.append(offsets[-1] + len(part))
+        return np.concatenate(parts), np.array(offsets, dtype=np.int64)
 
     def evaluate(self, z: np.ndarray, u: float = 0.0) -> np.ndarray:
         """Return Phi(z, u), shape (n,)."""

@@ -157,7 +157,7 @@ class Observer:
 
     def make_work(self) -> Work:
         """Return scratch memory for the kernels."""
-        return make_work(self.levels, self._configuration.model.depth)
+        return make_work(self.law, self._configuration.model.depth)
 
     @property
     def uses_input(self) -> bool:
@@ -192,7 +192,7 @@ class Observer:
         self._levels[:] = state.levels
         self._memory[:] = state.memory
         self._t = state.t
-        self._fit_gamma()
+        self._fit_memory()
 
     def check(self, changes: Mapping[str, Any]) -> None:
         """Raise what `configure` would raise, and change nothing."""
@@ -216,18 +216,19 @@ class Observer:
         before = self._law.flags
         self._configuration = configuration
         self._law = configuration.law
-        self._fit_gamma()
+        self._fit_memory()
         after = self._law.flags
-        if not before[law.ADAPTIVE] or before[law.LEVANT] != after[law.LEVANT]:
+        if not before[law.SENSITIVE] or before[law.LEVANT] != after[law.LEVANT]:
             self._levels[layout.HAT_SENSITIVITY :] = 0.0  # they were not carried along
 
-    def _fit_gamma(self) -> None:
-        c, gamma = self._law.scalars, self._memory[layout.GAMMA]
+    def _fit_memory(self) -> None:
+        flags, c = self._law.flags, self._law.scalars
+        gamma = self._memory[layout.GAMMA]
         self._memory[layout.GAMMA] = (
-            np.clip(gamma, c[law.MIN], c[law.MAX])
-            if self._law.flags[law.ADAPTIVE]
-            else FIXED_GAMMA
+            np.clip(gamma, c[law.MIN], c[law.MAX]) if flags[law.ADAPTIVE] else FIXED_GAMMA
         )
+        if not flags[law.SENSITIVE]:
+            self._levels[layout.HAT_SENSITIVITY :] = 0.0
 
     def reset(self) -> None:
         """Go back to the initial state; the next sample is the first."""

@@ -192,7 +192,7 @@ def solve(
     rows = np.empty((count, state.shape[1]))
     tape, offsets, kind, wave = system
     integrate(
-        *law, *make_work(levels.shape[1], depth),
+        *law, *make_work(law, depth),
         tape, offsets, kind, wave, np.zeros((2, len(z))), state, np.zeros((4, state.shape[1])),
         int(STAGES[index]), NODES[index], WEIGHTS[index], h, every, rows,
     )  # fmt: skip

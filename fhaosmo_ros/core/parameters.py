@@ -31,6 +31,13 @@ OBSERVER = (
         live=False,
     ),
     Parameter(
+        'unknown_input_derivatives', 0,
+        'Number k of derivatives of the unknown input that are estimated behind it, as further '
+        'levels (N = n + 1 + k): a smooth d is followed with less lag, and noise disturbs more. '
+        'Needs unknown_input.',
+        lower=0, upper=3, live=False,
+    ),
+    Parameter(
         'unknown_input_decay', 0.0,
         "Rate kappa of the observer's model of the unknown input, d' = -kappa d + what the "
         'innovations say; 0 assumes nothing. Greater where d comes and goes around 0: the '
@@ -53,19 +60,33 @@ OBSERVER = (
     Parameter(
         'scheme', 'implicit',
         'explicit: forward Euler (the paper). implicit: backward Euler, without the chatter that '
-        'a digital step makes.',
-        choices=('explicit', 'implicit'),
+        'a digital step makes. predict_correct (levant only): the model is followed to the new '
+        'sample by Runge-Kutta steps, then corrected as implicit does.',
+        choices=('explicit', 'implicit', 'predict_correct'),
+    ),
+    Parameter(
+        'prediction_step', 0.01,
+        'Longest Runge-Kutta step of predict_correct; a longer interval takes several. Well below '
+        "1 / rate of the model's fastest motion.",
+        unit='s', lower=1e-6, upper=10.0,
+    ),
+    Parameter(
+        'correction_period', 0.0,
+        'predict_correct: a sample corrects as if it stood for at most this time, usually the '
+        'sampling period, so that after a gap one noisy sample weighs no more than any other. 0: '
+        'it stands for all the time since the one before.',
+        unit='s', lower=0.0, upper=10.0,
     ),
     Parameter(
         'lambda', [740.0],
         'Correction factors lambda_i of the injection: |eps_i|^gamma psi_i(eps_i); levant: '
         '|eps_1|^(2 gamma (N - i) / N) psi_i(eps_1).',
-        lower=0.0, lower_open=True, upper=1e6, lengths=PER_LEVEL,
+        lower=0.0, lower_open=True, upper=1e15, lengths=PER_LEVEL,
     ),
     Parameter(
         'alpha', [155.0],
         'Gains alpha_i of the internal states. Not used by levant, which has none.',
-        lower=0.0, lower_open=True, upper=1e9, lengths=PER_LEVEL,
+        lower=0.0, lower_open=True, upper=1e15, lengths=PER_LEVEL,
     ),
     Parameter(
         'epsilon', 80.0,

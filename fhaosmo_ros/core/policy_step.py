@@ -2,12 +2,12 @@
 """The policy's steps (see policy.py): from one used sample to the next, also through a gap."""
 
 from fhaosmo_ros.core import policy_layout as at
+from fhaosmo_ros.core.flow import ahead, estimates, flow
 from fhaosmo_ros.core.kernels import innovations, step
-from fhaosmo_ros.core.law import DECAY
-from fhaosmo_ros.core.layout import GAMMA, Y
+from fhaosmo_ros.core.law import PREDICTING
+from fhaosmo_ros.core.layout import GAMMA, HAT, ROWS, Y
 from fhaosmo_ros.core.policy_data import is_spike
 from fhaosmo_ros.core.policy_time import restore, save, update_mean, WINDOW
-from fhaosmo_ros.core.prediction import advance, ahead, estimates
 from fhaosmo_ros.core.status import LEVEL_SHIFT, REJECTED, Status
 from fhaosmo_ros.core.tape import Floats, Ints
 from numba import njit
@@ -34,7 +34,8 @@ def step_over(
     Step to a sample `elapsed` later, through a gap in sub-steps; return the status word.
 
     In a gap the observer sees y as the model continues it from the last sample and the internal
-    estimates, plus a straight line that ends in the new sample.
+    estimates, plus a straight line that ends in the new sample. The scheme predict_correct follows
+    the model by itself, so it takes a gap in one step.
     """
     count = 1
     if ints[at.MAX_STEP]:
@@ -42,11 +43,14 @@ def step_over(
             count = min(-(-elapsed // ints[at.MAX_STEP]), MOST_SUB_STEPS)
     elif ints[at.INTERVALS] == WINDOW and elapsed > GAP_RATIO * reals[at.INTERVAL]:
         count = int(min(elapsed / reals[at.INTERVAL] + 0.5, MOST_SUB_STEPS))
-    h, decay = elapsed * NANOSECONDS / count, gains[DECAY, offsets.shape[0] - 3]
-    gamma, word, bend, modelled, z = memory[GAMMA], 0, 0.0, True, x[0]
+    is_gap = count > 1
+    if flags[PREDICTING]:
+        count = 1
+    h = elapsed * NANOSECONDS / count
+    gamma, word, bend, modelled, z = memory[GAMMA], 0, 0.0, True, x
     if count > 1 or reals[at.GATE] > 0.0:
-        z = np.empty(offsets.shape[0] - 1)
-        end = ahead(tape, offsets, m, stack, decay, levels, memory, z, h, u, count)
+        z = np.empty((ROWS, offsets.shape[0] - 1))
+        end = ahead(tape, offsets, m, stack, levels, memory, z, h, u, count)
         modelled = abs(end) <= reals[at.LIMIT]  # False for NaN
         if not modelled:
             end = memory[Y]
@@ -55,7 +59,7 @@ def step_over(
         bend = (y - end) / count
         estimates(levels, memory, z)
     ints[at.BRIDGED] = 0
-    if count > 1:
+    if is_gap:
         save(reals, levels, memory)
         ints[at.BRIDGED] = 1
         ints[at.BEFORE] = ints[at.LATEST]
@@ -66,8 +70,8 @@ def step_over(
         sample = y
         if k < count:
             if modelled:
-                advance(tape, offsets, m, stack, decay, z, h, u)
-            sample = z[0] + k * bend
+                flow(tape, offsets, m, stack, z, h, u)
+            sample = z[HAT, 0] + k * bend
         word = word & FLAGS | step(
             flags, gains, curves, scalars, tape, offsets, x, m, stack,
             levels, memory, sample, h, u, eps, row,
@@ -78,7 +82,7 @@ def step_over(
             break
     if not word & REJECTED:
         update_mean(ints, reals, elapsed)
-    elif count > 1:
+    elif is_gap:
         restore(reals, levels, memory)
         memory[Y] = y  # as where a single step fails
         word = word & FLAGS | innovations(scalars, levels, y, eps, row) << LEVEL_SHIFT

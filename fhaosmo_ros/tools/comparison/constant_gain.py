@@ -3,7 +3,7 @@
 The compiled recursion of every observer with a constant gain: predict by the model, correct by y.
 
     z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d
-    d' = d_1, ..., d_{m-1}' = -decay d_{m-1}
+    d' = d_1 - decay d, d_1' = d_2 - decay d_1, ..., d_{m-1}' = -decay d_{m-1}
     x(t_k) = prediction(t_k) + K (y_k - prediction_1(t_k))
 
 The prediction integrates the whole (nonlinear) model by Runge-Kutta steps, so these observers know
@@ -62,7 +62,9 @@ def run(
                         if stage > 0:
                             work[0, i] += reach * work[1 + stage, i]
                     for i in range(size):
-                        slope = work[0, i + 1] if i + 1 < size else -decay * work[0, i]
+                        slope = work[0, i + 1] if i + 1 < size else 0.0
+                        if i >= order:
+                            slope -= decay * work[0, i]
                         if i < order and offsets[i + 1] > offsets[i]:
                             phi, _ = evaluate(tape, offsets[i], offsets[i + 1], work, u[k], stack)
                             slope += phi

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tune a method for a sensor, and judge it on what the tuning has not seen."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import time
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from fhaosmo_ros.tools.comparison.methods import Method, Setting, Values
 from fhaosmo_ros.tools.comparison.ours import OUR_METHOD
 from fhaosmo_ros.tools.comparison.scores import Estimates, objective, Scores, scores
 from fhaosmo_ros.tools.comparison.sliding import SLIDING
-from fhaosmo_ros.tools.tuning.search import minimise
+from fhaosmo_ros.tools.tuning.search import Dimension, minimise
 import numpy as np
 
 REPEATS = 5
@@ -52,12 +52,28 @@ def tune(
     """Search a method's parameters; one without any is evaluated as it is."""
     space = list(method.space(setting))
     values: Values = {}
-    if space:
-        values = minimise(
-            lambda v: trial(method, setting, v, recordings)[0], space, trials, seed=seed, jobs=1
-        ).best
+
+    def judged(v: Values) -> float:
+        return trial(method, setting, v, recordings)[0]
+
+    if method.tune is not None:
+        values = method.tune(judged, setting, trials, seed)
+    elif len(space) == 1:
+        values = _scan(judged, space[0], trials)
+    elif space:
+        values = minimise(judged, space, trials, seed=seed, jobs=1).best
     value, readout = trial(method, setting, values, recordings)
     return Tuned(dict(values), readout or 'filtered', value)
+
+
+def _scan(judged: Callable[[Values], float], d: Dimension, trials: int) -> dict[str, float]:
+    """Try points all over the range of the only parameter, then closer ones around the best."""
+    coarse = max(1, 2 * trials // 3)
+    points = [d.start, *np.geomspace(d.low, d.high, coarse)][:coarse]
+    best = min(points, key=lambda x: judged({d.name: x}))
+    step = (d.high / d.low) ** (1.0 / max(coarse - 1, 1))
+    closer = np.geomspace(max(best / step, d.low), min(best * step, d.high), trials - coarse)
+    return {d.name: float(min([best, *closer], key=lambda x: judged({d.name: x})))}
 
 
 def judge(

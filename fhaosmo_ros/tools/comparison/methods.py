@@ -67,6 +67,9 @@ class Method(NamedTuple):
     prepare : callable
         From a setting and values to a run; raises ConfigurationError for values that make no
         observer.
+    tune : callable, optional
+        A search of its own: from an objective, a setting, a number of trials and a seed to
+        values.
 
     """
 
@@ -75,3 +78,4 @@ class Method(NamedTuple):
     linear: bool
     space: Callable[[Setting], tuple[Dimension, ...]]
     prepare: Callable[[Setting, Values], Run]
+    tune: Callable[[Callable[[Values], float], Setting, int, int], dict[str, float]] | None = None

@@ -28,13 +28,17 @@ from itertools import product
 from math import comb
 from typing import Any
 
+from fhaosmo_ros.core.differences import shares
 from fhaosmo_ros.core.family import Recording
+from fhaosmo_ros.core.fuzzy import curve, KNOTS, terms_of_level
+from fhaosmo_ros.tools.sampled_model import SampledModel
 import numpy as np
 from numpy.typing import NDArray
 
 OMEGAS = tuple(float(w) for w in np.geomspace(2.0, 200.0, 9))
 KAPPAS = (1.0, 5.0, 25.0)
 ZETAS = (0.7, 1.5, 4.0)
+SMALLEST = 1e-12
 OPEN = 100.0
 """epsilon, in the largest half-width: every level runs but for a start far away."""
 
@@ -89,6 +93,51 @@ def candidates(
                 'fuzzy_widths': _plain(widths),
                 'epsilon': OPEN * float(widths.max()),
             }
+
+
+def kalman_like(
+    model: SampledModel, bandwidth: float, width: float, small: float, gamma: float
+) -> NDArray[np.float64]:
+    """
+    Return lambda_1 .. lambda_N with which predict_correct is a Kalman filter (D 18).
+
+    For innovations of the size `small` the corrections are those of the steady-state Kalman filter
+    of the model, linearised at rest, whose last level is driven by white noise. For a chain of N
+    integrators and (intensity / density of the noise on y) = bandwidth^(2 N) its poles are
+    Butterworth's, at the distance `bandwidth`.
+
+    Parameters
+    ----------
+    model : SampledModel
+        With the observer's model of d.
+    bandwidth : float
+        rad/s.
+    width : float
+        Half-width of every level, unit of y.
+    small : float
+        Innovations that noise alone makes, unit of y.
+    gamma : float
+
+    Raises
+    ------
+    ConfigurationError
+        The Riccati equation has no solution in floating-point numbers.
+
+    """
+    n, h = model.size, model.period
+    k = model.kalman([h * bandwidth ** (2 * n)])
+    # eps = (1 - k_1) b after the correction: what every injection is a function of.
+    wanted = k / max(1.0 - k[0], SMALLEST)
+    injections = np.zeros(n)
+    share = shares(n)
+    for i in reversed(range(n)):  # wanted_i = sum_j beta_ji h^(j-i+1) v_j  (D 17)
+        behind = sum(share[j, i] * h ** (j - i + 1) * injections[j] for j in range(i + 1, n))
+        injections[i] = (wanted[i] - behind) / h
+    level = np.arange(1, n + 1)
+    power = 2.0 * gamma * (n - level) / n  # D 11
+    grid = np.linspace(0.0, width, KNOTS)
+    psi = [np.interp(small, grid, curve(terms_of_level(i), 'triangle', True)) for i in level]
+    return np.asarray(injections * small ** (1.0 - power) / psi)
 
 
 def second_derivatives(recordings: Sequence[Recording], levels: int) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Gains of the linear peers, by python-control: steady-state Kalman filter and pole placement.
+Gains of linear observers, by python-control: steady-state Kalman filter and pole placement.
 
 All gains are for a filter that predicts to t_k and then corrects with y_k itself. States are
 scaled by powers of a time, because the Riccati equation and the placement of poles are badly
@@ -34,7 +34,7 @@ class SampledModel:
     integrators_only : bool
         Take Phi = 0, as the gains of an extended state observer do.
     decay : float
-        Rate (1/s) at which the chain's last state decays.
+        Rate (1/s) at which the chain's states decay: all of them, so that d is a Matern process.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class SampledModel:
         self.period = period
         self._scale = period ** np.arange(self.size)
         self._rates = np.eye(self.size, k=1)
-        self._rates[-1, -1] = -decay
+        self._rates[range(model.order, self.size), range(model.order, self.size)] = -decay
         jacobian = model.jacobian(np.zeros(model.order))
         fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(model.order, k=1))))
         self.resolution = 0.1 / max(float(fastest), 1e-9)
@@ -83,8 +83,7 @@ class SampledModel:
         spectrum = np.zeros(self.size)
         for i, value in enumerate(intensities):
             spectrum[self.size - 1 - i] = value
-        noise = self._accumulated(np.diag(spectrum))
-        noise = noise * np.outer(self._scale, self._scale)
+        noise = self._accumulated(spectrum)
         # scipy's eigenvalues split into stable and unstable ones, or control says that they don't.
         try:
             _, p, _ = control.dlqe(self.a, np.eye(self.size), self._c, noise, np.eye(1))
@@ -94,11 +93,13 @@ class SampledModel:
 
     def _accumulated(self, spectrum: Matrix) -> Matrix:
         """Return the covariance that white noise builds up over a period (Van Loan)."""
-        n = self.size
+        n, rates = self.size, self._scaled(self._rates) * self.period
+        spectrum = spectrum * self._scale**2 * self.period
+        largest = float(spectrum.max()) or 1.0
         block = np.zeros((2 * n, 2 * n))
-        block[:n, :n], block[:n, n:], block[n:, n:] = -self._rates, spectrum, self._rates.T
-        exponential = expm(block * self.period)
-        covariance = exponential[n:, n:].T @ exponential[:n, n:]
+        block[:n, :n], block[:n, n:], block[n:, n:] = -rates, np.diag(spectrum / largest), rates.T
+        exponential = expm(block)
+        covariance = largest * exponential[n:, n:].T @ exponential[:n, n:]
         return 0.5 * (covariance + covariance.T)
 
     def placed(self, poles: Sequence[complex]) -> Matrix:
