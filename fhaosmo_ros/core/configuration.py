@@ -135,7 +135,7 @@ class ObserverConfiguration:
         gains[law.INVERSE_WIDTH] = 1.0 / np.array(widths)
         decay, n = p['unknown_input_decay'], self.model.order
         gains[law.DECAY, n - 1 : -1 if p['unknown_input'] else None] = (
-            decay  # D 15, internal states
+            decay  # D 17, internal states
         )
         tape, offsets = self.model.with_unknown_input(decay, p['unknown_input_derivatives'])
         scalars = np.zeros(law.SCALARS)

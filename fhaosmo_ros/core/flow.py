@@ -16,7 +16,7 @@ def flow(
     tape: Floats, offsets: Ints, m: Floats, stack: Floats, x: Floats, h: float, u: float
 ) -> None:
     """
-    Integrate D 1, D 17 and their derivatives along gamma over `h` in place, by a step of Runge-Kutta 4.
+    Integrate D 1 and D 17 over `h` in place, by a Runge-Kutta step, with their gamma derivatives.
 
     Parameters
     ----------

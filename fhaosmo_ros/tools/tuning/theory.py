@@ -99,7 +99,7 @@ def kalman_like(
     model: SampledModel, bandwidth: float, width: float, small: float, gamma: float
 ) -> NDArray[np.float64]:
     """
-    Return lambda_1 .. lambda_N with which predict_correct is a Kalman filter (D 18).
+    Return lambda_1 .. lambda_N with which predict_correct is a Kalman filter (D 19).
 
     For innovations of the size `small` the corrections are those of the steady-state Kalman filter
     of the model, linearised at rest, whose last level is driven by white noise. For a chain of N
@@ -130,7 +130,7 @@ def kalman_like(
     wanted = k / max(1.0 - k[0], SMALLEST)
     injections = np.zeros(n)
     share = shares(n)
-    for i in reversed(range(n)):  # wanted_i = sum_j beta_ji h^(j-i+1) v_j  (D 17)
+    for i in reversed(range(n)):  # wanted_i = sum_j beta_ji h^(j-i+1) v_j  (D 19)
         behind = sum(share[j, i] * h ** (j - i + 1) * injections[j] for j in range(i + 1, n))
         injections[i] = (wanted[i] - behind) / h
     level = np.arange(1, n + 1)
