@@ -134,9 +134,8 @@ class ObserverConfiguration:
         gains[law.ALPHA] = self._per_level('alpha')
         gains[law.INVERSE_WIDTH] = 1.0 / np.array(widths)
         decay, n = p['unknown_input_decay'], self.model.order
-        gains[law.DECAY, n - 1 : -1 if p['unknown_input'] else None] = (
-            decay  # D 17, internal states
-        )
+        modelled = slice(n - 1, -1 if p['unknown_input'] else None)  # d, d', .. but not theta
+        gains[law.DECAY, modelled] = decay  # D 17, internal states
         tape, offsets = self.model.with_unknown_input(decay, p['unknown_input_derivatives'])
         scalars = np.zeros(law.SCALARS)
         scalars[law.EPSILON] = np.inf if self.levant else p['epsilon']  # no gates
