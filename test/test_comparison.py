@@ -11,7 +11,7 @@ import sys
 from fhaosmo_ros.core import Family
 from fhaosmo_ros.core.family import Recording
 from fhaosmo_ros.tools import paper_document
-from fhaosmo_ros.tools.comparison import cells, command, results, tables
+from fhaosmo_ros.tools.comparison import cells, command, results, steps_bound, tables
 from fhaosmo_ros.tools.comparison.cells import HELD_OUT, PLANTS, Sensor, sensors
 from fhaosmo_ros.tools.comparison.evaluation import evaluate, judge, METHODS, trial, tune, Tuned
 from fhaosmo_ros.tools.comparison.ours import OURS
@@ -116,7 +116,7 @@ def test_noise_is_absolute_on_the_papers_plant_and_relative_elsewhere():
 def test_timings_do_what_they_say():
     even, jitter, dropouts = (
         Sensor('paper', ('mix',), 1e-3, 1000.0, timing).training(1)[0].t
-        for timing in cells.TIMINGS
+        for timing in ('even', 'jitter', 'dropouts')
     )
     np.testing.assert_allclose(np.diff(even), 1e-3, rtol=1e-6)
     assert np.std(np.diff(jitter)) == pytest.approx(np.sqrt(2.0) * 0.2e-3, rel=0.1)
@@ -135,6 +135,37 @@ def test_every_method_estimates_a_slow_d_without_noise(name):
     assert readout in ('filtered', 'internal')
     # The paper's gains are not made for this plant.
     assert value < (3.0 if name.startswith('paper') else 0.6)
+
+
+def test_posterior_mean_is_better_than_a_tuned_kalman_filter_and_near_the_truth():
+    sensor = Sensor('paper', ('steps',), 1e-3, 100.0)
+    kalman = evaluate(sensor, KALMAN, 1, 40)[1][0].d
+    known = steps_bound.bound(sensor)
+    assert 0.7 * kalman < known < 0.95 * kalman
+
+
+def test_posterior_mean_of_a_constant_d_is_least_squares():
+    """With steps that never come it is one Kalman filter without process noise."""
+    setting = SENSOR.setting()
+    y = np.random.default_rng(4).standard_normal(1000) * setting.noise
+    found = steps_bound.posterior_means(setting, y, 1, 1e9)
+    t = np.arange(len(y)) * setting.period
+    decayed = np.exp(-t)  # z3' = -z3 + d
+    seen = np.column_stack([np.ones_like(t), t, decayed - 1 + t, t**2 / 2 - t + 1 - decayed])
+    prior = np.array([1.0, 1.0, 1.0, setting.size])
+    rows = np.vstack([seen[1:] / setting.noise, np.diag(1.0 / prior)])
+    right = np.concatenate([y[1:] / setting.noise, [y[0], 0.0, 0.0, 0.0]])
+    assert found[-1] == pytest.approx(np.linalg.lstsq(rows, right, rcond=None)[0][3], rel=1e-6)
+
+
+def test_outliers_are_as_asked():
+    even, hit = (
+        Sensor('paper', ('mix',), 1e-3, 1000.0, timing).training(1)[0]
+        for timing in ('even', 'outliers')
+    )
+    np.testing.assert_array_equal(hit.z, even.z)
+    wrong = np.abs(hit.y - hit.z[:, 0]) > 6e-3
+    assert np.mean(wrong) == pytest.approx(0.009, rel=0.3)  # a tenth of the outliers is small
 
 
 def test_tuning_is_a_function_of_its_seed_and_does_not_get_worse():
@@ -177,7 +208,7 @@ def make_results():
         Entry(SENSOR, name, Tuned({'a': 0.1}, 'filtered', 0.5), [Scores(k + 1.0, 2, math.inf, 3)])
         for k, name in enumerate(METHODS)
     ]
-    return Results(entries, dict.fromkeys(METHODS, 1e-7), 3, 1)
+    return Results(entries, dict.fromkeys(METHODS, 1e-7), 3, 1, {SENSOR: 0.7})
 
 
 def test_results_survive_a_file(tmp_path):

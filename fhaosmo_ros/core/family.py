@@ -118,6 +118,9 @@ class Family:
                 f'an RMS of {p["rms_of_d"]:g}, got infinite ones (recording {number})'
             )
         y = z[:, 0] + p['noise_std'] * random.standard_normal(len(t))
+        if p['outliers'] > 0.0:
+            hit = random.uniform(size=len(t)) < p['outliers']
+            y[hit] += p['outlier_std'] * random.standard_normal(np.count_nonzero(hit))
         return Recording(t, quantised(y, p['quantisation']), u, z, d, shape)
 
     def _times(self, random: Generator) -> tuple[Floats, Floats]:

@@ -61,6 +61,15 @@ FAMILY = (
         'dropout_length', 1.0, 'Mean number of samples that are lost one after the other.',
         lower=1.0, upper=1e6, live=False,
     ),
+    Parameter(
+        'outliers', 0.0, 'Share of the samples that are outliers.', lower=0.0, upper=1.0,
+        live=False,
+    ),
+    Parameter(
+        'outlier_std', 1.0,
+        'Standard deviation of what an outlier adds to the noise of its sample (unit of y).',
+        lower=0.0, upper=1e9, live=False,
+    ),
 )  # fmt: skip
 
 FAMILY_PARAMETERS = ParameterTable(MODEL, SHARED, FAMILY)

@@ -23,11 +23,14 @@ TIMINGS: dict[str, dict[str, float]] = {
     'even': {},
     'jitter': {'period_jitter': 0.2},  # in periods
     'dropouts': {'dropout': 0.1, 'dropout_length': 0.05},  # the length in seconds
+    'outliers': {'outliers': 0.01, 'outlier_std': 50.0},  # in standard deviations of the noise
 }
 STEP = 5e-4
 """Of the simulations, in seconds: Runge-Kutta steps whose error is far below any estimate's."""
 TRAINING_SEED, HELD_OUT_SEED = 1, 1001
 HELD_OUT = 6
+FEW_SAMPLES, MORE = 300.0, 3
+"""Below this rate (Hz) the training has this many times the recordings."""
 
 
 class Disturbance(NamedTuple):
@@ -122,8 +125,10 @@ class Sensor(NamedTuple):
 
     @lru_cache(maxsize=2)  # noqa: B019  (a named tuple is its own key; few are kept)
     def training(self, count: int) -> list[Recording]:
-        """Return the recordings that the tuning sees."""
+        """Return the recordings that the tuning sees, more of them where they have few samples."""
         shapes = self.case.disturbances[self.disturbances[0]].shapes
+        if self.rate < FEW_SAMPLES:
+            count *= MORE
         return self._family(shapes, self.disturbances[0]).recordings(count, TRAINING_SEED)
 
     @lru_cache(maxsize=6)  # noqa: B019
@@ -143,6 +148,8 @@ class Sensor(NamedTuple):
             timing['period_jitter'] /= self.rate
         if 'dropout_length' in timing:
             timing['dropout_length'] *= self.rate
+        if 'outlier_std' in timing:
+            timing['outlier_std'] *= self._noise()
         return Family(
             family_values(self.plant)
             | {
@@ -219,6 +226,6 @@ def sensors(quick: bool = False) -> list[Sensor]:
                 Sensor(plant, tuple(PLANTS[plant].disturbances), noise, rate)
                 for plant in ('pendulum', 'motor')
             ]
-    for timing in ('jitter', 'dropouts'):
+    for timing in ('jitter', 'dropouts', 'outliers'):
         chosen += [Sensor('paper', (name,), 1e-3, 1000.0, timing) for name in ('mix', 'steps')]
     return chosen

@@ -2,7 +2,7 @@
 """Compare the observer with what people would use instead, all tuned by the same rules."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import as_completed, ProcessPoolExecutor
 import multiprocessing
 import multiprocessing.connection
@@ -12,10 +12,11 @@ import signal
 import sys
 import threading
 import time
+from typing import Any
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.tools import paper_document as document
-from fhaosmo_ros.tools.comparison import figures, results, tables
+from fhaosmo_ros.tools.comparison import figures, results, steps_bound, tables
 from fhaosmo_ros.tools.comparison.cells import Sensor, sensors
 from fhaosmo_ros.tools.comparison.evaluation import evaluate, METHODS, seconds_a_sample
 from fhaosmo_ros.tools.comparison.results import Entry, Results
@@ -26,6 +27,8 @@ DOCS = Path(__file__).resolve().parents[3] / 'docs'
 FOLDER, RESULTS = 'comparison', 'results.json'
 TRIALS, QUICK_TRIALS = 200, 15
 TRAINING, QUICK_TRAINING = 4, 1
+Work = tuple[Callable[..., Any], tuple[Any, ...], tuple[Any, ...]]
+"""Function, the arguments that name the result, further arguments."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -100,20 +103,28 @@ def _default_output(quick: bool) -> Path:
 def run(chosen: list[Sensor], trials: int, training: int, jobs: int) -> Results:
     """Tune and judge all methods for these sensors, in `jobs` processes."""
     tasks = [(sensor, name) for sensor in chosen for name in METHODS]
-    entries = {}
-    with tqdm(total=len(tasks), unit='tuning', desc='compare') as bar:
-        for task, entry in _evaluated(tasks, trials, training, jobs):
-            entries[task] = entry
+    known = [sensor for sensor in chosen if steps_bound.applies(sensor)]
+    entries, bounds = {}, {}
+    work: list[Work] = [(_task, task, (trials, training)) for task in tasks]
+    work += [(steps_bound.bound, (sensor,), ()) for sensor in known]
+    with tqdm(total=len(work), unit='tuning', desc='compare') as bar:
+        for what, key, found in _done(work, jobs):
+            if what is _task:
+                entries[key] = found
+            else:
+                bounds[key[0]] = found
             bar.update()
     seconds = {
         name: seconds_a_sample(name, entries[chosen[0], name].tuned, chosen[0]) for name in METHODS
     }
-    return Results([entries[task] for task in tasks], seconds, trials, training)
+    return Results(
+        [entries[task] for task in tasks], seconds, trials, training,
+        {sensor: bounds[sensor] for sensor in known},
+    )  # fmt: skip
 
 
-def _evaluated(
-    tasks: list[tuple[Sensor, str]], trials: int, training: int, jobs: int
-) -> Iterator[tuple[tuple[Sensor, str], Entry]]:
+def _done(work: list[Work], jobs: int) -> Iterator[tuple[Any, Any, Any]]:
+    """Call functions in processes; yield function, key and result as they come."""
     # One thread each for linear algebra: for matrices as small as these more only wait for each
     # other, and the processes already use all cores.
     for variable in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
@@ -124,10 +135,10 @@ def _evaluated(
         # The children inherit this: Ctrl-C reaches them too, and is the parent's business.
         # Blocked, not ignored: one that comes meanwhile is not lost.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        futures = {pool.submit(_task, *task, trials, training): task for task in tasks}
+        futures = {pool.submit(call, *key, *rest): (call, key) for call, key, rest in work}
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for future in as_completed(futures):
-            yield futures[future], future.result()
+            yield *futures[future], future.result()
     finally:
         # After Ctrl-C the tunings that run are not worth waiting for.
         for process in (pool._processes or {}).values():

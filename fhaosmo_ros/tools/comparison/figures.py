@@ -6,6 +6,7 @@ from pathlib import Path
 
 from fhaosmo_ros.tools.comparison.cells import NOISES, PLANTS, Sensor
 from fhaosmo_ros.tools.comparison.evaluation import estimates, METHODS
+from fhaosmo_ros.tools.comparison.linear import LINEAR_LIMIT
 from fhaosmo_ros.tools.comparison.ours import OURS
 from fhaosmo_ros.tools.comparison.results import Cell, Results, Table
 from fhaosmo_ros.tools.comparison.verdicts import KALMAN, verdicts
@@ -23,6 +24,7 @@ STYLES: dict[str, tuple[str, str, str]] = {
     'Kalman': (BLUE, 'o', '-'),
     'Kalman, ramp': (SKY, 'D', '--'),
     'Kalman, decaying': (BLUE, 'h', ':'),
+    LINEAR_LIMIT: (BLACK, 'd', '-.'),
     'ESO': (GREEN, '^', '-.'),
     'Luenberger': (GREEN, 'v', ':'),
     'Levant, explicit': (PINK, 's', '--'),

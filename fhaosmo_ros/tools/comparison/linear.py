@@ -7,15 +7,19 @@ from functools import lru_cache
 from fhaosmo_ros.core.compile_cache import compile_cache
 from fhaosmo_ros.core.family import Recording
 from fhaosmo_ros.core.model import TriangularModel
-from fhaosmo_ros.tools.comparison.methods import Method, Run, Setting, Values
+from fhaosmo_ros.tools.comparison.methods import DERIVATIVES, Method, Run, Setting, Values
 from fhaosmo_ros.tools.comparison.scores import Estimates
 from fhaosmo_ros.tools.sampled_model import pair, SampledModel
-from fhaosmo_ros.tools.tuning.search import Dimension
+from fhaosmo_ros.tools.tuning.search import Dimension, minimise
 import numpy as np
 
 with compile_cache():
     from fhaosmo_ros.tools.comparison.constant_gain import run
 
+LINEAR_LIMIT = 'Kalman, Matern'
+"""Not a rival: what our observer is for small innovations. It shows what the rest of it adds."""
+REACH, SLOWER = 10.0, (0.8, 0.6, 0.5, 0.42)
+"""How far a search for the bandwidth goes, and where it starts with each number of derivatives."""
 LONGEST = 1.5
 """Nominal periods that one step of a prediction may take."""
 Gain = Callable[[SampledModel, Values], np.ndarray]
@@ -38,10 +42,10 @@ def _bandwidth(name: str, setting: Setting) -> Dimension:
 
 
 def _prepare(
-    chain: int, gain: Gain, integrators_only: bool = False
+    shortest: int, gain: Gain, integrators_only: bool = False
 ) -> Callable[[Setting, Values], Run]:
     def prepare(setting: Setting, values: Values) -> Run:
-        model = setting.model
+        model, chain = setting.model, shortest + int(values.get('derivatives', 0))
         decay = values.get('decay', 0.0)
         sampled = _sampled(model.phi, setting.period, chain, integrators_only, decay)
         k = gain(sampled, values)
@@ -99,6 +103,31 @@ def _luenberger_space(setting: Setting) -> tuple[Dimension, ...]:
     return tuple(space)
 
 
+def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...]:
+    """Return bandwidth and decay of a filter whose d is a Matern process."""
+    speed, fastest = setting.speed * SLOWER[derivatives], 5.0 / setting.period
+    return (
+        Dimension('bandwidth', speed / REACH, min(speed * REACH, fastest), speed),
+        Dimension('decay', 0.03, 30.0, 1.0),
+    )
+
+
+def _tune_matern(
+    objective: Callable[[Values], float], setting: Setting, trials: int, seed: int
+) -> dict[str, float]:
+    """Search with each number of derivatives of d, as ours does first."""
+    best: tuple[float, dict[str, float]] = (float('inf'), {})
+    for k in DERIVATIVES:
+        fixed = {'derivatives': float(k)}
+        found = minimise(
+            lambda v, fixed=fixed: objective(fixed | v), matern_space(setting, k),
+            max(1, trials // len(DERIVATIVES)), seed=seed, jobs=1,
+        )  # fmt: skip
+        if not best[1] or found.value < best[0]:
+            best = found.value, fixed | found.best
+    return best[1]
+
+
 LINEAR = (
     Method(
         'Kalman', 'steady-state Kalman filter, d a random walk', True,
@@ -111,8 +140,11 @@ LINEAR = (
     ),
     Method(
         'Kalman, decaying', 'steady-state Kalman filter, d a random walk that decays', True,
-        lambda s: (_bandwidth('bandwidth', s), Dimension('decay', 1e-3, 1e2, 0.3)),
-        _prepare(1, _kalman),
+        matern_space, _prepare(1, _kalman),
+    ),
+    Method(
+        LINEAR_LIMIT, 'steady-state Kalman filter, d a Matern process as in ours', True,
+        matern_space, _prepare(1, _kalman), _tune_matern,
     ),
     Method(
         'ESO', 'high-gain (extended state) observer, all poles at one place', True,

@@ -9,6 +9,8 @@ from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.tools.comparison.scores import Estimates
 from fhaosmo_ros.tools.tuning.search import Dimension
 
+DERIVATIVES = (0, 1, 2, 3)
+"""Of d, that a model of it may have."""
 Values = Mapping[str, float]
 Run = Callable[[Recording], dict[str, Estimates]]
 """Estimates by readout: one method may offer several (filtered and internal states)."""

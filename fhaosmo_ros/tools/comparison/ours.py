@@ -9,9 +9,11 @@ and a factor for each gain and width.
 """
 
 from collections.abc import Callable, Mapping
+from itertools import product
 from typing import Any
 
-from fhaosmo_ros.tools.comparison.methods import Method, Setting, Values
+from fhaosmo_ros.tools.comparison.linear import matern_space
+from fhaosmo_ros.tools.comparison.methods import DERIVATIVES, Method, Setting, Values
 from fhaosmo_ros.tools.comparison.sliding import prepared
 from fhaosmo_ros.tools.sampled_model import SampledModel
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise
@@ -19,47 +21,43 @@ from fhaosmo_ros.tools.tuning.theory import kalman_like
 import numpy as np
 
 OURS = 'ours'
-DERIVATIVES = (0, 1, 2, 3)
 SMALLEST_GAMMA = 1e-4
 START_GAMMA = 3e-3
 START_KAPPA = 300.0
+SMALLEST_SPREAD, START_SPREAD = 1.6, 2.0
+"""
+Ratio of a level's half-width to the next one's. Gains that saturate all at once, by the same
+factor, leave an unstable observer: three or more integrators are only conditionally stable. By
+the describing functions of saturations, Butterworth's gains with this ratio or a larger one are
+stable (N <= 7) for innovations up to four times the first half-width.
+"""
+KAPPAS = (8.0, 4.0, 2.0)
+"""Half-widths to try, in what noise and start make of the innovations."""
 FIRST_SHARE = 0.1
+"""Of the trials: for bandwidth and decay alone, with each number of derivatives of d."""
+NEAR = 3.0
+"""How far the last search goes, as a factor to both sides."""
 WORTH = 0.99
 """More parameters have to bring at least this factor on the training, or they fit its noise."""
-REACH, NEAR = 30.0, 3.0
-"""Factors to both sides of a start: of the first searches, and of the last one."""
-"""Of the trials: for bandwidth and decay alone, with each number of derivatives of d."""
-
-
-def _general(setting: Setting) -> list[Dimension]:
-    """Return what matters most: how fast, and what d is like."""
-    speed, fastest = setting.speed, 5.0 / setting.period
-    return [
-        Dimension('bandwidth', speed / REACH, min(speed * REACH, fastest), speed),
-        Dimension('decay', 1e-3, 1e2, 0.3),
-    ]
 
 
 def _refined(setting: Setting, best: Values) -> list[Dimension]:
     """Return everything, near the best point so far."""
     levels = setting.model.order + 1 + int(best['derivatives'])
-    factors = {f'{name}_{i + 1}': 1.0 for name in ('lambda', 'width') for i in range(levels)}
+    factors = {f'lambda_{i + 1}': 1.0 for i in range(levels)}
     starts = {name: best[name] for name in ('bandwidth', 'decay')} | factors
     return [
         *(Dimension(name, x / NEAR, x * NEAR, x) for name, x in starts.items()),
-        Dimension('kappa', 0.1, 1e4, START_KAPPA),
-        Dimension('gamma', SMALLEST_GAMMA, 1.0, START_GAMMA),
+        Dimension('spread', SMALLEST_SPREAD, 10.0, START_SPREAD),
+        Dimension('kappa', 0.5, 1e4, best.get('kappa', START_KAPPA)),
+        Dimension('gamma', SMALLEST_GAMMA, 1.0, best.get('gamma', START_GAMMA)),
     ]
 
 
 def _space(setting: Setting) -> tuple[Dimension, ...]:
     """Return what is tuned at least: with d as it is, without derivatives."""
-    general = {d.name: d.start for d in _general(setting)}
+    general = {d.name: d.start for d in matern_space(setting)}
     return tuple(_refined(setting, {'derivatives': 0.0} | general))
-
-
-def _series(values: Values, name: str, levels: int) -> np.ndarray:
-    return np.array([values.get(f'{name}_{i + 1}', 1.0) for i in range(levels)])
 
 
 def _parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
@@ -68,9 +66,12 @@ def _parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
     bandwidth, gamma = values['bandwidth'], values.get('gamma', START_GAMMA)
     # Wide enough for the start, whose innovations are about a period's worth of z_2's error.
     width = values.get('kappa', START_KAPPA) * (setting.noise + setting.size * setting.period)
+    # Levels further from d saturate later, so that what is left of the gains is always stable.
+    widths = width * values.get('spread', START_SPREAD) ** np.arange(levels - 1, -1, -1.0)
     small = max(setting.noise, 1e-3 * width)
     model = SampledModel(setting.model, setting.period, 1 + derivatives, decay=values['decay'])
-    gain = kalman_like(model, bandwidth, width, small, gamma)
+    gain = kalman_like(model, bandwidth, widths, small, gamma)
+    factors = np.array([values.get(f'lambda_{i + 1}', 1.0) for i in range(levels)])
     return {
         'structure': 'levant',
         'scheme': 'predict_correct',
@@ -81,35 +82,59 @@ def _parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
         'gamma_min': SMALLEST_GAMMA,
         'unknown_input_derivatives': derivatives,
         'unknown_input_decay': values['decay'],
-        'lambda': (_series(values, 'lambda', levels) * gain).clip(1e-12, 1e15),
-        'fuzzy_widths': (_series(values, 'width', levels) * width).clip(1e-12, 1e12),
+        'lambda': (factors * gain).clip(1e-12, 1e15),
+        'fuzzy_widths': widths.clip(1e-12, 1e12),
     }
+
+
+class _Search:
+    """The best values so far, and the trials that are left."""
+
+    def __init__(self, objective: Callable[[Values], float], trials: int, seed: int) -> None:
+        self._objective, self._seed = objective, seed
+        self.left = trials
+        self.best: dict[str, float] = {}
+        self._value = float('inf')
+
+    def minimise(self, fixed: dict[str, float], space: list[Dimension], trials: int) -> None:
+        trials = min(trials, self.left)
+        if trials:
+            self.left -= trials
+            found = minimise(
+                lambda v: self._objective(fixed | v), space, trials, seed=self._seed, jobs=1
+            )
+            self._take(fixed | found.best, found.value)
+
+    def try_out(self, values: dict[str, float]) -> None:
+        if self.left:
+            self.left -= 1
+            self._take(values, self._objective(values))
+
+    def _take(self, values: dict[str, float], value: float) -> None:
+        if not self.best or value < WORTH * self._value:
+            self.best, self._value = values, value
 
 
 def _tune(
     objective: Callable[[Values], float], setting: Setting, trials: int, seed: int
 ) -> dict[str, float]:
-    """Choose the number of derivatives, then refine everything from the best point so far."""
-    each = max(1, int(FIRST_SHARE * trials))
-    best, value = {'derivatives': 0.0}, float('inf')
-    for derivatives in DERIVATIVES:
-        best, value = _better(
-            objective, {'derivatives': float(derivatives)}, _general(setting), each, seed,
-            best, value,
-        )  # fmt: skip
-    rest = trials - each * len(DERIVATIVES)
-    if rest > 0:
-        fixed = {'derivatives': best['derivatives']}
-        best, value = _better(objective, fixed, _refined(setting, best), rest, seed, best, value)
-    return best
-
-
-def _better(
-    objective: Callable[[Values], float], fixed: dict[str, float], space: list[Dimension],
-    trials: int, seed: int, best: dict[str, float], value: float,
-) -> tuple[dict[str, float], float]:  # fmt: skip
-    found = minimise(lambda v: objective(fixed | v), space, trials, seed=seed, jobs=1)
-    return (fixed | found.best, found.value) if found.value < WORTH * value else (best, value)
+    """Choose the number of derivatives, then the shape, then refine everything near the best."""
+    search = _Search(objective, trials, seed)
+    for k in DERIVATIVES:
+        share = max(1, int(FIRST_SHARE * trials))
+        search.minimise({'derivatives': float(k)}, list(matern_space(setting, k)), share)
+    linear = search.best
+    # Innovations that are cut off let the observer be faster: where there are outliers, as fast as
+    # without them.
+    speed, slow = setting.speed, linear['decay']
+    starts = [(linear['bandwidth'], slow), (0.7 * speed, slow), (0.7 * speed, 2.0), (speed, 2.0)]
+    orders = sorted({0.0, linear['derivatives']})
+    for k, kappa, (bandwidth, decay) in product(orders, KAPPAS, starts):
+        values = {'derivatives': k, 'kappa': kappa, 'bandwidth': bandwidth, 'decay': decay}
+        search.try_out(values)
+    fixed = {'derivatives': search.best['derivatives']}
+    search.minimise(fixed, _refined(setting, search.best), search.left)
+    return search.best
 
 
 OUR_METHOD = Method(

@@ -48,6 +48,8 @@ class Results(NamedTuple):
         Time a sample by method.
     trials, training : int
         Trials of each tuning, and recordings that each saw.
+    bounds : dict
+        What can be known of steps at all, by sensor; see steps_bound.py.
 
     """
 
@@ -55,6 +57,7 @@ class Results(NamedTuple):
     seconds: dict[str, float]
     trials: int
     training: int
+    bounds: dict[Sensor, float]
 
     def table(self, methods: Sequence[str]) -> Table:
         """Return the scores by cell and method."""
@@ -97,6 +100,7 @@ def save(results: Results, path: Path) -> None:
         'trials': results.trials,
         'training_recordings': results.training,
         'seconds_a_sample': results.seconds,
+        'bounds': [{**s._asdict(), 'd': bound} for s, bound in results.bounds.items()],
         'entries': rows,
     }
     text = json.dumps(_finite(data), indent=None, separators=(',', ':'), allow_nan=False)
@@ -108,13 +112,20 @@ def load(path: Path) -> Results:
     data = json.loads(path.read_text(encoding='utf-8'))
     entries = []
     for row in data['entries']:
-        sensor = Sensor(
-            row['plant'], tuple(row['disturbances']), row['noise'], row['rate'], row['timing']
-        )
+        sensor = _sensor(row)
         tuned = Tuned(row['values'], row['readout'], _number(row['training']))
         judged = [Scores(*(_number(s[k]) for k in Scores._fields)) for s in row['scores']]
         entries.append(Entry(sensor, row['method'], tuned, judged))
-    return Results(entries, data['seconds_a_sample'], data['trials'], data['training_recordings'])
+    bounds = {_sensor(row): row['d'] for row in data['bounds']}
+    return Results(
+        entries, data['seconds_a_sample'], data['trials'], data['training_recordings'], bounds
+    )
+
+
+def _sensor(row: dict[str, Any]) -> Sensor:
+    return Sensor(
+        row['plant'], tuple(row['disturbances']), row['noise'], row['rate'], row['timing']
+    )
 
 
 def _number(x: float | None) -> float:

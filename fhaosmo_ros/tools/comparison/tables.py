@@ -6,11 +6,13 @@ from itertools import groupby
 import math
 from statistics import geometric_mean
 
+from fhaosmo_ros.tools.comparison.cells import MORE
 from fhaosmo_ros.tools.comparison.evaluation import METHODS
+from fhaosmo_ros.tools.comparison.linear import LINEAR_LIMIT
 from fhaosmo_ros.tools.comparison.ours import OURS
 from fhaosmo_ros.tools.comparison.results import Cell, Results, Table
 from fhaosmo_ros.tools.comparison.scores import Scores
-from fhaosmo_ros.tools.comparison.verdicts import Verdict, verdicts
+from fhaosmo_ros.tools.comparison.verdicts import KALMAN, Verdict, verdicts
 
 USELESS = 1.0
 """From here on an estimate of d is no better than 0."""
@@ -39,6 +41,8 @@ def texts(results: Results) -> dict[str, str]:
         'methods': _methods(results, table),
         'verdicts': verdict_table(judged),
         'better': _better(table),
+        'limit': _limit(table),
+        'bound': _bound(results, table),
         'ratios': _ratios(judged),
     }
     return parts | {name: _scores(table, title, read) for name, (title, read) in MEASURES.items()}
@@ -73,7 +77,8 @@ def _setup(results: Results) -> str:
     sensors = {cell.sensor for cell in cells}
     return (
         f'{len(cells)} cells, {len(sensors)} tunings of each method; each tuning: '
-        f'{results.trials} trials on {results.training} recordings of 20 s.'
+        f'{results.trials} trials on {results.training} recordings of 20 s '
+        f'({MORE * results.training} at 100 Hz).'
     )
 
 
@@ -131,6 +136,38 @@ def verdict_table(judged: list[Verdict]) -> str:
         )  # fmt: skip
     head = ['bar: our RMS error of d', 'reached', 'cells', 'ratio, geometric mean', 'worst']
     return _table(head, rows)
+
+
+def _limit(table: Table) -> str:
+    """Return our error over that of our linear limit, by the kind of sampling."""
+    ratios: dict[str, list[float]] = {}
+    for cell, scores in table.items():
+        if LINEAR_LIMIT in scores and scores[LINEAR_LIMIT].d > 0.0:
+            noise = 'none' if cell.sensor.noise == 0.0 else 'Gaussian'
+            kind = f'{cell.sensor.timing}, noise: {noise}'
+            ratios.setdefault(kind, []).append(scores[OURS].d / scores[LINEAR_LIMIT].d)
+    rows = [
+        [kind, str(len(r)), _number(geometric_mean(r)), _number(min(r)), _number(max(r))]
+        for kind, r in ratios.items()
+    ]
+    return _table(['sampling', 'cells', 'geometric mean', 'least', 'most'], rows)
+
+
+def _bound(results: Results, table: Table) -> str:
+    """Return how far anybody could get on steps, over the tuned Kalman filter."""
+    rows = []
+    for cell, scores in table.items():
+        known = results.bounds.get(cell.sensor)
+        if known is not None:
+            kalman, ours = scores[KALMAN].d, scores[OURS].d
+            rows.append(
+                [
+                    *_names(cell)[2:],
+                    *map(_number, (kalman, ours, known, ours / kalman, known / kalman)),
+                ]
+            )
+    head = ['sampling', 'noise', 'Kalman', 'ours', 'bound', 'ours over Kalman']
+    return _table([*head, 'bound over Kalman'], rows)
 
 
 def _ratios(judged: list[Verdict]) -> str:

@@ -5,12 +5,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from fhaosmo_ros.tools.comparison.evaluation import METHODS
+from fhaosmo_ros.tools.comparison.linear import LINEAR_LIMIT
 from fhaosmo_ros.tools.comparison.ours import OURS
 from fhaosmo_ros.tools.comparison.results import Cell, Table
 from fhaosmo_ros.tools.comparison.scores import Scores
 
 KALMAN = 'Kalman'
-LINEAR = [name for name, method in METHODS.items() if method.linear]
+LINEAR = [name for name, method in METHODS.items() if method.linear and name != LINEAR_LIMIT]
 
 
 class Bar(NamedTuple):

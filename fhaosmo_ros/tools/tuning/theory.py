@@ -33,7 +33,7 @@ from fhaosmo_ros.core.family import Recording
 from fhaosmo_ros.core.fuzzy import curve, KNOTS, terms_of_level
 from fhaosmo_ros.tools.sampled_model import SampledModel
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 OMEGAS = tuple(float(w) for w in np.geomspace(2.0, 200.0, 9))
 KAPPAS = (1.0, 5.0, 25.0)
@@ -96,7 +96,7 @@ def candidates(
 
 
 def kalman_like(
-    model: SampledModel, bandwidth: float, width: float, small: float, gamma: float
+    model: SampledModel, bandwidth: float, widths: ArrayLike, small: float, gamma: float
 ) -> NDArray[np.float64]:
     """
     Return lambda_1 .. lambda_N with which predict_correct is a Kalman filter (D 19).
@@ -112,8 +112,8 @@ def kalman_like(
         With the observer's model of d.
     bandwidth : float
         rad/s.
-    width : float
-        Half-width of every level, unit of y.
+    widths : float or (N,) array
+        Half-widths, unit of y.
     small : float
         Innovations that noise alone makes, unit of y.
     gamma : float
@@ -135,8 +135,11 @@ def kalman_like(
         injections[i] = (wanted[i] - behind) / h
     level = np.arange(1, n + 1)
     power = 2.0 * gamma * (n - level) / n  # D 11
-    grid = np.linspace(0.0, width, KNOTS)
-    psi = [np.interp(small, grid, curve(terms_of_level(i), 'triangle', True)) for i in level]
+    grid = np.linspace(0.0, 1.0, KNOTS)
+    psi = [
+        np.interp(small / width, grid, curve(terms_of_level(i), 'triangle', True))
+        for i, width in zip(level, np.broadcast_to(widths, n), strict=True)
+    ]
     return np.asarray(injections * small ** (1.0 - power) / psi)
 
 
