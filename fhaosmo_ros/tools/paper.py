@@ -2,7 +2,9 @@
 """Reproduce every simulation of the paper, judge its findings, and look where it stops."""
 
 import argparse
+from concurrent.futures import ThreadPoolExecutor
 import json
+import os
 from pathlib import Path
 import sys
 import time
@@ -19,6 +21,7 @@ from fhaosmo_ros.tools.command import run_computation
 from tqdm import tqdm
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
+OBSERVERS = cases.OBSERVERS | cases.OURS
 FOLDER, RESULTS = 'paper', 'results.json'
 QUICK_WIDTHS = 4
 QUICK_LONG = 200.0
@@ -41,7 +44,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='paper', description=__doc__)
     parser.add_argument(
         '--quick', action='store_true',
-        help='a coarse search and a short long run, for a first look and for tests',
+        help='a coarse search, short long runs at one frequency: for a first look and for tests',
     )  # fmt: skip
     parser.add_argument(
         '--output', type=Path, metavar='FOLDER',
@@ -57,12 +60,14 @@ def _default_output(quick: bool) -> Path:
 
 def measure(solvers: tuple[str, ...], tick: Any) -> dict[str, findings.Scores]:
     """Return the scores of the paper's four observers and of ours by solver."""
-    scores: dict[str, findings.Scores] = {}
-    for solver in solvers:
-        scores[solver] = {}
-        for name in cases.OBSERVERS | cases.OURS:
-            for omega in cases.FREQUENCIES:
-                scores[solver][name, omega] = findings.measure(name, omega, solver)
+    scores: dict[str, findings.Scores] = {solver: {} for solver in solvers}
+    tasks = [(name, w, s) for s in solvers for name in OBSERVERS for w in cases.FREQUENCIES]
+    # The last one first, in this thread: it makes the curves, and Ctrl-C can cut the compiler.
+    findings.run(*tasks[-1])
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the integration releases the GIL
+        runs = pool.map(lambda task: findings.run(*task), tasks)
+        for (name, omega, solver), run in zip(tasks, runs, strict=True):
+            scores[solver][name, omega] = cases.score(run)
             tick()
     return scores
 
@@ -120,10 +125,11 @@ def _paper(output: Path, quick: bool) -> None:
     minutes = hours / 4.0
     rows_of_map = len(findings.WIDTHS[::every])
     # The bar counts the parts by about what they cost.
-    observers = len(cases.OBSERVERS | cases.OURS)
+    joint = len(SOLVERS) * len(OBSERVERS) * len(cases.FREQUENCIES)
     sweep = cases.FREQUENCIES[:1] if quick else beyond.SWEEP
-    long = len(beyond.LONG) + len(beyond.PROTECTED) + len(sweep)
-    total = len(SOLVERS) * observers + rows_of_map + 3 + len(beyond.NOISES) + long + 4
+    lasting = [(g, s, w, noise) for g, s, w, noise in beyond.LONG if w in sweep]
+    long = len(lasting) + len(beyond.PROTECTED) + len(sweep)
+    total = joint + rows_of_map + 3 + len(beyond.NOISES) + long + 4
     with tqdm(total=total, unit='part', desc='paper') as bar:
         scores = measure(SOLVERS, bar.update)
         solver = choose_solver(scores)
@@ -132,7 +138,7 @@ def _paper(output: Path, quick: bool) -> None:
         sampled = beyond.schemes(bar.update)
         noisy = beyond.noises(bar.update)
         long_runs = []
-        for cell in beyond.LONG:
+        for cell in lasting:
             long_runs += beyond.long_runs(beyond.LAWS, *cell, hours, beyond.WINDOW)
             bar.update()
         protected = []
@@ -141,7 +147,7 @@ def _paper(output: Path, quick: bool) -> None:
                 beyond.long_runs(beyond.PROTECTIONS, *cell, minutes, PROTECTION_WINDOW)
             )
             bar.update()
-        zones = beyond.dead_zones(sweep, bar.update)
+        zones = beyond.dead_zones(sweep, min(hours, beyond.SWEEP_DURATION), bar.update)
         preset = cases.preset().observer
         texts = findings_texts(scores, solver) | {
             'widths': tables.map_text(widths, preset['fuzzy_widths'], every),
@@ -179,8 +185,8 @@ def _draw(folder: Path, solver: str, preset: dict[str, Any], bar: Any) -> None:
     )
     bar.update()
     runs = {
-        name: [cases.joint(variant, w, step, solver) for w in cases.FREQUENCIES]
-        for name, (variant, step, _) in cases.OBSERVERS.items()
+        name: [findings.run(name, w, solver) for w in cases.FREQUENCIES]
+        for name in cases.OBSERVERS
     }
     adaptive = runs.pop(findings.ADAPTIVE)
     figures.save(figures.simz(list(runs.items()), cases.FREQUENCIES), folder, 'simz')
