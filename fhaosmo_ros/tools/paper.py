@@ -2,6 +2,7 @@
 """Reproduce every simulation of the paper, judge its findings, and look where it stops."""
 
 import argparse
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 import json
 import os
@@ -18,11 +19,13 @@ from fhaosmo_ros.tools import paper_figures as figures
 from fhaosmo_ros.tools import paper_findings as findings
 from fhaosmo_ros.tools import paper_tables as tables
 from fhaosmo_ros.tools.command import run_computation
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 OBSERVERS = cases.OBSERVERS | cases.OURS
 FOLDER, RESULTS = 'paper', 'results.json'
+FIGURES = 9
 QUICK_WIDTHS = 4
 QUICK_LONG = 200.0
 PROTECTION_WINDOW = 20.0
@@ -129,7 +132,7 @@ def _paper(output: Path, quick: bool) -> None:
     sweep = cases.FREQUENCIES[:1] if quick else beyond.SWEEP
     lasting = [(g, s, w, noise) for g, s, w, noise in beyond.LONG if w in sweep]
     long = len(lasting) + len(beyond.PROTECTED) + len(sweep)
-    total = joint + rows_of_map + 3 + len(beyond.NOISES) + long + 4
+    total = joint + rows_of_map + 3 + len(beyond.NOISES) + long + FIGURES
     with tqdm(total=total, unit='part', desc='paper') as bar:
         scores = measure(SOLVERS, bar.update)
         solver = choose_solver(scores)
@@ -157,13 +160,16 @@ def _paper(output: Path, quick: bool) -> None:
             'deadzone': tables.dead_zone_table(zones),
             'protection': tables.protection_table(r for runs in protected for r in runs),
         }
-        _draw(folder, solver, preset, bar)
-        figures.save(figures.half_widths(widths, preset['fuzzy_widths']), folder, 'widths')
-        shown = [r for r in long_runs if r.gains == 'paper']
-        figures.save(figures.long_runs(shown), folder, 'long')
-        figures.save(figures.protections(protected), folder, 'protection')
-        figures.save(figures.noise(noisy), folder, 'noise')
-        bar.update()
+
+        def save(figure: Figure, name: str) -> None:
+            figures.save(figure, folder, name)
+            bar.update()
+
+        _draw(save, solver, preset)
+        save(figures.half_widths(widths, preset['fuzzy_widths']), 'widths')
+        save(figures.long_runs([r for r in long_runs if r.gains == 'paper']), 'long')
+        save(figures.protections(protected), 'protection')
+        save(figures.noise(noisy), 'noise')
     document.write(output / 'paper.md', texts)
     text = json.dumps({'solver': solver, 'scores': dump(scores)}, indent=1)
     (folder / RESULTS).write_text(text + '\n', encoding='utf-8')
@@ -171,28 +177,20 @@ def _paper(output: Path, quick: bool) -> None:
     print(f'document: {output / "paper.md"}, figures: {folder} ({time.monotonic() - begin:.0f} s)')
 
 
-def _draw(folder: Path, solver: str, preset: dict[str, Any], bar: Any) -> None:
+def _draw(save: Callable[[Figure, str], None], solver: str, preset: dict[str, Any]) -> None:
     """Draw the paper's own four figures, and ours beside simz."""
     first = cases.first_observer(1e-5, solver, cases.DURATION, every=5)
-    figures.save(figures.sim1(first, ZOOM), folder, 'sim1')
-    bar.update()
-    figures.save(
-        figures.fuzzy_systems(
-            preset['fuzzy_widths'], preset['fuzzy_shape'], preset['fuzzy_normalise']
-        ),
-        folder,
-        'fuzzysystems',
-    )
-    bar.update()
+    save(figures.sim1(first, ZOOM), 'sim1')
+    names = ('fuzzy_widths', 'fuzzy_shape', 'fuzzy_normalise')
+    save(figures.fuzzy_systems(*(preset[name] for name in names)), 'fuzzysystems')
     runs = {
         name: [findings.run(name, w, solver) for w in cases.FREQUENCIES]
         for name in cases.OBSERVERS
     }
     adaptive = runs.pop(findings.ADAPTIVE)
-    figures.save(figures.simz(list(runs.items()), cases.FREQUENCIES), folder, 'simz')
-    figures.save(figures.simu(adaptive, cases.FREQUENCIES), folder, 'simu')
-    figures.save(figures.simz(beyond.shown(), cases.FREQUENCIES), folder, 'beyond')
-    bar.update()
+    save(figures.simz(list(runs.items()), cases.FREQUENCIES), 'simz')
+    save(figures.simu(adaptive, cases.FREQUENCIES), 'simu')
+    save(figures.simz(beyond.shown(), cases.FREQUENCIES), 'beyond')
 
 
 if __name__ == '__main__':
