@@ -19,7 +19,6 @@ from fhaosmo_ros.tools import paper_figures as figures
 from fhaosmo_ros.tools import paper_findings as findings
 from fhaosmo_ros.tools import paper_tables as tables
 from fhaosmo_ros.tools.command import run_computation
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
@@ -161,7 +160,7 @@ def _paper(output: Path, quick: bool) -> None:
             'protection': tables.protection_table(r for runs in protected for r in runs),
         }
 
-        def save(figure: Figure, name: str) -> None:
+        def save(figure: Any, name: str) -> None:
             figures.save(figure, folder, name)
             bar.update()
 
@@ -177,7 +176,7 @@ def _paper(output: Path, quick: bool) -> None:
     print(f'document: {output / "paper.md"}, figures: {folder} ({time.monotonic() - begin:.0f} s)')
 
 
-def _draw(save: Callable[[Figure, str], None], solver: str, preset: dict[str, Any]) -> None:
+def _draw(save: Callable[[Any, str], None], solver: str, preset: dict[str, Any]) -> None:
     """Draw the paper's own four figures, and ours beside simz."""
     first = cases.first_observer(1e-5, solver, cases.DURATION, every=5)
     save(figures.sim1(first, ZOOM), 'sim1')
