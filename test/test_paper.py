@@ -3,6 +3,9 @@
 
 import json
 from pathlib import Path
+import signal
+import subprocess
+import sys
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.metrics import high_passed
@@ -126,6 +129,17 @@ def test_quick_run_writes_everything(tmp_path, capsys):
     paper_document.write(tmp_path / 'out' / 'paper.md', old)
     again = paper_document.parts((tmp_path / 'out' / 'paper.md').read_text(encoding='utf-8'))
     assert again == old
+
+
+def test_interrupt_ends_it_in_one_line(tmp_path):
+    command = [sys.executable, '-m', 'fhaosmo_ros', 'paper', '--quick', '--output', tmp_path]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        process.stderr.read(1)  # the bar begins
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert 'Traceback' not in said
+    assert said.splitlines()[-1] == 'paper: interrupted'
 
 
 def test_document_without_the_markers_is_refused():

@@ -100,7 +100,7 @@ def rates(
     return loss
 
 
-@njit(cache=True, error_model='numpy')
+@njit(cache=True, error_model='numpy', nogil=True)
 def integrate(
     flags: Ints, gains: Floats, curves: Floats, scalars: Floats, tape: Floats, offsets: Ints,
     x: Floats, m: Floats, stack: Floats,

@@ -3,11 +3,10 @@
 
 import argparse
 from collections.abc import Callable
-import signal
 import sys
 
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.stop_signals import SIGNALS, Stop, stop_on_signals
+from fhaosmo_ros.stop_signals import Stop, stop_on_signals, Stopped
 
 Body = Callable[[argparse.Namespace, Stop], int | None]
 
@@ -47,14 +46,11 @@ def run_computation(
     """Run a command as `run_command` does, whose body the first signal ends wherever it is."""
 
     def interruptible(arguments: argparse.Namespace, stop: Stop) -> int | None:
-        def interrupt(*_: object) -> None:
-            if not stop.is_set():  # a second one must not cut the clean-up
-                stop.set()
-                raise KeyboardInterrupt
-
-        for number in SIGNALS:
-            signal.signal(number, interrupt)
-        return body(arguments)
+        try:
+            with stop.raising():
+                return body(arguments)
+        except Stopped:
+            raise Interrupted from None
 
     return run_command(parser, argv, interruptible)
 

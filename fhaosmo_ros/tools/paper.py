@@ -2,7 +2,10 @@
 """Reproduce every simulation of the paper, judge its findings, and look where it stops."""
 
 import argparse
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 import json
+import os
 from pathlib import Path
 import sys
 import time
@@ -19,7 +22,9 @@ from fhaosmo_ros.tools.command import run_computation
 from tqdm import tqdm
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
+OBSERVERS = cases.OBSERVERS | cases.OURS
 FOLDER, RESULTS = 'paper', 'results.json'
+FIGURES = 9
 QUICK_WIDTHS = 4
 QUICK_LONG = 200.0
 PROTECTION_WINDOW = 20.0
@@ -41,7 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='paper', description=__doc__)
     parser.add_argument(
         '--quick', action='store_true',
-        help='a coarse search and a short long run, for a first look and for tests',
+        help='a coarse search, short long runs at one frequency: for a first look and for tests',
     )  # fmt: skip
     parser.add_argument(
         '--output', type=Path, metavar='FOLDER',
@@ -57,12 +62,14 @@ def _default_output(quick: bool) -> Path:
 
 def measure(solvers: tuple[str, ...], tick: Any) -> dict[str, findings.Scores]:
     """Return the scores of the paper's four observers and of ours by solver."""
-    scores: dict[str, findings.Scores] = {}
-    for solver in solvers:
-        scores[solver] = {}
-        for name in cases.OBSERVERS | cases.OURS:
-            for omega in cases.FREQUENCIES:
-                scores[solver][name, omega] = findings.measure(name, omega, solver)
+    scores: dict[str, findings.Scores] = {solver: {} for solver in solvers}
+    tasks = [(name, w, s) for s in solvers for name in OBSERVERS for w in cases.FREQUENCIES]
+    # The last one first, in this thread: it makes the curves, and Ctrl-C can cut the compiler.
+    findings.run(*tasks[-1])
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the integration releases the GIL
+        runs = pool.map(lambda task: findings.run(*task), tasks)
+        for (name, omega, solver), run in zip(tasks, runs, strict=True):
+            scores[solver][name, omega] = cases.score(run)
             tick()
     return scores
 
@@ -120,10 +127,11 @@ def _paper(output: Path, quick: bool) -> None:
     minutes = hours / 4.0
     rows_of_map = len(findings.WIDTHS[::every])
     # The bar counts the parts by about what they cost.
-    observers = len(cases.OBSERVERS | cases.OURS)
+    joint = len(SOLVERS) * len(OBSERVERS) * len(cases.FREQUENCIES)
     sweep = cases.FREQUENCIES[:1] if quick else beyond.SWEEP
-    long = len(beyond.LONG) + len(beyond.PROTECTED) + len(sweep)
-    total = len(SOLVERS) * observers + rows_of_map + 3 + len(beyond.NOISES) + long + 4
+    lasting = [(g, s, w, noise) for g, s, w, noise in beyond.LONG if w in sweep]
+    long = len(lasting) + len(beyond.PROTECTED) + len(sweep)
+    total = joint + rows_of_map + 3 + len(beyond.NOISES) + long + FIGURES
     with tqdm(total=total, unit='part', desc='paper') as bar:
         scores = measure(SOLVERS, bar.update)
         solver = choose_solver(scores)
@@ -132,7 +140,7 @@ def _paper(output: Path, quick: bool) -> None:
         sampled = beyond.schemes(bar.update)
         noisy = beyond.noises(bar.update)
         long_runs = []
-        for cell in beyond.LONG:
+        for cell in lasting:
             long_runs += beyond.long_runs(beyond.LAWS, *cell, hours, beyond.WINDOW)
             bar.update()
         protected = []
@@ -141,7 +149,7 @@ def _paper(output: Path, quick: bool) -> None:
                 beyond.long_runs(beyond.PROTECTIONS, *cell, minutes, PROTECTION_WINDOW)
             )
             bar.update()
-        zones = beyond.dead_zones(sweep, bar.update)
+        zones = beyond.dead_zones(sweep, min(hours, beyond.SWEEP_DURATION), bar.update)
         preset = cases.preset().observer
         texts = findings_texts(scores, solver) | {
             'widths': tables.map_text(widths, preset['fuzzy_widths'], every),
@@ -151,13 +159,16 @@ def _paper(output: Path, quick: bool) -> None:
             'deadzone': tables.dead_zone_table(zones),
             'protection': tables.protection_table(r for runs in protected for r in runs),
         }
-        _draw(folder, solver, preset, bar)
-        figures.save(figures.half_widths(widths, preset['fuzzy_widths']), folder, 'widths')
-        shown = [r for r in long_runs if r.gains == 'paper']
-        figures.save(figures.long_runs(shown), folder, 'long')
-        figures.save(figures.protections(protected), folder, 'protection')
-        figures.save(figures.noise(noisy), folder, 'noise')
-        bar.update()
+
+        def save(figure: Any, name: str) -> None:
+            figures.save(figure, folder, name)
+            bar.update()
+
+        _draw(save, solver, preset)
+        save(figures.half_widths(widths, preset['fuzzy_widths']), 'widths')
+        save(figures.long_runs([r for r in long_runs if r.gains == 'paper']), 'long')
+        save(figures.protections(protected), 'protection')
+        save(figures.noise(noisy), 'noise')
     document.write(output / 'paper.md', texts)
     text = json.dumps({'solver': solver, 'scores': dump(scores)}, indent=1)
     (folder / RESULTS).write_text(text + '\n', encoding='utf-8')
@@ -165,28 +176,20 @@ def _paper(output: Path, quick: bool) -> None:
     print(f'document: {output / "paper.md"}, figures: {folder} ({time.monotonic() - begin:.0f} s)')
 
 
-def _draw(folder: Path, solver: str, preset: dict[str, Any], bar: Any) -> None:
+def _draw(save: Callable[[Any, str], None], solver: str, preset: dict[str, Any]) -> None:
     """Draw the paper's own four figures, and ours beside simz."""
     first = cases.first_observer(1e-5, solver, cases.DURATION, every=5)
-    figures.save(figures.sim1(first, ZOOM), folder, 'sim1')
-    bar.update()
-    figures.save(
-        figures.fuzzy_systems(
-            preset['fuzzy_widths'], preset['fuzzy_shape'], preset['fuzzy_normalise']
-        ),
-        folder,
-        'fuzzysystems',
-    )
-    bar.update()
+    save(figures.sim1(first, ZOOM), 'sim1')
+    names = ('fuzzy_widths', 'fuzzy_shape', 'fuzzy_normalise')
+    save(figures.fuzzy_systems(*(preset[name] for name in names)), 'fuzzysystems')
     runs = {
-        name: [cases.joint(variant, w, step, solver) for w in cases.FREQUENCIES]
-        for name, (variant, step, _) in cases.OBSERVERS.items()
+        name: [findings.run(name, w, solver) for w in cases.FREQUENCIES]
+        for name in cases.OBSERVERS
     }
     adaptive = runs.pop(findings.ADAPTIVE)
-    figures.save(figures.simz(list(runs.items()), cases.FREQUENCIES), folder, 'simz')
-    figures.save(figures.simu(adaptive, cases.FREQUENCIES), folder, 'simu')
-    figures.save(figures.simz(beyond.shown(), cases.FREQUENCIES), folder, 'beyond')
-    bar.update()
+    save(figures.simz(list(runs.items()), cases.FREQUENCIES), 'simz')
+    save(figures.simu(adaptive, cases.FREQUENCIES), 'simu')
+    save(figures.simz(beyond.shown(), cases.FREQUENCIES), 'beyond')
 
 
 if __name__ == '__main__':

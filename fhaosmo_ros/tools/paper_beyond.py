@@ -186,14 +186,14 @@ def long_runs(
 
 
 def dead_zones(
-    frequencies: Sequence[float], tick: Callable[[], object]
+    frequencies: Sequence[float], duration: float, tick: Callable[[], object]
 ) -> dict[tuple[float, float], list[LongRun]]:
     """Return, by dead zone and angular frequency, runs with the default law under both schemes."""
     laws = {f'{zone:g}': SAFE | {'gamma_dead_zone': zone} for zone in DEAD_ZONES}
     found: dict[tuple[float, float], list[LongRun]] = {}
     for omega in frequencies:
         for scheme in ('explicit', 'implicit'):
-            runs = long_runs(laws, 'paper', scheme, omega, 0.0, SWEEP_DURATION, WINDOW)
+            runs = long_runs(laws, 'paper', scheme, omega, 0.0, duration, WINDOW)
             for zone, run in zip(DEAD_ZONES, runs, strict=True):
                 found.setdefault((zone, omega), []).append(run)
         tick()

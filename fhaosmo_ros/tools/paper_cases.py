@@ -117,8 +117,9 @@ class Truth(NamedTuple):
     unknown_input: Floats
 
 
+@lru_cache(maxsize=len(FREQUENCIES))
 def truth_of(omega: float, step: float, noise: float, duration: float) -> Truth:
-    """Simulate the plant alone."""
+    """Simulate the plant alone; the observers that follow one another share the last ones."""
     plant = Plant(
         preset().plant
         | {'disturbance_omega': omega, 'noise_std': noise, 'integration_step': min(step, 1e-3)}

@@ -40,6 +40,7 @@ rcParams['svg.hashsalt'] = 'fhaosmo_ros'  # the same figure gives the same file
 def save(figure: Figure, folder: Path, name: str) -> None:
     """Write a figure as SVG and PNG, without the date of the day."""
     figure.savefig(folder / f'{name}.svg', metadata={'Date': None})
+    figure.set_layout_engine(None)  # it stands, and costs more than all the drawing
     figure.savefig(folder / f'{name}.png', dpi=130)
 
 

@@ -2,8 +2,10 @@
 """The paper's three findings as inequalities between numbers, and where they hold."""
 
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
+from fhaosmo_ros.core.joint import JointRun
 from fhaosmo_ros.tools.paper_cases import FREQUENCIES, joint, OBSERVERS, OURS, Score, score
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +40,11 @@ class Verdict(NamedTuple):
     numbers: str
 
 
-def measure(name: str, omega: float, solver: str) -> Score:
-    """Simulate one of the observers and judge it."""
+@cache
+def run(name: str, omega: float, solver: str) -> JointRun:
+    """Simulate one of the observers, once: the figures show what the tables judge."""
     variant, step, changes = (OBSERVERS | OURS)[name]
-    return score(joint(variant, omega, step, solver, **changes))
+    return joint(variant, omega, step, solver, **changes)
 
 
 def verdicts(s: Scores) -> list[Verdict]:
