@@ -4,6 +4,8 @@
 import atexit
 from collections.abc import Iterator
 import contextlib
+import math
+import os
 import select
 import signal
 import socket
@@ -12,6 +14,8 @@ from types import FrameType
 
 RETRY = 0.02
 """Seconds after which a signal that came at a bad moment comes again."""
+LOOK = 0.05
+"""Seconds between two looks at whether a block has ended."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -56,15 +60,31 @@ class Stop:
             raise Stopped
 
     @contextlib.contextmanager
-    def raising(self) -> Iterator[None]:
-        """Let the first signal cut the block, for what is long and leaves nothing behind."""
+    def raising(self, patience: float = math.inf) -> Iterator[None]:
+        """
+        Let the first signal cut the block, for what is long and leaves nothing behind.
+
+        Python takes a signal between two of its instructions only, and one that compiles can last
+        for seconds: where the block has not ended `patience` seconds after the signal, the process
+        ends here, with exit code 0.
+        """
         self._raises = True
+        left = threading.Event()
+        if patience < math.inf:
+            threading.Thread(target=self._watch, args=(left, patience), daemon=True).start()
         try:
             if self._set:
                 raise Stopped
             yield
         finally:
             self._raises = False
+            left.set()
+
+    def _watch(self, left: threading.Event, patience: float) -> None:
+        while not left.is_set():
+            ready, _, _ = select.select([self._reader], [], [], LOOK)
+            if ready and not left.wait(patience):
+                os._exit(0)
 
     def is_set(self) -> bool:
         """Return True once `set` has been called."""

@@ -111,7 +111,7 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
     ended = stop_on_signals()
     node = None
     try:
-        with ended.raising():  # the start may compile for seconds
+        with ended.raising(GRACE):  # the start may compile for seconds
             _check_arguments(name, argv)
             rclpy.init(args=[name, *argv], signal_handler_options=SignalHandlerOptions.NO)
             node = factory()
