@@ -19,7 +19,7 @@ from fhaosmo_ros.tools.tuning.kalman_start import (
     OTHER_WIDTHS,
     Point,
     ZOOMS,
-)  # fmt: skip
+)
 from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.theory import candidates, effective_noise
 import numpy as np
@@ -119,6 +119,7 @@ class Jury:
             finally:
                 self._bar.update()
 
+        self._bar.total = (self._bar.total or 0) + len(several)
         values = list(self._pool.map(judged, several))
         number = min(range(len(values)), key=values.__getitem__)
         return values[number], several[number]

@@ -22,7 +22,7 @@ from tqdm import tqdm
 DIGITS = 4
 """Of the gains that are written, unless rounding makes them worse by more than `LOSS`."""
 LOSS = 5e-3
-NEAR, FAR = 1.0, 3.0
+NEAR, FAR = 0.5, 3.0
 """`decades` around a start that a Kalman filter gave, and around any other one."""
 PARETO_WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Of the second objective, a search each."""
