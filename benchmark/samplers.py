@@ -35,7 +35,7 @@ def main() -> None:
     arguments = parser.parse_args()
     seeds = range(1, arguments.seeds + 1)
     rows = []
-    spent = {sampler: 0.0 for sampler in SAMPLERS}
+    spent = dict.fromkeys(SAMPLERS, 0.0)
     with tqdm(total=len(PROBLEMS) * len(SAMPLERS) * len(seeds), unit='search') as bar:
         for problem, (family, estimator) in PROBLEMS.items():
             values = TUNE_PARAMETERS.defaults() | COMMON | family

@@ -19,7 +19,7 @@ from fhaosmo_ros.tools.output import Output
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.source import BagChoice, Data, from_bag, simulated
 
-TRIALS = 2500
+TRIALS = 1000
 NEEDED = ('optuna', 'cmaes', 'control')
 """Only this command needs them, so a robot may lack them."""
 BOTH = ParameterTable(TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values())

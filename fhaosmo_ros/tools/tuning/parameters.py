@@ -7,11 +7,11 @@ from fhaosmo_ros.core.parameters import MODEL
 
 TUNING = (
     Parameter(
-        'recordings', 12, 'Number of recordings that the search sees.', lower=1, upper=10_000,
+        'recordings', 36, 'Number of recordings that the search sees.', lower=1, upper=10_000,
         live=False,
     ),
     Parameter(
-        'held_out', 12, 'Number of other recordings, with other seeds, that only the report sees.',
+        'held_out', 36, 'Number of other recordings, with other seeds, that only the report sees.',
         lower=1, upper=10_000, live=False,
     ),
     Parameter(
