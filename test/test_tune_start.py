@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where `tune` begins: gains that make the observer a Kalman filter, and who gets them."""
 
+from pathlib import Path
+
 import pytest
 
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
@@ -9,12 +11,14 @@ pytest.importorskip('control', reason='python-control is not installed (extra: t
 
 from fhaosmo_ros.core import Family, Observer, TriangularModel
 from fhaosmo_ros.core.compile_cache import compile_cache
+from fhaosmo_ros.core.family_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameter_file import load
 from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
 from fhaosmo_ros.tools.sampled_model import SampledModel
 from fhaosmo_ros.tools.tuning.command import main
 from fhaosmo_ros.tools.tuning.kalman_start import grid, KalmanStart
+from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.source import simulated
 from fhaosmo_ros.tools.tuning.start import SCHEME, with_scheme
@@ -25,6 +29,7 @@ import numpy as np
 with compile_cache():
     from fhaosmo_ros.tools.comparison.constant_gain import run
 
+ROOT = Path(__file__).resolve().parents[1]
 PHI = ['0', '0', '-z3']
 SHORT = {'duration': 6.0, 'integration_step': 1e-3, 'sample_rate': 200.0, 'noise_std': 1e-4}
 VALUES = TUNE_PARAMETERS.defaults() | SHORT | {'settled': 2.0, 'recordings': 3, 'held_out': 3}
@@ -200,3 +205,49 @@ def test_yaml_is_what_the_estimator_runs(tmp_path, capsys):
     assert main([*QUICK, '--trials=1', *file, '-o', str(again)]) == 0
     assert 'given, training' in capsys.readouterr().out
     assert load(again / 'gains.yaml', 'estimator').keys() == values.keys()
+
+
+# what is shipped
+
+
+@pytest.mark.parametrize('noise', ['1e-4', '1e-3', '1e-2'])
+def test_presets_fit_the_noise_in_their_name(noise):
+    path = ROOT / 'config' / f'noise_{noise}.yaml'
+    text = path.read_text()
+    assert 'python -m fhaosmo_ros tune ' in text
+    assert f'-p noise_std:={noise} -o noise_{noise}\n' in text
+    values = load(path, 'estimator')
+    assert dict(SCHEME).items() <= values.items()
+    assert load(path, 'plant')['noise_std'] == float(noise)
+    family = Family({'noise_std': float(noise), 'integration_step': 1e-3})
+    recordings = family.recordings(3, seed=77)
+    tuning = TUNE_PARAMETERS.defaults()
+    demo = load(ROOT / 'config' / 'demo.yaml', 'estimator')
+    judged = []
+    for p in (values, demo):
+        online = {k: v for k, v in p.items() if k in ONLINE_PARAMETERS}
+        judged.append(Objective(recordings, online, tuning, choose=False)({}))
+    assert judged[0].error < min(0.95, 0.9 * judged[1].error)
+    # The node's own path gives the same.
+    r = recordings[0]
+    online = OnlineEstimator({k: v for k, v in values.items() if k in ONLINE_PARAMETERS})
+    found = online.run(np.round(r.t * 1e9).astype(np.int64) + 1, r.y, r.u)
+    late = r.t >= tuning['settled']
+    error = np.sqrt(np.mean((found.unknown_input - r.d)[late] ** 2))
+    assert error == pytest.approx(judged[0].scores.error[0, 0, -1], rel=1e-3)
+
+
+@pytest.mark.parametrize('name', ['paper_plant', 'pendulum', 'dc_motor'])
+def test_gains_of_the_models_follow_their_plant(name):
+    path = ROOT / 'config' / 'models' / f'{name}.yaml'
+    assert 'python -m fhaosmo_ros tune ' in path.read_text()
+    values = load(path, 'estimator')
+    plant = load(path, 'plant')
+    amplitude = plant['disturbance_amplitude']
+    shared = {k: v for k, v in plant.items() if k in FAMILY_PARAMETERS}
+    family = Family(shared | {'rms_of_d': 0.7 * amplitude, 'integration_step': 1e-3})
+    r = family.recording(0, seed=78)
+    online = OnlineEstimator({k: v for k, v in values.items() if k in ONLINE_PARAMETERS})
+    found = online.run(np.round(r.t * 1e9).astype(np.int64) + 1, r.y, r.u)
+    error = np.sqrt(np.mean((found.unknown_input - r.d)[r.t >= 5.0] ** 2))
+    assert error < 0.3 * amplitude
