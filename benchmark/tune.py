@@ -3,7 +3,7 @@
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter
+from time import perf_counter, process_time
 
 import numpy as np
 from table import CannotMeasureError, Row
@@ -38,26 +38,28 @@ def measure(quick: bool) -> list[Row]:
         values |= {'duration': 6.0}
     tuner = Tuner(simulated(values, 1), {}, values, 1)
     start = {d.name: d.start for d in tuner.space}
-    times = np.empty((rounds, 3))
+    times, processor = np.empty((rounds, 3)), np.empty((rounds, 3))
     with (
         TemporaryDirectory() as folder,
         tqdm(total=3 * rounds, desc='tune', unit='run', leave=False) as progress,
     ):
         for k in range(rounds):
             for column, (jobs, work) in enumerate(((1, True), (CORES, True), (1, False))):
-                begin = perf_counter()
+                begin, spent = perf_counter(), process_time()
                 minimise(
                     # Equal work in every trial, wherever the search goes.
                     lambda _, work=work: tuner.judge(start) if work else (1.0,),
                     tuner.space, trials, jobs=jobs, storage=str(Path(folder, f'{k}-{column}')),
                 )  # fmt: skip
                 times[k, column] = (perf_counter() - begin) / trials * 1e3
+                processor[k, column] = (process_time() - spent) / trials * 1e3
                 progress.update()
     one, two, empty = np.median(times, axis=0)
     ratio = float(np.median(times[:, 1] / times[:, 0]))
+    busy = float(np.median(processor[:, 1]))
     note = (
-        f'{RECORDINGS} recordings of {values["duration"]:g} s at 1 kHz, fuzzy_adaptive, implicit: '
-        f'{60e3 / two:.0f} trials a minute'
+        f'{RECORDINGS} recordings of {values["duration"]:g} s at 1 kHz, predict_correct: '
+        f'{60e3 / two:.0f} trials a minute; {busy:.1f} ms of processor time'
     )
     return [
         Row(

@@ -68,6 +68,28 @@ def test_gap_restarts_as_in_the_node():
     )
 
 
+def test_losses_are_taken_as_in_the_node_where_the_model_is_followed():
+    """predict_correct steps through a gap at once, here and there: nothing has to be bridged."""
+    r = Family(
+        {'duration': 5.0, 'noise_std': 1e-3, 'integration_step': 1e-3, 'dropout': 0.2,
+         'dropout_length': 20.0}
+    ).recording(0)  # fmt: skip
+    values = {
+        'structure': 'levant', 'scheme': 'predict_correct', 'gamma_rate': 0.0, 'gamma_min': 1e-4,
+        'gamma_initial': 3e-3, 'correction_period': 1e-3, 'lambda': [153.0, 698.0, 1590.0, 2490.0],
+        'fuzzy_widths': [31.0],
+    }  # fmt: skip
+    scores = Trial([r], values, SETTLED, BAND)({})
+    online = OnlineEstimator(values)
+    run = online.run(np.round(r.t * 1e9).astype(np.int64) + 1, r.y, r.u)
+    assert online.counters.gaps > 10
+    assert not (run.status & REJECTED).any()
+    late = r.t >= SETTLED
+    expected = [*(rms((run.z - r.z)[late, k]) for k in range(3)),
+                rms((run.unknown_input - r.d)[late])]  # fmt: skip
+    np.testing.assert_allclose(scores.error[0, 0], expected, rtol=1e-6)
+
+
 def test_threads_do_not_disturb_one_another(recordings):
     trial = Trial(recordings, {}, SETTLED, BAND)
     changes = [GAINS | {'epsilon': 10.0 ** (k % 4 - 2)} for k in range(16)]

@@ -4,7 +4,8 @@ How good an observer is on recordings whose truth is known: one compiled call, n
 
 It releases the GIL and allocates nothing that grows with the recordings, so that trials run in as
 many threads as there are cores. Samples take the way of `OnlineEstimator`: a gap longer than
-`max_gap` starts afresh.
+`max_gap` starts afresh. A shorter one is one step, as it is there for predict_correct; the other
+schemes are bridged there (docs/operation.md) and so do a little better than is said here.
 """
 
 from collections.abc import Mapping, Sequence

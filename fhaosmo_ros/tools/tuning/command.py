@@ -19,8 +19,8 @@ from fhaosmo_ros.tools.output import Output
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.source import BagChoice, Data, from_bag, simulated
 
-TRIALS = 2500
-NEEDED = ('optuna', 'cmaes')
+TRIALS = 1000
+NEEDED = ('optuna', 'cmaes', 'control')
 """Only this command needs them, so a robot may lack them."""
 BOTH = ParameterTable(TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values())
 
@@ -43,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
     if missing:
         print(
             f'tune: error: {" and ".join(missing)} not installed: make tune does it, or '
-            "python3 -m pip install 'optuna>=4,<6' cmaes",
+            "python3 -m pip install 'optuna>=4,<6' cmaes control",
             file=sys.stderr,
         )
         return 1
@@ -124,13 +124,16 @@ def _tune(arguments: argparse.Namespace, command: str, stop: Stop) -> int:
             f'{len(data.training)} recordings to train on, {len(data.held_out)} held out: '
             f'{data.origin}'
         )
-        tuner = Tuner(data, estimator, TUNE_PARAMETERS.defaults() | tuning, arguments.seed)
+        jobs = arguments.jobs or os.cpu_count() or 1
+        tuner = Tuner(
+            data, estimator, TUNE_PARAMETERS.defaults() | tuning, arguments.seed, jobs,
+            stop.is_set,
+        )  # fmt: skip
         storage = arguments.storage or f'{arguments.output}.journal'
         if arguments.storage is None and Path(storage).exists():
             print(f'{storage}: of a run that was cut short; goes on where it asked the same')
         result = tuner.search(
-            arguments.trials, arguments.jobs or os.cpu_count() or 1, storage,
-            arguments.sampler, arguments.pareto, stop.is_set,
+            arguments.trials, jobs, storage, arguments.sampler, arguments.pareto, stop.is_set,
         )  # fmt: skip
         if result is None:
             print('tune: interrupted before the first trial, nothing written', file=sys.stderr)

@@ -7,11 +7,11 @@ from fhaosmo_ros.core.parameters import MODEL
 
 TUNING = (
     Parameter(
-        'recordings', 12, 'Number of recordings that the search sees.', lower=1, upper=10_000,
+        'recordings', 36, 'Number of recordings that the search sees.', lower=1, upper=10_000,
         live=False,
     ),
     Parameter(
-        'held_out', 12, 'Number of other recordings, with other seeds, that only the report sees.',
+        'held_out', 36, 'Number of other recordings, with other seeds, that only the report sees.',
         lower=1, upper=10_000, live=False,
     ),
     Parameter(
@@ -43,7 +43,7 @@ TUNING = (
         'search',
         [
             'lambda', 'alpha', 'fuzzy_widths', 'epsilon', 'gamma_initial',
-            'unknown_input_decay 0.001 100',
+            'unknown_input_decay',
         ],
         'Parameters of the estimator to search, each "NAME" or "NAME LOW HIGH", in logarithms '
         'where their scale is open and linearly where they lie between 0 and 1 ("NAME LOW HIGH '
@@ -52,9 +52,10 @@ TUNING = (
         live=False, lengths='1 or more',
     ),
     Parameter(
-        'decades', 3.0,
-        'Bounds of a search in logarithms, where none are given: powers of ten around its start.',
-        lower=0.1, upper=12.0, live=False,
+        'decades', 0.0,
+        'Bounds of a search in logarithms, where none are given: powers of ten around its start. '
+        "0: 0.5 around a Kalman filter's gains (docs/tuning.md), 3 around others.",
+        lower=0.0, upper=12.0, live=False,
     ),
 )  # fmt: skip
 

@@ -77,6 +77,15 @@ def gains_table(space: Sequence[Dimension], start: Mapping[str, float], best: An
     return '\n'.join(lines)
 
 
+def start_table(tried: Mapping[int, float], chosen: int) -> str:
+    """Return a Markdown table of the numbers of derivatives of d that were tried."""
+    lines = ['| unknown_input_derivatives | objective at the start |', '|---|---|']
+    lines += [
+        f'| {k}{" (taken)" if k == chosen else ""} | {value:.4f} |' for k, value in tried.items()
+    ]
+    return '\n'.join(lines)
+
+
 def at_bound(dimension: Dimension, value: float) -> bool:
     """Return True if the search may have wanted to go further."""
     low, high = dimension.low, dimension.high

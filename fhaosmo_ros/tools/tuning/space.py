@@ -14,6 +14,8 @@ import numpy as np
 NUMBERS = ('double', 'double_array')
 SMALLEST = 1e-12
 """Lower bound of a logarithm whose parameter may be 0."""
+DECAYS = (1e-3, 1e2)
+"""Bounds of unknown_input_decay (1/s) where nothing tells how fast d changes."""
 
 
 def make_space(
@@ -48,6 +50,9 @@ def make_space(
         low, high, log = _bounds(rule, rest, parameter)
         if name == 'gamma_initial' and low is None:
             low, high = start['gamma_min'], start['gamma_max']
+            log = high > 10.0 * low
+        if name == 'unknown_input_decay' and low is None and not start[name]:
+            low, high = DECAYS
         values = start[name] if isinstance(start[name], list) else [start[name]]
         if parameter.kind == 'double_array':
             values = [values[min(k, len(values) - 1)] for k in range(levels)]

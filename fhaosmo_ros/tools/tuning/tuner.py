@@ -9,23 +9,21 @@ import time
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.observer import FIXED_GAMMA, Observer
+from fhaosmo_ros.core.observer import Observer
 from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
 from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.search import minimise, Values
 from fhaosmo_ros.tools.tuning.source import Data
 from fhaosmo_ros.tools.tuning.space import changes, make_space
+from fhaosmo_ros.tools.tuning.start import begin, Question, with_scheme
 from fhaosmo_ros.tools.tuning.study import Point
-from fhaosmo_ros.tools.tuning.theory import candidates, effective_noise
 from tqdm import tqdm
 
 DIGITS = 4
 """Of the gains that are written, unless rounding makes them worse by more than `LOSS`."""
 LOSS = 5e-3
-GAMMAS = (0.25, 0.5)
-"""Powers that the start may have, where they are searched."""
-
-
+NEAR, FAR = 0.5, 3.0
+"""`decades` around a start that a Kalman filter gave, and around any other one."""
 PARETO_WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Of the second objective, a search each."""
 
@@ -72,6 +70,10 @@ class Tuner:
     tuning : mapping
         Of `TUNE_PARAMETERS`, complete.
     seed : int
+    jobs : int
+        Threads that look for a start.
+    stopped : callable
+        Asked now and then; True ends that with what there is.
 
     Attributes
     ----------
@@ -81,6 +83,8 @@ class Tuner:
         Parameters of the estimator that are not searched.
     training, held_out : Objective
     space : list of Dimension
+    tried : dict
+        Objective of the best Kalman filter by number of derivatives of d; see start.py.
 
     Raises
     ------
@@ -90,46 +94,45 @@ class Tuner:
     """
 
     def __init__(
-        self, data: Data, estimator: Mapping[str, Any], tuning: Mapping[str, Any], seed: int
-    ) -> None:
+        self, data: Data, estimator: Mapping[str, Any], tuning: Mapping[str, Any], seed: int,
+        jobs: int = 1, stopped: Callable[[], bool] = lambda: False,
+    ) -> None:  # fmt: skip
         self.data, self.tuning, self.seed = data, tuning, seed
-        # The estimator may have a model of its own, other than the plant's.
-        self.estimator = {name: tuning[name] for name in ('order', 'phi')} | dict(estimator)
-        online = {k: v for k, v in self.estimator.items() if k in ONLINE_PARAMETERS}
-        complete = Observer({k: v for k, v in online.items() if k in OBSERVER_PARAMETERS})
-        choose = 'estimate_from' not in estimator
-        self.training = Objective(data.training, online, tuning, choose)
-        self.held_out = Objective(data.held_out, online, tuning, choose, self.training.scale)
         names = [rule.split()[0] for rule in tuning['search'] if rule.split()]
+        # The estimator may have a model of its own, other than the plant's.
+        model = {name: tuning[name] for name in ('order', 'phi')}
+        self.estimator = with_scheme(model | dict(estimator), data.training)
+        self._choose = 'estimate_from' not in estimator
+        begun = begin(
+            Question(data.training, self.estimator, names, self._objective), jobs, stopped
+        )
+        self.tried = begun.tried
+        beside = {k: v for k, v in begun.gains.items() if k not in names}
+        self.estimator = beside | self.estimator
+        self.training = self._objective(self.estimator)
+        self.held_out = Objective(
+            data.held_out, _online(self.estimator), tuning, self._choose, self.training.scale
+        )
         given = {name: value for name, value in estimator.items() if name in names}
         given = given if 'lambda' in given else {}  # one number more or less is no set of gains
-        by_theory = self._by_theory(complete, names)
+        by_theory = {k: v for k, v in begun.gains.items() if k in names}
         # The user's own gains count, too: a tuning never ends worse than they are.
         start = min(
             [by_theory, given] if given else [by_theory],
-            key=lambda gains: self.training(gains).objective,
+            key=lambda gains: self._judge(gains).objective,
         )
         self.before_is_given = bool(given)
-        parameters = complete.parameters
+        complete = Observer({k: v for k, v in self.estimator.items() if k in OBSERVER_PARAMETERS})
         self.space = make_space(
-            tuning['search'], parameters | start, complete.levels, tuning['decades']
-        )
+            tuning['search'], complete.parameters | start, complete.levels,
+            tuning['decades'] or (NEAR if self.tried else FAR),
+        )  # fmt: skip
         searched = changes({d.name: d.start for d in self.space})
         self.before = given or searched
         self.fixed = {k: v for k, v in self.estimator.items() if k not in searched}
 
-    def _by_theory(self, complete: Observer, names: list[str]) -> dict[str, Any]:
-        recordings, p = self.data.training, complete.parameters
-        gammas = [FIXED_GAMMA]
-        if p['variant'].endswith('_adaptive'):
-            searched = 'gamma_initial' in names and 'gamma_initial' not in self.estimator
-            gammas = [g for g in GAMMAS if searched and p['gamma_min'] <= g <= p['gamma_max']]
-            gammas = gammas or [p['gamma_initial']]
-        several = candidates(
-            recordings, complete.levels, effective_noise(recordings), p['structure'], gammas
-        )
-        chosen = ({k: v for k, v in gains.items() if k in names} for gains in several)
-        return min(chosen, key=lambda gains: self._judge(gains).objective)
+    def _objective(self, estimator: Mapping[str, Any]) -> Objective:
+        return Objective(self.data.training, _online(estimator), self.tuning, self._choose)
 
     @property
     def study_name(self) -> str:
@@ -206,6 +209,10 @@ class Tuner:
         if self.judge(rounded).objective <= (1.0 + LOSS) * self.judge(best).objective:
             best = rounded
         return Found(best, points, time.monotonic() - begin, pareto)
+
+
+def _online(estimator: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in estimator.items() if k in ONLINE_PARAMETERS}
 
 
 def marks(point: Point) -> Marks:

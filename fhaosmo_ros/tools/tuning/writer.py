@@ -123,6 +123,9 @@ def _document(tuner: Tuner, found: Found, command: str, main: str) -> str:
         '## Gains', report.gains_table(tuner.space, begin, found.best),
         '![Sensitivity](sensitivity.png)',
     ]  # fmt: skip
+    if tuner.tried:
+        chosen = tuner.fixed['unknown_input_derivatives']
+        parts.insert(-1, report.start_table(tuner.tried, chosen))
     if found.pareto is not None:
         parts.append(f'![Error and {found.pareto}](pareto.png)')
     if tuner.data.sensor is not None:
