@@ -147,7 +147,9 @@ def test_ten_thousand_parameter_sets():
 @pytest.mark.parametrize('name', sorted(FIXED))
 def test_fixed_parameter_says_that_it_is_fixed(name):
     estimator = OnlineEstimator(SMALL)
-    other = {'order': 3, 'phi': ['0', '0'], 'unknown_input': False}[name]
+    other = {
+        'order': 3, 'phi': ['0', '0'], 'unknown_input': False, 'unknown_input_derivatives': 2,
+    }[name]  # fmt: skip
     with pytest.raises(ConfigurationError, match=f"'{name}': can't change in a running observer"):
         estimator.check({name: other, 'max_gap': 1.0})
     with pytest.raises(ConfigurationError, match=f"'{name}'"):

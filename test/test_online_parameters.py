@@ -25,11 +25,15 @@ class Change:
 
 
 SEED = [0.0, 1.0, 2.0, 3.0]
+PREDICTING = {'structure': 'levant', 'scheme': 'predict_correct'}
+PREDICTING |= {'lambda': [8.0, 20.0, 30.0, 16.0], 'fuzzy_widths': [1.0]}
 CHANGES = {
     'unknown_input_decay': Change(50.0),
     'structure': Change('levant'),
     'variant': Change('sign'),
     'scheme': Change('explicit'),
+    'prediction_step': Change(1e-4, PREDICTING),
+    'correction_period': Change(2e-4, PREDICTING),
     'lambda': Change(500.0),
     'alpha': Change([10.0, 20.0, 30.0, 40.0]),
     'epsilon': Change(1e-4),

@@ -49,11 +49,15 @@ class Case(NamedTuple):
     y: object = None
 
 
+PREDICTING = {'structure': 'levant', 'scheme': 'predict_correct'}
+PREDICTING |= {'lambda': [8.0, 20.0, 30.0, 16.0], 'fuzzy_widths': [1.0]}
 CASES = {
     'unknown_input_decay': Case(500.0),
     'structure': Case('levant'),
     'variant': Case('sign'),
     'scheme': Case('explicit'),
+    'prediction_step': Case(1e-5, PREDICTING),
+    'correction_period': Case(1e-5, PREDICTING),
     'lambda': Case([100.0]),
     'alpha': Case([300.0]),
     'epsilon': Case(1e-9),

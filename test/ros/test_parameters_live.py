@@ -35,6 +35,8 @@ OTHER = {
     'structure': 'levant',
     'variant': 'fuzzy',
     'scheme': 'explicit',
+    'prediction_step': 0.002,
+    'correction_period': 0.001,
     'lambda': [12.0, 13.0, 14.0, 16.0],
     'alpha': [20.0, 25.0, 30.0, 35.0],
     'epsilon': 0.05,
