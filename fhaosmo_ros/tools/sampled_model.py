@@ -86,7 +86,8 @@ class SampledModel:
         noise = self._accumulated(spectrum)
         # scipy's eigenvalues split into stable and unstable ones, or control says that they don't.
         try:
-            _, p, _ = control.dlqe(self.a, np.eye(self.size), self._c, noise, np.eye(1))
+            with np.errstate(invalid='ignore'):  # what comes of it is checked below
+                _, p, _ = control.dlqe(self.a, np.eye(self.size), self._c, noise, np.eye(1))
         except (np.linalg.LinAlgError, ValueError, control.ControlArgument) as error:
             raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
         return _finite(p[:, 0] / (p[0, 0] + 1.0) / self._scale)

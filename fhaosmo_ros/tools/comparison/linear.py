@@ -18,8 +18,8 @@ with compile_cache():
 
 LINEAR_LIMIT = 'Kalman, Matern'
 """Not a rival: what our observer is for small innovations. It shows what the rest of it adds."""
-REACH, SLOWER = 10.0, (0.8, 0.6, 0.5, 0.42)
-"""How far a search for the bandwidth goes, and where it starts with each number of derivatives."""
+REACH = 10.0
+"""How far a search for the bandwidth goes, as a factor to both sides."""
 LONGEST = 1.5
 """Nominal periods that one step of a prediction may take."""
 Gain = Callable[[SampledModel, Values], np.ndarray]
@@ -105,7 +105,7 @@ def _luenberger_space(setting: Setting) -> tuple[Dimension, ...]:
 
 def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...]:
     """Return bandwidth and decay of a filter whose d is a Matern process."""
-    speed, fastest = setting.speed * SLOWER[derivatives], 5.0 / setting.period
+    speed, fastest = setting.balance(derivatives), 5.0 / setting.period
     return (
         Dimension('bandwidth', speed / REACH, min(speed * REACH, fastest), speed),
         Dimension('decay', 0.03, 30.0, 1.0),

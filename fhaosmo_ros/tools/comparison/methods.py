@@ -11,6 +11,10 @@ from fhaosmo_ros.tools.tuning.search import Dimension
 
 DERIVATIVES = (0, 1, 2, 3)
 """Of d, that a model of it may have."""
+ROUNDING = 1e-15
+"""Noise of a y about 1."""
+DEADBEAT = 3.0
+"""Bandwidth times period of an observer that forgets all but the last few samples."""
 Values = Mapping[str, float]
 Run = Callable[[Recording], dict[str, Estimates]]
 """Estimates by readout: one method may offer several (filtered and internal states)."""
@@ -39,17 +43,20 @@ class Setting(NamedTuple):
 
     @property
     def speed(self) -> float:
+        """Where searches begin: the bandwidth (rad/s) at which noise weighs as much as d."""
+        fastest = 0.5 / self.period
+        return fastest if self.noise <= 0.0 else min(self.balance(0), fastest)
+
+    def balance(self, derivatives: int) -> float:
         """
-        Where searches begin: the bandwidth (rad/s) at which noise weighs as much as d.
+        Return the bandwidth (rad/s) at which noise weighs as much as d, for N levels.
 
         Noise of density noise^2 period leaves noise sqrt(period w^(2 N - 1)) in the N-th level.
+        Without any there is rounding.
         """
-        levels = self.model.order + 1
-        fastest = 0.5 / self.period
-        if self.noise <= 0.0:
-            return fastest
-        ratio = self.size / (self.noise * self.period**0.5)
-        return float(min(ratio ** (1.0 / (levels - 0.5)), fastest))
+        levels = self.model.order + 1 + derivatives
+        ratio = self.size / (max(self.noise, ROUNDING) * self.period**0.5)
+        return float(min(ratio ** (1.0 / (levels - 0.5)), DEADBEAT / self.period))
 
 
 class Method(NamedTuple):
