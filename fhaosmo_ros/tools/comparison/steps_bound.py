@@ -3,7 +3,7 @@
 What can be known at all of a d that steps.
 
 Without noise: d one sample late. The first sample after a step depends on its time and its size,
-so that it tells neither.
+so that it tells little of either.
 
 With noise: the posterior mean of one who knows how d was made. Between two steps the plant is
 linear and d constant, so a Kalman filter without any noise of its own is exact for one hypothesis
