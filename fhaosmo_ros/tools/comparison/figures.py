@@ -37,7 +37,7 @@ STYLES: dict[str, tuple[str, str, str]] = {
 TICKS = (1.0, 1.2, 1.5, 2.0, 3.0, 5.0, 8.0)
 SHOWN = (('paper', 'mix'), ('paper', 'steps'), ('pendulum', 'steps'), ('motor', 'steps'))
 """Plants and disturbances whose estimates are drawn."""
-FLOOR, CEILING = 1e-4, 10.0
+FLOOR, CEILING = 1e-7, 10.0
 """Limits of the error's axis."""
 
 rcParams['svg.hashsalt'] = 'fhaosmo_ros'  # the same figure gives the same file
