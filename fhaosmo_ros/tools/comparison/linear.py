@@ -7,10 +7,11 @@ from functools import lru_cache
 from fhaosmo_ros.core.compile_cache import compile_cache
 from fhaosmo_ros.core.family import Recording
 from fhaosmo_ros.core.model import TriangularModel
-from fhaosmo_ros.tools.comparison.methods import DERIVATIVES, Method, Run, Setting, Values
+from fhaosmo_ros.tools.comparison.methods import Method, Run, Setting, Values
 from fhaosmo_ros.tools.comparison.scores import Estimates
 from fhaosmo_ros.tools.sampled_model import pair, SampledModel
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise
+from fhaosmo_ros.tools.tuning.start import DERIVATIVES
 import numpy as np
 
 with compile_cache():

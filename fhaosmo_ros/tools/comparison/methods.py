@@ -9,8 +9,6 @@ from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.tools.comparison.scores import Estimates
 from fhaosmo_ros.tools.tuning.search import Dimension
 
-DERIVATIVES = (0, 1, 2, 3)
-"""Of d, that a model of it may have."""
 ROUNDING = 1e-15
 """Noise of a y about 1."""
 DEADBEAT = 3.0

@@ -13,15 +13,15 @@ from itertools import product
 from typing import Any
 
 from fhaosmo_ros.tools.comparison.linear import matern_space
-from fhaosmo_ros.tools.comparison.methods import DERIVATIVES, Method, Setting, Values
+from fhaosmo_ros.tools.comparison.methods import Method, Setting, Values
 from fhaosmo_ros.tools.comparison.sliding import prepared
 from fhaosmo_ros.tools.sampled_model import SampledModel
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise
+from fhaosmo_ros.tools.tuning.start import DERIVATIVES, SCHEME
 from fhaosmo_ros.tools.tuning.theory import kalman_like
 import numpy as np
 
 OURS = 'ours'
-SMALLEST_GAMMA = 1e-4
 START_GAMMA = 3e-3
 START_KAPPA = 300.0
 SMALLEST_SPREAD, START_SPREAD = 1.6, 2.0
@@ -50,7 +50,7 @@ def _refined(setting: Setting, best: Values) -> list[Dimension]:
         *(Dimension(name, x / NEAR, x * NEAR, x) for name, x in starts.items()),
         Dimension('spread', SMALLEST_SPREAD, 10.0, START_SPREAD),
         Dimension('kappa', 0.5, 1e4, best.get('kappa', START_KAPPA)),
-        Dimension('gamma', SMALLEST_GAMMA, 1.0, best.get('gamma', START_GAMMA)),
+        Dimension('gamma', SCHEME['gamma_min'], 1.0, best.get('gamma', START_GAMMA)),
     ]
 
 
@@ -73,13 +73,9 @@ def _parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
     gain = kalman_like(model, bandwidth, widths, small, gamma)
     factors = np.array([values.get(f'lambda_{i + 1}', 1.0) for i in range(levels)])
     return {
-        'structure': 'levant',
-        'scheme': 'predict_correct',
+        **SCHEME,
         'correction_period': setting.period,
-        'variant': 'fuzzy_adaptive',
-        'gamma_rate': 0.0,
         'gamma_initial': gamma,
-        'gamma_min': SMALLEST_GAMMA,
         'unknown_input_derivatives': derivatives,
         'unknown_input_decay': values['decay'],
         'lambda': (factors * gain).clip(1e-12, 1e15),
