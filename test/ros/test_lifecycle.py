@@ -42,7 +42,8 @@ class Manager:
 @pytest.fixture(scope='module')
 def node(client, start):
     process = start(
-        'estimator', *parameters(namespace='/managed', autostart='false', publish_rate=100.0)
+        'estimator',
+        *parameters(namespace='/managed', autostart='false', publish_rate=100.0, max_gap=60.0),
     )
     manager = Manager(client, '/managed/estimator')
     manager.process = process

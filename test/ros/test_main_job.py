@@ -94,11 +94,12 @@ def test_estimates_are_finite_and_close(pair):
     ],
 )
 def test_equals_a_replay_of_the_same_samples(client, folder, namespace, options):
-    arguments = parameters(namespace=namespace, publish_rate=500.0, **options)
+    arguments = parameters(namespace=namespace, publish_rate=500.0, max_gap=60.0, **options)
     with node_process(folder(), 'estimator', *arguments):
         rig = EstimatorRig(client, namespace)
         replay = OnlineEstimator(
-            options
+            {'max_gap': 60.0}
+            | options
             | ({'phi': ['u', '-z2 + sin(z1)'], 'lambda': [15, 10, 5]} if 'phi' in options else {})
         )
         for k in range(100):

@@ -21,7 +21,7 @@ from rosgraph_msgs.msg import Clock  # noqa: E402
 
 @pytest.fixture(scope='module')
 def rig(client, start):
-    process = start('estimator', *parameters(publish_rate=200.0, max_gap=1.0))
+    process = start('estimator', *parameters(publish_rate=200.0, max_gap=3.0))
     rig = EstimatorRig(client)
     rig.process = process
     return rig
