@@ -136,7 +136,7 @@ def test_interrupt_ends_it_in_one_line(tmp_path):
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         process.stderr.read(1)  # the bar begins
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=30)
+        _, said = process.communicate(timeout=60)
     assert process.returncode == 130
     assert 'Traceback' not in said
     assert said.splitlines()[-1] == 'paper: interrupted'

@@ -54,9 +54,9 @@ def test_estimator_restarts_where_the_loop_begins_again(tmp_path):
     finally:
         for process in (player, estimator):
             process.send_signal(signal.SIGINT)
-        out, _ = player.communicate(timeout=20)
-        estimator.wait(timeout=20)
-        reader.join(timeout=20)
+        out, _ = player.communicate(timeout=60)
+        estimator.wait(timeout=60)
+        reader.join(timeout=60)
     assert player.returncode == 0, out
     assert 'Traceback' not in out
 

@@ -102,7 +102,7 @@ def test_ctrl_c_leaves_nothing(tmp_path):
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGTERM)
     os.killpg(process.pid, signal.SIGINT)
-    _, error = process.communicate(timeout=30)
+    _, error = process.communicate(timeout=60)
     assert process.returncode == 130, error
     assert error.strip().splitlines()[-1] == 'plot: interrupted'
     assert 'Traceback' not in error

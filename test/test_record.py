@@ -85,7 +85,7 @@ def live():
     for node in nodes:
         node.send_signal(signal.SIGINT)
     for node in nodes:
-        node.communicate(timeout=20)
+        node.communicate(timeout=60)
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
@@ -95,7 +95,7 @@ def test_bag_is_complete_after_ctrl_c(storage, live, tmp_path):
     # Some ten seconds: the estimator may be discovered later than the plant.
     wait(lambda: size(bag) > 2_000_000, process, 'messages')
     process.send_signal(signal.SIGINT if storage == 'mcap' else signal.SIGTERM)
-    out, error = process.communicate(timeout=30)
+    out, error = process.communicate(timeout=60)
     assert process.returncode == 0, error
     information = yaml.safe_load((bag / 'metadata.yaml').read_text())
     information = information['rosbag2_bagfile_information']
@@ -149,7 +149,7 @@ def record_source(bag):
     finally:
         for process in (estimator, recorder):
             process.send_signal(signal.SIGINT)
-            _, error = process.communicate(timeout=30)
+            _, error = process.communicate(timeout=60)
     return error
 
 
@@ -183,7 +183,7 @@ def record_changes(bag):
         more = size(bag) + 200_000
         wait(lambda: size(bag) > more, process, 'messages')
         process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=30)
+        _, error = process.communicate(timeout=60)
         hand.set(epsilon=40.0, gamma_rate=0.004)
     assert process.returncode == 0, error
     return error
@@ -213,7 +213,7 @@ class Hand:
     def _done(self, future):
         ended = threading.Event()
         future.add_done_callback(lambda _: ended.set())
-        assert ended.wait(30)
+        assert ended.wait(60)
         return future.result()
 
     def __enter__(self):
@@ -279,7 +279,7 @@ def test_kill_loses_at_most_the_last_second(storage, live, tmp_path):
     wait(lambda: size(bag) > 150_000, process, 'messages')
     killed = time.time_ns()
     process.kill()
-    process.communicate(timeout=10)
+    process.communicate(timeout=60)
     assert not (bag / 'metadata.yaml').exists()
     result = run('record', '--repair', bag, '-o', tmp_path / 'saved')
     assert result.returncode == 0, result.stderr
@@ -333,7 +333,7 @@ def test_input_that_was_remapped_and_channels_are_recorded(tmp_path):
     finally:
         for process in reversed(processes):
             process.send_signal(signal.SIGINT)
-            process.communicate(timeout=30)
+            process.communicate(timeout=60)
     with BagReader(bag) as reader:
         counts = {c.topic: c.msgcount for c in reader.connections}
     assert counts['/force'] > 1000
@@ -355,7 +355,7 @@ def test_force_replaces_an_output(live, tmp_path):
     process = start('record', '-o', bag, '--force', '--topics', '/y')
     wait(lambda: size(bag) > 10_000, process, 'messages')
     process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=30)
+    _, error = process.communicate(timeout=60)
     assert process.returncode == 0, error
     assert sorted(p.name for p in bag.iterdir()) == ['bag.mcap', 'metadata.yaml']
 

@@ -505,7 +505,7 @@ def test_ctrl_c_leaves_nothing(tmp_path):
         time.sleep(0.01)
     os.killpg(process.pid, signals.SIGINT)
     os.killpg(process.pid, signals.SIGINT)
-    _, error = process.communicate(timeout=30)
+    _, error = process.communicate(timeout=60)
     assert process.returncode == 130, error
     assert 'Traceback' not in error
     assert sorted(p.name for p in tmp_path.iterdir()) == ['bag']

@@ -136,7 +136,7 @@ def test_policy_allows_exactly_what_the_node_has(client, start, policy, name):
                 return False
 
         try:
-            client.wait(same, f'{verb}', timeout=10.0)
+            client.wait(same, verb)
         except AssertionError:
             assert names(look(name, '/')) == set(listed)  # says what differs
     assert not names(node.get_client_names_and_types_by_node(name, '/'))
