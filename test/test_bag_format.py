@@ -141,6 +141,7 @@ def test_replayed_bag_is_read_by_another_reader(tmp_path):
         names = {i: c.topic for i, c in reader.get_summary().channels.items()}
         counts = {names[i]: n for i, n in statistics.channel_message_counts.items()}
         assert counts.pop('/y') == 3000
+        assert counts.pop('/estimator/parameters') == 1
         assert set(counts.values()) == {3000}
         assert len(counts) == 5
         assert (statistics.message_start_time, statistics.message_end_time) == (

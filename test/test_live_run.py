@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A replay begins, restarts and changes parameters where the live estimator in the bag did."""
 
+from itertools import product
+
 import bag_files as files
 from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameter_file import dumps
 from fhaosmo_ros.core.snapshot import Flag, labels, pack, Snapshot
 from fhaosmo_ros.tools import replay
 from fhaosmo_ros.tools.bags import labelled_array
@@ -40,6 +43,12 @@ class Live:
         vector = pack(Snapshot(estimator.latest, flags, estimator.memory))
         data = labelled_array(labels(estimator.observer.levels), vector)
         self.messages.append((f'{self.name}/snapshot', ARRAY, estimator.latest + delay, data))
+
+    def tell_parameters(self, stamp, **values):
+        """Publish them, as all that the node is set to."""
+        text = dumps(values, self.node)
+        data = files.cdr('std_msgs/msg/String', data=text)
+        self.messages.append((f'{self.node}/parameters', 'std_msgs/msg/String', int(stamp), data))
 
     def reset(self):
         self.estimator.reset()
@@ -130,6 +139,55 @@ def test_every_live_estimate_comes_again(begin, storage, tmp_path, capsys):
     assert f'{count} of {count} snapshots are the same' in text
 
 
+@pytest.mark.parametrize('begin', [0, 1200])
+def test_parameters_come_from_the_bag(begin, tmp_path, capsys):
+    """From the publisher's latest message, which a late recorder gets first."""
+    stamps, y = files.signal(2000)
+    live = Live('/rig/estimator', {'variant': 'fuzzy', 'epsilon': 3.0})
+    live.tell_parameters(stamps[0], variant='fuzzy', epsilon=3.0, publish_rate=50.0)
+    live.run(stamps, y, 0, 1000)
+    live.change(stamps[999], 'epsilon', 1e-6)
+    live.tell_parameters(stamps[1200 if begin else 999] + 200_000, variant='fuzzy', epsilon=1e-6)
+    live.run(stamps, y, 1000, 2000)
+    bag = write(tmp_path / 'bag', stamps, y, live, begin=begin)
+    out = tmp_path / 'o.npz'
+    code, text, _ = run(capsys, bag, '-o', out)
+    assert code == 0
+    assert 'parameters: /rig/estimator/parameters in the bag\n' in text
+    assert 'parameters differ' not in text
+    got = rows(out)
+    assert len(got) == 2000 - {0: 0, 1200: 1500}[begin]
+    for stamp, row in got.items():
+        np.testing.assert_array_equal(row, live.rows[stamp])
+
+
+def test_parameters_of_the_bag_make_way(tmp_path, capsys):
+    stamps, y = files.signal(600)
+    live = Live().run(stamps, y, 0, 600)
+    live.tell_parameters(stamps[0], variant='sign', epsilon=1.0)
+    bag = write(tmp_path / 'bag', stamps, y, live)
+    out = tmp_path / 'o.npz'
+    _, text, _ = run(capsys, bag, '-o', out, *OPTIONS, '-p', 'epsilon:=3.0')
+    assert 'in the bag, with variant, epsilon of the command line' in text
+    assert list(rows(out).values()) == list(live.rows.values())
+    path = tmp_path / 'p.yaml'
+    path.write_text('/**: {ros__parameters: {variant: fuzzy_adaptive, epsilon: 3.0}}')
+    _, text, _ = run(capsys, bag, '-o', out, '--force', '--params-file', path)
+    assert f'parameters: {path}\n' in text
+    assert list(rows(out).values()) == list(live.rows.values())
+
+
+def test_parameters_of_another_version_are_said(tmp_path, capsys):
+    stamps, y = files.signal(300)
+    live = Live().run(stamps, y, 0, 300)
+    live.tell_parameters(stamps[0], epsilom=1.0)
+    bag = write(tmp_path / 'bag', stamps, y, live)
+    code, _, error = run(capsys, bag, '-o', tmp_path / 'o.npz')
+    assert code == 2
+    for word in ("'/estimator/parameters'", 'epsilom', '--params-file'):
+        assert word in error
+
+
 def test_afresh_begins_at_the_first_sample(tmp_path, capsys):
     stamps, y = files.signal(1000)
     live = Live().run(stamps, y, 300, 1000)
@@ -216,11 +274,14 @@ def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
         live.change(stamps[699], 'epsilon', [1e-6, 0.5][k])
         live.run(stamps, y, 700, 1500)
     bag = write(tmp_path / 'bag', stamps, y, *lives)
+    own = {'hip.epsilon': 3.0, 'knee.epsilon': 3.0, 'channels': ['hip', 'knee']}
+    lives[0].tell_parameters(stamps[0], variant='fuzzy_adaptive', epsilon=7.0, **own)
+    told = write(tmp_path / 'told', stamps, y, *lives)
     (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
-    for live in lives:
-        out = tmp_path / f'{live.name.rpartition("/")[2]}.npz'
-        arguments = ['--follow', live.name, '--params-file', tmp_path / 'p.yaml', *OPTIONS]
-        code, text, _ = run(capsys, bag, '-o', out, *arguments)
+    file = ['--params-file', tmp_path / 'p.yaml', *OPTIONS]
+    for live, (source, options) in product(lives, [(bag, file), (told, [])]):
+        out = tmp_path / f'{live.name.rpartition("/")[2]}_{source.name}.npz'
+        code, text, _ = run(capsys, source, '-o', out, '--follow', live.name, *options)
         assert code == 0
         assert 'parameters differ' not in text
         got = rows(out)

@@ -18,6 +18,7 @@ pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.spin import Spinner
+from fhaosmo_ros.nodes.topics import LATCHED
 from fhaosmo_ros.tools.bag_reader import BagReader
 from fhaosmo_ros.tools.plot_data import PARTS
 from fhaosmo_ros.tools.series import series
@@ -113,7 +114,7 @@ def test_bag_is_complete_after_ctrl_c(storage, live, tmp_path):
         metadata = topic['topic_metadata']
         assert metadata['type_description_hash'].startswith('RIHS01_')
         assert metadata['offered_qos_profiles'][0]['reliability'] == 'reliable'
-        latched = metadata['name'] in ('/estimator/snapshot', '/rosout')
+        latched = metadata['name'] in (*LATCHED, '/rosout')
         durability = metadata['offered_qos_profiles'][0]['durability']
         assert durability == ('transient_local' if latched else 'volatile'), metadata['name']
     with AnyReader([bag]) as reader:

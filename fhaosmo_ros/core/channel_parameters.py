@@ -78,6 +78,14 @@ def of_channel(values: Mapping[str, Any], name: str) -> dict[str, Any]:
     return common | own
 
 
+def differing(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the common values, and of the channels' own those that are not the common ones."""
+    return {
+        name: value for name, value in values.items()
+        if '.' not in name or value != values[name.rpartition('.')[2]]
+    }  # fmt: skip
+
+
 def followers(name: str, names: Iterable[str], own: Collection[str]) -> list[str]:
     """Return the channels' parameters that follow the common one called `name`."""
     if name not in ONLINE_PARAMETERS:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2 parameter files, read and checked without ROS."""
+"""ROS 2 parameter files, read, checked and written without ROS."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -15,6 +15,8 @@ import yaml
 
 BUILT_IN = ('use_sim_time', 'start_type_description_service')
 """Parameters that rclpy declares itself."""
+DUMPER = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+"""libyaml's is some ten times as fast: a node writes its parameters while samples come."""
 
 
 def is_built_in(name: str) -> bool:
@@ -61,9 +63,40 @@ def load(
         raise ConfigurationError(f'{path}: {error}') from None
 
 
+def loads(text: str, node: str, table: ParameterTable) -> dict[str, Any]:
+    """Return what the text of a parameter file sets for a node; see `load`."""
+    return select(_of_node(_sections(text), node, strict=True), table)
+
+
+def dumps(values: Mapping[str, Any], node: str = '/**') -> str:
+    """
+    Return the text of a parameter file that sets these values.
+
+    Parameters
+    ----------
+    values : mapping
+        Of Python's own types.
+    node : str
+        The section's name: a node's full name, or a pattern.
+
+    """
+    content = {node: {'ros__parameters': dict(values)}}
+    text = yaml.dump(content, Dumper=DUMPER, sort_keys=False, default_flow_style=None, width=99)
+    return str(text)
+
+
 def read(path: str | Path, node: str, strict: bool = False) -> dict[str, Any]:
     """Return what a file sets for a node, unchecked; see `load`."""
-    sections = _sections(path)
+    try:
+        text = Path(path).read_text(encoding='utf-8')
+    except OSError as error:
+        raise ConfigurationError(f'expected a readable file, got: {error.strerror}') from None
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f'expected YAML, got: {error}') from None
+    return _of_node(_sections(text), node, strict)
+
+
+def _of_node(sections: Mapping[str, Mapping[str, Any]], node: str, strict: bool) -> dict[str, Any]:
     ours = [section for section in sections if _matches(section, node)]
     if strict and not ours:
         names = [section.lstrip('/') for section in sections]
@@ -95,14 +128,12 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
     return dict(table.coerce({k: v for k, v in values.items() if k in table}))
 
 
-def _sections(path: str | Path) -> dict[str, dict[str, Any]]:
+def _sections(text: str) -> dict[str, dict[str, Any]]:
     try:
-        content = parse(Path(path).read_text(encoding='utf-8'))
-    except OSError as error:
-        raise ConfigurationError(f'expected a readable file, got: {error.strerror}') from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        text = ' '.join(str(error).split())
-        raise ConfigurationError(f'expected YAML, got: {text}') from None
+        content = parse(text)
+    except yaml.YAMLError as error:
+        problem = ' '.join(str(error).split())
+        raise ConfigurationError(f'expected YAML, got: {problem}') from None
     sections: dict[str, dict[str, Any]] = {}
     if isinstance(content, Mapping):
         _collect(content, '', sections)

@@ -21,6 +21,7 @@ from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher, ERROR, OK, Repor
 from fhaosmo_ros.nodes.following import Following
 from fhaosmo_ros.nodes.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.outputs import check_overrides
+from fhaosmo_ros.nodes.parameter_topic import ParameterTopic
 from fhaosmo_ros.nodes.parameters import declare, on_change, overrides_of, values_of
 from fhaosmo_ros.nodes.spin import run_node
 
@@ -52,6 +53,7 @@ class EstimatorNode(ManagedNode):
         self._table = with_channels(ESTIMATOR_PARAMETERS, self._names, common)
         values = declare(self, self._table, self._check_all, fixed=['autostart', CHANNELS])
         self._channels: Channel | ChannelGroup | None = None
+        self._told: ParameterTopic | None = None
         self._following = Following(self._names, overrides)
         self._diagnostics = DiagnosticsPublisher(
             self, self._reports, values['diagnostics_period'], values['hardware_id']
@@ -74,6 +76,8 @@ class EstimatorNode(ManagedNode):
             self._channels = Channel(self, values)
         else:
             self._channels = ChannelGroup(self, values, self._names)
+        self._told = ParameterTopic(self, self._table)
+        self._told.publish()
         if self.get_parameter('use_sim_time').value and values['sampling'] == 'source_stamp':
             self.get_logger().warning(
                 "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing "
@@ -95,6 +99,9 @@ class EstimatorNode(ManagedNode):
         if self._channels is not None:
             self._channels.destroy()
             self._channels = None
+        if self._told is not None:
+            self._told.destroy()
+            self._told = None
 
     def _check_all(self, values: Mapping[str, Any]) -> None:
         """Raise if a channel can't be made of these values."""
@@ -120,6 +127,8 @@ class EstimatorNode(ManagedNode):
         self._following.adopted(changes)
         if self._channels is not None:
             self._channels.configure(changes)
+        if self._told is not None:
+            self._told.publish()
         if 'diagnostics_period' in changes:
             self._diagnostics.set_period(changes['diagnostics_period'])
         self._diagnostics.hardware_id = changes.get('hardware_id', self._diagnostics.hardware_id)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 import importlib
 from queue import SimpleQueue
+from time import time_ns
 from typing import Any, NamedTuple, Self
 
 from fhaosmo_ros.nodes.private_node import PrivateNode
@@ -14,6 +15,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 DEPTH = 5000
 DISCOVERY_PERIOD = 0.2
+OLD = 60 * 1_000_000_000
+"""
+Nanoseconds. A latched message that is older than the recording by more than this gets the stamp
+of the recording's beginning, or the bag would begin when somebody started the robot.
+"""
 SHARED = ('/parameter_events', '/rosout', '/diagnostics', '/tf', '/tf_static')
 """Topics of many publishers: the numbers of their messages tell nothing."""
 
@@ -27,7 +33,7 @@ class NewTopic(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """A message in CDR with its source time stamp in nanoseconds."""
+    """A message in CDR with its source time stamp in nanoseconds, but see `OLD`."""
 
     topic: str
     stamp: int
@@ -63,6 +69,7 @@ class TopicRecorder(PrivateNode):
         self.lost: dict[str, int] = {}
         self._wanted, self._listeners = wanted, listeners
         self._known: set[str] = set()
+        self._begin = time_ns()
         super().__init__('fhaosmo_recorder')
         self.node.create_timer(DISCOVERY_PERIOD, self._discover)
 
@@ -88,11 +95,15 @@ class TopicRecorder(PrivateNode):
                 )
                 continue
             profiles = [p.qos_profile for p in publishers]
+            qos = _matching(profiles)
+            latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            # What is measured keeps its stamps, even those of a clock that is wrong.
+            limit = self._begin - OLD if latched and topic not in inputs else 0
+            numbered = len(publishers) == 1 and topic not in SHARED
             self.queue.put(NewTopic(topic, types[0], [_plain(p) for p in profiles]))
             subscribe_with_info(
                 self.node, message_class, topic,
-                self._callback(topic, len(publishers) == 1 and topic not in SHARED),
-                _matching(profiles), raw=True,
+                self._callback(topic, numbered, limit), qos, raw=True,
             )  # fmt: skip
 
     def _inputs(self) -> set[str]:
@@ -104,7 +115,7 @@ class TopicRecorder(PrivateNode):
                 found |= {topic for topic, _ in topics}
         return found
 
-    def _callback(self, topic: str, numbered: bool) -> Any:
+    def _callback(self, topic: str, numbered: bool, limit: int) -> Any:
         put = self.queue.put
         latest = 0
 
@@ -117,7 +128,8 @@ class TopicRecorder(PrivateNode):
                 self.lost.pop(topic, None)
                 number = 2**63
             latest = max(latest, number)
-            put(Sample(topic, info['source_timestamp'] or info['received_timestamp'], data))
+            stamp = info['source_timestamp'] or info['received_timestamp']
+            put(Sample(topic, stamp if stamp >= limit else self._begin, data))
 
         return receive
 

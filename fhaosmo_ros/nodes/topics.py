@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of a run of plant and estimator, with their types."""
+"""The topics of a run of plant and estimator, with their types, and which of them are latched."""
 
 from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Log, ParameterEvent
-from std_msgs.msg import Float64, Float64MultiArray
+from std_msgs.msg import Float64, Float64MultiArray, String
 
 RUN_TOPICS = {
     '/y': Float64,
@@ -17,10 +17,14 @@ RUN_TOPICS = {
     '/estimator/gamma': Float64,
     '/estimator/innovation': Float64MultiArray,
     '/estimator/stamp': Time,
+    '/estimator/snapshot': Float64MultiArray,
+    '/estimator/parameters': String,
     '/diagnostics': DiagnosticArray,
     '/rosout': Log,
     '/parameter_events': ParameterEvent,
 }
+LATCHED = ('/estimator/snapshot', '/estimator/parameters')
+"""Kept by their publisher for who comes late."""
 
 
 def type_name(message_type: Any) -> str:

@@ -26,6 +26,8 @@ OFFERED_QOS = Qos(
     FOREVER, FOREVER, QosLiveliness.AUTOMATIC, FOREVER, False,
 )  # fmt: skip
 """What this package's nodes offer; `ros2 bag play` publishes with it again."""
+LATCHED_QOS = OFFERED_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
+"""The same, kept for who comes late."""
 
 
 def learn(message_type: str) -> bool:

@@ -10,9 +10,10 @@ import time
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.parameter_file import load
 from fhaosmo_ros.nodes.recorder import Recorder
-from fhaosmo_ros.nodes.topics import RUN_TOPICS, type_name
+from fhaosmo_ros.nodes.topics import LATCHED, RUN_TOPICS, type_name
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bag_writer import BagWriter
+from fhaosmo_ros.tools.bags import LATCHED_QOS, OFFERED_QOS
 from fhaosmo_ros.tools.command import Interrupted, run_command
 from fhaosmo_ros.tools.figures import save_run
 from fhaosmo_ros.tools.output import OutputFolder
@@ -94,12 +95,14 @@ def _default_output() -> Path:
 
 
 def _record(folder: Path, parameters: Path, duration: float, stop: Stop) -> None:
-    types = {topic: type_name(kind) for topic, kind in RUN_TOPICS.items()}
     with (
-        BagWriter(folder / 'bag', types) as bag,
-        Recorder(RUN_TOPICS, bag.write) as recorder,
+        BagWriter(folder / 'bag') as bag,
+        Recorder(RUN_TOPICS, bag.write, LATCHED) as recorder,
         Children(folder) as nodes,
     ):
+        for topic, kind in RUN_TOPICS.items():
+            qos = LATCHED_QOS if topic in LATCHED else OFFERED_QOS
+            bag.add(topic, type_name(kind), qos=[qos])
         options = ('--ros-args', '--params-file', str(parameters))
         nodes.start_node('estimator', *options)
         _wait(

@@ -13,6 +13,7 @@ from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameter import ParameterTable, unknown_parameter
 from fhaosmo_ros.core.parameter_file import load, parse, select
 from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
+from fhaosmo_ros.tools.recorded_parameters import Recorded
 import yaml
 
 
@@ -20,11 +21,11 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     """Add --params-file, -p, --node and --channel."""
     parser.add_argument(
         '--params-file', type=Path, action='append', default=[], metavar='FILE',
-        help="parameters of the estimator node, as in 'ros2 run'",
+        help="parameters of the estimator node, as in 'ros2 run' (default: those in the bag)",
     )  # fmt: skip
     parser.add_argument(
         '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
-        help='set one parameter; wins over the file',
+        help='set one parameter; wins over the file, or the bag',
     )  # fmt: skip
     parser.add_argument(
         '--node', default='estimator', metavar='NAME',
@@ -36,9 +37,17 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def online_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
+def online_parameters(
+    arguments: argparse.Namespace, recorded: Recorded | None = None
+) -> dict[str, Any]:
     """
     Return the parameters of the update path from the options.
+
+    Parameters
+    ----------
+    arguments : Namespace
+    recorded : Recorded, optional
+        What counts in place of --params-file, and of --channel, where they are not given.
 
     Raises
     ------
@@ -47,7 +56,11 @@ def online_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
 
     """
     values: dict[str, Any] = {}
-    origin: dict[str, Path | None] = {}
+    origin: dict[str, Path | str | None] = {}
+    if recorded and not arguments.params_file:
+        values = dict(recorded.values)
+        origin = dict.fromkeys(values, f'topic {recorded.topic!r}')
+        arguments.channel = arguments.channel or recorded.channel
     for path in arguments.params_file:
         of_file = load(path, arguments.node, ESTIMATOR_PARAMETERS, strict=True)
         values |= of_file

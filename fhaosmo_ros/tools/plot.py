@@ -48,7 +48,7 @@ def _plot(arguments: argparse.Namespace) -> None:
         c for bag in arguments.bags for c in read_curves(bag, arguments.names, arguments.plant)
     ]
     with Output(path, arguments.force) as output:
-        save_curves(curves, values.get('epsilon'), output.path, arguments.show)
+        save_curves(curves, values.get('epsilon', curves[0].epsilon), output.path, arguments.show)
         final = output.keep()
     print(f'{metrics(curves)}\nfigure: {final}', flush=True)
     if arguments.show:

@@ -4,9 +4,12 @@
 from pathlib import Path
 from typing import NamedTuple
 
+from fhaosmo_ros.core.channel_parameters import of_channel
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.metrics import chatter, rms
+from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools.bag_reader import BagReader
+from fhaosmo_ros.tools.recorded_parameters import recorded_parameters
 from fhaosmo_ros.tools.series import series
 from fhaosmo_ros.tools.ticks import read_ticks
 import numpy as np
@@ -32,6 +35,8 @@ class Curves(NamedTuple):
     gamma : (K,) array
     innovation : (K, N) array
     truth : (K, n + 1) array or None
+    epsilon : float or None
+        The gate of its levels, if it has one and the bag tells.
 
     """
 
@@ -42,6 +47,7 @@ class Curves(NamedTuple):
     gamma: NDArray[np.float64]
     innovation: NDArray[np.float64]
     truth: NDArray[np.float64] | None
+    epsilon: float | None
 
 
 def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]:
@@ -56,6 +62,12 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
     """
     with BagReader(path) as reader:
         topics = {c.topic for c in reader.connections if c.msgcount}
+        return _read_curves(reader, path, topics, names, plant)
+
+
+def _read_curves(
+    reader: BagReader, path: Path, topics: set[str], names: list[str] | None, plant: str
+) -> list[Curves]:
     found = sorted(t.removesuffix('/gamma') for t in topics if t.endswith('/gamma'))
     found = [name for name in found if all(f'{name}/{part}' in topics for part in PARTS)]
     for name in names or []:
@@ -70,10 +82,21 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
             f'name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
         )
     has_truth = {f'{plant}/state', f'{plant}/unknown_input'} <= topics
-    return [_curves(path, name, plant if has_truth else None) for name in names or found]
+    return [
+        _curves(path, name, plant if has_truth else None, _epsilon(reader, name))
+        for name in names or found
+    ]
 
 
-def _curves(path: Path, name: str, plant: str | None) -> Curves:
+def _epsilon(reader: BagReader, name: str) -> float | None:
+    recorded = recorded_parameters(reader, name)
+    if recorded is None:
+        return None
+    values = ESTIMATOR_PARAMETERS.defaults() | of_channel(recorded.values, recorded.channel)
+    return values['epsilon'] if values['structure'] == 'cascade' else None
+
+
+def _curves(path: Path, name: str, plant: str | None, epsilon: float | None) -> Curves:
     ticks = read_ticks(path, name, PARTS)
     when = ticks['stamp']
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
@@ -89,7 +112,7 @@ def _curves(path: Path, name: str, plant: str | None) -> Curves:
     ]
     return Curves(
         f'{path.resolve().name} {name}', when, [*labels, 'd'], estimate, ticks['gamma'],
-        ticks['innovation'], truth,
+        ticks['innovation'], truth, epsilon,
     )  # fmt: skip
 
 

@@ -2,12 +2,15 @@
 """Replay a recorded y through the node's update path, as fast as the machine allows."""
 
 import argparse
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bag_copy import copy_topics
 from fhaosmo_ros.tools.bag_reader import BagReader
@@ -16,6 +19,7 @@ from fhaosmo_ros.tools.command import Interrupted, run_command
 from fhaosmo_ros.tools.live_run import find_estimator, LiveRun, read_events
 from fhaosmo_ros.tools.options import add_parameter_options, named, online_parameters
 from fhaosmo_ros.tools.output import Output
+from fhaosmo_ros.tools.recorded_parameters import Recorded, recorded_parameters
 from fhaosmo_ros.tools.samples import Samples
 from fhaosmo_ros.tools.sinks import BagSink, CsvSink, NpzSink, Sink, TOPICS
 from tqdm import tqdm
@@ -74,17 +78,23 @@ def _parser() -> argparse.ArgumentParser:
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.every < 1:
         raise ConfigurationError(f'--every: expected an integer >= 1, got {arguments.every}')
-    estimator = OnlineEstimator(online_parameters(arguments))
     default = Path(f'{arguments.bag.resolve().name.removesuffix(".mcap")}_replayed')
     finals = arguments.output or [default]
     begin = perf_counter()
     with ExitStack() as stack:
         reader = stack.enter_context(BagReader(arguments.bag))
-        live = _live(reader, estimator, arguments)
+        name = None if arguments.afresh else find_estimator(reader, arguments.follow)
+        recorded = None if arguments.params_file else recorded_parameters(reader, name)
+        values = online_parameters(arguments, recorded)
+        estimator = OnlineEstimator(values)
+        live = None
+        if name is not None:
+            live = LiveRun(name, read_events(reader, name, named(arguments)), estimator)
         samples = Samples(reader, estimator, live, arguments)
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
         name = _name(reader, arguments.name)
-        _write(reader, samples, outputs, name, arguments, stop)
+        complete = ONLINE_PARAMETERS.defaults() | values
+        _write(reader, samples, outputs, name, complete, arguments, stop)
         finals = [output.keep() for output in outputs]
     seconds = perf_counter() - begin
     c = estimator.counters
@@ -92,6 +102,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         f'{c.accepted} samples used, {c.rejected} rejected, {c.restarts} restarts; '
         f'{samples.span:.1f} s of data in {seconds:.2f} s'
     )
+    print(f'parameters: {_origin(arguments, recorded)}')
     if live:
         print(live.report())
     for final in finals:
@@ -99,13 +110,15 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         print(f'output: {final}{where}')
 
 
-def _live(
-    reader: BagReader, estimator: OnlineEstimator, arguments: argparse.Namespace
-) -> LiveRun | None:
-    name = None if arguments.afresh else find_estimator(reader, arguments.follow)
-    if name is None:
-        return None
-    return LiveRun(name, read_events(reader, name, named(arguments)), estimator)
+def _origin(arguments: argparse.Namespace, recorded: Recorded | None) -> str:
+    if arguments.params_file:
+        base = ', '.join(map(str, arguments.params_file))
+    elif recorded:
+        base = f'{recorded.topic} in the bag'
+    else:
+        base = 'the defaults'
+    own = named(arguments)
+    return base + (f', with {", ".join(own)} of the command line' if own else '')
 
 
 def _name(reader: BagReader, name: str | None) -> str:
@@ -120,7 +133,7 @@ def _name(reader: BagReader, name: str | None) -> str:
 
 def _write(
     reader: BagReader, samples: Samples, outputs: list[Output], name: str,
-    arguments: argparse.Namespace, stop: Stop,
+    parameters: Mapping[str, Any], arguments: argparse.Namespace, stop: Stop,
 ) -> None:  # fmt: skip
     observer = samples.estimator.observer
     with ExitStack() as stack:
@@ -132,7 +145,7 @@ def _write(
                 sinks.append(NpzSink(output.path))
             else:
                 bag = stack.enter_context(BagWriter(output.path, storage=arguments.storage))
-                sinks.append(BagSink(bag, name, observer.order, observer.levels))
+                sinks.append(BagSink(bag, name, observer.order, observer.levels, parameters))
                 for _ in copy_topics(reader, bag):
                     _check_stop(stop)
         with tqdm(total=samples.total, unit='sample', unit_scale=True, desc='replay') as bar:

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where replayed estimates go: a bag, a CSV or an NPZ file, block by block."""
 
+from collections.abc import Mapping
 from itertools import groupby
 from pathlib import Path
 import shutil
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 import zipfile
 
 from fhaosmo_ros.core.observer import Trajectory
+from fhaosmo_ros.core.parameter_file import dumps
 from fhaosmo_ros.tools.bag_writer import BagWriter
-from fhaosmo_ros.tools.bags import labelled_array, serialise
+from fhaosmo_ros.tools.bags import labelled_array, LATCHED_QOS, serialise
 from fhaosmo_ros.tools.chunks import DATA_AT, MESSAGE, Records
+from fhaosmo_ros.tools.recorded_parameters import TOPIC as PARAMETERS
+from fhaosmo_ros.tools.recorded_parameters import TYPE as TEXT
 import numpy as np
 from numpy.typing import NDArray
 
@@ -134,10 +138,28 @@ class NpzSink:
 
 
 class BagSink:
-    """Adds the estimator's topics to an open bag, a message of each for every sample."""
+    """
+    Adds the estimator's topics to an open bag, a message of each for every sample.
 
-    def __init__(self, bag: BagWriter, name: str, order: int, levels: int) -> None:
+    Parameters
+    ----------
+    bag : BagWriter
+    name : str
+        What stands before the topics.
+    order, levels : int
+        Numbers of states and of innovations.
+    parameters : mapping
+        What the estimates are made with; told once, as the node does.
+
+    """
+
+    def __init__(
+        self, bag: BagWriter, name: str, order: int, levels: int, parameters: Mapping[str, Any]
+    ) -> None:
         self._bag = bag
+        self._parameters = f'{name}/{PARAMETERS}', dumps(parameters, name)
+        bag.add(self._parameters[0], TEXT, qos=[LATCHED_QOS])
+        self._told = False
         ids = [bag.add(f'{name}/{topic}', kind) for topic, kind in TOPICS.items()]
         state = [f'z{i + 1}' for i in range(order)]
         innovation = [f'eps{i + 1}' for i in range(levels)]
@@ -165,6 +187,10 @@ class BagSink:
 
     def write(self, rows: Rows) -> None:
         """Append the messages of each sample."""
+        if not self._told:
+            topic, text = self._parameters
+            self._bag.write(topic, int(rows.times[0]), serialise(TEXT, data=text))
+            self._told = True
         e = rows.estimates
         seconds, rest = np.divmod(e.t, 1_000_000_000)
         numbers = [

@@ -156,7 +156,7 @@ class Client:
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
-    def record(self, topic: str, message_type: type) -> list[Published]:
+    def record(self, topic: str, message_type: type, qos: QoSProfile = QOS) -> list[Published]:
         """Return a list that grows with the messages of a topic."""
         messages: list[Published] = []
 
@@ -165,7 +165,7 @@ class Client:
                 messages.append(Published(info['source_timestamp'], message))
                 self._changed.notify_all()
 
-        subscribe_with_info(self.node, message_type, topic, receive, QOS)
+        subscribe_with_info(self.node, message_type, topic, receive, qos)
         return messages
 
     def publisher(self, topic: str, message_type: type = Float64, qos: QoSProfile = QOS):

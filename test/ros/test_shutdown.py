@@ -15,7 +15,7 @@ pytestmark = pytest.mark.ros
 from rig import Parameters, parameters, Process  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
 
-GRACE = 5.0
+GRACE = 20.0
 """A second and what a loaded machine adds."""
 
 

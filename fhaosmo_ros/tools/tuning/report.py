@@ -4,11 +4,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.parameter_file import dumps
 from fhaosmo_ros.tools.tuning.objective import Objective, Verdict
 from fhaosmo_ros.tools.tuning.search import Dimension
 from fhaosmo_ros.tools.tuning.source import Data
 import numpy as np
-import yaml
 
 OVERFITTED = 1.25
 """Held-out error over that of the training from which on the report warns."""
@@ -27,8 +27,7 @@ class Column(NamedTuple):
 def parameter_file(parameters: Mapping[str, Any], comments: Sequence[str]) -> str:
     """Return a YAML that `estimator` loads as it is."""
     head = ''.join(f'# {line}'.rstrip() + '\n' for line in comments)
-    content = {'/**': {'ros__parameters': dict(parameters)}}
-    return head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=99)
+    return head + dumps(parameters)
 
 
 def table(columns: Sequence[Column]) -> str:
