@@ -109,7 +109,7 @@ def test_a_replay_takes_the_parameters_of_one_channel(tmp_path):
     words = ['--params-file', str(path), '-p', 'knee.lambda:=3']
     assert replayed(*words, '--channel', 'hip') == {'epsilon': 7.0}
     assert replayed(*words, '--channel', 'knee') == {'epsilon': 5.0, 'lambda': [3.0]}
-    with pytest.raises(ConfigurationError, match="--channel: expected 'hip' or 'knee', got ''"):
+    with pytest.raises(ConfigurationError, match='--channel: expected hip or knee, got none'):
         replayed(*words)
-    with pytest.raises(ConfigurationError, match="--channel: expected '', got 'hip'"):
+    with pytest.raises(ConfigurationError, match='--channel: expected none, .* got hip'):
         replayed('--channel', 'hip')

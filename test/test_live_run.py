@@ -297,3 +297,22 @@ def test_snapshot_of_another_version_is_said(tmp_path, capsys):
     assert code == 2
     assert "'/e/snapshot'" in error
     assert '--afresh' in error
+
+
+def test_channel_says_whom_to_follow(tmp_path, capsys):
+    stamps, y = files.signal(1200)
+    lives = [
+        Live(f'/estimator/{name}', node='/estimator').run(stamps, y, 0, 1200)
+        for name in ('hip', 'knee')
+    ]
+    own = {'variant': 'fuzzy_adaptive', 'epsilon': 3.0, 'channels': ['hip', 'knee']}
+    lives[0].tell_parameters(stamps[0], **own)
+    bag = write(tmp_path / 'bag', stamps, y, *lives)
+    out = tmp_path / 'o.npz'
+    code, text, _ = run(capsys, bag, '-o', out, '--channel', 'knee')
+    assert code == 0
+    assert 'followed /estimator/knee' in text
+    assert list(rows(out).values()) == list(lives[1].rows.values())
+    code, _, error = run(capsys, bag, '-o', out, '--afresh', '--channel', 'hop')
+    assert code == 2
+    assert '--channel: expected hip or knee, got hop' in error

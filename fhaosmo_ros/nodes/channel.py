@@ -199,7 +199,7 @@ class Channel:
     def _tell(self, word: int, y: float) -> None:
         if word & Status.RESTARTED:
             self._logger.warning(
-                'more than max_gap between two usable samples: restarted from the new one'
+                'the stamps jumped by more than max_gap, ahead or back: restarted from the new one'
             )
         if word & Status.DIVERGED:
             self._logger.error(

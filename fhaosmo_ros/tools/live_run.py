@@ -35,9 +35,11 @@ class Event(NamedTuple):
     changes: dict[str, Any]
 
 
-def find_estimator(reader: BagReader, name: str | None) -> str | None:
+def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> str | None:
     """
     Return the name of the estimator to follow: the one given, or the only one in the bag.
+
+    Of those with channels, the one of this channel.
 
     Raises
     ------
@@ -49,6 +51,9 @@ def find_estimator(reader: BagReader, name: str | None) -> str | None:
         c.topic.removesuffix(f'/{TOPIC}') for c in reader.connections
         if c.topic.endswith(f'/{TOPIC}') and c.msgcount
     )  # fmt: skip
+    of_channel = [other for other in found if channel and other.endswith(f'/{channel}')]
+    if name is None and len(of_channel) == 1:
+        return of_channel[0]
     if name is None and len(found) > 1:
         raise ConfigurationError(
             f'--follow: expected one of the live estimators in the bag ({", ".join(found)}), or '

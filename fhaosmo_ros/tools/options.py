@@ -7,7 +7,7 @@ from pathlib import Path
 import re
 from typing import Any
 
-from fhaosmo_ros.core.channel_parameters import channel_names, of_channel
+from fhaosmo_ros.core.channel_parameters import channel_names, of_channel, UNNAMED
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameter import ParameterTable, unknown_parameter
@@ -70,9 +70,9 @@ def online_parameters(
     origin |= dict.fromkeys(on_command_line)
     names = channel_names(values)
     if arguments.channel not in names:
+        allowed = 'none, as the node has no channels' if names == UNNAMED else ' or '.join(names)
         raise ConfigurationError(
-            f'--channel: expected {" or ".join(repr(name) for name in names)}, got '
-            f'{arguments.channel!r}'
+            f'--channel: expected {allowed}, got {arguments.channel or "none"}'
         )
     own = of_channel(values, arguments.channel)
     own = {name: value for name, value in own.items() if name in ONLINE_PARAMETERS}

@@ -83,7 +83,11 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     begin = perf_counter()
     with ExitStack() as stack:
         reader = stack.enter_context(BagReader(arguments.bag))
-        name = None if arguments.afresh else find_estimator(reader, arguments.follow)
+        name = (
+            None
+            if arguments.afresh
+            else find_estimator(reader, arguments.follow, arguments.channel)
+        )
         recorded = None if arguments.params_file else recorded_parameters(reader, name)
         values = online_parameters(arguments, recorded)
         estimator = OnlineEstimator(values)
