@@ -4,7 +4,7 @@
 import math
 
 from fhaosmo_ros.core import ConfigurationError
-from fhaosmo_ros.core.layout import HAT
+from fhaosmo_ros.core.layout import HAT, TILDE
 from fhaosmo_ros.core.online import OnlineEstimator
 from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
 from fhaosmo_ros.core.status import Status
@@ -263,6 +263,49 @@ def test_seed_after_a_gap_is_not_taken_back_with_the_gap():
     feed.count -= 50  # a late sample from inside the gap
     assert feed.sine(1)[0].rejected
     assert feed.estimator.estimate.unknown_input == 70.0
+
+
+@pytest.mark.parametrize('structure', ['cascade', 'levant'])
+def test_seed_takes_derivatives_of_the_unknown_input_for_zero(structure):
+    estimator = OnlineEstimator({'unknown_input_derivatives': 2, 'structure': structure})
+    estimator.update(START, 0.1)
+    estimator.seed([0.2, 1.0, 2.0], 3.0)
+    estimate = estimator.estimate
+    np.testing.assert_array_equal(estimate.z, [0.2, 1.0, 2.0])
+    assert estimate.unknown_input == 3.0
+    levels = estimator.observer.state.levels
+    np.testing.assert_array_equal(levels[HAT], [0.2, 1.0, 2.0, 3.0, 0.0, 0.0])
+    np.testing.assert_array_equal(levels[TILDE], [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
+
+
+def after_a_gap() -> Feed:
+    """Return a feed whose latest sample ended a gap, and whose gamma moves."""
+    feed = Feed(gamma_rate=50.0, gamma_dead_zone=0.0)
+    feed.sine(100)
+    before = feed.estimator.estimate.gamma
+    feed.count += 100
+    feed.sine(1)
+    assert feed.estimator.estimate.gamma != before
+    return feed
+
+
+@pytest.mark.parametrize('change', [{'variant': 'fuzzy'}, {'gamma_min': 0.6}])
+def test_gap_before_a_change_of_parameters_is_not_withdrawn(change):
+    feed = after_a_gap()
+    feed.estimator.configure(change)
+    gamma = feed.estimator.estimate.gamma
+    feed.count -= 50  # a late sample from inside the gap
+    assert feed.sine(1)[0].rejected
+    assert feed.estimator.estimate.gamma == gamma
+
+
+def test_frozen_gamma_stays_where_a_gap_could_be_withdrawn():
+    feed = after_a_gap()
+    feed.estimator.freeze(True)
+    gamma = feed.estimator.estimate.gamma
+    feed.count -= 50
+    feed.sine(200)
+    assert feed.estimator.estimate.gamma == gamma
 
 
 def test_seed_in_the_middle_of_a_run():

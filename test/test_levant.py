@@ -267,7 +267,8 @@ def powers(low, high):
 
 @settings(max_examples=1000)
 @given(
-    st.sampled_from(VARIANTS), powers(-20.0, 6.0), powers(-6.0, 0.5), powers(-3.0, 0.0),
+    st.sampled_from(VARIANTS), powers(-20.0, 6.0), powers(-6.0, 0.5),
+    powers(-3.0, 0.0) | st.sampled_from([1e-9, 1e-16, 1e-300]),
     st.lists(powers(-6.0, 6.0), min_size=4, max_size=4), powers(-9.0, 6.0),
 )  # fmt: skip
 def test_root(variant, b, h, gamma, lambdas, width):
@@ -286,6 +287,21 @@ def test_root(variant, b, h, gamma, lambdas, width):
     assert np.all((s >= 0.0) & (s <= 1.0))
     terms = np.append(weights[0] * w ** np.arange(3, -1, -1) * s, eps)
     np.testing.assert_allclose(terms.sum(), b, rtol=1e-11)
+
+
+@pytest.mark.parametrize('scheme', ['implicit', 'predict_correct'])
+def test_gamma_of_next_to_nothing_is_the_limit_of_small_ones(scheme):
+    p = {'structure': 'levant', 'scheme': scheme, 'variant': 'fuzzy_adaptive', 'gamma_rate': 0.0}
+    p |= {'lambda': [39.75, 276.3, 1498.0, 3260.0], 'fuzzy_widths': 4.0}
+    t = np.arange(0.0, 1.0, 1e-3)
+    small, smaller, *rest = (
+        Observer(p | {'gamma_min': gamma, 'gamma_initial': gamma}).run(t, np.sin(t)).z_hat
+        for gamma in (1e-6, 1e-9, 1e-12, 1e-15, 1e-18, 1e-300)
+    )
+    error = np.abs(small - smaller).max()
+    assert 0.0 < error < 1e-2
+    for z_hat in rest:
+        np.testing.assert_allclose(z_hat, smaller, rtol=0.0, atol=2e-3 * error)
 
 
 def test_structure_changes_live_without_a_jump():

@@ -91,17 +91,22 @@ import sys, time
 sys.path.insert(0, 'test')
 from test_search import bowl, SPACE
 from fhaosmo_ros.tools.tuning.search import minimise
+calls = 0
 def slow(values):
-    time.sleep(0.02)
+    global calls
+    calls += 1
+    time.sleep(0.02 if calls <= int(sys.argv[3]) else 3600.0)
     return bowl(values)
 result = minimise(slow, SPACE, int(sys.argv[2]), jobs=1, storage=sys.argv[1])
 print(len(result.trials), result.value)
 """
 
 
-def worker(storage, trials):
+def worker(storage, trials, calls=1_000_000):
+    """Start a search that hangs in the trial after so many."""
+    command = [sys.executable, '-c', WORKER, storage, str(trials), str(calls)]
     return subprocess.Popen(
-        [sys.executable, '-c', WORKER, storage, str(trials)], cwd=ROOT, stdout=subprocess.PIPE,
+        command, cwd=ROOT, stdout=subprocess.PIPE,
         text=True, env=os.environ | {'PYTHONPATH': str(ROOT)},
     )  # fmt: skip
 
@@ -113,7 +118,8 @@ def lines(storage):
 def test_two_processes_and_a_kill(tmp_path):
     """What the killed one had finished stays; the other one ends the study; it goes on later."""
     storage = tmp_path / 'study.log'
-    victim, other = worker(str(storage), 10_000), worker(str(storage), 150)
+    # The victim's trials end by themselves: how late it is killed does not matter.
+    victim, other = worker(str(storage), 10_000, calls=40), worker(str(storage), 150)
     try:
         deadline = time.monotonic() + 60.0
         while lines(storage) < 60 and time.monotonic() < deadline:

@@ -112,8 +112,10 @@ def root(
     """
     Solve eps + sum_i h^i lambda_i |eps|^{p_i} s_i = b, s_i in psi_i(eps), for b >= 0 (D 12).
 
-    Newton's method on the logarithms of both sides over that of w, where |eps|^{p_i} = w^{N-i}:
-    there a sum of powers is convex and nearly straight, at any gamma and over any range.
+    Newton's method on the logarithms of both sides over that of eps: there a sum of powers is
+    convex and nearly straight, at any gamma and over any range. Powers are those of w, as
+    |eps|^{p_i} = w^{N-i}, but eps does not come from w, which tells nothing of it as gamma goes
+    to 0.
 
     Parameters
     ----------
@@ -136,32 +138,32 @@ def root(
             return 0.0, 0.0, b / constant  # sliding: the set-valued sign takes what is needed
     target = b - constant
     q = 2.0 * gamma / n
-    w = target**q
-    low, high = TINY**q, w
+    x = math.log(target)  # of eps; the other terms only make it less
+    low, high = math.log(TINY), x
     for _ in range(NEWTON_STEPS):
-        e = w**n if gamma == 0.5 else w ** (1.0 / q)
-        # The left side but for sign's constant, and its derivative along log w.
-        f, slope, power = e, e / q, 1.0
+        w = math.exp(q * x)
+        e = w**n if gamma == 0.5 else math.exp(x)
+        # The left side but for sign's constant, and its derivative along x.
+        f, slope, power = e, e, 1.0
         for i in range(n - 1, -1, -1):
             s, ds = psi(flags, gains, curves, i, e)
             if i < n - 1 or not flags[SIGN]:
                 f += weights[0, i] * power * s
-                slope += weights[0, i] * power * ((n - 1 - i) * s + e / q * ds)
+                slope += weights[0, i] * power * (q * (n - 1 - i) * s + e * ds)
             power *= w
         if f > target:
-            high = w
+            high = x
         else:
-            low = w
+            low = x
         change = math.log1p((f - target) / target) * f / slope
-        trial = w * math.exp(-change)
-        if abs(change) <= NEWTON_TOLERANCE * q:
-            w = trial
+        trial = x - change
+        if abs(change) <= NEWTON_TOLERANCE:
+            x = trial
             break
         # For sign the way from above is monotone. A fuzzy curve has corners: bisect then.
-        w = trial if flags[SIGN] or low < trial < high else math.sqrt(low * high)
-    e = w**n if gamma == 0.5 else w ** (1.0 / q)
-    e = max(e, TINY)
-    return e, w, psi(flags, gains, curves, n - 1, e)[0]
+        x = trial if flags[SIGN] or low < trial < high else 0.5 * (low + high)
+    e = max(math.exp(x), TINY)
+    return e, math.exp(q * x), psi(flags, gains, curves, n - 1, e)[0]
 
 
 @njit(cache=True, error_model='numpy')

@@ -133,6 +133,7 @@ class OnlineEstimator:
         reals[at.EPSILON] = self.observer.parameters['epsilon']
         if p['sampling'] != before:
             self.forget_stamp()
+        ints[at.BRIDGED] = 0  # the state before a gap is that of the parameters before
         state = self.observer.state
         self.observer.reset()
         fresh = self.observer.state
@@ -216,13 +217,15 @@ class OnlineEstimator:
                 f'{limit:g} (divergence_limit), got {z!r} and {unknown_input!r}'
             )
         self._levels[:] = 0.0
-        self._levels[layout.HAT] = values[: self.observer.levels]
+        known = min(n + 1, self.observer.levels)  # derivatives of d, behind it, are 0
+        self._levels[layout.HAT, :known] = values[:known]
         self._levels[layout.TILDE, :n] = values[1:]
         self._ints[at.BRIDGED] = 0
 
     def freeze(self, held: bool) -> None:
         """Hold gamma where it is, or let it adapt again; no parameter changes."""
         self._ints[at.FROZEN] = held
+        self._ints[at.BRIDGED] = 0  # the state before a gap has another gamma
 
     @property
     def frozen(self) -> bool:

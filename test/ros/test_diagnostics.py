@@ -45,12 +45,17 @@ def test_names_are_those_that_ros_tools_expect(rig):
 
 
 def test_values_of_the_input(rig):
-    values = numbers(rig.wait_status('input', OK))
+    def as_sampled() -> bool:  # over 0.2 s, in which a loaded machine may stall
+        values.update(numbers(rig.wait_status('input', OK)))
+        return float(values['sample rate [Hz]']) == pytest.approx(RATE, rel=0.2)
+
+    values = {}
+    rig.client.wait(as_sampled, 'rate of the plant')
     assert values['topic'] == '/d/y'
     assert values['publishers'] == '/d/plant'
-    assert float(values['sample rate [Hz]']) == pytest.approx(RATE, rel=0.2)
     assert float(values['jitter (std / mean of the period)']) >= 0.0
-    assert float(values['longest period [s]']) >= 1.0 / RATE
+    mean = 1.0 / float(values['sample rate [Hz]'])
+    assert float(values['longest period [s]']) >= 0.999 * mean
     assert 0.0 < float(values['longest delay [s]']) < 10.0
     assert 0.0 <= float(values['age of the last sample [s]']) < 10.0
     assert int(values['samples accepted']) > 0
@@ -99,16 +104,17 @@ def test_hardware_id_and_period_are_live(rig):
         lambda: rig.wait_status('state', OK).hardware_id == 'encoder 7', 'new hardware_id'
     )
     assert rig.parameters.set(diagnostics_period=2.0)[0].successful
-    rig.wait_status('state', OK)
     first = len(rig.diagnostics)
-    rig.wait_status('state', OK)
-    rig.wait_status('state', OK)
-    stamps = [
-        m.stamp
-        for m in rig.diagnostics[first:]
-        if m.message.status[0].name == 'd/estimator: state'
-    ]
-    assert stamps[-1] - stamps[-2] > 1.5e9
+
+    def slow() -> bool:  # a report that comes late makes the time to the next one shorter
+        stamps = [
+            m.stamp
+            for m in rig.diagnostics[first:]
+            if m.message.status[0].name == 'd/estimator: state'
+        ]
+        return len(stamps) > 2 and stamps[-1] - stamps[-2] > 1.5e9
+
+    rig.client.wait(slow, 'reports 2 s apart')
     assert rig.parameters.set_atomically(hardware_id='none', diagnostics_period=0.2).successful
 
 

@@ -92,6 +92,7 @@ def test_life_of_a_node(client, unconfigured):
     rig.wait_status('state', b'\0', 'active')
     assert node.change(Transition.TRANSITION_DEACTIVATE)
     assert node.state() == 'inactive'
+    rig.wait_status('state', b'\3', 'inactive')  # what was on its way has come
     ticks = len(rig.topics['stamp'])
     rig.wait_status('state', b'\3', 'inactive')
     assert len(rig.topics['stamp']) == ticks

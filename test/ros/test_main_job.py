@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plant and estimator as two processes; the estimator alone against a replay of its samples."""
 
+import bisect
 import math
 import signal
 
@@ -35,9 +36,13 @@ def pair(client, start):
 
 def test_rate_is_the_timers(pair):
     rig, _ = pair
-    for messages in rig.topics.values():
-        stamps = [m.stamp for m in messages[-100:]]
-        assert np.median(np.diff(stamps)) * 1e-9 == pytest.approx(1.0 / RATE, rel=0.1)
+    for topic, messages in rig.topics.items():
+
+        def at_rate(messages=messages) -> bool:
+            stamps = [m.stamp for m in messages[-100:]]
+            return np.median(np.diff(stamps)) * 1e-9 == pytest.approx(1.0 / RATE, rel=0.1)
+
+        rig.client.wait(at_rate, f'{topic} at {RATE} Hz')
 
 
 def test_state_is_labelled_and_sized(pair):
@@ -64,25 +69,30 @@ def test_stamp_is_a_samples_source_stamp(pair):
 
 def test_estimates_are_finite_and_close(pair):
     rig, (states, inputs) = pair
-    estimates = rig.estimates
-    last = estimates[-int(RATE) :]
-    z_at = {m.stamp: m.message.data for m in list(states)}
-    d_at = {m.stamp: m.message.data for m in list(inputs)}
+    low = ESTIMATOR_PARAMETERS['gamma_min'].default
+    high = ESTIMATOR_PARAMETERS['gamma_max'].default
 
-    def nearest(values, stamp):
-        return values[min(values, key=lambda s: abs(s - stamp))]
+    def rms_of_a_second() -> np.ndarray:
+        last = rig.estimates[-int(RATE) :]
+        estimates = np.array([[*e.z, e.unknown_input] for e in last])
+        truth = np.array([
+            [*nearest(states, e.stamp).data, nearest(inputs, e.stamp).data] for e in last
+        ])  # fmt: skip
+        return np.sqrt(np.mean((estimates - truth) ** 2, axis=0))
 
-    for e in estimates:
+    # A machine that stalls makes a gap, and the observer starts afresh: then it has a second more.
+    rig.client.wait(
+        lambda: (rms_of_a_second() < [0.005, 0.05, 0.1, 0.05]).all(), 'estimates near the truth'
+    )
+    for e in rig.estimates:
         assert all(map(math.isfinite, [*e.z, e.unknown_input, e.gamma, *e.innovation]))
-        low = ESTIMATOR_PARAMETERS['gamma_min'].default
-        high = ESTIMATOR_PARAMETERS['gamma_max'].default
         assert low <= e.gamma <= high
-    z = np.array([[e.z, nearest(z_at, e.stamp)] for e in last])
-    d = np.array([[e.unknown_input, nearest(d_at, e.stamp)] for e in last])
-    rms = np.sqrt(np.mean((z[:, 0] - z[:, 1]) ** 2, axis=0))
-    assert (rms < [0.005, 0.05, 0.1]).all(), rms
-    rms_d = np.sqrt(np.mean((d[:, 0] - d[:, 1]) ** 2))
-    assert rms_d < 0.1, rms_d
+
+
+def nearest(messages: list, stamp: int):
+    """Return the message that was published nearest to a time."""
+    after = bisect.bisect([m.stamp for m in messages], stamp)
+    return min(messages[max(after - 1, 0) :][:2], key=lambda m: abs(m.stamp - stamp)).message
 
 
 @pytest.mark.parametrize(
