@@ -18,7 +18,7 @@ from fhaosmo_ros.tools.bags import labelled_array, serialise
 from fhaosmo_ros.tools.tuning.command import main, read_parameters
 from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.sensor import identify
+from fhaosmo_ros.tools.tuning.sensor import identify, noise_at_stamps
 from fhaosmo_ros.tools.tuning.source import simulated
 from fhaosmo_ros.tools.tuning.theory import candidates
 import numpy as np
@@ -167,15 +167,16 @@ def test_levant_is_tuned_without_what_it_does_not_use(tmp_path):
 # bags
 
 
-def make_bag(path, truth=True, noise=1e-3):
+def make_bag(path, truth=True, noise=1e-3, jitter=0.0):
     family = Family(SHORT | {'duration': 9.0, 'noise_std': noise, 'dropout': 0.02})
     r = family.recording(0)
+    stamps = r.t + jitter * np.random.default_rng(1).standard_normal(len(r.t))
     with BagWriter(path) as bag:
         bag.add('/y', 'std_msgs/msg/Float64')
         if truth:
             bag.add('/plant/unknown_input', 'std_msgs/msg/Float64')
             bag.add('/plant/state', 'std_msgs/msg/Float64MultiArray')
-        for k, stamp in enumerate((10**18 + np.round(r.t * 1e9)).astype(np.int64).tolist()):
+        for k, stamp in enumerate((10**18 + np.round(stamps * 1e9).astype(np.int64)).tolist()):
             bag.write('/y', stamp, serialise('std_msgs/msg/Float64', data=r.y[k]))
             if truth:
                 d = serialise('std_msgs/msg/Float64', data=r.d[k])
@@ -194,6 +195,17 @@ def test_bag_with_truth_is_what_it_trains_on(tmp_path):
     assert '1 recordings to train on, 1 held out' in report
     assert 'another run as well' in report
     assert 'simulated' not in (out / 'gains.yaml').read_text()
+
+
+def test_jitter_counts_where_the_truth_is_for_the_very_samples(tmp_path):
+    """As the plant publishes it: y is its z1 to the last bit, and only the stamps are off."""
+    make_bag(tmp_path / 'bag', noise=0.0, jitter=1e-4)
+    out = tmp_path / 'out'
+    words = [word for word in QUICK if 'scheme' not in word]
+    assert main([*words, '--bag', str(tmp_path / 'bag'), '-o', str(out)]) == 0
+    report = (out / 'report.md').read_text()
+    error = re.search(r'relative to the truth \|(.*)', report)[1].split('|')
+    assert all(float(word) < 0.9 for word in error[:4]), error
 
 
 def test_bag_without_truth_gives_the_sensor(tmp_path):
@@ -355,6 +367,20 @@ def test_sensor_outlives_bad_samples():
     assert identify(t, y).noise_std == pytest.approx(1e-3, rel=0.1)
     with pytest.raises(ConfigurationError, match='at least 200 samples'):
         identify(t[:100], y[:100])
+
+
+@pytest.mark.parametrize(('noise', 'jitter', 'expected'), [
+    (1e-4, 0.0, 1e-4), (0.0, 1e-4, 1e-4), (0.0, 0.0, 0.0),
+])  # fmt: skip
+def test_noise_at_stamps_is_noise_and_jitter(noise, jitter, expected):
+    """Uneven sampling that the stamps tell, and missing samples, are neither."""
+    random = np.random.default_rng(2)
+    t = 1e-3 * (np.arange(20_000) + random.uniform(-0.3, 0.3, 20_000))
+    t = t[random.random(len(t)) > 0.1]
+    y = np.sin(t) + t + noise * random.standard_normal(len(t))
+    slope = np.sqrt(np.mean((np.cos(t) + 1.0) ** 2))
+    t += 3**0.5 * jitter / slope * random.uniform(-1.0, 1.0, len(t))
+    assert noise_at_stamps(t, y) == pytest.approx(expected, rel=0.1, abs=1e-9)
 
 
 def test_theory_scales_with_the_unit_of_y():

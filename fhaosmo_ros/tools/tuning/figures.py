@@ -85,7 +85,11 @@ def save_sensitivity(
         x, value = curves[d.name]
         axes.plot(x, np.minimum(value, 10.0 * objective), color='#0072B2', marker='.', lw=1.2)
         axes.plot([best[d.name]], [objective], color='#D55E00', marker='o', ls='none')
-        axes.set_xscale('log' if d.log else 'linear')
+        if d.log:  # a decade or six: matplotlib's own labels would run into one another
+            axes.set_xscale('log')
+            ticks = np.geomspace(np.min(x), np.max(x), 3)
+            axes.set_xticks(ticks, [f'{tick:.2g}' for tick in ticks])
+            axes.minorticks_off()
         axes.set_title(d.name, fontsize='medium')
         axes.grid(alpha=0.3)
         axes.set_ylim(0.95 * objective, HIGHEST * objective)

@@ -75,12 +75,14 @@ class KalmanStart:
     derivatives : int
         Of d.
     gamma : float
+    least_noise : float
+        Of y, where the recordings have less.
 
     """
 
     def __init__(
         self, recordings: Sequence[Recording], fixed: Mapping[str, Any], model: TriangularModel,
-        derivatives: int, gamma: float,
+        derivatives: int, gamma: float, least_noise: float = 0.0,
     ) -> None:  # fmt: skip
         self._fixed, self._model, self._derivatives = fixed, model, derivatives
         self._gamma = gamma
@@ -90,7 +92,7 @@ class KalmanStart:
         self._size = float(size[-1])
         # Without noise the observer may be deadbeat, and is not asked for more.
         least = 0.1 * self._size * self._period**model.order
-        self._noise = max(effective_noise(recordings), least)
+        self._noise = max(effective_noise(recordings), least_noise, least)
         self._usual = self._noise + float(size[1]) * self._period
 
     def bandwidth(self, rate: float) -> float:

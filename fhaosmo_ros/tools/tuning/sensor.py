@@ -13,6 +13,8 @@ Floats = NDArray[np.float64]
 FEWEST = 200
 """Samples that an estimate needs."""
 DIFFERENCES = range(1, 9)
+DIVIDED = range(2, 6)
+"""Orders of differences: even ones, and divided ones."""
 NORMAL = 0.6745
 """Median of |x| of a standard normal x."""
 ON_GRID = 0.02
@@ -88,6 +90,42 @@ def identify(t: Floats, y: Floats) -> Sensor:
     return Sensor(
         noise, quantum, rate, jitter, lost / (lost + len(t)), lost / gaps if gaps else 1.0
     )
+
+
+def noise_at_stamps(t: Floats, y: Floats) -> float:
+    """
+    Return the RMS noise of y as a function of its stamps, whose jitter acts as noise as well.
+
+    From divided differences, scaled so that white noise leaves its own size; where samples are
+    missing none are taken.
+
+    Parameters
+    ----------
+    t, y : (K,) arrays
+        Increasing stamps (s) and samples. Of fewer than `FEWEST` the noise is 0: nothing is known.
+
+    """
+    if len(t) < FEWEST:
+        return 0.0
+    h = np.diff(t)
+    regular = h < 1.5 * float(np.median(h))
+    found = []
+    for order in DIVIDED:
+        whole = np.lib.stride_tricks.sliding_window_view(regular, order).all(axis=1)
+        times, values = (
+            np.lib.stride_tricks.sliding_window_view(x, order + 1)[whole] for x in (t, y)
+        )
+        if len(times) < FEWEST // 2:
+            continue
+        columns = range(order + 1)
+        times = times / h.mean()
+        weights = np.column_stack([
+            1.0 / np.prod([times[:, j] - times[:, k] for k in columns if k != j], axis=0)
+            for j in columns
+        ])  # fmt: skip
+        left = np.sum(weights * values, axis=1) / np.linalg.norm(weights, axis=1)
+        found.append(float(np.sqrt(np.mean(left**2))))
+    return min(found, default=0.0)
 
 
 def _noise(y: Floats, regular: NDArray[np.bool_]) -> float:

@@ -14,7 +14,7 @@ from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.tools.bag_reader import BagReader
 from fhaosmo_ros.tools.held_input import HeldInput
 from fhaosmo_ros.tools.series import series
-from fhaosmo_ros.tools.tuning.sensor import identify, Sensor
+from fhaosmo_ros.tools.tuning.sensor import identify, noise_at_stamps, Sensor
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +36,8 @@ class Data:
         What a bag's y said.
     parameters : dict
         Of the family, complete.
+    least_noise : float
+        RMS noise of y that shows without the truth, which may say less.
 
     """
 
@@ -44,6 +46,7 @@ class Data:
     origin: str
     parameters: dict[str, Any]
     sensor: Sensor | None = None
+    least_noise: float = 0.0
     notes: list[str] = field(default_factory=list)
 
 
@@ -89,6 +92,8 @@ def from_bag(choice: BagChoice, values: Mapping[str, Any], given: set[str], seed
     if truth is not None:
         data = _pieces(t, y, u, truth, values)
         data.sensor, data.origin = sensor, f'pieces of bag {choice.path.resolve().name}'
+        # The truth is that of the moment of a sample, not of its stamp: it knows no jitter.
+        data.least_noise = max(noise_at_stamps(r.t, r.y) for r in data.training)
         return data
     seen = sensor._asdict()
     data = simulated(dict(values) | {k: v for k, v in seen.items() if k not in given}, seed)
@@ -154,4 +159,4 @@ def _pieces(
         'The recordings are pieces of one run: gains can fit its one kind of d. Judge them on '
         'another run as well.'
     ]
-    return Data(parts[::2], parts[1::2], 'bag', family, None, notes)
+    return Data(parts[::2], parts[1::2], 'bag', family, notes=notes)

@@ -73,6 +73,8 @@ class Question(NamedTuple):
         Parameters that are searched.
     objective : callable
         From what is set for the estimator to an Objective.
+    least_noise : float
+        Of y, where the recordings have less.
 
     """
 
@@ -80,6 +82,7 @@ class Question(NamedTuple):
     estimator: Mapping[str, Any]
     names: Sequence[str]
     objective: Callable[[Mapping[str, Any]], Objective]
+    least_noise: float = 0.0
 
     @property
     def observer(self) -> Observer:
@@ -169,7 +172,11 @@ def _scaled(question: Question, jury: Jury) -> dict[str, Any]:
         gammas = gammas or [p['gamma_initial']]
     objective = question.objective(question.estimator)
     several = candidates(
-        recordings, observer.levels, effective_noise(recordings), p['structure'], gammas
+        recordings,
+        observer.levels,
+        max(effective_noise(recordings), question.least_noise),
+        p['structure'],
+        gammas,
     )
     chosen = [{k: v for k, v in gains.items() if k in question.names} for gains in several]
     return jury.best(lambda gains: objective(gains).objective, chosen)[1]
@@ -188,7 +195,7 @@ def _of_kalman_filters(question: Question, jury: Jury) -> Start | None:
     open_ = not {'unknown_input_derivatives', 'lambda'} & estimator.keys()
     starts, judges, found = {}, {}, {}
     for k in DERIVATIVES if open_ else [p['unknown_input_derivatives']]:
-        start = KalmanStart(question.recordings, fixed, model, k, gamma)
+        start = KalmanStart(question.recordings, fixed, model, k, gamma, question.least_noise)
         objective = question.objective({**estimator, 'unknown_input_derivatives': k})
 
         def judge(point: Point, start: Any = start, objective: Any = objective) -> float:

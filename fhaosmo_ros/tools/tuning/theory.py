@@ -154,7 +154,7 @@ def second_derivatives(recordings: Sequence[Recording], levels: int) -> NDArray[
 
 
 def effective_noise(recordings: Sequence[Recording]) -> float:
-    """Return the standard deviation of y about z_1 at the stamps: noise, quantum and jitter."""
+    """Return the RMS of y about z_1: noise, quantum and, where z_1 is at the stamps, jitter."""
     return _rms(np.concatenate([r.y - r.z[:, 0] for r in recordings]))
 
 

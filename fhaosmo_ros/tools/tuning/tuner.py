@@ -104,8 +104,9 @@ class Tuner:
         self.estimator = with_scheme(model | dict(estimator), data.training)
         self._choose = 'estimate_from' not in estimator
         begun = begin(
-            Question(data.training, self.estimator, names, self._objective), jobs, stopped
-        )
+            Question(data.training, self.estimator, names, self._objective, data.least_noise),
+            jobs, stopped,
+        )  # fmt: skip
         self.tried = begun.tried
         beside = {k: v for k, v in begun.gains.items() if k not in names}
         self.estimator = beside | self.estimator
