@@ -111,5 +111,5 @@ def test_a_replay_takes_the_parameters_of_one_channel(tmp_path):
     assert replayed(*words, '--channel', 'knee') == {'epsilon': 5.0, 'lambda': [3.0]}
     with pytest.raises(ConfigurationError, match='--channel: expected hip or knee, got none'):
         replayed(*words)
-    with pytest.raises(ConfigurationError, match='--channel: expected none, .* got hip'):
+    with pytest.raises(ConfigurationError, match=r'--channel: expected none, .* got hip'):
         replayed('--channel', 'hip')
