@@ -10,7 +10,11 @@ import time
 
 import bag_files as files
 from fhaosmo_ros.tools import plot, replay
+from fhaosmo_ros.tools.bags import labelled_array
+from fhaosmo_ros.tools.plot_data import metrics, read_curves
+import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 ROOT = Path(__file__).resolve().parents[1]
 MAGIC = {'png': b'\x89PNG\r\n\x1a\n', 'svg': b'<?xml', 'pdf': b'%PDF-'}
@@ -107,3 +111,21 @@ def test_ctrl_c_leaves_nothing(tmp_path):
     assert error.strip().splitlines()[-1] == 'plot: interrupted'
     assert 'Traceback' not in error
     assert sorted(p.name for p in tmp_path.iterdir()) == ['bag', 'out']
+
+
+def test_truth_is_unknown_where_the_bag_lacks_it(tmp_path):
+    """A recorder may hear the plant later than the estimator."""
+    stamps, y = files.signal(500)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+    assert replay.main([str(bag), '-o', str(tmp_path / 'one')]) == 0
+    data = labelled_array(['z1', 'z2', 'z3'], np.zeros(3))
+    late = [('/plant/state', 'std_msgs/msg/Float64MultiArray', int(s), data)
+            for s in stamps[100:400]]  # fmt: skip
+    with AnyReader([tmp_path / 'one']) as reader:
+        all_ = [(c.topic, c.msgtype, s, bytes(d)) for c, s, d in reader.messages()]
+    all_ += [*late, *files.floats(stamps[50:450], y[50:450], '/plant/unknown_input')]
+    both = files.write(tmp_path / 'both', sorted(all_, key=lambda m: m[2]))
+    (curves,) = read_curves(both, None, '/plant')
+    known = np.isfinite(curves.truth)
+    assert known.all(axis=1).tolist() == [100 <= k < 400 for k in range(500)]
+    assert 'nan' not in metrics([curves])

@@ -35,6 +35,7 @@ class Curves(NamedTuple):
     gamma : (K,) array
     innovation : (K, N) array
     truth : (K, n + 1) array or None
+        NaN where the bag does not reach.
     epsilon : float or None
         The gate of its levels, if it has one and the bag tells.
 
@@ -105,6 +106,8 @@ def _curves(path: Path, name: str, plant: str | None, epsilon: float | None) -> 
         z, true_d = series(path, f'{plant}/state'), series(path, f'{plant}/unknown_input')
         rows = [np.searchsorted(s.stamps, when).clip(0, len(s.stamps) - 1) for s in (z, true_d)]
         truth = np.column_stack([z.values[rows[0]], true_d.values[rows[1]]])
+        for s in (z, true_d):  # before it was heard, and after
+            truth[(when < s.stamps[0]) | (when > s.stamps[-1])] = np.nan
         if truth.shape != estimate.shape:  # another model than the plant's
             truth = None
     labels = series(path, f'{name}/state').labels or [
@@ -127,6 +130,8 @@ def metrics(curves: list[Curves]) -> str:
             line = f'{c.label:{width}}  {name:4}{rms(estimate):12.3g}'
             if c.truth is not None:
                 truth = c.truth[half, k]
+                known = np.isfinite(truth)
+                estimate, truth = estimate[known], truth[known]
                 line += f'{rms(estimate - truth):12.3g}{chatter(estimate, truth):10.3g}'
             lines.append(line)
     return '\n'.join(lines)
