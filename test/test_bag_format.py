@@ -29,7 +29,8 @@ def make(path, storage):
     latched = make_qos(
         'UNKNOWN', 0, 'RELIABLE', 'TRANSIENT_LOCAL', 2**63 - 1, 2**63 - 1, 'AUTOMATIC', 2**63 - 1
     )
-    with BagWriter(path, {'/y': 'std_msgs/msg/Float64'}, storage) as bag:
+    with BagWriter(path, storage) as bag:
+        bag.add('/y', 'std_msgs/msg/Float64')
         bag.add('/late', 'std_msgs/msg/Float64', qos=[latched])
         bag.write('/y', 5, files.float64(1.5))
         bag.write('/late', 7, files.float64(-2.5))

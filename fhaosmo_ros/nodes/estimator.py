@@ -53,7 +53,7 @@ class EstimatorNode(ManagedNode):
         self._table = with_channels(ESTIMATOR_PARAMETERS, self._names, common)
         values = declare(self, self._table, self._check_all, fixed=['autostart', CHANNELS])
         self._channels: Channel | ChannelGroup | None = None
-        self._told: ParameterTopic | None = None
+        self._parameter_topic: ParameterTopic | None = None
         self._following = Following(self._names, overrides)
         self._diagnostics = DiagnosticsPublisher(
             self, self._reports, values['diagnostics_period'], values['hardware_id']
@@ -76,8 +76,8 @@ class EstimatorNode(ManagedNode):
             self._channels = Channel(self, values)
         else:
             self._channels = ChannelGroup(self, values, self._names)
-        self._told = ParameterTopic(self, self._table)
-        self._told.publish()
+        self._parameter_topic = ParameterTopic(self, self._table)
+        self._parameter_topic.publish()
         if self.get_parameter('use_sim_time').value and values['sampling'] == 'source_stamp':
             self.get_logger().warning(
                 "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing "
@@ -99,9 +99,9 @@ class EstimatorNode(ManagedNode):
         if self._channels is not None:
             self._channels.destroy()
             self._channels = None
-        if self._told is not None:
-            self._told.destroy()
-            self._told = None
+        if self._parameter_topic is not None:
+            self._parameter_topic.destroy()
+            self._parameter_topic = None
 
     def _check_all(self, values: Mapping[str, Any]) -> None:
         """Raise if a channel can't be made of these values."""
@@ -127,8 +127,8 @@ class EstimatorNode(ManagedNode):
         self._following.adopted(changes)
         if self._channels is not None:
             self._channels.configure(changes)
-        if self._told is not None:
-            self._told.publish()
+        if self._parameter_topic is not None:
+            self._parameter_topic.publish()
         if 'diagnostics_period' in changes:
             self._diagnostics.set_period(changes['diagnostics_period'])
         self._diagnostics.hardware_id = changes.get('hardware_id', self._diagnostics.hardware_id)

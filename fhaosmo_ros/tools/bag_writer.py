@@ -79,25 +79,18 @@ class BagWriter:
     ----------
     path : path
         Folder to make; it must not exist.
-    topics : dict of str to str
-        Message type by topic, such as 'std_msgs/msg/Float64'; `add` adds more.
     storage : str
         'mcap' or 'sqlite3'.
 
     """
 
-    def __init__(
-        self, path: Path, topics: dict[str, str] | None = None, storage: str = 'mcap'
-    ) -> None:
+    def __init__(self, path: Path, storage: str = 'mcap') -> None:
         plugin = StoragePlugin[storage.upper()]
         self._writer = _Writer(path, version=VERSION, storage_plugin=plugin)
-        self._topics = topics or {}
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> 'BagWriter':
         self._writer.open()
-        for topic, message_type in self._topics.items():
-            self.add(topic, message_type)
         return self
 
     def add(
@@ -108,7 +101,7 @@ class BagWriter:
         qos: Sequence[Qos] = (OFFERED_QOS,),
         digest: str = '',
     ) -> int:
-        """Add a topic, and return its channel number; once for each topic."""
+        """Add a topic, such as of 'std_msgs/msg/Float64', once; return its channel number."""
         if topic not in self._connections:
             if message_type not in types.fielddefs and types is TYPES:
                 learn(message_type)

@@ -47,7 +47,7 @@ def online_parameters(
     ----------
     arguments : Namespace
     recorded : Recorded, optional
-        What counts in place of --params-file, and of --channel, where they are not given.
+        What files and -p change.
 
     Raises
     ------
@@ -57,10 +57,9 @@ def online_parameters(
     """
     values: dict[str, Any] = {}
     origin: dict[str, Path | str | None] = {}
-    if recorded and not arguments.params_file:
+    if recorded:
         values = dict(recorded.values)
         origin = dict.fromkeys(values, f'topic {recorded.topic!r}')
-        arguments.channel = arguments.channel or recorded.channel
     for path in arguments.params_file:
         of_file = load(path, arguments.node, ESTIMATOR_PARAMETERS, strict=True)
         values |= of_file

@@ -83,17 +83,19 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     begin = perf_counter()
     with ExitStack() as stack:
         reader = stack.enter_context(BagReader(arguments.bag))
-        name = (
-            None
-            if arguments.afresh
-            else find_estimator(reader, arguments.follow, arguments.channel)
-        )
-        recorded = None if arguments.params_file else recorded_parameters(reader, name)
+        followed = recorded = None
+        if not arguments.afresh:
+            followed = find_estimator(reader, arguments.follow, arguments.channel)
+        if not arguments.params_file:
+            recorded = recorded_parameters(reader, followed)
+        if recorded:
+            arguments.channel = arguments.channel or recorded.channel
         values = online_parameters(arguments, recorded)
         estimator = OnlineEstimator(values)
         live = None
-        if name is not None:
-            live = LiveRun(name, read_events(reader, name, named(arguments)), estimator)
+        if followed is not None:
+            events = read_events(reader, followed, named(arguments))
+            live = LiveRun(followed, events, estimator)
         samples = Samples(reader, estimator, live, arguments)
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
         name = _name(reader, arguments.name)
