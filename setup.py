@@ -73,6 +73,7 @@ setup(
             'mcap-ros2-support',
             'mypy',
             'pytest',
+            'pytest-rerunfailures',
             'pytest-xdist',
             'ruff',
             'setuptools>=68,<80',  # from 80 on, colcon build --symlink-install silently copies

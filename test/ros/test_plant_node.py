@@ -26,19 +26,28 @@ class PlantRig:
 
     def fresh(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return stamps [s], y and d of samples that come from now on."""
-        y = len(self.y)
-        self.client.wait(lambda: len(self.y) >= y + count, 'samples')
-        samples = self.y[y : y + count]
-        inputs = [m.message.data for m in self.of_ticks(self.d, samples)]
-        stamps = np.array([m.stamp - self.y[0].stamp for m in samples]) * 1e-9
-        return stamps, np.array([m.message.data for m in samples]), np.array(inputs)
+        ticks = self.ticks(self.d, count)
+        stamps = np.array([y.stamp - self.y[0].stamp for y, _ in ticks]) * 1e-9
+        return stamps, *np.array([(y.message.data, d.message.data) for y, d in ticks]).T
 
-    def of_ticks(self, messages: list, samples: list) -> list:
-        """Return what the plant published with each sample: the first one behind it."""
-        last = samples[-1].stamp
-        self.client.wait(lambda: messages[-1].stamp > last, 'rest of the tick')
-        stamps = [m.stamp for m in messages]
-        return [messages[k] for k in np.searchsorted(stamps, [m.stamp for m in samples])]
+    def ticks(self, messages: list, count: int) -> list:
+        """Return pairs of a sample and what the plant published behind it, from now on."""
+        first = len(self.y)
+        pairs = []
+
+        def look() -> bool:
+            samples, others = self.y[first:], list(messages)
+            after = np.searchsorted([m.stamp for m in samples], [m.stamp for m in others])
+            # Behind a sample and before the next one; a stall may have lost one of the two.
+            pairs[:] = [
+                (samples[k - 1], others[i])
+                for i, k in enumerate(after)
+                if k and (i == 0 or after[i - 1] != k)
+            ]
+            return len(pairs) >= count
+
+        self.client.wait(look, 'ticks')
+        return pairs[:count]
 
     def set(self, **values) -> None:
         result = self.parameters.set_atomically(**values)
@@ -91,8 +100,7 @@ def test_y_belongs_to_its_stamp(client, start):
 def test_truth_is_labelled_and_y_is_its_first_state(rig):
     message = rig.state[-1].message
     assert message.layout.dim[0].label == 'z1,z2,z3'
-    samples = rig.y[-50:]
-    for sample, state in zip(samples, rig.of_ticks(rig.state, samples), strict=True):
+    for sample, state in rig.ticks(rig.state, 50):
         assert state.message.data[0] == sample.message.data
 
 
