@@ -16,14 +16,14 @@ settings.load_profile('fixed')
 
 def pytest_collection_modifyitems(config, items):
     """
-    Give what runs over the middleware another try, as `colcon test --retest-until-pass` does.
+    Give what waits for other processes another try, as `colcon test --retest-until-pass` does.
 
     A shared machine may stall a process for seconds, which is not what these tests look for. The
     summary counts such tries as `rerun` and names them.
     """
     if config.pluginmanager.hasplugin('rerunfailures'):
         for item in items:
-            if item.get_closest_marker('ros'):
+            if item.get_closest_marker('ros') or item.get_closest_marker('signals'):
                 item.add_marker(pytest.mark.flaky(reruns=2))
 
 

@@ -270,6 +270,7 @@ def test_quick_run_writes_everything(tmp_path, capsys):
     assert new == tables.texts(results.load(out / 'comparison' / 'results.json'))
 
 
+@pytest.mark.signals
 def test_ctrl_c_ends_cleanly_and_writes_nothing(tmp_path):
     process = subprocess.Popen(
         [sys.executable, '-m', 'fhaosmo_ros', 'compare', '--output', str(tmp_path / 'out')],

@@ -131,6 +131,7 @@ def test_quick_run_writes_everything(tmp_path, capsys):
     assert again == old
 
 
+@pytest.mark.signals
 def test_interrupt_ends_it_in_one_line(tmp_path):
     command = [sys.executable, '-m', 'fhaosmo_ros', 'paper', '--quick', '--output', tmp_path]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:

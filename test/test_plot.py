@@ -90,6 +90,7 @@ def test_figure_is_kept_before_the_window_opens(bag, tmp_path, monkeypatch):
     assert out.exists()
 
 
+@pytest.mark.signals
 def test_ctrl_c_leaves_nothing(tmp_path):
     stamps, y = files.signal(60_000)
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y), 'sqlite3')

@@ -490,6 +490,7 @@ def test_record_beyond_its_chunk_is_refused():
         scan(data, [1])
 
 
+@pytest.mark.signals
 def test_ctrl_c_leaves_nothing(tmp_path):
     stamps, y = files.signal(200_000)
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y), 'sqlite3')

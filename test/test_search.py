@@ -115,6 +115,7 @@ def lines(storage):
     return storage.read_bytes().count(b'\n') if storage.exists() else 0
 
 
+@pytest.mark.signals
 def test_two_processes_and_a_kill(tmp_path):
     """What the killed one had finished stays; the other one ends the study; it goes on later."""
     storage = tmp_path / 'study.log'

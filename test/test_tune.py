@@ -239,6 +239,7 @@ def test_bag_that_is_too_short(tmp_path, capsys):
 # ends
 
 
+@pytest.mark.signals
 def test_interrupt_keeps_the_best(tmp_path):
     out = tmp_path / 'out'
     process = command(*QUICK, '--trials=1000000', '-o', out)
@@ -254,6 +255,7 @@ def test_interrupt_keeps_the_best(tmp_path):
     load(out / 'gains.yaml', 'estimator')
 
 
+@pytest.mark.signals
 def test_killed_run_goes_on(tmp_path, capsys):
     out, journal = tmp_path / 'out', tmp_path / 'out.journal'
     process = command(*QUICK, '--trials=1000000', '-o', out)
@@ -272,6 +274,7 @@ def test_killed_run_goes_on(tmp_path, capsys):
     assert not journal.exists()
 
 
+@pytest.mark.signals
 def test_two_processes_share_a_study(tmp_path):
     storage = tmp_path / 'shared.log'
     workers = [
