@@ -36,6 +36,8 @@ from std_srvs.srv import Trigger
 
 ROOT = Path(fhaosmo_ros.__file__).parents[1]
 DEADLINE = 30.0
+TRIES = 3
+"""Of a call, which share the deadline."""
 QOS = QoSProfile(depth=1000)
 ESTIMATES = {
     'state': Float64MultiArray,
@@ -197,11 +199,20 @@ class Client:
         return client.call_async(request)
 
     def call(self, service: str, service_type: type, request: object):
-        future = self.call_later(service, service_type, request)
+        """
+        Return a service's answer.
+
+        The middleware may lose the first call of a new client: one that is answered at the very
+        moment at which the executor begins to listen, in one of thousands. So it asks again.
+        """
         done = threading.Event()
-        future.add_done_callback(lambda _: done.set())
-        assert done.wait(DEADLINE), f'no answer from {service}'
-        return future.result()
+        futures = []
+        for _ in range(TRIES):
+            futures.append(self.call_later(service, service_type, request))
+            futures[-1].add_done_callback(lambda _: done.set())
+            if done.wait(DEADLINE / TRIES):
+                return next(future.result() for future in futures if future.done())
+        raise AssertionError(f'no answer from {service} within {DEADLINE} s')
 
 
 class Parameters:
