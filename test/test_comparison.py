@@ -113,6 +113,25 @@ def test_noise_is_absolute_on_the_papers_plant_and_relative_elsewhere():
     assert 0.1 < cells.amplitude('pendulum') < 1.0
 
 
+def test_quantum_of_the_encoder_is_known():
+    quiet, loud = (
+        Sensor('motor', ('mix',), noise, 1000.0).setting().noise for noise in (0.0, 1e-2)
+    )
+    y = Sensor('motor', ('mix',), 0.0, 1000.0).training(2)[0]
+    assert quiet == pytest.approx(np.std(y.y - y.z[:, 0]), rel=0.1)
+    assert loud == pytest.approx(1e-2 * cells.amplitude('motor'), rel=0.01)
+    assert Sensor('pendulum', ('mix',), 0.0, 1000.0).setting().noise == 0.0
+
+
+def test_training_sees_the_kinds_that_it_is_for():
+    def seen(*names):
+        return {r.shape for r in Sensor('pendulum', names, 1e-3, 100.0).training(2)}
+
+    assert seen('mix', 'chirp') == {'sines'}
+    assert seen('steps') == {'steps'}
+    assert seen('mix', 'steps', 'chirp') == {'sines', 'steps'}
+
+
 def test_timings_do_what_they_say():
     even, jitter, dropouts = (
         Sensor('paper', ('mix',), 1e-3, 1000.0, timing).training(1)[0].t
@@ -131,7 +150,7 @@ def test_every_method_estimates_a_slow_d_without_noise(name):
     values = {d.name: d.start for d in method.space(setting)}
     slow = cells.family_values('pendulum') | {'band_of_d': [0.1, 0.5], 'sample_rate': 100.0}
     recordings = Family(slow | {'disturbances': ['sines']}).recordings(1)
-    value, readout = trial(method, setting, values, recordings)
+    value, readout, _ = trial(method, setting, values, recordings)
     assert readout in ('filtered', 'internal')
     # The paper's gains are not made for this plant.
     assert value < (3.0 if name.startswith('paper') else 0.6)
@@ -174,7 +193,27 @@ def test_tuning_is_a_function_of_its_seed_and_does_not_get_worse():
     start = {d.name: d.start for d in method.space(setting)}
     one, same = (tune(method, setting, recordings, 20, 1) for _ in range(2))
     assert one == same
-    assert one.training <= trial(method, setting, start, recordings)[0]
+    assert one.training <= trial(method, setting, start, recordings).value
+
+
+@pytest.mark.parametrize('name', ['Kalman', 'Levant, explicit', OURS])
+def test_hopeless_trials_are_cut_short_and_nothing_is_lost_by_it(name):
+    """The first recording here is the easier one: what counts is how far behind it is there."""
+    method, setting = METHODS[name], SENSOR.setting()
+    recordings = [*Sensor('paper', ('low sine',), 1e-5, 100.0).training(1), *SENSOR.training(1)]
+    full = tune(method, setting, recordings, 20, 1)
+    good = trial(method, setting, full.values, recordings)
+    bad = trial(method, setting, {d.name: d.low for d in method.space(setting)}, recordings)
+    assert len(good.averages) == len(recordings)
+    assert good.averages[0] < 0.9 * good.value
+    assert bad.value > 1.5 * good.value
+    cut = trial(
+        method, setting, {d.name: d.low for d in method.space(setting)}, recordings, good.averages
+    )
+    assert len(cut.averages) < len(recordings)
+    assert cut.value > 1.5 * good.value
+    again = trial(method, setting, full.values, recordings, good.averages)
+    assert again == good
 
 
 def make_table(ours, kalman, others=1.0):

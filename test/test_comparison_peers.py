@@ -3,6 +3,7 @@
 
 from fhaosmo_ros.core import ConfigurationError, TriangularModel
 from fhaosmo_ros.core.family import Recording
+from fhaosmo_ros.core.plant import Plant
 from fhaosmo_ros.tools.comparison.evaluation import METHODS
 from fhaosmo_ros.tools.comparison.linear import LINEAR
 from fhaosmo_ros.tools.comparison.methods import Setting
@@ -128,3 +129,25 @@ def test_prediction_equals_the_matrix_exponential():
 def test_values_without_a_solution_are_an_error():
     with pytest.raises(ConfigurationError):
         SampledModel(MODELS['paper'], 1e-3).kalman([float('nan')])
+
+
+@pytest.mark.parametrize('period', PERIODS)
+@pytest.mark.parametrize('name', MODELS)
+def test_prediction_steps_are_short_enough(name, period):
+    """Four seconds of motion after a push, against steps of a fiftieth."""
+    model = MODELS[name]
+    t = np.arange(0.0, 4.0, period)
+    longest = min(period, SampledModel(model, period).resolution)
+    coarse, fine = (
+        Plant(
+            {
+                'order': model.order,
+                'phi': list(model.phi),
+                'initial_state': [0.5] * model.order,
+                'disturbance': 'none',
+                'integration_step': step,
+            }
+        ).simulate(t, 1.0)
+        for step in (longest, longest / 50.0)
+    )
+    assert np.abs(coarse.z - fine.z).max() < 1e-4 * np.abs(fine.z).max()

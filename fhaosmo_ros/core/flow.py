@@ -7,7 +7,7 @@ from fhaosmo_ros.core.layout import HAT, HAT_SENSITIVITY, TILDE, TILDE_SENSITIVI
 from fhaosmo_ros.core.tape import evaluate, Floats, Ints
 from numba import njit
 
-MOST_STEPS = 1000
+MOST_STEPS = 4000
 """Of one flow, whatever the interval: bounds what a sample may cost."""
 
 

@@ -65,7 +65,7 @@ OBSERVER = (
         choices=('explicit', 'implicit', 'predict_correct'),
     ),
     Parameter(
-        'prediction_step', 0.01,
+        'prediction_step', 0.0025,
         'Longest Runge-Kutta step of predict_correct; a longer interval takes several. Well below '
         "1 / rate of the model's fastest motion.",
         unit='s', lower=1e-6, upper=10.0,

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 Matrix = NDArray[np.float64]
+LONGEST_STEP = 1.0
+"""Seconds, for a model that does nothing by itself."""
 
 
 class SampledModel:
@@ -41,7 +43,9 @@ class SampledModel:
     a : (N, N) array
         Transition over a period, in scaled states x_i * period^(i - 1).
     resolution : float
-        Runge-Kutta steps (s) up to this one are exact to about 1e-7 of the state.
+        Runge-Kutta steps (s) up to this one are as good as exact. That would take steps of
+        0.1 / fastest rate for a linear model; a nonlinearity that is crossed in a few of them,
+        such as dry friction, takes shorter ones.
 
     """
 
@@ -60,7 +64,7 @@ class SampledModel:
         self._rates[range(model.order, self.size), range(model.order, self.size)] = -decay
         jacobian = model.jacobian(np.zeros(model.order))
         fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(model.order, k=1))))
-        self.resolution = 0.1 / max(float(fastest), 1e-9)
+        self.resolution = min(0.03 / max(float(fastest), 1e-9), LONGEST_STEP)
         if not integrators_only:
             self._rates[: model.order, : model.order] += jacobian
         self.a = self._scaled(expm(self._rates * period))

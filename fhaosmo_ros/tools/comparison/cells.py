@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from functools import lru_cache
+import math
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.family import Family, Recording
@@ -36,8 +37,8 @@ FEW_SAMPLES, MORE = 300.0, 3
 class Disturbance(NamedTuple):
     """A kind of d: what the tuning sees of it, and what judges."""
 
-    shapes: tuple[str, ...]
-    """Of the training's family."""
+    trained: str
+    """Shape that the tuning sees."""
     judged: str
     """Shape that judges; 'sine' is one that no family has."""
     band: tuple[float, float]
@@ -60,26 +61,26 @@ PLANTS = {
     'paper': PlantCase(
         "the paper's plant", 'paper_plant', 0.07, 0.0, False,
         {
-            'low sine': Disturbance(('sines',), 'sine', LOW),
-            'high sine': Disturbance(('sines',), 'sine', HIGH),
-            'mix': Disturbance(('sines',), 'sines', WIDE),
-            'steps': Disturbance(('steps',), 'steps', WIDE),
+            'low sine': Disturbance('sines', 'sine', LOW),
+            'high sine': Disturbance('sines', 'sine', HIGH),
+            'mix': Disturbance('sines', 'sines', WIDE),
+            'steps': Disturbance('steps', 'steps', WIDE),
         },
     ),
     'pendulum': PlantCase(
         'pendulum', 'pendulum', 2.5, 0.0, True,
         {
-            'mix': Disturbance(BOTH, 'sines', WIDE),
-            'steps': Disturbance(BOTH, 'steps', WIDE),
-            'chirp': Disturbance(BOTH, 'chirp', WIDE),
+            'mix': Disturbance('sines', 'sines', WIDE),
+            'steps': Disturbance('steps', 'steps', WIDE),
+            'chirp': Disturbance('sines', 'chirp', WIDE),
         },
     ),
     'motor': PlantCase(
         'DC motor', 'dc_motor', 70.0, 1.0, True,
         {
-            'mix': Disturbance(BOTH, 'sines', WIDE),
-            'steps': Disturbance(BOTH, 'steps', WIDE),
-            'chirp': Disturbance(BOTH, 'chirp', WIDE),
+            'mix': Disturbance('sines', 'sines', WIDE),
+            'steps': Disturbance('steps', 'steps', WIDE),
+            'chirp': Disturbance('sines', 'chirp', WIDE),
         },
     ),
 }  # fmt: skip
@@ -121,14 +122,23 @@ class Sensor(NamedTuple):
         """Return what a user knows before tuning."""
         values = self.values()
         model = TriangularModel(values['phi'], values['order'])
-        return Setting(model, 1.0 / self.rate, self.case.rms_of_d, self._noise())
+        # An encoder's rounding is spread evenly over a quantum.
+        rounding = values.get('quantisation', 0.0) / math.sqrt(12.0)
+        noise = math.hypot(self._noise(), rounding)
+        return Setting(model, 1.0 / self.rate, self.case.rms_of_d, noise)
 
     @lru_cache(maxsize=2)  # noqa: B019  (a named tuple is its own key; few are kept)
     def training(self, count: int) -> list[Recording]:
-        """Return the recordings that the tuning sees, more of them where they have few samples."""
-        shapes = self.case.disturbances[self.disturbances[0]].shapes
+        """
+        Return the recordings that the tuning sees.
+
+        More of them where they have few samples, fewer where no noise has to be averaged.
+        """
+        shapes = sorted({self.case.disturbances[name].trained for name in self.disturbances})
         if self.rate < FEW_SAMPLES:
             count *= MORE
+        if self.setting().noise == 0.0:
+            count = max(1, count // 2)
         return self._family(shapes, self.disturbances[0]).recordings(count, TRAINING_SEED)
 
     @lru_cache(maxsize=6)  # noqa: B019
@@ -222,9 +232,14 @@ def sensors(quick: bool = False) -> list[Sensor]:
             chosen += [
                 Sensor('paper', (name,), noise, rate) for name in PLANTS['paper'].disturbances
             ]
+            # Without noise gains for steps are deadbeat, and gains for smooth d are not.
+            groups = (
+                (('mix', 'chirp'), ('steps',)) if noise == 0.0 else (('mix', 'steps', 'chirp'),)
+            )
             chosen += [
-                Sensor(plant, tuple(PLANTS[plant].disturbances), noise, rate)
+                Sensor(plant, names, noise, rate)
                 for plant in ('pendulum', 'motor')
+                for names in groups
             ]
     for timing in ('jitter', 'dropouts', 'outliers'):
         chosen += [Sensor('paper', (name,), 1e-3, 1000.0, timing) for name in ('mix', 'steps')]

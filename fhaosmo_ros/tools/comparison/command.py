@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 DOCS = Path(__file__).resolve().parents[3] / 'docs'
 FOLDER, RESULTS = 'comparison', 'results.json'
-TRIALS, QUICK_TRIALS = 170, 15
+TRIALS, QUICK_TRIALS = 160, 15
 TRAINING, QUICK_TRAINING = 4, 1
 Work = tuple[Callable[..., Any], tuple[Any, ...], tuple[Any, ...]]
 """Function, the arguments that name the result, further arguments."""

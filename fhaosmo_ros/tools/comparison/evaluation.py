@@ -13,10 +13,12 @@ from fhaosmo_ros.tools.comparison.methods import Method, Setting, Values
 from fhaosmo_ros.tools.comparison.ours import OUR_METHOD
 from fhaosmo_ros.tools.comparison.scores import Estimates, objective, Scores, scores
 from fhaosmo_ros.tools.comparison.sliding import SLIDING
-from fhaosmo_ros.tools.tuning.search import Dimension, minimise
+from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
 import numpy as np
 
 REPEATS = 5
+HOPELESS = 1.5
+"""A trial this many times worse than the best one so far is not run on more recordings."""
 METHODS: dict[str, Method] = {method.name: method for method in (*LINEAR, *SLIDING, OUR_METHOD)}
 
 
@@ -28,22 +30,49 @@ class Tuned(NamedTuple):
     training: float
 
 
+class Outcome(NamedTuple):
+    """
+    What one set of values brings.
+
+    Attributes
+    ----------
+    value : float
+        Average of the objective over the recordings, of the best readout; an estimate where
+        not all of them were run.
+    readout : str
+        Its name.
+    averages : list of float
+        The same over the first recordings, so many as were run.
+
+    """
+
+    value: float
+    readout: str
+    averages: list[float]
+
+
 def trial(
-    method: Method, setting: Setting, values: Values, recordings: Sequence[Recording]
-) -> tuple[float, str]:
-    """Return the objective's average over recordings, of the best readout, and its name."""
+    method: Method, setting: Setting, values: Values, recordings: Sequence[Recording],
+    rival: Sequence[float] = (),
+) -> Outcome:  # fmt: skip
+    """Run on all recordings, or until hopelessly behind the averages of a `rival`."""
     try:
         run = method.prepare(setting, values)
     except ConfigurationError:  # values that make no observer, such as an unsolvable Riccati
-        return float('inf'), ''
+        return Outcome(float('inf'), '', [])
     totals: dict[str, float] = {}
-    for recording in recordings:
+    averages: list[float] = []
+    for count, recording in enumerate(recordings, 1):
         for name, estimates in run(recording).items():
             totals[name] = totals.get(name, 0.0) + objective(recording, estimates)
-        if not np.isfinite(min(totals.values())):
+        best = min(totals, key=totals.__getitem__)
+        averages.append(totals[best] / count)
+        if not averages[-1] <= (HOPELESS * rival[count - 1] if rival else BAD):
             break
-    best = min(totals, key=totals.__getitem__)
-    return totals[best] / len(recordings), best
+    value = averages[-1]
+    if rival and len(averages) < len(recordings):  # as much behind on the others
+        value *= rival[-1] / rival[len(averages) - 1]
+    return Outcome(value, best, averages)
 
 
 def tune(
@@ -52,9 +81,14 @@ def tune(
     """Search a method's parameters; one without any is evaluated as it is."""
     space = list(method.space(setting))
     values: Values = {}
+    best = Outcome(float('inf'), '', [])
 
     def judged(v: Values) -> float:
-        return trial(method, setting, v, recordings)[0]
+        nonlocal best
+        found = trial(method, setting, v, recordings, best.averages)
+        if len(found.averages) == len(recordings):
+            best = min(best, found)
+        return found.value
 
     if method.tune is not None:
         values = method.tune(judged, setting, trials, seed)
@@ -62,8 +96,8 @@ def tune(
         values = _scan(judged, space[0], trials)
     elif space:
         values = minimise(judged, space, trials, seed=seed, jobs=1).best
-    value, readout = trial(method, setting, values, recordings)
-    return Tuned(dict(values), readout or 'filtered', value)
+    found = trial(method, setting, values, recordings)
+    return Tuned(dict(values), found.readout or 'filtered', found.value)
 
 
 def _scan(judged: Callable[[Values], float], d: Dimension, trials: int) -> dict[str, float]:

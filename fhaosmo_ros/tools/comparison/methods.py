@@ -30,7 +30,7 @@ class Setting(NamedTuple):
     size : float
         About how large d is.
     noise : float
-        Standard deviation of the noise on y, in its unit.
+        Standard deviation of the noise on y, in its unit, with that of its rounding.
 
     """
 

@@ -75,6 +75,7 @@ def _parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
     return {
         **SCHEME,
         'correction_period': setting.period,
+        'prediction_step': model.resolution,
         'gamma_initial': gamma,
         'unknown_input_derivatives': derivatives,
         'unknown_input_decay': values['decay'],

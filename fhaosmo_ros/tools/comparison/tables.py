@@ -78,7 +78,7 @@ def _setup(results: Results) -> str:
     return (
         f'{len(cells)} cells, {len(sensors)} tunings of each method; each tuning: '
         f'{results.trials} trials on {results.training} recordings of 20 s '
-        f'({MORE * results.training} at 100 Hz).'
+        f'({MORE * results.training} at 100 Hz; half as many without any noise).'
     )
 
 

@@ -105,9 +105,13 @@ def warnings(
             'training: more recordings, or fewer parameters to search, would help.'
         )
     if held_out > 0.9:
+        why = (
+            'there is hardly anything to be known about this d through this sensor'
+            if training < 1.1
+            else 'the search has not found gains that work: more trials, or other bounds'
+        )
         found.append(
-            f'An estimate that is always 0 has the error 1; this one has {held_out:.2f}: there is '
-            'hardly anything to be known about this d through this sensor.'
+            f'An estimate that is always 0 has the error 1; this one {held_out:.2f}: {why}.'
         )
     stuck = [d.name for d in space if at_bound(d, best[d.name])]
     if stuck:
