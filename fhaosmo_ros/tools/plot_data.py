@@ -12,6 +12,7 @@ from fhaosmo_ros.tools.bag_reader import BagReader
 from fhaosmo_ros.tools.recorded_parameters import recorded_parameters
 from fhaosmo_ros.tools.series import series
 from fhaosmo_ros.tools.ticks import read_ticks
+from fhaosmo_ros.tools.truth import topics_of, truth_at
 import numpy as np
 from numpy.typing import NDArray
 
@@ -82,7 +83,7 @@ def _read_curves(
             f'bag {path}: expected the topics of an estimator ({", ".join(PARTS)} below its '
             f'name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
         )
-    has_truth = {f'{plant}/state', f'{plant}/unknown_input'} <= topics
+    has_truth = topics.issuperset(topics_of(plant))
     return [
         _curves(path, name, plant if has_truth else None, _epsilon(reader, name))
         for name in names or found
@@ -103,13 +104,9 @@ def _curves(path: Path, name: str, plant: str | None, epsilon: float | None) -> 
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
     truth = None
     if plant is not None:
-        z, true_d = series(path, f'{plant}/state'), series(path, f'{plant}/unknown_input')
-        rows = [np.searchsorted(s.stamps, when).clip(0, len(s.stamps) - 1) for s in (z, true_d)]
-        truth = np.column_stack([z.values[rows[0]], true_d.values[rows[1]]])
-        for s in (z, true_d):  # before it was heard, and after
-            truth[(when < s.stamps[0]) | (when > s.stamps[-1])] = np.nan
-        if truth.shape != estimate.shape:  # another model than the plant's
-            truth = None
+        found = truth_at(path, plant, when)
+        if found is not None and found.values.shape == estimate.shape:  # else another model's
+            truth = found.values
     labels = series(path, f'{name}/state').labels or [
         f'z{i + 1}' for i in range(estimate.shape[1] - 1)
     ]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from fhaosmo_ros.core.errors import ConfigurationError
 from fhaosmo_ros.core.metrics import chatter, rms, settling_time
 from fhaosmo_ros.tools.series import messages, series
+from fhaosmo_ros.tools.truth import truth_at
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,25 +62,21 @@ def read_run(bag: Path, plant: str = '/plant', estimator: str = '/estimator') ->
     state = series(bag, f'{estimator}/state')
     d = series(bag, f'{estimator}/unknown_input')
     gamma = series(bag, f'{estimator}/gamma')
-    true_state = series(bag, f'{plant}/state')
-    true_d = series(bag, f'{plant}/unknown_input')
     # The five topics of one tick are published together, and none is lost when reliable.
-    count = min(len(s.stamps) for s in (stamp, state, d, gamma))
-    if not count or not len(true_state.stamps) or not len(true_d.stamps):
+    count = min(len(part.stamps) for part in (stamp, state, d, gamma))
+    when = stamp.values[:count].astype(np.int64)
+    truth = truth_at(bag, plant, when)
+    if truth is None or not truth.known.any():
         raise ConfigurationError('the run ended before an estimate arrived beside its truth')
-    when = stamp.values[:count]
-    # The plant publishes y, then its states, then d: the truth of a sample follows its y.
-    z_row, d_row = (np.searchsorted(s.stamps, when) for s in (true_state, true_d))
-    known = (when >= y.stamps[0]) & (z_row < len(true_state.stamps)) & (d_row < len(true_d.stamps))
-    if not known.any():
-        raise ConfigurationError('the run ended before an estimate arrived beside its truth')
-    truth = np.column_stack([true_state.values[z_row[known]], true_d.values[d_row[known]]])
+    known = truth.known
     estimate = np.column_stack([state.values[:count][known], d.values[:count][known]])
     t = (when[known] - when[known][0]) * 1e-9
     span = (y.stamps[-1] - y.stamps[0]) * 1e-9
     rate = (len(y.stamps) - 1) / span if span > 0.0 else float('nan')
-    names = [*true_state.labels, 'd']
-    return Run(t, names, truth, estimate, gamma.values[:count][known], rate, _counters(bag))
+    names = [*truth.labels, 'd']
+    return Run(
+        t, names, truth.values[known], estimate, gamma.values[:count][known], rate, _counters(bag)
+    )
 
 
 def _counters(bag: Path) -> dict[str, str]:
