@@ -15,6 +15,8 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 MAX_PAUSE = 1_000_000_000
 """Clock jumps beyond this many nanoseconds are not simulated through."""
+DEPTH = 1000
+"""Of the topics' queues: a recorder that is held up for a second loses nothing at 1 kHz."""
 
 
 class PlantNode(Node):
@@ -38,9 +40,9 @@ class PlantNode(Node):
         self._now = 0
         self._encode = double_encoder()
         self._encode_state = array_encoder([f'z{i + 1}' for i in range(self.plant.order)])
-        self._publish_y = self.create_publisher(Float64, 'y', 10).publish
-        self._publish_state = self.create_publisher(Float64MultiArray, '~/state', 10).publish
-        self._publish_d = self.create_publisher(Float64, '~/unknown_input', 10).publish
+        self._publish_y = self.create_publisher(Float64, 'y', DEPTH).publish
+        self._publish_state = self.create_publisher(Float64MultiArray, '~/state', DEPTH).publish
+        self._publish_d = self.create_publisher(Float64, '~/unknown_input', DEPTH).publish
         if self.plant.uses_input:
             self.create_subscription(Float64, 'u', self._on_input, 10)
         self._timer = self._start_timer(values['sample_rate'])
