@@ -194,6 +194,7 @@ def test_polynomial_of_the_observers_degree_is_followed_exactly(h):
 def test_predict_correct_follows_a_polynomial_without_an_error_of_the_step():
     p = {'structure': 'levant', 'order': 3, 'phi': ['0'] * 3, 'variant': 'sign'}
     p |= {'scheme': 'predict_correct', 'lambda': gains(4, 1.0)}
+    p |= {'prediction_step': 1e-2}  # one: each rounds
     t = np.arange(2000) * 1e-2
     polynomial = np.polynomial.Polynomial([0.5, -0.3, 0.04, 0.005])
     run = Observer(p).run(t, polynomial(t))

@@ -160,7 +160,10 @@ def test_levant_is_tuned_without_what_it_does_not_use(tmp_path):
     assert main([*QUICK, '-pstructure:=levant', '-o', str(out)]) == 0
     values = load(out / 'gains.yaml', 'estimator')
     assert values['structure'] == 'levant'
-    assert not {'alpha', 'epsilon'} & set(values)
+    assert 'alpha' not in values
+    assert '| epsilon |' not in (out / 'report.md').read_text()
+    assert values['epsilon'] == max(values['fuzzy_widths'])
+    assert values['divergence_time'] == 0.1  # 20 samples at 200 Hz
     assert len(values['lambda']) == 4
 
 

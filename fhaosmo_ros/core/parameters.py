@@ -91,7 +91,8 @@ OBSERVER = (
     Parameter(
         'epsilon', 80.0,
         'A level runs while |eps_j| <= epsilon for every level j before it (unit of y, '
-        'and of the derivatives for the later levels). Not used by levant: all levels run.',
+        'and of the derivatives for the later levels). With levant all levels run: only '
+        'divergence_time goes by it.',
         lower=0.0, lower_open=True, upper=1e12,
     ),
     Parameter(

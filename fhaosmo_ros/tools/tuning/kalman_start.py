@@ -19,8 +19,10 @@ GAMMA = 3e-3
 """Small enough that the injections are linear in the innovation, unless the user sets one."""
 RATES = tuple(float(x) for x in np.geomspace(0.1, 30.0, 8))
 FACTORS = (0.8, 1.0, 1.25)
-WIDTH = 300.0
-OTHER_WIDTHS = (30.0, 3000.0)
+WIDTH = 3000.0
+"""Where all levels saturate at once the observer may lose y: none does for usual innovations."""
+NARROWER = (300.0, 30.0)
+"""Taken where that pays: with outliers on y."""
 ZOOMS = (0.5, 0.25)
 """Steps of the closer looks, in steps of the grid."""
 

@@ -16,7 +16,7 @@ from fhaosmo_ros.tools.tuning.kalman_start import (
     GAMMA,
     grid,
     KalmanStart,
-    OTHER_WIDTHS,
+    NARROWER,
     Point,
     ZOOMS,
 )
@@ -34,7 +34,7 @@ MEANT_FOR = ('lambda', 'alpha', 'epsilon', 'initial_internal')
 """Who gives one of these has chosen: gains are for the structure and the scheme beside them."""
 DERIVATIVES = (0, 1, 2, 3)
 WORTH = 0.99
-"""One derivative of d more has to bring at least this factor."""
+"""One derivative of d more, or narrower levels, have to bring at least this factor."""
 HOPELESS = 1.3
 """What is this factor behind the best after the coarse grid is not looked at closer."""
 GAMMAS = (0.25, 0.5)
@@ -208,8 +208,9 @@ def _of_kalman_filters(question: Question, jury: Jury) -> Start | None:
         if found[k][0] > limit:
             continue
         point = found[k][1]
-        wider = [point._replace(width=width) for width in OTHER_WIDTHS]
-        found[k] = min(found[k], jury.best(judge, wider))
+        narrower = jury.best(judge, [point._replace(width=width) for width in NARROWER])
+        if narrower[0] < WORTH * found[k][0]:
+            found[k] = narrower
         for zoom in ZOOMS:
             found[k] = min(found[k], jury.best(judge, list(around(found[k][1], zoom))))
     tried = {k: value for k, (value, _) in found.items()}

@@ -20,6 +20,12 @@ POINTS = 7
 REACH = 1.0
 """How far they go from the best one, in powers of ten or (linear) halves of the range."""
 SHOWN = 3
+LOST_TIME, LOST_SAMPLES = 0.1, 20
+"""
+Seconds, and at least so many samples, beyond the largest half-width after which y is lost and the
+estimator begins again from it. Once all levels saturate, integrators behind each other may swing
+for ever.
+"""
 SECOND = {
     'chatter': 'chatter of d, powers of ten',
     'settling': 'settling, share of the time',
@@ -79,6 +85,12 @@ def _parameters(tuner: Tuner, gains: dict[str, Any]) -> dict[str, Any]:
     """Return what the estimator needs: what was set for it, and what was found."""
     values = tuner.fixed | gains
     shown = Observer({k: v for k, v in values.items() if k in OBSERVER_PARAMETERS}).parameters
+    if shown['structure'] == 'levant' and shown['variant'].startswith('fuzzy'):
+        period = float(np.median(np.diff(tuner.data.training[0].t)))
+        values = {
+            'epsilon': max(shown['fuzzy_widths']),
+            'divergence_time': float(f'{max(LOST_TIME, LOST_SAMPLES * period):.4g}'),
+        } | values
     # These decide what the gains mean, so they stand there even where they are the defaults.
     for name in ('variant', 'scheme', 'unknown_input'):
         values[name] = shown[name]
