@@ -4,6 +4,7 @@
 import argparse
 from collections.abc import Callable, Iterator
 from concurrent.futures import as_completed, ProcessPoolExecutor
+import contextlib
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -132,11 +133,8 @@ def _done(work: list[Work], jobs: int) -> Iterator[tuple[Any, Any, Any]]:
     context = multiprocessing.get_context('spawn')
     pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_end_with_parent)
     try:
-        # The children inherit this: Ctrl-C reaches them too, and is the parent's business.
-        # Blocked, not ignored: one that comes meanwhile is not lost.
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        futures = {pool.submit(call, *key, *rest): (call, key) for call, key, rest in work}
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        with _without_ctrl_c():  # a child cut off in its birth would say so
+            futures = {pool.submit(call, *key, *rest): (call, key) for call, key, rest in work}
         for future in as_completed(futures):
             yield *futures[future], future.result()
     finally:
@@ -144,6 +142,25 @@ def _done(work: list[Work], jobs: int) -> Iterator[tuple[Any, Any, Any]]:
         for process in (pool._processes or {}).values():
             process.terminate()
         pool.shutdown(cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """
+    Hold Ctrl-C back until the end of the block; children that are started in it never see it.
+
+    They inherit the mask. It is not enough here, because another thread may take the signal.
+    """
+    held: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: held.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, before)
+    if held:
+        raise KeyboardInterrupt
 
 
 def _end_with_parent() -> None:
