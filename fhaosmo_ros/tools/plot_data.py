@@ -12,7 +12,7 @@ from fhaosmo_ros.tools.bag_reader import BagReader
 from fhaosmo_ros.tools.recorded_parameters import recorded_parameters
 from fhaosmo_ros.tools.series import series
 from fhaosmo_ros.tools.ticks import read_ticks
-from fhaosmo_ros.tools.truth import topics_of, truth_at
+from fhaosmo_ros.tools.truth import truth_at
 import numpy as np
 from numpy.typing import NDArray
 
@@ -83,11 +83,7 @@ def _read_curves(
             f'bag {path}: expected the topics of an estimator ({", ".join(PARTS)} below its '
             f'name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
         )
-    has_truth = topics.issuperset(topics_of(plant))
-    return [
-        _curves(path, name, plant if has_truth else None, _epsilon(reader, name))
-        for name in names or found
-    ]
+    return [_curves(path, name, plant, _epsilon(reader, name)) for name in names or found]
 
 
 def _epsilon(reader: BagReader, name: str) -> float | None:
@@ -98,21 +94,19 @@ def _epsilon(reader: BagReader, name: str) -> float | None:
     return values['epsilon'] if values['structure'] == 'cascade' else None
 
 
-def _curves(path: Path, name: str, plant: str | None, epsilon: float | None) -> Curves:
+def _curves(path: Path, name: str, plant: str, epsilon: float | None) -> Curves:
     ticks = read_ticks(path, name, PARTS)
     when = ticks['stamp']
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
-    truth = None
-    if plant is not None:
-        found = truth_at(path, plant, when)
-        if found is not None and found.values.shape == estimate.shape:  # else another model's
-            truth = found.values
+    truth = truth_at(path, plant, when)
+    if truth is not None and truth.values.shape != estimate.shape:
+        truth = None  # of another model
     labels = series(path, f'{name}/state').labels or [
         f'z{i + 1}' for i in range(estimate.shape[1] - 1)
     ]
     return Curves(
         f'{path.resolve().name} {name}', when, [*labels, 'd'], estimate, ticks['gamma'],
-        ticks['innovation'], truth, epsilon,
+        ticks['innovation'], truth.values if truth else None, epsilon,
     )  # fmt: skip
 
 

@@ -34,11 +34,6 @@ class Truth(NamedTuple):
         return np.asarray(np.isfinite(self.values).all(axis=1))
 
 
-def topics_of(plant: str) -> tuple[str, str]:
-    """Return the names of a plant's topics with its states and its unknown input."""
-    return f'{plant}/state', f'{plant}/unknown_input'
-
-
 def truth_at(bag: Path, plant: str, when: NDArray[np.int64]) -> Truth | None:
     """
     Return the truth that belongs to samples of y.
@@ -62,7 +57,7 @@ def truth_at(bag: Path, plant: str, when: NDArray[np.int64]) -> Truth | None:
     """
     columns = []
     labels: list[str] = []
-    for topic in topics_of(plant):
+    for topic in (f'{plant}/state', f'{plant}/unknown_input'):
         found = series(bag, topic)
         if not len(found.stamps):
             return None

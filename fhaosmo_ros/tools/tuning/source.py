@@ -13,7 +13,7 @@ from fhaosmo_ros.core.family_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.core.model import TriangularModel
 from fhaosmo_ros.tools.bag_reader import BagReader
 from fhaosmo_ros.tools.held_input import HeldInput
-from fhaosmo_ros.tools.truth import topics_of, truth_at
+from fhaosmo_ros.tools.truth import truth_at
 from fhaosmo_ros.tools.tuning.sensor import identify, noise_at_stamps, Sensor
 import numpy as np
 from numpy.typing import NDArray
@@ -118,13 +118,11 @@ def _read(
         u = np.zeros(len(y))
         if model.uses_input:
             u = HeldInput(reader, choice.input_topic, choice.input_field, lambda _: None)(times)
-        topics = {c.topic for c in reader.connections if c.msgcount}
     truth = None
-    if topics.issuperset(topics_of(choice.plant)):
-        found = truth_at(choice.path, choice.plant, times)
-        if found is not None and found.values.shape[1] == model.order + 1:
-            known = found.known
-            stamps, y, u, truth = stamps[known], y[known], u[known], found.values[known]
+    found = truth_at(choice.path, choice.plant, times)
+    if found is not None and found.values.shape[1] == model.order + 1:
+        known = found.known
+        stamps, y, u, truth = stamps[known], y[known], u[known], found.values[known]
     if not len(y):
         raise ConfigurationError(f'bag {choice.path}: expected samples with their truth, got none')
     return (stamps - stamps[0]) * 1e-9, y, u, truth
