@@ -28,13 +28,13 @@ demo:
 	@$(call with) && exec "$$python" -m fhaosmo_ros demo $(ARGS)
 
 paper:
-	@$(call with) && exec "$$python" -m fhaosmo_ros paper $(ARGS)
+	@$(call with) && exec "$$python" -m studies.paper $(ARGS)
 
 tune:
 	@$(call with,tune) && exec "$$python" -m fhaosmo_ros tune $(ARGS)
 
 compare:
-	@$(call with,compare) && exec "$$python" -m fhaosmo_ros compare $(ARGS)
+	@$(call with,compare) && exec "$$python" -m studies.comparison $(ARGS)
 
 lint:
 	@$(call with,test) && set -x && \

@@ -1,13 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build script of the ROS 2 package: colcon and scripts/environment.sh both read it."""
+"""
+Build script of the ROS 2 package: colcon, pip and scripts/environment.sh read it.
+
+colcon runs the commands `install` and `develop`; setup.cfg sends their scripts to lib/fhaosmo_ros,
+where `ros2 run` looks for executables: one for each command. pip builds a wheel, whose scripts go
+to bin, on everybody's PATH: there `record`, `play`, `plot` and others would hide programs of the
+same name (sox and ImageMagick have some), so a wheel has one script, `fhaosmo COMMAND`.
+"""
 
 from pathlib import Path
+import sys
 
 from fhaosmo_ros import __version__
 from fhaosmo_ros.commands import COMMANDS
 from setuptools import find_packages, setup
 
 NAME = 'fhaosmo_ros'
+FOR_ROS2_RUN = bool({'install', 'develop'} & set(sys.argv))
 TUNE = ['cmaes', 'control', 'optuna>=4,<6']
 
 
@@ -28,7 +37,7 @@ setup(
     maintainer_email='fhaosmo_ros@example.org',
     license='Apache-2.0',
     python_requires='>=3.11',
-    packages=find_packages(exclude=['test', 'test.*']),
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -43,7 +52,7 @@ setup(
         'orjson',
         'packaging',
         'pyyaml',
-        'rosbags>=0.11.9,<0.12',  # tools/bag_reader.py and bag_writer.py know its insides
+        'rosbags>=0.11.9,<0.12',  # tools/bags uses its internals
         'scikit-fuzzy',
         'scipy',
         'setuptools',
@@ -81,11 +90,11 @@ setup(
             'types-PyYAML',
         ],
     },
+    # Not the main of a command's module: importing that takes a second, and a signal during it
+    # must end the command too.
     entry_points={
-        'console_scripts': [
-            # Not the module's own main: what it imports takes a second, and signals come sooner.
-            f'{command} = fhaosmo_ros.__main__:{command}'
-            for command in COMMANDS
-        ],
+        'console_scripts': [f'{command} = {NAME}.__main__:{command}' for command in COMMANDS]
+        if FOR_ROS2_RUN
+        else [f'fhaosmo = {NAME}.__main__:main'],
     },
 )

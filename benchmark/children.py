@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 from time import monotonic, perf_counter, sleep
 from typing import Any
 
-from fhaosmo_ros.tools import processes
+from fhaosmo_ros.tools.cli import processes
 from table import CannotMeasureError
 
 ROOT = Path(__file__).parents[1]
@@ -26,7 +26,9 @@ class Child(processes.Child):
     ) -> None:
         self.started = perf_counter()
         environment = {'PYTHONUNBUFFERED': '1', **(environment or {})}
-        super().__init__(log, *arguments, environment=environment, apart=True, cwd=ROOT)
+        super().__init__(
+            log, *arguments, environment=environment, start_new_session=True, cwd=ROOT
+        )
 
     def wait_for(self, text: str) -> float:
         """Wait until `text` is in the output; return the seconds since the start."""

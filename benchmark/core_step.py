@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
-from fhaosmo_ros.core.observer import Observer
+from fhaosmo_ros.core.observer.observer import Observer
 import numpy as np
 from reference import assert_agreement, CASE, compile_reference, in_c, in_numba, output, PERIOD
 from table import CannotMeasureError, Row

@@ -14,10 +14,10 @@ import signal
 import threading
 
 from builtin_interfaces.msg import Time
-from fhaosmo_ros.nodes.diagnostics import DiagnosticsPublisher, Report
-from fhaosmo_ros.nodes.messages import labelled
-from fhaosmo_ros.nodes.spin import Spinner
-from fhaosmo_ros.nodes.subscription import SENSOR_QOS, subscribe_with_info
+from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, Report
+from fhaosmo_ros.nodes.middleware.messages import labelled
+from fhaosmo_ros.nodes.middleware.spin import Spinner
+from fhaosmo_ros.nodes.middleware.subscription import SENSOR_QOS, subscribe_with_info
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node

@@ -5,17 +5,16 @@ import signal
 import sys
 import threading
 
-from fhaosmo_ros.nodes.recorder import Recorder
-from std_msgs.msg import Float64
+from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, TopicRecorder
+from fhaosmo_ros.topics import FLOAT
 
 
 def main() -> None:
     """Listen to the topics in the arguments until SIGINT."""
     ended = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: ended.set())
-    with Recorder(
-        dict.fromkeys((f'/{topic}' for topic in sys.argv[1:]), Float64), lambda *_: None
-    ):
+    expected = [ExpectedTopic(f'/{topic}', FLOAT) for topic in sys.argv[1:]]
+    with TopicRecorder(lambda _: None, expected):
         print('listening', flush=True)
         ended.wait()
 

@@ -11,16 +11,16 @@ search.
 
 import argparse
 
-from fhaosmo_ros.core.model import TriangularModel
-from fhaosmo_ros.core.parameter_file import load
-from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
-from fhaosmo_ros.tools.sampled_model import SampledModel
-from fhaosmo_ros.tools.share import shipped
-from fhaosmo_ros.tools.tuning.objective import Objective, Verdict
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.tools.cli.share import shipped
+from fhaosmo_ros.tools.tuning.objective import Evaluation, Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.source import simulated
-from fhaosmo_ros.tools.tuning.start import SCHEME
-from fhaosmo_ros.tools.tuning.theory import kalman_like
+from fhaosmo_ros.tools.tuning.start.find import SCHEME
+from fhaosmo_ros.tools.tuning.start.sampled_model import SampledModel
+from fhaosmo_ros.tools.tuning.start.theory import kalman_like
 import numpy as np
 from tqdm import tqdm
 
@@ -39,16 +39,15 @@ def main() -> None:
     print('| noise | preset | demo.yaml | Kalman, random walk | Kalman, decaying |')
     print('|---|---|---|---|---|')
     for noise in tqdm(NOISES, unit='noise'):
-        values = TUNE_PARAMETERS.defaults() | {
-            'noise_std': float(noise), 'recordings': count, 'held_out': count,
-        }  # fmt: skip
+        values = TUNE_PARAMETERS.complete(
+            {'noise_std': float(noise), 'recordings': count, 'held_out': count}
+        )
         data = simulated(values, 1)
         training = Objective(data.training, dict(SCHEME), values, choose=False)
         cells = [noise]
         for name in (f'noise_{noise}', 'demo'):
-            preset = load(shipped(f'config/{name}.yaml'), 'estimator')
-            online = {k: v for k, v in preset.items() if k in ONLINE_PARAMETERS}
-            held_out = Objective(data.held_out, online, values, False, training.scale)
+            preset = load(shipped(f'config/{name}.yaml'), 'estimator', ONLINE_PARAMETERS)
+            held_out = Objective(data.held_out, preset, values, False, training.scale)
             cells.append(cell(held_out({})))
         held_out = Objective(data.held_out, dict(SCHEME), values, False, training.scale)
         points = [(decay, w) for decay in DECAYS for w in BANDWIDTHS]
@@ -61,9 +60,9 @@ def main() -> None:
         print(f'| {" | ".join(cells)} |', flush=True)
 
 
-def cell(verdict: Verdict) -> str:
+def cell(evaluation: Evaluation) -> str:
     """Return error and objective."""
-    return f'{verdict.error:.3f} ({verdict.objective:.3f})'
+    return f'{evaluation.error:.3f} ({evaluation.objective:.3f})'
 
 
 def gains(noise: float, decay: float, bandwidth: float) -> dict[str, object]:

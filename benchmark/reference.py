@@ -10,13 +10,13 @@ import shutil
 import subprocess
 from typing import Any
 
-from fhaosmo_ros.core import kernels
-from fhaosmo_ros.core.configuration import ObserverConfiguration
-from fhaosmo_ros.core.fuzzy import KNOTS
-from fhaosmo_ros.core.law import make_work
-from fhaosmo_ros.core.observer import Observer, ObserverState
-from fhaosmo_ros.core.plant import Plant
-from fhaosmo_ros.core.status import LEVEL_SHIFT
+from fhaosmo_ros.core.observer import arrays
+from fhaosmo_ros.core.observer import step as recursion
+from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.fuzzy import KNOTS
+from fhaosmo_ros.core.observer.observer import make_record, Observer, ObserverState
+from fhaosmo_ros.core.observer.status import LEVEL_SHIFT
+from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np
 from numpy.typing import NDArray
 from table import CannotMeasureError
@@ -28,7 +28,7 @@ CASE = {'variant': 'fuzzy_adaptive', 'scheme': 'explicit', 'fuzzy_widths': [0.1]
 """Wide fuzzy sets: no chatter, so that rounding does not grow and both end at the same state."""
 
 State = NDArray[np.float64]
-"""HAT, TILDE and their sensitivities (4 N), then gamma, y, pending, wait; see core/layout.py."""
+"""HAT, TILDE and their sensitivities (4 N), then gamma, y, pending, wait; see arrays.py."""
 
 
 def find_compiler() -> list[str]:
@@ -105,21 +105,19 @@ def in_c(library: ctypes.CDLL, y: NDArray[np.float64]) -> Callable[[], tuple[Sta
 def in_numba(
     parameters: dict[str, Any], y: NDArray[np.float64]
 ) -> Callable[[], tuple[State, int]]:
-    """Return the same of the kernel behind `Observer.run`, for any parameters."""
+    """Return the same of the compiled function behind `Observer.run`, for any parameters."""
     configuration = ObserverConfiguration(parameters)
     count, levels = len(y), configuration.levels
-    work = make_work(configuration.law, configuration.model.depth)
+    work = arrays.make_work(configuration.law, configuration.model.depth)
     start = first_state(parameters, y[0])
     h, u = np.full(count, PERIOD), np.zeros(count)
-    out, eps = np.empty((1, 2, levels)), np.empty((2, levels))
-    gamma, words = np.empty(1), np.empty(1, dtype=np.int64)
+    record = make_record(1, levels, 2)
 
     def run() -> tuple[State, int]:
-        array, memory = start.levels.copy(), start.memory.copy()
-        kernels.run(
-            *configuration.law, *work, array, memory, y, h, u, out, gamma, eps, words, 1, count
-        )
-        return np.concatenate([array.ravel(), memory]), int(words[0])
+        state = arrays.State(start.levels.copy(), start.memory.copy())
+        samples = recursion.Samples(y, h, u)
+        recursion.run(configuration.law, work, state, samples, record, 1, count)
+        return np.concatenate([state.levels.ravel(), state.memory]), int(record.words[0])
 
     return run
 

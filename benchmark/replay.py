@@ -7,8 +7,8 @@ import sys
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
-from fhaosmo_ros.tools.bag_writer import BagWriter
-from fhaosmo_ros.tools.chunks import DATA_AT, Records
+from fhaosmo_ros.tools.bags.mcap.chunks import DATA_AT, Records
+from fhaosmo_ros.tools.bags.writer import BagWriter
 import numpy as np
 from rosbags.highlevel import AnyReader
 from table import CannotMeasureError, Row
@@ -19,7 +19,7 @@ BAR = 1.5
 MEMORY_BAR = 1.25
 REPLAY = """
 import resource, sys
-from fhaosmo_ros.tools.replay import main
+from fhaosmo_ros.tools.replay.command import main
 code = main(sys.argv[1:])
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)
 sys.exit(code)

@@ -9,9 +9,9 @@ import argparse
 from time import process_time
 
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.search import minimise
+from fhaosmo_ros.tools.tuning.search.minimise import minimise, StudyOptions
+from fhaosmo_ros.tools.tuning.search.space import changes
 from fhaosmo_ros.tools.tuning.source import simulated
-from fhaosmo_ros.tools.tuning.space import changes
 from fhaosmo_ros.tools.tuning.tuner import Tuner
 import numpy as np
 from tqdm import tqdm
@@ -38,7 +38,7 @@ def main() -> None:
     spent = dict.fromkeys(SAMPLERS, 0.0)
     with tqdm(total=len(PROBLEMS) * len(SAMPLERS) * len(seeds), unit='search') as bar:
         for problem, (family, estimator) in PROBLEMS.items():
-            values = TUNE_PARAMETERS.defaults() | COMMON | family
+            values = TUNE_PARAMETERS.complete(COMMON | family)
             tuner = Tuner(simulated(values, 1), estimator, values, 1)
             start = changes({d.name: d.start for d in tuner.space})
             found = {}
@@ -47,9 +47,12 @@ def main() -> None:
                 for seed in seeds:
                     begin = process_time()
                     result = minimise(
-                        tuner.judge, tuner.space, arguments.trials, seed=seed, jobs=1,
-                        sampler=sampler,
-                    )  # fmt: skip
+                        tuner.evaluate,
+                        tuner.space,
+                        arguments.trials,
+                        StudyOptions(seed, sampler),
+                        jobs=1,
+                    )
                     spent[sampler] += process_time() - begin
                     held_out = tuner.held_out(changes(result.best)).objective
                     found[sampler].append((result.value, held_out))

@@ -6,10 +6,10 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 
 from children import Children
-from fhaosmo_ros.core.observer import Observer
-from fhaosmo_ros.core.parameter_file import load
-from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, PLANT_PARAMETERS
-from fhaosmo_ros.core.plant import Plant
+from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
+from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np
 from table import Row
 from tqdm import tqdm

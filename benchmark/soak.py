@@ -2,7 +2,9 @@
 """
 Run plant, fault injector and estimator for a long time, and say what grew, drifted or got lost.
 
-`make soak MINUTES=30`. Exit code 0 if everything held, 1 if not, 130 after Ctrl-C.
+`make soak MINUTES=30`. Exit code 0 if everything held, 1 if not, 3 if all that did not is
+explained by a machine that stalled, 130 after Ctrl-C. With ``--retries`` a run that ends with 3 is
+repeated, and no other.
 """
 
 import argparse
@@ -15,7 +17,8 @@ import sys
 from time import monotonic, sleep, time_ns
 
 from children import Child, Children, ROOT
-from fhaosmo_ros.core.counters import Counters
+from fhaosmo_ros.core.online.counters import Counters
+from heartbeat import Heartbeat, LATE
 import numpy as np
 from rates import isolate
 from soak_schedule import CALLS, CYCLE, JUDGED, RESTORE, schedule
@@ -28,6 +31,8 @@ ESTIMATOR = ('-r', 'y:=faulty_y', '-p', 'spike_gate:=1.0', '-p', 'gamma_leakage:
              '-p', 'gamma_dead_zone:=0.0')  # fmt: skip
 """What docs/operation.md advises for a node that nobody looks after."""
 MATCHED = 30.0
+STALLED = 3
+"""Exit code."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -36,6 +41,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--minutes', type=float, default=2.0, help='at least 2')
     parser.add_argument('--seed', type=int, default=1, help='of the schedule of faults')
     parser.add_argument('--output', type=Path, default=Path('soak_output'), help='folder')
+    parser.add_argument(
+        '--retries', type=int, default=0, help='if nothing failed but what a stall explains'
+    )
     arguments = parser.parse_args(argv)
     if arguments.minutes < 2.0:
         parser.error(f'argument --minutes: expected at least 2, got {arguments.minutes:g}')
@@ -43,37 +51,53 @@ def main(argv: list[str] | None = None) -> int:
         signal.signal(number, signal.default_int_handler)
     try:
         isolate()
-        from soak_verdict import draw, verdict
-
-        course = run(arguments.seed, arguments.minutes * 60.0)
+        for _ in range(arguments.retries + 1):
+            code = _soak(arguments.seed, arguments.minutes, arguments.output)
+            if code != STALLED:
+                break
+        return code
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
     except CannotMeasureError as error:
         print(f'soak: {error}', file=sys.stderr)
         return 1
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    draw(course, arguments.output / 'soak.png')
+
+
+def _soak(seed: int, minutes: float, output: Path) -> int:
+    """Run once, write figure and table, print the verdict; return the exit code."""
+    from soak_verdict import draw, explained, verdict
+
+    course = run(seed, minutes * 60.0)
+    output.mkdir(parents=True, exist_ok=True)
+    draw(course, output / 'soak.png')
     rows = verdict(course)
     faults = ', '.join(f'{n:,} {k}' for k, n in sorted(course.faults.items()))
     text = (
-        f'{arguments.minutes:g} minutes, seed {arguments.seed}, {os.cpu_count()} cores, load '
+        f'{minutes:g} minutes, seed {seed}, {os.cpu_count()} cores, load '
         f'{os.getloadavg()[1]:.1f}: {faults}\n\n{render(rows)}\n'
     )
-    (arguments.output / 'soak.txt').write_text(text)
-    print(f'{text}\nFigure: {arguments.output / "soak.png"}')
+    (output / 'soak.txt').write_text(text)
+    print(f'{text}\nFigure: {output / "soak.png"}')
     missed = [row.name for row in rows if row.missed]
-    print(f'FAILED: {"; ".join(missed)}' if missed else 'passed')
-    return 1 if missed else 0
+    if not missed:
+        print('passed')
+        return 0
+    stalled = explained(course).issuperset(missed)
+    print(f'{"STALLED" if stalled else "FAILED"}: {"; ".join(missed)}')
+    return STALLED if stalled else 1
 
 
 def run(seed: int, seconds: float):
     """Run a soak and return its course."""
     from soak_client import SoakClient
-    from soak_verdict import Course
+    from soak_verdict import BUSY, Course
     from soak_watch import SoakWatch
 
-    with Children() as children, SoakWatch() as watch, SoakClient() as client:
+    with (
+        Heartbeat() as heartbeat, Children() as children, SoakWatch() as watch,
+        SoakClient() as client,
+    ):  # fmt: skip
         estimator = children.start(
             'estimator', '-m', 'fhaosmo_ros', 'estimator', *PARAMETERS, *ESTIMATOR
         )
@@ -84,8 +108,13 @@ def run(seed: int, seconds: float):
         estimator.wait_for('estimating')
         plant.wait_for('injecting')
         client.learn()
-        memory, windows, lost = _follow(
+        start = monotonic()
+        memory, windows, losses = _follow(
             seed, seconds, {'estimator': estimator, 'plant': plant}, watch, client
+        )
+        late, busy = (
+            [heartbeat.late(start + k, start + k + 1.0, least) for k in range(round(seconds))]
+            for least in (LATE, BUSY)
         )
         plant.interrupt()
         plant.wait_for('}')
@@ -98,13 +127,12 @@ def run(seed: int, seconds: float):
         return Course(
             memory, windows, watch.outputs, watch.not_finite,
             counts['published'], _taken(watch.report), int(watch.report['samples lost']),
-            np.count_nonzero(np.diff(lost)),
-            counts, client.counts,
+            losses, np.array(late), np.array(busy), counts, client.counts,
         )  # fmt: skip
 
 
 def _follow(seed, seconds, nodes: dict[str, Child], watch, client):
-    """Make the scheduled calls; return memory by process, judged windows, losses by second."""
+    """Make the scheduled calls; return memory by process, judged windows, times of losses."""
     calls = [event for event in schedule(seed, seconds) if event.kind in CALLS][::-1]
     memory: dict[str, list[tuple[float, float]]] = defaultdict(list)
     windows, lost, restored, judging, second = [], [], 0, False, 0
@@ -131,14 +159,16 @@ def _follow(seed, seconds, nodes: dict[str, Child], watch, client):
             if now >= second + 1:
                 second = int(now)
                 progress.update(second - progress.n)
-                lost.append(int(watch.report.get('samples lost', 0)))
+                lost.append((now, int(watch.report.get('samples lost', 0))))
                 if now > CYCLE:
                     for name, node in nodes.items():
                         memory[name].append((now, node.resident_megabytes()))
                 progress.set_postfix_str(
                     f'{memory["estimator"][-1][1]:.1f} MB' if memory['estimator'] else 'warm-up'
                 )
-    return {name: np.array(course) for name, course in memory.items()}, np.array(windows), lost
+    ends, counts = np.array(lost).T
+    losses = ends[np.diff(counts, prepend=0) > 0]
+    return {name: np.array(course) for name, course in memory.items()}, np.array(windows), losses
 
 
 def _taken(report: dict[str, str]) -> int:

@@ -6,7 +6,7 @@ from time import monotonic, sleep
 from types import TracebackType
 from typing import Any
 
-from fhaosmo_ros.nodes.spin import Spinner
+from fhaosmo_ros.nodes.middleware.spin import Spinner
 import rclpy
 from rclpy.context import Context
 from rclpy.node import Node

@@ -15,9 +15,9 @@ import sys
 import threading
 from time import monotonic
 
-from fhaosmo_ros.nodes.messages import double_encoder, read_double
+from fhaosmo_ros.nodes.middleware.messages import double_encoder, read_double
+from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.nodes.plant import PlantNode
-from fhaosmo_ros.nodes.spin import Spinner
 import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions

@@ -4,14 +4,13 @@
 import struct
 import threading
 from types import TracebackType
-from typing import Any
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from fhaosmo_ros.nodes.recorder import Recorder
+from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, Sample, TopicRecorder
+from fhaosmo_ros.topics import ARRAY, FLOAT, OF_ALL_NODES, TIME
 import numpy as np
 from rclpy.serialization import deserialize_message
-from std_msgs.msg import Float64, Float64MultiArray
+from std_msgs.msg import Float64MultiArray
 
 TRUTH = '/plant/unknown_input'
 ESTIMATE = '/estimator/unknown_input'
@@ -19,10 +18,12 @@ GAMMA = '/estimator/gamma'
 STAMP = '/estimator/stamp'
 ARRAYS = ('/estimator/state', '/estimator/innovation')
 DIAGNOSTICS = '/diagnostics'
-TOPICS: dict[str, Any] = {
-    TRUTH: Float64, ESTIMATE: Float64, GAMMA: Float64, STAMP: Time,
-    **dict.fromkeys(ARRAYS, Float64MultiArray), DIAGNOSTICS: DiagnosticArray,
-}  # fmt: skip
+TOPICS = [
+    *(ExpectedTopic(topic, FLOAT) for topic in (TRUTH, ESTIMATE, GAMMA)),
+    *(ExpectedTopic(topic, ARRAY) for topic in ARRAYS),
+    ExpectedTopic(STAMP, TIME),
+    ExpectedTopic(DIAGNOSTICS, OF_ALL_NODES[DIAGNOSTICS]),
+]
 CDR_DOUBLE = struct.Struct('<4xd')
 CDR_TIME = struct.Struct('<4xiI')
 PAIRED = 5_000_000
@@ -47,9 +48,10 @@ class SoakWatch:
         self.report: dict[str, str] = {}
         self._kept: dict[str, list[tuple[int, float]]] | None = None
         self._lock = threading.Lock()
-        self._recorder = Recorder(TOPICS, self._receive)
+        self._recorder = TopicRecorder(self._receive, TOPICS)
 
-    def _receive(self, topic: str, published: int, data: bytes) -> None:
+    def _receive(self, sample: Sample) -> None:
+        topic, published, data = sample
         if topic == DIAGNOSTICS:
             for status in deserialize_message(data, DiagnosticArray).status:
                 values = {item.key: item.value for item in status.values}

@@ -10,7 +10,7 @@ from table import CannotMeasureError, Row
 from tqdm import tqdm
 
 try:
-    from fhaosmo_ros.tools.tuning.search import minimise
+    from fhaosmo_ros.tools.tuning.search.minimise import minimise, StudyOptions
     from fhaosmo_ros.tools.tuning.source import simulated
     from fhaosmo_ros.tools.tuning.tuner import Tuner
 except ModuleNotFoundError as error:
@@ -31,11 +31,11 @@ def measure(quick: bool) -> list[Row]:
     if MISSING is not None:
         raise CannotMeasureError(f'{MISSING} is not installed (extra: tune)')
     trials, rounds = (20, 1) if quick else (200, 5)
-    values = TUNE_PARAMETERS.defaults() | {
-        'noise_std': 1e-4, 'recordings': RECORDINGS, 'held_out': 1, 'integration_step': 1e-3,
-    }  # fmt: skip
+    values = TUNE_PARAMETERS.complete(
+        {'noise_std': 1e-4, 'recordings': RECORDINGS, 'held_out': 1, 'integration_step': 1e-3}
+    )
     if quick:
-        values |= {'duration': 6.0}
+        values = values.changed({'duration': 6.0})
     tuner = Tuner(simulated(values, 1), {}, values, 1)
     start = {d.name: d.start for d in tuner.space}
     times, processor = np.empty((rounds, 3)), np.empty((rounds, 3))
@@ -48,9 +48,12 @@ def measure(quick: bool) -> list[Row]:
                 begin, spent = perf_counter(), process_time()
                 minimise(
                     # Equal work in every trial, wherever the search goes.
-                    lambda _, work=work: tuner.judge(start) if work else (1.0,),
-                    tuner.space, trials, jobs=jobs, storage=str(Path(folder, f'{k}-{column}')),
-                )  # fmt: skip
+                    lambda _, work=work: tuner.evaluate(start) if work else (1.0,),
+                    tuner.space,
+                    trials,
+                    StudyOptions(storage=str(Path(folder, f'{k}-{column}'))),
+                    jobs=jobs,
+                )
                 times[k, column] = (perf_counter() - begin) / trials * 1e3
                 processor[k, column] = (process_time() - spent) / trials * 1e3
                 progress.update()

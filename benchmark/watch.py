@@ -5,9 +5,9 @@ import struct
 from types import TracebackType
 from typing import NamedTuple
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from fhaosmo_ros.nodes.recorder import Recorder
+from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, Sample, TopicRecorder
+from fhaosmo_ros.topics import OF_ALL_NODES, TIME
 import numpy as np
 from rclpy.serialization import deserialize_message
 
@@ -35,10 +35,12 @@ class Watch:
     def __init__(self, names: list[str]) -> None:
         self._pairs: dict[str, list[tuple[int, int]]] = {f'/{name}/stamp': [] for name in names}
         self._reports: dict[str, tuple[int, int]] = {}
-        topics = {DIAGNOSTICS: DiagnosticArray} | dict.fromkeys(self._pairs, Time)
-        self._recorder = Recorder(topics, self._receive)
+        expected = [ExpectedTopic(topic, TIME) for topic in self._pairs]
+        expected.append(ExpectedTopic(DIAGNOSTICS, OF_ALL_NODES[DIAGNOSTICS]))
+        self._recorder = TopicRecorder(self._receive, expected)
 
-    def _receive(self, topic: str, published: int, data: bytes) -> None:
+    def _receive(self, sample: Sample) -> None:
+        topic, published, data = sample
         if topic != DIAGNOSTICS:
             seconds, nanoseconds = CDR_TIME.unpack(data)
             self._pairs[topic].append((published, seconds * 1_000_000_000 + nanoseconds))

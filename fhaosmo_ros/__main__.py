@@ -1,21 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run one of the package's commands: `python -m fhaosmo_ros COMMAND [ARGUMENTS]`."""
+"""
+Run one of the package's commands.
+
+`python -m fhaosmo_ros COMMAND [ARGUMENTS]` in a checkout, `fhaosmo COMMAND [ARGUMENTS]` after pip
+install, `ros2 run fhaosmo_ros COMMAND [ARGUMENTS]` in a workspace.
+"""
 
 from collections.abc import Callable
 import difflib
 from functools import partial
 import importlib
 import os
+from pathlib import Path
 import signal
 import sys
 
-from fhaosmo_ros.commands import COMMANDS
+from fhaosmo_ros.commands import COMMANDS, STUDIES
+from fhaosmo_ros.stop_signals import ending_signals
 
 
 def usage() -> str:
     """Return the help text: one line for each command."""
+    program = 'fhaosmo' if Path(sys.argv[0]).name == 'fhaosmo' else 'python -m fhaosmo_ros'
     lines = [f'  {name:<10} {text}' for name, (_, text) in COMMANDS.items()]
-    return '\n'.join(['usage: python -m fhaosmo_ros COMMAND [ARGUMENTS]', '', *lines])
+    return '\n'.join([f'usage: {program} COMMAND [ARGUMENTS]', '', *lines])
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -28,6 +36,12 @@ def main(argv: list[str] | None = None) -> int:
     if name in ('-h', '--help'):
         print(usage())
         return 0
+    if name in STUDIES:
+        print(
+            f'error: {name!r} is not an installed command: run make {name} in a checkout',
+            file=sys.stderr,
+        )
+        return 2
     if name not in COMMANDS:
         close = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f'; did you mean {close[0]!r}?' if close else ''
@@ -39,12 +53,15 @@ def main(argv: list[str] | None = None) -> int:
 
 def run(name: str, arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code."""
-    if COMMANDS[name][0].startswith('fhaosmo_ros.nodes.'):
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: os._exit(0))  # while it loads nothing has begun
-    # Imported only now: a node needs ROS, and the help must not wait for numba.
+    # While it loads, nothing has begun. These handlers also end a process that was started with
+    # SIGINT ignored; the command sets its own.
+    code = 0 if COMMANDS[name][0].startswith('fhaosmo_ros.nodes.') else 130
+    for number in ending_signals():
+        signal.signal(number, lambda *_: os._exit(code))
     try:
+        # Imported only now: a node needs ROS, and the help must not wait for numba.
         module = importlib.import_module(COMMANDS[name][0])
+        return int(module.main(arguments))
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith('fhaosmo_ros'):
             raise
@@ -54,9 +71,6 @@ def run(name: str, arguments: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 1
-    except KeyboardInterrupt:  # while it loads; later the command itself sees to signals
-        return 130
-    return int(module.main(arguments))
 
 
 def __getattr__(name: str) -> Callable[[], int]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ending by Ctrl-C or SIGTERM without losing the clean-up."""
+"""Ending by Ctrl-C, SIGTERM or SIGHUP, with the clean-up done."""
 
 import atexit
 from collections.abc import Iterator
@@ -16,7 +16,19 @@ RETRY = 0.02
 """Seconds after which a signal that came at a bad moment comes again."""
 LOOK = 0.05
 """Seconds between two looks at whether a block has ended."""
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""What ends a node or a command."""
+
+
+def ending_signals() -> list[signal.Signals]:
+    """
+    Return the signals that are to end this process.
+
+    SIGHUP comes when a terminal or an SSH connection closes; it is not among them in a process
+    that nohup(1) started, which ignores it. An ignored SIGINT ends a process all the same: a shell
+    without job control starts its background jobs so.
+    """
+    return [s for s in SIGNALS if s != signal.SIGHUP or signal.getsignal(s) != signal.SIG_IGN]
 
 
 class Stopped(BaseException):
@@ -27,10 +39,10 @@ class Stop:
     """
     An event that a signal, or any thread, may set.
 
-    Not a threading.Event: its lock is not reentrant, so a handler that interrupts a wait can wait
-    for itself; and no lock at all, because the system may deliver a signal to one of the
-    middleware's threads, and then nothing interrupts the main thread's wait. Python writes each
-    signal into the wake-up socket from whichever thread it comes in.
+    A threading.Event does not serve: its lock is not reentrant, so a handler that interrupts a
+    wait can deadlock. No lock serves, because the system may deliver a signal to one of the
+    middleware's threads, and then nothing interrupts the wait of the main thread. So the main
+    thread waits for a socket: Python writes each signal into it, whichever thread it comes in.
     """
 
     def __init__(self) -> None:
@@ -50,7 +62,7 @@ class Stop:
             self._writer.send(b'\0')
 
     def signal(self, number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
-        """Take a signal: `set`, and within `raising` raise, but once only."""
+        """Handle a signal: `set`, and raise `Stopped` if within `raising`, but only once."""
         raises = self._raises and not self._set
         if raises and _called_by_compiler(frame):
             threading.Timer(RETRY, signal.raise_signal, (number,)).start()
@@ -62,7 +74,7 @@ class Stop:
     @contextlib.contextmanager
     def raising(self, patience: float = math.inf) -> Iterator[None]:
         """
-        Let the first signal cut the block, for what is long and leaves nothing behind.
+        Let the first signal interrupt the block; for long work that leaves nothing behind.
 
         Python takes a signal between two of its instructions only, and one that compiles can last
         for seconds: where the block has not ended `patience` seconds after the signal, the process
@@ -101,7 +113,7 @@ class Stop:
 
 
 def _called_by_compiler(frame: FrameType | None) -> bool:
-    """Return True within what C calls: an exception would be printed there, and lost."""
+    """Return True below a call from C (llvmlite), which prints an exception and loses it."""
     while frame is not None:
         if 'llvmlite' in frame.f_code.co_filename:
             return True
@@ -111,13 +123,13 @@ def _called_by_compiler(frame: FrameType | None) -> bool:
 
 def stop_on_signals() -> Stop:
     """
-    Make SIGINT and SIGTERM set the returned event, from now to the process's end.
+    Make the signals that end a process set the returned event, from now to the process's end.
 
-    They raise nothing (but see `Stop.raising`), so a second Ctrl-C can't cut the clean-up that the
-    first one began.
+    They raise nothing (but see `Stop.raising`), so a second Ctrl-C can't interrupt the clean-up
+    that the first one began.
     """
     stop = Stop()
-    for number in SIGNALS:
+    for number in ending_signals():
         signal.signal(number, stop.signal)
     stop.wake_on_signals()
     atexit.register(_ignore)
@@ -125,6 +137,6 @@ def stop_on_signals() -> Stop:
 
 
 def _ignore() -> None:
-    """Python takes its handlers away before the process ends; a late signal would kill it."""
+    """Ignore late signals: Python has removed its handlers, and they would kill the process."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)

@@ -1,12 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the simulated plant and the estimator with one parameter file."""
 
+from pathlib import Path
+
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, Shutdown
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
+
+
+def check_params_file(context):
+    """Raise if the file does not exist; launch would start the nodes with their defaults."""
+    path = Path(LaunchConfiguration('params_file').perform(context))
+    if not path.is_file():
+        raise FileNotFoundError(f'params_file: expected a file, got {path}')
+
+
+def end(event, context):
+    """End the launch with a node; raise, so that it exits with an error, if the node failed."""
+    if event.returncode:
+        raise RuntimeError(f'{event.process_name} ended with exit code {event.returncode}')
+    return Shutdown(reason=f'{event.process_name} ended')
 
 
 def generate_launch_description():
@@ -54,8 +70,8 @@ def generate_launch_description():
             ros_arguments=['--log-level', LaunchConfiguration('log_level')],
             output='screen',
             emulate_tty=True,
-            on_exit=Shutdown(reason=f'{name} ended'),
+            on_exit=end,
         )
         for name in ('plant', 'estimator')
     ]
-    return LaunchDescription([*arguments, *nodes])
+    return LaunchDescription([*arguments, OpaqueFunction(function=check_params_file), *nodes])

@@ -38,8 +38,13 @@ VARIANTS = [
 ]  # fmt: skip
 
 
-def write(path, messages, distribution, storage, how, parts=1):
-    """Write (topic, type, stamp, CDR) of Float64, to so many files one after the other."""
+def write(path, messages, distribution, storage, how, parts=1, published=None):
+    """
+    Write (topic, type, stamp, CDR) of Float64, to so many files one after the other.
+
+    In mcap, `published` are the publish times, by default the stamps.
+    """
+    published = [m[2] for m in messages] if published is None else published
     path.mkdir()
     share = -(-len(messages) // parts)
     pieces = [messages[k : k + share] for k in range(0, len(messages), share)]
@@ -48,7 +53,8 @@ def write(path, messages, distribution, storage, how, parts=1):
         suffix = 'mcap' if storage == 'mcap' else 'db3'
         file = path / f'{path.name}_{k}.{suffix}'
         if storage == 'mcap':
-            _mcap(file, piece, distribution, MCAP.get(how, MCAP['plain']))
+            times = published[k * share :]
+            _mcap(file, piece, times, distribution, MCAP.get(how, MCAP['plain']))
         else:
             _sqlite(file, piece, distribution, how == 'MESSAGE')
         if how == 'FILE':
@@ -61,21 +67,21 @@ def write(path, messages, distribution, storage, how, parts=1):
     return path
 
 
-def _mcap(file, messages, distribution, options):
+def _mcap(file, messages, published, distribution, options):
     with file.open('wb') as stream:
         writer = Writer(stream, chunk_size=20_000, **options)
         writer.start(profile='ros2', library='libmcap 1.3.1')
         text, _ = files.TYPES.generate_msgdef(KIND, ros_version=2)
         schema = writer.register_schema(KIND, 'ros2msg', text.encode())
         channels = {}
-        for topic, _, stamp, data in messages:
+        for (topic, _, stamp, data), sent in zip(messages, published, strict=False):
             if topic not in channels:
                 qos = QOS_NUMBERS if distribution == 'humble' else QOS_NAMES
                 extra = {'offered_qos_profiles': yaml.safe_dump(qos)}
                 if distribution == 'jazzy':
                     extra['topic_type_hash'] = HASH
                 channels[topic] = writer.register_channel(topic, 'cdr', schema, extra)
-            writer.add_message(channels[topic], int(stamp), data, int(stamp))
+            writer.add_message(channels[topic], int(stamp), data, int(sent))
         writer.finish()
 
 

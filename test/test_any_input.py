@@ -4,9 +4,9 @@
 import string
 
 from fhaosmo_ros.core import ConfigurationError
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameter import Parameter
-from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.declaration import Parameter
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -116,7 +116,7 @@ def try_to_configure(estimator: OnlineEstimator, values: dict) -> bool:
     """Configure; where it is refused, check that the reason names a value and nothing changed."""
     before = estimator.parameters
     try:
-        estimator.check(values)
+        estimator.prepare(values)
     except ConfigurationError as error:
         reason = str(error)
         assert any(f"'{name}'" in reason for name in values), reason
@@ -131,17 +131,16 @@ def try_to_configure(estimator: OnlineEstimator, values: dict) -> bool:
     return True
 
 
-@pytest.mark.slow
-def test_ten_thousand_parameter_sets():
+def test_three_thousand_parameter_sets():
     rng = np.random.default_rng(1)
     estimator = OnlineEstimator(SMALL)
     accepted, now = 0, START
-    for k in range(10_000):
+    for k in range(3000):
         accepted += try_to_configure(estimator, changes(rng, 0.15))
         for y in (0.3, rng.normal(), 0.3 + 0.1 * np.sin(0.01 * k)):
             now += 10**6
             assert finite(estimator.update(now, y))
-    assert 1000 < accepted < 9000  # both happen
+    assert 300 < accepted < 2700  # both happen
 
 
 @pytest.mark.parametrize('name', sorted(FIXED))
@@ -151,7 +150,7 @@ def test_fixed_parameter_says_that_it_is_fixed(name):
         'order': 3, 'phi': ['0', '0'], 'unknown_input': False, 'unknown_input_derivatives': 2,
     }[name]  # fmt: skip
     with pytest.raises(ConfigurationError, match=f"'{name}': can't change in a running observer"):
-        estimator.check({name: other, 'max_gap': 1.0})
+        estimator.prepare({name: other, 'max_gap': 1.0})
     with pytest.raises(ConfigurationError, match=f"'{name}'"):
         estimator.configure({'max_gap': 1.0, name: other})
     assert estimator.parameters['max_gap'] == ONLINE_PARAMETERS['max_gap'].default

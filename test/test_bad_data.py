@@ -2,7 +2,7 @@
 """Samples that no sensor should send: rejected, reported, and without harm to what follows."""
 
 from fhaosmo_ros.core import Observer, Status
-from fhaosmo_ros.core.layout import GAMMA, HAT, PENDING, Y
+from fhaosmo_ros.core.observer.arrays import GAMMA, HAT, PENDING, Y
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np

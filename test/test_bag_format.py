@@ -4,9 +4,9 @@
 import sqlite3
 
 import bag_files as files
-from fhaosmo_ros.tools import replay
-from fhaosmo_ros.tools.bag_writer import BagWriter
-from fhaosmo_ros.tools.bags import make_qos
+from fhaosmo_ros.tools.bags.types import make_qos
+from fhaosmo_ros.tools.bags.writer import BagWriter
+from fhaosmo_ros.tools.replay import command as replay
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 import numpy as np
@@ -77,13 +77,13 @@ def test_metadata_file(storage, tmp_path):
     content = yaml.safe_load((bag / 'metadata.yaml').read_text())
     assert list(content) == ['rosbag2_bagfile_information']
     suffix = {'mcap': 'mcap', 'sqlite3': 'db3'}[storage]
-    check(content['rosbag2_bagfile_information'], storage, f'bag.{suffix}')
-    assert sorted(p.name for p in bag.iterdir()) == [f'bag.{suffix}', 'metadata.yaml']
+    check(content['rosbag2_bagfile_information'], storage, f'bag_0.{suffix}')
+    assert sorted(p.name for p in bag.iterdir()) == [f'bag_0.{suffix}', 'metadata.yaml']
 
 
 def test_mcap_file(tmp_path):
     bag = make(tmp_path / 'bag', 'mcap')
-    with (bag / 'bag.mcap').open('rb') as file:
+    with (bag / 'bag_0.mcap').open('rb') as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == 'ros2'
         summary = reader.get_summary()
@@ -99,7 +99,7 @@ def test_mcap_file(tmp_path):
         (metadata,) = reader.iter_metadata()
         assert metadata.name == 'rosbag2'
         information = yaml.safe_load(metadata.metadata['serialized_metadata'])
-        check(information, 'mcap', 'bag.mcap')
+        check(information, 'mcap', 'bag_0.mcap')
         got = [
             (channel.topic, message.log_time, message.publish_time, decoded.data)
             for _, channel, message, decoded in reader.iter_decoded_messages()
@@ -109,14 +109,14 @@ def test_mcap_file(tmp_path):
 
 def test_sqlite_file(tmp_path):
     bag = make(tmp_path / 'bag', 'sqlite3')
-    with sqlite3.connect(bag / 'bag.db3') as database:
+    with sqlite3.connect(bag / 'bag_0.db3') as database:
 
         def rows(text):
             return database.execute(text).fetchall()
 
         assert rows('SELECT * FROM schema') == [(4, 'jazzy')]
         ((version, text),) = rows('SELECT metadata_version, metadata FROM metadata')
-        check(yaml.safe_load(text), 'sqlite3', 'bag.db3')
+        check(yaml.safe_load(text), 'sqlite3', 'bag_0.db3')
         assert version == 9
         topics = rows('SELECT name, offered_qos_profiles, type_description_hash FROM topics')
         assert [t[0] for t in topics] == ['/y', '/late']
@@ -136,7 +136,7 @@ def test_replayed_bag_is_read_by_another_reader(tmp_path):
     stamps, y = files.signal(3000)
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
     assert replay.main([str(bag), '-o', str(tmp_path / 'out')]) == 0
-    with (tmp_path / 'out' / 'out.mcap').open('rb') as file:
+    with (tmp_path / 'out' / 'out_0.mcap').open('rb') as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()], validate_crcs=True)
         statistics = reader.get_summary().statistics
         names = {i: c.topic for i, c in reader.get_summary().channels.items()}

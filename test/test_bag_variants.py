@@ -3,9 +3,9 @@
 
 import bag_files as files
 import bag_variants as variants
-from fhaosmo_ros.tools import replay
-from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.series import series
+from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.bags.topics import series
+from fhaosmo_ros.tools.replay import command as replay
 import numpy as np
 import pytest
 

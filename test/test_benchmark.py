@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 
-from fhaosmo_ros.core.status import open_levels
+from fhaosmo_ros.core.observer.status import open_levels
 import numpy as np
 import pytest
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers taken out of messages at once are those that rosbags deserialises one by one."""
 
-from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.tools.cdr import GROUPS, numbers
-from fhaosmo_ros.tools.fields import find_field
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.tools.bags.cdr import GROUPS, numbers
+from fhaosmo_ros.tools.bags.fields import find_field
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np

@@ -3,21 +3,21 @@
 
 import argparse
 
-from fhaosmo_ros.core.channel_parameters import (
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import load, select
+from fhaosmo_ros.core.parameters.per_channel import (
     channel_names,
     followers,
     of_channel,
     UNNAMED,
     with_channels,
 )
-from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.parameter_file import load, select
-from fhaosmo_ros.core.parameters import (
+from fhaosmo_ros.core.parameters.tables import (
     ESTIMATOR_PARAMETERS,
     ONLINE_PARAMETERS,
     PLANT_NODE_PARAMETERS,
 )
-from fhaosmo_ros.tools.options import add_parameter_options, online_parameters
+from fhaosmo_ros.tools.cli.options import add_parameter_options, online_parameters
 import pytest
 
 NAMES = ['hip', 'knee_2']

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Channels stepped together are, bit for bit, estimators stepped alone, whatever the samples."""
 
-from fhaosmo_ros.core.channels import Channels
-from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.online.batch import EstimatorBatch
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -60,7 +60,7 @@ def assert_same_state(one, other):
 def test_any_samples(samples, size):
     alone = Alone()
     together = [OnlineEstimator(p) for p in PARAMETERS]
-    channels = Channels(together)
+    channels = EstimatorBatch(together)
     now = [10**18] * len(PARAMETERS)
     columns = []
     for c, period, y, u in samples:
@@ -87,7 +87,7 @@ def test_a_long_run_of_many(scheme):
     for sample in zip(channel, stamps, y, strict=True):
         alone[sample[0]].advance(*sample[1:])
     together = [OnlineEstimator(p) for p in parameters]
-    words, _ = Channels(together).advance(channel, stamps, y, [0.0] * count)
+    words, _ = EstimatorBatch(together).advance(channel, stamps, y, [0.0] * count)
     assert len(words) == count
     for one, other in zip(alone, together, strict=True):
         assert one.counters.accepted > 100
@@ -97,7 +97,7 @@ def test_a_long_run_of_many(scheme):
 def test_single_steps_between_are_taken_along():
     """The arrays are the estimators' own: reset, seed and single samples act at once."""
     one, two = OnlineEstimator(), OnlineEstimator()
-    channels = Channels([one])
+    channels = EstimatorBatch([one])
     for k in range(50):
         stamp, y = 10**18 + k * MS, 0.1 * k
         two.advance(stamp, y)
@@ -117,7 +117,7 @@ def test_single_steps_between_are_taken_along():
 @pytest.mark.parametrize('change', LIVE)
 def test_changes_act_from_the_next_sample_on(change):
     one, two = OnlineEstimator({'variant': 'fuzzy'}), OnlineEstimator({'variant': 'fuzzy'})
-    channels = Channels([one])
+    channels = EstimatorBatch([one])
     unknown_inputs = []
     for k in range(40):
         if k == 20:

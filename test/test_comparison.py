@@ -9,19 +9,21 @@ import subprocess
 import sys
 
 from fhaosmo_ros.core import Family
-from fhaosmo_ros.core.family import Recording
-from fhaosmo_ros.tools import paper_document
-from fhaosmo_ros.tools.comparison import cells, command, results, steps_bound, tables
-from fhaosmo_ros.tools.comparison.cells import HELD_OUT, PLANTS, Sensor, sensors
-from fhaosmo_ros.tools.comparison.evaluation import evaluate, judge, METHODS, trial, tune, Tuned
-from fhaosmo_ros.tools.comparison.ours import OURS
-from fhaosmo_ros.tools.comparison.results import Cell, Entry, Results
-from fhaosmo_ros.tools.comparison.scores import Estimates, objective, Scores, scores
-from fhaosmo_ros.tools.comparison.verdicts import BARS, KALMAN, LINEAR, verdicts
+from fhaosmo_ros.core.simulation.recordings import Recording
 import numpy as np
 import pytest
+from studies import document as paper_document
+from studies.comparison import cells, command, results, tables
+from studies.comparison.cells import HELD_OUT, PLANTS, Sensor, sensors
+from studies.comparison.evaluation import evaluate, judge, METHODS, trial, tune, Tuned
+from studies.comparison.methods import steps_bound
+from studies.comparison.methods.ours import OURS
+from studies.comparison.results import Cell, Entry, Results
+from studies.comparison.scores import Estimates, objective, Scores, scores
+from studies.comparison.verdicts import BARS, KALMAN, LINEAR, verdicts
 
-DOCS = Path(__file__).resolve().parents[1] / 'docs'
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / 'docs'
 REWRITE = 'run make compare'
 T = np.linspace(0.0, 20.0, 2001)
 D = np.sin(T)
@@ -311,25 +313,34 @@ def test_quick_run_writes_everything(tmp_path, capsys):
 
 
 @pytest.mark.signals
-def test_ctrl_c_ends_cleanly_and_writes_nothing(tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'fhaosmo_ros', 'compare', '--output', str(tmp_path / 'out')],
-        stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+@pytest.mark.parametrize('ignored', [False, True])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signal_ends_it_cleanly_and_writes_nothing(tmp_path, number, ignored):
+    """Also where SIGINT is ignored at the start, as in a background job."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if ignored else None
+    try:
+        process = subprocess.Popen(
+            [sys.executable, '-m', 'studies.comparison', '--output', str(tmp_path / 'out')],
+            stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT,
+        )  # fmt: skip
+    finally:
+        if ignored:
+            signal.signal(signal.SIGINT, before)
     try:
         seen = ' '
         while '/' not in seen.split('compare:')[-1]:  # the progress bar: its children come up
             character = process.stderr.read(1)
             assert character, seen
             seen += character
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         out, err = process.communicate(timeout=60)
     finally:
         process.kill()
     assert process.returncode == 130
     assert 'interrupted' in err
     assert 'Traceback' not in err + out
-    assert not (tmp_path / 'out' / 'comparison.md').exists()
+    assert 'resource_tracker' not in err
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize('arguments', [['--trials', '0'], ['--jobs', 'x']])

@@ -2,15 +2,15 @@
 """The linear peers: their gains against independent formulas, their recursion against theory."""
 
 from fhaosmo_ros.core import ConfigurationError, TriangularModel
-from fhaosmo_ros.core.family import Recording
-from fhaosmo_ros.core.plant import Plant
-from fhaosmo_ros.tools.comparison.evaluation import METHODS
-from fhaosmo_ros.tools.comparison.linear import LINEAR
-from fhaosmo_ros.tools.comparison.methods import Setting
-from fhaosmo_ros.tools.sampled_model import pair, SampledModel
+from fhaosmo_ros.core.simulation.plant import Plant
+from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.tools.tuning.start.sampled_model import pair, SampledModel
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from studies.comparison.evaluation import METHODS
+from studies.comparison.methods.linear import LINEAR
+from studies.comparison.methods.method import Setting
 
 MODELS = {
     'paper': TriangularModel(['0', '0', '-z3']),

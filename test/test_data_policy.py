@@ -4,10 +4,10 @@
 import math
 
 from fhaosmo_ros.core import ConfigurationError
-from fhaosmo_ros.core.layout import HAT, TILDE
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
-from fhaosmo_ros.core.status import Status
+from fhaosmo_ros.core.observer.arrays import HAT, TILDE
+from fhaosmo_ros.core.observer.status import Status
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 import numpy as np
 from observer_cases import laws
 import pytest

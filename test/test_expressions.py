@@ -5,7 +5,14 @@ import ast
 import math
 
 from fhaosmo_ros.core import ConfigurationError, TriangularModel
-from fhaosmo_ros.core.expressions import FUNCTIONS, MAX_LENGTH, MAX_NESTING, parse
+from fhaosmo_ros.core.model.expressions import (
+    FUNCTIONS,
+    MAX_FUNCTIONS,
+    MAX_LENGTH,
+    MAX_NESTING,
+    MAX_OPERATIONS,
+    parse,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -140,11 +147,19 @@ REFUSED = {
     'deep calls': 'abs(' * 90 + 'z1' + ')' * 90,
     'deep sum': '+'.join(['z1'] * 120),
     'deep brackets': '[' * 190 + ']' * 190,
+    '50000 parentheses': '(' * 50_000 + 'z1' + ')' * 50_000,
+    '50000 signs': '-' * 50_000 + 'z1',
+    'much work': '+'.join(['(' + '-' * 20 + 'z1)'] * 15),
+    'many functions': '+'.join(['tan(' * 16 + 'z1' + ')' * 16] * 4),
+    # what Python warns of
+    'number without a space': '1if z1 else 2',
+    'escape': '"\\d"',
+    'identity': 'z1 is 1',
 }
 
 
 @pytest.mark.parametrize('text', REFUSED.values(), ids=REFUSED.keys())
-def test_anything_else_is_refused_in_one_line(text):
+def test_anything_else_is_refused_in_one_line(text, recwarn):
     with pytest.raises(ConfigurationError) as error:
         TriangularModel(['0', '0', text])
     message = str(error.value)
@@ -154,6 +169,7 @@ def test_anything_else_is_refused_in_one_line(text):
     assert message.isprintable()  # so it is one line
     assert len(message) < MAX_LENGTH * 4 + 400
     assert error.value.__suppress_context__ or error.value.__context__ is None
+    assert not recwarn.list
 
 
 @pytest.mark.parametrize(
@@ -169,6 +185,8 @@ def test_anything_else_is_refused_in_one_line(text):
         ('z1/(1 - 1)*0 + 1/0', 'a constant part of it is not a finite number'),
         ('2 z1', 'this is not an arithmetic expression'),
         ('-' * (MAX_NESTING + 1) + 'z1', f'nested deeper than {MAX_NESTING}'),
+        ('+'.join(['tan(z1)'] * (MAX_FUNCTIONS + 1)), f'31 functions, at most {MAX_FUNCTIONS}'),
+        ('+'.join(['(-z1-u-1)'] * 26), f'103 operations, at most {MAX_OPERATIONS}'),
         ('z1' * MAX_LENGTH, f'{2 * MAX_LENGTH} characters, at most {MAX_LENGTH}'),
     ],
 )
@@ -180,6 +198,8 @@ def test_message_gives_the_reason(text, reason):
 
 def test_what_is_just_within_the_limits_is_accepted():
     parse('-' * MAX_NESTING + 'z1', 1)
+    parse('+'.join(['tan(z1)'] * MAX_FUNCTIONS), 1)
+    parse('*'.join(['(-z1-u-1)'] * 25), 1)
     parse('z1' + ' ' * (MAX_LENGTH - 4) + '+1', 1)
 
 

@@ -2,7 +2,7 @@
 """Training recordings: seeded, true to their parameters, and solved accurately."""
 
 from fhaosmo_ros.core import ConfigurationError, Family, Plant, TriangularModel
-from fhaosmo_ros.core.response import respond
+from fhaosmo_ros.core.simulation.plant import respond
 import numpy as np
 import pytest
 

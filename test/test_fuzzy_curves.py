@@ -2,10 +2,10 @@
 """The curves psi against scikit-fuzzy's own control system, and what they promise."""
 
 from fhaosmo_ros.core import ConfigurationError
-from fhaosmo_ros.core.configuration import ObserverConfiguration
-from fhaosmo_ros.core.fuzzy import curve, infer, KNOTS, TERMS, terms_of_level
-from fhaosmo_ros.core.law import INVERSE_WIDTH
-from fhaosmo_ros.core.law import psi as read_psi
+from fhaosmo_ros.core.observer.arrays import INVERSE_WIDTH
+from fhaosmo_ros.core.observer.arrays import psi as read_psi
+from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.fuzzy import curve, infer, KNOTS, TERMS, terms_of_level
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -27,8 +27,8 @@ def law(level_widths=(0.02,), **options):
 
 
 def psi(law, level, x):
-    """Return psi of a signed x, as the kernels read it."""
-    value, _ = read_psi(law.flags, law.gains, law.curves, level, abs(x))
+    """Return psi of a signed x, as the compiled functions read it."""
+    value, _ = read_psi(law, level, abs(x))
     return np.copysign(value, x)
 
 
@@ -163,7 +163,7 @@ def test_slope_is_that_of_psi(law, level, share):
     if abs(position - round(position)) < 1e-3:
         return  # two pieces meet
     a, step = share * width, 1e-6 * width
-    _, slope = read_psi(law.flags, law.gains, law.curves, level, a)
+    _, slope = read_psi(law, level, a)
     rise = psi(law, level, a + step) - psi(law, level, a - step)
     np.testing.assert_allclose(slope, rise / (2.0 * step), rtol=1e-6, atol=1e-6 / width)
 
@@ -181,6 +181,6 @@ def test_width_scales_the_input(options, level, share, width):
 def test_sign_is_the_limit_of_a_narrow_psi(level, a):
     narrow = law((1e-12,))
     sign = law(variant='sign')
-    assert read_psi(sign.flags, sign.gains, sign.curves, level, a) == (1.0, 0.0)
+    assert read_psi(sign, level, a) == (1.0, 0.0)
     if a >= 1e-12:
         np.testing.assert_allclose(psi(narrow, level, a), 1.0, rtol=1e-12)

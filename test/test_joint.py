@@ -4,7 +4,7 @@
 from itertools import pairwise
 
 from fhaosmo_ros.core import ConfigurationError, Observer
-from fhaosmo_ros.core.joint import simulate
+from fhaosmo_ros.core.simulation.plant_and_observer import simulate
 import numpy as np
 import pytest
 

@@ -4,11 +4,11 @@
 from itertools import product
 
 import bag_files as files
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameter_file import dumps
-from fhaosmo_ros.core.snapshot import Flag, labels, pack, Snapshot
-from fhaosmo_ros.tools import replay
-from fhaosmo_ros.tools.bags import labelled_array
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.memory import Flag, labels, pack, Snapshot
+from fhaosmo_ros.core.parameters.files import dumps
+from fhaosmo_ros.tools.bags.types import labelled_array
+from fhaosmo_ros.tools.replay import command as replay
 import numpy as np
 import pytest
 

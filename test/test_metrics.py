@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics on series whose numbers are known by hand."""
 
-from fhaosmo_ros.core.metrics import chatter, rms, settling_time, total_variation
+from fhaosmo_ros.core.simulation.metrics import chatter, rms, settling_time, total_variation
 import numpy as np
 import pytest
 

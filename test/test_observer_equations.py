@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import math
 
 from fhaosmo_ros.core import Observer
-from fhaosmo_ros.core.fuzzy import curve, terms_of_level
+from fhaosmo_ros.core.observer.fuzzy import curve, terms_of_level
 import numpy as np
 from observer_cases import VARIANTS
 import pytest

@@ -2,7 +2,7 @@
 """What holds for every observer: splits, snapshots, symmetry, what an estimate is."""
 
 from fhaosmo_ros.core import ConfigurationError, Observer
-from fhaosmo_ros.core.layout import GAMMA
+from fhaosmo_ros.core.observer.arrays import GAMMA
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np

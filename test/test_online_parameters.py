@@ -4,8 +4,8 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 import numpy as np
 import pytest
 

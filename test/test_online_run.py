@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The batch path of a replay is the live path, bit for bit, whatever the samples."""
 
-from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np

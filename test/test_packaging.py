@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What colcon installs, what the launch file starts, which environment make chooses."""
+"""What colcon and pip install, what the launch file starts, which environment make chooses."""
 
 import importlib.util
 import os
@@ -8,7 +8,7 @@ import runpy
 import shutil
 import subprocess
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from xml.etree import ElementTree
 
 import fhaosmo_ros
@@ -71,8 +71,13 @@ def installed(request, checkout, tmp_path_factory) -> Path:
 
 def test_colcon_installs_executables_and_data(installed, checkout):
     prefix = installed / NAME
+    executables = {path.name for path in (prefix / 'lib' / NAME).iterdir()}
+    assert executables == set(COMMANDS)
     for command in COMMANDS:
         assert os.access(prefix / 'lib' / NAME / command, os.X_OK)
+    assert not (prefix / 'bin').exists()
+    for other in ('studies', 'benchmark', 'test'):
+        assert not list(prefix.rglob(other))
     share = prefix / 'share' / NAME
     for pattern in ('config/**/*.yaml', 'config/*.xml', 'launch/*.py', 'package.xml'):
         expected = {path.relative_to(checkout) for path in checkout.glob(pattern)}
@@ -105,10 +110,32 @@ def test_sourced_package_is_the_built_one(installed, checkout, tmp_path):
 
 def test_executable_starts_with_only_the_overlay_sourced(installed, tmp_path):
     """An executable that cannot find its package or its interpreter fails here."""
-    if not (ROOT / NAME / 'tools' / 'demo.py').exists():
-        pytest.skip('fhaosmo_ros.tools.demo does not exist')
     script = f'. {installed}/setup.bash && {installed}/{NAME}/lib/{NAME}/demo --help'
     assert '--duration' in run('bash', '-c', script, env=clean_environment(), cwd=tmp_path)
+
+
+# pip
+
+
+def test_wheel_has_one_script_and_only_this_package(checkout, tmp_path):
+    """Scripts of a wheel go to bin, where `record` or `plot` would hide other programs."""
+    pip = (sys.executable, '-m', 'pip', '--disable-pip-version-check')
+    options = ('--no-deps', '--no-build-isolation')
+    build = tmp_path / 'build'  # setuptools builds within the sources
+    shutil.copytree(checkout, build)
+    run(*pip, 'wheel', *options, '-w', tmp_path, build, env=clean_environment())
+    (wheel,) = tmp_path.glob('*.whl')
+    installed = tmp_path / 'installed'
+    run(*pip, 'install', '--no-deps', '--prefix', installed, wheel, env=clean_environment())
+    assert [path.name for path in (installed / 'bin').iterdir()] == ['fhaosmo']
+    (packages,) = installed.glob('lib/python*/site-packages')
+    assert {path.name for path in packages.iterdir() if path.suffix != '.dist-info'} == {NAME}
+    assert (installed / 'share' / NAME / 'config' / 'demo.yaml').is_file()
+    printed = run(
+        installed / 'bin' / 'fhaosmo', '--help', env=clean_environment(PYTHONPATH=str(packages))
+    )
+    assert printed.startswith('usage: fhaosmo COMMAND')
+    assert all(command in printed for command in COMMANDS)
 
 
 # package.xml
@@ -153,17 +180,22 @@ def stub(monkeypatch, module: str, *names: str) -> None:
     monkeypatch.setitem(sys.modules, module, fake)
 
 
-def test_launch_file_starts_both_nodes(monkeypatch):
+@pytest.fixture
+def launch_file(monkeypatch) -> dict:
+    """Return what the launch file defines."""
     stub(monkeypatch, 'launch', 'LaunchDescription')
-    stub(monkeypatch, 'launch.actions', 'DeclareLaunchArgument', 'Shutdown')
+    stub(monkeypatch, 'launch.actions', 'DeclareLaunchArgument', 'OpaqueFunction', 'Shutdown')
     stub(monkeypatch, 'launch.substitutions', 'LaunchConfiguration', 'PathJoinSubstitution')
     stub(monkeypatch, 'launch_ros')
     stub(monkeypatch, 'launch_ros.actions', 'Node')
     stub(monkeypatch, 'launch_ros.parameter_descriptions', 'ParameterValue')
     stub(monkeypatch, 'launch_ros.substitutions', 'FindPackageShare')
 
-    script = runpy.run_path(str(ROOT / 'launch' / 'demo.launch.py'))
-    (entities,) = script['generate_launch_description']().args
+    return runpy.run_path(str(ROOT / 'launch' / 'demo.launch.py'))
+
+
+def test_launch_file_starts_both_nodes(launch_file):
+    (entities,) = launch_file['generate_launch_description']().args
     arguments = {e.args[0]: e for e in entities if type(e).__name__ == 'DeclareLaunchArgument'}
     nodes = {e.kwargs['executable']: e.kwargs for e in entities if type(e).__name__ == 'Node'}
 
@@ -185,7 +217,29 @@ def test_launch_file_starts_both_nodes(monkeypatch):
         assert set(overrides) == {'use_sim_time', 'autostart'}
         assert all(value.kwargs == {'value_type': bool} for value in overrides.values())
         assert node['ros_arguments'][0] == '--log-level'
-        assert type(node['on_exit']).__name__ == 'Shutdown'
+        assert node['on_exit'] is launch_file['end']
+    (check,) = (e for e in entities if type(e).__name__ == 'OpaqueFunction')
+    assert entities.index(check) < len(entities) - len(nodes)  # before the nodes
+    assert check.kwargs['function'] is launch_file['check_params_file']
+
+
+def test_launch_ends_with_a_node_and_fails_with_one_that_failed(launch_file):
+    """An exception in an event's handler makes `ros2 launch` exit with 1."""
+    ended = SimpleNamespace(process_name='plant-1', returncode=0)
+    assert type(launch_file['end'](ended, None)).__name__ == 'Shutdown'
+    ended.returncode = 2
+    with pytest.raises(RuntimeError, match='plant-1 ended with exit code 2'):
+        launch_file['end'](ended, None)
+
+
+def test_launch_refuses_a_params_file_that_does_not_exist(launch_file, tmp_path, monkeypatch):
+    for path in (tmp_path / 'none.yaml', tmp_path):
+        monkeypatch.setattr(Recorded, 'perform', lambda *_, p=path: str(p), raising=False)
+        with pytest.raises(FileNotFoundError, match=f'params_file: expected a file, got {path}'):
+            launch_file['check_params_file'](None)
+    (tmp_path / 'some.yaml').touch()
+    monkeypatch.setattr(Recorded, 'perform', lambda *_: str(tmp_path / 'some.yaml'))
+    launch_file['check_params_file'](None)
 
 
 # scripts/environment.sh
@@ -253,6 +307,12 @@ def test_unknown_command_names_the_closest(capsys):
     assert "did you mean 'estimator'?" in message
     assert all(command in message for command in COMMANDS)
     assert len(message.splitlines()) == 1
+
+
+@pytest.mark.parametrize('study', ['compare', 'paper'])
+def test_study_is_run_by_make(study, capsys):
+    assert main([study]) == 2
+    assert f'make {study} in a checkout' in capsys.readouterr().err
 
 
 def test_no_command_lists_all(capsys):

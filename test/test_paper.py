@@ -1,25 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """docs/paper.md against its own results file, and that file against a short new run."""
 
+import contextlib
 import json
+import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
 
-from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.metrics import high_passed
-from fhaosmo_ros.tools import (
-    paper,
-    paper_beyond,
-    paper_cases,
-    paper_document,
-    paper_findings,
-)  # fmt: skip
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.simulation.metrics import high_passed
 import numpy as np
 import pytest
+from studies import document as paper_document
+from studies.paper import beyond as paper_beyond
+from studies.paper import cases as paper_cases
+from studies.paper import command as paper
+from studies.paper import findings as paper_findings
 
-DOCS = Path(__file__).resolve().parents[1] / 'docs'
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / 'docs'
 REWRITE = 'run make paper'
 
 
@@ -126,26 +127,65 @@ def test_quick_run_writes_everything(tmp_path, capsys):
     )
     assert set(new) == set(old)
     # A second run fills the document that the first one made.
-    paper_document.write(tmp_path / 'out' / 'paper.md', old)
+    with paper_document.rewriting(tmp_path / 'out', 'paper', 'again') as pages:
+        pages.write(old)
     again = paper_document.parts((tmp_path / 'out' / 'paper.md').read_text(encoding='utf-8'))
     assert again == old
 
 
 @pytest.mark.signals
-def test_interrupt_ends_it_in_one_line(tmp_path):
-    command = [sys.executable, '-m', 'fhaosmo_ros', 'paper', '--quick', '--output', tmp_path]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        process.stderr.read(1)  # the bar begins
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
+@pytest.mark.parametrize('ignored', [False, True])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signal_ends_it_in_one_line_and_leaves_nothing(tmp_path, number, ignored):
+    """Also where SIGINT is ignored at the start, as in a background job."""
+    command = [sys.executable, '-m', 'studies.paper', '--quick', '--output', tmp_path / 'out']
+    terminal, its_end = os.openpty()  # the bar begins at once there, and in a log after 30 s
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if ignored else None
+    try:
+        process = subprocess.Popen(command, cwd=ROOT, stderr=its_end)
+    finally:
+        os.close(its_end)
+        if ignored:
+            signal.signal(signal.SIGINT, before)
+    said = b''
+    try:
+        while b'%' not in said:  # the bar
+            said += os.read(terminal, 1024)
+        process.send_signal(number)
+        with contextlib.suppress(OSError):  # EIO: the process has ended
+            while True:
+                said += os.read(terminal, 1024)
+        process.wait(60)
+    finally:
+        process.kill()
+        os.close(terminal)
     assert process.returncode == 130
-    assert 'Traceback' not in said
-    assert said.splitlines()[-1] == 'paper: interrupted'
+    assert b'Traceback' not in said
+    assert said.splitlines()[-1] == b'paper: interrupted'
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_document_without_the_markers_is_refused():
     with pytest.raises(ConfigurationError, match='findings'):
         paper_document.filled('no markers here', {'findings': ''})
+
+
+def test_failure_leaves_document_and_folder_as_they_were(tmp_path):
+    with paper_document.rewriting(tmp_path, 'page', 'title') as pages:
+        (pages.folder / 'figure').write_text('old')
+        pages.write({'part': 'old'})
+
+    def fail():
+        with paper_document.rewriting(tmp_path, 'page', '') as pages:
+            (pages.folder / 'figure').write_text('new')
+            pages.write({'part': 'new'})
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert (tmp_path / 'page' / 'figure').read_text() == 'old'
+    assert paper_document.parts((tmp_path / 'page.md').read_text()) == {'part': 'old'}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['page', 'page.md']
 
 
 def test_output_that_is_a_file_is_an_error_of_one_line(tmp_path, capsys):

@@ -2,7 +2,8 @@
 """The simulated plant: each disturbance against its formula, noise, the known input, bad input."""
 
 from fhaosmo_ros.core import ConfigurationError, Plant
-from fhaosmo_ros.core.disturbance import KINDS
+from fhaosmo_ros.core.simulation.disturbance import KINDS
+from fhaosmo_ros.core.simulation.plant import quantised
 import numpy as np
 import pytest
 
@@ -76,6 +77,13 @@ def test_noise_is_seeded_and_of_the_right_size():
     np.testing.assert_allclose(np.std(noise), 0.03, atol=3e-4)
     np.testing.assert_allclose(np.mean(noise[1:] * noise[:-1]), 0.0, atol=1.2e-5)  # white
     np.testing.assert_array_equal(one.z[:, 0], 0.2)  # the truth has none
+
+
+@pytest.mark.filterwarnings('error')
+def test_quantisation_far_below_the_output_changes_nothing():
+    y = np.array([1e300, -1e300, 0.3, np.inf, np.nan])
+    np.testing.assert_array_equal(quantised(y, 5e-324), y)
+    np.testing.assert_allclose(quantised(y, 1e-12)[:3], y[:3], rtol=1e-11)
 
 
 def test_quantised_output_lies_on_the_grid_next_to_the_noisy_one():

@@ -10,17 +10,20 @@ import threading
 import time
 
 import pytest
+from rosbags.typesys import get_types_from_msg
 
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 import bag_files as files
+from fhaosmo_ros.nodes.middleware.messages import message_class
+from fhaosmo_ros.tools.bags.reader import BagReader
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[1]
 DOMAIN = str(20 + os.getpid() % 60)
 
 
-def start(*arguments):
+def start(*arguments, folder=None):
     environment = {
         **os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path]),
         'ROS_DOMAIN_ID': DOMAIN, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
@@ -28,6 +31,7 @@ def start(*arguments):
     return subprocess.Popen(
         [sys.executable, '-m', 'fhaosmo_ros', *map(str, arguments)], env=environment,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        cwd=folder,
     )  # fmt: skip
 
 
@@ -89,3 +93,72 @@ def test_wrong_input_is_said_in_one_line(arguments, words, tmp_path):
     assert process.returncode == 2
     assert len(out.strip().splitlines()) == 1
     assert all(word in out for word in words)
+
+
+def plant_package(folder, name):
+    """Write a package of messages whose import leaves a file; return that file."""
+    mark = folder / 'imported'
+    (folder / name / 'msg').mkdir(parents=True)
+    (folder / name / '__init__.py').write_text(f"open({str(mark)!r}, 'w').close()\n")
+    (folder / name / 'msg' / '__init__.py').write_text('class Thing:\n    pass\n')
+    return mark
+
+
+def test_package_beside_the_bag_is_not_imported(tmp_path):
+    """The names in a bag come from strangers."""
+    mark = plant_package(tmp_path, 'planted_msgs')
+    files.TYPES.register(get_types_from_msg('float64 data', 'planted_msgs/msg/Thing'))
+    stamps, y = files.signal(20)
+    things = [('/x', 'planted_msgs/msg/Thing', s, d) for _, _, s, d in files.floats(stamps, y)]
+    files.write(tmp_path / 'bag', [*files.floats(stamps, y), *things])
+    process = start('play', 'bag', folder=tmp_path)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, out
+    assert 'not played: /x: planted_msgs/msg/Thing is not installed here' in out
+    assert 'playing 1 topics' in out
+    assert not mark.exists()
+
+
+def test_only_installed_message_types_have_a_class(tmp_path, monkeypatch):
+    assert message_class('std_msgs/msg/Float64').__name__ == 'Float64'
+    site_packages = tmp_path / 'install' / 'lib' / 'python3' / 'site-packages'
+    mark = plant_package(site_packages, 'workspace_msgs')
+    monkeypatch.syspath_prepend(site_packages)
+    names = [
+        'workspace_msgs/msg/Thing', 'std_msgs/msg/Nothing', 'std_msgs/srv/Float64', 'os/msg/Path',
+        'std_msgs.msg/msg/Float64', 'std_msgs/Float64', 'numpy/msg/Thing', 'nothing/msg/Thing', '',
+    ]  # fmt: skip
+    for name in names:
+        with pytest.raises(LookupError, match='expected a message type that is installed here'):
+            message_class(name)
+    assert not mark.exists()
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{tmp_path / "install"}{os.pathsep}')
+    assert message_class('workspace_msgs/msg/Thing').__name__ == 'Thing'
+    assert mark.exists()
+
+
+def test_names_and_remappings_of_a_launch_file_act(tmp_path):
+    """With the arguments that launch adds, those without a meaning here included."""
+    stamps, y = files.signal(1000)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+    remapped = (
+        '--ros-args', '-r', '__ns:=/tools', '-r', '/y:=/rig/y', '--log-level', 'warn',
+        '-p', 'use_sim_time:=true', '--params-file', tmp_path / 'none.yaml',
+    )  # fmt: skip
+    recorder = start('record', '-o', tmp_path / 'out', *remapped, '-r', '__node:=scribe')
+    try:
+        assert 'recording to' in recorder.stdout.readline()
+        player = start('play', bag, '--loop', '--wait', '/y', *remapped)
+        try:
+            assert 'playing' in player.stdout.readline()
+            time.sleep(3.0)
+            assert player.poll() is None, player.communicate()
+        finally:
+            player.send_signal(signal.SIGINT)
+            player.communicate(timeout=60)
+    finally:
+        recorder.send_signal(signal.SIGINT)
+        said, _ = recorder.communicate(timeout=60)
+    assert recorder.returncode == 0, said
+    with BagReader(tmp_path / 'out') as recorded:
+        assert recorded.count('/rig/y') > 0

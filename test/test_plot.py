@@ -6,15 +6,19 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
-import time
 
 import bag_files as files
-from fhaosmo_ros.tools import plot, replay
-from fhaosmo_ros.tools.bags import labelled_array
-from fhaosmo_ros.tools.plot_data import metrics, read_curves
+from fhaosmo_ros.tools.bags.types import labelled_array
+from fhaosmo_ros.tools.plot import command as plot
+from fhaosmo_ros.tools.plot.curves import Curves, metrics, read_curves
+from fhaosmo_ros.tools.plot.figures import COLUMNS, envelope, save_curves
+from fhaosmo_ros.tools.replay import command as replay
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[1]
 MAGIC = {'png': b'\x89PNG\r\n\x1a\n', 'svg': b'<?xml', 'pdf': b'%PDF-'}
@@ -68,8 +72,12 @@ def test_window_that_can_not_be_opened_is_said(backend, bag, tmp_path):
     environment |= {'MPLBACKEND': backend} if backend else {}
     done = subprocess.run(
         [sys.executable, '-m', 'fhaosmo_ros', 'plot', bag, '-o', tmp_path / 'f.png', '--show'],
-        capture_output=True, text=True, env=environment, timeout=120, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=120,
+        check=False,
+    )
     assert done.returncode == 2, done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     assert 'DISPLAY' in done.stderr
@@ -90,21 +98,96 @@ def test_figure_is_kept_before_the_window_opens(bag, tmp_path, monkeypatch):
     assert out.exists()
 
 
+def test_thinned_curve_draws_the_same_pixels():
+    rng = np.random.default_rng(3)
+    t = np.sort(rng.uniform(0.0, 100.0, 200_000)) ** 2  # a rate that changes
+    curves = [np.sin(t * 1e-3), rng.normal(size=len(t)), np.where(t % 2000 < 500, np.nan, t)]
+    curves[0][777] = 9.0  # one spike
+    t[100_000:] += 500.0  # a gap
+    for x in curves:
+        thin = envelope(t, x)
+        assert len(thin[0]) <= 2 * COLUMNS + 2
+        assert [np.nanmin(thin[1]), np.nanmax(thin[1])] == [np.nanmin(x), np.nanmax(x)]
+        assert (thin[0][0], thin[0][-1]) == (t[0], t[-1])
+        pictures = []
+        for curve in ((t, x), thin):
+            figure = Figure(figsize=(8.5, 2.0))
+            figure.subplots().plot(*curve, linewidth=1.2)
+            canvas = FigureCanvasAgg(figure)
+            canvas.draw()
+            pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].mean(axis=2))
+        assert np.mean(np.abs(pictures[0] - pictures[1]) > 100.0) < 2e-3
+
+
+def test_figure_of_many_estimates_is_thinned(tmp_path, monkeypatch):
+    """All samples of a million estimates took 460 MB more."""
+    count = 20_000
+    stamps, y = files.signal(count)
+    estimate, innovation = np.column_stack([y, y]), np.column_stack([y, y])
+    curves = Curves('run', stamps, ['z1', 'd'], estimate, y, innovation, estimate, 1.0)
+    drawn = []
+    monkeypatch.setattr(Figure, 'savefig', lambda figure, *_, **__: drawn.extend(figure.axes))
+    save_curves([curves], 1.0, tmp_path / 'f.png', window=False)
+    lengths = [len(line.get_xdata()) for axes in drawn for line in axes.lines]
+    assert len(lengths) == 8
+    assert max(lengths) <= 2 * COLUMNS + 2 < count
+
+
+def test_thinning_leaves_short_curves_and_times_that_go_back():
+    t = np.concatenate([np.linspace(0.0, 10.0, 5000), np.linspace(2.0, 12.0, 5000)])
+    kept, _ = envelope(t, np.sin(t))
+    assert np.flatnonzero(np.diff(kept) < 0.0).size == 1
+    for count in (0, 1, 100):
+        assert envelope(t[:count], t[:count])[0] is not None
+        assert envelope(t[:count], t[:count])[1].tolist() == t[:count].tolist()
+    assert len(envelope(np.ones(9999), np.arange(9999.0))[0]) == 9999
+
+
+@pytest.mark.signals
+@pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
+def test_signal_in_a_destructor_is_not_lost(bag, tmp_path, monkeypatch, capsys):
+    class Collected:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(plot, 'save_curves', lambda c, e, path, show: path.write_bytes(b'x'))
+    monkeypatch.setattr(plot, 'read_curves', _then(plot.read_curves, Collected))
+    assert plot.main([str(bag), '-o', str(tmp_path / 'f.png')]) == 130
+    assert capsys.readouterr().err.endswith('plot: interrupted\n')
+    assert not list(tmp_path.glob('*f.png*'))
+
+
+def _then(function, another):
+    def both(*arguments):
+        another()
+        return function(*arguments)
+
+    return both
+
+
+# The command, which draws so long that no signal can come too late.
+SLOW = """
+import sys, time
+from fhaosmo_ros.tools.plot import command
+draw = command.save_curves
+command.save_curves = lambda *arguments: (draw(*arguments), time.sleep(120.0))
+sys.exit(command.main(sys.argv[1:]))
+"""
+
+
 @pytest.mark.signals
 def test_ctrl_c_leaves_nothing(tmp_path):
     stamps, y = files.signal(60_000)
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y), 'sqlite3')
     assert replay.main([str(bag), '-o', str(tmp_path / 'out'), '--storage', 'sqlite3']) == 0
     process = subprocess.Popen(
-        [sys.executable, '-m', 'fhaosmo_ros', 'plot', tmp_path / 'out', '-o', tmp_path / 'f.pdf'],
-        stderr=subprocess.PIPE, text=True, start_new_session=True,
+        [sys.executable, '-c', SLOW, tmp_path / 'out', '-o', tmp_path / 'f.pdf'],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
         env={**os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])},
-    )  # fmt: skip
-    deadline = time.monotonic() + 90
-    while not (tmp_path / '.f.pdf.part').exists():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    )
+    wait_until((tmp_path / '.f.pdf.part').exists, 'output', 90.0, process)
     os.killpg(process.pid, signal.SIGTERM)
     os.killpg(process.pid, signal.SIGINT)
     _, error = process.communicate(timeout=60)
@@ -120,8 +203,9 @@ def test_truth_is_unknown_where_the_bag_lacks_it(tmp_path):
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
     assert replay.main([str(bag), '-o', str(tmp_path / 'one')]) == 0
     data = labelled_array(['z1', 'z2', 'z3'], np.zeros(3))
-    late = [('/plant/state', 'std_msgs/msg/Float64MultiArray', int(s), data)
-            for s in stamps[100:400]]  # fmt: skip
+    late = [
+        ('/plant/state', 'std_msgs/msg/Float64MultiArray', int(s), data) for s in stamps[100:400]
+    ]
     with AnyReader([tmp_path / 'one']) as reader:
         all_ = [(c.topic, c.msgtype, s, bytes(d)) for c, s, d in reader.messages()]
     all_ += [*late, *files.floats(stamps[50:450], y[50:450], '/plant/unknown_input')]

@@ -3,10 +3,10 @@
 
 from pathlib import Path
 
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameter_file import load
-from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS, PLANT_PARAMETERS
-from fhaosmo_ros.core.plant import Plant
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS, PLANT_PARAMETERS
+from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np
 import pytest
 

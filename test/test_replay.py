@@ -10,20 +10,21 @@ import sqlite3
 import struct
 import subprocess
 import sys
-import time
 
 import bag_files as files
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.tools import replay, sinks
-from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.bag_writer import BagWriter
-from fhaosmo_ros.tools.chunks import scan
-from fhaosmo_ros.tools.series import series
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.tools.bags.mcap.chunks import scan
+from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.bags.topics import series
+from fhaosmo_ros.tools.bags.writer import BagWriter
+from fhaosmo_ros.tools.replay import command as replay
+from fhaosmo_ros.tools.replay import sinks
 import lz4.frame
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import storage_mcap
+from waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[1]
 COUNT = 5000
@@ -480,8 +481,33 @@ def test_existing_output_stays_without_force(bag, tmp_path, capsys):
     assert run(bag, '--topic', '/no', '-o', tmp_path / 'out', '--force') == 2
     assert (tmp_path / 'out' / 'precious').read_text() == 'mine'
     assert run(bag, '-o', tmp_path / 'out', '--force') == 0
-    assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == ['metadata.yaml', 'out.mcap']
+    assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == ['metadata.yaml', 'out_0.mcap']
     assert sorted(p.name for p in tmp_path.iterdir()) == ['bag', 'out']
+
+
+@pytest.mark.parametrize('name', ['.', '..', '/'])
+def test_output_without_a_name_is_refused(name, bag, capsys):
+    assert run(bag, '-o', name, '--force') == 2
+    error = capsys.readouterr().err.strip()
+    assert error == f'replay: error: output {name}: expected a name, got a folder that is in use'
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_full_disk_is_said_in_one_line(storage, bag, tmp_path):
+    """The system refuses to make a file larger than 300 kB."""
+    command = f'-m fhaosmo_ros replay {bag} -o {tmp_path / "out"} --storage {storage}'
+    result = subprocess.run(
+        ['sh', '-c', f'ulimit -f 600; exec {sys.executable} {command}'],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=120,
+        check=False,
+    )
+    assert result.returncode == 2, result.stderr
+    assert 'Traceback' not in result.stderr
+    assert 'replay: error: ' in result.stderr.splitlines()[-1]
+    assert not (tmp_path / 'out').exists()
 
 
 def test_record_beyond_its_chunk_is_refused():
@@ -500,12 +526,8 @@ def test_ctrl_c_leaves_nothing(tmp_path):
         stderr=subprocess.PIPE, text=True, cwd=ROOT,
         env={**os.environ, 'PYTHONPATH': str(ROOT)}, start_new_session=True,
     )  # fmt: skip
-    part = tmp_path / '.out.part' / 'out' / 'out.db3'
-    deadline = time.monotonic() + 60
-    while not part.exists():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    part = tmp_path / '.out.part' / 'out' / 'out_0.db3'
+    wait_until(part.exists, 'output', process=process)
     os.killpg(process.pid, signals.SIGINT)
     os.killpg(process.pid, signals.SIGINT)
     _, error = process.communicate(timeout=60)

@@ -7,15 +7,24 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
-import time
 
 from fhaosmo_ros.core import ConfigurationError
 import pytest
+from waiting import wait_until
 
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
 pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
 
-from fhaosmo_ros.tools.tuning.search import BAD, Dimension, log_dimensions, minimise
+from fhaosmo_ros.tools.tuning.search import storage as storages
+from fhaosmo_ros.tools.tuning.search.minimise import (
+    BAD,
+    Dimension,
+    log_dimensions,
+    minimise,
+    StudyOptions,
+)
+from optuna.storages import InMemoryStorage, RDBStorage
+import sqlalchemy.exc
 
 ROOT = Path(__file__).resolve().parents[1]
 SPACE = [Dimension('a', 1e-3, 1e3, 1.0), Dimension('b', -5.0, 5.0, 0.0, log=False)]
@@ -31,10 +40,11 @@ def test_minimum_is_found():
     assert result.best['a'] == pytest.approx(30.0, rel=0.1)
     assert len(result.trials) == 300
     assert result.trials[0].parameters == {'a': 1.0, 'b': 0.0}
+    assert result.failure is None
 
 
 def test_one_job_repeats_itself_and_the_seed_matters():
-    runs = [minimise(bowl, SPACE, 40, seed=seed, jobs=1).trials for seed in (3, 3, 4)]
+    runs = [minimise(bowl, SPACE, 40, StudyOptions(seed), jobs=1).trials for seed in (3, 3, 4)]
     assert runs[0] == runs[1] != runs[2]
 
 
@@ -49,7 +59,7 @@ def test_threads_share_one_study():
 def test_values_that_are_not_finite_are_bad_not_fatal():
     result = minimise(lambda v: bowl(v) if v['b'] < 1.0 else float('nan'), SPACE, 60, jobs=1)
     assert result.value < bowl({'a': 1.0, 'b': 0.0})
-    assert max(point.values[0] for point in result.trials) == BAD
+    assert max(trial.values[0] for trial in result.trials) == BAD
 
 
 def test_error_in_the_objective_ends_the_search():
@@ -76,28 +86,29 @@ def test_study_is_continued(tmp_path, kind):
     storage = str(tmp_path / 'study.log')
     if kind == 'sqlite':
         storage = f'sqlite:///{storage}'
-    first = minimise(bowl, SPACE, 20, jobs=1, storage=storage)
-    second = minimise(bowl, SPACE, 50, jobs=1, storage=storage)
+    first = minimise(bowl, SPACE, 20, StudyOptions(storage=storage), jobs=1)
+    second = minimise(bowl, SPACE, 50, StudyOptions(storage=storage), jobs=1)
     assert len(first.trials) == 20
     assert second.trials[:20] == first.trials
     assert len(second.trials) == 50
     assert second.value <= first.value
     # Another name is another study.
-    assert len(minimise(bowl, SPACE, 5, jobs=1, storage=storage, name='other').trials) == 5
+    other = minimise(bowl, SPACE, 5, StudyOptions(storage=storage, name='other'), jobs=1)
+    assert len(other.trials) == 5
 
 
 WORKER = """
 import sys, time
 sys.path.insert(0, 'test')
 from test_search import bowl, SPACE
-from fhaosmo_ros.tools.tuning.search import minimise
+from fhaosmo_ros.tools.tuning.search.minimise import minimise, StudyOptions
 calls = 0
 def slow(values):
     global calls
     calls += 1
     time.sleep(0.02 if calls <= int(sys.argv[3]) else 3600.0)
     return bowl(values)
-result = minimise(slow, SPACE, int(sys.argv[2]), jobs=1, storage=sys.argv[1])
+result = minimise(slow, SPACE, int(sys.argv[2]), StudyOptions(storage=sys.argv[1]), jobs=1)
 print(len(result.trials), result.value)
 """
 
@@ -106,9 +117,12 @@ def worker(storage, trials, calls=1_000_000):
     """Start a search that hangs in the trial after so many."""
     command = [sys.executable, '-c', WORKER, storage, str(trials), str(calls)]
     return subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE,
-        text=True, env=os.environ | {'PYTHONPATH': str(ROOT)},
-    )  # fmt: skip
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {'PYTHONPATH': str(ROOT)},
+    )
 
 
 def lines(storage):
@@ -122,9 +136,7 @@ def test_two_processes_and_a_kill(tmp_path):
     # The victim's trials end by themselves: how late it is killed does not matter.
     victim, other = worker(str(storage), 10_000, calls=40), worker(str(storage), 150)
     try:
-        deadline = time.monotonic() + 60.0
-        while lines(storage) < 60 and time.monotonic() < deadline:
-            time.sleep(0.02)
+        wait_until(lambda: lines(storage) >= 60, 'trials', process=victim)
         assert victim.poll() is None
         victim.send_signal(signal.SIGKILL)
         victim.wait()
@@ -138,19 +150,22 @@ def test_two_processes_and_a_kill(tmp_path):
     assert before >= 59
     assert 150 <= int(count) <= 152
     assert float(value) < 0.05
-    again = minimise(bowl, SPACE, 160, jobs=1, storage=str(storage))
+    again = minimise(bowl, SPACE, 160, StudyOptions(storage=str(storage)), jobs=1)
     assert len(again.trials) == 160
-    owners = {line.split('"worker":"')[1].split('"')[0]
-              for line in storage.read_text().splitlines() if '"worker":"' in line}  # fmt: skip
+    owners = {
+        line.split('"worker":"')[1].split('"')[0]
+        for line in storage.read_text().splitlines()
+        if '"worker":"' in line
+    }
     assert len(owners) == 3
 
 
 def test_line_cut_short_by_a_kill_is_cut_off(tmp_path):
     storage = tmp_path / 'study.log'
-    minimise(bowl, SPACE, 10, jobs=1, storage=str(storage))
+    minimise(bowl, SPACE, 10, StudyOptions(storage=str(storage)), jobs=1)
     with storage.open('ab') as file:
         file.write(b'{"op_code":4,"wor')
-    assert len(minimise(bowl, SPACE, 20, jobs=1, storage=str(storage)).trials) == 20
+    assert len(minimise(bowl, SPACE, 20, StudyOptions(storage=str(storage)), jobs=1).trials) == 20
 
 
 @pytest.mark.parametrize('storage', [None, 'study.log'])
@@ -160,11 +175,11 @@ def test_notes_are_kept_and_only_the_first_number_is_minimised(tmp_path, storage
 
     if storage is not None:
         storage = str(tmp_path / storage)
-    result = minimise(noted, SPACE, 100, jobs=1, storage=storage)
+    result = minimise(noted, SPACE, 100, StudyOptions(storage=storage), jobs=1)
     assert result.value < 0.1
-    for point in result.trials:
-        values = point.parameters
-        assert point.values == (bowl(values), values['b'], -1e6 * values['a'])
+    for trial in result.trials:
+        values = trial.parameters
+        assert trial.values == (bowl(values), values['b'], -1e6 * values['a'])
 
 
 @pytest.mark.parametrize(
@@ -187,8 +202,90 @@ def test_bad_space_is_one_line(space, message):
 )
 def test_bad_storage_is_one_line(storage):
     with pytest.raises(ConfigurationError, match=r'storage.*expected') as error:
-        minimise(bowl, SPACE, 1, storage=storage)
+        minimise(bowl, SPACE, 1, StudyOptions(storage=storage))
     assert '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ('installed', 'url', 'opened'),
+    [
+        ({'psycopg', 'psycopg2'}, 'postgresql://u@h/db', 'postgresql+psycopg://u@h/db'),
+        ({'psycopg2', 'pg8000'}, 'postgresql://u@h/db', 'postgresql+psycopg2://u@h/db'),
+        ({'pg8000'}, 'postgresql://u@h/db', 'postgresql+pg8000://u@h/db'),
+        ({'psycopg'}, 'postgresql+pg8000://u@h/db', 'postgresql+pg8000://u@h/db'),
+    ],
+)
+def test_postgresql_is_opened_by_the_driver_that_is_installed(monkeypatch, installed, url, opened):
+    urls = []
+    _install(monkeypatch, installed)
+    monkeypatch.setattr(storages, 'RDBStorage', lambda url: urls.append(url) or InMemoryStorage())
+    storages.open_study(url, 'study')
+    assert urls == [opened]
+
+
+def test_postgresql_without_a_driver_says_what_to_install(monkeypatch):
+    _install(monkeypatch, set())
+    with pytest.raises(ConfigurationError, match=r'psycopg2, pg8000.*pip install') as error:
+        storages.open_study('postgresql://u@h/db', 'study')
+    assert '\n' not in str(error.value)
+
+
+def _install(monkeypatch, drivers):
+    def import_module(name):
+        if name not in drivers:
+            raise ImportError(name)
+
+    monkeypatch.setattr(storages, 'import_module', import_module)
+
+
+def test_tables_that_another_process_creates_are_waited_for(tmp_path, monkeypatch):
+    errors = [
+        sqlalchemy.exc.OperationalError('', {}, Exception('table studies already exists')),
+        sqlalchemy.exc.IntegrityError('', {}, Exception('UNIQUE constraint failed: alembic')),
+    ]
+
+    def open_(url):
+        if errors:
+            raise errors.pop()
+        return RDBStorage(url)
+
+    monkeypatch.setattr(storages, 'PAUSE', 0.0)
+    monkeypatch.setattr(storages, 'RDBStorage', open_)
+    options = StudyOptions(storage=f'sqlite:///{tmp_path}/study.db')
+    assert len(minimise(bowl, SPACE, 3, options, jobs=1).trials) == 3
+    assert not errors
+
+
+@pytest.mark.parametrize('kind', ['journal', 'sqlite'])
+def test_storage_that_fails_in_the_middle_keeps_the_trials(tmp_path, kind):
+    file = tmp_path / 'study'
+    calls = []
+
+    def fail_later(values):
+        calls.append(values)
+        if len(calls) == 30:
+            file.write_bytes(b'damaged\n' * 1000)
+        return bowl(values)
+
+    options = StudyOptions(storage=str(file) if kind == 'journal' else f'sqlite:///{file}')
+    result = minimise(fail_later, SPACE, 10_000, options, jobs=2)
+    assert result.failure
+    assert '\n' not in result.failure
+    assert 30 <= len(calls) == len(result.trials) < 10_000
+    assert result.value == min(map(bowl, calls))
+
+
+@pytest.mark.parametrize('line', [b'{"op_code":4,"wor\xff', b'12', b'', b'{}'])
+def test_bad_line_of_a_journal_is_named(tmp_path, line):
+    storage = tmp_path / 'study.log'
+    minimise(bowl, SPACE, 10, StudyOptions(storage=str(storage)), jobs=1)
+    lines = storage.read_bytes().splitlines()
+    lines[4] = line
+    storage.write_bytes(b'\n'.join([*lines, b'']))
+    with pytest.raises(ConfigurationError, match=r'study\.log: line 5: .*journal') as error:
+        minimise(bowl, SPACE, 20, StudyOptions(storage=str(storage)), jobs=1)
+    assert '\n' not in str(error.value)
+    assert 'URL' not in str(error.value)
 
 
 def test_log_dimensions():

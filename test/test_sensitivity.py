@@ -2,7 +2,7 @@
 """The forward sensitivities and the gamma law, against finite differences of whole runs."""
 
 from fhaosmo_ros.core import Observer
-from fhaosmo_ros.core.layout import GAMMA, HAT, HAT_SENSITIVITY, TILDE, TILDE_SENSITIVITY
+from fhaosmo_ros.core.observer.arrays import GAMMA, HAT, HAT_SENSITIVITY, TILDE, TILDE_SENSITIVITY
 import numpy as np
 import pytest
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A snapshot holds all that an estimator needs to go on bit for bit."""
 
-from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.snapshot import Flag, labels, pack, Snapshot, unpack
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.memory import Flag, labels, pack, Snapshot, unpack
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 import pytest
 

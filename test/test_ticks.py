@@ -2,7 +2,7 @@
 """What an estimator published together is put together again, whatever the recording lacks."""
 
 import bag_files as files
-from fhaosmo_ros.tools.ticks import read_ticks
+from fhaosmo_ros.tools.bags.topics import read_ticks
 import numpy as np
 import pytest
 

@@ -5,12 +5,12 @@ import itertools
 import math
 
 from fhaosmo_ros.core import Observer, Plant
-from fhaosmo_ros.core.flow import ahead
-from fhaosmo_ros.core.layout import ROWS, SCALARS, TILDE, Y
-from fhaosmo_ros.core.model import TriangularModel
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.policy_step import MOST_SUB_STEPS
-from fhaosmo_ros.core.status import REJECTED, Status
+from fhaosmo_ros.core.observer.arrays import make_work, TILDE, Y
+from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.prediction import predicted_measurement
+from fhaosmo_ros.core.observer.status import REJECTED, Status
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.gaps import MOST_SUB_STEPS
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -193,20 +193,19 @@ def test_gap_of_exactly_max_gap_is_bridged():
 
 @pytest.mark.parametrize('decay', [0.0, 3.0])
 def test_prediction_is_the_plant_to_fourth_order(decay):
-    model = TriangularModel(['u - z1', 'sin(z1)', '-z3*z2'])
     start, u, d = np.array([0.4, -0.3, 0.8]), 0.7, 0.5
 
     def slope(_, z):
         return [z[1] + u - z[0], z[2] + np.sin(z[0]), z[3] - z[2] * z[1], -decay * z[3]]
 
     truth = solve_ivp(slope, (0.0, 0.5), [*start, d], rtol=1e-12, atol=1e-12).y[0, -1]
-    levels, memory = np.zeros((ROWS, 4)), np.zeros(SCALARS)
-    memory[Y], levels[TILDE] = start[0], [start[1], start[2], d, 9.9]
-    m, stack, x = np.zeros((2, 4)), np.zeros((2, model.depth)), np.zeros((ROWS, 4))
-    tapes = model.with_unknown_input(decay, 0)
+    p = {'phi': ['u - z1', 'sin(z1)', '-z3*z2'], 'unknown_input_decay': decay}
+    configuration = ObserverConfiguration(p)
+    state = configuration.initial_state()
+    state.memory[Y], state.levels[TILDE] = start[0], [start[1], start[2], d, 9.9]
+    law, work = configuration.law, make_work(configuration.law, configuration.model.depth)
     errors = [
-        abs(ahead(*tapes, m, stack, levels, memory, x, 0.5 / n, u, n) - truth)
-        for n in (10, 20, 40)
+        abs(predicted_measurement(law, work, state, 0.5 / n, u, n) - truth) for n in (10, 20, 40)
     ]
     assert errors[-1] < 1e-8
     np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 16.0, rtol=0.2)

@@ -7,52 +7,55 @@ import re
 import signal
 import subprocess
 import sys
-import time
 
 from fhaosmo_ros.core import ConfigurationError, Family, Observer
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameter_file import load
-from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
-from fhaosmo_ros.tools.bag_writer import BagWriter
-from fhaosmo_ros.tools.bags import labelled_array, serialise
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.simulation.scoring import Scores
+from fhaosmo_ros.tools.bags.types import labelled_array, serialise
+from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.tuning.command import main, read_parameters
-from fhaosmo_ros.tools.tuning.objective import Objective
+from fhaosmo_ros.tools.tuning.objective import Evaluation, Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.sensor import identify, noise_at_stamps
-from fhaosmo_ros.tools.tuning.source import simulated
-from fhaosmo_ros.tools.tuning.theory import candidates
+from fhaosmo_ros.tools.tuning.source import simulated, TuningData
+from fhaosmo_ros.tools.tuning.start.theory import candidates
 import numpy as np
 import pytest
+from waiting import wait_until
 
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
 pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
 
-from fhaosmo_ros.tools.tuning.study import Point
-from fhaosmo_ros.tools.tuning.tuner import front, Tuner
+from fhaosmo_ros.tools.tuning import report
+from fhaosmo_ros.tools.tuning.search.minimise import Dimension, StudyOptions
+from fhaosmo_ros.tools.tuning.search.study import FinishedTrial
+from fhaosmo_ros.tools.tuning.tuner import pareto_front, PARETO_WEIGHTS, TrialScores, Tuner
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = {'duration': 4.0, 'integration_step': 1e-3, 'sample_rate': 200.0}
-TUNING = TUNE_PARAMETERS.defaults() | SHORT | {'settled': 1.0}
+TUNING = TUNE_PARAMETERS.complete(SHORT | {'settled': 1.0})
 QUICK = [f'-p{name}:={value}' for name, value in SHORT.items()] + [
-    '-psettled:=1.0', '-precordings:=2', '-pheld_out:=3', '-pscheme:=explicit', '--trials=12',
+    '-psettled:=1.0',
+    '-precordings:=2',
+    '-pheld_out:=3',
+    '-pscheme:=explicit',
+    '--trials=12',
     '--jobs=2',
-]  # fmt: skip
+]
 FILES = ['estimates.png', 'gains.yaml', 'report.md', 'sensitivity.png', 'study.journal']
 
 
 def command(*arguments, **options):
     return subprocess.Popen(
         [sys.executable, '-m', 'fhaosmo_ros', 'tune', *map(str, arguments)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=os.environ | {'PYTHONPATH': str(ROOT)}, **options,
-    )  # fmt: skip
-
-
-def wait_for(condition, what, seconds=90.0):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, f'no {what}'
-        time.sleep(0.02)
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {'PYTHONPATH': str(ROOT)},
+        **options,
+    )
 
 
 def published(journal):
@@ -70,7 +73,7 @@ def test_output_is_what_the_estimator_loads(tmp_path, capsys):
     values = load(out / 'gains.yaml', 'estimator')
     assert len(values['lambda']) == 4
     assert values['scheme'] == 'explicit'
-    OnlineEstimator({k: v for k, v in values.items() if k in ONLINE_PARAMETERS})
+    OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values))
     text = (out / 'gains.yaml').read_text()
     assert f'python -m fhaosmo_ros tune {" ".join(QUICK)}' in text
     report = (out / 'report.md').read_text()
@@ -116,8 +119,8 @@ def test_front_of_error_and_chatter(tmp_path):
 
 def test_front_drops_what_is_beaten():
     pairs = [(2.0, 3.0), (1.0, 5.0), (4.0, 1.0), (2.0, 2.0), (3.0, 2.0)]
-    points = [Point({}, (0.0, 0.0, error, chatter, 9.0)) for error, chatter in pairs]
-    found = [(mark.error, mark.chatter) for mark in front(points, 'chatter')]
+    trials = [FinishedTrial({}, (0.0, 0.0, error, chatter, 9.0)) for error, chatter in pairs]
+    found = [(scores.error, scores.chatter) for scores in pareto_front(trials, 'chatter')]
     assert found == [(1.0, 5.0), (2.0, 2.0), (4.0, 1.0)]
 
 
@@ -148,7 +151,8 @@ def test_model_may_stand_in_any_section(tmp_path, section):
     path = tmp_path / 'model.yaml'
     path.write_text(f"{section}:\n  ros__parameters: {{order: 1, phi: ['-2.0*z1']}}\n")
     estimator, tuning = read_parameters([path], ['noise_std:=0.1'])
-    values = TUNE_PARAMETERS.defaults() | tuning | SHORT | {'settled': 1.0, 'recordings': 1}
+    short = SHORT | {'settled': 1.0, 'recordings': 1}
+    values = TUNE_PARAMETERS.complete(tuning | short)
     tuner = Tuner(simulated(values, 1), estimator, values, 1)
     assert tuner.fixed['phi'] == ['-2.0*z1']
     assert sum(d.name.startswith('lambda') for d in tuner.space) == 2
@@ -196,6 +200,8 @@ def test_bag_with_truth_is_what_it_trains_on(tmp_path):
     report = (out / 'report.md').read_text()
     assert 'pieces of bag bag' in report
     assert '1 recordings to train on, 1 held out' in report
+    errors = re.search(r'relative to the truth \|(.*)', report)[1].split('|')
+    assert errors[2] != errors[3]  # on other pieces
     assert 'another run as well' in report
     assert 'simulated' not in (out / 'gains.yaml').read_text()
 
@@ -218,8 +224,11 @@ def test_bag_without_truth_gives_the_sensor(tmp_path):
     assert main([*quick, '--bag', str(tmp_path / 'bag'), '-o', str(out)]) == 0
     report = (out / 'report.md').read_text()
     assert 'simulated family with the sensor of bag bag' in report
-    rows = dict(line.strip(' |').split(' | ') for line in report.splitlines()
-                if line.startswith(('| noise_std', '| sample_rate')))  # fmt: skip
+    rows = dict(
+        line.strip(' |').split(' | ')
+        for line in report.splitlines()
+        if line.startswith(('| noise_std', '| sample_rate'))
+    )
     assert float(rows['noise_std']) == pytest.approx(1e-3, rel=0.2)
     assert float(rows['sample_rate']) == pytest.approx(200.0, rel=0.01)
 
@@ -247,7 +256,7 @@ def test_interrupt_keeps_the_best(tmp_path):
     out = tmp_path / 'out'
     process = command(*QUICK, '--trials=1000000', '-o', out)
     try:
-        wait_for(lambda: published(tmp_path / 'out.journal') > 20, 'trial')
+        wait_until(lambda: published(tmp_path / 'out.journal') > 20, 'trial')
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=60.0)
     finally:
@@ -263,7 +272,7 @@ def test_killed_run_goes_on(tmp_path, capsys):
     out, journal = tmp_path / 'out', tmp_path / 'out.journal'
     process = command(*QUICK, '--trials=1000000', '-o', out)
     try:
-        wait_for(lambda: published(journal) > 20, 'trial')
+        wait_until(lambda: published(journal) > 20, 'trial')
     finally:
         process.kill()
         process.wait()
@@ -298,6 +307,25 @@ def test_two_processes_share_a_study(tmp_path):
     assert 'study.journal' not in [path.name for path in (tmp_path / 'a').iterdir()]
 
 
+def test_storage_that_fails_in_the_middle_leaves_the_best_so_far(tmp_path, monkeypatch, capsys):
+    out, file, calls = tmp_path / 'out', tmp_path / 'study.db', []
+    evaluate = Tuner.evaluate
+
+    def fail_later(self, values):
+        calls.append(values)
+        if len(calls) == 10:
+            file.write_bytes(b'damaged')
+        return evaluate(self, values)
+
+    monkeypatch.setattr(Tuner, 'evaluate', fail_later)
+    assert main([*QUICK, '--storage', f'sqlite:///{file}', '-o', str(out)]) == 1
+    errors = [x for x in capsys.readouterr().err.splitlines() if x.startswith('tune: error')]
+    assert len(errors) == 1
+    assert re.search(r"study\.db' failed after 1\d trials: .*best gains so far", errors[0])
+    assert sorted(path.name for path in out.iterdir()) == FILES[:-1]
+    load(out / 'gains.yaml', 'estimator')
+
+
 # wrong input
 
 
@@ -329,7 +357,7 @@ def test_wrong_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, messa
 
 
 def test_missing_optuna_says_how_to_install_it(monkeypatch, capsys):
-    from fhaosmo_ros.tools.tuning import command as module
+    from fhaosmo_ros.tools.cli import command as module
 
     monkeypatch.setattr(module, 'find_spec', lambda name: None)
     assert main([]) == 1
@@ -375,9 +403,14 @@ def test_sensor_outlives_bad_samples():
         identify(t[:100], y[:100])
 
 
-@pytest.mark.parametrize(('noise', 'jitter', 'expected'), [
-    (1e-4, 0.0, 1e-4), (0.0, 1e-4, 1e-4), (0.0, 0.0, 0.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ('noise', 'jitter', 'expected'),
+    [
+        (1e-4, 0.0, 1e-4),
+        (0.0, 1e-4, 1e-4),
+        (0.0, 0.0, 0.0),
+    ],
+)
 def test_noise_at_stamps_is_noise_and_jitter(noise, jitter, expected):
     """Uneven sampling that the stamps tell, and missing samples, are neither."""
     random = np.random.default_rng(2)
@@ -416,7 +449,7 @@ def test_objective_weighs_what_it_is_told_to():
     plain = {'chatter_weight': 0.0, 'settling_weight': 0.0}
 
     def judge(**changes):
-        return Objective(recordings, {}, TUNING | changes, choose=True)(gains)
+        return Objective(recordings, {}, TUNING.changed(changes), choose=True)(gains)
 
     only_d = judge(**plain)
     assert only_d.objective == only_d.error
@@ -430,9 +463,126 @@ def test_objective_weighs_what_it_is_told_to():
         both.objective, both.error + 2.0 * both.chatter + 3.0 * both.settling
     )
     assert both.settling > 0.0
-    other = Objective(recordings, {'estimate_from': 'filtered'}, TUNING | plain, choose=False)
+    other = Objective(
+        recordings, {'estimate_from': 'filtered'}, TUNING.changed(plain), choose=False
+    )
     assert other(gains).estimate_from == 'filtered'
     assert other(gains).error >= only_d.error
+
+
+def made_objective(monkeypatch, scores, **changes):
+    """Return an objective of two recordings whose trial always has these scores."""
+    recordings = Family(SHORT).recordings(2)
+    objective = Objective(recordings, {}, TUNING.changed(changes), choose=True, scale=np.ones(4))
+    monkeypatch.setattr(objective, 'trial', lambda parameters: scores)
+    objective._truth_varies = np.ones(2)
+    return objective
+
+
+def made_scores(error=1.0, transient=0.0, variation=0.0):
+    return Scores(
+        np.broadcast_to(error, (2, 2, 4)),
+        np.broadcast_to(transient, (2, 2)),
+        np.broadcast_to(variation, (2, 2)),
+    )
+
+
+def test_error_is_a_geometric_mean_of_weighted_errors(monkeypatch):
+    error = np.ones((2, 2, 4))
+    error[:, :, 1], error[0, :, 3], error[1, :, 3] = 7.0, 4.0, 1.0
+    found = made_objective(monkeypatch, made_scores(error), weights=[0.0, 1.0, 0.0, 3.0])({})
+    each = np.sqrt([(49.0 + 3.0 * 16.0) / 4.0, (49.0 + 3.0) / 4.0])
+    assert found.error == pytest.approx(np.sqrt(each[0] * each[1]))
+    assert made_objective(monkeypatch, made_scores(error))({}).error == pytest.approx(2.0)
+
+
+def test_chatter_and_settling_add_by_their_weights(monkeypatch):
+    weights = {'chatter_weight': 0.5, 'settling_weight': 0.25, 'settled': 2.0}
+    scores = made_scores(
+        3.0, transient=[[1.0, 1.0], [2.0, 2.0]], variation=[[100.0] * 2, [0.1] * 2]
+    )
+    found = made_objective(monkeypatch, scores, **weights)({})
+    # 100 times the variation of the truth is 2 decades; less variation than the truth is none.
+    assert (found.error, found.chatter, found.settling) == pytest.approx((3.0, 1.0, 0.75))
+    assert found.objective == pytest.approx(3.0 + 0.5 * 1.0 + 0.25 * 0.75)
+
+
+def test_better_of_internal_and_filtered_is_chosen(monkeypatch):
+    error = np.ones((2, 2, 4))
+    for better, name in enumerate(('internal', 'filtered')):
+        error[:, better], error[:, 1 - better] = 1.0, 2.0
+        objective = made_objective(monkeypatch, made_scores(error.copy()))
+        assert objective({}).estimate_from == name
+        assert objective({'estimate_from': 'internal'}).error == pytest.approx(1.0 + better)
+
+
+def test_held_out_recordings_are_others_with_the_scale_of_the_training():
+    values = TUNING.changed({'recordings': 2, 'held_out': 2, 'noise_std': 1e-3})
+    data = simulated(values, 1)
+    assert not any(np.array_equal(a.y, b.y) for a in data.training for b in data.held_out)
+    tuner = Tuner(data, {'scheme': 'explicit', 'lambda': [1.0], 'alpha': [1.0]}, values, 1)
+    assert tuner.training.trial.recordings == data.training
+    assert tuner.held_out.trial.recordings == data.held_out
+    np.testing.assert_array_equal(tuner.held_out.scale, tuner.training.scale)
+
+
+def searched(monkeypatch, cost, pareto=None):
+    """Return the result of a search in lambda whose trials cost what `cost` says."""
+    values = TUNING.changed({'recordings': 1, 'search': ['lambda 1 100'], 'noise_std': 1e-3})
+    estimator = {'scheme': 'explicit', 'variant': 'sign', 'unknown_input': False}
+    tuner = Tuner(simulated(values, 1), estimator, values, 1)
+    monkeypatch.setattr(tuner, 'evaluate', cost)
+    return tuner.search(180 if pareto else 20, 1, StudyOptions(), pareto, lambda: False)
+
+
+@pytest.mark.parametrize(('loss', 'rounds'), [(1e-4, True), (1e-1, False)])
+def test_gains_are_rounded_only_where_that_costs_little(monkeypatch, loss, rounds):
+    def cost(values):
+        rounded = all(v == float(f'{v:.4g}') for v in values.values())
+        objective = sum(values.values()) * (1.0 + loss * rounded)
+        return TrialScores(objective, objective, 0.0, 0.0)
+
+    best = searched(monkeypatch, cost).best
+    assert all(v == float(f'{v:.4g}') for v in best.values()) is rounds
+
+
+def test_each_search_of_a_front_weighs_the_second_objective(monkeypatch):
+    """The error falls and the chatter rises along x: the best x depends on the weight."""
+
+    def cost(values):
+        x = sum(np.log10(v) for v in values.values()) / len(values)  # 0 .. 2
+        return TrialScores(1.0, 1.0 + (2.0 - x) ** 2, x, 0.0)
+
+    trials = searched(monkeypatch, cost, 'chatter').trials
+    for trial in trials:
+        weight = (trial.values[0] - trial.values[2]) / trial.values[3]
+        assert min(abs(weight / w - 1.0) for w in PARETO_WEIGHTS) < 1e-6
+    weights = {round((t.values[0] - t.values[2]) / t.values[3], 6) for t in trials}
+    assert weights == set(PARETO_WEIGHTS)
+
+
+@pytest.mark.parametrize('second', ['chatter', 'settling'])
+def test_front_is_of_error_and_the_second_objective(second):
+    rows = [(1.0, 3.0, 5.0), (2.0, 2.0, 4.0), (3.0, 4.0, 1.0)]
+    trials = [FinishedTrial({}, (0.0, 0.0, *row)) for row in rows]
+    found = [getattr(scores, second) for scores in pareto_front(trials, second)]
+    assert found == {'chatter': [3.0, 2.0], 'settling': [5.0, 4.0, 1.0]}[second]
+
+
+def column(error):
+    return report.Column('', Evaluation(error, error, 0.0, 0.0, 'internal', None, 0), None)
+
+
+def test_report_warns_of_overfitting_and_of_bounds():
+    data = TuningData([], [], '', {})
+    space = [Dimension('a', 1e-3, 1e3, 1.0), Dimension('b', 0.0, 1.0, 0.5, log=False)]
+    middle = {'a': 1.0, 'b': 0.5}
+    assert report.warnings(space, middle, [column(0.4), column(0.49)], data) == []
+    (worse,) = report.warnings(space, middle, [column(0.4), column(0.52)], data)
+    assert '1.30 times' in worse
+    (bound,) = report.warnings(space, {'a': 1.1e-3, 'b': 0.5}, [column(0.4)] * 2, data)
+    assert 'At their bounds: a;' in bound
+    assert not report.at_bound(space[0], 3.0)  # in logarithms this is the middle
 
 
 def test_estimate_that_left_the_finite_numbers_is_the_worst():

@@ -10,45 +10,33 @@ pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
 pytest.importorskip('control', reason='python-control is not installed (extra: tune)')
 
 from fhaosmo_ros.core import Family, Observer, TriangularModel
-from fhaosmo_ros.core.compile_cache import compile_cache
-from fhaosmo_ros.core.family_parameters import FAMILY_PARAMETERS
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameter_file import load
-from fhaosmo_ros.core.parameters import ONLINE_PARAMETERS
-from fhaosmo_ros.tools.sampled_model import SampledModel
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.tools.tuning.command import main
-from fhaosmo_ros.tools.tuning.kalman_start import grid, KalmanStart
 from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.source import simulated
-from fhaosmo_ros.tools.tuning.start import SCHEME, with_scheme
-from fhaosmo_ros.tools.tuning.theory import kalman_like
+from fhaosmo_ros.tools.tuning.start.find import SCHEME, with_scheme
+from fhaosmo_ros.tools.tuning.start.kalman import grid, KalmanGains
+from fhaosmo_ros.tools.tuning.start.sampled_model import SampledModel
+from fhaosmo_ros.tools.tuning.start.theory import kalman_like
 from fhaosmo_ros.tools.tuning.tuner import Tuner
 import numpy as np
-
-with compile_cache():
-    from fhaosmo_ros.tools.comparison.constant_gain import run
+from studies.comparison.methods.constant_gain import estimates
 
 ROOT = Path(__file__).resolve().parents[1]
 PHI = ['0', '0', '-z3']
 SHORT = {'duration': 6.0, 'integration_step': 1e-3, 'sample_rate': 200.0, 'noise_std': 1e-4}
-VALUES = TUNE_PARAMETERS.defaults() | SHORT | {'settled': 2.0, 'recordings': 3, 'held_out': 3}
+VALUES = TUNE_PARAMETERS.complete(SHORT | {'settled': 2.0, 'recordings': 3, 'held_out': 3})
 QUICK = [f'-p{name}:={value}' for name, value in SHORT.items()] + [
-    '-psettled:=2.0', '-precordings:=3', '-pheld_out:=3', '--trials=6', '--jobs=2',
-]  # fmt: skip
-
-
-def constant_gain(r, gain, derivatives, decay):
-    """Return the estimates of z, d, .. of an observer with a constant gain."""
-    model = TriangularModel(PHI, 3)
-    size = 4 + derivatives
-    offsets = np.concatenate([model.offsets, np.repeat(model.offsets[-1:], size - 3)])
-    x, out = np.zeros(size), np.empty((len(r.y), size))
-    x[0] = r.y[0]
-    h = np.diff(r.t, prepend=r.t[0])
-    work, stack = np.zeros((7, size)), np.zeros((2, model.depth))
-    run(model.tape, offsets, work, stack, 3, gain, decay, x, r.y, h, r.u, 0.1, out)
-    return out
+    '-psettled:=2.0',
+    '-precordings:=3',
+    '-pheld_out:=3',
+    '--trials=6',
+    '--jobs=2',
+]
 
 
 # the Kalman filter inside (D 19)
@@ -61,17 +49,21 @@ def test_kalman_like_gains_make_a_kalman_filter(derivatives, decay):
     r = Family({'duration': 5.0, 'integration_step': 1e-3, 'noise_std': noise}).recording(0)
     model = SampledModel(TriangularModel(PHI, 3), period, 1 + derivatives, decay=decay)
     gain = model.kalman([period * bandwidth ** (2 * model.size)])
-    expected = constant_gain(r, gain, derivatives, decay)[:, : 4 + derivatives]
+    expected = estimates(TriangularModel(PHI, 3), gain, decay, r, 0.1)
     apart = []
     for width, gamma in ((10.0, 1e-2), (1e3, 1e-4)):
         observer = Observer(
-            dict(SCHEME) | {
-                'unknown_input_derivatives': derivatives, 'unknown_input_decay': decay,
+            dict(SCHEME)
+            | {
+                'unknown_input_derivatives': derivatives,
+                'unknown_input_decay': decay,
                 'lambda': kalman_like(model, bandwidth, width, noise, gamma).tolist(),
-                'fuzzy_widths': [width], 'gamma_initial': gamma, 'gamma_min': 1e-5,
+                'fuzzy_widths': [width],
+                'gamma_initial': gamma,
+                'gamma_min': 1e-5,
                 'correction_period': period,
             }
-        )  # fmt: skip
+        )
         found = observer.run(r.t, r.y, r.u).z_hat
         error = np.sqrt(np.mean((found - expected) ** 2, axis=0))
         apart.append(np.max(error / np.sqrt(np.mean(expected**2, axis=0))))
@@ -86,13 +78,13 @@ def test_bandwidth_is_that_of_the_matern_process_of_d():
     large = [r._replace(y=9.0 * r.y, z=9.0 * r.z, d=9.0 * r.d) for r in recordings]
     model = TriangularModel(PHI, 3)
     for k in (0, 2):
-        one, other = (KalmanStart(rs, {}, model, k, 1e-4) for rs in (recordings, large))
+        one, other = (KalmanGains(rs, {}, model, k, 1e-4) for rs in (recordings, large))
         assert one.bandwidth(2.0) == pytest.approx(other.bandwidth(2.0))
         assert one.bandwidth(4.0) > one.bandwidth(2.0)
         widths = [start(grid()[5])['fuzzy_widths'][0] for start in (one, other)]
         assert widths[1] == pytest.approx(9.0 * widths[0])
     # k = 0: a first-order Gauss-Markov process, var = intensity / (2 rate).
-    start = KalmanStart(recordings, {}, model, 0, 1e-4)
+    start = KalmanGains(recordings, {}, model, 0, 1e-4)
     d = np.concatenate([r.d for r in recordings])
     noise = np.concatenate([r.y - r.z[:, 0] for r in recordings])
     expected = (np.mean(d**2) * 2.0 * 3.0 / (np.mean(noise**2) / 200.0)) ** (1 / 8)
@@ -116,7 +108,7 @@ def test_start_is_as_good_as_the_best_kalman_filter(tuner):
         gain = model.kalman([model.period * bandwidth**8])
         errors = []
         for r in tuner.data.training:
-            wrong = constant_gain(r, gain, 0, 0.0)[:, 3] - r.d
+            wrong = estimates(TriangularModel(PHI, 3), gain, 0.0, r, 0.1)[:, 3] - r.d
             errors.append(np.sqrt(np.mean(wrong[r.t >= settled] ** 2)) / tuner.training.scale[-1])
         best = min(best, float(np.exp(np.mean(np.log(errors)))))
     assert tuner.training(tuner.before).error < 1.01 * best
@@ -134,7 +126,7 @@ def test_bounds_are_near_a_start_by_kalman_and_far_from_others(tuner):
     assert not cascade.tried
     for name in ('lambda[0]', 'fuzzy_widths[1]'):
         assert 0.0 < decades(tuner, name) < decades(cascade, name) == pytest.approx(6.0)
-    wide = Tuner(tuner.data, {'unknown_input_derivatives': 0}, VALUES | {'decades': 4.0}, 1)
+    wide = Tuner(tuner.data, {'unknown_input_derivatives': 0}, VALUES.changed({'decades': 4.0}), 1)
     assert decades(wide, 'lambda[0]') == pytest.approx(8.0)
 
 
@@ -165,15 +157,17 @@ def test_what_the_user_sets_stays(given, scheme):
         assert found['correction_period'] == 0.005
     else:
         assert found == given
-    Observer({k: v for k, v in found.items() if k != 'max_gap'})
+    Observer(ESTIMATOR_PARAMETERS.complete(found))
 
 
 def test_own_values_win_over_theory():
     own = {
-        'unknown_input_derivatives': 1, 'gamma_min': 0.01, 'correction_period': 0.002,
+        'unknown_input_derivatives': 1,
+        'gamma_min': 0.01,
+        'correction_period': 0.002,
         'unknown_input_decay': 2.0,
-    }  # fmt: skip
-    values = VALUES | {'search': ['lambda', 'gamma_initial'], 'recordings': 1}
+    }
+    values = VALUES.changed({'search': ['lambda', 'gamma_initial'], 'recordings': 1})
     tuner = Tuner(simulated(values, 1), own, values, 1)
     assert own.items() <= tuner.fixed.items()
     assert set(tuner.tried) == {1}
@@ -192,7 +186,7 @@ def test_yaml_is_what_the_estimator_runs(tmp_path, capsys):
     assert len(values['lambda']) == len(values['fuzzy_widths']) == n
     assert 'derivatives' in (out / 'report.md').read_text()
     assert 'alpha' not in values
-    online = OnlineEstimator({k: v for k, v in values.items() if k in ONLINE_PARAMETERS})
+    online = OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values))
     r = Family(SHORT | {'duration': 12.0}).recording(5)
     stamps = np.round(r.t * 1e9).astype(np.int64) + 10**9
     found = online.run(stamps, r.y, r.u)
@@ -225,12 +219,12 @@ def test_presets_fit_the_noise_in_their_name(noise):
     demo = load(ROOT / 'config' / 'demo.yaml', 'estimator')
     judged = []
     for p in (values, demo):
-        online = {k: v for k, v in p.items() if k in ONLINE_PARAMETERS}
-        judged.append(Objective(recordings, online, tuning, choose=False)({}))
+        complete = ESTIMATOR_PARAMETERS.complete(p)
+        judged.append(Objective(recordings, complete, tuning, choose=False)({}))
     assert judged[0].error < min(0.95, 0.9 * judged[1].error)
     # The node's own path gives the same.
     r = recordings[0]
-    online = OnlineEstimator({k: v for k, v in values.items() if k in ONLINE_PARAMETERS})
+    online = OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values))
     found = online.run(np.round(r.t * 1e9).astype(np.int64) + 1, r.y, r.u)
     late = r.t >= tuning['settled']
     error = np.sqrt(np.mean((found.unknown_input - r.d)[late] ** 2))
@@ -244,10 +238,10 @@ def test_gains_of_the_models_follow_their_plant(name):
     values = load(path, 'estimator')
     plant = load(path, 'plant')
     amplitude = plant['disturbance_amplitude']
-    shared = {k: v for k, v in plant.items() if k in FAMILY_PARAMETERS}
+    shared = load(path, 'plant', FAMILY_PARAMETERS)
     family = Family(shared | {'rms_of_d': 0.7 * amplitude, 'integration_step': 1e-3})
     r = family.recording(0, seed=78)
-    online = OnlineEstimator({k: v for k, v in values.items() if k in ONLINE_PARAMETERS})
+    online = OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values))
     found = online.run(np.round(r.t * 1e9).astype(np.int64) + 1, r.y, r.u)
     error = np.sqrt(np.mean((found.unknown_input - r.d)[r.t >= 5.0] ** 2))
     assert error < 0.3 * amplitude

@@ -1,24 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The observer as a plain Python library: no middleware, no bag reader, no plotting."""
 
-from fhaosmo_ros.core.compile_cache import compile_cache
-
-with compile_cache():
-    from fhaosmo_ros.core import channels, joint
-    from fhaosmo_ros.core.counters import Counters
-    from fhaosmo_ros.core.errors import ConfigurationError
-    from fhaosmo_ros.core.family import Family, Recording
-    from fhaosmo_ros.core.model import TriangularModel
-    from fhaosmo_ros.core.observer import Estimate, Observer, ObserverState, Trajectory
-    from fhaosmo_ros.core.online import OnlineEstimator
-    from fhaosmo_ros.core.plant import Plant
-    from fhaosmo_ros.core.status import Status
-    from fhaosmo_ros.core.trial import Trial
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.observer import Estimate, Observer, ObserverState, Trajectory
+from fhaosmo_ros.core.observer.status import Status
+from fhaosmo_ros.core.online.batch import EstimatorBatch
+from fhaosmo_ros.core.online.counters import Counters
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.simulation.plant import Plant
+from fhaosmo_ros.core.simulation.recordings import Family, Recording
+from fhaosmo_ros.core.simulation.scoring import Trial
 
 __all__ = [
     'ConfigurationError',
     'Counters',
     'Estimate',
+    'EstimatorBatch',
     'Family',
     'Observer',
     'ObserverState',
@@ -29,6 +27,4 @@ __all__ = [
     'Trajectory',
     'Trial',
     'TriangularModel',
-    'channels',
-    'joint',
 ]

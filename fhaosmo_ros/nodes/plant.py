@@ -3,25 +3,38 @@
 
 from collections.abc import Mapping
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.parameters import PLANT_NODE_PARAMETERS, PLANT_PARAMETERS
-from fhaosmo_ros.core.plant import Plant
-from fhaosmo_ros.nodes.messages import array_encoder, double_encoder
-from fhaosmo_ros.nodes.parameters import declare, on_change
-from fhaosmo_ros.nodes.spin import run_node
+from fhaosmo_ros.core.parameters.declaration import Parameters, Value
+from fhaosmo_ros.core.parameters.files import complete
+from fhaosmo_ros.core.parameters.tables import PLANT_NODE_PARAMETERS
+from fhaosmo_ros.core.simulation.plant import Plant
+from fhaosmo_ros.nodes.middleware.messages import array_encoder, double_encoder
+from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
+from fhaosmo_ros.nodes.middleware.simulated_time import reject_negative_time
+from fhaosmo_ros.nodes.middleware.spin import run_node
 from rclpy.node import Node
 from std_msgs.msg import Float64, Float64MultiArray
 
 MAX_PAUSE = 1_000_000_000
 """Clock jumps beyond this many nanoseconds are not simulated through."""
 DEPTH = 1000
-"""Of the topics' queues: a recorder that is held up for a second loses nothing at 1 kHz."""
+"""Of the topics' queues: a recorder that stalls for a second loses nothing at 1 kHz."""
+
+
+class Change(NamedTuple):
+    """A live change: what somebody sets, and the parameters of the simulation with it."""
+
+    changes: Mapping[str, Value]
+    simulation: Parameters
 
 
 class PlantNode(Node):
     """
     Publishes ``y``, ``~/state`` and ``~/unknown_input`` at `sample_rate`.
+
+    A plant that becomes unstable stays where it is: from the first value on that is not finite,
+    nothing is published, and an error is logged once.
 
     Raises
     ------
@@ -32,12 +45,16 @@ class PlantNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('plant', automatically_declare_parameters_from_overrides=True, **options)
-        values = declare(self, PLANT_NODE_PARAMETERS, lambda v: Plant(_plant(v)))
-        self.plant = Plant(_plant(values))
+        reject_negative_time(self)
+        values = complete(overrides_of(self), PLANT_NODE_PARAMETERS)
+        self.plant = Plant(values)
         self.plant.sample(0.0)  # compiles, or loads what an earlier start compiled
+        fixed = [name for name, p in PLANT_NODE_PARAMETERS.items() if not p.live]
+        self._node_parameters = NodeParameters(self, values, fixed)
         self._u = 0.0
         self._origin: int | None = None
         self._now = 0
+        self._diverged = False
         self._encode = double_encoder()
         self._encode_state = array_encoder([f'z{i + 1}' for i in range(self.plant.order)])
         self._publish_y = self.create_publisher(Float64, 'y', DEPTH).publish
@@ -46,7 +63,7 @@ class PlantNode(Node):
         if self.plant.uses_input:
             self.create_subscription(Float64, 'u', self._on_input, 10)
         self._timer = self._start_timer(values['sample_rate'])
-        on_change(self, PLANT_NODE_PARAMETERS, self._check, self._configure)
+        self._node_parameters.on_change(self._prepare, self._adopt)
         self.get_logger().info(
             f'simulating {self.plant.order} states, d: {values["disturbance"]}, '
             f'y at {values["sample_rate"]:g} Hz'
@@ -58,14 +75,29 @@ class PlantNode(Node):
 
         The middleware stamps y when it is published, and every microsecond between the clock's
         reading and that moment acts as noise on y. So the long way is integrated first, and the
-        clock is read again for the little that is left.
+        plant is checked to be finite; then the clock is read again for the little that is left.
         """
         clock = self.get_clock()
         self.plant.advance(self._plant_time(clock.now().nanoseconds), self._u)
+        if not self.plant.finite:
+            self._hold()
+            return
         truth = self.plant.sample(self._plant_time(clock.now().nanoseconds), self._u)
+        if not math.isfinite(truth.y):
+            return
         self._publish_y(self._encode(truth.y))
         self._publish_state(self._encode_state(truth.z))
         self._publish_d(self._encode(truth.unknown_input))
+
+    def _hold(self) -> None:
+        """Log once that the plant has left the finite numbers."""
+        if not self._diverged:
+            self._diverged = True
+            self.get_logger().error(
+                'the simulated plant has left the finite numbers: nothing is published any more; '
+                'its phi, the disturbance or a known input make it unstable. Correct them and '
+                'start the node again'
+            )
 
     def _plant_time(self, now: int) -> float:
         """Return the plant's time in seconds; it stands still while the clock jumps."""
@@ -74,7 +106,8 @@ class PlantNode(Node):
         elif not 0 <= now - self._now <= MAX_PAUSE:
             self.get_logger().warning(
                 f'the clock jumped by {(now - self._now) * 1e-9:.3g} s: the plant goes on from '
-                'where it was'
+                'where it was',
+                throttle_duration_sec=5.0,
             )
             self._origin += now - self._now
         self._now = now
@@ -92,19 +125,17 @@ class PlantNode(Node):
     def _start_timer(self, rate: float) -> Any:
         return self.create_timer(1.0 / rate, self._tick)
 
-    def _check(self, changes: Mapping[str, Any]) -> None:
-        self.plant.check(_plant(changes))
+    def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> Change:
+        return Change(changes, self.plant.prepare(values))
 
-    def _configure(self, changes: Mapping[str, Any]) -> None:
-        self.plant.configure(_plant(changes))
-        if 'sample_rate' in changes:
+    def _adopt(self, change: Change) -> None:
+        if 'noise_seed' in change.changes:  # the noise begins again, also with the same seed
+            self.plant.configure(change.simulation)
+        else:
+            self.plant.adopt(change.simulation)
+        if 'sample_rate' in change.changes:
             self.destroy_timer(self._timer)
-            self._timer = self._start_timer(changes['sample_rate'])
-
-
-def _plant(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters of the simulation among the node's."""
-    return {name: value for name, value in values.items() if name in PLANT_PARAMETERS}
+            self._timer = self._start_timer(change.changes['sample_rate'])
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publish a bag's topics in its own time, with /clock, where there is no `ros2 bag`."""
+"""Publish a bag's topics in the time of its stamps, with /clock; for a system without ros2 bag."""
 
 import argparse
 from itertools import count
@@ -7,17 +7,17 @@ from pathlib import Path
 import time
 from typing import TYPE_CHECKING
 
-from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.command import run_command
-from tqdm import tqdm
+from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.cli.command import run_command
+from fhaosmo_ros.tools.cli.progress import progress
 
 if TYPE_CHECKING:
-    from fhaosmo_ros.nodes.player import Player
+    from fhaosmo_ros.nodes.recording.player import Player
 
 CLOCK_PERIOD = 1_000_000
-"""Nanoseconds of the bag's time between two messages on /clock, at most."""
+"""Longest time between two messages on /clock, in nanoseconds of the bag's time."""
 NEVER_PLAYED = ('/clock', '/rosout', '/parameter_events')
 
 
@@ -37,16 +37,19 @@ def _parser() -> argparse.ArgumentParser:
     add('--rate', type=float, default=1.0, help='times real time (default: %(default)g)')
     add('--loop', action='store_true', help='begin again at the end, until Ctrl-C')
     add(
-        '--wait', nargs='*', default=[], metavar='TOPIC',
+        '--wait',
+        nargs='*',
+        default=[],
+        metavar='TOPIC',
         help='begin once each of these has a subscriber',
-    )  # fmt: skip
+    )
     return parser
 
 
 def _play(arguments: argparse.Namespace, stop: Stop) -> None:
     if not 1e-3 <= arguments.rate <= 1e3:
         raise ConfigurationError(f'--rate: expected 0.001 to 1000, got {arguments.rate:g}')
-    from fhaosmo_ros.nodes.player import Player  # here, so that --help needs no ROS
+    from fhaosmo_ros.nodes.recording.player import Player  # here, so that --help needs no ROS
 
     with BagReader(arguments.bag) as reader:
         for topic in arguments.topics or []:
@@ -61,13 +64,13 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
         }
         if not topics or not sum(reader.count(topic) for topic in topics):
             raise ConfigurationError(f'bag {arguments.bag}: expected a message to play, got none')
-        with Player(topics) as player:
+        with Player(topics, arguments.ros_arguments) as player:
             for topic in player.missing:
                 print(f'play: not played: {topic}: {topics[topic][0]} is not installed here')
             print(
                 f'playing {len(topics) - len(player.missing)} topics; Ctrl-C ends it', flush=True
             )
-            while not all(player.subscribers(topic) for topic in arguments.wait):
+            while not all(player.subscribers(player.resolved(t)) for t in arguments.wait):
                 if stop.wait(0.05):
                     return
             for turn in count(1):
@@ -81,12 +84,11 @@ def _qos(connection):
 
 
 def _once(
-    reader: BagReader, player: 'Player', topics: list[str], rate: float, turn: int,
-    stop: Stop,
-) -> None:  # fmt: skip
+    reader: BagReader, player: 'Player', topics: list[str], rate: float, turn: int, stop: Stop
+) -> None:
     begin, now = time.monotonic_ns(), None
     total = sum(reader.count(topic) for topic in topics)
-    with tqdm(total=total, unit='message', desc=f'play {turn}', unit_scale=True) as bar:
+    with progress(total=total, unit='message', desc=f'play {turn}', unit_scale=True) as bar:
         for topic, stamp, data in reader.messages(topics):
             if now is None:
                 first = now = stamp

@@ -1,25 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record y and the estimator's topics to a bag, or save a bag that was cut short."""
+"""Record y and the estimator's topics to a bag, or repair a bag that is cut or damaged."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
+from queue import SimpleQueue
 import re
 import shutil
 import sqlite3
 import sys
 import time
 
-from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.bag_writer import BagWriter
-from fhaosmo_ros.tools.bags import make_qos, TYPES
-from fhaosmo_ros.tools.command import run_command
-from fhaosmo_ros.tools.repair import repair
+from fhaosmo_ros.tools.bags.repair import repair
+from fhaosmo_ros.tools.bags.types import make_qos, TYPES
+from fhaosmo_ros.tools.bags.writer import BagWriter
+from fhaosmo_ros.tools.cli.command import run_command
+from fhaosmo_ros.tools.cli.output import named, Output
+from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.topics import OF_ALL_NODES
 from tqdm import tqdm
 
 FLUSH_PERIOD = 0.5
-"""Seconds after which a kill can't take back what has been written."""
-EXTRA = ('/y', '/u', '/diagnostics', '/rosout', '/parameter_events')
+"""Seconds between two flushes: a kill loses no more than that."""
+EXTRA = ('/y', '/u', *OF_ALL_NODES)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -30,7 +35,12 @@ def main(argv: list[str] | None = None) -> int:
 def _run(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.repair:
         final = arguments.output or Path(f'{arguments.repair.resolve().stem}_repaired')
-        count = repair(arguments.repair, final, arguments.force, arguments.storage)
+        with Output(final, arguments.force) as output:
+            with stop.raising():
+                count, missing = repair(arguments.repair, output.path, arguments.storage)
+            output.keep()
+        for part in missing:
+            print(f'record: missing: {part}', file=sys.stderr)
         print(f'saved {count} messages: {final}')
     else:
         _record(arguments, stop)
@@ -49,13 +59,18 @@ def _parser() -> argparse.ArgumentParser:
     choice.add_argument('--topics', nargs='+', metavar='TOPIC', help='these topics only')
     choice.add_argument('--all', action='store_true', help='every topic that has a publisher')
     choice.add_argument(
-        '--repair', type=Path, metavar='BAG',
-        help='record nothing: save what is whole of a bag that was cut short',
-    )  # fmt: skip
+        '--repair',
+        type=Path,
+        metavar='BAG',
+        help='record nothing: save what is whole of a bag that is cut or damaged',
+    )
     add(
-        '--names', nargs='+', default=['/estimator', '/plant'], metavar='NAME',
+        '--names',
+        nargs='+',
+        default=['/estimator', '/plant'],
+        metavar='NAME',
         help='nodes whose topics, in and out, to record (default: /estimator /plant)',
-    )  # fmt: skip
+    )
     add('--duration', type=float, metavar='SECONDS', help='stop by itself')
     return parser
 
@@ -63,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
 def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.duration is not None and not arguments.duration > 0.0:
         raise ConfigurationError(f'--duration: expected > 0 s, got {arguments.duration:g}')
-    path = arguments.output or Path(time.strftime('bag_%Y-%m-%d_%H-%M-%S'))
+    path = named(arguments.output or Path(time.strftime('bag_%Y-%m-%d_%H-%M-%S')))
     if path.exists() and not arguments.force:
         raise ConfigurationError(
             f'output {path}: expected a new name (or --force to replace it), got an existing '
@@ -74,20 +89,24 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
             if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', topic):
                 raise ConfigurationError(f'--topics: expected a name such as /y, got {topic!r}')
     # Here, so that --help and --repair need no ROS.
-    from fhaosmo_ros.nodes.topic_recorder import TopicRecorder
+    from fhaosmo_ros.nodes.recording.topic_recorder import TopicRecorder
 
-    wanted = _wanted(arguments)
     names = [f'/{name.strip("/")}' for name in arguments.names]
     listeners = [] if arguments.topics else names
+    queue: SimpleQueue = SimpleQueue()
+    recorder = TopicRecorder(
+        queue.put,
+        wanted=lambda topic: wanted(topic),
+        listeners=listeners,
+        ros_arguments=arguments.ros_arguments,
+    )
+    wanted = _wanted(arguments, recorder.resolved)  # by its node's remappings
     old = _put_aside(path)
     try:
-        # Signals that it listens: nobody need guess when to start what is to be recorded.
-        with (
-            BagWriter(path, storage=arguments.storage) as bag,
-            TopicRecorder(wanted, listeners) as recorder,
-        ):
+        with BagWriter(path, storage=arguments.storage) as bag, recorder:
+            # Says when it listens, so that a user knows when to start what is to be recorded.
             print(f'recording to {path}; Ctrl-C ends it', flush=True)
-            count = _drain(recorder, bag, arguments.duration, stop)
+            count = _drain(queue, recorder.problems, bag, arguments.duration, stop)
             lost = dict(recorder.lost)
     except (OSError, sqlite3.Error) as error:
         hint = f'; record --repair {path} saves what is there' if path.exists() else ''
@@ -126,29 +145,37 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _wanted(arguments: argparse.Namespace):
+def _wanted(arguments: argparse.Namespace, resolved: Callable[[str], str]):
+    """Return a function that says of a topic whether to record it."""
     if arguments.all:
         return lambda topic: True
     if arguments.topics:
-        names = {'/' + topic.lstrip('/') for topic in arguments.topics}
+        names = {resolved('/' + topic.lstrip('/')) for topic in arguments.topics}
         return lambda topic: topic in names
-    below = tuple(f'/{name.strip("/")}/' for name in arguments.names)
-    return lambda topic: topic.startswith(below) or topic in EXTRA
+    below = tuple(f'{resolved("/" + name.strip("/"))}/' for name in arguments.names)
+    extra = [resolved(topic) for topic in EXTRA]
+    return lambda topic: topic.startswith(below) or topic in extra
 
 
-def _drain(recorder, bag: BagWriter, duration: float | None, stop: Stop) -> int:
+def _drain(
+    queue: SimpleQueue,
+    problems: SimpleQueue,
+    bag: BagWriter,
+    duration: float | None,
+    stop: Stop,
+) -> int:
     """Write what arrives until the end; return how many messages there were."""
     begin = flushed = time.monotonic()
     count = 0
     bar_format = '{desc}: {n_fmt} messages, {elapsed}'
-    with tqdm(desc='record', unit='message', bar_format=bar_format) as bar:
+    with progress(desc='record', unit='message', bar_format=bar_format) as bar:
         ended = False
         while not ended:
             ended = stop.wait(0.05) or (
                 duration is not None and time.monotonic() - begin >= duration
             )
-            for _ in range(recorder.queue.qsize()):
-                item = recorder.queue.get()
+            for _ in range(queue.qsize()):
+                item = queue.get()
                 if hasattr(item, 'offered'):
                     qos = [make_qos(**profile) for profile in item.offered]
                     bag.add(item.topic, item.message_type, qos=_different(qos))
@@ -157,8 +184,8 @@ def _drain(recorder, bag: BagWriter, duration: float | None, stop: Stop) -> int:
                 else:
                     bag.write(item.topic, item.stamp, item.data)
                     count += 1
-            while not recorder.problems.empty():
-                tqdm.write(f'record: not recorded: {recorder.problems.get()}', file=sys.stderr)
+            while not problems.empty():
+                tqdm.write(f'record: not recorded: {problems.get()}', file=sys.stderr)
             if time.monotonic() - flushed >= FLUSH_PERIOD:
                 bag.flush()
                 flushed = time.monotonic()

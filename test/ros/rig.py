@@ -15,8 +15,8 @@ from typing import NamedTuple
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 import fhaosmo_ros
-from fhaosmo_ros.nodes.spin import Spinner
-from fhaosmo_ros.nodes.subscription import subscribe_with_info
+from fhaosmo_ros.nodes.middleware.spin import Spinner
+from fhaosmo_ros.nodes.middleware.subscription import subscribe_with_info
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import (
     DescribeParameters,
@@ -75,6 +75,8 @@ class Process:
             self._process = subprocess.Popen(
                 words, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err,
                 env=os.environ | {name: str(value) for name, value in environment.items()},
+                # A test under nohup ignores SIGHUP, and so would the node.
+                preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
             )  # fmt: skip
 
     @property
@@ -187,7 +189,7 @@ class Client:
         with self._changed:
             while not condition():
                 if time.monotonic() > end:
-                    raise AssertionError(f'no {what} within {timeout} s')
+                    raise TimeoutError(f'no {what} within {timeout} s')
                 self._changed.wait(0.05)
 
     def call_later(self, service: str, service_type: type, request: object):
@@ -212,7 +214,7 @@ class Client:
             futures[-1].add_done_callback(lambda _: done.set())
             if done.wait(DEADLINE / TRIES):
                 return next(future.result() for future in futures if future.done())
-        raise AssertionError(f'no answer from {service} within {DEADLINE} s')
+        raise TimeoutError(f'no answer from {service} within {DEADLINE} s')
 
 
 class Parameters:
@@ -303,9 +305,10 @@ class EstimatorRig:
         self.client.wait(lambda: self._publish.matched() >= 2, 'subscription of y')
         end = time.monotonic() + DEADLINE
         while not self.estimates:
-            assert time.monotonic() < end, f'{self._name} does not answer to samples'
+            if time.monotonic() > end:
+                raise TimeoutError(f'{self._name} does not answer to samples')
             self.send(0.0)
-            with contextlib.suppress(AssertionError):
+            with contextlib.suppress(TimeoutError):
                 self.client.wait(lambda: self.estimates, 'estimate', timeout=0.2)
         self.reset()
 

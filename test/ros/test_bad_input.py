@@ -12,7 +12,8 @@ import pytest
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
-from fhaosmo_ros.nodes import estimator, plant  # noqa: E402
+from fhaosmo_ros.nodes import plant  # noqa: E402
+from fhaosmo_ros.nodes.estimator import node as estimator  # noqa: E402
 from rig import command, DEADLINE, EstimatorRig, parameters, ROOT  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
 
@@ -20,6 +21,7 @@ NODES = {'estimator': estimator, 'plant': plant}
 
 FILES = {
     'unknown': '/**: {ros__parameters: {lamda: [15.0]}}',
+    'unknown_too': '/**: {ros__parameters: {lamda: [16.0]}}',
     'lambda': '/**: {ros__parameters: {lambda: [15.0, 15.0]}}',
     'alpha': 'estimator: {ros__parameters: {alpha: [1.0, 2.0, 3.0, 4.0, 5.0]}}',
     'negative': '/**: {ros__parameters: {alpha: [30.0, -3.0, 30.0, 30.0]}}',
@@ -41,10 +43,32 @@ FILES = {
 
 # name: (node, arguments, words of the message)
 CASES = {
-    'unknown key': ('estimator', 'unknown', ["unknown parameter 'lamda'", "mean 'lambda'?"]),
-    'length of lambda': ('estimator', 'lambda', ["'lambda'", '1 or 4', '[15.0, 15.0]']),
+    'unknown key': (
+        'estimator',
+        'unknown',
+        ["unknown.yaml: unknown parameter 'lamda'", "mean 'lambda'?"],
+    ),
+    'length of lambda': (
+        'estimator',
+        'lambda',
+        ["lambda.yaml: parameter 'lambda'", '1 or 4', '[15.0, 15.0]'],
+    ),
     'length of alpha': ('estimator', 'alpha', ["'alpha'", '1 or 4', '5.0]']),
-    'negative gain': ('estimator', 'negative', ["'alpha'", '> 0', '-3.0']),
+    'negative gain': (
+        'estimator',
+        'negative',
+        ["negative.yaml: parameter 'alpha'", '> 0', '-3.0'],
+    ),
+    'command line over a file': (
+        'estimator',
+        ['--ros-args', '--params-file', 'negative', '-p', 'alpha:=[-4.0]'],
+        ["error: parameter 'alpha'", '> 0', '[-4.0]'],
+    ),
+    'file over a file': (
+        'estimator',
+        ['--ros-args', '--params-file', 'unknown', '--params-file', 'unknown_too'],
+        ["unknown_too.yaml: unknown parameter 'lamda'"],
+    ),
     'forbidden expression': ('estimator', 'expression', ["'phi'", 'allowed', '__import__']),
     'forbidden in the plant': ('plant', 'expression', ["'phi'", 'allowed', '__import__']),
     'not triangular': ('estimator', 'triangular', ["'phi'", 'Phi_2', 'z3', 'z1..z2']),

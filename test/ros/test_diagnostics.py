@@ -175,3 +175,11 @@ def test_missing_known_input_is_said(client, start):
     rig = EstimatorRig(client, '/h', feed=False)
     rig.wait_status('input', STALE, 'no publisher of u')
     assert Parameters(client, '/h/estimator').get('phi') == ['0', '0', 'u']
+
+
+def test_simulation_time_samples_by_the_clock_unless_it_is_told_otherwise(client, start):
+    for given, expected in (({}, 'clock'), ({'sampling': 'nominal'}, 'nominal')):
+        namespace = f'/sim_{expected}'
+        start('estimator', *parameters(namespace=namespace, use_sim_time='true', **given))
+        values = Parameters(client, f'{namespace}/estimator')
+        assert values.get('sampling') == expected

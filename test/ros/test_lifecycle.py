@@ -11,6 +11,7 @@ pytestmark = pytest.mark.ros
 from lifecycle_msgs.msg import Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState  # noqa: E402
 from rig import ESTIMATES, EstimatorRig, Parameters, parameters, Process  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
 
 
 class Manager:
@@ -208,3 +209,17 @@ def test_a_signal_ends_it_in_every_state(client, folder, state, transitions):
             assert word not in process.output, process.output
     finally:
         process.kill()
+
+
+def test_reset_that_waits_during_cleanup_does_not_end_the_node(client, node, unconfigured):
+    """The requests come while `cleanup` destroys their service."""
+    change, reset = '/managed/estimator/change_state', '/managed/estimator/reset'
+    cleanup = ChangeState.Request(transition=Transition(label='cleanup'))
+    for _ in range(3):
+        assert node.change('configure')
+        client.call(reset, Trigger, Trigger.Request())
+        client.call_later(change, ChangeState, cleanup)
+        for _ in range(20):
+            client.call_later(reset, Trigger, Trigger.Request())
+        client.wait(lambda: node.state() == 'unconfigured', 'cleanup')
+        assert node.process.running

@@ -4,8 +4,8 @@
 import math
 from typing import NamedTuple
 
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
 import numpy as np
 import pytest
 

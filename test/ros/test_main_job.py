@@ -5,8 +5,8 @@ import bisect
 import math
 import signal
 
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np
 import pytest
 
@@ -134,7 +134,8 @@ def test_equals_a_replay_of_the_same_samples(client, folder, namespace, options)
 
 FALLBACK = """
 import sys
-from fhaosmo_ros.nodes import estimator, spin
+from fhaosmo_ros.nodes.estimator import node as estimator
+from fhaosmo_ros.nodes.middleware import spin
 
 spin.EventsExecutor = None  # an older rclpy
 sys.exit(estimator.main(sys.argv[1:]))

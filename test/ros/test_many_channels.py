@@ -3,7 +3,7 @@
 
 import math
 
-from fhaosmo_ros.core.online import OnlineEstimator
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 import numpy as np
 import pytest
 

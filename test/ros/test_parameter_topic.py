@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the estimator is set to, on a latched topic: the text of a parameter file."""
 
-from fhaosmo_ros.core.channel_parameters import of_channel, with_channels
-from fhaosmo_ros.core.parameter_file import loads
-from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.parameters.files import loads
+from fhaosmo_ros.core.parameters.per_channel import of_channel, with_channels
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
 
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
-from fhaosmo_ros.nodes.parameter_topic import LATEST  # noqa: E402
+from fhaosmo_ros.nodes.estimator.parameter_topic import LATEST  # noqa: E402
 from rig import Parameters, parameters  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 

@@ -3,17 +3,19 @@
 
 import math
 
-from fhaosmo_ros.core.online import OnlineEstimator
-from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS, PLANT_NODE_PARAMETERS
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, PLANT_NODE_PARAMETERS
 import numpy as np
 import pytest
+from yaml_texts import HOSTILE, random_texts
 
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
-from fhaosmo_ros.nodes.parameters import TYPES  # noqa: E402
+from fhaosmo_ros.nodes.middleware.parameters import TYPES  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import SetParameters  # noqa: E402
+from rclpy.parameter import Parameter as RosParameter  # noqa: E402
 from rig import EstimatorRig, Parameters, parameters  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
 
@@ -90,6 +92,18 @@ READ_ONLY = {
     'estimator': ['autostart', 'channels'],  # the rest can be set while the node is unconfigured
     'plant': [name for name, p in PLANT_NODE_PARAMETERS.items() if not p.live],
 }
+SLIDERS = {
+    'estimator': [
+        'order', 'unknown_input_derivatives', 'gamma_initial', 'gamma_min', 'gamma_max',
+        'publish_rate', 'input_depth', 'diagnostics_period', 'error_bad_share_above',
+    ],
+    'plant': ['order', 'sample_rate'],
+}  # fmt: skip
+"""Numbers whose bounds are a range to choose from; the others' only keep out nonsense."""
+SIGNED = {
+    'initial_estimate', 'initial_internal', 'initial_state', 'disturbance_amplitude',
+    'disturbance_phase', 'disturbance_offset',
+}  # fmt: skip
 LIVE = {node: [name for name, p in table.items() if p.live] for node, table in TABLES.items()}
 
 
@@ -124,11 +138,19 @@ def test_every_parameter_is_listed_and_described(nodes, node):
         assert d.type == TYPES[parameter.kind].value, name
         assert d.read_only == (name in READ_ONLY[node]), name
         assert parameter.allowed in d.additional_constraints, name
-        bounded = parameter.lower is not None and parameter.upper is not None
         ranges = [*d.floating_point_range, *d.integer_range]
-        assert len(ranges) == (bounded and parameter.kind in ('int', 'double')), name
+        assert len(ranges) == (name in SLIDERS[node]), name
         for r in ranges:
             assert (r.from_value, r.to_value) == (parameter.lower, parameter.upper), name
+            assert (r.to_value - r.from_value) / 100 <= max(1.0, abs(parameter.default)), name
+        logarithmic = 'logarithmic scale' in d.additional_constraints
+        assert logarithmic == (
+            parameter.kind.startswith('double')
+            and name not in SLIDERS[node]
+            and name not in SIGNED
+        ), name
+        fixed = not parameter.live and name not in READ_ONLY[node]
+        assert ('set it after cleanup' in d.additional_constraints) == fixed, name
 
 
 @pytest.mark.parametrize('node', TABLES)
@@ -310,6 +332,23 @@ def test_odd_texts_are_refused_for_a_list(rig, text):
     result = rig.parameters.set_text('lambda', text)
     assert not result.successful
     assert "parameter 'lambda': expected a list of numbers > 0" in result.reason
+
+
+@pytest.mark.parametrize('name', ['lambda', 'epsilon', 'fuzzy_widths'])
+def test_whatever_the_text_is_the_answer_is_one_line(rig, name):
+    before = rig.parameters.messages(*ESTIMATOR_PARAMETERS)
+    texts = [*HOSTILE.values(), *random_texts(200)]
+    for text in texts:
+        message = RosParameter(name, value=text).to_parameter_msg()
+        request = SetParameters.Request(parameters=[message])
+        (result,) = rig.client.call('/estimator/set_parameters', SetParameters, request).results
+        assert not result.successful, text
+        assert f"parameter '{name}': expected " in result.reason
+        assert result.reason.isprintable()
+        assert len(result.reason) < 300
+    assert rig.parameters.messages(*ESTIMATOR_PARAMETERS) == before
+    assert rig.process.running
+    assert math.isfinite(rig.feed(0.2).z[0])
 
 
 def test_a_parameter_cannot_be_deleted(rig):

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plant node: what it publishes belongs to the time at which it publishes it."""
 
+import time
+
 import numpy as np
 import pytest
 
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
-from fhaosmo_ros.core.disturbance import KINDS  # noqa: E402
-from fhaosmo_ros.core.plant import Plant  # noqa: E402
+from fhaosmo_ros.core.simulation.disturbance import KINDS  # noqa: E402
+from fhaosmo_ros.core.simulation.plant import Plant  # noqa: E402
 from rig import Parameters, parameters  # noqa: E402
 from std_msgs.msg import Float64, Float64MultiArray  # noqa: E402
 
@@ -189,3 +191,17 @@ def test_known_input_comes_from_its_topic(client, start):
     client.wait(lambda: 'rejected u = nan' in process.output, 'complaint about u')
     _, y, _ = rig.fresh(20)
     np.testing.assert_allclose(y, -1.5, rtol=0.0, atol=1e-3)
+
+
+def test_unstable_plant_says_so_once_and_publishes_nothing_more(client, start):
+    process = start(
+        'plant',
+        *parameters(namespace='/unstable', sample_rate=500.0, order=1, phi="['2000.0*z1 + 1.0']"),
+    )
+    rig = PlantRig(client, '/unstable')
+    client.wait(lambda: 'has left the finite numbers' in process.output, 'error')
+    count = len(rig.y)
+    time.sleep(0.3)  # 150 periods
+    assert len(rig.y) <= count + 1  # one may have been on its way
+    assert process.output.count('has left the finite numbers') == 1
+    assert all(np.isfinite(sample.message.data) for sample in rig.y)

@@ -3,15 +3,15 @@
 
 import math
 
-from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np
 import pytest
 
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
-from fhaosmo_ros.nodes.estimator import EstimatorNode  # noqa: E402
-from fhaosmo_ros.nodes.messages import double_encoder  # noqa: E402
+from fhaosmo_ros.nodes.estimator.node import EstimatorNode  # noqa: E402
+from fhaosmo_ros.nodes.middleware.messages import double_encoder  # noqa: E402
 from rclpy.context import Context  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.signals import SignalHandlerOptions  # noqa: E402

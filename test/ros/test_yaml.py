@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameter files: which sections serve which node, and that rcl reads them as we do."""
 
-from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.parameter_file import load
-from fhaosmo_ros.core.parameters import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
+from yaml_texts import HOSTILE
 
 
 @pytest.fixture
 def write(tmp_path):
     def write(text: str) -> str:
         path = tmp_path / 'file.yaml'
-        path.write_text(text)
+        path.write_text(text, encoding='utf-8')
         return str(path)
 
     return write
@@ -40,6 +41,24 @@ def write(tmp_path):
 def test_sections(write, section, node, matches):
     path = write(f"'{section}': {{ros__parameters: {{epsilon: 0.3}}}}")
     assert load(path, node) == ({'epsilon': 0.3} if matches else {})
+
+
+@pytest.mark.parametrize(
+    ('section', 'node'),
+    [
+        ('estimater', 'estimator'),
+        ('/Estimator', 'estimator'),
+        ('estimators', '/rig/estimator'),
+        ('/rig/estimatr', '/rig/estimator'),
+        ('plan', 'plant'),
+    ],
+)
+def test_misspelt_section_is_refused(write, section, node):
+    path = write(f"'{section}': {{ros__parameters: {{epsilon: 0.3}}}}")
+    with pytest.raises(ConfigurationError) as error:
+        load(path, node)
+    problem = f"no section is that of node '{node}', got '{section.lstrip('/')}'"
+    assert str(error.value) == f"{path}: {problem}; did you mean '{node}'?"
 
 
 def test_nested_namespaces(write):
@@ -166,9 +185,39 @@ def test_a_file_reaches_a_renamed_node_in_a_namespace(client, folder, write):
         assert 'noise_std' not in p.names()
 
 
+@pytest.mark.parametrize('text', HOSTILE.values(), ids=HOSTILE.keys())
+def test_hostile_text_at_the_start_gives_no_more_than_a_line(write, text):
+    """`run_node` shows both kinds of errors in one line; a RuntimeError is rcl's own."""
+    spin = pytest.importorskip('fhaosmo_ros.nodes.middleware.spin')
+    section = f'/**: {{ros__parameters: {{lambda: {text}}}}}'
+    for kind, content in (('-p', f'lambda:={text}'), ('file', text), ('file', section)):
+        arguments = ['-p', content] if kind == '-p' else ['--params-file', write(content)]
+        message = ''
+        try:
+            spin._check_arguments('estimator', ['--ros-args', *arguments])
+        except (ConfigurationError, RuntimeError) as error:
+            message = spin._one_line(error)
+        assert message.isprintable()
+        assert len(message) < 600
+
+
+def test_file_without_a_section_for_the_node_is_told(write, capfd):
+    spin = pytest.importorskip('fhaosmo_ros.nodes.middleware.spin')
+    path = write('plant: {ros__parameters: {order: 2}}')
+    spin._check_arguments('plant', ['--ros-args', '--params-file', path])
+    assert capfd.readouterr() == ('', '')
+    spin._check_arguments('estimator', ['--ros-args', '--params-file', path])
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith('[WARN]')
+    assert line.endswith(f'[estimator]: {path}: sets nothing for node /estimator')
+    renamed = ['--ros-args', '-r', '__node:=plans', '--params-file', path]
+    with pytest.raises(ConfigurationError, match="got 'plant'; did you mean '/plans'"):
+        spin._check_arguments('plant', renamed)
+
+
 def test_rule_for_another_node_is_let_through():
     """As ROS does: one command line may serve several nodes."""
-    spin = pytest.importorskip('fhaosmo_ros.nodes.spin')
+    spin = pytest.importorskip('fhaosmo_ros.nodes.middleware.spin')
     spin._check_arguments('estimator', ['--ros-args', '-p', 'plant:noise:=0.1'])
     with pytest.raises(ConfigurationError, match="'noise'"):
         spin._check_arguments('estimator', ['--ros-args', '-p', 'estimator:noise:=0.1'])

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding parameters of an estimator that fit a sensor."""
+"""`tune`: finds parameters of the estimator that fit a sensor, a plant and a kind of d."""

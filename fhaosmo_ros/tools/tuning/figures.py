@@ -4,9 +4,9 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from fhaosmo_ros.core.family import Recording
-from fhaosmo_ros.tools.figures import DASHES, TRUTH
-from fhaosmo_ros.tools.tuning.search import Dimension
+from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.tools.plot.figures import DASHES, TRUTH
+from fhaosmo_ros.tools.tuning.search.minimise import Dimension
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
@@ -17,7 +17,7 @@ BEFORE = {'color': '#999999', 'linewidth': 0.9, 'label': 'before'}
 AFTER = {'color': '#D55E00', 'linewidth': 1.2, 'linestyle': '--', 'label': 'tuned'}
 COLUMNS = 4
 HIGHEST = 2.0
-"""Upper end of the sensitivity's axis, in values of the best objective."""
+"""Upper end of the axis of the sensitivity, in units of the best objective."""
 
 
 def save_estimates(
@@ -30,7 +30,7 @@ def save_estimates(
     ----------
     shown : sequence of (title, recording, estimate before, estimate after)
     settled : float
-        From when on errors count; what comes before is shaded.
+        Errors count from this time on; the time before is shaded.
     path : path
 
     """
@@ -56,9 +56,12 @@ def save_estimates(
 
 
 def save_sensitivity(
-    curves: Mapping[str, tuple[Floats, Floats]], space: Sequence[Dimension],
-    best: Mapping[str, float], objective: float, path: Path,
-) -> None:  # fmt: skip
+    curves: Mapping[str, tuple[Floats, Floats]],
+    space: Sequence[Dimension],
+    best: Mapping[str, float],
+    objective: float,
+    path: Path,
+) -> None:
     """
     Draw the objective over each parameter alone.
 
@@ -85,7 +88,7 @@ def save_sensitivity(
         x, value = curves[d.name]
         axes.plot(x, np.minimum(value, 10.0 * objective), color='#0072B2', marker='.', lw=1.2)
         axes.plot([best[d.name]], [objective], color='#D55E00', marker='o', ls='none')
-        if d.log:  # a decade or six: matplotlib's own labels would run into one another
+        if d.log:  # matplotlib's own labels overlap in a panel as small as this
             axes.set_xscale('log')
             ticks = np.geomspace(np.min(x), np.max(x), 3)
             axes.set_xticks(ticks, [f'{tick:.2g}' for tick in ticks])
@@ -99,9 +102,8 @@ def save_sensitivity(
 
 
 def save_front(
-    all_values: Floats, front: Floats, chosen: Floats, names: tuple[str, str],
-    path: Path,
-) -> None:  # fmt: skip
+    all_values: Floats, front: Floats, chosen: Floats, names: tuple[str, str], path: Path
+) -> None:
     """Draw two objectives of all trials, the front of them, and the one that was taken."""
     figure = Figure(figsize=(6.5, 4.5), layout='constrained')
     axes: Axes = figure.subplots()

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One number out of the errors, the chatter and the settling of an observer's estimates."""
+"""The objective of a tuning: error, chatter and settling of the estimates as one number."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.family import Recording
-from fhaosmo_ros.core.trial import CHOICES, Scores, Trial
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.core.simulation.scoring import CHOICES, Scores, Trial
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 import numpy as np
 
 SMALLEST = 1e-12
-"""A smaller relative error is none."""
+"""Relative errors below this one count as this one, so that their logarithm is finite."""
 
 
-class Verdict(NamedTuple):
+class Evaluation(NamedTuple):
     """
     How good one set of parameters is.
 
@@ -23,17 +24,17 @@ class Verdict(NamedTuple):
     objective : float
         error + chatter_weight * chatter + settling_weight * settling.
     error : float
-        Weighted RMS error relative to the truth's RMS; geometric mean over the recordings, so
-        that a tenth less counts the same on an easy one and on a hard one.
+        Weighted RMS error relative to the RMS of the truth; geometric mean over the recordings,
+        so that an error smaller by a tenth counts the same on an easy recording and on a hard one.
     chatter : float
         Powers of ten between the total variation of the estimate of d and that of d; at least 0.
     settling : float
-        Mean share of the settling time that d needs.
+        Mean share of the time `settled` that the estimate of d needs to settle.
     estimate_from : str
-        Which variables are the estimates.
+        Which variables are the estimates: 'internal' or 'filtered'.
     scores : Scores
     choice : int
-        Of `estimate_from` in the scores.
+        Index of `estimate_from` in the scores.
 
     """
 
@@ -48,7 +49,7 @@ class Verdict(NamedTuple):
 
 class Objective:
     """
-    Judges parameters of the estimator on recordings.
+    Evaluates parameters of the estimator on recordings.
 
     Parameters
     ----------
@@ -60,17 +61,22 @@ class Objective:
     choose : bool
         Take the better of the internal and the filtered variables, instead of what `fixed` says.
     scale : array, optional
-        What errors are relative to; by default the truth of these recordings.
+        RMS values that errors are divided by; by default those of the truth of these recordings.
 
     """
 
     def __init__(
-        self, recordings: Sequence[Recording], fixed: Mapping[str, Any],
-        tuning: Mapping[str, Any], choose: bool, scale: Any = None,
-    ) -> None:  # fmt: skip
+        self,
+        recordings: Sequence[Recording],
+        fixed: Mapping[str, Any],
+        tuning: Mapping[str, Any],
+        choose: bool,
+        scale: Any = None,
+    ) -> None:
+        online = ONLINE_PARAMETERS.complete(fixed)
         d = np.concatenate([r.d for r in recordings])
         band = tuning['settling_band'] * float(np.sqrt(np.mean(d**2)))
-        self.trial = Trial(recordings, fixed, tuning['settled'], band)
+        self.trial = Trial(recordings, online, tuning['settled'], band)
         self.scale = self.trial.scale if scale is None else scale
         self._tuning = tuning
         quantities = len(self.scale)
@@ -89,23 +95,23 @@ class Objective:
             )
         self._weighted = np.flatnonzero(weighted)
         self._weights = np.array(weights)[weighted] / np.sum(weights)
+        # A d that is constant has no variation: its size takes the place of it.
         self._truth_varies = np.maximum(self.trial.variation, self.scale[-1] or 1.0)
-        chosen = dict(fixed).get('estimate_from', CHOICES[0])
-        self._choices = (0, 1) if choose else (CHOICES.index(chosen),)
+        self._choices = (0, 1) if choose else (CHOICES.index(online['estimate_from']),)
 
-    def __call__(self, parameters: Mapping[str, Any]) -> Verdict:
-        """Judge the fixed parameters with these; `estimate_from` among them leaves no choice."""
+    def __call__(self, parameters: Mapping[str, Any]) -> Evaluation:
+        """Evaluate the fixed parameters with these; `estimate_from` among them decides."""
         scores = self.trial(parameters)
         choices = self._choices
         if 'estimate_from' in parameters:
             choices = (CHOICES.index(parameters['estimate_from']),)
         return min(
-            (self._verdict(scores, choice) for choice in choices),
-            key=lambda verdict: verdict.objective,
+            (self._evaluate(scores, choice) for choice in choices),
+            key=lambda evaluation: evaluation.objective,
         )
 
-    def _verdict(self, scores: Scores, choice: int) -> Verdict:
-        # An estimate that left the finite numbers is infinitely wrong, not undefined.
+    def _evaluate(self, scores: Scores, choice: int) -> Evaluation:
+        # An estimate that is not finite is infinitely wrong, not undefined.
         wrong = np.nan_to_num(scores.error[:, choice, self._weighted], nan=np.inf)
         with np.errstate(over='ignore'):
             each = np.sqrt(np.square(wrong / self.scale[self._weighted]) @ self._weights)
@@ -119,4 +125,4 @@ class Objective:
             + self._tuning['chatter_weight'] * chatter
             + self._tuning['settling_weight'] * settling
         )
-        return Verdict(objective, error, chatter, settling, CHOICES[choice], scores, choice)
+        return Evaluation(objective, error, chatter, settling, CHOICES[choice], scores, choice)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `tune` can be told in a YAML file beside the estimator's and the family's parameters."""
+"""Parameters of `tune` itself, and the table of all that it takes beside the estimator's."""
 
-from fhaosmo_ros.core.family_parameters import FAMILY, SHARED
-from fhaosmo_ros.core.parameter import Parameter, ParameterTable
-from fhaosmo_ros.core.parameters import MODEL
+from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
+from fhaosmo_ros.core.parameters.tables import MODEL
+from fhaosmo_ros.core.simulation.recording_parameters import FAMILY, SHARED
 
 TUNING = (
     Parameter(

@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tuning says: the YAML for the estimator, and a report in words and tables."""
+"""Texts of a tuning: the YAML for the estimator, and the parts of the report."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.parameter_file import dumps
-from fhaosmo_ros.tools.tuning.objective import Objective, Verdict
-from fhaosmo_ros.tools.tuning.search import Dimension
-from fhaosmo_ros.tools.tuning.source import Data
+from fhaosmo_ros.core.parameters.files import dumps
+from fhaosmo_ros.tools.tuning.objective import Evaluation, Objective
+from fhaosmo_ros.tools.tuning.search.minimise import Dimension
+from fhaosmo_ros.tools.tuning.source import TuningData
 import numpy as np
 
 OVERFITTED = 1.25
-"""Held-out error over that of the training from which on the report warns."""
+"""The report warns from this ratio of the held-out error to the training error on."""
 AT_BOUND = 0.02
-"""Distance to a bound, as a share of the range, that counts as being there."""
+"""A value counts as at its bound if it is this close to it, as a share of the range."""
 
 
 class Column(NamedTuple):
-    """One set of gains, judged on one set of recordings."""
+    """One set of gains, evaluated on one set of recordings."""
 
     title: str
-    verdict: Verdict
+    evaluation: Evaluation
     objective: Objective
 
 
@@ -31,23 +31,23 @@ def parameter_file(parameters: Mapping[str, Any], comments: Sequence[str]) -> st
 
 
 def table(columns: Sequence[Column]) -> str:
-    """Return a Markdown table of the verdicts, a column each."""
-    rows = {'objective': [f'{c.verdict.objective:.4f}' for c in columns]}
-    rows['error, relative to the truth'] = [f'{c.verdict.error:.4f}' for c in columns]
+    """Return a Markdown table of the evaluations, a column each."""
+    rows = {'objective': [f'{c.evaluation.objective:.4f}' for c in columns]}
+    rows['error, relative to the truth'] = [f'{c.evaluation.error:.4f}' for c in columns]
     recordings = [c.objective.trial.recordings for c in columns]
     quantities = len(columns[0].objective.scale)
     names = [f'z{k + 1}' for k in range(quantities - 1)] + ['d']
     for k, name in enumerate(names):
         rows[f'RMS error of {name}'] = [
-            f'{_pooled(c.verdict.scores.error[:, c.verdict.choice, k]):.3g}' for c in columns
+            f'{_pooled(c.evaluation.scores.error[:, c.evaluation.choice, k]):.3g}' for c in columns
         ]
     shapes = dict.fromkeys(r.shape for rows_ in recordings for r in rows_)
     if len(shapes) > 1:
         for shape in shapes:
             rows[f'RMS error of d, {shape}'] = [_of_shape(c, shape) for c in columns]
-    rows['chatter of d, powers of ten'] = [f'{c.verdict.chatter:.2f}' for c in columns]
-    rows['settling, share of the time'] = [f'{c.verdict.settling:.2f}' for c in columns]
-    rows['estimates from'] = [c.verdict.estimate_from for c in columns]
+    rows['chatter of d, powers of ten'] = [f'{c.evaluation.chatter:.2f}' for c in columns]
+    rows['settling, share of the time'] = [f'{c.evaluation.settling:.2f}' for c in columns]
+    rows['estimates from'] = [c.evaluation.estimate_from for c in columns]
     head = ['', *(c.title for c in columns)]
     lines = [f'| {" | ".join(head)} |', '|' + '---|' * len(head)]
     lines += [f'| {" | ".join([name, *cells])} |' for name, cells in rows.items()]
@@ -60,7 +60,7 @@ def _pooled(values: np.ndarray) -> float:
 
 def _of_shape(column: Column, shape: str) -> str:
     chosen = [k for k, r in enumerate(column.objective.trial.recordings) if r.shape == shape]
-    errors = column.verdict.scores.error[chosen, column.verdict.choice, -1]
+    errors = column.evaluation.scores.error[chosen, column.evaluation.choice, -1]
     return f'{_pooled(errors):.3g}' if chosen else '-'
 
 
@@ -86,7 +86,7 @@ def start_table(tried: Mapping[int, float], chosen: int) -> str:
 
 
 def at_bound(dimension: Dimension, value: float) -> bool:
-    """Return True if the search may have wanted to go further."""
+    """Return True if the value is so close to a bound that a wider range may be better."""
     low, high = dimension.low, dimension.high
     if dimension.log:
         low, high, value = float(np.log(low)), float(np.log(high)), float(np.log(value))
@@ -94,11 +94,14 @@ def at_bound(dimension: Dimension, value: float) -> bool:
 
 
 def warnings(
-    space: Sequence[Dimension], best: Mapping[str, float], tuned: Sequence[Column], data: Data
+    space: Sequence[Dimension],
+    best: Mapping[str, float],
+    tuned: Sequence[Column],
+    data: TuningData,
 ) -> list[str]:
-    """Return what a reader should know before trusting the gains."""
+    """Return what a user should know before using the gains."""
     found = list(data.notes)
-    training, held_out = (column.verdict.error for column in tuned)
+    training, held_out = (column.evaluation.error for column in tuned)
     if held_out > OVERFITTED * training:
         found.append(
             f'The error on held-out recordings is {held_out / training:.2f} times that of the '
@@ -119,8 +122,8 @@ def warnings(
     return found
 
 
-def sensor_table(data: Data) -> str:
-    """Return what a bag's y said of its sensor."""
+def sensor_table(data: TuningData) -> str:
+    """Return a Markdown table of what was estimated from the y of a bag."""
     if data.sensor is None:
         return ''
     lines = ['| estimated from y | |', '|---|---|']

@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recorded y says of its sensor: noise, resolution, rate, jitter, losses."""
+"""Estimates of a sensor from its recorded y: noise, resolution, rate, jitter, losses."""
 
 from math import comb
 from typing import NamedTuple
 
-from fhaosmo_ros.core.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
 FEWEST = 200
-"""Samples that an estimate needs."""
+"""An estimate needs so many samples."""
 DIFFERENCES = range(1, 9)
 DIVIDED = range(2, 6)
-"""Orders of differences: even ones, and divided ones."""
+"""Orders of the differences on evenly spaced samples, and of the divided differences."""
 NORMAL = 0.6745
 """Median of |x| of a standard normal x."""
 ON_GRID = 0.02
-"""Largest distance from whole multiples, in multiples, that still counts as quantised."""
+"""Values count as quantised if they are this close to multiples of the quantum, relatively."""
 
 
 class Sensor(NamedTuple):
@@ -52,10 +52,10 @@ def identify(t: Floats, y: Floats) -> Sensor:
     """
     Estimate a sensor from what it measured.
 
-    Noise from differences of high order, which leave nothing of a smooth signal; all by medians,
-    so that steps and outliers do not count. Only white noise is seen: what a filter in the sensor
-    has smoothed away looks like signal. Whether periods or stamps jitter can't be told apart; it
-    is taken as the worse of the two, that of the stamps.
+    The noise follows from differences of high order, in which a smooth signal vanishes. Medians
+    make steps and outliers unimportant. Only white noise is found: noise that a filter in the
+    sensor has smoothed looks like signal. Jitter of the periods and jitter of the stamps cannot be
+    distinguished; it is taken as that of the stamps, which is the worse one.
 
     Parameters
     ----------
@@ -94,15 +94,15 @@ def identify(t: Floats, y: Floats) -> Sensor:
 
 def noise_at_stamps(t: Floats, y: Floats) -> float:
     """
-    Return the RMS noise of y as a function of its stamps, whose jitter acts as noise as well.
+    Return the RMS noise of y over its stamps; jitter of the stamps acts as noise, too.
 
-    From divided differences, scaled so that white noise leaves its own size; where samples are
-    missing none are taken.
+    It follows from divided differences, scaled so that white noise keeps its size. None is taken
+    across missing samples.
 
     Parameters
     ----------
     t, y : (K,) arrays
-        Increasing stamps (s) and samples. Of fewer than `FEWEST` the noise is 0: nothing is known.
+        Increasing stamps (s) and samples. Fewer than `FEWEST` of them tell nothing: 0 is returned.
 
     """
     if len(t) < FEWEST:
@@ -119,29 +119,33 @@ def noise_at_stamps(t: Floats, y: Floats) -> float:
             continue
         columns = range(order + 1)
         times = times / h.mean()
-        weights = np.column_stack([
-            1.0 / np.prod([times[:, j] - times[:, k] for k in columns if k != j], axis=0)
-            for j in columns
-        ])  # fmt: skip
+        weights = np.column_stack(
+            [
+                1.0 / np.prod([times[:, j] - times[:, k] for k in columns if k != j], axis=0)
+                for j in columns
+            ]
+        )
         left = np.sum(weights * values, axis=1) / np.linalg.norm(weights, axis=1)
         found.append(float(np.sqrt(np.mean(left**2))))
     return min(found, default=0.0)
 
 
 def _noise(y: Floats, regular: NDArray[np.bool_]) -> float:
-    """Return the smallest estimate over the orders: low ones see the signal as well."""
+    """Return the smallest estimate over the orders: low orders contain the signal as well."""
     found = []
     for order in DIFFERENCES:
         whole = np.lib.stride_tricks.sliding_window_view(regular, order).all(axis=1)
         differences = np.diff(y, order)[whole]
         if len(differences) >= FEWEST // 2:
-            size = _spread(differences) or float(np.std(differences))  # many equal ones: quantised
+            size = _spread(differences) or float(
+                np.std(differences)
+            )  # the median is 0 if quantised
             found.append(size / comb(2 * order, order) ** 0.5)
     return min(found) if found else 0.0
 
 
 def _quantum(y: Floats) -> float:
-    """Return the resolution of y, 0 if values do not lie on a grid that is coarse for them."""
+    """Return the resolution of y, 0 if its values lie on no grid, or on a very fine one."""
     steps = np.abs(np.diff(y))
     steps = steps[steps > 0.0]
     if len(steps) < FEWEST // 10:
@@ -157,5 +161,5 @@ def _quantum(y: Floats) -> float:
 
 
 def _spread(x: Floats) -> float:
-    """Return the standard deviation of the bulk, by the median of |x|."""
+    """Return the standard deviation without outliers, by the median of |x - median|."""
     return float(np.median(np.abs(x - np.median(x))) / NORMAL)

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings to train on and to judge by: of a simulated family, or pieces of a bag."""
+"""Training and held-out recordings: of a simulated family, or pieces of a bag."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.family import Family, Recording
-from fhaosmo_ros.core.family_parameters import FAMILY_PARAMETERS
-from fhaosmo_ros.core.model import TriangularModel
-from fhaosmo_ros.tools.bag_reader import BagReader
-from fhaosmo_ros.tools.held_input import HeldInput
-from fhaosmo_ros.tools.truth import truth_at
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.parameters.declaration import Parameters
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
+from fhaosmo_ros.core.simulation.recordings import Family, Recording
+from fhaosmo_ros.tools.bags.held_input import HeldInput
+from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.bags.topics import truth_at
 from fhaosmo_ros.tools.tuning.sensor import identify, noise_at_stamps, Sensor
 import numpy as np
 from numpy.typing import NDArray
@@ -23,21 +23,23 @@ HELD_OUT_SEED = 1_000_003
 
 
 @dataclass
-class Data:
+class TuningData:
     """
-    What there is to work with.
+    The recordings of a tuning, and where they come from.
 
     Attributes
     ----------
     training, held_out : list of Recording
     origin : str
         Where they come from, in words.
-    sensor : Sensor or None
-        What a bag's y said.
     parameters : dict
         Of the family, complete.
+    sensor : Sensor or None
+        Estimated from the y of a bag.
     least_noise : float
-        RMS noise of y that shows without the truth, which may say less.
+        RMS noise of y, estimated from y alone; y minus the true z_1 may show less.
+    notes : list of str
+        What a reader of the report should know.
 
     """
 
@@ -50,8 +52,8 @@ class Data:
     notes: list[str] = field(default_factory=list)
 
 
-class BagChoice(NamedTuple):
-    """Which numbers of a bag are y and u, and whose topics hold the truth; as `replay` has it."""
+class BagSource(NamedTuple):
+    """A bag, its fields that are y and u, and the plant whose topics are the truth."""
 
     path: Path
     topic: str = '/y'
@@ -62,77 +64,75 @@ class BagChoice(NamedTuple):
     plant: str = '/plant'
 
 
-def simulated(values: Mapping[str, Any], seed: int) -> Data:
-    """Return recordings of the family that `values` (of `TUNE_PARAMETERS`, complete) describe."""
-    family = Family({name: values[name] for name in FAMILY_PARAMETERS})
-    return Data(
+def simulated(values: Parameters, seed: int) -> TuningData:
+    """Return recordings of the family that `values` (of `TUNE_PARAMETERS`) describe."""
+    family = Family(FAMILY_PARAMETERS.complete(values))
+    return TuningData(
         family.recordings(values['recordings'], seed),
         family.recordings(values['held_out'], seed + HELD_OUT_SEED),
-        'simulated family', family.parameters,
-    )  # fmt: skip
+        'simulated family',
+        family.parameters,
+    )
 
 
-def from_bag(choice: BagChoice, values: Mapping[str, Any], given: set[str], seed: int) -> Data:
+def from_bag(source: BagSource, values: Parameters, given: set[str], seed: int) -> TuningData:
     """
     Return pieces of a bag that holds the truth, else a family with the sensor of its y.
 
     Parameters
     ----------
-    choice : BagChoice
-    values : mapping
-        Of `TUNE_PARAMETERS`, complete.
+    source : BagSource
+    values : Parameters
+        Of `TUNE_PARAMETERS`.
     given : set of str
-        Names that the user set: what the bag says does not replace them.
+        Names that the user set: estimates from the bag do not replace them.
     seed : int
 
     """
     model = TriangularModel(values['phi'], values['order'])
-    t, y, u, truth = _read(choice, model)
+    t, y, u, truth = _read(source, model)
     sensor = identify(t, y)
     if truth is not None:
         data = _pieces(t, y, u, truth, values)
-        data.sensor, data.origin = sensor, f'pieces of bag {choice.path.resolve().name}'
-        # The truth is that of the moment of a sample, not of its stamp: it knows no jitter.
+        data.sensor, data.origin = sensor, f'pieces of bag {source.path.resolve().name}'
+        # The truth is that at the time of a sample, not at its stamp, so y - z_1 has no jitter.
         data.least_noise = max(noise_at_stamps(r.t, r.y) for r in data.training)
         return data
-    seen = sensor._asdict()
-    data = simulated(dict(values) | {k: v for k, v in seen.items() if k not in given}, seed)
+    estimated = {k: v for k, v in sensor._asdict().items() if k not in given}
+    data = simulated(values.changed(estimated), seed)
     data.sensor = sensor
-    data.origin = f'simulated family with the sensor of bag {choice.path.resolve().name}'
+    data.origin = f'simulated family with the sensor of bag {source.path.resolve().name}'
     return data
 
 
 def _read(
-    choice: BagChoice, model: TriangularModel
+    source: BagSource, model: TriangularModel
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any] | None]:
-    with BagReader(choice.path) as reader:
-        found = reader.field(choice.topic, choice.field)
-        if choice.stamp == 'header' and not found.has_header:
-            raise ConfigurationError(
-                f'--stamp header: expected messages with a header on {choice.topic}, '
-                f'got {reader.message_type(choice.topic)}'
-            )
-        header = found.has_header and choice.stamp != 'bag'
-        blocks = list(reader.blocks(choice.topic, found, header))
+    with BagReader(source.path) as reader:
+        found = reader.field(source.topic, source.field)
+        blocks = list(reader.blocks(source.topic, found, source.stamp))
         times, stamps, y = (np.concatenate([block[k] for block in blocks]) for k in range(3))
         u = np.zeros(len(y))
         if model.uses_input:
-            u = HeldInput(reader, choice.input_topic, choice.input_field, lambda _: None)(times)
+            u = HeldInput(reader, source.input_topic, source.input_field, lambda _: None)(times)
     truth = None
-    found = truth_at(choice.path, choice.plant, times)
+    found = truth_at(source.path, source.plant, times)
     if found is not None and found.values.shape[1] == model.order + 1:
         known = found.known
         stamps, y, u, truth = stamps[known], y[known], u[known], found.values[known]
     if not len(y):
-        raise ConfigurationError(f'bag {choice.path}: expected samples with their truth, got none')
+        raise ConfigurationError(f'bag {source.path}: expected samples with their truth, got none')
     return (stamps - stamps[0]) * 1e-9, y, u, truth
 
 
 def _pieces(
-    t: NDArray[Any], y: NDArray[Any], u: NDArray[Any], truth: NDArray[Any],
-    values: Mapping[str, Any],
-) -> Data:  # fmt: skip
-    """Cut into pieces of `duration`, at least two; every other one is held out."""
+    t: NDArray[Any],
+    y: NDArray[Any],
+    u: NDArray[Any],
+    truth: NDArray[Any],
+    values: Parameters,
+) -> TuningData:
+    """Cut into pieces of `duration`, at least two; every second one is held out."""
     keep = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0.0]) & np.isfinite(y)
     t, y, u, truth = t[keep], y[keep], u[keep], truth[keep]
     span = float(t[-1] - t[0]) if len(t) else 0.0
@@ -149,9 +149,9 @@ def _pieces(
         Recording(t[a:b] - t[a], y[a:b], u[a:b], truth[a:b, :-1], truth[a:b, -1], 'recorded')
         for a, b in pairwise(edges)
     ]
-    family = {name: values[name] for name in FAMILY_PARAMETERS}
+    family = dict(FAMILY_PARAMETERS.complete(values))
     notes = [
         'The recordings are pieces of one run: gains can fit its one kind of d. Judge them on '
         'another run as well.'
     ]
-    return Data(parts[::2], parts[1::2], 'bag', family, notes=notes)
+    return TuningData(parts[::2], parts[1::2], 'bag', family, notes=notes)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One tuning: from data and parameters to the best gains, before anything is written."""
+"""One tuning: from recordings and parameters to the best gains, before anything is written."""
 
 from collections.abc import Callable, Mapping, Sequence
 import hashlib
@@ -8,28 +8,28 @@ import math
 import time
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.errors import ConfigurationError
-from fhaosmo_ros.core.observer import Observer
-from fhaosmo_ros.core.parameters import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
+from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.tuning.objective import Objective
-from fhaosmo_ros.tools.tuning.search import minimise, Values
-from fhaosmo_ros.tools.tuning.source import Data
-from fhaosmo_ros.tools.tuning.space import changes, make_space
-from fhaosmo_ros.tools.tuning.start import begin, Question, with_scheme
-from fhaosmo_ros.tools.tuning.study import Point
-from tqdm import tqdm
+from fhaosmo_ros.tools.tuning.search.minimise import minimise, StudyOptions, Values
+from fhaosmo_ros.tools.tuning.search.space import changes, make_space
+from fhaosmo_ros.tools.tuning.search.study import FinishedTrial
+from fhaosmo_ros.tools.tuning.source import TuningData
+from fhaosmo_ros.tools.tuning.start.find import find_start, StartProblem, with_scheme
 
 DIGITS = 4
-"""Of the gains that are written, unless rounding makes them worse by more than `LOSS`."""
+"""Of the gains that are written, unless rounding raises their objective by more than `LOSS`."""
 LOSS = 5e-3
 NEAR, FAR = 0.5, 3.0
 """`decades` around a start that a Kalman filter gave, and around any other one."""
 PARETO_WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
-"""Of the second objective, a search each."""
+"""Weights of the second objective; each has a search of its own."""
 
 
-class Marks(NamedTuple):
-    """What is kept of a trial; see `Verdict`."""
+class TrialScores(NamedTuple):
+    """What is stored with a trial; see `Evaluation`."""
 
     objective: float
     error: float
@@ -37,25 +37,28 @@ class Marks(NamedTuple):
     settling: float
 
 
-class Found(NamedTuple):
+class TuningResult(NamedTuple):
     """
-    The outcome of a search.
+    The outcome of a tuning.
 
     Attributes
     ----------
     best : dict
         Values by dimension, rounded.
-    trials : list of Point
+    trials : list of FinishedTrial
     seconds : float
     pareto : str or None
         Second objective.
+    failure : str or None
+        Why the storage failed in the middle, which ended the search.
 
     """
 
     best: Values
-    trials: list[Point]
+    trials: list[FinishedTrial]
     seconds: float
     pareto: str | None
+    failure: str | None
 
 
 class Tuner:
@@ -64,7 +67,7 @@ class Tuner:
 
     Parameters
     ----------
-    data : Data
+    data : TuningData
     estimator : mapping
         What the user set for the estimator.
     tuning : mapping
@@ -73,7 +76,7 @@ class Tuner:
     jobs : int
         Threads that look for a start.
     stopped : callable
-        Asked now and then; True ends that with what there is.
+        Asked before each evaluation of the start; True ends it with the best so far.
 
     Attributes
     ----------
@@ -84,7 +87,7 @@ class Tuner:
     training, held_out : Objective
     space : list of Dimension
     tried : dict
-        Objective of the best Kalman filter by number of derivatives of d; see start.py.
+        Objective of the best Kalman filter by number of derivatives of d; see start/find.py.
 
     Raises
     ------
@@ -94,78 +97,104 @@ class Tuner:
     """
 
     def __init__(
-        self, data: Data, estimator: Mapping[str, Any], tuning: Mapping[str, Any], seed: int,
-        jobs: int = 1, stopped: Callable[[], bool] = lambda: False,
-    ) -> None:  # fmt: skip
+        self,
+        data: TuningData,
+        estimator: Mapping[str, Any],
+        tuning: Mapping[str, Any],
+        seed: int,
+        jobs: int = 1,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
         self.data, self.tuning, self.seed = data, tuning, seed
         names = [rule.split()[0] for rule in tuning['search'] if rule.split()]
         # The estimator may have a model of its own, other than the plant's.
         model = {name: tuning[name] for name in ('order', 'phi')}
         self.estimator = with_scheme(model | dict(estimator), data.training)
         self._choose = 'estimate_from' not in estimator
-        begun = begin(
-            Question(data.training, self.estimator, names, self._objective, data.least_noise),
-            jobs, stopped,
-        )  # fmt: skip
-        self.tried = begun.tried
-        beside = {k: v for k, v in begun.gains.items() if k not in names}
-        self.estimator = beside | self.estimator
+        start = find_start(
+            StartProblem(data.training, self.estimator, names, self._objective, data.least_noise),
+            jobs,
+            stopped,
+        )
+        self.tried = start.tried
+        not_searched = {k: v for k, v in start.gains.items() if k not in names}
+        self.estimator = not_searched | self.estimator
         self.training = self._objective(self.estimator)
+        complete = ESTIMATOR_PARAMETERS.complete(self.estimator)
         self.held_out = Objective(
-            data.held_out, _online(self.estimator), tuning, self._choose, self.training.scale
+            data.held_out, complete, tuning, self._choose, self.training.scale
         )
         given = {name: value for name, value in estimator.items() if name in names}
-        given = given if 'lambda' in given else {}  # one number more or less is no set of gains
-        by_theory = {k: v for k, v in begun.gains.items() if k in names}
-        # The user's own gains count, too: a tuning never ends worse than they are.
-        start = min(
+        given = given if 'lambda' in given else {}  # other parameters alone are no set of gains
+        by_theory = {k: v for k, v in start.gains.items() if k in names}
+        # The user's own gains are a start, too: the tuned ones are never worse than they are.
+        best = min(
             [by_theory, given] if given else [by_theory],
-            key=lambda gains: self._judge(gains).objective,
+            key=lambda gains: self._evaluate(gains).objective,
         )
         self.before_is_given = bool(given)
-        complete = Observer({k: v for k, v in self.estimator.items() if k in OBSERVER_PARAMETERS})
+        observer = Observer(complete)
         self.space = make_space(
-            tuning['search'], complete.parameters | start, complete.levels,
+            tuning['search'],
+            observer.parameters | best,
+            observer.levels,
             tuning['decades'] or (NEAR if self.tried else FAR),
-        )  # fmt: skip
+        )
         searched = changes({d.name: d.start for d in self.space})
         self.before = given or searched
         self.fixed = {k: v for k, v in self.estimator.items() if k not in searched}
 
     def _objective(self, estimator: Mapping[str, Any]) -> Objective:
-        return Objective(self.data.training, _online(estimator), self.tuning, self._choose)
+        complete = ESTIMATOR_PARAMETERS.complete(estimator)
+        return Objective(self.data.training, complete, self.tuning, self._choose)
 
     @property
     def study_name(self) -> str:
-        """Say what the study is about: another question must not go on with its trials."""
-        question = json.dumps(
-            [self.tuning, self.data.parameters, self.estimator, self.space], sort_keys=True
+        """Name of the study: a digest of all that its trials depend on."""
+        problem = json.dumps(
+            [dict(self.tuning), self.data.parameters, self.estimator, self.space], sort_keys=True
         )
-        digest = hashlib.sha256(question.encode())
+        digest = hashlib.sha256(problem.encode())
         for recording in self.data.training:
             digest.update(recording.y.tobytes())
         return f'tune-{digest.hexdigest()[:16]}'
 
-    def judge(self, values: Values) -> Marks:
-        """Return the marks of the training at a point."""
-        return self._judge(changes(values))
+    def evaluate(self, values: Values) -> TrialScores:
+        """Return the scores of a point of the space on the training recordings."""
+        return self._evaluate(changes(values))
 
-    def _judge(self, gains: Mapping[str, Any]) -> Marks:
+    def _evaluate(self, gains: Mapping[str, Any]) -> TrialScores:
         try:
-            verdict = self.training(gains)
-        except ConfigurationError:  # out of a parameter's bounds, or not good together
-            return Marks(*(math.inf,) * 4)
-        return Marks(*verdict[:4])
+            evaluation = self.training(gains)
+        except ConfigurationError:  # a value out of its bounds, or values that do not fit
+            return TrialScores(*(math.inf,) * 4)
+        return TrialScores(*evaluation[:4])
 
     def search(
-        self, trials: int, jobs: int, storage: str, sampler: str, pareto: str | None,
+        self,
+        trials: int,
+        jobs: int,
+        options: StudyOptions,
+        pareto: str | None,
         stopped: Callable[[], bool],
-    ) -> Found | None:  # fmt: skip
+    ) -> TuningResult | None:
         """
-        Search until the study holds `trials`, or `stopped` says so; None if it says so at once.
+        Search until the study holds `trials`, or `stopped` returns True; None if it does at once.
 
-        For a front, one search after the other minimises error + weight * `pareto`, each from the
-        best that the ones before it have seen.
+        A storage that fails in the middle ends the search, too.
+
+        For a Pareto front, one search after the other minimises error + weight * `pareto`. Each
+        starts from the best trial of the searches before it.
+
+        Parameters
+        ----------
+        trials, jobs : int
+        options : StudyOptions
+            Its name is not used: the study is named by what it searches.
+        pareto : {'chatter', 'settling', None}
+            Second objective.
+        stopped : callable
+            Asked before each trial.
 
         Raises
         ------
@@ -178,61 +207,71 @@ class Tuner:
         begin = time.monotonic()
         weights = PARETO_WEIGHTS if pareto else (0.0,)
         each = -(-trials // len(weights))
-        points: list[Point] = []
-        with tqdm(total=each * len(weights), unit='trial', desc='tune', smoothing=0.05) as bar:
+        finished: list[FinishedTrial] = []
+        failure: str | None = None
+        with progress(total=each * len(weights), unit='trial', desc='tune', smoothing=0.05) as bar:
             for weight in weights:
-                name, value = self.study_name, _value(pareto, weight)
+                name, scalar = self.study_name, _scalar_objective(pareto, weight)
                 space = list(self.space)
                 if pareto:
                     name += f'-{pareto}-{weight:g}'
-                if points:
-                    start = min(points, key=lambda p: value(marks(p))).parameters
+                if finished:
+                    start = min(finished, key=lambda t: scalar(stored_scores(t))).parameters
                     space = [d._replace(start=start[d.name]) for d in space]
 
-                def objective(values: Values, value: Any = value) -> tuple[float, ...]:
-                    judged = self.judge(values)
-                    return (value(judged), *judged)
+                def objective(values: Values, scalar: Any = scalar) -> tuple[float, ...]:
+                    scores = self.evaluate(values)
+                    return (scalar(scores), *scores)
 
-                def show(count: int, best: float, done: int = len(points)) -> None:
+                def show(count: int, best: float, done: int = len(finished)) -> None:
                     if not bar.n:
                         bar.initial = count - 1
                     bar.set_postfix_str(f'best {best:.4f}', refresh=False)
                     bar.update(done + count - bar.n)
 
-                points += minimise(
-                    objective, space, each, seed=self.seed, jobs=jobs, storage=storage, name=name,
-                    sampler=sampler, on_trial=show, stopped=stopped,
-                ).trials  # fmt: skip
-                if stopped():
+                try:
+                    found = minimise(
+                        objective,
+                        space,
+                        each,
+                        options._replace(name=name),
+                        jobs=jobs,
+                        on_trial=show,
+                        stopped=stopped,
+                    )
+                except ConfigurationError as error:
+                    if not finished:
+                        raise
+                    failure = str(error)  # between two searches of a front
                     break
-        best = min(points, key=lambda point: marks(point).objective).parameters
+                finished += found.trials
+                failure = found.failure
+                if failure or stopped():
+                    break
+        best = min(finished, key=lambda trial: stored_scores(trial).objective).parameters
         rounded = {key: float(f'{v:.{DIGITS}g}') for key, v in best.items()}
-        if self.judge(rounded).objective <= (1.0 + LOSS) * self.judge(best).objective:
+        if self.evaluate(rounded).objective <= (1.0 + LOSS) * self.evaluate(best).objective:
             best = rounded
-        return Found(best, points, time.monotonic() - begin, pareto)
+        return TuningResult(best, finished, time.monotonic() - begin, pareto, failure)
 
 
-def _online(estimator: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in estimator.items() if k in ONLINE_PARAMETERS}
+def stored_scores(trial: FinishedTrial) -> TrialScores:
+    """Return the scores that were stored with a trial."""
+    return TrialScores(*trial.values[1:])
 
 
-def marks(point: Point) -> Marks:
-    """Return what was noted with a trial."""
-    return Marks(*point.values[1:])
-
-
-def front(points: Sequence[Point], second: str) -> list[Marks]:
-    """Return the marks that no other ones beat in error and in `second`, by error."""
-    found: list[Marks] = []
+def pareto_front(trials: Sequence[FinishedTrial], second: str) -> list[TrialScores]:
+    """Return the scores that no others dominate in error and in `second`, sorted by error."""
+    found: list[TrialScores] = []
     best = math.inf
-    for mark in sorted(map(marks, points), key=lambda m: (m.error, getattr(m, second))):
-        if getattr(mark, second) < best:
-            best = getattr(mark, second)
-            found.append(mark)
+    for scores in sorted(map(stored_scores, trials), key=lambda s: (s.error, getattr(s, second))):
+        if getattr(scores, second) < best:
+            best = getattr(scores, second)
+            found.append(scores)
     return found
 
 
-def _value(pareto: str | None, weight: float) -> Callable[[Marks], float]:
+def _scalar_objective(pareto: str | None, weight: float) -> Callable[[TrialScores], float]:
     if pareto is None:
-        return lambda mark: mark.objective
-    return lambda mark: mark.error + weight * float(getattr(mark, pareto))
+        return lambda scores: scores.objective
+    return lambda scores: scores.error + weight * float(getattr(scores, pareto))

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Arrays that compiled code uses without counting references.
+
+numba counts references atomically each time an array is handed from function to function, which
+costs more than the arithmetic of a step. A compiled function whose caller keeps its arrays alive
+for the whole call can use them without an owner instead.
+"""
+
+from typing import Any
+
+from numba import carray, njit, types  # type: ignore[attr-defined]
+from numba.extending import intrinsic
+
+
+def _unowned(typing_context: Any, value: Any) -> Any:
+    """Return the same array, or (named) tuple of arrays, without an owner."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _without_owner(context, builder, signature.args[0], arguments[0])
+
+    return value(value), generate
+
+
+def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    """Write the code that removes the reference to the owner from every array in `value`."""
+    if isinstance(kind, types.Array):
+        view = context.make_array(kind)(context, builder, value)
+        view.meminfo = view.meminfo.type(None)
+        return view._getvalue()
+    if isinstance(kind, types.BaseTuple):
+        members: Any = kind
+        parts = [
+            _without_owner(context, builder, member, builder.extract_value(value, index))
+            for index, member in enumerate(members)
+        ]
+        return context.make_tuple(builder, kind, parts)
+    return value
+
+
+unowned: Any = intrinsic(_unowned)
+"""
+Return an array, or a (named) tuple of arrays and numbers, without owners: for compiled code only.
+
+The result is valid while the caller's arrays live.
+"""
+
+
+def _pointer_to(kind: Any) -> Any:
+    """Return an intrinsic that makes a pointer of an address."""
+    pointer_type: Any = types.CPointer
+
+    def pointer(typing_context: Any, address: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+        return pointer_type(kind)(types.int64), generate
+
+    return intrinsic(pointer)
+
+
+_double_pointer, _integer_pointer = _pointer_to(types.float64), _pointer_to(types.int64)
+
+
+@njit(error_model='numpy', inline='always')
+def doubles_at(address: int, shape: Any) -> Any:
+    """Return the contiguous float64 array at an address, which its owner keeps alive."""
+    return carray(_double_pointer(address), shape)
+
+
+@njit(error_model='numpy', inline='always')
+def integers_at(address: int, shape: Any) -> Any:
+    """Return the contiguous int64 array at an address, which its owner keeps alive."""
+    return carray(_integer_pointer(address), shape)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the compiled observer works on, and where each quantity lives.
+
+Compiled functions take bundles of arrays: `Law` (a configuration), `Work` (scratch memory) and
+`State` (what the observer remembers).
+
+Rows of ``State.levels`` and ``Work.x``, column i - 1 for level i:
+
+| row | symbol | unit |
+|---|---|---|
+| HAT | filtered estimate z_hat_i | of z_i |
+| TILDE | internal state z_tilde_{i+1}; theta at the last level | of z_{i+1} |
+| HAT_SENSITIVITY | p_i = d z_hat_i / d gamma | of z_i |
+| TILDE_SENSITIVITY | q_i = d z_tilde_{i+1} / d gamma | of z_{i+1} |
+
+Entries of ``State.memory``:
+
+| index | symbol | unit |
+|---|---|---|
+| GAMMA | adaptive power gamma | 1 |
+| Y | last accepted sample of y, NaN before the first | of y |
+| PENDING | time of rejected samples, to be added to the next step | s |
+| WAIT | time for which the innovations have yet to stay small before gamma leaks | s |
+"""
+
+from typing import NamedTuple
+
+from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
+import numpy as np
+
+HAT, TILDE, HAT_SENSITIVITY, TILDE_SENSITIVITY = range(4)
+ROWS = 4
+GAMMA, Y, PENDING, WAIT = range(4)
+MEMORY = 4
+
+SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE = range(7)
+FLAGS = 7
+"""Number of flags of a law: 0 or 1 each. IMPLICIT: a step uses the sample at its end."""
+LAMBDA, ALPHA, INVERSE_WIDTH, DECAY = range(4)
+GAINS = 4
+"""
+Number of rows of gains. INVERSE_WIDTH is 1 / half-width. DECAY is that of the internal state, 0
+except for those that stand for the unknown input and its derivatives.
+"""
+EPSILON, GAMMA_INITIAL, RATE, MIN, MAX, DEAD_ZONE, LEAKAGE, DELAY = range(8)
+PREDICTION_STEP, CORRECTION_PERIOD = range(8, 10)
+SCALARS = 10
+"""Number of scalars of a law."""
+
+NEWTON_STEPS = 60
+NEWTON_TOLERANCE = 3e-8
+"""Relative change that ends the iteration; its square, about 1e-15, is the error that is left."""
+TINY = 1e-300
+"""Innovations below this are taken for 0: their powers would underflow."""
+
+
+class Law(NamedTuple):
+    """
+    What the compiled functions read of a configuration.
+
+    Attributes
+    ----------
+    flags : (FLAGS,) array
+        `SIGN` .. `SENSITIVE`.
+    gains : (GAINS, N) array
+        `LAMBDA` .. `DECAY` of each level.
+    curves : (N, K) array
+        psi of each level at K points of [0, half-width].
+    scalars : (SCALARS,) array
+        `EPSILON` .. `CORRECTION_PERIOD`.
+    model : Bytecode
+        Phi_1 .. Phi_n, and the model of the unknown input behind them (D 17).
+
+    """
+
+    flags: Ints
+    gains: Floats
+    curves: Floats
+    scalars: Floats
+    model: Bytecode
+
+
+class Work(NamedTuple):
+    """
+    Scratch memory of the compiled functions.
+
+    Attributes
+    ----------
+    x : (4, N) array
+        The levels while a step changes them.
+    stack : (2, depth) array
+        For the evaluation of expressions.
+    stages : (4, 2, n + 1 or N) array
+        Of the integrator; see core/model/integrate.py. A step has the measurements m_i of its
+        levels, and their sensitivities dm_i / dgamma, at ``stages[POINT]``.
+
+    """
+
+    x: Floats
+    stack: Floats
+    stages: Floats
+
+
+class State(NamedTuple):
+    """
+    What an observer remembers.
+
+    Attributes
+    ----------
+    levels : (4, N) array
+        `HAT` .. `TILDE_SENSITIVITY`.
+    memory : (4,) array
+        `GAMMA` .. `WAIT`.
+
+    """
+
+    levels: Floats
+    memory: Floats
+
+
+def make_work(law: Law, depth: int) -> Work:
+    """Return scratch memory for a law whose expressions need a stack of `depth`."""
+    levels, states = law.gains.shape[1], len(law.model.offsets) - 1
+    return Work(np.zeros((ROWS, levels)), np.zeros((2, depth)), np.zeros((4, 2, states)))
+
+
+@compiled(forceinline=True)
+def psi(law: Law, level: int, a: float) -> tuple[float, float]:
+    """Return psi at a = |eps| > 0 and its slope; psi is odd, so negative eps need no more."""
+    if law.flags[SIGN]:
+        return 1.0, 0.0
+    curves = law.curves
+    last = curves.shape[1] - 1
+    scale = law.gains[INVERSE_WIDTH, level] * last
+    position = a * scale
+    if not position < last:
+        return curves[level, last], 0.0
+    j = int(position)
+    rise = curves[level, j + 1] - curves[level, j]
+    return curves[level, j] + (position - j) * rise, rise * scale

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From checked parameters to the arrays of a law; here values are checked as a set."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer import arrays
+from fhaosmo_ros.core.observer.fuzzy import curve, KNOTS, terms_of_level
+from fhaosmo_ros.core.parameters.declaration import Parameter
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
+import numpy as np
+
+FIXED_GAMMA = 0.5
+"""Power of the variants that do not adapt (paper eq. triangularObserver, fuzzysuper)."""
+
+
+class ObserverConfiguration:
+    """
+    A valid set of observer parameters and the compiled law that it stands for.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Values by name, checked here unless they are `Parameters`; defaults for the rest.
+
+    Raises
+    ------
+    ConfigurationError
+        An unknown name, a bad value, or values that do not fit together.
+
+    """
+
+    def __init__(self, parameters: Mapping[str, Any]) -> None:
+        self.parameters = OBSERVER_PARAMETERS.complete(parameters)
+        self.model = TriangularModel(self.parameters['phi'], self.parameters['order'])
+        self._complete()
+
+    def changed(self, changes: Mapping[str, Any]) -> 'ObserverConfiguration':
+        """
+        Return a configuration with some live parameters changed.
+
+        Parameters
+        ----------
+        changes : mapping
+            Values to change, or complete `Parameters`.
+
+        Raises
+        ------
+        ConfigurationError
+            As the constructor, or a change of a parameter that can't change live.
+
+        """
+        other = object.__new__(ObserverConfiguration)
+        other.parameters = self.parameters.changed_live(changes, 'observer')
+        other.model = self.model
+        other._complete()
+        return other
+
+    def _complete(self) -> None:
+        p = self.parameters
+        if not p['gamma_min'] <= p['gamma_initial'] <= p['gamma_max']:
+            raise ConfigurationError(
+                "parameters 'gamma_min', 'gamma_initial', 'gamma_max': expected each at most the "
+                f'next one, got {p["gamma_min"]}, {p["gamma_initial"]}, {p["gamma_max"]}'
+            )
+        self.levant = p['structure'] == 'levant'
+        if self.levant and not p['unknown_input']:
+            raise ConfigurationError(
+                "parameters 'structure', 'unknown_input': levant estimates the unknown input as "
+                'its last level, expected unknown_input = true, got false'
+            )
+        if p['unknown_input_derivatives'] and not p['unknown_input']:
+            raise ConfigurationError(
+                "parameters 'unknown_input_derivatives', 'unknown_input': derivatives are levels "
+                'behind that of the unknown input, expected unknown_input = true or '
+                f'unknown_input_derivatives = 0, got false and {p["unknown_input_derivatives"]}'
+            )
+        if p['scheme'] == 'predict_correct' and not self.levant:
+            raise ConfigurationError(
+                "parameters 'scheme', 'structure': predict_correct is a scheme of levant alone, "
+                "expected structure = 'levant' or another scheme (explicit, implicit), got "
+                f'{p["structure"]!r} and {p["scheme"]!r}'
+            )
+        self.adaptive = p['variant'].endswith('_adaptive')
+        self.gamma_initial = p['gamma_initial'] if self.adaptive else FIXED_GAMMA
+        self.levels = self.model.order
+        if p['unknown_input']:
+            self.levels += 1 + p['unknown_input_derivatives']
+        self.initial_estimate = self._per_level('initial_estimate')
+        self.initial_internal = self._per_level('initial_internal')
+        if self.levant:
+            self.initial_internal = np.append(self.initial_estimate[1:], 0.0)
+        self.internal = p['estimate_from'] == 'internal'
+        n = self.model.order
+        filtered = not self.internal and self.levels > n
+        self.unknown_input_at = (arrays.HAT, n) if filtered else (arrays.TILDE, n - 1)
+        self.law = self._make_law()
+
+    def initial_state(self) -> arrays.State:
+        """Return the state of an observer that has seen no sample."""
+        levels, memory = np.zeros((arrays.ROWS, self.levels)), np.zeros(arrays.MEMORY)
+        levels[arrays.HAT] = self.initial_estimate
+        levels[arrays.TILDE] = self.initial_internal
+        memory[arrays.GAMMA] = self.gamma_initial
+        memory[arrays.Y] = np.nan
+        return arrays.State(levels, memory)
+
+    def _per_level(self, name: str) -> np.ndarray:
+        return per_level(OBSERVER_PARAMETERS[name], self.parameters[name], self.levels)
+
+    def _make_law(self) -> arrays.Law:
+        p, levels = self.parameters, self.levels
+        widths = p['fuzzy_widths']
+        if len(widths) > levels and widths != OBSERVER_PARAMETERS['fuzzy_widths'].default:
+            raise OBSERVER_PARAMETERS['fuzzy_widths'].error(
+                widths, f'1 to {levels} values (N = {levels} levels)'
+            )
+        widths = [widths[min(i, len(widths) - 1)] for i in range(levels)]
+        flags = np.zeros(arrays.FLAGS, dtype=np.int64)
+        flags[arrays.SIGN] = p['variant'].startswith('sign')
+        flags[arrays.IMPLICIT] = p['scheme'] != 'explicit'
+        flags[arrays.PREDICTING] = p['scheme'] == 'predict_correct'
+        flags[arrays.ADAPTIVE] = self.adaptive
+        flags[arrays.SENSITIVE] = self.adaptive and p['gamma_rate'] > 0.0
+        flags[arrays.FROM_MEASUREMENT] = p['start_from_measurement']
+        flags[arrays.LEVANT] = self.levant
+        if flags[arrays.SIGN]:  # they are not read
+            curves = np.ones((levels, KNOTS))
+        else:
+            curves = np.array(
+                [
+                    curve(terms_of_level(i + 1), p['fuzzy_shape'], p['fuzzy_normalise'])
+                    for i in range(levels)
+                ]
+            )
+        gains = np.zeros((arrays.GAINS, levels))
+        gains[arrays.LAMBDA] = self._per_level('lambda')
+        gains[arrays.ALPHA] = self._per_level('alpha')
+        gains[arrays.INVERSE_WIDTH] = 1.0 / np.array(widths)
+        decay, n = p['unknown_input_decay'], self.model.order
+        modelled = slice(n - 1, -1 if p['unknown_input'] else None)  # d, d', .. but not theta
+        gains[arrays.DECAY, modelled] = decay  # D 17, internal states
+        model = self.model.with_unknown_input(decay, p['unknown_input_derivatives'])
+        scalars = np.zeros(arrays.SCALARS)
+        scalars[arrays.EPSILON] = np.inf if self.levant else p['epsilon']  # no gates
+        scalars[arrays.GAMMA_INITIAL] = p['gamma_initial']
+        scalars[arrays.RATE] = p['gamma_rate']
+        scalars[arrays.MIN] = p['gamma_min']
+        scalars[arrays.MAX] = p['gamma_max']
+        scalars[arrays.DEAD_ZONE] = p['gamma_dead_zone']
+        scalars[arrays.LEAKAGE] = p['gamma_leakage']
+        scalars[arrays.DELAY] = p['gamma_leakage_delay']
+        scalars[arrays.PREDICTION_STEP] = p['prediction_step']
+        scalars[arrays.CORRECTION_PERIOD] = p['correction_period']
+        return arrays.Law(flags, gains, curves, scalars, model)
+
+
+def per_level(parameter: Parameter, values: list[float], count: int) -> np.ndarray:
+    """Return one value a level from a list of 1 or `count` values, or raise."""
+    if len(values) not in (1, count):
+        raise parameter.error(values, f'1 or {count} values')
+    return np.broadcast_to(np.array(values, dtype=np.float64), count).copy()

@@ -1,0 +1,444 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The observer: one sample at a time, or arrays of samples, by the same compiled recursion."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core.observer import arrays
+from fhaosmo_ros.core.observer import step as recursion
+from fhaosmo_ros.core.observer.arrays import Law, make_work, State, Work
+from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA, ObserverConfiguration
+from fhaosmo_ros.core.observer.status import flags, FLAGS_MASK, LEVEL_SHIFT, open_levels, Status
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class Estimate(NamedTuple):
+    """
+    What the observer knows after a sample.
+
+    Attributes
+    ----------
+    z : (n,) array
+        Estimated states; z[0] is z_hat_1, the others follow `estimate_from`.
+    unknown_input : float
+        Estimated d.
+    gamma : float
+        Power gamma in use.
+    innovation : (N,) array
+        eps_i = m_i - z_hat_i.
+    word : int
+        Status word; see `status` and `open_levels`.
+
+    """
+
+    z: NDArray[np.float64]
+    unknown_input: float
+    gamma: float
+    innovation: NDArray[np.float64]
+    word: int
+
+    @property
+    def status(self) -> Status:
+        """Flags of the step."""
+        return flags(self.word)
+
+    @property
+    def open_levels(self) -> int:
+        """Number of levels that run (the paper's E_i)."""
+        return open_levels(self.word)
+
+
+class Trajectory(NamedTuple):
+    """
+    Estimates of a run; row k belongs to ``t[k]``. Attributes as in `Estimate`.
+
+    Attributes
+    ----------
+    t : (K,) array
+        Times as given.
+    z : (K, n) array
+    unknown_input, gamma : (K,) arrays
+    innovation : (K, N) array
+    status, open_levels : (K,) integer arrays
+        Where `every` > 1, a row's flags are those of all samples since the row before it.
+    z_hat, z_tilde : (K, N) arrays
+        Filtered and internal states; z_tilde[:, i] belongs to z_{i+2}.
+
+    """
+
+    t: NDArray[Any]
+    z: NDArray[np.float64]
+    unknown_input: NDArray[np.float64]
+    gamma: NDArray[np.float64]
+    innovation: NDArray[np.float64]
+    status: NDArray[np.int64]
+    open_levels: NDArray[np.int64]
+    z_hat: NDArray[np.float64]
+    z_tilde: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ObserverState:
+    """
+    All that an observer remembers; a copy, safe to keep.
+
+    Attributes
+    ----------
+    levels : (4, N) array
+    memory : (4,) array
+        See `fhaosmo_ros.core.observer.arrays`.
+    t : float or int or None
+        Time of the last sample of `Observer.run`, in its unit (s, or ns for integers).
+
+    """
+
+    levels: NDArray[np.float64]
+    memory: NDArray[np.float64]
+    t: float | int | None = None
+
+
+def make_record(rows: int, levels: int, rows_of_eps: int) -> recursion.Record:
+    """Return memory for a compiled run to record into."""
+    return recursion.Record(
+        np.empty((rows, 2, levels)),
+        np.empty(rows),
+        np.empty((rows_of_eps, levels)),
+        np.empty(rows, dtype=np.int64),
+    )
+
+
+class Observer:
+    """
+    Fuzzy-based super-twisting adaptive-order sliding mode observer.
+
+    Parameters
+    ----------
+    parameters : mapping, optional
+        Values for the parameters in docs/parameters.md; defaults for the rest. `Parameters` have
+        been checked and are taken as they are.
+
+    Raises
+    ------
+    ConfigurationError
+        An unknown name, a bad value, or values that do not fit together.
+
+    Examples
+    --------
+    >>> observer = Observer({'order': 2, 'phi': ['0', '-z2'], 'lambda': 15, 'alpha': 30})
+    >>> observer.start(0.1).z
+    array([0.1, 0. ])
+    >>> observer.step(0.1, dt=0.001).status
+    <Status.OK: 0>
+
+    """
+
+    def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
+        self._configuration = ObserverConfiguration(parameters or {})
+        self._state = self._configuration.initial_state()
+        self._set_law()
+        self._eps = np.zeros((1, self._configuration.levels))
+        self._t: float | int | None = None
+        self._word = 0
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """All parameters with their present values; a copy."""
+        return dict(self._configuration.parameters)
+
+    @property
+    def order(self) -> int:
+        """Number of states n."""
+        return self._configuration.model.order
+
+    @property
+    def levels(self) -> int:
+        """Number of levels N."""
+        return self._configuration.levels
+
+    @property
+    def law(self) -> Law:
+        """What the compiled functions read of the parameters."""
+        return self._law
+
+    def make_work(self) -> Work:
+        """Return scratch memory for the compiled functions."""
+        return make_work(self._law, self._configuration.model.depth)
+
+    @property
+    def uses_input(self) -> bool:
+        """True if the model uses the known input u."""
+        return self._configuration.model.uses_input
+
+    @property
+    def started(self) -> bool:
+        """True once a sample has arrived."""
+        y = self._state.memory[arrays.Y]
+        return bool(y == y)  # NaN before the first sample; np.isnan costs half a microsecond
+
+    @property
+    def state(self) -> ObserverState:
+        """Snapshot of the state."""
+        levels, memory = self._state
+        return ObserverState(levels.copy(), memory.copy(), self._t)
+
+    def restore(self, state: ObserverState) -> None:
+        """
+        Go back to a snapshot, of this observer or of another one of the same size.
+
+        Raises
+        ------
+        ConfigurationError
+            The snapshot is of an observer with another number of levels.
+
+        """
+        if state.levels.shape != self._state.levels.shape:
+            raise ConfigurationError(
+                f'state: expected {self.levels} levels, got {state.levels.shape[-1]}'
+            )
+        self._write(state.levels, state.memory)
+        self._t = state.t
+        self._fit_memory()
+
+    def prepare(self, changes: Mapping[str, Any]) -> ObserverConfiguration:
+        """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
+        return self._configuration.changed(changes)
+
+    def configure(self, changes: Mapping[str, Any]) -> None:
+        """
+        Change parameters from the next sample on, without a jump of the estimate.
+
+        All or nothing: where anything is wrong, nothing has changed.
+
+        Raises
+        ------
+        ConfigurationError
+            As the constructor, or a change of a parameter that fixes the observer's size.
+
+        """
+        self.adopt(self.prepare(changes))
+
+    def adopt(self, configuration: ObserverConfiguration) -> None:
+        """Go on with a configuration that `prepare` has returned, from the next sample on."""
+        before = self._law.flags
+        self._configuration = configuration
+        self._set_law()
+        self._fit_memory()
+        after = self._law.flags
+        if not before[arrays.SENSITIVE] or before[arrays.LEVANT] != after[arrays.LEVANT]:
+            self._state.levels[arrays.HAT_SENSITIVITY :] = 0.0  # they were not carried along
+
+    def _set_law(self) -> None:
+        law = self._law = self._configuration.law
+        self._work = self.make_work()
+        flat_law = (law.flags, law.gains, law.curves, law.scalars, *law.model)
+        self._arguments = (*flat_law, *self._work, *self._state)
+
+    def _write(self, levels: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
+        self._state.levels[:] = levels
+        self._state.memory[:] = memory
+
+    def _fit_memory(self) -> None:
+        """Bring gamma within its bounds, and forget sensitivities that are not carried along."""
+        flags, c, (levels, memory) = self._law.flags, self._law.scalars, self._state
+        if flags[arrays.ADAPTIVE]:
+            memory[arrays.GAMMA] = np.clip(memory[arrays.GAMMA], c[arrays.MIN], c[arrays.MAX])
+        else:
+            memory[arrays.GAMMA] = FIXED_GAMMA
+        if not flags[arrays.SENSITIVE]:
+            levels[arrays.HAT_SENSITIVITY :] = 0.0
+
+    def reset(self) -> None:
+        """Go back to the initial state; the next sample is the first."""
+        self._write(*self.initial_state())
+        self._t = None
+
+    def initial_state(self) -> State:
+        """Return the state of this observer before its first sample."""
+        return self._configuration.initial_state()
+
+    def start(self, y: float) -> Estimate:
+        """Take the first sample: time has not passed yet, so nothing is integrated."""
+        self._word = recursion.start(self._law, self._state, float(y), self._eps, 0)
+        return self._estimate(self._word)
+
+    def step(self, y: float, dt: float, u: float = 0.0) -> Estimate:
+        """
+        Advance by `dt` to the sample `y`.
+
+        The explicit scheme integrates over the interval with the sample at its beginning, as
+        forward Euler does, so that `y` acts from the next step on; the implicit scheme uses `y`.
+
+        Parameters
+        ----------
+        y : float
+            Measured output at the end of the interval.
+        dt : float
+            Time since the previous call, in seconds, > 0.
+        u : float
+            Known input during the interval.
+
+        Returns
+        -------
+        Estimate
+            Bad data does not raise: `Estimate.status` says what was rejected, the state stays as
+            it was, and the time of a rejected sample is added to the next step (see `Status`).
+
+        """
+        word = self.advance(y, dt, u)
+        return self._estimate(word)
+
+    def advance(self, y: float, dt: float, u: float = 0.0) -> int:
+        """Do what `step` does and return only the status word; see `estimate`."""
+        if not self.started and np.isfinite(y):
+            self.start(y)
+        sample = float(y), float(dt), float(u), self._eps
+        self._word = recursion.step_once(*self._arguments, *sample)
+        return self._word
+
+    @property
+    def estimate(self) -> Estimate:
+        """Estimate of the present state, with the status of the last step."""
+        return self._estimate(self._word)
+
+    @property
+    def unknown_input(self) -> float:
+        """The estimate's unknown input alone, which costs less."""
+        return float(self._state.levels[self._configuration.unknown_input_at])
+
+    @property
+    def unknown_input_address(self) -> int:
+        """Where `unknown_input` lies in memory, for compiled functions; until `configure`."""
+        row, column = self._configuration.unknown_input_at
+        return int(self._state.levels[row, column:].ctypes.data)
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """
+        Arrays that compiled functions work on, one by one: of law, scratch memory and state.
+
+        For `step_once` and the policy's own entries; valid until the next `configure`.
+        """
+        return self._arguments
+
+    @property
+    def arrays(self) -> tuple[Law, Work, State]:
+        """The same as bundles, for runs of many samples."""
+        return self._law, self._work, self._state
+
+    @property
+    def innovations(self) -> NDArray[np.float64]:
+        """Innovations of the last step, (1, N); not a copy."""
+        return self._eps
+
+    def report(self, word: int) -> Estimate:
+        """Return the estimate of the present state after steps that ended with `word`."""
+        self._word = word
+        return self._estimate(word)
+
+    def _estimate(self, word: int) -> Estimate:
+        z, d = self.select(self._state.levels)
+        gamma = float(self._state.memory[arrays.GAMMA])
+        return Estimate(z, float(d), gamma, self._eps[0].copy(), word)
+
+    def select(self, levels: NDArray[Any]) -> tuple[NDArray[Any], Any]:
+        """Return copies of the estimates of z and d from arrays of shape (..., rows, N)."""
+        n = self.order
+        hat, tilde = levels[..., arrays.HAT, :], levels[..., arrays.TILDE, :]
+        z = hat[..., :n].copy()
+        if self._configuration.internal:
+            z[..., 1:] = tilde[..., : n - 1]
+        return z, levels[(..., *self._configuration.unknown_input_at)].copy()
+
+    def run(
+        self, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0, every: int = 1
+    ) -> Trajectory:
+        """
+        Step through arrays; the state goes on from where it is, so a run can be split.
+
+        Parameters
+        ----------
+        t : (K,) array
+            Sample times, in seconds, or in nanoseconds if integers. A sample that does not lie
+            after all samples before it is rejected.
+        y : (K,) array
+            Samples.
+        u : (K,) array or float
+            Known input during the interval that ends at each sample.
+        every : int
+            Record every `every`-th sample only.
+
+        Returns
+        -------
+        Trajectory
+            Row k is the estimate after sample ``(k + 1) * every - 1``. A fresh observer takes
+            the first sample as `start` does, else time goes on from the last run's last sample.
+
+        Raises
+        ------
+        ConfigurationError
+            Arrays whose shapes do not fit, or `every` < 1.
+
+        """
+        t, y = np.asarray(t), np.ascontiguousarray(y, dtype=np.float64)
+        if t.ndim != 1 or y.shape != t.shape:
+            raise ConfigurationError(
+                f'run: expected t and y with one dimension and equal length, '
+                f'got shapes {t.shape} and {y.shape}'
+            )
+        if every < 1:
+            raise ConfigurationError(f'run: expected every >= 1, got {every}')
+        u = np.asarray(u, dtype=np.float64)
+        if u.shape not in ((), y.shape):
+            raise ConfigurationError(
+                f'run: expected u to be a number or an array as long as y, got shapes {u.shape} '
+                f'and {y.shape}'
+            )
+        u = np.ascontiguousarray(np.broadcast_to(u, y.shape))
+        first = 0
+        if not self.started:
+            self._t = None
+            good = np.flatnonzero(np.isfinite(recursion.HEADROOM * y))
+            first = good[0] + 1 if len(good) else len(y)
+        samples = recursion.Samples(y, self._periods(t, first), u)
+        rows = len(y) // every
+        record = make_record(rows, self.levels, rows + 1)
+        recursion.run(self._law, self._work, self._state, samples, record, first, every)
+        recursion.innovations(self._law, self._state, self._state.memory[arrays.Y], self._eps, 0)
+        return self.trajectory(t[every - 1 :: every], record._replace(eps=record.eps[:rows]))
+
+    def trajectory(self, t: NDArray[Any], record: recursion.Record) -> Trajectory:
+        """Return what a compiled run has recorded; the last row is where this observer stands."""
+        words, levels = record.words, record.levels
+        if len(words):
+            self._word = int(words[-1])
+        z, d = self.select(levels)
+        return Trajectory(
+            t,
+            z,
+            d,
+            record.gamma,
+            record.eps,
+            words & FLAGS_MASK,
+            words >> LEVEL_SHIFT,
+            levels[:, arrays.HAT],
+            levels[:, arrays.TILDE],
+        )
+
+    def _periods(self, t: NDArray[Any], first: int) -> NDArray[np.float64]:
+        """Return the time of each sample since the latest sample before it, in seconds."""
+        integers = np.issubdtype(t.dtype, np.integer)
+        t = t.astype(np.int64 if integers else np.float64)
+        known = t if integers else np.where(np.isfinite(t), t, np.nan)
+        # Times before the first sample do not count.
+        known = known[max(first - 1, 0) :]
+        if not len(known):
+            return np.zeros(len(t))
+        start = self._t if self._t is not None else known[0]
+        latest = np.fmax.accumulate(np.concatenate([[start], known]).astype(t.dtype))
+        self._t = latest[-1].item()
+        h = np.zeros(len(t))
+        h[len(t) - len(known) :] = t[len(t) - len(known) :] - latest[:-1]
+        return h * 1e-9 if integers else h

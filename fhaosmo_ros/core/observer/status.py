@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a step reports beside its estimate: one integer, readable as flags and a level count."""
+
+from enum import IntFlag
+
+LEVEL_SHIFT = 16
+"""Bits from here on hold the number of open levels."""
+FLAGS_MASK = (1 << LEVEL_SHIFT) - 1
+"""The bits below it hold the flags."""
+
+
+class Status(IntFlag):
+    """
+    Flags of a step. The number of open levels is kept apart: see `open_levels`.
+
+    A rejected sample leaves the state as it was. The time it stood for is added to the next step,
+    except for `REJECTED_STEP`, which drops it, so that what could not be stepped over does not
+    come back. The flags after `SENSITIVITY_RESET` come from the policy of core/online only.
+    """
+
+    OK = 0
+    REJECTED_MEASUREMENT = 1  # y is NaN or infinite
+    REJECTED_PERIOD = 2  # dt is not a positive finite number
+    REJECTED_INPUT = 4  # u is NaN or infinite
+    REJECTED_STEP = 8  # the step would have left the finite numbers
+    GAMMA_AT_MIN = 16
+    GAMMA_AT_MAX = 32
+    SENSITIVITY_RESET = 64  # the sensitivities grew beyond use and start again at 0
+    REJECTED_SPIKE = 128  # y is further than spike_gate from its prediction
+    REJECTED_STUCK = 256  # y has not changed for stuck_time
+    HELD = 512  # with REJECTED_PERIOD: a jump of the stamp; the next sample decides
+    GAP = 1024  # a long interval was bridged in sub-steps
+    RESTARTED = 2048  # started afresh after a gap or a jump of the clock
+    DIVERGED = 4096  # the estimate had lost y and was restarted from it
+
+    @property
+    def rejected(self) -> bool:
+        """True if the sample was not used."""
+        return bool(int(self) & REJECTED)
+
+
+# The same flags as plain integers: compiled functions read them as constants, and an IntFlag costs
+# microseconds in a path that runs at 1 kHz.
+REJECTED_MEASUREMENT = int(Status.REJECTED_MEASUREMENT)
+REJECTED_PERIOD = int(Status.REJECTED_PERIOD)
+REJECTED_INPUT = int(Status.REJECTED_INPUT)
+REJECTED_STEP = int(Status.REJECTED_STEP)
+GAMMA_AT_MIN = int(Status.GAMMA_AT_MIN)
+GAMMA_AT_MAX = int(Status.GAMMA_AT_MAX)
+SENSITIVITY_RESET = int(Status.SENSITIVITY_RESET)
+REJECTED_SPIKE = int(Status.REJECTED_SPIKE)
+REJECTED_STUCK = int(Status.REJECTED_STUCK)
+HELD = int(Status.HELD)
+GAP = int(Status.GAP)
+RESTARTED = int(Status.RESTARTED)
+DIVERGED = int(Status.DIVERGED)
+REJECTED = (
+    REJECTED_MEASUREMENT
+    | REJECTED_PERIOD
+    | REJECTED_INPUT
+    | REJECTED_STEP
+    | REJECTED_SPIKE
+    | REJECTED_STUCK
+)
+"""Mask of the flags that say that a sample was not used."""
+
+
+def flags(word: int) -> Status:
+    """Return the flags of a step's status word."""
+    return Status(word & FLAGS_MASK)
+
+
+def open_levels(word: int) -> int:
+    """Return how many levels run: level i is open if |eps_j| <= epsilon for every j < i."""
+    return word >> LEVEL_SHIFT

@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+One step of either structure: what is rejected, the law of gamma, and runs of steps.
+
+Equations are cited as P (paper: label of the equation) and D (number in docs/mathematics.md).
+The arrays are described in arrays.py; the recursions are in cascade.py and levant.py.
+"""
+
+import math
+from typing import NamedTuple
+
+from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.compiled.unowned_arrays import unowned
+from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
+from fhaosmo_ros.core.observer import cascade, levant
+from fhaosmo_ros.core.observer.arrays import (
+    ADAPTIVE,
+    DEAD_ZONE,
+    DELAY,
+    EPSILON,
+    FROM_MEASUREMENT,
+    GAMMA,
+    GAMMA_INITIAL,
+    HAT,
+    HAT_SENSITIVITY,
+    IMPLICIT,
+    Law,
+    LEAKAGE,
+    LEVANT,
+    MAX,
+    MIN,
+    PENDING,
+    PREDICTING,
+    RATE,
+    ROWS,
+    State,
+    TILDE,
+    TILDE_SENSITIVITY,
+    WAIT,
+    Work,
+    Y,
+)
+from fhaosmo_ros.core.observer.status import (
+    FLAGS_MASK,
+    GAMMA_AT_MAX,
+    GAMMA_AT_MIN,
+    LEVEL_SHIFT,
+    REJECTED_INPUT,
+    REJECTED_MEASUREMENT,
+    REJECTED_PERIOD,
+    REJECTED_STEP,
+    SENSITIVITY_RESET,
+)
+
+SENSITIVITY_LIMIT = 1e9
+"""Sensitivities beyond it are set to 0."""
+HEADROOM = 1e8
+"""Reject values above DBL_MAX / HEADROOM, so that differences cannot overflow."""
+
+
+class Samples(NamedTuple):
+    """Samples of a run: y, and the time (s) and known input of the interval that ends at each."""
+
+    y: Floats
+    h: Floats
+    u: Floats
+
+
+class Record(NamedTuple):
+    """
+    What a run records, a row for each recorded sample.
+
+    Attributes
+    ----------
+    levels : (rows, 2, N) array
+        `HAT` and `TILDE`.
+    gamma : (rows,) array
+    eps : (rows or rows + 1, N) array
+        Innovations; a run that skips samples needs the row more.
+    words : (rows,) array
+        Status words.
+
+    """
+
+    levels: Floats
+    gamma: Floats
+    eps: Floats
+    words: Ints
+
+
+@compiled(forceinline=True)
+def innovations(law: Law, state: State, y: float, eps: Floats, row: int) -> int:
+    """Write eps_i = m_i - z_hat_i into a row of `eps`; return the number of open levels."""
+    levels, epsilon = state.levels, law.scalars[EPSILON]
+    count, running = 0, True
+    for i in range(levels.shape[1]):
+        m = y if i == 0 else levels[TILDE, i - 1]
+        eps[row, i] = m - levels[HAT, i]
+        if running:
+            count += 1
+        running = running and abs(eps[row, i]) <= epsilon  # P Eifunction
+    return count
+
+
+@compiled(forceinline=True)
+def start(law: Law, state: State, y: float, eps: Floats, row: int) -> int:
+    """
+    Take `y` as the first sample: no time has passed, so nothing is integrated.
+
+    Returns
+    -------
+    int
+        Status word (see status.py).
+
+    """
+    word, memory = 0, state.memory
+    if math.isfinite(HEADROOM * y):
+        memory[Y] = y
+        memory[PENDING] = 0.0
+        if law.flags[FROM_MEASUREMENT]:
+            state.levels[HAT, 0] = y
+    else:
+        word = REJECTED_MEASUREMENT
+    return word | (innovations(law, state, memory[Y], eps, row) << LEVEL_SHIFT)
+
+
+@compiled(forceinline=True)
+def step(
+    law: Law, work: Work, state: State, y: float, h: float, u: float, eps: Floats, row: int
+) -> int:
+    """
+    Advance a state in place to the sample `y` that lies `h` seconds after the last call.
+
+    Returns
+    -------
+    int
+        Status word (see status.py). A rejected sample changes no level; see `Status`.
+
+    """
+    x, levels, memory, n = work.x, state.levels, state.memory, law.gains.shape[1]
+    word = 0
+    if not math.isfinite(HEADROOM * y):
+        word |= REJECTED_MEASUREMENT
+    if not math.isfinite(u):
+        word |= REJECTED_INPUT
+    if not (h > 0.0 and math.isfinite(HEADROOM * h)):
+        word |= REJECTED_PERIOD
+    if not word:
+        for r in range(ROWS):
+            for i in range(n):
+                x[r, i] = levels[r, i]
+        whole = h + memory[PENDING]
+        loss, gradient = advance(law, work, memory, y, whole, u)
+        zero = 0.0
+        for i in range(n):
+            hat, tilde = HEADROOM * x[HAT, i], HEADROOM * x[TILDE, i]
+            zero += (hat - hat) + (tilde - tilde)
+        if zero != 0.0:  # a difference of equals is 0, and NaN if they are not finite
+            word = REJECTED_STEP
+            # Nothing of the sample may make the next step fail as well: not its time, and not
+            # the y at the interval's beginning, which is what fails explicitly.
+            memory[PENDING] = 0.0
+            if not law.flags[IMPLICIT]:
+                memory[Y] = y
+        else:
+            if law.flags[ADAPTIVE]:
+                word = adapt(law.scalars, x, memory, whole, loss, gradient)
+            for r in range(ROWS):
+                for i in range(n):
+                    levels[r, i] = x[r, i]
+            memory[Y] = y
+            memory[PENDING] = 0.0
+    if word & (REJECTED_MEASUREMENT | REJECTED_INPUT) and not word & REJECTED_PERIOD:
+        memory[PENDING] += h
+    return word | (innovations(law, state, memory[Y], eps, row) << LEVEL_SHIFT)
+
+
+@compiled(forceinline=True)
+def advance(
+    law: Law, work: Work, memory: Floats, y: float, h: float, u: float
+) -> tuple[float, float]:
+    """Advance ``work.x`` by the structure and scheme of the law; return L and dL/dgamma."""
+    flags, gamma = law.flags, memory[GAMMA]
+    if flags[LEVANT]:
+        if flags[PREDICTING]:
+            return levant.predict_correct(law, work, gamma, y, h, u)
+        if flags[IMPLICIT]:
+            return levant.implicit(law, work, gamma, y, h, u)
+        return levant.explicit(law, work, gamma, memory[Y], h, u)
+    if flags[IMPLICIT]:
+        return cascade.implicit(law, work, gamma, y, h, u)
+    return cascade.explicit(law, work, gamma, memory[Y], h, u)
+
+
+@compiled(forceinline=True)
+def adapt(c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient: float) -> int:
+    """
+    Change gamma (P adaptationlawgamma) and the time to wait in `memory`; return status flags.
+
+    Projection on [gamma_min, gamma_max], dead zone and leakage are ours (D 8).
+    """
+    word, gamma = 0, memory[GAMMA]
+    zero = gradient - gradient
+    for r in (HAT_SENSITIVITY, TILDE_SENSITIVITY):
+        for i in range(x.shape[1]):
+            if not abs(x[r, i]) < SENSITIVITY_LIMIT:
+                word = SENSITIVITY_RESET
+    if word or zero != 0.0:
+        word = SENSITIVITY_RESET
+        for r in (HAT_SENSITIVITY, TILDE_SENSITIVITY):
+            for i in range(x.shape[1]):
+                x[r, i] = 0.0
+    leaks = c[DEAD_ZONE] == 0.0
+    if loss <= c[DEAD_ZONE] * c[DEAD_ZONE]:  # adaptation rests
+        leaks = leaks or memory[WAIT] <= 0.0
+        memory[WAIT] = max(memory[WAIT] - h, 0.0)
+    else:
+        memory[WAIT] = c[DELAY]
+        if not word:
+            gamma -= h * c[RATE] * gradient  # P adaptationlawgamma
+    if leaks:
+        gamma -= min(h * c[LEAKAGE], 1.0) * (gamma - c[GAMMA_INITIAL])
+    if not gamma > c[MIN]:  # also for NaN, from an infinite gradient step
+        gamma = c[MIN]
+        word |= GAMMA_AT_MIN
+    elif gamma >= c[MAX]:
+        gamma = c[MAX]
+        word |= GAMMA_AT_MAX
+    memory[GAMMA] = gamma
+    return word
+
+
+@compiled()
+def step_once(
+    flags: Ints,
+    gains: Floats,
+    curves: Floats,
+    scalars: Floats,
+    code: Floats,
+    offsets: Ints,
+    x: Floats,
+    stack: Floats,
+    stages: Floats,
+    levels: Floats,
+    memory: Floats,
+    y: float,
+    h: float,
+    u: float,
+    eps: Floats,
+) -> int:
+    """
+    Advance by one sample; see `step`. The innovations go to eps[0].
+
+    Takes the contents of the bundles, because Python calls it for every sample: handing over a
+    named tuple costs some 3 microseconds a call.
+    """
+    law = unowned(Law(flags, gains, curves, scalars, Bytecode(code, offsets)))
+    work, state = unowned(Work(x, stack, stages)), unowned(State(levels, memory))
+    return step(law, work, state, y, h, u, unowned(eps), 0)
+
+
+@compiled()
+def run(
+    law: Law, work: Work, state: State, samples: Samples, record: Record, first: int, every: int
+) -> None:
+    """
+    Start with the samples before index `first`, step from it on; record every `every`-th one.
+
+    Row r of the record is the state after sample (r + 1) * every - 1; its flags are those of all
+    samples since the row before it.
+    """
+    law, work, state = unowned(law), unowned(work), unowned(state)
+    levels, memory, eps = state.levels, state.memory, unowned(record.eps)
+    row, seen = 0, 0
+    for k in range(samples.y.shape[0]):
+        if k >= first:
+            word = step(law, work, state, samples.y[k], samples.h[k], samples.u[k], eps, row)
+        else:
+            word = start(law, state, samples.y[k], eps, row)
+        seen |= word & FLAGS_MASK
+        if (k + 1) % every == 0:
+            for i in range(levels.shape[1]):
+                record.levels[row, HAT, i] = levels[HAT, i]
+                record.levels[row, TILDE, i] = levels[TILDE, i]
+            record.gamma[row] = memory[GAMMA]
+            record.words[row] = (word >> LEVEL_SHIFT << LEVEL_SHIFT) | seen
+            seen = 0
+            row += 1

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Many estimators stepped in one compiled call, each through the policy of a single one.
+
+The estimators keep their own arrays, of whatever size. A table says where these lie, so a call
+costs the same whether it steps one channel or fifty.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.compiled.unowned_arrays import doubles_at, integers_at
+from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
+from fhaosmo_ros.core.observer.arrays import Law, State, Work
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.memory import EstimatorArrays, Policy
+from fhaosmo_ros.core.online.policy import take
+import numpy as np
+from numpy.typing import NDArray
+
+(
+    EPS,
+    INTS,
+    REALS,
+    FLAGS,
+    GAINS,
+    CURVES,
+    SCALARS,
+    CODE,
+    OFFSETS,
+    X,
+    STACK,
+    STAGES,
+    LEVELS,
+    MEMORY,
+    UNKNOWN_INPUT,
+) = range(15)
+"""Index in the table: the arrays of `OnlineEstimator.arguments`, then the estimate of d."""
+
+
+class ChannelSamples(NamedTuple):
+    """Samples of several channels in the order in which they came."""
+
+    channel: Ints
+    stamps: Ints
+    y: Floats
+    u: Floats
+
+
+@compiled(inline='always')
+def plane_at(t: Ints, index: int) -> Any:
+    """Return the two-dimensional array that a channel's part of the table names."""
+    return doubles_at(t[index, 0], (t[index, 1], t[index, 2]))
+
+
+@compiled(inline='always')
+def line_at(t: Ints, index: int) -> Any:
+    """Return the array of doubles that a channel's part of the table names."""
+    return doubles_at(t[index, 0], t[index, 2])
+
+
+@compiled(inline='always')
+def integers_of(t: Ints, index: int) -> Any:
+    """Return the array of integers that a channel's part of the table names."""
+    return integers_at(t[index, 0], t[index, 2])
+
+
+@compiled(inline='always')
+def arrays_at(t: Ints) -> EstimatorArrays:
+    """Return the arrays of the estimator that a channel's part of the table names."""
+    model = Bytecode(plane_at(t, CODE), integers_of(t, OFFSETS))
+    law = Law(
+        integers_of(t, FLAGS), plane_at(t, GAINS), plane_at(t, CURVES), line_at(t, SCALARS), model
+    )
+    stages = doubles_at(t[STAGES, 0], (4, 2, t[STAGES, 2]))
+    work = Work(plane_at(t, X), plane_at(t, STACK), stages)
+    state = State(plane_at(t, LEVELS), line_at(t, MEMORY))
+    return EstimatorArrays(law, work, state, Policy(integers_of(t, INTS), line_at(t, REALS)))
+
+
+@compiled()
+def take_many(table: Ints, samples: ChannelSamples, words: Ints, unknown_inputs: Floats) -> None:
+    """
+    Take samples in order, each by the estimator of its channel.
+
+    Parameters
+    ----------
+    table : (m, 15, 3) array
+        Address, rows (of two dimensions) and columns of each array of each channel.
+    samples : ChannelSamples
+        K samples.
+    words, unknown_inputs : (K,) arrays
+        Get the status word and the estimate of d after each sample.
+
+    """
+    for k in range(samples.y.shape[0]):
+        t = table[samples.channel[k]]
+        words[k] = take(
+            arrays_at(t), samples.stamps[k], samples.y[k], samples.u[k], plane_at(t, EPS), 0
+        )
+        unknown_inputs[k] = doubles_at(t[UNKNOWN_INPUT, 0], 1)[0]
+
+
+class EstimatorBatch:
+    """
+    Estimators that take their samples in one call.
+
+    Parameters
+    ----------
+    estimators : sequence of OnlineEstimator
+        Channel c is the c-th one. They remain usable by themselves.
+
+    """
+
+    def __init__(self, estimators: Sequence[OnlineEstimator]) -> None:
+        self._estimators = list(estimators)
+        self._arguments: list[tuple[Any, ...]] = [()] * len(self._estimators)
+        self._table = np.zeros((len(self._estimators), UNKNOWN_INPUT + 1, 3), dtype=np.int64)
+
+    def advance(
+        self, channel: Sequence[int], stamps: Sequence[int], y: Sequence[float], u: Sequence[float]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """
+        Take samples in order, bit for bit as their estimators would take them one by one.
+
+        Parameters
+        ----------
+        channel : sequence of int
+            Which estimator takes each sample.
+        stamps, y, u : sequences
+            Of each sample; u is finite.
+
+        Returns
+        -------
+        (K,) array of int, (K,) array
+            Status word, and estimate of d, after each sample.
+
+        """
+        for c, estimator in enumerate(self._estimators):
+            if estimator.arguments is not self._arguments[c]:
+                self._place(c, estimator)
+        numbers = np.array(channel, dtype=np.int64)
+        words = np.empty(len(numbers), dtype=np.int64)
+        unknown_inputs = np.empty(len(numbers))
+        samples = ChannelSamples(
+            numbers,
+            np.array(stamps, dtype=np.int64),
+            np.array(y, dtype=np.float64),
+            np.array(u, dtype=np.float64),
+        )
+        take_many(self._table, samples, words, unknown_inputs)
+        for c, word in dict(zip(channel, words.tolist(), strict=True)).items():
+            self._estimators[c].taken(word)
+        return words, unknown_inputs
+
+    def _place(self, c: int, estimator: OnlineEstimator) -> None:
+        """Write where a channel's arrays are; holding them keeps them there."""
+        self._arguments[c] = estimator.arguments
+        for index, array in enumerate(estimator.arguments):
+            if not array.flags.c_contiguous:
+                raise AssertionError(f'argument {index} of a channel is not contiguous')
+            rows = array.shape[0] if array.ndim == 2 else 0
+            self._table[c, index] = array.ctypes.data, rows, array.shape[-1]
+        self._table[c, UNKNOWN_INPUT, 0] = estimator.observer.unknown_input_address

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What has happened to the samples, one number for each case of docs/operation.md."""
+
+from typing import NamedTuple
+
+
+class Counters(NamedTuple):
+    """
+    Numbers since the estimator was made; a snapshot. A reset does not clear them.
+
+    The compiled policy (policy.py) counts into an array in this order.
+    """
+
+    accepted: int = 0
+    """Samples used."""
+
+    rejected_measurements: int = 0
+    """y was NaN, infinite or beyond divergence_limit."""
+    rejected_spikes: int = 0
+    """y lay further than spike_gate from its prediction."""
+    rejected_stuck: int = 0
+    """y had not changed for stuck_time."""
+    rejected_steps: int = 0
+    """The step would have left the finite numbers."""
+    duplicate_stamps: int = 0
+    """The stamp was that of the sample before (sampling = source_stamp)."""
+    backward_stamps: int = 0
+    """The stamp was older than that of the sample before, by at most max_gap: a late sample."""
+    zero_stamps: int = 0
+    """The stamp was 0: no time yet (use_sim_time before the first /clock, an unset header)."""
+    far_stamps: int = 0
+    """The stamp lay more than max_gap from the one before: held until the next sample decides;
+    where that one confirms the jump, the observer starts from the held sample after all."""
+    rejected_inputs: int = 0
+    """u was NaN or infinite; the one before is held."""
+
+    gaps: int = 0
+    """Intervals longer than max_step that were bridged in sub-steps."""
+    sub_steps: int = 0
+    """Steps that these took."""
+    withdrawn_gaps: int = 0
+    """Bridged gaps that the next stamp disproved: taken back, with the sample that ended them."""
+    spread_stamps: int = 0
+    """Samples that came at the same clock time as the one before (sampling = clock): spread."""
+    bursts: int = 0
+    """Samples that came within a tenth of the mean interval after the one before."""
+    spikes_believed: int = 0
+    """Times that spike_gate_samples in a row lay beyond the gate: a real step of y."""
+    stuck: int = 0
+    """Times that y began to be stuck."""
+    restarts_forward: int = 0
+    """Restarts because of a gap longer than max_gap, or a clock that jumped forward."""
+    restarts_backward: int = 0
+    """Restarts because of a clock that jumped back (bag loop, simulator reset)."""
+    divergences: int = 0
+    """Times that the observer had lost y and was restarted from it."""
+
+    @property
+    def rejected_stamps(self) -> int:
+        """Samples that were not used, or not in the end, because of their stamp."""
+        return (
+            self.duplicate_stamps
+            + self.backward_stamps
+            + self.zero_stamps
+            + self.far_stamps
+            + self.withdrawn_gaps
+        )
+
+    @property
+    def rejected(self) -> int:
+        """Samples of y that were not used."""
+        return sum(getattr(self, name) for name in UNUSED_SAMPLES)
+
+    @property
+    def restarts(self) -> int:
+        """Starts from a new sample after a gap or a jump of time."""
+        return self.restarts_forward + self.restarts_backward
+
+
+UNUSED_SAMPLES = (
+    'rejected_measurements', 'rejected_spikes', 'rejected_stuck', 'rejected_steps',
+    'duplicate_stamps', 'backward_stamps', 'zero_stamps', 'far_stamps', 'withdrawn_gaps',
+)  # fmt: skip
+"""Counters that together are `Counters.rejected`."""

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The policy's steps (see policy.py): from one used sample to the next, also through a gap."""
+
+from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.model.bytecode import Floats
+from fhaosmo_ros.core.model.integrate import NOW
+from fhaosmo_ros.core.observer.arrays import GAMMA, PREDICTING, Y
+from fhaosmo_ros.core.observer.prediction import (
+    begin_at_estimates,
+    predict_step,
+    predicted_measurement,
+)
+from fhaosmo_ros.core.observer.status import (
+    FLAGS_MASK,
+    GAP,
+    LEVEL_SHIFT,
+    REJECTED,
+    REJECTED_SPIKE,
+)
+from fhaosmo_ros.core.observer.step import innovations, step
+from fhaosmo_ros.core.online import memory as at
+from fhaosmo_ros.core.online.memory import EstimatorArrays, Policy
+from fhaosmo_ros.core.online.outliers import is_spike
+from fhaosmo_ros.core.online.stamps import restore, save, update_mean, WINDOW
+
+NANOSECONDS = 1e-9
+GAP_RATIO = 2.0
+"""With max_step = 0 an interval of more mean intervals than this is a gap."""
+MOST_SUB_STEPS = 10_000
+"""Bounds what one sample may cost: a few milliseconds."""
+
+
+@compiled(inline='always')
+def sub_steps(policy: Policy, elapsed: int) -> int:
+    """Return the number of steps that an interval is divided into: more than 1 for a gap."""
+    longest, mean = policy.ints[at.MAX_STEP], policy.reals[at.INTERVAL]
+    if longest:
+        if elapsed > longest:
+            return int(min(-(-elapsed // longest), MOST_SUB_STEPS))
+    elif policy.ints[at.INTERVALS] == WINDOW and elapsed > GAP_RATIO * mean:
+        return int(min(elapsed / mean + 0.5, MOST_SUB_STEPS))
+    return 1
+
+
+@compiled(inline='always')
+def step_over(e: EstimatorArrays, elapsed: int, y: float, u: float, eps: Floats, row: int) -> int:
+    """
+    Step to a sample `elapsed` later, through a gap in sub-steps; return the status word.
+
+    In a gap the observer sees y as the model continues it from the last sample and the internal
+    estimates, plus a straight line that ends in the new sample. The scheme predict_correct follows
+    the model by itself, so it takes a gap in one step.
+    """
+    law, work, state, policy = e
+    ints, reals, memory = policy.ints, policy.reals, state.memory
+    count = sub_steps(policy, elapsed)
+    is_gap = count > 1
+    if law.flags[PREDICTING]:
+        count = 1
+    h = elapsed * NANOSECONDS / count
+    gamma, word, bend, modelled = memory[GAMMA], 0, 0.0, True
+    if count > 1 or reals[at.GATE] > 0.0:
+        end = predicted_measurement(law, work, state, h, u, count)
+        modelled = abs(end) <= reals[at.LIMIT]  # False for NaN
+        if not modelled:
+            end = memory[Y]
+        if reals[at.GATE] > 0.0 and is_spike(policy, y - end):
+            return REJECTED_SPIKE
+        bend = (y - end) / count
+        begin_at_estimates(work, state)
+    ints[at.BRIDGED] = 0
+    if is_gap:
+        save(policy, state)
+        ints[at.BRIDGED] = 1
+        ints[at.BEFORE] = ints[at.LATEST]
+        ints[at.GAPS] += 1
+        ints[at.SUB_STEPS] += count
+        word = GAP
+    for k in range(1, count + 1):
+        sample = y
+        if k < count:  # then the scheme is not predict_correct, which needs work.stages itself
+            if modelled:
+                predict_step(law, work, h, u)
+            sample = work.stages[NOW, 0, 0] + k * bend
+        word = word & FLAGS_MASK | step(law, work, state, sample, h, u, eps, row)
+        if ints[at.FROZEN]:
+            memory[GAMMA] = gamma
+        if word & REJECTED:
+            break
+    if not word & REJECTED:
+        update_mean(policy, elapsed)
+    elif is_gap:
+        restore(policy, state)
+        memory[Y] = y  # as where a single step fails
+        word = word & FLAGS_MASK | innovations(law, state, y, eps, row) << LEVEL_SHIFT
+    return word

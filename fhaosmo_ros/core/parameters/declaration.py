@@ -1,0 +1,344 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a parameter is: declared once, checked everywhere by the same rules."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+import difflib
+import math
+from typing import Any, TypeAlias
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.yaml_text import parse
+import numpy as np
+
+Value: TypeAlias = bool | int | float | str | list[float] | list[str]
+
+KINDS = {
+    'bool': 'true or false',
+    'int': 'an integer',
+    'double': 'a number',
+    'string': 'a string',
+    'double_array': 'a list of numbers',
+    'string_array': 'a list of strings',
+}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """
+    One parameter: the only place where its name, default, unit, bounds and text stand.
+
+    Attributes
+    ----------
+    name : str
+        Name in YAML, on the command line and in ROS.
+    default : Value
+        Its type decides the parameter's type.
+    text : str
+        What it does, one or two sentences.
+    unit : str
+        SI unit, empty where there is none.
+    lower, upper : float or None
+        Allowed interval, of each element for a list; None for no bound.
+    lower_open : bool
+        True where `lower` itself is not allowed.
+    choices : tuple of str
+        Allowed values of a string.
+    live : bool
+        False where it can't change in a running node (read-only in ROS).
+    lengths : str
+        Allowed numbers of values of a list, in words, for the documentation.
+
+    """
+
+    name: str
+    default: Value
+    text: str
+    unit: str = ''
+    lower: float | None = None
+    upper: float | None = None
+    lower_open: bool = False
+    choices: tuple[str, ...] = ()
+    live: bool = True
+    lengths: str = ''
+
+    @property
+    def kind(self) -> str:
+        """One of the keys of `KINDS`."""
+        if isinstance(self.default, bool):
+            return 'bool'
+        if isinstance(self.default, int):
+            return 'int'
+        if isinstance(self.default, float):
+            return 'double'
+        if isinstance(self.default, str):
+            return 'string'
+        return 'string_array' if isinstance(self.default[0], str) else 'double_array'
+
+    @property
+    def slider(self) -> bool:
+        """
+        True if the bounds of a number are a range to choose from.
+
+        Else they only keep out what cannot be meant. A slider has 100 steps: one of them must not
+        exceed the default, nor 1 for an integer.
+        """
+        if self.kind not in ('int', 'double') or self.lower is None or self.upper is None:
+            return False
+        step = abs(float(self.default))  # type: ignore[arg-type]
+        return self.upper - self.lower <= 100.0 * (max(step, 1.0) if self.kind == 'int' else step)
+
+    @property
+    def logarithmic(self) -> bool:
+        """True if sensible values spread over powers of ten, so that factors count."""
+        positive = self.lower is not None and self.lower >= 0.0
+        return self.kind in ('double', 'double_array') and positive and not self.slider
+
+    @property
+    def allowed(self) -> str:
+        """Allowed values, in words."""
+        if self.choices:
+            return 'one of ' + ', '.join(self.choices)
+        text = KINDS[self.kind]
+        if self.lower is not None:
+            text += f' {">" if self.lower_open else ">="} {self.lower:g}'
+        if self.upper is not None:
+            text += f'{" and" if self.lower is not None else ""} <= {self.upper:g}'
+        return text + (f' [{self.unit}]' if self.unit else '')
+
+    def coerce(self, value: Any) -> Value:
+        """
+        Return `value` in the parameter's own type, or raise.
+
+        An integer is accepted where a number is meant, and so is a list that a command line
+        delivered as text because it mixes both (``"[15, 15.5]"``).
+
+        Raises
+        ------
+        ConfigurationError
+            Wrong type, out of bounds, not finite or not one of the choices.
+
+        """
+        original = value
+        if isinstance(value, str) and self.kind in ('double_array', 'string_array'):
+            try:
+                value = parse(value)
+            except ConfigurationError:
+                raise self.error(original) from None
+        if isinstance(value, np.ndarray | np.generic):
+            value = value.tolist()
+        checked = self._typed(value)
+        if checked is None:
+            raise self.error(original)
+        items = checked if isinstance(checked, list) else [checked]
+        if not items or not all(self._within(item) for item in items):
+            raise self.error(original)
+        return checked
+
+    def _typed(self, value: Any) -> Value | None:
+        kind = self.kind
+        if kind == 'bool':
+            return value if isinstance(value, bool) else None
+        if kind == 'int':
+            return value if isinstance(value, int) and not isinstance(value, bool) else None
+        if kind == 'double':
+            return _number(value)
+        if kind == 'string':
+            return value if isinstance(value, str) else None
+        if kind == 'double_array' and _number(value) is not None:
+            value = [value]  # one number for every level
+        # Not only list and tuple: rclpy delivers array.array.
+        if isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
+            return None
+        if kind == 'string_array':
+            # A bare 0 in `phi: [0, 0, -z3]` is a number to YAML and an expression to its writer.
+            texts = [v if isinstance(v, str) else _expression_text(v) for v in value]
+            return None if any(v is None for v in texts) else [v for v in texts if v is not None]
+        numbers = [_number(v) for v in value]
+        return None if any(v is None for v in numbers) else [v for v in numbers if v is not None]
+
+    def _within(self, item: Any) -> bool:
+        if isinstance(item, str):
+            return not self.choices or item in self.choices
+        if isinstance(item, bool):
+            return True
+        if isinstance(item, float) and not math.isfinite(item):
+            return False
+        if self.lower is not None and (
+            item < self.lower or (self.lower_open and item == self.lower)
+        ):
+            return False
+        return self.upper is None or item <= self.upper
+
+    def error(self, value: Any, allowed: str | None = None) -> ConfigurationError:
+        """Build the error for `value`: what was wrong, what is allowed, what arrived."""
+        expected = allowed or self.allowed
+        message = f"parameter '{self.name}': expected {expected}, got {shown(value)}"
+        if self.choices and isinstance(value, str):
+            message += suggestion(value, self.choices)
+        return ConfigurationError(message)
+
+
+class ParameterTable(Mapping[str, Parameter]):
+    """Parameters by name, in the order in which they are declared."""
+
+    def __init__(self, *groups: Iterable[Parameter]) -> None:
+        self._by_name = {p.name: p for group in groups for p in group}
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self._by_name[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._by_name)
+
+    def __len__(self) -> int:
+        return len(self._by_name)
+
+    def defaults(self) -> dict[str, Any]:
+        """Return a fresh dictionary of the defaults."""
+        return {
+            p.name: list(p.default) if isinstance(p.default, list) else p.default
+            for p in self.values()
+        }
+
+    def complete(self, values: 'Mapping[str, Any] | None' = None) -> 'Parameters':
+        """
+        Return the values of all parameters: those given, checked, and defaults for the rest.
+
+        `Parameters` of any table have been checked already and are not checked again: of a larger
+        table the part that this one declares is taken.
+
+        Raises
+        ------
+        ConfigurationError
+            An unknown name (with the closest known one), or a bad value.
+
+        """
+        if isinstance(values, Parameters):
+            if values.table is self:
+                return values
+            return Parameters(self, {name: values[name] for name in self if name in values})
+        return Parameters(self, self.coerce(values or {}))
+
+    def coerce(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """
+        Check names, types and bounds of `values`; what is absent stays absent.
+
+        Raises
+        ------
+        ConfigurationError
+            An unknown name (with the closest known one), or a bad value.
+
+        """
+        for name in values:
+            if name not in self:
+                raise unknown_parameter(name, self)
+        return {name: self[name].coerce(value) for name, value in values.items()}
+
+
+class Parameters(Mapping[str, Any]):
+    """
+    Values of all parameters of a table, checked once and each in its own type; not to be changed.
+
+    `ParameterTable.complete` makes them where values enter the package. Code that receives them
+    does not check them again.
+
+    Attributes
+    ----------
+    table : ParameterTable
+        What they are the values of.
+
+    """
+
+    def __init__(self, table: ParameterTable, checked: Mapping[str, Any]) -> None:
+        self.table = table
+        self._values = table.defaults() | dict(checked)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __repr__(self) -> str:
+        return f'Parameters({self._values!r})'
+
+    def changed(self, changes: Mapping[str, Any]) -> 'Parameters':
+        """
+        Return these values with some changed; only the changes are checked.
+
+        Raises
+        ------
+        ConfigurationError
+            An unknown name or a bad value.
+
+        """
+        if isinstance(changes, Parameters):
+            return self.table.complete(changes)
+        return Parameters(self.table, self._values | self.table.coerce(changes))
+
+    def changed_live(self, changes: Mapping[str, Any], running: str) -> 'Parameters':
+        """
+        Return these values with some changed while something that was made of them runs.
+
+        Parameters
+        ----------
+        changes : mapping
+            Values to change, or complete `Parameters`.
+        running : str
+            What runs, for the message: 'observer'.
+
+        Raises
+        ------
+        ConfigurationError
+            As `changed`, or another value of a parameter that can't change live.
+
+        """
+        parameters = self.changed(changes)
+        for name, value in self.items():
+            if not self.table[name].live and parameters[name] != value:
+                raise ConfigurationError(
+                    f"parameter '{name}': can't change in a running {running} (it is {value!r}), "
+                    f'got {parameters[name]!r}'
+                )
+        return parameters
+
+
+def unknown_parameter(name: str, known: Iterable[str]) -> ConfigurationError:
+    """Build the error for a name that nobody declared."""
+    known = list(known)
+    hint = suggestion(name, known) or '; known are ' + ', '.join(known)
+    return ConfigurationError(f"unknown parameter '{name}'{hint}")
+
+
+def suggestion(word: str, known: Iterable[str]) -> str:
+    """Return ``; did you mean 'x'?`` for the closest of `known`, or nothing."""
+    close = difflib.get_close_matches(word, list(known), n=1)
+    return f"; did you mean '{close[0]}'?" if close else ''
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return None
+
+
+def _expression_text(value: Any) -> str | None:
+    return None if isinstance(value, bool) or not isinstance(value, int | float) else repr(value)
+
+
+def shown(value: Any) -> str:
+    """Return a value as a message shows it: at most 120 characters."""
+    if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
+        value = list(value)
+    try:
+        text = repr(value)
+    except ValueError:  # Python prints at most 4,300 digits
+        text = 'a longer integer'
+    return text if len(text) <= 120 else text[:117] + '...'

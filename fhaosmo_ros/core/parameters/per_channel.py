@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Parameters of an estimator with many channels: ``hip.lambda`` is channel hip's own ``lambda``.
+
+A channel takes its own value where it has one, else the common value. The table of m channels is
+the common table and m prefixed copies of it.
+"""
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
+import re
+from typing import Any, overload
+
+from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, ParameterTable
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
+
+CHANNELS = 'channels'
+UNNAMED = ['']
+"""The default: one channel, whose topics and parameters have no prefix."""
+NAME = re.compile(r'[A-Za-z](_?[A-Za-z0-9])*')
+"""What is valid between two slashes of a topic and in the name of a parameter."""
+
+
+def channel_names(values: Mapping[str, Any]) -> list[str]:
+    """
+    Return the names of the channels that `values` declare, `UNNAMED` if they declare none.
+
+    Raises
+    ------
+    ConfigurationError
+        A name that is not valid in a topic, that comes twice, or that is a parameter's name.
+
+    """
+    declared = ESTIMATOR_PARAMETERS[CHANNELS]
+    names: Any = declared.coerce(values.get(CHANNELS, UNNAMED))
+    if names == UNNAMED:
+        return UNNAMED
+    for name in names:
+        if not NAME.fullmatch(name):
+            raise declared.error(names, 'names of letters, digits and single _ between them')
+        if name in ESTIMATOR_PARAMETERS:
+            raise declared.error(names, f"names that no parameter has (there is one '{name}')")
+    if len(set(names)) < len(names):
+        raise declared.error(names, 'every name once')
+    return list(names)
+
+
+def with_channels(
+    table: Mapping[str, Parameter], names: Iterable[str], values: Mapping[str, Any] | None = None
+) -> ParameterTable:
+    """
+    Return `table` and, for each named channel, its own parameters.
+
+    Parameters
+    ----------
+    table : mapping
+        The common parameters; those of the update path get a copy for each channel.
+    names : iterable of str
+        As `channel_names` returns them.
+    values : mapping, optional
+        Checked common values: what a channel's own parameters default to.
+
+    """
+    values = values or {}
+    common = [p for p in table.values() if p.name in ONLINE_PARAMETERS]
+    own = [
+        replace(p, name=f'{name}.{p.name}', default=values.get(p.name, p.default))
+        for name in names
+        if name
+        for p in common
+    ]
+    return ParameterTable(table.values(), own)
+
+
+@overload
+def of_channel(values: Parameters, name: str) -> Parameters: ...
+
+
+@overload
+def of_channel(values: Mapping[str, Any], name: str) -> Mapping[str, Any]: ...
+
+
+def of_channel(values: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """
+    Return the values of one channel: its own ones, and the common ones for the rest.
+
+    Complete `Parameters` of a node give the complete `Parameters` of a channel, which are not
+    checked again. Of other values, those that are absent stay absent.
+    """
+    common = {key: value for key, value in values.items() if '.' not in key}
+    start = f'{name}.'
+    own = {k.removeprefix(start): v for k, v in values.items() if name and k.startswith(start)}
+    if isinstance(values, Parameters):
+        return Parameters(ESTIMATOR_PARAMETERS, common | own)
+    return common | own
+
+
+def differing(values: Parameters) -> dict[str, Any]:
+    """Return the common values, and of the channels' own those that are not the common ones."""
+    return {
+        name: value
+        for name, value in values.items()
+        if '.' not in name or value != values[name.rpartition('.')[2]]
+    }
+
+
+def followers(name: str, names: Iterable[str], own: Collection[str]) -> list[str]:
+    """
+    Return the parameters of channels that change along with the common one called `name`.
+
+    Parameters
+    ----------
+    name : str
+    names : iterable of str
+        The channels.
+    own : collection of str
+        Parameters of channels that have been set themselves, and so do not follow.
+
+    """
+    if name not in ONLINE_PARAMETERS:
+        return []
+    prefixed = [f'{channel}.{name}' for channel in names if channel]
+    return [parameter for parameter in prefixed if parameter not in own]

@@ -1,0 +1,366 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Every parameter of the package, declared once.
+
+YAML checks, ROS descriptors, docs/parameters.md and error messages derive from these tables.
+"""
+
+from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
+
+MAX_ORDER = 12
+PER_LEVEL = '1 (used for every level) or one a level'
+
+MODEL = (
+    Parameter(
+        'order', 3, 'Number n of states of the triangular model.',
+        lower=1, upper=MAX_ORDER, live=False,
+    ),
+    Parameter(
+        'phi', ['0', '0', '-z3'],
+        "The functions Phi_1 .. Phi_n of z_i' = z_{i+1} + Phi_i. Phi_i may use z1 .. zi, the "
+        'known input u, numbers, + - * / **, sin cos tan exp log sqrt abs tanh sign; at most 100 '
+        'operations, 30 of them functions.',
+        live=False, lengths='n (order)',
+    ),
+)  # fmt: skip
+
+OBSERVER = (
+    Parameter(
+        'unknown_input', True,
+        'Estimate the unknown input d as one more level (N = n + 1 levels instead of N = n; '
+        'without it d is the internal state theta of level n).',
+        live=False,
+    ),
+    Parameter(
+        'unknown_input_derivatives', 0,
+        'Number k of derivatives of the unknown input that are estimated behind it, as further '
+        'levels (N = n + 1 + k): a smooth d is followed with less lag, and noise disturbs more. '
+        'Needs unknown_input.',
+        lower=0, upper=3, live=False,
+    ),
+    Parameter(
+        'unknown_input_decay', 0.0,
+        "Rate kappa of the observer's model of the unknown input, d' = -kappa d + what the "
+        'innovations say; 0 assumes nothing. Greater where d comes and goes around 0: the '
+        'estimate follows noise less, but is too small where d stays. Explicit: below 2 / dt.',
+        unit='1/s', lower=0.0, upper=1e3,
+    ),
+    Parameter(
+        'structure', 'cascade',
+        "cascade: the paper's levels, each with an innovation of its own. levant: Levant's "
+        'arbitrary-order differentiator, every level driven by y - z_hat_1; it needs '
+        'unknown_input and other gains than the cascade (docs/mathematics.md).',
+        choices=('cascade', 'levant'),
+    ),
+    Parameter(
+        'variant', 'fuzzy_adaptive',
+        'sign: discontinuous injection, gamma = 1/2. fuzzy: fuzzy curve instead of sign. '
+        'sign_adaptive, fuzzy_adaptive: the same with adapted gamma.',
+        choices=('sign', 'fuzzy', 'fuzzy_adaptive', 'sign_adaptive'),
+    ),
+    Parameter(
+        'scheme', 'implicit',
+        'explicit: forward Euler (the paper). implicit: backward Euler, without the chatter that '
+        'a digital step makes. predict_correct (levant only): the model is followed to the new '
+        'sample by Runge-Kutta steps, then corrected as implicit does.',
+        choices=('explicit', 'implicit', 'predict_correct'),
+    ),
+    Parameter(
+        'prediction_step', 0.0025,
+        'Longest Runge-Kutta step of predict_correct; a longer interval takes several. Well below '
+        "1 / rate of the model's fastest motion.",
+        unit='s', lower=1e-6, upper=10.0,
+    ),
+    Parameter(
+        'correction_period', 0.0,
+        'predict_correct: a sample corrects as if it stood for at most this time, usually the '
+        'sampling period, so that after a gap one noisy sample weighs no more than any other. 0: '
+        'it stands for all the time since the one before.',
+        unit='s', lower=0.0, upper=10.0,
+    ),
+    Parameter(
+        'lambda', [740.0],
+        'Correction factors lambda_i of the injection: |eps_i|^gamma psi_i(eps_i); levant: '
+        '|eps_1|^(2 gamma (N - i) / N) psi_i(eps_1).',
+        lower=0.0, lower_open=True, upper=1e15, lengths=PER_LEVEL,
+    ),
+    Parameter(
+        'alpha', [155.0],
+        'Gains alpha_i of the internal states. Not used by levant, which has none.',
+        lower=0.0, lower_open=True, upper=1e15, lengths=PER_LEVEL,
+    ),
+    Parameter(
+        'epsilon', 80.0,
+        'A level runs while |eps_j| <= epsilon for every level j before it (unit of y, '
+        'and of the derivatives for the later levels). With levant all levels run: only '
+        'divergence_time goes by it.',
+        lower=0.0, lower_open=True, upper=1e12,
+    ),
+    Parameter(
+        'fuzzy_widths', [0.1, 1.4],
+        'Half-widths of the fuzzy input universes of levels 1, 2, ...; the last one serves the '
+        'levels that follow. Beyond its half-width psi is +-1. In the unit of the innovation '
+        'eps_i; levant: of y at every level.',
+        lower=1e-12, upper=1e12, lengths='1 to N; the last one serves the levels that follow',
+    ),
+    Parameter(
+        'fuzzy_shape', 'triangle', 'Shape of the membership functions.',
+        choices=('triangle', 'gaussian'),
+    ),
+    Parameter(
+        'fuzzy_normalise', True,
+        'Scale psi to saturate at +-1 as sign does. A centroid alone saturates at about 0.83 '
+        '(5 terms), which silently cuts every gain.',
+    ),
+    Parameter(
+        'gamma_initial', 0.67, 'Power gamma at the start of an adaptive variant.',
+        lower=0.0, lower_open=True, upper=1.0,
+    ),
+    Parameter(
+        'gamma_rate', 0.004, "Learning rate Gamma of gamma' = -Gamma dL/dgamma; 0 holds gamma.",
+        lower=0.0, upper=1e6,
+    ),
+    Parameter(
+        'gamma_min', 0.1, 'Lower bound of gamma, not above gamma_max.',
+        lower=0.0, lower_open=True, upper=1.0,
+    ),
+    Parameter(
+        'gamma_max', 1.0, 'Upper bound of gamma.', lower=0.0, lower_open=True, upper=1.0,
+    ),
+    Parameter(
+        'gamma_dead_zone', 0.006,
+        'Adaptation rests while the norm of the innovations is at most this (their unit; set it '
+        'below the norm at which the estimate has become good enough). 0: it never rests.',
+        lower=0.0, upper=1e12,
+    ),
+    Parameter(
+        'gamma_leakage', 0.05,
+        'Rate that draws gamma back to gamma_initial once the innovations have stayed within the '
+        'dead zone for gamma_leakage_delay; without a dead zone always. 0 for none.',
+        unit='1/s', lower=0.0, upper=1e3,
+    ),
+    Parameter(
+        'gamma_leakage_delay', 5.0,
+        'Leakage waits for this time after innovations beyond the dead zone. Not used where the '
+        'dead zone is 0.',
+        unit='s', lower=0.0, upper=1e6,
+    ),
+    Parameter(
+        'initial_estimate', [0.0], 'Filtered estimates z_hat_1 .. z_hat_N at the start.',
+        lower=-1e12, upper=1e12, lengths=PER_LEVEL,
+    ),
+    Parameter(
+        'initial_internal', [0.0],
+        'Internal states z_tilde_2 .. z_tilde_{N+1} at the start (the last one is theta). Not '
+        'used by levant, which has none.',
+        lower=-1e12, upper=1e12, lengths=PER_LEVEL,
+    ),
+    Parameter(
+        'start_from_measurement', True,
+        'Start z_hat_1 at the first sample of y instead of at initial_estimate[0].',
+    ),
+    Parameter(
+        'estimate_from', 'internal',
+        'Which variables are the published estimates of z_2 .. z_n and d: internal (z_tilde, '
+        'no lag) or filtered (z_hat, smoother). z_1 is always z_hat_1. The same for levant, '
+        'which has only z_hat.',
+        choices=('internal', 'filtered'),
+    ),
+)  # fmt: skip
+
+SAMPLING = (
+    Parameter(
+        'sampling', 'source_stamp',
+        "Sampling period of y: from the source time stamps of the middleware's messages, from "
+        'the node clock at reception (the choice with use_sim_time), or nominal_period.',
+        choices=('source_stamp', 'clock', 'nominal'),
+    ),
+    Parameter(
+        'nominal_period', 0.001, 'Sampling period with sampling = nominal.',
+        unit='s', lower=1e-6, upper=10.0,
+    ),
+    Parameter(
+        'max_gap', 0.5,
+        'A longer time between two usable samples, or a stamp that lies further back, restarts '
+        'the observer from the new samples, once a second one confirms the jump.',
+        unit='s', lower=1e-6, upper=3600.0,
+    ),
+    Parameter(
+        'max_step', 0.0,
+        'A longer interval, up to max_gap, is bridged: y in between is predicted by the model and '
+        'bent to the new sample, and the observer takes steps of at most this long. 0: intervals '
+        'of more than twice the mean are bridged, in steps of about the mean interval.',
+        unit='s', lower=0.0, upper=3600.0,
+    ),
+    Parameter(
+        'spike_gate', 0.0,
+        'A sample that lies further than this from what the model predicts from the one before '
+        'is rejected (unit of y); 0 for no gate.',
+        lower=0.0, upper=1e12,
+    ),
+    Parameter(
+        'spike_gate_samples', 5,
+        'So many samples in a row may be rejected by spike_gate; the next one is believed: a '
+        'step of y is not a spike.',
+        lower=1, upper=1_000_000,
+    ),
+    Parameter(
+        'stuck_time', 0.0,
+        'Samples are rejected while y has not changed at all for longer than this; 0 for never.',
+        unit='s', lower=0.0, upper=3600.0,
+    ),
+    Parameter(
+        'divergence_time', 1.0,
+        '|eps_1| above epsilon, or steps that leave the finite numbers, for longer than this: the '
+        'observer has lost y and starts afresh from it; 0 for never.',
+        unit='s', lower=0.0, upper=3600.0,
+    ),
+    Parameter(
+        'divergence_limit', 1e12,
+        'A sample of larger magnitude is rejected, and an observer with a larger state starts '
+        'afresh from y.',
+        lower=1.0, upper=1e100,
+    ),
+)  # fmt: skip
+
+ESTIMATOR_NODE = (
+    Parameter(
+        'channels', [''],
+        'Names of the outputs that one process estimates from. Channel hip reads hip/y, publishes '
+        '~/hip/state and so on, and takes each parameter of the model, the observer and the '
+        "sampling from hip.NAME where that is set, else from NAME. ['']: one channel, no prefix.",
+        live=False, lengths='any',
+    ),
+    Parameter(
+        'autostart', True,
+        'Configure and activate by itself at the start. false: wait for a lifecycle manager, or '
+        'for `ros2 lifecycle set`.',
+        live=False,
+    ),
+    Parameter(
+        'publish_rate', 100.0, 'Rate of the timer that publishes the estimates.',
+        unit='Hz', lower=0.1, upper=5000.0,
+    ),
+    Parameter(
+        'input_reliability', 'best_effort',
+        'QoS of the subscriptions of y and u. best_effort hears every publisher; reliable has '
+        'lost samples sent again, and hears reliable publishers only.',
+        choices=('best_effort', 'reliable'), live=False,
+    ),
+    Parameter(
+        'input_durability', 'volatile',
+        'QoS of the subscriptions of y and u. transient_local also hears what was published '
+        'before, of transient_local publishers only.',
+        choices=('volatile', 'transient_local'), live=False,
+    ),
+    Parameter(
+        'input_depth', 1000, 'Samples of y that wait while the node is busy; older ones are lost.',
+        lower=1, upper=100_000, live=False,
+    ),
+)  # fmt: skip
+
+DIAGNOSTICS = (
+    Parameter(
+        'diagnostics_period', 1.0, 'Time between two reports on /diagnostics, in host time.',
+        unit='s', lower=0.1, upper=60.0,
+    ),
+    Parameter(
+        'hardware_id', 'none', 'hardware_id of the reports: the sensor behind y.',
+    ),
+    Parameter(
+        'warn_rate_below', 0.0, 'WARN if the sample rate of y is lower; 0 for never.',
+        unit='Hz', lower=0.0, upper=1e5,
+    ),
+    Parameter(
+        'warn_jitter_above', 0.5,
+        'WARN if the standard deviation of the sampling period over its mean is higher.',
+        lower=0.0, upper=1e6,
+    ),
+    Parameter(
+        'warn_delay_above', 0.1,
+        'WARN if a sample is taken later than this after its source stamp: this host is too slow, '
+        "or its clock and the publisher's differ.",
+        unit='s', lower=0.0, upper=1e6,
+    ),
+    Parameter(
+        'warn_chatter_above', 0.0,
+        'WARN if the estimate of d chatters more (RMS of what a moving average of 5 samples '
+        'leaves, unit of d); 0 for never.',
+        lower=0.0, upper=1e12,
+    ),
+    Parameter(
+        'error_bad_share_above', 0.5,
+        'ERROR if a larger share of the samples was lost or rejected; any at all is a WARN.',
+        lower=0.0, upper=1.0,
+    ),
+)  # fmt: skip
+
+PLANT_MODEL = (
+    Parameter(
+        'initial_state', [0.2], 'States z_1 .. z_n of the plant at its start.',
+        lower=-1e12, upper=1e12, live=False, lengths='1 (used for every state) or n',
+    ),
+    Parameter(
+        'integration_step', 1e-4,
+        'Fixed step of the Runge-Kutta integration, independent of sample_rate.',
+        unit='s', lower=1e-6, upper=0.1, live=False,
+    ),
+    Parameter(
+        'disturbance', 'sine',
+        'The unknown input d(t): none (0), sine (amplitude sin(omega t + phase) + offset), step '
+        '(offset, from start on offset + amplitude), square (sign of the sine), chirp (sine whose '
+        'angular frequency goes from omega to omega_end within sweep_time and stays there).',
+        choices=('none', 'sine', 'step', 'square', 'chirp'),
+    ),
+    Parameter(
+        'disturbance_amplitude', 0.1, 'Amplitude of d.', lower=-1e9, upper=1e9,
+    ),
+    Parameter(
+        'disturbance_omega', 1.0, 'Angular frequency of d.', unit='rad/s', lower=0.0, upper=1e5,
+    ),
+    Parameter(
+        'disturbance_phase', 0.0, 'Phase of d.', unit='rad', lower=-1e3, upper=1e3,
+    ),
+    Parameter(
+        'disturbance_offset', 0.0, 'Constant part of d.', lower=-1e9, upper=1e9,
+    ),
+    Parameter(
+        'disturbance_start', 1.0, 'Time of the step.', unit='s', lower=0.0, upper=1e9,
+    ),
+    Parameter(
+        'disturbance_omega_end', 10.0, 'Angular frequency at the end of the chirp.',
+        unit='rad/s', lower=0.0, upper=1e5,
+    ),
+    Parameter(
+        'disturbance_sweep_time', 20.0, 'Duration of the sweep of the chirp.',
+        unit='s', lower=1e-3, upper=1e9,
+    ),
+    Parameter(
+        'noise_std', 0.0, 'Standard deviation of the white Gaussian noise on y (unit of y).',
+        lower=0.0, upper=1e9,
+    ),
+    Parameter(
+        'noise_seed', 1, 'Seed of the noise; setting it starts the noise sequence again.',
+        lower=0, upper=2**31 - 1,
+    ),
+    Parameter(
+        'quantisation', 0.0,
+        'Increment that y, noise included, is rounded to (unit of y), as an encoder does; 0 for '
+        'none.',
+        lower=0.0, upper=1e9,
+    ),
+)  # fmt: skip
+
+PLANT_NODE = (
+    Parameter(
+        'sample_rate', 1000.0, 'Rate at which y and the truth are published.',
+        unit='Hz', lower=0.1, upper=5000.0,
+    ),
+)  # fmt: skip
+
+OBSERVER_PARAMETERS = ParameterTable(MODEL, OBSERVER)
+ONLINE_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING)
+ESTIMATOR_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, ESTIMATOR_NODE, DIAGNOSTICS)
+PLANT_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL)
+PLANT_NODE_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL, PLANT_NODE)
+NODE_TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A family of recordings for training and for judging estimators: seeded, with their truth.
+
+::
+
+    family = Family({'noise_std': 1e-3, 'disturbances': ['steps']})
+    training, held_out = family.recordings(6), family.recordings(10, seed=1000)
+    r = training[0]        # r.t, r.y, r.u, r.z, r.d
+
+A recording is a function of the parameters, its number and the seed alone. Parameters:
+family_parameters.py; a plant's YAML serves as well.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.configuration import per_level
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
+from fhaosmo_ros.core.simulation.plant import quantised, respond
+from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+SHORTEST = 1e-9
+"""Stamps stay this far apart (s), as two integer nanoseconds do."""
+
+
+class Recording(NamedTuple):
+    """
+    What a sensor would have given, and the truth at the moments of sampling.
+
+    Attributes
+    ----------
+    t : (K,) array
+        Stamps in seconds, increasing.
+    y, u : (K,) arrays
+        Measured output; known input of the interval that ends at each sample.
+    z : (K, n) array
+    d : (K,) array
+    shape : str
+        Of the disturbance.
+
+    """
+
+    t: Floats
+    y: Floats
+    u: Floats
+    z: Floats
+    d: Floats
+    shape: str
+
+
+class Family:
+    """
+    Makes recordings.
+
+    Parameters
+    ----------
+    parameters : mapping, optional
+        Values for `FAMILY_PARAMETERS`; defaults for the rest.
+
+    Raises
+    ------
+    ConfigurationError
+        An unknown name, a bad value, or values that do not fit together.
+
+    """
+
+    def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
+        self.parameters: dict[str, Any] = dict(FAMILY_PARAMETERS.complete(parameters))
+        p = self.parameters
+        self.model = TriangularModel(p['phi'], p['order'])
+        self._start = per_level(
+            PLANT_PARAMETERS['initial_state'], p['initial_state'], self.model.order
+        )
+        low, *rest = p['band_of_d']
+        if len(rest) != 1 or not low < rest[0]:
+            raise FAMILY_PARAMETERS['band_of_d'].error(
+                p['band_of_d'], 'two angular frequencies, the lower one first'
+            )
+
+    def recordings(self, count: int, seed: int = 0, first: int = 0) -> list[Recording]:
+        """Return recordings `first` .. `first + count - 1` of a seed; shapes take turns."""
+        return [self.recording(first + k, seed) for k in range(count)]
+
+    def recording(self, number: int, seed: int = 0) -> Recording:
+        """
+        Return one recording.
+
+        Raises
+        ------
+        ConfigurationError
+            The plant leaves the finite numbers.
+
+        """
+        p = self.parameters
+        random = np.random.default_rng([p['noise_seed'], seed, number])
+        shape = p['disturbances'][number % len(p['disturbances'])]
+        true_t, t = self._times(random)
+        spacing = p['integration_step']
+        grid = np.arange(int(np.ceil(true_t[-1] / spacing)) + 2) * spacing
+        table = p['rms_of_d'] * self._wave(shape, grid, random)
+        u = np.zeros(len(t))
+        if self.model.uses_input:
+            u = p['rms_of_u'] * self._wave('sines', true_t, random)
+        z, d = respond(self.model, self._start, true_t, table, spacing, u, spacing)
+        if not np.isfinite(z).all():
+            raise ConfigurationError(
+                f'plant: expected states that stay finite for {p["duration"]:g} s under d with '
+                f'an RMS of {p["rms_of_d"]:g}, got infinite ones (recording {number})'
+            )
+        y = z[:, 0] + p['noise_std'] * random.standard_normal(len(t))
+        if p['outliers'] > 0.0:
+            hit = random.uniform(size=len(t)) < p['outliers']
+            y[hit] += p['outlier_std'] * random.standard_normal(np.count_nonzero(hit))
+        return Recording(t, quantised(y, p['quantisation']), u, z, d, shape)
+
+    def _times(self, random: Generator) -> tuple[Floats, Floats]:
+        """Return the moments of sampling and the stamps of the samples that are not lost."""
+        p = self.parameters
+        count = int(p['duration'] * p['sample_rate']) + 1
+        grid = np.arange(count) / p['sample_rate']
+        moments = _increasing(grid + p['period_jitter'] * random.standard_normal(count))
+        stamps = _increasing(moments + p['stamp_jitter'] * random.standard_normal(count))
+        if p['dropout'] > 0.0:
+            kept = _kept(count, p['dropout'], p['dropout_length'], random)
+            moments, stamps = moments[kept], stamps[kept]
+        return moments, stamps
+
+    def _wave(self, shape: str, t: Floats, random: Generator) -> Floats:
+        """Return a random signal of unit RMS."""
+        p = self.parameters
+        low, high = p['band_of_d']
+        if shape == 'sines':
+            return _sines(t, low, high, p['sines'], random)
+        if shape == 'chirp':
+            return _chirp(t, low, high, random)
+        return _steps(t, p['step_interval'], random)
+
+
+def _sines(t: Floats, low: float, high: float, count: int, random: Generator) -> Floats:
+    """One sine in each of `count` parts of the band, so that none is left out."""
+    share = (np.arange(count) + random.uniform(size=count)) / count
+    omega = low * (high / low) ** share
+    amplitude = random.uniform(0.5, 1.5, count)
+    amplitude *= np.sqrt(2.0 / np.sum(amplitude**2))
+    phase = random.uniform(0.0, 2.0 * np.pi, count)
+    wave = np.zeros_like(t)
+    for a, w, start in zip(amplitude, omega, phase, strict=True):
+        wave += a * np.sin(w * t + start)
+    return wave
+
+
+def _chirp(t: Floats, low: float, high: float, random: Generator) -> Floats:
+    """Angular frequency from one end of the band to the other, exponentially."""
+    first, last = (low, high) if random.uniform() < 0.5 else (high, low)
+    rate = np.log(last / first) / t[-1]
+    angle = first / rate * np.expm1(rate * t)
+    return np.asarray(np.sqrt(2.0) * np.sin(angle + random.uniform(0.0, 2.0 * np.pi)))
+
+
+def _steps(t: Floats, interval: float, random: Generator) -> Floats:
+    levels = max(2, int(np.ceil(3.0 * t[-1] / interval)) + 1)
+    waits = interval * (1.0 / 3.0 + random.exponential(2.0 / 3.0, levels))
+    number = np.searchsorted(np.cumsum(waits), t, side='right')
+    wave = random.standard_normal(levels + 1)[number]
+    size = np.sqrt(np.mean(wave**2))
+    return np.asarray(wave / size)
+
+
+def _increasing(t: Floats) -> Floats:
+    t = np.maximum(np.sort(t), 0.0)
+    rank = np.arange(len(t)) * SHORTEST
+    return np.asarray(np.maximum.accumulate(t - rank) + rank)
+
+
+def _kept(count: int, share: float, length: float, random: Generator) -> NDArray[np.bool_]:
+    """Lose runs of samples, geometric in length; the first sample stays."""
+    begin = share / (length * (1.0 - share))
+    draws = random.uniform(size=count)
+    kept = np.ones(count, dtype=bool)
+    for k in range(1, count):
+        kept[k] = draws[k] >= (begin if kept[k - 1] else 1.0 - 1.0 / length)
+    return kept

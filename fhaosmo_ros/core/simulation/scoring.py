@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How good an observer is on recordings whose truth is known: one compiled call, no trajectories.
+
+Samples take the way of the node's: through the policy of core/online. The call releases the GIL
+and allocates nothing that grows with the recordings, so that trials run in as many threads as
+there are cores.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.compiled.unowned_arrays import unowned
+from fhaosmo_ros.core.model.bytecode import Floats, Ints
+from fhaosmo_ros.core.observer import arrays
+from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.memory import EstimatorArrays
+from fhaosmo_ros.core.online.policy import take
+from fhaosmo_ros.core.online.stamps import forget_samples
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.core.simulation.metrics import total_variation
+from fhaosmo_ros.core.simulation.recordings import Recording
+import numpy as np
+from numpy.typing import NDArray
+
+CHOICES = ('internal', 'filtered')
+"""Values of `estimate_from`; both are judged in the same run."""
+TRANSIENT, VARIATION = range(2)
+NANOSECONDS = 1e-9
+FIRST_STAMP = 1_000_000_000
+"""Stamp (ns) of a recording's first sample; 0 would stand for a stamp that is not set."""
+
+
+class Truth(NamedTuple):
+    """
+    Recordings one behind the other.
+
+    Attributes
+    ----------
+    stamps, y, u : (K,) arrays
+        Samples (ns) and known input.
+    truth : (K, n + 1) array
+        z_1 .. z_n and d.
+    begins : (R + 1,) array
+        Where each recording begins, and where the last one ends.
+
+    """
+
+    stamps: Ints
+    y: Floats
+    u: Floats
+    truth: Floats
+    begins: Ints
+
+
+class Rules(NamedTuple):
+    """
+    How estimates are read and judged.
+
+    Attributes
+    ----------
+    pick : (2, n + 1) array
+        Places of the estimates in the flattened levels, for each of CHOICES.
+    settled, band : float
+        See `Trial`.
+
+    """
+
+    pick: Ints
+    settled: float
+    band: float
+
+
+class Scores(NamedTuple):
+    """
+    Errors of a trial on R recordings, for both CHOICES.
+
+    Attributes
+    ----------
+    error : (R, 2, n + 1) array
+        RMS of the errors of z_1 .. z_n and d, from `settled` on.
+    transient : (R, 2) array
+        Time of the last sample before `settled` at which d was wrong by more than `band`, s.
+    variation : (R, 2) array
+        Total variation of the estimate of d, from `settled` on; beside `Trial.variation` it tells
+        the chatter.
+
+    """
+
+    error: NDArray[np.float64]
+    transient: NDArray[np.float64]
+    variation: NDArray[np.float64]
+
+
+class _Sums(NamedTuple):
+    """What is added up: squared errors (R, 2, n + 1), and TRANSIENT and VARIATION (R, 2, 2)."""
+
+    squares: Floats
+    extra: Floats
+
+
+@compiled(nogil=True)
+def _judge(e: EstimatorArrays, recordings: Truth, rules: Rules, sums: _Sums, eps: Floats) -> None:
+    """Run through all recordings and add up."""
+    e, recordings, eps = unowned(e), unowned(recordings), unowned(eps)
+    stamps, levels, count = recordings.stamps, e.state.levels, recordings.truth.shape[1]
+    n, last = levels.shape[1], np.empty(2)
+    for r in range(recordings.begins.shape[0] - 1):
+        begin = recordings.begins[r]
+        forget_samples(e.policy, e.state)
+        for k in range(begin, recordings.begins[r + 1]):
+            take(e, stamps[k], recordings.y[k], recordings.u[k], eps, 0)
+            time = (stamps[k] - stamps[begin]) * NANOSECONDS
+            late = time >= rules.settled
+            for choice in range(2):
+                value = 0.0
+                for j in range(count):
+                    index = rules.pick[choice, j]
+                    value = levels[index // n, index % n]
+                    if late:
+                        wrong = value - recordings.truth[k, j]
+                        sums.squares[r, choice, j] += wrong * wrong
+                if late:
+                    if k > begin and last[choice] == last[choice]:
+                        sums.extra[r, choice, VARIATION] += abs(value - last[choice])
+                    last[choice] = value
+                else:
+                    last[choice] = np.nan
+                    if not abs(value - recordings.truth[k, count - 1]) <= rules.band:
+                        sums.extra[r, choice, TRANSIENT] = time
+
+
+class Trial:
+    """
+    Judges parameters on a fixed set of recordings; safe to call from several threads.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Each longer than `settled`.
+    parameters : mapping
+        Of the estimator (observer and sampling); those that do not change.
+    settled : float
+        Errors count from this time of a recording on, s.
+    band : float
+        See `Scores.transient`.
+
+    Attributes
+    ----------
+    scale : (n + 1,) array
+        RMS of z_1 .. z_n and d over all recordings, from `settled` on.
+    variation : (R,) array
+        Total variation of d, from `settled` on.
+
+    Raises
+    ------
+    ConfigurationError
+        No recording, one that is too short, or parameters of another model.
+
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        parameters: Mapping[str, Any],
+        settled: float,
+        band: float,
+    ) -> None:
+        self._fixed = ONLINE_PARAMETERS.complete(parameters)
+        self.recordings = list(recordings)
+        observer = OnlineEstimator(self._fixed).observer
+        for r in self.recordings:
+            if r.t[-1] - r.t[0] <= settled:
+                raise ConfigurationError(
+                    f'recording: expected more than {settled:g} s (until which an estimate '
+                    f'settles), got {r.t[-1] - r.t[0]:g} s'
+                )
+            if r.z.shape[1] != observer.order:
+                raise ConfigurationError(
+                    f'recording: expected the {observer.order} states of the model (order), '
+                    f'got {r.z.shape[1]}'
+                )
+        if not self.recordings:
+            raise ConfigurationError('trial: expected at least one recording, got none')
+        samples = [_as_samples(recording) for recording in self.recordings]
+        stamps, y, u, truth = (np.concatenate(part) for part in zip(*samples, strict=True))
+        self.truth = truth
+        begins = np.cumsum([0, *(len(r.t) for r in self.recordings)])
+        self._data = Truth(stamps, y, u, truth, begins)
+        late = [(row[0] - row[0][0]) * NANOSECONDS >= settled for row in samples]
+        self._counts = np.array([mask.sum() for mask in late])
+        self.variation = np.array(
+            [total_variation(r.d[m]) for r, m in zip(self.recordings, late, strict=True)]
+        )
+        squares = np.square(self.truth[np.concatenate(late)])
+        self.scale = np.sqrt(squares.mean(axis=0))
+        size = arrays.ROWS * observer.levels
+        places = np.arange(size).reshape(arrays.ROWS, observer.levels)
+        pick = np.array([self._places(choice, places) for choice in CHOICES])
+        self._rules = Rules(pick, float(settled), float(band))
+
+    def _places(self, choice: str, places: NDArray[np.int64]) -> list[int]:
+        z, d = Observer(self._fixed.changed({'estimate_from': choice})).select(places)
+        return [*z.tolist(), int(d)]
+
+    def __call__(self, changes: Mapping[str, Any]) -> Scores:
+        """
+        Judge the fixed parameters with some changed.
+
+        Raises
+        ------
+        ConfigurationError
+            As `OnlineEstimator`.
+
+        """
+        estimator = OnlineEstimator(self._fixed.changed(changes))
+        count, quantities = len(self.recordings), self.truth.shape[1]
+        sums = _Sums(np.zeros((count, 2, quantities)), np.zeros((count, 2, 2)))
+        eps = np.zeros((1, estimator.observer.levels))
+        _judge(estimator.arrays, self._data, self._rules, sums, eps)
+        error = np.sqrt(sums.squares / self._counts[:, None, None])
+        return Scores(error, sums.extra[:, :, TRANSIENT], sums.extra[:, :, VARIATION])
+
+
+def _as_samples(r: Recording) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
+    """Return stamps, y, u and truth of a recording."""
+    stamps = FIRST_STAMP + np.round((r.t - r.t[0]) / NANOSECONDS).astype(np.int64)
+    return stamps, r.y, r.u, np.column_stack([r.z, r.d])

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The estimator node: a managed node (ROS 2 lifecycle) of one channel or many."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from fhaosmo_ros.core.parameters.declaration import Parameters, Value
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import complete
+from fhaosmo_ros.core.parameters.per_channel import CHANNELS, UNNAMED
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.nodes.estimator.channel import Channel
+from fhaosmo_ros.nodes.estimator.channel_group import ChannelGroup, make_estimators
+from fhaosmo_ros.nodes.estimator.channel_inheritance import ChannelInheritance
+from fhaosmo_ros.nodes.estimator.outputs import check_overrides
+from fhaosmo_ros.nodes.estimator.parameter_topic import ParameterTopic
+from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, ERROR, OK, Report, STALE
+from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
+from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
+from fhaosmo_ros.nodes.middleware.spin import run_node
+
+
+class EstimatorNode(ManagedNode):
+    """
+    A managed node around one channel, or many.
+
+    configure makes the channel from the parameters; activate lets it take samples and publish;
+    deactivate stops that; cleanup destroys the channel, and then every parameter can be set,
+    except the names of the channels.
+
+    Raises
+    ------
+    ConfigurationError
+        Parameters that can't be used; nothing has been subscribed or published then.
+
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(
+            'estimator', automatically_declare_parameters_from_overrides=True, **options
+        )
+        overrides = overrides_of(self)
+        if overrides.get('use_sim_time') is True and 'sampling' not in overrides:
+            overrides['sampling'] = 'clock'  # the middleware's stamps are in the host's time
+            self.get_logger().info('use_sim_time: sampling is clock')
+        values = complete(overrides, ESTIMATOR_PARAMETERS)
+        self._names: list[str] = values[CHANNELS]
+        self._node_parameters = NodeParameters(self, values, fixed=['autostart', CHANNELS])
+        self._inheritance = ChannelInheritance(self._names, overrides)
+        self._channels: Channel | ChannelGroup | None = None
+        self._parameter_topic: ParameterTopic | None = None
+        self._diagnostics = DiagnosticsPublisher(
+            self, self._reports, values['diagnostics_period'], values['hardware_id']
+        )
+        self._node_parameters.on_change(self._prepare, self._adopt, self._inheritance.followers)
+        try:
+            if values['autostart']:
+                self.start()
+            else:
+                make_estimators(values, self._names)  # raises now what configure would raise
+        except Exception:
+            self.destroy_node()
+            raise
+        if not values['autostart']:
+            self.get_logger().info('waiting to be configured, for instance by ros2 lifecycle set')
+
+    def configure(self) -> None:
+        """Make the channel, or channels, from the present parameters."""
+        values = self._node_parameters.values
+        estimators = make_estimators(values, self._names)
+        check_overrides(self, [f'~/{name}/' if name else '~/' for name in self._names])
+        if self._names == UNNAMED:
+            self._channels = Channel(self, values, *estimators.values())
+        else:
+            self._channels = ChannelGroup(self, values, estimators)
+        self._parameter_topic = ParameterTopic(self)
+        self._parameter_topic.publish(values)
+        if self.get_parameter('use_sim_time').value and values['sampling'] == 'source_stamp':
+            self.get_logger().warning(
+                "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing "
+                "of /clock, so dt is in the host's time; set sampling to clock for simulation time"
+            )
+
+    def activate(self) -> None:
+        """Take samples and publish."""
+        assert self._channels is not None
+        self._channels.activate()
+
+    def deactivate(self) -> None:
+        """Drop samples and publish nothing."""
+        if self._channels is not None:
+            self._channels.deactivate()
+
+    def cleanup(self) -> None:
+        """Destroy the channels."""
+        if self._channels is not None:
+            self._channels.destroy()
+            self._channels = None
+        if self._parameter_topic is not None:
+            self._parameter_topic.destroy()
+            self._parameter_topic = None
+
+    def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> Any:
+        if self._channels is None:  # whether the values fit together is checked by configure
+            return None
+        present = self._node_parameters.values
+        for name, value in changes.items():
+            if not values.table[name].live and value != present[name]:
+                raise ConfigurationError(
+                    f"parameter '{name}': read when the node is configured (it is "
+                    f'{present[name]!r}), got {value!r}; set it after the transition cleanup'
+                )
+        return self._channels.prepare(values)
+
+    def _adopt(self, change: Any) -> None:
+        values = self._node_parameters.values
+        self._inheritance.adopt()
+        if self._channels is not None:
+            self._channels.adopt(change)
+        if self._parameter_topic is not None:
+            self._parameter_topic.publish(values)
+        self._diagnostics.set_period(values['diagnostics_period'])
+        self._diagnostics.hardware_id = values['hardware_id']
+
+    def _reports(self) -> list[Report]:
+        state = Report('state')
+        active = self.state == 'active'
+        state.find(OK if active else STALE, self.state)
+        if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
+            state.find(ERROR, 'use_sim_time, but nothing on /clock yet')
+        if not active or self._channels is None:
+            return [state]
+        return [state, *self._channels.reports()]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the estimator node."""
+    return run_node('estimator', EstimatorNode, argv)

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node's parameters on a topic, so that a bag says with which ones its estimates were made."""
+
+from fhaosmo_ros.core.parameters.declaration import Parameters
+from fhaosmo_ros.core.parameters.files import dumps
+from fhaosmo_ros.core.parameters.per_channel import differing
+from fhaosmo_ros.nodes.middleware.messages import message_class
+from fhaosmo_ros.topics import PARAMETERS, TEXT
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
+
+LATEST = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class ParameterTopic:
+    """
+    Publishes all parameters of a node as the text of a parameter file that makes such a node.
+
+    Parameters
+    ----------
+    node : Node
+
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publisher = node.create_publisher(message_class(TEXT), f'~/{PARAMETERS}', LATEST)
+
+    def publish(self, values: Parameters) -> None:
+        """Publish the node's values; the topic is transient-local."""
+        text = dumps(differing(values), self._node.get_fully_qualified_name())
+        self._publisher.publish(String(data=text))
+
+    def destroy(self) -> None:
+        """Take the topic away."""
+        self._node.destroy_publisher(self._publisher)

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Reports on /diagnostics, with the conventions of diagnostic_updater.
+
+diagnostic_updater itself is not used, because there is no wheel of it: nothing here could be
+tested without an installed ROS. Reports follow the host's steady clock, so that with use_sim_time
+they still come when /clock stops.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+OK, WARN = DiagnosticStatus.OK, DiagnosticStatus.WARN
+ERROR, STALE = DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+
+
+class Report:
+    """
+    One status of /diagnostics: values, findings, and the worst level of the findings.
+
+    Parameters
+    ----------
+    task : str
+        What it is about; its name is 'node: task'.
+
+    """
+
+    def __init__(self, task: str) -> None:
+        self.task = task
+        self.values: dict[str, Any] = {}
+        self._level = OK
+        self._findings: list[str] = []
+
+    def find(self, level: bytes, text: str) -> None:
+        """Add a finding; the status gets the worst level, and the messages of all findings."""
+        self._level = max(self._level, level)
+        self._findings.append(text)
+
+    def message(self, node: str, hardware_id: str) -> DiagnosticStatus:
+        """Return the status message."""
+        return DiagnosticStatus(
+            level=self._level,
+            name=f'{node}: {self.task}',
+            message='; '.join(self._findings) or 'OK',
+            hardware_id=hardware_id,
+            values=[KeyValue(key=k, value=_text(v)) for k, v in self.values.items()],
+        )
+
+
+class DiagnosticsPublisher:
+    """
+    Publishes a node's reports.
+
+    Parameters
+    ----------
+    reports : callable
+        Returns the present reports.
+    period : float
+        Seconds between two, of the host's steady clock.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        reports: Callable[[], Iterable[Report]],
+        period: float = 1.0,
+        hardware_id: str = 'none',
+    ) -> None:
+        self.hardware_id = hardware_id
+        self._node = node
+        self._reports = reports
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer: Any = None
+        self._period = 0.0
+        self.set_period(period)
+
+    def set_period(self, period: float) -> None:
+        """Change the time between two reports."""
+        if period == self._period:
+            return
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+        self._period = period
+        self._timer = self._node.create_timer(period, self.publish, clock=self._clock)
+
+    def publish(self) -> None:
+        """Publish all present reports."""
+        name = self._node.get_fully_qualified_name().lstrip('/')
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.status = [r.message(name, self.hardware_id) for r in self._reports()]
+        self._publisher.publish(message)
+
+
+def _text(value: Any) -> str:
+    return f'{value:.6g}' if isinstance(value, float) else str(value)

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Messages of numbers, and their serialised form (CDR); message classes by name.
+
+At 1 kHz a node would spend most of its own time on making message objects and serialising them.
+The serialised form of these messages ends with their numbers, so what stands before the numbers is
+made once.
+"""
+
+from array import array
+from collections.abc import Callable
+import importlib
+from importlib.util import find_spec
+import math
+import os
+from pathlib import Path
+import re
+import site
+import struct
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from numpy.typing import NDArray
+from rclpy.serialization import serialize_message
+from std_msgs.msg import Float64, Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+
+DOUBLE = struct.Struct('=d')
+TIME = struct.Struct('=iI')
+HEADER = 4
+"""Bytes of CDR's header; the second byte is odd for little endian."""
+_BIG, _LITTLE = struct.Struct('>d').unpack_from, struct.Struct('<d').unpack_from
+
+
+def labelled(names: list[str]) -> Float64MultiArray:
+    """Return a one-dimensional message whose label lists its elements, such as 'z1,z2,z3'."""
+    count = len(names)
+    dimension = MultiArrayDimension(label=','.join(names), size=count, stride=count)
+    layout = MultiArrayLayout(dim=[dimension])
+    return Float64MultiArray(layout=layout, data=array('d', [0.0] * count))
+
+
+def array_encoder(names: list[str]) -> Callable[[NDArray], bytes]:
+    """Return a function from an array of doubles to the serialised message; see `labelled`."""
+    head = serialize_message(labelled(names))[: -DOUBLE.size * len(names)]
+    return lambda values: head + values.tobytes()
+
+
+def double_encoder() -> Callable[[float], bytes]:
+    """Return a function from a number to a serialised Float64."""
+    head, pack = serialize_message(Float64())[:HEADER], DOUBLE.pack
+    return lambda value: head + pack(value)
+
+
+def time_encoder() -> Callable[[int], bytes]:
+    """Return a function from nanoseconds to a serialised Time."""
+    head, pack = serialize_message(Time())[:HEADER], TIME.pack
+    return lambda stamp: head + pack(*divmod(stamp, 1_000_000_000))
+
+
+def read_double(data: bytes) -> float:
+    """Return the number in a serialised Float64; NaN for a message that is too short."""
+    try:
+        return (_LITTLE if data[1] & 1 else _BIG)(data, HEADER)[0]
+    except (IndexError, struct.error):  # rclpy's own conversion would end the node
+        return math.nan
+
+
+def type_name(message_type: Any) -> str:
+    """Return the ROS name of a message class, such as 'std_msgs/msg/Float64'."""
+    package = message_type.__module__.split('.')[0]
+    return f'{package}/msg/{message_type.__name__}'
+
+
+def message_class(name: str) -> Any:
+    """
+    Return the class of a message type, such as 'std_msgs/msg/Float64'.
+
+    Names come from bags and from the network, and importing a module runs its code. So a package
+    is imported only from where interface packages are installed: the environment's site-packages,
+    or those of a sourced workspace (AMENT_PREFIX_PATH). One that lies in the working directory,
+    for instance beside the bag, is not.
+
+    Raises
+    ------
+    LookupError
+        No such message type is installed.
+
+    """
+    found = re.fullmatch(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)', name)
+    if found and _is_installed(found[1]):
+        try:
+            return getattr(importlib.import_module(f'{found[1]}.msg'), found[2])
+        except (ImportError, AttributeError):
+            pass
+    raise LookupError(f'expected a message type that is installed here, got {name}')
+
+
+def _is_installed(package: str) -> bool:
+    """Return True for a package of messages in site-packages; finding it does not run its code."""
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        return False
+    if not Path(spec.origin).with_name('msg').is_dir():
+        return False
+    folder = Path(spec.origin).parents[1].resolve()
+    own = [Path(path).resolve() for path in (*site.getsitepackages(), site.getusersitepackages())]
+    if folder in own:
+        return True
+    prefixes = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
+    in_workspace = any(folder.is_relative_to(Path(prefix).resolve()) for prefix in prefixes)
+    return in_workspace and folder.name in ('site-packages', 'dist-packages')

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node that a tool makes for itself."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+import shlex
+from types import TracebackType
+from typing import Self
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.nodes.middleware.spin import Spinner
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+ACTING = ('-r', '--remap', '-e', '--enclave')
+"""ROS arguments that act."""
+
+
+class PrivateNode:
+    """
+    A node in a context of its own, without signal handlers; spun while open.
+
+    Parameters
+    ----------
+    name : str
+    ros_arguments : sequence of str
+        What follows ``--ros-args``. Names and remappings (-r) and the enclave (-e) act; the rest,
+        parameters and log levels that launch gives to every node, does not concern this one.
+
+    Raises
+    ------
+    ConfigurationError
+        A remapping that ROS can't read.
+
+    Attributes
+    ----------
+    node : Node
+
+    """
+
+    def __init__(self, name: str, ros_arguments: Sequence[str] = ()) -> None:
+        self._context = Context()
+        acting = ['--ros-args']
+        for flag, word in pairwise(ros_arguments):
+            if flag in ACTING:
+                acting += [flag, word]
+        try:
+            rclpy.init(
+                args=acting,
+                context=self._context,
+                signal_handler_options=SignalHandlerOptions.NO,
+            )
+            self.node = Node(name, context=self._context)
+        except RuntimeError as error:
+            raise ConfigurationError(f'ROS arguments {shlex.join(acting)}: {error}') from None
+
+    def __enter__(self) -> Self:
+        self._spinner = Spinner(self.node).__enter__()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._spinner.__exit__(kind, error, trace)
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def resolved(self, name: str) -> str:
+        """Return the full name of a topic, or of a node, after remapping."""
+        return self.node.resolve_topic_name(name)
+
+    def publishers(self, topic: str) -> int:
+        """Return how many publishers of a topic have been discovered."""
+        return int(self.node.count_publishers(topic))
+
+    def subscribers(self, topic: str) -> int:
+        """Return how many subscribers of a topic have been discovered."""
+        return int(self.node.count_subscribers(topic))

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records topics: those that appear, with the QoS of their publishers, or expected ones."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from queue import SimpleQueue
+from time import time_ns
+from typing import Any, NamedTuple, Self
+
+from fhaosmo_ros.nodes.middleware.messages import message_class
+from fhaosmo_ros.nodes.middleware.subscription import subscribe_with_info
+from fhaosmo_ros.nodes.recording.private_node import PrivateNode
+from rclpy.node import NodeNameNonExistentError
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+DEPTH = 5000
+DISCOVERY_PERIOD = 0.2
+OLD = 60 * 1_000_000_000
+"""
+Nanoseconds. A transient-local message that is older than the recording by more than this gets the
+stamp of the recording's beginning; else the bag would begin when somebody started the robot.
+"""
+DURABILITIES = (DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL)
+SHARED = ('/parameter_events', '/rosout', '/diagnostics', '/tf', '/tf_static')
+"""Topics of many publishers: the sequence numbers of their messages say nothing."""
+
+
+class ExpectedTopic(NamedTuple):
+    """A topic that is subscribed at once, before anybody publishes it."""
+
+    topic: str
+    message_type: str
+    transient_local: bool = False
+
+
+class NewTopic(NamedTuple):
+    """A topic that has appeared and is recorded from now on, with its publishers' QoS."""
+
+    topic: str
+    message_type: str
+    offered: list[dict[str, Any]]
+
+
+class Sample(NamedTuple):
+    """A message in CDR with its source time stamp in nanoseconds, but see `OLD`."""
+
+    topic: str
+    stamp: int
+    data: bytes
+
+
+class TopicRecorder(PrivateNode):
+    """
+    A node that records while it is open.
+
+    Parameters
+    ----------
+    sink : callable
+        Called with `NewTopic`, then with the topic's `Sample`s, from the executor's thread; with
+        samples only for `expected` topics.
+    expected : iterable of ExpectedTopic
+        Subscribed at once, and reliably.
+    wanted : callable, optional
+        Says of the name of a topic that has a publisher whether to record it, too. Called while
+        it is open.
+    listeners : sequence of str
+        Names of nodes whose inputs to record as well, whatever their names.
+    ros_arguments : sequence of str
+        See `PrivateNode`.
+
+    Attributes
+    ----------
+    counts : dict of str to int
+        Messages by topic so far.
+    problems : SimpleQueue
+        Lines that say why a topic can't be recorded.
+    lost : dict of str to int
+        Messages by topic that were published but did not arrive; only of topics with one
+        publisher, whose messages are numbered.
+
+    Raises
+    ------
+    LookupError
+        The message type of an expected topic is not installed.
+
+    """
+
+    def __init__(
+        self,
+        sink: Callable[[NewTopic | Sample], None],
+        expected: Iterable[ExpectedTopic] = (),
+        wanted: Callable[[str], bool] | None = None,
+        listeners: Sequence[str] = (),
+        ros_arguments: Sequence[str] = (),
+    ) -> None:
+        self.counts: dict[str, int] = {}
+        self.problems: SimpleQueue[str] = SimpleQueue()
+        self.lost: dict[str, int] = {}
+        self._sink, self._wanted = sink, wanted
+        self._seen: set[str] = set()
+        self._begin = time_ns()
+        super().__init__('fhaosmo_recorder', ros_arguments)
+        self._listeners = [self.resolved(name) for name in listeners]
+        for topic, message_type, transient_local in expected:
+            self._seen.add(topic)
+            durability = DURABILITIES[transient_local]
+            qos = QoSProfile(depth=DEPTH, durability=durability)
+            limit = self._begin - OLD if transient_local else 0
+            receive = self._callback(topic, topic not in SHARED, limit)
+            self._subscribe(topic, message_class(message_type), receive, qos)
+
+    def __enter__(self) -> Self:
+        if self._wanted is not None:
+            self._discover()
+            self.node.create_timer(DISCOVERY_PERIOD, self._discover)
+        return super().__enter__()
+
+    def _discover(self) -> None:
+        inputs = self._inputs()
+        for topic, types in self.node.get_topic_names_and_types():
+            if topic in self._seen or not (topic in inputs or self._wanted(topic)):
+                continue
+            publishers = self.node.get_publishers_info_by_topic(topic)
+            publishers = [p for p in publishers if p.node_name != self.node.get_name()]
+            if not publishers:
+                continue
+            self._seen.add(topic)  # also if it can't be recorded
+            try:
+                kind = message_class(types[0])
+            except LookupError as error:
+                self.problems.put(f'{topic}: {error}')
+                continue
+            profiles = [p.qos_profile for p in publishers]
+            qos = _matching(profiles)
+            transient_local = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            # Measured samples keep their stamps, even those of a clock that is wrong.
+            limit = self._begin - OLD if transient_local and topic not in inputs else 0
+            numbered = len(publishers) == 1 and topic not in SHARED
+            self._sink(NewTopic(topic, types[0], [_plain(p) for p in profiles]))
+            self._subscribe(topic, kind, self._callback(topic, numbered, limit), qos)
+
+    def _subscribe(self, topic: str, kind: Any, receive: Any, qos: QoSProfile) -> None:
+        self.counts[topic] = 0
+        subscribe_with_info(self.node, kind, topic, receive, qos, raw=True)
+
+    def _inputs(self) -> set[str]:
+        found = set()
+        for listener in self._listeners:
+            space, _, name = listener.rpartition('/')
+            with suppress(NodeNameNonExistentError):  # not there yet
+                topics = self.node.get_subscriber_names_and_types_by_node(name, space or '/')
+                found |= {topic for topic, _ in topics}
+        return found
+
+    def _callback(self, topic: str, numbered: bool, limit: int) -> Any:
+        latest = 0
+
+        def receive(data: bytes, info: Mapping[str, int]) -> None:
+            nonlocal latest
+            number = info.get('publication_sequence_number') or 0 if numbered else 0
+            if latest and number > latest + 1:
+                self.lost[topic] = self.lost.get(topic, 0) + number - latest - 1
+            elif 0 < number <= latest:  # another publisher: its numbers say nothing
+                self.lost.pop(topic, None)
+                number = 2**63
+            latest = max(latest, number)
+            stamp = info['source_timestamp'] or info['received_timestamp']
+            self._sink(Sample(topic, stamp if stamp >= limit else self._begin, data))
+            self.counts[topic] += 1
+
+        return receive
+
+
+def _matching(profiles: list[QoSProfile]) -> QoSProfile:
+    """Return the strictest QoS that every publisher offers."""
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+    local = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+    return QoSProfile(
+        depth=DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if local else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _plain(profile: QoSProfile) -> dict[str, Any]:
+    """Return a QoS as names and numbers."""
+    return {
+        'history': profile.history.name,
+        'depth': profile.depth,
+        'reliability': profile.reliability.name,
+        'durability': profile.durability.name,
+        'deadline': profile.deadline.nanoseconds,
+        'lifespan': profile.lifespan.nanoseconds,
+        'liveliness': profile.liveliness.name,
+        'liveliness_lease_duration': profile.liveliness_lease_duration.nanoseconds,
+    }

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Topics of a bag as arrays, and which messages of several topics belong together.
+
+Messages of two topics are never paired by counting: a recording may lack some of them, most often
+at its begin and at its end. What was published together is found by its stamps in the bag.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.topics import TRUTH
+import numpy as np
+from numpy.typing import NDArray
+
+LATE = 0.75
+"""Periods of the plant by which the truth may follow its sample of y."""
+
+
+class Series(NamedTuple):
+    """
+    The messages of a topic as arrays.
+
+    Attributes
+    ----------
+    stamps : (K,) array of int
+        Stamps in nanoseconds.
+    values : (K,) or (K, n) array
+        Numbers of a Float64, a Float64MultiArray, or a Time (in nanoseconds, as integers).
+    labels : list of str
+        Names of the n columns, where the messages have a label.
+
+    """
+
+    stamps: NDArray[np.int64]
+    values: NDArray[Any]
+    labels: list[str]
+
+
+class Truth(NamedTuple):
+    """
+    States and unknown input of a simulated plant at some times.
+
+    Attributes
+    ----------
+    values : (K, n + 1) array
+        z_1 .. z_n and d; a row of NaN where the bag lacks them.
+    labels : list of str
+        Names of the states, where the messages have a label.
+
+    """
+
+    values: NDArray[np.float64]
+    labels: list[str]
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Return which rows the bag holds."""
+        return np.asarray(np.isfinite(self.values).all(axis=1))
+
+
+def messages(path: Path, topic: str) -> list[tuple[int, Any]]:
+    """Return the stamps (ns) and messages of a topic that has few of them."""
+    with BagReader(path) as reader:
+        return [(stamp, message) for _, stamp, message in reader.read_all([topic])]
+
+
+def series(path: Path, topic: str) -> Series:
+    """Read a topic of numbers; empty arrays if it has no message."""
+    with BagReader(path) as reader:
+        if not reader.count(topic):
+            return Series(np.zeros(0, np.int64), np.zeros(0), [])
+        first = reader.first(topic)
+        if hasattr(first, 'nanosec'):
+            stamps, seconds = _read(reader, topic, 'sec')
+            _, rest = _read(reader, topic, 'nanosec')
+            values = seconds.astype(np.int64) * 1_000_000_000 + rest.astype(np.int64)
+            return Series(stamps, values, [])
+        if not hasattr(first, 'layout'):
+            return Series(*_read(reader, topic, 'data'), [])
+        width = len(first.data)
+        stamps, values = _read(reader, topic, 'data[0]', width)
+        labels = first.layout.dim[0].label.split(',') if first.layout.dim else []
+        return Series(stamps, values.reshape(-1, width), labels)
+
+
+def _read(
+    reader: BagReader, topic: str, field: str, width: int = 1
+) -> tuple[NDArray[np.int64], NDArray[Any]]:
+    blocks = list(reader.blocks(topic, reader.field(topic, field), width=width))
+    times, _, values = (np.concatenate(part) for part in zip(*blocks, strict=True))
+    return times, values
+
+
+def read_ticks(path: Path, name: str, parts: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """
+    Return the values of an estimator's topics, a row for each tick that all of them have.
+
+    A tick is what the estimator publishes for one sample: a message on each topic.
+
+    Parameters
+    ----------
+    path : path
+        A bag.
+    name : str
+        Name of the estimator.
+    parts : sequence of str
+        Topics below it; the last one is published last.
+
+    """
+    ticks = series(path, f'{name}/{parts[-1]}').stamps
+    whole = np.ones(len(ticks), bool)
+    found = {}
+    for part in parts:  # one after the other: a long bag fills the memory
+        column = series(path, f'{name}/{part}')
+        row = _rows_of_ticks(column.stamps, ticks)
+        whole &= row >= 0
+        found[part] = column.values[row] if len(column.values) else column.values
+        del column, row
+    if whole.all():
+        return found
+    return {part: values[whole] if whole.any() else values[:0] for part, values in found.items()}
+
+
+def _rows_of_ticks(times: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """
+    Return which message of a topic belongs to each tick, -1 where it is missing.
+
+    Parameters
+    ----------
+    times : (K,) array
+        Stamps of the topic.
+    ticks : (T,) array
+        Stamps of the topic that is published last.
+
+    """
+    if not len(times) or not len(ticks):
+        return np.full(len(ticks), -1)
+    # The estimator publishes it before the last topic; but a recorder that stamps messages as
+    # they arrive may have taken it after. The topic's own pauses tell which of the two.
+    before = np.searchsorted(times, ticks, side='right') - 1
+    after = before + 1
+    until = np.concatenate([[np.iinfo(np.int64).min], ticks[:-1]])
+    since = np.concatenate([ticks[1:], [np.iinfo(np.int64).max]])
+    early = (before >= 0) & (times[before] > until)
+    late = (after < len(times)) & (times[after.clip(max=len(times) - 1)] < since)
+    lead = np.median((ticks - times[before])[early]) if early.any() else np.inf
+    lag = np.median(times[after[late]] - ticks[late]) if late.any() else np.inf
+    return np.where(early, before, -1) if lead <= lag else np.where(late, after, -1)
+
+
+def truth_at(bag: Path, plant: str, when: NDArray[np.int64]) -> Truth | None:
+    """
+    Return the truth that belongs to samples of y.
+
+    The plant publishes y, then its states, then d. So the truth of a sample is the first message
+    after it, unless that comes so late that it is another sample's.
+
+    Parameters
+    ----------
+    bag : Path
+    plant : str
+        Full name of the node.
+    when : (K,) array
+        Stamps of the samples in nanoseconds.
+
+    Returns
+    -------
+    Truth or None
+        None if the bag has no message of one of the topics.
+
+    """
+    columns = []
+    labels: list[str] = []
+    for part in TRUTH:
+        found = series(bag, f'{plant}/{part}')
+        if not len(found.stamps):
+            return None
+        row = np.searchsorted(found.stamps, when)
+        its_own = row < len(found.stamps)
+        row = row.clip(max=len(found.stamps) - 1)
+        if len(found.stamps) > 1:
+            its_own &= found.stamps[row] - when <= LATE * np.median(np.diff(found.stamps))
+        values = found.values[row].astype(np.float64).reshape(len(row), -1)
+        columns.append(np.where(its_own[:, None], values, np.nan))
+        labels = labels or found.labels
+    return Truth(np.column_stack(columns), labels)

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Message types, QoS profiles and messages in CDR, for bags."""
+
+import os
+from pathlib import Path
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+FOREVER = QosTime(sec=9223372036, nsec=854775807)
+"""An unlimited duration, as rosbag2 writes it."""
+OFFERED_QOS = Qos(
+    QosHistory.KEEP_LAST,
+    10,
+    QosReliability.RELIABLE,
+    QosDurability.VOLATILE,
+    FOREVER,
+    FOREVER,
+    QosLiveliness.AUTOMATIC,
+    FOREVER,
+    False,
+)
+"""QoS that this package's nodes offer; `ros2 bag play` publishes with it again."""
+LATCHED_QOS = OFFERED_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
+"""The same, but transient-local: a late subscriber still gets the last message."""
+
+
+def learn(message_type: str) -> bool:
+    """Look a type up in the sourced workspaces, add it to `TYPES`; return False if not found."""
+    if message_type in TYPES.fielddefs:
+        return True
+    package, kind, name = message_type.split('/')
+    for prefix in filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)):
+        path = Path(prefix, 'share', package, kind, f'{name}.msg')
+        if path.is_file():
+            found = get_types_from_msg(path.read_text(encoding='utf-8'), message_type)
+            names = re.findall(r"\(<Nodetype.NAME: 2>, '([^']+)'\)", repr(found[message_type]))
+            if all(learn(other) for other in names):
+                TYPES.register(found)
+                return True
+    return False
+
+
+def make_qos(
+    history: str,
+    depth: int,
+    reliability: str,
+    durability: str,
+    deadline: int,
+    lifespan: int,
+    liveliness: str,
+    liveliness_lease_duration: int,
+) -> Qos:
+    """Return a QoS from its policies' names and its durations in nanoseconds."""
+    return Qos(
+        QosHistory.__members__.get(history, QosHistory.UNKNOWN),
+        depth,
+        QosReliability[reliability],
+        QosDurability[durability],
+        QosTime(*divmod(deadline, 10**9)),
+        QosTime(*divmod(lifespan, 10**9)),
+        QosLiveliness[liveliness],
+        QosTime(*divmod(liveliness_lease_duration, 10**9)),
+        False,
+    )
+
+
+def serialise(message_type: str, **fields: Any) -> bytes:
+    """Return a message of one of ROS's own types in CDR."""
+    return bytes(TYPES.serialize_cdr(TYPES.types[message_type](**fields), message_type))
+
+
+def labelled_array(names: list[str], values: NDArray[np.float64]) -> bytes:
+    """Return a Float64MultiArray in CDR whose label lists its elements, as the nodes publish."""
+    types, count = TYPES.types, len(names)
+    dimension = types['std_msgs/msg/MultiArrayDimension'](
+        label=','.join(names), size=count, stride=count
+    )
+    layout = types['std_msgs/msg/MultiArrayLayout'](dim=[dimension], data_offset=0)
+    return serialise('std_msgs/msg/Float64MultiArray', layout=layout, data=values)

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Command-line options that several commands share."""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.declaration import (
+    Parameters,
+    ParameterTable,
+    unknown_parameter,
+)
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import read, select, with_origin
+from fhaosmo_ros.core.parameters.per_channel import channel_names, of_channel, UNNAMED
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
+from fhaosmo_ros.core.parameters.yaml_text import parse
+from fhaosmo_ros.tools.bags.recorded_parameters import Recorded
+
+
+def add_parameter_options(parser: argparse.ArgumentParser) -> None:
+    """Add --params-file, -p, --node and --channel."""
+    parser.add_argument(
+        '--params-file', type=Path, action='append', default=[], metavar='FILE',
+        help="parameters of the estimator node, as in 'ros2 run' (default: those in the bag)",
+    )  # fmt: skip
+    parser.add_argument(
+        '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
+        help='set one parameter; wins over the file, or the bag',
+    )  # fmt: skip
+    parser.add_argument(
+        '--node', default='estimator', metavar='NAME',
+        help='whose sections of the files to take, such as /rig/estimator (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--channel', default='', metavar='NAME',
+        help="take the parameters of this one of the node's channels",
+    )  # fmt: skip
+
+
+def online_parameters(
+    arguments: argparse.Namespace, recorded: Recorded | None = None
+) -> dict[str, Any]:
+    """
+    Return the parameters of the update path from the options.
+
+    Parameters
+    ----------
+    arguments : Namespace
+    recorded : Recorded, optional
+        What files and -p change.
+
+    Raises
+    ------
+    ConfigurationError
+        A file or a value that can't be used, by itself or together with the others.
+
+    """
+    values: dict[str, Any] = {}
+    origins: dict[str, Path | str | None] = {}
+    if recorded:
+        values = dict(recorded.values)
+        origins = dict.fromkeys(values, f'topic {recorded.topic!r}')
+    for path in arguments.params_file:
+        of_file = read(path, arguments.node, strict=True)
+        values |= of_file
+        origins |= dict.fromkeys(of_file, path)
+    on_command_line = _on_command_line(arguments)
+    origins |= dict.fromkeys(on_command_line)
+    try:
+        values = select(values | on_command_line, ESTIMATOR_PARAMETERS)
+    except ConfigurationError as error:
+        raise with_origin(error, origins) from None
+    names = channel_names(values)
+    if arguments.channel not in names:
+        allowed = 'none, as the node has no channels' if names == UNNAMED else ' or '.join(names)
+        raise ConfigurationError(
+            f'--channel: expected {allowed}, got {arguments.channel or "none"}'
+        )
+    own = of_channel(values, arguments.channel)
+    try:
+        OnlineEstimator(Parameters(ESTIMATOR_PARAMETERS, own))
+    except ConfigurationError as error:
+        raise with_origin(error, origins, arguments.channel) from None
+    return {name: own[name] for name in ONLINE_PARAMETERS if name in own}
+
+
+def named(arguments: argparse.Namespace) -> list[str]:
+    """Return the parameters of the update path that -p sets."""
+    names = [name.removeprefix(f'{arguments.channel}.') for name in _on_command_line(arguments)]
+    return [name for name in names if name in ONLINE_PARAMETERS]
+
+
+def assigned(rules: Sequence[str], table: ParameterTable) -> dict[str, Any]:
+    """
+    Return the values that NAME:=VALUE rules set, checked by a table.
+
+    Raises
+    ------
+    ConfigurationError
+        A rule that is none, an unknown name, or a bad value.
+
+    """
+    values = dict(_rules(rules))
+    for name in values:
+        if name not in table:
+            raise unknown_parameter(name, table)
+    return dict(table.coerce(values))
+
+
+def _on_command_line(arguments: argparse.Namespace) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for target, value in _rules(arguments.param):
+        node, _, name = target.rpartition(':')
+        if not node or node.strip('/') == arguments.node.strip('/'):
+            values[name] = value  # not another node's, as on a command line of ROS
+    return values
+
+
+def _rules(rules: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    for rule in rules:
+        name, separator, text = rule.partition(':=')
+        if not separator:
+            raise ConfigurationError(f'-p: expected NAME:=VALUE, got {rule!r}')
+        try:
+            yield name, parse(text)
+        except ConfigurationError:
+            yield name, text

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command demo: plant and estimator over DDS, recorded, with a table and a figure."""

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demonstration: plant and estimator as two processes over DDS, recorded and compared."""
+
+import argparse
+from collections.abc import Callable
+import os
+from pathlib import Path
+import time
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, TopicRecorder
+from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.tools.bags.types import LATCHED_QOS, OFFERED_QOS
+from fhaosmo_ros.tools.bags.writer import BagWriter
+from fhaosmo_ros.tools.cli.command import Interrupted, run_command
+from fhaosmo_ros.tools.cli.output import Output
+from fhaosmo_ros.tools.cli.processes import Children
+from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.tools.cli.share import shipped
+from fhaosmo_ros.tools.demo.figure import save_run
+from fhaosmo_ros.tools.demo.report import read_run, table
+from fhaosmo_ros.topics import (
+    ARRAY,
+    ESTIMATES,
+    FLOAT,
+    OF_ALL_NODES,
+    PARAMETERS,
+    SNAPSHOT,
+    TEXT,
+    TRUTH,
+)
+
+START_DEADLINE = 90.0
+"""Seconds for a node to appear: the very first start compiles."""
+TOPICS = [
+    ExpectedTopic('/y', FLOAT),
+    *(ExpectedTopic(f'/plant/{name}', kind) for name, kind in TRUTH.items()),
+    *(ExpectedTopic(f'/estimator/{name}', kind) for name, kind in ESTIMATES.items()),
+    ExpectedTopic(f'/estimator/{SNAPSHOT}', ARRAY, transient_local=True),
+    ExpectedTopic(f'/estimator/{PARAMETERS}', TEXT, transient_local=True),
+    *(ExpectedTopic(name, kind) for name, kind in OF_ALL_NODES.items()),
+]
+"""What is recorded."""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """
+    Run the demonstration.
+
+    Returns
+    -------
+    int
+        0 if there is a report (also of a run that Ctrl-C ended early), 130 if it was interrupted
+        before, 2 for a bad configuration.
+
+    """
+    return run_command(_parser(), argv, _demo)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='demo', description='Run plant and estimator, record, report, draw a figure.'
+    )
+    parser.add_argument(
+        '--duration', type=float, default=20.0, metavar='SECONDS', help='default: %(default)g'
+    )
+    parser.add_argument(
+        '--output',
+        type=Path,
+        metavar='FOLDER',
+        help='new or empty folder for bag and figure (default: demo_output/TIME)',
+    )
+    parser.add_argument('--force', action='store_true', help='replace an output that exists')
+    parser.add_argument(
+        '--params-file',
+        type=Path,
+        metavar='FILE',
+        help='parameters of both nodes (default: the shipped config/demo.yaml)',
+    )
+    return parser
+
+
+def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
+    if not 1.0 <= arguments.duration <= 3600.0:
+        raise ConfigurationError(
+            f'--duration: expected 1 to 3600 seconds, got {arguments.duration:g}'
+        )
+    parameters = arguments.params_file or shipped('config/demo.yaml')
+    for node in ('plant', 'estimator'):
+        load(parameters, node)
+    _keep_to_this_host()
+    print(
+        f'plant and estimator with {parameters}, on this host only, '
+        f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}'
+    )
+    with Output(arguments.output or _default_output(), arguments.force) as output:
+        folder = output.path
+        folder.mkdir()
+        _record(folder, parameters, arguments.duration, stop)
+        if stop.is_set():
+            print('stopped early: reporting what has been recorded')
+        run = read_run(folder / 'bag')
+        save_run(run, folder / 'demo.png')
+        text = table(run)
+        (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
+        print(f'\n{text}\n')
+        final = output.keep()
+    print(f'figure:  {final / "demo.png"}\nbag:     {final / "bag"}')
+
+
+def _keep_to_this_host() -> None:
+    """Keep the topics apart from other people's robots, and from a second demonstration."""
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+
+
+def _default_output() -> Path:
+    return Path('demo_output') / time.strftime('%Y-%m-%d_%H-%M-%S')
+
+
+def _record(folder: Path, parameters: Path, duration: float, stop: Stop) -> None:
+    with (
+        BagWriter(folder / 'bag') as bag,
+        TopicRecorder(lambda sample: bag.write(*sample), TOPICS) as recorder,
+        Children(folder) as nodes,
+    ):
+        for topic, kind, transient_local in TOPICS:
+            bag.add(topic, kind, qos=[LATCHED_QOS if transient_local else OFFERED_QOS])
+        options = ('--ros-args', '--params-file', str(parameters))
+        nodes.start_node('estimator', *options)
+        _wait(
+            'the estimator (the first start compiles, some 10 s)',
+            lambda: recorder.publishers('/estimator/state') and recorder.subscribers('/y') >= 2,
+            nodes,
+            stop,
+        )
+        nodes.start_node('plant', *options)
+        _wait('the first estimate', lambda: recorder.counts['/estimator/state'], nodes, stop)
+        _watch(recorder, nodes, duration, stop)
+
+
+def _wait(what: str, ready: Callable[[], object], nodes: Children, stop: Stop) -> None:
+    deadline = time.monotonic() + START_DEADLINE
+    print(f'waiting for {what} ...', flush=True)
+    while not ready():
+        nodes.check()
+        if stop.wait(0.02):
+            raise Interrupted('before the first estimate, nothing written')
+        if time.monotonic() > deadline:
+            raise ConfigurationError(f'waited {START_DEADLINE:g} s for {what}, in vain')
+
+
+def _watch(recorder: TopicRecorder, nodes: Children, duration: float, stop: Stop) -> None:
+    """Show a progress bar until the time is over or the user stops it."""
+    begin = time.monotonic()
+    with progress(
+        total=duration, unit='s', bar_format='{l_bar}{bar}| {n:.0f}/{total:.0f} s{postfix}'
+    ) as bar:
+        while not stop.wait(0.1):
+            nodes.check()
+            elapsed = min(time.monotonic() - begin, duration)
+            bar.set_postfix_str(f'{recorder.counts["/y"]} samples', refresh=False)
+            bar.update(elapsed - bar.n)
+            if elapsed >= duration:
+                return

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The estimates of each estimator in a bag, with the truth where the bag has it."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.per_channel import of_channel
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.simulation.metrics import chatter, rms
+from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.bags.recorded_parameters import recorded_parameters
+from fhaosmo_ros.tools.bags.topics import read_ticks, series, truth_at
+from fhaosmo_ros.topics import ESTIMATES
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Curves(NamedTuple):
+    """
+    Estimates of one estimator over the stamps of their samples.
+
+    Attributes
+    ----------
+    label : str
+        Bag and estimator.
+    stamps : (K,) array of int
+        In nanoseconds.
+    names : list of str
+        z1 .. zn and d.
+    estimate : (K, n + 1) array
+    gamma : (K,) array
+    innovation : (K, N) array
+    truth : (K, n + 1) array or None
+        NaN where the bag lacks it.
+    epsilon : float or None
+        Threshold of its gates, if it has gates and the bag has its parameters.
+
+    """
+
+    label: str
+    stamps: NDArray[np.int64]
+    names: list[str]
+    estimate: NDArray[np.float64]
+    gamma: NDArray[np.float64]
+    innovation: NDArray[np.float64]
+    truth: NDArray[np.float64] | None
+    epsilon: float | None
+
+
+def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]:
+    """
+    Read the estimates of some estimators, or of all that a bag holds.
+
+    Raises
+    ------
+    ConfigurationError
+        It is not a bag, or it holds no estimates.
+
+    """
+    with BagReader(path) as reader:
+        topics = {c.topic for c in reader.connections if c.msgcount}
+        return _read_curves(reader, path, topics, names, plant)
+
+
+def _read_curves(
+    reader: BagReader, path: Path, topics: set[str], names: list[str] | None, plant: str
+) -> list[Curves]:
+    found = sorted(t.removesuffix('/gamma') for t in topics if t.endswith('/gamma'))
+    found = [name for name in found if all(f'{name}/{part}' in topics for part in ESTIMATES)]
+    for name in names or []:
+        if name not in found:
+            raise ConfigurationError(
+                f'bag {path}: expected estimates of one of {", ".join(found) or "none"}, '
+                f'got {name!r}'
+            )
+    if not found:
+        raise ConfigurationError(
+            f'bag {path}: expected the topics of an estimator ({", ".join(ESTIMATES)} below its '
+            f'name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
+        )
+    return [_curves(path, name, plant, _epsilon(reader, name)) for name in names or found]
+
+
+def _epsilon(reader: BagReader, name: str) -> float | None:
+    recorded = recorded_parameters(reader, name)
+    if recorded is None:
+        return None
+    values = ESTIMATOR_PARAMETERS.defaults() | of_channel(recorded.values, recorded.channel)
+    return values['epsilon'] if values['structure'] == 'cascade' else None
+
+
+def _curves(path: Path, name: str, plant: str, epsilon: float | None) -> Curves:
+    ticks = read_ticks(path, name, list(ESTIMATES))
+    when = ticks['stamp']
+    estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
+    truth = truth_at(path, plant, when)
+    if truth is not None and truth.values.shape != estimate.shape:
+        truth = None  # of another model
+    labels = series(path, f'{name}/state').labels or [
+        f'z{i + 1}' for i in range(estimate.shape[1] - 1)
+    ]
+    return Curves(
+        f'{path.resolve().name} {name}',
+        when,
+        [*labels, 'd'],
+        estimate,
+        ticks['gamma'],
+        ticks['innovation'],
+        truth.values if truth else None,
+        epsilon,
+    )
+
+
+def metrics(curves: list[Curves]) -> str:
+    """Return a table: a row for each state and d of each estimator, over the second half."""
+    width = max(len(c.label) for c in curves)
+    lines = [f'{"2nd half":{width}}  {"":4}{"RMS":>12}{"RMS error":>12}{"chatter":>10}']
+    for c in curves:
+        half = slice(len(c.stamps) // 2, None)
+        for k, name in enumerate(c.names):
+            estimate = c.estimate[half, k]
+            line = f'{c.label:{width}}  {name:4}{rms(estimate):12.3g}'
+            if c.truth is not None:
+                truth = c.truth[half, k]
+                known = np.isfinite(truth)
+                estimate, truth = estimate[known], truth[known]
+                line += f'{rms(estimate - truth):12.3g}{chatter(estimate, truth):10.3g}'
+            lines.append(line)
+    return '\n'.join(lines)

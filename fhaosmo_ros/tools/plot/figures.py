@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of runs and of estimates in bags."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.tools.plot.curves import Curves
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+
+Thinning = Callable[[NDArray[Any], NDArray[Any]], tuple[NDArray[Any], NDArray[Any]]]
+WINDOWLESS = ('agg', 'cairo', 'pdf', 'pgf', 'ps', 'svg', 'template')
+"""Backends of matplotlib that open no window, in small letters."""
+TRUTH = {'color': '#0072B2', 'linewidth': 2.2, 'label': 'true'}
+"""Blue of the Okabe-Ito palette."""
+COLOURS = ('#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
+"""Okabe-Ito palette, without the blue of the truth; each curve also has its own dashes."""
+DASHES = ('-', '--', '-.', ':')
+TINY = 1e-300
+"""Added to what is drawn on a logarithmic scale, which has no place for zero."""
+COLUMNS = 1500
+"""Of a thinned curve; more than a figure has pixels in a row."""
+
+
+def envelope(t: NDArray[Any], x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """
+    Thin a curve to the least and the greatest sample of each of `COLUMNS` equal spans of time.
+
+    The picture stays the same, also where the curve chatters, has gaps or is NaN for a while.
+    Matplotlib takes about 50 bytes for each sample that it draws.
+    """
+    span = float(np.ptp(t)) if len(t) else 0.0
+    if len(t) <= 2 * COLUMNS or not span > 0.0:
+        return t, x
+    column = ((t - t.min()) * (COLUMNS / span)).astype(np.int64)
+    edges = [0, *(np.flatnonzero(np.diff(column)) + 1).tolist(), len(t)]
+    unknown = np.isnan(x)
+    low, high = np.where(unknown, np.inf, x), np.where(unknown, -np.inf, x)
+    kept = {0, len(t) - 1}
+    for begin, end in pairwise(edges):
+        kept |= {begin + int(low[begin:end].argmin()), begin + int(high[begin:end].argmax())}
+    rows = sorted(kept)
+    return t[rows], x[rows]
+
+
+def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window: bool) -> None:
+    """
+    Write a figure of several estimates laid one over another.
+
+    From top to bottom: a row for each state, for d, for gamma, for the innovations of the first
+    estimate, and for the open levels if the threshold of the gates is known.
+
+    Parameters
+    ----------
+    curves : list of Curves
+    epsilon : float or None
+        Threshold of the gates; drawn, and the gates with it, if known.
+    path : path
+        Its suffix names the format.
+    window : bool
+        Make a window too, for `show`. It gets all samples, as one may zoom in; without a window
+        the curves are thinned.
+
+    """
+    thinned = (lambda t, x: (t, x)) if window else envelope
+    names = max((c.names for c in curves), key=len)
+    rows = len(names) + (2 if epsilon is None else 3)
+    figure = _make_figure(rows, window)
+    axes = figure.subplots(rows, 1, sharex=True)
+    row_of = dict(zip([*names[:-1], 'd', 'gamma', 'innovation', 'levels'], axes, strict=False))
+    origin = min(c.stamps[0] for c in curves)
+    for number, c in enumerate(curves):
+        style = {
+            'color': COLOURS[number % len(COLOURS)],
+            'linestyle': DASHES[number % len(DASHES)],
+            'linewidth': 1.2,
+            'label': c.label,
+        }
+        t = (c.stamps - origin) * 1e-9
+        for k, name in enumerate(c.names):
+            row = row_of['d'] if name == 'd' else axes[k]
+            if c.truth is not None and number == 0:
+                row.plot(*thinned(t, c.truth[:, k]), **TRUTH)
+            row.plot(*thinned(t, c.estimate[:, k]), **style)
+        row_of['gamma'].plot(*thinned(t, c.gamma), **style)
+        if epsilon is not None:
+            levels = thinned(t, _open_levels(c, epsilon))
+            row_of['levels'].step(*levels, where='post', **style)
+    for name, row in zip(names, axes, strict=False):
+        _fit_after_transient(
+            row, [c.estimate[:, c.names.index(name)] for c in curves if name in c.names]
+        )
+        row.set_ylabel('unknown\ninput d' if name == 'd' else name)
+    row_of['gamma'].set_ylabel('power γ')
+    first = curves[0]
+    t = (first.stamps - origin) * 1e-9
+    _draw_innovations(row_of['innovation'], t, first.innovation, epsilon, thinned)
+    label = '|innovation|' if len(curves) == 1 else '|innovation|\n(first)'
+    row_of['innovation'].set_ylabel(label)
+    if epsilon is not None:
+        row_of['levels'].set_ylabel('open levels')
+        row_of['levels'].set_yticks(range(1, first.innovation.shape[1] + 1))
+    for row in axes:
+        row.grid(alpha=0.3)
+    axes[-1].set_xlabel('time since the first estimate [s]')
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside upper center', ncols=2, fontsize='small')
+    figure.savefig(path, dpi=150)
+
+
+def _draw_innovations(
+    axes: Axes,
+    t: NDArray[np.float64],
+    eps: NDArray[np.float64],
+    epsilon: float | None,
+    thinned: Thinning,
+) -> None:
+    """Draw |eps_1| .. |eps_N| on a logarithmic scale, and the band within which gates open."""
+    size = np.abs(eps)
+    for k in range(eps.shape[1]):
+        axes.plot(*thinned(t, size[:, k] + TINY), linewidth=0.8, label=f'ε{k + 1}')
+    axes.set_yscale('log')
+    size = size[size > 0.0]
+    if len(size):
+        top = size.max() * 3.0
+        axes.set_ylim(np.percentile(size, 1, overwrite_input=True) / 3.0, top)
+    if epsilon is not None:
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, max(high, 3.0 * epsilon))
+        axes.axhspan(low, epsilon, color='grey', alpha=0.15, label='band ε')
+    axes.legend(loc='upper right', ncols=5, fontsize='small')
+
+
+def _make_figure(rows: int, window: bool) -> Figure:
+    size = (8.5, 1.45 * rows + 0.9)
+    if not window:
+        return Figure(figsize=size, layout='constrained')
+    import matplotlib.pyplot as plt
+
+    _expect_windows()
+    return plt.figure(figsize=size, layout='constrained')
+
+
+def _open_levels(c: Curves, epsilon: float) -> NDArray[np.int64]:
+    """Return how many levels ran: those whose gate, and all gates before it, are open."""
+    gates = np.abs(c.innovation[:, :-1]) <= epsilon
+    return 1 + np.logical_and.accumulate(gates, axis=1).sum(axis=1)
+
+
+def _fit_after_transient(axes: Axes, rows: list[NDArray[np.float64]]) -> None:
+    """Fit the picture to what comes after the first tenth."""
+    late = np.concatenate([row[len(row) // 10 :] for row in rows])
+    late = late[np.isfinite(late)]
+    if len(late):
+        margin = 0.1 * float(np.ptp(late)) or 0.1 * abs(float(late[0])) or 1.0
+        axes.set_ylim(late.min() - margin, late.max() + margin)
+
+
+def show() -> None:
+    """Wait until the user has closed the window."""
+    import matplotlib.pyplot as plt
+
+    plt.show()
+
+
+def _expect_windows() -> None:
+    """
+    Let matplotlib choose its backend, or take that of MPLBACKEND.
+
+    Raises
+    ------
+    ConfigurationError
+        It can't open windows here.
+
+    """
+    import matplotlib.pyplot as plt
+
+    try:
+        plt.switch_backend(matplotlib.get_backend())
+        found = plt.get_backend()
+    except ImportError as error:
+        found = str(error)
+    if found.lower() in WINDOWLESS or ' ' in found:
+        raise ConfigurationError(
+            '--show: expected a display (DISPLAY or WAYLAND_DISPLAY), PyQt or tkinter, and no '
+            f'MPLBACKEND without windows, got {found}'
+        )

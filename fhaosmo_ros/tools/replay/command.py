@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Replay a recorded y through the node's update path, as fast as the machine allows."""
+
+import argparse
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+import sys
+from time import perf_counter
+from typing import Any
+
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.tools.bags.copy import copy_topics
+from fhaosmo_ros.tools.bags.reader import BagReader, STAMPS
+from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
+from fhaosmo_ros.tools.bags.writer import BagWriter
+from fhaosmo_ros.tools.cli.command import Interrupted, run_command
+from fhaosmo_ros.tools.cli.options import add_parameter_options, named, online_parameters
+from fhaosmo_ros.tools.cli.output import Output
+from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun, read_events
+from fhaosmo_ros.tools.replay.samples import Samples
+from fhaosmo_ros.tools.replay.sinks import BagSink, CsvSink, NpzSink, Sink
+from fhaosmo_ros.topics import ESTIMATES
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return 0 if the output is complete, else there is none."""
+    return run_command(_parser(), argv, _replay)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='replay',
+        description='Estimate offline from a recorded bag, with the result of the live node.',
+    )
+    add = parser.add_argument
+    add('bag', type=Path, help='folder of a bag, or its .mcap or .db3 file')
+    add(
+        '-o', '--output', type=Path, action='append', metavar='PATH',
+        help='.csv, .npz, or else a new bag; may be given several times '
+        '(default: a bag BAG_replayed in the current folder)',
+    )  # fmt: skip
+    add('--force', action='store_true', help='replace an output that exists')
+    add('--storage', choices=('mcap', 'sqlite3'), default='mcap', help='of a bag (%(default)s)')
+    add('--topic', default='/y', help='topic of the measured output (%(default)s)')
+    add('--field', help="number in its messages, such as 'position[2]' (default: the only one)")
+    add('--input-topic', default='/u', help='topic of the known input (%(default)s)')
+    add('--input-field', help='number in its messages')
+    add(
+        '--stamp', choices=STAMPS, default='auto',
+        help='where dt comes from; header: of the messages; source: publish time (mcap only); '
+        'bag: log time; auto: the first of these that the bag has',
+    )  # fmt: skip
+    add(
+        '--backwards', choices=('error', 'reject'), default='error',
+        help='what to do with stamps that go back; reject: as the live node does (%(default)s)',
+    )  # fmt: skip
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument(
+        '--follow', metavar='NAME',
+        help='live estimator whose first sample, resets and live changes to repeat (default: the '
+        'one whose ~/snapshot the bag holds)',
+    )  # fmt: skip
+    choice.add_argument(
+        '--afresh', action='store_true', help='begin at the first sample, follow no live estimator'
+    )
+    add('--every', type=int, default=1, metavar='N', help='keep every N-th estimate only')
+    add(
+        '--name', metavar='NAME',
+        help='put before the topics of the estimates (default: /estimator, or /replay/estimator '
+        'where the bag already holds estimates)',
+    )  # fmt: skip
+    add_parameter_options(parser)
+    return parser
+
+
+def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
+    if arguments.every < 1:
+        raise ConfigurationError(f'--every: expected an integer >= 1, got {arguments.every}')
+    default = Path(f'{arguments.bag.resolve().name.removesuffix(".mcap")}_replayed')
+    finals = arguments.output or [default]
+    begin = perf_counter()
+    with ExitStack() as stack:
+        reader = stack.enter_context(BagReader(arguments.bag))
+        followed = recorded = None
+        if not arguments.afresh:
+            followed = find_estimator(reader, arguments.follow, arguments.channel)
+        if not arguments.params_file:
+            recorded = recorded_parameters(reader, followed)
+        if recorded:
+            arguments.channel = arguments.channel or recorded.channel
+        values = online_parameters(arguments, recorded)
+        estimator = OnlineEstimator(values)
+        live = None
+        if followed is not None:
+            events = read_events(reader, followed, named(arguments))
+            live = LiveRun(followed, events, estimator)
+        samples = Samples(reader, estimator, live, arguments)
+        outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
+        name = _name(reader, arguments.name)
+        complete = ONLINE_PARAMETERS.defaults() | values
+        _write(reader, samples, outputs, name, complete, arguments, stop)
+        finals = [output.keep() for output in outputs]
+    seconds = perf_counter() - begin
+    c = estimator.counters
+    print(
+        f'{c.accepted} samples used, {c.rejected} rejected, {c.restarts} restarts; '
+        f'{samples.span:.1f} s of data in {seconds:.2f} s'
+    )
+    print(f'stamps: {samples.stamps}')
+    print(f'parameters: {_origin(arguments, recorded)}')
+    if not arguments.params_file and not recorded:
+        print(
+            'replay: warning: the bag has no ~/parameters to take, so the defaults are used; '
+            "--params-file gives the node's own",
+            file=sys.stderr,
+        )
+    if live:
+        print(live.report())
+    if reader.unchecked:
+        print('the bag has no checksums: damage to its numbers would not be noticed')
+    for final in finals:
+        where = '' if final.suffix in ('.csv', '.npz') else f' (estimates: {name}/...)'
+        print(f'output: {final}{where}')
+
+
+def _origin(arguments: argparse.Namespace, recorded: Recorded | None) -> str:
+    if arguments.params_file:
+        base = ', '.join(map(str, arguments.params_file))
+    elif recorded:
+        base = f'{recorded.topic} in the bag'
+    else:
+        base = 'the defaults'
+    own = named(arguments)
+    return base + (f', with {", ".join(own)} of the command line' if own else '')
+
+
+def _name(reader: BagReader, name: str | None) -> str:
+    """Return the name below which the estimates' topics go."""
+    present = {c.topic for c in reader.connections}
+    for candidate in [name.rstrip('/')] if name else ['/estimator', '/replay/estimator']:
+        taken = [topic for part in ESTIMATES if (topic := f'{candidate}/{part}') in present]
+        if not taken:
+            return candidate if candidate.startswith('/') else f'/{candidate}'
+    raise ConfigurationError(f'--name: expected topics that the bag lacks, got {taken[0]!r}')
+
+
+def _write(
+    reader: BagReader,
+    samples: Samples,
+    outputs: list[Output],
+    name: str,
+    parameters: Mapping[str, Any],
+    arguments: argparse.Namespace,
+    stop: Stop,
+) -> None:
+    observer = samples.estimator.observer
+    with ExitStack() as stack:
+        sinks: list[Sink] = []
+        for output in outputs:
+            if output.path.suffix == '.csv':
+                sinks.append(CsvSink(output.path))
+            elif output.path.suffix == '.npz':
+                sinks.append(NpzSink(output.path))
+            else:
+                bag = stack.enter_context(BagWriter(output.path, storage=arguments.storage))
+                sinks.append(BagSink(bag, name, observer.order, observer.levels, parameters))
+                for _ in copy_topics(reader, bag):
+                    _check_stop(stop)
+        with progress(total=samples.total, unit='sample', unit_scale=True, desc='replay') as bar:
+            for count, rows in samples:
+                _check_stop(stop)
+                for part in rows:
+                    for sink in sinks:
+                        sink.write(part)
+                bar.update(count)
+        for sink in sinks:
+            sink.close()
+
+
+def _check_stop(stop: Stop) -> None:
+    if stop.is_set():
+        raise Interrupted('nothing written')

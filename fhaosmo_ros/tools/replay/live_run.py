@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Following a live estimator through a bag: the same first sample, resets and live changes."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.memory import Flag, FROZEN, INTEGERS, Snapshot, unpack
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.tools.bags.reader import BagReader, Block
+from fhaosmo_ros.topics import SNAPSHOT
+import numpy as np
+from numpy.typing import NDArray
+
+EVENTS = '/parameter_events'
+TRIES = 30
+"""Snapshots that may have no sample in the bag, before replay stops looking for the first one."""
+AGREEMENT = 1e-12
+"""Relative or absolute difference up to which two memories count as the same."""
+VALUE_FIELDS = {
+    1: 'bool_value', 2: 'integer_value', 3: 'double_value', 4: 'string_value',
+    6: 'bool_array_value', 7: 'integer_array_value', 8: 'double_array_value',
+    9: 'string_array_value',
+}  # fmt: skip
+"""Field of a rcl_interfaces/msg/ParameterValue that holds the value, by the number of its type."""
+
+
+class Event(NamedTuple):
+    """A snapshot of the live estimator, and the parameters that changed before it (stamp: ns)."""
+
+    time: int
+    snapshot: Snapshot
+    changes: dict[str, Any]
+
+
+def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> str | None:
+    """
+    Return the name of the estimator to follow: the one given, or the only one in the bag.
+
+    Where several channels have snapshots, `channel` chooses.
+
+    Raises
+    ------
+    ConfigurationError
+        The one given has no snapshots in the bag, or none is given and there are several.
+
+    """
+    found = sorted(
+        c.topic.removesuffix(f'/{SNAPSHOT}')
+        for c in reader.connections
+        if c.topic.endswith(f'/{SNAPSHOT}') and c.msgcount
+    )
+    of_channel = [other for other in found if channel and other.endswith(f'/{channel}')]
+    if name is None and len(of_channel) == 1:
+        return of_channel[0]
+    if name is None and len(found) > 1:
+        raise ConfigurationError(
+            f'--follow: expected one of the live estimators in the bag ({", ".join(found)}), or '
+            '--afresh'
+        )
+    if name is not None and name not in found:
+        raise ConfigurationError(
+            f'--follow: expected an estimator whose snapshots are in the bag '
+            f'({", ".join(found) or "none"}), got {name!r}'
+        )
+    return name or next(iter(found), None)
+
+
+def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Event]:
+    """
+    Return the events of a live estimator in order.
+
+    Parameters
+    ----------
+    reader : BagReader
+    name : str
+        Name of the estimator: the node's full name, followed by the channel's if it has channels.
+    fixed : iterable of str
+        Parameters whose live changes are not repeated.
+
+    """
+    events: list[Event] = []
+    changes: dict[str, Any] = {}
+    topics = {f'{name}/{SNAPSHOT}', EVENTS} & {c.topic for c in reader.connections}
+    for topic, time, message in reader.read_all(topics):
+        if topic == EVENTS:
+            if name == message.node or name.startswith(f'{message.node}/'):
+                channel = name.removeprefix(message.node).strip('/')
+                changes |= _changes(message.changed_parameters, channel, set(fixed))
+            continue
+        try:
+            snapshot = unpack(message.data)
+        except ValueError as error:
+            raise ConfigurationError(
+                f'topic {topic!r}: expected snapshots of this version ({error}); --afresh does '
+                'without them'
+            ) from None
+        # The node publishes the change first, then the snapshot.
+        took_them = not events or snapshot.flags & (Flag.CHANGED | Flag.STARTED)
+        events.append(Event(time, snapshot, changes if took_them else {}))
+        if took_them:
+            changes = {}
+    return events
+
+
+def _changes(parameters: Sequence[Any], channel: str, fixed: set[str]) -> dict[str, Any]:
+    values = {}
+    for parameter in parameters:
+        of_channel, _, name = parameter.name.rpartition('.')
+        if of_channel == channel and name in ONLINE_PARAMETERS and name not in fixed:
+            value = getattr(parameter.value, VALUE_FIELDS[parameter.value.type])
+            values[name] = ONLINE_PARAMETERS[name].coerce(value)
+    return values
+
+
+class LiveRun:
+    """
+    Repeats at an estimator what was done to a live one, at the same samples.
+
+    Parameters
+    ----------
+    name : str
+        The live estimator's.
+    events : list of Event
+    estimator : OnlineEstimator
+        The one that follows the live one.
+
+    Attributes
+    ----------
+    left_out : int
+        Samples before the first one that can be followed.
+
+    """
+
+    def __init__(self, name: str, events: list[Event], estimator: OnlineEstimator) -> None:
+        self._name, self._events, self._estimator = name, deque(events), estimator
+        self.left_out = 0
+        self._followed = self._resumed = False
+        self._same = self._other = 0
+
+    def begin(self, blocks: Iterator[Block]) -> Iterator[Block]:
+        """Yield the samples from the first one at which a snapshot tells the live state."""
+        held: list[Block] = []
+        for _ in range(min(TRIES, len(self._events))):
+            event = self._events[0]
+            while not held or held[-1].times[-1] <= event.time:
+                block = next(blocks, None)
+                if block is None:
+                    break
+                if len(block.times):
+                    held.append(block)
+            for k, block in enumerate(held):
+                found = np.flatnonzero(block.stamps == event.snapshot.stamp)
+                if len(found):
+                    first = int(found[0]) + self._adopt(event)
+                    self._followed = True
+                    self.left_out = sum(len(b.times) for b in held[:k]) + first
+                    rest = Block(*(column[first:] for column in block))
+                    yield from chain([rest], held[k + 1 :], blocks)
+                    return
+            changes = self._events.popleft().changes
+            if self._events:
+                following = self._events[0]
+                self._events[0] = following._replace(changes=changes | following.changes)
+        self._events.clear()
+        yield from chain(held, blocks)
+
+    def _adopt(self, event: Event) -> bool:
+        """Take the memory after the event's sample; return True if the run goes on behind it."""
+        if event.snapshot.flags & Flag.STARTED:
+            return False  # first sample of the live estimator, or first after a restart
+        self._configure(event)
+        self._events.popleft()
+        try:
+            self._estimator.remember(event.snapshot.memory)
+        except ConfigurationError:  # the memory is that of an observer of another size
+            return False
+        self._resumed = True
+        return True
+
+    def parts(self, stamps: NDArray[np.int64]) -> Iterator[slice]:
+        """Yield parts of a block; in between, do what was done to the live estimator there."""
+        position = 0
+        while self._events:
+            event = self._events[0]
+            stamp, flags, _ = event.snapshot
+            found = np.flatnonzero(stamps[position:] == stamp)
+            if not len(found) and stamp > stamps.max():
+                break  # in a later block
+            self._events.popleft()
+            # If the bag lacks that sample, the event takes place before the next one.
+            at = position + int(found[0]) if len(found) else _next(stamps, position, stamp)
+            if flags & Flag.STARTED:
+                if at > position:
+                    yield slice(position, at)
+                position = at
+                self._configure(event)
+                self._estimator.reset()
+            end = at + 1 if len(found) else at
+            if end > position:
+                yield slice(position, end)
+                position = end
+            self._repeat(event)
+            if len(found) or self._estimator.latest == stamp:
+                self._compare(event.snapshot)
+        if position < len(stamps):
+            yield slice(position, len(stamps))
+
+    def _repeat(self, event: Event) -> None:
+        """Do what was done to the live estimator after the event's sample."""
+        _, flags, memory = event.snapshot
+        if not flags & Flag.STARTED:
+            self._configure(event)
+        if flags & Flag.RESET:
+            self._estimator.reset()
+        self._estimator.freeze(bool(memory.integers[INTEGERS.index(FROZEN)]))
+
+    def _configure(self, event: Event) -> None:
+        if not event.changes:
+            return
+        try:
+            self._estimator.configure(event.changes)
+        except ConfigurationError as error:
+            raise ConfigurationError(
+                f'live change of {", ".join(event.changes)}: {error}; -p keeps a parameter fixed, '
+                '--afresh repeats no changes'
+            ) from None
+
+    def _compare(self, snapshot: Snapshot) -> None:
+        ours, theirs = self._estimator.memory.now, snapshot.memory.now
+        same = self._estimator.latest == snapshot.stamp and ours.shape == theirs.shape
+        if same and np.allclose(ours, theirs, rtol=AGREEMENT, atol=AGREEMENT, equal_nan=True):
+            self._same += 1
+        else:
+            self._other += 1
+
+    def report(self) -> str:
+        """Return a line that says how far the live estimator was followed."""
+        if not self._followed:
+            return (
+                f"{self._name} not followed: none of its snapshots' stamps is that of a sample; "
+                'began afresh at the first'
+            )
+        begin = 'from the state it had' if self._resumed else 'afresh'
+        count = self._same + self._other
+        text = f'followed {self._name} {begin} after {self.left_out} samples of the bag'
+        text += f'; {self._same} of {count} snapshots are the same to {AGREEMENT:g}'
+        if self._other:
+            text += ' (parameters differ, or one of the two missed samples)'
+        return text
+
+
+def _next(stamps: NDArray[np.int64], position: int, stamp: int) -> int:
+    later = np.flatnonzero(stamps[position:] > stamp)
+    return position + int(later[0]) if len(later) else len(stamps)

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The samples of y in a bag, and their estimates."""
+
+import argparse
+from collections.abc import Iterator
+
+from fhaosmo_ros.core.observer.status import REJECTED
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.tools.bags.held_input import HeldInput
+from fhaosmo_ros.tools.bags.reader import BagReader, Block
+from fhaosmo_ros.tools.replay.live_run import LiveRun
+from fhaosmo_ros.tools.replay.sinks import Rows
+import numpy as np
+
+
+class Samples:
+    """
+    The estimates of a bag's samples, block by block.
+
+    Parameters
+    ----------
+    reader : BagReader
+    estimator : OnlineEstimator
+    live : LiveRun or None
+        The live estimator to follow.
+    arguments : Namespace
+        Options topic, field, input_topic, input_field, stamp, backwards and every of replay.
+
+    """
+
+    def __init__(
+        self,
+        reader: BagReader,
+        estimator: OnlineEstimator,
+        live: LiveRun | None,
+        arguments: argparse.Namespace,
+    ) -> None:
+        topic = arguments.topic
+        self.estimator, self.topic, self._live = estimator, topic, live
+        self._reader, self._backwards = reader, arguments.backwards == 'error'
+        self._every, self._seen, self._taken = arguments.every, 0, 0
+        self._field = reader.field(topic, arguments.field)
+        self._stamp = arguments.stamp
+        if self._stamp == 'auto' and not self._field.has_header:
+            # An estimator that used its clock took a sample when it came, not when it was sent.
+            self._stamp = 'bag' if estimator.parameters['sampling'] == 'clock' else 'auto'
+        self._other_than_bag = False
+        self._input = None
+        if estimator.observer.uses_input:
+            self._input = HeldInput(
+                reader, arguments.input_topic, arguments.input_field, estimator.reject_inputs
+            )
+        self._first: int | None = None
+        self._latest: int | None = None
+
+    @property
+    def total(self) -> int:
+        """Number of samples in the bag."""
+        return self._reader.count(self.topic)
+
+    @property
+    def span(self) -> float:
+        """Seconds from the first sample to the latest."""
+        return 0.0 if self._first is None else (self._latest - self._first) * 1e-9
+
+    @property
+    def stamps(self) -> str:
+        """Where the stamps came from, in words."""
+        if not self._other_than_bag:
+            return 'bag'
+        has_header = self._field.has_header and self._stamp != 'source'
+        return 'header of the messages' if has_header else 'source (publish times of the bag)'
+
+    def __iter__(self) -> Iterator[tuple[int, list[Rows]]]:
+        """Yield the number of samples taken, and their estimates."""
+        blocks = self._checked()
+        if self._live:
+            blocks = self._live.begin(blocks)
+        for block in blocks:
+            if len(block.times):
+                u = self._input(block.times) if self._input else np.zeros(len(block.times))
+                yield len(block.times), list(self._rows(block, u))
+        if not self._taken:
+            raise ConfigurationError(
+                f'topic {self.topic!r}: expected messages, read none although the bag lists them'
+            )
+
+    def _checked(self) -> Iterator[Block]:
+        for block in self._reader.blocks(self.topic, self._field, self._stamp):
+            if len(block.times):
+                self._check(block)
+                yield block
+
+    def _check(self, block: Block) -> None:
+        stamps = block.stamps
+        self._other_than_bag |= bool((stamps != block.times).any())
+        if self._first is None:
+            self._first = self._latest = int(stamps[0])
+        previous = np.concatenate([[self._latest], stamps[:-1]])
+        back = np.flatnonzero(stamps < previous)
+        if len(back) and self._backwards and self.estimator.uses_stamps:
+            k = int(back[0])
+            raise ConfigurationError(
+                f'topic {self.topic!r}: expected stamps that never go back, got {stamps[k]} '
+                f'after {previous[k]} (sample {self._taken + k + 1}); --backwards reject treats '
+                'them as the live node does'
+            )
+        self._latest = int(stamps[-1])
+        self._taken += len(stamps)
+
+    def _rows(self, block: Block, u: np.ndarray) -> Iterator[Rows]:
+        whole = [slice(0, len(block.times))]
+        for part in self._live.parts(block.stamps) if self._live else whole:
+            yield from self._estimate(Block(*(column[part] for column in block)), u[part])
+
+    def _estimate(self, block: Block, u: np.ndarray) -> Iterator[Rows]:
+        estimates = self.estimator.run(block.stamps, block.values, u)
+        keep = np.flatnonzero((estimates.status & REJECTED) == 0)
+        count = len(keep)
+        keep = keep[(self._every - 1 - self._seen) % self._every :: self._every]
+        self._seen += count
+        if len(keep):
+            if len(keep) < len(block.times):
+                estimates = type(estimates)(*(a[keep] for a in estimates))
+            yield Rows(block.times[keep], block.values[keep], estimates)

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The search space made from names of estimator parameters, and parameters from its points."""
+
+from collections.abc import Mapping, Sequence
+import re
+from typing import Any
+
+from fhaosmo_ros.core.parameters.declaration import Parameter, unknown_parameter
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
+from fhaosmo_ros.tools.tuning.search.minimise import Dimension, Values
+import numpy as np
+
+NUMBERS = ('double', 'double_array')
+SMALLEST = 1e-12
+"""Lower bound of a search in logarithms where the parameter itself may be 0."""
+DECAYS = (1e-3, 1e2)
+"""Bounds of unknown_input_decay (1/s) where neither user nor start set it."""
+
+
+def make_space(
+    search: Sequence[str], start: Mapping[str, Any], levels: int, decades: float
+) -> list[Dimension]:
+    """
+    Return the dimensions of a search.
+
+    Parameters
+    ----------
+    search : sequence of str
+        As the parameter `search` says.
+    start : mapping
+        Complete parameters of the observer: where the search begins.
+    levels : int
+        Number of levels N.
+    decades : float
+        See the parameter `decades`.
+
+    Raises
+    ------
+    ConfigurationError
+        A name that is no numeric parameter of the observer, or bounds that it can't have.
+
+    """
+    space: list[Dimension] = []
+    for rule in search:
+        name, *rest = rule.split()
+        parameter = _numeric(name)
+        if not _used(name, start):
+            continue
+        low, high, log = _bounds(rule, rest, parameter)
+        if name == 'gamma_initial' and low is None:
+            low, high = start['gamma_min'], start['gamma_max']
+            log = high > 10.0 * low
+        if name == 'unknown_input_decay' and low is None and not start[name]:
+            low, high = DECAYS
+        values = start[name] if isinstance(start[name], list) else [start[name]]
+        if parameter.kind == 'double_array':
+            values = [values[min(k, len(values) - 1)] for k in range(levels)]
+        for k, value in enumerate(values):
+            label = f'{name}[{k}]' if parameter.kind == 'double_array' else name
+            space.append(_dimension(label, value, low, high, log, decades, parameter))
+    if not space:
+        raise ConfigurationError(
+            f"parameter 'search': expected one that the variant {start['variant']} uses, "
+            f'got {list(search)!r}'
+        )
+    return space
+
+
+def changes(values: Values) -> dict[str, Any]:
+    """
+    Return the parameters of the observer at a point of the space.
+
+    Parameters
+    ----------
+    values : dict
+        By the names of the dimensions.
+
+    """
+    found: dict[str, Any] = {}
+    for label, value in values.items():
+        name = re.sub(r'\[\d+\]$', '', label)
+        if name == label:
+            found[name] = value
+        else:
+            found.setdefault(name, []).append(value)
+    return found
+
+
+def _numeric(name: str) -> Parameter:
+    numbers = [p.name for p in OBSERVER_PARAMETERS.values() if p.kind in NUMBERS]
+    if name not in numbers:
+        raise unknown_parameter(name, numbers)
+    return OBSERVER_PARAMETERS[name]
+
+
+def _used(name: str, start: Mapping[str, Any]) -> bool:
+    variant = str(start['variant'])
+    if start['structure'] == 'levant' and name in ('alpha', 'epsilon', 'initial_internal'):
+        return False
+    if name.startswith('fuzzy_'):
+        return variant.startswith('fuzzy')
+    if name.startswith('gamma_'):
+        return variant.endswith('_adaptive')
+    return True
+
+
+def _bounds(
+    rule: str, rest: list[str], parameter: Parameter
+) -> tuple[float | None, float | None, bool]:
+    lower = float('-inf') if parameter.lower is None else parameter.lower
+    upper = float('inf') if parameter.upper is None else parameter.upper
+    log = lower >= 0.0 and upper > 1.0
+    if not rest:
+        return None, None, log
+    error = ConfigurationError(
+        f"parameter 'search': expected NAME, NAME LOW HIGH or NAME LOW HIGH log|linear with "
+        f'bounds for {parameter.name} ({parameter.allowed}), got {rule!r}'
+    )
+    try:
+        low, high = float(rest[0]), float(rest[1])
+    except (ValueError, IndexError):
+        raise error from None
+    if len(rest) > 3 or (len(rest) == 3 and rest[2] not in ('log', 'linear')):
+        raise error
+    if len(rest) == 3:
+        log = rest[2] == 'log'
+    if not lower <= low < high <= upper or (log and low <= 0.0):
+        raise error
+    return low, high, log
+
+
+def _dimension(
+    label: str,
+    value: float,
+    low: float | None,
+    high: float | None,
+    log: bool,
+    decades: float,
+    parameter: Parameter,
+) -> Dimension:
+    lower, upper = parameter.lower or 0.0, parameter.upper or 1.0
+    if low is None or high is None:
+        if log:
+            value = max(value, SMALLEST)
+            low = max(value / 10.0**decades, lower, SMALLEST)
+            high = min(value * 10.0**decades, upper)
+        else:
+            low, high = lower + 0.05 * (upper - lower), upper
+    if log and value < low:  # such as 0, which has no logarithm
+        value = float(np.sqrt(low * high))
+    return Dimension(label, low, high, min(max(value, low), high), log)

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The topics of estimator and plant, declared once: for the nodes, and for tools that read bags.
+
+Message types are named as ROS names them, so that a tool without ROS can use them.
+"""
+
+FLOAT = 'std_msgs/msg/Float64'
+ARRAY = 'std_msgs/msg/Float64MultiArray'
+TEXT = 'std_msgs/msg/String'
+TIME = 'builtin_interfaces/msg/Time'
+
+ESTIMATES = {
+    'state': ARRAY,
+    'unknown_input': FLOAT,
+    'gamma': FLOAT,
+    'innovation': ARRAY,
+    'stamp': TIME,
+}
+"""Topics of an estimate below the estimator's name (and channel's), in order of publication."""
+SNAPSHOT = 'snapshot'
+"""All that an estimator remembers (ARRAY, transient-local), below its name and channel's."""
+PARAMETERS = 'parameters'
+"""Text of a parameter file (TEXT, transient-local), below the node's name."""
+TRUTH = {'state': ARRAY, 'unknown_input': FLOAT}
+"""Topics of the plant below its name: the truth that belongs to each sample of y."""
+OF_ALL_NODES = {
+    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+    '/rosout': 'rcl_interfaces/msg/Log',
+    '/parameter_events': 'rcl_interfaces/msg/ParameterEvent',
+}
+"""Topics that all nodes of a system share."""

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cells of the comparison: plant, disturbance, noise, rate, timing; and their recordings."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+import math
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
+from fhaosmo_ros.core.simulation.plant import Plant
+from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
+from fhaosmo_ros.core.simulation.recordings import Family, Recording
+from fhaosmo_ros.tools.cli.share import shipped
+import numpy as np
+from studies.comparison.methods.method import Setting
+
+NOISES = (0.0, 1e-4, 1e-3, 1e-2)
+RATES = (1000.0, 100.0)
+LOW, HIGH, WIDE = (0.3, 2.0), (4.0, 10.0), (0.5, 8.0)
+"""Bands of d in rad/s."""
+TIMINGS: dict[str, dict[str, float]] = {
+    'even': {},
+    'jitter': {'period_jitter': 0.2},  # in periods
+    'dropouts': {'dropout': 0.1, 'dropout_length': 0.05},  # the length in seconds
+    'outliers': {'outliers': 0.01, 'outlier_std': 50.0},  # in standard deviations of the noise
+}
+STEP = 5e-4
+"""Of the simulations, in seconds: Runge-Kutta steps whose error is far below any estimate's."""
+TRAINING_SEED, HELD_OUT_SEED = 1, 1001
+HELD_OUT = 6
+FEW_SAMPLES, MORE = 300.0, 3
+"""Below this rate (Hz) the training has this many times the recordings."""
+
+
+class Disturbance(NamedTuple):
+    """A kind of d: its shape in the tuning, and on the recordings that judge."""
+
+    trained: str
+    """Shape that the tuning sees."""
+    judged: str
+    """Shape that judges; 'sine' is one that no family has."""
+    band: tuple[float, float]
+
+
+class PlantCase(NamedTuple):
+    """A plant of config/models, and how its d and its noise are scaled."""
+
+    text: str
+    file: str
+    rms_of_d: float
+    rms_of_u: float
+    relative: bool
+    """Noise in units of y's amplitude instead of absolutely."""
+    disturbances: dict[str, Disturbance]
+
+
+BOTH = ('sines', 'steps')
+PLANTS = {
+    'paper': PlantCase(
+        "the paper's plant", 'paper_plant', 0.07, 0.0, False,
+        {
+            'low sine': Disturbance('sines', 'sine', LOW),
+            'high sine': Disturbance('sines', 'sine', HIGH),
+            'mix': Disturbance('sines', 'sines', WIDE),
+            'steps': Disturbance('steps', 'steps', WIDE),
+        },
+    ),
+    'pendulum': PlantCase(
+        'pendulum', 'pendulum', 2.5, 0.0, True,
+        {
+            'mix': Disturbance('sines', 'sines', WIDE),
+            'steps': Disturbance('steps', 'steps', WIDE),
+            'chirp': Disturbance('sines', 'chirp', WIDE),
+        },
+    ),
+    'motor': PlantCase(
+        'DC motor', 'dc_motor', 70.0, 1.0, True,
+        {
+            'mix': Disturbance('sines', 'sines', WIDE),
+            'steps': Disturbance('steps', 'steps', WIDE),
+            'chirp': Disturbance('sines', 'chirp', WIDE),
+        },
+    ),
+}  # fmt: skip
+
+
+class Sensor(NamedTuple):
+    """
+    A plant, its kinds of d, and how y is sampled. Each method is tuned once for each sensor.
+
+    Attributes
+    ----------
+    plant, disturbances : str and tuple of str
+        Keys of `PLANTS`, and of its disturbances.
+    noise : float
+        Standard deviation on y; see `PlantCase.relative`.
+    rate : float
+        Samples a second.
+    timing : str
+        Key of `TIMINGS`.
+
+    """
+
+    plant: str
+    disturbances: tuple[str, ...]
+    noise: float
+    rate: float
+    timing: str = 'even'
+
+    @property
+    def case(self) -> PlantCase:
+        """Return the plant's entry."""
+        return PLANTS[self.plant]
+
+    def values(self) -> dict[str, Any]:
+        """Return the plant's parameters from its YAML."""
+        return plant_values(self.case.file)
+
+    def setting(self) -> Setting:
+        """Return what a user knows before tuning."""
+        values = self.values()
+        model = TriangularModel(values['phi'], values['order'])
+        # An encoder's rounding is spread evenly over a quantum.
+        rounding = values.get('quantisation', 0.0) / math.sqrt(12.0)
+        noise = math.hypot(self._noise(), rounding)
+        return Setting(model, 1.0 / self.rate, self.case.rms_of_d, noise)
+
+    @lru_cache(maxsize=2)  # noqa: B019  (a named tuple is its own key; few are kept)
+    def training(self, count: int) -> list[Recording]:
+        """
+        Return the recordings that the tuning sees.
+
+        More of them where they have few samples, fewer where no noise has to be averaged.
+        """
+        shapes = sorted({self.case.disturbances[name].trained for name in self.disturbances})
+        if self.rate < FEW_SAMPLES:
+            count *= MORE
+        if self.setting().noise == 0.0:
+            count = max(1, count // 2)
+        return self._family(shapes, self.disturbances[0]).recordings(count, TRAINING_SEED)
+
+    @lru_cache(maxsize=6)  # noqa: B019
+    def held_out(self, disturbance: str, count: int = HELD_OUT) -> list[Recording]:
+        """Return the recordings that judge."""
+        judged = self.case.disturbances[disturbance].judged
+        if judged == 'sine':
+            return [self._sine(disturbance, k) for k in range(count)]
+        return self._family((judged,), disturbance).recordings(count, HELD_OUT_SEED)
+
+    def _noise(self) -> float:
+        return self.noise * (amplitude(self.plant) if self.case.relative else 1.0)
+
+    def _family(self, shapes: Sequence[str], disturbance: str) -> Family:
+        timing = dict(TIMINGS[self.timing])
+        if 'period_jitter' in timing:
+            timing['period_jitter'] /= self.rate
+        if 'dropout_length' in timing:
+            timing['dropout_length'] *= self.rate
+        if 'outlier_std' in timing:
+            timing['outlier_std'] *= self._noise()
+        return Family(
+            family_values(self.plant)
+            | {
+                'disturbances': list(shapes),
+                'band_of_d': list(self.case.disturbances[disturbance].band),
+                'noise_std': self._noise(),
+                'sample_rate': self.rate,
+            }
+            | timing
+        )
+
+    def _sine(self, disturbance: str, number: int) -> Recording:
+        """Return a recording whose d is one sine, with its own frequency and phase."""
+        random = np.random.default_rng([HELD_OUT_SEED, number])
+        low, high = self.case.disturbances[disturbance].band
+        plant = Plant(
+            self.values()
+            | {
+                'disturbance': 'sine',
+                'disturbance_amplitude': np.sqrt(2.0) * self.case.rms_of_d,
+                'disturbance_omega': low * (high / low) ** ((number + 0.5) / HELD_OUT),
+                'disturbance_phase': random.uniform(0.0, 2.0 * np.pi),
+                'noise_std': self._noise(),
+                'noise_seed': HELD_OUT_SEED + number,
+                'integration_step': STEP,
+            }
+        )
+        t = np.arange(int(20.0 * self.rate) + 1) / self.rate
+        truth = plant.simulate(t)
+        return Recording(t, truth.y, np.zeros(len(t)), truth.z, truth.unknown_input, 'sine')
+
+
+@lru_cache
+def plant_values(file: str) -> dict[str, Any]:
+    """Return the plant's parameters in a YAML of config/models."""
+    return load(shipped(f'config/models/{file}.yaml'), 'plant', PLANT_PARAMETERS)
+
+
+@lru_cache
+def family_values(plant: str) -> dict[str, Any]:
+    """Return the parameters of a plant's family that do not depend on the sensor."""
+    case = PLANTS[plant]
+    path = shipped(f'config/models/{case.file}.yaml')
+    values = load(path, 'plant', FAMILY_PARAMETERS)
+    return values | {
+        'rms_of_d': case.rms_of_d,
+        'rms_of_u': case.rms_of_u,
+        'integration_step': STEP,
+    }
+
+
+@lru_cache
+def amplitude(plant: str) -> float:
+    """Return half the range of y without noise, averaged over some recordings."""
+    family = Family(family_values(plant) | {'disturbances': list(BOTH), 'sample_rate': 100.0})
+    return float(np.mean([np.ptp(r.y) / 2.0 for r in family.recordings(4, TRAINING_SEED)]))
+
+
+def sensors(quick: bool = False) -> list[Sensor]:
+    """Return all sensors of the comparison, the ones that cost most first."""
+    if quick:
+        return [
+            Sensor('paper', ('steps',), 1e-3, 100.0),
+            Sensor('paper', ('low sine',), 0.0, 100.0),
+            Sensor('motor', ('mix', 'steps', 'chirp'), 1e-3, 100.0),
+        ]
+    chosen = []
+    for rate in RATES:
+        for noise in NOISES:
+            chosen += [
+                Sensor('paper', (name,), noise, rate) for name in PLANTS['paper'].disturbances
+            ]
+            # Without noise gains for steps are deadbeat, and gains for smooth d are not.
+            groups = (
+                (('mix', 'chirp'), ('steps',)) if noise == 0.0 else (('mix', 'steps', 'chirp'),)
+            )
+            chosen += [
+                Sensor(plant, names, noise, rate)
+                for plant in ('pendulum', 'motor')
+                for names in groups
+            ]
+    for timing in ('jitter', 'dropouts', 'outliers'):
+        chosen += [Sensor('paper', (name,), 1e-3, 1000.0, timing) for name in ('mix', 'steps')]
+    return chosen

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tune a method for a sensor, and judge it on what the tuning has not seen."""
+
+from collections.abc import Callable, Sequence
+import time
+from typing import NamedTuple
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.tools.tuning.search.minimise import BAD, Dimension, minimise, StudyOptions
+import numpy as np
+from studies.comparison.cells import Sensor
+from studies.comparison.methods.linear import LINEAR
+from studies.comparison.methods.method import Method, Setting, Values
+from studies.comparison.methods.ours import OUR_METHOD
+from studies.comparison.methods.sliding import SLIDING
+from studies.comparison.scores import Estimates, objective, Scores, scores
+
+REPEATS = 5
+HOPELESS = 1.5
+"""A trial this many times worse than the best one so far is not run on more recordings."""
+METHODS: dict[str, Method] = {method.name: method for method in (*LINEAR, *SLIDING, OUR_METHOD)}
+
+
+class Tuned(NamedTuple):
+    """A method's best values on the training recordings, and which of its readouts was best."""
+
+    values: dict[str, float]
+    readout: str
+    training: float
+
+
+class Outcome(NamedTuple):
+    """
+    What one set of values brings.
+
+    Attributes
+    ----------
+    value : float
+        Average of the objective over the recordings, of the best readout; an estimate where
+        not all of them were run.
+    readout : str
+        Its name.
+    averages : list of float
+        The same over the first recordings, so many as were run.
+
+    """
+
+    value: float
+    readout: str
+    averages: list[float]
+
+
+def trial(
+    method: Method,
+    setting: Setting,
+    values: Values,
+    recordings: Sequence[Recording],
+    rival: Sequence[float] = (),
+) -> Outcome:
+    """
+    Evaluate a set of values on all recordings.
+
+    It ends early where the average so far exceeds `HOPELESS` times that of the `rival`, the
+    averages of the best set of values so far.
+    """
+    try:
+        run = method.prepare(setting, values)
+    except ConfigurationError:  # values that make no observer, such as an unsolvable Riccati
+        return Outcome(float('inf'), '', [])
+    totals: dict[str, float] = {}
+    averages: list[float] = []
+    for count, recording in enumerate(recordings, 1):
+        for name, estimates in run(recording).items():
+            totals[name] = totals.get(name, 0.0) + objective(recording, estimates)
+        best = min(totals, key=totals.__getitem__)
+        averages.append(totals[best] / count)
+        if not averages[-1] <= (HOPELESS * rival[count - 1] if rival else BAD):
+            break
+    value = averages[-1]
+    if rival and len(averages) < len(recordings):  # as much worse on the others, it is assumed
+        value *= rival[-1] / rival[len(averages) - 1]
+    return Outcome(value, best, averages)
+
+
+def tune(
+    method: Method, setting: Setting, recordings: Sequence[Recording], trials: int, seed: int
+) -> Tuned:
+    """Search a method's parameters; one without any is evaluated as it is."""
+    space = list(method.space(setting))
+    values: Values = {}
+    best = Outcome(float('inf'), '', [])
+
+    def judged(v: Values) -> float:
+        nonlocal best
+        found = trial(method, setting, v, recordings, best.averages)
+        if len(found.averages) == len(recordings):
+            best = min(best, found)
+        return found.value
+
+    if method.tune is not None:
+        values = method.tune(judged, setting, trials, seed)
+    elif len(space) == 1:
+        values = _scan(judged, space[0], trials)
+    elif space:
+        values = minimise(judged, space, trials, StudyOptions(seed), jobs=1).best
+    found = trial(method, setting, values, recordings)
+    return Tuned(dict(values), found.readout or 'filtered', found.value)
+
+
+def _scan(judged: Callable[[Values], float], d: Dimension, trials: int) -> dict[str, float]:
+    """Try points all over the range of the only parameter, then closer ones around the best."""
+    coarse = max(1, 2 * trials // 3)
+    points = [d.start, *np.geomspace(d.low, d.high, coarse)][:coarse]
+    best = min(points, key=lambda x: judged({d.name: x}))
+    step = (d.high / d.low) ** (1.0 / max(coarse - 1, 1))
+    closer = np.geomspace(max(best / step, d.low), min(best * step, d.high), trials - coarse)
+    return {d.name: float(min([best, *closer], key=lambda x: judged({d.name: x})))}
+
+
+def judge(
+    method: Method, setting: Setting, tuned: Tuned, recordings: Sequence[Recording]
+) -> Scores:
+    """Return the scores on held-out recordings."""
+    return scores(recordings, estimates(method, setting, tuned, recordings))
+
+
+def estimates(
+    method: Method, setting: Setting, tuned: Tuned, recordings: Sequence[Recording]
+) -> list[Estimates]:
+    """Return the estimates of a tuned method."""
+    run = method.prepare(setting, tuned.values)
+    return [run(recording)[tuned.readout] for recording in recordings]
+
+
+def evaluate(sensor: Sensor, name: str, training: int, trials: int) -> tuple[Tuned, list[Scores]]:
+    """Tune a method for a sensor and return its scores for each of the sensor's disturbances."""
+    method, setting = METHODS[name], sensor.setting()
+    tuned = tune(method, setting, sensor.training(training), trials, seed=1)
+    return tuned, [
+        judge(method, setting, tuned, sensor.held_out(disturbance))
+        for disturbance in sensor.disturbances
+    ]
+
+
+def seconds_a_sample(name: str, tuned: Tuned, sensor: Sensor) -> float:
+    """Return the time that a tuned method takes for a sample; the least of some runs."""
+    recording = sensor.training(1)[0]
+    run = METHODS[name].prepare(sensor.setting(), tuned.values)
+    best = float('inf')
+    for _ in range(REPEATS):
+        begin = time.perf_counter()
+        run(recording)
+        best = min(best, time.perf_counter() - begin)
+    return best / len(recording.t)

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The linear peers: constant gains from python-control, the same model and Phi as ours.
+
+The extended state observer (ESO): J. Han, IEEE Transactions on Industrial Electronics 56(3), 2009,
+doi:10.1109/TIE.2008.2011621.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.tools.tuning.search.minimise import Dimension, minimise, StudyOptions
+from fhaosmo_ros.tools.tuning.start.find import DERIVATIVES
+from fhaosmo_ros.tools.tuning.start.sampled_model import pair, SampledModel
+import numpy as np
+from studies.comparison.methods.constant_gain import estimates
+from studies.comparison.methods.method import Method, Run, Setting, Values
+from studies.comparison.scores import Estimates
+
+LINEAR_LIMIT = 'Kalman, Matern'
+"""Our observer equals this filter for small innovations: a reference, not a competitor."""
+REACH = 10.0
+"""How far a search for the bandwidth goes, as a factor to both sides."""
+LONGEST = 1.5
+"""Nominal periods that one step of a prediction may take."""
+Gain = Callable[[SampledModel, Values], np.ndarray]
+
+
+@lru_cache(maxsize=64)
+def _sampled(
+    phi: tuple[str, ...], period: float, chain: int, integrators_only: bool, decay: float
+) -> SampledModel:
+    return SampledModel(TriangularModel(phi), period, chain, integrators_only, decay)
+
+
+def _bandwidth(name: str, setting: Setting) -> Dimension:
+    """
+    Return the range of a frequency in rad/s.
+
+    It reaches from far below any disturbance to 5 / period, where the observer is deadbeat.
+    """
+    return Dimension(name, 0.05, 5.0 / setting.period, setting.speed)
+
+
+def _prepare(
+    shortest: int, gain: Gain, integrators_only: bool = False
+) -> Callable[[Setting, Values], Run]:
+    def prepare(setting: Setting, values: Values) -> Run:
+        model, chain = setting.model, shortest + int(values.get('derivatives', 0))
+        decay = values.get('decay', 0.0)
+        sampled = _sampled(model.phi, setting.period, chain, integrators_only, decay)
+        k = gain(sampled, values)
+        n, longest = model.order, min(LONGEST * setting.period, sampled.resolution)
+
+        def estimate(r: Recording) -> dict[str, Estimates]:
+            out = estimates(model, k, decay, r, longest)
+            return {'filtered': Estimates(out[:, :n], out[:, n])}
+
+        return estimate
+
+    return prepare
+
+
+def _kalman(model: SampledModel, values: Values) -> np.ndarray:
+    """Intensity of d's random walk such that the filter's speed is about `bandwidth`."""
+    return model.kalman([model.period * values['bandwidth'] ** (2 * model.size)])
+
+
+def _kalman_ramp(model: SampledModel, values: Values) -> np.ndarray:
+    drift = model.period * values['drift_bandwidth'] ** (2 * model.size)
+    walk = model.period * values['bandwidth'] ** (2 * model.size - 2)
+    return model.kalman([drift, walk])
+
+
+def _eso(model: SampledModel, values: Values) -> np.ndarray:
+    return model.placed([complex(-values['bandwidth'])] * model.size)
+
+
+def _luenberger(model: SampledModel, values: Values) -> np.ndarray:
+    poles: list[complex] = []
+    for i in range(model.size // 2):
+        poles += pair(values[f'frequency_{i + 1}'], values[f'damping_{i + 1}'])
+    if model.size % 2:
+        poles.append(complex(-values['real_pole']))
+    return model.placed(poles)
+
+
+def _luenberger_space(setting: Setting) -> tuple[Dimension, ...]:
+    size = setting.model.order + 1
+    space = []
+    for i in range(size // 2):
+        space.append(_bandwidth(f'frequency_{i + 1}', setting))
+        space.append(Dimension(f'damping_{i + 1}', 0.1, 5.0, 0.7))
+    if size % 2:
+        space.append(_bandwidth('real_pole', setting))
+    return tuple(space)
+
+
+def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...]:
+    """Return bandwidth and decay of a filter whose d is a Matern process."""
+    speed, fastest = setting.balance(derivatives), 5.0 / setting.period
+    return (
+        Dimension('bandwidth', speed / REACH, min(speed * REACH, fastest), speed),
+        Dimension('decay', 0.03, 30.0, 1.0),
+    )
+
+
+def _tune_matern(
+    objective: Callable[[Values], float], setting: Setting, trials: int, seed: int
+) -> dict[str, float]:
+    """Search with each number of derivatives of d, as ours does first."""
+    best: tuple[float, dict[str, float]] = (float('inf'), {})
+    for k in DERIVATIVES:
+        fixed = {'derivatives': float(k)}
+        found = minimise(
+            lambda v, fixed=fixed: objective(fixed | v),
+            matern_space(setting, k),
+            max(1, trials // len(DERIVATIVES)),
+            StudyOptions(seed),
+            jobs=1,
+        )
+        if not best[1] or found.value < best[0]:
+            best = found.value, fixed | found.best
+    return best[1]
+
+
+LINEAR = (
+    Method(
+        'Kalman',
+        'steady-state Kalman filter, d a random walk',
+        True,
+        lambda s: (_bandwidth('bandwidth', s),),
+        _prepare(1, _kalman),
+    ),
+    Method(
+        'Kalman, ramp',
+        'steady-state Kalman filter, d and its derivative random walks',
+        True,
+        lambda s: (_bandwidth('bandwidth', s), _bandwidth('drift_bandwidth', s)),
+        _prepare(2, _kalman_ramp),
+    ),
+    Method(
+        'Kalman, decaying',
+        'steady-state Kalman filter, d a random walk that decays',
+        True,
+        matern_space,
+        _prepare(1, _kalman),
+    ),
+    Method(
+        LINEAR_LIMIT,
+        'steady-state Kalman filter, d a Matern process as in ours',
+        True,
+        matern_space,
+        _prepare(1, _kalman),
+        _tune_matern,
+    ),
+    Method(
+        'ESO',
+        'high-gain (extended state) observer, all poles at one place',
+        True,
+        lambda s: (_bandwidth('bandwidth', s),),
+        _prepare(1, _eso, integrators_only=True),
+    ),
+    Method(
+        'Luenberger',
+        'Luenberger observer with disturbance state, all poles free',
+        True,
+        _luenberger_space,
+        _prepare(1, _luenberger),
+    ),
+)

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The sliding mode observers, all of them by the core's own Observer.
+
+Levant's differentiator and its gains: A. Levant, International Journal of Control 76(9-10), 2003,
+doi:10.1080/0020717031000099029.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any
+
+from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
+from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.tools.cli.share import shipped
+from fhaosmo_ros.tools.tuning.search.minimise import Dimension
+import numpy as np
+from studies.comparison.methods.method import Method, Run, Setting, Values
+from studies.comparison.scores import Estimates
+
+Parameters = Callable[[Setting, Values], Mapping[str, Any]]
+
+RECURSIVE = (1.1, 1.5, 2.0, 3.0, 5.0, 7.0)
+"""Levant's lambda_0 .. lambda_5 of the recursive form, for a Lipschitz constant of 1."""
+
+
+def prepared(parameters: Parameters) -> Callable[[Setting, Values], Run]:
+    """Return a `Method.prepare` for parameters of the core's Observer."""
+
+    def prepare(setting: Setting, values: Values) -> Run:
+        model = setting.model
+        observer = Observer(
+            {'order': model.order, 'phi': list(model.phi)} | dict(parameters(setting, values))
+        )
+        n = model.order
+
+        def estimate(r: Recording) -> dict[str, Estimates]:
+            observer.reset()
+            found = observer.run(r.t, r.y, r.u)
+            internal = np.column_stack([found.z_hat[:, 0], found.z_tilde[:, : n - 1]])
+            return {
+                'filtered': Estimates(found.z_hat[:, :n], found.z_hat[:, n]),
+                'internal': Estimates(internal, found.z_tilde[:, n - 1]),
+            }
+
+        return estimate
+
+    return prepare
+
+
+@lru_cache
+def _paper() -> dict[str, Any]:
+    """Return the paper's numbers that fit any plant: all but the model and the initial values."""
+    values = load(shipped('config/paper.yaml'), 'estimator', OBSERVER_PARAMETERS)
+    left_out = ('order', 'phi', 'variant', 'initial_estimate', 'initial_internal')
+    kept = {k: v for k, v in values.items() if k not in left_out}
+    return kept | {name: kept[name][:1] for name in ('lambda', 'alpha')}
+
+
+def _papers_gains(variant: str) -> Parameters:
+    def parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
+        del setting, values
+        return _paper() | {'variant': variant, 'start_from_measurement': True}
+
+    return parameters
+
+
+def _levant(scheme: str) -> Parameters:
+    def parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
+        """Non-recursive form: kappa_i = lambda_i kappa_{i+1}^(i / (i+1)) L^((N-i) / N)."""
+        levels = setting.model.order + 1
+        gains, kappa = [], 1.0
+        for i in reversed(range(levels)):
+            kappa = RECURSIVE[i] * kappa ** (i / (i + 1))
+            gains.append(kappa * values['lipschitz'] ** ((levels - i) / levels))
+        return {'structure': 'levant', 'variant': 'sign', 'scheme': scheme, 'lambda': gains}
+
+    return parameters
+
+
+def _levant_space(setting: Setting) -> list[Dimension]:
+    return [Dimension('lipschitz', 1e-4 * setting.size, 1e8 * setting.size, 10.0 * setting.size)]
+
+
+def _none(setting: Setting) -> list[Dimension]:
+    del setting
+    return []
+
+
+SLIDING = (
+    Method(
+        'Levant, explicit',
+        "Levant's robust exact differentiator with Phi, explicit Euler",
+        False,
+        _levant_space,
+        prepared(_levant('explicit')),
+    ),
+    Method(
+        'Levant, implicit',
+        'the same, implicit Euler',
+        False,
+        _levant_space,
+        prepared(_levant('implicit')),
+    ),
+    Method(
+        'paper: sign',
+        "sign observer with the paper's gains",
+        False,
+        _none,
+        prepared(_papers_gains('sign')),
+    ),
+    Method(
+        'paper: fuzzy',
+        "fuzzy observer with the paper's gains",
+        False,
+        _none,
+        prepared(_papers_gains('fuzzy')),
+    ),
+    Method(
+        'paper: adaptive',
+        "fuzzy observer with adapted gamma and the paper's gains",
+        False,
+        _none,
+        prepared(_papers_gains('fuzzy_adaptive')),
+    ),
+)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The numbers of the demonstration's table, from a bag whose errors are known."""
+
+import bag_files as files
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.tools.bags.types import labelled_array
+from fhaosmo_ros.tools.demo.report import read_run, table
+from fhaosmo_ros.topics import ARRAY, ESTIMATES, FLOAT, TIME
+import numpy as np
+import pytest
+
+DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
+COUNT, PERIOD = 401, 0.01
+T = PERIOD * np.arange(COUNT)
+NAMES = ['z1', 'z2', 'z3', 'd']
+SIZES = np.array([1.0, 3.0, 0.2, 0.05])
+"""Amplitude of each state and of d; their range is twice that, so the band is 0.2 of it."""
+TRUTH = SIZES * np.sin(0.5 * np.pi * T)[:, None]
+ERROR = np.select([T < 0.995, T < 1.495, T < 2.0, T < 2.995], [1.0, 0.3, 0.1, 0.01], 0.03)
+"""Relative to the amplitude; the sign alternates. In a band twice as wide it settles at 1 s."""
+ESTIMATE = TRUTH + SIZES * (ERROR * (-1.0) ** np.arange(COUNT))[:, None]
+RMS = 0.0224
+"""Of the second half, 100 samples of 0.01 and 101 of 0.03; of the last quarter it is 0.03."""
+
+
+def tick(k, stamp):
+    """Return the CDR of an estimate's messages by their topics."""
+    z, d = ESTIMATE[k, :3], ESTIMATE[k, 3]
+    return {
+        'state': labelled_array(NAMES[:3], z),
+        'unknown_input': files.float64(d),
+        'gamma': files.float64(0.5 + 1e-3 * k),
+        'innovation': labelled_array(['eps1', 'eps2', 'eps3', 'eps4'], np.zeros(4)),
+        'stamp': files.cdr(TIME, sec=stamp // 10**9, nanosec=stamp % 10**9),
+    }
+
+
+def report(stamp, **values):
+    """Return the CDR of the estimator's diagnostics."""
+    types = files.TYPES.types
+    pair, status = types['diagnostic_msgs/msg/KeyValue'], 'diagnostic_msgs/msg/DiagnosticStatus'
+    pairs = [pair(key=key.replace('_', ' '), value=str(n)) for key, n in values.items()]
+    status = types[status](
+        level=0, name='estimator: input', message='OK', hardware_id='none', values=pairs
+    )
+    return files.cdr(DIAGNOSTICS, header=files.header(stamp), status=[status])
+
+
+def record(path, missing=(), count=5):
+    """Write a run; the first `count` messages of the topics in `missing` are not in the bag."""
+    messages = []
+    for k in range(COUNT):
+        stamp = files.ORIGIN + round(k * PERIOD * 1e9)
+        truth = labelled_array(NAMES[:3], TRUTH[k, :3])
+        rows = [
+            ('/y', FLOAT, 0, files.float64(TRUTH[k, 0])),
+            ('/plant/state', ARRAY, 20_000, truth),
+            ('/plant/unknown_input', FLOAT, 40_000, files.float64(TRUTH[k, 3])),
+        ]
+        for number, (name, data) in enumerate(tick(k, stamp).items()):
+            rows.append((f'/estimator/{name}', ESTIMATES[name], 10**6 + 10**4 * number, data))
+        if k in (100, 200, 300):
+            counters = {'samples_lost': 3, 'samples_accepted': k, 'samples_rejected': 2}
+            rows.append(('/diagnostics', DIAGNOSTICS, 2 * 10**6, report(stamp, **counters)))
+        messages += [
+            (topic, kind, stamp + delay, data)
+            for topic, kind, delay, data in rows
+            if k >= count or topic not in missing
+        ]
+    return files.write(path, messages)
+
+
+def rows_of(text):
+    """Return RMS of error and truth, settling time and chatter by quantity."""
+    rows = {}
+    for line in text.splitlines():
+        words = line.split()
+        if words and words[0] in NAMES:
+            rms, size, settled, _, chatter = words[1:]
+            rows[words[0]] = [float(word) for word in (rms, size, settled, chatter)]
+    return rows
+
+
+def test_table_says_the_errors_that_are_in_the_bag(tmp_path):
+    run = read_run(record(tmp_path / 'bag'))
+    assert run.names == NAMES
+    np.testing.assert_allclose(run.truth, TRUTH, rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(run.estimate, ESTIMATE, rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(run.t, T, rtol=0.0, atol=1e-12)
+    text = table(run)
+    rows = rows_of(text)
+    for column, name in enumerate(NAMES):
+        late = slice(COUNT // 2, None)
+        chatter = np.abs(np.diff(ESTIMATE[late, column])).sum() / (2.0 * SIZES[column])
+        expected = [RMS * SIZES[column], np.sqrt(0.5) * SIZES[column], 1.5, chatter]
+        assert rows[name] == pytest.approx(expected, rel=5e-3), name
+    assert 'sample rate held: 100.0 Hz' in text
+    assert 'samples: 300 used, 3 dropped, 2 rejected' in text
+
+
+@pytest.mark.parametrize(
+    'missing',
+    [
+        *([f'/estimator/{name}'] for name in ESTIMATES),
+        ['/plant/state'],
+        ['/plant/unknown_input'],
+        ['/y'],
+        ['/estimator/state', '/estimator/unknown_input', '/plant/state'],
+        ['/estimator/stamp', '/plant/unknown_input', '/y'],
+    ],
+)
+def test_early_messages_that_are_missing_change_no_number(missing, tmp_path):
+    """A recorder may hear some topics later than others."""
+    run = read_run(record(tmp_path / 'bag', missing))
+    begin = 0 if missing == ['/y'] else 5
+    np.testing.assert_array_equal(run.estimate, ESTIMATE[begin:])
+    np.testing.assert_array_equal(run.truth, TRUTH[begin:])
+    rows = rows_of(table(run))
+    for column, name in enumerate(NAMES):
+        assert rows[name][0] == pytest.approx(RMS * SIZES[column], rel=0.02), name
+        assert rows[name][2] == pytest.approx(1.5 - begin * PERIOD, abs=6e-3), name
+
+
+def test_bag_without_estimates_is_refused(tmp_path):
+    bag = record(tmp_path / 'bag', [f'/estimator/{name}' for name in ESTIMATES], COUNT)
+    with pytest.raises(ConfigurationError, match='ended before an estimate arrived'):
+        read_run(bag)

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""YAML from anybody: every text is content or one line of error, soon."""
+
+import time
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import dumps, loads
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.parameters.yaml_text import MAX_DEPTH, MAX_DIGITS, MAX_LENGTH, parse
+from fhaosmo_ros.tools.cli.options import assigned
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+import pytest
+from yaml_texts import HOSTILE, LAUGHS
+
+LISTS = ('lambda', 'phi', 'channels')
+
+
+def error_of(function, *arguments):
+    """Return the one line with which a call is refused, None if it is not."""
+    start = time.perf_counter()
+    try:
+        repr(function(*arguments))
+    except ConfigurationError as error:
+        message = str(error)
+        assert message.isprintable()
+        assert len(message) < 600
+    else:
+        message = None
+    assert time.perf_counter() - start < 5.0
+    return message
+
+
+@pytest.mark.parametrize('text', HOSTILE.values(), ids=HOSTILE.keys())
+def test_hostile_text_is_content_or_one_line(text):
+    error_of(parse, text)
+    for name in LISTS:
+        assert error_of(ESTIMATOR_PARAMETERS[name].coerce, text) or name != 'lambda'
+    error_of(assigned, [f'lambda:={text}'], ESTIMATOR_PARAMETERS)
+    assert error_of(loads, text, 'estimator', ESTIMATOR_PARAMETERS)
+    section = f'/**: {{ros__parameters: {{lambda: {text}}}}}'
+    assert error_of(loads, section, 'estimator', ESTIMATOR_PARAMETERS)
+
+
+PIECES = [
+    '[', ']', '{', '}', '? ', ': ', ', ', '- ', '&a ', '*a ', '!!float ', '!!int ', '!!bool ',
+    '!!timestamp ', '!!binary ', '!!set ', '!!null ', '!<x> ', '2020-99-99', '0b_', '0x_', '._',
+    '1:2:3', '1e5', '9' * 500, '"', "'", '|', '>', '\n', '  ', '\t', '#', '%YAML 1.1\n', '---\n',
+    '...', '<<', '=', '~', 'null', 'yes', '.nan', '-.inf', 'a', 'é', '\x00', '\ud800', '\u2028',
+    '\ufeff', '@', '`', '!', '\\x', '\r', '\x85', '0o7', '1_0', '+', '-', '.', '_', '0',
+]  # fmt: skip
+TEXTS = st.one_of(
+    st.text(),
+    st.lists(st.sampled_from(PIECES), max_size=30).map(''.join),
+    st.text('[]{}?:,-&*!ab01. \n"\'|>#%@`', max_size=60),
+)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(TEXTS)
+def test_any_text_is_content_or_one_line(text):
+    error_of(parse, text)
+    for name in LISTS:
+        error_of(ESTIMATOR_PARAMETERS[name].coerce, text)
+
+
+@pytest.mark.parametrize(
+    ('text', 'content'),
+    [
+        ('', None),
+        ('2001-02-30', '2001-02-30'),
+        ('2001-02-03 04:05:06', '2001-02-03 04:05:06'),
+        ('=', '='),
+        ('{<<: {a: 1}}', {'<<': {'a': 1}}),
+        ('!!float 3', 3.0),
+        ('!!str 3', '3'),
+        ('[1, 0x10, 1e-3, .inf, yes, ~, a]', [1, 16, 0.001, float('inf'), True, None, 'a']),
+        ('a: &anchor [1]', {'a': [1]}),
+        ('1' * MAX_DIGITS, int('1' * MAX_DIGITS)),
+        ('[' * MAX_DEPTH + ']' * MAX_DEPTH, None),
+    ],
+)
+def test_content(text, content):
+    assert content is None or parse(text) == content
+    parse(text)
+
+
+@pytest.mark.parametrize(
+    ('text', 'reason'),
+    [
+        ('{a: 1, b: 2, a: 3}', "the key 'a' twice (line 1)"),
+        ('a:\n  b: 1\n  b: 2', "the key 'b' twice (line 3)"),
+        ('a: &x [1]\nb: *x', 'the alias *x, which ROS does not read either (line 2)'),
+        (LAUGHS, 'the alias *a'),
+        ('[' * (MAX_DEPTH + 2), f'nested deeper than {MAX_DEPTH}'),
+        ('[' + '1,' * 100_000 + ']', 'more than 50000 values'),
+        ('1' * (MAX_DIGITS + 1), f'an integer of more than {MAX_DIGITS} digits'),
+        ('a' * (MAX_LENGTH + 1), f'{MAX_LENGTH + 1} characters, at most {MAX_LENGTH}'),
+        ('!!bool x', "'x', which is no bool"),
+        ('!!timestamp 2001-01-01', "the tag 'tag:yaml.org,2002:timestamp'"),
+        ('{[a]: 1}', 'a key that is no plain text'),
+        ('a: 1\n---\nb: 2', 'a second document (line 2)'),
+    ],
+)
+def test_refusal_gives_reason_and_line(text, reason):
+    message = error_of(parse, text)
+    assert message.startswith('expected YAML, got: ')
+    assert reason in message
+
+
+def test_section_or_parameter_given_twice_is_refused():
+    """Rcl merges them; a YAML library keeps the last one: nobody can rely on either."""
+    twice = '/**:\n  ros__parameters: {epsilon: 1.0}\n' * 2
+    message = error_of(loads, twice, 'estimator', ESTIMATOR_PARAMETERS)
+    assert message == "expected YAML, got: the key '/**' twice (line 3)"
+    nested = '/**: {ros__parameters: {channels: [a], a.epsilon: 1.0, a: {epsilon: 2.0}}}'
+    message = error_of(loads, nested, 'estimator', ESTIMATOR_PARAMETERS)
+    assert message == "section '/**': 'a.epsilon' is set twice"
+
+
+def test_written_file_has_no_alias():
+    gains = [1.0, 2.0]
+    text = dumps({'lambda': gains, 'alpha': gains})
+    assert loads(text, 'estimator', ESTIMATOR_PARAMETERS) == {'lambda': gains, 'alpha': gains}
+
+
+def test_file_is_read_up_to_a_bound(tmp_path):
+    path = tmp_path / 'zero.yaml'
+    path.write_text('#' * (3 * MAX_LENGTH))
+    from fhaosmo_ros.core.parameters.files import load
+
+    assert f'at most {MAX_LENGTH} are read' in error_of(load, path, 'estimator')
+
+
+def test_long_integer_of_a_caller_is_refused():
+    assert 'a longer integer' in error_of(ESTIMATOR_PARAMETERS['epsilon'].coerce, 10**5000)
