@@ -192,12 +192,13 @@ class Client:
                     raise TimeoutError(f'no {what} within {timeout} s')
                 self._changed.wait(0.05)
 
-    def call_later(self, service: str, service_type: type, request: object):
-        """Send a request and return the future of its answer."""
+    def call_later(self, service: str, service_type: type, request: object, wait: bool = True):
+        """Send a request and return the future of its answer; `wait` for the service first."""
         client = self._services.get(service)
         if client is None:
             client = self._services[service] = self.node.create_client(service_type, service)
-        self.wait(client.service_is_ready, f'service {service}')
+        if wait:
+            self.wait(client.service_is_ready, f'service {service}')
         return client.call_async(request)
 
     def call(self, service: str, service_type: type, request: object):

@@ -220,6 +220,6 @@ def test_reset_that_waits_during_cleanup_does_not_end_the_node(client, node, unc
         client.call(reset, Trigger, Trigger.Request())
         client.call_later(change, ChangeState, cleanup)
         for _ in range(20):
-            client.call_later(reset, Trigger, Trigger.Request())
+            client.call_later(reset, Trigger, Trigger.Request(), wait=False)
         client.wait(lambda: node.state() == 'unconfigured', 'cleanup')
         assert node.process.running
