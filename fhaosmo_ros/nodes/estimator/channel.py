@@ -2,7 +2,6 @@
 """One channel of an estimator node: y (and u) in, one observer, estimates out on a timer."""
 
 from collections.abc import Mapping
-from copy import deepcopy
 from time import perf_counter, time_ns
 from typing import Any, NamedTuple
 
@@ -68,7 +67,6 @@ class Channel:
         self._clock = node.get_clock()
         self._logger = node.get_logger()
         self.estimator = estimator
-        self._compile()
         self._values = values
         self._clock_stamps = values['sampling'] == 'clock'
         self._timer: Any = None
@@ -154,14 +152,6 @@ class Channel:
             for text in found.unheard.values() or ([] if found.heard else ['no publisher of u']):
                 reports[0].find(WARN, text)
         return reports
-
-    def _compile(self) -> None:
-        """
-        Compile before the first sample arrives, or load what an earlier start has compiled.
-
-        A copy takes the sample, so that the estimator remains as new, its counters too.
-        """
-        deepcopy(self.estimator).advance(1, 0.0)
 
     def _forget(self) -> None:
         self._arrived = False
