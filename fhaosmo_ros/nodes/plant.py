@@ -13,6 +13,7 @@ from fhaosmo_ros.core.simulation.plant import Plant
 from fhaosmo_ros.nodes.middleware.loading import Loading
 from fhaosmo_ros.nodes.middleware.messages import array_encoder, double_encoder
 from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
+from fhaosmo_ros.nodes.middleware.publishers import check_overrides, create_publisher
 from fhaosmo_ros.nodes.middleware.simulated_time import reject_negative_time
 from fhaosmo_ros.nodes.middleware.spin import run_node
 from rclpy.node import Node
@@ -22,6 +23,7 @@ MAX_PAUSE = 1_000_000_000
 """Clock jumps beyond this many nanoseconds are not simulated through."""
 DEPTH = 1000
 """Of the topics' queues: a recorder that stalls for a second loses nothing at 1 kHz."""
+TOPICS = {'y': Float64, '~/state': Float64MultiArray, '~/unknown_input': Float64}
 
 
 class Change(NamedTuple):
@@ -46,7 +48,12 @@ class PlantNode(Node):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__('plant', automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__(
+            'plant',
+            automatically_declare_parameters_from_overrides=True,
+            enable_logger_service=True,
+            **options,
+        )
         reject_negative_time(self)
         values = complete(overrides_of(self), PLANT_NODE_PARAMETERS)
         self.plant = Plant(values)
@@ -58,9 +65,10 @@ class PlantNode(Node):
         self._diverged = False
         self._encode = double_encoder()
         self._encode_state = array_encoder([f'z{i + 1}' for i in range(self.plant.order)])
-        self._publish_y = self.create_publisher(Float64, 'y', DEPTH).publish
-        self._publish_state = self.create_publisher(Float64MultiArray, '~/state', DEPTH).publish
-        self._publish_d = self.create_publisher(Float64, '~/unknown_input', DEPTH).publish
+        check_overrides(self, TOPICS)
+        self._publish_y, self._publish_state, self._publish_d = (
+            create_publisher(self, kind, topic, DEPTH).publish for topic, kind in TOPICS.items()
+        )
         if self.plant.uses_input:
             self.create_subscription(Float64, 'u', self._on_input, 10)
         self._timer: Any = None

@@ -13,13 +13,15 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.channel_group import ChannelGroup, load, make_estimators
 from fhaosmo_ros.nodes.estimator.channel_inheritance import ChannelInheritance
-from fhaosmo_ros.nodes.estimator.outputs import check_overrides
 from fhaosmo_ros.nodes.estimator.parameter_topic import ParameterTopic
-from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, ERROR, OK, Report, STALE
+from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.loading import Loading
 from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
+from fhaosmo_ros.nodes.middleware.publishers import check_overrides
+from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
 from fhaosmo_ros.nodes.middleware.spin import run_node
+from fhaosmo_ros.topics import ESTIMATES
 
 
 class EstimatorNode(ManagedNode):
@@ -39,7 +41,10 @@ class EstimatorNode(ManagedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(
-            'estimator', automatically_declare_parameters_from_overrides=True, **options
+            'estimator',
+            automatically_declare_parameters_from_overrides=True,
+            enable_logger_service=True,
+            **options,
         )
         overrides = overrides_of(self)
         if overrides.get('use_sim_time') is True and 'sampling' not in overrides:
@@ -51,6 +56,7 @@ class EstimatorNode(ManagedNode):
         self._inheritance = ChannelInheritance(self._names, overrides)
         self._channels: Channel | ChannelGroup | None = None
         self._parameter_topic: ParameterTopic | None = None
+        self._clock_watch = ClockWatch(self)
         self._diagnostics = DiagnosticsPublisher(
             self, self._reports, values['diagnostics_period'], values['hardware_id']
         )
@@ -75,7 +81,8 @@ class EstimatorNode(ManagedNode):
 
     def _make_estimators(self) -> dict[str, OnlineEstimator]:
         """Return new estimators; raise for parameters that do not fit together."""
-        check_overrides(self, [f'~/{name}/' if name else '~/' for name in self._names])
+        prefixes = [f'~/{name}/' if name else '~/' for name in self._names]
+        check_overrides(self, [prefix + topic for prefix in prefixes for topic in ESTIMATES])
         return make_estimators(self._node_parameters.values, self._names)
 
     def configure(self) -> None:
@@ -141,8 +148,8 @@ class EstimatorNode(ManagedNode):
         state = Report('state')
         active = self.state == 'active'
         state.find(OK if active else STALE, ': '.join(filter(None, (self.state, self.not_ready))))
-        if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
-            state.find(ERROR, 'use_sim_time, but nothing on /clock yet')
+        for level, text in self._clock_watch.look():
+            state.find(level, text)
         if not active or self._channels is None:
             return [state]
         return [state, *self._channels.reports()]
