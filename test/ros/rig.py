@@ -17,6 +17,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 import fhaosmo_ros
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.nodes.middleware.subscription import subscribe_with_info
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import (
     DescribeParameters,
@@ -263,6 +265,32 @@ class Parameters:
 
     def _call(self, service: str, service_type: type, request: object):
         return self._client.call(f'{self._node}/{service}', service_type, request)
+
+
+class Manager:
+    """Drives a managed node; what it answers is what a user of `ros2 lifecycle` sees."""
+
+    def __init__(self, client: Client, node: str) -> None:
+        self._client = client
+        self._node = node
+
+    def state(self) -> str:
+        return self._call('get_state', GetState, GetState.Request()).current_state.label
+
+    def transitions(self) -> set[str]:
+        service = GetAvailableTransitions
+        answer = self._call('get_available_transitions', service, service.Request())
+        return {t.transition.label for t in answer.available_transitions}
+
+    def change(self, transition: int | str) -> bool:
+        by_label = isinstance(transition, str)
+        wanted = Transition(label=transition) if by_label else Transition(id=transition)
+        return self._call(
+            'change_state', ChangeState, ChangeState.Request(transition=wanted)
+        ).success
+
+    def _call(self, service: str, kind: type, request: object):
+        return self._client.call(f'{self._node}/{service}', kind, request)
 
 
 def _messages(values: dict[str, object]) -> list[ParameterMessage]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reports on /diagnostics: their values, and what makes them WARN, ERROR and STALE."""
 
+import itertools
 import math
 
 import pytest
@@ -8,7 +9,9 @@ import pytest
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
+from builtin_interfaces.msg import Time  # noqa: E402
 from rig import EstimatorRig, node_process, Parameters, parameters  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
 OK, WARN, ERROR, STALE = b'\0', b'\1', b'\2', b'\3'
@@ -164,10 +167,24 @@ def test_share_of_bad_samples_makes_an_error(client, start):
         rig.wait_status('input', level, 'rejected measurements 1', start=reports)
 
 
-def test_no_clock_is_said(client, start):
-    start('estimator', *parameters(namespace='/g', use_sim_time='true', sampling='clock', **LAX))
+def test_a_clock_that_does_not_run_is_said(client, start):
+    process = start(
+        'estimator', *parameters(namespace='/g', use_sim_time='true', sampling='clock', **LAX)
+    )
     rig = EstimatorRig(client, '/g', feed=False)
     rig.wait_status('state', ERROR, 'nothing on /clock')
+    publish = client.publisher('/clock', Clock)
+    ticks = itertools.count(1)
+
+    def runs() -> bool:
+        publish(Clock(clock=Time(sec=next(ticks))))
+        return any(s.message == 'active' for s in rig.statuses())
+
+    client.wait(runs, 'clock that runs')
+    rig.wait_status('state', WARN, 'the time on /clock stands still for', 'paused')
+    publish.destroy()
+    rig.wait_status('state', ERROR, 'stands still', 'nobody publishes it any more')
+    assert process.output.count('stands still') == 1  # once, not five times a second
 
 
 def test_missing_known_input_is_said(client, start):
