@@ -170,8 +170,8 @@ class Health:
         if used < 2 * spread:
             report.find(
                 WARN,
-                f'/clock ticks once for {used / max(1, used - spread):.0f} samples: their times are '
-                "inexact; let it tick with every sample, or do not use sampling 'clock'",
+                f'/clock ticks once for {used / max(1, used - spread):.0f} samples, which makes '
+                "their times inexact: let it tick with each, or do not use sampling 'clock'",
             )
         for key in ('restarts', 'stuck'):
             if news[key]:
