@@ -10,6 +10,10 @@ rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2
 pytestmark = pytest.mark.ros
 
 from builtin_interfaces.msg import Time  # noqa: E402
+from fhaosmo_ros.core.online.estimator import OnlineEstimator  # noqa: E402
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS  # noqa: E402
+from fhaosmo_ros.nodes.estimator.health import Health  # noqa: E402
+from fhaosmo_ros.nodes.middleware.publisher_watch import Publishers  # noqa: E402
 from rig import EstimatorRig, node_process, Parameters, parameters  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
@@ -200,3 +204,17 @@ def test_simulation_time_samples_by_the_clock_unless_it_is_told_otherwise(client
         start('estimator', *parameters(namespace=namespace, use_sim_time='true', **given))
         values = Parameters(client, f'{namespace}/estimator')
         assert values.get('sampling') == expected
+
+
+@pytest.mark.parametrize(('samples', 'told'), [(25, 'ticks once for 25 samples'), (1, '')])
+def test_a_clock_that_is_slower_than_the_samples_is_said(samples, told):
+    """What `ros2 bag play --clock` gives, at 40 Hz, and a clock that ticks with every sample."""
+    estimator = OnlineEstimator({'sampling': 'clock'})
+    health = Health(estimator, ESTIMATOR_PARAMETERS.complete(LAX))
+    for begin in (1000, 2000):  # the first report is on the first tick too
+        for k in range(begin, begin + 1000):
+            estimator.update(k // samples * samples * 1_000_000, 0.2)
+        report, _ = health.reports('/y', Publishers({(1,): '/plant'}, {}), stale=False, name='')
+    status = report.message('estimator', 'none')
+    assert told in status.message
+    assert status.level == (WARN if told else OK)
