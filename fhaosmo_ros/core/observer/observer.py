@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.model.inputs import known_inputs, known_inputs_of_run
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer import step as recursion
 from fhaosmo_ros.core.observer.arrays import Law, make_work, State, Work
@@ -140,6 +141,7 @@ class Observer:
         self._state = self._configuration.initial_state()
         self._set_law()
         self._eps = np.zeros((1, self._configuration.levels))
+        self._u = np.zeros(len(self.inputs))
         self._t: float | int | None = None
         self._word = 0
 
@@ -169,8 +171,18 @@ class Observer:
 
     @property
     def uses_input(self) -> bool:
-        """True if the model uses the known input u."""
+        """True if the model uses a known input."""
         return self._configuration.model.uses_input
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the known inputs, in the order of their values."""
+        return self._configuration.model.inputs
+
+    @property
+    def used_inputs(self) -> tuple[str, ...]:
+        """Names of those of them that the model uses."""
+        return self._configuration.model.used_inputs
 
     @property
     def started(self) -> bool:
@@ -264,7 +276,7 @@ class Observer:
         self._word = recursion.start(self._law, self._state, float(y), self._eps, 0)
         return self._estimate(self._word)
 
-    def step(self, y: float, dt: float, u: float = 0.0) -> Estimate:
+    def step(self, y: float, dt: float, u: ArrayLike = 0.0) -> Estimate:
         """
         Advance by `dt` to the sample `y`.
 
@@ -277,8 +289,8 @@ class Observer:
             Measured output at the end of the interval.
         dt : float
             Time since the previous call, in seconds, > 0.
-        u : float
-            Known input during the interval.
+        u : number or (m,) array
+            Known input, or known inputs, during the interval.
 
         Returns
         -------
@@ -290,11 +302,15 @@ class Observer:
         word = self.advance(y, dt, u)
         return self._estimate(word)
 
-    def advance(self, y: float, dt: float, u: float = 0.0) -> int:
+    def advance(self, y: float, dt: float, u: ArrayLike = 0.0) -> int:
         """Do what `step` does and return only the status word; see `estimate`."""
         if not self.started and np.isfinite(y):
             self.start(y)
-        sample = float(y), float(dt), float(u), self._eps
+        if type(u) is float and len(self._u) == 1:
+            self._u[0] = u
+        else:
+            self._u[:] = known_inputs(u, self.inputs)
+        sample = float(y), float(dt), self._u, self._eps
         self._word = recursion.step_once(*self._arguments, *sample)
         return self._word
 
@@ -365,8 +381,8 @@ class Observer:
             after all samples before it is rejected.
         y : (K,) array
             Samples.
-        u : (K,) array or float
-            Known input during the interval that ends at each sample.
+        u : number, (K,) or (K, m) array
+            Known input, or known inputs, during the interval that ends at each sample.
         every : int
             Record every `every`-th sample only.
 
@@ -390,13 +406,7 @@ class Observer:
             )
         if every < 1:
             raise ConfigurationError(f'run: expected every >= 1, got {every}')
-        u = np.asarray(u, dtype=np.float64)
-        if u.shape not in ((), y.shape):
-            raise ConfigurationError(
-                f'run: expected u to be a number or an array as long as y, got shapes {u.shape} '
-                f'and {y.shape}'
-            )
-        u = np.ascontiguousarray(np.broadcast_to(u, y.shape))
+        u = known_inputs_of_run(u, len(y), self.inputs)
         first = 0
         if not self.started:
             self._t = None

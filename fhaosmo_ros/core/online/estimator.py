@@ -4,6 +4,7 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.model.inputs import known_inputs_of_run
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.observer import (
@@ -67,7 +68,7 @@ class OnlineEstimator:
         self._policy = make_policy(self.observer.initial_state())
         self._ints, self._reals = self._policy
         self._eps = self.observer.innovations
-        self._u = 0.0
+        self._u = np.zeros(len(self.observer.inputs))
         self._word = 0
         self._write_settings()
 
@@ -185,7 +186,7 @@ class OnlineEstimator:
             reals=self._reals[at.INTERVAL : at.STATES].copy(),
             before=self._reals[at.STATES + size :].copy(),
             now=np.concatenate([state.levels.ravel(), state.memory]),
-            u=self._u,
+            u=self._u.copy(),
         )
 
     def remember(self, memory: Memory) -> None:
@@ -195,7 +196,7 @@ class OnlineEstimator:
         Raises
         ------
         ConfigurationError
-            The memory is of an observer with another number of levels.
+            The memory is of an observer with another number of levels, or of known inputs.
 
         """
         size, levels = len(memory.now), self._arrays.state.levels
@@ -203,12 +204,16 @@ class OnlineEstimator:
             raise ConfigurationError(
                 f'memory: expected that of {self.observer.levels} levels, got {size} numbers'
             )
+        if len(memory.u) != len(self._u):
+            raise ConfigurationError(
+                f'memory: expected {len(self._u)} known inputs, got {len(memory.u)}'
+            )
         self._ints[at.FROZEN : at.COUNTERS] = memory.integers
         self._reals[at.INTERVAL : at.STATES] = memory.reals
         self._reals[at.STATES + size :] = memory.before
         state, scalars = memory.now[: levels.size], memory.now[levels.size :]
         self.observer.restore(ObserverState(state.reshape(levels.shape), scalars))
-        self._u = memory.u
+        self._u[:] = memory.u
 
     def seed(self, z: ArrayLike, unknown_input: float) -> None:
         """
@@ -259,16 +264,30 @@ class OnlineEstimator:
         self._ints[at.TIMED] = self._ints[at.TICK_COUNT] = 0
 
     @property
-    def input(self) -> float:
-        """The known input u that is held."""
-        return self._u
+    def inputs(self) -> tuple[float, ...]:
+        """The known inputs that are held, in the order of `Observer.inputs`."""
+        return tuple(self._u.tolist())
 
-    def set_input(self, u: float) -> bool:
-        """Hold `u` as the known input from now on; return False if it is not finite."""
+    def set_input(self, u: float, index: int = 0) -> bool:
+        """
+        Hold a known input from now on.
+
+        Parameters
+        ----------
+        u : float
+        index : int
+            Which one, in the order of `Observer.inputs`.
+
+        Returns
+        -------
+        bool
+            False if it is not finite: then the one before is held, and this one counted.
+
+        """
         if not np.isfinite(u):
             self.reject_inputs(1)
             return False
-        self._u = float(u)
+        self._u[index] = u
         return True
 
     def reject_inputs(self, count: int) -> None:
@@ -304,9 +323,7 @@ class OnlineEstimator:
         self._word = word
         return word
 
-    def run(
-        self, stamps: NDArray[np.int64], y: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> Trajectory:
+    def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
         """
         Take many samples, bit for bit as `update` would take one after the other.
 
@@ -316,8 +333,9 @@ class OnlineEstimator:
             Times of the samples in nanoseconds.
         y : (K,) array
             Samples.
-        u : (K,) array
-            Known input of the interval that ends at each sample.
+        u : number, (K,) or (K, m) array, optional
+            Known input, or known inputs, of the interval that ends at each sample; without it,
+            those that are held.
 
         Returns
         -------
@@ -325,17 +343,30 @@ class OnlineEstimator:
             A row for every sample, whose status says whether it was rejected. ``t`` holds the
             stamps.
 
+        Raises
+        ------
+        ConfigurationError
+            Arrays whose shapes do not fit.
+
         """
-        count, n = len(y), self.observer.levels
-        u = np.array(u, dtype=np.float64)
-        for k in np.flatnonzero(~np.isfinite(u)):
-            u[k] = u[k - 1] if k else self._u
-            self.reject_inputs(1)
-        record = make_record(count, n, count)
         stamps = np.ascontiguousarray(stamps, dtype=np.int64)
-        policy.run(self._arrays, stamps, np.ascontiguousarray(y, dtype=np.float64), u, record)
+        y = np.ascontiguousarray(y, dtype=np.float64)
+        if y.ndim != 1 or stamps.shape != y.shape:
+            raise ConfigurationError(
+                'run: expected stamps and y with one dimension and equal length, got shapes '
+                f'{stamps.shape} and {y.shape}'
+            )
+        count, n = len(y), self.observer.levels
+        inputs = np.tile(self._u, (count, 1))
+        if u is not None:
+            inputs = known_inputs_of_run(u, count, self.observer.inputs).copy()
+            for k, j in np.argwhere(~np.isfinite(inputs)):
+                inputs[k, j] = inputs[k - 1, j] if k else self._u[j]
+                self.reject_inputs(1)
+        record = make_record(count, n, count)
+        policy.run(self._arrays, stamps, y, inputs, record)
         if count:
-            self._u, self._word = float(u[-1]), int(record.words[-1])
+            self._u[:], self._word = inputs[-1], int(record.words[-1])
             self._eps[0] = record.eps[-1]
         return self.observer.trajectory(stamps, record)
 

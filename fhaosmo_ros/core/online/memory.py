@@ -13,6 +13,7 @@ bits (stamps) do not fit into a double: each stands in two, its upper and its lo
 
 from collections.abc import Sequence
 from enum import IntFlag
+import re
 from typing import NamedTuple
 
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
@@ -138,8 +139,8 @@ class Memory(NamedTuple):
         Of `Policy.reals`.
     before, now : (4N + 4,) arrays
         The observer's state (levels, then memory) before the latest bridged gap, and its state.
-    u : float
-        Known input.
+    u : (m,) array
+        Known inputs.
 
     """
 
@@ -147,7 +148,7 @@ class Memory(NamedTuple):
     reals: NDArray[np.float64]
     before: NDArray[np.float64]
     now: NDArray[np.float64]
-    u: float
+    u: NDArray[np.float64]
 
 
 class Snapshot(NamedTuple):
@@ -168,13 +169,14 @@ class Snapshot(NamedTuple):
     memory: Memory
 
 
-def labels(levels: int) -> list[str]:
-    """Return a name for each entry of the vector of an observer with that many levels."""
+def labels(levels: int, inputs: Sequence[str] = ('u',)) -> list[str]:
+    """Return a name for each entry of the vector of an observer with these levels and inputs."""
     integers = [f'{NAMES[k].lower()}_{half}' for k in INTEGERS for half in ('upper', 'lower')]
     rows = [f'{row}{i + 1}' for row in LABELS_OF_ROWS for i in range(levels)]
     state = [*rows, *LABELS_OF_MEMORY]
     before = (f'before_{name}' for name in state)
-    return [*HEAD, *integers, *LABELS_OF_REALS, *before, *state, 'u']
+    of_inputs = (name if name == 'u' else f'u_{name}' for name in inputs)
+    return [*HEAD, *integers, *LABELS_OF_REALS, *before, *state, *of_inputs]
 
 
 def pack(snapshot: Snapshot) -> NDArray[np.float64]:
@@ -183,30 +185,42 @@ def pack(snapshot: Snapshot) -> NDArray[np.float64]:
     halves = np.column_stack(np.divmod(memory.integers, HALF)).ravel()
     head: Sequence[int] = [int(snapshot.flags), *divmod(snapshot.stamp, SECOND)]
     return np.concatenate(
-        [head, halves, memory.reals, memory.before, memory.now, [memory.u]], dtype=np.float64
+        [head, halves, memory.reals, memory.before, memory.now, memory.u], dtype=np.float64
     )
 
 
-def unpack(vector: ArrayLike) -> Snapshot:
+def unpack(vector: ArrayLike, names: Sequence[str]) -> Snapshot:
     """
     Return the snapshot in a vector.
+
+    Parameters
+    ----------
+    vector : (K,) array
+    names : sequence of str
+        Name of each entry, as `labels` returns them. What an older version did not remember, and
+        so has no entry, is 0.
 
     Raises
     ------
     ValueError
-        Its length is that of no estimator.
+        The entries are not those of an estimator of this version, or of an older one.
 
     """
     v = np.asarray(vector, dtype=np.float64)
-    halves = 2 * len(INTEGERS)
-    begin = len(HEAD) + halves + len(LABELS_OF_REALS)
-    size, odd = divmod(len(v) - begin - 1, 2)
-    if v.ndim != 1 or odd or size <= arrays.MEMORY or (size - arrays.MEMORY) % arrays.ROWS:
-        raise ValueError(f'a snapshot can not have {v.size} entries')
-    upper, lower = v[len(HEAD) : len(HEAD) + halves].reshape(-1, 2).T
+    if v.shape != (len(names),):
+        raise ValueError(f'a snapshot with {len(names)} names can not have {v.size} entries')
+    entries = dict(zip(names, v.tolist(), strict=True))
+    levels = sum(re.fullmatch('z_hat[0-9]+', name) is not None for name in names)
+    inputs = [name.removeprefix('u_') for name in names if name == 'u' or name.startswith('u_')]
+    known = labels(levels, inputs)
+    unknown = [name for name in names if name not in known]
+    if unknown or not levels or len(entries) < len(v):
+        raise ValueError(f'a snapshot can not have the entries {", ".join(unknown) or names}')
+    v = np.array([entries.get(name, 0.0) for name in known])
+    size = arrays.ROWS * levels + arrays.MEMORY
+    counts = [len(HEAD), 2 * len(INTEGERS), len(LABELS_OF_REALS), size, size, len(inputs)]
+    head, halves, reals, before, now, u = np.split(v, np.cumsum(counts)[:-1])
+    upper, lower = halves.reshape(-1, 2).T
     integers = upper.astype(np.int64) * HALF + lower.astype(np.int64)
-    memory = Memory(
-        integers, v[begin - len(LABELS_OF_REALS) : begin].copy(), v[begin : begin + size].copy(),
-        v[begin + size : begin + 2 * size].copy(), float(v[-1]),
-    )  # fmt: skip
-    return Snapshot(int(v[1]) * SECOND + int(v[2]), Flag(int(v[0])), memory)
+    memory = Memory(integers, reals, before, now, u)
+    return Snapshot(int(head[1]) * SECOND + int(head[2]), Flag(int(head[0])), memory)

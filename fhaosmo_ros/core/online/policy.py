@@ -29,7 +29,7 @@ from fhaosmo_ros.core.online.stamps import clock_time, difference, forget, refre
 
 
 @compiled(inline='always')
-def take(e: EstimatorArrays, stamp: int, y: float, u: float, eps: Floats, row: int) -> int:
+def take(e: EstimatorArrays, stamp: int, y: float, u: Floats, eps: Floats, row: int) -> int:
     """
     Take one sample.
 
@@ -38,8 +38,10 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: float, eps: Floats, row: i
     e : EstimatorArrays
     stamp : int
         Nanoseconds.
-    y, u : float
-        Sample, any number, and known input, finite.
+    y : float
+        Sample, any number.
+    u : (m,) array
+        Known inputs, finite.
     eps : (rows, N) array
         Row `row` gets the innovations.
 
@@ -104,7 +106,7 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: float, eps: Floats, row: i
 def take_once(
     stamp: int,
     y: float,
-    u: float,
+    u: Floats,
     eps: Floats,
     ints: Ints,
     reals: Floats,
@@ -129,13 +131,13 @@ def take_once(
     law = Law(flags, gains, curves, scalars, Bytecode(code, offsets))
     work, state, policy = Work(x, stack, stages), State(levels, memory), Policy(ints, reals)
     e = unowned(EstimatorArrays(law, work, state, policy))
-    return take(e, stamp, y, u, unowned(eps), 0)
+    return take(e, stamp, y, unowned(u), unowned(eps), 0)
 
 
 @compiled()
 def run(e: EstimatorArrays, stamps: Ints, y: Floats, u: Floats, record: Record) -> None:
     """Take K samples; row k of the record is the estimate after the k-th."""
-    e, eps = unowned(e), unowned(record.eps)
+    e, u, eps = unowned(e), unowned(u), unowned(record.eps)
     levels, memory = e.state.levels, e.state.memory
     for k in range(y.shape[0]):
         record.words[k] = take(e, stamps[k], y[k], u[k], eps, k)

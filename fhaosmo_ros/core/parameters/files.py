@@ -141,9 +141,10 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
     if CHANNELS in table:
         table = with_channels(table, names)
     tables = [table, *(with_channels(other, names) for other in NODE_TABLES.values())]
-    everybody = dict.fromkeys(name for other in tables for name in other)
     for name in values:
-        if name not in everybody and not is_built_in(name):
+        if not any(name in other for other in tables) and not is_built_in(name):
+            families = (p.name for p in table.families)
+            everybody = dict.fromkeys([*(n for other in tables for n in other), *families])
             raise unknown_parameter(name, everybody)
     return {
         name: list(names) if name == CHANNELS else table[name].coerce(value)

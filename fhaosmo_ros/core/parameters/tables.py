@@ -8,6 +8,8 @@ YAML checks, ROS descriptors, docs/parameters.md and error messages derive from 
 from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
 
 MAX_ORDER = 12
+CONSTANTS = 'constants.'
+"""Begin of the names of constants in expressions."""
 PER_LEVEL = '1 (used for every level) or one a level'
 
 MODEL = (
@@ -18,9 +20,21 @@ MODEL = (
     Parameter(
         'phi', ['0', '0', '-z3'],
         "The functions Phi_1 .. Phi_n of z_i' = z_{i+1} + Phi_i. Phi_i may use z1 .. zi, the "
-        'known input u, numbers, + - * / **, sin cos tan exp log sqrt abs tanh sign; at most 100 '
-        'operations, 30 of them functions.',
+        'known inputs, the constants, numbers, pi, + - * / **, sin cos tan exp log sqrt abs tanh '
+        'sign atan2 min max; at most 100 operations, 30 of them functions.',
         live=False, lengths='n (order)',
+    ),
+    Parameter(
+        'inputs', ['u'],
+        'Names of the known inputs that Phi may use, such as [u1, u2] or [torque]; letters, '
+        'digits and _. The order is that of their columns where u is an array.',
+        live=False, lengths='any',
+    ),
+    Parameter(
+        'constants.NAME', 0.0,
+        'The constant NAME that Phi may use, one parameter for each: constants: {m: 1.3, b: 0.4} '
+        'in a file sets two.',
+        lower=-1e100, upper=1e100,
     ),
 )  # fmt: skip
 

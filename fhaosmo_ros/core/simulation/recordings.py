@@ -39,8 +39,10 @@ class Recording(NamedTuple):
     ----------
     t : (K,) array
         Stamps in seconds, increasing.
-    y, u : (K,) arrays
-        Measured output; known input of the interval that ends at each sample.
+    y : (K,) array
+        Measured output.
+    u : (K,) or (K, m) array
+        Known input, or known inputs, of the interval that ends at each sample.
     z : (K, n) array
     d : (K,) array
     shape : str
@@ -75,7 +77,7 @@ class Family:
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
         self.parameters: dict[str, Any] = dict(FAMILY_PARAMETERS.complete(parameters))
         p = self.parameters
-        self.model = TriangularModel(p['phi'], p['order'])
+        self.model = TriangularModel.of(p)
         self._start = per_level(
             PLANT_PARAMETERS['initial_state'], p['initial_state'], self.model.order
         )
@@ -106,9 +108,12 @@ class Family:
         spacing = p['integration_step']
         grid = np.arange(int(np.ceil(true_t[-1] / spacing)) + 2) * spacing
         table = p['rms_of_d'] * self._wave(shape, grid, random)
-        u = np.zeros(len(t))
-        if self.model.uses_input:
-            u = p['rms_of_u'] * self._wave('sines', true_t, random)
+        u = np.zeros((len(t), len(self.model.inputs)))
+        for k, name in enumerate(self.model.inputs):
+            if name in self.model.used_inputs:
+                u[:, k] = p['rms_of_u'] * self._wave('sines', true_t, random)
+        if u.shape[1] == 1:
+            u = u[:, 0]
         z, d = respond(self.model, self._start, true_t, table, spacing, u, spacing)
         if not np.isfinite(z).all():
             raise ConfigurationError(

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.compiled.unowned_arrays import unowned
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
+from fhaosmo_ros.core.model.inputs import known_inputs_of_run
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -40,8 +41,10 @@ class Truth(NamedTuple):
 
     Attributes
     ----------
-    stamps, y, u : (K,) arrays
-        Samples (ns) and known input.
+    stamps, y : (K,) arrays
+        Samples (ns).
+    u : (K, m) array
+        Known inputs.
     truth : (K, n + 1) array
         z_1 .. z_n and d.
     begins : (R + 1,) array
@@ -185,7 +188,7 @@ class Trial:
                 )
         if not self.recordings:
             raise ConfigurationError('trial: expected at least one recording, got none')
-        samples = [_as_samples(recording) for recording in self.recordings]
+        samples = [_as_samples(recording, observer.inputs) for recording in self.recordings]
         stamps, y, u, truth = (np.concatenate(part) for part in zip(*samples, strict=True))
         self.truth = truth
         begins = np.cumsum([0, *(len(r.t) for r in self.recordings)])
@@ -225,7 +228,10 @@ class Trial:
         return Scores(error, sums.extra[:, :, TRANSIENT], sums.extra[:, :, VARIATION])
 
 
-def _as_samples(r: Recording) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
+def _as_samples(
+    r: Recording, inputs: Sequence[str]
+) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
     """Return stamps, y, u and truth of a recording."""
     stamps = FIRST_STAMP + np.round((r.t - r.t[0]) / NANOSECONDS).astype(np.int64)
-    return stamps, r.y, r.u, np.column_stack([r.z, r.d])
+    u = known_inputs_of_run(r.u, len(r.t), inputs)
+    return stamps, r.y, u, np.column_stack([r.z, r.d])

@@ -22,7 +22,9 @@ from fhaosmo_ros.tools.tuning.source import BagSource, from_bag, simulated, Tuni
 TRIALS = 1000
 NEEDED = ('optuna>=4,<6', 'cmaes', 'control')
 """Only this command needs them, so a robot may lack them."""
-BOTH = ParameterTable(TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values())
+BOTH = ParameterTable(
+    TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values(), ESTIMATOR_PARAMETERS.families
+)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -175,7 +177,7 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
         found = load(path, 'estimator')
         estimator |= found
         # Where only the estimator has a model, the plant has the same one.
-        tuning |= {p.name: found[p.name] for p in MODEL if p.name in found}
+        tuning |= ParameterTable(MODEL).part_of(found)
         tuning |= load(path, 'plant', TUNE_PARAMETERS) | load(path, 'tune', TUNE_PARAMETERS)
     for name, value in assigned(rules, BOTH).items():
         for table, values in ((ESTIMATOR_PARAMETERS, estimator), (TUNE_PARAMETERS, tuning)):

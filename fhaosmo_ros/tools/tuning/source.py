@@ -89,7 +89,7 @@ def from_bag(source: BagSource, values: Parameters, given: set[str], seed: int) 
     seed : int
 
     """
-    model = TriangularModel(values['phi'], values['order'])
+    model = TriangularModel.of(values)
     t, y, u, truth = _read(source, model)
     sensor = identify(t, y)
     if truth is not None:
