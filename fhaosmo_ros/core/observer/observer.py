@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.inputs import known_inputs, known_inputs_of_run
+from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer import step as recursion
 from fhaosmo_ros.core.observer.arrays import Law, make_work, State, Work
@@ -173,6 +174,11 @@ class Observer:
     def uses_input(self) -> bool:
         """True if the model uses a known input."""
         return self._configuration.model.uses_input
+
+    @property
+    def model(self) -> TriangularModel:
+        """Phi, and the names of the known inputs."""
+        return self._configuration.model
 
     @property
     def inputs(self) -> tuple[str, ...]:

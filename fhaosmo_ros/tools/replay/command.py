@@ -48,8 +48,15 @@ def _parser() -> argparse.ArgumentParser:
     add('--storage', choices=('mcap', 'sqlite3'), default='mcap', help='of a bag (%(default)s)')
     add('--topic', default='/y', help='topic of the measured output (%(default)s)')
     add('--field', help="number in its messages, such as 'position[2]' (default: the only one)")
-    add('--input-topic', default='/u', help='topic of the known input (%(default)s)')
-    add('--input-field', help='number in its messages')
+    add(
+        '--input-topic', action='append', default=[], metavar='TOPIC',
+        help='topic of the known input; given several times: of each one that phi uses, in the '
+        'order of inputs (default: /NAME)',
+    )  # fmt: skip
+    add(
+        '--input-field', action='append', default=[], metavar='FIELD',
+        help='number in its messages; given several times: of each input',
+    )  # fmt: skip
     add(
         '--stamp', choices=STAMPS, default='auto',
         help='where dt comes from; header: of the messages; source: publish time (mcap only); '
