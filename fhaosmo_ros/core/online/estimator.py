@@ -14,8 +14,8 @@ from fhaosmo_ros.core.observer.observer import (
     ObserverState,
     Trajectory,
 )
+from fhaosmo_ros.core.online import delay, policy
 from fhaosmo_ros.core.online import memory as at
-from fhaosmo_ros.core.online import policy
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.memory import EstimatorArrays, make_policy, Memory
 from fhaosmo_ros.core.online.stamps import forget_samples
@@ -65,7 +65,19 @@ class OnlineEstimator:
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
         self._parameters = ONLINE_PARAMETERS.complete(parameters)
         self.observer = Observer(self._parameters)
-        self._policy = make_policy(self.observer.initial_state())
+        p = self._parameters
+        if p['input_delay'] > p['measurement_delay']:
+            raise ConfigurationError(
+                "parameters 'input_delay', 'measurement_delay': expected each at most the next "
+                f'one, got {p["input_delay"]} and {p["measurement_delay"]}'
+            )
+        self._lag = 0
+        if self.observer.uses_input:
+            self._lag = round((p['measurement_delay'] - p['input_delay']) / NANOSECONDS)
+        past = np.zeros(0)
+        if self.observer.uses_input and p['measurement_delay']:
+            past = delay.make_past(len(self.observer.inputs), self._lag)
+        self._policy = make_policy(self.observer.initial_state(), past)
         self._ints, self._reals = self._policy
         self._eps = self.observer.innovations
         self._u = np.zeros(len(self.observer.inputs))
@@ -107,8 +119,17 @@ class OnlineEstimator:
 
     @property
     def stamp(self) -> int | None:
-        """Stamp of the sample behind the latest estimate, in nanoseconds."""
-        return int(self._ints[at.STAMP]) if self._ints[at.VALID] else None
+        """
+        Time of the latest estimate in nanoseconds, None before there is one.
+
+        The stamp of its sample, less `measurement_delay` unless the estimate is carried over it.
+        """
+        return int(self._ints[at.STAMP]) - self._behind if self._ints[at.VALID] else None
+
+    @property
+    def _behind(self) -> int:
+        """How long before the stamp of its sample an estimate belongs, in nanoseconds."""
+        return 0 if self._ints[at.TO_NOW] else int(self._ints[at.DELAY])
 
     @property
     def period(self) -> float:
@@ -154,8 +175,12 @@ class OnlineEstimator:
         for index, name in (
             (at.PERIOD, 'nominal_period'), (at.MAX_GAP, 'max_gap'), (at.MAX_STEP, 'max_step'),
             (at.STUCK_TIME, 'stuck_time'), (at.DIVERGENCE_TIME, 'divergence_time'),
+            (at.DELAY, 'measurement_delay'),
         ):  # fmt: skip
             ints[index] = round(p[name] / NANOSECONDS)
+        ints[at.LAG] = self._lag
+        ints[at.TO_NOW] = p['predict_to_now']
+        ints[at.FILTERED] = p['estimate_from'] == 'filtered'
         ints[at.GATE_SAMPLES] = p['spike_gate_samples']
         reals[at.GATE] = p['spike_gate']
         reals[at.LIMIT] = p['divergence_limit']
@@ -184,9 +209,10 @@ class OnlineEstimator:
         return Memory(
             integers=self._ints[at.FROZEN : at.COUNTERS].copy(),
             reals=self._reals[at.INTERVAL : at.STATES].copy(),
-            before=self._reals[at.STATES + size :].copy(),
+            before=self._reals[at.STATES + size : at.STATES + 2 * size].copy(),
             now=np.concatenate([state.levels.ravel(), state.memory]),
             u=self._u.copy(),
+            past=self._reals[at.STATES + 2 * size :].copy(),
         )
 
     def remember(self, memory: Memory) -> None:
@@ -208,9 +234,17 @@ class OnlineEstimator:
             raise ConfigurationError(
                 f'memory: expected {len(self._u)} known inputs, got {len(memory.u)}'
             )
+        past = self._reals[at.STATES + 2 * size :]
+        if memory.past.shape != past.shape:
+            raise ConfigurationError(
+                'memory: expected the past of the known inputs for measurement_delay = '
+                f'{self._parameters["measurement_delay"]:g} s ({len(past)} numbers), got '
+                f'{len(memory.past)} numbers'
+            )
         self._ints[at.FROZEN : at.COUNTERS] = memory.integers
         self._reals[at.INTERVAL : at.STATES] = memory.reals
-        self._reals[at.STATES + size :] = memory.before
+        self._reals[at.STATES + size : at.STATES + 2 * size] = memory.before
+        past[:] = memory.past
         state, scalars = memory.now[: levels.size], memory.now[levels.size :]
         self.observer.restore(ObserverState(state.reshape(levels.shape), scalars))
         self._u[:] = memory.u
@@ -311,7 +345,7 @@ class OnlineEstimator:
             Of this sample, or the previous state's with the reason of the rejection.
 
         """
-        return self.observer.report(self.advance(int(stamp), y))
+        return self._published(self.advance(int(stamp), y))
 
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
@@ -341,7 +375,7 @@ class OnlineEstimator:
         -------
         Trajectory
             A row for every sample, whose status says whether it was rejected. ``t`` holds the
-            stamps.
+            times of the estimates: the stamps, less `measurement_delay` unless `predict_to_now`.
 
         Raises
         ------
@@ -364,13 +398,26 @@ class OnlineEstimator:
                 inputs[k, j] = inputs[k - 1, j] if k else self._u[j]
                 self.reject_inputs(1)
         record = make_record(count, n, count)
-        policy.run(self._arrays, stamps, y, inputs, record)
+        carried = bool(self._ints[at.TO_NOW] and self._ints[at.DELAY])
+        present = np.empty((count if carried else 0, self.observer.order + 1))
+        policy.run(self._arrays, stamps, y, inputs, record, present)
         if count:
             self._u[:], self._word = inputs[-1], int(record.words[-1])
             self._eps[0] = record.eps[-1]
-        return self.observer.trajectory(stamps, record)
+        found = self.observer.trajectory(stamps - self._behind, record)
+        if carried:
+            found = found._replace(z=present[:, :-1], unknown_input=present[:, -1])
+        return found
 
     @property
     def estimate(self) -> Estimate | None:
         """The latest estimate, None before the first sample."""
-        return self.observer.report(self._word) if self._ints[at.VALID] else None
+        return self._published(self._word) if self._ints[at.VALID] else None
+
+    def _published(self, word: int) -> Estimate:
+        estimate = self.observer.report(word)
+        if not (self._ints[at.TO_NOW] and self._ints[at.DELAY]):
+            return estimate
+        present = np.empty(self.observer.order + 1)
+        delay.published_once(self._arrays, present)
+        return estimate._replace(z=present[:-1], unknown_input=float(present[-1]))

@@ -235,6 +235,23 @@ SAMPLING = (
         'afresh from y.',
         lower=1.0, upper=1e100,
     ),
+    Parameter(
+        'measurement_delay', 0.0,
+        'How long before its stamp y was measured: a sample, and the estimate after it, tell of '
+        'the time stamp - measurement_delay.',
+        unit='s', lower=0.0, upper=10.0, live=False,
+    ),
+    Parameter(
+        'input_delay', 0.0,
+        'The same of the known inputs, at most measurement_delay: 0 for a command that acts at '
+        'once, measurement_delay for a measured one that comes in the message of y.',
+        unit='s', lower=0.0, upper=10.0, live=False,
+    ),
+    Parameter(
+        'predict_to_now', False,
+        'Carry what is published over measurement_delay by the model, with the known inputs since '
+        'then and the present d (which follows unknown_input_decay and _derivatives).',
+    ),
 )  # fmt: skip
 
 ESTIMATOR_NODE = (

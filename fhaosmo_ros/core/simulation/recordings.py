@@ -114,13 +114,19 @@ class Family:
                 u[:, k] = p['rms_of_u'] * self._wave('sines', true_t, random)
         if u.shape[1] == 1:
             u = u[:, 0]
-        z, d = respond(self.model, self._start, true_t, table, spacing, u, spacing)
+        delay = p['measurement_delay']
+        moments = np.sort(np.concatenate([true_t, np.maximum(true_t - delay, 0.0)]))
+        moments = moments if delay > 0.0 else true_t
+        acting = u[np.searchsorted(true_t, moments)]
+        z, d = respond(self.model, self._start, moments, table, spacing, acting, spacing)
+        measured = z[np.searchsorted(moments, np.maximum(true_t - delay, 0.0)), 0]
+        z, d = (values[np.searchsorted(moments, true_t)] for values in (z, d))
         if not np.isfinite(z).all():
             raise ConfigurationError(
                 f'plant: expected states that stay finite for {p["duration"]:g} s under d with '
                 f'an RMS of {p["rms_of_d"]:g}, got infinite ones (recording {number})'
             )
-        y = z[:, 0] + p['noise_std'] * random.standard_normal(len(t))
+        y = measured + p['noise_std'] * random.standard_normal(len(t))
         if p['outliers'] > 0.0:
             hit = random.uniform(size=len(t)) < p['outliers']
             y[hit] += p['outlier_std'] * random.standard_normal(np.count_nonzero(hit))

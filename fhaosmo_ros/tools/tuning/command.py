@@ -11,6 +11,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
+from fhaosmo_ros.core.simulation.recording_parameters import SENSOR
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.reader import STAMPS
 from fhaosmo_ros.tools.cli.command import Interrupted, run_command, without_password
@@ -183,8 +184,8 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
     for path in files:
         found = load(path, 'estimator')
         estimator |= found
-        # Where only the estimator has a model, the plant has the same one.
-        tuning |= ParameterTable(MODEL).part_of(found)
+        # Where only the estimator has a model, the plant has the same one; and so the sensor.
+        tuning |= ParameterTable(MODEL, SENSOR).part_of(found)
         tuning |= load(path, 'plant', TUNE_PARAMETERS) | load(path, 'tune', TUNE_PARAMETERS)
     for name, value in assigned(rules, BOTH).items():
         for table, values in ((ESTIMATOR_PARAMETERS, estimator), (TUNE_PARAMETERS, tuning)):
