@@ -240,6 +240,41 @@ def test_known_input_is_held_between_its_samples(tmp_path):
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y, parameters, u))
 
 
+def test_bag_of_ros1_is_read_as_one_of_ros2(tmp_path, capsys):
+    stamps, y = files.signal(500)
+    messages = []
+    for stamp, value in zip(stamps.tolist(), y.tolist(), strict=True):
+        joints = files.cdr(
+            'sensor_msgs/msg/JointState', header=files.header(stamp), name=['hip', 'knee'],
+            position=np.array([0.0, value]), velocity=np.zeros(0), effort=np.zeros(0),
+        )  # fmt: skip
+        messages.append(('/joints', 'sensor_msgs/msg/JointState', stamp + 250_000, joints))
+    messages += files.floats(stamps[::2] + 1, np.sin(stamps[::2] * 1e-9), '/u')
+    messages.sort(key=lambda m: m[2])
+    bags = (
+        files.write_ros1(tmp_path / 'old.bag', messages),
+        files.write(tmp_path / 'new', messages),
+    )
+    options = ['--topic', '/joints', '--field', 'position[1]', '-p', "phi:=['0','0','u-z3']"]
+    tables = []
+    for bag in bags:
+        out = tmp_path / f'{bag.stem}.npz'
+        assert run(bag, *options, '-o', out, '-o', tmp_path / f'{bag.stem}_out') == 0
+        assert 'stamps: header of the messages' in capsys.readouterr().out
+        with np.load(out) as found:
+            np.testing.assert_array_equal(found['stamp_ns'], stamps)
+            np.testing.assert_array_equal(found['bag_time_ns'], stamps + 250_000)
+        tables.append(table(out))
+    np.testing.assert_array_equal(*tables)
+    with BagReader(tmp_path / 'old_out') as copied:  # as a bag of ROS 2
+        assert [(t, s, d) for t, s, d in copied.messages(['/joints', '/u'])] == [
+            (topic, stamp, data) for topic, _, stamp, data in messages
+        ]
+    (tmp_path / 'bad.bag').write_bytes(bags[0].read_bytes()[:5000])
+    assert run(tmp_path / 'bad.bag', *options, '-o', tmp_path / 'o.npz') != 0
+    assert 'bad.bag: expected a whole bag' in capsys.readouterr().err
+
+
 def test_several_known_inputs_are_held_each_by_itself(tmp_path, capsys):
     stamps, y = files.signal(600)
     times = [stamps[100::250] + 1, stamps[50::100] + 1]

@@ -3,6 +3,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.inputs import known_inputs, known_inputs_of_run
@@ -12,7 +13,10 @@ from fhaosmo_ros.core.observer import step as recursion
 from fhaosmo_ros.core.observer.arrays import Law, make_work, State, Work
 from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA, ObserverConfiguration
 from fhaosmo_ros.core.observer.status import flags, FLAGS_MASK, LEVEL_SHIFT, open_levels, Status
+from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import make_from_file
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -119,8 +123,9 @@ class Observer:
     Parameters
     ----------
     parameters : mapping, optional
-        Values for the parameters in docs/parameters.md; defaults for the rest. `Parameters` have
-        been checked and are taken as they are.
+        Values for the parameters in docs/parameters.md; defaults for the rest. Those of the
+        estimator that are not the observer's are checked and left out, so that it takes what
+        `tune` has written. `Parameters` have been checked and are taken as they are.
 
     Raises
     ------
@@ -138,13 +143,37 @@ class Observer:
     """
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
-        self._configuration = ObserverConfiguration(parameters or {})
+        if not isinstance(parameters, Parameters):
+            parameters = ESTIMATOR_PARAMETERS.complete(parameters)
+        self._configuration = ObserverConfiguration(parameters)
         self._state = self._configuration.initial_state()
         self._set_law()
         self._eps = np.zeros((1, self._configuration.levels))
         self._u = np.zeros(len(self.inputs))
         self._t: float | int | None = None
         self._word = 0
+
+    @classmethod
+    def from_yaml(cls, path: str | Path, node: str = 'estimator', channel: str = '') -> 'Observer':
+        """
+        Return one with the parameters of a file for ROS, such as the `gains.yaml` of `tune`.
+
+        Parameters
+        ----------
+        path : path
+            A YAML file of the form ``estimator: {ros__parameters: {...}}``.
+        node : str
+            Whose sections to take, such as '/rig/estimator'.
+        channel : str
+            Name of the channel, of a node that has several.
+
+        Raises
+        ------
+        ConfigurationError
+            As the constructor, or a file that can't be used; the message begins with its path.
+
+        """
+        return make_from_file(cls, path, node, channel)
 
     @property
     def parameters(self) -> dict[str, Any]:

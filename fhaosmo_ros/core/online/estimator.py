@@ -2,6 +2,7 @@
 """The update path of time-stamped samples, shared by the node and by replays of bags."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.inputs import known_inputs_of_run
@@ -21,7 +22,8 @@ from fhaosmo_ros.core.online.memory import EstimatorArrays, make_policy, Memory
 from fhaosmo_ros.core.online.stamps import forget_samples
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.core.parameters.files import make_from_file
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -63,6 +65,8 @@ class OnlineEstimator:
     """
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
+        if not isinstance(parameters, Parameters):
+            parameters = ESTIMATOR_PARAMETERS.complete(parameters)
         self._parameters = ONLINE_PARAMETERS.complete(parameters)
         self.observer = Observer(self._parameters)
         p = self._parameters
@@ -83,6 +87,30 @@ class OnlineEstimator:
         self._u = np.zeros(len(self.observer.inputs))
         self._word = 0
         self._write_settings()
+
+    @classmethod
+    def from_yaml(
+        cls, path: str | Path, node: str = 'estimator', channel: str = ''
+    ) -> 'OnlineEstimator':
+        """
+        Return one with the parameters of a file for ROS, such as the `gains.yaml` of `tune`.
+
+        Parameters
+        ----------
+        path : path
+            A YAML file of the form ``estimator: {ros__parameters: {...}}``.
+        node : str
+            Whose sections to take, such as '/rig/estimator'.
+        channel : str
+            Name of the channel, of a node that has several.
+
+        Raises
+        ------
+        ConfigurationError
+            As the constructor, or a file that can't be used; the message begins with its path.
+
+        """
+        return make_from_file(cls, path, node, channel)
 
     @property
     def arguments(self) -> tuple[NDArray[Any], ...]:

@@ -38,7 +38,7 @@ def _parser() -> argparse.ArgumentParser:
         description='Estimate offline from a recorded bag, with the result of the live node.',
     )
     add = parser.add_argument
-    add('bag', type=Path, help='folder of a bag, or its .mcap or .db3 file')
+    add('bag', type=Path, help='folder of a bag, its .mcap or .db3 file, or a ROS 1 .bag')
     add(
         '-o', '--output', type=Path, action='append', metavar='PATH',
         help='.csv, .npz, or else a new bag; may be given several times '
@@ -88,7 +88,8 @@ def _parser() -> argparse.ArgumentParser:
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.every < 1:
         raise ConfigurationError(f'--every: expected an integer >= 1, got {arguments.every}')
-    default = Path(f'{arguments.bag.resolve().name.removesuffix(".mcap")}_replayed')
+    name = arguments.bag.resolve().name.removesuffix('.mcap').removesuffix('.bag')
+    default = Path(f'{name}_replayed')
     finals = arguments.output or [default]
     begin = perf_counter()
     with ExitStack() as stack:
