@@ -254,7 +254,7 @@ def load(estimators: Mapping[str, OnlineEstimator]) -> None:
     if list(estimators) == UNNAMED:
         copy.advance(1, 0.0)
     else:
-        EstimatorBatch([copy]).advance([0], [1], [0.0], [0.0])
+        EstimatorBatch([copy]).advance([0], [1], [0.0], [copy.inputs])
     copy.reset()
 
 
