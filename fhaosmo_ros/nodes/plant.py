@@ -3,6 +3,7 @@
 
 from collections.abc import Mapping
 from copy import deepcopy
+from functools import partial
 import math
 from typing import Any, NamedTuple
 
@@ -59,7 +60,7 @@ class PlantNode(Node):
         self.plant = Plant(values)
         fixed = [name for name, p in PLANT_NODE_PARAMETERS.items() if not p.live]
         self._node_parameters = NodeParameters(self, values, fixed)
-        self._u = 0.0
+        self._u = [0.0] * len(self.plant.model.inputs)
         self._origin: int | None = None
         self._now = 0
         self._diverged = False
@@ -69,8 +70,10 @@ class PlantNode(Node):
         self._publish_y, self._publish_state, self._publish_d = (
             create_publisher(self, kind, topic, DEPTH).publish for topic, kind in TOPICS.items()
         )
-        if self.plant.uses_input:
-            self.create_subscription(Float64, 'u', self._on_input, 10)
+        for index, name in enumerate(self.plant.model.inputs):
+            if name in self.plant.model.used_inputs:
+                take = partial(self._on_input, index, name)
+                self.create_subscription(Float64, name, take, 10)
         self._timer: Any = None
         self._node_parameters.on_change(self._prepare, self._adopt)
         copy = deepcopy(self.plant)
@@ -129,12 +132,13 @@ class PlantNode(Node):
         self._now = now
         return (now - self._origin) * 1e-9
 
-    def _on_input(self, message: Float64) -> None:
+    def _on_input(self, index: int, name: str, message: Float64) -> None:
         if math.isfinite(message.data):
-            self._u = message.data
+            self._u[index] = message.data
         else:
             self.get_logger().warning(
-                f'rejected u = {message.data}: expected a finite number; the last one is held',
+                f'rejected {name} = {message.data}: expected a finite number; the last one is '
+                'held',
                 throttle_duration_sec=5.0,
             )
 

@@ -2,6 +2,7 @@
 """One channel of an estimator node: y (and u) in, one observer, estimates out on a timer."""
 
 from collections.abc import Mapping
+from functools import partial
 from time import perf_counter, time_ns
 from typing import Any, NamedTuple
 
@@ -34,7 +35,7 @@ class ChannelChange(NamedTuple):
 
 class Channel:
     """
-    Subscribes ``y`` (and ``u``), steps the observer on each sample, publishes on a timer.
+    Subscribes ``y`` and the known inputs, steps the observer on each sample, publishes on a timer.
 
     A new channel is inactive: its topics and services exist, but samples are dropped and nothing
     is published.
@@ -81,10 +82,12 @@ class Channel:
         qos = input_qos(values)
         self._y = subscribe_with_info(node, Float64, inputs + 'y', self._on_sample, qos, raw=True)
         subscriptions = [self._y]
-        if observer.uses_input:
-            subscriptions.append(
-                subscribe_with_info(node, Float64, inputs + 'u', self._on_input, qos, raw=True)
-            )
+        for index, name in enumerate(observer.inputs):
+            if name in observer.used_inputs:
+                take = partial(self._on_input, index, name)
+                subscriptions.append(
+                    subscribe_with_info(node, Float64, inputs + name, take, qos, raw=True)
+                )
         services = [
             node.create_service(Trigger, outputs + 'reset', self.reset),
             node.create_service(SetBool, outputs + 'freeze', self.freeze),
@@ -150,8 +153,10 @@ class Channel:
         publishers, *of_input = [watch.look() for watch in self._watches]
         self._mixed = len(publishers.heard) > 1
         reports = self._health.reports(self._y.topic_name, publishers, self._stale, self._name)
-        for found in of_input:
-            for text in found.unheard.values() or ([] if found.heard else ['no publisher of u']):
+        names = self.estimator.observer.used_inputs
+        for name, found in zip(names, of_input, strict=True):
+            missing = [] if found.heard else [f'no publisher of {name}']
+            for text in found.unheard.values() or missing:
                 reports[0].find(WARN, text)
         return reports
 
@@ -242,11 +247,11 @@ class Channel:
         elif sequence and self._sequence and not self._mixed:
             self._health.lost += sequence - self._sequence - 1
 
-    def _on_input(self, data: bytes, _: Mapping[str, Any]) -> None:
+    def _on_input(self, index: int, name: str, data: bytes, _: Mapping[str, Any]) -> None:
         u = read_double(data)
-        if not self.estimator.set_input(u):
+        if not self.estimator.set_input(u, index):
             self._logger.warning(
-                f'rejected u = {u}: expected a finite number; the last one is held',
+                f'rejected {name} = {u}: expected a finite number; the last one is held',
                 throttle_duration_sec=QUIET,
             )
 

@@ -23,7 +23,7 @@ MOST_WAITING = 1000
 
 class Queue:
     """
-    Samples in the order in which they came: channel, stamp, y and the known input of each.
+    Samples in the order in which they came: channel, stamp, y and the known inputs of each.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Queue:
         self.channel: list[int] = []
         self.stamps: list[int] = []
         self.y: list[float] = []
-        self.u: list[float] = []
+        self.u: list[tuple[float, ...]] = []
 
 
 class QueuedChannel(Channel):
@@ -90,7 +90,7 @@ class QueuedChannel(Channel):
         queue.channel.append(self._index)
         queue.stamps.append(stamp)
         queue.y.append(y)
-        queue.u.append(self.estimator.input)
+        queue.u.append(self.estimator.inputs)
         if len(queue.y) >= MOST_WAITING:
             queue.step()
 
@@ -254,7 +254,7 @@ def load(estimators: Mapping[str, OnlineEstimator]) -> None:
     if list(estimators) == UNNAMED:
         copy.advance(1, 0.0)
     else:
-        EstimatorBatch([copy]).advance([0], [1], [0.0], [0.0])
+        EstimatorBatch([copy]).advance([0], [1], [0.0], [copy.inputs])
     copy.reset()
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.memory import Flag, FROZEN, INTEGERS, Snapshot, unpack
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.per_channel import split
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 from fhaosmo_ros.tools.bags.reader import BagReader, Block
 from fhaosmo_ros.topics import SNAPSHOT
@@ -92,8 +93,9 @@ def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Even
                 changes |= _changes(message.changed_parameters, channel, set(fixed))
             continue
         try:
-            snapshot = unpack(message.data)
-        except ValueError as error:
+            names = message.layout.dim[0].label.split(',')
+            snapshot = unpack(message.data, names)
+        except (IndexError, ValueError) as error:
             raise ConfigurationError(
                 f'topic {topic!r}: expected snapshots of this version ({error}); --afresh does '
                 'without them'
@@ -109,7 +111,7 @@ def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Even
 def _changes(parameters: Sequence[Any], channel: str, fixed: set[str]) -> dict[str, Any]:
     values = {}
     for parameter in parameters:
-        of_channel, _, name = parameter.name.rpartition('.')
+        of_channel, name = split(parameter.name)
         if of_channel == channel and name in ONLINE_PARAMETERS and name not in fixed:
             value = getattr(parameter.value, VALUE_FIELDS[parameter.value.type])
             values[name] = ONLINE_PARAMETERS[name].coerce(value)
