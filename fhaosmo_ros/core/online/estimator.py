@@ -171,7 +171,7 @@ class OnlineEstimator:
 
     def prepare(self, changes: Mapping[str, Any]) -> Change:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
-        parameters = self._parameters.changed(changes)
+        parameters = self._parameters.changed_live(changes, 'observer')
         return Change(parameters, self.observer.prepare(parameters))
 
     def adopt(self, change: Change) -> None:

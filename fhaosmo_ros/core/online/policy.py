@@ -115,7 +115,8 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: Floats, eps: Floats, row: 
     if not word & REJECTED:
         ints[at.ACCEPTED] += 1
         ints[at.VALID] = 1
-        keep_latest(policy, state, u)
+        if ints[at.DELAY] > 0:
+            keep_latest(policy, state, u)
         ints[at.STAMP] = stamp if ints[at.NOMINAL] else now
     elif word & REJECTED_STEP:
         ints[at.REJECTED_STEPS] += 1
