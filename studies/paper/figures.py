@@ -217,11 +217,14 @@ def long_runs(runs: Sequence[LongRun]) -> Figure:
     return figure
 
 
-def protections(cells: Sequence[Sequence[LongRun]]) -> Figure:
+def protections(runs_of_all: Sequence[LongRun]) -> Figure:
     """Draw gamma and the RMS error of d with each protection by itself, a column a cell."""
+    cells: dict[tuple[float, float], list[LongRun]] = {}
+    for run in runs_of_all:
+        cells.setdefault((run.omega, run.noise), []).append(run)
     figure = Figure(figsize=(10.0, 6.0), layout='constrained')
     panels = figure.subplots(2, len(cells), sharex=True, squeeze=False)
-    for (top, bottom), runs in zip(panels.T, cells, strict=True):
+    for (top, bottom), runs in zip(panels.T, cells.values(), strict=True):
         for run, (colour, style, width) in zip(runs, PROTECTION_STYLES, strict=True):
             line = {'color': colour, 'linestyle': style, 'linewidth': width}
             line['label'] = run.law.replace("paper's", "paper's law")
