@@ -9,10 +9,12 @@ from pathlib import Path
 import time
 from typing import Any
 
+from fhaosmo_ros.core.observer.fuzzy import of_level
 from fhaosmo_ros.core.simulation.plant_and_observer import SOLVERS
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.tools.plot.fuzzy import fuzzy_figure, Row
 from studies import document
 from studies.paper import beyond, cases, figures, findings, results
 
@@ -155,8 +157,11 @@ def _draw(save: Callable[[Any, str], None], solver: str, preset: dict[str, Any])
     """Draw the paper's own four figures, and ours beside simz."""
     first = cases.first_observer(1e-5, solver, cases.DURATION, every=5)
     save(figures.sim1(first, ZOOM), 'sim1')
-    names = ('fuzzy_widths', 'fuzzy_shape', 'fuzzy_normalise')
-    save(figures.fuzzy_systems(*(preset[name] for name in names)), 'fuzzysystems')
+    systems, widths = preset['fuzzy_systems'], preset['fuzzy_widths']
+    rows = [  # psi_1, psi_2, psi_3, as in the paper
+        Row(of_level(systems, i), of_level(widths, i), ('1', '2', '3, 4')[i]) for i in range(3)
+    ]
+    save(fuzzy_figure(rows, preset['fuzzy_shape'], preset['fuzzy_normalise']), 'fuzzysystems')
     runs = {
         name: [findings.run(name, w, solver) for w in cases.FREQUENCIES]
         for name in cases.OBSERVERS
