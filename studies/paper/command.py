@@ -16,7 +16,7 @@ from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.plot.fuzzy import fuzzy_figure, Row
 from studies import document
-from studies.paper import beyond, cases, figures, findings, results
+from studies.paper import beyond, cases, curves, figures, findings, results
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 OBSERVERS = cases.OBSERVERS | cases.OURS
@@ -115,6 +115,7 @@ def _paper(pages: document.Pages, quick: bool) -> None:
     lasting = [(g, s, w, noise) for g, s, w, noise in beyond.LONG if w in sweep]
     long = len(lasting) + len(beyond.PROTECTED) + len(sweep)
     total = joint + rows_of_map + 3 + len(beyond.NOISES) + long + FIGURES
+    total += len(curves.CELLS)
     with progress(total=total, unit='part', desc='paper') as bar:
         scores = measure(SOLVERS, bar.update)
         solver = choose_solver(scores)
@@ -133,9 +134,10 @@ def _paper(pages: document.Pages, quick: bool) -> None:
             )
             bar.update()
         zones = beyond.dead_zones(sweep, min(duration, beyond.SWEEP_DURATION), bar.update)
+        compared = curves.compare(bar.update)
         preset = cases.preset().observer
         found = results.Results(
-            solver, scores, widths, sampled, noisy, long_runs, protected, zones
+            solver, scores, widths, sampled, noisy, long_runs, protected, zones, compared
         )
 
         def save(figure: Any, name: str) -> None:

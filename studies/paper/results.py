@@ -10,6 +10,7 @@ import numpy as np
 from studies.paper import tables
 from studies.paper.beyond import LongRun, Row
 from studies.paper.cases import preset
+from studies.paper.curves import CurveRow
 from studies.paper.findings import Scores, WidthMap
 
 
@@ -27,6 +28,7 @@ class Results(NamedTuple):
     schemes, noise : list of Row
         Sampled observers without and with noise.
     long, protection, dead_zones : list of LongRun
+    curves : list of CurveRow
 
     """
 
@@ -38,6 +40,7 @@ class Results(NamedTuple):
     long: list[LongRun]
     protection: list[LongRun]
     dead_zones: list[LongRun]
+    curves: list[CurveRow]
 
 
 def parts(r: Results, every: int = 1) -> dict[str, str]:
@@ -53,6 +56,7 @@ def parts(r: Results, every: int = 1) -> dict[str, str]:
         'long': tables.long_table(r.long),
         'deadzone': tables.dead_zone_table(r.dead_zones),
         'protection': tables.protection_table(r.protection),
+        'curves': tables.curves_table(r.curves),
     }
 
 
@@ -90,6 +94,7 @@ def read(path: Path) -> Results:
 
 ROWS: dict[str, Any] = {
     'schemes': Row, 'noise': Row, 'long': LongRun, 'protection': LongRun, 'dead_zones': LongRun,
+    'curves': CurveRow,
 }  # fmt: skip
 
 
@@ -101,8 +106,8 @@ def _plain(row: Any) -> dict[str, Any]:
 
 
 def _row(kind: Any, values: dict[str, Any]) -> Any:
-    arrays = {name: np.array(v) for name, v in values.items() if isinstance(v, list)}
-    return kind(**(values | arrays))
+    lists = {k: np.array(v) for k, v in values.items() if isinstance(v, list)}
+    return kind(**(values | lists))
 
 
 def _lines(value: Any) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from fhaosmo_ros.core.simulation.plant_and_observer import SOLVERS
 from studies.paper.beyond import LongRun, Row, WORSE
 from studies.paper.cases import OBSERVERS, OURS, Score
+from studies.paper.curves import CurveRow, SYSTEMS
 from studies.paper.findings import (
     ADAPTIVE,
     COARSE,
@@ -163,6 +164,15 @@ def protection_table(runs: Iterable[LongRun]) -> str:
         '| law of γ | ω [rad/s] | noise on y | γ at the end | RMS d at the end '
         '| the same / that of γ = 1/2 |',
         rows,
+    )
+
+
+def curves_table(rows: Iterable[CurveRow]) -> str:
+    """Return the RMS errors of d by fuzzy system."""
+    names = ' | '.join(SYSTEMS)
+    return _table(
+        f'| gains | d | {names} |',
+        (f'| {r.gains} | {r.signal} | {" | ".join(_number(x) for x in r.rms_d)} |' for r in rows),
     )
 
 

@@ -35,6 +35,8 @@ SINGLETON = 'singleton'
 DEFUZZIFIERS = ('centroid', 'bisector')
 """Those of scikit-fuzzy whose result does not jump: mom, som and lom do."""
 MOST_TERMS = 99
+LEAST_GAP = 0.001
+"""Between two peaks; about the spacing of the output universe."""
 KNOTS = 193
 """Samples of a curve on [0, 1]: halves, thirds and quarters, where it has corners, are knots."""
 UNIVERSE = np.linspace(-1.0, 1.0, 2049)
@@ -184,9 +186,13 @@ def _terms(text: str, words: Sequence[str], shape: str, shapes: Sequence[str]) -
         if count not in range(3, MOST_TERMS + 1, 2):
             raise _refused(text, f'an odd number of terms, 3 to {MOST_TERMS}', f'{count:g}')
         return Terms(shape, tuple(np.linspace(-1.0, 1.0, int(count)).tolist()), True)
-    rising = all(low < high for low, high in pairwise([-1.1, *numbers, 1.1]))
-    if not rising or len(numbers) > MOST_TERMS or not -1.0 <= numbers[0] <= numbers[-1] <= 1.0:
-        raise _refused(text, f'2 to {MOST_TERMS} ascending peaks within [-1, 1]', shown(numbers))
+    apart = min(high - low for low, high in pairwise(numbers))
+    within = -1.0 <= numbers[0] <= numbers[-1] <= 1.0
+    if not (apart >= LEAST_GAP and within and len(numbers) <= MOST_TERMS):
+        allowed = (
+            f'2 to {MOST_TERMS} peaks within [-1, 1], each {LEAST_GAP} or more above the last'
+        )
+        raise _refused(text, allowed, shown(numbers))
     return Terms(shape, tuple(numbers), False)
 
 
