@@ -13,6 +13,7 @@ from studies import document as paper_document
 from studies.paper import beyond as paper_beyond
 from studies.paper import cases as paper_cases
 from studies.paper import command as paper
+from studies.paper import curves as paper_curves
 from studies.paper import findings as paper_findings
 from studies.paper import results as paper_results
 
@@ -64,6 +65,12 @@ def test_new_samples_agree_with_the_document(documented, table):
     assert [r[:-1] for r in new_rows] == [r[:-1] for r in rows]
     for new, old in zip(new_rows, rows, strict=True):
         check(new.score, old.score, f'{new[:-1]}'.strip("('"))
+
+
+def test_new_comparison_of_curves_agrees_with_the_document(documented):
+    for new, old in zip(paper_curves.compare(lambda: None), documented.curves, strict=True):
+        assert new[:-1] == old[:-1]
+        np.testing.assert_allclose(new.rms_d, old.rms_d, rtol=0.05, err_msg=REWRITE)
 
 
 def test_all_findings_come_out_with_the_shipped_half_widths(documented, fresh):

@@ -53,11 +53,11 @@ def findings_table(scores: dict[str, Scores], default: str) -> str:
     by_solver = {solver: verdicts(s) for solver, s in scores.items()}
     rows = []
     for k, verdict in enumerate(by_solver[default]):
-        others = '; '.join(
-            f'{solver}: {others[k].words}'
-            for solver, others in by_solver.items()
-            if solver != default
-        )
+        said: dict[str, list[str]] = {}
+        for solver, others in by_solver.items():
+            if solver != default:
+                said.setdefault(others[k].words, []).append(solver)
+        others = '; '.join(f'{", ".join(names)}: {words}' for words, names in said.items())
         holds = f'**{verdict.words}**' if verdict.estimates else verdict.words
         rows.append(
             f'| {verdict.name} | {verdict.claim} | {holds} | {verdict.numbers} | {others} |'

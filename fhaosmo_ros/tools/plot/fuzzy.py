@@ -87,7 +87,7 @@ def fuzzy_figure(rows: Sequence[Row], shape: str, normalise: bool) -> Figure:
         grid = np.linspace(0.0, row.width, len(half))
         right.plot([-row.width, 0, 0, row.width], [-1, -1, 1, 1], **GREY)
         right.plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')
-        right.locator_params(axis='x', nbins=5)
+        right.locator_params(axis='x', nbins=4)
         right.grid(alpha=0.3)
         if isinstance(system, FuzzySystem):
             _draw_terms(left, system.inputs, row.width)
@@ -119,4 +119,4 @@ def _draw_terms(axes: Axes, terms: Terms, scale: float) -> None:
     axes.set_xlim(-1.05 * scale, 1.05 * scale)
     axes.set_ylim(0.0, 1.18)
     axes.set_ylabel('membership [1]')
-    axes.locator_params(axis='x', nbins=5)
+    axes.locator_params(axis='x', nbins=4)
