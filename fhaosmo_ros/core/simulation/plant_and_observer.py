@@ -123,9 +123,7 @@ class _Joint(NamedTuple):
 
 
 @compiled(forceinline=True)
-def observer_rates(
-    joint: _Joint, law: Law, state: Floats, slopes: Floats
-) -> tuple[float, float]:
+def observer_rates(joint: _Joint, law: Law, state: Floats, slopes: Floats) -> tuple[float, float]:
     """Write the rates of the observer's levels by one of its laws; return L and dL/dgamma."""
     work, u = joint.work, joint.u
     x, levels = work.x, work.x.shape[1]
