@@ -6,7 +6,7 @@ from typing import Any
 
 from fhaosmo_ros.core.model.triangular import constants_of, TriangularModel
 from fhaosmo_ros.core.observer import arrays
-from fhaosmo_ros.core.observer.fuzzy import curve, KNOTS, terms_of_level
+from fhaosmo_ros.core.observer.fuzzy import curves, KNOTS, of_level, read_system
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
@@ -114,12 +114,11 @@ class ObserverConfiguration:
 
     def _make_law(self) -> arrays.Law:
         p, levels = self.parameters, self.levels
-        widths = p['fuzzy_widths']
-        if len(widths) > levels and widths != OBSERVER_PARAMETERS['fuzzy_widths'].default:
-            raise OBSERVER_PARAMETERS['fuzzy_widths'].error(
-                widths, f'1 to {levels} values (N = {levels} levels)'
-            )
-        widths = [widths[min(i, len(widths) - 1)] for i in range(levels)]
+        for name in ('fuzzy_widths', 'fuzzy_systems'):
+            declared = OBSERVER_PARAMETERS[name]
+            if len(p[name]) > levels and p[name] != declared.default:
+                raise declared.error(p[name], f'1 to {levels} values (N = {levels} levels)')
+        widths = [of_level(p['fuzzy_widths'], i) for i in range(levels)]
         flags = np.zeros(arrays.FLAGS, dtype=np.int64)
         flags[arrays.SIGN] = p['variant'].startswith('sign')
         flags[arrays.IMPLICIT] = p['scheme'] != 'explicit'
@@ -128,15 +127,12 @@ class ObserverConfiguration:
         flags[arrays.SENSITIVE] = self.adaptive and p['gamma_rate'] > 0.0
         flags[arrays.FROM_MEASUREMENT] = p['start_from_measurement']
         flags[arrays.LEVANT] = self.levant
-        if flags[arrays.SIGN]:  # they are not read
-            curves = np.ones((levels, KNOTS))
+        if flags[arrays.SIGN]:  # the curves are not read
+            for text in p['fuzzy_systems']:
+                read_system(text, p['fuzzy_shape'])
+            psi = np.ones((levels, KNOTS))
         else:
-            curves = np.array(
-                [
-                    curve(terms_of_level(i + 1), p['fuzzy_shape'], p['fuzzy_normalise'])
-                    for i in range(levels)
-                ]
-            )
+            psi = curves(p, levels)
         gains = np.zeros((arrays.GAINS, levels))
         gains[arrays.LAMBDA] = self._per_level('lambda')
         gains[arrays.ALPHA] = self._per_level('alpha')
@@ -156,7 +152,7 @@ class ObserverConfiguration:
         scalars[arrays.DELAY] = p['gamma_leakage_delay']
         scalars[arrays.PREDICTION_STEP] = p['prediction_step']
         scalars[arrays.CORRECTION_PERIOD] = p['correction_period']
-        return arrays.Law(flags, gains, curves, scalars, model)
+        return arrays.Law(flags, gains, psi, scalars, model)
 
 
 def per_level(parameter: Parameter, values: list[float], count: int) -> np.ndarray:
