@@ -12,8 +12,9 @@ search.
 import argparse
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.fuzzy import curves
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
 from fhaosmo_ros.tools.cli.share import shipped
 from fhaosmo_ros.tools.tuning.objective import Evaluation, Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
@@ -72,9 +73,10 @@ def gains(noise: float, decay: float, bandwidth: float) -> dict[str, object]:
     plant = TriangularModel.of(defaults)
     model = SampledModel(plant, period, decay=decay)
     width = WIDE * noise
+    psi = curves(OBSERVER_PARAMETERS.defaults(), model.size)
     return {
         'unknown_input_decay': decay, 'correction_period': period, 'fuzzy_widths': [width],
-        'lambda': kalman_like(model, bandwidth, width, noise, LINEAR).tolist(),
+        'lambda': kalman_like(model, bandwidth, width, psi, noise, LINEAR).tolist(),
         'gamma_initial': LINEAR, 'gamma_min': LINEAR,
     }  # fmt: skip
 

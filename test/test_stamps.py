@@ -68,7 +68,7 @@ def test_arrays_that_do_not_fit_are_refused():
         ([0.0, 1.0], [0.0, 1.0], [0.0, 1.0, 2.0]),
         ([0.0, 1.0], [0.0, 1.0], 0.0, 0),
     ):
-        with pytest.raises(ConfigurationError, match='run: expected'):
+        with pytest.raises(ConfigurationError, match='expected'):
             observer.run(*arguments)
     assert_same_state(observer.state, before)
 

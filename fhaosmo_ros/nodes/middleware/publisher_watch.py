@@ -7,6 +7,9 @@ from fhaosmo_ros.nodes.middleware.messages import type_name
 from rclpy.node import Node
 from rclpy.qos import qos_check_compatible, QoSCompatibility
 
+UNKNOWN = '_NODE_NAME_UNKNOWN_'
+"""The name of a node that has been discovered later than its publisher, or is none of ROS."""
+
 
 class Publishers(NamedTuple):
     """
@@ -41,12 +44,16 @@ class PublisherWatch:
         self._qos = subscription.qos_profile
         self._seen = Publishers({}, {})
         self._last: dict[tuple[int, ...], str] = {}
+        self._nameless: set[tuple[int, ...]] = set()
 
     def look(self) -> Publishers:
         """Return the present publishers."""
         found = Publishers({}, {})
         for endpoint in self._node.get_publishers_info_by_topic(self._topic):
             gid = tuple(endpoint.endpoint_gid)
+            if endpoint.node_name == UNKNOWN and gid not in self._nameless:
+                self._nameless.add(gid)  # its node is usually known at the next look
+                continue
             name = f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
             reason = self._mismatch(endpoint)
             if reason:

@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping
 from itertools import product
 from typing import Any
 
+from fhaosmo_ros.core.observer.fuzzy import curves
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.tools.tuning.search.minimise import Dimension, minimise, StudyOptions
 from fhaosmo_ros.tools.tuning.start.find import DERIVATIVES, SCHEME
 from fhaosmo_ros.tools.tuning.start.sampled_model import SampledModel
@@ -70,7 +72,8 @@ def _parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
     widths = width * values.get('spread', START_SPREAD) ** np.arange(levels - 1, -1, -1.0)
     small = max(setting.noise, 1e-3 * width)
     model = SampledModel(setting.model, setting.period, 1 + derivatives, decay=values['decay'])
-    gain = kalman_like(model, bandwidth, widths, small, gamma)
+    psi = curves(OBSERVER_PARAMETERS.defaults(), levels)
+    gain = kalman_like(model, bandwidth, widths, psi, small, gamma)
     factors = np.array([values.get(f'lambda_{i + 1}', 1.0) for i in range(levels)])
     return {
         **SCHEME,
