@@ -41,7 +41,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        *files('config/**/*.yaml', 'config/*.xml', 'launch/*.py'),
+        *files('config/**/*.yaml', 'config/*.xml', 'launch/*.py', 'docs/*.md', 'docs/*.png'),
     ],
     zip_safe=False,
     install_requires=[
@@ -64,10 +64,12 @@ setup(
         'ros': [
             'ros-jazzy-builtin-interfaces',
             'ros-jazzy-diagnostic-msgs',
+            'ros-jazzy-geometry-msgs',
             'ros-jazzy-lifecycle-msgs',
             'ros-jazzy-rcl-interfaces',
             'ros-jazzy-rclpy[fastrtps]',
             'ros-jazzy-rosgraph-msgs',
+            'ros-jazzy-sensor-msgs',
             'ros-jazzy-std-msgs',
             'ros-jazzy-std-srvs',
         ],

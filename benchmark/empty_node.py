@@ -22,6 +22,8 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+from source import joint_state, JOINTS
 from std_msgs.msg import Float64
 
 READY = 'computing nothing'
@@ -29,45 +31,60 @@ READY = 'computing nothing'
 
 class EmptyNode(Node):
     """
-    Counts samples of ``y``; publishes constants, and the stamp of the latest sample.
+    Counts samples; publishes constants, and the stamp of the latest sample.
 
     Parameters
     ----------
     rate : float
-        Rate of the timer, in Hz.
+        Rate of the timer, in Hz; 0: publish on each sample.
     name : str
+    joints : int
+        0: a Float64 on ``y``. Else so many joints of a JointState, with the messages of each.
 
     """
 
-    def __init__(self, rate: float, name: str) -> None:
+    def __init__(self, rate: float, name: str, joints: int = 0) -> None:
         super().__init__(name)
         self._count = 0
         self._latest = 0
-        self._stamp = Time()
-        messages = {
-            'state': labelled(['z1', 'z2', 'z3']),
-            'unknown_input': Float64(),
-            'gamma': Float64(),
-            'innovation': labelled(['eps1', 'eps2', 'eps3', 'eps4']),
-            'stamp': self._stamp,
-        }
+        self._stamp, self._joint_states = Time(), joint_state(max(joints, 1))
+        outputs = []
+        for prefix in [f'~/{joint}/' for joint in JOINTS[:joints]] or ['~/']:
+            messages = {
+                'state': labelled(['z1', 'z2', 'z3']),
+                'unknown_input': Float64(),
+                'gamma': Float64(),
+                'innovation': labelled(['eps1', 'eps2', 'eps3', 'eps4']),
+                'stamp': self._stamp,
+            }
+            outputs += [(prefix + topic, message) for topic, message in messages.items()]
+        outputs.append(('~/joint_states', self._joint_states))
         self._outputs = [
-            (self.create_publisher(type(message), f'~/{name}', 10).publish, message)
-            for name, message in messages.items()
+            (self.create_publisher(type(message), topic, 10).publish, message)
+            for topic, message in outputs
         ]
         self._diagnostics = DiagnosticsPublisher(self, self._reports)
-        self._timer = self.create_timer(1.0 / rate, self._publish)
-        self._y = subscribe_with_info(self, Float64, 'y', self._on_sample, SENSOR_QOS)
+        self._each = not rate
+        if rate:
+            self._timer = self.create_timer(1.0 / rate, self._publish)
+        kind, topic = (JointState, 'joint_states') if joints else (Float64, 'y')
+        self._y = subscribe_with_info(self, kind, topic, self._on_sample, SENSOR_QOS)
         self.get_logger().info(READY)
 
-    def _on_sample(self, _: Float64, info: dict[str, int]) -> None:
+    def _on_sample(self, message: Float64 | JointState, info: dict[str, int]) -> None:
         self._count += 1
         self._latest = info['source_timestamp']
+        if isinstance(message, JointState):
+            stamp = message.header.stamp
+            self._latest = stamp.sec * 1_000_000_000 + stamp.nanosec
+        if self._each:
+            self._publish()
 
     def _publish(self) -> None:
         if not self._latest:
             return
         self._stamp.sec, self._stamp.nanosec = divmod(self._latest, 1_000_000_000)
+        self._joint_states.header.stamp = self._stamp
         for publish, message in self._outputs:
             publish(message)
 
@@ -81,7 +98,8 @@ class EmptyNode(Node):
 def main() -> None:
     """Run the node until SIGINT."""
     parser = argparse.ArgumentParser(description='A node that computes nothing.')
-    parser.add_argument('--rate', type=float, default=100.0, help='rate of the timer, in Hz')
+    parser.add_argument('--rate', type=float, default=100.0, help='of the timer; 0: on samples')
+    parser.add_argument('--joints', type=int, default=0, help='of a JointState instead of y')
     parser.add_argument('--plain', action='store_true', help='spin with rclpy.spin')
     arguments = parser.parse_args()
     ended = threading.Event()
@@ -92,7 +110,7 @@ def main() -> None:
         return
     signal.signal(signal.SIGINT, lambda *_: ended.set())
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = EmptyNode(arguments.rate, 'empty_node')
+    node = EmptyNode(arguments.rate, 'empty_node', arguments.joints)
     gc.collect()
     gc.freeze()  # as run_node does
     with Spinner(node, on_end=ended.set):

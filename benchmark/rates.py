@@ -15,17 +15,24 @@ from tqdm import tqdm
 BAR = 1.2
 GOAL = 1000.0
 """Rate in Hz of the bars."""
-CASES = ((100.0, 100.0), (500.0, 500.0), (1000.0, 100.0), (1000.0, 1000.0), (2000.0, 2000.0))
-"""Rates of y and of the estimates."""
+CASES = (
+    (100.0, 100.0), (100.0, 0.0), (500.0, 500.0), (1000.0, 100.0), (1000.0, 1000.0),
+    (1000.0, 0.0), (2000.0, 2000.0),
+)  # fmt: skip
+"""Rates of y and of the estimates; 0: publish_on is sample."""
+JOINTS = 7
+JOINT_CASES = ((500.0, 100.0), (1000.0, 100.0))
+JOINT_BAR = 1.3
 WARM_UP = 1.5
 HELD = 0.97
 """A run counts for the ratio if each node published at this part of the rate at least."""
 MATCHED = 30.0
 """Seconds that discovery may take."""
+ON_SAMPLES = ('-p', 'publish_on:=sample')
 COMMANDS = {
-    'estimator': ('-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-p', 'publish_rate:={rate}'),
-    'empty_node': ('benchmark/empty_node.py', '--rate', '{rate}'),
-    'plain': ('benchmark/empty_node.py', '--rate', '{rate}', '--plain'),
+    'estimator': ('-m', 'fhaosmo_ros', 'estimator', '--ros-args'),
+    'empty_node': ('benchmark/empty_node.py',),
+    'plain': ('benchmark/empty_node.py', '--plain'),
 }
 TITLES = {'estimator': 'estimator', 'empty_node': 'empty', 'plain': 'empty, rclpy.spin'}
 HEADER = (
@@ -81,9 +88,15 @@ def measure(quick: bool) -> list[Row | Table]:
         if min(f.held for f in figures.values()) >= HELD:
             ratios[rate, out].append(ratio)
         else:
-            tqdm.write(f'rates: left out a run at {out:g} Hz in which a node was starved')
+            tqdm.write(f'rates: left out a run, {_rate(out)}, in which a node was starved')
     rows = [
-        _ratio(rate, out, ratios[rate, out]) for rate, out, names in cases if 'plain' not in names
+        _ratio(
+            f'CPU, estimator / empty node, y {rate:g} Hz, estimates {_rate(out)}',
+            ratios[rate, out],
+            BAR if rate == GOAL else None,
+        )
+        for rate, out, names in cases
+        if 'plain' not in names
     ]
     lost = sum(f.sent - f.taken for f in runs[GOAL, GOAL, 'estimator'])
     sent = sum(f.sent for f in runs[GOAL, GOAL, 'estimator'])
@@ -100,20 +113,56 @@ def isolate() -> None:
     os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
 
 
-def observe(rate: float, out: float, names: tuple[str, ...], seconds: float) -> dict[str, Figures]:
+def joints(quick: bool) -> list[Row | Table]:
+    """Return the same of an estimator of seven joints of one JointState."""
+    isolate()
+    seconds, repetitions = (2.0, 1) if quick else (8.0, 3)
+    names = ('estimator', 'empty_node')
+    rows: list[Row | Table] = []
+    runs: dict[tuple[float, float, str], list[Figures]] = defaultdict(list)
+    for rate, out in JOINT_CASES:
+        ratios = []
+        for k in tqdm(range(repetitions), desc=f'joints {rate:g} Hz', unit='run', leave=False):
+            figures = observe(rate, out, names if k % 2 == 0 else names[::-1], seconds, JOINTS)
+            for name in names:
+                runs[rate, out, name].append(figures[name])
+            if min(f.held for f in figures.values()) >= HELD:
+                ratios.append(figures['estimator'].cpu / figures['empty_node'].cpu)
+        title = f'CPU, estimator / empty node, {JOINTS} joints {rate:g} Hz, estimates {out:g} Hz'
+        rows.append(_ratio(title, ratios, JOINT_BAR))
+        lost = sum(f.sent - f.taken for f in runs[rate, out, 'estimator'])
+        sent = sum(f.sent for f in runs[rate, out, 'estimator'])
+        rows.append(Row(f'messages lost, {JOINTS} joints {rate:g} Hz', lost, bar=0.0,
+                        note=f'of {sent:,}, over {repetitions} runs'))  # fmt: skip
+    return [*rows, _table(runs, seconds, repetitions)]
+
+
+def _arguments(name: str, out: float, joints: int) -> list[str]:
+    """Return the command of a node that publishes at a rate, 0 for on samples."""
+    words = list(COMMANDS[name])
+    if name == 'estimator':
+        words += ['-p', f'publish_rate:={out}'] if out else ON_SAMPLES
+        words += ['-p', 'channels:=[from_joint_names]'] if joints else []
+    else:
+        words += ['--rate', str(out)] + (['--joints', str(joints)] if joints else [])
+    return words
+
+
+def observe(
+    rate: float, out: float, names: tuple[str, ...], seconds: float, joints: int = 0
+) -> dict[str, Figures]:
     """Start a source of y and the named nodes, all on the same samples, for `seconds`."""
     from watch import Watch  # needs ROS
 
-    with Children() as children, Watch(sorted(names)) as watch:
-        nodes = {
-            name: children.start(name, *(word.format(rate=out) for word in COMMANDS[name]))
-            for name in names
-        }
+    watched = {name: f'{name}/joint1' if joints else name for name in names}
+    ready = 'waiting' if joints else 'estimating'
+    with Children() as children, Watch(sorted(watched.values())) as watch:
+        nodes = {name: children.start(name, *_arguments(name, out, joints)) for name in names}
         for name, node in nodes.items():
-            node.wait_for('estimating' if name == 'estimator' else 'computing nothing')
+            node.wait_for(ready if name == 'estimator' else 'computing nothing')
         source = children.start(
-            'source', 'benchmark/source.py',
-            '--rate', str(rate), '--subscribers', str(len(nodes)),
+            'source', 'benchmark/source.py', '--rate', str(rate), '--joints', str(joints),
+            '--subscribers', str(len(nodes)),
         )  # fmt: skip
         source.wait_for('publishing')
         sleep(WARM_UP)
@@ -122,8 +171,12 @@ def observe(rate: float, out: float, names: tuple[str, ...], seconds: float) -> 
         sleep(seconds)
         elapsed = monotonic() - start
         used = {name: node.cpu_seconds() - before[name] for name, node in nodes.items()}
-        held = {name: watch.count(name) / (out * elapsed) for name in names}
-        times = {name: (*watch.jitter(name, out), *watch.latency(name)) for name in names}
+        asked = out or rate
+        held = {name: watch.count(watched[name]) / (asked * elapsed) for name in names}
+        times = {
+            name: (*watch.jitter(topic, asked), *watch.latency(topic))
+            for name, topic in watched.items()
+        }
         sent = _end(source)
         ended, taken = time_ns(), {}
         for name in names:
@@ -149,17 +202,21 @@ def _wait(condition, complaint: str) -> None:
         sleep(0.02)
 
 
-def _ratio(rate: float, out: float, ratios: list[float]) -> Row:
+def _ratio(title: str, ratios: list[float], bar: float | None) -> Row:
     return Row(
-        f'CPU, estimator / empty node, y {rate:g} Hz, estimates {out:g} Hz',
+        title,
         float(np.median(ratios)) if ratios else None,
-        bar=BAR if rate == GOAL else None,
+        bar=bar,
         note=(
             f'ratios {", ".join(f"{r:.2f}" for r in ratios)}'
             if ratios
             else 'in every run a node was starved: the machine is too busy'
         ),
     )
+
+
+def _rate(out: float) -> str:
+    return f'{out:g} Hz' if out else 'on samples'
 
 
 def _table(
@@ -170,7 +227,8 @@ def _table(
         times = np.median([f.times for f in figures], axis=0)
         times[[2, 5]] = np.max([f.times for f in figures], axis=0)[[2, 5]]
         lines.append((
-            f'{rate:g}', f'{out:g}', f'{np.median([f.held for f in figures]):.0%}', TITLES[name],
+            f'{rate:g}', f'{out:g}' if out else 'sample',
+            f'{np.median([f.held for f in figures]):.0%}', TITLES[name],
             f'{100.0 * np.median([f.cpu for f in figures]):.1f}',
             f'{sum(f.sent - f.taken for f in figures)}', f'{sum(f.sent for f in figures):,}',
             *(f'{1e3 * t:.3f}' for t in times),

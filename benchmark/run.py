@@ -24,6 +24,7 @@ PARTS = {
     'core': core_step.measure,
     'simulation': simulation.measure,
     'rates': rates.measure,
+    'joints': rates.joints,
     'channels': channels.measure,
     'startup': startup.measure,
     'replay': replay.measure,

@@ -15,12 +15,20 @@ import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 READY = 'publishing'
+JOINTS = [f'joint{k}' for k in range(1, 33)]
 PUBLISHED = 'published'
 SETTLE = 0.5
 """Seconds between the match as seen from here and the first sample: the other side's match."""
+
+
+def joint_state(count: int) -> JointState:
+    """Return a message of so many joints with zeros."""
+    zeros = [0.0] * count
+    return JointState(name=JOINTS[:count], position=zeros, velocity=zeros, effort=zeros)
 
 
 def main() -> None:
@@ -28,6 +36,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description='Publishes y at an exact rate.')
     parser.add_argument('--rate', type=float, default=1000.0, help='in Hz')
     parser.add_argument('--topics', nargs='+', default=['y'])
+    parser.add_argument('--joints', type=int, default=0, help='of a JointState instead of y')
     parser.add_argument('--subscribers', type=int, default=1, help='of each topic')
     arguments = parser.parse_args()
     ended = False
@@ -40,18 +49,26 @@ def main() -> None:
     context = Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = Node('source', context=context, start_parameter_services=False)
-    publishers = [node.create_publisher(Float64, topic, 10) for topic in arguments.topics]
+    joints = joint_state(arguments.joints) if arguments.joints else None
+    topics, kind = (['joint_states'], JointState) if joints else (arguments.topics, Float64)
+    publishers = [node.create_publisher(kind, topic, 10) for topic in topics]
     while not ended and any(
         publisher.get_subscription_count() < arguments.subscribers for publisher in publishers
     ):
         time.sleep(0.02)
     time.sleep(SETTLE)
     print(READY, flush=True)
-    message, count = Float64(), 0
+    message, count = joints or Float64(), 0
     start = time.monotonic()
     while not ended:
         time.sleep(max(0.0, start + count / arguments.rate - time.monotonic()))
-        message.data = 0.2 + 0.1 * math.sin(count / arguments.rate)
+        y = 0.2 + 0.1 * math.sin(count / arguments.rate)
+        if joints:
+            message.position = [y] * arguments.joints
+            stamp = divmod(time.time_ns(), 1_000_000_000)
+            message.header.stamp.sec, message.header.stamp.nanosec = stamp
+        else:
+            message.data = y
         for publisher in publishers:
             publisher.publish(message)
         count += 1

@@ -16,6 +16,7 @@ from pathlib import Path
 import signal
 import sys
 
+from fhaosmo_ros import __version__
 from fhaosmo_ros.commands import COMMANDS, STUDIES
 from fhaosmo_ros.stop_signals import ending_signals
 
@@ -43,6 +44,9 @@ def main(argv: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 2
+    if name == '--version':
+        print(f'fhaosmo_ros {__version__}')
+        return 0
     if name not in COMMANDS:
         close = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f'; did you mean {close[0]!r}?' if close else ''

@@ -18,6 +18,12 @@ ESTIMATES = {
     'stamp': TIME,
 }
 """Topics of an estimate below the estimator's name (and channel's), in order of publication."""
+TYPED_ESTIMATES = {
+    'joint_states': 'sensor_msgs/msg/JointState',
+    'wrench': 'geometry_msgs/msg/WrenchStamped',
+    'accel': 'geometry_msgs/msg/AccelStamped',
+}
+"""Topics below the estimator's name for those who want stamped messages, if asked for."""
 SNAPSHOT = 'snapshot'
 """All that an estimator remembers (ARRAY, transient-local), below its name and channel's."""
 PARAMETERS = 'parameters'

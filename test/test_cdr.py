@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers taken out of messages at once are those that rosbags deserialises one by one."""
 
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.tools.bags.cdr import GROUPS, numbers
-from fhaosmo_ros.tools.bags.fields import find_field
+from fhaosmo_ros.messages.fields import find_field, MissingElementError
+from fhaosmo_ros.messages.reader import MessageReader
+from fhaosmo_ros.tools.bags.cdr import expect_all, GROUPS, numbers
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -87,9 +87,15 @@ def test_any_number_in_messages_of_any_lengths(store_and_type, seed, longest):
     starts = ends - [len(text) for text in texts]
     for path in everywhere[:6]:
         field = find_field(store.fielddefs, message_type, path)
-        values, got = numbers(field, data, starts, ends)
-        np.testing.assert_array_equal(values, [paths[path] for paths in known])
-        np.testing.assert_array_equal(got, stamps)
+        column = numbers(field, data, starts, ends)
+        np.testing.assert_array_equal(column.values, [paths[path] for paths in known])
+        np.testing.assert_array_equal(column.stamps, stamps)
+    # One after the other as the node reads them, all fields at once; some messages lack some.
+    union = sorted(set().union(*known))[:8]
+    if union:
+        reader = MessageReader([find_field(store.fielddefs, message_type, path) for path in union])
+        for text, paths, stamp in zip(texts, known, stamps, strict=True):
+            assert reader.read(text) == (stamp, pytest.approx([paths.get(p) for p in union]))
 
 
 def test_one_list_that_is_too_short_is_told():
@@ -108,8 +114,10 @@ def test_one_list_that_is_too_short_is_told():
     ends = np.cumsum([len(text) for text in texts])
     starts = ends - [len(text) for text in texts]
     field = find_field(store.fielddefs, 'sensor_msgs/msg/JointState', 'position[2]')
-    with pytest.raises(ConfigurationError, match='2 in one message, got 2'):
-        numbers(field, np.frombuffer(b''.join(texts), np.uint8), starts, ends)
+    column = numbers(field, np.frombuffer(b''.join(texts), np.uint8), starts, ends)
+    np.testing.assert_array_equal(column.values, [1.0, 1.0, np.nan])
+    with pytest.raises(MissingElementError, match='2 in one message, got 2'):
+        expect_all(column)
 
 
 @pytest.mark.parametrize('length', [0, 3, 4, 11, 15])

@@ -13,8 +13,8 @@ from fhaosmo_ros.core.parameters.per_channel import (
     with_channels,
 )
 from fhaosmo_ros.core.parameters.tables import (
+    CHANNEL_PARAMETERS,
     ESTIMATOR_PARAMETERS,
-    ONLINE_PARAMETERS,
     PLANT_NODE_PARAMETERS,
 )
 from fhaosmo_ros.tools.cli.options import add_parameter_options, online_parameters
@@ -60,7 +60,7 @@ def test_own_value_wins_and_the_common_one_serves_the_rest():
 
 def test_own_parameters_are_checked_as_the_common_ones():
     table = with_channels(ESTIMATOR_PARAMETERS, NAMES)
-    assert len(table) == len(ESTIMATOR_PARAMETERS) + 2 * len(ONLINE_PARAMETERS)
+    assert len(table) == len(ESTIMATOR_PARAMETERS) + 2 * len(CHANNEL_PARAMETERS)
     with pytest.raises(ConfigurationError, match=r"'hip.epsilon': expected a number > 0 .*got -1"):
         table.coerce({'hip.epsilon': -1})
     assert table['hip.order'].live == ESTIMATOR_PARAMETERS['order'].live

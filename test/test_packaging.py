@@ -79,7 +79,7 @@ def test_colcon_installs_executables_and_data(installed, checkout):
     for other in ('studies', 'benchmark', 'test'):
         assert not list(prefix.rglob(other))
     share = prefix / 'share' / NAME
-    for pattern in ('config/**/*.yaml', 'config/*.xml', 'launch/*.py', 'package.xml'):
+    for pattern in ('config/**/*.yaml', 'config/*.xml', 'launch/*.py', 'package.xml', 'docs/*.md'):
         expected = {path.relative_to(checkout) for path in checkout.glob(pattern)}
         assert {path.relative_to(share) for path in share.glob(pattern)} == expected
     assert (share / 'launch' / 'demo.launch.py').is_file()
@@ -181,16 +181,21 @@ def stub(monkeypatch, module: str, *names: str) -> None:
 
 
 @pytest.fixture
-def launch_file(monkeypatch) -> dict:
-    """Return what the launch file defines."""
+def stubs(monkeypatch) -> None:
     stub(monkeypatch, 'launch', 'LaunchDescription')
-    stub(monkeypatch, 'launch.actions', 'DeclareLaunchArgument', 'OpaqueFunction', 'Shutdown')
+    names = 'DeclareLaunchArgument', 'IncludeLaunchDescription', 'OpaqueFunction', 'Shutdown'
+    stub(monkeypatch, 'launch.actions', *names)
+    stub(monkeypatch, 'launch.launch_description_sources', 'PythonLaunchDescriptionSource')
     stub(monkeypatch, 'launch.substitutions', 'LaunchConfiguration', 'PathJoinSubstitution')
     stub(monkeypatch, 'launch_ros')
     stub(monkeypatch, 'launch_ros.actions', 'Node')
     stub(monkeypatch, 'launch_ros.parameter_descriptions', 'ParameterValue')
     stub(monkeypatch, 'launch_ros.substitutions', 'FindPackageShare')
 
+
+@pytest.fixture
+def launch_file(stubs) -> dict:
+    """Return what the launch file defines."""
     return runpy.run_path(str(ROOT / 'launch' / 'demo.launch.py'))
 
 
@@ -248,6 +253,56 @@ def test_launch_refuses_a_params_file_that_does_not_exist(launch_file, tmp_path,
     (tmp_path / 'some.yaml').touch()
     monkeypatch.setattr(Recorded, 'perform', lambda *_: str(tmp_path / 'some.yaml'))
     launch_file['check_params_file'](None)
+
+
+def arguments_of(file: dict) -> dict[str, dict]:
+    (entities,) = file['generate_launch_description']().args
+    return {e.args[0]: e.kwargs for e in entities if type(e).__name__ == 'DeclareLaunchArgument'}
+
+
+def test_estimator_launch_file_leaves_to_the_file_what_is_not_given(stubs, monkeypatch, tmp_path):
+    file = runpy.run_path(str(ROOT / 'launch' / 'estimator.launch.py'))
+    arguments = arguments_of(file)
+    given = {name: kwargs['default_value'] for name, kwargs in arguments.items()}
+    monkeypatch.setattr(Recorded, 'perform', lambda self, _: given[self.args[0]], raising=False)
+    (node,) = file['start'](None)
+    assert node.kwargs['executable'] == 'estimator'
+    assert node.kwargs['parameters'] == [{'use_sim_time': False, 'autostart': True}]
+    path = tmp_path / 'some.yaml'
+    path.touch()
+    given |= {
+        'params_file': str(path), 'use_sim_time': 'true', 'namespace': '/arm',
+        'input_topic': '/joint_states', 'input_field': 'position[elbow]', 'log_level': 'debug',
+    }  # fmt: skip
+    (node,) = file['start'](None)
+    assert node.kwargs['namespace'] == '/arm'
+    assert node.kwargs['ros_arguments'] == ['--log-level', 'debug']
+    first, values = node.kwargs['parameters']
+    assert first == str(path)
+    assert values == {
+        'use_sim_time': True, 'autostart': True, 'input_topic': '/joint_states',
+        'input_field': 'position[elbow]',
+    }  # fmt: skip
+    given['params_file'] = str(tmp_path / 'none.yaml')
+    with pytest.raises(FileNotFoundError, match='params_file: expected a file'):
+        file['start'](None)
+
+
+def test_joint_launch_file_includes_the_other_with_arguments_that_it_has(stubs):
+    """Composition: every argument passed on is declared by the file that is included."""
+    file = runpy.run_path(str(ROOT / 'launch' / 'joint_estimator.launch.py'))
+    included = runpy.run_path(str(ROOT / 'launch' / 'estimator.launch.py'))
+    arguments = arguments_of(file)
+    ((share, *path),) = arguments['params_file']['default_value'].args
+    assert (ROOT / Path(*path)).is_file()
+    (entities,) = file['generate_launch_description']().args
+    (include,) = (e for e in entities if type(e).__name__ == 'IncludeLaunchDescription')
+    ((share, *path),) = include.args[0].args[0].args
+    assert (ROOT / Path(*path)).is_file()
+    assert share.args == (NAME,)
+    passed_on = dict(include.kwargs['launch_arguments'])
+    assert set(passed_on) <= set(arguments) & set(arguments_of(included))
+    assert all(value.args == (name,) for name, value in passed_on.items())
 
 
 # scripts/environment.sh
@@ -334,6 +389,11 @@ def test_help(capsys, flag):
     assert main([flag]) == 0
     message = capsys.readouterr().out
     assert all(command in message for command in COMMANDS)
+
+
+def test_version(capsys):
+    assert main(['--version']) == 0
+    assert capsys.readouterr().out == f'fhaosmo_ros {fhaosmo_ros.__version__}\n'
 
 
 def test_command_gets_its_arguments_and_returns_its_code(monkeypatch):

@@ -51,7 +51,9 @@ def test_declaration_is_complete():
         assert name.isidentifier()
         assert bool(parameter.lengths) == parameter.kind.endswith('array'), name
         if parameter.choices:
-            assert parameter.default in parameter.choices, name
+            default = parameter.default
+            defaults = default if isinstance(default, list) else [default]
+            assert set(defaults) <= set(parameter.choices), name
             assert all(choice in parameter.allowed for choice in parameter.choices), name
 
 

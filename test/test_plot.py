@@ -267,3 +267,11 @@ def test_truth_is_unknown_where_the_bag_lacks_it(tmp_path):
     known = np.isfinite(curves.truth)
     assert known.all(axis=1).tolist() == [100 <= k < 400 for k in range(500)]
     assert 'nan' not in metrics([curves])
+
+
+def test_units_follow_from_that_of_y():
+    empty = np.zeros((0, 3))
+    names = ['z1', 'z2', 'd']
+    curves = Curves('run', np.zeros(0, np.int64), names, empty, empty, empty, None, None, 'rad')
+    assert [curves.title(name).split('[')[1] for name in names] == ['rad]', 'rad/s]', 'rad/s^2]']
+    assert curves._replace(unit='').title('z1') == 'z1'

@@ -12,6 +12,10 @@ import sys
 import time
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.per_channel import channel_names, of_channel
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.repair import repair
 from fhaosmo_ros.tools.bags.types import make_qos, TYPES
@@ -70,6 +74,14 @@ def _parser() -> argparse.ArgumentParser:
         default=['/estimator', '/plant'],
         metavar='NAME',
         help='nodes whose topics, in and out, to record (default: /estimator /plant)',
+    )
+    add(
+        '--params-file',
+        type=Path,
+        action='append',
+        default=[],
+        metavar='FILE',
+        help='of an estimator: its inputs are recorded before it runs, too',
     )
     add('--duration', type=float, metavar='SECONDS', help='stop by itself')
     return parser
@@ -153,8 +165,23 @@ def _wanted(arguments: argparse.Namespace, resolved: Callable[[str], str]):
         names = {resolved('/' + topic.lstrip('/')) for topic in arguments.topics}
         return lambda topic: topic in names
     below = tuple(f'{resolved("/" + name.strip("/"))}/' for name in arguments.names)
-    extra = [resolved(topic) for topic in EXTRA]
+    extra = [resolved(topic) for topic in (*EXTRA, *_inputs(arguments))]
     return lambda topic: topic.startswith(below) or topic in extra
+
+
+def _inputs(arguments: argparse.Namespace) -> set[str]:
+    """Return the topics that the estimators of the parameter files read."""
+    found = set()
+    for path in arguments.params_file:
+        for name in arguments.names:
+            values = with_joints(load(path, name.strip('/'), ESTIMATOR_PARAMETERS))
+            namespace = f'/{name.strip("/")}'.rpartition('/')[0]
+            for channel in channel_names(values) if values else []:
+                own = of_channel(values, channel)
+                known = known_inputs(own, ['u'], channel).values()
+                wanted = [measured_output(own, channel), *known]
+                found |= {one.absolute(namespace) for one in wanted}
+    return found
 
 
 def _drain(

@@ -101,9 +101,10 @@ ELSEWHERE = {
     'max_gap', 'publish_rate', 'diagnostics_period', 'hardware_id', 'warn_rate_below',
     'warn_jitter_above', 'warn_delay_above', 'warn_chatter_above', 'error_bad_share_above',
     'predict_to_now',  # needs a delay, which is fixed: test_delay.py
+    'publish_on', 'measurement_unit', 'unknown_input_unit', 'unknown_input_scale',
     'prediction_step',  # between samples this close it moves the last digits only: test_levant.py
 }  # fmt: skip
-"""Tested below, in test_parameters_live.py and in test_diagnostics.py."""
+"""Tested below, in test_parameters_live.py, test_diagnostics.py and test_messages.py."""
 
 
 def test_no_live_parameter_is_left_out():

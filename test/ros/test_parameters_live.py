@@ -70,6 +70,10 @@ OTHER = {
     'publish_rate': 250.0,
     'diagnostics_period': 0.5,
     'hardware_id': 'encoder',
+    'publish_on': 'sample',
+    'measurement_unit': 'rad',
+    'unknown_input_scale': -2.5,
+    'unknown_input_unit': 'N m',
     'warn_rate_below': 1.0,
     'warn_jitter_above': 0.4,
     'warn_delay_above': 0.2,
@@ -103,6 +107,7 @@ SLIDERS = {
 }  # fmt: skip
 """Numbers whose bounds are a range to choose from; the others' only keep out nonsense."""
 SIGNED = {
+    'unknown_input_scale',
     'initial_estimate', 'initial_internal', 'initial_state', 'disturbance_amplitude',
     'disturbance_phase', 'disturbance_offset',
 }  # fmt: skip
@@ -417,6 +422,7 @@ def _wait_period(client, messages: list, period: float) -> None:
 
 def test_publish_rate_acts_on_the_wire(rig):
     rig.feed(0.2)
+    assert rig.parameters.set(publish_on='timer')[0].successful
     for rate in (20.0, 100.0):
         (result,) = rig.parameters.set(publish_rate=rate)
         assert result.successful

@@ -152,6 +152,8 @@ class Parameter:
             return value if isinstance(value, str) else None
         if kind == 'double_array' and _number(value) is not None:
             value = [value]  # one number for every level
+        if kind == 'string_array' and isinstance(value, str):
+            value = [value]
         # Not only list and tuple: rclpy delivers array.array.
         if isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
             return None

@@ -18,6 +18,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import (
     channel_names,
     CHANNELS,
+    declared_channels,
     of_channel,
     UNNAMED,
     with_channels,
@@ -145,7 +146,7 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
         A name that no node of the package declares, or a bad value.
 
     """
-    names = channel_names(values)
+    names = declared_channels(values)
     if CHANNELS in table:
         table = with_channels(table, names)
     tables = [table, *(with_channels(other, names) for other in NODE_TABLES.values())]
@@ -155,7 +156,7 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
             everybody = dict.fromkeys([*(n for other in tables for n in other), *families])
             raise unknown_parameter(name, everybody)
     return {
-        name: list(names) if name == CHANNELS else table[name].coerce(value)
+        name: channel_names(values) if name == CHANNELS else table[name].coerce(value)
         for name, value in values.items()
         if name in table
     }
@@ -181,7 +182,7 @@ def complete(values: Mapping[str, Any], table: ParameterTable) -> Parameters:
 
     """
     checked = select(values, table)
-    return Parameters(with_channels(table, checked.get(CHANNELS, []), checked), checked)
+    return Parameters(with_channels(table, declared_channels(checked), checked), checked)
 
 
 def make_from_file(

@@ -13,14 +13,16 @@ from typing import Any, overload
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.tables import (
+    CHANNEL_PARAMETERS,
     CONSTANTS,
     ESTIMATOR_PARAMETERS,
-    ONLINE_PARAMETERS,
 )
 
 CHANNELS = 'channels'
 UNNAMED = ['']
 """The default: one channel, whose topics and parameters have no prefix."""
+FROM_JOINTS = ['from_joint_names']
+"""The channels are the joints of a message that is still to come."""
 NAME = re.compile(r'[A-Za-z](_?[A-Za-z0-9])*')
 """What is valid between two slashes of a topic and in the name of a parameter."""
 
@@ -55,6 +57,30 @@ def channel_names(values: Mapping[str, Any]) -> list[str]:
     return list(names)
 
 
+def declared_channels(values: Mapping[str, Any]) -> list[str]:
+    """
+    Return the channels whose own parameters may be set by `values`.
+
+    These are the names of the channels; where they are `FROM_JOINTS`, every name that has a
+    parameter of its own: whether there is such a joint turns out later.
+
+    Raises
+    ------
+    ConfigurationError
+        As `channel_names`.
+
+    """
+    names = channel_names(values)
+    if names != FROM_JOINTS:
+        return names
+    parts = [split(name) for name in values]
+    return list(dict.fromkeys(
+        start for start, end in parts
+        if NAME.fullmatch(start) and start not in ESTIMATOR_PARAMETERS
+        and end in CHANNEL_PARAMETERS
+    ))  # fmt: skip
+
+
 def with_channels(
     table: Mapping[str, Parameter], names: Iterable[str], values: Mapping[str, Any] | None = None
 ) -> ParameterTable:
@@ -64,7 +90,7 @@ def with_channels(
     Parameters
     ----------
     table : mapping
-        The common parameters; those of the update path get a copy for each channel.
+        The common parameters; `CHANNEL_PARAMETERS` among them get a copy for each channel.
     names : iterable of str
         As `channel_names` returns them.
     values : mapping, optional
@@ -72,8 +98,8 @@ def with_channels(
 
     """
     values = values or {}
-    declared = ParameterTable(table.values(), ONLINE_PARAMETERS.families)
-    common = [p for p in table.values() if p.name in ONLINE_PARAMETERS]
+    declared = ParameterTable(table.values(), CHANNEL_PARAMETERS.families)
+    common = [p for p in table.values() if p.name in CHANNEL_PARAMETERS]
     common += [declared[name] for name in values if name.startswith(CONSTANTS)]
     common += declared.families
     own = [
@@ -130,7 +156,7 @@ def followers(name: str, names: Iterable[str], own: Collection[str]) -> list[str
         Parameters of channels that have been set themselves, and so do not follow.
 
     """
-    if name not in ONLINE_PARAMETERS:
+    if name not in CHANNEL_PARAMETERS:
         return []
     prefixed = [f'{channel}.{name}' for channel in names if channel]
     return [parameter for parameter in prefixed if parameter not in own]

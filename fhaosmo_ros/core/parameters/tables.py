@@ -193,8 +193,9 @@ OBSERVER = (
 SAMPLING = (
     Parameter(
         'sampling', 'source_stamp',
-        "Sampling period of y: from the source time stamps of the middleware's messages, from "
-        'the node clock at reception (the choice with use_sim_time), or nominal_period.',
+        'Sampling period of y: from the stamps of its messages (input_stamp says which), from '
+        'the node clock at reception (the choice with use_sim_time where messages have no '
+        'header), or nominal_period.',
         choices=('source_stamp', 'clock', 'nominal'),
     ),
     Parameter(
@@ -262,12 +263,85 @@ SAMPLING = (
     ),
 )  # fmt: skip
 
+INPUT = (
+    Parameter(
+        'input_topic', '',
+        "Topic of the measured output y. '': y, or NAME/y in a channel.",
+        live=False,
+    ),
+    Parameter(
+        'input_type', '',
+        "Message type of that topic, such as sensor_msgs/msg/JointState. '': that of its "
+        'publisher; std_msgs/msg/Float64 where input_topic and input_field are not set either.',
+        live=False,
+    ),
+    Parameter(
+        'input_field', '',
+        'The number in its messages that is y: angular_velocity.z, position[0] (by index), '
+        'position[elbow] (by the name beside it, wherever it stands), pose.pose.orientation.yaw '
+        '(roll, pitch, yaw of a quaternion, continuous over whole turns). In a channel, a list '
+        "without index, such as position, means the element with the channel's name. '': the only "
+        'number, or data; position of a JointState in a channel.',
+        live=False,
+    ),
+    Parameter(
+        'input_stamp', 'auto',
+        'Which stamp of a message is the time of its sample: header (when it was measured), '
+        'source (when it was published), reception (when it arrived here). auto: header where the '
+        'message has one, else source.',
+        choices=('auto', 'header', 'source', 'reception'), live=False,
+    ),
+    Parameter(
+        'known_input_topics', [''],
+        "Topic of each known input. '': u (or its own name); in a channel NAME/u.",
+        live=False, lengths='1 (used for every known input) or one each',
+    ),
+    Parameter(
+        'known_input_types', [''], 'Their message types, as input_type.',
+        live=False, lengths='1 (used for every known input) or one each',
+    ),
+    Parameter(
+        'known_input_fields', [''],
+        'The numbers in their messages, as input_field: effort[elbow], also of the same message '
+        'as y.',
+        live=False, lengths='1 (used for every known input) or one each',
+    ),
+)  # fmt: skip
+
+CHANNEL_OUTPUT = (
+    Parameter(
+        'measurement_unit', '',
+        'Unit of y, such as rad; units of the states and of d follow from it. Shown in '
+        'diagnostics, descriptors and figures; nothing is converted.',
+    ),
+    Parameter(
+        'unknown_input_scale', 1.0,
+        'What one unit of d stands for in ~/joint_states (effort) and ~/wrench: the mass or '
+        'inertia that turns an acceleration into a force or torque.',
+        lower=-1e12, upper=1e12,
+    ),
+    Parameter(
+        'unknown_input_unit', '',
+        'Unit of d times unknown_input_scale, such as N m. Shown in diagnostics.',
+    ),
+    Parameter(
+        'output_axis', 'linear.x',
+        'Axis of ~/wrench and ~/accel that d is written to: linear is a force or a linear '
+        'acceleration, angular a torque or an angular one.',
+        choices=(
+            'linear.x', 'linear.y', 'linear.z', 'angular.x', 'angular.y', 'angular.z',
+        ), live=False,
+    ),
+)  # fmt: skip
+
 ESTIMATOR_NODE = (
     Parameter(
         'channels', [''],
-        'Names of the outputs that one process estimates from. Channel hip reads hip/y, publishes '
-        '~/hip/state and so on, and takes each parameter of the model, the observer and the '
-        "sampling from hip.NAME where that is set, else from NAME. ['']: one channel, no prefix.",
+        'Names of the outputs that one process estimates from. Channel hip reads hip/y (or its '
+        'own field of input_topic), publishes ~/hip/state and so on, and takes each parameter of '
+        'the model, the observer, the sampling, the inputs and the units from hip.NAME where that '
+        "is set, else from NAME. ['']: one channel, no prefix. from_joint_names: one for each "
+        'joint of the first JointState on input_topic.',
         live=False, lengths='any',
     ),
     Parameter(
@@ -277,8 +351,24 @@ ESTIMATOR_NODE = (
         live=False,
     ),
     Parameter(
+        'publish_on', 'timer',
+        'timer: estimates are published at publish_rate, the latest one again where y is slower. '
+        'sample: each estimate once, as soon as its sample has been used (least latency).',
+        choices=('timer', 'sample'),
+    ),
+    Parameter(
         'publish_rate', 100.0, 'Rate of the timer that publishes the estimates.',
         unit='Hz', lower=0.1, upper=5000.0,
+    ),
+    Parameter(
+        'typed_outputs', ['joint_states'],
+        'Messages published beside the numbers, with the header stamp of the sample: joint_states '
+        '(name: the channels, position: z_1, velocity: z_2, effort: d times unknown_input_scale), '
+        'wrench (d times unknown_input_scale), accel (d); none. One message for all channels.',
+        choices=('none', 'joint_states', 'wrench', 'accel'), live=False, lengths='any',
+    ),
+    Parameter(
+        'frame_id', '', 'frame_id of these messages.', live=False,
     ),
     Parameter(
         'input_reliability', 'best_effort',
@@ -399,7 +489,16 @@ PLANT_NODE = (
 
 OBSERVER_PARAMETERS = ParameterTable(MODEL, OBSERVER)
 ONLINE_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING)
-ESTIMATOR_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, ESTIMATOR_NODE, DIAGNOSTICS)
+CHANNEL = (*MODEL, *OBSERVER, *SAMPLING, *INPUT, *CHANNEL_OUTPUT)
+CHANNEL_PARAMETERS = ParameterTable(CHANNEL)
+"""What each channel of an estimator node may have for itself."""
+ESTIMATOR_PARAMETERS = ParameterTable(CHANNEL, ESTIMATOR_NODE, DIAGNOSTICS)
 PLANT_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL)
 PLANT_NODE_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL, PLANT_NODE)
 NODE_TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}
+FIRST = (
+    'order', 'phi', 'inputs', 'structure', 'variant', 'scheme', 'lambda', 'alpha', 'epsilon',
+    'fuzzy_widths', 'unknown_input_decay', 'sampling', 'max_gap', 'input_topic', 'input_field',
+    'channels', 'publish_on', 'publish_rate', 'disturbance', 'noise_std', 'sample_rate',
+)  # fmt: skip
+"""The parameters that matter first, of both nodes."""

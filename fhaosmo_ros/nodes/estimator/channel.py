@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One channel of an estimator node: y (and u) in, one observer, estimates out on a timer."""
+"""One channel of an estimator node: y (and u) in, one observer, estimates out."""
 
-from collections.abc import Mapping
 from functools import partial
 from time import perf_counter, time_ns
 from typing import Any, NamedTuple
@@ -9,15 +8,14 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
+from fhaosmo_ros.inputs import known_inputs, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
 from fhaosmo_ros.nodes.estimator.outputs import Outputs
 from fhaosmo_ros.nodes.estimator.snapshots import SnapshotPublisher
-from fhaosmo_ros.nodes.middleware.diagnostics import Report, WARN
-from fhaosmo_ros.nodes.middleware.messages import read_double
-from fhaosmo_ros.nodes.middleware.publisher_watch import PublisherWatch
-from fhaosmo_ros.nodes.middleware.subscription import input_qos, subscribe_with_info
+from fhaosmo_ros.nodes.estimator.sources import Listener, Sources
+from fhaosmo_ros.nodes.estimator.typed_outputs import Output, TypedOutputs
+from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, WARN
 from rclpy.node import Node
-from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
 TOLD = REJECTED | int(Status.RESTARTED | Status.DIVERGED)
@@ -35,7 +33,7 @@ class ChannelChange(NamedTuple):
 
 class Channel:
     """
-    Subscribes ``y`` and the known inputs, steps the observer on each sample, publishes on a timer.
+    Takes y and the known inputs out of messages, steps the observer, publishes the estimates.
 
     A new channel is inactive: its topics and services exist, but samples are dropped and nothing
     is published.
@@ -48,11 +46,10 @@ class Channel:
         Those of an estimator node, as they are for this channel.
     estimator : OnlineEstimator
         Made with `values`.
-    inputs, outputs : str
-        Prefixes of the topics read (y, u), and of the topics written and the services (state, ...,
-        reset).
+    sources : Sources
+        Of the node. They are not open yet.
     name : str
-        Prefix of the names of its reports.
+        Of the channel: in its topics and services, its reports and its log; '' without names.
 
     """
 
@@ -61,54 +58,54 @@ class Channel:
         node: Node,
         values: Parameters,
         estimator: OnlineEstimator,
-        inputs: str = '',
-        outputs: str = '~/',
+        sources: Sources,
         name: str = '',
     ) -> None:
         self._node = node
-        self._name = name
+        self.name = name
+        outputs = f'~/{name}/' if name else '~/'
         self._clock = node.get_clock()
         self._logger = node.get_logger()
+        if name:
+            self._logger = self._logger.get_child(name)
         self.estimator = estimator
         self._values = values
-        self._clock_stamps = values['sampling'] == 'clock'
+        self._read_settings()
         self._timer: Any = None
         self._active = False
+        self._lost_before = 0
         self._forget()
         observer = self.estimator.observer
         self._outputs = Outputs(node, outputs, observer.order, observer.levels)
         self._snapshots = SnapshotPublisher(node, self.estimator, outputs)
-        self._health = Health(self.estimator, values)
-        qos = input_qos(values)
-        self._y = subscribe_with_info(node, Float64, inputs + 'y', self._on_sample, qos, raw=True)
-        subscriptions = [self._y]
-        for index, name in enumerate(observer.inputs):
-            if name in observer.used_inputs:
-                take = partial(self._on_input, index, name)
-                subscriptions.append(
-                    subscribe_with_info(node, Float64, inputs + name, take, qos, raw=True)
-                )
+        simulated = node.get_parameter('use_sim_time').value
+        self._health = Health(self.estimator, values, simulated)
+        wanted = measured_output(values, name)
+        self._y = sources.of(wanted).add(wanted, self._on_sample, self._logger)
+        self._u: dict[str, Listener] = {}
+        for u, its in known_inputs(values, observer.used_inputs, name).items():
+            take = partial(self._on_input, observer.inputs.index(u), u)
+            self._u[u] = sources.of(its).add(its, take, self._logger, first=True)
+        self._typed = self._typed_outputs(values)
         services = [
             node.create_service(Trigger, outputs + 'reset', self.reset),
             node.create_service(SetBool, outputs + 'freeze', self.freeze),
         ]
-        self._owned = [
-            *((node.destroy_subscription, s) for s in subscriptions),
-            *((node.destroy_service, s) for s in services),
-        ]
-        self._watches = [PublisherWatch(node, s) for s in subscriptions]
+        self._owned = [(node.destroy_service, s) for s in services]
 
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
         self.estimator.reset()
         self._snapshots.reset()
         self._forget()
+        self._y.source.forget()
+        self._lost_before = self._y.source.lost
         self._active = True
         self._start_timer()
         parameters = self.estimator.observer.parameters
         self._logger.info(
             f'estimating {parameters["order"]} states and the unknown input from '
-            f'{self._y.topic_name} ({parameters["variant"]}, {parameters["scheme"]})'
+            f'{self._y.source.topic} ({parameters["variant"]}, {parameters["scheme"]})'
         )
 
     def deactivate(self) -> None:
@@ -123,6 +120,8 @@ class Channel:
             destroy(entity)
         self._owned = []
         self._outputs.destroy()
+        if self._typed is not None:
+            self._typed.destroy()
         self._snapshots.destroy()
 
     def prepare(self, values: Parameters) -> ChannelChange:
@@ -143,42 +142,50 @@ class Channel:
         self._snapshots.changed()
         before, self._values = self._values, change.values
         self._health.limits = change.values
-        self._clock_stamps = change.values['sampling'] == 'clock'
+        self._read_settings()
         if self._active and change.values['publish_rate'] != before['publish_rate']:
             self._stop_timer()
             self._start_timer()
 
     def reports(self) -> list[Report]:
         """Return the reports for /diagnostics, on the time since the last ones."""
-        publishers, *of_input = [watch.look() for watch in self._watches]
-        self._mixed = len(publishers.heard) > 1
-        reports = self._health.reports(self._y.topic_name, publishers, self._stale, self._name)
-        names = self.estimator.observer.used_inputs
-        for name, found in zip(names, of_input, strict=True):
-            missing = [] if found.heard else [f'no publisher of {name}']
-            for text in found.unheard.values() or missing:
-                reports[0].find(WARN, text)
+        y = self._y
+        publishers = y.source.look()
+        self._health.lost = y.source.lost - self._lost_before
+        self._health.damaged = y.source.damaged
+        self._health.lacking = y.lacking
+        title = f'{self.name} ' if self.name else ''
+        reports = self._health.reports(y, publishers, self._stale, title)
+        for name, u in self._u.items():
+            found = u.source.look() if u.source is not y.source else publishers
+            for text in [u.error] if u.error else found.unheard.values():
+                reports[0].find(ERROR if u.error else WARN, text)
+            if not found.heard and not found.unheard:
+                reports[0].find(WARN, f'no publisher of {name}')
         return reports
+
+    def _read_settings(self) -> None:
+        self._clock_stamps = self._values['sampling'] == 'clock'
+        self._each = self._values['publish_on'] == 'sample'
+
+    def _typed_outputs(self, values: Parameters) -> TypedOutputs | None:
+        return TypedOutputs(self._node, values)
 
     def _forget(self) -> None:
         self._arrived = False
         self._stale = True
         self._quiet_until: dict[int, float] = {}
         self._silent_since: int | None = None
-        self._sequence = 0
-        self._mixed = False
 
-    def _on_sample(self, data: bytes, info: Mapping[str, Any]) -> None:
+    def _on_sample(self, stamp: int, y: float, source: int) -> None:
+        """Take a sample; `source` is when its message was published (all times in ns)."""
         if not self._active:
             return
-        source = info['source_timestamp']
-        stamp = self._clock.now().nanoseconds if self._clock_stamps else source
-        sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
-        if sequence != self._sequence + 1:
-            self._count_lost(sequence)
-        self._sequence = sequence
-        y = read_double(data)
-        self._health.delays.append(time_ns() - source)
+        health = self._health
+        health.delays.append(time_ns() - source)
+        health.offset = source - stamp if stamp else 0
+        if self._clock_stamps:
+            stamp = self._clock.now().nanoseconds
         self._take(stamp, y)
 
     def _take(self, stamp: int, y: float) -> None:
@@ -186,6 +193,8 @@ class Channel:
         begin, estimator = perf_counter(), self.estimator
         word = estimator.advance(stamp, y)
         self.taken(word, stamp, y, estimator.observer.unknown_input, perf_counter() - begin)
+        if self._each and not word & REJECTED:
+            self.publish()
 
     def taken(
         self, word: int, stamp: int, y: float, unknown_input: float, duration: float
@@ -214,9 +223,9 @@ class Channel:
             health.stamps.append(stamp)
             health.unknown_inputs.append(unknown_input)
         if word & TOLD:
-            self._tell(word, y)
+            self._tell(word, stamp, y)
 
-    def _tell(self, word: int, y: float) -> None:
+    def _tell(self, word: int, stamp: int, y: float) -> None:
         counters = self.estimator.counters
         if word & Status.RESTARTED:
             self._logger.warning(
@@ -232,7 +241,7 @@ class Channel:
                 throttle_duration_sec=QUIET,
             )
         if word & REJECTED:
-            flag, reason = _reason(word, y)
+            flag, reason = self._reason(word, stamp, y)
             now = perf_counter()
             if now >= self._quiet_until.get(flag, 0.0):  # each reason by itself
                 self._quiet_until[flag] = now + QUIET
@@ -240,15 +249,7 @@ class Channel:
                     f'rejected a sample: {reason} ({counters.rejected} rejected so far)'
                 )
 
-    def _count_lost(self, sequence: int) -> None:
-        """Count the samples between the publisher's last sequence number and this one."""
-        if 0 < sequence <= self._sequence:  # another publisher's
-            self._mixed = True  # until `reports` has looked how many there are
-        elif sequence and self._sequence and not self._mixed:
-            self._health.lost += sequence - self._sequence - 1
-
-    def _on_input(self, index: int, name: str, data: bytes, _: Mapping[str, Any]) -> None:
-        u = read_double(data)
+    def _on_input(self, index: int, name: str, _: int, u: float, __: int) -> None:
         if not self.estimator.set_input(u, index):
             self._logger.warning(
                 f'rejected {name} = {u}: expected a finite number; the last one is held',
@@ -256,24 +257,40 @@ class Channel:
             )
 
     def _start_timer(self) -> None:
-        self._timer = self._node.create_timer(1.0 / self._values['publish_rate'], self.publish)
+        self._timer = self._node.create_timer(1.0 / self._values['publish_rate'], self._tick)
 
     def _stop_timer(self) -> None:
         if self._timer is not None:
             self._node.destroy_timer(self._timer)
             self._timer = None
 
+    def _tick(self) -> None:
+        if not self.is_stale() and not self._each:
+            self.publish()
+
     def publish(self) -> None:
-        """Publish the latest estimate, unless samples have stopped coming."""
+        """Publish the latest estimate."""
+        output = self.output()
+        if output is not None and self._typed is not None:
+            self._typed.publish([output])
+
+    def output(self) -> Output | None:
+        """Publish the numbers of the latest estimate; return it for the typed messages."""
         estimator = self.estimator
-        if self._is_stale():
-            return
         estimate = estimator.estimate
         if estimate is None:  # reset, and no sample since
-            return
-        self._outputs.publish(estimate, estimator.stamp)
+            return None
+        stamp = estimator.stamp
+        self._outputs.publish(estimate, stamp)
+        return Output(self.label, stamp, estimate, self._values)
 
-    def _is_stale(self) -> bool:
+    @property
+    def label(self) -> str:
+        """Its name in messages: the channel's, else that of the joint that is y."""
+        field = self._y.field
+        return self.name or (field.key if field else '') or 'y'
+
+    def is_stale(self) -> bool:
         """Return True while no sample has come for max_gap, and log it once."""
         if self._arrived:
             self._arrived = self._stale = False
@@ -285,7 +302,7 @@ class Channel:
             elif not 0 <= now - self._silent_since <= max_gap * 1e9:  # or it jumped back
                 self._stale = True
                 self._logger.warning(
-                    f'no usable sample on {self._y.topic_name} for {max_gap:g} s: not '
+                    f'no usable sample on {self._y.source.topic} for {max_gap:g} s: not '
                     'publishing until one comes',
                     throttle_duration_sec=QUIET,
                 )
@@ -309,22 +326,25 @@ class Channel:
         self._logger.info(f'freeze: {response.message}')
         return response
 
-
-def _reason(word: int, y: float) -> tuple[int, str]:
-    """Return the flag that says why a sample was rejected, and the reason in words."""
-    for flag, text in (
-        (
-            Status.HELD,
-            'its stamp lies more than max_gap from the one before; the next one decides',
-        ),
-        (Status.REJECTED_PERIOD, 'expected a stamp later than the one before'),
-        (Status.REJECTED_SPIKE, f'y = {y} lies beyond spike_gate'),
-        (Status.REJECTED_STUCK, f'y = {y} has not changed for stuck_time'),
-        (
-            Status.REJECTED_MEASUREMENT,
-            f'expected a finite y of at most divergence_limit, got {y}',
-        ),
-    ):
-        if word & flag:
-            return int(flag), text
-    return int(Status.REJECTED_STEP), f'y = {y} would have made the estimate infinite'
+    def _reason(self, word: int, stamp: int, y: float) -> tuple[int, str]:
+        """Return the flag that says why a sample was rejected, and the reason in words."""
+        late = 'expected a stamp later than the one before'
+        if not stamp and not self._clock_stamps:
+            hint = '; input_stamp: source does without it' if self._y.stamps == 'header' else ''
+            late = f'its {self._y.stamps} stamp is 0: nobody fills it{hint}'
+        for flag, text in (
+            (
+                Status.HELD,
+                'its stamp lies more than max_gap from the one before; the next one decides',
+            ),
+            (Status.REJECTED_PERIOD, late),
+            (Status.REJECTED_SPIKE, f'y = {y} lies beyond spike_gate'),
+            (Status.REJECTED_STUCK, f'y = {y} has not changed for stuck_time'),
+            (
+                Status.REJECTED_MEASUREMENT,
+                f'expected a finite y of at most divergence_limit, got {y}',
+            ),
+        ):
+            if word & flag:
+                return int(flag), text
+        return int(Status.REJECTED_STEP), f'y = {y} would have made the estimate infinite'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many channels in one node: samples are queued, and all channels step at the timer."""
+"""Many channels in one node: samples are queued, and all channels step in one call."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -7,12 +7,15 @@ from copy import deepcopy
 from time import perf_counter
 from typing import Any
 
+from fhaosmo_ros.core.observer.status import REJECTED
 from fhaosmo_ros.core.online.batch import EstimatorBatch
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import of_channel, UNNAMED
 from fhaosmo_ros.nodes.estimator.channel import Channel, ChannelChange
+from fhaosmo_ros.nodes.estimator.sources import Sources
+from fhaosmo_ros.nodes.estimator.typed_outputs import TypedOutputs
 from fhaosmo_ros.nodes.middleware.diagnostics import Report
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
@@ -50,10 +53,8 @@ class QueuedChannel(Channel):
 
     Parameters
     ----------
-    node, values, estimator
+    node, values, estimator, sources, name
         As for `Channel`.
-    name : str
-        Prefix of its topics: ``hip/y``, ``~/hip/state``.
     index : int
         Its number in the queue.
     queue : Queue
@@ -65,15 +66,16 @@ class QueuedChannel(Channel):
         node: Node,
         values: Parameters,
         estimator: OnlineEstimator,
+        sources: Sources,
         name: str,
         index: int,
         queue: Queue,
     ) -> None:
-        self.name = name
         self._index = index
         self._queue = queue
-        super().__init__(node, values, estimator, f'{name}/', f'~/{name}/', f'{name} ')
-        self._logger = node.get_logger().get_child(name)
+        self.fresh = False
+        """It has an estimate that has not been published."""
+        super().__init__(node, values, estimator, sources, name)
 
     def reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start the observer afresh; samples that wait come before it."""
@@ -94,6 +96,17 @@ class QueuedChannel(Channel):
         if len(queue.y) >= MOST_WAITING:
             queue.step()
 
+    def taken(
+        self, word: int, stamp: int, y: float, unknown_input: float, duration: float
+    ) -> None:
+        """Remember, and log, what became of a sample; see `Channel.taken`."""
+        super().taken(word, stamp, y, unknown_input, duration)
+        if not word & REJECTED:
+            self.fresh = True
+
+    def _typed_outputs(self, values: Parameters) -> None:
+        """Do nothing: the group's messages are those of all channels."""
+
     def _start_timer(self) -> None:
         """Do nothing: the group's timer serves all of its channels."""
 
@@ -109,23 +122,33 @@ class ChannelGroup:
         Of the node, the channels' own ones included.
     estimators : mapping of str to OnlineEstimator
         As `make_estimators` returns them.
+    sources : Sources
+        Of the node. They are not open yet.
 
     """
 
     def __init__(
-        self, node: Node, values: Parameters, estimators: Mapping[str, OnlineEstimator]
+        self,
+        node: Node,
+        values: Parameters,
+        estimators: Mapping[str, OnlineEstimator],
+        sources: Sources,
     ) -> None:
         self._node = node
         self._queue = Queue(self._step)
         self._rate = values['publish_rate']
+        self._each = values['publish_on'] == 'sample'
+        sources.after_message(self._after_message)
+        self._typed: TypedOutputs | None = None
         self._timer: Any = None
         self._services: list[Any] = []
         self._channels: list[QueuedChannel] = []
         try:
             for index, (name, estimator) in enumerate(estimators.items()):
                 own = of_channel(values, name)
-                channel = QueuedChannel(node, own, estimator, name, index, self._queue)
+                channel = QueuedChannel(node, own, estimator, sources, name, index, self._queue)
                 self._channels.append(channel)
+            self._typed = TypedOutputs(node, values)
             self._services = [
                 node.create_service(Trigger, '~/reset', self._reset),
                 node.create_service(SetBool, '~/freeze', self._freeze),
@@ -153,6 +176,8 @@ class ChannelGroup:
         self.deactivate()
         while self._channels:
             self._channels.pop().destroy()
+        if self._typed is not None:
+            self._typed.destroy()
         while self._services:
             self._node.destroy_service(self._services.pop())
 
@@ -178,6 +203,7 @@ class ChannelGroup:
         for channel, change in zip(self._channels, changes, strict=True):
             channel.adopt(change)
         rate = changes[0].values['publish_rate']
+        self._each = changes[0].values['publish_on'] == 'sample'
         if rate != self._rate:
             self._rate = rate
             if self._timer is not None:
@@ -190,8 +216,24 @@ class ChannelGroup:
 
     def _tick(self) -> None:
         self._step()
-        for channel in self._channels:
-            channel.publish()
+        alive = [channel for channel in self._channels if not channel.is_stale()]
+        if not self._each:
+            self._publish(alive)
+
+    def _after_message(self) -> None:
+        if self._each and self._queue.y:
+            self._step()
+            self._publish([channel for channel in self._channels if channel.fresh])
+
+    def _publish(self, channels: Iterable[QueuedChannel]) -> None:
+        outputs = []
+        for channel in channels:
+            channel.fresh = False
+            output = channel.output()
+            if output is not None:
+                outputs.append(output)
+        if outputs and self._typed is not None:
+            self._typed.publish(outputs)
 
     def _step(self) -> None:
         """Step all channels through the samples that wait."""

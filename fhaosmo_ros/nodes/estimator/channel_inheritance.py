@@ -32,6 +32,10 @@ class ChannelInheritance:
             follower: name for name in names for follower in followers(name, self._channels, own)
         }
 
+    def extend(self, channels: list[str]) -> None:
+        """Go on with these channels, which have turned out later."""
+        self._channels = channels
+
     def adopt(self) -> None:
         """Remember that ROS has accepted the latest names: these no longer follow."""
         self._own |= self._asked

@@ -9,7 +9,9 @@ from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.counters import UNUSED_SAMPLES
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
+from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
+from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
 from fhaosmo_ros.nodes.middleware.publisher_watch import Publishers
 import numpy as np
@@ -71,6 +73,8 @@ class Health:
     estimator : OnlineEstimator
     limits : Parameters
         The channel's; the thresholds warn_* and error_* are among them.
+    simulated : bool
+        True if stamps are in simulated time.
 
     Attributes
     ----------
@@ -81,31 +85,38 @@ class Health:
         (ns); time that the callback took (s); estimate of d.
     lost : int
         Samples missing between the publisher's sequence numbers.
+    damaged, lacking : int
+        Messages that are shorter than their type, and those that lack the field.
+    offset : int
+        From the latest sample's stamp to the publication of its message (ns).
 
     """
 
-    def __init__(self, estimator: OnlineEstimator, limits: Parameters) -> None:
+    def __init__(
+        self, estimator: OnlineEstimator, limits: Parameters, simulated: bool = False
+    ) -> None:
         self._estimator = estimator
+        self.simulated = simulated
         self.limits = limits
         self.stamps: deque[int] = deque(maxlen=LIMIT)
         self.delays: deque[int] = deque(maxlen=LIMIT)
         self.durations: deque[float] = deque(maxlen=LIMIT)
         self.unknown_inputs: deque[float] = deque(maxlen=LIMIT)
-        self.lost = 0
+        self.lost = self.damaged = self.lacking = 0
+        self.offset = 0
         self.latest = float('nan')
         """Time of the last sample on `perf_counter`."""
         self._before: dict[str, int] = self._counts()
 
-    def reports(self, topic: str, publishers: Publishers, stale: bool, name: str) -> list[Report]:
+    def reports(self, y: Listener, publishers: Publishers, stale: bool, name: str) -> list[Report]:
         """
         Return the reports on the time since the last ones.
 
         Parameters
         ----------
-        topic : str
-            Of y.
+        y : Listener
         publishers : Publishers
-            Of `topic`.
+            Of the topic of y.
         stale : bool
             No estimates are published, because no samples come.
         name : str
@@ -114,7 +125,7 @@ class Health:
         """
         interval = self._interval(stale)
         return [
-            self._input(Report(f'{name}input'), interval, topic, publishers),
+            self._input(Report(f'{name}input'), interval, y, publishers),
             self._observer(Report(f'{name}observer'), interval),
         ]
 
@@ -132,8 +143,9 @@ class Health:
         return Interval(periods, delays, durations, d, counts, news, stale)
 
     def _input(
-        self, report: Report, interval: Interval, topic: str, publishers: Publishers
+        self, report: Report, interval: Interval, y: Listener, publishers: Publishers
     ) -> Report:
+        topic = y.source.topic
         limits, news = self.limits, interval.news
         periods, delays = interval.periods, interval.delays
         mean = float(np.mean(periods)) if len(periods) else float('nan')
@@ -143,24 +155,32 @@ class Health:
         names = ', '.join(sorted(publishers.heard.values()))
         report.values = {
             'topic': topic,
+            'type': y.source.message_type or 'not known yet',
+            'field': y.field.text if y.field else 'not known yet',
+            'stamps': 'clock' if limits['sampling'] == 'clock' else y.stamps or 'not known yet',
             'publishers': names or 'none',
             'sample rate [Hz]': 1.0 / mean if mean > 0.0 else float('nan'),
             'jitter (std / mean of the period)': jitter,
             'longest period [s]': float(np.max(periods)) if len(periods) else float('nan'),
             'longest delay [s]': delay,
+            'from stamp to publication [s]': self.offset * NANOSECONDS,
             'age of the last sample [s]': age,
             **interval.counts,
         }
+        if y.error:
+            report.find(ERROR, y.error)
         for text in publishers.unheard.values():
             report.find(WARN if names else ERROR, text)
         silence = ERROR if publishers.unheard and not names else STALE
         if interval.stale:
             since = f'for {age:.3g} s' if age == age else 'yet'
             report.find(silence, f'no usable sample {since}')
-        if not names:
+        if not names and not y.error:
             report.find(silence, f'no publisher of {topic} that can be heard')
-        elif len(publishers.heard) > 1:
+        elif len(publishers.heard) > 1 and not news['messages without y']:
             report.find(WARN, f'{len(publishers.heard)} publishers, their samples mix')
+        if news['messages without y'] and not news['samples accepted']:
+            report.find(WARN, f'{news["messages without y"]} messages without y: {y.why}')
         bad = {key: news[key] for key in UNUSED if news[key]}
         if bad:
             share = sum(bad.values()) / (sum(bad.values()) + news['samples accepted'])
@@ -182,10 +202,27 @@ class Health:
             report.find(WARN, f'jitter {jitter:.3g}')
         if delay > limits['warn_delay_above']:
             report.find(WARN, f'samples arrive {delay:.3g} s after their stamps')
+        self._find_other_clock(report, y)
         return report
+
+    def _find_other_clock(self, report: Report, y: Listener) -> None:
+        """Tell of header stamps that are far from the time of publication."""
+        if y.stamps != 'header' or self.simulated:
+            return
+        offset, limit = self.offset * NANOSECONDS, self.limits['warn_delay_above']
+        if abs(offset) > limit:
+            side = 'before' if offset > 0.0 else 'after'
+            report.find(
+                WARN,
+                f'header stamps lie {abs(offset):.3g} s {side} publication: another clock '
+                "than the host's, or an old measurement; dt is not affected",
+            )
 
     def _observer(self, report: Report, interval: Interval) -> Report:
         observer, estimate = self._estimator.observer, self._estimator.estimate
+        limits = self.limits
+        unit = derivative_unit(limits['measurement_unit'], observer.order)
+        d_now = estimate.unknown_input if estimate else float('nan')
         periods, durations, d = interval.periods, interval.durations, interval.unknown_inputs
         diverged = interval.news['divergences']
         chatter = high_passed(d, WINDOW)
@@ -195,7 +232,7 @@ class Health:
             'open levels': f'{estimate.open_levels if estimate else 0} of {observer.levels}',
             'gamma': estimate.gamma if estimate else float('nan'),
             'gamma at': _bound(self._estimator, estimate.status if estimate else Status.OK),
-            'unknown input': estimate.unknown_input if estimate else float('nan'),
+            titled('unknown input', unit): d_now,
             'chatter of the unknown input': chatter,
             'chatter index (0 smooth, 1 nothing but chatter)': (
                 min(1.0, chatter / spread) if spread > 0.0 else 0.0
@@ -204,6 +241,9 @@ class Health:
             'step time, longest [us]': 1e6 * float(np.max(durations)) if len(durations) else 0.0,
             'overruns': overruns,
         }
+        if limits['unknown_input_unit']:
+            scaled = titled('unknown input, scaled', limits['unknown_input_unit'])
+            report.values[scaled] = d_now * limits['unknown_input_scale']
         if interval.stale:
             report.find(STALE, 'no usable samples')
         elif estimate is not None and estimate.open_levels < observer.levels:
@@ -222,6 +262,8 @@ class Health:
         return {
             'samples accepted': counters.accepted,
             'samples lost': self.lost,
+            'damaged messages': self.damaged,
+            'messages without y': self.lacking,
             'samples rejected': counters.rejected,
             **{_words(name): n for name, n in counters._asdict().items() if name != 'accepted'},
             'restarts': counters.restarts,

@@ -5,15 +5,26 @@ from collections.abc import Mapping
 from typing import Any
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.parameters.declaration import Parameters, Value
+from fhaosmo_ros.core.parameters.declaration import Parameters, suggestion, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
-from fhaosmo_ros.core.parameters.per_channel import CHANNELS, UNNAMED
+from fhaosmo_ros.core.parameters.per_channel import (
+    CHANNELS,
+    declared_channels,
+    FROM_JOINTS,
+    NAME,
+    of_channel,
+    split,
+    UNNAMED,
+)
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.inputs import measured_output, with_joints
 from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.channel_group import ChannelGroup, load, make_estimators
 from fhaosmo_ros.nodes.estimator.channel_inheritance import ChannelInheritance
 from fhaosmo_ros.nodes.estimator.parameter_topic import ParameterTopic
+from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
+from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.loading import Loading
@@ -21,7 +32,9 @@ from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
 from fhaosmo_ros.nodes.middleware.publishers import check_overrides
 from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
 from fhaosmo_ros.nodes.middleware.spin import run_node
+from fhaosmo_ros.nodes.middleware.subscription import input_qos
 from fhaosmo_ros.topics import ESTIMATES
+from rclpy.parameter import Parameter as RosParameter
 
 
 class EstimatorNode(ManagedNode):
@@ -47,13 +60,18 @@ class EstimatorNode(ManagedNode):
             **options,
         )
         overrides = overrides_of(self)
-        if overrides.get('use_sim_time') is True and 'sampling' not in overrides:
-            overrides['sampling'] = 'clock'  # the middleware's stamps are in the host's time
-            self.get_logger().info('use_sim_time: sampling is clock')
-        values = complete(overrides, ESTIMATOR_PARAMETERS)
+        # In simulated time the middleware's stamps are of no use, but those of headers are.
+        self._chooses_sampling = (
+            overrides.get('use_sim_time') is True and 'sampling' not in overrides
+        )
+        if self._chooses_sampling:
+            overrides['sampling'] = 'clock'
+        values = complete(with_joints(overrides), ESTIMATOR_PARAMETERS)
         self._names: list[str] = values[CHANNELS]
+        self._joints: set[str] = set()
         self._node_parameters = NodeParameters(self, values, fixed=['autostart', CHANNELS])
-        self._inheritance = ChannelInheritance(self._names, overrides)
+        self._inheritance = ChannelInheritance(declared_channels(values), overrides)
+        self._sources: Sources | None = None
         self._channels: Channel | ChannelGroup | None = None
         self._parameter_topic: ParameterTopic | None = None
         self._clock_watch = ClockWatch(self)
@@ -81,9 +99,15 @@ class EstimatorNode(ManagedNode):
 
     def _make_estimators(self) -> dict[str, OnlineEstimator]:
         """Return new estimators; raise for parameters that do not fit together."""
-        prefixes = [f'~/{name}/' if name else '~/' for name in self._names]
+        values, names = self._node_parameters.values, self._names
+        if names == FROM_JOINTS:  # which joints there are is not known yet, but some may be named
+            names = [*names, *declared_channels(values)]
+        prefixes = [f'~/{name}/' if name else '~/' for name in names]
         check_overrides(self, [prefix + topic for prefix in prefixes for topic in ESTIMATES])
-        return make_estimators(self._node_parameters.values, self._names)
+        estimators = make_estimators(values, names)
+        check_inputs(values, estimators)
+        check_axes(values, {name: of_channel(values, name) for name in self._names})
+        return estimators
 
     def configure(self) -> None:
         """Make the channel, or channels, from the present parameters."""
@@ -91,22 +115,93 @@ class EstimatorNode(ManagedNode):
         made, self._made = self._made, None
         fresh = made is not None and made[0] is values
         estimators = made[1] if made and fresh else self._make_estimators()
-        if self._names == UNNAMED:
-            self._channels = Channel(self, values, *estimators.values())
-        else:
-            self._channels = ChannelGroup(self, values, estimators)
+        self._sources = Sources(self, input_qos(values), self._found_type)
         self._parameter_topic = ParameterTopic(self)
-        self._parameter_topic.publish(values)
-        if self.get_parameter('use_sim_time').value and values['sampling'] == 'source_stamp':
+        if self._names == FROM_JOINTS:
+            source = self._sources.of(measured_output(values))
+            source.on_names = self._take_joints
+            self._sources.open()
+            self.get_logger().info(
+                f'channels from_joint_names: waiting for the first message on {source.topic}'
+            )
+        else:
+            self._make_channels(estimators)
+        self._parameter_topic.publish(self._node_parameters.values)
+
+    def _make_channels(self, estimators: dict[str, OnlineEstimator]) -> None:
+        values = self._node_parameters.values
+        assert self._sources is not None
+        if self._names == UNNAMED:
+            self._channels = Channel(self, values, *estimators.values(), self._sources)
+        else:
+            self._channels = ChannelGroup(self, values, estimators, self._sources)
+        if self._joints:
+            self._sources.of(measured_output(values)).on_names = self._take_joints
+        self._sources.open()
+
+    def _found_type(self) -> None:
+        """Choose the sampling of simulated time, once it is known which stamps there are."""
+        if not self.get_parameter('use_sim_time').value or self._sources is None:
+            return
+        stamps = self._sources.stamps
+        if self._chooses_sampling and stamps and stamps <= {'header'}:
+            self._chooses_sampling = False
+            self.get_logger().info('use_sim_time: dt comes from the header stamps')
+            self.set_parameters([RosParameter('sampling', value='source_stamp')])
+        elif self._node_parameters.values['sampling'] == 'source_stamp' and 'source' in stamps:
             self.get_logger().warning(
                 "use_sim_time with sampling = source_stamp: the middleware's stamps know nothing "
                 "of /clock, so dt is in the host's time; set sampling to clock for simulation time"
             )
 
+    def _take_joints(self, names: list[str]) -> None:
+        """Make the channels from the first names; later, report those that are new."""
+        new = [name for name in names if name not in self._joints]
+        self._joints |= set(new)
+        if self._names != FROM_JOINTS:
+            for name in new:
+                self.get_logger().warning(
+                    f"joint '{name}' has come after the first message: it is not estimated; start "
+                    'the node again to take it'
+                )
+            return
+        fit = [name for name in new if NAME.fullmatch(name) and name not in ESTIMATOR_PARAMETERS]
+        for name in sorted(set(new) - set(fit)):
+            self.get_logger().error(
+                f"joint '{name}' can't be the name of a channel (letters, digits and single _ "
+                f'between them): it is left out; name a channel and set input_field to '
+                f'position[{name}] for it'
+            )
+        if not fit:
+            return
+        present = self._node_parameters.values
+        for name in set(declared_channels(present)) - set(fit):
+            self.get_logger().error(
+                f"parameters of '{name}' are not used: there is no such joint"
+                f'{suggestion(name, fit)}'
+            )
+        values = complete({
+            **{k: v for k, v in present.items() if (split(k)[0] or fit[0]) in fit},
+            CHANNELS: fit,
+        }, ESTIMATOR_PARAMETERS)  # fmt: skip
+        self._names = fit
+        self._inheritance.extend(fit)
+        self._node_parameters.extend(values)
+        try:
+            self._make_channels(self._make_estimators())
+        except ConfigurationError as error:
+            self.get_logger().error(str(error))
+            return
+        assert self._parameter_topic is not None
+        self._parameter_topic.publish(values)
+        self.get_logger().info(f'channels: {", ".join(fit)}')
+        if self.state == 'active':
+            self.activate()
+
     def activate(self) -> None:
         """Take samples and publish."""
-        assert self._channels is not None
-        self._channels.activate()
+        if self._channels is not None:  # else the joints' names are still to come
+            self._channels.activate()
 
     def deactivate(self) -> None:
         """Drop samples and publish nothing."""
@@ -118,6 +213,9 @@ class EstimatorNode(ManagedNode):
         if self._channels is not None:
             self._channels.destroy()
             self._channels = None
+        if self._sources is not None:
+            self._sources.close()
+            self._sources = None
         if self._parameter_topic is not None:
             self._parameter_topic.destroy()
             self._parameter_topic = None
@@ -150,6 +248,8 @@ class EstimatorNode(ManagedNode):
         state.find(OK if active else STALE, ': '.join(filter(None, (self.state, self.not_ready))))
         for level, text in self._clock_watch.look():
             state.find(level, text)
+        if active and self._channels is None:
+            state.find(STALE, 'no message with the names of the joints yet')
         if not active or self._channels is None:
             return [state]
         return [state, *self._channels.reports()]

@@ -3,7 +3,8 @@
 
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import dumps
-from fhaosmo_ros.core.parameters.per_channel import differing
+from fhaosmo_ros.core.parameters.per_channel import CHANNELS, differing, of_channel
+from fhaosmo_ros.inputs import measured_output
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.topics import PARAMETERS, TEXT
 from rclpy.node import Node
@@ -29,8 +30,21 @@ class ParameterTopic:
 
     def publish(self, values: Parameters) -> None:
         """Publish the node's values; the topic is transient-local."""
-        text = dumps(differing(values), self._node.get_fully_qualified_name())
+        named = differing(values) | self._remapped(values)
+        text = dumps(named, self._node.get_fully_qualified_name())
         self._publisher.publish(String(data=text))
+
+    def _remapped(self, values: Parameters) -> dict[str, str]:
+        """Return the topics of y that a remapping has changed: a bag knows of none."""
+        found = {}
+        for channel in values[CHANNELS]:
+            prefix = f'{channel}.' if channel else ''
+            y = measured_output(of_channel(values, channel), channel)
+            topic = self._node.resolve_topic_name(y.topic)
+            if topic != y.absolute(self._node.get_namespace()):
+                found[f'{prefix}input_topic'] = topic
+                found[f'{prefix}input_type'] = y.message_type
+        return found
 
     def destroy(self) -> None:
         """Take the topic away."""

@@ -12,6 +12,7 @@ from fhaosmo_ros.core.parameters.declaration import (
 )
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import is_built_in
+from fhaosmo_ros.core.parameters.per_channel import split
 from fhaosmo_ros.core.parameters.yaml_text import parse
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -33,9 +34,13 @@ TYPES = {
 }
 
 
-def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
+def descriptor(
+    parameter: Parameter, read_only: bool, values: Mapping[str, Any]
+) -> ParameterDescriptor:
     """
     Return the ROS descriptor of a declared parameter.
+
+    It says the unit of y where `values` have one and the parameter is in that unit.
 
     Typing is dynamic so that a wrong type reaches our own check, whose message names the
     parameter; the check accepts no other type. Bounds are a ROS range only where a slider of
@@ -48,6 +53,10 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
         constraints.append('logarithmic scale: change it by a factor')
     if not parameter.live and not read_only:
         constraints.append('fixed while the node is configured: set it after cleanup')
+    channel, _ = split(parameter.name)
+    unit = values.get(f'{channel}.measurement_unit' if channel else 'measurement_unit', '')
+    if unit and 'unit of y' in parameter.text:
+        constraints.append(f'unit of y: {unit}')
     result = ParameterDescriptor(
         name=parameter.name,
         type=TYPES[parameter.kind].value,
@@ -115,14 +124,23 @@ class NodeParameters:
         for name in overrides_of(node):
             if not is_built_in(name):  # declared as it came, without a descriptor
                 node.undeclare_parameter(name)
-        read_only = set(fixed)
+        self._read_only = set(fixed)
+        self._declare(values)
+
+    def extend(self, values: Parameters) -> None:
+        """Go on with values of a larger table, whose further parameters are declared now."""
+        self._declare(values)
+        self.values = values
+
+    def _declare(self, values: Parameters) -> None:
         for name, value in values.items():
-            node.declare_parameter(
-                name,
-                value,
-                descriptor(values.table[name], name in read_only),
-                ignore_override=True,
-            )
+            if not self._node.has_parameter(name):
+                self._node.declare_parameter(
+                    name,
+                    value,
+                    descriptor(values.table[name], name in self._read_only, values),
+                    ignore_override=True,
+                )
 
     def on_change(
         self,

@@ -1,17 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starting, spinning and stopping a node: what both nodes' `main` share."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 import os
 import re
 import sys
+import textwrap
 import threading
 import traceback
 from typing import Any
 
-from fhaosmo_ros.core.parameters.declaration import suggestion, unknown_parameter
+from fhaosmo_ros import __version__
+from fhaosmo_ros.core.parameters.declaration import (
+    Parameter,
+    shown,
+    suggestion,
+    unknown_parameter,
+)
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import (
     check_one_type,
@@ -19,7 +26,7 @@ from fhaosmo_ros.core.parameters.files import (
     read,
     with_origin,
 )
-from fhaosmo_ros.core.parameters.tables import NODE_TABLES
+from fhaosmo_ros.core.parameters.tables import FIRST, NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import parse
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.loading import is_loading, settle_memory
@@ -149,9 +156,13 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
 
     """
     argv = sys.argv[1:] if argv is None else argv
-    if any(word in ('-h', '--help') for word in argv):
-        print(_usage(name))
-        return 0
+    for flag, text in (
+        ('-h', help_text), ('--help', help_text), ('--help-parameters', all_parameters),
+        ('--version', lambda _: f'fhaosmo_ros {__version__}'),
+    ):  # fmt: skip
+        if flag in argv:
+            print(text(name))
+            return 0
     ended = stop_on_signals()
     node = None
     origins: dict[str, str | None] = {}
@@ -263,10 +274,34 @@ def _full_name(name: str, options: list[tuple[str, str]]) -> str:
     return f'{parts["ns"].rstrip("/")}/{parts["name"]}'
 
 
+def help_text(name: str) -> str:
+    """Return the usage of a node and the parameters that matter first, with their defaults."""
+    first = [p for p in NODE_TABLES[name].values() if p.name in FIRST]
+    return '\n'.join([
+        f'usage: {name} [--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r FROM:=TO] ...]',
+        '', 'The parameters that matter first, and their defaults:', '', *_lines(first), '',
+        f'All of them: {name} --help-parameters; docs/parameters.md says more.',
+    ])  # fmt: skip
+
+
+def all_parameters(name: str) -> str:
+    """Return all parameters of a node with their defaults, what is allowed, and what they do."""
+    table = NODE_TABLES[name]
+    return '\n'.join(_lines([*table.values(), *table.families]))
+
+
+def _lines(parameters: Iterable[Parameter]) -> Iterator[str]:
+    for p in parameters:
+        yield f'{p.name}: {shown(p.default)}'
+        indent = ' ' * 4
+        text = f'{p.text} ({p.allowed})'
+        yield from textwrap.wrap(text, 99, initial_indent=indent, subsequent_indent=indent)
+
+
 def _usage(name: str) -> str:
     return (
         f'usage: {name} [--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r FROM:=TO] ...]; '
-        'parameters are listed in docs/parameters.md'
+        f'parameters: {name} --help'
     )
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded known inputs, held between their samples as the node holds them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.inputs import Input
 from fhaosmo_ros.tools.bags.reader import BagReader
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,8 @@ class HeldInputs:
     reader : BagReader
     model : TriangularModel
         Says which known inputs there are, and which of them it uses; the others are 0.
-    topics, fields : sequence of str
-        Of the inputs that the model uses, in their order: none (topic /NAME, the only number in
-        its messages), one for all, or one for each; see `find_field`.
+    wanted : mapping of str to Input
+        Where those that it uses are; full names of the topics.
     reject : callable
         Gets the number of values that were not finite, and were left out.
 
@@ -36,19 +35,13 @@ class HeldInputs:
         self,
         reader: BagReader,
         model: TriangularModel,
-        topics: Sequence[str],
-        fields: Sequence[str],
+        wanted: Mapping[str, Input],
         reject: Callable[[int], None],
     ) -> None:
         used = model.used_inputs
-        sources = zip(
-            _one_each('--input-topic', topics, used) or [f'/{name}' for name in used],
-            _one_each('--input-field', fields, used) or [None] * len(used),
-            strict=True,
-        )
         self._width = len(model.inputs)
         self._columns = [model.inputs.index(name) for name in used]
-        self._held = [_HeldInput(reader, *source, reject) for source in sources]
+        self._held = [_HeldInput(reader, wanted[name], reject) for name in used]
 
     def __call__(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return u at each time (of the bag), (K, m): the last finite ones, or 0."""
@@ -58,22 +51,12 @@ class HeldInputs:
         return u
 
 
-def _one_each(option: str, given: Sequence[str], names: Sequence[str]) -> list[str]:
-    if len(given) > 1 and len(given) != len(names):
-        raise ConfigurationError(
-            f'{option}: expected one, or one for each known input that phi uses '
-            f'({", ".join(names) or "none"}), got {len(given)}'
-        )
-    return list(given) * (len(names) if len(given) == 1 else 1)
-
-
 class _HeldInput:
     """One of them."""
 
-    def __init__(
-        self, reader: BagReader, topic: str, field: str | None, reject: Callable[[int], None]
-    ) -> None:
-        self._blocks = reader.blocks(topic, reader.field(topic, field))
+    def __init__(self, reader: BagReader, wanted: Input, reject: Callable[[int], None]) -> None:
+        field = reader.field(wanted.topic, wanted.field, wanted.name)
+        self._blocks = reader.blocks(wanted.topic, field, every=False)
         self._reject = reject
         self._times = np.zeros(0, dtype=np.int64)
         self._values = np.zeros(0)

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.tools.bags.cdr import numbers
-from fhaosmo_ros.tools.bags.fields import Field, find_field
+from fhaosmo_ros.messages.fields import Field, find_field
+from fhaosmo_ros.tools.bags.cdr import expect_all, numbers
 from fhaosmo_ros.tools.bags.mcap import chunks
 from fhaosmo_ros.tools.bags.mcap.pieces import check_summary, find_pieces, load
 from fhaosmo_ros.tools.bags.ros1 import Ros1Storage, with_header_of_ros2
@@ -67,6 +67,8 @@ class BagReader:
     ----------
     unchecked : bool
         True if something was read that has no CRC, so that damage may go unnoticed.
+    lacking : Counter of str
+        Messages that `blocks` has left out, by why they lack the field.
 
     Raises
     ------
@@ -79,6 +81,7 @@ class BagReader:
         self.path = path
         _expect_bag(path)
         self.unchecked = False
+        self.lacking: Counter[str] = Counter()
 
     def __enter__(self) -> 'BagReader':
         try:
@@ -211,12 +214,12 @@ class BagReader:
         for storage, _, data, records in self.chunk_records(topics):
             yield {c.id: c.topic for c in storage.connections}, data, records
 
-    def field(self, topic: str, text: str | None) -> Field:
+    def field(self, topic: str, text: str | None, name: str = '') -> Field:
         """Find a numeric field of a topic; see `find_field`."""
-        return find_field(self.types.fielddefs, self.message_type(topic), text)
+        return find_field(self.types.fielddefs, self.message_type(topic), text, name)
 
     def blocks(
-        self, topic: str, field: Field, stamp: str = 'bag', width: int = 1
+        self, topic: str, field: Field, stamp: str = 'bag', width: int = 1, every: bool = True
     ) -> Iterator[Block]:
         """
         Yield a field's samples in order, in blocks; memory does not grow with the bag.
@@ -231,11 +234,13 @@ class BagReader:
             for `ros2 bag record` the time of reception. 'auto': the first of these that there is.
         width : int
             Read so many neighbours in a list, from the field on.
+        every : bool
+            False: leave out messages whose lists are too short or lack the name, as the node does.
 
         Raises
         ------
         ConfigurationError
-            The messages have no header, or the bag no publish times.
+            The messages have no header, or the bag no publish times; a message lacks the field.
 
         """
         if stamp == 'header' and not field.has_header:
@@ -250,7 +255,7 @@ class BagReader:
         if stamp == 'auto':
             stamp = 'header' if field.has_header else 'source'
         read = self._by_chunk if self.has_chunks else self._by_message
-        return read(topic, _Wanted(field, stamp, width))
+        return read(topic, _Wanted(field, stamp, width, every))
 
     @property
     def has_chunks(self) -> bool:
@@ -308,17 +313,24 @@ class BagReader:
     def _block(self, data: chunks.Bytes, records: chunks.Records, wanted: '_Wanted') -> Block:
         times, starts, ends = records.times, records.starts, records.ends
         try:
-            values, stamps = numbers(
-                wanted.field, data, starts + chunks.DATA_AT, ends, wanted.width
-            )
+            column = numbers(wanted.field, data, starts + chunks.DATA_AT, ends, wanted.width)
+            if wanted.every:
+                expect_all(column)
         except Exception as error:
             raise _unreadable(self.path, error) from None
+        stamps = column.stamps
         if wanted.stamp == 'source':
             stamps = chunks.gather(data, starts + chunks.PUBLISHED_AT, np.dtype('<i8'))
             stamps = np.where(stamps > 0, stamps, times)  # 0: its writer did not know
         elif wanted.stamp == 'bag':
             stamps = times
-        return Block(times, stamps, values)
+        block = Block(times, stamps, column.values)
+        if not column.missing:
+            return block
+        self.lacking.update(column.missing.values())
+        keep = np.ones(len(times), bool)
+        keep[list(column.missing)] = False
+        return Block(*(part[keep] for part in block))
 
 
 class _Wanted(NamedTuple):
@@ -327,6 +339,7 @@ class _Wanted(NamedTuple):
     field: Field
     stamp: str
     width: int
+    every: bool
 
 
 def _expect_bag(path: Path) -> None:

@@ -28,6 +28,11 @@ class Recorded(NamedTuple):
     values: dict[str, Any]
     channel: str
 
+    @property
+    def namespace(self) -> str:
+        """Namespace of the node: '/rig' of /rig/estimator/parameters."""
+        return self.topic.rsplit('/', 2)[0]
+
 
 def recorded_parameters(reader: BagReader, name: str | None = None) -> Recorded | None:
     """

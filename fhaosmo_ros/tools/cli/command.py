@@ -9,6 +9,7 @@ import shlex
 import sqlite3
 import sys
 
+from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals, Stopped
 
@@ -57,6 +58,7 @@ def run_command(
 
     """
     given = sys.argv[1:] if argv is None else argv
+    parser.add_argument('--version', action='version', version=f'fhaosmo_ros {__version__}')
     own, ros_arguments = split_ros_arguments(given)
     arguments = parser.parse_args(own)
     arguments.ros_arguments = ros_arguments

@@ -2,9 +2,9 @@
 """Command-line options that several commands share."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import (
@@ -14,9 +14,20 @@ from fhaosmo_ros.core.parameters.declaration import (
 )
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import read, select, with_origin
-from fhaosmo_ros.core.parameters.per_channel import channel_names, of_channel, UNNAMED
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
+from fhaosmo_ros.core.parameters.per_channel import (
+    channel_names,
+    FROM_JOINTS,
+    of_channel,
+    UNNAMED,
+)
+from fhaosmo_ros.core.parameters.tables import (
+    CHANNEL_PARAMETERS,
+    ESTIMATOR_PARAMETERS,
+    ONLINE_PARAMETERS,
+)
 from fhaosmo_ros.core.parameters.yaml_text import parse
+from fhaosmo_ros.inputs import Input, known_inputs, measured_output, with_joints
+from fhaosmo_ros.tools.bags.reader import STAMPS
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded
 
 
@@ -40,11 +51,104 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def online_parameters(
+class BagInputs(NamedTuple):
+    """
+    Where y and u are in a bag.
+
+    Attributes
+    ----------
+    y : Input
+        With the full name of its topic.
+    u : mapping of str to Input
+        The known inputs that the model uses, likewise.
+    stamp : str
+        One of `STAMPS` of the bag reader.
+
+    """
+
+    y: Input
+    u: Mapping[str, Input]
+    stamp: str
+
+
+STAMP_OF = {'auto': 'auto', 'header': 'header', 'source': 'source', 'reception': 'bag'}
+"""Stamps of a bag's reader, by input_stamp of the node."""
+
+
+def add_input_options(add: Callable[..., Any]) -> None:
+    """Add the options that say where in a bag y and u are, with a parser's `add_argument`."""
+    add('--topic', help='topic of the measured output (default: input_topic, else /y)')
+    add(
+        '--field',
+        help="number in its messages, such as 'position[2]', 'position[elbow]' or "
+        "'orientation.yaw' (default: input_field, else the only one)",
+    )
+    add(
+        '--input-topic', action='append', default=[], metavar='TOPIC',
+        help='topic of the known input; given several times: of each one that phi uses, in the '
+        'order of inputs (default: known_input_topics, else /NAME)',
+    )  # fmt: skip
+    add(
+        '--input-field', action='append', default=[], metavar='FIELD',
+        help='number in its messages; given several times: of each input (default: '
+        'known_input_fields)',
+    )  # fmt: skip
+    add(
+        '--stamp', choices=STAMPS,
+        help='where dt comes from; header: of the messages; source: publish time (mcap only); '
+        'bag: log time; auto: the first of these that the bag has (default: input_stamp)',
+    )  # fmt: skip
+
+
+def bag_inputs(
+    arguments: argparse.Namespace,
+    values: Mapping[str, Any],
+    used: Sequence[str],
+    present: Collection[str] = (),
+    namespace: str = '',
+) -> BagInputs:
+    """
+    Return where y and u are: as the options say, else as the parameters of the estimator do.
+
+    Parameters
+    ----------
+    arguments : Namespace
+        With the options of `add_input_options`.
+    values : mapping
+        Parameters of the channel.
+    used : sequence of str
+        Known inputs that its model uses.
+    present : collection of str
+        Topics of the bag.
+    namespace : str
+        Of the node.
+
+    """
+    channel = getattr(arguments, 'channel', '')
+
+    def full(wanted: Input) -> str:
+        # A bag may hold the y of one channel, or of a node in another namespace, as /y.
+        relative = wanted.topic.removeprefix(f'{channel}/')
+        names = [wanted.absolute(namespace), wanted.absolute(''), f'/{relative.lstrip("/")}']
+        return next((name for name in names if name in present), names[1])
+
+    y = measured_output(values, channel)
+    y = y._replace(topic=arguments.topic or full(y), field=arguments.field or y.field)
+    given = dict(values)
+    if arguments.input_topic:
+        given['known_input_topics'] = arguments.input_topic
+    if arguments.input_field:
+        given['known_input_fields'] = arguments.input_field
+    found = known_inputs(given, used, channel)
+    u = {name: its._replace(topic=full(its)) for name, its in found.items()}
+    return BagInputs(y, u, arguments.stamp or STAMP_OF[y.stamp])
+
+
+def channel_parameters(
     arguments: argparse.Namespace, recorded: Recorded | None = None
 ) -> dict[str, Any]:
     """
-    Return the parameters of the update path from the options.
+    Return the parameters of a channel from the options.
 
     Parameters
     ----------
@@ -73,8 +177,9 @@ def online_parameters(
         values = select(values | on_command_line, ESTIMATOR_PARAMETERS)
     except ConfigurationError as error:
         raise with_origin(error, origins) from None
+    values = with_joints(values)
     names = channel_names(values)
-    if arguments.channel not in names:
+    if arguments.channel not in names and (names != FROM_JOINTS or not arguments.channel):
         allowed = 'none, as the node has no channels' if names == UNNAMED else ' or '.join(names)
         raise ConfigurationError(
             f'--channel: expected {allowed}, got {arguments.channel or "none"}'
@@ -84,7 +189,12 @@ def online_parameters(
         OnlineEstimator(Parameters(ESTIMATOR_PARAMETERS, own))
     except ConfigurationError as error:
         raise with_origin(error, origins, arguments.channel) from None
-    return ONLINE_PARAMETERS.part_of(own)
+    return CHANNEL_PARAMETERS.part_of(own)
+
+
+def online_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return those of `channel_parameters` that belong to the update path."""
+    return ONLINE_PARAMETERS.part_of(channel_parameters(arguments))
 
 
 def named(arguments: argparse.Namespace) -> list[str]:

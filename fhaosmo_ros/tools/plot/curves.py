@@ -7,6 +7,7 @@ from typing import NamedTuple
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import of_channel
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded_parameters import recorded_parameters
@@ -35,6 +36,8 @@ class Curves(NamedTuple):
         NaN where the bag lacks it.
     epsilon : float or None
         Threshold of its gates, if it has gates and the bag has its parameters.
+    unit : str
+        Of y, '' if the bag does not say it.
 
     """
 
@@ -46,6 +49,12 @@ class Curves(NamedTuple):
     innovation: NDArray[np.float64]
     truth: NDArray[np.float64] | None
     epsilon: float | None
+    unit: str = ''
+
+    def title(self, name: str) -> str:
+        """Return one of `names` with its unit, which follows from that of y."""
+        unit = derivative_unit(self.unit, self.names.index(name))
+        return titled('unknown\ninput d' if name == 'd' else name, unit)
 
 
 def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]:
@@ -79,18 +88,20 @@ def _read_curves(
             f'bag {path}: expected the topics of an estimator ({", ".join(ESTIMATES)} below its '
             f'name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
         )
-    return [_curves(path, name, plant, _epsilon(reader, name)) for name in names or found]
+    return [_curves(path, name, plant, *_settings(reader, name)) for name in names or found]
 
 
-def _epsilon(reader: BagReader, name: str) -> float | None:
+def _settings(reader: BagReader, name: str) -> tuple[float | None, str]:
+    """Return the threshold of an estimator's gates, and the unit of y, if the bag says them."""
     recorded = recorded_parameters(reader, name)
     if recorded is None:
-        return None
+        return None, ''
     values = ESTIMATOR_PARAMETERS.defaults() | of_channel(recorded.values, recorded.channel)
-    return values['epsilon'] if values['structure'] == 'cascade' else None
+    epsilon = values['epsilon'] if values['structure'] == 'cascade' else None
+    return epsilon, values['measurement_unit']
 
 
-def _curves(path: Path, name: str, plant: str, epsilon: float | None) -> Curves:
+def _curves(path: Path, name: str, plant: str, epsilon: float | None, unit: str) -> Curves:
     ticks = read_ticks(path, name, list(ESTIMATES))
     when = ticks['stamp']
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
@@ -109,6 +120,7 @@ def _curves(path: Path, name: str, plant: str, epsilon: float | None) -> Curves:
         ticks['innovation'],
         truth.values if truth else None,
         epsilon,
+        unit,
     )
 
 

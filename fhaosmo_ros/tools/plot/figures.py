@@ -96,7 +96,7 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
         _fit_after_transient(
             row, [c.estimate[:, c.names.index(name)] for c in curves if name in c.names]
         )
-        row.set_ylabel('unknown\ninput d' if name == 'd' else name)
+        row.set_ylabel(next(c.title(name) for c in curves if name in c.names))
     row_of['gamma'].set_ylabel('power γ')
     first = curves[0]
     t = (first.stamps - origin) * 1e-9

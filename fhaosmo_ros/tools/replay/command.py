@@ -14,11 +14,17 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.copy import copy_topics
-from fhaosmo_ros.tools.bags.reader import BagReader, STAMPS
+from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Interrupted, run_command
-from fhaosmo_ros.tools.cli.options import add_parameter_options, named, online_parameters
+from fhaosmo_ros.tools.cli.options import (
+    add_input_options,
+    add_parameter_options,
+    bag_inputs,
+    channel_parameters,
+    named,
+)
 from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun, read_events
@@ -46,22 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add('--force', action='store_true', help='replace an output that exists')
     add('--storage', choices=('mcap', 'sqlite3'), default='mcap', help='of a bag (%(default)s)')
-    add('--topic', default='/y', help='topic of the measured output (%(default)s)')
-    add('--field', help="number in its messages, such as 'position[2]' (default: the only one)")
-    add(
-        '--input-topic', action='append', default=[], metavar='TOPIC',
-        help='topic of the known input; given several times: of each one that phi uses, in the '
-        'order of inputs (default: /NAME)',
-    )  # fmt: skip
-    add(
-        '--input-field', action='append', default=[], metavar='FIELD',
-        help='number in its messages; given several times: of each input',
-    )  # fmt: skip
-    add(
-        '--stamp', choices=STAMPS, default='auto',
-        help='where dt comes from; header: of the messages; source: publish time (mcap only); '
-        'bag: log time; auto: the first of these that the bag has',
-    )  # fmt: skip
+    add_input_options(add)
     add(
         '--backwards', choices=('error', 'reject'), default='error',
         help='what to do with stamps that go back; reject: as the live node does (%(default)s)',
@@ -101,16 +92,21 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             recorded = recorded_parameters(reader, followed)
         if recorded:
             arguments.channel = arguments.channel or recorded.channel
-        values = online_parameters(arguments, recorded)
+        own = channel_parameters(arguments, recorded)
+        values = ONLINE_PARAMETERS.part_of(own)
         estimator = OnlineEstimator(values)
         live = None
         if followed is not None:
             events = read_events(reader, followed, named(arguments))
             live = LiveRun(followed, events, estimator)
-        samples = Samples(reader, estimator, live, arguments)
+        namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
+        used = estimator.observer.used_inputs
+        present = {c.topic for c in reader.connections}
+        inputs = bag_inputs(arguments, own, used, present, namespace)
+        samples = Samples(reader, estimator, live, inputs, arguments)
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
         name = _name(reader, arguments.name)
-        complete = ONLINE_PARAMETERS.defaults() | values
+        complete = ONLINE_PARAMETERS.defaults() | own
         _write(reader, samples, outputs, name, complete, arguments, stop)
         finals = [output.keep() for output in outputs]
     seconds = perf_counter() - begin
@@ -119,6 +115,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         f'{c.accepted} samples used, {c.rejected} rejected, {c.restarts} restarts; '
         f'{samples.span:.1f} s of data in {seconds:.2f} s'
     )
+    for why, count in reader.lacking.items():
+        print(f'{count} messages left out: {why}')
     print(f'stamps: {samples.stamps}')
     print(f'parameters: {_origin(arguments, recorded)}')
     if not arguments.params_file and not recorded:

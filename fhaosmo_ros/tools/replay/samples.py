@@ -4,11 +4,14 @@
 import argparse
 from collections.abc import Iterator
 
+from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.status import REJECTED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.messages.fields import Unwrapper
 from fhaosmo_ros.tools.bags.held_input import HeldInputs
 from fhaosmo_ros.tools.bags.reader import BagReader, Block
+from fhaosmo_ros.tools.cli.options import BagInputs
 from fhaosmo_ros.tools.replay.live_run import LiveRun
 from fhaosmo_ros.tools.replay.sinks import Rows
 import numpy as np
@@ -24,8 +27,9 @@ class Samples:
     estimator : OnlineEstimator
     live : LiveRun or None
         The live estimator to follow.
+    inputs : BagInputs
     arguments : Namespace
-        Options topic, field, input_topic, input_field, stamp, backwards and every of replay.
+        Options backwards and every of replay.
 
     """
 
@@ -34,23 +38,23 @@ class Samples:
         reader: BagReader,
         estimator: OnlineEstimator,
         live: LiveRun | None,
+        inputs: BagInputs,
         arguments: argparse.Namespace,
     ) -> None:
-        topic = arguments.topic
+        y, self._stamp = inputs.y, inputs.stamp
+        topic = y.topic
         self.estimator, self.topic, self._live = estimator, topic, live
         self._reader, self._backwards = reader, arguments.backwards == 'error'
         self._every, self._seen, self._taken = arguments.every, 0, 0
-        self._field = reader.field(topic, arguments.field)
-        self._stamp = arguments.stamp
+        self._field = reader.field(topic, y.field, y.name)
         if self._stamp == 'auto' and not self._field.has_header:
             # An estimator that used its clock took a sample when it came, not when it was sent.
             self._stamp = 'bag' if estimator.parameters['sampling'] == 'clock' else 'auto'
         self._other_than_bag = False
         self._input = None
         if estimator.observer.uses_input:
-            topics, fields = arguments.input_topic, arguments.input_field
             self._input = HeldInputs(
-                reader, estimator.observer.model, topics, fields, estimator.reject_inputs
+                reader, estimator.observer.model, inputs.u, estimator.reject_inputs
             )
         self._first: int | None = None
         self._latest: int | None = None
@@ -78,17 +82,28 @@ class Samples:
         blocks = self._checked()
         if self._live:
             blocks = self._live.begin(blocks)
-        for block in blocks:
+        for block in self._continuous(blocks) if self._field.wraps else blocks:
             if len(block.times):
                 u = self._input(block.times) if self._input else None
                 yield len(block.times), list(self._rows(block, u))
+        if not self._taken and self._reader.lacking:
+            raise ConfigurationError(f'topic {self.topic!r}: {next(iter(self._reader.lacking))}')
         if not self._taken:
             raise ConfigurationError(
                 f'topic {self.topic!r}: expected messages, read none although the bag lists them'
             )
 
+    def _continuous(self, blocks: Iterator[Block]) -> Iterator[Block]:
+        """Yield the blocks with the angle continuous, from the live estimator's y on."""
+        unwrap = Unwrapper()
+        for k, block in enumerate(blocks):
+            if k == 0 and self.estimator.latest is not None:
+                unwrap.begin_near(self.estimator.arrays.state.memory[arrays.Y])
+            values = np.array([unwrap(value) for value in block.values.tolist()])
+            yield block._replace(values=values)
+
     def _checked(self) -> Iterator[Block]:
-        for block in self._reader.blocks(self.topic, self._field, self._stamp):
+        for block in self._reader.blocks(self.topic, self._field, self._stamp, every=False):
             if len(block.times):
                 self._check(block)
                 yield block

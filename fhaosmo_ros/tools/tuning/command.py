@@ -7,15 +7,15 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.recording_parameters import SENSOR
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.bags.reader import STAMPS
 from fhaosmo_ros.tools.cli.command import Interrupted, run_command, without_password
-from fhaosmo_ros.tools.cli.options import assigned
+from fhaosmo_ros.tools.cli.options import add_input_options, assigned, bag_inputs
 from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.source import BagSource, from_bag, simulated, TuningData
@@ -106,18 +106,7 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         help='with the truth in it: tune on it; without: take noise, rate and jitter from its y',
     )
-    add('--topic', default='/y', help='topic of the measured output (%(default)s)')
-    add('--field', help="number in its messages, such as 'position[2]' (default: the only one)")
-    add(
-        '--input-topic', action='append', default=[], metavar='TOPIC',
-        help='topic of the known input; given several times: of each one that phi uses, in the '
-        'order of inputs (default: /NAME)',
-    )  # fmt: skip
-    add(
-        '--input-field', action='append', default=[], metavar='FIELD',
-        help='number in its messages; given several times: of each input',
-    )  # fmt: skip
-    add('--stamp', choices=STAMPS, default='auto', help='where dt comes from, as for replay')
+    add_input_options(add)
     add('--plant', default='/plant', help='whose topics are the truth (%(default)s)')
     return parser
 
@@ -136,7 +125,7 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> int:
     with Output(arguments.output, arguments.force) as output:
         values = TUNE_PARAMETERS.complete(tuning)
         with stop.raising():
-            data = _data(arguments, values, set(tuning))
+            data = _data(arguments, estimator, values, set(tuning))
         print(
             f'{len(data.training)} recordings to train on, {len(data.held_out)} held out: '
             f'{data.origin}'
@@ -194,18 +183,14 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
     return estimator, tuning
 
 
-def _data(arguments: argparse.Namespace, values: Parameters, given: set[str]) -> TuningData:
+def _data(
+    arguments: argparse.Namespace, estimator: dict[str, Any], values: Parameters, given: set[str]
+) -> TuningData:
     if arguments.bag is None:
         return simulated(values, arguments.seed)
-    source = BagSource(
-        arguments.bag,
-        arguments.topic,
-        arguments.field,
-        arguments.input_topic,
-        arguments.input_field,
-        arguments.stamp,
-        arguments.plant.rstrip('/'),
-    )
+    used = TriangularModel.of(values).used_inputs
+    inputs = bag_inputs(arguments, estimator, used)
+    source = BagSource(arguments.bag, *inputs, arguments.plant.rstrip('/'))
     return from_bag(source, values, given, arguments.seed)
 
 

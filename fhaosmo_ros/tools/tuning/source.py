@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training and held-out recordings: of a simulated family, or pieces of a bag."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
@@ -12,6 +13,8 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Family, Recording
+from fhaosmo_ros.inputs import Input, measured_output
+from fhaosmo_ros.messages.fields import Unwrapper
 from fhaosmo_ros.tools.bags.held_input import HeldInputs
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import truth_at
@@ -57,10 +60,8 @@ class BagSource(NamedTuple):
     """A bag, its fields that are y and u, and the plant whose topics are the truth."""
 
     path: Path
-    topic: str = '/y'
-    field: str | None = None
-    input_topics: Sequence[str] = ()
-    input_fields: Sequence[str] = ()
+    y: Input = measured_output({})
+    u: Mapping[str, Input] = MappingProxyType({})
     stamp: str = 'auto'
     plant: str = '/plant'
 
@@ -110,13 +111,15 @@ def _read(
     source: BagSource, model: TriangularModel
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any] | None]:
     with BagReader(source.path) as reader:
-        found = reader.field(source.topic, source.field)
-        blocks = list(reader.blocks(source.topic, found, source.stamp))
+        topic = source.y.absolute('')
+        found = reader.field(topic, source.y.field, source.y.name)
+        blocks = list(reader.blocks(topic, found, source.stamp, every=False))
         times, stamps, y = (np.concatenate([block[k] for block in blocks]) for k in range(3))
+        if found.wraps:
+            y = np.array(list(map(Unwrapper(), y.tolist())))
         u = np.zeros((len(y), len(model.inputs)))
         if model.uses_input:
-            names = source.input_topics, source.input_fields
-            u = HeldInputs(reader, model, *names, lambda _: None)(times)
+            u = HeldInputs(reader, model, source.u, lambda _: None)(times)
     truth = None
     found = truth_at(source.path, source.plant, times)
     if found is not None and found.values.shape[1] == model.order + 1:

@@ -1,0 +1,482 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Subscriptions that channels share: one for each topic, and one look at each of its messages.
+
+The type of a topic is given, or found from the graph: then the subscription begins once somebody
+publishes it, and begins anew if the publisher returns with another type.
+"""
+
+from collections.abc import Callable, Mapping
+from time import monotonic
+from typing import Any
+
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.declaration import Parameters
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.per_channel import of_channel
+from fhaosmo_ros.inputs import Input, known_inputs, measured_output
+from fhaosmo_ros.messages.fields import Field, find_field, Unwrapper
+from fhaosmo_ros.messages.layout import names_in
+from fhaosmo_ros.messages.reader import MessageReader
+from fhaosmo_ros.nodes.middleware.definitions import definitions
+from fhaosmo_ros.nodes.middleware.messages import message_class
+from fhaosmo_ros.nodes.middleware.publisher_watch import Publishers, PublisherWatch
+from fhaosmo_ros.nodes.middleware.subscription import subscribe_with_info
+from rclpy.clock import Clock, ClockType
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+DISCOVERY_PERIOD = 0.2
+FRESH = 0.2
+"""Seconds for which what was seen of the publishers serves further channels."""
+MOST_WHYS = 20
+"""Different reasons that are told, of a publisher that always has another one."""
+NOBODY = Publishers({}, {})
+Take = Callable[[int, float, int], None]
+"""Gets the stamp of a sample, its value, and when it was published; times in nanoseconds."""
+
+
+class Listener:
+    """
+    Somebody who takes one number out of each message of a source.
+
+    Attributes
+    ----------
+    wanted : Input
+    take : callable
+        See `Take`.
+    is_sample : bool
+        True for y, False for a known input, which a message gives first.
+    source : Source
+    field : Field or None
+        None until the topic's type is known.
+    error : str
+        Why no field can be found in the topic's type, else ''.
+    lacking : int
+        Messages that lacked the field.
+    why : str
+        Why the latest one of them did.
+
+    """
+
+    def __init__(
+        self, wanted: Input, take: Take, source: 'Source', logger: Any, is_sample: bool
+    ) -> None:
+        self.wanted, self.take, self.source = wanted, take, source
+        self.is_sample = is_sample
+        self.field: Field | None = None
+        self.error = self.why = ''
+        self.lacking = 0
+        self._whys: set[str] = set()
+        self._logger = logger
+        self._kind = 'source'
+        self._unwrap: Unwrapper | None = None
+
+    @property
+    def stamps(self) -> str:
+        """Which stamps its samples have: header, source or reception; '' if not known yet."""
+        return self._kind if self.field else ''
+
+    def find(self, types: Mapping[str, Any], message_type: str) -> None:
+        """Find its field in a message type, or keep the reason as `error`."""
+        wanted, self.field, self.error = self.wanted, None, ''
+        try:
+            field = find_wanted(types, wanted._replace(message_type=message_type))
+        except ConfigurationError as error:
+            self.error = str(error)
+            return
+        self.field = field
+        self._kind = wanted.stamp
+        if wanted.stamp == 'auto':
+            self._kind = 'header' if field.has_header else 'source'
+        self._unwrap = Unwrapper() if field.wraps else None
+
+    def hear(self, value: float | None, header: int, info: Mapping[str, Any]) -> None:
+        """Pass the number in a message on, or count that there is none."""
+        if value is None:
+            self._miss()
+            return
+        if self._unwrap:
+            value = self._unwrap(value)
+        source: int = info['source_timestamp']
+        if self._kind == 'header':
+            self.take(header, value, source)
+        elif self._kind == 'source':
+            self.take(source, value, source)
+        else:
+            self.take(info['received_timestamp'], value, source)
+
+    def _miss(self) -> None:
+        self.lacking += 1
+        self.why = self.source.missing(self)
+        if self.why not in self._whys and len(self._whys) < MOST_WHYS:
+            self._whys.add(self.why)  # each is told once: two publishers may alternate
+            self._logger.warning(f'a message on {self.source.topic} is left out: {self.why}')
+
+
+class Source:
+    """
+    A topic and all that its messages are read for.
+
+    Parameters
+    ----------
+    node : Node
+    wanted : Input
+        Its topic and message type.
+    qos : QoSProfile
+
+    Attributes
+    ----------
+    topic : str
+        Full name, after remapping.
+    message_type : str
+        '' while it is not known.
+    lost : int
+        Messages missing between the publisher's sequence numbers.
+    damaged : int
+        Messages that are shorter than their type.
+
+    """
+
+    def __init__(self, node: Node, wanted: Input, qos: QoSProfile) -> None:
+        self._node, self._qos = node, qos
+        self._logger = node.get_logger()
+        self.topic = node.resolve_topic_name(wanted.topic)
+        self.message_type = wanted.message_type
+        self._from_graph = not wanted.message_type
+        self.lost = self.damaged = 0
+        self._sequence = 0
+        self._mixed = False
+        self._listeners: list[Listener] = []
+        self.after: Callable[[], None] | None = None
+        """Called after each message."""
+        self._reader: MessageReader | None = None
+        self._heard: list[Listener] = []  # those with a field, in the order of the reader
+        self._subscription: Any = None
+        self._watch: PublisherWatch | None = None
+        self._seen, self._seen_at = NOBODY, -FRESH
+        self._told = ''
+        self._timer: Any = None
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.on_names: Callable[[list[str]], None] | None = None
+        """Called with the names in a message when they are not those of the one before."""
+        self.on_type: Callable[[], None] = lambda: None
+        self._pattern: object = None
+
+    def expect_type(self, message_type: str) -> None:
+        """
+        Take a message type that was given, '' for any.
+
+        Raises
+        ------
+        ConfigurationError
+            Another one was given before.
+
+        """
+        if self.message_type and message_type not in ('', self.message_type):
+            raise ConfigurationError(
+                f'topic {self.topic}: expected one message type for all inputs from it, got '
+                f'{self.message_type} and {message_type}'
+            )
+        if message_type and not self.message_type:
+            self.message_type, self._from_graph = message_type, False
+
+    def add(self, wanted: Input, take: Take, logger: Any, first: bool = False) -> Listener:
+        """Add a listener; a `first` one hears a message before those that are not."""
+        listener = Listener(wanted, take, self, logger, is_sample=not first)
+        if first:
+            self._listeners.insert(0, listener)
+        else:
+            self._listeners.append(listener)
+        return listener
+
+    def open(self) -> None:
+        """
+        Subscribe, now or once the type of the topic is known.
+
+        Raises
+        ------
+        ConfigurationError
+            A type that was given is not installed, or it does not have a listener's field.
+
+        """
+        if self._subscription is not None:
+            self._find_fields()
+            self._expect_fields()
+        elif self.message_type:
+            try:
+                self._subscribe(self.message_type)
+            except LookupError as error:
+                raise ConfigurationError(f"parameter 'input_type': {error}") from None
+            self._expect_fields()
+        elif self._listeners or self.on_names:
+            self._begin_discovery()
+            self._discover()
+
+    def _expect_fields(self) -> None:
+        for listener in self._listeners:
+            if listener.error:
+                raise ConfigurationError(listener.error)
+
+    def close(self) -> None:
+        """Take the subscription away."""
+        self._end_discovery()
+        self._unsubscribe()
+        self._listeners, self._heard, self.after = [], [], None
+
+    def forget(self) -> None:
+        """Expect a publisher that numbers its messages anew."""
+        self._sequence, self._mixed = 0, False
+
+    def look(self) -> Publishers:
+        """Return the topic's publishers; begin anew if its type has changed."""
+        if monotonic() - self._seen_at < FRESH:
+            return self._seen
+        self._seen_at = monotonic()
+        self._seen = self._watch.look() if self._watch else NOBODY
+        self._mixed = len(self._seen.heard) > 1
+        if self._from_graph and self._watch and not self._seen.heard and self._seen.unheard:
+            kinds = self._kinds()
+            if kinds and self.message_type not in kinds:
+                self._logger.warning(
+                    f'the type of {self.topic} changed from {self.message_type} to {kinds[0]}'
+                )
+                self._unsubscribe()
+                # Not at once: the executor lets go of the old subscription a little later, and
+                # the middleware has one type for each topic of a process.
+                self._begin_discovery()
+        return self._seen
+
+    def missing(self, listener: Listener) -> str:
+        """Return why the latest message lacked the field of a listener."""
+        assert self._reader is not None
+        return self._reader.missing.get(self._heard.index(listener), '')
+
+    @property
+    def stamps(self) -> set[str]:
+        """Which stamps its listeners' samples of y have, as far as is known."""
+        return {li.stamps for li in self._listeners if li.stamps and li.is_sample}
+
+    def _kinds(self) -> list[str]:
+        found = self._node.get_publishers_info_by_topic(self.topic)
+        return sorted({endpoint.topic_type for endpoint in found})
+
+    def _discover(self) -> None:
+        kinds = self._kinds()
+        if kinds:
+            self._take_type(kinds[0])
+
+    def _take_type(self, message_type: str) -> None:
+        """Subscribe with a type that was found; say once why if that is not possible."""
+        problems: list[str] = []
+        try:
+            self._subscribe(message_type)
+            self._end_discovery()
+            self.on_type()
+            problems = [listener.error for listener in self._listeners if listener.error]
+        except (LookupError, rclpy_implementation.RCLError) as error:
+            problems = [f'{self.topic}: {error}']
+            for listener in self._listeners:
+                listener.field, listener.error = None, problems[0]
+            self._begin_discovery()
+        text = '; '.join(dict.fromkeys(problems))
+        if text and text != self._told:
+            self._logger.error(text)
+        self._told = text
+
+    def _begin_discovery(self) -> None:
+        if self._timer is None:
+            self._timer = self._node.create_timer(
+                DISCOVERY_PERIOD, self._discover, clock=self._steady
+            )
+
+    def _end_discovery(self) -> None:
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+            self._timer = None
+
+    def _subscribe(self, message_type: str) -> None:
+        kind = message_class(message_type)
+        self._types = definitions(message_type)
+        self.message_type = message_type
+        self._find_fields()
+        self.forget()
+        self._subscription = subscribe_with_info(
+            self._node, kind, self.topic, self._on_message, self._qos, raw=True
+        )
+        self._watch = PublisherWatch(self._node, self._subscription)
+        self._seen_at = -FRESH
+
+    def _find_fields(self) -> None:
+        for listener in self._listeners:
+            listener.find(self._types, self.message_type)
+        self._heard = [listener for listener in self._listeners if listener.field]
+        fields = [listener.field for listener in self._heard if listener.field]
+        self._reader = MessageReader(fields) if fields else None
+
+    def _unsubscribe(self) -> None:
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+        self._subscription = self._watch = None
+        self._heard, self._reader = [], None
+
+    def _on_message(self, data: bytes, info: Mapping[str, Any]) -> None:
+        sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
+        if sequence != self._sequence + 1:
+            self._count_lost(sequence)
+        self._sequence = sequence
+        if self._reader is None:
+            if self.on_names is None:
+                return
+            self._tell_names(data)
+            if self._reader is None:
+                return
+        try:
+            header, values = self._reader.read(data)
+            if self._reader.pattern is not self._pattern:
+                self._pattern = self._reader.pattern
+                self._tell_names(data)
+        except ValueError:  # rclpy's own conversion would end the node
+            self.damaged += 1
+            header, values = 0, [float('nan')] * len(self._heard)
+        for listener, value in zip(self._heard, values, strict=True):
+            listener.hear(value, header, info)
+        if self.after is not None:
+            self.after()
+
+    def _tell_names(self, data: bytes) -> None:
+        if self.on_names is None:
+            return
+        try:
+            names = names_in(self._types, self.message_type, data)
+        except ValueError:
+            return
+        if names:
+            self.on_names(names)
+
+    def _count_lost(self, sequence: int) -> None:
+        """Count the messages between the publisher's last sequence number and this one."""
+        if 0 < sequence <= self._sequence:  # another publisher's
+            self._mixed = True  # until `look` has seen how many there are
+        elif sequence and self._sequence and not self._mixed:
+            self.lost += sequence - self._sequence - 1
+
+
+def check_inputs(values: Parameters, estimators: Mapping[str, OnlineEstimator]) -> None:
+    """
+    Raise for inputs that cannot be, as far as their message types are given.
+
+    Parameters
+    ----------
+    values : Parameters
+        Of the node.
+    estimators : mapping of str to OnlineEstimator
+        By the names of the channels.
+
+    Raises
+    ------
+    ConfigurationError
+        A type that is not installed, or no such field.
+
+    """
+    for name, estimator in estimators.items():
+        own = of_channel(values, name)
+        used = estimator.observer.used_inputs
+        for wanted in (measured_output(own, name), *known_inputs(own, used, name).values()):
+            if wanted.message_type:
+                try:
+                    find_wanted(definitions(wanted.message_type), wanted)
+                except LookupError as error:
+                    raise ConfigurationError(f"parameter 'input_type': {error}") from None
+
+
+def find_wanted(types: Mapping[str, Any], wanted: Input) -> Field:
+    """
+    Return the field of an input in its message type.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such field, or no header where its stamp is asked for.
+
+    """
+    field = find_field(types, wanted.message_type, wanted.field, wanted.name)
+    if wanted.stamp == 'header' and not field.has_header:
+        raise ConfigurationError(
+            f"parameter 'input_stamp': expected messages with a header, got {wanted.message_type}"
+        )
+    return field
+
+
+class Sources:
+    """
+    The sources of a node: one for each topic.
+
+    Parameters
+    ----------
+    node : Node
+    qos : QoSProfile
+        Of all subscriptions.
+    on_type : callable
+        Called when the type of a topic has become known.
+
+    """
+
+    def __init__(
+        self, node: Node, qos: QoSProfile, on_type: Callable[[], None] = lambda: None
+    ) -> None:
+        self._node, self._qos, self._on_type = node, qos, on_type
+        self._by_topic: dict[str, Source] = {}
+        self._after: Callable[[], None] | None = None
+
+    def after_message(self, call: Callable[[], None]) -> None:
+        """Have something called after each message, once they are open."""
+        self._after = call
+
+    def of(self, wanted: Input) -> Source:
+        """
+        Return the source that an input is read from; new ones are not open yet.
+
+        Raises
+        ------
+        ConfigurationError
+            Another input is read from the same topic with another type.
+
+        """
+        topic = self._node.resolve_topic_name(wanted.topic)
+        if topic not in self._by_topic:
+            self._by_topic[topic] = Source(self._node, wanted, self._qos)
+        source = self._by_topic[topic]
+        source.expect_type(wanted.message_type)
+        return source
+
+    def open(self) -> None:
+        """
+        Open all of them.
+
+        Raises
+        ------
+        ConfigurationError
+            As `Source.open`.
+
+        """
+        for source in self._by_topic.values():
+            source.after, source.on_type = self._after, self._on_type
+            source.open()
+        self._on_type()
+
+    @property
+    def stamps(self) -> set[str]:
+        """Which stamps the samples of y have, as far as is known."""
+        return {stamps for source in self._by_topic.values() for stamps in source.stamps}
+
+    def close(self) -> None:
+        """Take all subscriptions away."""
+        while self._by_topic:
+            self._by_topic.popitem()[1].close()
+
+    def forget(self) -> None:
+        """Expect publishers that number their messages anew."""
+        for source in self._by_topic.values():
+            source.forget()

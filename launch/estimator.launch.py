@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Start an estimator with a parameter file, on a robot's own topic."""
+
+from pathlib import Path
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+ARGUMENTS = {
+    'params_file': ('', 'YAML file of the estimator; empty: the defaults'),
+    'namespace': ('', 'namespace of the node'),
+    'name': ('estimator', 'name of the node'),
+    'input_topic': ('', 'topic of y; empty: as the file says, else y'),
+    'input_field': ('', 'number in its messages; empty: as the file says, else the only one'),
+    'log_level': ('info', 'least severity that is logged'),
+}
+SWITCHES = {
+    'use_sim_time': ('false', 'take the time from /clock'),
+    'autostart': ('true', 'false: a lifecycle manager configures and activates the node'),
+}
+
+
+def start(context):
+    """Return the node; an argument that is empty leaves the parameter to the file."""
+    names = [*ARGUMENTS, *SWITCHES]
+    given = {name: LaunchConfiguration(name).perform(context) for name in names}
+    path = given['params_file']
+    if path and not Path(path).is_file():
+        raise FileNotFoundError(f'params_file: expected a file, got {path}')
+    # Later entries win, but only over the wildcard keys (/**) that the shipped YAML uses.
+    values = {name: given[name] == 'true' for name in SWITCHES}
+    values |= {name: given[name] for name in ('input_topic', 'input_field') if given[name]}
+    parameters = [*([path] if path else []), values]
+    return [
+        Node(
+            package='fhaosmo_ros',
+            executable='estimator',
+            name=given['name'],
+            namespace=given['namespace'],
+            parameters=parameters,
+            ros_arguments=['--log-level', given['log_level']],
+            output='screen',
+            emulate_tty=True,
+        )
+    ]
+
+
+def generate_launch_description():
+    """Return the arguments and the node."""
+    arguments = [
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in ARGUMENTS.items()
+    ]
+    arguments += [
+        DeclareLaunchArgument(
+            name, default_value=default, choices=['true', 'false'], description=text
+        )
+        for name, (default, text) in SWITCHES.items()
+    ]
+    return LaunchDescription([*arguments, OpaqueFunction(function=start)])
