@@ -16,7 +16,7 @@ from fhaosmo_ros.core.observer.observer import (
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online import policy
 from fhaosmo_ros.core.online.counters import Counters
-from fhaosmo_ros.core.online.memory import EstimatorArrays, make_policy, Memory
+from fhaosmo_ros.core.online.memory import completed, EstimatorArrays, make_policy, Memory
 from fhaosmo_ros.core.online.stamps import forget_samples
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -198,15 +198,18 @@ class OnlineEstimator:
             The memory is of an observer with another number of levels.
 
         """
-        size, levels = len(memory.now), self._arrays.state.levels
-        if size != levels.size + self._arrays.state.memory.size:
+        levels = self._arrays.state.levels
+        size = levels.size + self._arrays.state.memory.size
+        fresh = self._reals[at.STATES : at.STATES + size]
+        now, before = completed(memory.now, fresh), completed(memory.before, fresh)
+        if size != len(now):
             raise ConfigurationError(
-                f'memory: expected that of {self.observer.levels} levels, got {size} numbers'
+                f'memory: expected that of {self.observer.levels} levels, got {len(now)} numbers'
             )
         self._ints[at.FROZEN : at.COUNTERS] = memory.integers
         self._reals[at.INTERVAL : at.STATES] = memory.reals
-        self._reals[at.STATES + size :] = memory.before
-        state, scalars = memory.now[: levels.size], memory.now[levels.size :]
+        self._reals[at.STATES + size :] = before
+        state, scalars = now[: levels.size], now[levels.size :]
         self.observer.restore(ObserverState(state.reshape(levels.shape), scalars))
         self._u = memory.u
 
@@ -237,8 +240,9 @@ class OnlineEstimator:
                 f'seed: expected {n} states and an unknown input, finite and of at most '
                 f'{limit:g} (divergence_limit), got {z!r} and {unknown_input!r}'
             )
-        levels = self._arrays.state.levels
-        levels[:] = 0.0
+        levels, scalars = self._arrays.state
+        levels[: arrays.ROWS] = 0.0
+        scalars[arrays.SETTLED] = 1.0
         known = min(n + 1, self.observer.levels)  # derivatives of d, behind it, are 0
         levels[arrays.HAT, :known] = values[:known]
         levels[arrays.TILDE, :n] = values[1:]

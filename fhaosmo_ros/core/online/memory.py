@@ -111,8 +111,12 @@ INTEGERS = range(FROZEN, COUNTERS)
 """What of the policy's integers a snapshot holds: neither settings nor counters."""
 LABELS_OF_REALS = ['interval', 'jitter', 'held_y']
 LABELS_OF_ROWS = ['z_hat', 'z_tilde', 'z_hat_sensitivity', 'z_tilde_sensitivity']
-LABELS_OF_MEMORY = ['gamma', 'y', 'pending', 'wait']
+LABELS_OF_MEMORY = [
+    'gamma', 'y', 'pending', 'wait', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread',
+]  # fmt: skip
 """Labels of a snapshot's entries: they are in bags, so they stay as they are."""
+OLD_MEMORY = 4
+"""Entries of the memory in snapshots that have no covariance and nothing after `wait`."""
 
 
 class Flag(IntFlag):
@@ -136,8 +140,9 @@ class Memory(NamedTuple):
         Of `Policy.ints`.
     reals : (3,) array
         Of `Policy.reals`.
-    before, now : (4N + 4,) arrays
+    before, now : ((4 + N) N + 10,) arrays
         The observer's state (levels, then memory) before the latest bridged gap, and its state.
+        Of an older version 4N + 4 numbers, without the covariance; see `completed`.
     u : float
         Known input.
 
@@ -172,9 +177,42 @@ def labels(levels: int) -> list[str]:
     """Return a name for each entry of the vector of an observer with that many levels."""
     integers = [f'{NAMES[k].lower()}_{half}' for k in INTEGERS for half in ('upper', 'lower')]
     rows = [f'{row}{i + 1}' for row in LABELS_OF_ROWS for i in range(levels)]
+    rows += [f'covariance{i + 1}_{j + 1}' for i in range(levels) for j in range(levels)]
     state = [*rows, *LABELS_OF_MEMORY]
     before = (f'before_{name}' for name in state)
     return [*HEAD, *integers, *LABELS_OF_REALS, *before, *state, 'u']
+
+
+def _levels(size: int) -> int:
+    """Return the number of levels of a state of so many numbers, 0 if there is none."""
+    for levels in range(1, 17):
+        if size == (arrays.ROWS + levels) * levels + arrays.MEMORY:
+            return levels
+        if size == arrays.ROWS * levels + OLD_MEMORY:  # never that of a newer one: a multiple of 4
+            return levels
+    return 0
+
+
+def completed(state: NDArray[np.float64], fresh: NDArray[np.float64]) -> NDArray[np.float64]:
+    """
+    Return an observer's state as this version remembers it.
+
+    Parameters
+    ----------
+    state : array
+        As in `Memory`, of this version or an older one.
+    fresh : array
+        That of a fresh observer, which has what an older version did not remember.
+
+    """
+    levels = arrays.ROWS * _levels(len(fresh))
+    if len(state) != levels + OLD_MEMORY:
+        return state
+    result = fresh.copy()
+    result[:levels] = state[:levels]
+    begin = len(fresh) - arrays.MEMORY
+    result[begin : begin + OLD_MEMORY] = state[levels:]
+    return result
 
 
 def pack(snapshot: Snapshot) -> NDArray[np.float64]:
@@ -201,7 +239,7 @@ def unpack(vector: ArrayLike) -> Snapshot:
     halves = 2 * len(INTEGERS)
     begin = len(HEAD) + halves + len(LABELS_OF_REALS)
     size, odd = divmod(len(v) - begin - 1, 2)
-    if v.ndim != 1 or odd or size <= arrays.MEMORY or (size - arrays.MEMORY) % arrays.ROWS:
+    if v.ndim != 1 or odd or not _levels(size):
         raise ValueError(f'a snapshot can not have {v.size} entries')
     upper, lower = v[len(HEAD) : len(HEAD) + halves].reshape(-1, 2).T
     integers = upper.astype(np.int64) * HALF + lower.astype(np.int64)

@@ -229,7 +229,7 @@ def simulate(
     p = PLANT_PARAMETERS.complete(plant)
     model = TriangularModel(p['phi'], p['order'])
     z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], model.order)
-    levels = configuration.initial_state().levels
+    levels = configuration.initial_state().levels[:ROWS]
     if configuration.parameters['start_from_measurement']:
         levels[HAT, 0] = z[0]
     system = make_system(model, *unknown_input(p))

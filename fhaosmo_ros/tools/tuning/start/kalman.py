@@ -8,11 +8,14 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.start.sampled_model import SampledModel
 from fhaosmo_ros.tools.tuning.start.theory import effective_noise, kalman_like
 import numpy as np
 
+LEAST = 1e-30
+"""Gain that stands for one that is not positive."""
 FASTEST = 5.0
 """Bandwidth times period of a deadbeat observer."""
 GAMMA = 3e-3
@@ -132,7 +135,7 @@ class KalmanGains:
         return {
             'unknown_input_derivatives': self._derivatives,
             'unknown_input_decay': decay,
-            'lambda': [float(x) for x in gain.clip(1e-12, 1e15)],
+            'lambda': [float(x) for x in gain.clip(LEAST, OBSERVER_PARAMETERS['lambda'].upper)],
             'fuzzy_widths': [width] * len(gain),
             'gamma_initial': self._gamma,
         }
