@@ -26,7 +26,7 @@ Entries of ``State.memory``:
 | SCALE | factor s of the half-widths and of the injections (D 22) | 1 |
 | SATURATED | samples in a row with |eps_1| beyond all half-widths | 1 |
 | BEYOND | samples in a row that are too far from the prediction to be likely | 1 |
-| SETTLED | 1: the gains are the tuned ones, P is the steady one | 1 |
+| SETTLED | 1: the gains are the tuned ones; else minus the time since the start, or 0 | s |
 | PERIOD | running mean of the intervals between samples | s |
 | SPREAD | size of the innovations over that expected, at least 1 (D 21) | 1 |
 """

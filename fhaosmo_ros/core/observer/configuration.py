@@ -168,7 +168,9 @@ class ObserverConfiguration:
         else:
             scalars[arrays.WIDEST] = np.inf
         flags[arrays.SCHEDULED] = (
-            flags[arrays.PREDICTING] and p['noise_size'] > 0.0 and p['correction_period'] > 0.0
+            p['noise_size'] > 0.0
+            and p['unknown_input']
+            and (p['correction_period'] > 0.0 or not flags[arrays.PREDICTING])
         )
         chances = np.zeros((3 * levels + 4, levels))
         chances[-3:-1] = self.initial_estimate, self.initial_internal
@@ -181,18 +183,20 @@ class ObserverConfiguration:
         p, n, scalars, chances = self.parameters, self.levels, law.scalars, law.chances
         period = p['correction_period']
         uncertainty = Uncertainty(self.model, p, self.state_sizes)
+        chances[:n], chances[2 * n : 3 * n] = uncertainty.rates, uncertainty.fresh
+        scalars[arrays.VARIANCE] = uncertainty.variance
+        scalars[arrays.INTENSITY] = uncertainty.intensity
+        scalars[arrays.FASTEST] = uncertainty.fastest
+        if not law.flags[arrays.PREDICTING]:
+            return
         steady = uncertainty.steady(period)
-        chances[:n], chances[n : 2 * n] = uncertainty.rates, steady
-        chances[2 * n : 3 * n] = uncertainty.fresh
+        chances[n : 2 * n] = steady
         chances[3 * n, steady[0] > 0.0] = 1.0 / steady[0, steady[0] > 0.0]
         tuned = tuned_corrections(law, p['noise_size'], period, self.gamma_initial)
         wanted = steady[0] / uncertainty.variance
         alike = (wanted > 0.0) & (tuned > 0.0)
         chances[-1] = 1.0
         chances[-1, alike] = np.clip(tuned[alike] / wanted[alike], 1e-6, 1e6)
-        scalars[arrays.VARIANCE] = uncertainty.variance
-        scalars[arrays.INTENSITY] = uncertainty.intensity
-        scalars[arrays.FASTEST] = uncertainty.fastest
         scalars[arrays.STEADY_VARIANCE] = steady[0, 0] + uncertainty.variance
 
 

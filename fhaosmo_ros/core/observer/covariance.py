@@ -14,9 +14,34 @@ import math
 from typing import Any
 
 from fhaosmo_ros.core.compiled.cache import compiled
-from fhaosmo_ros.core.model.integrate import SLOPE, TOTAL
+from fhaosmo_ros.core.model.bytecode import evaluate, Floats
+from fhaosmo_ros.core.model.integrate import NOW, POINT, SLOPE, TOTAL
 from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.observer.arrays import COVARIANCE, FASTEST, INTENSITY, Law, VARIANCE, Work
+from fhaosmo_ros.core.observer.arrays import (
+    ALPHA,
+    BEYOND,
+    COVARIANCE,
+    FASTEST,
+    GAMMA,
+    HAT,
+    HAT_SENSITIVITY,
+    INTENSITY,
+    INVERSE_WIDTH,
+    LAMBDA,
+    Law,
+    LEVANT,
+    PREDICTION_STEP,
+    psi,
+    SETTLED,
+    SIGN,
+    SPREAD,
+    TILDE,
+    TILDE_SENSITIVITY,
+    VARIANCE,
+    Work,
+    Y,
+)
+from fhaosmo_ros.core.observer.prediction import predict
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +52,17 @@ RATES, STEADY, FRESH = range(3)
 STEP = 0.5
 """Part of the time constant of the fastest motion that one step of the covariance may take."""
 MOST_STEPS = 100
+LONG = 8.0
+"""Time constants of the steady Kalman filter after which its errors are steady."""
+HUBER = 3.0
+"""Innovations of more standard deviations count as so many (D 21)."""
+MEDIAN = 0.6745
+"""Of |x| where x is normal with variance 1."""
+SPREAD_RATE = 0.005
+GATE = 6.0
+"""Innovations of so many standard deviations are too unlikely to be used (D 21)."""
 DOUBLINGS = 60
+BISECTIONS = 60
 DECIDING = (
     'noise_size', 'unknown_input_size', 'unknown_input_rate', 'unknown_input_decay',
     'correction_period', 'structure', 'scheme', 'phi',
@@ -92,6 +127,111 @@ def correct_covariance(law: Law, work: Work) -> None:
     for j in range(n):
         p[COVARIANCE, j] *= variance / s
         p[COVARIANCE + j, 0] = p[COVARIANCE, j]
+
+
+@compiled(forceinline=True)
+def usual_innovation(memory: Floats, b: float, expected: float) -> float:
+    """
+    Return the size that innovations have: the expected one times the spread, which follows (D 21).
+
+    The spread goes up by a small part of it where |b| is above its median if it were normal, and
+    down by as much where |b| is below. So its size does not matter, and outliers hardly do.
+    A sample that is too far off is counted in ``memory[BEYOND]``.
+    """
+    if abs(b) > MEDIAN * memory[SPREAD] * expected:
+        memory[SPREAD] *= 1.0 + SPREAD_RATE
+    else:
+        memory[SPREAD] = max(memory[SPREAD] / (1.0 + SPREAD_RATE), 1.0)
+    usual = float(memory[SPREAD] * expected)
+    memory[BEYOND] = memory[BEYOND] + 1.0 if abs(b) > GATE * usual else 0.0
+    return usual
+
+
+@compiled()
+def begin_estimates(
+    law: Law, work: Work, memory: Floats, y: float, h: float, u: float
+) -> tuple[float, float]:
+    """
+    Estimate by the Kalman filter itself until P is steady, for schemes with gains of other kinds.
+
+    In place; see `levant.predict_correct`. Sensitivities rest.
+    """
+    x, n, stages = work.x, law.gains.shape[1], work.stages
+    predict_covariance(law, work, h)
+    s = x[COVARIANCE, 0] + law.scalars[VARIANCE]
+    for i in range(n):
+        stages[NOW, 0, i], stages[NOW, 1, i] = x[HAT, i], 0.0
+    predict(law, work, h, u, law.scalars[PREDICTION_STEP])
+    b = y - stages[NOW, 0, 0]
+    usual_innovation(memory, b, math.sqrt(s))
+    if memory[BEYOND] > 0.0:
+        return 0.0, 0.0
+    for i in range(n):
+        x[HAT, i] = stages[NOW, 0, i] + x[COVARIANCE, i] / s * b
+        x[HAT_SENSITIVITY, i] = x[TILDE_SENSITIVITY, i] = 0.0
+    for i in range(n - 1):
+        x[TILDE, i] = x[HAT, i + 1]
+    x[TILDE, n - 1] = 0.0
+    correct_covariance(law, work)
+    memory[SETTLED] -= h
+    speed = (law.scalars[INTENSITY] / (law.scalars[VARIANCE] * h)) ** (0.5 / n)
+    if -memory[SETTLED] * speed > LONG:
+        hand_over(law, work, memory)
+        memory[SETTLED] = 1.0
+    return (1.0 - x[COVARIANCE, 0] / law.scalars[VARIANCE]) * b * b, 0.0
+
+
+@compiled()
+def hand_over(law: Law, work: Work, memory: Floats) -> None:
+    """
+    Put the levels of a cascade where they would be if they had followed these estimates.
+
+    Level i then has alpha_i psi_i(eps_i) = z_{i+1}', and its internal state lags by its injection.
+    """
+    x, m, n, gamma = work.x, work.stages[POINT], law.gains.shape[1], memory[GAMMA]
+    if law.flags[LEVANT]:
+        return
+    for i in range(n):
+        m[0, i], m[1, i] = x[HAT, i], 0.0
+    for i in range(n):
+        rate = 0.0
+        if i + 1 < n:
+            rate = evaluate(law.model, i + 1, m, 0.0, work.stack)[0]
+            if i + 2 < n:
+                rate += m[0, i + 2]
+        wanted = min(abs(rate) / law.gains[ALPHA, i], 1.0)
+        low, high = 0.0, 1.0 / law.gains[INVERSE_WIDTH, i]
+        if law.flags[SIGN]:
+            high = 0.0
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            if psi(law, i, middle)[0] < wanted:
+                low = middle
+            else:
+                high = middle
+        eps = math.copysign(high, rate)
+        injection = law.gains[LAMBDA, i] * high**gamma * wanted if high > 0.0 else 0.0
+        x[HAT, i] = (x[HAT, 0] if i == 0 else x[TILDE, i - 1]) - eps
+        behind = m[0, i + 1] if i + 1 < n else 0.0
+        x[TILDE, i] = behind - math.copysign(injection, rate)
+
+
+@compiled()
+def is_unlikely(law: Law, work: Work, memory: Floats, y: float, h: float, u: float) -> bool:
+    """Return True if y is too far from one Euler step of the internal states (D 21)."""
+    x, m = work.x, work.stages[POINT]
+    m[0, 0], m[1, 0] = memory[Y], 0.0
+    phi = evaluate(law.model, 0, m, u, work.stack)[0]
+    eps, rate = memory[Y] - x[HAT, 0], x[TILDE, 0] + phi
+    if law.flags[LEVANT]:
+        b = y - x[HAT, 0] - h * rate
+    else:  # the internal state lags by the injection of the first level
+        if eps != 0.0:
+            injection = law.gains[LAMBDA, 0] * abs(eps) ** memory[GAMMA] * psi(law, 0, abs(eps))[0]
+            rate += math.copysign(injection, eps)
+        b = y - memory[Y] - h * rate
+    usual_innovation(memory, b, math.sqrt(x[COVARIANCE, 0] + law.scalars[VARIANCE]))
+    return bool(memory[BEYOND] > 0.0)
 
 
 class Uncertainty:

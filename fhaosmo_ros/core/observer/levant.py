@@ -39,7 +39,6 @@ from fhaosmo_ros.core.observer.arrays import (
     SENSITIVE,
     SETTLED,
     SIGN,
-    SPREAD,
     STEADY_VARIANCE,
     TILDE,
     TILDE_SENSITIVITY,
@@ -48,7 +47,12 @@ from fhaosmo_ros.core.observer.arrays import (
     WIDEST,
     Work,
 )
-from fhaosmo_ros.core.observer.covariance import correct_covariance, predict_covariance
+from fhaosmo_ros.core.observer.covariance import (
+    correct_covariance,
+    HUBER,
+    predict_covariance,
+    usual_innovation,
+)
 from fhaosmo_ros.core.observer.prediction import predict
 import numpy as np
 from numpy.typing import NDArray
@@ -57,13 +61,6 @@ MOST_LEVELS = 16
 """order <= 12, the unknown input, and at most 3 derivatives of it."""
 
 
-HUBER = 3.0
-"""Innovations of more standard deviations count as so many (D 21)."""
-MEDIAN = 0.6745
-"""Of |x| where x is normal with variance 1."""
-SPREAD_RATE = 0.005
-GATE = 6.0
-"""Innovations of so many standard deviations are too unlikely to be used (D 21)."""
 NEAR = 0.25
 """An interval that differs from the tuned one by at most this part of it needs no other gains."""
 CLOSE = 0.02
@@ -309,10 +306,8 @@ def predict_correct(
         return correct(law, work, memory, y, h)
     b, ratio = y - x[HAT, 0], stages[RATIO, 0]
     usual = usual_innovation(memory, b, math.sqrt(variance))
-    if abs(b) > GATE * usual:  # D 21
-        memory[BEYOND] += 1.0
+    if memory[BEYOND] > 0.0:
         return 0.0, 0.0
-    memory[BEYOND] = 0.0
     if not scheduled:  # where P is not steady it counts on the whole innovation
         y = x[HAT, 0] + min(max(b, -HUBER * usual), HUBER * usual)
     even(work)
@@ -328,21 +323,6 @@ def predict_correct(
         correct_covariance(law, work)
         memory[SETTLED] = 0.0 if far else 1.0
     return correct(law, work, memory, y, period)
-
-
-@compiled(forceinline=True)
-def usual_innovation(memory: Floats, b: float, expected: float) -> float:
-    """
-    Return the size that innovations have: the expected one times the spread, which follows (D 21).
-
-    The spread goes up by a small part of it where |b| is above its median if it were normal, and
-    down by as much where |b| is below. So its size does not matter, and outliers hardly do.
-    """
-    if abs(b) > MEDIAN * memory[SPREAD] * expected:
-        memory[SPREAD] *= 1.0 + SPREAD_RATE
-    else:
-        memory[SPREAD] = max(memory[SPREAD] / (1.0 + SPREAD_RATE), 1.0)
-    return float(memory[SPREAD] * expected)
 
 
 @compiled(forceinline=True)

@@ -230,7 +230,10 @@ class Observer:
         if not before[arrays.SENSITIVE] or before[arrays.LEVANT] != after[arrays.LEVANT]:
             self._state.levels[arrays.HAT_SENSITIVITY : arrays.ROWS] = 0.0  # not carried along
         steady = slice(self.levels, 2 * self.levels)
-        if not np.array_equal(chances[steady], self._law.chances[steady]):  # P is of other sizes
+        same = before[arrays.SCHEDULED] == after[arrays.SCHEDULED]
+        if not same or not np.array_equal(
+            chances[steady], self._law.chances[steady]
+        ):  # P is of other sizes
             self._state.memory[arrays.SETTLED] = 1.0
 
     def _set_law(self) -> None:

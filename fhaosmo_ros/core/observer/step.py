@@ -37,6 +37,7 @@ from fhaosmo_ros.core.observer.arrays import (
     RATE,
     SATURATED,
     SCALE,
+    SCHEDULED,
     SETTLED,
     State,
     TILDE,
@@ -45,6 +46,7 @@ from fhaosmo_ros.core.observer.arrays import (
     Work,
     Y,
 )
+from fhaosmo_ros.core.observer.covariance import begin_estimates, is_unlikely
 from fhaosmo_ros.core.observer.status import (
     DIVERGED,
     FLAGS_MASK,
@@ -217,6 +219,11 @@ def advance(
 ) -> tuple[float, float]:
     """Advance ``work.x`` by the structure and scheme of the law; return L and dL/dgamma."""
     flags, gamma = law.flags, memory[GAMMA]
+    if flags[SCHEDULED] and not flags[PREDICTING]:
+        if memory[SETTLED] <= 0.0:
+            return begin_estimates(law, work, memory, y, h, u)
+        if is_unlikely(law, work, memory, y, h, u):
+            return 0.0, 0.0
     if flags[LEVANT]:
         if flags[PREDICTING]:
             return levant.predict_correct(law, work, memory, y, h, u)

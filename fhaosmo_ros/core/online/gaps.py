@@ -4,7 +4,7 @@
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.model.integrate import NOW
-from fhaosmo_ros.core.observer.arrays import GAMMA, PENDING, PREDICTING, Y
+from fhaosmo_ros.core.observer.arrays import BEYOND, GAMMA, PENDING, PREDICTING, SPREAD, Y
 from fhaosmo_ros.core.observer.prediction import (
     begin_at_estimates,
     predict_step,
@@ -54,8 +54,8 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: float, eps: Floats,
     law, work, state, policy = e
     ints, reals, memory = policy.ints, policy.reals, state.memory
     count = sub_steps(policy, elapsed)
-    is_gap = count > 1
-    if law.flags[PREDICTING]:
+    is_gap = count > 1 and memory[BEYOND] == 0.0  # after rejected samples it is none
+    if law.flags[PREDICTING] or not is_gap:
         count = 1
     h = elapsed * NANOSECONDS / count
     gamma, word, bend, modelled = memory[GAMMA], 0, 0.0, True
@@ -90,6 +90,9 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: float, eps: Floats,
                 ints[at.GAPS] -= 1
                 ints[at.SUB_STEPS] -= count
                 ints[at.BRIDGED] = 0
+                beyond, spread = memory[BEYOND], memory[SPREAD]
+                restore(policy, state)
+                memory[BEYOND], memory[SPREAD] = beyond, spread
             return word & (FLAGS_MASK ^ GAP) | word >> LEVEL_SHIFT << LEVEL_SHIFT
         if ints[at.FROZEN]:
             memory[GAMMA] = gamma
