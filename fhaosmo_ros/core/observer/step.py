@@ -26,6 +26,7 @@ from fhaosmo_ros.core.observer.arrays import (
     HAT,
     HAT_SENSITIVITY,
     IMPLICIT,
+    INVERSE_WIDTH,
     Law,
     LEAKAGE,
     LEVANT,
@@ -39,6 +40,7 @@ from fhaosmo_ros.core.observer.arrays import (
     SCALE,
     SCHEDULED,
     SETTLED,
+    SIGN,
     State,
     TILDE,
     TILDE_SENSITIVITY,
@@ -183,7 +185,7 @@ def step(
             word = REJECTED_SPIKE
         else:
             if law.flags[ADAPTIVE]:
-                word = adapt(law.scalars, x, memory, whole, loss, gradient)
+                word = adapt(law.scalars, x, memory, whole, loss, gradient, is_upset(law, x, y))
             for r in range(levels.shape[0]):
                 for i in range(n):
                     levels[r, i] = x[r, i]
@@ -236,11 +238,28 @@ def advance(
 
 
 @compiled(forceinline=True)
-def adapt(c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient: float) -> int:
+def is_upset(law: Law, x: Floats, y: float) -> bool:
+    """Return True if an innovation is beyond its half-width: it says nothing of gamma (D 8)."""
+    if law.flags[SIGN]:
+        return False
+    eps = y - x[HAT, 0]
+    for i in range(x.shape[1]):
+        if i > 0 and not law.flags[LEVANT]:
+            eps = x[TILDE, i - 1] - x[HAT, i]
+        if abs(eps) * law.gains[INVERSE_WIDTH, i] > 1.0:
+            return True
+    return False
+
+
+@compiled(forceinline=True)
+def adapt(
+    c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient: float, upset: bool
+) -> int:
     """
     Change gamma (P adaptationlawgamma) and the time to wait in `memory`; return status flags.
 
-    Projection on [gamma_min, gamma_max], dead zone and leakage are ours (D 8).
+    Projection on [gamma_min, gamma_max], dead zone, leakage, and the rest while `upset` are
+    ours (D 8).
     """
     word, gamma = 0, memory[GAMMA]
     zero = gradient - gradient
@@ -253,6 +272,9 @@ def adapt(c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient:
         for r in (HAT_SENSITIVITY, TILDE_SENSITIVITY):
             for i in range(x.shape[1]):
                 x[r, i] = 0.0
+    if upset and c[DEAD_ZONE] > 0.0:
+        memory[WAIT] = c[DELAY]
+        return word
     leaks = c[DEAD_ZONE] == 0.0
     if loss <= c[DEAD_ZONE] * c[DEAD_ZONE]:  # adaptation rests
         leaks = leaks or memory[WAIT] <= 0.0

@@ -119,6 +119,11 @@ class OnlineEstimator:
         """Running mean of the intervals' distance from their mean, in seconds."""
         return float(self._reals[at.JITTER]) * NANOSECONDS
 
+    @property
+    def spread(self) -> float:
+        """Size of the innovations over that expected from noise_size, at least 1 (D 21)."""
+        return float(self._arrays.state.memory[arrays.SPREAD])
+
     def prepare(self, changes: Mapping[str, Any]) -> Change:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
         parameters = self._parameters.changed(changes)
