@@ -203,11 +203,9 @@ class Reference:
             return
         loss = sum((e * e for e in eps), Dual(0.0))
         gamma = self.gamma
-        if p['gamma_dead_zone'] > 0.0 and self.is_upset():
-            self.calm = 0.0
-            return
         if loss.value > p['gamma_dead_zone'] ** 2:
-            gamma -= h * p['gamma_rate'] * loss.slope
+            if not (p['gamma_dead_zone'] > 0.0 and self.is_upset(eps)):
+                gamma -= h * p['gamma_rate'] * loss.slope
             self.calm = 0.0
         rests = loss.value <= p['gamma_dead_zone'] ** 2
         waited = self.calm > p['gamma_leakage_delay'] - 1e-12
@@ -217,14 +215,11 @@ class Reference:
             gamma -= h * p['gamma_leakage'] * (gamma - p['gamma_initial'])
         self.gamma = min(max(gamma, p['gamma_min']), p['gamma_max'])
 
-    def is_upset(self):
-        if self.p['variant'].startswith('sign'):
-            return False
-        m = [self.y, *(v.value for v in self.tilde[: self.N - 1])]
-        widths = [
-            self.p['fuzzy_widths'][min(i, len(self.p['fuzzy_widths']) - 1)] for i in range(self.N)
-        ]
-        return any(abs(a - b.value) > w for a, b, w in zip(m, self.hat, widths, strict=True))
+    def is_upset(self, eps):
+        w = self.p['fuzzy_widths']
+        widths = [w[min(i, len(w) - 1)] for i in range(self.N)]
+        fuzzy = not self.p['variant'].startswith('sign')
+        return fuzzy and any(abs(e.value) > w for e, w in zip(eps, widths, strict=True))
 
     def open(self):
         m = [self.y, *(v.value for v in self.tilde[: self.N - 1])]

@@ -185,7 +185,12 @@ def step(
             word = REJECTED_SPIKE
         else:
             if law.flags[ADAPTIVE]:
-                word = adapt(law.scalars, x, memory, whole, loss, gradient, is_upset(law, x, y))
+                upset = (
+                    is_upset(law, x, y)
+                    if law.flags[IMPLICIT]
+                    else is_upset(law, levels, memory[Y])
+                )
+                word = adapt(law.scalars, x, memory, whole, loss, gradient, upset)
             for r in range(levels.shape[0]):
                 for i in range(n):
                     levels[r, i] = x[r, i]
@@ -272,16 +277,13 @@ def adapt(
         for r in (HAT_SENSITIVITY, TILDE_SENSITIVITY):
             for i in range(x.shape[1]):
                 x[r, i] = 0.0
-    if upset and c[DEAD_ZONE] > 0.0:
-        memory[WAIT] = c[DELAY]
-        return word
     leaks = c[DEAD_ZONE] == 0.0
     if loss <= c[DEAD_ZONE] * c[DEAD_ZONE]:  # adaptation rests
         leaks = leaks or memory[WAIT] <= 0.0
         memory[WAIT] = max(memory[WAIT] - h, 0.0)
     else:
         memory[WAIT] = c[DELAY]
-        if not word:
+        if not word and not (upset and c[DEAD_ZONE] > 0.0):
             gamma -= h * c[RATE] * gradient  # P adaptationlawgamma
     if leaks:
         gamma -= min(h * c[LEAKAGE], 1.0) * (gamma - c[GAMMA_INITIAL])

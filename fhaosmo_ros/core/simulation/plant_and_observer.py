@@ -44,6 +44,7 @@ from fhaosmo_ros.core.observer.arrays import (
     Work,
 )
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration, per_level
+from fhaosmo_ros.core.observer.step import is_upset
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.disturbance import disturbance, disturbances
@@ -122,7 +123,7 @@ def rates(joint: _Joint, state: Floats, slopes: Floats, t: float, wait: float) -
     for r in range(ROWS):
         for i in range(levels):
             x[r, i] = state[n + r * levels + i]
-    gamma = state[n + ROWS * levels]
+    gamma, upset = state[n + ROWS * levels], is_upset(law, x, state[0])
     # A forward Euler step of length 1 moves the state by its rate.
     if law.flags[LEVANT]:
         loss, gradient = levant.explicit(law, work, gamma, state[0], 1.0, 0.0)
@@ -135,7 +136,7 @@ def rates(joint: _Joint, state: Floats, slopes: Floats, t: float, wait: float) -
     slope = 0.0
     if law.flags[ADAPTIVE]:
         rests = loss <= c[DEAD_ZONE] * c[DEAD_ZONE]
-        if not rests:
+        if not rests and not (upset and c[DEAD_ZONE] > 0.0):
             slope = -c[RATE] * gradient  # P adaptationlawgamma
         if c[DEAD_ZONE] == 0.0 or (rests and wait <= 0.0):
             slope -= c[LEAKAGE] * (gamma - c[GAMMA_INITIAL])
