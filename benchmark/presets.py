@@ -69,7 +69,7 @@ def gains(noise: float, decay: float, bandwidth: float) -> dict[str, object]:
     """Return the observer that is the Kalman filter (D 19)."""
     defaults = TUNE_PARAMETERS.defaults()
     period = 1.0 / defaults['sample_rate']
-    plant = TriangularModel(defaults['phi'], defaults['order'])
+    plant = TriangularModel.of(defaults)
     model = SampledModel(plant, period, decay=decay)
     width = WIDE * noise
     return {

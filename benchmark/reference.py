@@ -112,7 +112,7 @@ def in_numba(
     count, levels = len(y), configuration.levels
     work = arrays.make_work(configuration.law, configuration.model.depth)
     start = first_state(parameters, y[0])
-    h, u = np.full(count, PERIOD), np.zeros(count)
+    h, u = np.full(count, PERIOD), np.zeros((count, 1))
     record = make_record(1, levels, 2)
 
     def run() -> tuple[State, int]:

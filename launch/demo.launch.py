@@ -19,7 +19,15 @@ def check_params_file(context):
 
 
 def end(event, context):
-    """End the launch with a node; raise, so that it exits with an error, if the node failed."""
+    """
+    End the launch with a node; raise, so that it exits with an error, if the node failed.
+
+    With `respawn`, launch starts a node that failed again, but not one that was ended by a signal
+    (exit code 0) or refuses its parameters (2).
+    """
+    respawn = LaunchConfiguration('respawn').perform(context) == 'true'
+    if respawn and event.returncode not in (0, 2):
+        return None
     if event.returncode:
         raise RuntimeError(f'{event.process_name} ended with exit code {event.returncode}')
     return Shutdown(reason=f'{event.process_name} ended')
@@ -48,6 +56,12 @@ def generate_launch_description():
             description='false: a lifecycle manager configures and activates the estimator',
         ),
         DeclareLaunchArgument(
+            'respawn',
+            default_value='false',
+            choices=['true', 'false'],
+            description='start a node that failed again, after 2 s',
+        ),
+        DeclareLaunchArgument(
             'log_level',
             default_value='info',
             choices=['debug', 'info', 'warn', 'error', 'fatal'],
@@ -71,6 +85,8 @@ def generate_launch_description():
             output='screen',
             emulate_tty=True,
             on_exit=end,
+            respawn=LaunchConfiguration('respawn'),
+            respawn_delay=2.0,  # where `end` ends the launch, no node starts in this time
         )
         for name in ('plant', 'estimator')
     ]

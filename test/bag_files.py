@@ -4,6 +4,7 @@
 import struct
 
 import numpy as np
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
@@ -38,6 +39,26 @@ def write(path, messages, storage='mcap', compression=None, version=9):
     """Write (topic, type, stamp, CDR) tuples."""
     with Writer(path, version=version, storage_plugin=StoragePlugin[storage.upper()]) as bag:
         _fill(bag, messages)
+    return path
+
+
+def write_ros1(path, messages):
+    """Write (topic, type, stamp, CDR) tuples as a bag of ROS 1, with its own message types."""
+    types = get_typestore(Stores.ROS1_NOETIC)
+    connections = {}
+    with Ros1Writer(path) as bag:
+        for topic, message_type, stamp, data in messages:
+            if topic not in connections:
+                connections[topic] = bag.add_connection(topic, message_type, typestore=types)
+            message = TYPES.deserialize_cdr(data, message_type)
+            if hasattr(message, 'header'):  # theirs has a sequence number in front
+                header = types.types['std_msgs/msg/Header'](
+                    seq=7, stamp=message.header.stamp, frame_id=message.header.frame_id
+                )
+                fields = {f: getattr(message, f) for f, _ in TYPES.fielddefs[message_type][1]}
+                message = types.types[message_type](**(fields | {'header': header}))
+            raw = types.serialize_ros1(message, message_type)
+            bag.write(connections[topic], int(stamp), raw)
     return path
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 COUNT = 400
-FLIPS = 100
+FLIPS = 30
 
 
 def run(*arguments):

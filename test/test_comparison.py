@@ -5,12 +5,12 @@ import json
 import math
 from pathlib import Path
 import signal
-import subprocess
 import sys
 
 from fhaosmo_ros.core import Family
 from fhaosmo_ros.core.simulation.recordings import Recording
 import numpy as np
+from on_terminal import OnTerminal
 import pytest
 from studies import document as paper_document
 from studies.comparison import cells, command, results, tables
@@ -317,29 +317,13 @@ def test_quick_run_writes_everything(tmp_path, capsys):
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_signal_ends_it_cleanly_and_writes_nothing(tmp_path, number, ignored):
     """Also where SIGINT is ignored at the start, as in a background job."""
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if ignored else None
-    try:
-        process = subprocess.Popen(
-            [sys.executable, '-m', 'studies.comparison', '--output', str(tmp_path / 'out')],
-            stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT,
-        )  # fmt: skip
-    finally:
-        if ignored:
-            signal.signal(signal.SIGINT, before)
-    try:
-        seen = ' '
-        while '/' not in seen.split('compare:')[-1]:  # the progress bar: its children come up
-            character = process.stderr.read(1)
-            assert character, seen
-            seen += character
-        process.send_signal(number)
-        out, err = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == 130
-    assert 'interrupted' in err
-    assert 'Traceback' not in err + out
-    assert 'resource_tracker' not in err
+    arguments = 'studies.comparison', '--output', tmp_path / 'out'
+    with OnTerminal(*arguments, ignored=ignored) as comparison:
+        comparison.wait_for('tuning')  # the progress bar: its children come up
+        assert comparison.end(number) == 130
+    assert 'interrupted' in comparison.said
+    assert 'Traceback' not in comparison.said
+    assert 'resource_tracker' not in comparison.said
     assert list(tmp_path.iterdir()) == []
 
 

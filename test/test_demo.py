@@ -57,7 +57,7 @@ def parameters(tmp_path_factory):
 @pytest.fixture(scope='module')
 def finished(parameters):
     folder = parameters.parent / 'out'
-    return run('--duration', 8, '--output', folder, '--params-file', parameters), folder
+    return run('--duration', 6, '--output', folder, '--params-file', parameters), folder
 
 
 def test_it_succeeds_and_leaves_no_process(finished, parameters):
@@ -85,7 +85,7 @@ def test_bag_holds_every_topic_and_can_be_read(finished):
 def test_estimate_is_near_the_truth(finished):
     _, folder = finished
     run_ = read_run(folder / 'bag')
-    late = run_.t > 4.0
+    late = run_.t > 3.0
     assert late.any()
     error = run_.estimate[late] - run_.truth[late]
     # The median: other tests load the machine meanwhile, and in bursts its stamps jitter then.

@@ -4,7 +4,7 @@
 import ast
 import math
 
-from fhaosmo_ros.core import ConfigurationError, TriangularModel
+from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, TriangularModel
 from fhaosmo_ros.core.model.expressions import (
     FUNCTIONS,
     MAX_FUNCTIONS,
@@ -13,6 +13,7 @@ from fhaosmo_ros.core.model.expressions import (
     MAX_OPERATIONS,
     parse,
 )
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -22,6 +23,7 @@ Z, U = np.array([0.7, -1.3, 2.1]), 0.4
 NAMES = {'z1': Z[0], 'z2': Z[1], 'z3': Z[2], 'u': U} | {
     name: getattr(np, name) for name in FUNCTIONS
 }
+NAMES |= {'pi': math.pi, 'atan2': math.atan2, 'min': min, 'max': max}
 
 ACCEPTED = [
     '0', '-0', '1', '1.5e-3', '.5', '5.', '1_000', '0x10', '-z3', '+z1', 'u', '--z1', ' z1 ',
@@ -29,6 +31,8 @@ ACCEPTED = [
     '-0.5*z2 - sin(z1)', 'sin(cos(tan(z1)))', 'exp(-z1**2)', 'log(abs(z2))', 'sqrt(z1**2 + 1)',
     'tanh(u)*sign(z2)', '(z1 + z2)*(z1 - z2)', '(z1\n+ z2)', 'z1  # a comment', 'abs(-z1)',
     '1/(1 + exp(-z3))', '3.7*sin(2*u) - 0.1*z3*abs(z3)', '*'.join(['z1'] * 40),
+    'pi', '2*pi*z1', 'atan2(z1, z2)', 'atan2(0*z1, -1)', 'min(z1, z2)', 'max(z1, 0)',
+    'max(min(z2, 1), -1)', 'min(z1, z2, z3, u)', 'max(1, 2, z1)', 'atan2(sin(z1), cos(z2))',
 ]  # fmt: skip
 
 
@@ -103,7 +107,11 @@ REFUSED = {
     'capital': 'Z1',
     'unknown name': 'x',
     'dunder': '__builtins__',
-    'pi': 'pi',
+    'pi of a number': 'pi(2)',
+    'one argument of two': 'atan2(z1)',
+    'three arguments of two': 'atan2(z1, z2, z3)',
+    'smallest of one': 'min(z1)',
+    'function of two as a value': 'max',
     'true': 'True',
     'false': '-False',
     # numbers
@@ -245,3 +253,72 @@ def test_outside_its_domain_a_function_gives_no_finite_number():
     model = TriangularModel(['log(z1)', 'sqrt(z1)', '1/(z1 + 1)', 'z1**0.5'])
     with np.errstate(all='ignore'):
         assert not np.any(np.isfinite(model.evaluate(np.array([-1.0, 0.0, 0.0, 0.0]))))
+
+
+MOTOR = {'order': 2, 'phi': ['0', '(k*torque - b*z2 - m*9.81*sin(z1) + load)/m']}
+MOTOR |= {'inputs': ['torque', 'load'], 'constants.m': 2.0, 'constants.b': 0.5, 'constants.k': 3}
+
+
+def test_named_inputs_and_constants_stand_for_their_values():
+    model = TriangularModel.of(OBSERVER_PARAMETERS.complete(MOTOR))
+    assert model.inputs == model.used_inputs == ('torque', 'load')
+    z, (torque, load) = np.array([0.3, -0.7]), (1.5, -0.2)
+    expected = (3 * torque - 0.5 * z[1] - 2 * 9.81 * np.sin(z[0]) + load) / 2
+    np.testing.assert_allclose(model.evaluate(z, [torque, load]), [0.0, expected], rtol=1e-15)
+    np.testing.assert_allclose(model.jacobian(z, [torque, load])[1], [-9.81 * np.cos(0.3), -0.25])
+
+
+def test_named_model_is_the_same_as_one_with_numbers():
+    names = Observer(MOTOR)
+    numbers = Observer(
+        {'order': 2, 'phi': ['0', '(3.0*u - 0.5*z2 - 2.0*9.81*sin(z1) + v)/2.0']}
+        | {'inputs': ['u', 'v']}
+    )
+    rng = np.random.default_rng(1)
+    t, y, u = np.arange(300) * 1e-3, rng.standard_normal(300), rng.standard_normal((300, 2))
+    for mine, other in zip(names.run(t, y, u), numbers.run(t, y, u), strict=True):
+        np.testing.assert_array_equal(mine, other)
+
+
+def test_constant_changes_live_and_the_rest_stays():
+    observer, other = Observer(MOTOR), Observer(MOTOR | {'constants.b': 0.9})
+    observer.configure({'constants.b': 0.9})
+    rng = np.random.default_rng(2)
+    t, y, u = np.arange(100) * 1e-3, rng.standard_normal(100), rng.standard_normal((100, 2))
+    for mine, wanted in zip(observer.run(t, y, u), other.run(t, y, u), strict=True):
+        np.testing.assert_array_equal(mine, wanted)
+    for bad in ({'constants.m': np.nan}, {'constants.q': 1.0}, {'constants.b': 'x'}):
+        with pytest.raises(ConfigurationError, match=next(iter(bad)).rpartition('.')[2]):
+            observer.configure(bad)
+    assert observer.parameters['constants.m'] == 2.0
+
+
+@pytest.mark.parametrize(
+    ('changes', 'said'),
+    [
+        ({'phi': ['0', 'z1^2'], 'inputs': ['u']}, r'z1\*\*2'),
+        ({'phi': ['0', 'torqe']}, "did you mean 'torque'"),
+        ({'phi': ['0', 'g']}, "'constants.g'"),
+        ({'inputs': ['torque', 'torque']}, 'once'),
+        ({'inputs': ['z1', 'torque', 'load']}, 'taken'),
+        ({'inputs': ['pi', 'torque', 'load']}, 'taken'),
+        ({'inputs': ['lambda', 'torque', 'load']}, 'letter'),
+        ({'inputs': ['a b', 'torque', 'load']}, 'letter'),
+        ({'constants.torque': 1.0}, 'once'),
+        ({'constants.max': 1.0}, 'taken'),
+        ({'constants.': 1.0}, 'unknown parameter'),
+        ({'constants.a.b': 1.0}, 'unknown parameter'),
+        ({'constants.m': np.inf}, 'constants.m'),
+    ],
+)
+def test_bad_names_are_refused_in_words_that_help(changes, said):
+    with pytest.raises(ConfigurationError, match=said):
+        Observer(MOTOR | changes)
+
+
+@pytest.mark.parametrize('u', [1.0, np.zeros(3), np.zeros(5), np.zeros((5, 3)), np.zeros((4, 2))])
+def test_inputs_of_another_shape_are_refused(u):
+    with pytest.raises(ConfigurationError, match='inputs torque, load'):
+        Observer(MOTOR).run(np.arange(5) * 1e-3, np.zeros(5), u)
+    with pytest.raises(ConfigurationError, match='inputs torque, load'):
+        OnlineEstimator(MOTOR).run(np.arange(5) * 10**6, np.zeros(5), u)

@@ -24,12 +24,15 @@ class magnitude(sympy.Function):
 
 FUNCTIONS = {name: getattr(sympy, name) for name in ('sin', 'cos', 'tan', 'exp', 'log', 'sqrt')}
 FUNCTIONS |= {'abs': magnitude, 'tanh': sympy.tanh, 'sign': signum}
+FUNCTIONS_OF_TWO = {'atan2': sympy.atan2, 'min': sympy.Min, 'max': sympy.Max}
 NUMERIC = [{'magnitude': abs, 'signum': mpmath.sign}, 'mpmath']
+NUMERIC[0]['Heaviside'] = lambda x, _=0: (mpmath.sign(x) + 1) / 2
 
 LEAVES = [*SYMBOLS] * 4 + ['1', '2', '0.5', '3.25', '1e-3', '10']
 POWERS = ['2', '3', '-1', '0.5', '-2', '1.5', '0', '1', '(-z2)', 'u', '(0.3*z1)']
 FORMS = ['({0} + {1})', '({0} - {1})', '({0} * {1})', '({0} / {1})', '(-{0})', '({0})**{2}']
 FORMS += [f'{name}({{0}})' for name in FUNCTIONS]
+FORMS += [f'{name}({{0}}, {{1}})' for name in FUNCTIONS_OF_TWO]
 # Within their domains more often than by chance.
 FORMS += ['log(abs({0}) + 0.1)', 'sqrt({0}*{0} + 0.1)', '(abs({0}) + 0.1)**{1}']
 
@@ -59,7 +62,7 @@ def exactly(expression, point):
 
 def compare(text, point):
     """Compare with sympy; return False where there is nothing to compare."""
-    exact = sympy.parse_expr(text, {**SYMBOLS, **FUNCTIONS}, evaluate=True)
+    exact = sympy.parse_expr(text, {**SYMBOLS, **FUNCTIONS, **FUNCTIONS_OF_TWO}, evaluate=True)
     exact = sympy.nsimplify(exact, rational=True)
     wanted = exactly(exact, point)
     slopes = [exactly(sympy.diff(exact, SYMBOLS[f'z{j}']), point) for j in (1, 2, 3)]
@@ -95,7 +98,9 @@ FIXED = [
     'abs(z1 - z2)', 'tanh(3*z3)', 'sign(z1 - z2)*z3', 'z1**3', 'z1**-2.5', 'z1**z2', 'z1**(-u)',
     '2**z1', '(z1*z2)**(z3 - u)', '(z1 - z2)**2', '(z1 - z2)**3', '(-z1)**3', 'z1/z2/z3',
     'z1 - z2 - z3', 'z3*u', 'u**2', '1/(1 + exp(-z1))', 'z1**0', '1**z2',
-    'sin(cos(tan(tanh(z1))))', 'z1**2**0.5', '-z1**2', '(z1**2 + z2**2)**1.5', 'z1*0', 'z2 - z2',
+    'atan2(z1, z2)', 'atan2(z2 - 2, z1 - u)', 'atan2(-z1, -z3)', 'min(z1*z2, z3)', 'max(z2, u)',
+    'max(min(z1, 1.1), 0.3)*z2', 'sin(cos(tan(tanh(z1))))', 'z1**2**0.5', '-z1**2',
+    '(z1**2 + z2**2)**1.5', 'z1*0', 'z2 - z2',
 ]  # fmt: skip
 
 
@@ -118,6 +123,10 @@ def test_fixed_expression(text, point):
         ('sin(z1)', 1.0),
         ('sqrt(1 + z1)', 0.5),
         ('sqrt(0*z1)', 0.0),
+        ('max(z1, -z1)', 0.0),  # as abs(z1)
+        ('min(z1, 0)', 0.5),
+        ('atan2(z1, 1)', 1.0),
+        ('atan2(0*z1, 0)', 0.0),
     ],
 )
 def test_derivative_at_0_is_finite(text, slope):
@@ -135,3 +144,9 @@ def test_jacobian_is_lower_triangular():
     z = np.array([0.3, 0.5, 0.7])
     expected = [[np.cos(0.3), 0.0, 0.0], [0.5, 0.3, 0.0], [0.35, 0.21, 0.15]]
     np.testing.assert_allclose(model.jacobian(z), expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize('text', ['min(log(z1), 1)', 'min(1, log(z1))', 'max(log(z1), 1)',
+                                  'max(1, log(z1))', 'atan2(log(z1), 1)'])  # fmt: skip
+def test_what_is_outside_a_domain_is_not_hidden(text):
+    assert np.isnan(TriangularModel([text]).evaluate(np.array([-1.0]))).all()

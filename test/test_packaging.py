@@ -200,7 +200,7 @@ def test_launch_file_starts_both_nodes(launch_file):
     nodes = {e.kwargs['executable']: e.kwargs for e in entities if type(e).__name__ == 'Node'}
 
     assert set(arguments) == {
-        'params_file', 'namespace', 'use_sim_time', 'autostart', 'log_level',
+        'params_file', 'namespace', 'use_sim_time', 'autostart', 'respawn', 'log_level',
     }  # fmt: skip
     ((share, *path),) = arguments['params_file'].kwargs['default_value'].args
     assert share.args == (NAME,)
@@ -218,18 +218,26 @@ def test_launch_file_starts_both_nodes(launch_file):
         assert all(value.kwargs == {'value_type': bool} for value in overrides.values())
         assert node['ros_arguments'][0] == '--log-level'
         assert node['on_exit'] is launch_file['end']
+        assert node['respawn'].args == ('respawn',)
+        assert node['respawn_delay'] > 0.0  # `end` is called first, and has time to end the launch
     (check,) = (e for e in entities if type(e).__name__ == 'OpaqueFunction')
     assert entities.index(check) < len(entities) - len(nodes)  # before the nodes
     assert check.kwargs['function'] is launch_file['check_params_file']
 
 
-def test_launch_ends_with_a_node_and_fails_with_one_that_failed(launch_file):
+@pytest.mark.parametrize('respawn', ['false', 'true'])
+def test_launch_ends_with_a_node_and_fails_with_one_that_failed(launch_file, monkeypatch, respawn):
     """An exception in an event's handler makes `ros2 launch` exit with 1."""
+    monkeypatch.setattr(Recorded, 'perform', lambda *_: respawn, raising=False)
     ended = SimpleNamespace(process_name='plant-1', returncode=0)
     assert type(launch_file['end'](ended, None)).__name__ == 'Shutdown'
-    ended.returncode = 2
-    with pytest.raises(RuntimeError, match='plant-1 ended with exit code 2'):
-        launch_file['end'](ended, None)
+    for code in (1, 2, -11):
+        ended.returncode = code
+        if respawn == 'true' and code != 2:  # bad parameters do not become better
+            assert launch_file['end'](ended, None) is None
+            continue
+        with pytest.raises(RuntimeError, match=f'plant-1 ended with exit code {code}'):
+            launch_file['end'](ended, None)
 
 
 def test_launch_refuses_a_params_file_that_does_not_exist(launch_file, tmp_path, monkeypatch):

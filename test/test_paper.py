@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """docs/paper.md against its own results file, and that file against a short new run."""
 
-import contextlib
 import json
-import os
 from pathlib import Path
 import signal
-import subprocess
-import sys
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.metrics import high_passed
 import numpy as np
+from on_terminal import OnTerminal
 import pytest
 from studies import document as paper_document
 from studies.paper import beyond as paper_beyond
@@ -138,30 +135,12 @@ def test_quick_run_writes_everything(tmp_path, capsys):
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_signal_ends_it_in_one_line_and_leaves_nothing(tmp_path, number, ignored):
     """Also where SIGINT is ignored at the start, as in a background job."""
-    command = [sys.executable, '-m', 'studies.paper', '--quick', '--output', tmp_path / 'out']
-    terminal, its_end = os.openpty()  # the bar begins at once there, and in a log after 30 s
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if ignored else None
-    try:
-        process = subprocess.Popen(command, cwd=ROOT, stderr=its_end)
-    finally:
-        os.close(its_end)
-        if ignored:
-            signal.signal(signal.SIGINT, before)
-    said = b''
-    try:
-        while b'%' not in said:  # the bar
-            said += os.read(terminal, 1024)
-        process.send_signal(number)
-        with contextlib.suppress(OSError):  # EIO: the process has ended
-            while True:
-                said += os.read(terminal, 1024)
-        process.wait(60)
-    finally:
-        process.kill()
-        os.close(terminal)
-    assert process.returncode == 130
-    assert b'Traceback' not in said
-    assert said.splitlines()[-1] == b'paper: interrupted'
+    arguments = 'studies.paper', '--quick', '--output', tmp_path / 'out'
+    with OnTerminal(*arguments, ignored=ignored) as paper_command:
+        paper_command.wait_for('part')  # the bar
+        assert paper_command.end(number) == 130
+    assert 'Traceback' not in paper_command.said
+    assert paper_command.said.rstrip().endswith('paper: interrupted')
     assert list(tmp_path.iterdir()) == []
 
 

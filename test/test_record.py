@@ -92,8 +92,8 @@ def live():
 def test_bag_is_complete_after_ctrl_c(storage, live, tmp_path):
     bag = tmp_path / 'bag'
     process = start('record', '-o', bag, '--storage', storage)
-    # Some ten seconds: the estimator may be discovered later than the plant.
-    wait_until(lambda: size(bag) > 2_000_000, 'messages', 90.0, process)
+    # Some four seconds: the estimator may be discovered later than the plant.
+    wait_until(lambda: size(bag) > 800_000, 'messages', 90.0, process)
     process.send_signal(signal.SIGINT if storage == 'mcap' else signal.SIGTERM)
     out, error = process.communicate(timeout=60)
     assert process.returncode == 0, error
@@ -314,7 +314,7 @@ def lost_by_a_kill(storage, folder):
 
 
 def test_all_topics(live, tmp_path):
-    result = run('record', '-o', tmp_path / 'bag', '--all', '--duration', '10')
+    result = run('record', '-o', tmp_path / 'bag', '--all', '--duration', '5')
     assert result.returncode == 0, result.stderr
     with BagReader(tmp_path / 'bag') as reader:
         topics = {c.topic for c in reader.connections}
@@ -382,9 +382,9 @@ def test_force_replaces_an_output(live, tmp_path):
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 def test_full_disk_leaves_what_was_recorded(storage, live, tmp_path):
-    """The system refuses to make a file larger than 300 kB."""
+    """The system refuses to make a file larger than 150 kB."""
     command = ['record', '-o', str(tmp_path / 'bag'), '--topics', '/y', '--storage', storage]
-    limited = f'ulimit -f 600; exec {" ".join(map(shlex.quote, [*COMMAND, *command]))}'
+    limited = f'ulimit -f 300; exec {" ".join(map(shlex.quote, [*COMMAND, *command]))}'
     result = subprocess.run(
         ['sh', '-c', limited], capture_output=True, text=True, timeout=120, env=environment(),
         check=False,
@@ -394,7 +394,7 @@ def test_full_disk_leaves_what_was_recorded(storage, live, tmp_path):
     assert f'record --repair {tmp_path / "bag"} saves what is there' in result.stderr
     result = run('record', '--repair', tmp_path / 'bag', '-o', tmp_path / 'saved')
     assert result.returncode == 0, result.stderr
-    assert len(series(tmp_path / 'saved', '/y').values) > 3000
+    assert len(series(tmp_path / 'saved', '/y').values) > 1500
 
 
 def test_what_is_there_stays_if_nothing_comes(tmp_path):

@@ -13,6 +13,7 @@ import sys
 
 import bag_files as files
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.tools.bags.mcap.chunks import scan
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import series
@@ -237,6 +238,67 @@ def test_known_input_is_held_between_its_samples(tmp_path):
     assert run(bag, *arguments, '-o', tmp_path / 'o.npz') == 0
     u = np.concatenate([[0.0], [0.5, -0.25, -0.25, 1.0]])[np.searchsorted(u_stamps, stamps)]
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y, parameters, u))
+
+
+def test_bag_of_ros1_is_read_as_one_of_ros2(tmp_path, capsys):
+    stamps, y = files.signal(500)
+    messages = []
+    for stamp, value in zip(stamps.tolist(), y.tolist(), strict=True):
+        joints = files.cdr(
+            'sensor_msgs/msg/JointState', header=files.header(stamp), name=['hip', 'knee'],
+            position=np.array([0.0, value]), velocity=np.zeros(0), effort=np.zeros(0),
+        )  # fmt: skip
+        messages.append(('/joints', 'sensor_msgs/msg/JointState', stamp + 250_000, joints))
+    messages += files.floats(stamps[::2] + 1, np.sin(stamps[::2] * 1e-9), '/u')
+    messages.sort(key=lambda m: m[2])
+    bags = (
+        files.write_ros1(tmp_path / 'old.bag', messages),
+        files.write(tmp_path / 'new', messages),
+    )
+    options = ['--topic', '/joints', '--field', 'position[1]', '-p', "phi:=['0','0','u-z3']"]
+    tables = []
+    for bag in bags:
+        out = tmp_path / f'{bag.stem}.npz'
+        assert run(bag, *options, '-o', out, '-o', tmp_path / f'{bag.stem}_out') == 0
+        assert 'stamps: header of the messages' in capsys.readouterr().out
+        with np.load(out) as found:
+            np.testing.assert_array_equal(found['stamp_ns'], stamps)
+            np.testing.assert_array_equal(found['bag_time_ns'], stamps + 250_000)
+        tables.append(table(out))
+    np.testing.assert_array_equal(*tables)
+    with BagReader(tmp_path / 'old_out') as copied:  # as a bag of ROS 2
+        assert [(t, s, d) for t, s, d in copied.messages(['/joints', '/u'])] == [
+            (topic, stamp, data) for topic, _, stamp, data in messages
+        ]
+    (tmp_path / 'bad.bag').write_bytes(bags[0].read_bytes()[:5000])
+    assert run(tmp_path / 'bad.bag', *options, '-o', tmp_path / 'o.npz') != 0
+    assert 'bad.bag: expected a whole bag' in capsys.readouterr().err
+
+
+def test_several_known_inputs_are_held_each_by_itself(tmp_path, capsys):
+    stamps, y = files.signal(600)
+    times = [stamps[100::250] + 1, stamps[50::100] + 1]
+    values = [np.array([0.5, -0.25]), np.linspace(-1.0, 1.0, 6)]
+    messages = files.floats(stamps, y)
+    for at, u, topic in zip(times, values, ('/left', '/b'), strict=True):
+        messages += files.floats(at, u, topic)
+    bag = files.write(tmp_path / 'bag', sorted(messages, key=lambda m: m[2]))
+    parameters = {'phi': ['0', '0', 'k*(a + 2*b) - z3'], 'inputs': ['a', 'unused', 'b']}
+    parameters |= {'constants.k': 0.5}
+    (tmp_path / 'p.yaml').write_text(dumps(parameters))
+    arguments = ['--params-file', tmp_path / 'p.yaml', '-o', tmp_path / 'o.npz']
+    topics = ['--input-topic', '/left', '--input-topic', '/b']
+    assert run(bag, *arguments, *topics) == 0
+    u = np.zeros((len(y), 3))
+    for column, at, known in zip((0, 2), times, values, strict=True):
+        u[:, column] = np.concatenate([[0.0], known])[np.searchsorted(at, stamps)]
+    estimates = OnlineEstimator(parameters).run(stamps, y, u)
+    with np.load(tmp_path / 'o.npz') as found:
+        np.testing.assert_array_equal(found['unknown_input'], estimates.unknown_input)
+    assert run(bag, *arguments, '--force', *topics, '--input-topic', '/c') != 0
+    assert 'each known input that phi uses (a, b)' in capsys.readouterr().err
+    assert run(bag, *arguments, '--force') != 0
+    assert "'/a'" in capsys.readouterr().err
 
 
 def test_chunks_that_overlap_are_put_in_order(tmp_path, monkeypatch):

@@ -2,6 +2,8 @@
 """The plant node: simulates a triangular system and publishes y and the truth."""
 
 from collections.abc import Mapping
+from copy import deepcopy
+from functools import partial
 import math
 from typing import Any, NamedTuple
 
@@ -9,8 +11,10 @@ from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.tables import PLANT_NODE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import Plant
+from fhaosmo_ros.nodes.middleware.loading import Loading
 from fhaosmo_ros.nodes.middleware.messages import array_encoder, double_encoder
 from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
+from fhaosmo_ros.nodes.middleware.publishers import check_overrides, create_publisher
 from fhaosmo_ros.nodes.middleware.simulated_time import reject_negative_time
 from fhaosmo_ros.nodes.middleware.spin import run_node
 from rclpy.node import Node
@@ -20,6 +24,7 @@ MAX_PAUSE = 1_000_000_000
 """Clock jumps beyond this many nanoseconds are not simulated through."""
 DEPTH = 1000
 """Of the topics' queues: a recorder that stalls for a second loses nothing at 1 kHz."""
+TOPICS = {'y': Float64, '~/state': Float64MultiArray, '~/unknown_input': Float64}
 
 
 class Change(NamedTuple):
@@ -44,26 +49,40 @@ class PlantNode(Node):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__('plant', automatically_declare_parameters_from_overrides=True, **options)
+        super().__init__(
+            'plant',
+            automatically_declare_parameters_from_overrides=True,
+            enable_logger_service=True,
+            **options,
+        )
         reject_negative_time(self)
         values = complete(overrides_of(self), PLANT_NODE_PARAMETERS)
         self.plant = Plant(values)
-        self.plant.sample(0.0)  # compiles, or loads what an earlier start compiled
         fixed = [name for name, p in PLANT_NODE_PARAMETERS.items() if not p.live]
         self._node_parameters = NodeParameters(self, values, fixed)
-        self._u = 0.0
+        self._u = [0.0] * len(self.plant.model.inputs)
         self._origin: int | None = None
         self._now = 0
         self._diverged = False
         self._encode = double_encoder()
         self._encode_state = array_encoder([f'z{i + 1}' for i in range(self.plant.order)])
-        self._publish_y = self.create_publisher(Float64, 'y', DEPTH).publish
-        self._publish_state = self.create_publisher(Float64MultiArray, '~/state', DEPTH).publish
-        self._publish_d = self.create_publisher(Float64, '~/unknown_input', DEPTH).publish
-        if self.plant.uses_input:
-            self.create_subscription(Float64, 'u', self._on_input, 10)
-        self._timer = self._start_timer(values['sample_rate'])
+        check_overrides(self, TOPICS)
+        self._publish_y, self._publish_state, self._publish_d = (
+            create_publisher(self, kind, topic, DEPTH).publish for topic, kind in TOPICS.items()
+        )
+        for index, name in enumerate(self.plant.model.inputs):
+            if name in self.plant.model.used_inputs:
+                take = partial(self._on_input, index, name)
+                self.create_subscription(Float64, name, take, 10)
+        self._timer: Any = None
         self._node_parameters.on_change(self._prepare, self._adopt)
+        copy = deepcopy(self.plant)
+        self._loading = Loading(self, lambda: copy.sample(0.0), self._begin)
+
+    def _begin(self) -> None:
+        values = self._node_parameters.values
+        self.plant.sample(0.0)
+        self._timer = self._start_timer(values['sample_rate'])
         self.get_logger().info(
             f'simulating {self.plant.order} states, d: {values["disturbance"]}, '
             f'y at {values["sample_rate"]:g} Hz'
@@ -113,12 +132,13 @@ class PlantNode(Node):
         self._now = now
         return (now - self._origin) * 1e-9
 
-    def _on_input(self, message: Float64) -> None:
+    def _on_input(self, index: int, name: str, message: Float64) -> None:
         if math.isfinite(message.data):
-            self._u = message.data
+            self._u[index] = message.data
         else:
             self.get_logger().warning(
-                f'rejected u = {message.data}: expected a finite number; the last one is held',
+                f'rejected {name} = {message.data}: expected a finite number; the last one is '
+                'held',
                 throttle_duration_sec=5.0,
             )
 
@@ -133,7 +153,7 @@ class PlantNode(Node):
             self.plant.configure(change.simulation)
         else:
             self.plant.adopt(change.simulation)
-        if 'sample_rate' in change.changes:
+        if 'sample_rate' in change.changes and self._timer is not None:
             self.destroy_timer(self._timer)
             self._timer = self._start_timer(change.changes['sample_rate'])
 

@@ -56,7 +56,10 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
             reader.message_type(topic)
         below = tuple(f'{name.rstrip("/")}/' for name in arguments.exclude)
         topics = {
-            c.topic: (c.msgtype, any(q.durability.name == 'TRANSIENT_LOCAL' for q in _qos(c)))
+            c.topic: (
+                c.msgtype,
+                any(q.durability.name == 'TRANSIENT_LOCAL' for q in reader.offered(c)[0]),
+            )
             for c in reader.connections
             if c.topic in (arguments.topics or [c.topic])
             and c.topic not in (*NEVER_PLAYED, *arguments.exclude)
@@ -77,10 +80,6 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
                 _once(reader, player, list(topics), arguments.rate, turn, stop)
                 if stop.is_set() or not arguments.loop:
                     return
-
-
-def _qos(connection):
-    return connection.ext.offered_qos_profiles
 
 
 def _once(

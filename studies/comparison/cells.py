@@ -121,7 +121,7 @@ class Sensor(NamedTuple):
     def setting(self) -> Setting:
         """Return what a user knows before tuning."""
         values = self.values()
-        model = TriangularModel(values['phi'], values['order'])
+        model = TriangularModel.of(values)
         # An encoder's rounding is spread evenly over a quantum.
         rounding = values.get('quantisation', 0.0) / math.sqrt(12.0)
         noise = math.hypot(self._noise(), rounding)

@@ -17,6 +17,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 import fhaosmo_ros
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.nodes.middleware.subscription import subscribe_with_info
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import (
     DescribeParameters,
@@ -192,12 +194,13 @@ class Client:
                     raise TimeoutError(f'no {what} within {timeout} s')
                 self._changed.wait(0.05)
 
-    def call_later(self, service: str, service_type: type, request: object):
-        """Send a request and return the future of its answer."""
+    def call_later(self, service: str, service_type: type, request: object, wait: bool = True):
+        """Send a request and return the future of its answer; `wait` for the service first."""
         client = self._services.get(service)
         if client is None:
             client = self._services[service] = self.node.create_client(service_type, service)
-        self.wait(client.service_is_ready, f'service {service}')
+        if wait:
+            self.wait(client.service_is_ready, f'service {service}')
         return client.call_async(request)
 
     def call(self, service: str, service_type: type, request: object):
@@ -262,6 +265,32 @@ class Parameters:
 
     def _call(self, service: str, service_type: type, request: object):
         return self._client.call(f'{self._node}/{service}', service_type, request)
+
+
+class Manager:
+    """Drives a managed node; what it answers is what a user of `ros2 lifecycle` sees."""
+
+    def __init__(self, client: Client, node: str) -> None:
+        self._client = client
+        self._node = node
+
+    def state(self) -> str:
+        return self._call('get_state', GetState, GetState.Request()).current_state.label
+
+    def transitions(self) -> set[str]:
+        service = GetAvailableTransitions
+        answer = self._call('get_available_transitions', service, service.Request())
+        return {t.transition.label for t in answer.available_transitions}
+
+    def change(self, transition: int | str) -> bool:
+        by_label = isinstance(transition, str)
+        wanted = Transition(label=transition) if by_label else Transition(id=transition)
+        return self._call(
+            'change_state', ChangeState, ChangeState.Request(transition=wanted)
+        ).success
+
+    def _call(self, service: str, kind: type, request: object):
+        return self._client.call(f'{self._node}/{service}', kind, request)
 
 
 def _messages(values: dict[str, object]) -> list[ParameterMessage]:

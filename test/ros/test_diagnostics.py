@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reports on /diagnostics: their values, and what makes them WARN, ERROR and STALE."""
 
+import itertools
 import math
 
 import pytest
@@ -8,7 +9,13 @@ import pytest
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
+from builtin_interfaces.msg import Time  # noqa: E402
+from fhaosmo_ros.core.online.estimator import OnlineEstimator  # noqa: E402
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS  # noqa: E402
+from fhaosmo_ros.nodes.estimator.health import Health  # noqa: E402
+from fhaosmo_ros.nodes.middleware.publisher_watch import Publishers  # noqa: E402
 from rig import EstimatorRig, node_process, Parameters, parameters  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
 OK, WARN, ERROR, STALE = b'\0', b'\1', b'\2', b'\3'
@@ -164,10 +171,24 @@ def test_share_of_bad_samples_makes_an_error(client, start):
         rig.wait_status('input', level, 'rejected measurements 1', start=reports)
 
 
-def test_no_clock_is_said(client, start):
-    start('estimator', *parameters(namespace='/g', use_sim_time='true', sampling='clock', **LAX))
+def test_a_clock_that_does_not_run_is_said(client, start):
+    process = start(
+        'estimator', *parameters(namespace='/g', use_sim_time='true', sampling='clock', **LAX)
+    )
     rig = EstimatorRig(client, '/g', feed=False)
     rig.wait_status('state', ERROR, 'nothing on /clock')
+    publish = client.publisher('/clock', Clock)
+    ticks = itertools.count(1)
+
+    def runs() -> bool:
+        publish(Clock(clock=Time(sec=next(ticks))))
+        return any(s.message == 'active' for s in rig.statuses())
+
+    client.wait(runs, 'clock that runs')
+    rig.wait_status('state', WARN, 'the time on /clock stands still for', 'paused')
+    publish.destroy()
+    rig.wait_status('state', ERROR, 'stands still', 'nobody publishes it any more')
+    assert process.output.count('stands still') == 1  # once, not five times a second
 
 
 def test_missing_known_input_is_said(client, start):
@@ -183,3 +204,17 @@ def test_simulation_time_samples_by_the_clock_unless_it_is_told_otherwise(client
         start('estimator', *parameters(namespace=namespace, use_sim_time='true', **given))
         values = Parameters(client, f'{namespace}/estimator')
         assert values.get('sampling') == expected
+
+
+@pytest.mark.parametrize(('samples', 'told'), [(25, 'ticks once for 25 samples'), (1, '')])
+def test_a_clock_that_is_slower_than_the_samples_is_said(samples, told):
+    """What `ros2 bag play --clock` gives, at 40 Hz, and a clock that ticks with every sample."""
+    estimator = OnlineEstimator({'sampling': 'clock'})
+    health = Health(estimator, ESTIMATOR_PARAMETERS.complete(LAX))
+    for begin in (1000, 2000):  # the first report is on the first tick too
+        for k in range(begin, begin + 1000):
+            estimator.update(k // samples * samples * 1_000_000, 0.2)
+        report, _ = health.reports('/y', Publishers({(1,): '/plant'}, {}), stale=False, name='')
+    status = report.message('estimator', 'none')
+    assert told in status.message
+    assert status.level == (WARN if told else OK)

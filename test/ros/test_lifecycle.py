@@ -9,35 +9,9 @@ rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2
 pytestmark = pytest.mark.ros
 
 from lifecycle_msgs.msg import Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState  # noqa: E402
-from rig import ESTIMATES, EstimatorRig, Parameters, parameters, Process  # noqa: E402
+from lifecycle_msgs.srv import ChangeState  # noqa: E402
+from rig import ESTIMATES, EstimatorRig, Manager, Parameters, parameters, Process  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
-
-
-class Manager:
-    """Drives a managed node; what it answers is what a user of `ros2 lifecycle` sees."""
-
-    def __init__(self, client, node: str) -> None:
-        self._client = client
-        self._node = node
-
-    def state(self) -> str:
-        return self._call('get_state', GetState, GetState.Request()).current_state.label
-
-    def transitions(self) -> set[str]:
-        service = GetAvailableTransitions
-        answer = self._call('get_available_transitions', service, service.Request())
-        return {t.transition.label for t in answer.available_transitions}
-
-    def change(self, transition: int | str) -> bool:
-        by_label = isinstance(transition, str)
-        wanted = Transition(label=transition) if by_label else Transition(id=transition)
-        return self._call(
-            'change_state', ChangeState, ChangeState.Request(transition=wanted)
-        ).success
-
-    def _call(self, service: str, kind: type, request: object):
-        return self._client.call(f'{self._node}/{service}', kind, request)
 
 
 @pytest.fixture(scope='module')
@@ -220,6 +194,6 @@ def test_reset_that_waits_during_cleanup_does_not_end_the_node(client, node, unc
         client.call(reset, Trigger, Trigger.Request())
         client.call_later(change, ChangeState, cleanup)
         for _ in range(20):
-            client.call_later(reset, Trigger, Trigger.Request())
+            client.call_later(reset, Trigger, Trigger.Request(), wait=False)
         client.wait(lambda: node.state() == 'unconfigured', 'cleanup')
         assert node.process.running

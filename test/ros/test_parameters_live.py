@@ -65,6 +65,7 @@ OTHER = {
     'stuck_time': 100.0,
     'divergence_time': 5.0,
     'divergence_limit': 1e9,
+    'predict_to_now': True,
     'publish_rate': 250.0,
     'diagnostics_period': 0.5,
     'hardware_id': 'encoder',
@@ -170,6 +171,26 @@ def test_the_model_is_read_only(nodes, node, name):
     assert not result.successful
     assert name in result.reason
     assert nodes[node].get(name) == before
+
+
+def test_constants_are_parameters_of_their_own(client, start):
+    model = {'order': 2, 'phi': "['0', 'k*a + b']", 'inputs': "['a', 'b']"}
+    start('estimator', *parameters(namespace='/motor', **model, **{'constants.k': 2.0}))
+    node = Parameters(client, '/motor/estimator')
+    assert node.get('constants.k') == 2.0
+    assert 'Phi' in node.describe('constants.k')['constants.k'].description
+    for topic in ('/motor/a', '/motor/b'):
+        client.wait(
+            lambda t=topic: client.node.count_subscribers(t) == 1, f'subscription of {topic}'
+        )
+    (result,) = node.set(**{'constants.k': 3})
+    assert result.successful
+    assert node.get('constants.k') == 3.0
+    for bad in ({'constants.k': math.nan}, {'constants.k': 'x'}, {'constants.q': 1.0}):
+        (result,) = node.set(**bad)
+        assert not result.successful
+        assert next(iter(bad)) in result.reason
+    assert node.get('constants.k') == 3.0
 
 
 def _settle(rig) -> None:

@@ -2,19 +2,19 @@
 """Publishers that can't be heard are named; QoS of inputs and outputs can be chosen."""
 
 import gc
-import signal
 
 import pytest
 
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
+from fhaosmo_ros.nodes import plant  # noqa: E402
 from fhaosmo_ros.nodes.estimator import node as estimator  # noqa: E402
 from rclpy.context import Context  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
-from rig import EstimatorRig, node_process, one_line_error, parameters  # noqa: E402
+from rig import EstimatorRig, node_process, one_line_error, Parameters, parameters  # noqa: E402
 from std_msgs.msg import Float64, Int64  # noqa: E402
 
 OK, WARN, ERROR, STALE = b'\0', b'\1', b'\2', b'\3'
@@ -125,6 +125,27 @@ def test_outputs_qos_can_be_overridden(client, listen):
     assert rig.parameters.get(f'qos_overrides.{prefix}/innovation.publisher.depth') == 10
 
 
+def test_outputs_of_the_plant_too(client, start):
+    prefix = '/test_outputs_of_the_plant_too'
+    policies = {
+        f'qos_overrides.{prefix}/y.publisher.reliability': 'best_effort',
+        f'qos_overrides.{prefix}/plant/state.publisher.depth': 7,
+    }
+    start('plant', *parameters(namespace=prefix, **policies))
+    values = Parameters(client, f'{prefix}/plant')
+    assert values.get(f'qos_overrides.{prefix}/plant/state.publisher.depth') == 7
+    (y,) = client.node.get_publishers_info_by_topic(f'{prefix}/y')
+    assert y.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+
+
+def test_override_that_the_plant_does_not_have_is_refused(capfd):
+    code = plant.main(['--ros-args', '-p', 'qos_overrides./yy.publisher.depth:=5'])
+    gc.collect()
+    assert code == 2
+    message = one_line_error('plant', capfd.readouterr().err)
+    assert "'qos_overrides./yy.publisher.depth': expected TOPIC" in message
+
+
 @pytest.mark.parametrize(
     ('name', 'value', 'words'),
     [
@@ -136,13 +157,8 @@ def test_outputs_qos_can_be_overridden(client, listen):
     ],
 )
 def test_override_that_cannot_be_is_refused_in_one_line(name, value, words, capfd):
-    handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        code = estimator.main(['--ros-args', '-p', f'qos_overrides.{name}:={value}'])
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        gc.collect()  # the node itself: two of one name in a process make rcl warn
+    code = estimator.main(['--ros-args', '-p', f'qos_overrides.{name}:={value}'])
+    gc.collect()  # the node itself: two of one name in a process make rcl warn
     assert code == 2
     message = one_line_error('estimator', capfd.readouterr().err)
     for word in words:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ten thousand random sets of parameters: none of them hurts, each refusal has its reason."""
+"""Two thousand random sets of parameters: none of them hurts, each refusal has its reason."""
 
 import math
 
@@ -16,7 +16,7 @@ from rclpy.context import Context  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
 
-COUNT = 10_000
+COUNT = 2_000
 LIVE = {name: p for name, p in ESTIMATOR_PARAMETERS.items() if p.live}
 FIXED = [name for name in ESTIMATOR_PARAMETERS if name not in LIVE]
 ODD = (

@@ -161,9 +161,11 @@ def test_stamps_that_jump_all_the_time_do_not_flood_the_log(client, folder):
     arguments = parameters(namespace='/flood', max_gap=0.001)
     with node_process(folder(), 'estimator', *arguments) as process:
         rig = EstimatorRig(client, '/flood', greet=False)
+        begin = time.monotonic()
         for _ in range(60):
             rig.send(1.0)
             time.sleep(0.01)
         rig.wait_count('restarts', 20)
-        assert 1 <= process.output.count('restarted from the new one') <= 2
+        said = process.output.count('restarted from the new one')
+        assert 1 <= said <= 1 + (time.monotonic() - begin) // 5.0
         assert 'restarts so far)' in process.output

@@ -137,8 +137,9 @@ def test_policy_allows_exactly_what_the_node_has(client, start, policy, name):
 
         try:
             client.wait(same, verb)
-        except AssertionError:
+        except TimeoutError:
             assert names(look(name, '/')) == set(listed)  # says what differs
+            raise
     assert not names(node.get_client_names_and_types_by_node(name, '/'))
 
 

@@ -12,7 +12,8 @@ import pytest
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
-from rig import Parameters, parameters, Process  # noqa: E402
+from fhaosmo_ros.core.compiled import cache  # noqa: E402
+from rig import Manager, Parameters, parameters, Process  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
 from waiting import wait_until  # noqa: E402
 
@@ -90,18 +91,29 @@ def test_signal_while_it_starts(folder, name, delay):
         process.kill()
 
 
-def test_signal_while_it_compiles(folder):
+@pytest.mark.parametrize(
+    ('name', 'number', 'begun'),
+    [('estimator', signal.SIGINT, 'estimating'), ('plant', signal.SIGHUP, 'simulating')],
+)
+def test_it_answers_while_it_compiles_and_ends_on_a_signal(client, folder, name, number, begun):
     """With an empty cache the start takes seconds, most of them in the compiler."""
-    cache = folder()
-    process = Process(folder(), 'estimator', *parameters(namespace='/cold'), NUMBA_CACHE_DIR=cache)
+    empty = folder()
+    process = Process(folder(), name, *parameters(namespace='/cold'), NUMBA_CACHE_DIR=empty)
     try:
+        wait_until(lambda: cache.COMPILING in process.output, 'word of the compiler')
+        values = Parameters(client, f'/cold/{name}')
+        assert values.get('order') == 3
+        if name == 'estimator':
+            manager = Manager(client, '/cold/estimator')
+            assert manager.state() == 'unconfigured'
+            assert not manager.change('configure')
+            assert 'still being compiled' in process.output
+            assert values.set(epsilon=7.0)[0].successful
         # The first functions are done, the large ones not.
-        wait_until(lambda: any(cache.rglob('*.nb*')), 'compiled function')
-        assert 'estimating' not in process.output
-        process.send(signal.SIGINT)
-        assert process.wait(GRACE) == 0, process.output
-        assert 'Traceback' not in process.output, process.output
-        assert 'estimating' not in process.output
+        wait_until(lambda: any(empty.rglob('*.nb*')), 'compiled function')
+        process.send(number)
+        ends_well(process)
+        assert begun not in process.output
     finally:
         process.kill()
 

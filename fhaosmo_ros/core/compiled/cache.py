@@ -23,6 +23,7 @@ import pickle
 import shutil
 import stat
 import tempfile
+import threading
 import time
 from typing import Any, TypeVar
 
@@ -45,6 +46,8 @@ CHECKSUM = 32
 """Bytes of a checksum."""
 
 logger = logging.getLogger(NAME)
+compiling = threading.Event()
+"""Set whenever a function has to be compiled."""
 
 
 def compiled(**options: Any) -> Callable[[Function], Function]:
@@ -89,6 +92,7 @@ class MachineCode(_numba.FunctionCache):  # type: ignore[misc]
             _warn(f'thrown away a damaged compile cache in {self._cache_path} ({_text(error)})')
         if found is None:
             _say_that_it_compiles()
+            compiling.set()
         return found
 
     def save_overload(self, signature: Any, result: Any) -> None:

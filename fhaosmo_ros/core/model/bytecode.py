@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 CONST, STATE, INPUT = 0, 1, 2
-ADD, SUB, MUL, DIV, POW, NEG = 3, 4, 5, 6, 7, 8
-SIN, COS, TAN, EXP, LOG, SQRT, ABS, TANH, SIGN = 9, 10, 11, 12, 13, 14, 15, 16, 17
+ADD, SUB, MUL, DIV, POW, ATAN2, MIN, MAX = 3, 4, 5, 6, 7, 8, 9, 10
+NEG, SIN, COS, TAN, EXP, LOG, SQRT, ABS, TANH, SIGN = 11, 12, 13, 14, 15, 16, 17, 18, 19, 20
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -29,7 +29,7 @@ class Bytecode(NamedTuple):
     Attributes
     ----------
     code : (T, 2) array
-        Operation codes, and the constant or state index that belongs to each.
+        Operation codes, and the constant, state or input index that belongs to each.
     offsets : (count + 1,) array
         Expression i occupies ``code[offsets[i]:offsets[i + 1]]``; an empty one is the constant 0.
 
@@ -41,7 +41,7 @@ class Bytecode(NamedTuple):
 
 @compiled(forceinline=True)
 def evaluate(
-    expressions: Bytecode, i: int, z: Floats, u: float, stack: Floats
+    expressions: Bytecode, i: int, z: Floats, u: Floats, stack: Floats
 ) -> tuple[float, float]:
     """
     Evaluate expression i and its derivative along dz.
@@ -53,8 +53,8 @@ def evaluate(
         0 for Phi_1.
     z : (2, > i) array
         States z_1 .. z_{i+1}, and their tangent dz.
-    u : float
-        Known input; its tangent is 0.
+    u : (m,) array
+        Known inputs; their tangent is 0.
     stack : (2, depth) array
         Scratch memory for values and slopes.
 
@@ -75,8 +75,8 @@ def evaluate(
                 j = int(tape[k, 1])
                 stack[0, top], stack[1, top] = z[0, j], z[1, j]
             else:
-                stack[0, top], stack[1, top] = u, 0.0
-        elif code <= POW:
+                stack[0, top], stack[1, top] = u[int(tape[k, 1])], 0.0
+        elif code <= MAX:
             b, db = stack[0, top], stack[1, top]
             top -= 1
             a, da = stack[0, top], stack[1, top]
@@ -89,7 +89,7 @@ def evaluate(
             elif code == DIV:
                 v = a / b
                 stack[0, top], stack[1, top] = v, (da - v * db) / b
-            else:
+            elif code == POW:
                 v = np.power(a, b)
                 d = 0.0
                 if da != 0.0 and b != 0.0:
@@ -97,6 +97,14 @@ def evaluate(
                 if db != 0.0 and v != 0.0:
                     d += v * np.log(a) * db
                 stack[0, top], stack[1, top] = v, d
+            elif code == ATAN2:
+                r = math.hypot(a, b)  # a is sin, b is cos of the angle, times r
+                d = (b / r * da - a / r * db) / r if da != 0.0 or db != 0.0 else 0.0
+                stack[0, top], stack[1, top] = math.atan2(a, b), d
+            elif a == b:  # the middle of the subdifferential, as for abs
+                stack[1, top] = 0.5 * (da + db)
+            elif b != b or (b < a if code == MIN else b > a):  # else a stays, NaN too
+                stack[0, top], stack[1, top] = b, db
         else:
             a, da = stack[0, top], stack[1, top]
             if code == NEG:

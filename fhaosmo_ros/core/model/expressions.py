@@ -7,8 +7,11 @@ Nothing is evaluated by Python, so an expression can't run anything.
 """
 
 import ast
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+import keyword
 import math
+import re
+from types import MappingProxyType
 from typing import NamedTuple
 import warnings
 
@@ -40,6 +43,16 @@ FUNCTIONS = {
     'tanh': bytecode.TANH,
     'sign': bytecode.SIGN,
 }
+"""Functions of one argument."""
+FUNCTIONS_OF_SEVERAL = {
+    'atan2': bytecode.ATAN2,
+    'min': bytecode.MIN,
+    'max': bytecode.MAX,
+}
+"""Functions of two arguments; min and max also take more."""
+NUMBERS = {'pi': math.pi}
+"""Names of numbers."""
+KNOWN = [*FUNCTIONS, *FUNCTIONS_OF_SEVERAL, *NUMBERS]
 OPERATORS: dict[type[ast.operator], int] = {
     ast.Add: bytecode.ADD,
     ast.Sub: bytecode.SUB,
@@ -56,16 +69,61 @@ class Instruction(NamedTuple):
     operand: float = 0.0
 
 
-def parse(text: str, level: int) -> list[Instruction]:
+class Names(NamedTuple):
+    """
+    Names that expressions may use beside those of the states.
+
+    Attributes
+    ----------
+    inputs : sequence of str
+        Known inputs, in the order of their values in u.
+    constants : mapping
+        Numbers by name.
+
+    """
+
+    inputs: Sequence[str] = ('u',)
+    constants: Mapping[str, float] = MappingProxyType({})
+
+    def check(self) -> None:
+        """
+        Refuse names that an expression could not use.
+
+        Raises
+        ------
+        ConfigurationError
+            Says which, and why.
+
+        """
+        for parameter, names in ('inputs', list(self.inputs)), ('constants', [*self.constants]):
+            for name in names:
+                problem = ''
+                if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name) or keyword.iskeyword(name):
+                    problem = 'expected a letter, then letters, digits and _'
+                elif re.fullmatch('z[0-9]+', name) or name in KNOWN:
+                    problem = 'expected a name that is not yet taken'
+                elif [*self.inputs, *self.constants].count(name) > 1:
+                    problem = 'expected every name once'
+                if problem:
+                    raise ConfigurationError(f"parameter '{parameter}': {problem}, got {name!r}")
+
+
+ONLY_U = Names()
+
+
+def parse(text: str, level: int, names: Names = ONLY_U) -> list[Instruction]:
     """
     Parse Phi_level.
 
     Parameters
     ----------
     text : str
-        The expression; it may use z1 .. z<level>, u, numbers, + - * / ** and `FUNCTIONS`.
+        The expression; it may use z1 .. z<level>, `names`, numbers, + - * / **, `FUNCTIONS`,
+        `FUNCTIONS_OF_SEVERAL` and `NUMBERS`.
     level : int
         1-based index of Phi.
+    names : Names
+        Known inputs and constants.
 
     Returns
     -------
@@ -78,28 +136,32 @@ def parse(text: str, level: int) -> list[Instruction]:
         Anything that is not on the whitelist, or more work than the limits above allow.
 
     """
+    parser = _Parser(text, level, names)
     if len(text) > MAX_LENGTH:
-        raise _error(level, text[:40] + '...', f'{len(text)} characters, at most {MAX_LENGTH}')
+        parser.text = text[:40] + '...'
+        raise parser.error(f'{len(text)} characters, at most {MAX_LENGTH}')
     if not text.isascii():  # Python would read some letters as the ones that they look like
-        raise _error(level, text, 'only ASCII characters can be used')
+        raise parser.error('only ASCII characters can be used')
     try:
         with warnings.catch_warnings():  # Python warns of what is refused below
             warnings.simplefilter('ignore')
             body = ast.parse(text.strip(), mode='eval').body
     except (SyntaxError, ValueError, RecursionError, MemoryError):
-        raise _error(level, text, 'this is not an arithmetic expression') from None
-    parser = _Parser(text, level)
+        raise parser.error('this is not an arithmetic expression') from None
     parser.check_work(body)
     instructions = parser.emit(body, 0)
     return [] if instructions == [Instruction(bytecode.CONST, 0.0)] else instructions
 
 
 class _Parser:
-    def __init__(self, text: str, level: int) -> None:
+    def __init__(self, text: str, level: int, names: Names) -> None:
         self.text = text
         self.level = level
+        self.others = [*names.inputs, *names.constants]
         self.names = {f'z{j + 1}': Instruction(bytecode.STATE, j) for j in range(level)}
-        self.names['u'] = Instruction(bytecode.INPUT)
+        self.names |= {n: Instruction(bytecode.INPUT, k) for k, n in enumerate(names.inputs)}
+        for name, number in (NUMBERS | dict(names.constants)).items():
+            self.names[name] = Instruction(bytecode.CONST, number)
 
     def check_work(self, body: ast.expr) -> None:
         """Refuse an expression that would take long at every evaluation."""
@@ -131,13 +193,26 @@ class _Parser:
             case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
                 a, b = self.emit(left, nesting + 1), self.emit(right, nesting + 1)
                 return self.fold([*a, *b, Instruction(OPERATORS[type(op)])])
-            case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]):
-                if name not in FUNCTIONS:
-                    raise self.error(f"unknown function '{name}'{suggestion(name, FUNCTIONS)}")
-                inner = self.emit(argument, nesting + 1)
-                return self.fold([*inner, Instruction(FUNCTIONS[name])])
+            case ast.BinOp(op=ast.BitXor()):
+                raise self.error("'^' is not allowed, a power is written z1**2")
+            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
+                return self.call(name, [self.emit(a, nesting + 1) for a in arguments])
         part = ast.get_source_segment(self.text.strip(), node) or ''
         raise self.error(f'{part[:60]!r} is not allowed')
+
+    def call(self, name: str, arguments: list[list[Instruction]]) -> list[Instruction]:
+        several = name in FUNCTIONS_OF_SEVERAL
+        if not several and name not in FUNCTIONS:
+            known = [*FUNCTIONS, *FUNCTIONS_OF_SEVERAL]
+            raise self.error(f"unknown function '{name}'{suggestion(name, known)}")
+        if len(arguments) != 1 + several and not (name in ('min', 'max') and len(arguments) > 2):
+            raise self.error(f'{_needs(name)}, got {len(arguments)}')
+        result, *rest = arguments
+        if not several:
+            return self.fold([*result, Instruction(FUNCTIONS[name])])
+        for argument in rest:
+            result = self.fold([*result, *argument, Instruction(FUNCTIONS_OF_SEVERAL[name])])
+        return result
 
     def constant(self, number: float) -> Instruction:
         try:
@@ -155,30 +230,39 @@ class _Parser:
             raise self.error(
                 f'{name} comes after z{self.level}: the model would not be triangular'
             )
-        if name in FUNCTIONS:
-            raise self.error(f'{name} needs one argument')
-        raise self.error(f"unknown name '{name}'{suggestion(name, [*self.names, *FUNCTIONS])}")
+        if name in FUNCTIONS or name in FUNCTIONS_OF_SEVERAL:
+            raise self.error(_needs(name))
+        hint = suggestion(name, [*self.names, *KNOWN])
+        raise self.error(
+            f"unknown name '{name}'{hint}; 'inputs' declares known inputs and 'constants.{name}' "
+            'a constant'
+        )
 
     def fold(self, instructions: list[Instruction]) -> list[Instruction]:
         """Replace an operation on constants by its result."""
         if any(i.code != bytecode.CONST for i in instructions[:-1]):
             return instructions
         stack = np.zeros((2, len(instructions)))
-        value, _ = bytecode.evaluate(assembled([instructions]), 0, np.zeros((2, 1)), 0.0, stack)
+        value, _ = bytecode.evaluate(
+            assembled([instructions]), 0, np.zeros((2, 1)), np.zeros(1), stack
+        )
         if not math.isfinite(value):
             raise self.error('a constant part of it is not a finite number')
         return [Instruction(bytecode.CONST, float(value))]
 
     def error(self, reason: str) -> ConfigurationError:
-        return _error(self.level, self.text, reason)
+        states = 'z1' if self.level == 1 else f'z1..z{self.level}'
+        names = ', '.join([states, *self.others, 'numbers'])
+        return ConfigurationError(
+            f"parameter 'phi': Phi_{self.level} = {self.text!r}: {reason}; allowed are {names}, "
+            f'+ - * / ** and {" ".join(KNOWN)}'
+        )
 
 
-def _error(level: int, text: str, reason: str) -> ConfigurationError:
-    names = 'z1' if level == 1 else f'z1..z{level}'
-    return ConfigurationError(
-        f"parameter 'phi': Phi_{level} = {text!r}: {reason}; allowed are {names}, u, numbers, "
-        f'+ - * / ** and {" ".join(FUNCTIONS)}'
-    )
+def _needs(name: str) -> str:
+    if name in FUNCTIONS:
+        return f'{name} needs one argument'
+    return f'{name} needs two arguments{"" if name == "atan2" else " or more"}'
 
 
 def assembled(expressions: Sequence[Sequence[Instruction]]) -> bytecode.Bytecode:

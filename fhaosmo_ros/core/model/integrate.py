@@ -89,7 +89,7 @@ def take_slope(method: Method, stage: int, h: float, stages: Floats) -> None:
 
 @compiled(forceinline=True)
 def triangular_rates(
-    model: Bytecode, drive: float, u: float, stack: Floats, stages: Floats
+    model: Bytecode, drive: float, u: Floats, stack: Floats, stages: Floats
 ) -> None:
     """
     Write the rates of P triangular, and their derivatives, at ``stages[POINT]``.
@@ -100,8 +100,8 @@ def triangular_rates(
         Phi_1 .. Phi_n.
     drive : float
         What the last state is driven by beside Phi_n: d, or 0.
-    u : float
-        Known input.
+    u : (m,) array
+        Known inputs.
     stack : (2, depth) array
         Scratch memory.
     stages : (4, 2, n) array

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Triangular models (paper eq. triangular): z_i' = z_{i+1} + Phi_i(z_1..z_i, u)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from fhaosmo_ros.core.model.bytecode import Bytecode, evaluate, INPUT
-from fhaosmo_ros.core.model.expressions import assembled, parse
+from fhaosmo_ros.core.model.expressions import assembled, Names, ONLY_U, parse
+from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import CONSTANTS
 import numpy as np
+from numpy.typing import ArrayLike
 
 ROOM_FOR_DECAY = 4
 """Stack size that is enough for the expression in `TriangularModel.with_unknown_input`."""
@@ -22,6 +26,8 @@ class TriangularModel:
         One expression a state.
     order : int, optional
         Number of states n, to be checked against ``len(phi)``.
+    names : Names, optional
+        Known inputs and constants; without it, one known input u.
 
     Attributes
     ----------
@@ -29,6 +35,8 @@ class TriangularModel:
         Number of states n.
     expressions : Bytecode
         Phi_1 .. Phi_n, and an empty one for the level of the unknown input, whose Phi is 0.
+    inputs : tuple of str
+        Names of the known inputs u_1 .. u_m, in the order of their values.
     depth : int
         Size of the stack that the expressions need, those of `with_unknown_input` included.
 
@@ -39,7 +47,9 @@ class TriangularModel:
 
     """
 
-    def __init__(self, phi: Sequence[str], order: int | None = None) -> None:
+    def __init__(
+        self, phi: Sequence[str], order: int | None = None, names: Names = ONLY_U
+    ) -> None:
         if order is not None and len(phi) != order:
             raise ConfigurationError(
                 f"parameter 'phi': expected {order} expressions (order = {order}), "
@@ -47,14 +57,29 @@ class TriangularModel:
             )
         self.phi = tuple(phi)
         self.order = len(self.phi)
-        self._parsed = [parse(text, i + 1) for i, text in enumerate(self.phi)]
+        names.check()
+        self.inputs = tuple(names.inputs)
+        self._parsed = [parse(text, i + 1, names) for i, text in enumerate(self.phi)]
         self.expressions = assembled([*self._parsed, []])
         self.depth = max(ROOM_FOR_DECAY, *map(len, self._parsed))
 
+    @classmethod
+    def of(cls, parameters: Mapping[str, Any]) -> 'TriangularModel':
+        """Return the model that checked parameters describe."""
+        p = parameters
+        return cls(p['phi'], p['order'], Names(p['inputs'], constants_of(p)))
+
+    @property
+    def used_inputs(self) -> tuple[str, ...]:
+        """Names of the known inputs that a Phi uses."""
+        codes, operands = self.expressions.code.T
+        used = set(operands[codes == INPUT].tolist())
+        return tuple(name for k, name in enumerate(self.inputs) if k in used)
+
     @property
     def uses_input(self) -> bool:
-        """True if a Phi uses the known input u."""
-        return bool(np.any(self.expressions.code[:, 0] == INPUT))
+        """True if a Phi uses a known input."""
+        return bool(self.used_inputs)
 
     def with_unknown_input(self, decay: float, derivatives: int) -> Bytecode:
         """
@@ -72,18 +97,27 @@ class TriangularModel:
         behind = [parse(f'-{decay!r} * z{i}', i) if decay > 0.0 else [] for i in levels]
         return assembled([*self._parsed, *behind])
 
-    def evaluate(self, z: np.ndarray, u: float = 0.0) -> np.ndarray:
-        """Return Phi(z, u), shape (n,)."""
+    def evaluate(self, z: np.ndarray, u: ArrayLike = 0.0) -> np.ndarray:
+        """Return Phi(z, u), shape (n,); u is a number or an array (m,)."""
         return self._along(z, np.zeros(self.order), u)[0]
 
-    def jacobian(self, z: np.ndarray, u: float = 0.0) -> np.ndarray:
+    def jacobian(self, z: np.ndarray, u: ArrayLike = 0.0) -> np.ndarray:
         """Return the exact Jacobian dPhi_i/dz_j, shape (n, n), lower triangular."""
         columns = [self._along(z, e, u)[1] for e in np.eye(self.order)]
         return np.stack(columns, axis=1)
 
-    def _along(self, z: np.ndarray, dz: np.ndarray, u: float) -> tuple[np.ndarray, np.ndarray]:
+    def _along(self, z: np.ndarray, dz: np.ndarray, u: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         point = np.array([z, dz], dtype=np.float64)
-        stack = np.empty((2, self.depth))
-        pairs = [evaluate(self.expressions, i, point, float(u), stack) for i in range(self.order)]
+        stack, inputs = np.empty((2, self.depth)), known_inputs(u, self.inputs)
+        pairs = [evaluate(self.expressions, i, point, inputs, stack) for i in range(self.order)]
         values, slopes = np.array(pairs).T
         return values, slopes
+
+
+def constants_of(parameters: Mapping[str, Any]) -> dict[str, float]:
+    """Return the named constants among some parameters."""
+    return {
+        name.removeprefix(CONSTANTS): value
+        for name, value in parameters.items()
+        if name.startswith(CONSTANTS)
+    }

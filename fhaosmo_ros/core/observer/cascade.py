@@ -100,7 +100,7 @@ def root(law: Law, level: int, b: float, h: float, gamma: float) -> tuple[float,
 
 @compiled(forceinline=True)
 def explicit(
-    law: Law, work: Work, gamma: float, y: float, h: float, u: float
+    law: Law, work: Work, gamma: float, y: float, h: float, u: Floats
 ) -> tuple[float, float]:
     """
     Forward Euler of P adaptivesupertwistingobserverfuzzymodified, in place.
@@ -165,7 +165,7 @@ def explicit(
 
 @compiled(forceinline=True)
 def implicit(
-    law: Law, work: Work, gamma: float, y: float, h: float, u: float
+    law: Law, work: Work, gamma: float, y: float, h: float, u: Floats
 ) -> tuple[float, float]:
     """
     Backward Euler of the same equations in place, one scalar equation a level (D 9).

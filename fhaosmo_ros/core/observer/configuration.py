@@ -4,7 +4,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.model.triangular import constants_of, TriangularModel
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.covariance import Uncertainty
 from fhaosmo_ros.core.observer.fuzzy import curve, KNOTS, terms_of_level
@@ -36,7 +36,7 @@ class ObserverConfiguration:
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
         self.parameters = OBSERVER_PARAMETERS.complete(parameters)
-        self.model = TriangularModel(self.parameters['phi'], self.parameters['order'])
+        self.model = TriangularModel.of(self.parameters)
         self._complete()
 
     def changed(self, changes: Mapping[str, Any]) -> 'ObserverConfiguration':
@@ -57,6 +57,8 @@ class ObserverConfiguration:
         other = object.__new__(ObserverConfiguration)
         other.parameters = self.parameters.changed_live(changes, 'observer')
         other.model = self.model
+        if constants_of(other.parameters) != constants_of(self.parameters):
+            other.model = TriangularModel.of(other.parameters)
         other._complete()
         return other
 

@@ -149,7 +149,7 @@ def usual_innovation(memory: Floats, b: float, expected: float) -> float:
 
 @compiled()
 def begin_estimates(
-    law: Law, work: Work, memory: Floats, y: float, h: float, u: float
+    law: Law, work: Work, memory: Floats, y: float, h: float, u: Floats
 ) -> tuple[float, float]:
     """
     Estimate by the Kalman filter itself until P is steady, for schemes with gains of other kinds.
@@ -176,13 +176,13 @@ def begin_estimates(
     memory[SETTLED] -= h
     speed = (law.scalars[INTENSITY] / (law.scalars[VARIANCE] * h)) ** (0.5 / n)
     if -memory[SETTLED] * speed > LONG:
-        hand_over(law, work, memory)
+        hand_over(law, work, memory, u)
         memory[SETTLED] = 1.0
     return (1.0 - x[COVARIANCE, 0] / law.scalars[VARIANCE]) * b * b, 0.0
 
 
 @compiled()
-def hand_over(law: Law, work: Work, memory: Floats) -> None:
+def hand_over(law: Law, work: Work, memory: Floats, u: Floats) -> None:
     """
     Put the levels of a cascade where they would be if they had followed these estimates.
 
@@ -196,7 +196,7 @@ def hand_over(law: Law, work: Work, memory: Floats) -> None:
     for i in range(n):
         rate = 0.0
         if i + 1 < n:
-            rate = evaluate(law.model, i + 1, m, 0.0, work.stack)[0]
+            rate = evaluate(law.model, i + 1, m, u, work.stack)[0]
             if i + 2 < n:
                 rate += m[0, i + 2]
         wanted = min(abs(rate) / law.gains[ALPHA, i], 1.0)
@@ -217,7 +217,7 @@ def hand_over(law: Law, work: Work, memory: Floats) -> None:
 
 
 @compiled()
-def is_unlikely(law: Law, work: Work, memory: Floats, y: float, h: float, u: float) -> bool:
+def is_unlikely(law: Law, work: Work, memory: Floats, y: float, h: float, u: Floats) -> bool:
     """Return True if y is too far from one Euler step of the internal states (D 21)."""
     x, m = work.x, work.stages[POINT]
     m[0, 0], m[1, 0] = memory[Y], 0.0

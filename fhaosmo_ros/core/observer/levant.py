@@ -128,7 +128,7 @@ def injection(law: Law, level: int, a: float, power: float, p: float) -> tuple[f
 
 @compiled()
 def explicit(
-    law: Law, work: Work, gamma: float, y: float, h: float, u: float
+    law: Law, work: Work, gamma: float, y: float, h: float, u: Floats
 ) -> tuple[float, float]:
     """
     Forward Euler of D 11, in place.
@@ -231,7 +231,7 @@ def root(law: Law, weights: Floats, b: float, gamma: float) -> tuple[float, floa
 
 @compiled()
 def implicit(
-    law: Law, work: Work, memory: Floats, y: float, h: float, u: float
+    law: Law, work: Work, memory: Floats, y: float, h: float, u: Floats
 ) -> tuple[float, float]:
     """
     Backward Euler of D 11 in place, one scalar equation for all levels (D 12).
@@ -266,7 +266,7 @@ def implicit(
 
 @compiled()
 def predict_correct(
-    law: Law, work: Work, memory: Floats, y: float, h: float, u: float
+    law: Law, work: Work, memory: Floats, y: float, h: float, u: Floats
 ) -> tuple[float, float]:
     """
     Follow the model to the sample, then correct (D 18), in place.

@@ -3,14 +3,20 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.model.inputs import known_inputs, known_inputs_of_run
+from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer import step as recursion
 from fhaosmo_ros.core.observer.arrays import Law, make_work, State, Work
 from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA, ObserverConfiguration
 from fhaosmo_ros.core.observer.status import flags, FLAGS_MASK, LEVEL_SHIFT, open_levels, Status
+from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import make_from_file
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -117,8 +123,9 @@ class Observer:
     Parameters
     ----------
     parameters : mapping, optional
-        Values for the parameters in docs/parameters.md; defaults for the rest. `Parameters` have
-        been checked and are taken as they are.
+        Values for the parameters in docs/parameters.md; defaults for the rest. Those of the
+        estimator that are not the observer's are checked and left out, so that it takes what
+        `tune` has written. `Parameters` have been checked and are taken as they are.
 
     Raises
     ------
@@ -136,12 +143,37 @@ class Observer:
     """
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
-        self._configuration = ObserverConfiguration(parameters or {})
+        if not isinstance(parameters, Parameters):
+            parameters = ESTIMATOR_PARAMETERS.complete(parameters)
+        self._configuration = ObserverConfiguration(parameters)
         self._state = self._configuration.initial_state()
         self._set_law()
         self._eps = np.zeros((1, self._configuration.levels))
+        self._u = np.zeros(len(self.inputs))
         self._t: float | int | None = None
         self._word = 0
+
+    @classmethod
+    def from_yaml(cls, path: str | Path, node: str = 'estimator', channel: str = '') -> 'Observer':
+        """
+        Return one with the parameters of a file for ROS, such as the `gains.yaml` of `tune`.
+
+        Parameters
+        ----------
+        path : path
+            A YAML file of the form ``estimator: {ros__parameters: {...}}``.
+        node : str
+            Whose sections to take, such as '/rig/estimator'.
+        channel : str
+            Name of the channel, of a node that has several.
+
+        Raises
+        ------
+        ConfigurationError
+            As the constructor, or a file that can't be used; the message begins with its path.
+
+        """
+        return make_from_file(cls, path, node, channel)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -169,8 +201,23 @@ class Observer:
 
     @property
     def uses_input(self) -> bool:
-        """True if the model uses the known input u."""
+        """True if the model uses a known input."""
         return self._configuration.model.uses_input
+
+    @property
+    def model(self) -> TriangularModel:
+        """Phi, and the names of the known inputs."""
+        return self._configuration.model
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the known inputs, in the order of their values."""
+        return self._configuration.model.inputs
+
+    @property
+    def used_inputs(self) -> tuple[str, ...]:
+        """Names of those of them that the model uses."""
+        return self._configuration.model.used_inputs
 
     @property
     def started(self) -> bool:
@@ -270,7 +317,7 @@ class Observer:
         self._word = recursion.start(self._law, self._state, float(y), self._eps, 0)
         return self._estimate(self._word)
 
-    def step(self, y: float, dt: float, u: float = 0.0) -> Estimate:
+    def step(self, y: float, dt: float, u: ArrayLike = 0.0) -> Estimate:
         """
         Advance by `dt` to the sample `y`.
 
@@ -283,8 +330,8 @@ class Observer:
             Measured output at the end of the interval.
         dt : float
             Time since the previous call, in seconds, > 0.
-        u : float
-            Known input during the interval.
+        u : number or (m,) array
+            Known input, or known inputs, during the interval.
 
         Returns
         -------
@@ -296,11 +343,15 @@ class Observer:
         word = self.advance(y, dt, u)
         return self._estimate(word)
 
-    def advance(self, y: float, dt: float, u: float = 0.0) -> int:
+    def advance(self, y: float, dt: float, u: ArrayLike = 0.0) -> int:
         """Do what `step` does and return only the status word; see `estimate`."""
         if not self.started and np.isfinite(y):
             self.start(y)
-        sample = float(y), float(dt), float(u), self._eps
+        if type(u) is float and len(self._u) == 1:
+            self._u[0] = u
+        else:
+            self._u[:] = known_inputs(u, self.inputs)
+        sample = float(y), float(dt), self._u, self._eps
         self._word = recursion.step_once(*self._arguments, *sample)
         return self._word
 
@@ -371,8 +422,8 @@ class Observer:
             after all samples before it is rejected.
         y : (K,) array
             Samples.
-        u : (K,) array or float
-            Known input during the interval that ends at each sample.
+        u : number, (K,) or (K, m) array
+            Known input, or known inputs, during the interval that ends at each sample.
         every : int
             Record every `every`-th sample only.
 
@@ -396,13 +447,7 @@ class Observer:
             )
         if every < 1:
             raise ConfigurationError(f'run: expected every >= 1, got {every}')
-        u = np.asarray(u, dtype=np.float64)
-        if u.shape not in ((), y.shape):
-            raise ConfigurationError(
-                f'run: expected u to be a number or an array as long as y, got shapes {u.shape} '
-                f'and {y.shape}'
-            )
-        u = np.ascontiguousarray(np.broadcast_to(u, y.shape))
+        u = known_inputs_of_run(u, len(y), self.inputs)
         first = 0
         if not self.started:
             self._t = None

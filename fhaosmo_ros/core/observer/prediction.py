@@ -9,6 +9,7 @@ derivatives along gamma in row 1.
 import math
 
 from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.model.integrate import (
     begin_step,
     CLASSICAL_DIVIDED,
@@ -24,7 +25,7 @@ METHOD = CLASSICAL_DIVIDED
 
 
 @compiled()
-def predict_step(law: Law, work: Work, h: float, u: float) -> None:
+def predict_step(law: Law, work: Work, h: float, u: Floats) -> None:
     """Integrate D 1 and D 17 over `h` by one step of the classical Runge-Kutta method."""
     stages = work.stages
     begin_step(stages)
@@ -34,7 +35,7 @@ def predict_step(law: Law, work: Work, h: float, u: float) -> None:
 
 
 @compiled()
-def predict(law: Law, work: Work, h: float, u: float, longest: float) -> None:
+def predict(law: Law, work: Work, h: float, u: Floats, longest: float) -> None:
     """Integrate over `h` in equal steps of at most `longest`."""
     count = 1
     if h > longest:
@@ -54,7 +55,7 @@ def begin_at_estimates(work: Work, state: State) -> None:
 
 @compiled()
 def predicted_measurement(
-    law: Law, work: Work, state: State, h: float, u: float, count: int
+    law: Law, work: Work, state: State, h: float, u: Floats, count: int
 ) -> float:
     """Return y after `count` steps of `h` from the present estimates."""
     begin_at_estimates(work, state)

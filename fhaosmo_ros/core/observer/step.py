@@ -74,7 +74,17 @@ HEADROOM = 1e8
 
 
 class Samples(NamedTuple):
-    """Samples of a run: y, and the time (s) and known input of the interval that ends at each."""
+    """
+    Samples of a run.
+
+    Attributes
+    ----------
+    y, h : (K,) arrays
+        Samples, and the time (s) of the interval that ends at each.
+    u : (K, m) array
+        Known inputs of that interval.
+
+    """
 
     y: Floats
     h: Floats
@@ -141,7 +151,7 @@ def start(law: Law, state: State, y: float, eps: Floats, row: int) -> int:
 
 @compiled(forceinline=True)
 def step(
-    law: Law, work: Work, state: State, y: float, h: float, u: float, eps: Floats, row: int
+    law: Law, work: Work, state: State, y: float, h: float, u: Floats, eps: Floats, row: int
 ) -> int:
     """
     Advance a state in place to the sample `y` that lies `h` seconds after the last call.
@@ -156,8 +166,9 @@ def step(
     word = 0
     if not math.isfinite(HEADROOM * y):
         word |= REJECTED_MEASUREMENT
-    if not math.isfinite(u):
-        word |= REJECTED_INPUT
+    for j in range(u.shape[0]):
+        if not math.isfinite(u[j]):
+            word |= REJECTED_INPUT
     if not (h > 0.0 and math.isfinite(HEADROOM * h)):
         word |= REJECTED_PERIOD
     if not word:
@@ -222,7 +233,7 @@ def restart(law: Law, state: State, y: float) -> None:
 
 @compiled(forceinline=True)
 def advance(
-    law: Law, work: Work, memory: Floats, y: float, h: float, u: float
+    law: Law, work: Work, memory: Floats, y: float, h: float, u: Floats
 ) -> tuple[float, float]:
     """Advance ``work.x`` by the structure and scheme of the law; return L and dL/dgamma."""
     flags, gamma = law.flags, memory[GAMMA]
@@ -313,7 +324,7 @@ def step_once(
     memory: Floats,
     y: float,
     h: float,
-    u: float,
+    u: Floats,
     eps: Floats,
 ) -> int:
     """
@@ -324,7 +335,7 @@ def step_once(
     """
     law = unowned(Law(flags, gains, curves, scalars, chances, Bytecode(code, offsets)))
     work, state = unowned(Work(x, stack, stages)), unowned(State(levels, memory))
-    return step(law, work, state, y, h, u, unowned(eps), 0)
+    return step(law, work, state, y, h, unowned(u), unowned(eps), 0)
 
 
 @compiled()
@@ -339,10 +350,10 @@ def run(
     """
     law, work, state = unowned(law), unowned(work), unowned(state)
     levels, memory, eps = state.levels, state.memory, unowned(record.eps)
-    row, seen = 0, 0
+    u, row, seen = unowned(samples.u), 0, 0
     for k in range(samples.y.shape[0]):
         if k >= first:
-            word = step(law, work, state, samples.y[k], samples.h[k], samples.u[k], eps, row)
+            word = step(law, work, state, samples.y[k], samples.h[k], u[k], eps, row)
         else:
             word = start(law, state, samples.y[k], eps, row)
         seen |= word & FLAGS_MASK

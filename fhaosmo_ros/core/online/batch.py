@@ -41,7 +41,16 @@ from numpy.typing import NDArray
 
 
 class ChannelSamples(NamedTuple):
-    """Samples of several channels in the order in which they came."""
+    """
+    Samples of several channels in the order in which they came.
+
+    Attributes
+    ----------
+    channel, stamps, y : (K,) arrays
+    u : (K, m) array
+        Known inputs; a channel with fewer than m reads the first ones of a row.
+
+    """
 
     channel: Ints
     stamps: Ints
@@ -121,7 +130,11 @@ class EstimatorBatch:
         self._table = np.zeros((len(self._estimators), UNKNOWN_INPUT + 1, 3), dtype=np.int64)
 
     def advance(
-        self, channel: Sequence[int], stamps: Sequence[int], y: Sequence[float], u: Sequence[float]
+        self,
+        channel: Sequence[int],
+        stamps: Sequence[int],
+        y: Sequence[float],
+        u: Sequence[float | Sequence[float]],
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """
         Take samples in order, bit for bit as their estimators would take them one by one.
@@ -130,8 +143,11 @@ class EstimatorBatch:
         ----------
         channel : sequence of int
             Which estimator takes each sample.
-        stamps, y, u : sequences
-            Of each sample; u is finite.
+        stamps, y : sequences
+            Of each sample.
+        u : sequence of numbers or sequences
+            Known inputs of each sample, all finite, as many as its estimator has; just a number
+            where no estimator has more than one.
 
         Returns
         -------
@@ -149,12 +165,19 @@ class EstimatorBatch:
             numbers,
             np.array(stamps, dtype=np.int64),
             np.array(y, dtype=np.float64),
-            np.array(u, dtype=np.float64),
+            self._padded(u),
         )
         take_many(self._table, samples, words, unknown_inputs)
         for c, word in dict(zip(channel, words.tolist(), strict=True)).items():
             self._estimators[c].taken(word)
         return words, unknown_inputs
+
+    def _padded(self, u: Sequence[Any]) -> Floats:
+        """Return the known inputs as an array, zeros behind the shorter rows."""
+        width = max(len(estimator.observer.inputs) for estimator in self._estimators)
+        if width > 1:
+            u = [[*row, *[0.0] * (width - len(row))] for row in u]
+        return np.array(u, dtype=np.float64).reshape(len(u), width)
 
     def _place(self, c: int, estimator: OnlineEstimator) -> None:
         """Write where a channel's arrays are; holding them keeps them there."""

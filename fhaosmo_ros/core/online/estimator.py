@@ -2,8 +2,10 @@
 """The update path of time-stamped samples, shared by the node and by replays of bags."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.model.inputs import known_inputs_of_run
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.observer import (
@@ -13,14 +15,15 @@ from fhaosmo_ros.core.observer.observer import (
     ObserverState,
     Trajectory,
 )
+from fhaosmo_ros.core.online import delay, policy
 from fhaosmo_ros.core.online import memory as at
-from fhaosmo_ros.core.online import policy
 from fhaosmo_ros.core.online.counters import Counters
-from fhaosmo_ros.core.online.memory import completed, EstimatorArrays, make_policy, Memory
+from fhaosmo_ros.core.online.memory import EstimatorArrays, make_policy, Memory
 from fhaosmo_ros.core.online.stamps import forget_samples
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.core.parameters.files import make_from_file
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -62,14 +65,52 @@ class OnlineEstimator:
     """
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
+        if not isinstance(parameters, Parameters):
+            parameters = ESTIMATOR_PARAMETERS.complete(parameters)
         self._parameters = ONLINE_PARAMETERS.complete(parameters)
         self.observer = Observer(self._parameters)
-        self._policy = make_policy(self.observer.initial_state())
+        p = self._parameters
+        if p['input_delay'] > p['measurement_delay']:
+            raise ConfigurationError(
+                "parameters 'input_delay', 'measurement_delay': expected each at most the next "
+                f'one, got {p["input_delay"]} and {p["measurement_delay"]}'
+            )
+        self._lag = 0
+        if self.observer.uses_input:
+            self._lag = round((p['measurement_delay'] - p['input_delay']) / NANOSECONDS)
+        past = np.zeros(0)
+        if self.observer.uses_input and p['measurement_delay']:
+            past = delay.make_past(len(self.observer.inputs), self._lag)
+        self._policy = make_policy(self.observer.initial_state(), past)
         self._ints, self._reals = self._policy
         self._eps = self.observer.innovations
-        self._u = 0.0
+        self._u = np.zeros(len(self.observer.inputs))
         self._word = 0
         self._write_settings()
+
+    @classmethod
+    def from_yaml(
+        cls, path: str | Path, node: str = 'estimator', channel: str = ''
+    ) -> 'OnlineEstimator':
+        """
+        Return one with the parameters of a file for ROS, such as the `gains.yaml` of `tune`.
+
+        Parameters
+        ----------
+        path : path
+            A YAML file of the form ``estimator: {ros__parameters: {...}}``.
+        node : str
+            Whose sections to take, such as '/rig/estimator'.
+        channel : str
+            Name of the channel, of a node that has several.
+
+        Raises
+        ------
+        ConfigurationError
+            As the constructor, or a file that can't be used; the message begins with its path.
+
+        """
+        return make_from_file(cls, path, node, channel)
 
     @property
     def arguments(self) -> tuple[NDArray[Any], ...]:
@@ -106,8 +147,17 @@ class OnlineEstimator:
 
     @property
     def stamp(self) -> int | None:
-        """Stamp of the sample behind the latest estimate, in nanoseconds."""
-        return int(self._ints[at.STAMP]) if self._ints[at.VALID] else None
+        """
+        Time of the latest estimate in nanoseconds, None before there is one.
+
+        The stamp of its sample, less `measurement_delay` unless the estimate is carried over it.
+        """
+        return int(self._ints[at.STAMP]) - self._behind if self._ints[at.VALID] else None
+
+    @property
+    def _behind(self) -> int:
+        """How long before the stamp of its sample an estimate belongs, in nanoseconds."""
+        return 0 if self._ints[at.TO_NOW] else int(self._ints[at.DELAY])
 
     @property
     def period(self) -> float:
@@ -126,7 +176,7 @@ class OnlineEstimator:
 
     def prepare(self, changes: Mapping[str, Any]) -> Change:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
-        parameters = self._parameters.changed(changes)
+        parameters = self._parameters.changed_live(changes, 'observer')
         return Change(parameters, self.observer.prepare(parameters))
 
     def adopt(self, change: Change) -> None:
@@ -158,8 +208,12 @@ class OnlineEstimator:
         for index, name in (
             (at.PERIOD, 'nominal_period'), (at.MAX_GAP, 'max_gap'), (at.MAX_STEP, 'max_step'),
             (at.STUCK_TIME, 'stuck_time'), (at.DIVERGENCE_TIME, 'divergence_time'),
+            (at.DELAY, 'measurement_delay'),
         ):  # fmt: skip
             ints[index] = round(p[name] / NANOSECONDS)
+        ints[at.LAG] = self._lag
+        ints[at.TO_NOW] = p['predict_to_now']
+        ints[at.FILTERED] = p['estimate_from'] == 'filtered'
         ints[at.GATE_SAMPLES] = p['spike_gate_samples']
         reals[at.GATE] = p['spike_gate']
         reals[at.LIMIT] = p['divergence_limit']
@@ -188,9 +242,10 @@ class OnlineEstimator:
         return Memory(
             integers=self._ints[at.FROZEN : at.COUNTERS].copy(),
             reals=self._reals[at.INTERVAL : at.STATES].copy(),
-            before=self._reals[at.STATES + size :].copy(),
+            before=self._reals[at.STATES + size : at.STATES + 2 * size].copy(),
             now=np.concatenate([state.levels.ravel(), state.memory]),
-            u=self._u,
+            u=self._u.copy(),
+            past=self._reals[at.STATES + 2 * size :].copy(),
         )
 
     def remember(self, memory: Memory) -> None:
@@ -200,23 +255,32 @@ class OnlineEstimator:
         Raises
         ------
         ConfigurationError
-            The memory is of an observer with another number of levels.
+            The memory is of an observer with another number of levels, or of known inputs.
 
         """
-        levels = self._arrays.state.levels
-        size = levels.size + self._arrays.state.memory.size
-        fresh = self._reals[at.STATES : at.STATES + size]
-        now, before = completed(memory.now, fresh), completed(memory.before, fresh)
-        if size != len(now):
+        size, levels = len(memory.now), self._arrays.state.levels
+        if size != levels.size + self._arrays.state.memory.size:
             raise ConfigurationError(
-                f'memory: expected that of {self.observer.levels} levels, got {len(now)} numbers'
+                f'memory: expected that of {self.observer.levels} levels, got {size} numbers'
+            )
+        if len(memory.u) != len(self._u):
+            raise ConfigurationError(
+                f'memory: expected {len(self._u)} known inputs, got {len(memory.u)}'
+            )
+        past = self._reals[at.STATES + 2 * size :]
+        if memory.past.shape != past.shape:
+            raise ConfigurationError(
+                'memory: expected the past of the known inputs for measurement_delay = '
+                f'{self._parameters["measurement_delay"]:g} s ({len(past)} numbers), got '
+                f'{len(memory.past)} numbers'
             )
         self._ints[at.FROZEN : at.COUNTERS] = memory.integers
         self._reals[at.INTERVAL : at.STATES] = memory.reals
-        self._reals[at.STATES + size :] = before
-        state, scalars = now[: levels.size], now[levels.size :]
+        self._reals[at.STATES + size : at.STATES + 2 * size] = memory.before
+        past[:] = memory.past
+        state, scalars = memory.now[: levels.size], memory.now[levels.size :]
         self.observer.restore(ObserverState(state.reshape(levels.shape), scalars))
-        self._u = memory.u
+        self._u[:] = memory.u
 
     def seed(self, z: ArrayLike, unknown_input: float) -> None:
         """
@@ -268,16 +332,30 @@ class OnlineEstimator:
         self._ints[at.TIMED] = self._ints[at.TICK_COUNT] = 0
 
     @property
-    def input(self) -> float:
-        """The known input u that is held."""
-        return self._u
+    def inputs(self) -> tuple[float, ...]:
+        """The known inputs that are held, in the order of `Observer.inputs`."""
+        return tuple(self._u.tolist())
 
-    def set_input(self, u: float) -> bool:
-        """Hold `u` as the known input from now on; return False if it is not finite."""
+    def set_input(self, u: float, index: int = 0) -> bool:
+        """
+        Hold a known input from now on.
+
+        Parameters
+        ----------
+        u : float
+        index : int
+            Which one, in the order of `Observer.inputs`.
+
+        Returns
+        -------
+        bool
+            False if it is not finite: then the one before is held, and this one counted.
+
+        """
         if not np.isfinite(u):
             self.reject_inputs(1)
             return False
-        self._u = float(u)
+        self._u[index] = u
         return True
 
     def reject_inputs(self, count: int) -> None:
@@ -301,7 +379,7 @@ class OnlineEstimator:
             Of this sample, or the previous state's with the reason of the rejection.
 
         """
-        return self.observer.report(self.advance(int(stamp), y))
+        return self._published(self.advance(int(stamp), y))
 
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
@@ -313,9 +391,7 @@ class OnlineEstimator:
         self._word = word
         return word
 
-    def run(
-        self, stamps: NDArray[np.int64], y: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> Trajectory:
+    def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
         """
         Take many samples, bit for bit as `update` would take one after the other.
 
@@ -325,30 +401,57 @@ class OnlineEstimator:
             Times of the samples in nanoseconds.
         y : (K,) array
             Samples.
-        u : (K,) array
-            Known input of the interval that ends at each sample.
+        u : number, (K,) or (K, m) array, optional
+            Known input, or known inputs, of the interval that ends at each sample; without it,
+            those that are held.
 
         Returns
         -------
         Trajectory
             A row for every sample, whose status says whether it was rejected. ``t`` holds the
-            stamps.
+            times of the estimates: the stamps, less `measurement_delay` unless `predict_to_now`.
+
+        Raises
+        ------
+        ConfigurationError
+            Arrays whose shapes do not fit.
 
         """
-        count, n = len(y), self.observer.levels
-        u = np.array(u, dtype=np.float64)
-        for k in np.flatnonzero(~np.isfinite(u)):
-            u[k] = u[k - 1] if k else self._u
-            self.reject_inputs(1)
-        record = make_record(count, n, count)
         stamps = np.ascontiguousarray(stamps, dtype=np.int64)
-        policy.run(self._arrays, stamps, np.ascontiguousarray(y, dtype=np.float64), u, record)
+        y = np.ascontiguousarray(y, dtype=np.float64)
+        if y.ndim != 1 or stamps.shape != y.shape:
+            raise ConfigurationError(
+                'run: expected stamps and y with one dimension and equal length, got shapes '
+                f'{stamps.shape} and {y.shape}'
+            )
+        count, n = len(y), self.observer.levels
+        inputs = np.tile(self._u, (count, 1))
+        if u is not None:
+            inputs = known_inputs_of_run(u, count, self.observer.inputs).copy()
+            for k, j in np.argwhere(~np.isfinite(inputs)):
+                inputs[k, j] = inputs[k - 1, j] if k else self._u[j]
+                self.reject_inputs(1)
+        record = make_record(count, n, count)
+        carried = bool(self._ints[at.TO_NOW] and self._ints[at.DELAY])
+        present = np.empty((count if carried else 0, self.observer.order + 1))
+        policy.run(self._arrays, stamps, y, inputs, record, present)
         if count:
-            self._u, self._word = float(u[-1]), int(record.words[-1])
+            self._u[:], self._word = inputs[-1], int(record.words[-1])
             self._eps[0] = record.eps[-1]
-        return self.observer.trajectory(stamps, record)
+        found = self.observer.trajectory(stamps - self._behind, record)
+        if carried:
+            found = found._replace(z=present[:, :-1], unknown_input=present[:, -1])
+        return found
 
     @property
     def estimate(self) -> Estimate | None:
         """The latest estimate, None before the first sample."""
-        return self.observer.report(self._word) if self._ints[at.VALID] else None
+        return self._published(self._word) if self._ints[at.VALID] else None
+
+    def _published(self, word: int) -> Estimate:
+        estimate = self.observer.report(word)
+        if not (self._ints[at.TO_NOW] and self._ints[at.DELAY]):
+            return estimate
+        present = np.empty(self.observer.order + 1)
+        delay.published_once(self._arrays, present)
+        return estimate._replace(z=present[:-1], unknown_input=float(present[-1]))

@@ -43,7 +43,7 @@ def sub_steps(policy: Policy, elapsed: int) -> int:
 
 
 @compiled(inline='always')
-def step_over(e: EstimatorArrays, elapsed: int, y: float, u: float, eps: Floats, row: int) -> int:
+def step_over(e: EstimatorArrays, elapsed: int, y: float, u: Floats, eps: Floats, row: int) -> int:
     """
     Step to a sample `elapsed` later, through a gap in sub-steps; return the status word.
 

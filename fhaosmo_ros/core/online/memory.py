@@ -4,8 +4,9 @@ All that an estimator remembers beside its observer's state: one layout, and sna
 
 `Policy` holds an array of integers and one of floating-point numbers. Times are in nanoseconds.
 ``ints`` begins with the settings, goes on with what is remembered, and ends with the counters in
-the order of `Counters`. ``reals`` ends with two copies of an observer's state (levels, then
-memory): a fresh one, and the one before the latest bridged gap.
+the order of `Counters`. ``reals`` goes on with two copies of an observer's state (levels, then
+memory), a fresh one and the one before the latest bridged gap, and ends with the past of the
+known inputs where y is known later than they are (see delay.py).
 
 A snapshot is one labelled vector, enough to go on exactly where the estimator was. Integers of 64
 bits (stamps) do not fit into a double: each stands in two, its upper and its lower half.
@@ -13,6 +14,7 @@ bits (stamps) do not fit into a double: each stands in two, its upper and its lo
 
 from collections.abc import Sequence
 from enum import IntFlag
+import re
 from typing import NamedTuple
 
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
@@ -30,32 +32,36 @@ MAX_STEP = 4  # 0: twice the mean interval
 GATE_SAMPLES = 5
 STUCK_TIME = 6
 DIVERGENCE_TIME = 7
-FROZEN = 8  # 1: gamma is held
+DELAY = 8  # of y
+LAG = 9  # how much later than the inputs y is known: measurement_delay - input_delay
+TO_NOW = 10  # 1: estimates are carried over the delay
+FILTERED = 11  # 1: estimates are z_hat
+FROZEN = 12  # 1: gamma is held
 # Remembered
-VALID = 9  # 1: there is an estimate
-STAMP = 10  # of the sample behind it
-TIMED = 11  # 0: the next sample's stamp is of another clock
-LATEST = 12  # time up to which the observer has been stepped
-NOW = 13  # the clock that counts nominal periods
-TICK = 14  # CLOCK: latest clock reading
-TICK_LENGTH = 15  # from the reading before it
-TICK_COUNT = 16  # samples at it
-SPACING = 17  # of samples at one reading; 0: not known yet
-PLACED = 18  # where the latest one was put
-HELD = 19  # 1: a sample far away waits for the next one's word
-HELD_STAMP = 20
-BRIDGED = 21  # 1: the latest sample ended a bridged gap
-BEFORE = 22  # LATEST before that gap
-SPIKES = 23  # rejected by the gate, in a row
-SEEN = 24  # time of the latest sample, used or not
-CHANGED = 25  # since when y is what it is
-STUCK = 26  # 1: it is stuck
-LOST = 27  # 1: eps_1 is above epsilon, or steps fail
-LOST_SINCE = 28
-INTERVALS = 29  # number of intervals in the mean, up to WINDOW
+VALID = 13  # 1: there is an estimate
+STAMP = 14  # of the sample behind it
+TIMED = 15  # 0: the next sample's stamp is of another clock
+LATEST = 16  # time up to which the observer has been stepped
+NOW = 17  # the clock that counts nominal periods
+TICK = 18  # CLOCK: latest clock reading
+TICK_LENGTH = 19  # from the reading before it
+TICK_COUNT = 20  # samples at it
+SPACING = 21  # of samples at one reading; 0: not known yet
+PLACED = 22  # where the latest one was put
+HELD = 23  # 1: a sample far away waits for the next one's word
+HELD_STAMP = 24
+BRIDGED = 25  # 1: the latest sample ended a bridged gap
+BEFORE = 26  # LATEST before that gap
+SPIKES = 27  # rejected by the gate, in a row
+SEEN = 28  # time of the latest sample, used or not
+CHANGED = 29  # since when y is what it is
+STUCK = 30  # 1: it is stuck
+LOST = 31  # 1: eps_1 is above epsilon, or steps fail
+LOST_SINCE = 32
+INTERVALS = 33  # number of intervals in the mean, up to WINDOW
 NAMES = {v: k for k, v in dict(globals()).items() if k.isupper() and isinstance(v, int)}
 """Names of these integers by index: they label the entries of a snapshot."""
-COUNTERS = 30
+COUNTERS = 34
 """Index of the first counter."""
 
 (
@@ -81,7 +87,7 @@ class Policy(NamedTuple):
     Attributes
     ----------
     ints : (NOMINAL .. DIVERGENCES,) array
-    reals : (GATE .., two states) array
+    reals : (GATE .., two states, past inputs) array
 
     """
 
@@ -98,10 +104,11 @@ class EstimatorArrays(NamedTuple):
     policy: Policy
 
 
-def make_policy(state: arrays.State) -> Policy:
-    """Return the policy's arrays for an observer with such a state."""
+def make_policy(state: arrays.State, past: Floats) -> Policy:
+    """Return the policy's arrays for such a state, and for the past of the inputs."""
     ints = np.zeros(COUNTERS + len(Counters._fields), dtype=np.int64)
-    return Policy(ints, np.zeros(STATES + 2 * (state.levels.size + state.memory.size)))
+    states = np.zeros(STATES + 2 * (state.levels.size + state.memory.size))
+    return Policy(ints, np.concatenate([states, past]))
 
 
 HALF = 2**32
@@ -115,8 +122,8 @@ LABELS_OF_MEMORY = [
     'gamma', 'y', 'pending', 'wait', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread',
 ]  # fmt: skip
 """Labels of a snapshot's entries: they are in bags, so they stay as they are."""
-OLD_MEMORY = 4
-"""Entries of the memory in snapshots that have no covariance and nothing after `wait`."""
+MISSING = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}
+"""What an older version did not remember and is not 0."""
 
 
 class Flag(IntFlag):
@@ -142,9 +149,10 @@ class Memory(NamedTuple):
         Of `Policy.reals`.
     before, now : ((4 + N) N + 10,) arrays
         The observer's state (levels, then memory) before the latest bridged gap, and its state.
-        Of an older version 4N + 4 numbers, without the covariance; see `completed`.
-    u : float
-        Known input.
+    u : (m,) array
+        Known inputs.
+    past : (P,) array
+        Of the known inputs, see delay.py; empty where it does not matter.
 
     """
 
@@ -152,7 +160,8 @@ class Memory(NamedTuple):
     reals: NDArray[np.float64]
     before: NDArray[np.float64]
     now: NDArray[np.float64]
-    u: float
+    u: NDArray[np.float64]
+    past: NDArray[np.float64]
 
 
 class Snapshot(NamedTuple):
@@ -173,46 +182,27 @@ class Snapshot(NamedTuple):
     memory: Memory
 
 
-def labels(levels: int) -> list[str]:
-    """Return a name for each entry of the vector of an observer with that many levels."""
+def labels(levels: int, inputs: Sequence[str] = ('u',), past: int = 0) -> list[str]:
+    """
+    Return a name for each entry of the vector of an estimator.
+
+    Parameters
+    ----------
+    levels : int
+    inputs : sequence of str
+        Names of the known inputs.
+    past : int
+        Length of `Memory.past`.
+
+    """
     integers = [f'{NAMES[k].lower()}_{half}' for k in INTEGERS for half in ('upper', 'lower')]
     rows = [f'{row}{i + 1}' for row in LABELS_OF_ROWS for i in range(levels)]
     rows += [f'covariance{i + 1}_{j + 1}' for i in range(levels) for j in range(levels)]
     state = [*rows, *LABELS_OF_MEMORY]
     before = (f'before_{name}' for name in state)
-    return [*HEAD, *integers, *LABELS_OF_REALS, *before, *state, 'u']
-
-
-def _levels(size: int) -> int:
-    """Return the number of levels of a state of so many numbers, 0 if there is none."""
-    for levels in range(1, 17):
-        if size == (arrays.ROWS + levels) * levels + arrays.MEMORY:
-            return levels
-        if size == arrays.ROWS * levels + OLD_MEMORY:  # never that of a newer one: a multiple of 4
-            return levels
-    return 0
-
-
-def completed(state: NDArray[np.float64], fresh: NDArray[np.float64]) -> NDArray[np.float64]:
-    """
-    Return an observer's state as this version remembers it.
-
-    Parameters
-    ----------
-    state : array
-        As in `Memory`, of this version or an older one.
-    fresh : array
-        That of a fresh observer, which has what an older version did not remember.
-
-    """
-    levels = arrays.ROWS * _levels(len(fresh))
-    if len(state) != levels + OLD_MEMORY:
-        return state
-    result = fresh.copy()
-    result[:levels] = state[:levels]
-    begin = len(fresh) - arrays.MEMORY
-    result[begin : begin + OLD_MEMORY] = state[levels:]
-    return result
+    of_past = (f'past{k + 1}' for k in range(past))
+    of_inputs = (name if name == 'u' else f'u_{name}' for name in inputs)
+    return [*HEAD, *integers, *LABELS_OF_REALS, *before, *state, *of_inputs, *of_past]
 
 
 def pack(snapshot: Snapshot) -> NDArray[np.float64]:
@@ -221,30 +211,44 @@ def pack(snapshot: Snapshot) -> NDArray[np.float64]:
     halves = np.column_stack(np.divmod(memory.integers, HALF)).ravel()
     head: Sequence[int] = [int(snapshot.flags), *divmod(snapshot.stamp, SECOND)]
     return np.concatenate(
-        [head, halves, memory.reals, memory.before, memory.now, [memory.u]], dtype=np.float64
+        [head, halves, memory.reals, memory.before, memory.now, memory.u, memory.past],
+        dtype=np.float64,
     )
 
 
-def unpack(vector: ArrayLike) -> Snapshot:
+def unpack(vector: ArrayLike, names: Sequence[str]) -> Snapshot:
     """
     Return the snapshot in a vector.
+
+    Parameters
+    ----------
+    vector : (K,) array
+    names : sequence of str
+        Name of each entry, as `labels` returns them. What an older version did not remember, and
+        so has no entry, is 0, or as in `MISSING`.
 
     Raises
     ------
     ValueError
-        Its length is that of no estimator.
+        The entries are not those of an estimator of this version, or of an older one.
 
     """
     v = np.asarray(vector, dtype=np.float64)
-    halves = 2 * len(INTEGERS)
-    begin = len(HEAD) + halves + len(LABELS_OF_REALS)
-    size, odd = divmod(len(v) - begin - 1, 2)
-    if v.ndim != 1 or odd or not _levels(size):
-        raise ValueError(f'a snapshot can not have {v.size} entries')
-    upper, lower = v[len(HEAD) : len(HEAD) + halves].reshape(-1, 2).T
+    if v.shape != (len(names),):
+        raise ValueError(f'a snapshot with {len(names)} names can not have {v.size} entries')
+    entries = dict(zip(names, v.tolist(), strict=True))
+    levels = sum(re.fullmatch('z_hat[0-9]+', name) is not None for name in names)
+    inputs = [name.removeprefix('u_') for name in names if name == 'u' or name.startswith('u_')]
+    past = sum(re.fullmatch('past[0-9]+', name) is not None for name in names)
+    known = labels(levels, inputs, past)
+    unknown = [name for name in names if name not in known]
+    if unknown or not levels or len(entries) < len(v):
+        raise ValueError(f'a snapshot can not have the entries {", ".join(unknown) or names}')
+    v = np.array([entries.get(name, MISSING.get(name, 0.0)) for name in known])
+    size = (arrays.ROWS + levels) * levels + arrays.MEMORY
+    counts = [len(HEAD), 2 * len(INTEGERS), len(LABELS_OF_REALS), size, size, len(inputs), past]
+    head, halves, reals, *rest = np.split(v, np.cumsum(counts)[:-1])
+    upper, lower = halves.reshape(-1, 2).T
     integers = upper.astype(np.int64) * HALF + lower.astype(np.int64)
-    memory = Memory(
-        integers, v[begin - len(LABELS_OF_REALS) : begin].copy(), v[begin : begin + size].copy(),
-        v[begin + size : begin + 2 * size].copy(), float(v[-1]),
-    )  # fmt: skip
-    return Snapshot(int(v[1]) * SECOND + int(v[2]), Flag(int(v[0])), memory)
+    memory = Memory(integers, reals, *rest)
+    return Snapshot(int(head[1]) * SECOND + int(head[2]), Flag(int(head[0])), memory)

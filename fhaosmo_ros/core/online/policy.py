@@ -19,9 +19,19 @@ from fhaosmo_ros.core.observer.status import (
     REJECTED_SPIKE,
     REJECTED_STEP,
     REJECTED_STUCK,
+    RESTARTED,
 )
 from fhaosmo_ros.core.observer.step import innovations, Record, start
 from fhaosmo_ros.core.online import memory as at
+from fhaosmo_ros.core.online.delay import (
+    forget_past,
+    inputs_before,
+    keep_latest,
+    note_inputs,
+    past_of,
+    published,
+    withdraw_inputs,
+)
 from fhaosmo_ros.core.online.gaps import step_over
 from fhaosmo_ros.core.online.memory import EstimatorArrays, Policy
 from fhaosmo_ros.core.online.outliers import has_diverged, is_stuck
@@ -29,7 +39,7 @@ from fhaosmo_ros.core.online.stamps import clock_time, difference, forget, refre
 
 
 @compiled(inline='always')
-def take(e: EstimatorArrays, stamp: int, y: float, u: float, eps: Floats, row: int) -> int:
+def take(e: EstimatorArrays, stamp: int, y: float, u: Floats, eps: Floats, row: int) -> int:
     """
     Take one sample.
 
@@ -38,8 +48,10 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: float, eps: Floats, row: i
     e : EstimatorArrays
     stamp : int
         Nanoseconds.
-    y, u : float
-        Sample, any number, and known input, finite.
+    y : float
+        Sample, any number.
+    u : (m,) array
+        Known inputs, finite.
     eps : (rows, N) array
         Row `row` gets the innovations.
 
@@ -72,8 +84,20 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: float, eps: Floats, row: i
         if 0 < elapsed <= ints[at.MAX_GAP]:
             ints[at.HELD] = 0
         else:
+            latest = ints[at.LATEST]
             elapsed, word = settle(e, now, elapsed, y, eps, row)
-    if elapsed > 0:
+            if word & RESTARTED:
+                forget_past(policy, state)
+            elif elapsed > 0 and ints[at.LAG] > 0:  # a gap was withdrawn
+                withdraw_inputs(past_of(policy, state), latest - ints[at.LATEST], u.shape[0])
+    if elapsed > 0 and ints[at.LAG] > 0:
+        past = past_of(policy, state)
+        note_inputs(past, elapsed, u)
+        acting = inputs_before(past, ints[at.LAG], elapsed, u)
+        word |= step_over(e, elapsed, y, acting, eps, row)
+        if word & REJECTED_SPIKE:
+            withdraw_inputs(past, elapsed, u.shape[0])
+    elif elapsed > 0:
         word |= step_over(e, elapsed, y, u, eps, row)
     elif not word & REJECTED:  # first sample, or first after a restart
         word |= start(law, state, y, eps, row)
@@ -94,6 +118,8 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: float, eps: Floats, row: i
     if not word & REJECTED:
         ints[at.ACCEPTED] += 1
         ints[at.VALID] = 1
+        if ints[at.DELAY] > 0:
+            keep_latest(policy, state, u)
         ints[at.STAMP] = stamp if ints[at.NOMINAL] else now
     elif word & REJECTED_STEP:
         ints[at.REJECTED_STEPS] += 1
@@ -107,7 +133,7 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: float, eps: Floats, row: i
 def take_once(
     stamp: int,
     y: float,
-    u: float,
+    u: Floats,
     eps: Floats,
     ints: Ints,
     reals: Floats,
@@ -133,13 +159,23 @@ def take_once(
     law = Law(flags, gains, curves, scalars, chances, Bytecode(code, offsets))
     work, state, policy = Work(x, stack, stages), State(levels, memory), Policy(ints, reals)
     e = unowned(EstimatorArrays(law, work, state, policy))
-    return take(e, stamp, y, u, unowned(eps), 0)
+    return take(e, stamp, y, unowned(u), unowned(eps), 0)
 
 
 @compiled()
-def run(e: EstimatorArrays, stamps: Ints, y: Floats, u: Floats, record: Record) -> None:
-    """Take K samples; row k of the record is the estimate after the k-th."""
-    e, eps = unowned(e), unowned(record.eps)
+def run(
+    e: EstimatorArrays, stamps: Ints, y: Floats, u: Floats, record: Record, present: Floats
+) -> None:
+    """
+    Take K samples; row k of the record is the estimate after the k-th.
+
+    Parameters
+    ----------
+    present : (K, n + 1) or (0, n + 1) array
+        Gets z and d as they are published, if there is room for them.
+
+    """
+    e, u, eps = unowned(e), unowned(u), unowned(record.eps)
     levels, memory = e.state.levels, e.state.memory
     for k in range(y.shape[0]):
         record.words[k] = take(e, stamps[k], y[k], u[k], eps, k)
@@ -147,3 +183,5 @@ def run(e: EstimatorArrays, stamps: Ints, y: Floats, u: Floats, record: Record) 
             record.levels[k, HAT, i] = levels[HAT, i]
             record.levels[k, TILDE, i] = levels[TILDE, i]
         record.gamma[k] = memory[GAMMA]
+        if present.shape[0] > 0:
+            published(e, e.policy.ints[at.FILTERED], present[k])

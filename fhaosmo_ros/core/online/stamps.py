@@ -7,6 +7,7 @@ from fhaosmo_ros.core.observer.arrays import GAMMA, State
 from fhaosmo_ros.core.observer.status import HELD, REJECTED_PERIOD, RESTARTED
 from fhaosmo_ros.core.observer.step import start
 from fhaosmo_ros.core.online import memory as at
+from fhaosmo_ros.core.online.delay import forget_past
 from fhaosmo_ros.core.online.memory import EstimatorArrays, Policy
 
 WINDOW = 32
@@ -165,6 +166,7 @@ def refresh(policy: Policy, state: State) -> None:
 def forget_samples(policy: Policy, state: State) -> None:
     """Start afresh: the next sample is the first. Counters go on."""
     refresh(policy, state)
+    forget_past(policy, state)
     policy.ints[at.VALID] = 0
     policy.ints[at.TICK_COUNT] = policy.ints[at.SPACING] = 0
 

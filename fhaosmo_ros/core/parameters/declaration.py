@@ -2,9 +2,10 @@
 """What a parameter is: declared once, checked everywhere by the same rules."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import difflib
 import math
+import re
 from typing import Any, TypeAlias
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -22,6 +23,9 @@ KINDS = {
     'string_array': 'a list of strings',
 }
 
+ANY_NAME = '.NAME'
+"""End of the name of a declaration that stands for any number of parameters."""
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -31,7 +35,8 @@ class Parameter:
     Attributes
     ----------
     name : str
-        Name in YAML, on the command line and in ROS.
+        Name in YAML, on the command line and in ROS. One that ends in .NAME stands for any number
+        of parameters that users name, each a letter, then letters, digits and _.
     default : Value
         Its type decides the parameter's type.
     text : str
@@ -183,10 +188,29 @@ class ParameterTable(Mapping[str, Parameter]):
     """Parameters by name, in the order in which they are declared."""
 
     def __init__(self, *groups: Iterable[Parameter]) -> None:
-        self._by_name = {p.name: p for group in groups for p in group}
+        declared = [p for group in groups for p in group]
+        self._by_name = {p.name: p for p in declared if not p.name.endswith(ANY_NAME)}
+        self._families = {
+            p.name.removesuffix(ANY_NAME): p for p in declared if p.name.endswith(ANY_NAME)
+        }
 
     def __getitem__(self, name: str) -> Parameter:
-        return self._by_name[name]
+        family = self._families.get(name.rpartition('.')[0]) if '.' in name else None
+        if family is None or name in self._by_name:
+            return self._by_name[name]
+        if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name.rpartition('.')[2]):
+            raise KeyError(name)
+        return replace(family, name=name)
+
+    @property
+    def families(self) -> tuple[Parameter, ...]:
+        """Declarations of parameters that users name; iteration leaves them out."""
+        return tuple(self._families.values())
+
+    def part_of(self, values: 'Mapping[str, Any]') -> dict[str, Any]:
+        """Return those of `values` that this table declares, in its order."""
+        declared = {name: values[name] for name in self if name in values}
+        return declared | {name: values[name] for name in values if name in self}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._by_name)
@@ -217,7 +241,7 @@ class ParameterTable(Mapping[str, Parameter]):
         if isinstance(values, Parameters):
             if values.table is self:
                 return values
-            return Parameters(self, {name: values[name] for name in self if name in values})
+            return Parameters(self, self.part_of(values))
         return Parameters(self, self.coerce(values or {}))
 
     def coerce(self, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -232,7 +256,7 @@ class ParameterTable(Mapping[str, Parameter]):
         """
         for name in values:
             if name not in self:
-                raise unknown_parameter(name, self)
+                raise unknown_parameter(name, [*self, *(p.name for p in self.families)])
         return {name: self[name].coerce(value) for name, value in values.items()}
 
 
@@ -298,6 +322,9 @@ class Parameters(Mapping[str, Any]):
 
         """
         parameters = self.changed(changes)
+        for name in parameters:
+            if name not in self:
+                raise unknown_parameter(name, self)
         for name, value in self.items():
             if not self.table[name].live and parameters[name] != value:
                 raise ConfigurationError(

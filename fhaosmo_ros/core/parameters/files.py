@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS 2 parameter files, read, checked and written without ROS."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import difflib
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, TypeVar
 
 from fhaosmo_ros.core.parameters.declaration import (
     Parameters,
@@ -15,10 +15,18 @@ from fhaosmo_ros.core.parameters.declaration import (
     unknown_parameter,
 )
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.per_channel import channel_names, CHANNELS, with_channels
+from fhaosmo_ros.core.parameters.per_channel import (
+    channel_names,
+    CHANNELS,
+    of_channel,
+    UNNAMED,
+    with_channels,
+)
 from fhaosmo_ros.core.parameters.tables import NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import MAX_LENGTH, parse
 import yaml
+
+Made = TypeVar('Made')
 
 BUILT_IN = ('use_sim_time', 'start_type_description_service')
 """Parameters that rclpy declares itself."""
@@ -141,9 +149,10 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
     if CHANNELS in table:
         table = with_channels(table, names)
     tables = [table, *(with_channels(other, names) for other in NODE_TABLES.values())]
-    everybody = dict.fromkeys(name for other in tables for name in other)
     for name in values:
-        if name not in everybody and not is_built_in(name):
+        if not any(name in other for other in tables) and not is_built_in(name):
+            families = (p.name for p in table.families)
+            everybody = dict.fromkeys([*(n for other in tables for n in other), *families])
             raise unknown_parameter(name, everybody)
     return {
         name: list(names) if name == CHANNELS else table[name].coerce(value)
@@ -173,6 +182,40 @@ def complete(values: Mapping[str, Any], table: ParameterTable) -> Parameters:
     """
     checked = select(values, table)
     return Parameters(with_channels(table, checked.get(CHANNELS, []), checked), checked)
+
+
+def make_from_file(
+    make: Callable[[Parameters], Made], path: str | Path, node: str, channel: str
+) -> Made:
+    """
+    Return what `make` makes of the parameters that a file sets for a channel of an estimator.
+
+    Parameters
+    ----------
+    make : callable
+        Takes those of `ESTIMATOR_PARAMETERS`, complete.
+    path : path
+    node : str
+        Full or last part of the node's name.
+    channel : str
+        Name of the channel; '' for a node with a single one.
+
+    Raises
+    ------
+    ConfigurationError
+        As `load` and `make`, no section of the node, or a channel that it does not have.
+
+    """
+    table = NODE_TABLES['estimator']
+    values = load(path, node, table, strict=True)
+    try:
+        names = channel_names(values)
+        if channel not in names:
+            allowed = 'none (the node has one)' if names == UNNAMED else ' or '.join(names)
+            raise ConfigurationError(f'channel: expected {allowed}, got {channel or "none"}')
+        return make(Parameters(table, table.part_of(of_channel(values, channel))))
+    except ConfigurationError as error:
+        raise ConfigurationError(f'{path}: {error}') from None
 
 
 def with_origin(

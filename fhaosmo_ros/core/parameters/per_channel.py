@@ -12,13 +12,23 @@ import re
 from typing import Any, overload
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, ParameterTable
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import (
+    CONSTANTS,
+    ESTIMATOR_PARAMETERS,
+    ONLINE_PARAMETERS,
+)
 
 CHANNELS = 'channels'
 UNNAMED = ['']
 """The default: one channel, whose topics and parameters have no prefix."""
 NAME = re.compile(r'[A-Za-z](_?[A-Za-z0-9])*')
 """What is valid between two slashes of a topic and in the name of a parameter."""
+
+
+def split(name: str) -> tuple[str, str]:
+    """Return the channel that a parameter's name begins with ('' for none), and the rest."""
+    channel, dot, own = name.partition('.')
+    return (channel, own) if dot and channel + dot != CONSTANTS else ('', name)
 
 
 def channel_names(values: Mapping[str, Any]) -> list[str]:
@@ -38,7 +48,7 @@ def channel_names(values: Mapping[str, Any]) -> list[str]:
     for name in names:
         if not NAME.fullmatch(name):
             raise declared.error(names, 'names of letters, digits and single _ between them')
-        if name in ESTIMATOR_PARAMETERS:
+        if name in ESTIMATOR_PARAMETERS or f'{name}.' == CONSTANTS:
             raise declared.error(names, f"names that no parameter has (there is one '{name}')")
     if len(set(names)) < len(names):
         raise declared.error(names, 'every name once')
@@ -62,14 +72,18 @@ def with_channels(
 
     """
     values = values or {}
+    declared = ParameterTable(table.values(), ONLINE_PARAMETERS.families)
     common = [p for p in table.values() if p.name in ONLINE_PARAMETERS]
+    common += [declared[name] for name in values if name.startswith(CONSTANTS)]
+    common += declared.families
     own = [
         replace(p, name=f'{name}.{p.name}', default=values.get(p.name, p.default))
         for name in names
         if name
         for p in common
     ]
-    return ParameterTable(table.values(), own)
+    families = table.families if isinstance(table, ParameterTable) else ()
+    return ParameterTable(table.values(), families, own)
 
 
 @overload
@@ -87,9 +101,8 @@ def of_channel(values: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     Complete `Parameters` of a node give the complete `Parameters` of a channel, which are not
     checked again. Of other values, those that are absent stay absent.
     """
-    common = {key: value for key, value in values.items() if '.' not in key}
-    start = f'{name}.'
-    own = {k.removeprefix(start): v for k, v in values.items() if name and k.startswith(start)}
+    common = {key: value for key, value in values.items() if not split(key)[0]}
+    own = {split(k)[1]: v for k, v in values.items() if name and split(k)[0] == name}
     if isinstance(values, Parameters):
         return Parameters(ESTIMATOR_PARAMETERS, common | own)
     return common | own
@@ -100,7 +113,7 @@ def differing(values: Parameters) -> dict[str, Any]:
     return {
         name: value
         for name, value in values.items()
-        if '.' not in name or value != values[name.rpartition('.')[2]]
+        if not split(name)[0] or value != values.get(split(name)[1])
     }
 
 

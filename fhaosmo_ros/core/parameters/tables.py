@@ -8,6 +8,8 @@ YAML checks, ROS descriptors, docs/parameters.md and error messages derive from 
 from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
 
 MAX_ORDER = 12
+CONSTANTS = 'constants.'
+"""Begin of the names of constants in expressions."""
 PER_LEVEL = '1 (used for every level) or one a level'
 
 MODEL = (
@@ -18,9 +20,21 @@ MODEL = (
     Parameter(
         'phi', ['0', '0', '-z3'],
         "The functions Phi_1 .. Phi_n of z_i' = z_{i+1} + Phi_i. Phi_i may use z1 .. zi, the "
-        'known input u, numbers, + - * / **, sin cos tan exp log sqrt abs tanh sign; at most 100 '
-        'operations, 30 of them functions.',
+        'known inputs, the constants, numbers, pi, + - * / **, sin cos tan exp log sqrt abs tanh '
+        'sign atan2 min max; at most 100 operations, 30 of them functions.',
         live=False, lengths='n (order)',
+    ),
+    Parameter(
+        'inputs', ['u'],
+        'Names of the known inputs that Phi may use, such as [u1, u2] or [torque]; letters, '
+        'digits and _. The order is that of their columns where u is an array.',
+        live=False, lengths='any',
+    ),
+    Parameter(
+        'constants.NAME', 0.0,
+        'The constant NAME that Phi may use, one parameter for each: constants: {m: 1.3, b: 0.4} '
+        'in a file sets two.',
+        lower=-1e100, upper=1e100,
     ),
 )  # fmt: skip
 
@@ -249,6 +263,23 @@ SAMPLING = (
         'A sample of larger magnitude is rejected, and an observer with a larger state starts '
         'afresh from y.',
         lower=1.0, upper=1e100,
+    ),
+    Parameter(
+        'measurement_delay', 0.0,
+        'How long before its stamp y was measured: a sample, and the estimate after it, tell of '
+        'the time stamp - measurement_delay.',
+        unit='s', lower=0.0, upper=10.0, live=False,
+    ),
+    Parameter(
+        'input_delay', 0.0,
+        'The same of the known inputs, at most measurement_delay: 0 for a command that acts at '
+        'once, measurement_delay for a measured one that comes in the message of y.',
+        unit='s', lower=0.0, upper=10.0, live=False,
+    ),
+    Parameter(
+        'predict_to_now', False,
+        'Carry what is published over measurement_delay by the model, with the known inputs since '
+        'then and the present d (which follows unknown_input_decay and _derivatives).',
     ),
 )  # fmt: skip
 

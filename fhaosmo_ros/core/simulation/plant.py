@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Bytecode, Floats
+from fhaosmo_ros.core.model.inputs import known_inputs, known_inputs_of_run
 from fhaosmo_ros.core.model.integrate import (
     begin_step,
     CLASSICAL,
@@ -79,7 +80,7 @@ def make_system(model: TriangularModel, kind: int, wave: Floats) -> System:
 
 
 @compiled()
-def integrate_step(system: System, z: Floats, t: float, h: float, u: float) -> None:
+def integrate_step(system: System, z: Floats, t: float, h: float, u: Floats) -> None:
     """Take one step of P triangular by the classical Runge-Kutta method, in place."""
     stages, n = system.stages, z.shape[0]
     for i in range(n):
@@ -95,7 +96,7 @@ def integrate_step(system: System, z: Floats, t: float, h: float, u: float) -> N
 
 @compiled()
 def _advance(
-    system: System, z: Floats, at: Floats, step: int, t: float, h: float, u: float
+    system: System, z: Floats, at: Floats, step: int, t: float, h: float, u: Floats
 ) -> int:
     """
     Bring the grid state `z` (at time step * h) up to `t`, and `at` to `t` itself.
@@ -155,7 +156,7 @@ class Plant:
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
         p = self._parameters = PLANT_PARAMETERS.complete(parameters)
-        self._model = TriangularModel(p['phi'], p['order'])
+        self._model = TriangularModel.of(p)
         n = self._model.order
         self._h = float(p['integration_step'])
         self._z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], n)
@@ -175,8 +176,13 @@ class Plant:
         return self._model.order
 
     @property
+    def model(self) -> TriangularModel:
+        """Phi, and the names of the known inputs."""
+        return self._model
+
+    @property
     def uses_input(self) -> bool:
-        """True if the model uses the known input u."""
+        """True if the model uses a known input."""
         return self._model.uses_input
 
     def configure(self, changes: Mapping[str, Any]) -> None:
@@ -195,30 +201,40 @@ class Plant:
 
     def prepare(self, changes: Mapping[str, Any]) -> Parameters:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
-        return self._parameters.changed_live(changes, 'plant')
+        parameters = self._parameters.changed_live(changes, 'plant')
+        TriangularModel.of(parameters)  # raises where it can't be used with other constants
+        return parameters
 
     def adopt(self, parameters: Parameters) -> None:
         """Go on with parameters that `prepare` has returned."""
         self._parameters = parameters
+        self._model = TriangularModel.of(parameters)
         self._system = self._make_system()
 
     def _make_system(self) -> System:
         return make_system(self._model, *unknown_input(self._parameters))
 
-    def advance(self, t: float, u: float = 0.0) -> None:
+    def advance(self, t: float, u: ArrayLike = 0.0) -> None:
         """
-        Integrate up to the time `t` (s since the start), with the known input `u` held.
+        Integrate up to the time `t` (s since the start), with known inputs held.
+
+        Parameters
+        ----------
+        t : float
+        u : number or (m,) array
+            Known inputs.
 
         Raises
         ------
         ConfigurationError
-            A time that is not finite.
+            A time that is not finite, or another number of inputs.
 
         """
         if not math.isfinite(t):
             raise ConfigurationError(f'plant: expected a finite time, got {t}')
+        inputs = known_inputs(u, self._model.inputs)
         self._step = _advance(
-            self._system, self._z, self._at, self._step, float(t), self._h, float(u)
+            self._system, self._z, self._at, self._step, float(t), self._h, inputs
         )
 
     @property
@@ -226,7 +242,7 @@ class Plant:
         """False once the states have left the finite numbers."""
         return bool(np.isfinite(self._at).all())
 
-    def sample(self, t: float, u: float = 0.0) -> Truth:
+    def sample(self, t: float, u: ArrayLike = 0.0) -> Truth:
         """Advance to `t` and measure: y = z_1 + noise, quantised."""
         self.advance(t, u)
         d = disturbance(self._system.kind, self._system.wave, float(t))
@@ -240,8 +256,8 @@ class Plant:
         ----------
         t : (K,) array
             Times since the start, in seconds, not decreasing.
-        u : (K,) array or float
-            Known input during the interval that ends at each time.
+        u : number, (K,) or (K, m) array
+            Known input, or known inputs, during the interval that ends at each time.
 
         Returns
         -------
@@ -251,13 +267,13 @@ class Plant:
         Raises
         ------
         ConfigurationError
-            A time that is not finite.
+            A time that is not finite, or u of another shape.
 
         """
         t = np.ascontiguousarray(t, dtype=np.float64)
         if not np.all(np.isfinite(t)):
             raise ConfigurationError('plant: expected finite times, got some that are not')
-        u = np.ascontiguousarray(np.broadcast_to(np.asarray(u, dtype=np.float64), t.shape))
+        u = known_inputs_of_run(u, len(t), self._model.inputs)
         z = np.empty((len(t), self.order))
         self._step = _simulate(self._system, self._z, self._step, t, self._h, u, z)
         d = disturbances(self._system.kind, self._system.wave, t)
@@ -314,15 +330,15 @@ def respond(
         d at 0, spacing, 2 spacing, ...; linear in between, constant behind the end. M >= 2.
     spacing : float
         Seconds.
-    u : (K,) array or float
-        Known input, held during the interval that ends at each time.
+    u : number, (K,) or (K, m) array
+        Known input, or known inputs, held during the interval that ends at each time.
     step : float
         Longest step in seconds; each interval is divided evenly.
 
     """
     t = np.ascontiguousarray(t, dtype=np.float64)
     wave = np.concatenate([[spacing], np.asarray(table, dtype=np.float64)])
-    u = np.ascontiguousarray(np.broadcast_to(np.asarray(u, dtype=np.float64), t.shape))
+    u = known_inputs_of_run(u, len(t), model.inputs)
     z = np.array(np.broadcast_to(initial_state, model.order), dtype=np.float64)
     states = np.empty((len(t), model.order))
     _respond(make_system(model, SAMPLED, wave), z, t, step, u, states)

@@ -83,12 +83,13 @@ class _Joint(NamedTuple):
     """
     Plant and observer; the state is z, then the levels row by row, then gamma.
 
-    The observer's model need not be the plant's. Its scheme is not used.
+    The observer's model need not be the plant's. Its scheme is not used. Known inputs u are 0.
     """
 
     plant: System
     law: Law
     work: Work
+    u: Floats
 
 
 @compiled(forceinline=True)
@@ -111,13 +112,13 @@ def rates(joint: _Joint, state: Floats, slopes: Floats, t: float, wait: float) -
         L.
 
     """
-    plant, law, work = joint
+    plant, law, work, u = joint
     c, x = law.scalars, work.x
     n, levels = plant.stages.shape[2], x.shape[1]
     for i in range(n):
         plant.stages[POINT, 0, i] = state[i]
     d = disturbance(plant.kind, plant.wave, t)
-    triangular_rates(plant.model, d, 0.0, plant.stack, plant.stages)
+    triangular_rates(plant.model, d, u, plant.stack, plant.stages)
     for i in range(n):
         slopes[i] = plant.stages[SLOPE, 0, i]
     for r in range(ROWS):
@@ -126,9 +127,9 @@ def rates(joint: _Joint, state: Floats, slopes: Floats, t: float, wait: float) -
     gamma, upset = state[n + ROWS * levels], is_upset(law, x, state[0])
     # A forward Euler step of length 1 moves the state by its rate.
     if law.flags[LEVANT]:
-        loss, gradient = levant.explicit(law, work, gamma, state[0], 1.0, 0.0)
+        loss, gradient = levant.explicit(law, work, gamma, state[0], 1.0, u)
     else:
-        loss, gradient = cascade.explicit(law, work, gamma, state[0], 1.0, 0.0)
+        loss, gradient = cascade.explicit(law, work, gamma, state[0], 1.0, u)
     for r in range(ROWS):
         for i in range(levels):
             k = n + r * levels + i
@@ -228,18 +229,19 @@ def simulate(
         raise ConfigurationError(f'every: expected an integer >= 1, got {every}')
     configuration = ObserverConfiguration(observer)
     p = PLANT_PARAMETERS.complete(plant)
-    model = TriangularModel(p['phi'], p['order'])
+    model = TriangularModel.of(p)
     z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], model.order)
     levels = configuration.initial_state().levels[:ROWS]
     if configuration.parameters['start_from_measurement']:
         levels[HAT, 0] = z[0]
     system = make_system(model, *unknown_input(p))
+    inputs = max(len(model.inputs), len(configuration.model.inputs))
     law, depth = configuration.law, max(model.depth, configuration.model.depth)
     state = np.concatenate([z, levels.ravel(), [configuration.gamma_initial]])
     stages = np.zeros((4, 1, len(state)))
     stages[NOW, 0] = state
     rows = np.empty((round(duration / step) // every + 1, len(state)))
-    joint = _Joint(system, law, make_work(law, depth))
+    joint = _Joint(system, law, make_work(law, depth), np.zeros(inputs))
     integrate(joint, SOLVERS[solver], stages, step, every, rows)
     t = np.arange(len(rows), dtype=np.float64) * (every * step)
     n = model.order

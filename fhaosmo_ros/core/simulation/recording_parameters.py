@@ -2,7 +2,7 @@
 """Parameters of a family of recordings, declared once; see recordings.py."""
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
-from fhaosmo_ros.core.parameters.tables import MODEL, PLANT_NODE_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import MODEL, ONLINE_PARAMETERS, PLANT_NODE_PARAMETERS
 
 SHAPES = ('sines', 'steps', 'chirp')
 
@@ -14,6 +14,8 @@ SHARED = tuple(
     )
 )  # fmt: skip
 """A plant's YAML describes these for its family, too."""
+SENSOR = (ONLINE_PARAMETERS['measurement_delay'],)
+"""An estimator's YAML describes this."""
 
 FAMILY = (
     Parameter(
@@ -72,4 +74,4 @@ FAMILY = (
     ),
 )  # fmt: skip
 
-FAMILY_PARAMETERS = ParameterTable(MODEL, SHARED, FAMILY)
+FAMILY_PARAMETERS = ParameterTable(MODEL, SENSOR, SHARED, FAMILY)

@@ -39,8 +39,10 @@ class Recording(NamedTuple):
     ----------
     t : (K,) array
         Stamps in seconds, increasing.
-    y, u : (K,) arrays
-        Measured output; known input of the interval that ends at each sample.
+    y : (K,) array
+        Measured output.
+    u : (K,) or (K, m) array
+        Known input, or known inputs, of the interval that ends at each sample.
     z : (K, n) array
     d : (K,) array
     shape : str
@@ -75,7 +77,7 @@ class Family:
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
         self.parameters: dict[str, Any] = dict(FAMILY_PARAMETERS.complete(parameters))
         p = self.parameters
-        self.model = TriangularModel(p['phi'], p['order'])
+        self.model = TriangularModel.of(p)
         self._start = per_level(
             PLANT_PARAMETERS['initial_state'], p['initial_state'], self.model.order
         )
@@ -106,16 +108,25 @@ class Family:
         spacing = p['integration_step']
         grid = np.arange(int(np.ceil(true_t[-1] / spacing)) + 2) * spacing
         table = p['rms_of_d'] * self._wave(shape, grid, random)
-        u = np.zeros(len(t))
-        if self.model.uses_input:
-            u = p['rms_of_u'] * self._wave('sines', true_t, random)
-        z, d = respond(self.model, self._start, true_t, table, spacing, u, spacing)
+        u = np.zeros((len(t), len(self.model.inputs)))
+        for k, name in enumerate(self.model.inputs):
+            if name in self.model.used_inputs:
+                u[:, k] = p['rms_of_u'] * self._wave('sines', true_t, random)
+        if u.shape[1] == 1:
+            u = u[:, 0]
+        delay = p['measurement_delay']
+        moments = np.sort(np.concatenate([true_t, np.maximum(true_t - delay, 0.0)]))
+        moments = moments if delay > 0.0 else true_t
+        acting = u[np.searchsorted(true_t, moments)]
+        z, d = respond(self.model, self._start, moments, table, spacing, acting, spacing)
+        measured = z[np.searchsorted(moments, np.maximum(true_t - delay, 0.0)), 0]
+        z, d = (values[np.searchsorted(moments, true_t)] for values in (z, d))
         if not np.isfinite(z).all():
             raise ConfigurationError(
                 f'plant: expected states that stay finite for {p["duration"]:g} s under d with '
                 f'an RMS of {p["rms_of_d"]:g}, got infinite ones (recording {number})'
             )
-        y = z[:, 0] + p['noise_std'] * random.standard_normal(len(t))
+        y = measured + p['noise_std'] * random.standard_normal(len(t))
         if p['outliers'] > 0.0:
             hit = random.uniform(size=len(t)) < p['outliers']
             y[hit] += p['outlier_std'] * random.standard_normal(np.count_nonzero(hit))

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.compiled.unowned_arrays import unowned
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
-from fhaosmo_ros.core.observer import arrays
-from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.model.inputs import known_inputs_of_run
+from fhaosmo_ros.core.online.delay import published
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.memory import EstimatorArrays
 from fhaosmo_ros.core.online.policy import take
@@ -40,8 +40,10 @@ class Truth(NamedTuple):
 
     Attributes
     ----------
-    stamps, y, u : (K,) arrays
-        Samples (ns) and known input.
+    stamps, y : (K,) arrays
+        Samples (ns).
+    u : (K, m) array
+        Known inputs.
     truth : (K, n + 1) array
         z_1 .. z_n and d.
     begins : (R + 1,) array
@@ -62,14 +64,11 @@ class Rules(NamedTuple):
 
     Attributes
     ----------
-    pick : (2, n + 1) array
-        Places of the estimates in the flattened levels, for each of CHOICES.
     settled, band : float
         See `Trial`.
 
     """
 
-    pick: Ints
     settled: float
     band: float
 
@@ -106,22 +105,21 @@ class _Sums(NamedTuple):
 def _judge(e: EstimatorArrays, recordings: Truth, rules: Rules, sums: _Sums, eps: Floats) -> None:
     """Run through all recordings and add up."""
     e, recordings, eps = unowned(e), unowned(recordings), unowned(eps)
-    stamps, levels, count = recordings.stamps, e.state.levels, recordings.truth.shape[1]
-    n, last = levels.shape[1], np.empty(2)
+    stamps, count = recordings.stamps, recordings.truth.shape[1]
+    u, last, values = unowned(recordings.u), np.empty(2), np.empty(count)
     for r in range(recordings.begins.shape[0] - 1):
         begin = recordings.begins[r]
         forget_samples(e.policy, e.state)
         for k in range(begin, recordings.begins[r + 1]):
-            take(e, stamps[k], recordings.y[k], recordings.u[k], eps, 0)
+            take(e, stamps[k], recordings.y[k], u[k], eps, 0)
             time = (stamps[k] - stamps[begin]) * NANOSECONDS
             late = time >= rules.settled
             for choice in range(2):
-                value = 0.0
+                published(e, choice, values)
+                value = values[count - 1]
                 for j in range(count):
-                    index = rules.pick[choice, j]
-                    value = levels[index // n, index % n]
                     if late:
-                        wrong = value - recordings.truth[k, j]
+                        wrong = values[j] - recordings.truth[k, j]
                         sums.squares[r, choice, j] += wrong * wrong
                 if late:
                     if k > begin and last[choice] == last[choice]:
@@ -185,7 +183,9 @@ class Trial:
                 )
         if not self.recordings:
             raise ConfigurationError('trial: expected at least one recording, got none')
-        samples = [_as_samples(recording) for recording in self.recordings]
+        p = self._fixed
+        behind = 0.0 if p['predict_to_now'] else p['measurement_delay']
+        samples = [_as_samples(r, observer.inputs, behind) for r in self.recordings]
         stamps, y, u, truth = (np.concatenate(part) for part in zip(*samples, strict=True))
         self.truth = truth
         begins = np.cumsum([0, *(len(r.t) for r in self.recordings)])
@@ -197,14 +197,7 @@ class Trial:
         )
         squares = np.square(self.truth[np.concatenate(late)])
         self.scale = np.sqrt(squares.mean(axis=0))
-        size = arrays.ROWS * observer.levels
-        places = np.arange(size).reshape(arrays.ROWS, observer.levels)
-        pick = np.array([self._places(choice, places) for choice in CHOICES])
-        self._rules = Rules(pick, float(settled), float(band))
-
-    def _places(self, choice: str, places: NDArray[np.int64]) -> list[int]:
-        z, d = Observer(self._fixed.changed({'estimate_from': choice})).select(places)
-        return [*z.tolist(), int(d)]
+        self._rules = Rules(float(settled), float(band))
 
     def __call__(self, changes: Mapping[str, Any]) -> Scores:
         """
@@ -225,7 +218,13 @@ class Trial:
         return Scores(error, sums.extra[:, :, TRANSIENT], sums.extra[:, :, VARIATION])
 
 
-def _as_samples(r: Recording) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
-    """Return stamps, y, u and truth of a recording."""
+def _as_samples(
+    r: Recording, inputs: Sequence[str], behind: float
+) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
+    """Return stamps, y, u of a recording, and the truth `behind` seconds before each sample."""
     stamps = FIRST_STAMP + np.round((r.t - r.t[0]) / NANOSECONDS).astype(np.int64)
-    return stamps, r.y, r.u, np.column_stack([r.z, r.d])
+    u = known_inputs_of_run(r.u, len(r.t), inputs)
+    truth = np.column_stack([r.z, r.d])
+    if behind > 0.0:
+        truth = np.column_stack([np.interp(r.t - behind, r.t, column) for column in truth.T])
+    return stamps, r.y, u, truth

@@ -2,7 +2,7 @@
 """One channel of an estimator node: y (and u) in, one observer, estimates out on a timer."""
 
 from collections.abc import Mapping
-from copy import deepcopy
+from functools import partial
 from time import perf_counter, time_ns
 from typing import Any, NamedTuple
 
@@ -22,6 +22,8 @@ from std_srvs.srv import SetBool, Trigger
 
 TOLD = REJECTED | int(Status.RESTARTED | Status.DIVERGED)
 """Flags of a step that are logged."""
+QUIET = 5.0
+"""Seconds between two warnings of one kind."""
 
 
 class ChannelChange(NamedTuple):
@@ -33,7 +35,7 @@ class ChannelChange(NamedTuple):
 
 class Channel:
     """
-    Subscribes ``y`` (and ``u``), steps the observer on each sample, publishes on a timer.
+    Subscribes ``y`` and the known inputs, steps the observer on each sample, publishes on a timer.
 
     A new channel is inactive: its topics and services exist, but samples are dropped and nothing
     is published.
@@ -68,7 +70,6 @@ class Channel:
         self._clock = node.get_clock()
         self._logger = node.get_logger()
         self.estimator = estimator
-        self._compile()
         self._values = values
         self._clock_stamps = values['sampling'] == 'clock'
         self._timer: Any = None
@@ -81,10 +82,12 @@ class Channel:
         qos = input_qos(values)
         self._y = subscribe_with_info(node, Float64, inputs + 'y', self._on_sample, qos, raw=True)
         subscriptions = [self._y]
-        if observer.uses_input:
-            subscriptions.append(
-                subscribe_with_info(node, Float64, inputs + 'u', self._on_input, qos, raw=True)
-            )
+        for index, name in enumerate(observer.inputs):
+            if name in observer.used_inputs:
+                take = partial(self._on_input, index, name)
+                subscriptions.append(
+                    subscribe_with_info(node, Float64, inputs + name, take, qos, raw=True)
+                )
         services = [
             node.create_service(Trigger, outputs + 'reset', self.reset),
             node.create_service(SetBool, outputs + 'freeze', self.freeze),
@@ -150,22 +153,17 @@ class Channel:
         publishers, *of_input = [watch.look() for watch in self._watches]
         self._mixed = len(publishers.heard) > 1
         reports = self._health.reports(self._y.topic_name, publishers, self._stale, self._name)
-        for found in of_input:
-            for text in found.unheard.values() or ([] if found.heard else ['no publisher of u']):
+        names = self.estimator.observer.used_inputs
+        for name, found in zip(names, of_input, strict=True):
+            missing = [] if found.heard else [f'no publisher of {name}']
+            for text in found.unheard.values() or missing:
                 reports[0].find(WARN, text)
         return reports
-
-    def _compile(self) -> None:
-        """
-        Compile before the first sample arrives, or load what an earlier start has compiled.
-
-        A copy takes the sample, so that the estimator remains as new, its counters too.
-        """
-        deepcopy(self.estimator).advance(1, 0.0)
 
     def _forget(self) -> None:
         self._arrived = False
         self._stale = True
+        self._quiet_until: dict[int, float] = {}
         self._silent_since: int | None = None
         self._sequence = 0
         self._mixed = False
@@ -223,20 +221,24 @@ class Channel:
         if word & Status.RESTARTED:
             self._logger.warning(
                 'the stamps jumped by more than max_gap, ahead or back: restarted from the new one'
-                f' ({counters.restarts_forward + counters.restarts_backward} restarts so far)',
-                throttle_duration_sec=5.0,
+                f' ({counters.restarts_forward + counters.restarts_backward} restarts so far); '
+                'where y always comes so slowly, set max_gap to several of its periods',
+                throttle_duration_sec=QUIET,
             )
         if word & Status.DIVERGED:
             self._logger.error(
                 'the observer had lost y and started again from it; its gains do not fit '
                 f'({counters.divergences} divergences so far)',
-                throttle_duration_sec=5.0,
+                throttle_duration_sec=QUIET,
             )
         if word & REJECTED:
-            self._logger.warning(
-                f'rejected a sample: {_reason(word, y)} ({counters.rejected} rejected so far)',
-                throttle_duration_sec=5.0,
-            )
+            flag, reason = _reason(word, y)
+            now = perf_counter()
+            if now >= self._quiet_until.get(flag, 0.0):  # each reason by itself
+                self._quiet_until[flag] = now + QUIET
+                self._logger.warning(
+                    f'rejected a sample: {reason} ({counters.rejected} rejected so far)'
+                )
 
     def _count_lost(self, sequence: int) -> None:
         """Count the samples between the publisher's last sequence number and this one."""
@@ -245,12 +247,12 @@ class Channel:
         elif sequence and self._sequence and not self._mixed:
             self._health.lost += sequence - self._sequence - 1
 
-    def _on_input(self, data: bytes, _: Mapping[str, Any]) -> None:
+    def _on_input(self, index: int, name: str, data: bytes, _: Mapping[str, Any]) -> None:
         u = read_double(data)
-        if not self.estimator.set_input(u):
+        if not self.estimator.set_input(u, index):
             self._logger.warning(
-                f'rejected u = {u}: expected a finite number; the last one is held',
-                throttle_duration_sec=5.0,
+                f'rejected {name} = {u}: expected a finite number; the last one is held',
+                throttle_duration_sec=QUIET,
             )
 
     def _start_timer(self) -> None:
@@ -284,7 +286,8 @@ class Channel:
                 self._stale = True
                 self._logger.warning(
                     f'no usable sample on {self._y.topic_name} for {max_gap:g} s: not '
-                    'publishing until one comes'
+                    'publishing until one comes',
+                    throttle_duration_sec=QUIET,
                 )
         return self._stale
 
@@ -307,15 +310,21 @@ class Channel:
         return response
 
 
-def _reason(word: int, y: float) -> str:
-    if word & Status.HELD:
-        return 'its stamp lies more than max_gap from the one before; the next one decides'
-    if word & Status.REJECTED_PERIOD:
-        return 'expected a stamp later than the one before'
-    if word & Status.REJECTED_SPIKE:
-        return f'y = {y} lies beyond spike_gate'
-    if word & Status.REJECTED_STUCK:
-        return f'y = {y} has not changed for stuck_time'
-    if word & Status.REJECTED_MEASUREMENT:
-        return f'expected a finite y of at most divergence_limit, got {y}'
-    return f'y = {y} would have made the estimate infinite'
+def _reason(word: int, y: float) -> tuple[int, str]:
+    """Return the flag that says why a sample was rejected, and the reason in words."""
+    for flag, text in (
+        (
+            Status.HELD,
+            'its stamp lies more than max_gap from the one before; the next one decides',
+        ),
+        (Status.REJECTED_PERIOD, 'expected a stamp later than the one before'),
+        (Status.REJECTED_SPIKE, f'y = {y} lies beyond spike_gate'),
+        (Status.REJECTED_STUCK, f'y = {y} has not changed for stuck_time'),
+        (
+            Status.REJECTED_MEASUREMENT,
+            f'expected a finite y of at most divergence_limit, got {y}',
+        ),
+    ):
+        if word & flag:
+            return int(flag), text
+    return int(Status.REJECTED_STEP), f'y = {y} would have made the estimate infinite'

@@ -11,7 +11,7 @@ from fhaosmo_ros.core.online.batch import EstimatorBatch
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.per_channel import of_channel
+from fhaosmo_ros.core.parameters.per_channel import of_channel, UNNAMED
 from fhaosmo_ros.nodes.estimator.channel import Channel, ChannelChange
 from fhaosmo_ros.nodes.middleware.diagnostics import Report
 from rclpy.node import Node
@@ -23,7 +23,7 @@ MOST_WAITING = 1000
 
 class Queue:
     """
-    Samples in the order in which they came: channel, stamp, y and the known input of each.
+    Samples in the order in which they came: channel, stamp, y and the known inputs of each.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Queue:
         self.channel: list[int] = []
         self.stamps: list[int] = []
         self.y: list[float] = []
-        self.u: list[float] = []
+        self.u: list[tuple[float, ...]] = []
 
 
 class QueuedChannel(Channel):
@@ -90,12 +90,9 @@ class QueuedChannel(Channel):
         queue.channel.append(self._index)
         queue.stamps.append(stamp)
         queue.y.append(y)
-        queue.u.append(self.estimator.input)
+        queue.u.append(self.estimator.inputs)
         if len(queue.y) >= MOST_WAITING:
             queue.step()
-
-    def _compile(self) -> None:
-        """Do nothing: the group compiles what steps all of its channels."""
 
     def _start_timer(self) -> None:
         """Do nothing: the group's timer serves all of its channels."""
@@ -137,8 +134,6 @@ class ChannelGroup:
             self.destroy()
             raise
         self._together = EstimatorBatch(list(estimators.values()))
-        copy = deepcopy(self._channels[0].estimator)
-        EstimatorBatch([copy]).advance([0], [1], [0.0], [0.0])  # compiles; see Channel._compile
 
     def activate(self) -> None:
         """Take samples and publish from now on."""
@@ -247,6 +242,20 @@ def make_estimators(values: Parameters, names: Iterable[str]) -> dict[str, Onlin
         with naming_channel(name):
             estimators[name] = OnlineEstimator(of_channel(values, name))
     return estimators
+
+
+def load(estimators: Mapping[str, OnlineEstimator]) -> None:
+    """
+    Call the compiled functions that estimators need: it loads or compiles them.
+
+    A copy takes the sample, so that the estimators remain as new, their counters too.
+    """
+    copy = deepcopy(next(iter(estimators.values())))
+    if list(estimators) == UNNAMED:
+        copy.advance(1, 0.0)
+    else:
+        EstimatorBatch([copy]).advance([0], [1], [0.0], [copy.inputs])
+    copy.reset()
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 
 from collections.abc import Collection, Iterable
 
-from fhaosmo_ros.core.parameters.per_channel import followers
+from fhaosmo_ros.core.parameters.per_channel import followers, split
 
 
 class ChannelInheritance:
@@ -21,12 +21,12 @@ class ChannelInheritance:
 
     def __init__(self, channels: list[str], given: Iterable[str]) -> None:
         self._channels = channels
-        self._own = {name for name in given if '.' in name}
+        self._own = {name for name in given if split(name)[0]}
         self._asked: set[str] = set()
 
     def followers(self, names: Collection[str]) -> dict[str, str]:
         """Return the parameters that change along if `names` are set, and what each follows."""
-        self._asked = {name for name in names if '.' in name}
+        self._asked = {name for name in names if split(name)[0]}
         own = self._own | self._asked
         return {
             follower: name for name in names for follower in followers(name, self._channels, own)

@@ -172,6 +172,13 @@ class Health:
             share = sum(bad.values()) / (sum(bad.values()) + news['samples accepted'])
             level = ERROR if share > limits['error_bad_share_above'] else WARN
             report.find(level, ', '.join(f'{key} {n}' for key, n in bad.items()))
+        used, spread = news['samples accepted'], news['spread stamps']
+        if used < 2 * spread:
+            report.find(
+                WARN,
+                f'/clock ticks once for {used / max(1, used - spread):.0f} samples, which makes '
+                "their times inexact: let it tick with each, or do not use sampling 'clock'",
+            )
         for key in ('restarts', 'stuck'):
             if news[key]:
                 report.find(WARN, f'{key} {news[key]}')

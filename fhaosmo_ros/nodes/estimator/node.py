@@ -4,20 +4,24 @@
 from collections.abc import Mapping
 from typing import Any
 
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.per_channel import CHANNELS, UNNAMED
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.nodes.estimator.channel import Channel
-from fhaosmo_ros.nodes.estimator.channel_group import ChannelGroup, make_estimators
+from fhaosmo_ros.nodes.estimator.channel_group import ChannelGroup, load, make_estimators
 from fhaosmo_ros.nodes.estimator.channel_inheritance import ChannelInheritance
-from fhaosmo_ros.nodes.estimator.outputs import check_overrides
 from fhaosmo_ros.nodes.estimator.parameter_topic import ParameterTopic
-from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, ERROR, OK, Report, STALE
+from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
+from fhaosmo_ros.nodes.middleware.loading import Loading
 from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
+from fhaosmo_ros.nodes.middleware.publishers import check_overrides
+from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
 from fhaosmo_ros.nodes.middleware.spin import run_node
+from fhaosmo_ros.topics import ESTIMATES
 
 
 class EstimatorNode(ManagedNode):
@@ -37,7 +41,10 @@ class EstimatorNode(ManagedNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(
-            'estimator', automatically_declare_parameters_from_overrides=True, **options
+            'estimator',
+            automatically_declare_parameters_from_overrides=True,
+            enable_logger_service=True,
+            **options,
         )
         overrides = overrides_of(self)
         if overrides.get('use_sim_time') is True and 'sampling' not in overrides:
@@ -49,26 +56,41 @@ class EstimatorNode(ManagedNode):
         self._inheritance = ChannelInheritance(self._names, overrides)
         self._channels: Channel | ChannelGroup | None = None
         self._parameter_topic: ParameterTopic | None = None
+        self._clock_watch = ClockWatch(self)
         self._diagnostics = DiagnosticsPublisher(
             self, self._reports, values['diagnostics_period'], values['hardware_id']
         )
         self._node_parameters.on_change(self._prepare, self._adopt, self._inheritance.followers)
+        self._made: tuple[Parameters, dict[str, OnlineEstimator]] | None = None
         try:
-            if values['autostart']:
-                self.start()
-            else:
-                make_estimators(values, self._names)  # raises now what configure would raise
+            estimators = self._make_estimators()  # raises now what configure would raise
+            self._made = values, estimators  # for the first configure
+            self.not_ready = 'the core is still being compiled'
+            self._loading = Loading(self, lambda: load(estimators), self._begin)
         except Exception:
             self.destroy_node()
             raise
-        if not values['autostart']:
+
+    def _begin(self) -> None:
+        """Configure and activate the node if that is its own task."""
+        self.not_ready = ''
+        if not self._node_parameters.values['autostart']:
             self.get_logger().info('waiting to be configured, for instance by ros2 lifecycle set')
+        elif self.state == 'unconfigured':
+            self.start()
+
+    def _make_estimators(self) -> dict[str, OnlineEstimator]:
+        """Return new estimators; raise for parameters that do not fit together."""
+        prefixes = [f'~/{name}/' if name else '~/' for name in self._names]
+        check_overrides(self, [prefix + topic for prefix in prefixes for topic in ESTIMATES])
+        return make_estimators(self._node_parameters.values, self._names)
 
     def configure(self) -> None:
         """Make the channel, or channels, from the present parameters."""
         values = self._node_parameters.values
-        estimators = make_estimators(values, self._names)
-        check_overrides(self, [f'~/{name}/' if name else '~/' for name in self._names])
+        made, self._made = self._made, None
+        fresh = made is not None and made[0] is values
+        estimators = made[1] if made and fresh else self._make_estimators()
         if self._names == UNNAMED:
             self._channels = Channel(self, values, *estimators.values())
         else:
@@ -125,9 +147,9 @@ class EstimatorNode(ManagedNode):
     def _reports(self) -> list[Report]:
         state = Report('state')
         active = self.state == 'active'
-        state.find(OK if active else STALE, self.state)
-        if self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds:
-            state.find(ERROR, 'use_sim_time, but nothing on /clock yet')
+        state.find(OK if active else STALE, ': '.join(filter(None, (self.state, self.not_ready))))
+        for level, text in self._clock_watch.look():
+            state.find(level, text)
         if not active or self._channels is None:
             return [state]
         return [state, *self._channels.reports()]

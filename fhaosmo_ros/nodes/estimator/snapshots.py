@@ -29,7 +29,8 @@ class SnapshotPublisher:
     def __init__(self, node: Node, estimator: OnlineEstimator, prefix: str) -> None:
         self._node, self._estimator = node, estimator
         self._due, self._first = True, True
-        self._encode = array_encoder(labels(estimator.observer.levels))
+        observer, past = estimator.observer, len(estimator.memory.past)
+        self._encode = array_encoder(labels(observer.levels, observer.inputs, past))
         self._publisher = node.create_publisher(message_class(ARRAY), prefix + SNAPSHOT, QOS)
         self._timer = node.create_timer(PERIOD, self._request)
 

@@ -116,11 +116,11 @@ class NodeParameters:
             if not is_built_in(name):  # declared as it came, without a descriptor
                 node.undeclare_parameter(name)
         read_only = set(fixed)
-        for name, parameter in values.table.items():
+        for name, value in values.items():
             node.declare_parameter(
                 name,
-                values[name],
-                descriptor(parameter, name in read_only),
+                value,
+                descriptor(values.table[name], name in read_only),
                 ignore_override=True,
             )
 

@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-import gc
 from itertools import pairwise
 import os
 import re
@@ -23,6 +22,7 @@ from fhaosmo_ros.core.parameters.files import (
 from fhaosmo_ros.core.parameters.tables import NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import parse
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
+from fhaosmo_ros.nodes.middleware.loading import is_loading, settle_memory
 from fhaosmo_ros.stop_signals import stop_on_signals, Stopped
 import rclpy
 from rclpy.exceptions import InvalidHandle
@@ -156,15 +156,14 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
     node = None
     origins: dict[str, str | None] = {}
     try:
-        with ended.raising(GRACE):  # the start may compile for seconds
+        with ended.raising(GRACE):  # one import can last for a second
             origins = _check_arguments(name, argv)
             rclpy.init(args=[name, *argv], signal_handler_options=SignalHandlerOptions.NO)
             node = factory()
-        gc.collect()
-        gc.freeze()  # these objects live to the end: later collections need not visit them
+        settle_memory()
         with Spinner(node, on_end=ended.set) as spinner:
             ended.wait()
-        if spinner.stuck:  # for instance compiling; a node has nothing to save
+        if spinner.stuck:  # a node has nothing to save
             print(f'{name}: ended while a callback was running', file=sys.stderr, flush=True)
             os._exit(0)
         if spinner.error is not None:
@@ -185,6 +184,9 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
                 node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
+        if is_loading():  # a compiler that runs while Python ends can crash
+            sys.stderr.flush()
+            os._exit(0)
 
 
 def _check_arguments(name: str, argv: list[str]) -> dict[str, str | None]:

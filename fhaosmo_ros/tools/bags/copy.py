@@ -16,7 +16,7 @@ BATCH = 8192
 def copy_topics(reader: BagReader, writer: BagWriter) -> Iterator[None]:
     """Copy every topic as it is; yield after each chunk or batch, so that the caller can stop."""
     ids = {
-        c.topic: writer.add(c.topic, c.msgtype, reader.types, c.ext.offered_qos_profiles, c.digest)
+        c.topic: writer.add(c.topic, c.msgtype, reader.types, *reader.offered(c))
         for c in reader.connections
     }
     if reader.has_chunks and writer.takes_chunks:

@@ -1,32 +1,74 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded known input u, held between its samples as the node holds it."""
+"""Recorded known inputs, held between their samples as the node holds them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.bags.reader import BagReader
 import numpy as np
 from numpy.typing import NDArray
 
 
-class HeldInput:
+class HeldInputs:
     """
     Callable that returns u at given times; the times of a call follow those of the call before.
 
     Parameters
     ----------
     reader : BagReader
-    topic : str
-    field : str or None
-        Number in its messages; see `find_field`.
+    model : TriangularModel
+        Says which known inputs there are, and which of them it uses; the others are 0.
+    topics, fields : sequence of str
+        Of the inputs that the model uses, in their order: none (topic /NAME, the only number in
+        its messages), one for all, or one for each; see `find_field`.
     reject : callable
         Gets the number of values that were not finite, and were left out.
 
     Raises
     ------
     ConfigurationError
-        The bag has no such topic or field.
+        The bag has no such topic or field, or another number of them is given.
 
     """
+
+    def __init__(
+        self,
+        reader: BagReader,
+        model: TriangularModel,
+        topics: Sequence[str],
+        fields: Sequence[str],
+        reject: Callable[[int], None],
+    ) -> None:
+        used = model.used_inputs
+        sources = zip(
+            _one_each('--input-topic', topics, used) or [f'/{name}' for name in used],
+            _one_each('--input-field', fields, used) or [None] * len(used),
+            strict=True,
+        )
+        self._width = len(model.inputs)
+        self._columns = [model.inputs.index(name) for name in used]
+        self._held = [_HeldInput(reader, *source, reject) for source in sources]
+
+    def __call__(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return u at each time (of the bag), (K, m): the last finite ones, or 0."""
+        u = np.zeros((len(times), self._width))
+        for column, held in zip(self._columns, self._held, strict=True):
+            u[:, column] = held(times)
+        return u
+
+
+def _one_each(option: str, given: Sequence[str], names: Sequence[str]) -> list[str]:
+    if len(given) > 1 and len(given) != len(names):
+        raise ConfigurationError(
+            f'{option}: expected one, or one for each known input that phi uses '
+            f'({", ".join(names) or "none"}), got {len(given)}'
+        )
+    return list(given) * (len(names) if len(given) == 1 else 1)
+
+
+class _HeldInput:
+    """One of them."""
 
     def __init__(
         self, reader: BagReader, topic: str, field: str | None, reject: Callable[[int], None]
@@ -38,7 +80,6 @@ class HeldInput:
         self._held = 0.0
 
     def __call__(self, times: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return u at each time (of the bag): the last finite one that is not later, or 0."""
         while not len(self._times) or self._times[-1] <= times[-1]:
             block = next(self._blocks, None)
             if block is None:

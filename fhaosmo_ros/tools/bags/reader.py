@@ -9,7 +9,7 @@ goes message by message.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path
@@ -21,11 +21,12 @@ from fhaosmo_ros.tools.bags.cdr import numbers
 from fhaosmo_ros.tools.bags.fields import Field, find_field
 from fhaosmo_ros.tools.bags.mcap import chunks
 from fhaosmo_ros.tools.bags.mcap.pieces import check_summary, find_pieces, load
-from fhaosmo_ros.tools.bags.types import TYPES
+from fhaosmo_ros.tools.bags.ros1 import Ros1Storage, with_header_of_ros2
+from fhaosmo_ros.tools.bags.types import LATCHED_QOS, OFFERED_QOS, TYPES
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2.storage_mcap import McapReader
 
 BLOCK = 16_384
@@ -57,7 +58,7 @@ class Block(NamedTuple):
 
 class BagReader:
     """
-    An open bag: a folder with metadata.yaml, or one storage file of it.
+    An open bag: a folder with metadata.yaml, one storage file of it, or a bag of ROS 1.
 
     Where the file has CRCs, what is read agrees with them; and a topic that is read to its end has
     as many messages as the bag lists.
@@ -88,8 +89,13 @@ class BagReader:
             self._reader.open()
         except Exception as error:  # rosbags also lets IndexError, struct.error, ... through
             raise _unreadable(self.path, error) from None
-        storage = self._reader.readers[0].storage
-        self._storages = list(getattr(storage, 'storages', [])) or [storage]
+        self._types = self._reader.typestore
+        first: Any = self._reader.readers[0]
+        if self._reader.is2:
+            self._storages = list(getattr(first.storage, 'storages', [])) or [first.storage]
+        else:
+            self._types = with_header_of_ros2(self._types)
+            self._storages = [Ros1Storage(first, self._types)]
         stored = [c for s in self._storages for c in s.connections]
         try:
             for topic in {c.topic for c in self.connections}:
@@ -111,13 +117,19 @@ class BagReader:
 
     @property
     def connections(self) -> list[Connection]:
-        """Topics with their types, QoS and message counts; a topic may appear twice."""
+        """Topics with their types and message counts; a topic may appear twice."""
         return list(self._reader.connections)
+
+    def offered(self, connection: Connection) -> tuple[Sequence[Qos], str]:
+        """Return the QoS of a topic of the bag, and the hash of its type, '' if not known."""
+        if self._reader.is2:
+            return connection.ext.offered_qos_profiles, connection.digest
+        return [LATCHED_QOS if connection.ext.latching else OFFERED_QOS], ''
 
     @property
     def types(self) -> Any:
         """The bag's own type definitions: a rosbags typestore."""
-        return self._reader.typestore
+        return self._types
 
     @property
     def span(self) -> tuple[int, int]:
@@ -184,7 +196,7 @@ class BagReader:
         found.sort(key=itemgetter(1))
         try:
             return [
-                (topic, time, self._reader.deserialize(data, types[topic]))
+                (topic, time, self._types.deserialize_cdr(data, types[topic]))
                 for topic, time, data in found
             ]
         except Exception as error:
@@ -193,7 +205,7 @@ class BagReader:
     def first(self, topic: str) -> Any:
         """Return the first message of a topic that has one."""
         _, _, data = next(self.messages([topic]))
-        return self._reader.deserialize(data, self.message_type(topic))
+        return self._types.deserialize_cdr(data, self.message_type(topic))
 
     def _chunks_of(self, topics: list[str]) -> Iterator[tuple[dict[int, str], Any, Any]]:
         for storage, _, data, records in self.chunk_records(topics):
@@ -318,15 +330,15 @@ class _Wanted(NamedTuple):
 
 
 def _expect_bag(path: Path) -> None:
-    allowed = 'expected a bag (a folder with metadata.yaml, or its .mcap or .db3 file)'
+    allowed = 'expected a bag (a folder with metadata.yaml, its .mcap or .db3, or a ROS 1 .bag)'
     if not path.exists():
         raise ConfigurationError(f'bag {path}: {allowed}, got a path that does not exist')
     if path.is_dir() and not (path / 'metadata.yaml').exists():
         files = sorted(p.name for p in path.iterdir() if p.suffix in ('.mcap', '.db3'))
         hint = f' but {files[0]}: name that file, or run record --repair' if files else ''
         raise ConfigurationError(f'bag {path}: {allowed}, got a folder without it{hint}')
-    if path.is_file() and path.suffix not in ('.mcap', '.db3'):
-        raise ConfigurationError(f'bag {path}: {allowed}, got a file that is neither')
+    if path.is_file() and path.suffix not in ('.mcap', '.db3', '.bag'):
+        raise ConfigurationError(f'bag {path}: {allowed}, got a file that is none')
 
 
 def _unreadable(path: Path, error: Exception) -> ConfigurationError:

@@ -84,7 +84,7 @@ def online_parameters(
         OnlineEstimator(Parameters(ESTIMATOR_PARAMETERS, own))
     except ConfigurationError as error:
         raise with_origin(error, origins, arguments.channel) from None
-    return {name: own[name] for name in ONLINE_PARAMETERS if name in own}
+    return ONLINE_PARAMETERS.part_of(own)
 
 
 def named(arguments: argparse.Namespace) -> list[str]:

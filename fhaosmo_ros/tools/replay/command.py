@@ -38,7 +38,7 @@ def _parser() -> argparse.ArgumentParser:
         description='Estimate offline from a recorded bag, with the result of the live node.',
     )
     add = parser.add_argument
-    add('bag', type=Path, help='folder of a bag, or its .mcap or .db3 file')
+    add('bag', type=Path, help='folder of a bag, its .mcap or .db3 file, or a ROS 1 .bag')
     add(
         '-o', '--output', type=Path, action='append', metavar='PATH',
         help='.csv, .npz, or else a new bag; may be given several times '
@@ -48,8 +48,15 @@ def _parser() -> argparse.ArgumentParser:
     add('--storage', choices=('mcap', 'sqlite3'), default='mcap', help='of a bag (%(default)s)')
     add('--topic', default='/y', help='topic of the measured output (%(default)s)')
     add('--field', help="number in its messages, such as 'position[2]' (default: the only one)")
-    add('--input-topic', default='/u', help='topic of the known input (%(default)s)')
-    add('--input-field', help='number in its messages')
+    add(
+        '--input-topic', action='append', default=[], metavar='TOPIC',
+        help='topic of the known input; given several times: of each one that phi uses, in the '
+        'order of inputs (default: /NAME)',
+    )  # fmt: skip
+    add(
+        '--input-field', action='append', default=[], metavar='FIELD',
+        help='number in its messages; given several times: of each input',
+    )  # fmt: skip
     add(
         '--stamp', choices=STAMPS, default='auto',
         help='where dt comes from; header: of the messages; source: publish time (mcap only); '
@@ -81,7 +88,8 @@ def _parser() -> argparse.ArgumentParser:
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.every < 1:
         raise ConfigurationError(f'--every: expected an integer >= 1, got {arguments.every}')
-    default = Path(f'{arguments.bag.resolve().name.removesuffix(".mcap")}_replayed')
+    name = arguments.bag.resolve().name.removesuffix('.mcap').removesuffix('.bag')
+    default = Path(f'{name}_replayed')
     finals = arguments.output or [default]
     begin = perf_counter()
     with ExitStack() as stack:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from fhaosmo_ros.core.observer.status import REJECTED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.tools.bags.held_input import HeldInput
+from fhaosmo_ros.tools.bags.held_input import HeldInputs
 from fhaosmo_ros.tools.bags.reader import BagReader, Block
 from fhaosmo_ros.tools.replay.live_run import LiveRun
 from fhaosmo_ros.tools.replay.sinks import Rows
@@ -48,8 +48,9 @@ class Samples:
         self._other_than_bag = False
         self._input = None
         if estimator.observer.uses_input:
-            self._input = HeldInput(
-                reader, arguments.input_topic, arguments.input_field, estimator.reject_inputs
+            topics, fields = arguments.input_topic, arguments.input_field
+            self._input = HeldInputs(
+                reader, estimator.observer.model, topics, fields, estimator.reject_inputs
             )
         self._first: int | None = None
         self._latest: int | None = None
@@ -79,7 +80,7 @@ class Samples:
             blocks = self._live.begin(blocks)
         for block in blocks:
             if len(block.times):
-                u = self._input(block.times) if self._input else np.zeros(len(block.times))
+                u = self._input(block.times) if self._input else None
                 yield len(block.times), list(self._rows(block, u))
         if not self._taken:
             raise ConfigurationError(
@@ -109,12 +110,13 @@ class Samples:
         self._latest = int(stamps[-1])
         self._taken += len(stamps)
 
-    def _rows(self, block: Block, u: np.ndarray) -> Iterator[Rows]:
+    def _rows(self, block: Block, u: np.ndarray | None) -> Iterator[Rows]:
         whole = [slice(0, len(block.times))]
         for part in self._live.parts(block.stamps) if self._live else whole:
-            yield from self._estimate(Block(*(column[part] for column in block)), u[part])
+            inputs = None if u is None else u[part]
+            yield from self._estimate(Block(*(column[part] for column in block)), inputs)
 
-    def _estimate(self, block: Block, u: np.ndarray) -> Iterator[Rows]:
+    def _estimate(self, block: Block, u: np.ndarray | None) -> Iterator[Rows]:
         estimates = self.estimator.run(block.stamps, block.values, u)
         keep = np.flatnonzero((estimates.status & REJECTED) == 0)
         count = len(keep)

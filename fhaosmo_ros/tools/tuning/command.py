@@ -11,6 +11,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
+from fhaosmo_ros.core.simulation.recording_parameters import SENSOR
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.reader import STAMPS
 from fhaosmo_ros.tools.cli.command import Interrupted, run_command, without_password
@@ -22,7 +23,9 @@ from fhaosmo_ros.tools.tuning.source import BagSource, from_bag, simulated, Tuni
 TRIALS = 1000
 NEEDED = ('optuna>=4,<6', 'cmaes', 'control')
 """Only this command needs them, so a robot may lack them."""
-BOTH = ParameterTable(TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values())
+BOTH = ParameterTable(
+    TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values(), ESTIMATOR_PARAMETERS.families
+)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -105,8 +108,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     add('--topic', default='/y', help='topic of the measured output (%(default)s)')
     add('--field', help="number in its messages, such as 'position[2]' (default: the only one)")
-    add('--input-topic', default='/u', help='topic of the known input (%(default)s)')
-    add('--input-field', help='number in its messages')
+    add(
+        '--input-topic', action='append', default=[], metavar='TOPIC',
+        help='topic of the known input; given several times: of each one that phi uses, in the '
+        'order of inputs (default: /NAME)',
+    )  # fmt: skip
+    add(
+        '--input-field', action='append', default=[], metavar='FIELD',
+        help='number in its messages; given several times: of each input',
+    )  # fmt: skip
     add('--stamp', choices=STAMPS, default='auto', help='where dt comes from, as for replay')
     add('--plant', default='/plant', help='whose topics are the truth (%(default)s)')
     return parser
@@ -174,8 +184,8 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
     for path in files:
         found = load(path, 'estimator')
         estimator |= found
-        # Where only the estimator has a model, the plant has the same one.
-        tuning |= {p.name: found[p.name] for p in MODEL if p.name in found}
+        # Where only the estimator has a model, the plant has the same one; and so the sensor.
+        tuning |= ParameterTable(MODEL, SENSOR).part_of(found)
         tuning |= load(path, 'plant', TUNE_PARAMETERS) | load(path, 'tune', TUNE_PARAMETERS)
     for name, value in assigned(rules, BOTH).items():
         for table, values in ((ESTIMATOR_PARAMETERS, estimator), (TUNE_PARAMETERS, tuning)):

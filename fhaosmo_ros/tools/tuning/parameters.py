@@ -3,7 +3,7 @@
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
 from fhaosmo_ros.core.parameters.tables import MODEL
-from fhaosmo_ros.core.simulation.recording_parameters import FAMILY, SHARED
+from fhaosmo_ros.core.simulation.recording_parameters import FAMILY, SENSOR, SHARED
 
 TUNING = (
     Parameter(
@@ -59,4 +59,4 @@ TUNING = (
     ),
 )  # fmt: skip
 
-TUNE_PARAMETERS = ParameterTable(MODEL, SHARED, FAMILY, TUNING)
+TUNE_PARAMETERS = ParameterTable(MODEL, SENSOR, SHARED, FAMILY, TUNING)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training and held-out recordings: of a simulated family, or pieces of a bag."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +12,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Family, Recording
-from fhaosmo_ros.tools.bags.held_input import HeldInput
+from fhaosmo_ros.tools.bags.held_input import HeldInputs
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import truth_at
 from fhaosmo_ros.tools.tuning.sensor import identify, noise_at_stamps, Sensor
@@ -58,8 +59,8 @@ class BagSource(NamedTuple):
     path: Path
     topic: str = '/y'
     field: str | None = None
-    input_topic: str = '/u'
-    input_field: str | None = None
+    input_topics: Sequence[str] = ()
+    input_fields: Sequence[str] = ()
     stamp: str = 'auto'
     plant: str = '/plant'
 
@@ -89,7 +90,7 @@ def from_bag(source: BagSource, values: Parameters, given: set[str], seed: int) 
     seed : int
 
     """
-    model = TriangularModel(values['phi'], values['order'])
+    model = TriangularModel.of(values)
     t, y, u, truth = _read(source, model)
     sensor = identify(t, y)
     if truth is not None:
@@ -112,9 +113,10 @@ def _read(
         found = reader.field(source.topic, source.field)
         blocks = list(reader.blocks(source.topic, found, source.stamp))
         times, stamps, y = (np.concatenate([block[k] for block in blocks]) for k in range(3))
-        u = np.zeros(len(y))
+        u = np.zeros((len(y), len(model.inputs)))
         if model.uses_input:
-            u = HeldInput(reader, source.input_topic, source.input_field, lambda _: None)(times)
+            names = source.input_topics, source.input_fields
+            u = HeldInputs(reader, model, *names, lambda _: None)(times)
     truth = None
     found = truth_at(source.path, source.plant, times)
     if found is not None and found.values.shape[1] == model.order + 1:

@@ -107,7 +107,7 @@ def _parameters(tuner: Tuner, gains: dict[str, Any]) -> dict[str, Any]:
     # The gains fit these only, so the file has them even where they are the defaults.
     for name in ('variant', 'scheme', 'unknown_input'):
         values[name] = shown[name]
-    return {name: values[name] for name in ESTIMATOR_PARAMETERS if name in values}
+    return ESTIMATOR_PARAMETERS.part_of(values)
 
 
 def _comments(

@@ -14,6 +14,7 @@ error that decreases with the longest step. Each estimate uses the sample of its
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.compiled.unowned_arrays import unowned
 from fhaosmo_ros.core.model.bytecode import Bytecode, Floats
+from fhaosmo_ros.core.model.inputs import known_inputs_of_run
 from fhaosmo_ros.core.model.integrate import (
     begin_step,
     CLASSICAL,
@@ -59,6 +60,7 @@ def _run(
 
     """
     model, stack, stages = unowned(model), unowned(stack), unowned(stages)
+    u = unowned(samples.u)
     x, size = stages[NOW, 0], stages.shape[2]
     for k in range(samples.y.shape[0]):
         if k > 0:
@@ -66,7 +68,7 @@ def _run(
             for _ in range(steps):
                 begin_step(stages)
                 for stage in range(CLASSICAL.nodes.size):
-                    triangular_rates(model, 0.0, samples.u[k], stack, stages)
+                    triangular_rates(model, 0.0, u[k], stack, stages)
                     take_slope(CLASSICAL, stage, samples.h[k] / steps, stages)
             innovation = samples.y[k] - x[0]
             for i in range(size):
@@ -98,7 +100,8 @@ def estimates(
     stages, stack = np.zeros((4, 2, size)), np.zeros((2, model.depth))
     stages[NOW, 0, 0] = recording.y[0]
     periods = np.diff(recording.t, prepend=recording.t[0])
-    samples = Samples(recording.y, periods, recording.u)
+    u = known_inputs_of_run(recording.u, len(recording.y), model.inputs)
+    samples = Samples(recording.y, periods, u)
     out = np.empty((len(recording.y), size))
     _run(expressions, stack, stages, gain, samples, longest, out)
     return out

@@ -209,7 +209,7 @@ def _best_kalman_filter(problem: StartProblem, evaluator: CandidateEvaluator) ->
     elif problem.free_gamma:
         gamma = min(max(GAMMA, p['gamma_min']), p['gamma_max'])
     fixed = {k: v for k, v in estimator.items() if k not in problem.names}
-    model = TriangularModel(p['phi'], p['order'])
+    model = TriangularModel.of(p)
     open_ = not {'unknown_input_derivatives', 'lambda'} & estimator.keys()
     gains, objectives, found = {}, {}, {}
     for k in DERIVATIVES if open_ else [p['unknown_input_derivatives']]:

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publishers whose QoS a user may override by parameters qos_overrides./TOPIC.publisher.POLICY."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from rclpy.node import Node
+from rclpy.qos import QoSPolicyKind, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+POLICIES: dict[QoSPolicyKind, tuple[str, ...] | range] = {
+    QoSPolicyKind.HISTORY: ('keep_last', 'keep_all'),
+    QoSPolicyKind.DEPTH: range(1, 100_001),
+    QoSPolicyKind.RELIABILITY: ('reliable', 'best_effort'),
+    QoSPolicyKind.DURABILITY: ('volatile', 'transient_local'),
+}
+"""QoS policies that a user may override, with the values that each may have."""
+OF_RCLPY = ('/clock.', '/parameter_events.', '/rosout.')
+"""Topics whose QoS can be overridden in every node of rclpy."""
+
+
+def create_publisher(node: Node, kind: Any, topic: str, depth: int) -> Any:
+    """Return a publisher, reliable and volatile unless the user wants another QoS."""
+    return node.create_publisher(
+        kind,
+        topic,
+        QoSProfile(depth=depth),
+        qos_overriding_options=QoSOverridingOptions(POLICIES),
+    )
+
+
+def check_overrides(node: Node, topics: Iterable[str]) -> None:
+    """
+    Raise for QoS overrides that rclpy would ignore, or refuse with an unclear message.
+
+    Parameters
+    ----------
+    node : Node
+    topics : iterable of str
+        All topics that the node makes by `create_publisher`.
+
+    Raises
+    ------
+    ConfigurationError
+        A topic that is none of them, or a policy or value that can't be set.
+
+    """
+    names = [node.resolve_topic_name(topic) for topic in topics]
+    policies = {policy.name.lower(): allowed for policy, allowed in POLICIES.items()}
+    for name, parameter in node.get_parameters_by_prefix('qos_overrides').items():
+        if name.startswith(OF_RCLPY):
+            continue
+        topic, _, policy = name.rpartition('.publisher.')
+        if topic not in names or policy not in policies:
+            raise ConfigurationError(
+                f"parameter 'qos_overrides.{name}': expected TOPIC.publisher.POLICY with TOPIC "
+                f'one of {", ".join(names)} and POLICY one of {", ".join(policies)}'
+            )
+        allowed = policies[policy]
+        if parameter.value not in allowed:
+            words = (
+                ' or '.join(allowed)
+                if isinstance(allowed, tuple)
+                else f'an integer from {allowed[0]} to {allowed[-1]}'
+            )
+            raise ConfigurationError(
+                f"parameter 'qos_overrides.{name}': expected {words}, got {parameter.value!r}"
+            )

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A known delay of y: the inputs that acted then, the estimate's time, and the present."""
+
+from fhaosmo_ros.core import ConfigurationError, Family, OnlineEstimator, Trial
+from fhaosmo_ros.core.online import delay
+from fhaosmo_ros.core.online.memory import Flag, labels, pack, Snapshot, unpack
+from fhaosmo_ros.core.simulation.plant import respond
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+PERIOD, LATE = 2_000_000, 20
+"""Nanoseconds, and periods by which y is late."""
+COUNT = 1500
+STAMPS = 10**18 + PERIOD * np.arange(COUNT)
+MOTOR = {
+    'order': 2, 'phi': ['0', '8*u - 3*z2 - 5*sin(z1)'], 'structure': 'levant', 'variant': 'sign',
+    'scheme': 'predict_correct', 'lambda': [5.5, 16.0, 22.0],
+}  # fmt: skip
+DELAYED = MOTOR | {'measurement_delay': LATE * PERIOD * 1e-9}
+
+
+def voltage(stamps=STAMPS):
+    """u of the interval that ends at each sample; constant until the delay is over."""
+    t = (stamps - stamps[0]) * 1e-9
+    return np.where(np.arange(len(t)) < 2 * LATE, 0.3, 0.3 + np.sin(40.0 * (t - t[2 * LATE])))
+
+
+def truth(estimator=None, u=None):
+    model = (estimator or OnlineEstimator(MOTOR)).observer.model
+    t = (STAMPS - STAMPS[0]) * 1e-9
+    u = voltage() if u is None else u
+    return respond(model, [0.1, 0.0], t, [0.7, 0.7], 100.0, u, 1e-3)
+
+
+def late(y):
+    return np.concatenate([np.full(LATE, np.nan), y[:-LATE]])
+
+
+@pytest.mark.parametrize('scheme', ['predict_correct', 'implicit', 'explicit'])
+def test_late_samples_give_the_estimates_of_punctual_ones(scheme):
+    y, u = truth().z[:, 0], voltage()
+    punctual = OnlineEstimator(MOTOR | {'scheme': scheme}).run(STAMPS, y, u)
+    delayed = OnlineEstimator(DELAYED | {'scheme': scheme}).run(STAMPS, late(y), u)
+    np.testing.assert_array_equal(delayed.t[LATE:], punctual.t[:-LATE])
+    np.testing.assert_array_equal(delayed.z[LATE:], punctual.z[:-LATE])
+    np.testing.assert_array_equal(delayed.unknown_input[LATE:], punctual.unknown_input[:-LATE])
+
+
+def test_inputs_that_come_as_late_as_y_belong_to_it():
+    y, u = truth().z[:, 0], voltage()
+    same = OnlineEstimator(DELAYED | {'input_delay': DELAYED['measurement_delay']})
+    found, wanted = same.run(STAMPS, y, u), OnlineEstimator(MOTOR).run(STAMPS, y, u)
+    np.testing.assert_array_equal(found.z, wanted.z)
+    np.testing.assert_array_equal(found.t, wanted.t - LATE * PERIOD)
+
+
+@pytest.mark.parametrize('estimate_from', ['internal', 'filtered'])
+@pytest.mark.parametrize('share', [0.0, 0.5, 1.0], ids='input late by {} of the delay'.format)
+def test_prediction_ends_at_the_present_state(share, estimate_from):
+    full = DELAYED['measurement_delay']
+    parameters = DELAYED | {'input_delay': share * full, 'estimate_from': estimate_from}
+    u = np.repeat(voltage()[::50], 50)  # constant since long enough at the end
+    z, d = truth(u=u)
+    shown = np.roll(u, round(share * LATE))
+    then = OnlineEstimator(parameters).run(STAMPS, late(z[:, 0]), shown)
+    now = OnlineEstimator(parameters | {'predict_to_now': True}).run(STAMPS, late(z[:, 0]), shown)
+    np.testing.assert_array_equal(now.t, STAMPS)
+    # Where inputs come late, they have to have been constant over the delay.
+    at_end = slice(COUNT - 8 if share else COUNT // 2, None)
+    np.testing.assert_allclose(now.z[at_end], z[at_end], atol=1e-6)
+    np.testing.assert_allclose(now.unknown_input[at_end], d[at_end], atol=1e-6)
+    before = slice(at_end.start - LATE, COUNT - LATE)
+    np.testing.assert_allclose(then.z[at_end], z[before], atol=1e-6)
+    assert np.abs(then.z[at_end, 1] - z[at_end, 1]).max() > 0.02  # so the delay matters
+
+
+def ring(pieces, inputs=2):
+    past = delay.make_past(inputs, 1)
+    for duration, *u in pieces:
+        delay.note_inputs(past, duration, np.array(u, dtype=float))
+    return past
+
+
+durations = st.integers(1, 50)
+known = st.lists(st.tuples(durations, st.integers(-2, 2), st.integers(-2, 2)), max_size=30)
+
+
+@given(known, st.integers(0, 200), durations)
+def test_inputs_of_an_interval_are_their_mean(pieces, lag, elapsed):
+    now = np.array([9.0, -9.0])
+    series = [np.array(u, dtype=float) for duration, *u in pieces for _ in range(duration)]
+    oldest = series[0] if series else now
+    series = np.array([oldest] * (lag + elapsed) + series)
+    wanted = series[len(series) - lag - elapsed : len(series) - lag].mean(axis=0)
+    found = delay.inputs_before(ring(pieces), lag, elapsed, now)
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+
+
+@given(known, durations)
+def test_what_is_withdrawn_has_not_been(pieces, elapsed):
+    past, now = ring(pieces), np.array([5.0, 5.0])
+    delay.note_inputs(past, elapsed, now)
+    delay.withdraw_inputs(past, elapsed, 2)
+    for lag in (0, 7, 40):
+        np.testing.assert_array_equal(
+            delay.inputs_before(past, lag, 10, now),
+            delay.inputs_before(ring(pieces), lag, 10, now),
+        )
+
+
+def test_more_pieces_than_there_is_room_for_lose_the_oldest():
+    count = delay.PIECES + 100
+    past = ring([(10, k, -k) for k in range(count)])
+    now = np.zeros(2)
+    for back in (0, 100, delay.PIECES - 1):
+        newest = count - 1 - back
+        found = delay.inputs_before(past, 10 * back, 10, now)
+        np.testing.assert_array_equal(found, [newest, -newest])
+    np.testing.assert_array_equal(delay.inputs_before(past, 10 * count, 10, now)[0], 100)
+
+
+CASES = {
+    'delay': DELAYED, 'predicted': DELAYED | {'predict_to_now': True},
+    'no input': DELAYED | {'phi': ['0', '-z2'], 'predict_to_now': True},
+    'input as late': DELAYED | {'input_delay': 0.04, 'predict_to_now': True},
+}  # fmt: skip
+
+
+def disturbed():
+    """Samples with everything that a live run has: jitter, a spike, gaps, a stamp ahead."""
+    rng = np.random.default_rng(4)
+    stamps = STAMPS + rng.integers(-300_000, 300_000, COUNT)
+    stamps[400:] += 30_000_000
+    stamps[600] += 50_000_000
+    stamps[1000:] += 10**9
+    y = truth().z[:, 0] + 1e-4 * rng.standard_normal(COUNT)
+    y[200], y[300] = 9.0, np.nan
+    return stamps, y, voltage() + 0.1 * rng.standard_normal(COUNT)
+
+
+@pytest.mark.parametrize('parameters', CASES.values(), ids=CASES.keys())
+def test_one_by_one_many_and_resumed_are_the_same(parameters):
+    parameters = parameters | {'spike_gate': 1.0}
+    stamps, y, u = disturbed()
+    one, many, resumed = (OnlineEstimator(parameters) for _ in range(3))
+    found = many.run(stamps, y, u)
+    assert many.counters.withdrawn_gaps == many.counters.rejected_spikes == 1
+    assert many.counters.restarts == 1
+    for k in range(COUNT):
+        one.set_input(u[k])
+        e = one.update(int(stamps[k]), y[k])
+        np.testing.assert_array_equal(
+            [*e.z, e.unknown_input], [*found.z[k], found.unknown_input[k]]
+        )
+        one.set_input(-3.0)  # not yet: the next sample has another one
+        if k % 200 == 0:
+            assert one.stamp == (
+                one.latest - (0 if parameters.get('predict_to_now') else 40 * 10**6)
+            )
+            np.testing.assert_array_equal(one.estimate.z, e.z)
+    many = OnlineEstimator(parameters)
+    many.run(stamps[:700], y[:700], u[:700])
+    memory = many.memory
+    names = labels(3, many.observer.inputs, len(memory.past))
+    vector = pack(Snapshot(many.latest, Flag(0), memory))
+    resumed.remember(unpack(vector, names).memory)
+    rest = resumed.run(stamps[700:], y[700:], u[700:])
+    np.testing.assert_array_equal(rest.z, found.z[700:])
+
+
+def test_a_withdrawn_gap_leaves_no_trace_in_the_past_of_the_inputs():
+    stamps, u = STAMPS[:300].copy(), voltage()[:300]
+    y = truth().z[:300, 0]
+    stamps[200] += 100_000_000
+    with_it, without = OnlineEstimator(DELAYED), OnlineEstimator(DELAYED)
+    with_it.run(stamps[:202], y[:202], u[:202])
+    keep = np.delete(np.arange(202), 200)
+    without.run(stamps[keep], y[keep], u[keep])
+    assert with_it.counters.withdrawn_gaps == 1
+    out = [delay.inputs_before(e.memory.past, lag * 10**6, PERIOD, np.zeros(1))[0]
+           for e in (with_it, without) for lag in range(0, 100, 3)]  # fmt: skip
+    half = len(out) // 2
+    np.testing.assert_array_equal(out[:half], out[half:])
+
+
+def test_memory_of_another_delay_is_refused():
+    with pytest.raises(ConfigurationError, match='measurement_delay'):
+        OnlineEstimator(DELAYED).remember(OnlineEstimator(MOTOR).memory)
+
+
+def test_input_later_than_y_is_refused():
+    with pytest.raises(ConfigurationError, match='input_delay'):
+        OnlineEstimator(DELAYED | {'input_delay': 0.05})
+
+
+def test_trial_knows_of_the_delay():
+    model = {'order': 2, 'phi': ['0', '8*u - 3*z2'], 'measurement_delay': 0.05}
+    family = Family(model | {'duration': 6.0, 'sample_rate': 200.0, 'rms_of_d': 2.0,
+                             'disturbances': ['sines'], 'band_of_d': [0.5, 3.0],
+                             'initial_state': 0.0, 'integration_step': 1e-3})  # fmt: skip
+    recordings = family.recordings(2)
+    gains = {key: MOTOR[key] for key in ('structure', 'scheme', 'variant', 'lambda')} | model
+    gains['fuzzy_widths'] = [0.5]
+
+    def error(changes):
+        return Trial(recordings, gains | changes, 2.0, 1.0)({}).error[:, 0].max(axis=0)
+
+    then, now = error({}), error({'predict_to_now': True})
+    unknown = error({'measurement_delay': 0.0})
+    assert (then < 0.2 * unknown).all()  # z1, z2, d
+    assert (now[:2] < 0.2 * unknown[:2]).all()
