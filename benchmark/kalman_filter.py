@@ -30,18 +30,17 @@ def _run(
 ) -> None:  # fmt: skip
     """Filter; `transitions` holds A and Q of each different interval, `which` chooses them."""
     n, r, huber, lost = prior.shape[0], settings[0], settings[1], settings[2] > 0.0
-    p, x, beyond = prior.copy(), stages[NOW, 0], 0
+    p, x, beyond, u = prior.copy(), stages[NOW, 0], 0, np.zeros(1)
     x[:] = 0.0
     x[0] = y[0]
     out[0] = 0.0
-    pending = False
     for k in range(1, len(y)):
         a, q = transitions[0, int(which[k])], transitions[1, int(which[k])]
         steps = int((t[k] - t[k - 1]) / 1.5e-3) + 1
         for _ in range(steps):
             begin_step(stages)
             for stage in range(4):
-                triangular_rates(model, 0.0, 0.0, stack, stages)
+                triangular_rates(model, 0.0, u, stack, stages)
                 take_slope(CLASSICAL, stage, (t[k] - t[k - 1]) / steps, stages)
         p = a @ p @ a.T + q
         b, s = y[k] - x[0], p[0, 0] + r
@@ -49,7 +48,7 @@ def _run(
         if lost:
             beyond = beyond + 1 if abs(b) > GATE * math.sqrt(s) else 0
             skip = beyond > 0
-            if beyond >= MOST or pending:
+            if beyond > MOST:
                 p, beyond = prior.copy(), 0
                 x[:] = 0.0
                 x[0] = y[k]
@@ -63,7 +62,7 @@ def _run(
             keep = np.eye(n)
             keep[:, 0] -= gain
             p = keep @ p @ keep.T + rr * np.outer(gain, gain)
-        out[k] = x[settings.shape[0] - 3] if False else x[int(settings[3])]
+        out[k] = x[int(settings[3])]
 
 
 class KalmanFilter:

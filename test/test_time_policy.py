@@ -205,7 +205,8 @@ def test_prediction_is_the_plant_to_fourth_order(decay):
     state.memory[Y], state.levels[TILDE] = start[0], [start[1], start[2], d, 9.9]
     law, work = configuration.law, make_work(configuration.law, configuration.model.depth)
     errors = [
-        abs(predicted_measurement(law, work, state, 0.5 / n, u, n) - truth) for n in (10, 20, 40)
+        abs(predicted_measurement(law, work, state, 0.5 / n, np.array([u]), n) - truth)
+        for n in (10, 20, 40)
     ]
     assert errors[-1] < 1e-8
     np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 16.0, rtol=0.2)

@@ -114,6 +114,7 @@ class ObserverConfiguration:
         memory[arrays.GAMMA] = self.gamma_initial
         memory[arrays.Y] = np.nan
         memory[arrays.SCALE] = memory[arrays.SPREAD] = 1.0
+        memory[arrays.SETTLED] = 1.0 - self.law.flags[arrays.SCHEDULED]
         return arrays.State(levels, memory)
 
     def _per_level(self, name: str) -> np.ndarray:
