@@ -10,7 +10,7 @@ from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
-from observer_cases import SMALL
+from observer_cases import SMALL, SYSTEMS
 import pytest
 
 START = 1_700_000_000 * 10**9
@@ -25,6 +25,8 @@ def valid(parameter: Parameter, rng: np.random.Generator):
         return str(rng.choice(parameter.choices))
     if parameter.kind == 'bool':
         return bool(rng.integers(2))
+    if parameter.kind == 'string_array':  # fuzzy_systems
+        return rng.choice([*SYSTEMS, 'terms 4'], rng.integers(1, 4)).tolist()
     low, high = parameter.lower, parameter.upper
     if parameter.kind == 'int':
         return int(rng.choice([low, high, rng.integers(low, min(high, low + 20), endpoint=True)]))

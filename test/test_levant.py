@@ -12,8 +12,9 @@ import math
 from fhaosmo_ros.core import ConfigurationError, Observer, Plant
 from fhaosmo_ros.core.observer.arrays import LAMBDA, psi
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.fuzzy import curve, terms_of_level
+from fhaosmo_ros.core.observer.fuzzy import curves
 from fhaosmo_ros.core.observer.levant import root
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.plant_and_observer import simulate
 from hypothesis import given, settings
@@ -73,11 +74,12 @@ class Reference:
         self.sign = p['variant'].startswith('sign')
         self.phi = PHI[self.n][1]
         self.z = np.array(p['initial_estimate'])
+        self.curves = curves(OBSERVER_PARAMETERS.defaults(), self.N)
 
     def psi(self, i, e):
         if self.sign:
             return np.sign(e)
-        values = curve(terms_of_level(i + 1), 'triangle', True)
+        values = self.curves[i]
         grid = np.linspace(0.0, WIDTHS[min(i, 1)], len(values))
         return math.copysign(np.interp(abs(e), grid, values), e)
 

@@ -25,6 +25,7 @@ CHANGES = {
     'alpha': [2, [3, 4, 5]],
     'epsilon': [1.0],
     'fuzzy_widths': [0.5, [0.1, 0.2], [0.1, 0.2, 0.3]],
+    'fuzzy_systems': [['terms 3'], ['terms 5; output singleton 5', 'curve 0 0.9 1']],
     'fuzzy_shape': ['gaussian'],
     'fuzzy_normalise': [False],
     'fuzzy_growth': [True],

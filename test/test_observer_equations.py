@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import math
 
 from fhaosmo_ros.core import Observer
-from fhaosmo_ros.core.observer.fuzzy import curve, terms_of_level
+from fhaosmo_ros.core.observer.fuzzy import curves
 import numpy as np
 from observer_cases import VARIANTS
 import pytest
@@ -112,10 +112,7 @@ class Reference:
         self.gamma = p['gamma_initial'] if p['variant'].endswith('_adaptive') else 0.5
         self.y = y
         self.calm = np.inf  # how long the innovations have been within the dead zone
-        self.curves = [
-            curve(terms_of_level(i + 1), p['fuzzy_shape'], p['fuzzy_normalise'])
-            for i in range(self.N)
-        ]
+        self.curves = curves(p, self.N)
 
     def psi(self, i, x):
         if self.sign:
@@ -239,6 +236,7 @@ def parameters(n, extra, **others):
         'alpha': list(4.0 + 3.0 * rng.random(levels)),
         'epsilon': 0.2,
         'fuzzy_widths': [0.05, 0.3][:levels],
+        'fuzzy_systems': ['terms 5', 'terms 7'],
         'fuzzy_shape': 'triangle',
         'fuzzy_normalise': True,
         'gamma_initial': 0.5,

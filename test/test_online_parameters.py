@@ -44,6 +44,7 @@ CHANGES = {
     'epsilon': Change(1e-4),
     'fuzzy_widths': Change(0.02),
     'fuzzy_growth': Change(True, PREDICTING | {'fuzzy_widths': [1e-3], 'gamma_initial': 0.1}),
+    'fuzzy_systems': Change(['curve 0 0.8 1']),
     'fuzzy_shape': Change('gaussian'),
     'fuzzy_normalise': Change(False),
     'gamma_initial': Change(0.9, {'gamma_leakage': 5.0, 'gamma_dead_zone': 0.0}),

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """docs/paper.md against its own results file, and that file against a short new run."""
 
-import json
 from pathlib import Path
 import signal
 
@@ -14,7 +13,9 @@ from studies import document as paper_document
 from studies.paper import beyond as paper_beyond
 from studies.paper import cases as paper_cases
 from studies.paper import command as paper
+from studies.paper import curves as paper_curves
 from studies.paper import findings as paper_findings
+from studies.paper import results as paper_results
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
@@ -23,44 +24,76 @@ REWRITE = 'run make paper'
 
 @pytest.fixture(scope='module')
 def documented():
-    data = json.loads((DOCS / 'paper' / 'results.json').read_text(encoding='utf-8'))
-    return data['solver'], paper.undump(data['scores'])
+    return paper_results.read(DOCS / 'paper' / 'results.json')
 
 
 @pytest.fixture(scope='module')
 def fresh(documented):
-    """Return the scores of a new run with the documented solver."""
-    return paper.measure((documented[0],), lambda: None)[documented[0]]
+    """Return the scores of a new run with the documented solver, and with the sign held."""
+    return paper.measure((documented.solver, 'ode4 held'), lambda: None)
 
 
 def test_document_shows_the_results_file(documented):
-    solver, scores = documented
     shown = paper_document.parts((DOCS / 'paper.md').read_text(encoding='utf-8'))
-    for name, text in paper.findings_texts(scores, solver).items():
+    texts = paper_results.parts(documented)
+    assert set(shown) == set(texts)
+    for name, text in texts.items():
         assert shown[name] == text, f'{name}: {REWRITE}'
-    assert paper.choose_solver(scores) == solver, REWRITE
+    assert paper.choose_solver(documented.scores) == documented.solver, REWRITE
 
 
 def test_new_run_agrees_with_the_document(documented, fresh):
-    solver, scores = documented
-    assert set(fresh) == set(scores[solver])
-    for (name, omega), score in fresh.items():
-        # The sign observer's trajectories depend on the last bit, so on the machine.
-        factor = 1.5 if name.startswith(('sign', 'Levant')) else 1.05
-        for key in ('rms_z1', 'rms_z2', 'rms_z3', 'rms_d'):
-            ratio = score[key] / scores[solver][name, omega][key]
-            assert 1 / factor < ratio < factor, f'{name}, {omega}, {key}: {REWRITE}'
+    for solver, scores in fresh.items():
+        assert set(scores) == set(documented.scores[solver])
+        for (name, omega), score in scores.items():
+            check(score, documented.scores[solver][name, omega], f'{name}, {solver}, {omega}')
+
+
+def check(new, old, name):
+    """Compare two scores; trajectories with sign depend on the last bit, so on the machine."""
+    factor = 1.5 if name.startswith(('sign', 'Levant')) else 1.05
+    for key in ('rms_z1', 'rms_z2', 'rms_z3', 'rms_d'):
+        if max(new[key], old[key]) > 1e-12:  # 0 but for rounding while it slides
+            assert 1 / factor < new[key] / old[key] < factor, f'{name}, {key}: {REWRITE}'
+
+
+@pytest.mark.parametrize('table', ['schemes', 'noise'])
+def test_new_samples_agree_with_the_document(documented, table):
+    rows = getattr(documented, table)
+    measure = {'schemes': paper_beyond.schemes, 'noise': paper_beyond.noises}[table]
+    new_rows = measure(lambda: None)
+    assert [r[:-1] for r in new_rows] == [r[:-1] for r in rows]
+    for new, old in zip(new_rows, rows, strict=True):
+        check(new.score, old.score, f'{new[:-1]}'.strip("('"))
+
+
+def test_new_comparison_of_curves_agrees_with_the_document(documented):
+    for new, old in zip(paper_curves.compare(lambda: None), documented.curves, strict=True):
+        assert new[:-1] == old[:-1]
+        np.testing.assert_allclose(new.rms_d, old.rms_d, rtol=0.05, err_msg=REWRITE)
 
 
 def test_all_findings_come_out_with_the_shipped_half_widths(documented, fresh):
-    solver, scores = documented
-    now = {v.name: v.holds for v in paper_findings.verdicts(fresh)}
-    assert now == {v.name: v.holds for v in paper_findings.verdicts(scores[solver])}, REWRITE
-    assert all(now.values()), now
+    for solver, scores in fresh.items():
+        now = {v.name: v.words for v in paper_findings.verdicts(scores)}
+        before = paper_findings.verdicts(documented.scores[solver])
+        assert now == {v.name: v.words for v in before}, REWRITE
+        failed = [name for name, words in now.items() if words.startswith('no')]
+        assert failed == (['F1b high'] if solver == 'ode4 held' else [])
+
+
+def test_sign_is_an_estimate_only_where_it_is_held(documented, fresh):
+    for omega in paper_cases.FREQUENCIES:
+        plain, held = (
+            fresh[solver][paper_findings.FINE, omega]
+            for solver in (documented.solver, 'ode4 held')
+        )
+        assert held['rms_d'] < held['true_d'] < plain['rms_d']
+        assert held['high_pass'] > paper_findings.VISIBLE  # it chatters all the same
 
 
 def test_shipped_half_widths_lie_inside_the_region(documented):
-    solver, scores = documented
+    solver, scores = documented.solver, documented.scores
     signs = {w: scores[solver][paper_findings.FINE, w] for w in paper_cases.FREQUENCIES}
     for first in (1.5, 3.0):
         for later in (0.03, 0.07):

@@ -8,10 +8,12 @@ import subprocess
 import sys
 
 import bag_files as files
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.tools.bags.types import labelled_array
 from fhaosmo_ros.tools.plot import command as plot
 from fhaosmo_ros.tools.plot.curves import Curves, metrics, read_curves
 from fhaosmo_ros.tools.plot.figures import COLUMNS, envelope, save_curves
+from fhaosmo_ros.tools.plot.fuzzy import fuzzy_figure, rows_of
 from fhaosmo_ros.tools.replay import command as replay
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -195,6 +197,57 @@ def test_ctrl_c_leaves_nothing(tmp_path):
     assert error.strip().splitlines()[-1] == 'plot: interrupted'
     assert 'Traceback' not in error
     assert sorted(p.name for p in tmp_path.iterdir()) == ['bag', 'out']
+
+
+def test_fuzzy_systems_are_drawn_without_a_bag(tmp_path, capsys):
+    out = tmp_path / 'fuzzy.svg'
+    systems = "['input -1 -0.2 0 0.2 1; output singleton 5', 'terms 11', 'curve 0 0.8 1']"
+    assert plot.main(['--fuzzy', '-p', f'fuzzy_systems:={systems}', '-o', str(out)]) == 0
+    assert out.read_bytes().startswith(MAGIC['svg'])
+    assert capsys.readouterr().out == f'figure: {out}\n'
+
+
+def test_figure_of_fuzzy_systems_shows_memberships_and_curve():
+    parameters = OBSERVER_PARAMETERS.complete({'fuzzy_widths': [2.0, 0.5]})
+    rows = rows_of(parameters, 4)
+    assert [(row.text, row.width, row.levels) for row in rows] == [
+        ('terms 5', 2.0, '1'),
+        ('terms 7', 0.5, '2 to 4'),
+    ]
+    figure = fuzzy_figure(rows, 'triangle', True)
+    for row, axes, terms in zip(rows, np.reshape(figure.axes, (2, 3)), (5, 7), strict=True):
+        for side, scale in ((axes[0], row.width), (axes[1], 1.0)):
+            assert len(side.lines) == terms
+            peaks = [line.get_xdata()[line.get_ydata().argmax()] for line in side.lines]
+            np.testing.assert_allclose(peaks, scale * np.linspace(-1, 1, terms), atol=2e-3 * scale)
+        x, psi = axes[2].lines[-1].get_data()
+        assert (x[0], x[-1], psi[0], psi[-1]) == (-row.width, row.width, -1.0, 1.0)
+
+
+def test_fuzzy_systems_of_a_bag_are_those_it_was_made_with(tmp_path, monkeypatch):
+    stamps, y = files.signal(100)
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+    own = ['curve 0 0.8 1']
+    arguments = ['-o', str(tmp_path / 'one'), '-p', f'fuzzy_systems:={own}']
+    assert replay.main([str(bag), *arguments]) == 0
+    drawn = []
+    monkeypatch.setattr(plot, 'rows_of', lambda p, n: drawn.append(p) or rows_of(p, n))
+    assert plot.main(['--fuzzy', str(tmp_path / 'one'), '-o', str(tmp_path / 'f.png')]) == 0
+    assert drawn[0]['fuzzy_systems'] == own
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        ([], 'a BAG or --fuzzy'),
+        (['--fuzzy', '--show'], 'no --show'),
+        (['--fuzzy', '-p', "fuzzy_systems:=['terms 4']"], 'odd number of terms'),
+    ],
+)
+def test_wrong_fuzzy_arguments_are_said_in_one_line(arguments, words, capsys):
+    assert plot.main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line
 
 
 def test_truth_is_unknown_where_the_bag_lacks_it(tmp_path):

@@ -10,9 +10,10 @@ pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
 pytest.importorskip('control', reason='python-control is not installed (extra: tune)')
 
 from fhaosmo_ros.core import Family, Observer, TriangularModel
+from fhaosmo_ros.core.observer.fuzzy import curves
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.tools.tuning.command import main
 from fhaosmo_ros.tools.tuning.objective import Objective
@@ -51,13 +52,14 @@ def test_kalman_like_gains_make_a_kalman_filter(derivatives, decay):
     gain = model.kalman([period * bandwidth ** (2 * model.size)])
     expected = estimates(TriangularModel(PHI, 3), gain, decay, r, 0.1)
     apart = []
+    psi = curves(OBSERVER_PARAMETERS.defaults(), model.size)
     for width, gamma in ((10.0, 1e-2), (1e3, 1e-4)):
         observer = Observer(
             dict(SCHEME)
             | {
                 'unknown_input_derivatives': derivatives,
                 'unknown_input_decay': decay,
-                'lambda': kalman_like(model, bandwidth, width, noise, gamma).tolist(),
+                'lambda': kalman_like(model, bandwidth, width, psi, noise, gamma).tolist(),
                 'fuzzy_widths': [width],
                 'gamma_initial': gamma,
                 'gamma_min': 1e-5,

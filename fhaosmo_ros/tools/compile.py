@@ -5,12 +5,12 @@ import argparse
 from time import perf_counter
 
 from fhaosmo_ros.core.compiled.cache import cache_folder
-from fhaosmo_ros.core.observer.fuzzy import curve, TERMS
+from fhaosmo_ros.core.observer.fuzzy import curves, SHAPES
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.online.batch import EstimatorBatch
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import Plant
 from fhaosmo_ros.core.simulation.recordings import Family
 from fhaosmo_ros.core.simulation.scoring import Trial
@@ -41,9 +41,8 @@ def _compile(_: argparse.Namespace, stop: Stop) -> None:
 
 def _call_everything() -> None:
     """Do in small what the nodes, replay and tune do."""
-    for shape in ('triangle', 'gaussian'):
-        for terms in TERMS:
-            curve(terms, shape, normalise=True)
+    for shape in SHAPES:
+        curves(OBSERVER_PARAMETERS.complete({'fuzzy_shape': shape}), levels=2)
     estimator = OnlineEstimator()
     estimator.advance(1, 0.0)
     estimator.run(np.array([2, 3]), np.zeros(2), np.zeros(2))

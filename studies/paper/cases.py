@@ -176,9 +176,9 @@ def score(run: JointRun, start: float = CONVERGED) -> Score:
     Returns
     -------
     dict
-        rms_z1 .. rms_zn, rms_d: RMS errors. bias_d: mean error of d. settling: time from which
-        the error of d stays within `SETTLED` (s). variation: total variation of the estimate of
-        d over that of d. high_pass: RMS of its high-passed part. gamma: at the end.
+        rms_z1 .. rms_zn, rms_d: RMS errors. true_d: RMS of d. bias_d: mean error of d. settling:
+        time from which the error of d stays within `SETTLED` (s). variation: total variation of
+        the estimate of d over that of d. high_pass: RMS of its high-passed part. gamma: the last.
 
     """
     late = run.t >= start
@@ -188,6 +188,7 @@ def score(run: JointRun, start: float = CONVERGED) -> Score:
     result = {f'rms_z{i + 1}': rms(errors[:, i]) for i in range(n)}
     return result | {
         'rms_d': rms((estimate - d)[late]),
+        'true_d': rms(d[late]),
         'bias_d': float(np.mean((estimate - d)[late])),
         'settling': settling_time(run.t, estimate - d, SETTLED),
         'variation': chatter(estimate[late], d[late]),

@@ -4,7 +4,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from fhaosmo_ros.core.observer.fuzzy import curve, memberships, TERMS, terms_of_level
 from fhaosmo_ros.core.simulation.plant_and_observer import JointRun
 from fhaosmo_ros.tools.plot.figures import COLOURS, envelope, TRUTH
 from matplotlib import rcParams
@@ -78,39 +77,6 @@ def sim1(run: JointRun, zoom: float) -> Figure:
     panels[0, 1].set_title(f'zoom: the last {1e3 * zoom:g} ms')
     panels[3, 0].set_xlabel(TIME)
     panels[3, 1].set_xlabel(f'time after {run.t[late][0]:.2f} s [ms]')
-    return figure
-
-
-def fuzzy_systems(widths: Sequence[float], shape: str, normalise: bool) -> Figure:
-    """Figure fuzzysystems: memberships of input and output, and the curve, of psi_1 .. psi_3."""
-    figure = Figure(figsize=(9.0, 6.6), layout='constrained')
-    panels = figure.subplots(3, 3)
-    x = np.linspace(-1.0, 1.0, 401)
-    for i, row in enumerate(panels):
-        width = widths[min(i, len(widths) - 1)]
-        terms = terms_of_level(i + 1)
-        for axes, scale in ((row[0], width), (row[1], 1.0)):
-            for k, (name, member) in enumerate(
-                zip(TERMS[terms], memberships(x, terms, shape), strict=True)
-            ):
-                colour = '#0072B2' if k % 2 else '#D55E00'
-                axes.plot(scale * x, member, color=colour, linestyle='--' if k % 2 else '-')
-                axes.text(
-                    scale * np.linspace(-1, 1, terms)[k], 1.04, name, ha='center', fontsize=6
-                )
-            axes.set_ylim(0.0, 1.18)
-            axes.set_ylabel('membership [1]')
-        row[0].set_xlabel(f'ε of level {i + 1 if i < 2 else "3, 4"} [unit of the level]')
-        row[1].set_xlabel(f'ψ{"₁₂₃"[i]} [1], before scaling to ±1')
-        half = curve(terms, shape, normalise)
-        grid = np.linspace(0.0, width, len(half))
-        row[2].plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')
-        row[2].plot([-width, 0, 0, width], [-1, -1, 1, 1], color='#999999', linestyle=':')
-        row[2].set_xlabel('ε [unit of the level]')
-        row[2].set_ylabel(f'ψ{"₁₂₃"[i]}(ε) [1]')
-        row[2].grid(alpha=0.3)
-    for axes, title in zip(panels[0], ('input', 'output', 'curve (dotted: sign)'), strict=True):
-        axes.set_title(title, pad=10)
     return figure
 
 
@@ -217,11 +183,14 @@ def long_runs(runs: Sequence[LongRun]) -> Figure:
     return figure
 
 
-def protections(cells: Sequence[Sequence[LongRun]]) -> Figure:
+def protections(runs_of_all: Sequence[LongRun]) -> Figure:
     """Draw gamma and the RMS error of d with each protection by itself, a column a cell."""
+    cells: dict[tuple[float, float], list[LongRun]] = {}
+    for run in runs_of_all:
+        cells.setdefault((run.omega, run.noise), []).append(run)
     figure = Figure(figsize=(10.0, 6.0), layout='constrained')
     panels = figure.subplots(2, len(cells), sharex=True, squeeze=False)
-    for (top, bottom), runs in zip(panels.T, cells, strict=True):
+    for (top, bottom), runs in zip(panels.T, cells.values(), strict=True):
         for run, (colour, style, width) in zip(runs, PROTECTION_STYLES, strict=True):
             line = {'color': colour, 'linestyle': style, 'linewidth': width}
             line['label'] = run.law.replace("paper's", "paper's law")

@@ -32,12 +32,35 @@ Scores = dict[tuple[str, float], Score]
 
 
 class Verdict(NamedTuple):
-    """One finding: its name, what it claims, and the numbers that decide."""
+    """
+    One finding.
+
+    Attributes
+    ----------
+    name, claim : str
+    holds : bool
+    numbers : str
+        What decides.
+    estimates : bool
+        False if every observer that is judged has a larger RMS error of d than the estimate 0.
+
+    """
 
     name: str
     claim: str
     holds: bool
     numbers: str
+    estimates: bool
+
+    @property
+    def words(self) -> str:
+        """Whether it holds, and what that is worth."""
+        text = 'yes' if self.holds else 'no'
+        return text if self.estimates else f'{text}, but no estimate'
+
+
+def _estimates(*scores: Score) -> bool:
+    return any(s['rms_d'] < s['true_d'] for s in scores)
 
 
 @cache
@@ -59,19 +82,23 @@ def verdicts(s: Scores) -> list[Verdict]:
                 f'F1a {label}',
                 'sign at 1e-5 s chatters visibly',
                 fine_hp >= VISIBLE,
-                f'high-passed RMS {fine_hp:.1e} (visible from {VISIBLE:g})',
+                f'high-passed RMS {fine_hp:.1e} (visible from {VISIBLE:g}); '
+                f'RMS of d {fine["rms_d"]:.3f}',
+                _estimates(fine),
             ),
             Verdict(
                 f'F1b {label}',
                 'sign at 1e-3 s is bad',
                 coarse['rms_d'] >= BADLY * fine['rms_d'],
                 f'RMS of d {coarse["rms_d"]:.3f}, at 1e-5 s {fine["rms_d"]:.3f}',
+                _estimates(coarse, fine),
             ),
             Verdict(
                 f'F1c {label}',
                 'fuzzy at 1e-3 s does not chatter',
                 fuzzy_hp <= SMOOTH * fine_hp,
                 f'high-passed RMS {fuzzy_hp:.1e}, sign at 1e-5 s {fine_hp:.1e}',
+                _estimates(fuzzy, fine),
             ),
             Verdict(
                 f'F3 {label}',
@@ -79,15 +106,17 @@ def verdicts(s: Scores) -> list[Verdict]:
                 adaptive['rms_d'] < fuzzy['rms_d'] and abs(adaptive['gamma'] - 0.5) >= MOVED,
                 f'RMS of d {adaptive["rms_d"]:.4f}, without {fuzzy["rms_d"]:.4f}; '
                 f'γ ends at {adaptive["gamma"]:.3f}',
+                _estimates(adaptive, fuzzy),
             ),
         ]
-    fuzzy, fine = s[FUZZY, HIGH]['rms_d'], s[FINE, HIGH]['rms_d']
+    fuzzy, fine = s[FUZZY, HIGH], s[FINE, HIGH]
     result.append(
         Verdict(
             'F2',
             'at the high frequency fuzzy is worse than sign',
-            fuzzy > fine,
-            f'RMS of d {fuzzy:.3f}, sign at 1e-5 s {fine:.3f}',
+            fuzzy['rms_d'] > fine['rms_d'],
+            f'RMS of d {fuzzy["rms_d"]:.3f}, sign at 1e-5 s {fine["rms_d"]:.3f}',
+            _estimates(fuzzy, fine),
         )
     )
     return sorted(result)

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The generated parts of docs/paper.md, as Markdown."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 
+from fhaosmo_ros.core.simulation.plant_and_observer import SOLVERS
 from studies.paper.beyond import LongRun, Row, WORSE
 from studies.paper.cases import OBSERVERS, OURS, Score
+from studies.paper.curves import CurveRow, SYSTEMS
 from studies.paper.findings import (
     ADAPTIVE,
+    COARSE,
     DEFAULT_LAW,
+    FINE,
     FUZZY,
     Scores,
     verdicts,
@@ -36,8 +40,9 @@ def observers_table(scores: dict[str, Scores]) -> str:
     """Return the scores of the observers, by frequency and solver."""
     rows = [
         f'| {name} | {omega:g} | {solver} | {_cells(by_case[name, omega])} |'
-        for name in OBSERVERS | OURS
+        for name, case in (OBSERVERS | OURS).items()
         for solver, by_case in scores.items()
+        if case.variant == 'sign' or not SOLVERS[solver].holds_sign
         for omega in sorted({w for _, w in by_case})
     ]
     return _table(f'| observer | ω [rad/s] | solver {RMS_HEAD}', rows)
@@ -48,12 +53,12 @@ def findings_table(scores: dict[str, Scores], default: str) -> str:
     by_solver = {solver: verdicts(s) for solver, s in scores.items()}
     rows = []
     for k, verdict in enumerate(by_solver[default]):
-        others = ', '.join(
-            f'{solver} {"yes" if others[k].holds else "no"}'
-            for solver, others in by_solver.items()
-            if solver != default
-        )
-        holds = '**yes**' if verdict.holds else '**no**'
+        said: dict[str, list[str]] = {}
+        for solver, others in by_solver.items():
+            if solver != default:
+                said.setdefault(others[k].words, []).append(solver)
+        others = '; '.join(f'{", ".join(names)}: {words}' for words, names in said.items())
+        holds = f'**{verdict.words}**' if verdict.estimates else verdict.words
         rows.append(
             f'| {verdict.name} | {verdict.claim} | {holds} | {verdict.numbers} | {others} |'
         )
@@ -64,6 +69,8 @@ def bar_table(scores: dict[str, Scores]) -> str:
     """Return how adaptation compares with none, in every cell of the four observers' table."""
     rows = []
     for solver, s in scores.items():
+        if SOLVERS[solver].holds_sign:
+            continue  # there is no sign in these
         for omega in sorted({w for _, w in s}):
             paper, default = (
                 s[name, omega]['rms_d'] / s[FUZZY, omega]['rms_d']
@@ -78,17 +85,21 @@ def bar_table(scores: dict[str, Scores]) -> str:
     )
 
 
-def solver_table(scores: dict[str, Scores], fine: str, default: str) -> str:
-    """Return how sign at 1e-5 s depends on the solver."""
+def solver_table(scores: dict[str, Scores], default: str) -> str:
+    """Return how sign depends on the solver."""
     rows = [
-        f'| {solver}{" (default)" if solver == default else ""} | {omega:g} | '
-        f'{_number(s[fine, omega]["rms_d"])} | {_number(s[fine, omega]["bias_d"])} | '
-        f'{_number(s[fine, omega]["variation"])} | {_number(s[fine, omega]["high_pass"])} |'
-        for solver, s in scores.items()
-        for omega in sorted({w for _, w in s})
+        f'| {name} | {solver}{" (default)" if solver == default else ""} | {omega:g} | '
+        f'{_number(s["rms_d"])} | {s["rms_d"] / s["true_d"]:.2f} | {_number(s["bias_d"])} | '
+        f'{_number(s["variation"])} | {_number(s["high_pass"])} |'
+        for name in (FINE, COARSE)
+        for solver, by_case in scores.items()
+        for omega in sorted({w for _, w in by_case})
+        for s in (by_case[name, omega],)
     ]
     return _table(
-        '| solver | ω [rad/s] | RMS d | mean error of d | variation | high-passed |', rows
+        '| observer | solver | ω [rad/s] | RMS d | the same / RMS of d itself '
+        '| mean error of d | variation | high-passed |',
+        rows,
     )
 
 
@@ -156,17 +167,29 @@ def protection_table(runs: Iterable[LongRun]) -> str:
     )
 
 
-def dead_zone_table(runs: Mapping[tuple[float, float], Sequence[LongRun]]) -> str:
+def curves_table(rows: Iterable[CurveRow]) -> str:
+    """Return the RMS errors of d by fuzzy system."""
+    names = ' | '.join(SYSTEMS)
+    return _table(
+        f'| gains | d | {names} |',
+        (f'| {r.gains} | {r.signal} | {" | ".join(_number(x) for x in r.rms_d)} |' for r in rows),
+    )
+
+
+def dead_zone_table(runs: Iterable[LongRun]) -> str:
     """Return the worse ratio to gamma = 1/2 of both schemes, by dead zone and frequency."""
-    zones = list(dict.fromkeys(zone for zone, _ in runs))
-    frequencies = list(dict.fromkeys(omega for _, omega in runs))
+    by_cell: dict[tuple[str, float], list[LongRun]] = {}
+    for r in runs:
+        by_cell.setdefault((r.law, r.omega), []).append(r)
+    zones = list(dict.fromkeys(zone for zone, _ in by_cell))
+    frequencies = list(dict.fromkeys(omega for _, omega in by_cell))
     rows = []
     for zone in zones:
         cells = []
         for omega in frequencies:
-            found = runs[zone, omega]
+            found = by_cell[zone, omega]
             ratio = max(r.rms_d[-1] / r.fixed for r in found)
             met = ratio <= WORSE and all(r.rms_d[-1] <= r.rms_d[0] for r in found)
             cells.append(f'{ratio:.3f}' if met else f'**{ratio:.3f}**')
-        rows.append(f'| {zone:g} | {" | ".join(cells)} |')
+        rows.append(f'| {zone} | {" | ".join(cells)} |')
     return _table(f'| dead zone | {" | ".join(f"ω = {w:g}" for w in frequencies)} |', rows)

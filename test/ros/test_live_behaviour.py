@@ -63,6 +63,7 @@ CASES = {
     'alpha': Case([300.0]),
     'epsilon': Case(1e-9),
     'fuzzy_widths': Case([0.01, 0.02]),
+    'fuzzy_systems': Case(['curve 0 0.8 1']),
     'fuzzy_shape': Case('gaussian'),
     'fuzzy_normalise': Case(False),
     'gamma_initial': Case(0.5, reset=True),

@@ -5,6 +5,7 @@ import math
 
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np
+from observer_cases import SYSTEMS
 import pytest
 
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
@@ -56,6 +57,8 @@ def valid(rng, parameter) -> object:
             return number(rng, parameter)
         case 'string':
             return 'any'
+        case 'string_array':  # fuzzy_systems
+            return rng.choice([*SYSTEMS, 'terms 4'], rng.integers(1, 4)).tolist()
     return [number(rng, parameter) for _ in range(rng.choice([1, 4]))]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from fhaosmo_ros.core.model.triangular import constants_of, TriangularModel
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.covariance import Uncertainty
-from fhaosmo_ros.core.observer.fuzzy import curve, KNOTS, terms_of_level
+from fhaosmo_ros.core.observer.fuzzy import curves, KNOTS, of_level, read_system
 from fhaosmo_ros.core.observer.levant import deadbeat_shares
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -122,12 +122,11 @@ class ObserverConfiguration:
 
     def _make_law(self) -> arrays.Law:
         p, levels = self.parameters, self.levels
-        widths = p['fuzzy_widths']
-        if len(widths) > levels and widths != OBSERVER_PARAMETERS['fuzzy_widths'].default:
-            raise OBSERVER_PARAMETERS['fuzzy_widths'].error(
-                widths, f'1 to {levels} values (N = {levels} levels)'
-            )
-        widths = [widths[min(i, len(widths) - 1)] for i in range(levels)]
+        for name in ('fuzzy_widths', 'fuzzy_systems'):
+            declared = OBSERVER_PARAMETERS[name]
+            if len(p[name]) > levels and p[name] != declared.default:
+                raise declared.error(p[name], f'1 to {levels} values (N = {levels} levels)')
+        widths = [of_level(p['fuzzy_widths'], i) for i in range(levels)]
         flags = np.zeros(arrays.FLAGS, dtype=np.int64)
         flags[arrays.SIGN] = p['variant'].startswith('sign')
         flags[arrays.IMPLICIT] = p['scheme'] != 'explicit'
@@ -136,15 +135,12 @@ class ObserverConfiguration:
         flags[arrays.SENSITIVE] = self.adaptive and p['gamma_rate'] > 0.0
         flags[arrays.FROM_MEASUREMENT] = p['start_from_measurement']
         flags[arrays.LEVANT] = self.levant
-        if flags[arrays.SIGN]:  # they are not read
-            curves = np.ones((levels, KNOTS))
+        if flags[arrays.SIGN]:  # the curves are not read
+            for text in p['fuzzy_systems']:
+                read_system(text, p['fuzzy_shape'])
+            psi = np.ones((levels, KNOTS))
         else:
-            curves = np.array(
-                [
-                    curve(terms_of_level(i + 1), p['fuzzy_shape'], p['fuzzy_normalise'])
-                    for i in range(levels)
-                ]
-            )
+            psi = curves(p, levels)
         gains = np.zeros((arrays.GAINS, levels))
         gains[arrays.LAMBDA] = self._per_level('lambda')
         gains[arrays.ALPHA] = self._per_level('alpha')
@@ -178,8 +174,8 @@ class ObserverConfiguration:
         chances = np.zeros((3 * levels + 4, levels))
         chances[-3:-1] = self.initial_estimate, self.initial_internal
         if flags[arrays.SCHEDULED]:
-            self._schedule(arrays.Law(flags, gains, curves, scalars, chances, model))
-        return arrays.Law(flags, gains, curves, scalars, chances, model)
+            self._schedule(arrays.Law(flags, gains, psi, scalars, chances, model))
+        return arrays.Law(flags, gains, psi, scalars, chances, model)
 
     def _schedule(self, law: arrays.Law) -> None:
         """Write what the covariance is computed from (D 20)."""

@@ -1,122 +1,380 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-From the paper's rule bases to curves psi that a step reads in constant time.
+From fuzzy systems, the paper's or the user's, to curves psi that a step reads in constant time.
 
+A system is one text of `fuzzy_systems`, a level each (`read_system`). The default is the paper's:
 psi_1 has 5 terms (NB NS ZR PS PB), psi_2 and psi_3 have 7 (NBB .. PBB); rule k maps term k of the
 input to term k of the output (paper, section 3). scikit-fuzzy makes the membership functions and
-the centroid; this is the only module that imports it, and only where a curve is not kept beside
+defuzzifies; this is the only module that imports it, and only where a curve is not kept beside
 the machine code yet, because importing it takes longer than reading a curve. Input and output
 universes are [-1, 1]; a half-width scales the input, so that a width can change without a new
 inference.
 """
 
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
+import hashlib
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.compiled.cache import kept
+from fhaosmo_ros.core.parameters.declaration import shown
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import NDArray
 
-TERMS = {5: ('NB', 'NS', 'ZR', 'PS', 'PB'), 7: ('NBB', 'NB', 'NS', 'ZR', 'PS', 'PB', 'PBB')}
+NAMES = {
+    3: ('N', 'ZR', 'P'),
+    5: ('NB', 'NS', 'ZR', 'PS', 'PB'),
+    7: ('NBB', 'NB', 'NS', 'ZR', 'PS', 'PB', 'PBB'),
+}
+"""Names of terms by their number; those of the paper for 5 and 7."""
+SHAPES = ('triangle', 'trapezoid', 'gaussian')
+SINGLETON = 'singleton'
+"""Terms of the output may also be points."""
+DEFUZZIFIERS = ('centroid', 'bisector')
+"""Those of scikit-fuzzy whose result does not jump: mom, som and lom do."""
+MOST_TERMS = 99
+LEAST_GAP = 0.001
+"""Between two peaks; about the spacing of the output universe."""
 KNOTS = 193
 """Samples of a curve on [0, 1]: halves, thirds and quarters, where it has corners, are knots."""
 UNIVERSE = np.linspace(-1.0, 1.0, 2049)
 """Output universe; its grid holds every peak of 5 terms, and 0 and +-1 of 7."""
+ODD = 1e-6
+"""psi(x) + psi(-x) of an odd curve may differ from 0 by this; a smaller psi(1) is 0."""
 
 Curve = NDArray[np.float64]
 
 
-def terms_of_level(level: int) -> int:
-    """Return how many terms the rule base of a level (1-based) has."""
-    return 5 if level == 1 else 7
-
-
-def memberships(universe: Curve, terms: int, shape: str) -> Curve:
+class Terms(NamedTuple):
     """
-    Return the membership functions of evenly spaced terms on [-1, 1].
+    Membership functions on [-1, 1], from the most negative term to the most positive one.
+
+    Attributes
+    ----------
+    shape : str
+        One of `SHAPES`, or `SINGLETON`.
+    peaks : tuple of float
+        Ascending.
+    even : bool
+        True if they divide [-1, 1] evenly.
+
+    """
+
+    shape: str
+    peaks: tuple[float, ...]
+    even: bool
+
+
+class FuzzySystem(NamedTuple):
+    """
+    A fuzzy inference system with one input and one output.
+
+    Attributes
+    ----------
+    inputs, outputs : Terms
+    rules : tuple of int
+        Rule k maps input term k to output term rules[k]; both count from 0.
+    defuzzifier : str
+        One of `DEFUZZIFIERS`.
+
+    """
+
+    inputs: Terms
+    outputs: Terms
+    rules: tuple[int, ...]
+    defuzzifier: str
+
+
+def read_system(text: str, shape: str) -> FuzzySystem | Curve:
+    """
+    Read the text of a system: clauses with ``;`` between them, each a word and its values.
+
+    ==================== ==========================================================================
+    ``terms [S] P``      membership functions of input and output
+    ``input [S] P``      those of the input alone
+    ``output [S] P``     those of the output alone
+    ``rules k1 k2 ..``   output term of each input term, counted from 1; default: 1 2 3 ..
+    ``defuzzify D``      centroid (default) or bisector
+    ``curve v0 v1 ..``   instead of all these: samples of psi
+    ==================== ==========================================================================
+
+    S is a shape, `shape` where it is left out. P is the number of terms that divide [-1, 1]
+    evenly, or their peaks. Samples are evenly spaced, over [0, 1] if the first one is 0, else
+    over [-1, 1].
+
+    Returns
+    -------
+    FuzzySystem, or array
+        Of the samples over [0, 1].
+
+    Raises
+    ------
+    ConfigurationError
+        The text is no system.
+
+    """
+    clauses: dict[str, list[str]] = {}
+    for clause in text.split(';'):
+        name, *values = clause.replace(',', ' ').split() or ['']
+        if name not in CLAUSES or name in clauses:
+            raise _refused(text, f'clauses {", ".join(CLAUSES)}, each once', repr(name))
+        clauses[name] = values
+    if 'curve' in clauses:
+        if len(clauses) > 1:
+            raise _refused(text, 'curve by itself', ', '.join(clauses))
+        return _samples(text, _numbers(text, clauses['curve']))
+    if 'terms' in clauses and {'input', 'output'} <= clauses.keys():
+        raise _refused(text, 'terms, or input and output', ', '.join(clauses))
+    common = clauses.get('terms')
+    sides = [clauses.get(side, common) for side in ('input', 'output')]
+    if sides[0] is None:
+        raise _refused(text, 'terms, input or curve', ', '.join(clauses))
+    inputs = _terms(text, sides[0], shape, SHAPES)
+    outputs = _terms(text, sides[1] or sides[0], shape, (*SHAPES, SINGLETON))
+    if 'rules' in clauses:
+        numbers = _numbers(text, clauses['rules'])
+        rules = tuple(int(k) - 1 for k in numbers if k == int(k) and 1 <= k <= len(outputs.peaks))
+        if len(rules) < len(numbers) or len(rules) != len(inputs.peaks):
+            raise _refused(
+                text,
+                f'{len(inputs.peaks)} rules, each an output term from 1 to {len(outputs.peaks)}',
+                shown(numbers),
+            )
+    elif len(inputs.peaks) == len(outputs.peaks):
+        rules = tuple(range(len(inputs.peaks)))
+    else:
+        raise _refused(
+            text, 'rules where input and output have not the same number of terms',
+            f'{len(inputs.peaks)} and {len(outputs.peaks)} terms',
+        )  # fmt: skip
+    defuzzifier = ' '.join(clauses.get('defuzzify', DEFUZZIFIERS[:1]))
+    allowed = DEFUZZIFIERS[:1] if outputs.shape == SINGLETON else DEFUZZIFIERS
+    if defuzzifier not in allowed:
+        raise _refused(text, f'defuzzify {" or ".join(allowed)}', repr(defuzzifier))
+    return FuzzySystem(inputs, outputs, rules, defuzzifier)
+
+
+CLAUSES = ('terms', 'input', 'output', 'rules', 'defuzzify', 'curve')
+
+
+def _refused(text: str, allowed: str, got: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"parameter 'fuzzy_systems': expected {allowed}, got {got} in {shown(text)}"
+    )
+
+
+def _numbers(text: str, words: Sequence[str]) -> list[float]:
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if not numbers or not np.all(np.isfinite(numbers)):
+        raise _refused(text, 'numbers', shown(' '.join(words)))
+    return numbers
+
+
+def _terms(text: str, words: Sequence[str], shape: str, shapes: Sequence[str]) -> Terms:
+    if words and words[0][:1].isalpha():
+        shape, *words = words
+    if shape not in shapes:
+        raise _refused(text, f'a shape of {", ".join(shapes)}', repr(shape))
+    numbers = _numbers(text, words)
+    if len(numbers) == 1:
+        count = numbers[0]
+        if count not in range(3, MOST_TERMS + 1, 2):
+            raise _refused(text, f'an odd number of terms, 3 to {MOST_TERMS}', f'{count:g}')
+        return Terms(shape, tuple(np.linspace(-1.0, 1.0, int(count)).tolist()), True)
+    apart = min(high - low for low, high in pairwise(numbers))
+    within = -1.0 <= numbers[0] <= numbers[-1] <= 1.0
+    if not (apart >= LEAST_GAP and within and len(numbers) <= MOST_TERMS):
+        allowed = (
+            f'2 to {MOST_TERMS} peaks within [-1, 1], each {LEAST_GAP} or more above the last'
+        )
+        raise _refused(text, allowed, shown(numbers))
+    return Terms(shape, tuple(numbers), False)
+
+
+def _samples(text: str, values: list[float]) -> Curve:
+    samples = np.array(values)
+    if samples[0] != 0.0:
+        if len(values) % 2 == 0:
+            raise _refused(text, 'an odd number of samples over [-1, 1]', f'{len(values)}')
+        _expect_odd(text, np.linspace(-1.0, 1.0, len(samples)), samples, samples[::-1])
+        samples = samples[len(samples) // 2 :]
+    if len(samples) < 2:
+        raise _refused(text, '2 samples or more over [0, 1]', f'{len(samples)}')
+    samples[0] = 0.0
+    return samples
+
+
+def memberships(universe: Curve, terms: Terms) -> Curve:
+    """
+    Return the membership functions of terms.
+
+    A triangle reaches 0 at its neighbours' peaks; a trapezoid is 1 over half of that; trapezoids
+    and bells cross their neighbours at 1/2. The outermost terms are 1 beyond their peaks.
 
     Parameters
     ----------
     universe : (K,) array
         Where to evaluate them, within [-1, 1].
-    terms : int
-        5 or 7.
-    shape : {'triangle', 'gaussian'}
-        Triangles reach 0 at their neighbours' peaks; bells cross there neighbours at 1/2.
+    terms : Terms
 
     Returns
     -------
     (terms, K) array
-        One row a term, from the most negative to the most positive.
+        One row a term. A singleton is 1 at the point next to its peak.
 
     """
     import skfuzzy
 
-    peaks = np.linspace(-1.0, 1.0, terms)
-    gap = peaks[1] - peaks[0]
-    if shape == 'triangle':
-        rows = [skfuzzy.trimf(universe, [c - gap, c, c + gap]) for c in peaks]
-    elif shape == 'gaussian':
-        sigma = gap / (2.0 * np.sqrt(2.0 * np.log(2.0)))
-        rows = [skfuzzy.gaussmf(universe, c, sigma) for c in peaks]
-    else:
-        raise ConfigurationError(
-            f"parameter 'fuzzy_shape': expected triangle or gaussian, got {shape!r}"
-        )
+    peaks = np.array(terms.peaks)
+    gaps = np.full(len(peaks) - 1, peaks[1] - peaks[0]) if terms.even else np.diff(peaks)
+    rows = []
+    for c, left, right in zip(peaks, np.r_[gaps[0], gaps], np.r_[gaps, gaps[-1]], strict=True):
+        if terms.shape == 'triangle':
+            row = skfuzzy.trimf(universe, [c - left, c, c + right])
+        elif terms.shape == 'trapezoid':
+            knots = [c - 0.75 * left, c - 0.25 * left, c + 0.25 * right, c + 0.75 * right]
+            row = skfuzzy.trapmf(universe, knots)
+        elif terms.shape == 'gaussian':
+            bell = 2.0 * np.sqrt(2.0 * np.log(2.0))  # half its height at half a gap
+            row = skfuzzy.gauss2mf(universe, c, left / bell, c, right / bell)
+        else:
+            row = np.zeros(len(universe))
+            row[np.abs(universe - c).argmin()] = 1.0
+        rows.append(row)
+    if terms.shape != SINGLETON:
+        rows[0][universe < peaks[0]] = 1.0
+        rows[-1][universe > peaks[-1]] = 1.0
     return np.array(rows)
 
 
-def infer(x: float, terms: int, shape: str) -> float:
+def infer(x: Curve, system: FuzzySystem) -> Curve:
     """
-    Mamdani inference with rule k: term k -> term k; minimum, maximum, centroid.
+    Mamdani inference: minimum, maximum, defuzzification; singletons: their weighted mean.
 
     Parameters
     ----------
-    x : float
-        Input within [-1, 1].
+    x : (K,) array
+        Inputs within [-1, 1].
 
     Returns
     -------
-    float
-        The crisp output, not normalised.
+    (K,) array
+        The crisp outputs, not normalised.
 
     """
     import skfuzzy
 
-    activation = memberships(np.array([x]), terms, shape)
-    clipped = np.minimum(activation, _output_terms(terms, shape))
-    return float(skfuzzy.defuzz(UNIVERSE, clipped.max(axis=0), 'centroid'))
+    activations, rules = memberships(x, system.inputs), list(system.rules)
+    if system.outputs.shape == SINGLETON:
+        peaks = np.array(system.outputs.peaks)[rules]
+        return np.asarray(peaks @ activations / activations.sum(axis=0))
+    outputs = memberships(UNIVERSE, system.outputs)[rules]
+    regions = (np.minimum(a[:, None], outputs).max(axis=0) for a in activations.T)
+    return np.array([skfuzzy.defuzz(UNIVERSE, r, system.defuzzifier) for r in regions])
 
 
 @lru_cache(maxsize=32)
-def curve(terms: int, shape: str, normalise: bool) -> Curve:
+def curve(text: str, shape: str, normalise: bool) -> Curve:
     """
     Return psi at `KNOTS` evenly spaced points of [0, 1] (it is odd), read-only.
 
     Parameters
     ----------
+    text, shape : str
+        See `read_system`.
     normalise : bool
-        Scale the curve to end at 1. The centroid alone ends at about 0.83 (5 terms).
+        Scale the curve to end at 1. A centroid alone ends at about 0.83 (5 terms).
 
     Returns
     -------
     (KNOTS,) array
-        0 at 0, non-decreasing.
+        0 at 0, non-decreasing, at most 1.
+
+    Raises
+    ------
+    ConfigurationError
+        The text is no system, or its curve is not odd, falls, stays 0, or leaves [-1, 1].
 
     """
-    psi = kept(f'centroid_{terms}_{shape}', lambda: _centroid(terms, shape))
+    system = read_system(text, shape)
+    if isinstance(system, FuzzySystem):
+        digest = hashlib.sha256(repr(system).encode()).hexdigest()[:16]
+        psi = kept(f'psi_{digest}', lambda: _inferred(text, system))
+    else:
+        psi = np.interp(np.linspace(0.0, 1.0, KNOTS), np.linspace(0.0, 1.0, len(system)), system)
+    _expect_rising(text, psi)
     if normalise:
         psi /= psi[-1]
     psi.flags.writeable = False
     return psi
 
 
-def _centroid(terms: int, shape: str) -> Curve:
-    psi = np.array([infer(x, terms, shape) for x in np.linspace(0.0, 1.0, KNOTS)])
-    psi[0] = 0.0  # the rules are symmetric; the centroid leaves rounding errors
-    return psi
+def curves(parameters: Mapping[str, Any], levels: int) -> Curve:
+    """
+    Return psi of each level.
+
+    Parameters
+    ----------
+    parameters : mapping
+        With `fuzzy_systems`, `fuzzy_shape` and `fuzzy_normalise`.
+    levels : int
+        N.
+
+    Returns
+    -------
+    (N, KNOTS) array
+
+    """
+    options = parameters['fuzzy_shape'], parameters['fuzzy_normalise']
+    texts = parameters['fuzzy_systems']
+    return np.array([curve(of_level(texts, i), *options) for i in range(levels)])
 
 
-@lru_cache(maxsize=8)
-def _output_terms(terms: int, shape: str) -> Curve:
-    return memberships(UNIVERSE, terms, shape)
+def of_level(values: Sequence[Any], level: int) -> Any:
+    """Return what a list says for a level (0-based): its last value serves those that follow."""
+    return values[min(level, len(values) - 1)]
+
+
+def _inferred(text: str, system: FuzzySystem) -> Curve:
+    x = np.linspace(0.0, 1.0, KNOTS)
+    psi = infer(x, system)
+    if not _is_mirrored(system):
+        _expect_odd(text, x, psi, infer(-x, system))
+    psi[0] = 0.0  # an odd curve is 0 there; the inference leaves rounding errors
+    # What falls by less than the grid of the output universe can tell does not fall.
+    level = np.maximum.accumulate(psi)
+    return np.where(level - psi < ODD, level, psi)
+
+
+def _is_mirrored(system: FuzzySystem) -> bool:
+    """Return True if the system is its own mirror image, so that its curve is odd."""
+    last = len(system.outputs.peaks) - 1
+    return system.rules == tuple(last - k for k in reversed(system.rules)) and all(
+        terms.even or terms.peaks == tuple(-c for c in reversed(terms.peaks))
+        for terms in (system.inputs, system.outputs)
+    )
+
+
+def _expect_odd(text: str, x: Curve, psi: Curve, mirrored: Curve) -> None:
+    """Raise unless psi(-x), which is `mirrored`, is -psi(x)."""
+    k = int(np.abs(psi + mirrored).argmax())
+    if not abs(psi[k] + mirrored[k]) <= ODD:
+        values = f'psi({x[k]:.3g}) = {psi[k]:.3g} and psi({-x[k]:.3g}) = {mirrored[k]:.3g}'
+        raise _refused(text, 'an odd curve psi(-x) = -psi(x)', values)
+
+
+def _expect_rising(text: str, psi: Curve) -> None:
+    """Raise unless psi is 0 at 0, does not fall, ends above 0, and is at most 1."""
+    k = int(np.diff(psi).argmin())
+    where = f'psi({k / (KNOTS - 1):.3g}) = {psi[k]:.4g}, psi({(k + 1) / (KNOTS - 1):.3g}) = '
+    if psi[k + 1] < psi[k]:
+        raise _refused(text, 'a curve that does not fall', f'{where}{psi[k + 1]:.4g}')
+    if not ODD < psi[-1] <= 1.0:
+        raise _refused(
+            text, 'a curve that ends above 0 and at most at 1', f'psi(1) = {psi[-1]:.4g}'
+        )

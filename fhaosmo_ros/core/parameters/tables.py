@@ -147,8 +147,16 @@ OBSERVER = (
         'below 1/2, where an observer whose levels are all saturated would never find y again.',
     ),
     Parameter(
-        'fuzzy_shape', 'triangle', 'Shape of the membership functions.',
-        choices=('triangle', 'gaussian'),
+        'fuzzy_systems', ['terms 5', 'terms 7'],
+        'The fuzzy systems of levels 1, 2, ...: terms, peaks and shapes of their membership '
+        'functions, rules and defuzzifier, or a sampled curve (docs/mathematics.md, Fuzzy '
+        'curves). A curve that is not odd, falls, or stays 0 is refused.',
+        lengths='1 to N; the last one serves the levels that follow',
+    ),
+    Parameter(
+        'fuzzy_shape', 'triangle',
+        'Shape of the membership functions where fuzzy_systems names none.',
+        choices=('triangle', 'trapezoid', 'gaussian'),
     ),
     Parameter(
         'fuzzy_normalise', True,

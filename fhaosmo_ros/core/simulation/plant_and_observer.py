@@ -28,10 +28,12 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import cascade, levant
 from fhaosmo_ros.core.observer.arrays import (
     ADAPTIVE,
+    ALPHA,
     DEAD_ZONE,
     DELAY,
     GAMMA_INITIAL,
     HAT,
+    LAMBDA,
     Law,
     LEAKAGE,
     LEVANT,
@@ -40,6 +42,7 @@ from fhaosmo_ros.core.observer.arrays import (
     MIN,
     RATE,
     ROWS,
+    SIGN,
     TILDE,
     Work,
 )
@@ -51,7 +54,31 @@ from fhaosmo_ros.core.simulation.disturbance import disturbance, disturbances
 from fhaosmo_ros.core.simulation.plant import make_system, System, unknown_input
 import numpy as np
 
-SOLVERS: dict[str, Method] = {'ode1': EULER, 'ode3': BOGACKI_SHAMPINE, 'ode4': CLASSICAL}
+
+class Solver(NamedTuple):
+    """
+    How plant and observer are integrated.
+
+    Attributes
+    ----------
+    method : Method
+    holds_sign : bool
+        True if sign(eps_i) is taken at the first stage of a step and held for its other stages,
+        as simulators with zero-crossing detection do with their sign block. All else, |eps_i|
+        included, follows every stage. For the variants with sign; a fuzzy curve is not held.
+
+    """
+
+    method: Method
+    holds_sign: bool = False
+
+
+SOLVERS = {
+    'ode1': Solver(EULER),
+    'ode3': Solver(BOGACKI_SHAMPINE),
+    'ode4': Solver(CLASSICAL),
+    'ode4 held': Solver(CLASSICAL, holds_sign=True),
+}
 """What a fixed-step simulation offers, by its usual names."""
 
 
@@ -84,16 +111,79 @@ class _Joint(NamedTuple):
     Plant and observer; the state is z, then the levels row by row, then gamma.
 
     The observer's model need not be the plant's. Its scheme is not used. Known inputs u are 0.
+    `free` is its law without injections (lambda = alpha = 0). `signs` holds sign(eps_i), or is
+    empty if they are not held.
     """
 
     plant: System
     law: Law
     work: Work
     u: Floats
+    free: Law
+    signs: Floats
 
 
 @compiled(forceinline=True)
-def rates(joint: _Joint, state: Floats, slopes: Floats, t: float, wait: float) -> float:
+def observer_rates(joint: _Joint, law: Law, state: Floats, slopes: Floats) -> tuple[float, float]:
+    """Write the rates of the observer's levels by one of its laws; return L and dL/dgamma."""
+    work, u = joint.work, joint.u
+    x, levels = work.x, work.x.shape[1]
+    size = ROWS * levels + 1
+    n = state.size - size
+    for r in range(ROWS):
+        for i in range(levels):
+            x[r, i] = state[n + r * levels + i]
+    gamma = state[n + ROWS * levels]
+    rests = law.scalars[DEAD_ZONE] > 0.0 and is_upset(law, x, state[0])
+    # A forward Euler step of length 1 moves the state by its rate.
+    if law.flags[LEVANT]:
+        loss, gradient = levant.explicit(law, work, gamma, state[0], 1.0, u)
+    else:
+        loss, gradient = cascade.explicit(law, work, gamma, state[0], 1.0, u)
+    for r in range(ROWS):
+        for i in range(levels):
+            k = n + r * levels + i
+            slopes[k] = x[r, i] - state[k]
+    return loss, 0.0 if rests else gradient
+
+
+@compiled()
+def hold_signs(joint: _Joint, state: Floats, slopes: Floats, first: bool) -> None:
+    """
+    Remember the signs of the innovations, or replace those behind `slopes` by the held ones.
+
+    Parameters
+    ----------
+    state, slopes : (S,) arrays
+        The observer's rates are those of the sign at this state, and are changed in place.
+    first : bool
+        True at the first stage of a step.
+
+    """
+    levels = joint.signs.size
+    n = state.size - ROWS * levels - 1
+    free = slopes[:0]
+    for i in range(levels):
+        hat, measured = n + i, state[0]
+        if joint.law.flags[LEVANT]:
+            hat = n
+        elif i > 0:
+            measured = state[n + levels + i - 1]
+        sign = np.sign(measured - state[hat])
+        if first:
+            joint.signs[i] = sign
+        elif joint.signs[i] != sign:
+            if not free.size:
+                free = np.empty(state.size)
+                observer_rates(joint, joint.free, state, free)
+            for k in (n + i, n + levels + i):  # HAT, TILDE: what the injections add
+                slopes[k] = free[k] + joint.signs[i] * sign * (slopes[k] - free[k])
+
+
+@compiled(forceinline=True)
+def rates(
+    joint: _Joint, state: Floats, slopes: Floats, t: float, wait: float, first: bool
+) -> float:
     """
     Write the rates of a state.
 
@@ -105,6 +195,8 @@ def rates(joint: _Joint, state: Floats, slopes: Floats, t: float, wait: float) -
         Seconds.
     wait : float
         Time (s) until gamma leaks, if the innovations stay small.
+    first : bool
+        True at the first stage of a step.
 
     Returns
     -------
@@ -112,36 +204,25 @@ def rates(joint: _Joint, state: Floats, slopes: Floats, t: float, wait: float) -
         L.
 
     """
-    plant, law, work, u = joint
-    c, x = law.scalars, work.x
-    n, levels = plant.stages.shape[2], x.shape[1]
+    plant, law = joint.plant, joint.law
+    c, n = law.scalars, plant.stages.shape[2]
     for i in range(n):
         plant.stages[POINT, 0, i] = state[i]
     d = disturbance(plant.kind, plant.wave, t)
-    triangular_rates(plant.model, d, u, plant.stack, plant.stages)
+    triangular_rates(plant.model, d, joint.u, plant.stack, plant.stages)
     for i in range(n):
         slopes[i] = plant.stages[SLOPE, 0, i]
-    for r in range(ROWS):
-        for i in range(levels):
-            x[r, i] = state[n + r * levels + i]
-    gamma, upset = state[n + ROWS * levels], is_upset(law, x, state[0])
-    # A forward Euler step of length 1 moves the state by its rate.
-    if law.flags[LEVANT]:
-        loss, gradient = levant.explicit(law, work, gamma, state[0], 1.0, u)
-    else:
-        loss, gradient = cascade.explicit(law, work, gamma, state[0], 1.0, u)
-    for r in range(ROWS):
-        for i in range(levels):
-            k = n + r * levels + i
-            slopes[k] = x[r, i] - state[k]
-    slope = 0.0
+    loss, gradient = observer_rates(joint, law, state, slopes)
+    if joint.signs.size:
+        hold_signs(joint, state, slopes, first)
+    slope, gamma = 0.0, state[state.size - 1]
     if law.flags[ADAPTIVE]:
         rests = loss <= c[DEAD_ZONE] * c[DEAD_ZONE]
-        if not rests and not (upset and c[DEAD_ZONE] > 0.0):
+        if not rests:
             slope = -c[RATE] * gradient  # P adaptationlawgamma
         if c[DEAD_ZONE] == 0.0 or (rests and wait <= 0.0):
             slope -= c[LEAKAGE] * (gamma - c[GAMMA_INITIAL])
-    slopes[n + ROWS * levels] = slope
+    slopes[state.size - 1] = slope
     return loss
 
 
@@ -176,7 +257,7 @@ def integrate(
         begin_step(stages)
         for stage in range(method.nodes.size):
             time = t + method.nodes[stage] * h
-            found = rates(joint, stages[POINT, 0], stages[SLOPE, 0], time, wait)
+            found = rates(joint, stages[POINT, 0], stages[SLOPE, 0], time, wait, stage == 0)
             if stage == 0:
                 loss = found
             take_slope(method, stage, h, stages)
@@ -204,8 +285,8 @@ def simulate(
     ----------
     observer, plant : mapping
         Parameters as for `Observer` and `Plant`; scheme, noise and integration_step play no part.
-    solver : {'ode1', 'ode3', 'ode4'}
-        Euler, Bogacki-Shampine, classical Runge-Kutta.
+    solver : {'ode1', 'ode3', 'ode4', 'ode4 held'}
+        Euler, Bogacki-Shampine, classical Runge-Kutta, the same with held signs; see `Solver`.
     step : float
         Fixed step in seconds.
     duration : float
@@ -241,8 +322,12 @@ def simulate(
     stages = np.zeros((4, 1, len(state)))
     stages[NOW, 0] = state
     rows = np.empty((round(duration / step) // every + 1, len(state)))
-    joint = _Joint(system, law, make_work(law, depth), np.zeros(inputs))
-    integrate(joint, SOLVERS[solver], stages, step, every, rows)
+    method, holds = SOLVERS[solver]
+    free = law._replace(gains=law.gains.copy())
+    free.gains[[LAMBDA, ALPHA]] = 0.0
+    signs = np.zeros(configuration.levels if holds and law.flags[SIGN] else 0)
+    joint = _Joint(system, law, make_work(law, depth), np.zeros(inputs), free, signs)
+    integrate(joint, method, stages, step, every, rows)
     t = np.arange(len(rows), dtype=np.float64) * (every * step)
     n = model.order
     found = rows[:, n:-1].reshape(len(rows), ROWS, -1)

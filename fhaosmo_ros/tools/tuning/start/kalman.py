@@ -7,6 +7,7 @@ import math
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.fuzzy import curves
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Recording
@@ -73,7 +74,7 @@ class KalmanGains:
         With their truth, from which the sizes of d and of the noise follow.
     fixed : mapping
         Parameters of the observer that are set and not searched: `unknown_input_decay` and the
-        first of `fuzzy_widths` replace those of a design.
+        first of `fuzzy_widths` replace those of a design; its fuzzy curves are theirs.
     model : TriangularModel
     derivatives : int
         Derivatives of d that the observer estimates.
@@ -128,7 +129,8 @@ class KalmanGains:
             model = SampledModel(self._model, self._period, 1 + self._derivatives, decay=decay)
         except np.linalg.LinAlgError as error:  # the model at rest has no finite slope
             raise ConfigurationError(f'Kalman gain: {error}') from None
-        gain = kalman_like(model, bandwidth, width, small, self._gamma)
+        psi = curves(OBSERVER_PARAMETERS.defaults() | dict(self._fixed), model.size)
+        gain = kalman_like(model, bandwidth, width, psi, small, self._gamma)
         return {
             'unknown_input_derivatives': self._derivatives,
             'unknown_input_decay': decay,

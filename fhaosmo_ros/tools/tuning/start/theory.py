@@ -29,8 +29,8 @@ from itertools import product
 from math import comb
 from typing import Any
 
-from fhaosmo_ros.core.observer.fuzzy import curve, KNOTS, terms_of_level
 from fhaosmo_ros.core.observer.levant import deadbeat_shares
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.start.sampled_model import SampledModel
 import numpy as np
@@ -97,7 +97,12 @@ def candidates(
 
 
 def kalman_like(
-    model: SampledModel, bandwidth: float, widths: ArrayLike, small: float, gamma: float
+    model: SampledModel,
+    bandwidth: float,
+    widths: ArrayLike,
+    curves: NDArray[np.float64],
+    small: float,
+    gamma: float,
 ) -> NDArray[np.float64]:
     """
     Return lambda_1 .. lambda_N with which predict_correct is a Kalman filter (D 19).
@@ -115,6 +120,8 @@ def kalman_like(
         rad/s.
     widths : float or (N,) array
         Half-widths, unit of y.
+    curves : (N, K) array
+        psi of each level; see `fuzzy.curves`.
     small : float
         Size of the innovations that noise alone causes, unit of y.
     gamma : float
@@ -122,7 +129,7 @@ def kalman_like(
     Raises
     ------
     ConfigurationError
-        The Riccati equation has no solution in floating-point numbers.
+        The Riccati equation has no solution in floating-point numbers, or psi is 0 there.
 
     """
     n, h = model.size, model.period
@@ -136,11 +143,15 @@ def kalman_like(
         injections[i] = (wanted[i] - behind) / h
     level = np.arange(1, n + 1)
     power = 2.0 * gamma * (n - level) / n  # D 11
-    grid = np.linspace(0.0, 1.0, KNOTS)
-    psi = [
-        np.interp(small / width, grid, curve(terms_of_level(i), 'triangle', True))
-        for i, width in zip(level, np.broadcast_to(widths, n), strict=True)
-    ]
+    grid = np.linspace(0.0, 1.0, curves.shape[1])
+    psi = np.array(
+        [
+            np.interp(small / width, grid, curve)
+            for width, curve in zip(np.broadcast_to(widths, n), curves, strict=True)
+        ]
+    )
+    if not psi.all():
+        raise ConfigurationError(f'Kalman gain: expected psi > 0 at {small:g}, got {psi}')
     return np.asarray(injections * small ** (1.0 - power) / psi)
 
 
