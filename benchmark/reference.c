@@ -32,9 +32,10 @@ static int step(const struct law *law, double *state, double y, double h, double
     }
     h += x[4 * N + 2];
     double loss = 0.0, gradient = 0.0;
-    int running = 1;
+    int running = 1, upset = 0;
     for (int i = 0; i < N; i++) {
         const double e = m[i] - x[i], s = dm[i] - x[2 * N + i], a = fabs(e);
+        upset = upset || a * law->inverse_width[i] > 1.0;
         loss += e * e;
         gradient += 2.0 * e * s;
         if (!running)
@@ -79,7 +80,7 @@ static int step(const struct law *law, double *state, double y, double h, double
         x[4 * N + 3] = fmax(x[4 * N + 3] - h, 0.0);
     } else {
         x[4 * N + 3] = law->delay;
-        if (!word)
+        if (!word && !(upset && law->dead_zone > 0.0))
             g -= h * law->rate * gradient;
     }
     if (leaks)

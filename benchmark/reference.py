@@ -24,6 +24,8 @@ from table import CannotMeasureError
 SOURCE = Path(__file__).with_name('reference.c')
 OPTIONS = ('-O3', '-shared', '-fPIC', f'-DLEVEL_SHIFT={LEVEL_SHIFT}')
 PERIOD = 1e-3
+REMEMBERED = 4
+"""Entries of the memory that matter to a cascade."""
 CASE = {'variant': 'fuzzy_adaptive', 'scheme': 'explicit', 'fuzzy_widths': [0.1]}
 """Wide fuzzy sets: no chatter, so that rounding does not grow and both end at the same state."""
 
@@ -92,7 +94,7 @@ def in_c(library: ctypes.CDLL, y: NDArray[np.float64]) -> Callable[[], tuple[Sta
     rest, eps = np.ascontiguousarray(y[1:]), np.empty(4)
 
     def run() -> tuple[State, int]:
-        state = np.concatenate([start.levels.ravel(), start.memory])
+        state = np.concatenate([start.levels[: arrays.ROWS].ravel(), start.memory[:REMEMBERED]])
         word = library.run(
             packed.ctypes.data, state.ctypes.data, rest.ctypes.data, PERIOD, len(rest),
             eps.ctypes.data,
@@ -117,7 +119,8 @@ def in_numba(
         state = arrays.State(start.levels.copy(), start.memory.copy())
         samples = recursion.Samples(y, h, u)
         recursion.run(configuration.law, work, state, samples, record, 1, count)
-        return np.concatenate([state.levels.ravel(), state.memory]), int(record.words[0])
+        levels, memory = state.levels[: arrays.ROWS], state.memory[:REMEMBERED]
+        return np.concatenate([levels.ravel(), memory]), int(record.words[0])
 
     return run
 

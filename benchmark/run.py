@@ -19,6 +19,7 @@ import simulation
 import startup
 from table import CannotMeasureError, render, Row, Table
 import tune
+import upsets
 
 PARTS = {
     'core': core_step.measure,
@@ -29,6 +30,7 @@ PARTS = {
     'startup': startup.measure,
     'replay': replay.measure,
     'tune': tune.measure,
+    'upsets': upsets.measure,
 }
 
 

@@ -201,7 +201,8 @@ class Reference:
         loss = sum((e * e for e in eps), Dual(0.0))
         gamma = self.gamma
         if loss.value > p['gamma_dead_zone'] ** 2:
-            gamma -= h * p['gamma_rate'] * loss.slope
+            if not (p['gamma_dead_zone'] > 0.0 and self.is_upset(eps)):
+                gamma -= h * p['gamma_rate'] * loss.slope
             self.calm = 0.0
         rests = loss.value <= p['gamma_dead_zone'] ** 2
         waited = self.calm > p['gamma_leakage_delay'] - 1e-12
@@ -210,6 +211,12 @@ class Reference:
         if leaks:
             gamma -= h * p['gamma_leakage'] * (gamma - p['gamma_initial'])
         self.gamma = min(max(gamma, p['gamma_min']), p['gamma_max'])
+
+    def is_upset(self, eps):
+        w = self.p['fuzzy_widths']
+        widths = [w[min(i, len(w) - 1)] for i in range(self.N)]
+        fuzzy = not self.p['variant'].startswith('sign')
+        return fuzzy and any(abs(e.value) > w for e, w in zip(eps, widths, strict=True))
 
     def open(self):
         m = [self.y, *(v.value for v in self.tilde[: self.N - 1])]

@@ -27,6 +27,7 @@ class Change:
 SEED = [0.0, 1.0, 2.0, 3.0]
 PREDICTING = {'structure': 'levant', 'scheme': 'predict_correct'}
 PREDICTING |= {'lambda': [8.0, 20.0, 30.0, 16.0], 'fuzzy_widths': [1.0]}
+SCHEDULED = PREDICTING | {'noise_size': 0.01, 'correction_period': 1e-3}
 CHANGES = {
     'unknown_input_decay': Change(50.0),
     'structure': Change('levant'),
@@ -34,10 +35,15 @@ CHANGES = {
     'scheme': Change('explicit'),
     'prediction_step': Change(1e-4, PREDICTING),
     'correction_period': Change(2e-4, PREDICTING),
+    'noise_size': Change(1e-3, SCHEDULED, reset=True),
+    'state_sizes': Change(5.0, SCHEDULED, reset=True),
+    'unknown_input_size': Change(9.0, SCHEDULED, reset=True),
+    'unknown_input_rate': Change(9.0, SCHEDULED, reset=True),
     'lambda': Change(500.0),
     'alpha': Change([10.0, 20.0, 30.0, 40.0]),
     'epsilon': Change(1e-4),
     'fuzzy_widths': Change(0.02),
+    'fuzzy_growth': Change(True, PREDICTING | {'fuzzy_widths': [1e-3], 'gamma_initial': 0.1}),
     'fuzzy_systems': Change(['curve 0 0.8 1']),
     'fuzzy_shape': Change('gaussian'),
     'fuzzy_normalise': Change(False),

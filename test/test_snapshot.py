@@ -24,6 +24,9 @@ def feed(estimator, begin, end):
 @pytest.mark.parametrize('parameters', [
     {'variant': 'fuzzy_adaptive'}, {'variant': 'sign', 'order': 2, 'phi': ['0', '-z2']},
     {'scheme': 'explicit', 'variant': 'fuzzy_adaptive'},
+    {'noise_size': 1e-3},
+    {'structure': 'levant', 'scheme': 'predict_correct', 'correction_period': 1e-3,
+     'lambda': [8.0, 20.0, 30.0, 16.0], 'fuzzy_widths': [0.1], 'noise_size': 1e-3},
 ])  # fmt: skip
 def test_another_estimator_goes_on_bit_for_bit(parameters):
     first, second = OnlineEstimator(parameters), OnlineEstimator(parameters)
@@ -107,3 +110,21 @@ def test_memory_of_another_size_is_refused_and_changes_nothing():
         estimator.remember(OnlineEstimator({'order': 2, 'phi': ['0', '0']}).memory)
     for mine, was in zip(estimator.memory, before, strict=True):
         np.testing.assert_array_equal(mine, was)
+
+
+@pytest.mark.parametrize('scheme', ['implicit', 'explicit'])
+def test_snapshot_without_the_covariance_is_followed(scheme):
+    """As of an older version, which remembered less."""
+    parameters = {'scheme': scheme, 'structure': 'levant', 'lambda': [8.0, 20.0, 30.0, 16.0]}
+    first, second = OnlineEstimator(parameters), OnlineEstimator(parameters)
+    feed(first, 0, 1500)
+    later = ('covariance', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread')
+    vector = pack(Snapshot(first.latest, Flag.CHANGED, first.memory))
+    kept = {
+        label: value
+        for label, value in zip(labels(first.observer.levels), vector, strict=True)
+        if not label.removeprefix('before_').startswith(later)
+    }
+    assert len(kept) < len(vector)
+    second.remember(unpack(list(kept.values()), list(kept)).memory)
+    np.testing.assert_array_equal(feed(second, 1500, 3000), feed(first, 1500, 3000))

@@ -13,6 +13,7 @@ Rows of ``State.levels`` and ``Work.x``, column i - 1 for level i:
 | TILDE | internal state z_tilde_{i+1}; theta at the last level | of z_{i+1} |
 | HAT_SENSITIVITY | p_i = d z_hat_i / d gamma | of z_i |
 | TILDE_SENSITIVITY | q_i = d z_tilde_{i+1} / d gamma | of z_{i+1} |
+| COVARIANCE .. | covariance P of the errors, N rows; not used without `noise_size` | product |
 
 Entries of ``State.memory``:
 
@@ -22,6 +23,12 @@ Entries of ``State.memory``:
 | Y | last accepted sample of y, NaN before the first | of y |
 | PENDING | time of rejected samples, to be added to the next step | s |
 | WAIT | time for which the innovations have yet to stay small before gamma leaks | s |
+| SCALE | factor s of the half-widths and of the injections (D 22) | 1 |
+| SATURATED | samples in a row with |eps_1| beyond all half-widths | 1 |
+| BEYOND | samples in a row that are too far from the prediction to be likely | 1 |
+| SETTLED | 1: the gains are the tuned ones; else minus the time since the start, or 0 | s |
+| PERIOD | running mean of the intervals between samples | s |
+| SPREAD | size of the innovations over that expected, at least 1 (D 21) | 1 |
 """
 
 from typing import NamedTuple
@@ -30,13 +37,14 @@ from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
 import numpy as np
 
-HAT, TILDE, HAT_SENSITIVITY, TILDE_SENSITIVITY = range(4)
+HAT, TILDE, HAT_SENSITIVITY, TILDE_SENSITIVITY, COVARIANCE = range(5)
 ROWS = 4
-GAMMA, Y, PENDING, WAIT = range(4)
-MEMORY = 4
+"""Number of rows before the covariance."""
+GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD = range(10)
+MEMORY = 10
 
-SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE = range(7)
-FLAGS = 7
+SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
+FLAGS = 8
 """Number of flags of a law: 0 or 1 each. IMPLICIT: a step uses the sample at its end."""
 LAMBDA, ALPHA, INVERSE_WIDTH, DECAY = range(4)
 GAINS = 4
@@ -45,8 +53,9 @@ Number of rows of gains. INVERSE_WIDTH is 1 / half-width. DECAY is that of the i
 except for those that stand for the unknown input and its derivatives.
 """
 EPSILON, GAMMA_INITIAL, RATE, MIN, MAX, DEAD_ZONE, LEAKAGE, DELAY = range(8)
-PREDICTION_STEP, CORRECTION_PERIOD = range(8, 10)
-SCALARS = 10
+PREDICTION_STEP, CORRECTION_PERIOD, WIDEST, RELAXATION = range(8, 12)
+VARIANCE, INTENSITY, FASTEST, STEADY_VARIANCE = range(12, 16)
+SCALARS = 16
 """Number of scalars of a law."""
 
 NEWTON_STEPS = 60
@@ -69,7 +78,13 @@ class Law(NamedTuple):
     curves : (N, K) array
         psi of each level at K points of [0, half-width].
     scalars : (SCALARS,) array
-        `EPSILON` .. `CORRECTION_PERIOD`.
+        `EPSILON` .. `STEADY_VARIANCE`.
+    chances : (3N + 4, N) array
+        What the covariance is computed from, with `noise_size` (D 20): the rates A of the model,
+        linearised at rest; the steady covariance of the errors of predictions; that of the errors
+        of a fresh observer; and four rows: one over the first of the steady covariance (0 where
+        that is not positive), first estimates, first internal states, and the tuned corrections
+        of a small innovation over those of the Kalman filter.
     model : Bytecode
         Phi_1 .. Phi_n, and the model of the unknown input behind them (D 17).
 
@@ -79,6 +94,7 @@ class Law(NamedTuple):
     gains: Floats
     curves: Floats
     scalars: Floats
+    chances: Floats
     model: Bytecode
 
 
@@ -88,7 +104,7 @@ class Work(NamedTuple):
 
     Attributes
     ----------
-    x : (4, N) array
+    x : (4 + N, N) array
         The levels while a step changes them.
     stack : (2, depth) array
         For the evaluation of expressions.
@@ -109,10 +125,10 @@ class State(NamedTuple):
 
     Attributes
     ----------
-    levels : (4, N) array
-        `HAT` .. `TILDE_SENSITIVITY`.
-    memory : (4,) array
-        `GAMMA` .. `WAIT`.
+    levels : (4 + N, N) array
+        `HAT` .. `COVARIANCE` and the rows that follow.
+    memory : (10,) array
+        `GAMMA` .. `SPREAD`.
 
     """
 
@@ -123,7 +139,7 @@ class State(NamedTuple):
 def make_work(law: Law, depth: int) -> Work:
     """Return scratch memory for a law whose expressions need a stack of `depth`."""
     levels, states = law.gains.shape[1], len(law.model.offsets) - 1
-    return Work(np.zeros((ROWS, levels)), np.zeros((2, depth)), np.zeros((4, 2, states)))
+    return Work(np.zeros((ROWS + levels, levels)), np.zeros((2, depth)), np.zeros((4, 2, states)))
 
 
 @compiled(forceinline=True)

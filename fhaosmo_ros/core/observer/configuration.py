@@ -6,7 +6,9 @@ from typing import Any
 
 from fhaosmo_ros.core.model.triangular import constants_of, TriangularModel
 from fhaosmo_ros.core.observer import arrays
+from fhaosmo_ros.core.observer.covariance import Uncertainty
 from fhaosmo_ros.core.observer.fuzzy import curves, KNOTS, of_level, read_system
+from fhaosmo_ros.core.observer.levant import deadbeat_shares
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
@@ -92,6 +94,8 @@ class ObserverConfiguration:
             self.levels += 1 + p['unknown_input_derivatives']
         self.initial_estimate = self._per_level('initial_estimate')
         self.initial_internal = self._per_level('initial_internal')
+        sizes = OBSERVER_PARAMETERS['state_sizes']
+        self.state_sizes = per_level(sizes, p['state_sizes'], self.model.order)
         if self.levant:
             self.initial_internal = np.append(self.initial_estimate[1:], 0.0)
         self.internal = p['estimate_from'] == 'internal'
@@ -102,11 +106,15 @@ class ObserverConfiguration:
 
     def initial_state(self) -> arrays.State:
         """Return the state of an observer that has seen no sample."""
-        levels, memory = np.zeros((arrays.ROWS, self.levels)), np.zeros(arrays.MEMORY)
+        rows = arrays.ROWS + self.levels
+        levels, memory = np.zeros((rows, self.levels)), np.zeros(arrays.MEMORY)
         levels[arrays.HAT] = self.initial_estimate
         levels[arrays.TILDE] = self.initial_internal
+        levels[arrays.COVARIANCE :] = self.law.chances[2 * self.levels : 3 * self.levels]
         memory[arrays.GAMMA] = self.gamma_initial
         memory[arrays.Y] = np.nan
+        memory[arrays.SCALE] = memory[arrays.SPREAD] = 1.0
+        memory[arrays.SETTLED] = 1.0 - self.law.flags[arrays.SCHEDULED]
         return arrays.State(levels, memory)
 
     def _per_level(self, name: str) -> np.ndarray:
@@ -152,7 +160,56 @@ class ObserverConfiguration:
         scalars[arrays.DELAY] = p['gamma_leakage_delay']
         scalars[arrays.PREDICTION_STEP] = p['prediction_step']
         scalars[arrays.CORRECTION_PERIOD] = p['correction_period']
-        return arrays.Law(flags, gains, psi, scalars, model)
+        if self.levant and p['fuzzy_growth'] and not flags[arrays.SIGN]:
+            scalars[arrays.WIDEST] = max(widths)
+            speed = (gains[arrays.LAMBDA, -1] / widths[-1]) ** (1.0 / levels)
+            scalars[arrays.RELAXATION] = speed / 3.0
+        else:
+            scalars[arrays.WIDEST] = np.inf
+        flags[arrays.SCHEDULED] = (
+            p['noise_size'] > 0.0
+            and p['unknown_input']
+            and (p['correction_period'] > 0.0 or not flags[arrays.PREDICTING])
+        )
+        chances = np.zeros((3 * levels + 4, levels))
+        chances[-3:-1] = self.initial_estimate, self.initial_internal
+        if flags[arrays.SCHEDULED]:
+            self._schedule(arrays.Law(flags, gains, psi, scalars, chances, model))
+        return arrays.Law(flags, gains, psi, scalars, chances, model)
+
+    def _schedule(self, law: arrays.Law) -> None:
+        """Write what the covariance is computed from (D 20)."""
+        p, n, scalars, chances = self.parameters, self.levels, law.scalars, law.chances
+        period = p['correction_period']
+        uncertainty = Uncertainty(self.model, p, self.state_sizes)
+        chances[:n], chances[2 * n : 3 * n] = uncertainty.rates, uncertainty.fresh
+        scalars[arrays.VARIANCE] = uncertainty.variance
+        scalars[arrays.INTENSITY] = uncertainty.intensity
+        scalars[arrays.FASTEST] = uncertainty.fastest
+        if not law.flags[arrays.PREDICTING]:
+            return
+        steady = uncertainty.steady(period)
+        chances[n : 2 * n] = steady
+        chances[3 * n, steady[0] > 0.0] = 1.0 / steady[0, steady[0] > 0.0]
+        tuned = tuned_corrections(law, p['noise_size'], period, self.gamma_initial)
+        wanted = steady[0] / uncertainty.variance
+        alike = (wanted > 0.0) & (tuned > 0.0)
+        chances[-1] = 1.0
+        chances[-1, alike] = np.clip(tuned[alike] / wanted[alike], 1e-6, 1e6)
+        scalars[arrays.STEADY_VARIANCE] = steady[0, 0] + uncertainty.variance
+
+
+def tuned_corrections(law: arrays.Law, small: float, period: float, gamma: float) -> np.ndarray:
+    """Return S_1 .. S_N of D 19 with which an innovation of the size `small` is corrected."""
+    n = law.gains.shape[1]
+    level = np.arange(1, n + 1)
+    injections = law.gains[arrays.LAMBDA] * small ** (2.0 * gamma * (n - level) / n - 1.0)
+    injections *= [arrays.psi(law, i, small)[0] for i in range(n)]
+    shares = deadbeat_shares(n)
+    return np.array([
+        sum(shares[j, i] * period ** (j - i + 1) * injections[j] for j in range(i, n))
+        for i in range(n)
+    ])  # fmt: skip
 
 
 def per_level(parameter: Parameter, values: list[float], count: int) -> np.ndarray:

@@ -16,24 +16,42 @@ import math
 
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import evaluate, Floats
-from fhaosmo_ros.core.model.integrate import NOW, POINT
+from fhaosmo_ros.core.model.integrate import NOW, POINT, TOTAL
 from fhaosmo_ros.core.observer.arrays import (
+    BEYOND,
     CORRECTION_PERIOD,
+    COVARIANCE,
+    GAMMA,
     HAT,
     HAT_SENSITIVITY,
     LAMBDA,
     Law,
     NEWTON_STEPS,
     NEWTON_TOLERANCE,
+    PERIOD,
     PREDICTING,
     PREDICTION_STEP,
     psi,
+    RELAXATION,
+    SATURATED,
+    SCALE,
+    SCHEDULED,
     SENSITIVE,
+    SETTLED,
     SIGN,
+    STEADY_VARIANCE,
     TILDE,
     TILDE_SENSITIVITY,
     TINY,
+    VARIANCE,
+    WIDEST,
     Work,
+)
+from fhaosmo_ros.core.observer.covariance import (
+    correct_covariance,
+    HUBER,
+    predict_covariance,
+    usual_innovation,
 )
 from fhaosmo_ros.core.observer.prediction import predict
 import numpy as np
@@ -41,6 +59,16 @@ from numpy.typing import NDArray
 
 MOST_LEVELS = 16
 """order <= 12, the unknown input, and at most 3 derivatives of it."""
+
+
+NEAR = 0.25
+"""An interval that differs from the tuned one by at most this part of it needs no other gains."""
+CLOSE = 0.02
+"""Gains that differ from the tuned ones by at most this part of them are replaced by them."""
+SATURATED_SAMPLES = 20
+"""So many samples in a row beyond all half-widths widen them."""
+RATIO = TOTAL
+"""``stages[RATIO, 0]``: factors of the corrections of the levels, P / steady P."""
 
 
 def deadbeat_shares(count: int) -> NDArray[np.float64]:
@@ -203,7 +231,7 @@ def root(law: Law, weights: Floats, b: float, gamma: float) -> tuple[float, floa
 
 @compiled()
 def implicit(
-    law: Law, work: Work, gamma: float, y: float, h: float, u: Floats
+    law: Law, work: Work, memory: Floats, y: float, h: float, u: Floats
 ) -> tuple[float, float]:
     """
     Backward Euler of D 11 in place, one scalar equation for all levels (D 12).
@@ -232,12 +260,13 @@ def implicit(
         above = x[HAT, i] + h * above
         dabove = x[HAT_SENSITIVITY, i] + h * dabove
         x[HAT, i], x[HAT_SENSITIVITY, i] = above, dabove
-    return correct(law, work, gamma, y, h)
+    even(work)
+    return correct(law, work, memory, y, h)
 
 
 @compiled()
 def predict_correct(
-    law: Law, work: Work, gamma: float, y: float, h: float, u: Floats
+    law: Law, work: Work, memory: Floats, y: float, h: float, u: Floats
 ) -> tuple[float, float]:
     """
     Follow the model to the sample, then correct (D 18), in place.
@@ -254,18 +283,76 @@ def predict_correct(
 
     """
     x, n, stages = work.x, law.gains.shape[1], work.stages
+    scheduled = law.flags[SCHEDULED] and not holds(law, memory, h)
+    variance = law.scalars[STEADY_VARIANCE]
+    if scheduled:
+        if memory[SETTLED] > 0.0:
+            for i in range(n):
+                for j in range(n):
+                    x[COVARIANCE + i, j] = law.chances[n + i, j]
+            correct_covariance(law, work)
+        predict_covariance(law, work, h)
+        variance = x[COVARIANCE, 0] + law.scalars[VARIANCE]
     for i in range(n):
         stages[NOW, 0, i], stages[NOW, 1, i] = x[HAT, i], x[HAT_SENSITIVITY, i]
     predict(law, work, h, u, law.scalars[PREDICTION_STEP])
     for i in range(n):
         x[HAT, i], x[HAT_SENSITIVITY, i] = stages[NOW, 0, i], stages[NOW, 1, i]
-    if 0.0 < law.scalars[CORRECTION_PERIOD] < h:
-        h = law.scalars[CORRECTION_PERIOD]
-    return correct(law, work, gamma, y, h)
+    period = law.scalars[CORRECTION_PERIOD]
+    if not law.flags[SCHEDULED]:
+        even(work)
+        if period > 0.0:  # not below the mean interval: another rate is no gap
+            h = min(h, max(period, memory[PERIOD]))
+        return correct(law, work, memory, y, h)
+    b, ratio = y - x[HAT, 0], stages[RATIO, 0]
+    usual = usual_innovation(memory, b, math.sqrt(variance))
+    if memory[BEYOND] > 0.0:
+        return 0.0, 0.0
+    if not scheduled:  # where P is not steady it counts on the whole innovation
+        y = x[HAT, 0] + min(max(b, -HUBER * usual), HUBER * usual)
+    even(work)
+    if scheduled:
+        far, largest = abs(h - period) > NEAR * period, 1.0
+        for i in range(n):  # D 20
+            inverse = law.chances[3 * n, i]
+            ratio[i] = x[COVARIANCE, i] * inverse if inverse > 0.0 else ratio[0]
+            largest = max(largest, ratio[i])
+            far = far or abs(ratio[i] - 1.0) > CLOSE
+        for i in range(n):  # from the Kalman filter's gains to the tuned ones
+            ratio[i] *= law.chances[3 * n + 3, i] ** (1.0 / largest - 1.0)
+        correct_covariance(law, work)
+        memory[SETTLED] = 0.0 if far else 1.0
+    return correct(law, work, memory, y, period)
+
+
+@compiled(forceinline=True)
+def even(work: Work) -> None:
+    """Let every level be corrected by its tuned gain."""
+    for i in range(work.stages.shape[2]):
+        work.stages[RATIO, 0, i] = 1.0
+
+
+@compiled(forceinline=True)
+def holds(law: Law, memory: Floats, h: float) -> bool:
+    """Return True while the tuned gains are the right ones: steady, at the tuned rate."""
+    period = law.scalars[CORRECTION_PERIOD]
+    return bool(memory[SETTLED] > 0.0 and abs(h - period) <= NEAR * period)
+
+
+@compiled(forceinline=True)
+def grow(law: Law, memory: Floats, a: float, h: float) -> None:
+    """Widen the fuzzy sets while all of them have been saturated for long (D 22)."""
+    if a > law.scalars[WIDEST]:
+        memory[SATURATED] += 1.0
+        if memory[SATURATED] >= SATURATED_SAMPLES:
+            memory[SCALE] *= 2.0
+    else:
+        memory[SATURATED] = 0.0
+        memory[SCALE] = 1.0 + (memory[SCALE] - 1.0) / (1.0 + h * law.scalars[RELAXATION])
 
 
 @compiled()
-def correct(law: Law, work: Work, gamma: float, y: float, h: float) -> tuple[float, float]:
+def correct(law: Law, work: Work, memory: Floats, y: float, h: float) -> tuple[float, float]:
     """
     Turn predicted estimates into corrected ones by the solution of D 12 or D 18, in place.
 
@@ -282,10 +369,11 @@ def correct(law: Law, work: Work, gamma: float, y: float, h: float) -> tuple[flo
     """
     flags, gains, n = law.flags, law.gains, law.gains.shape[1]
     x, m = work.x, work.stages[POINT]
-    b, db = y - x[HAT, 0], -x[HAT_SENSITIVITY, 0]
+    ratio, scale, gamma = work.stages[RATIO, 0], memory[SCALE], memory[GAMMA]
+    b, db = (y - x[HAT, 0]) / scale, -x[HAT_SENSITIVITY, 0] / scale  # D 22
     weight = h
     for i in range(n):
-        m[0, i], m[1, i] = weight * gains[LAMBDA, i], weight
+        m[0, i], m[1, i] = ratio[0] * weight * gains[LAMBDA, i], weight
         weight *= h
     a, w, top = root(law, m, abs(b), gamma)
     sliding = flags[SIGN] and a == 0.0
@@ -314,11 +402,13 @@ def correct(law: Law, work: Work, gamma: float, y: float, h: float) -> tuple[flo
         power *= w
     for i in range(n):
         for j in range(i, n):
-            share = m[1, j - i]
+            share = scale * ratio[i] * m[1, j - i]
             if flags[PREDICTING]:
                 share *= SHARES[j, i]
             x[HAT, i] += share * x[TILDE, j]
             x[HAT_SENSITIVITY, i] += share * x[TILDE_SENSITIVITY, j]
+    grow(law, memory, a, h)
+    a, deps = scale * a, scale * deps
     # What the sum above is but for rounding.
     x[HAT, 0] = y - math.copysign(a, b)
     if flags[SENSITIVE]:

@@ -93,8 +93,8 @@ class ObserverState:
 
     Attributes
     ----------
-    levels : (4, N) array
-    memory : (4,) array
+    levels : (4 + N, N) array
+    memory : (10,) array
         See `fhaosmo_ros.core.observer.arrays`.
     t : float or int or None
         Time of the last sample of `Observer.run`, in its unit (s, or ns for integers).
@@ -269,18 +269,24 @@ class Observer:
 
     def adopt(self, configuration: ObserverConfiguration) -> None:
         """Go on with a configuration that `prepare` has returned, from the next sample on."""
-        before = self._law.flags
+        before, chances = self._law.flags, self._law.chances
         self._configuration = configuration
         self._set_law()
         self._fit_memory()
         after = self._law.flags
         if not before[arrays.SENSITIVE] or before[arrays.LEVANT] != after[arrays.LEVANT]:
-            self._state.levels[arrays.HAT_SENSITIVITY :] = 0.0  # they were not carried along
+            self._state.levels[arrays.HAT_SENSITIVITY : arrays.ROWS] = 0.0  # not carried along
+        steady = slice(self.levels, 2 * self.levels)
+        same = before[arrays.SCHEDULED] == after[arrays.SCHEDULED]
+        if not same or not np.array_equal(
+            chances[steady], self._law.chances[steady]
+        ):  # P is of other sizes
+            self._state.memory[arrays.SETTLED] = 1.0
 
     def _set_law(self) -> None:
         law = self._law = self._configuration.law
         self._work = self.make_work()
-        flat_law = (law.flags, law.gains, law.curves, law.scalars, *law.model)
+        flat_law = (law.flags, law.gains, law.curves, law.scalars, law.chances, *law.model)
         self._arguments = (*flat_law, *self._work, *self._state)
 
     def _write(self, levels: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
@@ -295,7 +301,7 @@ class Observer:
         else:
             memory[arrays.GAMMA] = FIXED_GAMMA
         if not flags[arrays.SENSITIVE]:
-            levels[arrays.HAT_SENSITIVITY :] = 0.0
+            levels[arrays.HAT_SENSITIVITY : arrays.ROWS] = 0.0
 
     def reset(self) -> None:
         """Go back to the initial state; the next sample is the first."""

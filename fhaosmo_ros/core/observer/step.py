@@ -15,6 +15,8 @@ from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
 from fhaosmo_ros.core.observer import cascade, levant
 from fhaosmo_ros.core.observer.arrays import (
     ADAPTIVE,
+    BEYOND,
+    COVARIANCE,
     DEAD_ZONE,
     DELAY,
     EPSILON,
@@ -24,15 +26,21 @@ from fhaosmo_ros.core.observer.arrays import (
     HAT,
     HAT_SENSITIVITY,
     IMPLICIT,
+    INVERSE_WIDTH,
     Law,
     LEAKAGE,
     LEVANT,
     MAX,
     MIN,
     PENDING,
+    PERIOD,
     PREDICTING,
     RATE,
-    ROWS,
+    SATURATED,
+    SCALE,
+    SCHEDULED,
+    SETTLED,
+    SIGN,
     State,
     TILDE,
     TILDE_SENSITIVITY,
@@ -40,7 +48,9 @@ from fhaosmo_ros.core.observer.arrays import (
     Work,
     Y,
 )
+from fhaosmo_ros.core.observer.covariance import begin_estimates, is_unlikely
 from fhaosmo_ros.core.observer.status import (
+    DIVERGED,
     FLAGS_MASK,
     GAMMA_AT_MAX,
     GAMMA_AT_MIN,
@@ -48,12 +58,17 @@ from fhaosmo_ros.core.observer.status import (
     REJECTED_INPUT,
     REJECTED_MEASUREMENT,
     REJECTED_PERIOD,
+    REJECTED_SPIKE,
     REJECTED_STEP,
     SENSITIVITY_RESET,
 )
 
 SENSITIVITY_LIMIT = 1e9
 """Sensitivities beyond it are set to 0."""
+LOST_SAMPLES = 20
+"""More samples in a row that are too far from the prediction say that y is lost (D 21)."""
+MEAN_OF = 32
+"""Intervals that the running mean remembers."""
 HEADROOM = 1e8
 """Reject values above DBL_MAX / HEADROOM, so that differences cannot overflow."""
 
@@ -157,7 +172,7 @@ def step(
     if not (h > 0.0 and math.isfinite(HEADROOM * h)):
         word |= REJECTED_PERIOD
     if not word:
-        for r in range(ROWS):
+        for r in range(levels.shape[0]):
             for i in range(n):
                 x[r, i] = levels[r, i]
         whole = h + memory[PENDING]
@@ -173,17 +188,47 @@ def step(
             memory[PENDING] = 0.0
             if not law.flags[IMPLICIT]:
                 memory[Y] = y
+        elif memory[BEYOND] > LOST_SAMPLES:
+            restart(law, state, y)
+            word = DIVERGED
+        elif memory[BEYOND] > 0.0:
+            memory[PENDING] = whole
+            word = REJECTED_SPIKE
         else:
             if law.flags[ADAPTIVE]:
-                word = adapt(law.scalars, x, memory, whole, loss, gradient)
-            for r in range(ROWS):
+                upset = (
+                    is_upset(law, x, y)
+                    if law.flags[IMPLICIT]
+                    else is_upset(law, levels, memory[Y])
+                )
+                word = adapt(law.scalars, x, memory, whole, loss, gradient, upset)
+            for r in range(levels.shape[0]):
                 for i in range(n):
                     levels[r, i] = x[r, i]
             memory[Y] = y
             memory[PENDING] = 0.0
+            mean = memory[PERIOD] if memory[PERIOD] > 0.0 else whole
+            memory[PERIOD] = mean + (min(whole, 2.0 * mean) - mean) / MEAN_OF
     if word & (REJECTED_MEASUREMENT | REJECTED_INPUT) and not word & REJECTED_PERIOD:
         memory[PENDING] += h
     return word | (innovations(law, state, memory[Y], eps, row) << LEVEL_SHIFT)
+
+
+@compiled()
+def restart(law: Law, state: State, y: float) -> None:
+    """Begin afresh from `y`; the time of the next sample counts from it."""
+    levels, memory, n = state.levels, state.memory, law.gains.shape[1]
+    for i in range(n):
+        levels[HAT, i] = law.chances[3 * n + 1, i]
+        levels[TILDE, i] = law.chances[3 * n + 2, i]
+        levels[HAT_SENSITIVITY, i] = levels[TILDE_SENSITIVITY, i] = 0.0
+        for j in range(n):
+            levels[COVARIANCE + i, j] = law.chances[2 * n + i, j]
+    levels[HAT, 0] = memory[Y] = y
+    if law.flags[ADAPTIVE]:
+        memory[GAMMA] = law.scalars[GAMMA_INITIAL]
+    memory[PENDING] = memory[WAIT] = memory[SATURATED] = memory[BEYOND] = memory[SETTLED] = 0.0
+    memory[SCALE] = 1.0
 
 
 @compiled(forceinline=True)
@@ -192,11 +237,16 @@ def advance(
 ) -> tuple[float, float]:
     """Advance ``work.x`` by the structure and scheme of the law; return L and dL/dgamma."""
     flags, gamma = law.flags, memory[GAMMA]
+    if flags[SCHEDULED] and not flags[PREDICTING]:
+        if memory[SETTLED] <= 0.0:
+            return begin_estimates(law, work, memory, y, h, u)
+        if is_unlikely(law, work, memory, y, h, u):
+            return 0.0, 0.0
     if flags[LEVANT]:
         if flags[PREDICTING]:
-            return levant.predict_correct(law, work, gamma, y, h, u)
+            return levant.predict_correct(law, work, memory, y, h, u)
         if flags[IMPLICIT]:
-            return levant.implicit(law, work, gamma, y, h, u)
+            return levant.implicit(law, work, memory, y, h, u)
         return levant.explicit(law, work, gamma, memory[Y], h, u)
     if flags[IMPLICIT]:
         return cascade.implicit(law, work, gamma, y, h, u)
@@ -204,11 +254,28 @@ def advance(
 
 
 @compiled(forceinline=True)
-def adapt(c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient: float) -> int:
+def is_upset(law: Law, x: Floats, y: float) -> bool:
+    """Return True if an innovation is beyond its half-width: it says nothing of gamma (D 8)."""
+    if law.flags[SIGN]:
+        return False
+    eps = y - x[HAT, 0]
+    for i in range(x.shape[1]):
+        if i > 0 and not law.flags[LEVANT]:
+            eps = x[TILDE, i - 1] - x[HAT, i]
+        if abs(eps) * law.gains[INVERSE_WIDTH, i] > 1.0:
+            return True
+    return False
+
+
+@compiled(forceinline=True)
+def adapt(
+    c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient: float, upset: bool
+) -> int:
     """
     Change gamma (P adaptationlawgamma) and the time to wait in `memory`; return status flags.
 
-    Projection on [gamma_min, gamma_max], dead zone and leakage are ours (D 8).
+    Projection on [gamma_min, gamma_max], dead zone, leakage, and the rest while `upset` are
+    ours (D 8).
     """
     word, gamma = 0, memory[GAMMA]
     zero = gradient - gradient
@@ -227,7 +294,7 @@ def adapt(c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient:
         memory[WAIT] = max(memory[WAIT] - h, 0.0)
     else:
         memory[WAIT] = c[DELAY]
-        if not word:
+        if not word and not (upset and c[DEAD_ZONE] > 0.0):
             gamma -= h * c[RATE] * gradient  # P adaptationlawgamma
     if leaks:
         gamma -= min(h * c[LEAKAGE], 1.0) * (gamma - c[GAMMA_INITIAL])
@@ -247,6 +314,7 @@ def step_once(
     gains: Floats,
     curves: Floats,
     scalars: Floats,
+    chances: Floats,
     code: Floats,
     offsets: Ints,
     x: Floats,
@@ -265,7 +333,7 @@ def step_once(
     Takes the contents of the bundles, because Python calls it for every sample: handing over a
     named tuple costs some 3 microseconds a call.
     """
-    law = unowned(Law(flags, gains, curves, scalars, Bytecode(code, offsets)))
+    law = unowned(Law(flags, gains, curves, scalars, chances, Bytecode(code, offsets)))
     work, state = unowned(Work(x, stack, stages)), unowned(State(levels, memory))
     return step(law, work, state, y, h, unowned(u), unowned(eps), 0)
 

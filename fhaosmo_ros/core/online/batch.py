@@ -27,6 +27,7 @@ from numpy.typing import NDArray
     GAINS,
     CURVES,
     SCALARS,
+    CHANCES,
     CODE,
     OFFSETS,
     X,
@@ -35,7 +36,7 @@ from numpy.typing import NDArray
     LEVELS,
     MEMORY,
     UNKNOWN_INPUT,
-) = range(15)
+) = range(16)
 """Index in the table: the arrays of `OnlineEstimator.arguments`, then the estimate of d."""
 
 
@@ -80,8 +81,9 @@ def arrays_at(t: Ints) -> EstimatorArrays:
     """Return the arrays of the estimator that a channel's part of the table names."""
     model = Bytecode(plane_at(t, CODE), integers_of(t, OFFSETS))
     law = Law(
-        integers_of(t, FLAGS), plane_at(t, GAINS), plane_at(t, CURVES), line_at(t, SCALARS), model
-    )
+        integers_of(t, FLAGS), plane_at(t, GAINS), plane_at(t, CURVES), line_at(t, SCALARS),
+        plane_at(t, CHANCES), model,
+    )  # fmt: skip
     stages = doubles_at(t[STAGES, 0], (4, 2, t[STAGES, 2]))
     work = Work(plane_at(t, X), plane_at(t, STACK), stages)
     state = State(plane_at(t, LEVELS), line_at(t, MEMORY))
@@ -95,7 +97,7 @@ def take_many(table: Ints, samples: ChannelSamples, words: Ints, unknown_inputs:
 
     Parameters
     ----------
-    table : (m, 15, 3) array
+    table : (m, 16, 3) array
         Address, rows (of two dimensions) and columns of each array of each channel.
     samples : ChannelSamples
         K samples.

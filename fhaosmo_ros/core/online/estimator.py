@@ -169,6 +169,11 @@ class OnlineEstimator:
         """Running mean of the intervals' distance from their mean, in seconds."""
         return float(self._reals[at.JITTER]) * NANOSECONDS
 
+    @property
+    def spread(self) -> float:
+        """Size of the innovations over that expected from noise_size, at least 1 (D 21)."""
+        return float(self._arrays.state.memory[arrays.SPREAD])
+
     def prepare(self, changes: Mapping[str, Any]) -> Change:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
         parameters = self._parameters.changed_live(changes, 'observer')
@@ -304,8 +309,9 @@ class OnlineEstimator:
                 f'seed: expected {n} states and an unknown input, finite and of at most '
                 f'{limit:g} (divergence_limit), got {z!r} and {unknown_input!r}'
             )
-        levels = self._arrays.state.levels
-        levels[:] = 0.0
+        levels, scalars = self._arrays.state
+        levels[: arrays.ROWS] = 0.0
+        scalars[arrays.SETTLED] = 1.0
         known = min(n + 1, self.observer.levels)  # derivatives of d, behind it, are 0
         levels[arrays.HAT, :known] = values[:known]
         levels[arrays.TILDE, :n] = values[1:]

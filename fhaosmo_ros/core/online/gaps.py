@@ -4,7 +4,7 @@
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.model.integrate import NOW
-from fhaosmo_ros.core.observer.arrays import GAMMA, PREDICTING, Y
+from fhaosmo_ros.core.observer.arrays import BEYOND, GAMMA, PENDING, PREDICTING, SPREAD, Y
 from fhaosmo_ros.core.observer.prediction import (
     begin_at_estimates,
     predict_step,
@@ -54,8 +54,8 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: Floats, eps: Floats
     law, work, state, policy = e
     ints, reals, memory = policy.ints, policy.reals, state.memory
     count = sub_steps(policy, elapsed)
-    is_gap = count > 1
-    if law.flags[PREDICTING]:
+    is_gap = count > 1 and memory[BEYOND] == 0.0  # after rejected samples it is none
+    if law.flags[PREDICTING] or not is_gap:
         count = 1
     h = elapsed * NANOSECONDS / count
     gamma, word, bend, modelled = memory[GAMMA], 0, 0.0, True
@@ -83,6 +83,17 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: Floats, eps: Floats
                 predict_step(law, work, h, u)
             sample = work.stages[NOW, 0, 0] + k * bend
         word = word & FLAGS_MASK | step(law, work, state, sample, h, u, eps, row)
+        if word & REJECTED_SPIKE:  # as if it had not come: the next one is stepped to from LATEST
+            memory[PENDING] = 0.0
+            ints[at.REJECTED_SPIKES] += 1
+            if is_gap:
+                ints[at.GAPS] -= 1
+                ints[at.SUB_STEPS] -= count
+                ints[at.BRIDGED] = 0
+                beyond, spread = memory[BEYOND], memory[SPREAD]
+                restore(policy, state)
+                memory[BEYOND], memory[SPREAD] = beyond, spread
+            return word & (FLAGS_MASK ^ GAP) | word >> LEVEL_SHIFT << LEVEL_SHIFT
         if ints[at.FROZEN]:
             memory[GAMMA] = gamma
         if word & REJECTED:

@@ -118,8 +118,12 @@ INTEGERS = range(FROZEN, COUNTERS)
 """What of the policy's integers a snapshot holds: neither settings nor counters."""
 LABELS_OF_REALS = ['interval', 'jitter', 'held_y']
 LABELS_OF_ROWS = ['z_hat', 'z_tilde', 'z_hat_sensitivity', 'z_tilde_sensitivity']
-LABELS_OF_MEMORY = ['gamma', 'y', 'pending', 'wait']
+LABELS_OF_MEMORY = [
+    'gamma', 'y', 'pending', 'wait', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread',
+]  # fmt: skip
 """Labels of a snapshot's entries: they are in bags, so they stay as they are."""
+MISSING = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}
+"""What an older version did not remember and is not 0."""
 
 
 class Flag(IntFlag):
@@ -143,7 +147,7 @@ class Memory(NamedTuple):
         Of `Policy.ints`.
     reals : (3,) array
         Of `Policy.reals`.
-    before, now : (4N + 4,) arrays
+    before, now : ((4 + N) N + 10,) arrays
         The observer's state (levels, then memory) before the latest bridged gap, and its state.
     u : (m,) array
         Known inputs.
@@ -193,6 +197,7 @@ def labels(levels: int, inputs: Sequence[str] = ('u',), past: int = 0) -> list[s
     """
     integers = [f'{NAMES[k].lower()}_{half}' for k in INTEGERS for half in ('upper', 'lower')]
     rows = [f'{row}{i + 1}' for row in LABELS_OF_ROWS for i in range(levels)]
+    rows += [f'covariance{i + 1}_{j + 1}' for i in range(levels) for j in range(levels)]
     state = [*rows, *LABELS_OF_MEMORY]
     before = (f'before_{name}' for name in state)
     of_past = (f'past{k + 1}' for k in range(past))
@@ -220,7 +225,7 @@ def unpack(vector: ArrayLike, names: Sequence[str]) -> Snapshot:
     vector : (K,) array
     names : sequence of str
         Name of each entry, as `labels` returns them. What an older version did not remember, and
-        so has no entry, is 0.
+        so has no entry, is 0, or as in `MISSING`.
 
     Raises
     ------
@@ -239,8 +244,8 @@ def unpack(vector: ArrayLike, names: Sequence[str]) -> Snapshot:
     unknown = [name for name in names if name not in known]
     if unknown or not levels or len(entries) < len(v):
         raise ValueError(f'a snapshot can not have the entries {", ".join(unknown) or names}')
-    v = np.array([entries.get(name, 0.0) for name in known])
-    size = arrays.ROWS * levels + arrays.MEMORY
+    v = np.array([entries.get(name, MISSING.get(name, 0.0)) for name in known])
+    size = (arrays.ROWS + levels) * levels + arrays.MEMORY
     counts = [len(HEAD), 2 * len(INTEGERS), len(LABELS_OF_REALS), size, size, len(inputs), past]
     head, halves, reals, *rest = np.split(v, np.cumsum(counts)[:-1])
     upper, lower = halves.reshape(-1, 2).T

@@ -106,7 +106,10 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: Floats, eps: Floats, row: 
     if elapsed > 0 and not word & REJECTED_SPIKE:
         ints[at.LATEST] = now
         failed = word & REJECTED_STEP != 0
-        if has_diverged(e, eps[row, 0], failed, now):
+        if word & DIVERGED:
+            ints[at.DIVERGENCES] += 1
+            ints[at.LOST] = 0
+        elif has_diverged(e, eps[row, 0], failed, now):
             refresh(policy, state)
             levels[HAT, 0] = memory[Y] = y
             ints[at.DIVERGENCES] += 1
@@ -138,6 +141,7 @@ def take_once(
     gains: Floats,
     curves: Floats,
     scalars: Floats,
+    chances: Floats,
     code: Floats,
     offsets: Ints,
     x: Floats,
@@ -152,7 +156,7 @@ def take_once(
     Takes the contents of the bundles, because Python calls it for every sample: handing over a
     named tuple costs some 3 microseconds a call.
     """
-    law = Law(flags, gains, curves, scalars, Bytecode(code, offsets))
+    law = Law(flags, gains, curves, scalars, chances, Bytecode(code, offsets))
     work, state, policy = Work(x, stack, stages), State(levels, memory), Policy(ints, reals)
     e = unowned(EstimatorArrays(law, work, state, policy))
     return take(e, stamp, y, unowned(u), unowned(eps), 0)

@@ -93,15 +93,38 @@ OBSERVER = (
         unit='s', lower=0.0, upper=10.0,
     ),
     Parameter(
+        'noise_size', 0.0,
+        'Standard deviation of the noise on y. With it, and with a correction_period, '
+        'predict_correct knows how sure it is: at the start, and where samples come at another '
+        'rate, the gains are those of a Kalman filter; unlikely samples are rejected, and y that '
+        'stays unlikely counts as lost. 0: not known.',
+        lower=0.0, upper=1e12,
+    ),
+    Parameter(
+        'state_sizes', [1.0],
+        'RMS values of z_1 .. z_n in usual operation: how far off a fresh observer may be. Used '
+        'with noise_size.',
+        lower=1e-12, upper=1e12, lengths='1 (used for every state) or n',
+    ),
+    Parameter(
+        'unknown_input_size', 1.0, 'RMS value of d in usual operation. Used with noise_size.',
+        lower=1e-12, upper=1e12,
+    ),
+    Parameter(
+        'unknown_input_rate', 1.0,
+        'How fast d changes, where unknown_input_decay is 0. Used with noise_size.',
+        unit='1/s', lower=1e-6, upper=1e6,
+    ),
+    Parameter(
         'lambda', [740.0],
         'Correction factors lambda_i of the injection: |eps_i|^gamma psi_i(eps_i); levant: '
         '|eps_1|^(2 gamma (N - i) / N) psi_i(eps_1).',
-        lower=0.0, lower_open=True, upper=1e15, lengths=PER_LEVEL,
+        lower=0.0, lower_open=True, upper=1e30, lengths=PER_LEVEL,
     ),
     Parameter(
         'alpha', [155.0],
         'Gains alpha_i of the internal states. Not used by levant, which has none.',
-        lower=0.0, lower_open=True, upper=1e15, lengths=PER_LEVEL,
+        lower=0.0, lower_open=True, upper=1e30, lengths=PER_LEVEL,
     ),
     Parameter(
         'epsilon', 80.0,
@@ -116,6 +139,12 @@ OBSERVER = (
         'levels that follow. Beyond its half-width psi is +-1. In the unit of the innovation '
         'eps_i; levant: of y at every level.',
         lower=1e-12, upper=1e12, lengths='1 to N; the last one serves the levels that follow',
+    ),
+    Parameter(
+        'fuzzy_growth', False,
+        'levant, implicit and predict_correct: half-widths and injections grow while innovations '
+        'stay beyond all half-widths, and shrink to what they were afterwards. For gamma well '
+        'below 1/2, where an observer whose levels are all saturated would never find y again.',
     ),
     Parameter(
         'fuzzy_systems', ['terms 5', 'terms 7'],

@@ -22,6 +22,12 @@ LIMIT = 20_000
 WINDOW = 5
 """Samples in the moving average that separates chatter from the signal."""
 NANOSECONDS = 1e-9
+GAMMA_AWAY = 0.2
+"""Distance of gamma from where it began that deserves a warning."""
+RATE_RATIO = 1.5
+"""Factor between the rate of y and that of the gains that deserves one."""
+SPREAD = 3.0
+"""Factor between the innovations and those expected that deserves one."""
 
 
 def _words(name: str) -> str:
@@ -228,10 +234,14 @@ class Health:
         chatter = high_passed(d, WINDOW)
         spread = float(np.std(d)) if len(d) else float('nan')
         overruns = int(np.sum(durations > np.mean(periods))) if len(periods) else 0
+        away, tuned = _gamma_away(self._estimator), observer.parameters['correction_period']
+        mean = float(np.mean(periods)) if len(periods) else 0.0
         report.values = {
             'open levels': f'{estimate.open_levels if estimate else 0} of {observer.levels}',
             'gamma': estimate.gamma if estimate else float('nan'),
+            'gamma away from gamma_initial': away,
             'gamma at': _bound(self._estimator, estimate.status if estimate else Status.OK),
+            'innovations over those expected': self._estimator.spread,
             titled('unknown input', unit): d_now,
             'chatter of the unknown input': chatter,
             'chatter index (0 smooth, 1 nothing but chatter)': (
@@ -251,6 +261,18 @@ class Health:
             report.find(WARN, f'levels from {first} on hold: an innovation is above epsilon')
         if diverged:
             report.find(ERROR, f'diverged and started again from y, {diverged} times')
+        if abs(away) > GAMMA_AWAY:
+            report.find(WARN, f'gamma is {away:+.2g} away from gamma_initial')
+        tuned = tuned if observer.parameters['scheme'] == 'predict_correct' else 0.0
+        if tuned and mean and not tuned / RATE_RATIO < mean < tuned * RATE_RATIO:
+            report.find(
+                WARN, f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / mean:.4g} Hz'
+            )
+        if self._estimator.spread > SPREAD:
+            report.find(
+                WARN,
+                f'innovations are {self._estimator.spread:.3g} times as large as noise_size says',
+            )
         if overruns:
             report.find(WARN, f'{overruns} steps took longer than the sampling period')
         if 0.0 < self.limits['warn_chatter_above'] < chatter:
@@ -268,6 +290,13 @@ class Health:
             **{_words(name): n for name, n in counters._asdict().items() if name != 'accepted'},
             'restarts': counters.restarts,
         }
+
+
+def _gamma_away(estimator: OnlineEstimator) -> float:
+    estimate, parameters = estimator.estimate, estimator.observer.parameters
+    if estimate is None or not parameters['variant'].endswith('_adaptive'):
+        return 0.0
+    return float(estimate.gamma - parameters['gamma_initial'])
 
 
 def _bound(estimator: OnlineEstimator, status: Status) -> str:

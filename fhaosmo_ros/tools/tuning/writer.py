@@ -97,7 +97,8 @@ def _parameters(tuner: Tuner, gains: dict[str, Any]) -> dict[str, Any]:
     """Return what the estimator needs: what was set for it, and what was result."""
     values = tuner.fixed | gains
     shown = ESTIMATOR_PARAMETERS.complete(values)
-    if shown['structure'] == 'levant' and shown['variant'].startswith('fuzzy'):
+    fuzzy = shown['structure'] == 'levant' and shown['variant'].startswith('fuzzy')
+    if fuzzy and not shown['noise_size']:
         period = float(np.median(np.diff(tuner.data.training[0].t)))
         values = {
             'epsilon': max(shown['fuzzy_widths']),

@@ -19,7 +19,6 @@ from fhaosmo_ros.tools.tuning.start.kalman import (
     grid,
     KalmanDesign,
     KalmanGains,
-    NARROWER,
     ZOOMS,
 )
 from fhaosmo_ros.tools.tuning.start.theory import candidates, effective_noise
@@ -31,13 +30,14 @@ SCHEME: Mapping[str, Any] = {
     'variant': 'fuzzy_adaptive',
     'gamma_rate': 0.0,
     'gamma_min': 1e-4,
+    'fuzzy_growth': True,
 }
 """What is tuned where the user sets no other structure or scheme."""
 MEANT_FOR = ('lambda', 'alpha', 'epsilon', 'initial_internal')
 """A user who sets one of these has chosen structure and scheme: such values fit one of them."""
 DERIVATIVES = (0, 1, 2, 3)
 WORTH = 0.99
-"""One more derivative of d, or narrower levels, must reduce the objective to this part of it."""
+"""One more derivative of d must reduce the objective to this part of it."""
 HOPELESS = 1.3
 """Numbers of derivatives that are this factor behind the best on the grid are given up."""
 GAMMAS = (0.25, 0.5)
@@ -131,14 +131,29 @@ class CandidateEvaluator:
         return values[number], several[number]
 
 
-def with_scheme(estimator: Mapping[str, Any], recordings: Sequence[Recording]) -> dict[str, Any]:
-    """Return what the user set for the estimator, with `SCHEME` where that is open."""
+def with_scheme(
+    estimator: Mapping[str, Any], recordings: Sequence[Recording], least_noise: float = 0.0
+) -> dict[str, Any]:
+    """
+    Return what the user set for the estimator, with `SCHEME` where that is open.
+
+    The sizes of the noise, of the states and of d are those of the recordings. Without noise on y
+    they are left out: nothing says how sure the observer is.
+    """
     given = dict(estimator)
     others = any(given.get(k, SCHEME[k]) != SCHEME[k] for k in ('structure', 'scheme'))
     if others or not given.get('unknown_input', True) or any(k in given for k in MEANT_FOR):
         return given
     period = float(f'{np.median(np.diff(recordings[0].t)):.4g}')
-    return {**SCHEME, 'correction_period': period, **given}
+    noise = max(effective_noise(recordings), least_noise)
+    sizes = np.sqrt(
+        np.mean(np.concatenate([np.column_stack([r.z, r.d]) for r in recordings]) ** 2, axis=0)
+    )
+    known = {}
+    if noise > 0.0 and (sizes > 0.0).all():
+        z, d = [float(f'{x:.3g}') for x in sizes[:-1]], float(f'{sizes[-1]:.3g}')
+        known = {'noise_size': float(f'{noise:.3g}'), 'state_sizes': z, 'unknown_input_size': d}
+    return {**SCHEME, 'correction_period': period, **known, **given}
 
 
 def find_start(problem: StartProblem, jobs: int, stopped: Callable[[], bool]) -> Start:
@@ -210,10 +225,6 @@ def _best_kalman_filter(problem: StartProblem, evaluator: CandidateEvaluator) ->
     for k, objective in objectives.items():
         if found[k][0] > limit:
             continue
-        design = found[k][1]
-        narrower = evaluator.best(objective, [design._replace(width=width) for width in NARROWER])
-        if narrower[0] < WORTH * found[k][0]:
-            found[k] = narrower
         for zoom in ZOOMS:
             neighbours = list(around(found[k][1], zoom))
             found[k] = min(found[k], evaluator.best(objective, neighbours))

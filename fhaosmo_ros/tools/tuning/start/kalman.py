@@ -15,16 +15,16 @@ from fhaosmo_ros.tools.tuning.start.sampled_model import SampledModel
 from fhaosmo_ros.tools.tuning.start.theory import effective_noise, kalman_like
 import numpy as np
 
+LEAST = 1e-30
+"""Gain that stands for one that is not positive."""
 FASTEST = 5.0
 """Bandwidth times period of a deadbeat observer."""
 GAMMA = 3e-3
 """Power at which the injections are nearly linear in the innovation; the user may set another."""
 RATES = tuple(float(x) for x in np.geomspace(0.1, 30.0, 8))
 FACTORS = (0.8, 1.0, 1.25)
-WIDTH = 3000.0
-"""Wide enough that no level saturates at usual innovations: if all do, the observer may lose y."""
-NARROWER = (300.0, 30.0)
-"""Half-widths that are taken where they reduce the objective, as with outliers on y."""
+WIDTH = 16.0
+"""Nearly linear for the noise itself, and outliers count as a few standard deviations of it."""
 ZOOMS = (0.5, 0.25)
 """Distances to the neighbours that are tried around the best design, in steps of the grid."""
 
@@ -40,7 +40,7 @@ class KalmanDesign(NamedTuple):
     factor : float
         Bandwidth, relative to the one that this d and the noise ask for.
     width : float
-        Half-width of all levels, in units of the innovations that are usual at the start.
+        Half-width of all levels, in units of the noise.
 
     """
 
@@ -71,7 +71,7 @@ class KalmanGains:
     Parameters
     ----------
     recordings : sequence of Recording
-        With their truth, from which the sizes of d, z_2 and the noise follow.
+        With their truth, from which the sizes of d and of the noise follow.
     fixed : mapping
         Parameters of the observer that are set and not searched: `unknown_input_decay` and the
         first of `fuzzy_widths` replace those of a design; its fuzzy curves are theirs.
@@ -102,7 +102,6 @@ class KalmanGains:
         # Without noise the fastest observer is deadbeat: this noise is too small to slow it down.
         least = 0.1 * self._size * self._period**model.order
         self._noise = max(effective_noise(recordings), least_noise, least)
-        self._usual = self._noise + float(size[1]) * self._period
 
     def bandwidth(self, rate: float) -> float:
         """Return the bandwidth (rad/s) of the Kalman filter for a Matern d of this rate (D 17)."""
@@ -122,7 +121,7 @@ class KalmanGains:
 
         """
         decay = self._fixed.get('unknown_input_decay', design.rate)
-        width = design.width * self._usual
+        width = design.width * self._noise
         width = self._fixed.get('fuzzy_widths', [width])[0]
         bandwidth = min(design.factor * self.bandwidth(design.rate), FASTEST / self._period)
         small = max(self._noise, 1e-3 * width)
@@ -135,7 +134,7 @@ class KalmanGains:
         return {
             'unknown_input_derivatives': self._derivatives,
             'unknown_input_decay': decay,
-            'lambda': [float(x) for x in gain.clip(1e-12, 1e15)],
+            'lambda': [float(x) for x in gain.clip(LEAST, OBSERVER_PARAMETERS['lambda'].upper)],
             'fuzzy_widths': [width] * len(gain),
             'gamma_initial': self._gamma,
         }
