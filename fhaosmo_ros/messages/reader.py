@@ -42,7 +42,7 @@ class MessageReader:
 
     Where the numbers lie is known from a message with the same lengths and names before them:
     then one comparison and one unpacking give all of them. A `JointState` of seven joints takes
-    1 microsecond so, and 60 with rclpy's deserialisation.
+    1.2 microseconds so, and 14 with rclpy's deserialisation.
 
     Parameters
     ----------
