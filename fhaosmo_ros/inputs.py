@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.declaration import Parameter
-from fhaosmo_ros.core.parameters.per_channel import channel_names, CHANNELS, FROM_JOINTS
+from fhaosmo_ros.core.parameters.per_channel import CHANNELS, FROM_JOINTS
 from fhaosmo_ros.core.parameters.tables import CHANNEL_PARAMETERS
 from fhaosmo_ros.messages.fields import JOINT_STATE
 from fhaosmo_ros.topics import FLOAT
@@ -51,7 +51,8 @@ class Input(NamedTuple):
 def with_joints(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values to which the topic and type are added that `FROM_JOINTS` stands for."""
     result = dict(values)
-    if CHANNELS in values and channel_names(values) == FROM_JOINTS:
+    names = values.get(CHANNELS)  # not checked yet
+    if ([names] if isinstance(names, str) else names) == FROM_JOINTS:
         for name, value in (('input_topic', 'joint_states'), ('input_type', JOINT_STATE)):
             result[name] = result.get(name) or value
     return result

@@ -17,7 +17,7 @@ CHANGES = {
     'scheme': ['explicit', 'implicit'],
     'prediction_step': [1e-4],
     'correction_period': [5e-4],
-    'noise_size': [1e-3],
+    'noise_size': [1.0],
     'state_sizes': [2.0, [1.0, 2.0]],
     'unknown_input_size': [0.1],
     'unknown_input_rate': [2.0],

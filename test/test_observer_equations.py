@@ -111,6 +111,7 @@ class Reference:
             self.hat[0] = Dual(y)
         self.gamma = p['gamma_initial'] if p['variant'].endswith('_adaptive') else 0.5
         self.y = y
+        self.upset = 0.0  # how long gamma rests yet
         self.calm = np.inf  # how long the innovations have been within the dead zone
         self.curves = curves(p, self.N)
 
@@ -200,8 +201,9 @@ class Reference:
             return
         loss = sum((e * e for e in eps), Dual(0.0))
         gamma = self.gamma
+        upset = self.is_upset(eps, h) and p['gamma_dead_zone'] > 0.0
         if loss.value > p['gamma_dead_zone'] ** 2:
-            if not (p['gamma_dead_zone'] > 0.0 and self.is_upset(eps)):
+            if not upset:
                 gamma -= h * p['gamma_rate'] * loss.slope
             self.calm = 0.0
         rests = loss.value <= p['gamma_dead_zone'] ** 2
@@ -212,11 +214,12 @@ class Reference:
             gamma -= h * p['gamma_leakage'] * (gamma - p['gamma_initial'])
         self.gamma = min(max(gamma, p['gamma_min']), p['gamma_max'])
 
-    def is_upset(self, eps):
-        w = self.p['fuzzy_widths']
-        widths = [w[min(i, len(w) - 1)] for i in range(self.N)]
+    def is_upset(self, eps, h):
         fuzzy = not self.p['variant'].startswith('sign')
-        return fuzzy and any(abs(e.value) > w for e, w in zip(eps, widths, strict=True))
+        self.upset = max(self.upset - h, 0.0)
+        if fuzzy and abs(eps[0].value) > self.p['fuzzy_widths'][0]:
+            self.upset = self.p['gamma_leakage_delay']
+        return self.upset > 0.0
 
     def open(self):
         m = [self.y, *(v.value for v in self.tilde[: self.N - 1])]

@@ -21,7 +21,10 @@ import pytest
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
 PAPER = CONFIG / 'paper.yaml'
-FILES = [path for path in sorted(CONFIG.glob('**/*.yaml')) if path != PAPER]
+FILES = [
+    path for path in sorted(CONFIG.glob('**/*.yaml'))
+    if path != PAPER and 'noise_size' in load(path, 'estimator', ONLINE_PARAMETERS)
+]  # fmt: skip
 RATE = 1000
 HIT, BACK, SOON = 6 * RATE, 13 * RATE // 2, RATE
 """Samples: when it happens, when it is over, and when the error is usual again after that."""

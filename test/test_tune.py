@@ -155,7 +155,8 @@ def test_model_may_stand_in_any_section(tmp_path, section):
     values = TUNE_PARAMETERS.complete(tuning | short)
     tuner = Tuner(simulated(values, 1), estimator, values, 1)
     assert tuner.fixed['phi'] == ['-2.0*z1']
-    assert sum(d.name.startswith('lambda') for d in tuner.space) == 2
+    levels = 2 + tuner.fixed.get('unknown_input_derivatives', 0)
+    assert sum(d.name.startswith('lambda') for d in tuner.space) == levels
     assert values['noise_std'] == 0.1
 
 

@@ -2,7 +2,7 @@
 """Record y and the estimator's topics to a bag, or repair a bag that is cut or damaged."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from queue import SimpleQueue
 import re
@@ -10,7 +10,9 @@ import shutil
 import sqlite3
 import sys
 import time
+from typing import Any
 
+from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.per_channel import channel_names, of_channel
@@ -169,6 +171,10 @@ def _wanted(arguments: argparse.Namespace, resolved: Callable[[str], str]):
     return lambda topic: topic.startswith(below) or topic in extra
 
 
+def _used_inputs(values: Mapping[str, Any]) -> tuple[str, ...]:
+    return TriangularModel.of(ESTIMATOR_PARAMETERS.complete(values)).used_inputs
+
+
 def _inputs(arguments: argparse.Namespace) -> set[str]:
     """Return the topics that the estimators of the parameter files read."""
     found = set()
@@ -178,7 +184,7 @@ def _inputs(arguments: argparse.Namespace) -> set[str]:
             namespace = f'/{name.strip("/")}'.rpartition('/')[0]
             for channel in channel_names(values) if values else []:
                 own = of_channel(values, channel)
-                known = known_inputs(own, ['u'], channel).values()
+                known = known_inputs(own, _used_inputs(own), channel).values()
                 wanted = [measured_output(own, channel), *known]
                 found |= {one.absolute(namespace) for one in wanted}
     return found

@@ -11,7 +11,6 @@ rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2
 pytestmark = pytest.mark.ros
 
 from fhaosmo_ros.nodes.estimator.node import EstimatorNode  # noqa: E402
-from fhaosmo_ros.nodes.middleware.messages import double_encoder  # noqa: E402
 from rclpy.context import Context  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
@@ -111,6 +110,5 @@ def test_change_acts_on_the_channel(start):
     for name in ('epsilon', 'max_gap', 'sampling'):
         assert channel.estimator.parameters[name] == changes[name]
     assert channel._timer.timer_period_ns == 20_000_000
-    info = {'source_timestamp': 10**18, 'publication_sequence_number': 0}
-    channel._on_sample(double_encoder()(0.2), info)
+    channel._on_sample(10**18, 0.2, 10**18)
     assert channel.estimator.stamp != 10**18

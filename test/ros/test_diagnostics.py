@@ -3,6 +3,7 @@
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import pytest
 
@@ -211,10 +212,12 @@ def test_a_clock_that_is_slower_than_the_samples_is_said(samples, told):
     """What `ros2 bag play --clock` gives, at 40 Hz, and a clock that ticks with every sample."""
     estimator = OnlineEstimator({'sampling': 'clock'})
     health = Health(estimator, ESTIMATOR_PARAMETERS.complete(LAX))
+    source = SimpleNamespace(topic='/y', message_type='std_msgs/msg/Float64')
+    y = SimpleNamespace(source=source, field=None, stamps='source', error='', lacking=0, why='')
     for begin in (1000, 2000):  # the first report is on the first tick too
         for k in range(begin, begin + 1000):
             estimator.update(k // samples * samples * 1_000_000, 0.2)
-        report, _ = health.reports('/y', Publishers({(1,): '/plant'}, {}), stale=False, name='')
+        report, _ = health.reports(y, Publishers({(1,): '/plant'}, {}), stale=False, name='')
     status = report.message('estimator', 'none')
     assert told in status.message
     assert status.level == (WARN if told else OK)

@@ -11,7 +11,6 @@ pytestmark = pytest.mark.ros
 
 from fhaosmo_ros.nodes.estimator import channel as channel_module  # noqa: E402
 from fhaosmo_ros.nodes.estimator.node import EstimatorNode  # noqa: E402
-from fhaosmo_ros.nodes.middleware.messages import double_encoder  # noqa: E402
 from rcl_interfaces.msg import LoggerLevel  # noqa: E402
 from rcl_interfaces.srv import SetLoggerLevels  # noqa: E402
 from rclpy.context import Context  # noqa: E402
@@ -37,13 +36,12 @@ def node():
 def test_a_slow_sensor_gets_one_warning_of_each_kind(node, capfd, monkeypatch):
     """Each sample comes long after max_gap; without a limit two warnings a sample are logged."""
     monkeypatch.setattr(channel_module, 'QUIET', 3600.0)
-    channel, encode = node._channels, double_encoder()
+    channel = node._channels
     said = ''
     for k in range(1, 11):
-        info = {'source_timestamp': k * 10**9, 'publication_sequence_number': k}
-        channel._on_sample(encode(math.nan if k == 6 else 0.2), info)
+        channel._on_sample(k * 10**9, math.nan if k == 6 else 0.2, k * 10**9)
         channel.publish()
-        wait_until(lambda: channel._is_stale(), 'silence')
+        wait_until(lambda: channel.is_stale(), 'silence')
         said += capfd.readouterr().err
     warnings = re.findall(r'\[WARN\] .*?: (.{22})', said)
     assert sorted(warnings) == [

@@ -12,7 +12,6 @@ rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 from fhaosmo_ros.nodes.estimator.node import EstimatorNode  # noqa: E402
-from fhaosmo_ros.nodes.middleware.messages import double_encoder  # noqa: E402
 from rclpy.context import Context  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
@@ -64,7 +63,7 @@ def valid(rng, parameter) -> object:
 
 def test_random_sets(node):
     rng = np.random.default_rng(5)
-    encode, channel = double_encoder(), node._channels
+    channel = node._channels
     stamp, accepted, refused = 10**18, 0, 0
     for k in range(COUNT):
         names = rng.choice([*LIVE, *FIXED[:2]], size=rng.integers(1, 4), replace=False)
@@ -88,9 +87,7 @@ def test_random_sets(node):
         for _ in range(2):
             stamp += int(rng.choice([1_000, 1_000_000, 20_000_000]))
             y = rng.normal() if rng.random() < 0.99 else rng.choice([math.nan, 1e300])
-            channel._on_sample(
-                encode(float(y)), {'source_timestamp': stamp, 'publication_sequence_number': 0}
-            )
+            channel._on_sample(stamp, float(y), stamp)
         estimate = channel.estimator.estimate
         if estimate is not None:
             numbers = [*estimate.z, estimate.unknown_input, estimate.gamma, *estimate.innovation]

@@ -29,6 +29,7 @@ Entries of ``State.memory``:
 | SETTLED | 1: the gains are the tuned ones; else minus the time since the start, or 0 | s |
 | PERIOD | running mean of the intervals between samples | s |
 | SPREAD | size of the innovations over that expected, at least 1 (D 21) | 1 |
+| UPSET | time for which gamma has yet to rest after |eps_1| > w_1 (D 8) | s |
 """
 
 from typing import NamedTuple
@@ -40,8 +41,8 @@ import numpy as np
 HAT, TILDE, HAT_SENSITIVITY, TILDE_SENSITIVITY, COVARIANCE = range(5)
 ROWS = 4
 """Number of rows before the covariance."""
-GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD = range(10)
-MEMORY = 10
+GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSET = range(11)
+MEMORY = 11
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 FLAGS = 8

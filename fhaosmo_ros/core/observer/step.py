@@ -44,6 +44,7 @@ from fhaosmo_ros.core.observer.arrays import (
     State,
     TILDE,
     TILDE_SENSITIVITY,
+    UPSET,
     WAIT,
     Work,
     Y,
@@ -196,12 +197,11 @@ def step(
             word = REJECTED_SPIKE
         else:
             if law.flags[ADAPTIVE]:
-                upset = (
-                    is_upset(law, x, y)
-                    if law.flags[IMPLICIT]
-                    else is_upset(law, levels, memory[Y])
-                )
-                word = adapt(law.scalars, x, memory, whole, loss, gradient, upset)
+                memory[UPSET] = max(memory[UPSET] - whole, 0.0)
+                measured = y if law.flags[IMPLICIT] else memory[Y]
+                if is_upset(law, x if law.flags[IMPLICIT] else levels, measured):
+                    memory[UPSET] = law.scalars[DELAY]
+                word = adapt(law.scalars, x, memory, whole, loss, gradient)
             for r in range(levels.shape[0]):
                 for i in range(n):
                     levels[r, i] = x[r, i]
@@ -228,6 +228,7 @@ def restart(law: Law, state: State, y: float) -> None:
     if law.flags[ADAPTIVE]:
         memory[GAMMA] = law.scalars[GAMMA_INITIAL]
     memory[PENDING] = memory[WAIT] = memory[SATURATED] = memory[BEYOND] = memory[SETTLED] = 0.0
+    memory[UPSET] = 0.0
     memory[SCALE] = 1.0
 
 
@@ -255,26 +256,16 @@ def advance(
 
 @compiled(forceinline=True)
 def is_upset(law: Law, x: Floats, y: float) -> bool:
-    """Return True if an innovation is beyond its half-width: it says nothing of gamma (D 8)."""
-    if law.flags[SIGN]:
-        return False
-    eps = y - x[HAT, 0]
-    for i in range(x.shape[1]):
-        if i > 0 and not law.flags[LEVANT]:
-            eps = x[TILDE, i - 1] - x[HAT, i]
-        if abs(eps) * law.gains[INVERSE_WIDTH, i] > 1.0:
-            return True
-    return False
+    """Return True while y's own innovation is beyond its half-width, as after a jump (D 8)."""
+    return abs(y - x[HAT, 0]) * law.gains[INVERSE_WIDTH, 0] > 1.0 and not law.flags[SIGN]
 
 
 @compiled(forceinline=True)
-def adapt(
-    c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient: float, upset: bool
-) -> int:
+def adapt(c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient: float) -> int:
     """
     Change gamma (P adaptationlawgamma) and the time to wait in `memory`; return status flags.
 
-    Projection on [gamma_min, gamma_max], dead zone, leakage, and the rest while `upset` are
+    Projection on [gamma_min, gamma_max], dead zone, leakage, and the rest after an upset are
     ours (D 8).
     """
     word, gamma = 0, memory[GAMMA]
@@ -294,7 +285,7 @@ def adapt(
         memory[WAIT] = max(memory[WAIT] - h, 0.0)
     else:
         memory[WAIT] = c[DELAY]
-        if not word and not (upset and c[DEAD_ZONE] > 0.0):
+        if not word and not (memory[UPSET] > 0.0 and c[DEAD_ZONE] > 0.0):
             gamma -= h * c[RATE] * gradient  # P adaptationlawgamma
     if leaks:
         gamma -= min(h * c[LEAKAGE], 1.0) * (gamma - c[GAMMA_INITIAL])

@@ -120,6 +120,7 @@ LABELS_OF_REALS = ['interval', 'jitter', 'held_y']
 LABELS_OF_ROWS = ['z_hat', 'z_tilde', 'z_hat_sensitivity', 'z_tilde_sensitivity']
 LABELS_OF_MEMORY = [
     'gamma', 'y', 'pending', 'wait', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread',
+    'upset',
 ]  # fmt: skip
 """Labels of a snapshot's entries: they are in bags, so they stay as they are."""
 MISSING = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}

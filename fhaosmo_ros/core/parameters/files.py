@@ -18,10 +18,10 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import (
     channel_names,
     CHANNELS,
-    declared_channels,
     of_channel,
     UNNAMED,
     with_channels,
+    with_own_parameters,
 )
 from fhaosmo_ros.core.parameters.tables import NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import MAX_LENGTH, parse
@@ -146,17 +146,18 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
         A name that no node of the package declares, or a bad value.
 
     """
-    names = declared_channels(values)
+    names = channel_names(values)
+    own = with_own_parameters(names, values)
     if CHANNELS in table:
-        table = with_channels(table, names)
-    tables = [table, *(with_channels(other, names) for other in NODE_TABLES.values())]
+        table = with_channels(table, own)
+    tables = [table, *(with_channels(other, own) for other in NODE_TABLES.values())]
     for name in values:
         if not any(name in other for other in tables) and not is_built_in(name):
             families = (p.name for p in table.families)
             everybody = dict.fromkeys([*(n for other in tables for n in other), *families])
             raise unknown_parameter(name, everybody)
     return {
-        name: channel_names(values) if name == CHANNELS else table[name].coerce(value)
+        name: names if name == CHANNELS else table[name].coerce(value)
         for name, value in values.items()
         if name in table
     }
@@ -182,7 +183,8 @@ def complete(values: Mapping[str, Any], table: ParameterTable) -> Parameters:
 
     """
     checked = select(values, table)
-    return Parameters(with_channels(table, declared_channels(checked), checked), checked)
+    own = with_own_parameters(checked.get(CHANNELS, UNNAMED), checked)
+    return Parameters(with_channels(table, own, checked), checked)
 
 
 def make_from_file(

@@ -57,20 +57,13 @@ def channel_names(values: Mapping[str, Any]) -> list[str]:
     return list(names)
 
 
-def declared_channels(values: Mapping[str, Any]) -> list[str]:
+def with_own_parameters(names: list[str], values: Iterable[str]) -> list[str]:
     """
-    Return the channels whose own parameters may be set by `values`.
+    Return the channels whose own parameters may be among `values`.
 
-    These are the names of the channels; where they are `FROM_JOINTS`, every name that has a
-    parameter of its own: whether there is such a joint turns out later.
-
-    Raises
-    ------
-    ConfigurationError
-        As `channel_names`.
-
+    These are `names`, as `channel_names` returns them; where they are `FROM_JOINTS`, every name
+    that has a parameter of its own: whether there is such a joint turns out later.
     """
-    names = channel_names(values)
     if names != FROM_JOINTS:
         return names
     parts = [split(name) for name in values]

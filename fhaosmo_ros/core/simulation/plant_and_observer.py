@@ -47,7 +47,6 @@ from fhaosmo_ros.core.observer.arrays import (
     Work,
 )
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration, per_level
-from fhaosmo_ros.core.observer.step import is_upset
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.disturbance import disturbance, disturbances
@@ -134,7 +133,6 @@ def observer_rates(joint: _Joint, law: Law, state: Floats, slopes: Floats) -> tu
         for i in range(levels):
             x[r, i] = state[n + r * levels + i]
     gamma = state[n + ROWS * levels]
-    rests = law.scalars[DEAD_ZONE] > 0.0 and is_upset(law, x, state[0])
     # A forward Euler step of length 1 moves the state by its rate.
     if law.flags[LEVANT]:
         loss, gradient = levant.explicit(law, work, gamma, state[0], 1.0, u)
@@ -144,7 +142,7 @@ def observer_rates(joint: _Joint, law: Law, state: Floats, slopes: Floats) -> tu
         for i in range(levels):
             k = n + r * levels + i
             slopes[k] = x[r, i] - state[k]
-    return loss, 0.0 if rests else gradient
+    return loss, gradient
 
 
 @compiled()

@@ -10,12 +10,12 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.per_channel import (
     CHANNELS,
-    declared_channels,
     FROM_JOINTS,
     NAME,
     of_channel,
     split,
     UNNAMED,
+    with_own_parameters,
 )
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import measured_output, with_joints
@@ -70,7 +70,9 @@ class EstimatorNode(ManagedNode):
         self._names: list[str] = values[CHANNELS]
         self._joints: set[str] = set()
         self._node_parameters = NodeParameters(self, values, fixed=['autostart', CHANNELS])
-        self._inheritance = ChannelInheritance(declared_channels(values), overrides)
+        self._inheritance = ChannelInheritance(
+            with_own_parameters(values[CHANNELS], values), overrides
+        )
         self._sources: Sources | None = None
         self._channels: Channel | ChannelGroup | None = None
         self._parameter_topic: ParameterTopic | None = None
@@ -101,7 +103,7 @@ class EstimatorNode(ManagedNode):
         """Return new estimators; raise for parameters that do not fit together."""
         values, names = self._node_parameters.values, self._names
         if names == FROM_JOINTS:  # which joints there are is not known yet, but some may be named
-            names = [*names, *declared_channels(values)]
+            names = [*names, *with_own_parameters(values[CHANNELS], values)]
         prefixes = [f'~/{name}/' if name else '~/' for name in names]
         check_overrides(self, [prefix + topic for prefix in prefixes for topic in ESTIMATES])
         estimators = make_estimators(values, names)
@@ -175,7 +177,7 @@ class EstimatorNode(ManagedNode):
         if not fit:
             return
         present = self._node_parameters.values
-        for name in set(declared_channels(present)) - set(fit):
+        for name in set(with_own_parameters(present[CHANNELS], present)) - set(fit):
             self.get_logger().error(
                 f"parameters of '{name}' are not used: there is no such joint"
                 f'{suggestion(name, fit)}'

@@ -58,7 +58,8 @@ def run_command(
 
     """
     given = sys.argv[1:] if argv is None else argv
-    parser.add_argument('--version', action='version', version=f'fhaosmo_ros {__version__}')
+    if '--version' in given:
+        parser.exit(0, f'fhaosmo_ros {__version__}\n')
     own, ros_arguments = split_ros_arguments(given)
     arguments = parser.parse_args(own)
     arguments.ros_arguments = ros_arguments

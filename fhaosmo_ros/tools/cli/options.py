@@ -192,9 +192,11 @@ def channel_parameters(
     return CHANNEL_PARAMETERS.part_of(own)
 
 
-def online_parameters(arguments: argparse.Namespace) -> dict[str, Any]:
+def online_parameters(
+    arguments: argparse.Namespace, recorded: Recorded | None = None
+) -> dict[str, Any]:
     """Return those of `channel_parameters` that belong to the update path."""
-    return ONLINE_PARAMETERS.part_of(channel_parameters(arguments))
+    return ONLINE_PARAMETERS.part_of(channel_parameters(arguments, recorded))
 
 
 def named(arguments: argparse.Namespace) -> list[str]:
