@@ -92,8 +92,8 @@ def live():
 def test_bag_is_complete_after_ctrl_c(storage, live, tmp_path):
     bag = tmp_path / 'bag'
     process = start('record', '-o', bag, '--storage', storage)
-    # Some four seconds: the estimator may be discovered later than the plant.
-    wait_until(lambda: size(bag) > 800_000, 'messages', 90.0, process)
+    # Some six seconds: the estimator may be discovered later than the plant.
+    wait_until(lambda: size(bag) > 1_200_000, 'messages', 90.0, process)
     process.send_signal(signal.SIGINT if storage == 'mcap' else signal.SIGTERM)
     out, error = process.communicate(timeout=60)
     assert process.returncode == 0, error
@@ -104,7 +104,7 @@ def test_bag_is_complete_after_ctrl_c(storage, live, tmp_path):
         for t in information['topics_with_message_count']
     }
     assert counts['/y'] > 1000
-    assert counts['/estimator/stamp'] > 100
+    assert counts['/estimator/stamp'] > 20
     assert counts['/plant/state'] > 1000
     assert information['message_count'] == sum(counts.values())
     assert str(information['message_count']) in out
@@ -168,7 +168,9 @@ def test_replay_follows_a_run_that_began_before_the_recording(live, tmp_path):
     assert int(followed[1]) == int(followed[2]) > 3
     compare(tmp_path / 'out')
     # What is fixed on the command line stays, whatever was changed live.
-    fixed = run('replay', bag, '-o', tmp_path / 'fixed', *arguments, '-p', 'epsilon:=0.5')
+    fixed = run(
+        'replay', bag, '-o', tmp_path / 'fixed', *arguments, '-p', 'unknown_input_decay:=0.0'
+    )
     assert 'parameters differ' in fixed.stdout
 
 
@@ -176,7 +178,7 @@ def record_changes(bag):
     process = start('record', '-o', bag)
     wait_until(lambda: size(bag) > 800_000, 'messages', 90.0, process)
     with Hand(int(DOMAIN)) as hand:
-        hand.set(epsilon=0.05, gamma_rate=0.008)
+        hand.set(epsilon=0.05, gamma_rate=0.008, unknown_input_decay=0.5)
         wait_for_more(bag, 100_000, process)  # half a second of messages to compare
         hand.reset()
         wait_for_more(bag, 100_000, process)
@@ -184,7 +186,7 @@ def record_changes(bag):
         wait_for_more(bag, 200_000, process)
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=60)
-        hand.set(epsilon=40.0, gamma_rate=0.004)
+        hand.set(epsilon=40.0, gamma_rate=0.004, unknown_input_decay=0.0)
     assert process.returncode == 0, error
     return error
 
