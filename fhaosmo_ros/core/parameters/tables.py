@@ -192,8 +192,9 @@ OBSERVER = (
     ),
     Parameter(
         'gamma_leakage_delay', 5.0,
-        'Leakage waits for this time after innovations beyond the dead zone. Not used where the '
-        'dead zone is 0.',
+        'Leakage waits for this time after innovations beyond the dead zone, and adaptation for '
+        'this time after an innovation of y beyond its half-width. Not used where the dead zone '
+        'is 0.',
         unit='s', lower=0.0, upper=1e6,
     ),
     Parameter(
