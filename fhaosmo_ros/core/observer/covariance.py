@@ -304,6 +304,21 @@ class Uncertainty:
             There is no such covariance in floating-point numbers.
 
         """
+        try:
+            with np.errstate(all='ignore'):
+                h, unit = self._doubled(period)
+        except (ArithmeticError, np.linalg.LinAlgError):
+            h = unit = np.full((1, 1), math.nan)
+        if not np.isfinite(h).all() or not h[0, 0] > 0.0:
+            raise ConfigurationError(
+                f'parameters {", ".join(map(repr, DECIDING))}: expected values for which there is '
+                'a Kalman filter in floating-point numbers, or noise_size = 0, got a noise of '
+                f'{math.sqrt(self.variance):g} and an intensity of {self.intensity:g}'
+            )
+        return np.asarray(h * np.outer(unit, unit))
+
+    def _doubled(self, period: float) -> tuple[Matrix, Matrix]:
+        """Return the covariance in the filter's own units, and the units."""
         n = len(self.rates)
         speed = (self.intensity / (self.variance * period)) ** (0.5 / n)
         unit = math.sqrt(self.variance) * speed ** np.arange(n)
@@ -312,23 +327,16 @@ class Uncertainty:
         h = q / np.outer(unit, unit)
         g = np.zeros((n, n))
         g[0, 0] = 1.0
-        with np.errstate(all='ignore'):
-            for _ in range(DOUBLINGS):
-                shared = np.linalg.solve(np.eye(n) + g @ h, np.column_stack([a, g]))
-                before = h
-                g = g + a @ shared[:, n:] @ a.T
-                h = h + a.T @ h @ shared[:, :n]
-                a = a @ shared[:, :n]
-                h = 0.5 * (h + h.T)
-                if np.allclose(h, before, rtol=1e-12, atol=0.0):
-                    break
-        if not np.isfinite(h).all() or not h[0, 0] > 0.0:
-            raise ConfigurationError(
-                f'parameters {", ".join(map(repr, DECIDING))}: expected values for which there is '
-                'a Kalman filter in floating-point numbers, or noise_size = 0, got a noise of '
-                f'{math.sqrt(self.variance):g} and an intensity of {self.intensity:g}'
-            )
-        return np.asarray(h * np.outer(unit, unit))
+        for _ in range(DOUBLINGS):
+            shared = np.linalg.solve(np.eye(n) + g @ h, np.column_stack([a, g]))
+            before = h
+            g = g + a @ shared[:, n:] @ a.T
+            h = h + a.T @ h @ shared[:, :n]
+            a = a @ shared[:, :n]
+            h = 0.5 * (h + h.T)
+            if np.allclose(h, before, rtol=1e-12, atol=0.0):
+                break
+        return h, unit
 
 
 def stationary(chain: Matrix, intensity: float) -> Matrix:
