@@ -38,6 +38,11 @@ from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
 import numpy as np
 
+RATES, STEADY, FRESH, SINGLE = range(4)
+"""Parts of `Law.chances`, of N rows each; the single rows behind them begin at the last."""
+INVERSE_STEADY, FIRST_HAT, FIRST_TILDE, TUNED_OVER_KALMAN = range(4)
+SINGLES = 4
+"""Single rows of `Law.chances`."""
 HAT, TILDE, HAT_SENSITIVITY, TILDE_SENSITIVITY, COVARIANCE = range(5)
 ROWS = 4
 """Number of rows before the covariance."""
@@ -64,6 +69,11 @@ NEWTON_TOLERANCE = 3e-8
 """Relative change that ends the iteration; its square, about 1e-15, is the error that is left."""
 TINY = 1e-300
 """Innovations below this are taken for 0: their powers would underflow."""
+
+
+def part(index: int, levels: int) -> slice:
+    """Return the rows of one of the parts `RATES` .. `FRESH` of `Law.chances`."""
+    return slice(index * levels, (index + 1) * levels)
 
 
 class Law(NamedTuple):

@@ -110,7 +110,7 @@ class ObserverConfiguration:
         levels, memory = np.zeros((rows, self.levels)), np.zeros(arrays.MEMORY)
         levels[arrays.HAT] = self.initial_estimate
         levels[arrays.TILDE] = self.initial_internal
-        levels[arrays.COVARIANCE :] = self.law.chances[2 * self.levels : 3 * self.levels]
+        levels[arrays.COVARIANCE :] = self.law.chances[arrays.part(arrays.FRESH, self.levels)]
         memory[arrays.GAMMA] = self.gamma_initial
         memory[arrays.Y] = np.nan
         memory[arrays.SCALE] = memory[arrays.SPREAD] = 1.0
@@ -171,8 +171,10 @@ class ObserverConfiguration:
             and p['unknown_input']
             and (p['correction_period'] > 0.0 or not flags[arrays.PREDICTING])
         )
-        chances = np.zeros((3 * levels + 4, levels))
-        chances[-3:-1] = self.initial_estimate, self.initial_internal
+        single = arrays.SINGLE * levels
+        chances = np.zeros((single + arrays.SINGLES, levels))
+        chances[single + arrays.FIRST_HAT] = self.initial_estimate
+        chances[single + arrays.FIRST_TILDE] = self.initial_internal
         if flags[arrays.SCHEDULED]:
             self._schedule(arrays.Law(flags, gains, psi, scalars, chances, model))
         return arrays.Law(flags, gains, psi, scalars, chances, model)
@@ -182,20 +184,24 @@ class ObserverConfiguration:
         p, n, scalars, chances = self.parameters, self.levels, law.scalars, law.chances
         period = p['correction_period']
         uncertainty = Uncertainty(self.model, p, self.state_sizes)
-        chances[:n], chances[2 * n : 3 * n] = uncertainty.rates, uncertainty.fresh
+        chances[arrays.part(arrays.RATES, n)] = uncertainty.rates
+        chances[arrays.part(arrays.FRESH, n)] = uncertainty.fresh
         scalars[arrays.VARIANCE] = uncertainty.variance
         scalars[arrays.INTENSITY] = uncertainty.intensity
         scalars[arrays.FASTEST] = uncertainty.fastest
         if not law.flags[arrays.PREDICTING]:
             return
         steady = uncertainty.steady(period)
-        chances[n : 2 * n] = steady
-        chances[3 * n, steady[0] > 0.0] = 1.0 / steady[0, steady[0] > 0.0]
+        chances[arrays.part(arrays.STEADY, n)] = steady
+        single = chances[arrays.SINGLE * n :]
+        known = steady[0] > 0.0
+        single[arrays.INVERSE_STEADY, known] = 1.0 / steady[0, known]
         tuned = tuned_corrections(law, p['noise_size'], period, self.gamma_initial)
         wanted = steady[0] / uncertainty.variance
         alike = (wanted > 0.0) & (tuned > 0.0)
-        chances[-1] = 1.0
-        chances[-1, alike] = np.clip(tuned[alike] / wanted[alike], 1e-6, 1e6)
+        ratio = single[arrays.TUNED_OVER_KALMAN]
+        ratio[:] = 1.0
+        ratio[alike] = np.clip(tuned[alike] / wanted[alike], 1e-6, 1e6)
         scalars[arrays.STEADY_VARIANCE] = steady[0, 0] + uncertainty.variance
 
 

@@ -47,8 +47,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
-RATES, STEADY, FRESH = range(3)
-"""Parts of `Law.chances`, of N rows each."""
 STEP = 0.5
 """Part of the time constant of the fastest motion that one step of the covariance may take."""
 MOST_STEPS = 100

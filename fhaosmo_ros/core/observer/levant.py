@@ -24,6 +24,7 @@ from fhaosmo_ros.core.observer.arrays import (
     GAMMA,
     HAT,
     HAT_SENSITIVITY,
+    INVERSE_STEADY,
     LAMBDA,
     Law,
     NEWTON_STEPS,
@@ -39,10 +40,13 @@ from fhaosmo_ros.core.observer.arrays import (
     SENSITIVE,
     SETTLED,
     SIGN,
+    SINGLE,
+    STEADY,
     STEADY_VARIANCE,
     TILDE,
     TILDE_SENSITIVITY,
     TINY,
+    TUNED_OVER_KALMAN,
     VARIANCE,
     WIDEST,
     Work,
@@ -289,7 +293,7 @@ def predict_correct(
         if memory[SETTLED] > 0.0:
             for i in range(n):
                 for j in range(n):
-                    x[COVARIANCE + i, j] = law.chances[n + i, j]
+                    x[COVARIANCE + i, j] = law.chances[STEADY * n + i, j]
             correct_covariance(law, work)
         predict_covariance(law, work, h)
         variance = x[COVARIANCE, 0] + law.scalars[VARIANCE]
@@ -314,12 +318,12 @@ def predict_correct(
     if scheduled:
         far, largest = abs(h - period) > NEAR * period, 1.0
         for i in range(n):  # D 20
-            inverse = law.chances[3 * n, i]
+            inverse = law.chances[SINGLE * n + INVERSE_STEADY, i]
             ratio[i] = x[COVARIANCE, i] * inverse if inverse > 0.0 else ratio[0]
             largest = max(largest, ratio[i])
             far = far or abs(ratio[i] - 1.0) > CLOSE
         for i in range(n):  # from the Kalman filter's gains to the tuned ones
-            ratio[i] *= law.chances[3 * n + 3, i] ** (1.0 / largest - 1.0)
+            ratio[i] *= law.chances[SINGLE * n + TUNED_OVER_KALMAN, i] ** (1.0 / largest - 1.0)
         correct_covariance(law, work)
         memory[SETTLED] = 0.0 if far else 1.0
     return correct(law, work, memory, y, period)

@@ -276,7 +276,7 @@ class Observer:
         after = self._law.flags
         if not before[arrays.SENSITIVE] or before[arrays.LEVANT] != after[arrays.LEVANT]:
             self._state.levels[arrays.HAT_SENSITIVITY : arrays.ROWS] = 0.0  # not carried along
-        steady = slice(self.levels, 2 * self.levels)
+        steady = arrays.part(arrays.STEADY, self.levels)
         same = before[arrays.SCHEDULED] == after[arrays.SCHEDULED]
         if not same or not np.array_equal(
             chances[steady], self._law.chances[steady]

@@ -20,6 +20,9 @@ from fhaosmo_ros.core.observer.arrays import (
     DEAD_ZONE,
     DELAY,
     EPSILON,
+    FIRST_HAT,
+    FIRST_TILDE,
+    FRESH,
     FROM_MEASUREMENT,
     GAMMA,
     GAMMA_INITIAL,
@@ -41,6 +44,7 @@ from fhaosmo_ros.core.observer.arrays import (
     SCHEDULED,
     SETTLED,
     SIGN,
+    SINGLE,
     State,
     TILDE,
     TILDE_SENSITIVITY,
@@ -219,11 +223,11 @@ def restart(law: Law, state: State, y: float) -> None:
     """Begin afresh from `y`; the time of the next sample counts from it."""
     levels, memory, n = state.levels, state.memory, law.gains.shape[1]
     for i in range(n):
-        levels[HAT, i] = law.chances[3 * n + 1, i]
-        levels[TILDE, i] = law.chances[3 * n + 2, i]
+        levels[HAT, i] = law.chances[SINGLE * n + FIRST_HAT, i]
+        levels[TILDE, i] = law.chances[SINGLE * n + FIRST_TILDE, i]
         levels[HAT_SENSITIVITY, i] = levels[TILDE_SENSITIVITY, i] = 0.0
         for j in range(n):
-            levels[COVARIANCE + i, j] = law.chances[2 * n + i, j]
+            levels[COVARIANCE + i, j] = law.chances[FRESH * n + i, j]
     levels[HAT, 0] = memory[Y] = y
     if law.flags[ADAPTIVE]:
         memory[GAMMA] = law.scalars[GAMMA_INITIAL]

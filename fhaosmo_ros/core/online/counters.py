@@ -56,17 +56,6 @@ class Counters(NamedTuple):
     """Times that the observer had lost y and was restarted from it."""
 
     @property
-    def rejected_stamps(self) -> int:
-        """Samples that were not used, or not in the end, because of their stamp."""
-        return (
-            self.duplicate_stamps
-            + self.backward_stamps
-            + self.zero_stamps
-            + self.far_stamps
-            + self.withdrawn_gaps
-        )
-
-    @property
     def rejected(self) -> int:
         """Samples of y that were not used."""
         return sum(getattr(self, name) for name in UNUSED_SAMPLES)
