@@ -198,6 +198,25 @@ def test_papers_gains_find_y_again(offset):
     assert wrong.max() < 40.0 * np.abs(truth.unknown_input).max()  # these gains have such peaks
 
 
+@pytest.mark.parametrize('unit', [1e6, 1e-6])
+def test_units_do_not_matter(unit):
+    """The motor's angle in microradians: lambda_6 is 1e13, the largest state 1e15."""
+    case = Case(CONFIG / 'models' / 'dc_motor.yaml')
+    p, y = dict(case.parameters), case.y.copy()
+    y[HIT:BACK] += 1.0
+    expected = case.errors(y, case.d)
+    levels = len(p['lambda'])
+    powers = 2.0 * p['gamma_initial'] * (levels - 1 - np.arange(levels)) / levels
+    case.parameters |= {
+        'phi': ['0', f'{500.0 * unit}*u - 25*z2'],
+        'lambda': (np.array(p['lambda']) * unit ** (1.0 - powers)).tolist(),
+        **{name: unit * p[name] for name in ('noise_size', 'unknown_input_size')},
+        **{name: [unit * x for x in p[name]] for name in ('state_sizes', 'fuzzy_widths')},
+    }  # fmt: skip
+    found = case.errors(unit * y, unit * case.d)
+    np.testing.assert_allclose(found / unit, expected, atol=1e-9 * case.largest)
+
+
 # the covariance (D 20)
 
 
