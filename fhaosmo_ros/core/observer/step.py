@@ -217,7 +217,7 @@ def step(
                 used = y if law.flags[IMPLICIT] else memory[Y]
                 if is_upset(law, x if law.flags[IMPLICIT] else levels, used):
                     memory[UPSET] = law.scalars[DELAY]
-                word = adapt(law.scalars, x, memory, whole, loss, gradient)
+                word = adapt(law, x, memory, whole, loss, gradient)
             for r in range(levels.shape[0]):
                 for i in range(n):
                     levels[r, i] = x[r, i]
@@ -277,14 +277,14 @@ def is_upset(law: Law, x: Floats, y: float) -> bool:
 
 
 @compiled(forceinline=True)
-def adapt(c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient: float) -> int:
+def adapt(law: Law, x: Floats, memory: Floats, h: float, loss: float, gradient: float) -> int:
     """
     Change gamma (P adaptationlawgamma) and the time to wait in `memory`; return status flags.
 
     Projection on [gamma_min, gamma_max], dead zone, leakage, and the rest after an upset are
     ours (D 8).
     """
-    word, gamma = 0, memory[GAMMA]
+    word, gamma, c = 0, memory[GAMMA], law.scalars
     zero = gradient - gradient
     for r in (HAT_SENSITIVITY, TILDE_SENSITIVITY):
         for i in range(x.shape[1]):
@@ -296,7 +296,7 @@ def adapt(c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient:
             for i in range(x.shape[1]):
                 x[r, i] = 0.0
     leaks, dead_zone = c[DEAD_ZONE] == 0.0, c[DEAD_ZONE]
-    if not leaks:  # it follows the noise
+    if law.flags[SCHEDULED] and not leaks:  # it follows the noise
         if not memory[UPSET] > 0.0:
             change = 1.0 + h / max(c[DELAY], h)
             memory[USUAL] *= change if loss > memory[USUAL] * memory[USUAL] else 1.0 / change
