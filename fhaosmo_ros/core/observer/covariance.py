@@ -70,7 +70,7 @@ MEDIAN = 0.6745
 SPREAD_RATE = 0.005
 GATE = 6.0
 """Innovations of so many standard deviations are too unlikely to be used (D 21)."""
-STATES_DOUBT, INPUT_DOUBT = 5.0, 0.5
+STATES_DOUBT, INPUT_DOUBT = 5.0, 0.4
 """
 At the start states count as so many times larger than `state_sizes`, d as so much smaller than
 `unknown_input_size`: the start hardly depends on sizes of states that are too large, or on a size
