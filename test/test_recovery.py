@@ -126,6 +126,21 @@ def test_offset_that_the_model_contradicts_is_taken_off_and_forgotten():
     assert observer.state.memory[OFFSET] == 0.0
 
 
+def test_jumps_are_counted_and_a_snapshot_goes_on_from_them():
+    case = Case(CONFIG / 'models' / 'pendulum.yaml')
+    y, stamps = case.y.copy(), 10**9 + np.round(case.t * 1e9).astype(np.int64)
+    y[HIT:BACK] += 1.0
+    whole, middle = OnlineEstimator(case.parameters), HIT + RATE // 4
+    expected = whole.run(stamps, y, np.zeros(len(y)))
+    assert (whole.counters.jumps, whole.counters.divergences) == (2, 0)
+    one, other = OnlineEstimator(case.parameters), OnlineEstimator(case.parameters)
+    one.run(stamps[:middle], y[:middle], np.zeros(middle))
+    assert one.offset == pytest.approx(1.0, abs=0.01)
+    other.remember(one.memory)
+    found = other.run(stamps[middle:], y[middle:], np.zeros(len(y) - middle))
+    np.testing.assert_array_equal(found.unknown_input, expected.unknown_input[middle:])
+
+
 def test_sensor_that_is_put_right_is_believed():
     """As a zero that is found after the start: the wrong one had needed a large d."""
     case = Case(CONFIG / 'models' / 'pendulum.yaml')
