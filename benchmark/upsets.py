@@ -7,6 +7,7 @@ d that the preset has. Their bandwidth is scanned on a recording without upsets.
 """
 
 from collections.abc import Callable
+from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,10 +38,11 @@ SETTLED = 3.0
 """From then on the error of a clean run is the usual one."""
 
 
+WRONG = 'peak at the start, sizes wrong'
 START, UPSET, LATE = 'peak at the start', 'peak after an upset', 'seconds to the usual error'
 PLAIN = 'error with outliers over that of the Kalman filter'
 ROBUST = 'error with outliers over that of the best robust one'
-BARS = {START: 1.5, UPSET: 2.0, LATE: 0.3, PLAIN: 0.6, ROBUST: 1.0}
+BARS = {START: 1.5, WRONG: 1.9, UPSET: 2.0, LATE: 0.3, PLAIN: 0.6, ROBUST: 1.0}
 """Worst values of the node over all files but the paper's, and what is allowed."""
 
 
@@ -182,6 +184,18 @@ def upset_cases(p: Preset, quick: bool) -> dict[str, Case]:
     return cases
 
 
+def wrong_sizes(p: Preset) -> dict[str, Preset]:
+    """Return the preset with one of its sizes wrong at a time, by what is wrong."""
+    found = {}
+    for name, factor in (('noise_size', 3.0), ('state_sizes', 10.0), ('unknown_input_size', 3.0)):
+        for times in (factor, 1.0 / factor) if name in p.estimator else ():
+            other, right = copy(p), p.estimator[name]
+            wrong = [times * x for x in right] if isinstance(right, list) else times * right
+            other.estimator = {**p.estimator, name: wrong}
+            found[f'start, {name} x {times:.2g}'] = other
+    return found
+
+
 def steady_cases(p: Preset) -> dict[str, Case]:
     """Return runs whose RMS error is judged, by name."""
     cases = {'clean': p.clean}
@@ -223,6 +237,15 @@ def measure(quick: bool) -> list[Row | Table]:
                         judge(UPSET if case.back else START, float(peak), f'{p.name}, {title}')
                         judge(LATE, late, f'{p.name}, {title}')
                 upsets.append(tuple(line))
+            for title, other in wrong_sizes(p).items():
+                line, case = [p.name, title], p.clean
+                for run in (in_node(other, case)[0], bare(other, case)):
+                    error = run - case.d
+                    peak = float(np.abs(error).max() / largest)
+                    late = time_to_usual(error, case, 1.1 * usual['node'])
+                    line.append(f'{peak:.2g} {late:.2g}')
+                    judge(WRONG, peak, f'{p.name}, {title}')
+                upsets.append((*line, *['-'] * (len(runs) - 2)))
             for title, case in steady_cases(p).items():
                 size = rms(p.clean.d, p.clean.t)
                 found = [rms(run(case) - case.d, case.t) / size for run in runs.values()]

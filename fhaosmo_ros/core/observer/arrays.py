@@ -30,6 +30,12 @@ Entries of ``State.memory``:
 | PERIOD | running mean of the intervals between samples | s |
 | SPREAD | size of the innovations over that expected, at least 1 (D 21) | 1 |
 | UPSET | time for which gamma has yet to rest after |eps_1| > w_1 (D 8) | s |
+| OFFSET | what y is more than z_1, since a jump that the model contradicts (D 23) | of y |
+| JUMPS | sum of the jumps of y, 0 once it is back (D 23) | of y |
+| FIRST_MISS, MISS | first and last prediction error of the unlikely samples in a row | of y |
+| WATCHED | samples for which it has yet to be watched whether only y jumped (D 23) | 1 |
+| DRIFT | sum of the recent prediction errors over their usual size, while watched | 1 |
+| USUAL | running median of sqrt(L) (D 8) | of the innovations |
 """
 
 from typing import NamedTuple
@@ -40,14 +46,15 @@ import numpy as np
 
 RATES, STEADY, FRESH, SINGLE = range(4)
 """Parts of `Law.chances`, of N rows each; the single rows behind them begin at the last."""
-INVERSE_STEADY, FIRST_HAT, FIRST_TILDE, TUNED_OVER_KALMAN = range(4)
-SINGLES = 4
+INVERSE_STEADY, FIRST_HAT, FIRST_TILDE, TUNED_OVER_KALMAN, NEXT_SIZE = range(5)
+SINGLES = 5
 """Single rows of `Law.chances`."""
 HAT, TILDE, HAT_SENSITIVITY, TILDE_SENSITIVITY, COVARIANCE = range(5)
 ROWS = 4
 """Number of rows before the covariance."""
 GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSET = range(11)
-MEMORY = 11
+OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
+MEMORY = 18
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 FLAGS = 8
@@ -90,12 +97,12 @@ class Law(NamedTuple):
         psi of each level at K points of [0, half-width].
     scalars : (SCALARS,) array
         `EPSILON` .. `STEADY_VARIANCE`.
-    chances : (3N + 4, N) array
+    chances : (3N + 5, N) array
         What the covariance is computed from, with `noise_size` (D 20): the rates A of the model,
         linearised at rest; the steady covariance of the errors of predictions; that of the errors
-        of a fresh observer; and four rows: one over the first of the steady covariance (0 where
-        that is not positive), first estimates, first internal states, and the tuned corrections
-        of a small innovation over those of the Kalman filter.
+        of a fresh observer; and five rows: one over the first of the steady covariance (0 where
+        that is not positive), first estimates, first internal states, the tuned corrections of a
+        small innovation over those of the Kalman filter, and the sizes of z_2 .. z_n, d.
     model : Bytecode
         Phi_1 .. Phi_n, and the model of the unknown input behind them (D 17).
 
@@ -138,8 +145,8 @@ class State(NamedTuple):
     ----------
     levels : (4 + N, N) array
         `HAT` .. `COVARIANCE` and the rows that follow.
-    memory : (10,) array
-        `GAMMA` .. `SPREAD`.
+    memory : (MEMORY,) array
+        `GAMMA` .. `USUAL`.
 
     """
 

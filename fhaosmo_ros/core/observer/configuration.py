@@ -186,6 +186,9 @@ class ObserverConfiguration:
         uncertainty = Uncertainty(self.model, p, self.state_sizes)
         chances[arrays.part(arrays.RATES, n)] = uncertainty.rates
         chances[arrays.part(arrays.FRESH, n)] = uncertainty.fresh
+        order = self.model.order
+        sizes = [*self.state_sizes[1:], p['unknown_input_size']]
+        chances[arrays.SINGLE * n + arrays.NEXT_SIZE, :order] = sizes
         scalars[arrays.VARIANCE] = uncertainty.variance
         scalars[arrays.INTENSITY] = uncertainty.intensity
         scalars[arrays.FASTEST] = uncertainty.fastest

@@ -21,23 +21,34 @@ from fhaosmo_ros.core.observer.arrays import (
     ALPHA,
     BEYOND,
     COVARIANCE,
+    DRIFT,
     FASTEST,
+    FIRST_MISS,
     GAMMA,
     HAT,
     HAT_SENSITIVITY,
     INTENSITY,
     INVERSE_WIDTH,
+    JUMPS,
     LAMBDA,
     Law,
     LEVANT,
+    MISS,
+    NEXT_SIZE,
+    OFFSET,
+    PREDICTING,
     PREDICTION_STEP,
     psi,
     SETTLED,
     SIGN,
+    SINGLE,
     SPREAD,
+    State,
+    STEADY,
     TILDE,
     TILDE_SENSITIVITY,
     VARIANCE,
+    WATCHED,
     Work,
     Y,
 )
@@ -52,13 +63,26 @@ STEP = 0.5
 MOST_STEPS = 100
 LONG = 8.0
 """Time constants of the steady Kalman filter after which its errors are steady."""
-HUBER = 3.0
+HUBER = 2.0
 """Innovations of more standard deviations count as so many (D 21)."""
 MEDIAN = 0.6745
 """Of |x| where x is normal with variance 1."""
 SPREAD_RATE = 0.005
 GATE = 6.0
 """Innovations of so many standard deviations are too unlikely to be used (D 21)."""
+STATES_DOUBT, INPUT_DOUBT = 5.0, 0.4
+"""
+At the start states count as so many times larger than `state_sizes`, d as so much smaller than
+`unknown_input_size`: the start hardly depends on sizes of states that are too large, or on a size
+of d that is too small, but it does on the opposite.
+"""
+WATCH, REMEMBERED, MOST_DRIFT = 1000.0, 100.0, 35.0
+"""
+Samples after a jump of y in which prediction errors may not sum up, how many of them the sum
+remembers, and the sum that is too much: five standard deviations of that of white noise (D 23).
+"""
+OF_SIZE = 0.25
+"""A jump of y contradicts the model if it changes a Phi by more than this part of z_{i+1} or d."""
 DOUBLINGS = 60
 BISECTIONS = 60
 DECIDING = (
@@ -141,8 +165,83 @@ def usual_innovation(memory: Floats, b: float, expected: float) -> float:
     else:
         memory[SPREAD] = max(memory[SPREAD] / (1.0 + SPREAD_RATE), 1.0)
     usual = float(memory[SPREAD] * expected)
-    memory[BEYOND] = memory[BEYOND] + 1.0 if abs(b) > GATE * usual else 0.0
+    if abs(b) > GATE * usual:
+        memory[BEYOND] += 1.0
+        memory[MISS] = b
+        if memory[BEYOND] == 1.0:
+            memory[FIRST_MISS] = b
+        return usual
+    memory[BEYOND] = 0.0
+    if memory[WATCHED] > 0.0:
+        memory[WATCHED] -= 1.0
+        memory[DRIFT] += b / usual - memory[DRIFT] / REMEMBERED
+        if abs(memory[DRIFT]) > MOST_DRIFT:
+            memory[BEYOND] = math.inf
     return usual
+
+
+@compiled()
+def jump(law: Law, work: Work, state: State, u: Floats) -> bool:
+    """
+    Go on with a y that alone has jumped (D 23), in place.
+
+    Returns
+    -------
+    bool
+        False if that is not what happened: y differs from its prediction by no constant, or the
+        model says that the plant is now elsewhere. Then nothing but `JUMPS` has changed.
+
+    """
+    levels, memory, x = state.levels, state.memory, work.x
+    n, m = law.gains.shape[1], work.stages[POINT]
+    b, s = memory[MISS], x[COVARIANCE, 0] + law.scalars[VARIANCE]
+    small = GATE * memory[SPREAD] * math.sqrt(2.0 * s)
+    if not (memory[BEYOND] < math.inf and abs(b - memory[FIRST_MISS]) <= small):
+        memory[JUMPS] = 0.0
+        return False
+    offset, total = memory[OFFSET] + b, memory[JUMPS] + b
+    is_back, contradicted, larger = abs(total) <= small, False, True
+    for i in range(n):
+        m[0, i], m[1, i] = x[HAT, i], 0.0
+    for i in range(n):
+        size = law.chances[SINGLE * n + NEXT_SIZE, i]
+        m[0, 0] = x[HAT, 0]
+        change = evaluate(law.model, i, m, u, work.stack)[0]
+        m[0, 0] = x[HAT, 0] + offset
+        change -= evaluate(law.model, i, m, u, work.stack)[0]
+        if not abs(change) <= OF_SIZE * size:
+            contradicted = True
+            d = x[HAT, i + 1] if i + 1 < n else 0.0
+            larger = larger and not abs(d + change) <= abs(d)
+    memory[JUMPS] = 0.0 if is_back else total
+    if contradicted and not is_back:
+        if not larger:
+            return False
+        memory[OFFSET] = offset
+    elif contradicted and memory[OFFSET] == 0.0:
+        return False
+    else:
+        memory[OFFSET] = 0.0
+        levels[HAT, 0] += offset
+        memory[Y] += offset
+    if law.flags[PREDICTING] or memory[SETTLED] <= 0.0:
+        for i in range(n):
+            for j in range(n):
+                x[COVARIANCE + i, j] = levels[COVARIANCE + i, j]
+                if memory[SETTLED] > 0.0:
+                    x[COVARIANCE + i, j] = law.chances[STEADY * n + i, j]
+        if memory[SETTLED] > 0.0:
+            correct_covariance(law, work)
+        for i in range(n):
+            x[COVARIANCE, i] = x[COVARIANCE + i, 0] = 0.0
+        x[COVARIANCE, 0] = b * b
+        for i in range(n):
+            for j in range(n):
+                levels[COVARIANCE + i, j] = x[COVARIANCE + i, j]
+        memory[SETTLED] = min(memory[SETTLED], 0.0)
+    memory[BEYOND] = memory[DRIFT] = 0.0
+    memory[WATCHED] = WATCH
+    return True
 
 
 @compiled()
@@ -278,11 +377,11 @@ class Uncertainty:
         factor = (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2 / math.factorial(2 * k)
         self.variance, self.intensity = p['noise_size'] ** 2, size**2 * factor
         self.fresh = np.zeros((levels, levels))
-        self.fresh[range(n), range(n)] = np.square(sizes)
+        self.fresh[range(n), range(n)] = np.square(STATES_DOUBT * sizes)
         if p['start_from_measurement']:
             self.fresh[0, 0] = self.variance
         chain = np.eye(k + 1, k=1) - rate * np.eye(k + 1)
-        self.fresh[n:, n:] = stationary(chain, self.intensity)
+        self.fresh[n:, n:] = INPUT_DOUBT**2 * stationary(chain, self.intensity)
 
     @property
     def fastest(self) -> float:

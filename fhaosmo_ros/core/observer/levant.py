@@ -69,6 +69,8 @@ NEAR = 0.25
 """An interval that differs from the tuned one by at most this part of it needs no other gains."""
 CLOSE = 0.02
 """Gains that differ from the tuned ones by at most this part of them are replaced by them."""
+NEARLY_STEADY = 1.5
+"""Up to so many times the steady variance of the innovation, their influence is limited (D 21)."""
 SATURATED_SAMPLES = 20
 """So many samples in a row beyond all half-widths widen them."""
 RATIO = TOTAL
@@ -312,7 +314,7 @@ def predict_correct(
     usual = usual_innovation(memory, b, math.sqrt(variance))
     if memory[BEYOND] > 0.0:
         return 0.0, 0.0
-    if not scheduled:  # where P is not steady it counts on the whole innovation
+    if variance < NEARLY_STEADY * law.scalars[STEADY_VARIANCE]:  # a large P counts on all of b
         y = x[HAT, 0] + min(max(b, -HUBER * usual), HUBER * usual)
     even(work)
     if scheduled:

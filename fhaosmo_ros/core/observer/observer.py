@@ -94,7 +94,7 @@ class ObserverState:
     Attributes
     ----------
     levels : (4 + N, N) array
-    memory : (10,) array
+    memory : (MEMORY,) array
         See `fhaosmo_ros.core.observer.arrays`.
     t : float or int or None
         Time of the last sample of `Observer.run`, in its unit (s, or ns for integers).
@@ -302,6 +302,9 @@ class Observer:
             memory[arrays.GAMMA] = FIXED_GAMMA
         if not flags[arrays.SENSITIVE]:
             levels[arrays.HAT_SENSITIVITY : arrays.ROWS] = 0.0
+        if not flags[arrays.SCHEDULED] and memory[arrays.OFFSET]:
+            memory[arrays.Y] += memory[arrays.OFFSET]
+            memory[arrays.OFFSET] = memory[arrays.JUMPS] = 0.0
 
     def reset(self) -> None:
         """Go back to the initial state; the next sample is the first."""

@@ -32,6 +32,7 @@ class Status(IntFlag):
     GAP = 1024  # a long interval was bridged in sub-steps
     RESTARTED = 2048  # started afresh after a gap or a jump of the clock
     DIVERGED = 4096  # the estimate had lost y and was restarted from it
+    JUMPED = 8192  # with REJECTED_SPIKE: y alone has jumped; the other estimates go on
 
     @property
     def rejected(self) -> bool:
@@ -54,6 +55,7 @@ HELD = int(Status.HELD)
 GAP = int(Status.GAP)
 RESTARTED = int(Status.RESTARTED)
 DIVERGED = int(Status.DIVERGED)
+JUMPED = int(Status.JUMPED)
 REJECTED = (
     REJECTED_MEASUREMENT
     | REJECTED_PERIOD

@@ -19,6 +19,7 @@ from fhaosmo_ros.core.observer.arrays import (
     COVARIANCE,
     DEAD_ZONE,
     DELAY,
+    DRIFT,
     EPSILON,
     FIRST_HAT,
     FIRST_TILDE,
@@ -35,6 +36,7 @@ from fhaosmo_ros.core.observer.arrays import (
     LEVANT,
     MAX,
     MIN,
+    OFFSET,
     PENDING,
     PERIOD,
     PREDICTING,
@@ -49,16 +51,19 @@ from fhaosmo_ros.core.observer.arrays import (
     TILDE,
     TILDE_SENSITIVITY,
     UPSET,
+    USUAL,
     WAIT,
+    WATCHED,
     Work,
     Y,
 )
-from fhaosmo_ros.core.observer.covariance import begin_estimates, is_unlikely
+from fhaosmo_ros.core.observer.covariance import begin_estimates, is_unlikely, jump
 from fhaosmo_ros.core.observer.status import (
     DIVERGED,
     FLAGS_MASK,
     GAMMA_AT_MAX,
     GAMMA_AT_MIN,
+    JUMPED,
     LEVEL_SHIFT,
     REJECTED_INPUT,
     REJECTED_MEASUREMENT,
@@ -72,6 +77,8 @@ SENSITIVITY_LIMIT = 1e9
 """Sensitivities beyond it are set to 0."""
 LOST_SAMPLES = 20
 """More samples in a row that are too far from the prediction say that y is lost (D 21)."""
+UNUSUAL = 3.0
+"""Innovations of so many times their usual size let gamma adapt (D 8)."""
 MEAN_OF = 32
 """Intervals that the running mean remembers."""
 HEADROOM = 1e8
@@ -144,6 +151,7 @@ def start(law: Law, state: State, y: float, eps: Floats, row: int) -> int:
 
     """
     word, memory = 0, state.memory
+    memory[OFFSET] = 0.0
     if math.isfinite(HEADROOM * y):
         memory[Y] = y
         memory[PENDING] = 0.0
@@ -168,7 +176,8 @@ def step(
 
     """
     x, levels, memory, n = work.x, state.levels, state.memory, law.gains.shape[1]
-    word = 0
+    word, measured = 0, y
+    y -= memory[OFFSET]  # D 23
     if not math.isfinite(HEADROOM * y):
         word |= REJECTED_MEASUREMENT
     for j in range(u.shape[0]):
@@ -193,8 +202,11 @@ def step(
             memory[PENDING] = 0.0
             if not law.flags[IMPLICIT]:
                 memory[Y] = y
+        elif memory[BEYOND] > LOST_SAMPLES and jump(law, work, state, u):
+            memory[PENDING] = whole
+            word = REJECTED_SPIKE | JUMPED
         elif memory[BEYOND] > LOST_SAMPLES:
-            restart(law, state, y)
+            restart(law, state, measured)
             word = DIVERGED
         elif memory[BEYOND] > 0.0:
             memory[PENDING] = whole
@@ -202,10 +214,10 @@ def step(
         else:
             if law.flags[ADAPTIVE]:
                 memory[UPSET] = max(memory[UPSET] - whole, 0.0)
-                measured = y if law.flags[IMPLICIT] else memory[Y]
-                if is_upset(law, x if law.flags[IMPLICIT] else levels, measured):
+                used = y if law.flags[IMPLICIT] else memory[Y]
+                if is_upset(law, x if law.flags[IMPLICIT] else levels, used):
                     memory[UPSET] = law.scalars[DELAY]
-                word = adapt(law.scalars, x, memory, whole, loss, gradient)
+                word = adapt(law, x, memory, whole, loss, gradient)
             for r in range(levels.shape[0]):
                 for i in range(n):
                     levels[r, i] = x[r, i]
@@ -232,7 +244,7 @@ def restart(law: Law, state: State, y: float) -> None:
     if law.flags[ADAPTIVE]:
         memory[GAMMA] = law.scalars[GAMMA_INITIAL]
     memory[PENDING] = memory[WAIT] = memory[SATURATED] = memory[BEYOND] = memory[SETTLED] = 0.0
-    memory[UPSET] = 0.0
+    memory[UPSET] = memory[OFFSET] = memory[WATCHED] = memory[DRIFT] = 0.0
     memory[SCALE] = 1.0
 
 
@@ -265,14 +277,14 @@ def is_upset(law: Law, x: Floats, y: float) -> bool:
 
 
 @compiled(forceinline=True)
-def adapt(c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient: float) -> int:
+def adapt(law: Law, x: Floats, memory: Floats, h: float, loss: float, gradient: float) -> int:
     """
     Change gamma (P adaptationlawgamma) and the time to wait in `memory`; return status flags.
 
     Projection on [gamma_min, gamma_max], dead zone, leakage, and the rest after an upset are
     ours (D 8).
     """
-    word, gamma = 0, memory[GAMMA]
+    word, gamma, c = 0, memory[GAMMA], law.scalars
     zero = gradient - gradient
     for r in (HAT_SENSITIVITY, TILDE_SENSITIVITY):
         for i in range(x.shape[1]):
@@ -283,8 +295,14 @@ def adapt(c: Floats, x: Floats, memory: Floats, h: float, loss: float, gradient:
         for r in (HAT_SENSITIVITY, TILDE_SENSITIVITY):
             for i in range(x.shape[1]):
                 x[r, i] = 0.0
-    leaks = c[DEAD_ZONE] == 0.0
-    if loss <= c[DEAD_ZONE] * c[DEAD_ZONE]:  # adaptation rests
+    leaks, dead_zone = c[DEAD_ZONE] == 0.0, c[DEAD_ZONE]
+    if law.flags[SCHEDULED] and not leaks:  # it follows the noise
+        if not memory[UPSET] > 0.0:
+            change = 1.0 + h / max(c[DELAY], h)
+            memory[USUAL] *= change if loss > memory[USUAL] * memory[USUAL] else 1.0 / change
+        memory[USUAL] = max(memory[USUAL], dead_zone / UNUSUAL)
+        dead_zone = UNUSUAL * memory[USUAL]
+    if loss <= dead_zone * dead_zone:  # adaptation rests
         leaks = leaks or memory[WAIT] <= 0.0
         memory[WAIT] = max(memory[WAIT] - h, 0.0)
     else:

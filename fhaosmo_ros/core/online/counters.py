@@ -54,6 +54,8 @@ class Counters(NamedTuple):
     """Restarts because of a clock that jumped back (bag loop, simulator reset)."""
     divergences: int = 0
     """Times that the observer had lost y and was restarted from it."""
+    jumps: int = 0
+    """Times that y jumped, and all estimates but that of z_1 went on (D 23)."""
 
     @property
     def rejected(self) -> int:

@@ -174,6 +174,11 @@ class OnlineEstimator:
         """Size of the innovations over that expected from noise_size, at least 1 (D 21)."""
         return float(self._arrays.state.memory[arrays.SPREAD])
 
+    @property
+    def offset(self) -> float:
+        """What y is taken to be too large by, since a jump that the model contradicts (D 23)."""
+        return float(self._arrays.state.memory[arrays.OFFSET])
+
     def prepare(self, changes: Mapping[str, Any]) -> Change:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
         parameters = self._parameters.changed_live(changes, 'observer')

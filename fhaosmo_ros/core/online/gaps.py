@@ -4,7 +4,7 @@
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.model.integrate import NOW
-from fhaosmo_ros.core.observer.arrays import BEYOND, GAMMA, PENDING, PREDICTING, SPREAD, Y
+from fhaosmo_ros.core.observer.arrays import BEYOND, GAMMA, OFFSET, PENDING, PREDICTING, SPREAD, Y
 from fhaosmo_ros.core.observer.prediction import (
     begin_at_estimates,
     predict_step,
@@ -13,6 +13,7 @@ from fhaosmo_ros.core.observer.prediction import (
 from fhaosmo_ros.core.observer.status import (
     FLAGS_MASK,
     GAP,
+    JUMPED,
     LEVEL_SHIFT,
     REJECTED,
     REJECTED_SPIKE,
@@ -53,7 +54,7 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: Floats, eps: Floats
     """
     law, work, state, policy = e
     ints, reals, memory = policy.ints, policy.reals, state.memory
-    count = sub_steps(policy, elapsed)
+    count, corrected = sub_steps(policy, elapsed), y - memory[OFFSET]
     is_gap = count > 1 and memory[BEYOND] == 0.0  # after rejected samples it is none
     if law.flags[PREDICTING] or not is_gap:
         count = 1
@@ -64,9 +65,9 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: Floats, eps: Floats
         modelled = abs(end) <= reals[at.LIMIT]  # False for NaN
         if not modelled:
             end = memory[Y]
-        if reals[at.GATE] > 0.0 and is_spike(policy, y - end):
+        if reals[at.GATE] > 0.0 and is_spike(policy, corrected - end):
             return REJECTED_SPIKE
-        bend = (y - end) / count
+        bend = (corrected - end) / count
         begin_at_estimates(work, state)
     ints[at.BRIDGED] = 0
     if is_gap:
@@ -81,11 +82,12 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: Floats, eps: Floats
         if k < count:  # then the scheme is not predict_correct, which needs work.stages itself
             if modelled:
                 predict_step(law, work, h, u)
-            sample = work.stages[NOW, 0, 0] + k * bend
+            sample = work.stages[NOW, 0, 0] + k * bend + memory[OFFSET]
         word = word & FLAGS_MASK | step(law, work, state, sample, h, u, eps, row)
         if word & REJECTED_SPIKE:  # as if it had not come: the next one is stepped to from LATEST
             memory[PENDING] = 0.0
             ints[at.REJECTED_SPIKES] += 1
+            ints[at.JUMPS] += (word & JUMPED) > 0
             if is_gap:
                 ints[at.GAPS] -= 1
                 ints[at.SUB_STEPS] -= count
@@ -102,6 +104,6 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: Floats, eps: Floats
         update_mean(policy, elapsed)
     elif is_gap:
         restore(policy, state)
-        memory[Y] = y  # as where a single step fails
-        word = word & FLAGS_MASK | innovations(law, state, y, eps, row) << LEVEL_SHIFT
+        memory[Y] = corrected  # as where a single step fails
+        word = word & FLAGS_MASK | innovations(law, state, corrected, eps, row) << LEVEL_SHIFT
     return word

@@ -68,7 +68,7 @@ COUNTERS = 34
     ACCEPTED, REJECTED_MEASUREMENTS, REJECTED_SPIKES, REJECTED_STUCK_, REJECTED_STEPS,
     DUPLICATE_STAMPS, BACKWARD_STAMPS, ZERO_STAMPS, FAR_STAMPS, REJECTED_INPUTS,
     GAPS, SUB_STEPS, WITHDRAWN_GAPS, SPREAD_STAMPS, BURSTS, SPIKES_BELIEVED, STUCK_EVENTS,
-    RESTARTS_FORWARD, RESTARTS_BACKWARD, DIVERGENCES,
+    RESTARTS_FORWARD, RESTARTS_BACKWARD, DIVERGENCES, JUMPS,
 ) = range(COUNTERS, COUNTERS + len(Counters._fields))  # fmt: skip
 
 GATE = 0
@@ -120,7 +120,8 @@ LABELS_OF_REALS = ['interval', 'jitter', 'held_y']
 LABELS_OF_ROWS = ['z_hat', 'z_tilde', 'z_hat_sensitivity', 'z_tilde_sensitivity']
 LABELS_OF_MEMORY = [
     'gamma', 'y', 'pending', 'wait', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread',
-    'upset',
+    'upset', 'offset', 'jumps', 'first_miss', 'miss', 'watched', 'drift',
+    'usual',
 ]  # fmt: skip
 """Labels of a snapshot's entries: they are in bags, so they stay as they are."""
 MISSING = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}
@@ -148,7 +149,7 @@ class Memory(NamedTuple):
         Of `Policy.ints`.
     reals : (3,) array
         Of `Policy.reals`.
-    before, now : ((4 + N) N + 10,) arrays
+    before, now : ((4 + N) N + MEMORY,) arrays
         The observer's state (levels, then memory) before the latest bridged gap, and its state.
     u : (m,) array
         Known inputs.

@@ -8,7 +8,7 @@ What it does, case by case, is in docs/operation.md; the arrays are described in
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.compiled.unowned_arrays import unowned
 from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
-from fhaosmo_ros.core.observer.arrays import GAMMA, HAT, Law, State, TILDE, Work, Y
+from fhaosmo_ros.core.observer.arrays import GAMMA, HAT, Law, OFFSET, State, TILDE, Work, Y
 from fhaosmo_ros.core.observer.status import (
     DIVERGED,
     FLAGS_MASK,
@@ -75,7 +75,7 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: Floats, eps: Floats, row: 
     elif stamp == 0 and not ints[at.NOMINAL]:
         word = REJECTED_PERIOD
         ints[at.ZERO_STAMPS] += 1
-    elif ints[at.STUCK_TIME] and is_stuck(policy, memory[Y], y, now):
+    elif ints[at.STUCK_TIME] and is_stuck(policy, memory[Y], y - memory[OFFSET], now):
         word = REJECTED_STUCK
     elif memory[Y] == memory[Y]:
         if not ints[at.TIMED]:

@@ -181,7 +181,8 @@ OBSERVER = (
     Parameter(
         'gamma_dead_zone', 0.006,
         'Adaptation rests while the norm of the innovations is at most this (their unit; set it '
-        'below the norm at which the estimate has become good enough). 0: it never rests.',
+        'below the norm at which the estimate has become good enough); with noise_size, '
+        'also while it is at most three times its running median. 0: it never rests.',
         lower=0.0, upper=1e12,
     ),
     Parameter(

@@ -18,7 +18,7 @@ from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, WARN
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
-TOLD = REJECTED | int(Status.RESTARTED | Status.DIVERGED)
+TOLD = REJECTED | int(Status.RESTARTED | Status.DIVERGED | Status.JUMPED)
 """Flags of a step that are logged."""
 QUIET = 5.0
 """Seconds between two warnings of one kind."""
@@ -240,7 +240,15 @@ class Channel:
                 f'({counters.divergences} divergences so far)',
                 throttle_duration_sec=QUIET,
             )
-        if word & REJECTED:
+        if word & Status.JUMPED:
+            offset = self.estimator.offset
+            then = f'the model contradicts it: y is taken as {offset:.4g} too large'
+            self._logger.warning(
+                f'y jumped; {then if offset else "z1 follows it, the other estimates go on"}'
+                f' ({counters.jumps} jumps so far)',
+                throttle_duration_sec=QUIET,
+            )
+        elif word & REJECTED:
             flag, reason = self._reason(word, stamp, y)
             now = perf_counter()
             if now >= self._quiet_until.get(flag, 0.0):  # each reason by itself

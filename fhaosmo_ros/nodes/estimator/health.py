@@ -230,7 +230,8 @@ class Health:
         unit = derivative_unit(limits['measurement_unit'], observer.order)
         d_now = estimate.unknown_input if estimate else float('nan')
         periods, durations, d = interval.periods, interval.durations, interval.unknown_inputs
-        diverged = interval.news['divergences']
+        diverged, jumps = interval.news['divergences'], interval.news['jumps']
+        offset = self._estimator.offset
         chatter = high_passed(d, WINDOW)
         spread = float(np.std(d)) if len(d) else float('nan')
         overruns = int(np.sum(durations > np.mean(periods))) if len(periods) else 0
@@ -242,6 +243,7 @@ class Health:
             'gamma away from gamma_initial': away,
             'gamma at': _bound(self._estimator, estimate.status if estimate else Status.OK),
             'innovations over those expected': self._estimator.spread,
+            'y over z1, since it jumped': offset,
             titled('unknown input', unit): d_now,
             'chatter of the unknown input': chatter,
             'chatter index (0 smooth, 1 nothing but chatter)': (
@@ -261,6 +263,10 @@ class Health:
             report.find(WARN, f'levels from {first} on hold: an innovation is above epsilon')
         if diverged:
             report.find(ERROR, f'diverged and started again from y, {diverged} times')
+        if jumps:
+            report.find(WARN, f'y jumped {jumps} times')
+        if offset:
+            report.find(WARN, f'y is taken as {offset:.3g} too large since it jumped')
         if abs(away) > GAMMA_AWAY:
             report.find(WARN, f'gamma is {away:+.2g} away from gamma_initial')
         tuned = tuned if observer.parameters['scheme'] == 'predict_correct' else 0.0

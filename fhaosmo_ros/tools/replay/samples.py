@@ -98,7 +98,8 @@ class Samples:
         unwrap = Unwrapper()
         for k, block in enumerate(blocks):
             if k == 0 and self.estimator.latest is not None:
-                unwrap.begin_near(self.estimator.arrays.state.memory[arrays.Y])
+                memory = self.estimator.arrays.state.memory
+                unwrap.begin_near(memory[arrays.Y] + memory[arrays.OFFSET])
             values = np.array([unwrap(value) for value in block.values.tolist()])
             yield block._replace(values=values)
 
