@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
 from fhaosmo_ros.core.model.inputs import known_inputs_of_run
-from fhaosmo_ros.core.observer.arrays import HAT, Law, MEMORY, SPREAD, TILDE, Work
+from fhaosmo_ros.core.observer.arrays import HAT, Law, MEMORY, TILDE, Work
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.smoothing import (
     BEGINS,
@@ -54,7 +54,6 @@ class Smoother:
         self._lag, levels = lag, configuration.levels
         self._rows = Rows.empty(64, levels)
         self._memory, self._point = np.zeros(MEMORY), np.zeros((4 + levels, levels))
-        self._memory[SPREAD] = 1.0
         self._count = self._done = self._new = self._began = 0
         self._wait = BLOCK
         self._begins = True

@@ -22,6 +22,7 @@ from fhaosmo_ros.core.observer.arrays import (
     FROM_MEASUREMENT,
     Law,
     PREDICTION_STEP,
+    SPREAD,
     Work,
 )
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
@@ -275,6 +276,7 @@ def take_rows(
             step = (rows.times[k] - rows.times[k - 1]) * 1e-9
         if rows.kinds[k] == BEGINS:
             begin(law, problem, rows, k, y[place])
+            memory[SPREAD] = 1.0
             continue
         if not step > 0.0:
             repeat(rows, k)
