@@ -8,7 +8,7 @@ Kalman filter of the deviation from the observer's estimates, backward by the re
 Tung and Striebel in the form of Bierman, which inverts no matrix. For a nonlinear Phi this is one
 Gauss-Newton step towards the most likely trajectory, begun at the observer's (Bell 1994).
 
-Rauch, Tung and Striebel 1965, doi:10.2514/3.3166; Bierman 1973, doi:10.1016/0005-1098(73)90048-9;
+Rauch, Tung and Striebel 1965, doi:10.2514/3.3166; Bierman 1973, Int. J. Control 18 (1);
 Bell 1994, doi:10.1137/0804035.
 """
 
