@@ -6,7 +6,7 @@ import sys
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fhaosmo_ros import __version__  # noqa: E402
+from fhaosmo_ros import __version__
 
 project = 'fhaosmo_ros'
 author = 'fhaosmo_ros maintainers'
