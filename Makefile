@@ -6,7 +6,7 @@ MINUTES ?= 2
 # $(call with,EXTRA): set $python to the environment's Python, making the environment first.
 with = python=$$(PYTHON='$(PYTHON)' sh scripts/environment.sh $(1))
 
-.PHONY: help demo paper tune compare test lint bench soak clean
+.PHONY: help demo paper tune compare test lint docs bench soak clean
 .NOTPARALLEL:
 
 help:
@@ -16,6 +16,7 @@ help:
 	@echo 'make compare tune other observers by the same rules, rewrite docs/comparison.md'
 	@echo 'make test    check style and types, run the tests'
 	@echo 'make lint    check style and types only'
+	@echo 'make docs    build the pages in docs/ as a site, build/docs/index.html'
 	@echo 'make bench   measure speed'
 	@echo 'make soak    run with faults for MINUTES=2, judge memory, losses and drift'
 	@echo 'make clean   remove environments, builds and caches'
@@ -45,6 +46,9 @@ lint:
 
 test: lint
 	@$(call with,test) && exec "$$python" -m pytest -n 2 --dist loadfile $(ARGS)
+
+docs:
+	@$(call with,docs) && exec "$$python" -m sphinx -W --keep-going -q $(ARGS) docs build/docs
 
 bench:
 	@$(call with,tune) && exec "$$python" benchmark/run.py $(ARGS)

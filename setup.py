@@ -18,6 +18,7 @@ from setuptools import find_packages, setup
 NAME = 'fhaosmo_ros'
 FOR_ROS2_RUN = bool({'install', 'develop'} & set(sys.argv))
 TUNE = ['cmaes', 'control', 'optuna>=4,<6']
+DOCS = ['myst-parser', 'sphinx', 'sphinx-rtd-theme']
 
 
 def files(*patterns):
@@ -41,7 +42,14 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        *files('config/**/*.yaml', 'config/*.xml', 'launch/*.py', 'docs/*.md', 'docs/*.png'),
+        *files(
+            'config/**/*.yaml',
+            'config/*.xml',
+            'launch/*.py',
+            'docs/*.md',
+            'docs/*.png',
+            'docs/*.svg',
+        ),
     ],
     zip_safe=False,
     install_requires=[
@@ -73,9 +81,12 @@ setup(
             'ros-jazzy-std-msgs',
             'ros-jazzy-std-srvs',
         ],
+        'differentiate': ['cvxpy', 'pynumdiff>=0.3'],
+        'docs': DOCS,
         'tune': TUNE,
         'compare': TUNE,
         'test': [
+            *DOCS,
             *TUNE,
             'colcon-common-extensions',
             'hypothesis',

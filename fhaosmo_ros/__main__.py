@@ -75,7 +75,7 @@ def run(name: str, arguments: list[str] | None = None) -> int:
             raise
         print(
             f'error: {name!r} needs the Python module {error.name!r}, which is not installed: '
-            'start it through make, or source a ROS 2 Jazzy first (see README)',
+            'start it through make, or source a ROS 2 Jazzy first (see docs/ros.md)',
             file=sys.stderr,
         )
         return 1

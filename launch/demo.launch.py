@@ -3,6 +3,7 @@
 
 from pathlib import Path
 
+from ament_index_python.packages import get_package_share_directory, PackageNotFoundError
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
@@ -31,6 +32,28 @@ def end(event, context):
     if event.returncode:
         raise RuntimeError(f'{event.process_name} ended with exit code {event.returncode}')
     return Shutdown(reason=f'{event.process_name} ended')
+
+
+def plotjuggler(context):
+    """Return PlotJuggler with the layout of the demonstration, where it is asked for."""
+    if LaunchConfiguration('plotjuggler').perform(context) != 'true':
+        return []
+    try:
+        get_package_share_directory('plotjuggler')
+    except PackageNotFoundError:
+        raise RuntimeError(
+            'plotjuggler:=true: expected the package plotjuggler, which is not installed '
+            '(sudo apt install ros-jazzy-plotjuggler-ros)'
+        ) from None
+    share = get_package_share_directory('fhaosmo_ros')
+    layout = str(Path(share) / 'config' / 'layouts' / 'demo.plotjuggler.xml')
+    return [
+        Node(
+            package='plotjuggler',
+            executable='plotjuggler',
+            arguments=['--nosplash', '--layout', layout],
+        )
+    ]
 
 
 def generate_launch_description():
@@ -62,6 +85,12 @@ def generate_launch_description():
             description='start a node that failed again, after 2 s',
         ),
         DeclareLaunchArgument(
+            'plotjuggler',
+            default_value='false',
+            choices=['true', 'false'],
+            description='show the curves in PlotJuggler, if it is installed',
+        ),
+        DeclareLaunchArgument(
             'log_level',
             default_value='info',
             choices=['debug', 'info', 'warn', 'error', 'fatal'],
@@ -90,4 +119,5 @@ def generate_launch_description():
         )
         for name in ('plant', 'estimator')
     ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=check_params_file), *nodes])
+    checks = [OpaqueFunction(function=check_params_file), OpaqueFunction(function=plotjuggler)]
+    return LaunchDescription([*arguments, *checks, *nodes])

@@ -205,7 +205,8 @@ def test_launch_file_starts_both_nodes(launch_file):
     nodes = {e.kwargs['executable']: e.kwargs for e in entities if type(e).__name__ == 'Node'}
 
     assert set(arguments) == {
-        'params_file', 'namespace', 'use_sim_time', 'autostart', 'respawn', 'log_level',
+        'params_file', 'namespace', 'use_sim_time', 'autostart', 'respawn', 'plotjuggler',
+        'log_level',
     }  # fmt: skip
     ((share, *path),) = arguments['params_file'].kwargs['default_value'].args
     assert share.args == (NAME,)
@@ -225,9 +226,28 @@ def test_launch_file_starts_both_nodes(launch_file):
         assert node['on_exit'] is launch_file['end']
         assert node['respawn'].args == ('respawn',)
         assert node['respawn_delay'] > 0.0  # `end` is called first, and has time to end the launch
-    (check,) = (e for e in entities if type(e).__name__ == 'OpaqueFunction')
-    assert entities.index(check) < len(entities) - len(nodes)  # before the nodes
-    assert check.kwargs['function'] is launch_file['check_params_file']
+    checks = [e for e in entities if type(e).__name__ == 'OpaqueFunction']
+    assert entities.index(checks[-1]) < len(entities) - len(nodes)  # before the nodes
+    functions = [check.kwargs['function'] for check in checks]
+    assert functions == [launch_file['check_params_file'], launch_file['plotjuggler']]
+
+
+def test_plotjuggler_is_started_where_it_is_installed(launch_file, tmp_path, monkeypatch):
+    function = launch_file['plotjuggler']
+    monkeypatch.setattr(Recorded, 'perform', lambda *_: 'false', raising=False)
+    assert function(None) == []
+    monkeypatch.setattr(Recorded, 'perform', lambda *_: 'true', raising=False)
+    with pytest.raises(RuntimeError, match='apt install ros-jazzy-plotjuggler-ros'):
+        function(None)
+    for package in ('plotjuggler', NAME):
+        index = tmp_path / 'share/ament_index/resource_index/packages'
+        index.mkdir(parents=True, exist_ok=True)
+        (index / package).touch()
+        (tmp_path / 'share' / package).mkdir()
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    (node,) = function(None)
+    layout = Path(node.kwargs['arguments'][-1]).relative_to(tmp_path / 'share' / NAME)
+    assert (ROOT / layout).is_file()
 
 
 @pytest.mark.parametrize('respawn', ['false', 'true'])

@@ -597,3 +597,34 @@ def test_ctrl_c_leaves_nothing(tmp_path):
     assert 'Traceback' not in error
     assert sorted(p.name for p in tmp_path.iterdir()) == ['bag']
     shutil.rmtree(bag)
+
+
+@pytest.mark.parametrize('every', [1, 3])
+@pytest.mark.parametrize('way', ['--smooth', '--lag'])
+def test_smoothed_estimates_are_the_librarys(way, every, tmp_path, capsys):
+    stamps, y = files.signal(3000)
+    y[500:503] = np.nan
+    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+    lag = [] if way == '--smooth' else ['0.2']
+    options = ['--params-file', ROOT / 'config' / 'demo.yaml', '--every', every]
+    assert run(bag, '-o', tmp_path / 'o.npz', way, *lag, *options) == 0
+    estimator = OnlineEstimator.from_yaml(ROOT / 'config' / 'demo.yaml')
+    if lag:
+        estimator = OnlineEstimator(estimator.parameters | {'smoothing_lag': 0.2})
+    else:
+        estimator.smooth()
+    parts = [estimator.run(stamps, y), *([] if lag else [estimator.finish()])]
+    with np.load(tmp_path / 'o.npz') as found:
+        columns = {name: found[name] for name in found.files}
+    for name, key in (('stamp_ns', 't'), ('unknown_input', 'unknown_input')):
+        ours = np.concatenate([getattr(part, key) for part in parts])[every - 1 :: every]
+        np.testing.assert_allclose(columns[name], ours, rtol=0.0, atol=1e-7)
+    np.testing.assert_array_equal(columns['bag_time_ns'], columns['stamp_ns'])
+    of_stamp = dict(zip(stamps.tolist(), y.tolist(), strict=True))
+    np.testing.assert_array_equal(columns['y'], [of_stamp[t] for t in columns['stamp_ns']])
+    assert 'smoothed: each estimate by the samples before' in capsys.readouterr().out
+
+
+def test_smoothing_without_a_size_of_the_noise_is_refused(bag, capsys):
+    assert run(bag, '--smooth') == 2
+    assert "expected 'noise_size' > 0" in capsys.readouterr().err

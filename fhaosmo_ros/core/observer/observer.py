@@ -12,6 +12,7 @@ from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer import step as recursion
 from fhaosmo_ros.core.observer.arrays import Law, make_work, State, Work
 from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA, ObserverConfiguration
+from fhaosmo_ros.core.observer.smoother import smoothed
 from fhaosmo_ros.core.observer.status import flags, FLAGS_MASK, LEVEL_SHIFT, open_levels, Status
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -189,6 +190,11 @@ class Observer:
     def levels(self) -> int:
         """Number of levels N."""
         return self._configuration.levels
+
+    @property
+    def configuration(self) -> ObserverConfiguration:
+        """Its parameters, checked as a set, and what follows from them."""
+        return self._configuration
 
     @property
     def law(self) -> Law:
@@ -462,6 +468,32 @@ class Observer:
         recursion.run(self._law, self._work, self._state, samples, record, first, every)
         recursion.innovations(self._law, self._state, self._state.memory[arrays.Y], self._eps, 0)
         return self.trajectory(t[every - 1 :: every], record._replace(eps=record.eps[:rows]))
+
+    def smooth(self, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0) -> Trajectory:
+        """
+        Estimate each time from the samples before and after it (D 24, D 25).
+
+        A fresh observer goes forward through the samples; this one stays as it is. A sample that
+        it rejects (NaN stands for a missing one) does not count, and its time is bridged by those
+        on both sides. Nothing is smoothed across a restart.
+
+        Parameters
+        ----------
+        t, y, u
+            As in `run`.
+
+        Returns
+        -------
+        Trajectory
+            A row for each sample, with `z` and `unknown_input` smoothed; the rest as `run` has it.
+
+        Raises
+        ------
+        ConfigurationError
+            As `run`; or `noise_size` is 0, which says how much to trust a sample.
+
+        """
+        return smoothed(Observer(self._configuration.parameters), t, y, u)
 
     def trajectory(self, t: NDArray[Any], record: recursion.Record) -> Trajectory:
         """Return what a compiled run has recorded; the last row is where this observer stands."""

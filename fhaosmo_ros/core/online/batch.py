@@ -155,6 +155,8 @@ class EstimatorBatch:
             Status word, and estimate of d, after each sample.
 
         """
+        if any(estimator.smooths for estimator in self._estimators):
+            return self._one_by_one(channel, stamps, y, u)
         for c, estimator in enumerate(self._estimators):
             if estimator.arguments is not self._arguments[c]:
                 self._place(c, estimator)
@@ -171,6 +173,23 @@ class EstimatorBatch:
         for c, word in dict(zip(channel, words.tolist(), strict=True)).items():
             self._estimators[c].taken(word)
         return words, unknown_inputs
+
+    def _one_by_one(
+        self,
+        channel: Sequence[int],
+        stamps: Sequence[int],
+        y: Sequence[float],
+        u: Sequence[float | Sequence[float]],
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Do the same where an estimator also estimates the past, which a batch can't."""
+        words, unknown_inputs = [], []
+        for c, stamp, value, inputs in zip(channel, stamps, y, u, strict=True):
+            estimator = self._estimators[c]
+            for k, number in enumerate(np.atleast_1d(inputs)[: len(estimator.inputs)]):
+                estimator.set_input(float(number), k)
+            words.append(estimator.advance(stamp, value))
+            unknown_inputs.append(estimator.observer.unknown_input)
+        return np.array(words, dtype=np.int64), np.array(unknown_inputs)
 
     def _padded(self, u: Sequence[Any]) -> Floats:
         """Return the known inputs as an array, zeros behind the shorter rows."""

@@ -15,10 +15,12 @@ from fhaosmo_ros.core.observer.observer import (
     ObserverState,
     Trajectory,
 )
+from fhaosmo_ros.core.observer.smoothing import make_problem
 from fhaosmo_ros.core.online import delay, policy
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.memory import EstimatorArrays, make_policy, Memory
+from fhaosmo_ros.core.online.past_estimates import check_lag, PastEstimates
 from fhaosmo_ros.core.online.stamps import forget_samples
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -75,6 +77,10 @@ class OnlineEstimator:
                 "parameters 'input_delay', 'measurement_delay': expected each at most the next "
                 f'one, got {p["input_delay"]} and {p["measurement_delay"]}'
             )
+        self._smoothing: PastEstimates | None = None
+        if p['smoothing_lag'] > 0.0:
+            check_lag(p)
+            self._smoothing = PastEstimates(self.observer, round(p['smoothing_lag'] / NANOSECONDS))
         self._lag = 0
         if self.observer.uses_input:
             self._lag = round((p['measurement_delay'] - p['input_delay']) / NANOSECONDS)
@@ -131,6 +137,11 @@ class OnlineEstimator:
         return self._arrays
 
     @property
+    def smooths(self) -> bool:
+        """True if estimates are of the past."""
+        return self._smoothing is not None
+
+    @property
     def uses_stamps(self) -> bool:
         """True if dt comes from the samples' stamps."""
         return not self._ints[at.NOMINAL]
@@ -151,7 +162,10 @@ class OnlineEstimator:
         Time of the latest estimate in nanoseconds, None before there is one.
 
         The stamp of its sample, less `measurement_delay` unless the estimate is carried over it.
+        With `smoothing_lag` its sample is the one that is so old.
         """
+        if self._smoothing is not None:
+            return self._smoothing.stamp if self._smoothing.estimate else None
         return int(self._ints[at.STAMP]) - self._behind if self._ints[at.VALID] else None
 
     @property
@@ -182,13 +196,19 @@ class OnlineEstimator:
     def prepare(self, changes: Mapping[str, Any]) -> Change:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
         parameters = self._parameters.changed_live(changes, 'observer')
-        return Change(parameters, self.observer.prepare(parameters))
+        configuration = self.observer.prepare(parameters)
+        if self._smoothing is not None:
+            check_lag(parameters)
+            make_problem(configuration)
+        return Change(parameters, configuration)
 
     def adopt(self, change: Change) -> None:
         """Go on with a change that `prepare` has returned, from the next sample on."""
         before = self._parameters['sampling']
         self._parameters = change.parameters
         self.observer.adopt(change.configuration)
+        if self._smoothing is not None:
+            self._smoothing.configure()
         if change.parameters['sampling'] != before:
             self.forget_stamp()
         self._write_settings()
@@ -233,6 +253,35 @@ class OnlineEstimator:
     def reset(self) -> None:
         """Start afresh: the next sample is the first. Counters go on, and so does `freeze`."""
         forget_samples(self._policy, self._arrays.state)
+        if self._smoothing is not None:
+            self._smoothing.cut()
+
+    def smooth(self) -> None:
+        """
+        Let `run` return smoothed estimates, each once later samples no longer matter to it.
+
+        To be called before the first sample; `finish` returns the rest. The samples that come
+        later matter for some time constants of the observer, so memory stays bounded.
+
+        Raises
+        ------
+        ConfigurationError
+            `noise_size` is 0, which says how much to trust a sample; or `predict_to_now`.
+
+        """
+        check_lag(self._parameters)
+        self._smoothing = PastEstimates(self.observer, None)
+
+    @property
+    def due(self) -> NDArray[np.int64]:
+        """Which samples, counted from 0, the rows are of that `run` or `finish` returned last."""
+        return np.zeros(0, dtype=np.int64) if self._smoothing is None else self._smoothing.numbers
+
+    def finish(self) -> Trajectory:
+        """Return the smoothed estimates that still wait: nothing comes after them."""
+        if self._smoothing is None:
+            raise ConfigurationError('finish: expected smoothing_lag > 0, or a call of `smooth`')
+        return self._smoothing.finish()
 
     @property
     def latest(self) -> int | None:
@@ -286,6 +335,8 @@ class OnlineEstimator:
         state, scalars = memory.now[: levels.size], memory.now[levels.size :]
         self.observer.restore(ObserverState(state.reshape(levels.shape), scalars))
         self._u[:] = memory.u
+        if self._smoothing is not None:
+            self._smoothing.cut()
 
     def seed(self, z: ArrayLike, unknown_input: float) -> None:
         """
@@ -321,6 +372,8 @@ class OnlineEstimator:
         levels[arrays.HAT, :known] = values[:known]
         levels[arrays.TILDE, :n] = values[1:]
         self._ints[at.BRIDGED] = 0
+        if self._smoothing is not None:
+            self._smoothing.cut()
 
     def freeze(self, held: bool) -> None:
         """Hold gamma where it is, or let it adapt again; no parameter changes."""
@@ -367,7 +420,7 @@ class OnlineEstimator:
         """Count values of u that were not finite."""
         self._ints[at.REJECTED_INPUTS] += count
 
-    def update(self, stamp: int, y: float) -> Estimate:
+    def update(self, stamp: int, y: float) -> Estimate | None:
         """
         Take one sample.
 
@@ -381,10 +434,12 @@ class OnlineEstimator:
         Returns
         -------
         Estimate
-            Of this sample, or the previous state's with the reason of the rejection.
+            Of this sample, or the previous state's with the reason of the rejection. With
+            `smoothing_lag` that of the time so long ago; None while there is none.
 
         """
-        return self._published(self.advance(int(stamp), y))
+        word = self.advance(int(stamp), y)
+        return self._published(word) if self._smoothing is None else self.estimate
 
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
@@ -394,6 +449,8 @@ class OnlineEstimator:
             limit = LARGEST_STAMP if stamp > 0 else -LARGEST_STAMP
             word = policy.take_once(limit, float(y), self._u, *self._arguments)
         self._word = word
+        if self._smoothing is not None:
+            self._smoothing.take_one(self._arrays, self._eps, word, y, self._u)
         return word
 
     def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
@@ -415,6 +472,8 @@ class OnlineEstimator:
         Trajectory
             A row for every sample, whose status says whether it was rejected. ``t`` holds the
             times of the estimates: the stamps, less `measurement_delay` unless `predict_to_now`.
+            With `smoothing_lag`, or after `smooth`, a row for each used sample whose estimate has
+            become final.
 
         Raises
         ------
@@ -439,18 +498,24 @@ class OnlineEstimator:
         record = make_record(count, n, count)
         carried = bool(self._ints[at.TO_NOW] and self._ints[at.DELAY])
         present = np.empty((count if carried else 0, self.observer.order + 1))
-        policy.run(self._arrays, stamps, y, inputs, record, present)
+        rows = 0 if self._smoothing is None else count
+        times, acting = np.empty(rows, dtype=np.int64), np.empty((rows, len(self._u)))
+        policy.run(self._arrays, stamps, y, inputs, record, present, times, acting)
         if count:
             self._u[:], self._word = inputs[-1], int(record.words[-1])
             self._eps[0] = record.eps[-1]
         found = self.observer.trajectory(stamps - self._behind, record)
         if carried:
             found = found._replace(z=present[:, :-1], unknown_input=present[:, -1])
+        if self._smoothing is not None:
+            return self._smoothing.take(found, y, times, acting)
         return found
 
     @property
     def estimate(self) -> Estimate | None:
-        """The latest estimate, None before the first sample."""
+        """The latest estimate, None before the first sample (that is `smoothing_lag` old)."""
+        if self._smoothing is not None:
+            return self._smoothing.estimate
         return self._published(self._word) if self._ints[at.VALID] else None
 
     def _published(self, word: int) -> Estimate:

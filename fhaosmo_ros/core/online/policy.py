@@ -25,6 +25,7 @@ from fhaosmo_ros.core.observer.step import innovations, Record, start
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online.delay import (
     forget_past,
+    INPUTS,
     inputs_before,
     keep_latest,
     note_inputs,
@@ -164,7 +165,14 @@ def take_once(
 
 @compiled()
 def run(
-    e: EstimatorArrays, stamps: Ints, y: Floats, u: Floats, record: Record, present: Floats
+    e: EstimatorArrays,
+    stamps: Ints,
+    y: Floats,
+    u: Floats,
+    record: Record,
+    present: Floats,
+    times: Ints,
+    acting: Floats,
 ) -> None:
     """
     Take K samples; row k of the record is the estimate after the k-th.
@@ -173,6 +181,8 @@ def run(
     ----------
     present : (K, n + 1) or (0, n + 1) array
         Gets z and d as they are published, if there is room for them.
+    times, acting : (K,), (K, m) or (0,), (0, m) arrays
+        Get the time of the observer after each, and the inputs that acted until then.
 
     """
     e, u, eps = unowned(e), unowned(u), unowned(record.eps)
@@ -185,3 +195,9 @@ def run(
         record.gamma[k] = memory[GAMMA]
         if present.shape[0] > 0:
             published(e, e.policy.ints[at.FILTERED], present[k])
+        if times.shape[0] > 0:
+            times[k] = e.policy.ints[at.LATEST]
+            delayed = e.policy.ints[at.LAG] > 0
+            past = past_of(e.policy, e.state)
+            for j in range(u.shape[1]):
+                acting[k, j] = past[INPUTS + j] if delayed else u[k, j]

@@ -292,6 +292,13 @@ SAMPLING = (
         'Carry what is published over measurement_delay by the model, with the known inputs since '
         'then and the present d (which follows unknown_input_decay and _derivatives).',
     ),
+    Parameter(
+        'smoothing_lag', 0.0,
+        'Estimate each time from the samples before it and for so long after it: less noise, '
+        'known so much later, and stamped with the time that it tells of. Needs noise_size. 0: '
+        'off.',
+        unit='s', lower=0.0, upper=60.0, live=False,
+    ),
 )  # fmt: skip
 
 INPUT = (

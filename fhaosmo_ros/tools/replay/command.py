@@ -66,6 +66,15 @@ def _parser() -> argparse.ArgumentParser:
     choice.add_argument(
         '--afresh', action='store_true', help='begin at the first sample, follow no live estimator'
     )
+    past = parser.add_mutually_exclusive_group()
+    past.add_argument(
+        '--smooth', action='store_true',
+        help='estimate each time from the samples before and after it; needs noise_size',
+    )  # fmt: skip
+    past.add_argument(
+        '--lag', type=float, metavar='SECONDS',
+        help='from those before it and for so long after it, as the node with smoothing_lag does',
+    )  # fmt: skip
     add('--every', type=int, default=1, metavar='N', help='keep every N-th estimate only')
     add(
         '--name', metavar='NAME',
@@ -93,8 +102,13 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         if recorded:
             arguments.channel = arguments.channel or recorded.channel
         own = channel_parameters(arguments, recorded)
+        if arguments.lag is not None or arguments.smooth:
+            lag = 0.0 if arguments.smooth else arguments.lag
+            own = own | {'smoothing_lag': ONLINE_PARAMETERS['smoothing_lag'].coerce(lag)}
         values = ONLINE_PARAMETERS.part_of(own)
         estimator = OnlineEstimator(values)
+        if arguments.smooth:
+            estimator.smooth()
         live = None
         if followed is not None:
             events = read_events(reader, followed, named(arguments))
@@ -117,6 +131,10 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     )
     for why, count in reader.lacking.items():
         print(f'{count} messages left out: {why}')
+    if estimator.smooths:
+        lag = estimator.parameters['smoothing_lag']
+        later = 'and after' if arguments.smooth else f'and until {lag:g} s after'
+        print(f'smoothed: each estimate by the samples before {later} it')
     print(f'stamps: {samples.stamps}')
     print(f'parameters: {_origin(arguments, recorded)}')
     if not arguments.params_file and not recorded:

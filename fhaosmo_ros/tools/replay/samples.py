@@ -5,6 +5,7 @@ import argparse
 from collections.abc import Iterator
 
 from fhaosmo_ros.core.observer import arrays
+from fhaosmo_ros.core.observer.observer import Trajectory
 from fhaosmo_ros.core.observer.status import REJECTED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -29,7 +30,7 @@ class Samples:
         The live estimator to follow.
     inputs : BagInputs
     arguments : Namespace
-        Options backwards and every of replay.
+        Options backwards, every and smooth of replay.
 
     """
 
@@ -56,6 +57,8 @@ class Samples:
             self._input = HeldInputs(
                 reader, estimator.observer.model, inputs.u, estimator.reject_inputs
             )
+        self._whole = arguments.smooth
+        self._waiting, self._dropped = np.zeros((2, 0), dtype=np.int64), 0
         self._first: int | None = None
         self._latest: int | None = None
 
@@ -86,6 +89,8 @@ class Samples:
             if len(block.times):
                 u = self._input(block.times) if self._input else None
                 yield len(block.times), list(self._rows(block, u))
+        if self._whole:
+            yield 0, list(self._due(self.estimator.finish()))
         if not self._taken and self._reader.lacking:
             raise ConfigurationError(f'topic {self.topic!r}: {next(iter(self._reader.lacking))}')
         if not self._taken:
@@ -134,6 +139,10 @@ class Samples:
 
     def _estimate(self, block: Block, u: np.ndarray | None) -> Iterator[Rows]:
         estimates = self.estimator.run(block.stamps, block.values, u)
+        if self.estimator.smooths:
+            self._waiting = np.append(self._waiting, [block.times, block.values.view(np.int64)], 1)
+            yield from self._due(estimates)
+            return
         keep = np.flatnonzero((estimates.status & REJECTED) == 0)
         count = len(keep)
         keep = keep[(self._every - 1 - self._seen) % self._every :: self._every]
@@ -142,3 +151,16 @@ class Samples:
             if len(keep) < len(block.times):
                 estimates = type(estimates)(*(a[keep] for a in estimates))
             yield Rows(block.times[keep], block.values[keep], estimates)
+
+    def _due(self, estimates: Trajectory) -> Iterator[Rows]:
+        """Yield the rows whose smoothed estimates are final, with the samples that waited."""
+        numbers = self.estimator.due
+        keep = slice((self._every - 1 - self._seen) % self._every, None, self._every)
+        self._seen += len(numbers)
+        if len(numbers[keep]):
+            times, y = self._waiting[:, numbers[keep] - self._dropped]
+            estimates = Trajectory._make(column[keep] for column in estimates)
+            yield Rows(times, y.view(np.float64), estimates)
+        if len(numbers):
+            self._waiting = self._waiting[:, numbers[-1] + 1 - self._dropped :]
+            self._dropped = int(numbers[-1]) + 1

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Smoothed estimates in the order of their samples, with bounded memory; see smoothing.py."""
+
+from typing import TYPE_CHECKING
+
+from fhaosmo_ros.core.model.bytecode import Floats, Ints
+from fhaosmo_ros.core.model.inputs import known_inputs_of_run
+from fhaosmo_ros.core.observer.arrays import HAT, Law, MEMORY, TILDE, Work
+from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.smoothing import (
+    BEGINS,
+    make_problem,
+    MEASURED,
+    Rows,
+    settled_row,
+    smooth_lagging,
+    smooth_rows,
+    take_rows,
+    UNMEASURED,
+)
+from fhaosmo_ros.core.observer.status import DIVERGED, REJECTED
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from fhaosmo_ros.core.observer.observer import Observer, Trajectory
+
+BLOCK = 8192
+"""Rows after which a recording is smoothed as far as later samples no longer matter."""
+
+
+class Smoother:
+    """
+    Smoothed estimates of an observer's samples, handed out in their order.
+
+    Memory is bounded: a row is dropped once its estimate is final, `lag` later or, for a whole
+    recording, when later samples can no longer change it by more than `TOLERANCE`.
+
+    Parameters
+    ----------
+    configuration : ObserverConfiguration
+    lag : int or None
+        In nanoseconds; None for all that comes later.
+
+    Raises
+    ------
+    ConfigurationError
+        The parameters do not say how large noise and d are.
+
+    """
+
+    def __init__(self, configuration: ObserverConfiguration, lag: int | None = None) -> None:
+        self.configure(configuration)
+        self._lag, levels = lag, configuration.levels
+        self._rows = Rows.empty(64, levels)
+        self._memory, self._point = np.zeros(MEMORY), np.zeros((4 + levels, levels))
+        self._count = self._done = self._new = self._began = 0
+        self._wait = BLOCK
+        self._begins = True
+
+    def configure(self, configuration: ObserverConfiguration) -> None:
+        """Go on with other parameters from the next row on."""
+        self._problem = make_problem(configuration)
+        self._internal = configuration.internal
+
+    def cut(self) -> None:
+        """Let the next row begin: it has nothing to do with those before it."""
+        self._begins = True
+
+    @property
+    def goes_on(self) -> bool:
+        """True if a row has been handed out since the latest one that begins."""
+        return self._done > self._began
+
+    @property
+    def waiting(self) -> int:
+        """Number of rows that have not been handed out."""
+        return self._count - self._done
+
+    def take(
+        self,
+        law: Law,
+        work: Work,
+        levels: Floats,
+        samples: tuple[Floats, Floats, Floats],
+        times: Ints,
+        kinds: Ints,
+    ) -> None:
+        """
+        Append rows.
+
+        Parameters
+        ----------
+        levels : (K, 2, N) array
+            `HAT` and `TILDE` of the observer after each.
+        samples : (y, h, u)
+            As `Samples` of a run.
+        times, kinds : (K,) arrays
+            As in `Rows`.
+
+        """
+        count = len(times)
+        if not count:
+            return
+        self._make_room(count)
+        kinds = kinds.copy()
+        if self._begins:
+            kinds[0], self._begins = BEGINS, False
+        part = slice(self._count, self._count + count)
+        self._rows.times[part], self._rows.kinds[part] = times, kinds
+        estimates = levels[:, HAT].copy()
+        if self._internal:
+            estimates[:, 1:] = levels[:, TILDE, :-1]
+        y, h, u = samples
+        take_rows(
+            law, work, self._problem, self._rows, self._count, estimates, h, y, u, self._memory,
+            self._point,
+        )  # fmt: skip
+        began = np.flatnonzero(kinds == BEGINS)
+        if len(began):
+            self._began = self._count + int(began[-1])
+        self._new = self._count
+        self._count += count
+
+    def _make_room(self, count: int) -> None:
+        """Drop rows that are done, all but two to go on from, and get more memory if needed."""
+        drop = max(min(self._done, self._count - 2), 0)
+        room = len(self._rows.times)
+        if self._count + count > room:
+            kept = self._count - drop
+            rows = self._rows
+            if kept + count > room // 2:
+                rows = Rows.empty(2 * (kept + count), rows.base.shape[1])
+            for target, source in zip(rows, self._rows, strict=True):
+                target[:kept] = source[drop : self._count].copy()
+            self._rows = rows
+            self._count, self._done = kept, self._done - drop
+            self._began -= drop
+
+    def due(self) -> Floats:
+        """Return the estimates, (K, N), that have become final since the last call."""
+        if self._lag is not None:
+            out = np.empty((self._count - self._done, self._rows.base.shape[1]))
+            done = smooth_lagging(self._rows, self._new, self._count, self._done, self._lag, out)
+            out = out[: done - self._done]
+            self._done, self._new = done, self._count
+            return out
+        if self.waiting < self._wait:
+            return self._smooth(self._done)
+        settled = settled_row(self._rows, self._count - 1, self._done)
+        out = self._smooth(settled + 1)
+        self._wait = self.waiting + BLOCK
+        return out
+
+    def finish(self) -> Floats:
+        """Return the estimates of all rows that wait: nothing comes after them."""
+        return self._smooth(self._count)
+
+    def _smooth(self, end: int) -> Floats:
+        """Return the estimates of the rows before `end` that wait, by all that is known."""
+        out = np.empty((end - self._done, self._rows.base.shape[1]))
+        if len(out):
+            smooth_rows(self._rows, self._count - 1, self._done, end - 1, out)
+        self._done = end
+        return out
+
+    def innovations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return e and S of the samples that are remembered, for their likelihood."""
+        rows = slice(0, self._count)
+        used = self._rows.certainty[rows] > 0.0
+        variance = 1.0 / self._rows.certainty[rows][used]
+        return self._rows.pull[rows][used] * variance, variance
+
+
+def smoothed(observer: 'Observer', t: ArrayLike, y: ArrayLike, u: ArrayLike) -> 'Trajectory':
+    """Return what `Observer.smooth` returns; `observer` is a fresh one."""
+    t, y = np.asarray(t), np.asarray(y, dtype=np.float64)
+    u = known_inputs_of_run(u, len(t), observer.inputs).copy()
+    smoother = Smoother(observer.configuration)
+    parts: list[Trajectory] = [observer.run(t[:0], y[:0], u[:0])]
+    found, first = [], None
+    for start in range(0, len(t), BLOCK):
+        block = slice(start, start + BLOCK)
+        part = observer.run(t[block], y[block], u[block])
+        parts.append(part)
+        if first is None and observer.started:
+            first = start + int(np.argmax((part.status & REJECTED) == 0))
+            latest, held = t[first], u[first]
+        if first is None:
+            continue
+        rows = slice(max(first, start), start + len(part.t))
+        status, inputs = part.status[rows.start - start :], u[rows]
+        for k in np.flatnonzero(~np.isfinite(inputs).all(axis=1)):  # the last ones are held
+            inputs[k] = inputs[k - 1] if k else held
+        times = np.fmax.accumulate(np.append(latest, t[rows]))
+        h = np.diff(times) * (1e-9 if np.issubdtype(t.dtype, np.integer) else 1.0)
+        latest, held = times[-1], inputs[-1]
+        kinds = np.where(status & REJECTED, UNMEASURED, MEASURED)
+        kinds[(status & DIVERGED) > 0] = BEGINS
+        levels = np.stack([part.z_hat, part.z_tilde], axis=1)[rows.start - start :]
+        numbers = np.arange(rows.start, rows.stop)
+        smoother.take(*observer.arrays[:2], levels, (y[rows], h, inputs), numbers, kinds)
+        found.append(smoother.due())
+    found.append(smoother.finish())
+    whole = type(parts[0])(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    if first is None:
+        return whole
+    estimates, n = np.concatenate(found), observer.order
+    whole.z[first:], whole.unknown_input[first:] = estimates[:, :n], estimates[:, n]
+    return whole

@@ -1,0 +1,411 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Estimates of the past from the samples before and after: a whole recording, or a fixed lag.
+
+The observer runs forward as ever. About its estimates the model is linearised, with D 17 as the
+model of d, and the smoothing problem of this linear model is solved (D 24, D 25): forward by the
+Kalman filter of the deviation from the observer's estimates, backward by the recursion of Rauch,
+Tung and Striebel in the form of Bierman, which inverts no matrix. For a nonlinear Phi this is one
+Gauss-Newton step towards the most likely trajectory, begun at the observer's (Bell 1994).
+
+Rauch, Tung and Striebel 1965, doi:10.2514/3.3166; Bierman 1973, Int. J. Control 18 (1);
+Bell 1994, doi:10.1137/0804035.
+"""
+
+from typing import NamedTuple
+
+from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.compiled.unowned_arrays import unowned
+from fhaosmo_ros.core.model.bytecode import Floats, Ints
+from fhaosmo_ros.core.model.integrate import NOW
+from fhaosmo_ros.core.observer.arrays import (
+    FROM_MEASUREMENT,
+    Law,
+    PREDICTION_STEP,
+    SPREAD,
+    Work,
+)
+from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.covariance import (
+    HUBER,
+    MOST_STEPS,
+    STEP,
+    Uncertainty,
+    usual_innovation,
+)
+from fhaosmo_ros.core.observer.prediction import predict
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+import numpy as np
+
+MEASURED, UNMEASURED, BEGINS = range(3)
+"""What a row is: a sample that was used, a time at which none was, the first of a fresh start."""
+TOLERANCE = 1e-9
+"""What later samples may still change, in standard deviations of the filter's errors."""
+
+
+class Problem(NamedTuple):
+    """
+    What the smoother knows beside the law, from parameters.
+
+    Attributes
+    ----------
+    variance, intensity, fastest : float
+        Of the noise on y; of the white noise that drives the last level; of the model (1/s).
+    fresh : (N, N) array
+        Covariance of the errors of a fresh observer.
+    first : (N,) array
+        Its estimates.
+
+    """
+
+    variance: float
+    intensity: float
+    fastest: float
+    fresh: Floats
+    first: Floats
+
+
+class Rows(NamedTuple):
+    """
+    What the way back needs of each time: room for R of them.
+
+    Attributes
+    ----------
+    base : (R, N) array
+        The observer's estimates, about which the model is linearised.
+    transition : (R, N, N) array
+        F from the time before; 0 where a row begins.
+    deviation, covariance : (R, N), (R, N, N) arrays
+        Predicted from the rows before: of the state from the base, and P of its error.
+    pull, certainty, noise : (R,) arrays
+        e / S, 1 / S, and the variance that the sample is taken to have; 0 without a sample.
+    times, kinds : (R,) arrays
+        In ns; `MEASURED`, `UNMEASURED` or `BEGINS`.
+
+    """
+
+    base: Floats
+    transition: Floats
+    deviation: Floats
+    covariance: Floats
+    pull: Floats
+    certainty: Floats
+    noise: Floats
+    times: Ints
+    kinds: Ints
+
+    @classmethod
+    def empty(cls, room: int, levels: int) -> 'Rows':
+        """Return room for so many rows."""
+        matrix, integers = (room, levels, levels), np.zeros((2, room), dtype=np.int64)
+        return cls(
+            np.zeros((room, levels)), np.zeros(matrix), np.zeros((room, levels)),
+            np.zeros(matrix), *np.zeros((3, room)), *integers,
+        )  # fmt: skip
+
+
+def make_problem(configuration: ObserverConfiguration) -> Problem:
+    """
+    Return what the smoother needs of a configuration.
+
+    Raises
+    ------
+    ConfigurationError
+        The parameters do not say how large noise and d are.
+
+    """
+    p = configuration.parameters
+    if not (p['noise_size'] > 0.0 and p['unknown_input']):
+        raise ConfigurationError(
+            "smoothing: expected 'noise_size' > 0 (standard deviation of the noise on y; `tune` "
+            f"writes it) and 'unknown_input' = true, got {p['noise_size']:g} and "
+            f'{str(p["unknown_input"]).lower()}'
+        )
+    its = Uncertainty(configuration.model, p, configuration.state_sizes)
+    first = configuration.initial_estimate.copy()
+    return Problem(its.variance, its.intensity, its.fastest, its.fresh, first)
+
+
+@compiled()
+def begin(law: Law, problem: Problem, rows: Rows, k: int, y: float) -> None:
+    """Let nothing before row k matter: its estimate is that of a fresh observer."""
+    n = rows.base.shape[1]
+    rows.pull[k] = rows.certainty[k] = rows.noise[k] = 0.0
+    rows.kinds[k] = BEGINS
+    for i in range(n):
+        rows.deviation[k, i] = problem.first[i] - rows.base[k, i]
+        for j in range(n):
+            rows.transition[k, i, j] = 0.0
+            rows.covariance[k, i, j] = problem.fresh[i, j]
+    if law.flags[FROM_MEASUREMENT]:
+        rows.deviation[k, 0] = y - rows.base[k, 0]
+
+
+@compiled()
+def repeat(rows: Rows, k: int) -> None:
+    """Make row k say what row k - 1 says after its sample: no time has passed."""
+    n = rows.base.shape[1]
+    filtered(rows, k - 1, rows.deviation[k], rows.covariance[k])
+    rows.pull[k] = rows.certainty[k] = rows.noise[k] = 0.0
+    rows.kinds[k], rows.times[k] = UNMEASURED, rows.times[k - 1]
+    for i in range(n):
+        rows.base[k, i] = rows.base[k - 1, i]
+        for j in range(n):
+            rows.transition[k, i, j] = 1.0 if i == j else 0.0
+
+
+@compiled()
+def filtered(rows: Rows, k: int, deviation: Floats, p: Floats) -> None:
+    """Write the deviation and its covariance after the sample of row k."""
+    n, before, c = rows.base.shape[1], rows.covariance[k], rows.certainty[k]
+    for i in range(n):
+        deviation[i] = rows.deviation[k, i] + before[i, 0] * rows.pull[k]
+        for j in range(n):
+            if c > 0.0 and (i == 0 or j == 0):  # without a difference of large numbers
+                p[i, j] = before[i, j] * c * rows.noise[k]
+            else:
+                p[i, j] = before[i, j] - before[i, 0] * before[0, j] * c
+
+
+@compiled()
+def predict_row(
+    law: Law, work: Work, problem: Problem, rows: Rows, k: int, h: float, u: Floats, point: Floats
+) -> None:
+    """
+    Predict row k from row k - 1 (D 24): F, the deviation and P; leave the model's z in `point`.
+
+    Parameters
+    ----------
+    point : (4 + N, N) array
+        Scratch memory: z in row 0, the deviation in row 1, a row of F or P, Q's powers, and F.
+
+    """
+    n, stages = rows.base.shape[1], work.stages
+    p, f, x, power = rows.covariance[k], rows.transition[k], point[0], point[3]
+    filtered(rows, k - 1, point[1], p)
+    for i in range(n):
+        x[i] = rows.base[k - 1, i]
+        for j in range(n):
+            f[i, j] = 1.0 if i == j else 0.0
+    count = max(int(min(np.ceil(h * problem.fastest / STEP), MOST_STEPS)), 1)
+    h /= count
+    power[n - 1] = 1.0
+    for i in range(n - 1, 0, -1):
+        power[i - 1] = power[i] * h / (n - i)
+    slope = point[4:]
+    for _ in range(count):
+        for j in range(n):  # exact derivative of the Runge-Kutta steps along each state
+            for i in range(n):
+                stages[NOW, 0, i], stages[NOW, 1, i] = x[i], 1.0 if i == j else 0.0
+            predict(law, work, h, u, law.scalars[PREDICTION_STEP])
+            for i in range(n):
+                slope[i, j] = stages[NOW, 1, i]
+        for i in range(n):
+            x[i] = stages[NOW, 0, i]
+        multiply(slope, f, point[2], False)
+        multiply(slope, p, point[2], False)
+        multiply(slope, p, point[2], True)
+        for i in range(n):
+            for j in range(n):
+                q = power[i] * power[j] / (2 * n - 1 - i - j)
+                p[i, j] += problem.intensity * h * q
+    for i in range(n):
+        total = x[i]
+        for j in range(n):
+            total += f[i, j] * point[1, j]
+        rows.deviation[k, i] = total
+        for j in range(i):
+            p[i, j] = p[j, i] = 0.5 * (p[i, j] + p[j, i])
+
+
+@compiled(forceinline=True)
+def multiply(a: Floats, b: Floats, line: Floats, right: bool) -> None:
+    """Replace b by a b, or by b a'."""
+    n = b.shape[0]
+    for j in range(n):
+        for i in range(n):
+            line[i] = b[j, i] if right else b[i, j]
+        for i in range(n):
+            total = 0.0
+            for k in range(n):
+                total += a[i, k] * line[k]
+            if right:
+                b[j, i] = total
+            else:
+                b[i, j] = total
+
+
+@compiled()
+def take_rows(
+    law: Law,
+    work: Work,
+    problem: Problem,
+    rows: Rows,
+    first: int,
+    estimates: Floats,
+    h: Floats,
+    y: Floats,
+    u: Floats,
+    memory: Floats,
+    point: Floats,
+) -> None:
+    """
+    Go forward (D 24) through rows from `first` on, whose times and kinds are written already.
+
+    Parameters
+    ----------
+    estimates : (K, N) array
+        The observer's.
+    h, y, u : (K,), (K,), (K, m) arrays
+        Time (s) since the row before, sample, and known inputs meanwhile.
+    memory : (MEMORY,) array
+        Remembers the size of the innovations (D 21).
+    point : (4 + N, N) array
+        Scratch memory.
+
+    """
+    law, work, rows, u = unowned(law), unowned(work), unowned(rows), unowned(u)
+    n = rows.base.shape[1]
+    for place in range(y.shape[0]):
+        k, step = first + place, h[place]
+        for i in range(n):
+            rows.base[k, i] = estimates[place, i]
+        if rows.kinds[k] == MEASURED and step <= 0.0 and rows.kinds[k - 1] != BEGINS:
+            # The policy has withdrawn the sample before: its stamp was ahead.
+            repeat(rows, k - 1)
+            step = (rows.times[k] - rows.times[k - 1]) * 1e-9
+        if rows.kinds[k] == BEGINS:
+            begin(law, problem, rows, k, y[place])
+            memory[SPREAD] = 1.0
+            continue
+        if not step > 0.0:
+            repeat(rows, k)
+            continue
+        predict_row(law, work, problem, rows, k, step, u[place], point)
+        if rows.kinds[k] == UNMEASURED:
+            for i in range(n):
+                rows.base[k, i] = point[0, i]
+        for i in range(n):
+            rows.deviation[k, i] -= rows.base[k, i]
+        rows.pull[k] = rows.certainty[k] = rows.noise[k] = 0.0
+        zero, e = 0.0, 0.0
+        for i in range(n):
+            zero += rows.deviation[k, i] - rows.deviation[k, i]
+            zero += rows.covariance[k, i, i] - rows.covariance[k, i, i]
+        s = rows.covariance[k, 0, 0] + problem.variance
+        if zero != 0.0 or not s > 0.0:  # not finite: begin at the observer's estimate
+            begin(law, problem, rows, k, estimates[place, 0])
+            for i in range(n):
+                rows.base[k, i] = estimates[place, i]
+                rows.deviation[k, i] = 0.0
+        elif rows.kinds[k] == MEASURED:
+            e = y[place] - rows.base[k, 0] - rows.deviation[k, 0]
+            usual = usual_innovation(memory, e, np.sqrt(s))
+            noise = problem.variance * max(abs(e) / (HUBER * usual), 1.0)
+            rows.noise[k] = noise
+            rows.certainty[k] = 1.0 / (rows.covariance[k, 0, 0] + noise)
+            rows.pull[k] = e * rows.certainty[k]
+
+
+@compiled(forceinline=True)
+def back(rows: Rows, k: int, costate: Floats) -> None:
+    """Go from the costate behind the sample of row k to the one before it (D 25), in place."""
+    total = rows.pull[k]
+    for i in range(costate.shape[0]):
+        total += rows.certainty[k] * rows.covariance[k, i, 0] * costate[i]
+    costate[0] -= total
+
+
+@compiled(forceinline=True)
+def back_over(rows: Rows, k: int, costate: Floats, line: Floats) -> None:
+    """Go from row k to row k - 1: multiply the costate by F' (D 25), in place."""
+    n = costate.shape[0]
+    for i in range(n):
+        line[i] = costate[i]
+    for j in range(n):
+        total = 0.0
+        for i in range(n):
+            total += rows.transition[k, i, j] * line[i]
+        costate[j] = total
+
+
+@compiled()
+def smooth_rows(rows: Rows, last: int, stop: int, top: int, out: Floats) -> None:
+    """
+    Go back from row `last` to row `stop` (D 25); write the estimates of rows `stop` .. `top`.
+
+    Parameters
+    ----------
+    out : (top - stop + 1, N) array
+
+    """
+    rows, out = unowned(rows), unowned(out)
+    n = rows.base.shape[1]
+    costate, line = np.zeros(n), np.zeros(n)
+    for k in range(last, stop - 1, -1):
+        back(rows, k, costate)
+        if k <= top:
+            for i in range(n):
+                total = rows.base[k, i] + rows.deviation[k, i]
+                for j in range(n):
+                    total -= rows.covariance[k, i, j] * costate[j]
+                out[k - stop, i] = total
+        back_over(rows, k, costate, line)
+
+
+@compiled()
+def settled_row(rows: Rows, last: int, first: int) -> int:
+    """Return the last row that samples after row `last` can change by `TOLERANCE` at most."""
+    rows = unowned(rows)
+    n = rows.base.shape[1]
+    influence, line = np.zeros((n, n)), np.zeros(n)
+    for i in range(n):
+        if rows.covariance[last, i, i] > 0.0:
+            influence[i, i] = 1.0 / np.sqrt(rows.covariance[last, i, i])
+    for k in range(last, first - 1, -1):
+        largest = 0.0
+        for m in range(n):
+            back(rows, k, influence[m])
+            influence[m, 0] += rows.pull[k]  # of the costate alone, not of this sample
+            for i in range(n):
+                total = 0.0
+                for j in range(n):
+                    total += rows.covariance[k, i, j] * influence[m, j]
+                if total != 0.0:
+                    largest = max(largest, abs(total) / np.sqrt(abs(rows.covariance[k, i, i])))
+            back_over(rows, k, influence[m], line)
+        if largest < TOLERANCE:
+            return k
+    return first - 1
+
+
+@compiled()
+def smooth_lagging(rows: Rows, new: int, count: int, done: int, lag: int, out: Floats) -> int:
+    """
+    Write the estimates of the rows that become `lag` (ns) old with rows new .. count - 1.
+
+    A row that begins makes all before it due: they will not be known better.
+
+    Parameters
+    ----------
+    done : int
+        Rows that were due before.
+    out : (count - done, N) array
+
+    Returns
+    -------
+    int
+        Rows that are due now.
+
+    """
+    before = done
+    for k in range(new, count):
+        due, last = done, k
+        if rows.kinds[k] == BEGINS:
+            due, last = k, k - 1
+        while due <= last and rows.times[k] - rows.times[due] >= lag:
+            due += 1
+        if due > done:
+            smooth_rows(rows, last, done, due - 1, out[done - before : due - before])
+            done = due
+    return done

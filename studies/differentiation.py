@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+`python -m studies.differentiation` compares the smoother with PyNumDiff for docs/smoothing.md.
+
+PyNumDiff's simulated systems with its own noise, each of its methods tuned by its own optimiser:
+without the truth, as a user has to (it is told the bandwidth of the signal), and with the truth.
+Ours has y' as unknown input. Without the truth it is told nothing: it takes the noise, the size
+and the correlation time of y', and the number of derivatives, that make its innovations likeliest.
+
+It takes hours; `--check` computes our columns alone and compares them with what the page says.
+"""
+
+import argparse
+import json
+from pathlib import Path
+import sys
+from typing import Any
+import warnings
+
+from fhaosmo_ros.core import Observer, OnlineEstimator
+from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.covariance import Uncertainty
+from fhaosmo_ros.core.observer.levant import deadbeat_shares
+from fhaosmo_ros.core.observer.smoother import Smoother
+from fhaosmo_ros.core.observer.smoothing import MEASURED
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from studies.document import filled
+
+DT, LAG = 0.01, 0.2
+BANDLIMITS = {
+    'sine': 3.0, 'triangle': 4.0, 'pop_dyn': 2.0, 'linear_autonomous': 4.0,
+    'pi_cruise_control': 2.0, 'lorenz_x': 4.0,
+}  # fmt: skip
+"""Hz, told to PyNumDiff's optimiser; ours is not told."""
+NOISES = (0.1,)
+METHODS = (
+    'kerneldiff', 'butterdiff', 'savgoldiff', 'splinediff', 'spectraldiff', 'waveletdiff',
+    'finitediff', 'polydiff', 'rbfdiff', 'rtsdiff',
+)  # fmt: skip
+"""Without those that need convex optimisation, each of which takes minutes a signal."""
+DERIVATIVES = (1, 2, 3)
+DOCS = Path(__file__).resolve().parents[1] / 'docs'
+Cell = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def cell(system: str, noise: float) -> Cell:
+    """Return y and the truth of its derivative."""
+    from pynumdiff.utils import simulate
+
+    y, _, rate = getattr(simulate, system)(duration=4, noise_parameters=(0, noise), dt=DT)
+    return np.asarray(y, dtype=np.float64), np.asarray(rate, dtype=np.float64)
+
+
+def parameters(derivatives: int, noise: float, size: float, decay: float) -> dict[str, Any]:
+    """Return an observer of y' whose gains are those of the Kalman filter (D 19)."""
+    p = {
+        'order': 1, 'phi': ['0'], 'structure': 'levant', 'scheme': 'predict_correct',
+        'variant': 'fuzzy_adaptive', 'gamma_initial': 1e-4, 'gamma_min': 1e-4, 'gamma_rate': 0.0,
+        'correction_period': DT, 'noise_size': noise, 'state_sizes': [noise],
+        'unknown_input_size': size, 'unknown_input_decay': decay,
+        'unknown_input_derivatives': derivatives, 'fuzzy_systems': ['curve 0 1'],
+        'fuzzy_widths': [16.0 * noise], 'fuzzy_growth': True,
+    }  # fmt: skip
+    model = ObserverConfiguration(p | {'noise_size': 0.0}).model
+    steady = Uncertainty(model, ObserverConfiguration(p).parameters, np.array([noise])).steady(DT)
+    levels = derivatives + 2
+    injections, shares = np.zeros(levels), deadbeat_shares(levels)
+    for i in reversed(range(levels)):
+        behind = sum(
+            shares[j, i] * DT ** (j - i + 1) * injections[j] for j in range(i + 1, levels)
+        )
+        injections[i] = max(steady[0, i] / noise**2 - behind, 1e-9) / DT
+    return p | {'lambda': [float(g) for g in injections * 16.0 * noise]}
+
+
+def unfitness(
+    y: NDArray[np.float64], p: dict[str, Any], rate: NDArray[np.float64] | None
+) -> float:
+    """Return minus the logarithm of the likelihood of the innovations, or the error of y'."""
+    observer = Observer(p)
+    if rate is not None:
+        return rms(observer.smooth(np.arange(len(y)) * DT, y).unknown_input - rate)
+    smoother, count = Smoother(observer.configuration), len(y)
+    samples = y, np.full(count, DT), np.zeros((count, 1))
+    rows = np.arange(count), np.full(count, MEASURED)
+    smoother.take(*observer.arrays[:2], np.zeros((count, 2, observer.levels)), samples, *rows)
+    e, variance = smoother.innovations()
+    return 0.5 * float(np.sum(np.log(variance) + e**2 / variance))
+
+
+def tuned(y: NDArray[np.float64], rate: NDArray[np.float64] | None = None) -> dict[str, Any]:
+    """Return the parameters of the largest likelihood; with `rate`, from there the best ones."""
+    rough = float(np.std(np.diff(y, 3)) / np.sqrt(20.0))
+    starts = [(rough, 5.0 * float(np.std(y)), decay) for decay in (0.5, 3.0)]
+    if rate is not None:
+        starts = [sizes_of(tuned(y))]
+    return searched(y, rate, starts)
+
+
+def sizes_of(p: dict[str, Any]) -> tuple[float, float, float]:
+    """Return what is searched for."""
+    return p['noise_size'], p['unknown_input_size'], p['unknown_input_decay']
+
+
+def searched(
+    y: NDArray[np.float64],
+    rate: NDArray[np.float64] | None,
+    starts: list[tuple[float, float, float]],
+) -> dict[str, Any]:
+    """Return the best parameters that searches from these starts find."""
+    best: tuple[float, dict[str, Any]] = (np.inf, {})
+    for derivatives in DERIVATIVES:
+
+        def cost(x: NDArray[np.float64], k: int = derivatives) -> float:
+            if not (abs(x) < 14.0).all():
+                return 1e9
+            try:
+                return unfitness(y, parameters(k, *np.exp(x).tolist()), rate)
+            except ConfigurationError:
+                return 1e9
+
+        for start in starts:
+            options = {'maxiter': 160}
+            found = minimize(cost, np.log(start), method='Nelder-Mead', options=options)
+            if found.fun < best[0]:
+                best = found.fun, parameters(derivatives, *np.exp(found.x).tolist())
+    return best[1]
+
+
+def ours(y: NDArray[np.float64], rate: NDArray[np.float64]) -> dict[str, Any]:
+    """Return the RMS errors of y' and what was tuned."""
+    p = tuned(y)
+    t = np.arange(len(y)) * DT
+    observer = Observer(p)
+    stamps = np.round(t * 1e9).astype(np.int64) + 1
+    lagging = OnlineEstimator(p | {'smoothing_lag': LAG}).run(stamps, y).unknown_input
+    found = {
+        'causal': rms(observer.run(t, y).unknown_input - rate),
+        'lag': rms(lagging - rate[: len(lagging)]),
+        'smoothed': rms(observer.smooth(t, y).unknown_input - rate),
+        'with the truth': rms(Observer(tuned(y, rate)).smooth(t, y).unknown_input - rate),
+    }
+    names = ('unknown_input_derivatives', 'noise_size', 'unknown_input_size')
+    return found | {name: p[name] for name in (*names, 'unknown_input_decay')}
+
+
+def theirs(
+    y: NDArray[np.float64], rate: NDArray[np.float64], bandlimit: float, name: str, known: bool
+) -> float:
+    """Return the RMS error of one of PyNumDiff's methods."""
+    import pynumdiff
+    from pynumdiff.optimize import optimize
+
+    method = getattr(pynumdiff, name)
+    told = {'dxdt_truth': rate} if known else {'bandlimit': bandlimit}
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        found, _ = optimize(method, y, DT, parallel=False, **told)
+        return rms(method(y, DT, **found)[1] - rate)
+
+
+def rms(x: NDArray[np.float64]) -> float:
+    """Return the root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+def table(results: dict[str, Any]) -> str:
+    """Return the table of the page."""
+    lines = [
+        '| system, noise | causal | lag of 200 ms | smoothed | best of theirs | ratio | smoothed, '
+        'tuned with the truth | best of theirs, likewise | ratio |',
+        '|---|---|---|---|---|---|---|---|---|',
+    ]
+    for name, row in results.items():
+        mine = row['ours']
+        columns = [f'{mine[key]:.3g}' for key in ('causal', 'lag')]
+        for key, way in (('smoothed', 'loss'), ('with the truth', 'truth')):
+            method = min(row[way], key=row[way].__getitem__)
+            best = row[way][method]
+            columns.append(f'{mine[key]:.3g}')
+            columns += [f'{best:.3g} ({method})', f'{mine[key] / best:.2f}']
+        lines.append(f'| {name} | {" | ".join(columns)} |')
+    return '\n'.join(lines)
+
+
+def main() -> int:
+    """Compute what is missing in the results, write them and the page."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
+    parser.add_argument('--check', action='store_true', help='compute our columns, compare')
+    parser.add_argument('--methods', nargs='*', default=METHODS, help='of PyNumDiff')
+    arguments = parser.parse_args()
+    path, page = DOCS / 'smoothing.json', DOCS / 'smoothing.md'
+    results = json.loads(path.read_text()) if path.exists() else {}
+    for noise in NOISES:
+        for system, bandlimit in BANDLIMITS.items():
+            y, rate = cell(system, noise)
+            name = f'{system}, {noise:g}'
+            row = results.setdefault(name, {'loss': {}, 'truth': {}})
+            mine = ours(y, rate)
+            print(name, mine, flush=True)
+            if arguments.check and abs(mine['smoothed'] / row['ours']['smoothed'] - 1.0) > 0.02:
+                print(f'{name}: expected {row["ours"]["smoothed"]:.4g}')
+                return 1
+            row['ours'] = mine
+            for method in () if arguments.check else arguments.methods:
+                for way in ('loss', 'truth'):
+                    if method not in row[way]:
+                        row[way][method] = theirs(y, rate, bandlimit, method, way == 'truth')
+                        print(name, method, way, row[way][method], flush=True)
+            path.write_text(json.dumps(results, indent=1) + '\n')
+    if not arguments.check:
+        text = page.read_text(encoding='utf-8')
+        page.write_text(filled(text, {'table': table(results)}), encoding='utf-8')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
