@@ -3,6 +3,8 @@
 
 from fhaosmo_ros.core import Observer, OnlineEstimator, Plant
 from fhaosmo_ros.core.observer import smoother
+from fhaosmo_ros.core.observer.covariance import INPUT_DOUBT, STATES_DOUBT
+from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 import pytest
@@ -48,12 +50,13 @@ def textbook(observer, t, y):
     drive = np.zeros((levels, levels))
     drive[-1, -1] = p['unknown_input_size'] ** 2 * density
     cov = np.zeros((levels, levels))
-    cov[range(n), range(n)] = np.square(np.broadcast_to(p['state_sizes'], n))
+    cov[range(n), range(n)] = np.square(STATES_DOUBT * np.broadcast_to(p['state_sizes'], n))
     cov[0, 0] = p['noise_size'] ** 2
     tail = a[n:, n:]
     eye = np.eye(k + 1)
     lyapunov = np.kron(tail, eye) + np.kron(eye, tail)
-    cov[n:, n:] = np.linalg.solve(lyapunov, -drive[n:, n:].ravel()).reshape(k + 1, k + 1)
+    stationary = np.linalg.solve(lyapunov, -drive[n:, n:].ravel()).reshape(k + 1, k + 1)
+    cov[n:, n:] = INPUT_DOUBT**2 * stationary
     x = np.zeros(levels)
     x[0] = y[0]
     filtered, predicted, transitions = [(x, cov)], [], []
@@ -193,6 +196,29 @@ def test_outliers_count_as_little_as_in_the_observer():
     y[bad] += np.random.default_rng(3).normal(0.0, 0.3, len(bad))
     found = observer.smooth(t, y)
     assert rms((found.unknown_input - truth.unknown_input)[judged]) < 1.3 * clean
+
+
+@pytest.mark.parametrize('stays', [False, True])
+def test_a_jump_of_y_alone_hardly_matters(stays):
+    t, y, truth = recording(8.0)
+    judged = slice(2000, 6000)
+    observer = Observer.from_yaml(CONFIG)
+    clean = rms((observer.smooth(t, y).unknown_input - truth.unknown_input)[judged])
+    y[4000 : len(y) if stays else 4500] += 5.0
+    found = observer.smooth(t, y)
+    assert (found.status & Status.JUMPED).any()
+    assert rms((found.unknown_input - truth.unknown_input)[judged]) < 3.0 * clean
+    assert np.abs((found.z[:, 0] - y)[4100:4400]).max() < 3.0 * NOISE
+    stamps = np.round(t * 1e9).astype(np.int64) + MS
+    whole, parts = online(), online()
+    whole.smooth()
+    parts.smooth()
+    d = np.append(whole.run(stamps, y).unknown_input, whole.finish().unknown_input)
+    rows = [parts.run(stamps[k : k + 13], y[k : k + 13]) for k in range(0, len(t), 13)]
+    rows.append(parts.finish())
+    np.testing.assert_array_equal(np.concatenate([row.unknown_input for row in rows]), d)
+    used = (found.status & REJECTED) == 0
+    np.testing.assert_allclose(d, found.unknown_input[used], rtol=0.0, atol=0.1 * clean)
 
 
 def test_known_inputs_and_a_nonlinear_model():

@@ -9,6 +9,7 @@ from fhaosmo_ros.core.observer.arrays import HAT, Law, MEMORY, TILDE, Work
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.smoothing import (
     BEGINS,
+    JUMPS,
     make_problem,
     MEASURED,
     Rows,
@@ -18,7 +19,7 @@ from fhaosmo_ros.core.observer.smoothing import (
     take_rows,
     UNMEASURED,
 )
-from fhaosmo_ros.core.observer.status import DIVERGED, REJECTED
+from fhaosmo_ros.core.observer.status import DIVERGED, JUMPED, REJECTED, RESTARTED
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -56,7 +57,7 @@ class Smoother:
         self._memory, self._point = np.zeros(MEMORY), np.zeros((4 + levels, levels))
         self._count = self._done = self._new = self._began = 0
         self._wait = BLOCK
-        self._begins = True
+        self._expected = {JUMPS: 0, BEGINS: 1}
 
     def configure(self, configuration: ObserverConfiguration) -> None:
         """Go on with other parameters from the next row on."""
@@ -65,7 +66,22 @@ class Smoother:
 
     def cut(self) -> None:
         """Let the next row begin: it has nothing to do with those before it."""
-        self._begins = True
+        self._expected[BEGINS] = 1
+
+    def kinds(self, status: Ints) -> Ints:
+        """
+        Return what the rows of samples are, by the status flags of an observer.
+
+        A jump of y, and a restart, are those of the next sample that is used.
+        """
+        kinds = np.where(status & REJECTED, UNMEASURED, MEASURED)
+        used = np.flatnonzero(kinds == MEASURED)
+        for kind, flags in ((JUMPS, JUMPED), (BEGINS, RESTARTED | DIVERGED)):
+            marks = self._expected[kind] + np.cumsum((status & flags) > 0)
+            kinds[used[np.diff(marks[used], prepend=0) > 0]] = kind
+            latest = marks[used[-1]] if len(used) else 0
+            self._expected[kind] = int(len(status) > 0 and marks[-1] > latest)
+        return kinds
 
     @property
     def goes_on(self) -> bool:
@@ -94,18 +110,15 @@ class Smoother:
         levels : (K, 2, N) array
             `HAT` and `TILDE` of the observer after each.
         samples : (y, h, u)
-            As `Samples` of a run.
+            As `Samples` of a run, with y less its offset (D 23).
         times, kinds : (K,) arrays
-            As in `Rows`.
+            As in `Rows`; see `kinds`.
 
         """
         count = len(times)
         if not count:
             return
         self._make_room(count)
-        kinds = kinds.copy()
-        if self._begins:
-            kinds[0], self._begins = BEGINS, False
         part = slice(self._count, self._count + count)
         self._rows.times[part], self._rows.kinds[part] = times, kinds
         estimates = levels[:, HAT].copy()
@@ -195,11 +208,11 @@ def smoothed(observer: 'Observer', t: ArrayLike, y: ArrayLike, u: ArrayLike) -> 
         times = np.fmax.accumulate(np.append(latest, t[rows]))
         h = np.diff(times) * (1e-9 if np.issubdtype(t.dtype, np.integer) else 1.0)
         latest, held = times[-1], inputs[-1]
-        kinds = np.where(status & REJECTED, UNMEASURED, MEASURED)
-        kinds[(status & DIVERGED) > 0] = BEGINS
+        kinds = smoother.kinds(status)
         levels = np.stack([part.z_hat, part.z_tilde], axis=1)[rows.start - start :]
+        used = (part.z_hat + part.innovation)[rows.start - start :, 0]
         numbers = np.arange(rows.start, rows.stop)
-        smoother.take(*observer.arrays[:2], levels, (y[rows], h, inputs), numbers, kinds)
+        smoother.take(*observer.arrays[:2], levels, (used, h, inputs), numbers, kinds)
         found.append(smoother.due())
     found.append(smoother.finish())
     whole = type(parts[0])(*(np.concatenate(column) for column in zip(*parts, strict=True)))

@@ -37,8 +37,11 @@ from fhaosmo_ros.core.observer.prediction import predict
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 
-MEASURED, UNMEASURED, BEGINS = range(3)
-"""What a row is: a sample that was used, a time at which none was, the first of a fresh start."""
+MEASURED, UNMEASURED, JUMPS, BEGINS = range(4)
+"""
+What a row is: a sample that was used, a time at which none was, the first used after a jump of y
+alone (D 23), the first of a fresh start.
+"""
 TOLERANCE = 1e-9
 """What later samples may still change, in standard deviations of the filter's errors."""
 
@@ -74,13 +77,13 @@ class Rows(NamedTuple):
     base : (R, N) array
         The observer's estimates, about which the model is linearised.
     transition : (R, N, N) array
-        F from the time before; 0 where a row begins.
+        F from the time before; 0 where a row begins, and of z_1 where y jumps.
     deviation, covariance : (R, N), (R, N, N) arrays
         Predicted from the rows before: of the state from the base, and P of its error.
     pull, certainty, noise : (R,) arrays
         e / S, 1 / S, and the variance that the sample is taken to have; 0 without a sample.
     times, kinds : (R,) arrays
-        In ns; `MEASURED`, `UNMEASURED` or `BEGINS`.
+        In ns; `MEASURED`, `UNMEASURED`, `JUMPS` or `BEGINS`.
 
     """
 
@@ -139,6 +142,15 @@ def begin(law: Law, problem: Problem, rows: Rows, k: int, y: float) -> None:
             rows.covariance[k, i, j] = problem.fresh[i, j]
     if law.flags[FROM_MEASUREMENT]:
         rows.deviation[k, 0] = y - rows.base[k, 0]
+
+
+@compiled()
+def jump_row(problem: Problem, rows: Rows, k: int, y: float) -> None:
+    """Let nothing before row k matter to z_1, which is y: y alone has jumped (D 23)."""
+    for i in range(rows.base.shape[1]):
+        rows.transition[k, 0, i] = rows.covariance[k, 0, i] = rows.covariance[k, i, 0] = 0.0
+    rows.covariance[k, 0, 0] = problem.variance
+    rows.deviation[k, 0] = y - rows.base[k, 0]
 
 
 @compiled()
@@ -270,8 +282,11 @@ def take_rows(
         k, step = first + place, h[place]
         for i in range(n):
             rows.base[k, i] = estimates[place, i]
-        if rows.kinds[k] == MEASURED and step <= 0.0 and rows.kinds[k - 1] != BEGINS:
+        used = rows.kinds[k] == MEASURED or rows.kinds[k] == JUMPS
+        if used and step <= 0.0 and rows.kinds[k - 1] != BEGINS:
             # The policy has withdrawn the sample before: its stamp was ahead.
+            if rows.kinds[k - 1] == JUMPS:
+                rows.kinds[k] = JUMPS
             repeat(rows, k - 1)
             step = (rows.times[k] - rows.times[k - 1]) * 1e-9
         if rows.kinds[k] == BEGINS:
@@ -279,7 +294,10 @@ def take_rows(
             memory[SPREAD] = 1.0
             continue
         if not step > 0.0:
+            jumps = rows.kinds[k] == JUMPS
             repeat(rows, k)
+            if jumps:
+                jump_row(problem, rows, k, y[place])
             continue
         predict_row(law, work, problem, rows, k, step, u[place], point)
         if rows.kinds[k] == UNMEASURED:
@@ -298,6 +316,8 @@ def take_rows(
             for i in range(n):
                 rows.base[k, i] = estimates[place, i]
                 rows.deviation[k, i] = 0.0
+        elif rows.kinds[k] == JUMPS:
+            jump_row(problem, rows, k, y[place])
         elif rows.kinds[k] == MEASURED:
             e = y[place] - rows.base[k, 0] - rows.deviation[k, 0]
             usual = usual_innovation(memory, e, np.sqrt(s))

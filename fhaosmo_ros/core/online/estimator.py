@@ -450,7 +450,7 @@ class OnlineEstimator:
             word = policy.take_once(limit, float(y), self._u, *self._arguments)
         self._word = word
         if self._smoothing is not None:
-            self._smoothing.take_one(self._arrays, self._eps, word, y, self._u)
+            self._smoothing.take_one(self._arrays, self._eps, word, self._u)
         return word
 
     def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
@@ -508,7 +508,7 @@ class OnlineEstimator:
         if carried:
             found = found._replace(z=present[:, :-1], unknown_input=present[:, -1])
         if self._smoothing is not None:
-            return self._smoothing.take(found, y, times, acting)
+            return self._smoothing.take(found, times, acting)
         return found
 
     @property

@@ -9,8 +9,7 @@ from fhaosmo_ros.core.model.bytecode import Floats, Ints
 from fhaosmo_ros.core.observer.arrays import GAMMA
 from fhaosmo_ros.core.observer.observer import Estimate, Observer, Trajectory
 from fhaosmo_ros.core.observer.smoother import Smoother
-from fhaosmo_ros.core.observer.smoothing import BEGINS, MEASURED
-from fhaosmo_ros.core.observer.status import DIVERGED, LEVEL_SHIFT, REJECTED, RESTARTED
+from fhaosmo_ros.core.observer.status import LEVEL_SHIFT, REJECTED
 from fhaosmo_ros.core.observer.step import Record
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online.delay import INPUTS, past_of
@@ -61,7 +60,7 @@ class PastEstimates:
         self._smoother.cut()
         self.estimate = None
 
-    def take(self, found: Trajectory, y: Floats, times: Ints, u: Floats) -> Trajectory:
+    def take(self, found: Trajectory, times: Ints, u: Floats) -> Trajectory:
         """
         Take the samples of a run; return the rows that are due now.
 
@@ -69,14 +68,14 @@ class PastEstimates:
         ----------
         found : Trajectory
             Of K samples, as the observer estimates them.
-        y, times, u : (K,), (K,), (K, m) arrays
-            Samples, the observer's time (ns) after each, and the inputs that acted until then.
+        times, u : (K,), (K, m) arrays
+            The observer's time (ns) after each, and the inputs that acted until then.
 
         """
-        self._append(found, y, times, u)
+        self._append(found, times, u)
         return self._handed_out(self._smoother.due())
 
-    def take_one(self, e: EstimatorArrays, eps: Floats, word: int, y: float, u: Floats) -> None:
+    def take_one(self, e: EstimatorArrays, eps: Floats, word: int, u: Floats) -> None:
         """Take the sample that an estimator has just taken, with its status word."""
         ints, (levels, memory) = e.policy.ints, e.state
         record = Record(
@@ -85,31 +84,29 @@ class PastEstimates:
         found = self._observer.trajectory(ints[[at.STAMP]] - ints[at.DELAY], record)
         if ints[at.LAG] > 0:
             u = past_of(e.policy, e.state)[INPUTS : INPUTS + len(u)]
-        self.take(found, np.array([y]), ints[[at.LATEST]], u[np.newaxis].copy())
+        self.take(found, ints[[at.LATEST]], u[np.newaxis].copy())
 
     def finish(self) -> Trajectory:
         """Return the rows that still wait: nothing comes after them."""
         return self._handed_out(self._smoother.finish())
 
-    def _append(self, found: Trajectory, y: Floats, times: Ints, u: Floats) -> None:
+    def _append(self, found: Trajectory, times: Ints, u: Floats) -> None:
         kept = np.flatnonzero((found.status & REJECTED) == 0)
         numbers = self._taken + kept
-        self._taken += len(y)
-        restarts = np.cumsum(found.status & (RESTARTED | DIVERGED) > 0)
-        if len(kept) < len(y):
-            found = part_of(found, kept)
-            y, times, u = y[kept], times[kept], u[kept]
-        if len(y):
-            kinds = np.where(np.diff(restarts[kept], prepend=0) > 0, BEGINS, MEASURED)
+        self._taken += len(times)
+        kinds = self._smoother.kinds(found.status)
+        if len(kept) < len(times):
+            found, kinds = part_of(found, kept), kinds[kept]
+            times, u = times[kept], u[kept]
+        if len(times):
             before = times[0] if self._time is None else self._time
             h = np.diff(times, prepend=before) * 1e-9
             self._time = int(times[-1])
             levels = np.stack([found.z_hat, found.z_tilde], axis=1)
             law, work, _ = self._observer.arrays
+            y = found.z_hat[:, 0] + found.innovation[:, 0]  # less its offset (D 23)
             self._smoother.take(law, work, levels, (y, h, u), times, kinds)
             self._parts.append((found, numbers))
-        if len(restarts) and restarts[-1] > (restarts[kept[-1]] if len(kept) else 0):
-            self._smoother.cut()
 
     def _handed_out(self, smoothed: NDArray[np.float64]) -> Trajectory:
         """Return the oldest rows with their smoothed estimates."""
