@@ -215,6 +215,8 @@ class ChannelGroup:
         return [report for channel in self._channels for report in channel.reports()]
 
     def _tick(self) -> None:
+        for channel in self._channels:
+            channel.end_waiting()
         self._step()
         alive = [channel for channel in self._channels if not channel.is_stale()]
         if not self._each:

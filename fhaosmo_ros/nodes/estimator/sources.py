@@ -404,7 +404,8 @@ def find_wanted(types: Mapping[str, Any], wanted: Input) -> Field:
     field = find_field(types, wanted.message_type, wanted.field, wanted.name)
     if wanted.stamp == 'header' and not field.has_header:
         raise ConfigurationError(
-            f"parameter 'input_stamp': expected messages with a header, got {wanted.message_type}"
+            "parameters 'input_stamp', 'known_input_stamps': expected messages with a header on "
+            f'{wanted.topic} for the stamps header, got {wanted.message_type}'
         )
     return field
 

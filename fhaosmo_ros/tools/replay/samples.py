@@ -54,7 +54,11 @@ class Samples:
         self._input = None
         if estimator.observer.uses_input:
             self._input = HeldInputs(
-                reader, estimator.observer.model, inputs.u, estimator.reject_inputs
+                reader,
+                estimator.observer.model,
+                inputs.u,
+                inputs.values,
+                estimator.reject_inputs,
             )
         self._first: int | None = None
         self._latest: int | None = None
@@ -82,10 +86,14 @@ class Samples:
         blocks = self._checked()
         if self._live:
             blocks = self._live.begin(blocks)
-        for block in self._continuous(blocks) if self._field.wraps else blocks:
-            if len(block.times):
-                u = self._input(block.times) if self._input else None
-                yield len(block.times), list(self._rows(block, u))
+        blocks = (block for block in blocks if len(block.times))
+        if self._field.wraps:
+            blocks = self._continuous(blocks)
+        pairs = ((block, None) for block in blocks)
+        if self._input:
+            pairs = self._input.along(blocks, lambda: self.estimator.inputs)
+        for block, u in pairs:
+            yield len(block.times), list(self._rows(block, u))
         if not self._taken and self._reader.lacking:
             raise ConfigurationError(f'topic {self.topic!r}: {next(iter(self._reader.lacking))}')
         if not self._taken:
