@@ -296,3 +296,58 @@ def test_known_input_from_the_message_of_y(client, folder):
             expected.set_input(float(k % 5))
             e = expected.update(SECOND + (k + 1) * 2_000_000, 0.01 * k)
         assert rig.estimates[-1].unknown_input == pytest.approx(e.unknown_input, abs=1e-12)
+
+
+def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(client, folder, tmp_path):
+    """It arrives after y, remapped; live, replayed and by the library the result is one."""
+    model = {
+        'order': 1, 'phi': ['k*u'], 'constants.k': 2.0, 'lambda': [15.0, 5.0], 'max_gap': 60.0,
+        'known_input_stamps': ['header'], 'known_input_wait': 0.2,
+    }  # fmt: skip
+    arguments = parameters(
+        namespace='/arm2', input_topic='q', input_field='position[a]', publish_on='sample',
+        known_input_fields='["effort[a]"]', typed_outputs='[none]', input_reliability='reliable',
+        **model,
+    )  # fmt: skip
+    stamps = [SECOND + (k + 1) * 2_000_000 for k in range(30)]
+    recorder = Process(
+        folder(), 'record', '-o', tmp_path / 'bag', '--names', '/arm2/estimator', '/arm2/other'
+    )
+    try:
+        client.wait(lambda: 'recording to' in recorder.output, 'recorder')
+        with node_process(folder(), 'estimator', *arguments, '-r', 'u:=/motor/state'):
+            rig = EstimatorRig(client, '/arm2', feed=False)
+            y = client.publisher('/arm2/q', JointState)
+            u = client.publisher('/motor/state', JointState)
+            client.wait(lambda: y.matched() == u.matched() == 2, 'estimator and recorder')
+            expected = OnlineEstimator(model)
+            for k, stamp in enumerate(stamps):
+                y(joint_state(stamp, a=0.01 * k))
+                client.wait(lambda k=k: len(rig.estimates) == k, 'estimate of the sample before')
+                message = joint_state(stamp, a=0.0)
+                message.effort = [float(k % 5)]
+                u(message)
+                expected.set_input(float(k % 5))
+                e = expected.update(stamp, 0.01 * k)
+                client.wait(lambda k=k: len(rig.estimates) > k, 'estimate with its input')
+            y(joint_state(stamps[-1] + 2_000_000, a=0.3))  # its input never comes
+            client.wait(lambda: len(rig.estimates) == 31, 'end of the wait')
+            u(joint_state(stamps[-1], a=0.0))  # no effort: left out
+            message.header.stamp = Time(sec=1, nanosec=62_000_000)
+            u(message)
+            client.wait(lambda: rig.value('late inputs') == '1', 'count of late inputs')
+            live = rig.estimates[29]
+            assert live.unknown_input == pytest.approx(e.unknown_input, abs=1e-12)
+        recorder.end()
+    finally:
+        recorder.kill()
+    subprocess.run(
+        [sys.executable, '-m', 'fhaosmo_ros', 'replay', tmp_path / 'bag',
+         '-o', tmp_path / 'o.npz'],
+        cwd=ROOT, check=True, capture_output=True,
+    )  # fmt: skip
+    with np.load(tmp_path / 'o.npz') as replayed:
+        assert replayed['stamp_ns'].tolist() == [*stamps, stamps[-1] + 2_000_000]
+        np.testing.assert_allclose(
+            replayed['unknown_input'], [e.unknown_input for e in rig.estimates], atol=1e-12
+        )
