@@ -36,7 +36,7 @@ setup(
     maintainer='fhaosmo_ros maintainers',
     maintainer_email='fhaosmo_ros@example.org',
     license='Apache-2.0',
-    python_requires='>=3.11',
+    python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

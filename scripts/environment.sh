@@ -19,9 +19,9 @@ other='name another, as in: make demo PYTHON=python3.12'
 say() { printf '%s\n' "$*" >&2; }
 fail() { say "error: $*"; exit 1; }
 
-command -v "$python" >/dev/null || fail "no $python here: install Python 3.11 or later, or $other"
-"$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
-    fail "Python 3.11 or later is needed, $python is $("$python" -V 2>&1): $other"
+command -v "$python" >/dev/null || fail "no $python here: install Python 3.10 or later, or $other"
+"$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' ||
+    fail "Python 3.10 or later is needed, $python is $("$python" -V 2>&1): $other"
 
 if [ -n "${ROS_DISTRO:-}" ] && "$python" -c 'import rclpy' 2>/dev/null; then
     venv=.venv-ros options=--system-site-packages wheels=no distribution=$ROS_DISTRO

@@ -351,12 +351,12 @@ def test_plan_with_ros_for_another_python_is_an_error(tmp_path):
 
 def test_plan_with_an_old_python_is_an_error(tmp_path):
     old = tmp_path / 'python3'
-    old.write_text('#!/bin/sh\n[ "$1" = -V ] && echo Python 3.10.1\nexit 1\n')
+    old.write_text('#!/bin/sh\n[ "$1" = -V ] && echo Python 3.9.1\nexit 1\n')
     old.chmod(0o755)
     done = plan(old)
     assert done.returncode == 1
-    assert 'Python 3.11 or later is needed' in done.stderr
-    assert 'Python 3.10.1' in done.stderr
+    assert 'Python 3.10 or later is needed' in done.stderr
+    assert 'Python 3.9.1' in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 

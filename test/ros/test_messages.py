@@ -351,3 +351,33 @@ def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(client, folder, 
         np.testing.assert_allclose(
             replayed['unknown_input'], [e.unknown_input for e in rig.estimates], atol=1e-12
         )
+
+
+def test_header_stamps_are_the_time_in_simulation(client, start):
+    """dt comes from them, whatever /clock does; without headers it comes from /clock."""
+    common = {
+        'use_sim_time': 'true', 'publish_on': 'sample', 'input_topic': 'in',
+        'typed_outputs': '[none]',
+    }  # fmt: skip
+    process = start(
+        'estimator', *parameters(namespace='/stamped', input_field='position[a]', **common)
+    )
+    start('estimator', *parameters(namespace='/plain', **common))
+    publish = {
+        'stamped': client.publisher('/stamped/in', JointState),
+        'plain': client.publisher('/plain/in'),
+    }
+    for name in ('stamped', 'plain'):
+        client.wait(lambda name=name: publish[name].matched() == 1, f'subscription of {name}')
+    rig = EstimatorRig(client, '/stamped', feed=False)
+    assert rig.parameters.get('sampling') == 'source_stamp'
+    assert rig.parameters.get('use_sim_time') is True
+    assert 'dt comes from the header stamps' in process.output
+    stamps = [SECOND + (k + 1) * 2_000_000 for k in range(20)]
+    for k, stamp in enumerate(stamps):
+        publish['stamped'](joint_state(stamp, a=0.01 * k))
+    client.wait(lambda: len(rig.estimates) == len(stamps), 'estimate of every sample')
+    expected = OnlineEstimator().run(stamps, 0.01 * np.arange(20))
+    assert [e.stamp for e in rig.estimates] == stamps
+    np.testing.assert_array_equal([e.unknown_input for e in rig.estimates], expected.unknown_input)
+    assert EstimatorRig(client, '/plain', feed=False).parameters.get('sampling') == 'clock'
