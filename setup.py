@@ -17,7 +17,18 @@ from setuptools import find_packages, setup
 
 NAME = 'fhaosmo_ros'
 FOR_ROS2_RUN = bool({'install', 'develop'} & set(sys.argv))
+CHECK = ['hypothesis', 'pytest', 'pytest-rerunfailures', 'pytest-xdist']
 TUNE = ['cmaes', 'control', 'optuna>=4,<6']
+
+
+def wheels(distribution):
+    """Return what the nodes need of a ROS distribution, as wheels."""
+    packages = (
+        'builtin-interfaces', 'diagnostic-msgs', 'geometry-msgs', 'lifecycle-msgs',
+        'rcl-interfaces', 'rclpy', 'rmw-fastrtps-cpp', 'rosgraph-msgs', 'sensor-msgs',
+        'std-msgs', 'std-srvs',
+    )  # fmt: skip
+    return [f'ros-{distribution}-{package}' for package in packages]
 
 
 def files(*patterns):
@@ -60,32 +71,19 @@ setup(
     ],
     # Not tests_require: colcon then finds no tests.
     extras_require={
-        # Community builds of Jazzy, for machines without ROS. Never beside an installed ROS.
-        'ros': [
-            'ros-jazzy-builtin-interfaces',
-            'ros-jazzy-diagnostic-msgs',
-            'ros-jazzy-geometry-msgs',
-            'ros-jazzy-lifecycle-msgs',
-            'ros-jazzy-rcl-interfaces',
-            'ros-jazzy-rclpy[fastrtps]',
-            'ros-jazzy-rosgraph-msgs',
-            'ros-jazzy-sensor-msgs',
-            'ros-jazzy-std-msgs',
-            'ros-jazzy-std-srvs',
-        ],
+        # Community builds, for machines without ROS. Never beside an installed ROS.
+        **{f'ros-{distribution}': wheels(distribution) for distribution in ('jazzy', 'kilted')},
         'tune': TUNE,
         'compare': TUNE,
+        'check': CHECK,
         'test': [
+            *CHECK,
             *TUNE,
             'colcon-common-extensions',
-            'hypothesis',
             'import-linter',
             'mcap',
             'mcap-ros2-support',
             'mypy',
-            'pytest',
-            'pytest-rerunfailures',
-            'pytest-xdist',
             'ruff',
             'setuptools>=68,<80',  # from 80 on, colcon build --symlink-install silently copies
             'sympy',

@@ -106,6 +106,12 @@ CASES = {
         parameters(lambda_='[15, 15.5, 16, 17]'),
         ["'lambda'", 'one type', '15.5'],
     ),
+    'no topic': ('estimator', parameters(input_topic='/a b'), ["'input_topic'", "'/a b'"]),
+    'no type': (
+        'estimator',
+        parameters(input_topic='/a', input_type='sensor_msgs/JoinState'),
+        ["'input_type'", "mean 'sensor_msgs/msg/JointState'?"],
+    ),
     'half a rule': ('estimator', ['--ros-args', '-p', 'epsilon'], ["'-p epsilon'"]),
     'no rule': ('estimator', ['--ros-args', '-p'], ['-p']),
     'unexpected argument': ('plant', ['fast'], ["'fast'", 'usage: plant']),

@@ -115,8 +115,13 @@ def arm(client, start):
     out = client.record('/arm/estimator/joint_states', JointState)
     client.wait(lambda: client.node.count_publishers('/arm/estimator/joint_states') == 0, 'wait')
     stamp = SECOND
-    publish(joint_state(stamp, shoulder=0.1, elbow=0.2, wrist=0.3))
+    first = joint_state(stamp, shoulder=0.1, elbow=0.2, wrist=0.3)
+    first.name += ['elbow', 'constants', '', 'left/wrist']  # the second elbow is nobody
+    first.position.extend([9.0] * 4)
+    publish(first)
     client.wait(lambda: client.node.count_publishers('/arm/estimator/joint_states') == 1, 'arm')
+    for name in ('constants', '', 'left/wrist'):
+        assert f"joint '{name}' can't be the name of a channel: it is left out" in process.output
     return process, publish, out
 
 
@@ -178,7 +183,7 @@ def test_bad_messages_are_told_counted_and_survived(client, folder):
         message.position = []
         publish(message)
         rig.wait_count('messages without y', 2)
-        assert 'expected an index below the number of elements, 0 in one message' in process.output
+        assert "expected an element for each name, got none for 'elbow'" in process.output
         publish(joint_state(0, elbow=0.2))
         rig.wait_count('zero stamps', 1)
         assert 'its header stamp is 0: nobody fills it; input_stamp: source' in process.output

@@ -11,9 +11,10 @@ from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.inputs import known_inputs, make_pairing, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
+from fhaosmo_ros.nodes.estimator.listener import Listener
 from fhaosmo_ros.nodes.estimator.outputs import Outputs
 from fhaosmo_ros.nodes.estimator.snapshots import SnapshotPublisher
-from fhaosmo_ros.nodes.estimator.sources import Listener, Sources
+from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import Output, TypedOutputs
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, WARN
 from rclpy.node import Node
