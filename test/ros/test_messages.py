@@ -167,6 +167,7 @@ def test_each_joint_is_a_channel_whatever_the_order_of_the_names(client, arm):
 def test_bad_messages_are_told_counted_and_survived(client, folder):
     arguments = parameters(
         namespace='/bad', input_topic='data', input_field='position[elbow]', max_gap=60.0,
+        input_reliability='reliable',
         diagnostics_period=0.2, publish_on='sample', typed_outputs='[none]',
     )  # fmt: skip
     with node_process(folder(), 'estimator', *arguments) as process:
@@ -235,15 +236,16 @@ def test_what_cannot_be_meant_is_one_line_before_anything_starts(folder, options
 def test_yaw_is_continuous_and_the_outputs_are_typed(client, folder):
     arguments = parameters(
         namespace='/yaw', input_topic='pose', input_field='pose.orientation.yaw', order=2,
+        input_reliability='reliable',
         phi="['0', '0']", lambda_='[15.0, 10.0, 5.0]', publish_on='sample', max_gap=60.0,
         typed_outputs='[wrench, accel]', output_axis='angular.z', unknown_input_scale=3.0,
         frame_id='base', measurement_unit='rad', unknown_input_unit="'N m'",
         diagnostics_period=0.2,
     )  # fmt: skip
+    wrench = client.record('/yaw/estimator/wrench', WrenchStamped)
+    accel = client.record('/yaw/estimator/accel', AccelStamped)
     with node_process(folder(), 'estimator', *arguments):
         rig = EstimatorRig(client, '/yaw', feed=False)
-        wrench = client.record('/yaw/estimator/wrench', WrenchStamped)
-        accel = client.record('/yaw/estimator/accel', AccelStamped)
         publish = client.publisher('/yaw/pose', PoseStamped)
         client.wait(lambda: publish.matched() == 1, 'subscription')
         expected = OnlineEstimator({
@@ -281,6 +283,7 @@ def test_known_input_from_the_message_of_y(client, folder):
     """u of a message is that of its own sample."""
     arguments = parameters(
         namespace='/drive', input_topic='imu', input_field='angular_velocity.z', order=1,
+        input_reliability='reliable',
         phi="['u']", lambda_='[15.0, 5.0]', publish_on='sample', max_gap=60.0,
         known_input_topics='[imu]', known_input_fields='[linear_acceleration.x]',
         typed_outputs='[none]',
@@ -362,7 +365,7 @@ def test_header_stamps_are_the_time_in_simulation(client, start):
     """dt comes from them, whatever /clock does; without headers it comes from /clock."""
     common = {
         'use_sim_time': 'true', 'publish_on': 'sample', 'input_topic': 'in',
-        'typed_outputs': '[none]',
+        'typed_outputs': '[none]', 'input_reliability': 'reliable',
     }  # fmt: skip
     process = start(
         'estimator', *parameters(namespace='/stamped', input_field='position[a]', **common)

@@ -64,8 +64,8 @@ def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> st
         return of_channel[0]
     if name is None and len(found) > 1:
         raise ConfigurationError(
-            f'--follow: expected one of the live estimators in the bag ({", ".join(found)}), or '
-            '--afresh'
+            f'--follow: expected one of the live estimators in the bag ({", ".join(found)}), '
+            '--channel for one of a node, or --afresh'
         )
     if name is not None and name not in found:
         raise ConfigurationError(
