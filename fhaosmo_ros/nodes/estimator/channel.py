@@ -104,6 +104,7 @@ class Channel:
         self._forget()
         if self._pairing is not None:
             self._pairing.forget_samples()
+            self._unpaired = self._pairing.late, self._pairing.ahead
         self._y.source.forget()
         self._lost_before = self._y.source.lost
         self._active = True
