@@ -57,6 +57,6 @@ soak:
 	@$(call with) && exec "$$python" benchmark/soak.py --minutes $(MINUTES) $(ARGS)
 
 clean:
-	rm -rf .venv .venv-ros build install log *.egg-info .coverage .hypothesis \
+	rm -rf .venv .venv-ros .venv-kilted build install log *.egg-info .coverage .hypothesis \
 	    .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find . -name .git -prune -o -name __pycache__ -type d -exec rm -rf {} +

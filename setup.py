@@ -17,8 +17,19 @@ from setuptools import find_packages, setup
 
 NAME = 'fhaosmo_ros'
 FOR_ROS2_RUN = bool({'install', 'develop'} & set(sys.argv))
+CHECK = ['hypothesis', 'pytest', 'pytest-rerunfailures', 'pytest-xdist']
 TUNE = ['cmaes', 'control', 'optuna>=4,<6']
 DOCS = ['myst-parser', 'sphinx', 'sphinx-rtd-theme']
+
+
+def wheels(distribution):
+    """Return what the nodes need of a ROS distribution, as wheels."""
+    packages = (
+        'builtin-interfaces', 'diagnostic-msgs', 'geometry-msgs', 'lifecycle-msgs',
+        'rcl-interfaces', 'rclpy', 'rmw-fastrtps-cpp', 'rosgraph-msgs', 'sensor-msgs',
+        'std-msgs', 'std-srvs',
+    )  # fmt: skip
+    return [f'ros-{distribution}-{package}' for package in packages]
 
 
 def files(*patterns):
@@ -37,7 +48,7 @@ setup(
     maintainer='fhaosmo_ros maintainers',
     maintainer_email='fhaosmo_ros@example.org',
     license='Apache-2.0',
-    python_requires='>=3.11',
+    python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
@@ -68,35 +79,22 @@ setup(
     ],
     # Not tests_require: colcon then finds no tests.
     extras_require={
-        # Community builds of Jazzy, for machines without ROS. Never beside an installed ROS.
-        'ros': [
-            'ros-jazzy-builtin-interfaces',
-            'ros-jazzy-diagnostic-msgs',
-            'ros-jazzy-geometry-msgs',
-            'ros-jazzy-lifecycle-msgs',
-            'ros-jazzy-rcl-interfaces',
-            'ros-jazzy-rclpy[fastrtps]',
-            'ros-jazzy-rosgraph-msgs',
-            'ros-jazzy-sensor-msgs',
-            'ros-jazzy-std-msgs',
-            'ros-jazzy-std-srvs',
-        ],
         'differentiate': ['cvxpy', 'pynumdiff>=0.3'],
         'docs': DOCS,
+        # Community builds, for machines without ROS. Never beside an installed ROS.
+        **{f'ros-{distribution}': wheels(distribution) for distribution in ('jazzy', 'kilted')},
         'tune': TUNE,
         'compare': TUNE,
+        'check': CHECK,
         'test': [
+            *CHECK,
             *DOCS,
             *TUNE,
             'colcon-common-extensions',
-            'hypothesis',
             'import-linter',
             'mcap',
             'mcap-ros2-support',
             'mypy',
-            'pytest',
-            'pytest-rerunfailures',
-            'pytest-xdist',
             'ruff',
             'setuptools>=68,<80',  # from 80 on, colcon build --symlink-install silently copies
             'sympy',

@@ -3,16 +3,11 @@
 
 from collections import Counter
 from time import monotonic, sleep
-from types import TracebackType
 from typing import Any
 
-from fhaosmo_ros.nodes.middleware.spin import Spinner
-import rclpy
-from rclpy.context import Context
-from rclpy.node import Node
+from fhaosmo_ros.nodes.recording.private_node import PrivateNode
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 from table import CannotMeasureError
 
@@ -42,7 +37,7 @@ ANSWERED = 10.0
 """Seconds that an answer may take."""
 
 
-class SoakClient:
+class SoakClient(PrivateNode):
     """
     Calls the estimator's services while it is open.
 
@@ -56,12 +51,9 @@ class SoakClient:
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self._turn: Counter[str] = Counter()
-        self._context = Context()
-        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = Node('soak_client', context=self._context, use_global_arguments=False)
-        self._parameters = AsyncParameterClient(self._node, '/estimator')
-        self._reset = self._node.create_client(Trigger, '/estimator/reset')
-        self._spinner = Spinner(self._node)
+        super().__init__('soak_client')
+        self._parameters = AsyncParameterClient(self.node, '/estimator')
+        self._reset = self.node.create_client(Trigger, '/estimator/reset')
         self._base: dict[str, Any] = {}
 
     def learn(self) -> None:
@@ -102,20 +94,6 @@ class SoakClient:
                 raise CannotMeasureError(f'the estimator did not answer within {ANSWERED:g} s')
             sleep(0.002)
         return future.result()
-
-    def __enter__(self) -> 'SoakClient':
-        self._spinner.__enter__()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._spinner.__exit__(kind, error, trace)
-        self._node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
 
 
 def _message(name: str, value: Any) -> Any:

@@ -13,6 +13,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.per_channel import CHANNELS, FROM_JOINTS
 from fhaosmo_ros.core.parameters.tables import CHANNEL_PARAMETERS
 from fhaosmo_ros.messages.fields import JOINT_STATE
+from fhaosmo_ros.pairing import StampPairing
 from fhaosmo_ros.topics import FLOAT
 
 
@@ -29,7 +30,7 @@ class Input(NamedTuple):
     field : str
         '' for the only number.
     stamp : str
-        auto, header, source or reception.
+        auto, header, source or reception; of a known input header or reception.
     name : str
         Of the channel: the element of a list that is meant where the field has no index.
 
@@ -72,9 +73,12 @@ def measured_output(values: Mapping[str, Any], channel: str = '') -> Input:
     """
     get = _values(values)
     topic, kind, field = get('input_topic'), get('input_type'), get('input_field')
+    stamp = get('input_stamp')
+    if stamp == 'auto' and 'header' in get('known_input_stamps'):
+        stamp = 'header'
     if not (topic or kind or field):
         kind = FLOAT
-    return Input(topic or _below(channel, 'y'), kind, field, get('input_stamp'), channel)
+    return Input(topic or _below(channel, 'y'), kind, field, stamp, channel)
 
 
 def known_inputs(
@@ -93,20 +97,55 @@ def known_inputs(
     Raises
     ------
     ConfigurationError
-        A list with neither one entry nor one for each known input.
+        A list with neither one entry nor one for each known input, or inputs by their header's
+        stamp where y is not.
 
     """
     get = _values(values)
+    stamps = CHANNEL_PARAMETERS['known_input_stamps']
+    if 'header' in get(stamps.name) and get('input_stamp') not in ('auto', 'header'):
+        raise stamps.error(
+            get(stamps.name), f'reception where input_stamp is {get("input_stamp")}'
+        )
     columns = []
-    for part in ('topics', 'types', 'fields'):
+    for part in ('topics', 'types', 'fields', 'stamps'):
         declared = CHANNEL_PARAMETERS[f'known_input_{part}']
         columns.append(_one_each(declared, get(declared.name), names))
     found = {}
-    for name, topic, kind, field in zip(names, *columns, strict=True):
+    for name, topic, kind, field, stamp in zip(names, *columns, strict=True):
         if not (topic or kind or field):
             kind = FLOAT
-        found[name] = Input(topic or _below(channel, name), kind, field, 'auto', channel)
+        found[name] = Input(topic or _below(channel, name), kind, field, stamp, channel)
     return found
+
+
+def make_pairing(
+    values: Mapping[str, Any],
+    names: Sequence[str],
+    known: Mapping[str, Input],
+    held: Sequence[float],
+) -> StampPairing | None:
+    """
+    Return what pairs known inputs with samples by their headers' stamps; None without such inputs.
+
+    Parameters
+    ----------
+    values : mapping
+        Parameters of the channel.
+    names : sequence of str
+        All known inputs of the model.
+    known : mapping of str to Input
+        Those that it uses.
+    held : sequence of float
+        What they are before the first ones come.
+
+    """
+    by_stamp = [name in known and known[name].stamp == 'header' for name in names]
+    if not any(by_stamp):
+        return None
+    get = _values(values)
+    wait, max_gap = (round(get(name) * 1e9) for name in ('known_input_wait', 'max_gap'))
+    return StampPairing(by_stamp, wait, max_gap, held)
 
 
 def _values(values: Mapping[str, Any]) -> Any:

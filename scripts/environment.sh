@@ -5,8 +5,9 @@
 #   sh scripts/environment.sh [--print-plan] [EXTRA ...]    EXTRA of setup.py, such as: test
 #
 # Where a ROS 2 is sourced, its own rclpy is used (.venv-ros sees the system's packages and
-# PYTHONPATH); elsewhere community wheels of Jazzy are installed (.venv). Never both: two builds
-# of one library in one process crash.
+# PYTHONPATH); elsewhere community wheels are installed, those of Jazzy (.venv), or with
+# ROS_WHEELS=kilted those of Kilted (.venv-kilted). Never both: two builds of one library in one
+# process crash.
 #
 # Only the dependencies are installed, not the package: an editable install leaves egg-info in
 # the tree and stale copies of the data files in the venv. A .pth file names the checkout instead.
@@ -19,20 +20,24 @@ other='name another, as in: make demo PYTHON=python3.12'
 say() { printf '%s\n' "$*" >&2; }
 fail() { say "error: $*"; exit 1; }
 
-command -v "$python" >/dev/null || fail "no $python here: install Python 3.11 or later, or $other"
-"$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
-    fail "Python 3.11 or later is needed, $python is $("$python" -V 2>&1): $other"
+command -v "$python" >/dev/null || fail "no $python here: install Python 3.10 or later, or $other"
+"$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' ||
+    fail "Python 3.10 or later is needed, $python is $("$python" -V 2>&1): $other"
 
 if [ -n "${ROS_DISTRO:-}" ] && "$python" -c 'import rclpy' 2>/dev/null; then
     venv=.venv-ros options=--system-site-packages wheels=no distribution=$ROS_DISTRO
     cost='up to a minute and 500 MB'
-    [ "$ROS_DISTRO" = jazzy ] || say "warning: only ROS 2 Jazzy is tested, sourced is $ROS_DISTRO"
+    case $ROS_DISTRO in
+        jazzy | kilted) ;;
+        *) say "warning: only ROS 2 Jazzy and Kilted are tested, sourced is $ROS_DISTRO" ;;
+    esac
 elif [ -n "${ROS_DISTRO:-}" ] && [ -n "${AMENT_PREFIX_PATH:-}" ]; then
     fail "ROS 2 $ROS_DISTRO is sourced but $python ($("$python" -V)) cannot import rclpy:" \
         "use the Python ROS was built for (make demo PYTHON=/usr/bin/python3)" \
         "or a shell without ROS"
 else
-    venv=.venv options='' wheels=yes distribution=''
+    venv=.venv options='' wheels=${ROS_WHEELS:-jazzy} distribution=''
+    [ "$wheels" = jazzy ] || venv=.venv-$wheels
     cost='about a minute and 750 MB'
 fi
 if [ "${1:-}" = --print-plan ]; then
@@ -88,7 +93,7 @@ if ! current run; then
     say "Making the environment $venv, once; this takes $cost ..."
     make_venv
     install run
-    [ $wheels = no ] || install ros
+    [ "$wheels" = no ] || install "ros-$wheels"
     "$bin/python" -c 'import rclpy' || fail "rclpy cannot be imported in $venv (see above)"
     printf '%s' "$origin" >"$venv/made-run"
 fi

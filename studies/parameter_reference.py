@@ -6,8 +6,10 @@ import sys
 
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.tables import (
+    CHANNEL_OUTPUT,
     DIAGNOSTICS,
     ESTIMATOR_NODE,
+    INPUT,
     MODEL,
     OBSERVER,
     PLANT_MODEL,
@@ -36,6 +38,8 @@ GROUPS = (
     ('Model (estimator and plant)', MODEL),
     ('Observer (estimator)', OBSERVER),
     ('Sampling (estimator)', SAMPLING),
+    ('Topics in (estimator)', INPUT),
+    ('Messages out (estimator)', CHANNEL_OUTPUT),
     ('Node (estimator)', ESTIMATOR_NODE),
     ('Diagnostics (estimator)', DIAGNOSTICS),
     ('Simulation (plant)', PLANT_MODEL),

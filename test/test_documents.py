@@ -9,7 +9,7 @@ import sys
 from fhaosmo_ros.core import Observer, Plant
 from fhaosmo_ros.core.compiled.cache import cache_folder
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import NODE_TABLES, OBSERVER_PARAMETERS, PLANT_PARAMETERS
 import pytest
 from studies.parameter_reference import markdown
 import yaml
@@ -21,6 +21,8 @@ CONFIGURATIONS = sorted((ROOT / 'config').glob('**/*.yaml'))
 def test_parameter_table_is_up_to_date():
     text = (ROOT / 'docs' / 'parameters.md').read_text(encoding='utf-8')
     assert text == markdown(), 'run python -m studies.parameter_reference'
+    for table in NODE_TABLES.values():
+        assert [name for name in table if f'| `{name}` |' not in text] == []
 
 
 @pytest.mark.parametrize('path', CONFIGURATIONS, ids=lambda p: p.stem)

@@ -188,6 +188,25 @@ def test_parameters_of_another_version_are_said(tmp_path, capsys):
         assert word in error
 
 
+@pytest.mark.parametrize('begin', [0, 700])
+def test_input_that_came_before_the_recording_holds(begin, tmp_path, capsys):
+    """Such as a set-point that is published once: only the live estimator knows it."""
+    stamps, y = files.signal(COUNT)
+    live = Live(parameters={'phi': ['0', '0', 'u - z3']})
+    live.estimator.set_input(0.7)
+    live.run(stamps, y, 0, 3000)
+    live.estimator.set_input(-0.4)
+    live.messages += files.floats(stamps[3000:3001] - 1, np.array([-0.4]), '/u')
+    live.run(stamps, y, 3000, COUNT)
+    bag = write(tmp_path / 'bag', stamps, y, live, begin=begin)
+    out = tmp_path / 'o.npz'
+    code, _, error = run(capsys, bag, '-o', out, '-p', "phi:=['0', '0', 'u - z3']")
+    assert code == 0, error
+    found = rows(out)
+    assert len(found) >= COUNT - 1000
+    assert found == {stamp: live.rows[stamp] for stamp in found}
+
+
 def test_afresh_begins_at_the_first_sample(tmp_path, capsys):
     stamps, y = files.signal(1000)
     live = Live().run(stamps, y, 300, 1000)

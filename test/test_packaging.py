@@ -346,7 +346,8 @@ def fake_ros(tmp_path) -> Path:
 
 
 def test_plan_without_ros_takes_the_wheels():
-    assert plan().stdout == 'venv: .venv\nwheels: yes\n'
+    assert plan().stdout == 'venv: .venv\nwheels: jazzy\n'
+    assert plan(ROS_WHEELS='kilted').stdout == 'venv: .venv-kilted\nwheels: kilted\n'
 
 
 def test_plan_with_sourced_jazzy_takes_its_rclpy(fake_ros):
@@ -356,9 +357,9 @@ def test_plan_with_sourced_jazzy_takes_its_rclpy(fake_ros):
 
 
 def test_plan_with_another_distribution_warns(fake_ros):
-    done = plan(ROS_DISTRO='kilted', PYTHONPATH=str(fake_ros))
+    done = plan(ROS_DISTRO='rolling', PYTHONPATH=str(fake_ros))
     assert done.stdout == 'venv: .venv-ros\nwheels: no\n'
-    assert 'only ROS 2 Jazzy is tested, sourced is kilted' in done.stderr
+    assert 'only ROS 2 Jazzy and Kilted are tested, sourced is rolling' in done.stderr
 
 
 def test_plan_with_ros_for_another_python_is_an_error(tmp_path):
@@ -371,12 +372,12 @@ def test_plan_with_ros_for_another_python_is_an_error(tmp_path):
 
 def test_plan_with_an_old_python_is_an_error(tmp_path):
     old = tmp_path / 'python3'
-    old.write_text('#!/bin/sh\n[ "$1" = -V ] && echo Python 3.10.1\nexit 1\n')
+    old.write_text('#!/bin/sh\n[ "$1" = -V ] && echo Python 3.9.1\nexit 1\n')
     old.chmod(0o755)
     done = plan(old)
     assert done.returncode == 1
-    assert 'Python 3.11 or later is needed' in done.stderr
-    assert 'Python 3.10.1' in done.stderr
+    assert 'Python 3.10 or later is needed' in done.stderr
+    assert 'Python 3.9.1' in done.stderr
     assert len(done.stderr.splitlines()) == 1
 
 

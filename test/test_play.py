@@ -51,7 +51,7 @@ def test_estimator_restarts_where_the_loop_begins_again(tmp_path):
 
     reader = threading.Thread(target=read)
     reader.start()
-    player = start('play', bag, '--loop', '--rate', '2', '--wait', '/y', '/clock')
+    player = start('play', bag, '--loop', '--rate', '2', '--delay', '0', '--wait', '/y', '/clock')
     try:
         assert jumped.wait(60), ''.join(lines)
         assert player.poll() is None
@@ -69,11 +69,11 @@ def test_bag_takes_its_own_time_over_the_rate(tmp_path):
     stamps, y = files.signal(1500)
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
     begin = time.monotonic()  # from before its start: a lower bound, however it is held up
-    process = start('play', bag, '--rate', '0.5')
+    process = start('play', bag, '--rate', '0.5', '--delay', '0.5')
     out, _ = process.communicate(timeout=60)
     assert process.returncode == 0
     assert 'playing' in out
-    assert time.monotonic() - begin >= 2.99  # 1.5 s at half the speed
+    assert time.monotonic() - begin >= 3.49  # 1.5 s at half the speed, after the delay
 
 
 @pytest.mark.parametrize(
@@ -81,6 +81,7 @@ def test_bag_takes_its_own_time_over_the_rate(tmp_path):
     [
         (['/no/bag'], ['/no/bag', 'does not exist']),
         (['BAG', '--rate', '0'], ['--rate', '0.001 to 1000', '0']),
+        (['BAG', '--delay', '-1'], ['--delay', '0 to 3600', '-1']),
         (['BAG', '--topics', '/x'], ["'/x'", '/y']),
         (['BAG', '--exclude', '/y'], ['expected a message to play']),
     ],
@@ -111,7 +112,7 @@ def test_package_beside_the_bag_is_not_imported(tmp_path):
     stamps, y = files.signal(20)
     things = [('/x', 'planted_msgs/msg/Thing', s, d) for _, _, s, d in files.floats(stamps, y)]
     files.write(tmp_path / 'bag', [*files.floats(stamps, y), *things])
-    process = start('play', 'bag', folder=tmp_path)
+    process = start('play', 'bag', '--delay', '0', folder=tmp_path)
     out, _ = process.communicate(timeout=60)
     assert process.returncode == 0, out
     assert 'not played: /x: planted_msgs/msg/Thing is not installed here' in out
@@ -148,14 +149,9 @@ def test_names_and_remappings_of_a_launch_file_act(tmp_path):
     recorder = start('record', '-o', tmp_path / 'out', *remapped, '-r', '__node:=scribe')
     try:
         assert 'recording to' in recorder.stdout.readline()
-        player = start('play', bag, '--loop', '--wait', '/y', *remapped)
-        try:
-            assert 'playing' in player.stdout.readline()
-            time.sleep(3.0)
-            assert player.poll() is None, player.communicate()
-        finally:
-            player.send_signal(signal.SIGINT)
-            player.communicate(timeout=60)
+        player = start('play', bag, '--delay', '0', '--wait', '/y', *remapped)
+        played, _ = player.communicate(timeout=60)  # it waits for the recorder, then ends
+        assert player.returncode == 0, played
     finally:
         recorder.send_signal(signal.SIGINT)
         said, _ = recorder.communicate(timeout=60)

@@ -101,10 +101,13 @@ class _Walk:
                 count, position = self._length(position)
             last = index + self._width - 1
             if last >= count:
-                raise MissingElementError(
-                    f'field {self._field.text!r}: expected an index below the number of '
-                    f'elements, {count} in one message, got {last}'
+                problem = (
+                    'expected an index below the number of elements, '
+                    f'{count} in one message, got {last}'
                 )
+                if isinstance(step, Key):  # the same text wherever the name stands
+                    problem = f'expected an element for each name, got none for {step.name!r}'
+                raise MissingElementError(f'field {self._field.text!r}: {problem}')
             node = node[1][0]
             position = self._past_many(node, index, position)
         return HEADER + _aligned(position, self._field.kind.itemsize)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 CLOCK_PERIOD = 1_000_000
 """Longest time between two messages on /clock, in nanoseconds of the bag's time."""
 NEVER_PLAYED = ('/clock', '/rosout', '/parameter_events')
+MATCHED = 0.5
+"""Seconds from when a subscriber has been found until it has found this publisher, too."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -37,6 +39,14 @@ def _parser() -> argparse.ArgumentParser:
     add('--rate', type=float, default=1.0, help='times real time (default: %(default)g)')
     add('--loop', action='store_true', help='begin again at the end, until Ctrl-C')
     add(
+        '--delay',
+        type=float,
+        default=4.0,
+        metavar='SECONDS',
+        help='begin so long after the topics appear: nodes take up to 3 s to find them and '
+        'lose what is published before that (default: %(default)g)',
+    )
+    add(
         '--wait',
         nargs='*',
         default=[],
@@ -49,6 +59,8 @@ def _parser() -> argparse.ArgumentParser:
 def _play(arguments: argparse.Namespace, stop: Stop) -> None:
     if not 1e-3 <= arguments.rate <= 1e3:
         raise ConfigurationError(f'--rate: expected 0.001 to 1000, got {arguments.rate:g}')
+    if not 0.0 <= arguments.delay <= 3600.0:
+        raise ConfigurationError(f'--delay: expected 0 to 3600 s, got {arguments.delay:g}')
     from fhaosmo_ros.nodes.recording.player import Player  # here, so that --help needs no ROS
 
     with BagReader(arguments.bag) as reader:
@@ -73,13 +85,22 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
             print(
                 f'playing {len(topics) - len(player.missing)} topics; Ctrl-C ends it', flush=True
             )
-            while not all(player.subscribers(player.resolved(t)) for t in arguments.wait):
-                if stop.wait(0.05):
-                    return
+            if not _wait(player, arguments, stop):
+                return
             for turn in count(1):
                 _once(reader, player, list(topics), arguments.rate, turn, stop)
                 if stop.is_set() or not arguments.loop:
                     return
+
+
+def _wait(player: 'Player', arguments: argparse.Namespace, stop: Stop) -> bool:
+    """Give nodes the time to find the topics; return False if it is to stop."""
+    begin = time.monotonic() + arguments.delay
+    while not all(player.subscribers(player.resolved(topic)) for topic in arguments.wait):
+        if stop.wait(0.05):
+            return False
+    found = time.monotonic() + (MATCHED if arguments.wait else 0.0)
+    return not stop.wait(max(0.0, begin - time.monotonic(), found - time.monotonic()))
 
 
 def _once(

@@ -267,6 +267,13 @@ class Parameters:
         return self._client.call(f'{self._node}/{service}', service_type, request)
 
 
+GOALS = {
+    'configure': 'inactive', 'activate': 'active', 'deactivate': 'inactive',
+    'cleanup': 'unconfigured', 'shutdown': 'finalized',
+}  # fmt: skip
+"""State that a transition leads to, where it succeeds."""
+
+
 class Manager:
     """Drives a managed node; what it answers is what a user of `ros2 lifecycle` sees."""
 
@@ -285,9 +292,10 @@ class Manager:
     def change(self, transition: int | str) -> bool:
         by_label = isinstance(transition, str)
         wanted = Transition(label=transition) if by_label else Transition(id=transition)
-        return self._call(
-            'change_state', ChangeState, ChangeState.Request(transition=wanted)
-        ).success
+        goal, before = GOALS.get(transition), self.state()
+        answer = self._call('change_state', ChangeState, ChangeState.Request(transition=wanted))
+        # Asked again after a lost answer, the node refuses a transition that it has made.
+        return answer.success or (before != goal and self.state() == goal)
 
     def _call(self, service: str, kind: type, request: object):
         return self._client.call(f'{self._node}/{service}', kind, request)

@@ -38,6 +38,7 @@ FILES = {
     'not_a_number': '/**: {ros__parameters: {epsilon: .nan}}',
     'gamma': '/**: {ros__parameters: {gamma_min: 0.9, gamma_max: 0.8}}',
     'integer': '/**: {ros__parameters: {order: 3.0}}',
+    'constant': '/**: {ros__parameters: {constants: {m: }}}',
     'renamed': 'lead: {ros__parameters: {lambda: []}}',
 }
 
@@ -80,6 +81,7 @@ CASES = {
     'mixed expressions': ('estimator', 'mixed_phi', ["'phi'", 'one type', "[0, 0, '-z3']"]),
     'empty list': ('estimator', 'empty_list', ["'lambda'", 'list of numbers > 0', '[]']),
     'no value': ('estimator', 'nothing', ["'max_gap'", 'a number', 'None']),
+    'constant without value': ('estimator', 'constant', ["'constants.m'", 'a number', 'None']),
     'nan in a file': ('estimator', 'not_a_number', ["'epsilon'", 'a number > 0', 'nan']),
     'bounds crossed': ('estimator', 'gamma', ['gamma_min', 'gamma_max', '0.9', '0.8']),
     'number for an integer': ('estimator', 'integer', ["'order'", 'an integer', '3.0']),
@@ -103,6 +105,12 @@ CASES = {
         'estimator',
         parameters(lambda_='[15, 15.5, 16, 17]'),
         ["'lambda'", 'one type', '15.5'],
+    ),
+    'no topic': ('estimator', parameters(input_topic='/a b'), ["'input_topic'", "'/a b'"]),
+    'no type': (
+        'estimator',
+        parameters(input_topic='/a', input_type='sensor_msgs/JoinState'),
+        ["'input_type'", "mean 'sensor_msgs/msg/JointState'?"],
     ),
     'half a rule': ('estimator', ['--ros-args', '-p', 'epsilon'], ["'-p epsilon'"]),
     'no rule': ('estimator', ['--ros-args', '-p'], ['-p']),

@@ -174,6 +174,7 @@ def test_a_signal_ends_it_in_every_state(client, folder, state, transitions):
     process = Process(folder(), 'estimator', *parameters(namespace=namespace, autostart='false'))
     try:
         node = Manager(client, f'{namespace}/estimator')
+        client.wait(lambda: 'waiting to be configured' in process.output, 'start')
         for transition in transitions:
             assert node.change(transition)
         assert node.state() == state

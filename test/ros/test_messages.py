@@ -115,8 +115,13 @@ def arm(client, start):
     out = client.record('/arm/estimator/joint_states', JointState)
     client.wait(lambda: client.node.count_publishers('/arm/estimator/joint_states') == 0, 'wait')
     stamp = SECOND
-    publish(joint_state(stamp, shoulder=0.1, elbow=0.2, wrist=0.3))
+    first = joint_state(stamp, shoulder=0.1, elbow=0.2, wrist=0.3)
+    first.name += ['elbow', 'constants', '', 'left/wrist']  # the second elbow is nobody
+    first.position.extend([9.0] * 4)
+    publish(first)
     client.wait(lambda: client.node.count_publishers('/arm/estimator/joint_states') == 1, 'arm')
+    for name in ('constants', '', 'left/wrist'):
+        assert f"joint '{name}' can't be the name of a channel: it is left out" in process.output
     return process, publish, out
 
 
@@ -162,6 +167,7 @@ def test_each_joint_is_a_channel_whatever_the_order_of_the_names(client, arm):
 def test_bad_messages_are_told_counted_and_survived(client, folder):
     arguments = parameters(
         namespace='/bad', input_topic='data', input_field='position[elbow]', max_gap=60.0,
+        input_reliability='reliable',
         diagnostics_period=0.2, publish_on='sample', typed_outputs='[none]',
     )  # fmt: skip
     with node_process(folder(), 'estimator', *arguments) as process:
@@ -178,7 +184,7 @@ def test_bad_messages_are_told_counted_and_survived(client, folder):
         message.position = []
         publish(message)
         rig.wait_count('messages without y', 2)
-        assert 'expected an index below the number of elements, 0 in one message' in process.output
+        assert "expected an element for each name, got none for 'elbow'" in process.output
         publish(joint_state(0, elbow=0.2))
         rig.wait_count('zero stamps', 1)
         assert 'its header stamp is 0: nobody fills it; input_stamp: source' in process.output
@@ -230,15 +236,16 @@ def test_what_cannot_be_meant_is_one_line_before_anything_starts(folder, options
 def test_yaw_is_continuous_and_the_outputs_are_typed(client, folder):
     arguments = parameters(
         namespace='/yaw', input_topic='pose', input_field='pose.orientation.yaw', order=2,
+        input_reliability='reliable',
         phi="['0', '0']", lambda_='[15.0, 10.0, 5.0]', publish_on='sample', max_gap=60.0,
         typed_outputs='[wrench, accel]', output_axis='angular.z', unknown_input_scale=3.0,
         frame_id='base', measurement_unit='rad', unknown_input_unit="'N m'",
         diagnostics_period=0.2,
     )  # fmt: skip
+    wrench = client.record('/yaw/estimator/wrench', WrenchStamped)
+    accel = client.record('/yaw/estimator/accel', AccelStamped)
     with node_process(folder(), 'estimator', *arguments):
         rig = EstimatorRig(client, '/yaw', feed=False)
-        wrench = client.record('/yaw/estimator/wrench', WrenchStamped)
-        accel = client.record('/yaw/estimator/accel', AccelStamped)
         publish = client.publisher('/yaw/pose', PoseStamped)
         client.wait(lambda: publish.matched() == 1, 'subscription')
         expected = OnlineEstimator({
@@ -276,6 +283,7 @@ def test_known_input_from_the_message_of_y(client, folder):
     """u of a message is that of its own sample."""
     arguments = parameters(
         namespace='/drive', input_topic='imu', input_field='angular_velocity.z', order=1,
+        input_reliability='reliable',
         phi="['u']", lambda_='[15.0, 5.0]', publish_on='sample', max_gap=60.0,
         known_input_topics='[imu]', known_input_fields='[linear_acceleration.x]',
         typed_outputs='[none]',
@@ -296,3 +304,88 @@ def test_known_input_from_the_message_of_y(client, folder):
             expected.set_input(float(k % 5))
             e = expected.update(SECOND + (k + 1) * 2_000_000, 0.01 * k)
         assert rig.estimates[-1].unknown_input == pytest.approx(e.unknown_input, abs=1e-12)
+
+
+def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(client, folder, tmp_path):
+    """It arrives after y, remapped; live, replayed and by the library the result is one."""
+    model = {
+        'order': 1, 'phi': ['k*u'], 'constants.k': 2.0, 'lambda': [15.0, 5.0], 'max_gap': 60.0,
+        'known_input_stamps': ['header'], 'known_input_wait': 0.2,
+    }  # fmt: skip
+    arguments = parameters(
+        namespace='/arm2', input_topic='q', input_field='position[a]', publish_on='sample',
+        known_input_fields='["effort[a]"]', typed_outputs='[none]', input_reliability='reliable',
+        **model,
+    )  # fmt: skip
+    stamps = [SECOND + (k + 1) * 2_000_000 for k in range(30)]
+    recorder = Process(
+        folder(), 'record', '-o', tmp_path / 'bag', '--names', '/arm2/estimator', '/arm2/other'
+    )
+    try:
+        client.wait(lambda: 'recording to' in recorder.output, 'recorder')
+        with node_process(folder(), 'estimator', *arguments, '-r', 'u:=/motor/state'):
+            rig = EstimatorRig(client, '/arm2', feed=False)
+            y = client.publisher('/arm2/q', JointState)
+            u = client.publisher('/motor/state', JointState)
+            client.wait(lambda: y.matched() == u.matched() == 2, 'estimator and recorder')
+            expected = OnlineEstimator(model)
+            for k, stamp in enumerate(stamps):
+                y(joint_state(stamp, a=0.01 * k))
+                client.wait(lambda k=k: len(rig.estimates) == k, 'estimate of the sample before')
+                message = joint_state(stamp, a=0.0)
+                message.effort = [float(k % 5)]
+                u(message)
+                expected.set_input(float(k % 5))
+                e = expected.update(stamp, 0.01 * k)
+                client.wait(lambda k=k: len(rig.estimates) > k, 'estimate with its input')
+            y(joint_state(stamps[-1] + 2_000_000, a=0.3))  # its input never comes
+            client.wait(lambda: len(rig.estimates) == 31, 'end of the wait')
+            u(joint_state(stamps[-1], a=0.0))  # no effort: left out
+            message.header.stamp = Time(sec=1, nanosec=62_000_000)
+            u(message)
+            client.wait(lambda: rig.value('late inputs') == '1', 'count of late inputs')
+            live = rig.estimates[29]
+            assert live.unknown_input == pytest.approx(e.unknown_input, abs=1e-12)
+        recorder.end()
+    finally:
+        recorder.kill()
+    subprocess.run(
+        [sys.executable, '-m', 'fhaosmo_ros', 'replay', tmp_path / 'bag',
+         '-o', tmp_path / 'o.npz'],
+        cwd=ROOT, check=True, capture_output=True,
+    )  # fmt: skip
+    with np.load(tmp_path / 'o.npz') as replayed:
+        assert replayed['stamp_ns'].tolist() == [*stamps, stamps[-1] + 2_000_000]
+        np.testing.assert_allclose(
+            replayed['unknown_input'], [e.unknown_input for e in rig.estimates], atol=1e-12
+        )
+
+
+def test_header_stamps_are_the_time_in_simulation(client, start):
+    """dt comes from them, whatever /clock does; without headers it comes from /clock."""
+    common = {
+        'use_sim_time': 'true', 'publish_on': 'sample', 'input_topic': 'in',
+        'typed_outputs': '[none]', 'input_reliability': 'reliable',
+    }  # fmt: skip
+    process = start(
+        'estimator', *parameters(namespace='/stamped', input_field='position[a]', **common)
+    )
+    start('estimator', *parameters(namespace='/plain', **common))
+    publish = {
+        'stamped': client.publisher('/stamped/in', JointState),
+        'plain': client.publisher('/plain/in'),
+    }
+    for name in ('stamped', 'plain'):
+        client.wait(lambda name=name: publish[name].matched() == 1, f'subscription of {name}')
+    rig = EstimatorRig(client, '/stamped', feed=False)
+    assert rig.parameters.get('sampling') == 'source_stamp'
+    assert rig.parameters.get('use_sim_time') is True
+    assert 'dt comes from the header stamps' in process.output
+    stamps = [SECOND + (k + 1) * 2_000_000 for k in range(20)]
+    for k, stamp in enumerate(stamps):
+        publish['stamped'](joint_state(stamp, a=0.01 * k))
+    client.wait(lambda: len(rig.estimates) == len(stamps), 'estimate of every sample')
+    expected = OnlineEstimator().run(stamps, 0.01 * np.arange(20))
+    assert [e.stamp for e in rig.estimates] == stamps
+    np.testing.assert_array_equal([e.unknown_input for e in rig.estimates], expected.unknown_input)
+    assert EstimatorRig(client, '/plain', feed=False).parameters.get('sampling') == 'clock'

@@ -221,3 +221,12 @@ def test_rule_for_another_node_is_let_through():
     spin._check_arguments('estimator', ['--ros-args', '-p', 'plant:noise:=0.1'])
     with pytest.raises(ConfigurationError, match="'noise'"):
         spin._check_arguments('estimator', ['--ros-args', '-p', 'estimator:noise:=0.1'])
+
+
+def test_list_takes_the_place_of_a_single_value(write):
+    """Of these two, rcl returns the single one, whichever was set last."""
+    spin = pytest.importorskip('fhaosmo_ros.nodes.middleware.spin')
+    path = write('/**: {ros__parameters: {lambda: 7.0, alpha: [3.0], channels: hip}}')
+    rules = ['-p', 'lambda:=[1.0, 2.0]', '-p', 'alpha:=4.0', '-p', 'channels:=knee']
+    _, lists = spin._check_arguments('estimator', ['--ros-args', '--params-file', path, *rules])
+    assert lists == {'lambda': [1.0, 2.0]}

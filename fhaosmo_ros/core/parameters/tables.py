@@ -344,6 +344,23 @@ INPUT = (
         'as y.',
         live=False, lengths='1 (used for every known input) or one each',
     ),
+    Parameter(
+        'known_input_stamps', ['reception'],
+        'From when on each of them holds. reception: from when it arrives; one of the same '
+        'message as y is that of its sample. header: a sample gets the newest one whose header '
+        'stamp is not after its own, whatever arrived first; y is then read with that of its '
+        'header, too.',
+        choices=('reception', 'header'), live=False,
+        lengths='1 (used for every known input) or one each',
+    ),
+    Parameter(
+        'known_input_wait', 0.0,
+        'How long a sample of y waits for those with known_input_stamps = header, until each has '
+        'come with its stamp or a later one, by the stamps of y. Enough for the latest of them, '
+        'it makes the estimates independent of the order of arrival, at the cost of that delay. '
+        'For inputs that come about as often as y.',
+        unit='s', lower=0.0, upper=10.0, live=False,
+    ),
 )  # fmt: skip
 
 CHANNEL_OUTPUT = (

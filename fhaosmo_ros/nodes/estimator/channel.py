@@ -2,17 +2,19 @@
 """One channel of an estimator node: y (and u) in, one observer, estimates out."""
 
 from functools import partial
+from math import isfinite
 from time import perf_counter, time_ns
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
-from fhaosmo_ros.inputs import known_inputs, measured_output
+from fhaosmo_ros.inputs import known_inputs, make_pairing, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
+from fhaosmo_ros.nodes.estimator.listener import Listener
 from fhaosmo_ros.nodes.estimator.outputs import Outputs
 from fhaosmo_ros.nodes.estimator.snapshots import SnapshotPublisher
-from fhaosmo_ros.nodes.estimator.sources import Listener, Sources
+from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import Output, TypedOutputs
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, WARN
 from rclpy.node import Node
@@ -83,7 +85,9 @@ class Channel:
         wanted = measured_output(values, name)
         self._y = sources.of(wanted).add(wanted, self._on_sample, self._logger)
         self._u: dict[str, Listener] = {}
-        for u, its in known_inputs(values, observer.used_inputs, name).items():
+        known = known_inputs(values, observer.used_inputs, name)
+        self._pairing = make_pairing(values, observer.inputs, known, estimator.inputs)
+        for u, its in known.items():
             take = partial(self._on_input, observer.inputs.index(u), u)
             self._u[u] = sources.of(its).add(its, take, self._logger, first=True)
         self._typed = self._typed_outputs(values)
@@ -98,6 +102,9 @@ class Channel:
         self.estimator.reset()
         self._snapshots.reset()
         self._forget()
+        if self._pairing is not None:
+            self._pairing.forget_samples()
+            self._unpaired = self._pairing.late, self._pairing.ahead
         self._y.source.forget()
         self._lost_before = self._y.source.lost
         self._active = True
@@ -162,7 +169,27 @@ class Channel:
                 reports[0].find(ERROR if u.error else WARN, text)
             if not found.heard and not found.unheard:
                 reports[0].find(WARN, f'no publisher of {name}')
+        if self._pairing is not None:
+            self._report_pairing(reports[0])
         return reports
+
+    def _report_pairing(self, report: Report) -> None:
+        before, now = self._unpaired, (self._pairing.late, self._pairing.ahead)
+        self._unpaired = now
+        report.values |= {'late inputs': now[0], 'samples before any input': now[1]}
+        late, ahead = (b - a for a, b in zip(before, now, strict=True))
+        if late:
+            report.find(
+                WARN,
+                f'{late} known inputs came after their sample had been used: raise '
+                'known_input_wait, or their header stamps are of another clock',
+            )
+        if ahead:
+            report.find(
+                WARN,
+                f'{ahead} samples are older than every known input: are their header stamps of '
+                'one clock?',
+            )
 
     def _read_settings(self) -> None:
         self._clock_stamps = self._values['sampling'] == 'clock'
@@ -176,6 +203,8 @@ class Channel:
         self._stale = True
         self._quiet_until: dict[int, float] = {}
         self._silent_since: int | None = None
+        self._waits_since = 0.0
+        self._unpaired = 0, 0
 
     def _on_sample(self, stamp: int, y: float, source: int) -> None:
         """Take a sample; `source` is when its message was published (all times in ns)."""
@@ -184,9 +213,29 @@ class Channel:
         health = self._health
         health.delays.append(time_ns() - source)
         health.offset = source - stamp if stamp else 0
+        measured = stamp
         if self._clock_stamps:
             stamp = self._clock.now().nanoseconds
-        self._take(stamp, y)
+        if self._pairing is None:
+            self._take(stamp, y)
+        else:
+            self._pairing.take_sample(measured, (stamp, y))
+            self._waits_since = perf_counter()
+            self._take_paired()
+
+    def _take_paired(self, at_once: bool = False) -> None:
+        """Step to the samples whose known inputs are there."""
+        for (stamp, y), inputs in self._pairing.released(at_once):
+            for index, u in enumerate(inputs):
+                self.estimator.set_input(u, index)
+            self._take(stamp, y)
+
+    def end_waiting(self) -> None:
+        """Step to samples that wait for known inputs although no sample has followed for long."""
+        if self._pairing is not None:
+            waited = perf_counter() - self._waits_since
+            if waited > self._values['known_input_wait']:
+                self._take_paired(at_once=True)
 
     def _take(self, stamp: int, y: float) -> None:
         """Step the observer to a sample."""
@@ -257,8 +306,11 @@ class Channel:
                     f'rejected a sample: {reason} ({counters.rejected} rejected so far)'
                 )
 
-    def _on_input(self, index: int, name: str, _: int, u: float, __: int) -> None:
-        if not self.estimator.set_input(u, index):
+    def _on_input(self, index: int, name: str, stamp: int, u: float, _: int) -> None:
+        if self._pairing is not None and isfinite(u):
+            self._pairing.take_input(index, stamp, u)
+            self._take_paired()
+        elif not self.estimator.set_input(u, index):
             self._logger.warning(
                 f'rejected {name} = {u}: expected a finite number; the last one is held',
                 throttle_duration_sec=QUIET,
@@ -273,6 +325,7 @@ class Channel:
             self._timer = None
 
     def _tick(self) -> None:
+        self.end_waiting()
         if not self.is_stale() and not self._each:
             self.publish()
 

@@ -13,7 +13,7 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import of_channel, UNNAMED
-from fhaosmo_ros.nodes.estimator.channel import Channel, ChannelChange
+from fhaosmo_ros.nodes.estimator.channel import Channel, ChannelChange, TOLD
 from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import TypedOutputs
 from fhaosmo_ros.nodes.middleware.diagnostics import Report
@@ -73,6 +73,7 @@ class QueuedChannel(Channel):
     ) -> None:
         self._index = index
         self._queue = queue
+        self._held = None if estimator.observer.uses_input else estimator.inputs
         self.fresh = False
         """It has an estimate that has not been published."""
         super().__init__(node, values, estimator, sources, name)
@@ -92,7 +93,7 @@ class QueuedChannel(Channel):
         queue.channel.append(self._index)
         queue.stamps.append(stamp)
         queue.y.append(y)
-        queue.u.append(self.estimator.inputs)
+        queue.u.append(self._held or self.estimator.inputs)
         if len(queue.y) >= MOST_WAITING:
             queue.step()
 
@@ -103,6 +104,21 @@ class QueuedChannel(Channel):
         super().taken(word, stamp, y, unknown_input, duration)
         if not word & REJECTED:
             self.fresh = True
+
+    def all_taken(
+        self, words: list[int], stamps: list[int], unknown_inputs: list[float], duration: float
+    ) -> bool:
+        """Do what `taken` does for each of some samples, and return True, if all were used."""
+        if any(word & TOLD for word in words):
+            return False
+        health = self._health
+        health.durations.extend([duration] * len(words))
+        health.stamps.extend(stamps)
+        health.unknown_inputs.extend(unknown_inputs)
+        health.latest = perf_counter()
+        self._arrived = self.fresh = True
+        self._snapshots.accepted(stamps[0])
+        return True
 
     def _typed_outputs(self, values: Parameters) -> None:
         """Do nothing: the group's messages are those of all channels."""
@@ -215,6 +231,8 @@ class ChannelGroup:
         return [report for channel in self._channels for report in channel.reports()]
 
     def _tick(self) -> None:
+        for channel in self._channels:
+            channel.end_waiting()
         self._step()
         alive = [channel for channel in self._channels if not channel.is_stale()]
         if not self._each:
@@ -246,8 +264,16 @@ class ChannelGroup:
         )
         share = (perf_counter() - begin) / len(queue.y)
         columns = words.tolist(), queue.stamps, queue.y, unknown_inputs.tolist()
-        for index, *sample in zip(queue.channel, *columns, strict=True):
-            self._channels[index].taken(*sample, share)
+        count, turns = len(self._channels), len(queue.y) // len(self._channels)
+        if turns > 1 and queue.channel == list(range(count)) * turns:  # all channels in turn
+            for c, channel in enumerate(self._channels):
+                its, stamps, y, d = (column[c::count] for column in columns)
+                if not channel.all_taken(its, stamps, d, share):
+                    for sample in zip(its, stamps, y, d, strict=True):
+                        channel.taken(*sample, share)
+        else:
+            for index, *sample in zip(queue.channel, *columns, strict=True):
+                self._channels[index].taken(*sample, share)
         queue.clear()
 
     def _start_timer(self) -> None:

@@ -11,7 +11,7 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
-from fhaosmo_ros.nodes.estimator.sources import Listener
+from fhaosmo_ros.nodes.estimator.listener import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
 from fhaosmo_ros.nodes.middleware.publisher_watch import Publishers
 import numpy as np

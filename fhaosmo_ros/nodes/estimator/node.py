@@ -9,9 +9,9 @@ from fhaosmo_ros.core.parameters.declaration import Parameters, suggestion, Valu
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.per_channel import (
+    channel_names,
     CHANNELS,
     FROM_JOINTS,
-    NAME,
     of_channel,
     split,
     UNNAMED,
@@ -22,8 +22,9 @@ from fhaosmo_ros.inputs import measured_output, with_joints
 from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.channel_group import ChannelGroup, load, make_estimators
 from fhaosmo_ros.nodes.estimator.channel_inheritance import ChannelInheritance
+from fhaosmo_ros.nodes.estimator.listener import check_inputs
 from fhaosmo_ros.nodes.estimator.parameter_topic import ParameterTopic
-from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
+from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
@@ -107,7 +108,7 @@ class EstimatorNode(ManagedNode):
         prefixes = [f'~/{name}/' if name else '~/' for name in names]
         check_overrides(self, [prefix + topic for prefix in prefixes for topic in ESTIMATES])
         estimators = make_estimators(values, names)
-        check_inputs(values, estimators)
+        check_inputs(self, values, estimators)
         check_axes(values, {name: of_channel(values, name) for name in self._names})
         return estimators
 
@@ -158,7 +159,7 @@ class EstimatorNode(ManagedNode):
 
     def _take_joints(self, names: list[str]) -> None:
         """Make the channels from the first names; later, report those that are new."""
-        new = [name for name in names if name not in self._joints]
+        new = [name for name in dict.fromkeys(names) if name not in self._joints]
         self._joints |= set(new)
         if self._names != FROM_JOINTS:
             for name in new:
@@ -167,13 +168,15 @@ class EstimatorNode(ManagedNode):
                     'the node again to take it'
                 )
             return
-        fit = [name for name in new if NAME.fullmatch(name) and name not in ESTIMATOR_PARAMETERS]
-        for name in sorted(set(new) - set(fit)):
-            self.get_logger().error(
-                f"joint '{name}' can't be the name of a channel (letters, digits and single _ "
-                f'between them): it is left out; name a channel and set input_field to '
-                f'position[{name}] for it'
-            )
+        fit = []
+        for name in new:
+            try:
+                fit += channel_names({CHANNELS: [name or '?']})  # '' is no channel's name
+            except ConfigurationError as error:
+                self.get_logger().error(
+                    f"joint '{name}' can't be the name of a channel: it is left out ({error}); "
+                    f'name a channel and set input_field to position[{name}] for it'
+                )
         if not fit:
             return
         present = self._node_parameters.values

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A node's parameters on a topic, so that a bag says with which ones its estimates were made."""
 
+from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.per_channel import CHANNELS, differing, of_channel
-from fhaosmo_ros.inputs import measured_output
+from fhaosmo_ros.inputs import Input, known_inputs, measured_output
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.topics import PARAMETERS, TEXT
 from rclpy.node import Node
@@ -34,17 +35,26 @@ class ParameterTopic:
         text = dumps(named, self._node.get_fully_qualified_name())
         self._publisher.publish(String(data=text))
 
-    def _remapped(self, values: Parameters) -> dict[str, str]:
-        """Return the topics of y that a remapping has changed: a bag knows of none."""
-        found = {}
+    def _remapped(self, values: Parameters) -> dict[str, str | list[str]]:
+        """Return the topics of y and u that a remapping has changed: a bag knows of none."""
+        found: dict[str, str | list[str]] = {}
         for channel in values[CHANNELS]:
             prefix = f'{channel}.' if channel else ''
-            y = measured_output(of_channel(values, channel), channel)
-            topic = self._node.resolve_topic_name(y.topic)
-            if topic != y.absolute(self._node.get_namespace()):
-                found[f'{prefix}input_topic'] = topic
+            own = of_channel(values, channel)
+            y = measured_output(own, channel)
+            if self._is_remapped(y):
+                found[f'{prefix}input_topic'] = self._node.resolve_topic_name(y.topic)
                 found[f'{prefix}input_type'] = y.message_type
+            u = known_inputs(own, TriangularModel.of(own).used_inputs, channel).values()
+            if any(map(self._is_remapped, u)):
+                topics = [self._node.resolve_topic_name(one.topic) for one in u]
+                found[f'{prefix}known_input_topics'] = topics
+                found[f'{prefix}known_input_types'] = [one.message_type for one in u]
         return found
+
+    def _is_remapped(self, wanted: Input) -> bool:
+        plain = wanted.absolute(self._node.get_namespace())
+        return self._node.resolve_topic_name(wanted.topic) != plain
 
     def destroy(self) -> None:
         """Take the topic away."""

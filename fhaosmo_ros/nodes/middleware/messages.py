@@ -9,6 +9,7 @@ made once.
 
 from array import array
 from collections.abc import Callable
+from contextlib import suppress
 import importlib
 from importlib.util import find_spec
 import math
@@ -20,6 +21,7 @@ import struct
 from typing import Any
 
 from builtin_interfaces.msg import Time
+from fhaosmo_ros.core.parameters.declaration import suggestion
 from numpy.typing import NDArray
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Float64, Float64MultiArray, MultiArrayDimension, MultiArrayLayout
@@ -86,13 +88,16 @@ def message_class(name: str) -> Any:
         No such message type is installed.
 
     """
-    found = re.fullmatch(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)', name)
+    found = re.fullmatch(r'([a-z][a-z0-9_]*)/(msg/)?([A-Z][A-Za-z0-9]*)', name)
+    hint = '' if found else '; a type is written as in std_msgs/msg/Float64'
     if found and _is_installed(found[1]):
-        try:
-            return getattr(importlib.import_module(f'{found[1]}.msg'), found[2])
-        except (ImportError, AttributeError):
-            pass
-    raise LookupError(f'expected a message type that is installed here, got {name}')
+        with suppress(ImportError):
+            module = importlib.import_module(f'{found[1]}.msg')
+            if found[2] and hasattr(module, found[3]):
+                return getattr(module, found[3])
+            types = [f'{found[1]}/msg/{word}' for word in dir(module) if word[0].isupper()]
+            hint = suggestion(f'{found[1]}/msg/{found[3]}', types)
+    raise LookupError(f'expected a message type that is installed here, got {name}{hint}')
 
 
 def _is_installed(package: str) -> bool:

@@ -36,6 +36,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
@@ -52,8 +53,7 @@ FOREVER = 3600.0
 Seconds. Without a finite timeout, the events executor of the PyPI wheels (rclpy 7.1) never runs a
 callback and keeps a core busy.
 """
-DECLARED = {name: p for table in NODE_TABLES.values() for name, p in table.items()}
-"""All parameters of the package's nodes."""
+TABLES = tuple(NODE_TABLES.values())
 
 
 def make_executor(context: Any) -> Any:
@@ -140,9 +140,9 @@ class Spinner:
             self._on_end()
 
 
-def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> int:
+def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) -> int:
     """
-    Run a node until SIGINT, SIGTERM or SIGHUP.
+    Run a node, made with the options of rclpy's Node, until SIGINT, SIGTERM or SIGHUP.
 
     rclpy's own signal handlers are off: SIGINT would come out of the events executor as a
     RuntimeError, and a second Ctrl-C would cut the clean-up short. See `Spinner` and
@@ -168,9 +168,10 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
     origins: dict[str, str | None] = {}
     try:
         with ended.raising(GRACE):  # one import can last for a second
-            origins = _check_arguments(name, argv)
+            origins, lists = _check_arguments(name, argv)
             rclpy.init(args=[name, *argv], signal_handler_options=SignalHandlerOptions.NO)
-            node = factory()
+            overrides = [RosParameter(name, value=value) for name, value in lists.items()]
+            node = factory(parameter_overrides=overrides) if overrides else factory()
         settle_memory()
         with Spinner(node, on_end=ended.set) as spinner:
             ended.wait()
@@ -200,7 +201,9 @@ def run_node(name: str, factory: Callable[[], Node], argv: list[str] | None) -> 
             os._exit(0)
 
 
-def _check_arguments(name: str, argv: list[str]) -> dict[str, str | None]:
+def _check_arguments(
+    name: str, argv: list[str]
+) -> tuple[dict[str, str | None], dict[str, list[Any]]]:
     """
     Refuse what rcl ignores silently or refuses without saying which parameter is wrong.
 
@@ -208,13 +211,17 @@ def _check_arguments(name: str, argv: list[str]) -> dict[str, str | None]:
 
     Returns
     -------
-    dict
+    origins : dict
         Where each parameter comes from, by name: the file, or None for the command line.
+    lists : dict
+        Lists that take the place of single values: of these, rcl returns the single one.
 
     """
     options = list(pairwise(argv))
     full_name = _full_name(name, options)
     origins: dict[str, str | None] = {}
+    latest: dict[str, Any] = {}
+    single: set[str] = set()
     for path in (os.path.expanduser(word) for flag, word in options if flag == '--params-file'):
         values = read(path, full_name)
         if not values:
@@ -225,6 +232,8 @@ def _check_arguments(name: str, argv: list[str]) -> dict[str, str | None]:
             except ConfigurationError as error:
                 raise ConfigurationError(f'{path}: {error}') from None
             origins[parameter] = path
+        latest |= values
+        single |= {key for key, value in values.items() if not isinstance(value, list)}
     for parameter, text in _on_command_line(options, full_name):
         # The node gets no other node's parameters of one command line, but may of one file.
         if '.' not in parameter and parameter not in NODE_TABLES[name]:
@@ -237,11 +246,13 @@ def _check_arguments(name: str, argv: list[str]) -> dict[str, str | None]:
             raise ConfigurationError(f"parameter '{parameter}': {error}") from None
         check_one_type(parameter, value)
         _check_form(parameter, value)
-        origins[parameter] = None
+        origins[parameter], latest[parameter] = None, value
+        if not isinstance(value, list):
+            single.add(parameter)
     rest = remove_ros_args([name, *argv])[1:]
     if rest:
         raise ConfigurationError(f'unexpected argument {rest[0]!r}; {_usage(name)}')
-    return origins
+    return origins, {k: v for k, v in latest.items() if isinstance(v, list) and k in single}
 
 
 def _on_command_line(options: list[tuple[str, str]], full_name: str) -> Iterator[tuple[str, str]]:
@@ -258,10 +269,11 @@ def _check_form(name: str, value: Any) -> None:
     """Refuse a parameter without a value, an empty list, and a list of lists."""
     empty = value is None or value == []
     if empty or (isinstance(value, list) and isinstance(value[0], list | dict)):
-        declared = DECLARED.get(name.rpartition('.')[2])
-        if declared is None:
-            raise unknown_parameter(name, DECLARED)
-        raise replace(declared, name=name).error(value)
+        own = name, name.partition('.')[2]  # of the node, or of a channel
+        declared = [table[part] for part in own for table in TABLES if part in table]
+        if not declared:
+            raise unknown_parameter(name, [other for table in TABLES for other in table])
+        raise replace(declared[0], name=name).error(value)
 
 
 def _full_name(name: str, options: list[tuple[str, str]]) -> str:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from itertools import pairwise
 import shlex
 from types import TracebackType
-from typing import Self
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.spin import Spinner
@@ -56,7 +55,7 @@ class PrivateNode:
         except RuntimeError as error:
             raise ConfigurationError(f'ROS arguments {shlex.join(acting)}: {error}') from None
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> 'PrivateNode':
         self._spinner = Spinner(self.node).__enter__()
         return self
 

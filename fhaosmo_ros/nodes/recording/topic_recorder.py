@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from queue import SimpleQueue
 from time import time_ns
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.nodes.middleware.subscription import subscribe_with_info
@@ -109,11 +109,12 @@ class TopicRecorder(PrivateNode):
             receive = self._callback(topic, topic not in SHARED, limit)
             self._subscribe(topic, message_class(message_type), receive, qos)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> 'TopicRecorder':
         if self._wanted is not None:
             self._discover()
             self.node.create_timer(DISCOVERY_PERIOD, self._discover)
-        return super().__enter__()
+        super().__enter__()
+        return self
 
     def _discover(self) -> None:
         inputs = self._inputs()

@@ -63,12 +63,15 @@ class BagInputs(NamedTuple):
         The known inputs that the model uses, likewise.
     stamp : str
         One of `STAMPS` of the bag reader.
+    values : mapping
+        Parameters of the channel.
 
     """
 
     y: Input
     u: Mapping[str, Input]
     stamp: str
+    values: Mapping[str, Any]
 
 
 STAMP_OF = {'auto': 'auto', 'header': 'header', 'source': 'source', 'reception': 'bag'}
@@ -141,7 +144,7 @@ def bag_inputs(
         given['known_input_fields'] = arguments.input_field
     found = known_inputs(given, used, channel)
     u = {name: its._replace(topic=full(its)) for name, its in found.items()}
-    return BagInputs(y, u, arguments.stamp or STAMP_OF[y.stamp])
+    return BagInputs(y, u, arguments.stamp or STAMP_OF[y.stamp], values)
 
 
 def channel_parameters(

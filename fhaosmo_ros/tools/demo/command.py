@@ -31,7 +31,7 @@ from fhaosmo_ros.topics import (
     TRUTH,
 )
 
-START_DEADLINE = 90.0
+START_DEADLINE = 300.0
 """Seconds for a node to appear: the very first start compiles."""
 TOPICS = [
     ExpectedTopic('/y', FLOAT),

@@ -64,8 +64,8 @@ def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> st
         return of_channel[0]
     if name is None and len(found) > 1:
         raise ConfigurationError(
-            f'--follow: expected one of the live estimators in the bag ({", ".join(found)}), or '
-            '--afresh'
+            f'--follow: expected one of the live estimators in the bag ({", ".join(found)}), '
+            '--channel for one of a node, or --afresh'
         )
     if name is not None and name not in found:
         raise ConfigurationError(
@@ -178,7 +178,10 @@ class LiveRun:
     def _adopt(self, event: Event) -> bool:
         """Take the memory after the event's sample; return True if the run goes on behind it."""
         if event.snapshot.flags & Flag.STARTED:
-            return False  # first sample of the live estimator, or first after a restart
+            # First sample of the live estimator, or first after a restart: it may hold inputs.
+            for index, u in enumerate(event.snapshot.memory.u[: len(self._estimator.inputs)]):
+                self._estimator.set_input(u, index)
+            return False
         self._configure(event)
         self._events.popleft()
         try:

@@ -55,7 +55,11 @@ class Samples:
         self._input = None
         if estimator.observer.uses_input:
             self._input = HeldInputs(
-                reader, estimator.observer.model, inputs.u, estimator.reject_inputs
+                reader,
+                estimator.observer.model,
+                inputs.u,
+                inputs.values,
+                estimator.reject_inputs,
             )
         self._whole = arguments.smooth
         self._waiting, self._dropped = np.zeros((2, 0), dtype=np.int64), 0
@@ -85,10 +89,14 @@ class Samples:
         blocks = self._checked()
         if self._live:
             blocks = self._live.begin(blocks)
-        for block in self._continuous(blocks) if self._field.wraps else blocks:
-            if len(block.times):
-                u = self._input(block.times) if self._input else None
-                yield len(block.times), list(self._rows(block, u))
+        blocks = (block for block in blocks if len(block.times))
+        if self._field.wraps:
+            blocks = self._continuous(blocks)
+        pairs = ((block, None) for block in blocks)
+        if self._input:
+            pairs = self._input.along(blocks, lambda: self.estimator.inputs)
+        for block, u in pairs:
+            yield len(block.times), list(self._rows(block, u))
         if self._whole:
             yield 0, list(self._due(self.estimator.finish()))
         if not self._taken and self._reader.lacking:

@@ -63,6 +63,7 @@ class BagSource(NamedTuple):
     y: Input = measured_output({})
     u: Mapping[str, Input] = MappingProxyType({})
     stamp: str = 'auto'
+    values: Mapping[str, Any] = MappingProxyType({})
     plant: str = '/plant'
 
 
@@ -119,7 +120,8 @@ def _read(
             y = np.array(list(map(Unwrapper(), y.tolist())))
         u = np.zeros((len(y), len(model.inputs)))
         if model.uses_input:
-            u = HeldInputs(reader, model, source.u, lambda _: None)(times)
+            held = HeldInputs(reader, model, source.u, source.values)
+            u = np.concatenate([u for _, u in held.along(blocks)])
     truth = None
     found = truth_at(source.path, source.plant, times)
     if found is not None and found.values.shape[1] == model.order + 1:

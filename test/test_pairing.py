@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Known inputs paired with y by header stamps: whatever arrives first, the result is one."""
+
+import bag_files as files
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.inputs import known_inputs
+from fhaosmo_ros.pairing import MOST, StampPairing
+from fhaosmo_ros.tools.replay import command as replay
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+MS = 1_000_000
+GAP = 500 * MS
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+
+
+def fed(pairing, events):
+    """Feed (arrival, kind, stamp, value) in order; kind: 'y' or the number of an input."""
+    found = []
+    for _, kind, stamp, value in sorted(events, key=lambda e: e[0]):
+        if kind == 'y':
+            pairing.take_sample(stamp, value)
+        else:
+            pairing.take_input(kind, stamp, value)
+        found += list(pairing.released())
+    return found + list(pairing.released(at_once=True))
+
+
+def newest(stamps, values, at, before=0.0):
+    """The zero-order hold that is meant: the newest value not stamped after each time."""
+    return np.concatenate([[before], values])[np.searchsorted(stamps, at, side='right')]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 7), st.integers(0, 30))
+def test_order_of_arrival_within_the_wait_changes_nothing(seed, spacing, latest):
+    rng = np.random.default_rng(seed)
+    y = np.cumsum(rng.integers(1, 10, 40)) * MS
+    u = [np.cumsum(rng.integers(1, 2 * spacing, 60)) * MS for _ in range(2)]
+    values = [rng.normal(size=60) for _ in u]
+
+    def arriving(stamps):  # a topic keeps its own order
+        return np.maximum.accumulate(stamps + rng.integers(0, latest * MS + 1, len(stamps)))
+
+    events = [
+        (at, 'y', stamp, k) for k, (at, stamp) in enumerate(zip(arriving(y), y, strict=True))
+    ]
+    for j in range(2):
+        events += zip(arriving(u[j]), [j] * 60, u[j], values[j], strict=True)
+    pairing = StampPairing([True, True], (2 * latest + 20) * MS, GAP, [0.0, 0.0])
+    found = fed(pairing, events)
+    assert [sample for sample, _ in found] == list(range(40))
+    expected = np.column_stack([newest(u[j], values[j], y) for j in range(2)])
+    np.testing.assert_array_equal([row for _, row in found], expected)
+
+
+def test_without_a_wait_the_newest_that_is_there_acts_and_late_ones_are_counted():
+    pairing = StampPairing([True], 0, GAP, [7.0])
+    events = [
+        (1, 0, 20 * MS, 2.0), (2, 'y', 10 * MS, 'a'), (3, 'y', 20 * MS, 'b'),
+        (4, 'y', 30 * MS, 'c'), (5, 0, 30 * MS, 3.0), (6, 'y', 40 * MS, 'd'),
+    ]  # fmt: skip
+    assert fed(pairing, events) == [('a', [7.0]), ('b', [2.0]), ('c', [2.0]), ('d', [3.0])]
+    assert (pairing.late, pairing.ahead) == (1, 1)
+
+
+def test_input_without_stamp_or_by_reception_holds_from_its_arrival_on():
+    pairing = StampPairing([True, False], 100 * MS, GAP, [0.0, 0.0])
+    events = [
+        (1, 1, 99 * MS, 5.0), (2, 'y', 10 * MS, 'a'), (3, 1, 1 * MS, 6.0), (4, 0, 10 * MS, 1.0),
+        (5, 0, 0, 9.0), (6, 'y', 11 * MS, 'b'),
+    ]  # fmt: skip
+    assert fed(pairing, events) == [('a', [1.0, 5.0]), ('b', [9.0, 6.0])]
+
+
+def test_clock_that_jumps_back_and_silence_leave_nothing_behind():
+    pairing = StampPairing([True], 20 * MS, GAP, [0.0])
+    events, at = [], 0
+    for begin in (5000, 0, 9000):  # a bag that is played in a loop, then a jump ahead
+        for k in range(0, 100, 10):
+            for kind in ('y', 0):
+                at += 1
+                events.append((at, kind, (begin + k + 1) * MS, float(begin + k)))
+    found = fed(pairing, events)
+    assert len(found) == 30
+    steady = [sample == u[0] for sample, u in found]
+    assert sum(steady) >= 27  # at a jump, the sample before it may not have waited
+    for k in range(3 * MOST):  # y alone: memory stays bounded, samples go on
+        pairing.take_sample((20_000 + k) * MS // 1000, k)
+    assert len(list(pairing.released())) > 2 * MOST - 10
+
+
+def test_replay_of_inputs_that_came_late_is_that_of_inputs_in_time(tmp_path):
+    """Zero-order hold at the stamps of y, whatever the bag's order; equal to the last bit."""
+    stamps, y = files.signal(1500)
+    at = stamps[5::3] - 300_000
+    values = np.sin(at % 10**12 * 1e-9 * 4.0)
+
+    def joints(topic, arrival, stamp, **fields):
+        empty = dict.fromkeys(('position', 'velocity', 'effort'), np.zeros(0))
+        data = files.cdr(JOINT_STATE, header=files.header(stamp), name=['a'], **(empty | fields))
+        return topic, JOINT_STATE, arrival, data
+
+    tables = []
+    rng = np.random.default_rng(3)
+    for k, lateness in enumerate((np.zeros(len(at), int), rng.integers(0, 4 * MS, len(at)))):
+        messages = [
+            joints('/q', s + 100, s, position=np.array([v]))
+            for s, v in zip(stamps.tolist(), y.tolist(), strict=True)
+        ]
+        arrivals = np.maximum.accumulate(at + lateness)
+        messages += [
+            joints('/tau', arrival, s, effort=np.array([v]))
+            for arrival, s, v in zip(arrivals.tolist(), at.tolist(), values.tolist(), strict=True)
+        ]
+        bag = files.write(tmp_path / f'bag{k}', sorted(messages, key=lambda m: m[2]))
+        rules = (
+            'input_topic:=/q', 'input_field:=position[a]', "phi:=['0', '0', 'u - z3']",
+            'known_input_topics:=[/tau]',
+            'known_input_fields:=["effort[a]"]', 'known_input_stamps:=header',
+            'known_input_wait:=0.008',
+        )  # fmt: skip
+        options = [part for rule in rules for part in ('-p', rule)]
+        out = tmp_path / f'{k}.npz'
+        assert replay.main([str(bag), *options, '-o', str(out)]) == 0
+        with np.load(out) as found:
+            tables.append(np.column_stack([found['stamp_ns'], found['unknown_input']]))
+    u = newest(at, values, stamps)
+    expected = OnlineEstimator({'phi': ['0', '0', 'u - z3']}).run(stamps, y, u)
+    for got in tables:
+        np.testing.assert_array_equal(got[:, 1], expected.unknown_input)
+
+
+def test_pairing_needs_headers_on_both_sides():
+    values = {'known_input_stamps': ['header'], 'input_stamp': 'source'}
+    with pytest.raises(ConfigurationError, match='input_stamp is source'):
+        known_inputs(values, ['u'])
