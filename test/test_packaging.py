@@ -237,6 +237,7 @@ def test_plotjuggler_is_started_where_it_is_installed(launch_file, tmp_path, mon
     monkeypatch.setattr(Recorded, 'perform', lambda *_: 'false', raising=False)
     assert function(None) == []
     monkeypatch.setattr(Recorded, 'perform', lambda *_: 'true', raising=False)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
     with pytest.raises(RuntimeError, match='apt install ros-jazzy-plotjuggler-ros'):
         function(None)
     for package in ('plotjuggler', NAME):
@@ -244,7 +245,6 @@ def test_plotjuggler_is_started_where_it_is_installed(launch_file, tmp_path, mon
         index.mkdir(parents=True, exist_ok=True)
         (index / package).touch()
         (tmp_path / 'share' / package).mkdir()
-    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
     (node,) = function(None)
     layout = Path(node.kwargs['arguments'][-1]).relative_to(tmp_path / 'share' / NAME)
     assert (ROOT / layout).is_file()
