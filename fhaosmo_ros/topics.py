@@ -24,6 +24,8 @@ TYPED_ESTIMATES = {
     'accel': 'geometry_msgs/msg/AccelStamped',
 }
 """Topics below the estimator's name for those who want stamped messages, if asked for."""
+SELF_TUNED = {'standard_deviation': ARRAY, 'tuning': ARRAY}
+"""Further topics of a self-tuning estimator, with each estimate."""
 SNAPSHOT = 'snapshot'
 """All that an estimator remembers (ARRAY, transient-local), below its name and channel's."""
 PARAMETERS = 'parameters'

@@ -46,6 +46,7 @@ def _call_everything() -> None:
     estimator = OnlineEstimator()
     estimator.advance(1, 0.0)
     estimator.run(np.array([2, 3]), np.zeros(2), np.zeros(2))
+    OnlineEstimator({'gains': 'self_tuning'})
     EstimatorBatch([OnlineEstimator()]).advance([0], [1], [0.0], [0.0])
     t = np.arange(3) * 1e-3
     Observer(ESTIMATOR_PARAMETERS.complete({})).run(t, np.zeros(3), np.zeros(3))

@@ -109,8 +109,8 @@ def test_it_answers_while_it_compiles_and_ends_on_a_signal(client, folder, name,
             assert not manager.change('configure')
             assert 'still being compiled' in process.output
             assert values.set(epsilon=7.0)[0].successful
-        # The first functions are done, the large ones not.
-        wait_until(lambda: any(empty.rglob('*.nb*')), 'compiled function')
+            # The first functions are done, the large ones not. The plant has no large ones.
+            wait_until(lambda: any(empty.rglob('*.nb*')), 'compiled function')
         process.send(number)
         ends_well(process)
         assert begun not in process.output

@@ -29,6 +29,7 @@ from typing import Any, TypeVar
 
 import numba
 from numba.core import caching
+from numba.core.ccallback import CFunc
 
 Function = TypeVar('Function', bound=Callable[..., Any])
 Value = TypeVar('Value')
@@ -36,6 +37,7 @@ Value = TypeVar('Value')
 _numba: Any = caching
 
 CORE = Path(__file__).resolve().parents[1]
+NUMPY_ERRORS = {'error_model': 'numpy'}
 KEPT = 4
 """Folders of other versions that stay."""
 UNUSED = 86_400.0
@@ -72,6 +74,29 @@ def compiled(**options: Any) -> Callable[[Function], Function]:
         return dispatcher  # type: ignore[no-any-return]
 
     return decorate
+
+
+def compiled_callback(function: Callable[..., Any], signature: Any) -> int:
+    """
+    Return the address of a function's machine code, from the cache if it is there.
+
+    Callers do not contain its code, unlike that of `compiled` functions, so that it costs those
+    nothing who never call it.
+
+    Parameters
+    ----------
+    function : callable
+        Calls compiled functions only.
+    signature : numba signature
+        Of integers and floats.
+
+    """
+    callback: Any = CFunc(function, (signature.args, signature.return_type), {}, NUMPY_ERRORS)
+    folder = cache_folder()
+    if folder is not None:
+        callback._cache = _cache_in(folder, function) or callback._cache
+    callback.compile()
+    return int(callback.address)
 
 
 class MachineCode(_numba.FunctionCache):  # type: ignore[misc]

@@ -9,6 +9,7 @@ for the whole call can use them without an owner instead.
 
 from typing import Any
 
+from llvmlite import ir
 from numba import carray, njit, types  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 
@@ -72,3 +73,26 @@ def doubles_at(address: int, shape: Any) -> Any:
 def integers_at(address: int, shape: Any) -> Any:
     """Return the contiguous int64 array at an address, which its owner keeps alive."""
     return carray(_integer_pointer(address), shape)
+
+
+def _call_at(
+    typing_context: Any, address: Any, table: Any, y: Any, h: Any, inputs: Any, count: Any
+) -> Any:
+    """Return an intrinsic that calls a function by its address."""
+    integer, double = types.int64, types.float64
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        integers, doubles = context.get_value_type(integer), context.get_value_type(double)
+        kinds = [integers, doubles, doubles, integers, integers]
+        kind = ir.FunctionType(doubles, kinds)
+        return builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), arguments[1:])
+
+    return double(integer, integer, double, double, integer, integer), generate
+
+
+call_at: Any = intrinsic(_call_at)
+"""
+Call the function at an address with (table, y, h, address of the inputs, their count).
+
+For compiled code only; see `compiled_callback`.
+"""

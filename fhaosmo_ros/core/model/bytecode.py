@@ -7,6 +7,7 @@ needs no code generation: nothing is compiled when a node starts, and nothing fr
 executed. The derivative along dz is carried by forward-mode differentiation (dual numbers).
 """
 
+from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
@@ -37,6 +38,26 @@ class Bytecode(NamedTuple):
 
     code: Floats
     offsets: Ints
+
+
+def is_linear(tokens: Sequence[tuple[int, float]]) -> bool:
+    """Return True if an expression is sums of states times numbers, and of anything else."""
+    # 0: a number, 1: a number or known inputs, 2: linear in the states, 3: anything else
+    stack: list[int] = []
+    for code, _ in tokens:
+        if code <= INPUT:
+            stack.append({CONST: 0, INPUT: 1, STATE: 2}[int(code)])
+        elif code <= MAX:
+            b, a = stack.pop(), stack.pop()
+            most = max(a, b)
+            is_kept = (
+                code in (ADD, SUB) or (code == MUL and 0 in (a, b)) or (code == DIV and b == 0)
+            )
+            stack.append(most if is_kept or most < 2 else 3)
+        else:
+            a = stack.pop()
+            stack.append(a if code == NEG or a < 2 else 3)
+    return max(stack, default=0) < 3
 
 
 @compiled(forceinline=True)

@@ -4,7 +4,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fhaosmo_ros.core.model.bytecode import Bytecode, evaluate, INPUT
+from fhaosmo_ros.core.model.bytecode import Bytecode, evaluate, INPUT, is_linear
 from fhaosmo_ros.core.model.expressions import assembled, Names, ONLY_U, parse
 from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -80,6 +80,11 @@ class TriangularModel:
     def uses_input(self) -> bool:
         """True if a Phi uses a known input."""
         return bool(self.used_inputs)
+
+    @property
+    def is_linear(self) -> bool:
+        """True if every Phi is a linear function of the states, whatever the known inputs."""
+        return all(is_linear(tokens) for tokens in self._parsed)
 
     def with_unknown_input(self, decay: float, derivatives: int) -> Bytecode:
         """

@@ -36,6 +36,16 @@ Entries of ``State.memory``:
 | WATCHED | samples for which it has yet to be watched whether only y jumped (D 23) | 1 |
 | DRIFT | sum of the recent prediction errors over their usual size, while watched | 1 |
 | USUAL | running median of sqrt(L) (D 8) | of the innovations |
+| SAMPLES | self-tuning: samples gathered; more than FIRST_SAMPLES once the members run | 1 |
+| FAR_SIGN | sign of the last innovation that was too far off for every member | 1 |
+| QUANTUM | smallest step of y seen | of y |
+| REPEATED | share of samples that repeat the one before | 1 |
+| MOVING | members of each k whose covariances move | 1 |
+| UNSETTLED | time since they began to | s |
+| STEADY_PERIOD, FLOW_PERIOD | interval that the covariances, and the flow, are those of | s |
+| FIRST_NOISE | variance of the noise when the members began | of y^2 |
+| LIKELIEST | index of the colour of the likeliest member | 1 |
+| CALM | samples since the noise has grown | 1 |
 """
 
 from typing import NamedTuple
@@ -54,11 +64,17 @@ ROWS = 4
 """Number of rows before the covariance."""
 GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSET = range(11)
 OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
-MEMORY = 18
+SAMPLES, FAR_SIGN, QUANTUM, REPEATED, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
+FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM = range(25, 29)
+MEMORY = 29
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
-FLAGS = 8
-"""Number of flags of a law: 0 or 1 each. IMPLICIT: a step uses the sample at its end."""
+SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)
+FLAGS = 12
+"""
+Number of flags of a law: 0 or 1 each. IMPLICIT: a step uses the sample at its end. The last two
+are addresses, of the self-tuning step and of the table of arrays that it works on.
+"""
 LAMBDA, ALPHA, INVERSE_WIDTH, DECAY = range(4)
 GAINS = 4
 """
@@ -68,7 +84,8 @@ except for those that stand for the unknown input and its derivatives.
 EPSILON, GAMMA_INITIAL, RATE, MIN, MAX, DEAD_ZONE, LEAKAGE, DELAY = range(8)
 PREDICTION_STEP, CORRECTION_PERIOD, WIDEST, RELAXATION = range(8, 12)
 VARIANCE, INTENSITY, FASTEST, STEADY_VARIANCE = range(12, 16)
-SCALARS = 16
+FORGETTING, SLIDER, LEAST_NOISE = range(16, 19)
+SCALARS = 19
 """Number of scalars of a law."""
 
 NEWTON_STEPS = 60
@@ -90,7 +107,7 @@ class Law(NamedTuple):
     Attributes
     ----------
     flags : (FLAGS,) array
-        `SIGN` .. `SENSITIVE`.
+        `SIGN` .. `TABLE_AT`.
     gains : (GAINS, N) array
         `LAMBDA` .. `DECAY` of each level.
     curves : (N, K) array

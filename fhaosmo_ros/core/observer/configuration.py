@@ -9,6 +9,7 @@ from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.covariance import Uncertainty
 from fhaosmo_ros.core.observer.fuzzy import curves, KNOTS, of_level, read_system
 from fhaosmo_ros.core.observer.levant import deadbeat_shares
+from fhaosmo_ros.core.observer.members import ORDERS, rows_of
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
@@ -69,6 +70,10 @@ class ObserverConfiguration:
                 "parameters 'gamma_min', 'gamma_initial', 'gamma_max': expected each at most the "
                 f'next one, got {p["gamma_min"]}, {p["gamma_initial"]}, {p["gamma_max"]}'
             )
+        self.self_tuning = p['gains'] == 'self_tuning'
+        if self.self_tuning:
+            self._complete_self_tuning()
+            return
         self.levant = p['structure'] == 'levant'
         if self.levant and not p['unknown_input']:
             raise ConfigurationError(
@@ -104,13 +109,47 @@ class ObserverConfiguration:
         self.unknown_input_at = (arrays.HAT, n) if filtered else (arrays.TILDE, n - 1)
         self.law = self._make_law()
 
+    def _complete_self_tuning(self) -> None:
+        p, n = self.parameters, self.model.order
+        if not p['unknown_input']:
+            raise ConfigurationError(
+                "parameters 'gains', 'unknown_input': self_tuning follows the unknown input, "
+                'expected unknown_input = true, got false'
+            )
+        self.levant, self.internal, self.adaptive, self.gamma_initial = True, False, False, 0.0
+        self.levels = n + ORDERS
+        self.initial_estimate = self.initial_internal = np.zeros(self.levels)
+        self.state_sizes = per_level(OBSERVER_PARAMETERS['state_sizes'], p['state_sizes'], n)
+        self.unknown_input_at = arrays.HAT, n
+        flags = np.zeros(arrays.FLAGS, dtype=np.int64)
+        for flag in (arrays.IMPLICIT, arrays.LEVANT, arrays.PREDICTING, arrays.SELF_TUNING):
+            flags[flag] = 1
+        flags[arrays.FROM_MEASUREMENT] = p['start_from_measurement']
+        flags[arrays.LINEAR] = self.model.is_linear
+        scalars = np.zeros(arrays.SCALARS)
+        scalars[[arrays.EPSILON, arrays.WIDEST]] = np.inf  # no gates, no growth
+        scalars[arrays.PREDICTION_STEP] = p['prediction_step']
+        scalars[arrays.FORGETTING] = p['tuning_memory']
+        scalars[arrays.SLIDER] = p['bandwidth']
+        scalars[arrays.LEAST_NOISE] = p['noise_size']
+        chances = np.zeros((arrays.SINGLE * self.levels + arrays.SINGLES, self.levels))
+        diagonal = arrays.FRESH * self.levels + np.arange(n), np.arange(n)
+        chances[diagonal] = self.state_sizes**2
+        gains = np.ones((arrays.GAINS, self.levels))
+        model = self.model.with_unknown_input(0.0, ORDERS - 1)
+        curves = np.ones((self.levels, KNOTS))
+        self.law = arrays.Law(flags, gains, curves, scalars, chances, model)
+
     def initial_state(self) -> arrays.State:
         """Return the state of an observer that has seen no sample."""
         rows = arrays.ROWS + self.levels
+        if self.self_tuning:
+            rows += rows_of(self.model.order)
         levels, memory = np.zeros((rows, self.levels)), np.zeros(arrays.MEMORY)
         levels[arrays.HAT] = self.initial_estimate
         levels[arrays.TILDE] = self.initial_internal
-        levels[arrays.COVARIANCE :] = self.law.chances[arrays.part(arrays.FRESH, self.levels)]
+        if not self.self_tuning:
+            levels[arrays.COVARIANCE :] = self.law.chances[arrays.part(arrays.FRESH, self.levels)]
         memory[arrays.GAMMA] = self.gamma_initial
         memory[arrays.Y] = np.nan
         memory[arrays.SCALE] = memory[arrays.SPREAD] = 1.0

@@ -11,7 +11,9 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer import step as recursion
 from fhaosmo_ros.core.observer.arrays import Law, make_work, State, Work
-from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA, ObserverConfiguration
+from fhaosmo_ros.core.observer.bank import step_address
+from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.members import FIRST_SAMPLES, Tuning, tuning_in, UNKNOWN
 from fhaosmo_ros.core.observer.smoother import smoothed
 from fhaosmo_ros.core.observer.status import flags, FLAGS_MASK, LEVEL_SHIFT, open_levels, Status
 from fhaosmo_ros.core.parameters.declaration import Parameters
@@ -73,6 +75,9 @@ class Trajectory(NamedTuple):
         Where `every` > 1, a row's flags are those of all samples since the row before it.
     z_hat, z_tilde : (K, N) arrays
         Filtered and internal states; z_tilde[:, i] belongs to z_{i+2}.
+    standard_deviation : (K, n + 1) array or None
+        Of the errors of z and, in the last column, of the unknown input, as a self-tuning observer
+        expects them.
 
     """
 
@@ -85,6 +90,7 @@ class Trajectory(NamedTuple):
     open_levels: NDArray[np.int64]
     z_hat: NDArray[np.float64]
     z_tilde: NDArray[np.float64]
+    standard_deviation: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -107,10 +113,12 @@ class ObserverState:
     t: float | int | None = None
 
 
-def make_record(rows: int, levels: int, rows_of_eps: int) -> recursion.Record:
+def make_record(
+    rows: int, levels: int, rows_of_eps: int, variances: bool = False
+) -> recursion.Record:
     """Return memory for a compiled run to record into."""
     return recursion.Record(
-        np.empty((rows, 2, levels)),
+        np.empty((rows, 2 + variances, levels)),
         np.empty(rows),
         np.empty((rows_of_eps, levels)),
         np.empty(rows, dtype=np.int64),
@@ -206,6 +214,28 @@ class Observer:
         return make_work(self._law, self._configuration.model.depth)
 
     @property
+    def self_tuning(self) -> bool:
+        """True if it finds its gains by itself."""
+        return bool(self._configuration.self_tuning)
+
+    @property
+    def standard_deviation(self) -> NDArray[np.float64]:
+        """
+        Standard deviations of the errors of z and d, (n + 1,), as a self-tuning observer expects.
+
+        Infinite before it knows the noise; NaN for an observer with fixed gains.
+        """
+        variances = self._state.levels[arrays.COVARIANCE, : self.order + 1]
+        return np.sqrt(variances) if self.self_tuning else np.full(self.order + 1, np.nan)
+
+    @property
+    def tuning(self) -> Tuning:
+        """What a self-tuning observer has found; NaN before it knows the noise."""
+        rows = self._state.levels[arrays.ROWS + self.levels :]
+        known = self.self_tuning and self._state.memory[arrays.SAMPLES] > FIRST_SAMPLES
+        return tuning_in(rows, self.order) if known else UNKNOWN
+
+    @property
     def uses_input(self) -> bool:
         """True if the model uses a known input."""
         return self._configuration.model.uses_input
@@ -290,10 +320,20 @@ class Observer:
             self._state.memory[arrays.SETTLED] = 1.0
 
     def _set_law(self) -> None:
-        law = self._law = self._configuration.law
+        law = self._configuration.law
+        law = self._law = law._replace(flags=law.flags.copy())
         self._work = self.make_work()
         flat_law = (law.flags, law.gains, law.curves, law.scalars, law.chances, *law.model)
         self._arguments = (*flat_law, *self._work, *self._state)
+        if self.self_tuning:
+            self._table = np.array(
+                [
+                    (a.ctypes.data, a.shape[0] if a.ndim == 2 else 0, a.shape[-1])
+                    for a in self._arguments
+                ]
+            )
+            law.flags[arrays.STEP_AT] = step_address()
+            law.flags[arrays.TABLE_AT] = self._table.ctypes.data
 
     def _write(self, levels: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
         self._state.levels[:] = levels
@@ -305,7 +345,7 @@ class Observer:
         if flags[arrays.ADAPTIVE]:
             memory[arrays.GAMMA] = np.clip(memory[arrays.GAMMA], c[arrays.MIN], c[arrays.MAX])
         else:
-            memory[arrays.GAMMA] = FIXED_GAMMA
+            memory[arrays.GAMMA] = self._configuration.gamma_initial
         if not flags[arrays.SENSITIVE]:
             levels[arrays.HAT_SENSITIVITY : arrays.ROWS] = 0.0
         if not flags[arrays.SCHEDULED] and memory[arrays.OFFSET]:
@@ -464,7 +504,7 @@ class Observer:
             first = good[0] + 1 if len(good) else len(y)
         samples = recursion.Samples(y, self._periods(t, first), u)
         rows = len(y) // every
-        record = make_record(rows, self.levels, rows + 1)
+        record = make_record(rows, self.levels, rows + 1, self.self_tuning)
         recursion.run(self._law, self._work, self._state, samples, record, first, every)
         recursion.innovations(self._law, self._state, self._state.memory[arrays.Y], self._eps, 0)
         return self.trajectory(t[every - 1 :: every], record._replace(eps=record.eps[:rows]))
@@ -511,6 +551,9 @@ class Observer:
             words >> LEVEL_SHIFT,
             levels[:, arrays.HAT],
             levels[:, arrays.TILDE],
+            np.sqrt(levels[:, recursion.VARIANCES, : self.order + 1])
+            if self.self_tuning
+            else None,
         )
 
     def _periods(self, t: NDArray[Any], first: int) -> NDArray[np.float64]:

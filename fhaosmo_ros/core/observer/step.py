@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from fhaosmo_ros.core.compiled.cache import compiled
-from fhaosmo_ros.core.compiled.unowned_arrays import unowned
+from fhaosmo_ros.core.compiled.unowned_arrays import call_at, unowned
 from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
 from fhaosmo_ros.core.observer import cascade, levant
 from fhaosmo_ros.core.observer.arrays import (
@@ -41,13 +41,17 @@ from fhaosmo_ros.core.observer.arrays import (
     PERIOD,
     PREDICTING,
     RATE,
+    SAMPLES,
     SATURATED,
     SCALE,
     SCHEDULED,
+    SELF_TUNING,
     SETTLED,
     SIGN,
     SINGLE,
     State,
+    STEP_AT,
+    TABLE_AT,
     TILDE,
     TILDE_SENSITIVITY,
     UPSET,
@@ -73,6 +77,8 @@ from fhaosmo_ros.core.observer.status import (
     SENSITIVITY_RESET,
 )
 
+VARIANCES = 2
+"""Index in `Record.levels`."""
 SENSITIVITY_LIMIT = 1e9
 """Sensitivities beyond it are set to 0."""
 LOST_SAMPLES = 20
@@ -109,8 +115,8 @@ class Record(NamedTuple):
 
     Attributes
     ----------
-    levels : (rows, 2, N) array
-        `HAT` and `TILDE`.
+    levels : (rows, 2 or 3, N) array
+        `HAT` and `TILDE`, and the variances of a self-tuning observer.
     gamma : (rows,) array
     eps : (rows or rows + 1, N) array
         Innovations; a run that skips samples needs the row more.
@@ -186,11 +192,17 @@ def step(
     if not (h > 0.0 and math.isfinite(HEADROOM * h)):
         word |= REJECTED_PERIOD
     if not word:
-        for r in range(levels.shape[0]):
+        for r in range(x.shape[0]):
             for i in range(n):
                 x[r, i] = levels[r, i]
         whole = h + memory[PENDING]
-        loss, gradient = advance(law, work, memory, y, whole, u)
+        if law.flags[SELF_TUNING]:
+            at, table = law.flags[STEP_AT], law.flags[TABLE_AT]
+            loss = call_at(at, table, y, whole, u.ctypes.data, u.shape[0])
+            gradient = 0.0
+            levant.mirror(x)
+        else:
+            loss, gradient = advance(law, work, memory, y, whole, u)
         zero = 0.0
         for i in range(n):
             hat, tilde = HEADROOM * x[HAT, i], HEADROOM * x[TILDE, i]
@@ -200,9 +212,14 @@ def step(
             # Nothing of the sample may make the next step fail as well: not its time, and not
             # the y at the interval's beginning, which is what fails explicitly.
             memory[PENDING] = 0.0
+            memory[SAMPLES] = 0.0  # the members begin afresh
             if not law.flags[IMPLICIT]:
                 memory[Y] = y
-        elif memory[BEYOND] > LOST_SAMPLES and jump(law, work, state, u):
+        elif (
+            memory[BEYOND] > LOST_SAMPLES
+            and not law.flags[SELF_TUNING]
+            and jump(law, work, state, u)
+        ):
             memory[PENDING] = whole
             word = REJECTED_SPIKE | JUMPED
         elif memory[BEYOND] > LOST_SAMPLES:
@@ -218,7 +235,7 @@ def step(
                 if is_upset(law, x if law.flags[IMPLICIT] else levels, used):
                     memory[UPSET] = law.scalars[DELAY]
                 word = adapt(law, x, memory, whole, loss, gradient)
-            for r in range(levels.shape[0]):
+            for r in range(x.shape[0]):
                 for i in range(n):
                     levels[r, i] = x[r, i]
             memory[Y] = y
@@ -234,6 +251,10 @@ def step(
 def restart(law: Law, state: State, y: float) -> None:
     """Begin afresh from `y`; the time of the next sample counts from it."""
     levels, memory, n = state.levels, state.memory, law.gains.shape[1]
+    if law.flags[SELF_TUNING]:
+        call_at(law.flags[STEP_AT], law.flags[TABLE_AT], y, 0.0, 0, 0)
+        memory[PENDING] = 0.0
+        return
     for i in range(n):
         levels[HAT, i] = law.chances[SINGLE * n + FIRST_HAT, i]
         levels[TILDE, i] = law.chances[SINGLE * n + FIRST_TILDE, i]
@@ -374,6 +395,8 @@ def run(
             for i in range(levels.shape[1]):
                 record.levels[row, HAT, i] = levels[HAT, i]
                 record.levels[row, TILDE, i] = levels[TILDE, i]
+                if record.levels.shape[1] > VARIANCES:
+                    record.levels[row, VARIANCES, i] = levels[COVARIANCE, i]
             record.gamma[row] = memory[GAMMA]
             record.words[row] = (word >> LEVEL_SHIFT << LEVEL_SHIFT) | seen
             seen = 0

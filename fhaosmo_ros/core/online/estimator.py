@@ -2,6 +2,7 @@
 """The update path of time-stamped samples, shared by the node and by replays of bags."""
 
 from collections.abc import Mapping
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -242,7 +243,8 @@ class OnlineEstimator:
         ints[at.GATE_SAMPLES] = p['spike_gate_samples']
         reals[at.GATE] = p['spike_gate']
         reals[at.LIMIT] = p['divergence_limit']
-        reals[at.EPSILON] = p['epsilon']
+        self_tuning = p['gains'] == 'self_tuning'
+        reals[at.EPSILON] = math.inf if self_tuning else p['epsilon']
         ints[at.BRIDGED] = 0  # the state before a gap is that of the parameters before
         levels, memory = self.observer.initial_state()
         size = levels.size + memory.size
@@ -291,16 +293,25 @@ class OnlineEstimator:
     @property
     def memory(self) -> Memory:
         """All that it remembers; a copy."""
-        state = self.observer.state
+        state, named = self.observer.state, self._named
         size = state.levels.size + state.memory.size
+        before = self._reals[at.STATES + size : at.STATES + 2 * size]
+        levels = state.levels.ravel()
         return Memory(
             integers=self._ints[at.FROZEN : at.COUNTERS].copy(),
             reals=self._reals[at.INTERVAL : at.STATES].copy(),
-            before=self._reals[at.STATES + size : at.STATES + 2 * size].copy(),
-            now=np.concatenate([state.levels.ravel(), state.memory]),
+            before=np.concatenate([before[:named], before[levels.size :]]),
+            now=np.concatenate([levels[:named], state.memory]),
             u=self._u.copy(),
             past=self._reals[at.STATES + 2 * size :].copy(),
+            members=levels[named:],
         )
+
+    @property
+    def _named(self) -> int:
+        """How many of the state's levels are not those of members."""
+        n = self.observer.levels
+        return (arrays.ROWS + n) * n
 
     def remember(self, memory: Memory) -> None:
         """
@@ -312,10 +323,16 @@ class OnlineEstimator:
             The memory is of an observer with another number of levels, or of known inputs.
 
         """
-        size, levels = len(memory.now), self._arrays.state.levels
-        if size != levels.size + self._arrays.state.memory.size:
+        levels, scalars = self._arrays.state
+        named, size = self._named, levels.size + scalars.size
+        if (
+            len(memory.now) + len(memory.members) != size
+            or len(memory.now) != named + scalars.size
+        ):
             raise ConfigurationError(
-                f'memory: expected that of {self.observer.levels} levels, got {size} numbers'
+                f'memory: expected that of {self.observer.levels} levels and '
+                f'{levels.size - named} numbers of members, got {len(memory.now)} and '
+                f'{len(memory.members)} numbers'
             )
         if len(memory.u) != len(self._u):
             raise ConfigurationError(
@@ -330,10 +347,11 @@ class OnlineEstimator:
             )
         self._ints[at.FROZEN : at.COUNTERS] = memory.integers
         self._reals[at.INTERVAL : at.STATES] = memory.reals
-        self._reals[at.STATES + size : at.STATES + 2 * size] = memory.before
+        saved = self._reals[at.STATES + size : at.STATES + 2 * size]
+        saved[:named], saved[levels.size :] = memory.before[:named], memory.before[named:]
         past[:] = memory.past
-        state, scalars = memory.now[: levels.size], memory.now[levels.size :]
-        self.observer.restore(ObserverState(state.reshape(levels.shape), scalars))
+        state = np.concatenate([memory.now[:named], memory.members])
+        self.observer.restore(ObserverState(state.reshape(levels.shape), memory.now[named:]))
         self._u[:] = memory.u
         if self._smoothing is not None:
             self._smoothing.cut()
@@ -495,7 +513,7 @@ class OnlineEstimator:
             for k, j in np.argwhere(~np.isfinite(inputs)):
                 inputs[k, j] = inputs[k - 1, j] if k else self._u[j]
                 self.reject_inputs(1)
-        record = make_record(count, n, count)
+        record = make_record(count, n, count, self.observer.self_tuning)
         carried = bool(self._ints[at.TO_NOW] and self._ints[at.DELAY])
         present = np.empty((count if carried else 0, self.observer.order + 1))
         rows = 0 if self._smoothing is None else count

@@ -4,7 +4,16 @@
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.model.integrate import NOW
-from fhaosmo_ros.core.observer.arrays import BEYOND, GAMMA, OFFSET, PENDING, PREDICTING, SPREAD, Y
+from fhaosmo_ros.core.observer.arrays import (
+    BEYOND,
+    GAMMA,
+    OFFSET,
+    PENDING,
+    PREDICTING,
+    SELF_TUNING,
+    SPREAD,
+    Y,
+)
 from fhaosmo_ros.core.observer.prediction import (
     begin_at_estimates,
     predict_step,
@@ -70,9 +79,11 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: Floats, eps: Floats
         bend = (corrected - end) / count
         begin_at_estimates(work, state)
     ints[at.BRIDGED] = 0
+    kept = is_gap and not law.flags[SELF_TUNING]  # the members are too many to be kept
     if is_gap:
-        save(policy, state)
-        ints[at.BRIDGED] = 1
+        if kept:
+            save(policy, state)
+            ints[at.BRIDGED] = 1
         ints[at.BEFORE] = ints[at.LATEST]
         ints[at.GAPS] += 1
         ints[at.SUB_STEPS] += count
@@ -92,6 +103,7 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: Floats, eps: Floats
                 ints[at.GAPS] -= 1
                 ints[at.SUB_STEPS] -= count
                 ints[at.BRIDGED] = 0
+            if kept:
                 beyond, spread = memory[BEYOND], memory[SPREAD]
                 restore(policy, state)
                 memory[BEYOND], memory[SPREAD] = beyond, spread
@@ -102,7 +114,7 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: Floats, eps: Floats
             break
     if not word & REJECTED:
         update_mean(policy, elapsed)
-    elif is_gap:
+    elif kept:
         restore(policy, state)
         memory[Y] = corrected  # as where a single step fails
         word = word & FLAGS_MASK | innovations(law, state, corrected, eps, row) << LEVEL_SHIFT

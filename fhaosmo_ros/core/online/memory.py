@@ -120,8 +120,9 @@ LABELS_OF_REALS = ['interval', 'jitter', 'held_y']
 LABELS_OF_ROWS = ['z_hat', 'z_tilde', 'z_hat_sensitivity', 'z_tilde_sensitivity']
 LABELS_OF_MEMORY = [
     'gamma', 'y', 'pending', 'wait', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread',
-    'upset', 'offset', 'jumps', 'first_miss', 'miss', 'watched', 'drift',
-    'usual',
+    'upset', 'offset', 'jumps', 'first_miss', 'miss', 'watched', 'drift', 'usual', 'samples',
+    'far_sign', 'quantum', 'repeated', 'moving', 'unsettled', 'steady_period', 'flow_period',
+    'first_noise', 'likeliest', 'calm',
 ]  # fmt: skip
 """Labels of a snapshot's entries: they are in bags, so they stay as they are."""
 MISSING = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}
@@ -155,6 +156,8 @@ class Memory(NamedTuple):
         Known inputs.
     past : (P,) array
         Of the known inputs, see delay.py; empty where it does not matter.
+    members : (M,) array
+        Of a self-tuning observer; empty for another.
 
     """
 
@@ -164,6 +167,7 @@ class Memory(NamedTuple):
     now: NDArray[np.float64]
     u: NDArray[np.float64]
     past: NDArray[np.float64]
+    members: NDArray[np.float64]
 
 
 class Snapshot(NamedTuple):
@@ -184,7 +188,9 @@ class Snapshot(NamedTuple):
     memory: Memory
 
 
-def labels(levels: int, inputs: Sequence[str] = ('u',), past: int = 0) -> list[str]:
+def labels(
+    levels: int, inputs: Sequence[str] = ('u',), past: int = 0, members: int = 0
+) -> list[str]:
     """
     Return a name for each entry of the vector of an estimator.
 
@@ -193,8 +199,8 @@ def labels(levels: int, inputs: Sequence[str] = ('u',), past: int = 0) -> list[s
     levels : int
     inputs : sequence of str
         Names of the known inputs.
-    past : int
-        Length of `Memory.past`.
+    past, members : int
+        Lengths of `Memory.past` and `Memory.members`.
 
     """
     integers = [f'{NAMES[k].lower()}_{half}' for k in INTEGERS for half in ('upper', 'lower')]
@@ -204,7 +210,9 @@ def labels(levels: int, inputs: Sequence[str] = ('u',), past: int = 0) -> list[s
     before = (f'before_{name}' for name in state)
     of_past = (f'past{k + 1}' for k in range(past))
     of_inputs = (name if name == 'u' else f'u_{name}' for name in inputs)
-    return [*HEAD, *integers, *LABELS_OF_REALS, *before, *state, *of_inputs, *of_past]
+    of_members = (f'm{k + 1}' for k in range(members))
+    known = [*HEAD, *integers, *LABELS_OF_REALS, *before, *state, *of_inputs, *of_past]
+    return [*known, *of_members]
 
 
 def pack(snapshot: Snapshot) -> NDArray[np.float64]:
@@ -213,7 +221,7 @@ def pack(snapshot: Snapshot) -> NDArray[np.float64]:
     halves = np.column_stack(np.divmod(memory.integers, HALF)).ravel()
     head: Sequence[int] = [int(snapshot.flags), *divmod(snapshot.stamp, SECOND)]
     return np.concatenate(
-        [head, halves, memory.reals, memory.before, memory.now, memory.u, memory.past],
+        [head, halves, *memory[1:]],
         dtype=np.float64,
     )
 
@@ -242,13 +250,16 @@ def unpack(vector: ArrayLike, names: Sequence[str]) -> Snapshot:
     levels = sum(re.fullmatch('z_hat[0-9]+', name) is not None for name in names)
     inputs = [name.removeprefix('u_') for name in names if name == 'u' or name.startswith('u_')]
     past = sum(re.fullmatch('past[0-9]+', name) is not None for name in names)
-    known = labels(levels, inputs, past)
-    unknown = [name for name in names if name not in known]
+    members = sum(re.fullmatch('m[0-9]+', name) is not None for name in names)
+    known = labels(levels, inputs, past, members)
+    allowed = set(known)
+    unknown = [name for name in names if name not in allowed]
     if unknown or not levels or len(entries) < len(v):
         raise ValueError(f'a snapshot can not have the entries {", ".join(unknown) or names}')
     v = np.array([entries.get(name, MISSING.get(name, 0.0)) for name in known])
     size = (arrays.ROWS + levels) * levels + arrays.MEMORY
-    counts = [len(HEAD), 2 * len(INTEGERS), len(LABELS_OF_REALS), size, size, len(inputs), past]
+    counts = [len(HEAD), 2 * len(INTEGERS), len(LABELS_OF_REALS), size, size, len(inputs)]
+    counts += [past, members]
     head, halves, reals, *rest = np.split(v, np.cumsum(counts)[:-1])
     upper, lower = halves.reshape(-1, 2).T
     integers = upper.astype(np.int64) * HALF + lower.astype(np.int64)

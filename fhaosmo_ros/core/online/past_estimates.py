@@ -146,7 +146,7 @@ class PastEstimates:
 
 def part_of(rows: Trajectory, index: Any) -> Trajectory:
     """Return some rows."""
-    return Trajectory._make(column[index] for column in rows)
+    return Trajectory._make(None if column is None else column[index] for column in rows)
 
 
 def check_lag(p: Mapping[str, Any]) -> None:

@@ -8,7 +8,17 @@ What it does, case by case, is in docs/operation.md; the arrays are described in
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.compiled.unowned_arrays import unowned
 from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
-from fhaosmo_ros.core.observer.arrays import GAMMA, HAT, Law, OFFSET, State, TILDE, Work, Y
+from fhaosmo_ros.core.observer.arrays import (
+    COVARIANCE,
+    GAMMA,
+    HAT,
+    Law,
+    OFFSET,
+    State,
+    TILDE,
+    Work,
+    Y,
+)
 from fhaosmo_ros.core.observer.status import (
     DIVERGED,
     FLAGS_MASK,
@@ -21,7 +31,7 @@ from fhaosmo_ros.core.observer.status import (
     REJECTED_STUCK,
     RESTARTED,
 )
-from fhaosmo_ros.core.observer.step import innovations, Record, start
+from fhaosmo_ros.core.observer.step import innovations, Record, start, VARIANCES
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online.delay import (
     forget_past,
@@ -192,6 +202,8 @@ def run(
         for i in range(levels.shape[1]):
             record.levels[k, HAT, i] = levels[HAT, i]
             record.levels[k, TILDE, i] = levels[TILDE, i]
+            if record.levels.shape[1] > VARIANCES:
+                record.levels[k, VARIANCES, i] = levels[COVARIANCE, i]
         record.gamma[k] = memory[GAMMA]
         if present.shape[0] > 0:
             published(e, e.policy.ints[at.FILTERED], present[k])

@@ -60,6 +60,24 @@ OBSERVER = (
         unit='1/s', lower=0.0, upper=1e3,
     ),
     Parameter(
+        'gains', 'fixed',
+        'fixed: those below. self_tuning: none; many observers run side by side and are weighted '
+        'by how well they predict y, so that noise, size and speed of d are found and followed. '
+        'Of the parameters from structure to gamma_leakage_delay it uses prediction_step, '
+        'noise_size and state_sizes alone.',
+        choices=('fixed', 'self_tuning'), live=False,
+    ),
+    Parameter(
+        'bandwidth', 1.0,
+        'self_tuning: factor on the bandwidth that it would choose. Higher: quicker and noisier.',
+        lower=0.1, upper=10.0,
+    ),
+    Parameter(
+        'tuning_memory', 8.0,
+        'self_tuning: how long a sample counts in the choice of the observers.',
+        unit='s', lower=0.01, upper=1e6,
+    ),
+    Parameter(
         'structure', 'cascade',
         "cascade: the paper's levels, each with an innovation of its own. levant: Levant's "
         'arbitrary-order differentiator, every level driven by y - z_hat_1; it needs '

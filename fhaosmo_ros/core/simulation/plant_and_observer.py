@@ -307,6 +307,10 @@ def simulate(
     if every < 1:
         raise ConfigurationError(f'every: expected an integer >= 1, got {every}')
     configuration = ObserverConfiguration(observer)
+    if configuration.self_tuning:
+        raise ConfigurationError(
+            "parameter 'gains': expected fixed for a solver's steps, got 'self_tuning'"
+        )
     p = PLANT_PARAMETERS.complete(plant)
     model = TriangularModel.of(p)
     z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], model.order)

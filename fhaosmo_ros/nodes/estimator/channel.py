@@ -12,7 +12,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.inputs import known_inputs, make_pairing, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
 from fhaosmo_ros.nodes.estimator.listener import Listener
-from fhaosmo_ros.nodes.estimator.outputs import Outputs
+from fhaosmo_ros.nodes.estimator.outputs import Outputs, TuningOutputs
 from fhaosmo_ros.nodes.estimator.snapshots import SnapshotPublisher
 from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import Output, TypedOutputs
@@ -79,6 +79,9 @@ class Channel:
         self._forget()
         observer = self.estimator.observer
         self._outputs = Outputs(node, outputs, observer.order, observer.levels)
+        self._tuning: TuningOutputs | None = None
+        if observer.self_tuning:
+            self._tuning = TuningOutputs(node, outputs, observer.order)
         self._snapshots = SnapshotPublisher(node, self.estimator, outputs)
         simulated = node.get_parameter('use_sim_time').value
         self._health = Health(self.estimator, values, simulated)
@@ -127,6 +130,8 @@ class Channel:
             destroy(entity)
         self._owned = []
         self._outputs.destroy()
+        if self._tuning is not None:
+            self._tuning.destroy()
         if self._typed is not None:
             self._typed.destroy()
         self._snapshots.destroy()
@@ -344,6 +349,8 @@ class Channel:
             return None
         stamp = estimator.stamp
         self._outputs.publish(estimate, stamp)
+        if self._tuning is not None:
+            self._tuning.publish(estimator.observer)
         return Output(self.label, stamp, estimate, self._values)
 
     @property

@@ -253,6 +253,14 @@ class Health:
             'step time, longest [us]': 1e6 * float(np.max(durations)) if len(durations) else 0.0,
             'overruns': overruns,
         }
+        if observer.self_tuning:
+            tuning = observer.tuning
+            report.values |= {
+                'noise of y': tuning.noise,
+                'correlation of the noise': tuning.correlation,
+                'd is followed within [s]': 1.0 / tuning.bandwidth,
+                titled('standard deviation of d', unit): float(observer.standard_deviation[-1]),
+            }
         if limits['unknown_input_unit']:
             scaled = titled('unknown input, scaled', limits['unknown_input_unit'])
             report.values[scaled] = d_now * limits['unknown_input_scale']
@@ -300,7 +308,8 @@ class Health:
 
 def _gamma_away(estimator: OnlineEstimator) -> float:
     estimate, parameters = estimator.estimate, estimator.observer.parameters
-    if estimate is None or not parameters['variant'].endswith('_adaptive'):
+    adaptive = parameters['variant'].endswith('_adaptive') and not estimator.observer.self_tuning
+    if estimate is None or not adaptive:
         return 0.0
     return float(estimate.gamma - parameters['gamma_initial'])
 

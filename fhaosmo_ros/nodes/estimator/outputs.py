@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The topics on which a channel publishes its estimates."""
 
-from fhaosmo_ros.core.observer.observer import Estimate
+from fhaosmo_ros.core.observer.members import ORDERS
+from fhaosmo_ros.core.observer.observer import Estimate, Observer
 from fhaosmo_ros.nodes.middleware.messages import (
     array_encoder,
     double_encoder,
@@ -9,7 +10,8 @@ from fhaosmo_ros.nodes.middleware.messages import (
     time_encoder,
 )
 from fhaosmo_ros.nodes.middleware.publishers import create_publisher
-from fhaosmo_ros.topics import ESTIMATES
+from fhaosmo_ros.topics import ESTIMATES, SELF_TUNED
+import numpy as np
 from rclpy.node import Node
 
 DEPTH = 10
@@ -49,6 +51,44 @@ class Outputs:
         self._gamma(self._encode_double(estimate.gamma))
         self._innovation(self._encode_innovation(estimate.innovation))
         self._stamp(self._encode_time(stamp))
+
+    def destroy(self) -> None:
+        """Take the publishers away."""
+        while self._publishers:
+            self._node.destroy_publisher(self._publishers.pop())
+
+
+class TuningOutputs:
+    """
+    Publishers of what a self-tuning observer knows beside its estimates.
+
+    Parameters
+    ----------
+    node : Node
+    prefix : str
+        Prefix of the topics' names.
+    order : int
+        Number of states.
+
+    """
+
+    def __init__(self, node: Node, prefix: str, order: int) -> None:
+        self._node = node
+        self._publishers = [
+            create_publisher(node, message_class(kind), prefix + name, DEPTH)
+            for name, kind in SELF_TUNED.items()
+        ]
+        self._encode_deviation = array_encoder([*(f'z{i + 1}' for i in range(order)), 'd'])
+        self._encode_tuning = array_encoder([
+            'noise', 'correlation', 'bandwidth', *(f'derivatives{k}' for k in range(ORDERS)),
+        ])  # fmt: skip
+
+    def publish(self, observer: Observer) -> None:
+        """Publish the standard deviations of the latest estimate, and the tuning."""
+        deviation, tuning = self._publishers
+        deviation.publish(self._encode_deviation(observer.standard_deviation))
+        noise, correlation, bandwidth, shares = observer.tuning
+        tuning.publish(self._encode_tuning(np.array([noise, correlation, bandwidth, *shares])))
 
     def destroy(self) -> None:
         """Take the publishers away."""

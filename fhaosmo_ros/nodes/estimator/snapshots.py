@@ -8,7 +8,7 @@ from fhaosmo_ros.topics import ARRAY, SNAPSHOT
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-PERIOD = 1.0
+PERIOD, PERIOD_WITH_MEMBERS = 1.0, 30.0
 QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """A recorder that starts later still gets the latest ones."""
 
@@ -29,10 +29,11 @@ class SnapshotPublisher:
     def __init__(self, node: Node, estimator: OnlineEstimator, prefix: str) -> None:
         self._node, self._estimator = node, estimator
         self._due, self._first = True, True
-        observer, past = estimator.observer, len(estimator.memory.past)
-        self._encode = array_encoder(labels(observer.levels, observer.inputs, past))
+        observer, memory = estimator.observer, estimator.memory
+        past, members = len(memory.past), len(memory.members)
+        self._encode = array_encoder(labels(observer.levels, observer.inputs, past, members))
         self._publisher = node.create_publisher(message_class(ARRAY), prefix + SNAPSHOT, QOS)
-        self._timer = node.create_timer(PERIOD, self._request)
+        self._timer = node.create_timer(PERIOD_WITH_MEMBERS if members else PERIOD, self._request)
 
     def _request(self) -> None:
         self._due = True

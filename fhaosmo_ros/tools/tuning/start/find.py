@@ -7,7 +7,8 @@ import math
 from typing import Any, NamedTuple, TypeVar
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.observer.observer import FIXED_GAMMA, Observer
+from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA
+from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Recording

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The members of the self-tuning observer: which they are, and where they lie in memory (D 26).
+
+A member is an observer with its own model of d (D 17: k = 0, 1 or 2 derivatives, intensity q,
+decay kappa) and of the noise (white, or coloured: v_j = a v_{j-1} + w_j). Members of the same k
+form an array, the slowest first. Arrays have one column a member, so that a step of all members is
+a few loops that the compiler turns into vector instructions.
+
+The members lie in the rows of ``State.levels`` behind the covariance, one array after the other.
+"""
+
+import math
+from typing import NamedTuple
+
+from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.model.bytecode import Floats
+import numpy as np
+from numpy.typing import NDArray
+
+ORDERS = 3
+"""Members have k = 0, 1, 2 derivatives of d."""
+BANDS = 15
+"""Bandwidths of the members of each k."""
+SLOWEST, QUICKEST = 1e-4, 0.5
+"""Their range, in rad a sample."""
+COLOURS = np.array([0.0, 0.6, 0.9, 0.98])
+"""Correlations a of the noise of neighbouring samples."""
+KINDS = np.array([[c, r] for c in range(len(COLOURS)) for r in (0.1, 0.5, 1.5)])
+"""Members of each bandwidth omega: index of the colour, and kappa / omega."""
+IN_BAND = len(KINDS)
+COUNT = BANDS * IN_BAND
+"""Members of each k."""
+STEP_OF_BANDS = (QUICKEST / SLOWEST) ** (1.0 / (BANDS - 1))
+BANDWIDTHS = np.repeat(np.geomspace(SLOWEST, QUICKEST, BANDS), IN_BAND)
+"""omega of each member, in rad a sample."""
+COLOUR = np.tile(KINDS[:, 0], BANDS).astype(np.int64)
+RATIO = np.tile(KINDS[:, 1], BANDS)
+LONGEST = 13
+"""Largest number of states and known chains: order 12 and d."""
+FACTORIALS = np.array([math.factorial(i) for i in range(2 * LONGEST + 8)], dtype=np.float64)
+FIRST_SAMPLES = 50
+"""So many samples tell the period and the noise before the members begin."""
+
+KAPPA, TAU, CORRELATION, DECAYED = range(4)
+"""Rows of `Members.rates`: kappa, correlation time of the noise, a and exp(-kappa h) for h."""
+WEIGHT, SCORE, VARIANCE, LOG_VARIANCE, RESIDUAL, FAR, SHORT, INTENSITY, PRIOR = range(9)
+"""
+Planes of `Members.record`: weights; log-likelihoods relative to the best; variances S of the
+innovations over that of the noise, and their logarithms; last residuals of y; samples in a row
+beyond the gate; short means of squared innovations; intensities q; scores without samples.
+"""
+PLANES = 9
+SQUARE, USED = range(2)
+"""Rows of `Members.noise`: variance of the noise of each colour, and the one that P counts on."""
+
+
+class Members(NamedTuple):
+    """
+    The arrays of the members, as views on ``State.levels``.
+
+    Attributes
+    ----------
+    rates : (4, COUNT) array
+    noise : (2, colours) array
+    record : (PLANES, ORDERS, COUNT) array
+    flow : (N, N) array
+        Derivative of the prediction to the next sample.
+    x0, x1, x2 : (n + 1 + k, COUNT) arrays
+        Estimates of z, d and its derivatives, of the members with k = 0, 1, 2.
+    p0, p1, p2 : ((n + 1 + k) (n + 2 + k) / 2, COUNT) arrays
+        Upper triangles of their covariances, row by row.
+    g0, g1, g2 : (n + 1 + k, COUNT) arrays
+        Their gains.
+
+    """
+
+    rates: Floats
+    noise: Floats
+    record: Floats
+    flow: Floats
+    x0: Floats
+    x1: Floats
+    x2: Floats
+    p0: Floats
+    p1: Floats
+    p2: Floats
+    g0: Floats
+    g1: Floats
+    g2: Floats
+
+
+def size_of(order: int) -> int:
+    """Return how many numbers the members of a model with n = `order` states need."""
+    total = 4 * COUNT + 2 * len(COLOURS) + PLANES * ORDERS * COUNT + (order + ORDERS) ** 2
+    for k in range(ORDERS):
+        d = order + 1 + k
+        total += (2 * d + d * (d + 1) // 2) * COUNT
+    return total
+
+
+def rows_of(order: int) -> int:
+    """Return how many rows of N = n + 3 numbers hold the members."""
+    return -(-size_of(order) // (order + ORDERS))
+
+
+@compiled(forceinline=True)
+def members_in(rows: Floats, n: int) -> Members:
+    """Return the members' arrays in the rows that hold them."""
+    flat, c, colours = rows.ravel(), COUNT, COLOURS.size
+    at = 4 * c
+    rates = flat[:at].reshape((4, c))
+    noise = flat[at : at + 2 * colours].reshape((2, colours))
+    at += 2 * colours
+    record = flat[at : at + PLANES * ORDERS * c].reshape((PLANES, ORDERS, c))
+    at += PLANES * ORDERS * c
+    levels = n + ORDERS
+    flow = flat[at : at + levels * levels].reshape((levels, levels))
+    at += levels * levels
+    d = n + 1
+    x0 = flat[at : at + d * c].reshape((d, c))
+    at += d * c
+    x1 = flat[at : at + (d + 1) * c].reshape((d + 1, c))
+    at += (d + 1) * c
+    x2 = flat[at : at + (d + 2) * c].reshape((d + 2, c))
+    at += (d + 2) * c
+    size = d * (d + 1) // 2
+    p0 = flat[at : at + size * c].reshape((size, c))
+    at += size * c
+    size += d + 1
+    p1 = flat[at : at + size * c].reshape((size, c))
+    at += size * c
+    size += d + 2
+    p2 = flat[at : at + size * c].reshape((size, c))
+    at += size * c
+    g0 = flat[at : at + d * c].reshape((d, c))
+    at += d * c
+    g1 = flat[at : at + (d + 1) * c].reshape((d + 1, c))
+    at += (d + 1) * c
+    g2 = flat[at : at + (d + 2) * c].reshape((d + 2, c))
+    return Members(rates, noise, record, flow, x0, x1, x2, p0, p1, p2, g0, g1, g2)
+
+
+class Tuning(NamedTuple):
+    """
+    What a self-tuning observer has found.
+
+    Attributes
+    ----------
+    noise : float
+        Standard deviation of the noise on y (unit of y).
+    correlation : float
+        Correlation of the noise of neighbouring samples; 0 for white noise.
+    bandwidth : float
+        How fast d is followed, in rad/s.
+    derivatives : (3,) array
+        Shares of the models of d with 0, 1 and 2 derivatives.
+
+    """
+
+    noise: float
+    correlation: float
+    bandwidth: float
+    derivatives: NDArray[np.float64]
+
+
+UNKNOWN = Tuning(math.nan, math.nan, math.nan, np.full(ORDERS, math.nan))
+"""Before the members have begun."""
+
+
+def tuning_in(rows: NDArray[np.float64], order: int) -> Tuning:
+    """Return what the members in `rows` say, for a model with n = `order` states."""
+    members: Members = members_in.py_func(rows, order)  # type: ignore[attr-defined]
+    weight = members.record[WEIGHT]
+    of_member = weight.sum(axis=0)
+    correlation = members.rates[CORRELATION]
+    variance = members.noise[SQUARE, COLOUR] / (1.0 - correlation**2)
+    bandwidth = members.rates[KAPPA] / RATIO
+    return Tuning(
+        float(np.sqrt(of_member @ variance)),
+        float(of_member @ correlation),
+        float(np.exp(of_member @ np.log(bandwidth))),
+        weight.sum(axis=1),
+    )

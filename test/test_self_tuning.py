@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The self-tuning observer: its members are Kalman filters; together they fit y by themselves."""
+
+import math
+
+from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer import arrays
+from fhaosmo_ros.core.observer.members import (
+    COLOUR,
+    INTENSITY,
+    KAPPA,
+    members_in,
+    ORDERS,
+    SCORE,
+    TAU,
+    USED,
+    WEIGHT,
+)
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+PERIOD = 1e-3
+SELF_TUNING = {'gains': 'self_tuning'}
+PLANTS = {
+    'paper': {'order': 3, 'phi': ['0', '0', '-z3']},
+    'input': {'order': 2, 'phi': ['0', '5*u - 2*z2']},
+}
+
+
+def matern(size, rate, count, rng):
+    """Return a d of two derivatives whose corner frequency is `rate` (rad/s)."""
+    d = rng.standard_normal(count + 4000)
+    share = math.exp(-rate * PERIOD)
+    for _ in range(3):
+        for k in range(1, len(d)):
+            d[k] += share * d[k - 1]
+    return size * d[4000:] / d[4000:].std()
+
+
+def states_of(rates, d, start):
+    """Return the states of z' = A z + e_n d from sample to sample, d held."""
+    n = len(rates)
+    whole = np.zeros((n + 1, n + 1))
+    whole[:n, :n], whole[n - 1, n] = rates, 1.0
+    step = expm(whole * PERIOD)
+    z = np.empty((len(d), n))
+    z[0] = start
+    for k in range(1, len(d)):
+        z[k] = step[:n, :n] @ z[k - 1] + step[:n, n] * d[k - 1]
+    return z
+
+
+@pytest.fixture(scope='module')
+def case():
+    """Return times, z, d of the paper's plant for 30 s, and unit noise."""
+    rng = np.random.default_rng(4)
+    count = 30_000
+    d = matern(0.07, 1.5, count, rng)
+    rates = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    z = states_of(rates, d, [0.2, 0.2, 0.2])
+    return np.arange(count) * PERIOD, z, d, rng.standard_normal(count)
+
+
+def rms(values):
+    """Return the root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def members_of(observer):
+    """Return the members of an observer."""
+    return members_in.py_func(
+        observer.state.levels[arrays.ROWS + observer.levels :], observer.order
+    )
+
+
+def filtered(y, periods, rates, intensity, variance, first, covariance):
+    """Return estimate and covariance of a textbook Kalman filter, the noise being a state."""
+    size = len(rates)
+    x, p = np.append(first, 0.0), np.zeros((size + 1, size + 1))
+    p[:size, :size] = covariance
+    c = np.zeros(size + 1)
+    c[0] = c[-1] = 1.0
+    whole = np.zeros((2 * size, 2 * size))
+    whole[:size, :size], whole[size:, size:] = -rates, rates.T
+    whole[size - 1, 2 * size - 1] = intensity
+    for measured, h in zip(y, periods, strict=True):
+        exponential = expm(whole * h)  # Van Loan
+        a = np.zeros((size + 1, size + 1))
+        a[:size, :size] = exponential[size:, size:].T
+        q = np.zeros_like(p)
+        q[:size, :size] = a[:size, :size] @ exponential[:size, size:]
+        q[-1, -1] = variance
+        x, p = a @ x, a @ p @ a.T + q
+        s = c @ p @ c
+        gain = p @ c / s
+        x, p = x + gain * (measured - c @ x), p - np.outer(gain, c @ p)
+    return x, p
+
+
+@pytest.mark.parametrize('stretch', [1.0, 1.2])
+def test_members_with_white_noise_are_kalman_filters(case, stretch):
+    """State and covariance of members of every k, while no innovation is large."""
+    t, z, _, noise = case
+    y = z[:, 0] + 1e-3 * np.where(t < 2.0, noise, 0.3 * noise)
+    observer = Observer(SELF_TUNING)
+    observer.run(t[:2000], y[:2000])
+    members, moving = members_of(observer), int(observer.state.memory[arrays.MOVING])
+    samples, periods = y[2000:2015], [stretch * PERIOD] * 15
+    for measured, h in zip(samples, periods, strict=True):
+        observer.step(measured, h)
+    after = members_of(observer)
+    for k in range(ORDERS):
+        g = np.argmax(np.where(COLOUR == 0, members.record[SCORE, k], -np.inf)[:moving])
+        size, first = 4 + k, (members.x0, members.x1, members.x2)[k][:, g]
+        covariance, upper = np.zeros((size, size)), np.triu_indices(size)
+        covariance[upper] = (members.p0, members.p1, members.p2)[k][:, g]
+        covariance += np.triu(covariance, 1).T
+        rates = np.eye(size, k=1)
+        rates[2, 2] = -1.0
+        rates[range(3, size), range(3, size)] = -members.rates[KAPPA, g]
+        drive, variance = members.record[INTENSITY, k, g], members.noise[USED, 0]
+        found, expected = filtered(samples, periods, rates, drive, variance, first, covariance)
+        estimate = (after.x0, after.x1, after.x2)[k][:, g]
+        deviations = np.sqrt(np.diag(expected)[:size])
+        assert (np.abs(estimate - found[:size]) < 1e-6 * deviations).all(), k
+        triangle = (after.p0, after.p1, after.p2)[k][:, g]
+        np.testing.assert_allclose(triangle, expected[:size, :size][upper], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('phi', 'linear'),
+    [
+        (['0', '0', '-z3'], True), (['0', 'u/2 - 3*z2 + sin(u)'], True),
+        (['z1*2 - z1', '0'], True),
+        (['0', 'u*z2'], False), (['0', 'sin(z1)'], False), (['0', 'z1*z2'], False),
+        (['0', '1/(1 + z2)'], False), (['0', 'min(z1, 1)'], False), (['0', 'z2**2'], False),
+    ],
+)  # fmt: skip
+def test_linear_models_are_known(phi, linear):
+    """Only those may keep their covariances once they are steady."""
+    model = TriangularModel(phi)
+    assert model.is_linear == linear
+    if linear:
+        points = np.random.default_rng(0).normal(size=(5, len(phi)))
+        slopes = [model.jacobian(z, 0.7) for z in points]
+        assert np.ptp(slopes, axis=0).max() < 1e-12
+
+
+def test_it_finds_noise_and_d(case):
+    """Error, noise and error bars without any parameter but the model, at two noise levels."""
+    t, z, d, noise = case
+    for size, bar in ((1e-4, 0.35), (1e-3, 0.8)):
+        run = Observer(SELF_TUNING).run(t, z[:, 0] + size * noise)
+        error = run.unknown_input - d
+        assert np.abs(error).max() < 1.5 * np.abs(d).max()  # from the first sample on
+        assert rms(error[5000:]) < bar * rms(d)
+        expected = run.standard_deviation[5000:, 3]
+        assert 0.5 < np.mean(np.abs(error[5000:]) < expected) < 0.86
+        assert np.mean(np.abs(error[5000:]) < 1.96 * expected) > 0.8
+
+
+def test_it_follows_the_noise(case):
+    """From the middle on the noise is ten times larger; then a hundred times."""
+    t, z, d, noise = case
+    for factor in (10.0, 100.0):
+        observer = Observer(SELF_TUNING)
+        sizes = np.where(t < 15.0, 1e-4, factor * 1e-4)
+        run = observer.run(t, z[:, 0] + sizes * noise)
+        assert np.abs(run.unknown_input - d).max() < 1.5 * np.abs(d).max()
+        assert observer.tuning.noise == pytest.approx(factor * 1e-4, rel=0.15)
+
+
+def test_coloured_noise_is_not_taken_for_d(case):
+    """Noise with a correlation of 0.9 from sample to sample."""
+    t, z, d, noise = case
+    coloured = noise.copy()
+    for k in range(1, len(coloured)):
+        coloured[k] = 0.9 * coloured[k - 1] + math.sqrt(1.0 - 0.81) * noise[k]
+    observer = Observer(SELF_TUNING)
+    run = observer.run(t, z[:, 0] + 1e-3 * coloured)
+    assert rms((run.unknown_input - d)[5000:]) < rms(d)
+    assert observer.tuning.correlation == pytest.approx(0.9, abs=0.05)
+    assert observer.tuning.noise == pytest.approx(1e-3, rel=0.2)
+
+
+def test_outliers_and_jumps_of_y(case):
+    """One sample in a hundred is 50 sigma off; y is 1 off for half a second."""
+    t, z, d, noise = case
+    clean = z[:, 0] + 1e-3 * noise
+    expected = rms((Observer(SELF_TUNING).run(t, clean).unknown_input - d)[5000:])
+    outliers = clean + 0.05 * noise * (np.random.default_rng(2).uniform(size=len(t)) < 0.01)
+    jump = clean + ((t > 15.0) & (t < 15.5))
+    for y in (outliers, jump):
+        error = Observer(SELF_TUNING).run(t, y).unknown_input - d
+        assert rms(error[5000:]) < 1.25 * expected
+        assert np.abs(error).max() < 2.0 * np.abs(d).max()
+
+
+def test_another_rate_and_lost_samples(case):
+    """Every tenth sample, and then half of the samples at random, from the middle on."""
+    t, z, d, noise = case
+    y = z[:, 0] + 1e-4 * noise
+    keep = np.random.default_rng(3).uniform(size=len(t)) < 0.5
+    keep[: len(t) // 2] = True
+    for index in (np.arange(0, len(t), 10), np.flatnonzero(keep)):
+        error = Observer(SELF_TUNING).run(t[index], y[index]).unknown_input - d[index]
+        assert np.abs(error).max() < 1.5 * np.abs(d).max()
+        assert rms(error[t[index] > 5.0]) < 0.6 * rms(d)
+
+
+def test_known_input_is_used():
+    """d is what the known input does not explain."""
+    rng = np.random.default_rng(5)
+    count = 10_000
+    t = np.arange(count) * PERIOD
+    d, u = matern(0.5, 1.5, count, rng), np.sign(np.sin(3.0 * t))
+    rates = np.array([[0.0, 1.0], [0.0, -2.0]])
+    z = states_of(rates, d + 5.0 * np.append(u[1:], 0.0), [0.0, 0.0])  # u: during the interval
+    y = z[:, 0] + 1e-4 * rng.standard_normal(count)
+    run = Observer({**SELF_TUNING, **PLANTS['input']}).run(t, y, u)
+    assert rms((run.unknown_input - d)[3000:]) < 0.4 * rms(d)
+
+
+def test_y_that_says_nothing():
+    """A constant y, and one without noise: finite estimates, and no guess before y moves."""
+    t = np.arange(3000) * PERIOD
+    observer = Observer(SELF_TUNING)
+    run = observer.run(t, np.full(3000, 0.3))
+    assert (run.unknown_input == 0.0).all()
+    assert np.isinf(run.standard_deviation[-1, -1])
+    assert math.isnan(observer.tuning.noise)
+    run = Observer(SELF_TUNING).run(t, 0.2 + 0.05 * np.sin(t))
+    assert np.isfinite(run.unknown_input).all()
+    assert np.isfinite(run.z).all()
+
+
+def test_quantised_y(case):
+    """An encoder whose steps are five times the noise of before."""
+    t, z, d, _ = case
+    run = Observer(SELF_TUNING).run(t, np.round(z[:, 0] / 5e-3) * 5e-3)
+    assert rms((run.unknown_input - d)[5000:]) < rms(d)
+
+
+def test_slider(case):
+    """A larger bandwidth makes the estimate noisier; 1 is what it chooses."""
+    t, z, _, noise = case
+    y, roughness = z[:8000, 0] + 1e-3 * noise[:8000], []
+    for bandwidth in (0.3, 1.0, 3.0):
+        run = Observer({**SELF_TUNING, 'bandwidth': bandwidth}).run(t[:8000], y)
+        roughness.append(rms(np.diff(run.unknown_input[4000:])))
+    assert roughness[0] < 0.5 * roughness[1] < 0.25 * roughness[2]
+
+
+def test_a_memory_goes_on_where_it_was(case):
+    """Bit for bit, through bad samples, and live as offline."""
+    t, z, _, noise = case
+    y = z[:4000, 0] + 1e-3 * noise[:4000]
+    y[[1500, 2500]] = np.nan, 40.0
+    stamps = np.round(t[:4000] * 1e9).astype(np.int64) + 1
+    whole = OnlineEstimator(SELF_TUNING)
+    whole.run(stamps[:2000], y[:2000])
+    other = OnlineEstimator(SELF_TUNING)
+    other.remember(whole.memory)
+    for stamp, measured in zip(stamps[2000:].tolist(), y[2000:].tolist(), strict=True):
+        other.update(stamp, measured)
+    run = whole.run(stamps[2000:], y[2000:])
+    assert run.unknown_input[-1] == other.estimate.unknown_input
+    assert (whole.memory.members == other.memory.members).all()
+
+
+def test_weights_are_shares(case):
+    """They are not negative and add up to 1; coloured members have a correlation time."""
+    t, z, _, noise = case
+    observer = Observer(SELF_TUNING)
+    observer.run(t[:1000], z[:1000, 0] + 1e-3 * noise[:1000])
+    members = members_of(observer)
+    assert members.record[WEIGHT].min() >= 0.0
+    assert members.record[WEIGHT].sum() == pytest.approx(1.0)
+    assert ((members.rates[TAU] > 0.0) == (COLOUR > 0)).all()
+    assert observer.tuning.derivatives.shape == (ORDERS,)
+
+
+def test_it_needs_the_unknown_input():
+    """Without it there is nothing to tune."""
+    with pytest.raises(ConfigurationError, match='unknown_input'):
+        Observer({**SELF_TUNING, 'unknown_input': False})
