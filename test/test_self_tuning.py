@@ -103,16 +103,16 @@ def filtered(y, periods, rates, intensity, variance, first, covariance):
 def test_members_with_white_noise_are_kalman_filters(case, stretch):
     """State and covariance of members of every k, while no innovation is large."""
     t, z, _, noise = case
-    y = z[:, 0] + 1e-3 * np.where(t < 2.0, noise, 0.3 * noise)
+    y = z[:, 0] + 1e-3 * np.where(t < 0.3, noise, 0.3 * noise)
     observer = Observer(SELF_TUNING)
-    observer.run(t[:2000], y[:2000])
+    observer.run(t[:300], y[:300])
     members, moving = members_of(observer), int(observer.state.memory[arrays.MOVING])
-    samples, periods = y[2000:2015], [stretch * PERIOD] * 15
+    samples, periods = y[300:315], [stretch * PERIOD] * 15
     for measured, h in zip(samples, periods, strict=True):
         observer.step(measured, h)
     after = members_of(observer)
     for k in range(ORDERS):
-        g = np.argmax(np.where(COLOUR == 0, members.record[SCORE, k], -np.inf)[:moving])
+        g = np.argmax(np.where(COLOUR == 0, members.record[SCORE, k], -np.inf)[: moving - 12])
         size, first = 4 + k, (members.x0, members.x1, members.x2)[k][:, g]
         covariance, upper = np.zeros((size, size)), np.triu_indices(size)
         covariance[upper] = (members.p0, members.p1, members.p2)[k][:, g]
@@ -286,3 +286,10 @@ def test_it_needs_the_unknown_input():
     """Without it there is nothing to tune."""
     with pytest.raises(ConfigurationError, match='unknown_input'):
         Observer({**SELF_TUNING, 'unknown_input': False})
+
+
+def test_it_is_not_smoothed():
+    """The smoother needs the parameters of fixed gains."""
+    observer = Observer({**SELF_TUNING, 'noise_size': 1e-3})
+    with pytest.raises(ConfigurationError, match='self_tuning'):
+        observer.smooth(np.arange(3) * PERIOD, np.zeros(3))

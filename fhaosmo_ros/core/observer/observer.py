@@ -75,9 +75,9 @@ class Trajectory(NamedTuple):
         Where `every` > 1, a row's flags are those of all samples since the row before it.
     z_hat, z_tilde : (K, N) arrays
         Filtered and internal states; z_tilde[:, i] belongs to z_{i+2}.
-    standard_deviation : (K, n + 1) array or None
+    standard_deviation : (K, n + 1) array
         Of the errors of z and, in the last column, of the unknown input, as a self-tuning observer
-        expects them.
+        expects them; (K, 0) with fixed gains.
 
     """
 
@@ -90,7 +90,7 @@ class Trajectory(NamedTuple):
     open_levels: NDArray[np.int64]
     z_hat: NDArray[np.float64]
     z_tilde: NDArray[np.float64]
-    standard_deviation: NDArray[np.float64] | None = None
+    standard_deviation: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -541,6 +541,7 @@ class Observer:
         if len(words):
             self._word = int(words[-1])
         z, d = self.select(levels)
+        known = self.order + 1 if self.self_tuning else 0
         return Trajectory(
             t,
             z,
@@ -551,9 +552,7 @@ class Observer:
             words >> LEVEL_SHIFT,
             levels[:, arrays.HAT],
             levels[:, arrays.TILDE],
-            np.sqrt(levels[:, recursion.VARIANCES, : self.order + 1])
-            if self.self_tuning
-            else None,
+            np.sqrt(levels[:, -1, :known]),
         )
 
     def _periods(self, t: NDArray[Any], first: int) -> NDArray[np.float64]:

@@ -118,6 +118,11 @@ def make_problem(configuration: ObserverConfiguration) -> Problem:
 
     """
     p = configuration.parameters
+    if configuration.self_tuning:
+        raise ConfigurationError(
+            "smoothing, 'gains': expected fixed (`tune` finds them and what else it needs), got "
+            "'self_tuning'"
+        )
     if not (p['noise_size'] > 0.0 and p['unknown_input']):
         raise ConfigurationError(
             "smoothing: expected 'noise_size' > 0 (standard deviation of the noise on y; `tune` "

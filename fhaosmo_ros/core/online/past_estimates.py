@@ -140,13 +140,22 @@ class PastEstimates:
         n, levels, none = self._observer.order, self._observer.levels, np.zeros(0)
         integers, wide = np.zeros(0, dtype=np.int64), np.zeros((0, levels))
         return Trajectory(
-            integers, np.zeros((0, n)), none, none, wide, integers, integers, wide, wide
+            integers,
+            np.zeros((0, n)),
+            none,
+            none,
+            wide,
+            integers,
+            integers,
+            wide,
+            wide,
+            wide[:, :0],
         )
 
 
 def part_of(rows: Trajectory, index: Any) -> Trajectory:
     """Return some rows."""
-    return Trajectory._make(None if column is None else column[index] for column in rows)
+    return Trajectory._make(column[index] for column in rows)
 
 
 def check_lag(p: Mapping[str, Any]) -> None:
