@@ -12,6 +12,8 @@ import pytest
 
 CHANGES = {
     'unknown_input_decay': [5.0],
+    'bandwidth': [2.0],
+    'tuning_memory': [3.0],
     'structure': ['cascade', 'levant'],
     'variant': list(VARIANTS),
     'scheme': ['explicit', 'implicit'],

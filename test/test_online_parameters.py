@@ -28,8 +28,11 @@ SEED = [0.0, 1.0, 2.0, 3.0]
 PREDICTING = {'structure': 'levant', 'scheme': 'predict_correct'}
 PREDICTING |= {'lambda': [8.0, 20.0, 30.0, 16.0], 'fuzzy_widths': [1.0]}
 SCHEDULED = PREDICTING | {'noise_size': 0.01, 'correction_period': 1e-3}
+SELF_TUNING = {'gains': 'self_tuning'}
 CHANGES = {
     'unknown_input_decay': Change(50.0),
+    'bandwidth': Change(3.0, SELF_TUNING),
+    'tuning_memory': Change(0.05, SELF_TUNING),
     'structure': Change('levant'),
     'variant': Change('sign'),
     'scheme': Change('explicit'),

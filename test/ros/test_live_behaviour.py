@@ -102,7 +102,7 @@ ELSEWHERE = {
     'predict_to_now',  # needs a delay, which is fixed: test_delay.py
     # These act where y is far off or its rate changes: test_online_parameters.py.
     'correction_period', 'noise_size', 'state_sizes', 'unknown_input_size', 'unknown_input_rate',
-    'fuzzy_growth',
+    'fuzzy_growth', 'bandwidth', 'tuning_memory',
     'publish_on', 'measurement_unit', 'unknown_input_unit', 'unknown_input_scale',
     'prediction_step',  # between samples this close it moves the last digits only: test_levant.py
 }  # fmt: skip

@@ -34,6 +34,8 @@ STARTED_WITH = {
 
 OTHER = {
     'unknown_input_decay': 2.0,
+    'bandwidth': 2.0,
+    'tuning_memory': 4.0,
     'structure': 'levant',
     'variant': 'fuzzy',
     'scheme': 'explicit',
@@ -105,7 +107,7 @@ READ_ONLY = {
 }
 SLIDERS = {
     'estimator': [
-        'order', 'unknown_input_derivatives', 'gamma_initial', 'gamma_min', 'gamma_max',
+        'order', 'unknown_input_derivatives', 'bandwidth', 'gamma_initial', 'gamma_min', 'gamma_max',
         'publish_rate', 'input_depth', 'diagnostics_period', 'error_bad_share_above',
     ],
     'plant': ['order', 'sample_rate'],
