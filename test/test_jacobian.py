@@ -68,6 +68,8 @@ def compare(text, point):
     slopes = [exactly(sympy.diff(exact, SYMBOLS[f'z{j}']), point) for j in (1, 2, 3)]
     if wanted is None or None in slopes:
         return False
+    if text.count('min') + text.count('max') > 1 and len(set(point)) < len(point):
+        return False  # sympy simplifies ties of several; each slope between theirs is one
     z, u = np.array(point[:3]), point[3]
     model = TriangularModel(['0', '0', text])
     got, jacobian = model.evaluate(z, u)[2], model.jacobian(z, u)[2]

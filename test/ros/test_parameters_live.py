@@ -107,8 +107,8 @@ READ_ONLY = {
 }
 SLIDERS = {
     'estimator': [
-        'order', 'unknown_input_derivatives', 'bandwidth', 'gamma_initial', 'gamma_min', 'gamma_max',
-        'publish_rate', 'input_depth', 'diagnostics_period', 'error_bad_share_above',
+        'order', 'unknown_input_derivatives', 'bandwidth', 'gamma_initial', 'gamma_min',
+        'gamma_max', 'publish_rate', 'input_depth', 'diagnostics_period', 'error_bad_share_above',
     ],
     'plant': ['order', 'sample_rate'],
 }  # fmt: skip
