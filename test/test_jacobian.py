@@ -62,10 +62,13 @@ def exactly(expression, point):
 
 def compare(text, point):
     """Compare with sympy; return False where there is nothing to compare."""
-    exact = sympy.parse_expr(text, {**SYMBOLS, **FUNCTIONS, **FUNCTIONS_OF_TWO}, evaluate=True)
-    exact = sympy.nsimplify(exact, rational=True)
-    wanted = exactly(exact, point)
-    slopes = [exactly(sympy.diff(exact, SYMBOLS[f'z{j}']), point) for j in (1, 2, 3)]
+    names = {**SYMBOLS, **FUNCTIONS, **FUNCTIONS_OF_TWO}
+    try:
+        exact = sympy.nsimplify(sympy.parse_expr(text, names, evaluate=True), rational=True)
+        wanted = exactly(exact, point)
+        slopes = [exactly(sympy.diff(exact, SYMBOLS[f'z{j}']), point) for j in (1, 2, 3)]
+    except (KeyError, TypeError, ValueError):  # sympy's, for log(0) or min of complex numbers
+        return False
     if wanted is None or None in slopes:
         return False
     if text.count('min') + text.count('max') > 1 and len(set(point)) < len(point):
