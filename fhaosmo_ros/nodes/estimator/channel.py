@@ -112,10 +112,13 @@ class Channel:
         self._lost_before = self._y.source.lost
         self._active = True
         self._start_timer()
-        parameters = self.estimator.observer.parameters
+        observer = self.estimator.observer
+        parameters, kind = observer.parameters, 'self-tuning'
+        if not observer.self_tuning:
+            kind = f'{parameters["variant"]}, {parameters["scheme"]}'
         self._logger.info(
-            f'estimating {parameters["order"]} states and the unknown input from '
-            f'{self._y.source.topic} ({parameters["variant"]}, {parameters["scheme"]})'
+            f'estimating {observer.order} states and the unknown input from '
+            f'{self._y.source.topic} ({kind})'
         )
 
     def deactivate(self) -> None:
