@@ -122,7 +122,8 @@ def names(answer) -> set[str]:
 @pytest.mark.parametrize('name', ['estimator', 'plant'])
 def test_policy_allows_exactly_what_the_node_has(client, start, policy, name):
     # With everything that is optional: a known input, simulated time.
-    start(name, *parameters(phi="['0', '0', 'u - z3']", use_sim_time='true'))
+    # In a namespace: other tests leave nodes of this name behind for a while.
+    start(name, *parameters(namespace='/policy', phi="['0', '0', 'u - z3']", use_sim_time='true'))
     node = client.node
     for kind, verb, look in (
         ('topic', 'publish', node.get_publisher_names_and_types_by_node),
@@ -134,16 +135,20 @@ def test_policy_allows_exactly_what_the_node_has(client, start, policy, name):
 
         def same(look=look, listed=listed) -> bool:
             try:
-                return names(look(name, '/')) == set(listed)
+                return {n.removeprefix('/policy') for n in names(look(name, '/policy'))} == set(
+                    listed
+                )
             except Exception:  # rclpy: the node is not known yet
                 return False
 
         try:
             client.wait(same, verb, COLD_START)
         except TimeoutError:
-            assert names(look(name, '/')) == set(listed)  # says what differs
+            assert {n.removeprefix('/policy') for n in names(look(name, '/policy'))} == set(
+                listed
+            )  # says what differs
             raise
-    assert not names(node.get_client_names_and_types_by_node(name, '/'))
+    assert not names(node.get_client_names_and_types_by_node(name, '/policy'))
 
 
 def test_operator_may_watch_and_call_all_of_it(policy):
