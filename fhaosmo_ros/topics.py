@@ -5,6 +5,9 @@ The topics of estimator and plant, declared once: for the nodes, and for tools t
 Message types are named as ROS names them, so that a tool without ROS can use them.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 FLOAT = 'std_msgs/msg/Float64'
 ARRAY = 'std_msgs/msg/Float64MultiArray'
 TEXT = 'std_msgs/msg/String'
@@ -38,3 +41,8 @@ OF_ALL_NODES = {
     '/parameter_events': 'rcl_interfaces/msg/ParameterEvent',
 }
 """Topics that all nodes of a system share."""
+
+
+def estimates_of(parameters: Mapping[str, Any]) -> dict[str, str]:
+    """Return topics and types of an estimate, by the parameters of its channel."""
+    return ESTIMATES | (SELF_TUNED if parameters['gains'] == 'self_tuning' else {})

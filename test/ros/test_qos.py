@@ -125,6 +125,13 @@ def test_outputs_qos_can_be_overridden(client, listen):
     assert rig.parameters.get(f'qos_overrides.{prefix}/innovation.publisher.depth') == 10
 
 
+def test_topics_of_a_self_tuning_estimator_have_policies_too(listen):
+    prefix = '/test_topics_of_a_self_tuning_estimator_have_policies_too/estimator'
+    name = f'qos_overrides.{prefix}/standard_deviation.publisher.depth'
+    rig = listen(gains='self_tuning', **{name: 7})
+    assert rig.parameters.get(name) == 7
+
+
 def test_outputs_of_the_plant_too(client, start):
     prefix = '/test_outputs_of_the_plant_too'
     policies = {

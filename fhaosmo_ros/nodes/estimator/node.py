@@ -34,7 +34,7 @@ from fhaosmo_ros.nodes.middleware.publishers import check_overrides
 from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
 from fhaosmo_ros.nodes.middleware.spin import run_node
 from fhaosmo_ros.nodes.middleware.subscription import input_qos
-from fhaosmo_ros.topics import ESTIMATES
+from fhaosmo_ros.topics import estimates_of
 from rclpy.parameter import Parameter as RosParameter
 
 
@@ -105,8 +105,14 @@ class EstimatorNode(ManagedNode):
         values, names = self._node_parameters.values, self._names
         if names == FROM_JOINTS:  # which joints there are is not known yet, but some may be named
             names = [*names, *with_own_parameters(values[CHANNELS], values)]
-        prefixes = [f'~/{name}/' if name else '~/' for name in names]
-        check_overrides(self, [prefix + topic for prefix in prefixes for topic in ESTIMATES])
+        check_overrides(
+            self,
+            [
+                f'~/{name}/{topic}' if name else f'~/{topic}'
+                for name in names
+                for topic in estimates_of(of_channel(values, name))
+            ],
+        )
         estimators = make_estimators(values, names)
         check_inputs(self, values, estimators)
         check_axes(values, {name: of_channel(values, name) for name in self._names})

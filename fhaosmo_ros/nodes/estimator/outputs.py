@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The topics on which a channel publishes its estimates."""
 
+from collections.abc import Mapping
+
 from fhaosmo_ros.core.observer.members import ORDERS
 from fhaosmo_ros.core.observer.observer import Estimate, Observer
 from fhaosmo_ros.nodes.middleware.messages import (
@@ -17,9 +19,36 @@ from rclpy.node import Node
 DEPTH = 10
 
 
-class Outputs:
+class Publishers:
     """
-    Publishers of the estimates, each with ROS' parameters qos_overrides./TOPIC.publisher.POLICY.
+    Publishers of some topics, each with ROS' parameters qos_overrides./TOPIC.publisher.POLICY.
+
+    Parameters
+    ----------
+    node : Node
+    prefix : str
+        Prefix of the topics' names.
+    kinds : mapping of str to str
+        Their message types.
+
+    """
+
+    def __init__(self, node: Node, prefix: str, kinds: Mapping[str, str]) -> None:
+        self._node = node
+        self._publishers = [
+            create_publisher(node, message_class(kind), prefix + name, DEPTH)
+            for name, kind in kinds.items()
+        ]
+
+    def destroy(self) -> None:
+        """Take the publishers away."""
+        while self._publishers:
+            self._node.destroy_publisher(self._publishers.pop())
+
+
+class Outputs(Publishers):
+    """
+    Publishers of the estimates.
 
     Parameters
     ----------
@@ -32,11 +61,7 @@ class Outputs:
     """
 
     def __init__(self, node: Node, prefix: str, order: int, levels: int) -> None:
-        self._node = node
-        self._publishers = [
-            create_publisher(node, message_class(kind), prefix + name, DEPTH)
-            for name, kind in ESTIMATES.items()
-        ]
+        super().__init__(node, prefix, ESTIMATES)
         self._state, self._unknown_input, self._gamma, self._innovation, self._stamp = (
             publisher.publish for publisher in self._publishers
         )
@@ -52,13 +77,8 @@ class Outputs:
         self._innovation(self._encode_innovation(estimate.innovation))
         self._stamp(self._encode_time(stamp))
 
-    def destroy(self) -> None:
-        """Take the publishers away."""
-        while self._publishers:
-            self._node.destroy_publisher(self._publishers.pop())
 
-
-class TuningOutputs:
+class TuningOutputs(Publishers):
     """
     Publishers of what a self-tuning observer knows beside its estimates.
 
@@ -73,11 +93,7 @@ class TuningOutputs:
     """
 
     def __init__(self, node: Node, prefix: str, order: int) -> None:
-        self._node = node
-        self._publishers = [
-            create_publisher(node, message_class(kind), prefix + name, DEPTH)
-            for name, kind in SELF_TUNED.items()
-        ]
+        super().__init__(node, prefix, SELF_TUNED)
         self._encode_deviation = array_encoder([*(f'z{i + 1}' for i in range(order)), 'd'])
         self._encode_tuning = array_encoder([
             'noise', 'correlation', 'bandwidth', *(f'derivatives{k}' for k in range(ORDERS)),
@@ -89,8 +105,3 @@ class TuningOutputs:
         deviation.publish(self._encode_deviation(observer.standard_deviation))
         noise, correlation, bandwidth, shares = observer.tuning
         tuning.publish(self._encode_tuning(np.array([noise, correlation, bandwidth, *shares])))
-
-    def destroy(self) -> None:
-        """Take the publishers away."""
-        while self._publishers:
-            self._node.destroy_publisher(self._publishers.pop())
