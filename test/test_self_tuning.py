@@ -3,7 +3,7 @@
 
 import math
 
-from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator
+from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.members import (
@@ -113,20 +113,35 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
     after = members_of(observer)
     for k in range(ORDERS):
         g = np.argmax(np.where(COLOUR == 0, members.record[SCORE, k], -np.inf)[: moving - 12])
-        size, first = 4 + k, (members.x0, members.x1, members.x2)[k][:, g]
+        size, first = 4 + k, members.x[k][:, g]
         covariance, upper = np.zeros((size, size)), np.triu_indices(size)
-        covariance[upper] = (members.p0, members.p1, members.p2)[k][:, g]
+        covariance[upper] = members.p[k][:, g]
         covariance += np.triu(covariance, 1).T
         rates = np.eye(size, k=1)
         rates[2, 2] = -1.0
         rates[range(3, size), range(3, size)] = -members.rates[KAPPA, g]
         drive, variance = members.record[INTENSITY, k, g], members.noise[USED, 0]
         found, expected = filtered(samples, periods, rates, drive, variance, first, covariance)
-        estimate = (after.x0, after.x1, after.x2)[k][:, g]
+        estimate = after.x[k][:, g]
         deviations = np.sqrt(np.diag(expected)[:size])
         assert (np.abs(estimate - found[:size]) < 1e-6 * deviations).all(), k
-        triangle = (after.p0, after.p1, after.p2)[k][:, g]
+        triangle = after.p[k][:, g]
         np.testing.assert_allclose(triangle, expected[:size, :size][upper], rtol=1e-6)
+
+
+def test_a_sample_that_is_not_likely_changes_no_member(case):
+    """Neither estimates nor covariances nor gains, although all are predicted to it."""
+    t, z, _, noise = case
+    y = z[:, 0] + 1e-3 * noise
+    observer = Observer(SELF_TUNING)
+    observer.run(t[:300], y[:300])
+    before = members_of(observer)
+    assert observer.step(y[300] + 10.0, PERIOD).status & Status.REJECTED_SPIKE
+    after = members_of(observer)
+    for one, other in zip(
+        before.x + before.p + before.gain, after.x + after.p + after.gain, strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,14 @@ costs more than the arithmetic of a step. A compiled function whose caller keeps
 for the whole call can use them without an owner instead.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 from llvmlite import ir
 from numba import carray, njit, types  # type: ignore[attr-defined]
 from numba.extending import intrinsic
+import numpy as np
+from numpy.typing import NDArray
 
 
 def _unowned(typing_context: Any, value: Any) -> Any:
@@ -73,6 +76,41 @@ def doubles_at(address: int, shape: Any) -> Any:
 def integers_at(address: int, shape: Any) -> Any:
     """Return the contiguous int64 array at an address, which its owner keeps alive."""
     return carray(_integer_pointer(address), shape)
+
+
+def table_of(arrays: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
+    """
+    Return where arrays of doubles or integers lie: address, rows (0 of a line), columns of each.
+
+    Raises
+    ------
+    AssertionError
+        One is not contiguous.
+
+    """
+    for index, array in enumerate(arrays):
+        if not array.flags.c_contiguous:
+            raise AssertionError(f'array {index} is not contiguous')
+    rows = [array.shape[0] if array.ndim == 2 else 0 for array in arrays]
+    return np.array([(a.ctypes.data, r, a.shape[-1]) for a, r in zip(arrays, rows, strict=True)])
+
+
+@njit(error_model='numpy', inline='always')
+def plane_at(t: Any, index: int) -> Any:
+    """Return the two-dimensional array that row `index` of a table names."""
+    return doubles_at(t[index, 0], (t[index, 1], t[index, 2]))
+
+
+@njit(error_model='numpy', inline='always')
+def line_at(t: Any, index: int) -> Any:
+    """Return the array of doubles that row `index` of a table names."""
+    return doubles_at(t[index, 0], t[index, 2])
+
+
+@njit(error_model='numpy', inline='always')
+def integers_of(t: Any, index: int) -> Any:
+    """Return the array of integers that row `index` of a table names."""
+    return integers_at(t[index, 0], t[index, 2])
 
 
 def _call_at(

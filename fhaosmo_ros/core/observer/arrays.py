@@ -51,6 +51,12 @@ Entries of ``State.memory``:
 from typing import NamedTuple
 
 from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.compiled.unowned_arrays import (
+    doubles_at,
+    integers_of,
+    line_at,
+    plane_at,
+)
 from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
 import numpy as np
 
@@ -169,6 +175,27 @@ class State(NamedTuple):
 
     levels: Floats
     memory: Floats
+
+
+@compiled(inline='always')
+def observer_at(t: Ints, first: int) -> tuple[Law, Work, State]:
+    """Return the bundles whose arrays rows `first` .. of a table name (`Observer.arguments`)."""
+    model = Bytecode(plane_at(t, first + 5), integers_of(t, first + 6))
+    law = Law(
+        integers_of(t, first),
+        plane_at(t, first + 1),
+        plane_at(t, first + 2),
+        line_at(t, first + 3),
+        plane_at(t, first + 4),
+        model,
+    )
+    stages = doubles_at(t[first + 9, 0], (4, 2, t[first + 9, 2]))
+    work = Work(plane_at(t, first + 7), plane_at(t, first + 8), stages)
+    return law, work, State(plane_at(t, first + 10), line_at(t, first + 11))
+
+
+ARRAYS = 12
+"""Arrays of `Law`, `Work` and `State`, one by one."""
 
 
 def make_work(law: Law, depth: int) -> Work:

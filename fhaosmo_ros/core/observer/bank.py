@@ -12,9 +12,10 @@ import math
 
 from fhaosmo_ros.core.compiled.cache import compiled, compiled_callback
 from fhaosmo_ros.core.compiled.unowned_arrays import doubles_at, integers_at, unowned
-from fhaosmo_ros.core.model.bytecode import Bytecode, Floats
+from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.model.integrate import NOW
 from fhaosmo_ros.core.observer.arrays import (
+    ARRAYS,
     BEYOND,
     CALM,
     COVARIANCE,
@@ -29,6 +30,7 @@ from fhaosmo_ros.core.observer.arrays import (
     LIKELIEST,
     LINEAR,
     MOVING,
+    observer_at,
     PREDICTION_STEP,
     QUANTUM,
     REPEATED,
@@ -73,9 +75,6 @@ from fhaosmo_ros.core.observer.members import (
 from fhaosmo_ros.core.observer.prediction import predict
 from numba import types
 import numpy as np
-
-ARRAYS = 12
-"""Arrays of law, work and state, in the order of `Observer.arguments`."""
 
 HUBER = 3.0
 """Innovations of more standard deviations count as so many (Huber 1964)."""
@@ -258,12 +257,10 @@ def expect_innovations(
 def correct_covariances(
     members: Members, n: int, k: int, p: Floats, gain: Floats, s: Floats, moving: int
 ) -> None:
-    """Take a sample into P of the members that move, and write their gains (D 27)."""
+    """Take a sample into P of the members that move, and turn P C' into their gains (D 27)."""
     d, used, inverse = n + 1 + k, members.noise[USED], np.empty(moving)
     for g in range(moving):
         inverse[g] = 1.0 / (s[g] * used[COLOUR[g]])
-        members.record[VARIANCE, k, g] = s[g]
-        members.record[LOG_VARIANCE, k, g] = math.log(s[g])
     for i in range(d):
         first = gain[i]
         for j in range(i, d):
@@ -277,10 +274,9 @@ def correct_covariances(
 
 
 @compiled()
-def correct_states(
-    members: Members, n: int, k: int, y: float, ahead: Floats, x: Floats, gain: Floats, b: Floats
-) -> None:
+def correct_states(members: Members, n: int, k: int, y: float, ahead: Floats, b: Floats) -> None:
     """Correct the members' predictions by their innovations `b`, of bounded influence."""
+    x, gain = members.x[k], members.gain[k]
     for i in range(n + 1 + k):
         row, source, factor = x[i], ahead[i], gain[i]
         for g in range(COUNT):
@@ -295,7 +291,7 @@ def correct_states(
 @compiled()
 def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: float) -> None:
     """Collect the first samples, which tell the period, the noise and the sizes (D 28)."""
-    n, x, first = law.gains.shape[1] - ORDERS, work.x, members.p2
+    n, x, first = law.gains.shape[1] - ORDERS, work.x, members.p[2]
     count = int(memory[SAMPLES])
     if count == 0:
         first[0, 0], first[1, 0] = memory[Y], 0.0
@@ -365,7 +361,7 @@ def begin(
 ) -> None:
     """Let the members begin at `y` (D 28)."""
     n = law.gains.shape[1] - ORDERS
-    sizes, first = np.empty(n), members.p2[0, :count].copy()
+    sizes, first = np.empty(n), members.p[2][0, :count].copy()
     stride = max((count - 1) // n, 1)
     for i in range(n):  # how large z_i may be: its setting, or what differences say
         sizes[i] = law.chances[FRESH * law.gains.shape[1] + i, i]
@@ -387,8 +383,8 @@ def begin(
         rates[TAU, g] = -period / math.log(colour) if colour > 0.0 else 0.0
     least = math.inf
     for k in range(ORDERS):
-        x = members.x0 if k == 0 else (members.x1 if k == 1 else members.x2)
-        p = members.p0 if k == 0 else (members.p1 if k == 1 else members.p2)
+        x = members.x[k]
+        p = members.p[k]
         d = n + 1 + k
         x[:] = 0.0
         p[:] = 0.0
@@ -462,7 +458,7 @@ def mix(law: Law, members: Members, x: Floats) -> None:
     for i in range(x.shape[1]):
         x[HAT, i] = x[COVARIANCE, i] = 0.0
     for k in range(ORDERS):
-        z = members.x0 if k == 0 else (members.x1 if k == 1 else members.x2)
+        z = members.x[k]
         for g in range(COUNT):
             w = shown[k, g]
             if w > 0.0:
@@ -476,8 +472,8 @@ def mix(law: Law, members: Members, x: Floats) -> None:
                 x[HAT, n + 1] += w * (rate - c * d)
                 x[HAT, n + 2] += w * (second - 2.0 * c * rate + c * c * d)
     for k in range(ORDERS):
-        z = members.x0 if k == 0 else (members.x1 if k == 1 else members.x2)
-        p = members.p0 if k == 0 else (members.p1 if k == 1 else members.p2)
+        z = members.x[k]
+        p = members.p[k]
         for g in range(COUNT):
             w = shown[k, g]
             if w > 0.0:
@@ -623,6 +619,33 @@ def follow_noise(members: Members, b: Floats, s: Floats, largest: float, count: 
 
 
 @compiled()
+def judge(members: Members, b: Floats, s: Floats, grown: float, kept: float) -> None:
+    """
+    Take a sample into the log-likelihoods, and bound the innovations (D 27, D 28), in place.
+
+    Parameters
+    ----------
+    kept : float
+        Part of the log-likelihoods that is not forgotten; negative to leave them as they are.
+
+    """
+    record, colours = members.record, members.noise[SQUARE]
+    log_colours = np.log(colours)
+    for k in range(ORDERS):
+        for g in range(COUNT):
+            variance = s[k, g] * colours[COLOUR[g]]
+            r = b[k, g] * b[k, g] / variance
+            record[FAR, k, g] = record[FAR, k, g] + 1.0 if r > GATE * GATE else 0.0
+            if kept >= 0.0:
+                prior, log_s = record[PRIOR, k, g], record[LOG_VARIANCE, k, g]
+                likelihood = min(r / grown, HUBER * HUBER) + log_s + log_colours[COLOUR[g]]
+                score = prior + kept * (record[SCORE, k, g] - prior)
+                record[SCORE, k, g] = score - 0.5 * likelihood
+            limit = HUBER * math.sqrt(variance)
+            b[k, g] = min(max(b[k, g], -limit), limit)
+
+
+@compiled()
 def step_members(
     law: Law, work: Work, memory: Floats, rows: Floats, y: float, h: float, u: Floats
 ) -> float:
@@ -647,21 +670,22 @@ def step_members(
     carry_flow(law, work, members, memory, h, u)
     mean, predicted = x[HAT].copy(), now[0].copy()
     b, s, believed = np.empty((3, ORDERS, COUNT))
-    a0, a1, a2 = members.x0.copy(), members.x1.copy(), members.x2.copy()
-    q0, q1, q2 = members.p0, members.p1, members.p2
+    # A sample that is not likely must change none of these.
+    x0, x1, x2 = members.x
+    ahead, p, gain = (x0.copy(), x1.copy(), x2.copy()), members.p, members.gain
     if moving > 0:
-        q0, q1, q2 = q0.copy(), q1.copy(), q2.copy()
+        p, gain = (
+            (p[0].copy(), p[1].copy(), p[2].copy()),
+            (gain[0].copy(), gain[1].copy(), gain[2].copy()),
+        )
     for k in range(ORDERS):
-        a = a0 if k == 0 else (a1 if k == 1 else a2)
-        q = q0 if k == 0 else (q1 if k == 1 else q2)
-        gain = members.g0 if k == 0 else (members.g1 if k == 1 else members.g2)
-        predict_states(members, n, k, h, mean, predicted, a)
+        predict_states(members, n, k, h, mean, predicted, ahead[k])
         if moving > 0:
-            predict_covariances(members, n, k, h, q, moving)
-        expect_innovations(members, n, k, h, q, gain, s[k], moving)
+            predict_covariances(members, n, k, h, p[k], moving)
+        expect_innovations(members, n, k, h, p[k], gain[k], s[k], moving)
         residual, correlation = members.record[RESIDUAL, k], members.rates[CORRELATION]
         for g in range(COUNT):
-            off = y - a[0, g] - correlation[g] * residual[g]
+            off = y - ahead[k][0, g] - correlation[g] * residual[g]
             b[k, g] = max(off - zone, 0.0) + min(off + zone, 0.0)
             believed[k, g] = s[k, g]
             if memory[BEYOND] > 0.0:  # P grows meanwhile, and the quick members believe anything
@@ -682,29 +706,15 @@ def step_members(
     grown = follow_noise(members, b, believed, largest, count)
     memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
     kept = math.exp(-h / law.scalars[FORGETTING])
+    members.record[VARIANCE, :, :moving] = s[:, :moving]
+    members.record[LOG_VARIANCE, :, :moving] = np.log(s[:, :moving])
+    judge(members, b, s, grown, kept if memory[CALM] > CALM_SAMPLES else -1.0)
     for k in range(ORDERS):
-        record, colours = members.record, members.noise[SQUARE]
-        for g in range(COUNT):
-            variance = s[k, g] * colours[COLOUR[g]]
-            r = b[k, g] * b[k, g] / variance
-            record[FAR, k, g] = record[FAR, k, g] + 1.0 if r > GATE * GATE else 0.0
-            prior = record[PRIOR, k, g]
-            log_s = math.log(s[k, g]) if g < moving else record[LOG_VARIANCE, k, g]
-            likelihood = min(r / grown, HUBER * HUBER) + log_s + math.log(colours[COLOUR[g]])
-            if memory[CALM] > CALM_SAMPLES:
-                score = prior + kept * (record[SCORE, k, g] - prior)
-                record[SCORE, k, g] = score - 0.5 * likelihood
-            limit = HUBER * math.sqrt(variance)
-            b[k, g] = min(max(b[k, g], -limit), limit)
-        a = a0 if k == 0 else (a1 if k == 1 else a2)
-        q = q0 if k == 0 else (q1 if k == 1 else q2)
-        z = members.x0 if k == 0 else (members.x1 if k == 1 else members.x2)
-        p = members.p0 if k == 0 else (members.p1 if k == 1 else members.p2)
-        gain = members.g0 if k == 0 else (members.g1 if k == 1 else members.g2)
         if moving > 0:
-            correct_covariances(members, n, k, q, gain, s[k], moving)
-            p[:, :moving] = q[:, :moving]
-        correct_states(members, n, k, y, a, z, gain, b[k])
+            correct_covariances(members, n, k, p[k], gain[k], s[k], moving)
+            members.p[k][:, :moving] = p[k][:, :moving]
+            members.gain[k][:, :moving] = gain[k][:, :moving]
+        correct_states(members, n, k, y, ahead[k], b[k])
     memory[LIKELIEST] = weigh(members)
     mix(law, members, x)
     find_strays(members, n, x)
@@ -716,7 +726,7 @@ def find_strays(members: Members, n: int, x: Floats) -> None:
     """Put members that have been far off for long to the mean."""
     far, kappa = members.record[FAR], members.rates[KAPPA]
     for k in range(ORDERS):
-        z = members.x0 if k == 0 else (members.x1 if k == 1 else members.x2)
+        z = members.x[k]
         for g in range(COUNT):
             if far[k, g] > LOST_SAMPLES:
                 far[k, g] = 0.0
@@ -737,8 +747,8 @@ def restart_members(law: Law, levels: Floats, memory: Floats, rows: Floats, y: f
     memory[UNSETTLED], memory[BEYOND] = 0.0, 0.0
     levels[HAT, 0] = memory[Y] = y
     for k in range(ORDERS):
-        z = members.x0 if k == 0 else (members.x1 if k == 1 else members.x2)
-        p = members.p0 if k == 0 else (members.p1 if k == 1 else members.p2)
+        z = members.x[k]
+        p = members.p[k]
         d = n + 1 + k
         for g in range(COUNT):
             c = members.rates[CORRELATION, g]
@@ -755,22 +765,7 @@ def restart_members(law: Law, levels: Floats, memory: Floats, rows: Floats, y: f
 
 def _step_at(table: int, y: float, h: float, inputs: int, count: int) -> float:
     """Do what `step_members` does, or with h = 0 `restart_members`, on the arrays of a table."""
-    t = integers_at(table, (ARRAYS, 3))
-    model = Bytecode(doubles_at(t[5, 0], (t[5, 1], t[5, 2])), integers_at(t[6, 0], t[6, 2]))
-    law = Law(
-        integers_at(t[0, 0], t[0, 2]),
-        doubles_at(t[1, 0], (t[1, 1], t[1, 2])),
-        doubles_at(t[2, 0], (t[2, 1], t[2, 2])),
-        doubles_at(t[3, 0], t[3, 2]),
-        doubles_at(t[4, 0], (t[4, 1], t[4, 2])),
-        model,
-    )
-    work = Work(
-        doubles_at(t[7, 0], (t[7, 1], t[7, 2])),
-        doubles_at(t[8, 0], (t[8, 1], t[8, 2])),
-        doubles_at(t[9, 0], (4, 2, t[9, 2])),
-    )
-    levels, memory = doubles_at(t[10, 0], (t[10, 1], t[10, 2])), doubles_at(t[11, 0], t[11, 2])
+    law, work, (levels, memory) = observer_at(integers_at(table, (ARRAYS, 3)), 0)
     rows = levels[ROWS + law.gains.shape[1] :]
     if h > 0.0:
         return step_members(law, work, memory, rows, y, h, doubles_at(inputs, count))

@@ -55,6 +55,10 @@ SQUARE, USED = range(2)
 """Rows of `Members.noise`: variance of the noise of each colour, and the one that P counts on."""
 
 
+OfEach = tuple[Floats, Floats, Floats]
+"""An array for each k."""
+
+
 class Members(NamedTuple):
     """
     The arrays of the members, as views on ``State.levels``.
@@ -66,12 +70,11 @@ class Members(NamedTuple):
     record : (PLANES, ORDERS, COUNT) array
     flow : (N, N) array
         Derivative of the prediction to the next sample.
-    x0, x1, x2 : (n + 1 + k, COUNT) arrays
+    x : tuple of (n + 1 + k, COUNT) arrays
         Estimates of z, d and its derivatives, of the members with k = 0, 1, 2.
-    p0, p1, p2 : ((n + 1 + k) (n + 2 + k) / 2, COUNT) arrays
+    p : tuple of ((n + 1 + k) (n + 2 + k) / 2, COUNT) arrays
         Upper triangles of their covariances, row by row.
-    g0, g1, g2 : (n + 1 + k, COUNT) arrays
-        Their gains.
+    gain : tuple of (n + 1 + k, COUNT) arrays
 
     """
 
@@ -79,15 +82,9 @@ class Members(NamedTuple):
     noise: Floats
     record: Floats
     flow: Floats
-    x0: Floats
-    x1: Floats
-    x2: Floats
-    p0: Floats
-    p1: Floats
-    p2: Floats
-    g0: Floats
-    g1: Floats
-    g2: Floats
+    x: OfEach
+    p: OfEach
+    gain: OfEach
 
 
 def size_of(order: int) -> int:
@@ -105,40 +102,40 @@ def rows_of(order: int) -> int:
 
 
 @compiled(forceinline=True)
+def grid(flat: Floats, at: int, rows: int) -> Floats:
+    """Return the array of `rows` rows that begins at `at`."""
+    return flat[at : at + rows * COUNT].reshape((rows, COUNT))
+
+
+@compiled(forceinline=True)
+def of_states(flat: Floats, at: int, d: int) -> OfEach:
+    """Return arrays of d, d + 1 and d + 2 rows, one behind the other."""
+    first, second = d * COUNT, (2 * d + 1) * COUNT
+    return grid(flat, at, d), grid(flat, at + first, d + 1), grid(flat, at + second, d + 2)
+
+
+@compiled(forceinline=True)
 def members_in(rows: Floats, n: int) -> Members:
     """Return the members' arrays in the rows that hold them."""
-    flat, c, colours = rows.ravel(), COUNT, COLOURS.size
-    at = 4 * c
-    rates = flat[:at].reshape((4, c))
+    flat, c, colours, levels, d = rows.ravel(), COUNT, COLOURS.size, n + ORDERS, n + 1
+    rates, at = grid(flat, 0, 4), 4 * c
     noise = flat[at : at + 2 * colours].reshape((2, colours))
     at += 2 * colours
     record = flat[at : at + PLANES * ORDERS * c].reshape((PLANES, ORDERS, c))
     at += PLANES * ORDERS * c
-    levels = n + ORDERS
     flow = flat[at : at + levels * levels].reshape((levels, levels))
     at += levels * levels
-    d = n + 1
-    x0 = flat[at : at + d * c].reshape((d, c))
-    at += d * c
-    x1 = flat[at : at + (d + 1) * c].reshape((d + 1, c))
-    at += (d + 1) * c
-    x2 = flat[at : at + (d + 2) * c].reshape((d + 2, c))
-    at += (d + 2) * c
+    x = of_states(flat, at, d)
+    at += (3 * d + 3) * c
     size = d * (d + 1) // 2
-    p0 = flat[at : at + size * c].reshape((size, c))
-    at += size * c
-    size += d + 1
-    p1 = flat[at : at + size * c].reshape((size, c))
-    at += size * c
-    size += d + 2
-    p2 = flat[at : at + size * c].reshape((size, c))
-    at += size * c
-    g0 = flat[at : at + d * c].reshape((d, c))
-    at += d * c
-    g1 = flat[at : at + (d + 1) * c].reshape((d + 1, c))
-    at += (d + 1) * c
-    g2 = flat[at : at + (d + 2) * c].reshape((d + 2, c))
-    return Members(rates, noise, record, flow, x0, x1, x2, p0, p1, p2, g0, g1, g2)
+    larger, largest = size + d + 1, size + 2 * d + 3
+    p = (
+        grid(flat, at, size),
+        grid(flat, at + size * c, larger),
+        grid(flat, at + (size + larger) * c, largest),
+    )
+    gain = of_states(flat, at + (size + larger + largest) * c, d)
+    return Members(rates, noise, record, flow, x, p, gain)
 
 
 class Tuning(NamedTuple):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.compiled.unowned_arrays import table_of
 from fhaosmo_ros.core.model.inputs import known_inputs, known_inputs_of_run
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
@@ -326,12 +327,7 @@ class Observer:
         flat_law = (law.flags, law.gains, law.curves, law.scalars, law.chances, *law.model)
         self._arguments = (*flat_law, *self._work, *self._state)
         if self.self_tuning:
-            self._table = np.array(
-                [
-                    (a.ctypes.data, a.shape[0] if a.ndim == 2 else 0, a.shape[-1])
-                    for a in self._arguments
-                ]
-            )
+            self._table = table_of(self._arguments)
             law.flags[arrays.STEP_AT] = step_address()
             law.flags[arrays.TABLE_AT] = self._table.ctypes.data
 

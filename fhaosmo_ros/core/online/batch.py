@@ -6,37 +6,27 @@ The estimators keep their own arrays, of whatever size. A table says where these
 costs the same whether it steps one channel or fifty.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.compiled.cache import compiled
-from fhaosmo_ros.core.compiled.unowned_arrays import doubles_at, integers_at
-from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
-from fhaosmo_ros.core.observer.arrays import Law, State, Work
+from fhaosmo_ros.core.compiled.unowned_arrays import (
+    doubles_at,
+    integers_of,
+    line_at,
+    plane_at,
+    table_of,
+)
+from fhaosmo_ros.core.model.bytecode import Floats, Ints
+from fhaosmo_ros.core.observer.arrays import ARRAYS, observer_at
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.memory import EstimatorArrays, Policy
 from fhaosmo_ros.core.online.policy import take
 import numpy as np
 from numpy.typing import NDArray
 
-(
-    EPS,
-    INTS,
-    REALS,
-    FLAGS,
-    GAINS,
-    CURVES,
-    SCALARS,
-    CHANCES,
-    CODE,
-    OFFSETS,
-    X,
-    STACK,
-    STAGES,
-    LEVELS,
-    MEMORY,
-    UNKNOWN_INPUT,
-) = range(16)
+EPS, INTS, REALS, OBSERVER = range(4)
+UNKNOWN_INPUT = OBSERVER + ARRAYS
 """Index in the table: the arrays of `OnlineEstimator.arguments`, then the estimate of d."""
 
 
@@ -59,34 +49,9 @@ class ChannelSamples(NamedTuple):
 
 
 @compiled(inline='always')
-def plane_at(t: Ints, index: int) -> Any:
-    """Return the two-dimensional array that a channel's part of the table names."""
-    return doubles_at(t[index, 0], (t[index, 1], t[index, 2]))
-
-
-@compiled(inline='always')
-def line_at(t: Ints, index: int) -> Any:
-    """Return the array of doubles that a channel's part of the table names."""
-    return doubles_at(t[index, 0], t[index, 2])
-
-
-@compiled(inline='always')
-def integers_of(t: Ints, index: int) -> Any:
-    """Return the array of integers that a channel's part of the table names."""
-    return integers_at(t[index, 0], t[index, 2])
-
-
-@compiled(inline='always')
 def arrays_at(t: Ints) -> EstimatorArrays:
     """Return the arrays of the estimator that a channel's part of the table names."""
-    model = Bytecode(plane_at(t, CODE), integers_of(t, OFFSETS))
-    law = Law(
-        integers_of(t, FLAGS), plane_at(t, GAINS), plane_at(t, CURVES), line_at(t, SCALARS),
-        plane_at(t, CHANCES), model,
-    )  # fmt: skip
-    stages = doubles_at(t[STAGES, 0], (4, 2, t[STAGES, 2]))
-    work = Work(plane_at(t, X), plane_at(t, STACK), stages)
-    state = State(plane_at(t, LEVELS), line_at(t, MEMORY))
+    law, work, state = observer_at(t, OBSERVER)
     return EstimatorArrays(law, work, state, Policy(integers_of(t, INTS), line_at(t, REALS)))
 
 
@@ -156,7 +121,7 @@ class EstimatorBatch:
 
         """
         if any(estimator.smooths for estimator in self._estimators):
-            return self._one_by_one(channel, stamps, y, u)
+            return self._one_by_one(zip(channel, stamps, y, u, strict=True))
         for c, estimator in enumerate(self._estimators):
             if estimator.arguments is not self._arguments[c]:
                 self._place(c, estimator)
@@ -175,15 +140,11 @@ class EstimatorBatch:
         return words, unknown_inputs
 
     def _one_by_one(
-        self,
-        channel: Sequence[int],
-        stamps: Sequence[int],
-        y: Sequence[float],
-        u: Sequence[float | Sequence[float]],
+        self, samples: Iterable[tuple[int, int, float, float | Sequence[float]]]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Do the same where an estimator also estimates the past, which a batch can't."""
         words, unknown_inputs = [], []
-        for c, stamp, value, inputs in zip(channel, stamps, y, u, strict=True):
+        for c, stamp, value, inputs in samples:
             estimator = self._estimators[c]
             for k, number in enumerate(np.atleast_1d(inputs)[: len(estimator.inputs)]):
                 estimator.set_input(float(number), k)
@@ -201,9 +162,5 @@ class EstimatorBatch:
     def _place(self, c: int, estimator: OnlineEstimator) -> None:
         """Write where a channel's arrays are; holding them keeps them there."""
         self._arguments[c] = estimator.arguments
-        for index, array in enumerate(estimator.arguments):
-            if not array.flags.c_contiguous:
-                raise AssertionError(f'argument {index} of a channel is not contiguous')
-            rows = array.shape[0] if array.ndim == 2 else 0
-            self._table[c, index] = array.ctypes.data, rows, array.shape[-1]
+        self._table[c, :UNKNOWN_INPUT] = table_of(estimator.arguments)
         self._table[c, UNKNOWN_INPUT, 0] = estimator.observer.unknown_input_address

@@ -243,8 +243,7 @@ class OnlineEstimator:
         ints[at.GATE_SAMPLES] = p['spike_gate_samples']
         reals[at.GATE] = p['spike_gate']
         reals[at.LIMIT] = p['divergence_limit']
-        self_tuning = p['gains'] == 'self_tuning'
-        reals[at.EPSILON] = math.inf if self_tuning else p['epsilon']
+        reals[at.EPSILON] = math.inf if self.observer.self_tuning else p['epsilon']
         ints[at.BRIDGED] = 0  # the state before a gap is that of the parameters before
         levels, memory = self.observer.initial_state()
         size = levels.size + memory.size
