@@ -6,7 +6,7 @@ import math
 from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
-from fhaosmo_ros.core.observer.members import (
+from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOUR,
     INTENSITY,
     KAPPA,

@@ -9,7 +9,7 @@ from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.covariance import Uncertainty
 from fhaosmo_ros.core.observer.fuzzy import curves, KNOTS, of_level, read_system
 from fhaosmo_ros.core.observer.levant import deadbeat_shares
-from fhaosmo_ros.core.observer.members import ORDERS, rows_of
+from fhaosmo_ros.core.observer.self_tuning.members import ORDERS, rows_of
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS

@@ -12,9 +12,9 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer import step as recursion
 from fhaosmo_ros.core.observer.arrays import Law, make_work, State, Work
-from fhaosmo_ros.core.observer.bank import step_address
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.members import FIRST_SAMPLES, Tuning, tuning_in, UNKNOWN
+from fhaosmo_ros.core.observer.self_tuning.members import FIRST_SAMPLES, Tuning, tuning_in, UNKNOWN
+from fhaosmo_ros.core.observer.self_tuning.step import step_address
 from fhaosmo_ros.core.observer.smoother import smoothed
 from fhaosmo_ros.core.observer.status import flags, FLAGS_MASK, LEVEL_SHIFT, open_levels, Status
 from fhaosmo_ros.core.parameters.declaration import Parameters

@@ -3,8 +3,8 @@
 
 from collections.abc import Mapping
 
-from fhaosmo_ros.core.observer.members import ORDERS
 from fhaosmo_ros.core.observer.observer import Estimate, Observer
+from fhaosmo_ros.core.observer.self_tuning.members import ORDERS
 from fhaosmo_ros.nodes.middleware.messages import (
     array_encoder,
     double_encoder,

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The first samples, and members that begin with what these tell (D 26, D 28)."""
+
+import math
+
+from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.model.bytecode import Floats
+from fhaosmo_ros.core.observer.arrays import (
+    COVARIANCE,
+    FIRST_NOISE,
+    FLOW_PERIOD,
+    FRESH,
+    HAT,
+    Law,
+    LEAST_NOISE,
+    LIKELIEST,
+    MOVING,
+    QUANTUM,
+    REPEATED,
+    SAMPLES,
+    STEADY_PERIOD,
+    UNSETTLED,
+    Work,
+    Y,
+)
+from fhaosmo_ros.core.observer.covariance import MEDIAN
+from fhaosmo_ros.core.observer.self_tuning.filters import at
+from fhaosmo_ros.core.observer.self_tuning.members import (
+    BANDWIDTHS,
+    COLOUR,
+    COLOURS,
+    COUNT,
+    FACTORIALS,
+    FAR,
+    FIRST_SAMPLES,
+    INTENSITY,
+    KAPPA,
+    LOG_VARIANCE,
+    Members,
+    ORDERS,
+    PRIOR,
+    RATIO,
+    RESIDUAL,
+    SCORE,
+    SHORT,
+    SQUARE,
+    TAU,
+    USED,
+    VARIANCE,
+)
+from fhaosmo_ros.core.observer.self_tuning.noise import SAME_LOW
+from fhaosmo_ros.core.observer.self_tuning.weights import weigh
+import numpy as np
+
+
+@compiled()
+def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: float) -> None:
+    """Collect the first samples, which tell the period, the noise and the sizes (D 28)."""
+    n, x, first = law.gains.shape[1] - ORDERS, work.x, members.p[2]
+    count = int(memory[SAMPLES])
+    if count == 0:
+        first[0, 0], first[1, 0] = memory[Y], 0.0
+        count = 1
+    if count == FIRST_SAMPLES:  # y has not changed since
+        for i in range(count - 1):
+            first[0, i], first[1, i] = first[0, i + 1], first[1, i + 1]
+        count -= 1
+    first[0, count], first[1, count] = y, h
+    count += 1
+    memory[SAMPLES] = count
+    for i in range(x.shape[1]):
+        x[HAT, i] = 0.0
+        x[COVARIANCE, i] = math.inf
+    x[HAT, 0] = y
+    least = law.scalars[LEAST_NOISE]
+    if count < FIRST_SAMPLES and not (least > 0.0 and count > 2 * n + 4):
+        return
+    period = 0.0
+    for i in range(1, count):
+        period += first[1, i] / (count - 1)
+    differences, values = first[0, :count].copy(), np.empty(count)
+    noise, largest, binomial, quantum, repeated = math.inf, 0.0, 1.0, math.inf, 0.0
+    for i in range(count):
+        largest = max(largest, abs(first[0, i]))
+    for order in range(1, n + 2):
+        length = count - order
+        binomial *= (4.0 * order - 2.0) / order  # (2 order)! / order!^2
+        for i in range(length):
+            differences[i] = differences[i + 1] - differences[i]
+            values[i] = abs(differences[i])
+            if order == 1 and values[i] > 1e-12 * largest:
+                quantum = min(quantum, values[i])
+            elif order == 1:
+                repeated += 1.0 / length
+        size = middle(values, length) / MEDIAN / math.sqrt(binomial)
+        if size > 0.0:
+            noise = min(noise, size)
+    if quantum == math.inf and least == 0.0:
+        return
+    if repeated > SAME_LOW:
+        noise = max(quantum / math.sqrt(12.0), noise if noise < math.inf else 0.0)
+        memory[QUANTUM] = quantum
+    memory[REPEATED] = repeated
+    if noise == math.inf:
+        noise = quantum
+    noise = max(noise, least, 1e-9 * largest, 1e-150)
+    begin(law, memory, members, count, y, period, noise)
+    memory[SAMPLES] = FIRST_SAMPLES + 1
+
+
+@compiled()
+def middle(values: Floats, count: int) -> float:
+    """Return the median of the first `count` values, which are sorted in place."""
+    for i in range(1, count):
+        value, j = values[i], i
+        while j > 0 and values[j - 1] > value:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = value
+    return float(values[count // 2])
+
+
+@compiled()
+def begin(
+    law: Law, memory: Floats, members: Members, count: int, y: float, period: float, noise: float
+) -> None:
+    """Let the members begin at `y` (D 28)."""
+    n = law.gains.shape[1] - ORDERS
+    sizes, first = np.empty(n), members.p[2][0, :count].copy()
+    stride = max((count - 1) // n, 1)
+    for i in range(n):  # how large z_i may be: its setting, or what differences say
+        sizes[i] = law.chances[FRESH * law.gains.shape[1] + i, i]
+        if i > 0:
+            for j in range(count - i * stride):
+                first[j] = (first[j + stride] - first[j]) / (stride * period)
+                sizes[i] = max(sizes[i], first[j] * first[j])
+    memory[MOVING] = COUNT
+    memory[STEADY_PERIOD] = period
+    memory[UNSETTLED] = 0.0
+    memory[FLOW_PERIOD] = 0.0
+    memory[FIRST_NOISE] = noise * noise
+    for c in range(COLOURS.size):
+        members.noise[SQUARE, c] = members.noise[USED, c] = noise * noise
+    rates, record = members.rates, members.record
+    for g in range(COUNT):
+        omega, colour = BANDWIDTHS[g] / period, COLOURS[COLOUR[g]]
+        rates[KAPPA, g] = RATIO[g] * omega
+        rates[TAU, g] = -period / math.log(colour) if colour > 0.0 else 0.0
+    least = math.inf
+    for k in range(ORDERS):
+        x = members.x[k]
+        p = members.p[k]
+        d = n + 1 + k
+        x[:] = 0.0
+        p[:] = 0.0
+        for g in range(COUNT):
+            omega, kappa = BANDWIDTHS[g] / period, rates[KAPPA, g]
+            intensity = noise * noise * period * omega ** (2 * d)
+            record[INTENSITY, k, g] = intensity
+            x[0, g] = y
+            p[0, g] = noise * noise
+            for i in range(1, n):
+                p[at(d, i, i), g] = sizes[i]
+            for i in range(k + 1):
+                for j in range(i, k + 1):
+                    below = 2 * k - i - j
+                    p[at(d, n + i, n + j), g] = (
+                        intensity
+                        * FACTORIALS[below]
+                        / (FACTORIALS[k - i] * FACTORIALS[k - j] * (2.0 * kappa) ** (below + 1))
+                    )
+            size = math.log(p[at(d, n, n), g])
+            record[PRIOR, k, g] = -0.5 * size
+            least = min(least, size)
+    for k in range(ORDERS):
+        for g in range(COUNT):
+            record[PRIOR, k, g] += 0.5 * least
+            record[SCORE, k, g] = record[PRIOR, k, g]
+            record[VARIANCE, k, g] = 1.0
+            record[LOG_VARIANCE, k, g] = record[RESIDUAL, k, g] = record[FAR, k, g] = 0.0
+            record[SHORT, k, g] = 1.0
+    memory[LIKELIEST] = weigh(members)

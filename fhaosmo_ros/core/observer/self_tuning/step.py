@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One step of all members, and their restart; called by address (D 26 to D 29)."""
+
+from functools import cache
+import math
+
+from fhaosmo_ros.core.compiled.cache import compiled, compiled_callback
+from fhaosmo_ros.core.compiled.unowned_arrays import doubles_at, integers_at, unowned
+from fhaosmo_ros.core.model.bytecode import Floats
+from fhaosmo_ros.core.model.integrate import NOW
+from fhaosmo_ros.core.observer.arrays import (
+    ARRAYS,
+    BEYOND,
+    CALM,
+    FAR_SIGN,
+    FIRST_NOISE,
+    FLOW_PERIOD,
+    FORGETTING,
+    FRESH,
+    HAT,
+    Law,
+    LIKELIEST,
+    LINEAR,
+    MOVING,
+    observer_at,
+    PREDICTION_STEP,
+    ROWS,
+    SAMPLES,
+    STEADY_PERIOD,
+    UNSETTLED,
+    Work,
+    Y,
+)
+from fhaosmo_ros.core.observer.levant import NEAR
+from fhaosmo_ros.core.observer.prediction import predict
+from fhaosmo_ros.core.observer.self_tuning.filters import (
+    at,
+    correct_covariances,
+    correct_states,
+    expect_innovations,
+    predict_covariances,
+    predict_states,
+)
+from fhaosmo_ros.core.observer.self_tuning.members import (
+    BANDS,
+    COLOUR,
+    COLOURS,
+    CORRELATION,
+    COUNT,
+    DECAYED,
+    FAR,
+    FIRST_SAMPLES,
+    IN_BAND,
+    KAPPA,
+    LOG_VARIANCE,
+    Members,
+    members_in,
+    ORDERS,
+    RATIO,
+    RESIDUAL,
+    SHORT,
+    SQUARE,
+    TAU,
+    USED,
+    VARIANCE,
+)
+from fhaosmo_ros.core.observer.self_tuning.noise import (
+    find_quantum,
+    follow_noise,
+    is_likely,
+    knowing,
+    STEADY,
+)
+from fhaosmo_ros.core.observer.self_tuning.start import gather
+from fhaosmo_ros.core.observer.self_tuning.weights import judge, mix, weigh
+from fhaosmo_ros.core.observer.step import LOST_SAMPLES
+from numba import types
+import numpy as np
+
+NOISE_SAMPLES = 1000.0
+"""The noise is averaged over so many samples."""
+CALM_SAMPLES = 40.0
+"""Until so many samples after that no sample judges the members."""
+ANOTHER, FAR_OFF = 1.3, 3.0
+"""Factors on the variance of the noise, of the likeliest colour and others, that make P move."""
+LONG = 12.0
+"""Time constants of a member after which its P is steady."""
+
+
+@compiled()
+def follow_period(law: Law, members: Members, memory: Floats, h: float) -> None:
+    """Decide which covariances move, and what depends on the period (D 27)."""
+    rates, noise = members.rates, members.noise
+    if h != memory[FLOW_PERIOD]:
+        for g in range(COUNT):
+            rates[DECAYED, g] = math.exp(-rates[KAPPA, g] * h)
+            tau = rates[TAU, g]
+            rates[CORRELATION, g] = math.exp(-h / tau) if tau > 0.0 else 0.0
+    changed = abs(h - memory[STEADY_PERIOD]) > NEAR * memory[STEADY_PERIOD]
+    likeliest = int(memory[LIKELIEST])
+    for c in range(COLOURS.size):
+        ratio, limit = noise[SQUARE, c] / noise[USED, c], ANOTHER if c == likeliest else FAR_OFF
+        changed = changed or not 1.0 / limit < ratio < limit
+    if changed:
+        noise[USED] = noise[SQUARE]
+    if changed or not law.flags[LINEAR]:
+        memory[UNSETTLED] = 0.0
+        memory[STEADY_PERIOD] = h
+    memory[UNSETTLED] += h
+    n = law.gains.shape[1] - ORDERS
+    slowed = 1.0
+    for c in range(COLOURS.size):
+        slowed = min(slowed, (memory[FIRST_NOISE] / noise[USED, c]) ** (0.5 / (n + 1)))
+    moving = 0
+    for band in range(BANDS):
+        kappa, ratio = rates[KAPPA, band * IN_BAND], RATIO[band * IN_BAND]
+        if kappa / ratio * slowed * memory[UNSETTLED] < LONG:
+            moving += IN_BAND
+    memory[MOVING] = moving
+
+
+@compiled()
+def carry_flow(
+    law: Law, work: Work, members: Members, memory: Floats, h: float, u: Floats
+) -> None:
+    """Predict the mean, with its derivative by each of its entries (D 27); to ``stages[NOW]``."""
+    levels, now = law.gains.shape[1], work.stages[NOW]
+    known = law.flags[LINEAR] and h == memory[FLOW_PERIOD]
+    for j in range(levels - 1 if known else 0, levels):
+        for i in range(levels):
+            now[0, i], now[1, i] = work.x[HAT, i], 0.0
+        now[1, j] = 1.0
+        predict(law, work, h, u, law.scalars[PREDICTION_STEP])
+        for i in range(levels):
+            members.flow[i, j] = now[1, i]
+    memory[FLOW_PERIOD] = h
+
+
+@compiled()
+def step_members(
+    law: Law, work: Work, memory: Floats, rows: Floats, y: float, h: float, u: Floats
+) -> float:
+    """
+    Advance the members, and the estimates in ``work.x``, to the sample `y`.
+
+    Returns
+    -------
+    float
+        Square of the innovation of the mean. A sample that is too far off is counted in
+        ``memory[BEYOND]``, and changes nothing else.
+
+    """
+    x, n = work.x, law.gains.shape[1] - ORDERS
+    members = unowned(members_in(rows, n))
+    if memory[SAMPLES] <= FIRST_SAMPLES:
+        gather(law, work, memory, members, y, h)
+        return 0.0
+    zone = find_quantum(members, memory, y)
+    follow_period(law, members, memory, h)
+    moving, now = int(memory[MOVING]), work.stages[NOW]
+    carry_flow(law, work, members, memory, h, u)
+    mean, predicted = x[HAT].copy(), now[0].copy()
+    b, s, believed = np.empty((3, ORDERS, COUNT))
+    # A sample that is not likely must change none of these.
+    x0, x1, x2 = members.x
+    ahead, p, gain = (x0.copy(), x1.copy(), x2.copy()), members.p, members.gain
+    if moving > 0:
+        p, gain = (
+            (p[0].copy(), p[1].copy(), p[2].copy()),
+            (gain[0].copy(), gain[1].copy(), gain[2].copy()),
+        )
+    for k in range(ORDERS):
+        predict_states(members, n, k, h, mean, predicted, ahead[k])
+        if moving > 0:
+            predict_covariances(members, n, k, h, p[k], moving)
+        expect_innovations(members, n, k, h, p[k], gain[k], s[k], moving)
+        residual, correlation = members.record[RESIDUAL, k], members.rates[CORRELATION]
+        for g in range(COUNT):
+            off = y - ahead[k][0, g] - correlation[g] * residual[g]
+            b[k, g] = max(off - zone, 0.0) + min(off + zone, 0.0)
+            believed[k, g] = s[k, g]
+            if memory[BEYOND] > 0.0:  # P grows meanwhile, and the quick members believe anything
+                believed[k, g] = min(s[k, g], 4.0 * members.record[VARIANCE, k, g])
+    count = min(memory[SAMPLES], NOISE_SAMPLES)
+    memory[SAMPLES] = count + 1.0
+    largest = knowing(members, believed)
+    if not is_likely(members, b, believed, largest):
+        sign = math.copysign(1.0, b[ORDERS - 1, COUNT - 1])
+        if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
+            memory[BEYOND] += 1.0
+        else:  # noise has both signs, y that is off has one
+            memory[BEYOND] = 1.0
+            follow_noise(members, b, believed, largest, count)
+        memory[FAR_SIGN] = sign
+        return 0.0
+    memory[BEYOND] = 0.0
+    grown = follow_noise(members, b, believed, largest, count)
+    memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
+    kept = math.exp(-h / law.scalars[FORGETTING])
+    members.record[VARIANCE, :, :moving] = s[:, :moving]
+    members.record[LOG_VARIANCE, :, :moving] = np.log(s[:, :moving])
+    judge(members, b, s, grown, kept if memory[CALM] > CALM_SAMPLES else -1.0)
+    for k in range(ORDERS):
+        if moving > 0:
+            correct_covariances(members, n, k, p[k], gain[k], s[k], moving)
+            members.p[k][:, :moving] = p[k][:, :moving]
+            members.gain[k][:, :moving] = gain[k][:, :moving]
+        correct_states(members, n, k, y, ahead[k], b[k])
+    memory[LIKELIEST] = weigh(members)
+    mix(law, members, x)
+    find_strays(members, n, x)
+    return float((y - x[HAT, 0]) ** 2)
+
+
+@compiled()
+def find_strays(members: Members, n: int, x: Floats) -> None:
+    """Put members that have been far off for long to the mean."""
+    far, kappa = members.record[FAR], members.rates[KAPPA]
+    for k in range(ORDERS):
+        z = members.x[k]
+        for g in range(COUNT):
+            if far[k, g] > LOST_SAMPLES:
+                far[k, g] = 0.0
+                for i in range(n + 1):
+                    z[i, g] = x[HAT, i]
+                rate = x[HAT, n + 1] + kappa[g] * x[HAT, n]
+                if k > 0:
+                    z[n + 1, g] = rate
+                if k > 1:
+                    z[n + 2, g] = x[HAT, n + 2] + kappa[g] * (2.0 * rate - kappa[g] * x[HAT, n])
+
+
+@compiled()
+def restart_members(law: Law, levels: Floats, memory: Floats, rows: Floats, y: float) -> None:
+    """Begin afresh from `y`: z is not known any more, d and the noise are (D 29)."""
+    n = law.gains.shape[1] - ORDERS
+    members = members_in(rows, n)
+    memory[UNSETTLED], memory[BEYOND] = 0.0, 0.0
+    levels[HAT, 0] = memory[Y] = y
+    for k in range(ORDERS):
+        z = members.x[k]
+        p = members.p[k]
+        d = n + 1 + k
+        for g in range(COUNT):
+            c = members.rates[CORRELATION, g]
+            z[0, g] = y
+            for i in range(n):
+                size = law.chances[FRESH * law.gains.shape[1] + i, i]
+                p[at(d, i, i), g] = max(size, levels[HAT, i] ** 2)
+                for j in range(i + 1, d):
+                    p[at(d, i, j), g] = 0.0
+            p[0, g] = members.noise[SQUARE, COLOUR[g]] / (1.0 - c * c)
+            members.record[RESIDUAL, k, g] = members.record[FAR, k, g] = 0.0
+            members.record[SHORT, k, g] = 1.0
+
+
+def _step_at(table: int, y: float, h: float, inputs: int, count: int) -> float:
+    """Do what `step_members` does, or with h = 0 `restart_members`, on the arrays of a table."""
+    law, work, (levels, memory) = observer_at(integers_at(table, (ARRAYS, 3)), 0)
+    rows = levels[ROWS + law.gains.shape[1] :]
+    if h > 0.0:
+        return step_members(law, work, memory, rows, y, h, doubles_at(inputs, count))
+    restart_members(law, levels, memory, rows, y)
+    return 0.0
+
+
+@cache
+def step_address() -> int:
+    """Return the address of the machine code of a step; compiles it where that is new."""
+    integer, double = types.int64, types.float64
+    return compiled_callback(_step_at, double(integer, double, double, integer, integer))
