@@ -39,12 +39,12 @@ def matern(size, rate, count, rng):
     return size * d[4000:] / d[4000:].std()
 
 
-def states_of(rates, d, start):
+def states_of(rates, d, start, period=PERIOD):
     """Return the states of z' = A z + e_n d from sample to sample, d held."""
     n = len(rates)
     whole = np.zeros((n + 1, n + 1))
     whole[:n, :n], whole[n - 1, n] = rates, 1.0
-    step = expm(whole * PERIOD)
+    step = expm(whole * period)
     z = np.empty((len(d), n))
     z[0] = start
     for k in range(1, len(d)):
@@ -255,7 +255,47 @@ def test_quantised_y(case):
     """An encoder whose steps are five times the noise of before."""
     t, z, d, _ = case
     run = Observer(SELF_TUNING).run(t, np.round(z[:, 0] / 5e-3) * 5e-3)
-    assert rms((run.unknown_input - d)[5000:]) < rms(d)
+    assert rms((run.unknown_input - d)[5000:]) < 0.9 * rms(d)
+
+
+def swept(rates, size, period, duration, shape):
+    """Return times, z_1 and d of a plant from rest, d a function of its phase at 3 rad/s."""
+    t = np.arange(0.0, duration, period)
+    d = size * shape(3.0 * t)
+    z = states_of(rates, d, [0.0, 0.0], period)
+    return t, z[:, 0], d
+
+
+MOTOR = {**SELF_TUNING, 'order': 2, 'phi': ['0', '-25*z2']}
+FRICTION = np.array([[0.0, 1.0], [0.0, -25.0]])
+
+
+def test_a_large_d_is_not_taken_for_noise():
+    """A d a million times the noise: the noise found is that of y all the same."""
+    t, y, d = swept(FRICTION, 100.0, PERIOD, 12.0, np.sin)
+    y = y + 4.4e-5 * np.random.default_rng(6).standard_normal(len(t))
+    observer = Observer(MOTOR)
+    run = observer.run(t, y)
+    assert observer.tuning.noise == pytest.approx(4.4e-5, rel=0.3)
+    assert rms((run.unknown_input - d)[5000:]) < 0.015 * rms(d)
+
+
+def test_jumps_of_d_at_a_low_rate():
+    """Each jump moves y by 45 times the noise in one sample: no limit cycle, no loss of y."""
+    t, y, d = swept(FRICTION, 70.0, 1e-2, 40.0, lambda phase: np.sign(np.sin(phase)))
+    y = y + 4.4e-4 * np.random.default_rng(7).standard_normal(len(t))
+    run = Observer(MOTOR).run(t, y)
+    assert rms((run.unknown_input - d)[500:]) < 0.85 * rms(d)
+    assert abs(run.unknown_input).max() < 5.0 * 70.0  # a limit cycle has 8
+
+
+def test_quanta_bound_the_noise():
+    """An encoder at rest repeats itself: the noise does not fall below the error of rounding."""
+    t, y, d = swept(FRICTION, 70.0, PERIOD, 15.0, lambda phase: np.sin(phase) ** 31)
+    observer = Observer(MOTOR)
+    run = observer.run(t, np.round(y / 2.2e-3) * 2.2e-3)
+    assert observer.tuning.noise > 0.99 * 2.2e-3 / math.sqrt(12.0)
+    assert rms((run.unknown_input - d)[5000:]) < 0.4 * rms(d)
 
 
 def test_slider(case):

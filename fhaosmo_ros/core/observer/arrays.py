@@ -39,7 +39,9 @@ Entries of ``State.memory``:
 | SAMPLES | self-tuning: samples gathered; more than FIRST_SAMPLES once the members run | 1 |
 | FAR_SIGN | sign of the last innovation that was too far off for every member | 1 |
 | QUANTUM | smallest step of y seen | of y |
-| REPEATED | share of samples that repeat the one before | 1 |
+| LATTICE | share of the steps of y that are multiples of the smallest | 1 |
+| GROWING | unlikely samples in a row, each farther off than the one before | 1 |
+| FARTHEST | how far off the last unlikely sample was | of y |
 | MOVING | members of each k whose covariances move | 1 |
 | UNSETTLED | time since they began to | s |
 | STEADY_PERIOD, FLOW_PERIOD | interval that the covariances, and the flow, are those of | s |
@@ -70,9 +72,9 @@ ROWS = 4
 """Number of rows before the covariance."""
 GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSET = range(11)
 OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
-SAMPLES, FAR_SIGN, QUANTUM, REPEATED, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
-FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM = range(25, 29)
-MEMORY = 29
+SAMPLES, FAR_SIGN, QUANTUM, LATTICE, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
+FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM, GROWING, FARTHEST = range(25, 31)
+MEMORY = 31
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)

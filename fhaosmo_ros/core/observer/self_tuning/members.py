@@ -24,9 +24,11 @@ BANDS = 15
 """Bandwidths of the members of each k."""
 SLOWEST, QUICKEST = 1e-4, 0.5
 """Their range, in rad a sample."""
-COLOURS = np.array([0.0, 0.6, 0.9, 0.98])
+COLOURS = np.array([0.0, 0.7, 0.92, 0.98])
 """Correlations a of the noise of neighbouring samples."""
-KINDS = np.array([[c, r] for c in range(len(COLOURS)) for r in (0.1, 0.5, 1.5)])
+RATIOS = (0.1, 0.5, 1.5)
+SHAPES = len(RATIOS)
+KINDS = np.array([[c, r] for c in range(len(COLOURS)) for r in RATIOS])
 """Members of each bandwidth omega: index of the colour, and kappa / omega."""
 IN_BAND = len(KINDS)
 COUNT = BANDS * IN_BAND
@@ -67,6 +69,9 @@ class Members(NamedTuple):
     ----------
     rates : (4, COUNT) array
     noise : (2, colours) array
+    rough : (1 + colours, n + 2) array
+        Differences of y at the last sample, of order 0 to n + 1, and for each colour what those
+        of order 1 to n + 1 say that the variance of the noise is at most.
     record : (PLANES, ORDERS, COUNT) array
     flow : (N, N) array
         Derivative of the prediction to the next sample.
@@ -80,6 +85,7 @@ class Members(NamedTuple):
 
     rates: Floats
     noise: Floats
+    rough: Floats
     record: Floats
     flow: Floats
     x: OfEach
@@ -90,6 +96,7 @@ class Members(NamedTuple):
 def size_of(order: int) -> int:
     """Return how many numbers the members of a model with n = `order` states need."""
     total = 4 * COUNT + 2 * len(COLOURS) + PLANES * ORDERS * COUNT + (order + ORDERS) ** 2
+    total += (1 + len(COLOURS)) * (order + 2)
     for k in range(ORDERS):
         d = order + 1 + k
         total += (2 * d + d * (d + 1) // 2) * COUNT
@@ -117,14 +124,17 @@ def of_states(flat: Floats, at: int, d: int) -> OfEach:
 @compiled(forceinline=True)
 def members_in(rows: Floats, n: int) -> Members:
     """Return the members' arrays in the rows that hold them."""
-    flat, c, colours, levels, d = rows.ravel(), COUNT, COLOURS.size, n + ORDERS, n + 1
+    flat, c, colours, levels, d = rows.ravel(), COUNT, COLOURS.size, n + ORDERS, n + 2
     rates, at = grid(flat, 0, 4), 4 * c
     noise = flat[at : at + 2 * colours].reshape((2, colours))
     at += 2 * colours
+    rough = flat[at : at + (1 + colours) * d].reshape((1 + colours, d))
+    at += (1 + colours) * d
     record = flat[at : at + PLANES * ORDERS * c].reshape((PLANES, ORDERS, c))
     at += PLANES * ORDERS * c
     flow = flat[at : at + levels * levels].reshape((levels, levels))
     at += levels * levels
+    d = n + 1
     x = of_states(flat, at, d)
     at += (3 * d + 3) * c
     size = d * (d + 1) // 2
@@ -135,7 +145,7 @@ def members_in(rows: Floats, n: int) -> Members:
         grid(flat, at + (size + larger) * c, largest),
     )
     gain = of_states(flat, at + (size + larger + largest) * c, d)
-    return Members(rates, noise, record, flow, x, p, gain)
+    return Members(rates, noise, rough, record, flow, x, p, gain)
 
 
 class Tuning(NamedTuple):

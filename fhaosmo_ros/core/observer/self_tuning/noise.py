@@ -5,16 +5,18 @@ import math
 
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
-from fhaosmo_ros.core.observer.arrays import QUANTUM, REPEATED, Y
+from fhaosmo_ros.core.observer.arrays import FIRST_NOISE, LATTICE, QUANTUM, Y
 from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOUR,
     COLOURS,
+    CORRELATION,
     COUNT,
     Members,
     ORDERS,
     SCORE,
+    SHAPES,
     SHORT,
     SQUARE,
 )
@@ -31,29 +33,73 @@ STEADY = 1.5
 """If squared innovations over S are larger of late for every member, the noise has grown."""
 QUICK_SAMPLES = 30.0
 """It is averaged over so many samples then."""
-SAME_LOW, SAME_HIGH = 0.3, 0.7
-"""Shares of repeated samples between which y passes from noisy to quantised."""
-SAME_SAMPLES = 300.0
+LATTICE_STEPS = 30.0
+"""The share of steps of y that are multiples of the smallest is averaged over so many."""
+LATTICE_SHARE = 0.9
+"""With a larger share y is quantised."""
+HIDDEN = 4.0
+"""Noise of so many times the variance of the error of rounding hides the quanta."""
+ROUGH_SAMPLES = 100.0
+"""Squared differences of y are averaged over so many samples."""
+ROUGH = 2.0
+"""The variance of the noise is at most so many times what they say."""
+
+
+@compiled(forceinline=True)
+def is_multiple(step: float, quantum: float, y: float) -> bool:
+    """Return True if `step` is a multiple of `quantum`, up to the rounding of y to 32 bits."""
+    tolerance = 1e-3 * quantum + 3e-7 * abs(y)
+    return tolerance < 0.1 * quantum and abs(step - round(step / quantum) * quantum) <= tolerance
 
 
 @compiled()
 def find_quantum(members: Members, memory: Floats, y: float) -> float:
     """
-    Follow the quantum of y; return the half-width of the zone in which y says nothing (D 29).
+    Follow the smallest step of y, and whether the others are multiples of it (D 29).
 
-    The zone is 0 unless samples repeat, which noise of the size of the quantum prevents.
+    Returns
+    -------
+    float
+        Variance of the error of rounding; 0 unless y is quantised, and noise does not hide it.
+
     """
-    step = abs(y - memory[Y])
-    if step > 1e-12 * abs(y) and (memory[QUANTUM] == 0.0 or step < memory[QUANTUM]):
-        memory[QUANTUM] = step
-    repeats = 1.0 if step == 0.0 else 0.0
-    memory[REPEATED] += (repeats - memory[REPEATED]) / SAME_SAMPLES
-    share = min(max((memory[REPEATED] - SAME_LOW) / (SAME_HIGH - SAME_LOW), 0.0), 1.0)
-    least = share * memory[QUANTUM] ** 2 / 12.0
-    for c in range(COLOURS.size):
-        square = max(members.noise[SQUARE, c], least * (1.0 - COLOURS[c] ** 2))
-        members.noise[SQUARE, c] = square
-    return float(0.5 * share * memory[QUANTUM])
+    step, quantum = abs(y - memory[Y]), memory[QUANTUM]
+    if step > 1e-12 * abs(y):
+        fits = 1.0
+        if quantum == 0.0 or step < 0.99 * quantum:
+            memory[QUANTUM] = step
+            if quantum > 0.0 and not is_multiple(quantum, step, y):
+                memory[LATTICE] = fits = 0.0
+        elif not is_multiple(step, quantum, y):
+            fits = 0.0
+        memory[LATTICE] += (fits - memory[LATTICE]) / LATTICE_STEPS
+    quanta = memory[QUANTUM] ** 2 / 12.0
+    hidden = HIDDEN * quanta < members.noise[SQUARE, 0]
+    return 0.0 if hidden or memory[LATTICE] < LATTICE_SHARE else float(quanta)
+
+
+@compiled()
+def difference(members: Members, memory: Floats, y: float) -> None:
+    """
+    Follow what the differences of y say that the noise of each colour is at most (D 29).
+
+    White noise w adds C(2p, p) times its variance to that of a difference of order p. What y does
+    besides adds to it, so that the smallest of the variances is an upper bound.
+    """
+    last, orders = members.rough[0], members.rough.shape[1]
+    value, binomial, least = y, 1.0, 1e-12 * memory[FIRST_NOISE]
+    for p in range(orders):
+        before, value_before = last[p], value
+        last[p] = value
+        value = value_before - before
+        if p == 0:
+            continue
+        binomial *= (4.0 * p - 2.0) / p
+        for c in range(COLOURS.size):
+            white = value_before - members.rates[CORRELATION, c * SHAPES] * before
+            r = white * white / (members.rough[1 + c, p] * binomial)
+            grown = 1.0 + (min(r, HUBER * HUBER) / CLIPPED - 1.0) / ROUGH_SAMPLES
+            members.rough[1 + c, p] = max(members.rough[1 + c, p] * grown, least)
 
 
 @compiled()
@@ -79,12 +125,16 @@ def is_likely(members: Members, b: Floats, s: Floats, largest: float) -> bool:
 
 
 @compiled()
-def follow_noise(members: Members, b: Floats, s: Floats, largest: float, count: float) -> float:
+def follow_noise(
+    members: Members, quanta: float, b: Floats, s: Floats, largest: float, count: float
+) -> float:
     """
     Follow the noise of y of each colour, by the innovations of its likeliest members (D 29).
 
     Parameters
     ----------
+    quanta : float
+        Variance of the error of rounding, the least that the noise can have.
     largest : float
         See `knowing`.
     count : float
@@ -120,4 +170,8 @@ def follow_noise(members: Members, b: Floats, s: Floats, largest: float, count: 
     for c in range(COLOURS.size):
         ratio = squares[c] / weights[c] / CLIPPED
         noise[SQUARE, c] *= 1.0 + (ratio - 1.0) / count
+        most = members.rough[1 + c, 1]
+        for p in range(2, members.rough.shape[1]):
+            most = min(most, members.rough[1 + c, p])
+        noise[SQUARE, c] = max(min(noise[SQUARE, c], ROUGH * most), quanta)
     return max(least, 1.0)

@@ -11,12 +11,12 @@ from fhaosmo_ros.core.observer.arrays import (
     FLOW_PERIOD,
     FRESH,
     HAT,
+    LATTICE,
     Law,
     LEAST_NOISE,
     LIKELIEST,
     MOVING,
     QUANTUM,
-    REPEATED,
     SAMPLES,
     STEADY_PERIOD,
     UNSETTLED,
@@ -29,6 +29,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     BANDWIDTHS,
     COLOUR,
     COLOURS,
+    CORRELATION,
     COUNT,
     FACTORIALS,
     FAR,
@@ -48,9 +49,12 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     USED,
     VARIANCE,
 )
-from fhaosmo_ros.core.observer.self_tuning.noise import SAME_LOW
-from fhaosmo_ros.core.observer.self_tuning.weights import weigh
+from fhaosmo_ros.core.observer.self_tuning.noise import difference, is_multiple, LATTICE_SHARE
+from fhaosmo_ros.core.observer.self_tuning.weights import FLOOR, weigh
 import numpy as np
+
+REPEATED = 0.3
+"""If a larger share of the first samples repeat the one before, y is quantised."""
 
 
 @compiled()
@@ -79,7 +83,7 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
     for i in range(1, count):
         period += first[1, i] / (count - 1)
     differences, values = first[0, :count].copy(), np.empty(count)
-    noise, largest, binomial, quantum, repeated = math.inf, 0.0, 1.0, math.inf, 0.0
+    noise, largest, binomial, quantum = math.inf, 0.0, 1.0, math.inf
     for i in range(count):
         largest = max(largest, abs(first[0, i]))
     for order in range(1, n + 2):
@@ -90,22 +94,36 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
             values[i] = abs(differences[i])
             if order == 1 and values[i] > 1e-12 * largest:
                 quantum = min(quantum, values[i])
-            elif order == 1:
-                repeated += 1.0 / length
         size = middle(values, length) / MEDIAN / math.sqrt(binomial)
         if size > 0.0:
             noise = min(noise, size)
     if quantum == math.inf and least == 0.0:
         return
-    if repeated > SAME_LOW:
-        noise = max(quantum / math.sqrt(12.0), noise if noise < math.inf else 0.0)
+    if quantum < math.inf:
         memory[QUANTUM] = quantum
-    memory[REPEATED] = repeated
+        memory[LATTICE] = share_of_multiples(first[0, :count], quantum)
+        if memory[LATTICE] > LATTICE_SHARE:
+            noise = max(quantum / math.sqrt(12.0), noise if noise < math.inf else 0.0)
     if noise == math.inf:
         noise = quantum
     noise = max(noise, least, 1e-9 * largest, 1e-150)
     begin(law, memory, members, count, y, period, noise)
     memory[SAMPLES] = FIRST_SAMPLES + 1
+
+
+@compiled()
+def share_of_multiples(values: Floats, quantum: float) -> float:
+    """Return the share of multiples of `quantum` among the steps; 1 if many samples repeat."""
+    steps, multiples, repeated = 0.0, -1.0, 0.0  # the smallest step is one in any case
+    for i in range(1, len(values)):
+        step = abs(values[i] - values[i - 1])
+        if step < 0.99 * quantum:
+            repeated += 1.0
+        else:
+            steps += 1.0
+            if is_multiple(step, quantum, values[i]):
+                multiples += 1.0
+    return 1.0 if repeated > REPEATED * (len(values) - 1) else multiples / steps
 
 
 @compiled()
@@ -126,7 +144,8 @@ def begin(
 ) -> None:
     """Let the members begin at `y` (D 28)."""
     n = law.gains.shape[1] - ORDERS
-    sizes, first = np.empty(n), members.p[2][0, :count].copy()
+    sizes, samples = np.empty(n), members.p[2][0, :count].copy()
+    first = samples.copy()
     stride = max((count - 1) // n, 1)
     for i in range(n):  # how large z_i may be: its setting, or what differences say
         sizes[i] = law.chances[FRESH * law.gains.shape[1] + i, i]
@@ -146,6 +165,11 @@ def begin(
         omega, colour = BANDWIDTHS[g] / period, COLOURS[COLOUR[g]]
         rates[KAPPA, g] = RATIO[g] * omega
         rates[TAU, g] = -period / math.log(colour) if colour > 0.0 else 0.0
+        rates[CORRELATION, g] = colour
+    members.rough[0] = 0.0
+    members.rough[1:] = noise * noise
+    for j in range(count):
+        difference(members, memory, samples[j])
     least = math.inf
     for k in range(ORDERS):
         x = members.x[k]
@@ -179,4 +203,4 @@ def begin(
             record[VARIANCE, k, g] = 1.0
             record[LOG_VARIANCE, k, g] = record[RESIDUAL, k, g] = record[FAR, k, g] = 0.0
             record[SHORT, k, g] = 1.0
-    memory[LIKELIEST] = weigh(members)
+    memory[LIKELIEST] = weigh(members, FLOOR)

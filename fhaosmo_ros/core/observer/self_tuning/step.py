@@ -13,10 +13,12 @@ from fhaosmo_ros.core.observer.arrays import (
     BEYOND,
     CALM,
     FAR_SIGN,
+    FARTHEST,
     FIRST_NOISE,
     FLOW_PERIOD,
     FORGETTING,
     FRESH,
+    GROWING,
     HAT,
     Law,
     LIKELIEST,
@@ -65,6 +67,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     VARIANCE,
 )
 from fhaosmo_ros.core.observer.self_tuning.noise import (
+    difference,
     find_quantum,
     follow_noise,
     is_likely,
@@ -72,13 +75,22 @@ from fhaosmo_ros.core.observer.self_tuning.noise import (
     STEADY,
 )
 from fhaosmo_ros.core.observer.self_tuning.start import gather
-from fhaosmo_ros.core.observer.self_tuning.weights import judge, mix, weigh
+from fhaosmo_ros.core.observer.self_tuning.weights import (
+    FLOOR,
+    judge,
+    judge_quantised,
+    mix,
+    QUANTISED_FLOOR,
+    weigh,
+)
 from fhaosmo_ros.core.observer.step import LOST_SAMPLES
 from numba import types
 import numpy as np
 
 NOISE_SAMPLES = 1000.0
 """The noise is averaged over so many samples."""
+GROWTHS = 3.0
+"""A sample that is farther off than the one before, so many times in a row, is due to d."""
 CALM_SAMPLES = 40.0
 """Until so many samples after that no sample judges the members."""
 ANOTHER, FAR_OFF = 1.3, 3.0
@@ -155,8 +167,9 @@ def step_members(
     if memory[SAMPLES] <= FIRST_SAMPLES:
         gather(law, work, memory, members, y, h)
         return 0.0
-    zone = find_quantum(members, memory, y)
+    quanta = find_quantum(members, memory, y)
     follow_period(law, members, memory, h)
+    difference(members, memory, y)
     moving, now = int(memory[MOVING]), work.stages[NOW]
     carry_flow(law, work, members, memory, h, u)
     mean, predicted = x[HAT].copy(), now[0].copy()
@@ -176,37 +189,43 @@ def step_members(
         expect_innovations(members, n, k, h, p[k], gain[k], s[k], moving)
         residual, correlation = members.record[RESIDUAL, k], members.rates[CORRELATION]
         for g in range(COUNT):
-            off = y - ahead[k][0, g] - correlation[g] * residual[g]
-            b[k, g] = max(off - zone, 0.0) + min(off + zone, 0.0)
+            b[k, g] = y - ahead[k][0, g] - correlation[g] * residual[g]
             believed[k, g] = s[k, g]
             if memory[BEYOND] > 0.0:  # P grows meanwhile, and the quick members believe anything
                 believed[k, g] = min(s[k, g], 4.0 * members.record[VARIANCE, k, g])
     count = min(memory[SAMPLES], NOISE_SAMPLES)
     memory[SAMPLES] = count + 1.0
     largest = knowing(members, believed)
-    if not is_likely(members, b, believed, largest):
+    off = abs(b[ORDERS - 1, COUNT - 1])
+    grows = off > 1.1 * memory[FARTHEST] + 2.0 * math.sqrt(members.noise[SQUARE, 0])
+    memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and grows else 0.0
+    memory[FARTHEST] = off
+    if memory[GROWING] < GROWTHS and not is_likely(members, b, believed, largest):
         sign = math.copysign(1.0, b[ORDERS - 1, COUNT - 1])
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
             memory[BEYOND] += 1.0
         else:  # noise has both signs, y that is off has one
             memory[BEYOND] = 1.0
-            follow_noise(members, b, believed, largest, count)
+            follow_noise(members, quanta, b, believed, largest, count)
         memory[FAR_SIGN] = sign
         return 0.0
     memory[BEYOND] = 0.0
-    grown = follow_noise(members, b, believed, largest, count)
+    grown = follow_noise(members, quanta, b, believed, largest, count)
     memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
     kept = math.exp(-h / law.scalars[FORGETTING])
     members.record[VARIANCE, :, :moving] = s[:, :moving]
     members.record[LOG_VARIANCE, :, :moving] = np.log(s[:, :moving])
-    judge(members, b, s, grown, kept if memory[CALM] > CALM_SAMPLES else -1.0)
+    judged = memory[CALM] > CALM_SAMPLES
+    judge(members, b, s, grown, kept if judged and quanta == 0.0 else -1.0)
+    if judged and quanta > 0.0:
+        judge_quantised(members, y, ahead, quanta, kept)
     for k in range(ORDERS):
         if moving > 0:
             correct_covariances(members, n, k, p[k], gain[k], s[k], moving)
             members.p[k][:, :moving] = p[k][:, :moving]
             members.gain[k][:, :moving] = gain[k][:, :moving]
         correct_states(members, n, k, y, ahead[k], b[k])
-    memory[LIKELIEST] = weigh(members)
+    memory[LIKELIEST] = weigh(members, QUANTISED_FLOOR if quanta > 0.0 else FLOOR)
     mix(law, members, x)
     find_strays(members, n, x)
     return float((y - x[HAT, 0]) ** 2)

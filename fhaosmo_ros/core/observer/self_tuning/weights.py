@@ -17,6 +17,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     KAPPA,
     LOG_VARIANCE,
     Members,
+    OfEach,
     ORDERS,
     PRIOR,
     SCORE,
@@ -26,8 +27,10 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
 )
 import numpy as np
 
-FLOOR = 30.0
-"""No log-likelihood falls further below the best one."""
+FLOOR, QUANTISED_FLOOR = 30.0, 100.0
+"""No log-likelihood falls further below the best one (D 28, D 31)."""
+VAGUE = 0.04
+"""Part of the square of half a quantum by which predictions are less certain than their P says."""
 NEGLIGIBLE = 25.0
 """Members whose log-likelihood is so far below the best one have no weight."""
 
@@ -55,12 +58,42 @@ def judge(members: Members, b: Floats, s: Floats, grown: float, kept: float) -> 
                 likelihood = min(r / grown, HUBER * HUBER) + log_s + log_colours[COLOUR[g]]
                 score = prior + kept * (record[SCORE, k, g] - prior)
                 record[SCORE, k, g] = score - 0.5 * likelihood
-            limit = HUBER * math.sqrt(variance)
+            late = max(record[FAR, k, g] - 1.0, 0.0)  # in a row: not an outlier, but d
+            limit = HUBER * math.sqrt(variance) * (1.0 + late * late)
             b[k, g] = min(max(b[k, g], -limit), limit)
 
 
 @compiled()
-def weigh(members: Members) -> int:
+def judge_quantised(members: Members, y: float, ahead: OfEach, quanta: float, kept: float) -> None:
+    """
+    Take a quantised sample into the log-likelihoods (D 31), in place.
+
+    A prediction that would be rounded to `y` is not worse than another one that would be.
+
+    Parameters
+    ----------
+    ahead : tuple of arrays
+        The members' predictions of z and d.
+    quanta : float
+        Variance of the error of rounding.
+
+    """
+    record, half = members.record, math.sqrt(3.0 * quanta)
+    least = max(members.noise[SQUARE, 0] - quanta, 0.0) + VAGUE * half * half
+    box = half * math.sqrt(2.0 / math.pi)
+    for k in range(ORDERS):
+        for g in range(COUNT):
+            variance = members.p[k][0, g] + least
+            off = max(abs(y - ahead[k][0, g]) - half, 0.0)
+            likelihood = min(off * off / variance, HUBER * HUBER)
+            likelihood += 2.0 * math.log(math.sqrt(variance) + box)
+            prior = record[PRIOR, k, g]
+            score = prior + kept * (record[SCORE, k, g] - prior)
+            record[SCORE, k, g] = score - 0.5 * likelihood
+
+
+@compiled()
+def weigh(members: Members, floor: float) -> int:
     """Turn log-likelihoods into weights (D 28); return the colour of the likeliest member."""
     score, weight, total = members.record[SCORE], members.record[WEIGHT], 0.0
     best, colour = -math.inf, 0
@@ -70,7 +103,7 @@ def weigh(members: Members) -> int:
                 best, colour = score[k, g], COLOUR[g]
     for k in range(ORDERS):
         for g in range(COUNT):
-            score[k, g] = max(score[k, g] - best, -FLOOR)
+            score[k, g] = max(score[k, g] - best, -floor)
             weight[k, g] = math.exp(score[k, g]) if score[k, g] > -NEGLIGIBLE else 0.0
             total += weight[k, g]
     for k in range(ORDERS):
