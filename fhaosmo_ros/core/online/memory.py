@@ -121,8 +121,8 @@ LABELS_OF_ROWS = ['z_hat', 'z_tilde', 'z_hat_sensitivity', 'z_tilde_sensitivity'
 LABELS_OF_MEMORY = [
     'gamma', 'y', 'pending', 'wait', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread',
     'upset', 'offset', 'jumps', 'first_miss', 'miss', 'watched', 'drift', 'usual', 'samples',
-    'far_sign', 'quantum', 'repeated', 'moving', 'unsettled', 'steady_period', 'flow_period',
-    'first_noise', 'likeliest', 'calm',
+    'far_sign', 'quantum', 'lattice', 'moving', 'unsettled', 'steady_period', 'flow_period',
+    'first_noise', 'likeliest', 'calm', 'growing', 'farthest',
 ]  # fmt: skip
 """Labels of a snapshot's entries: they are in bags, so they stay as they are."""
 MISSING = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}
