@@ -215,9 +215,9 @@ def _identify(
     if others:
         raise ConfigurationError(
             f'--bag without the truth: expected gains of structure levant and scheme '
-            f'predict_correct, got {", ".join(others)} set. Leave that out; or tune by a simulated '
-            'family: without --bag, with -p noise_std:=..., rms_of_d, band_of_d as this command '
-            'finds them'
+            f'predict_correct, got {", ".join(others)} set. Leave that out; or tune by a '
+            'simulated family: without --bag, with noise_std, rms_of_d and band_of_d as this '
+            'command finds them'
         )
     where = {
         'input_topic': arguments.topic,

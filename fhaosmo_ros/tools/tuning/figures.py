@@ -101,6 +101,7 @@ def save_identified(
     below.axhspan(-chance, chance, color='grey', alpha=0.3, label='as chance makes it')
     largest = max(1.3 * float(np.abs(correlations).max()), 3.0 * chance)
     below.set_ylim(-largest, largest)
+    below.set_xticks(lags[[0, *range(4, len(lags), 5)]])
     below.set_xlabel('samples between two innovations')
     below.set_ylabel('correlation')
     below.legend(loc='upper right', fontsize='small')

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is wrong with a recorded y, or with its model, in plain sentences."""
 
+from itertools import pairwise
 import math
 
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.tuning.identification.gains import BEGIN, Gains, Run
 from fhaosmo_ros.tools.tuning.identification.identify import (
     Identified,
-    MOST_COLOUR,
     NothingToFind,
     PIECES,
 )
@@ -45,13 +44,13 @@ def refuse(found: Identified) -> None:
     period, sensor = likelihood.period, found.sensor
     top = 0.9 * QUICKEST / period
     white = found.white or found.best
-    if not likelihood.fixed and not sensor.quantisation:
-        if sensor.noise_std < NO_NOISE * float(np.std(y)):
-            raise NothingToFind(
-                f'y: expected noise, got none that shows ({sensor.noise_std:.1e} in a y of '
-                f'{np.std(y):.3g}), as in a simulation without noise: the less noise, the larger '
-                'the gains, without limit. Say what the sensor will have: -p noise_size:=...'
-            )
+    silent = sensor.noise_std < NO_NOISE * float(np.std(y)) and not sensor.quantisation
+    if silent and not likelihood.fixed:
+        raise NothingToFind(
+            f'y: expected noise, got none that shows ({sensor.noise_std:.1e} in a y of '
+            f'{np.std(y):.3g}), as in a simulation without noise: the less noise, the larger the '
+            'gains, without limit. Say what the sensor will have: -p noise_size:=...'
+        )
     if not likelihood.fixed and max(white.design.bandwidth, design.bandwidth) > top:
         raise NothingToFind(
             f'y: the likeliest filter follows every sample ({design.bandwidth:.3g} rad/s at '
@@ -112,13 +111,13 @@ def _of_noise(found: Identified) -> list[str]:
             'as behind a low-pass filter in the sensor. Fixed gains know white noise only. These '
             f'count on white noise of {found.best.low_noise:.3g}, which has the same power at '
             'low frequencies; so innovations are smaller than expected, and correlated. '
-            '`gains: self_tuning` follows the colour itself, and is better here. (White noise is '
-            f'less likely by {gain:.0f} in the logarithm.)'
+            f'`gains: self_tuning` follows the colour itself. (White noise is less likely by '
+            f'{gain:.0f} in the logarithm.)'
         )
     r = found.best.innovations
     edges = np.linspace(0, len(r), PIECES + 1).astype(int)
     levels = []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         piece = np.abs(r[a:b][np.isfinite(r[a:b]) & found.likelihood.samples.used[a:b]])
         if len(piece) >= 30:
             levels.append(float(np.median(piece)) / 0.6745 * found.best.noise)
@@ -156,13 +155,22 @@ def _of_model(found: Identified) -> list[str]:
         )
     level, gain = max(found.shaken.items(), key=lambda item: item[1])
     if gain > SURE and level < n + 1:
-        where = f"z{level}' = {f'z{level + 1}' if level < n else 'd'} + phi[{level}]"
+        where = f"z{level}' = {f'z{level + 1}' if level < n else 'd'} + Phi_{level}"
         texts.append(
             f'The model misses something: y is likelier by {gain:.0f} in the logarithm if random '
             f'shocks act in {where} as well. The order may be wrong (an unknown input that acts '
             'there makes a model of fewer states the right one), phi may be, or y may slip or '
             'drift. Standard deviations are too small then.'
         )
+    smoother = found.tried.get(2), found.tried.get(1)
+    if found.best.design.derivatives == 2 and all(smoother):
+        gain = (smoother[0].held_out - smoother[1].held_out) * 0.5 * len(samples.y)
+        if gain > SURE:
+            texts.append(
+                'd is so smooth that two of its derivatives are followed. If the order '
+                f'({n}) is right, there is nothing to do. A model with too few states shows the '
+                'same: d is then a state of the plant, and what acts on it lies behind.'
+            )
     begin = int(BEGIN * len(samples.y))
     t, d = np.cumsum(samples.h)[begin:], found.best.estimates[begin:, n]
     slope, middle = np.polyfit(t - t.mean(), d, 1)
@@ -199,8 +207,9 @@ def _of_run(found: Identified, run: Run) -> list[str]:
     if not coloured and run.probability < UNLIKELY and largest > SMALL_CORRELATION:
         lag = int(np.abs(run.correlations).argmax()) + 1
         texts.append(
-            f'Innovations are not white: they correlate by {run.correlations[lag - 1]:+.2f} over '
-            f'{lag} samples. The model of the plant, of d or of the noise does not quite fit; '
-            'the gains are the best of their kind, but standard deviations are too small.'
+            f'Innovations are not white: they correlate by {run.correlations[lag - 1]:+.2f} with '
+            f'those {lag} before them. The model of the plant, of d or of the noise does not '
+            'quite fit; the gains are the best of their kind, but standard deviations are too '
+            'small.'
         )
     return texts

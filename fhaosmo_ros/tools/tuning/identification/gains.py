@@ -10,19 +10,19 @@ from fhaosmo_ros.core.observer.fuzzy import curves
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
-from fhaosmo_ros.tools.tuning.identification.identify import Identified
+from fhaosmo_ros.tools.tuning.identification.identify import Identified, ljung_box
 from fhaosmo_ros.tools.tuning.start.find import SCHEME
 from fhaosmo_ros.tools.tuning.start.kalman import GAMMA, LEAST, WIDTH
 from fhaosmo_ros.tools.tuning.start.theory import with_gain
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 Floats = NDArray[np.float64]
-LAGS = 20
 DIGITS = 4
 FIRST_STAMP = 1_000_000_000
 """Stamp (ns) of the first sample; 0 would stand for a stamp that is not set."""
+SIZE_OF_USUAL = 0.9616
+"""RMS of a standard normal number among the 99 % that are nearest to 0."""
 BEGIN = 0.1
 """Part of the bag in which the estimates may still be settling."""
 
@@ -112,7 +112,9 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
     errors = np.sqrt(np.maximum(np.diag(p - np.outer(p[0], p[0]) / total), 0.0))
     psi = curves(checked, len(k))
     small = max(noise, 1e-3 * width)
-    found_lambda = with_gain(k, period, values['fuzzy_widths'][0], psi, small, checked['gamma_initial'])
+    found_lambda = with_gain(
+        k, period, values['fuzzy_widths'][0], psi, small, checked['gamma_initial']
+    )
     largest = OBSERVER_PARAMETERS['lambda'].upper
     values['lambda'] = [_rounded(x) for x in found_lambda.clip(LEAST, largest)]
     return Gains(values, errors[: model.order + 1], math.sqrt(total), 1.0 - float(k[0]))
@@ -139,19 +141,6 @@ def run(found: Identified, gains: Gains) -> Run:
         probability,
         estimator.counters,
     )
-
-
-SIZE_OF_USUAL = 0.9616
-"""RMS of a standard normal number among the 99 % that are nearest to 0."""
-
-
-def ljung_box(r: Floats, lags: int = LAGS) -> tuple[Floats, float]:
-    """Return autocorrelations of `r`, and their probability for white noise (Ljung, Box 1978)."""
-    r = r - r.mean()
-    count, power = len(r), float(r @ r)
-    found = np.array([r[:-j] @ r[j:] / power for j in range(1, lags + 1)])
-    statistic = count * (count + 2.0) * np.sum(found**2 / (count - np.arange(1, lags + 1)))
-    return found, float(chi2.sf(statistic, lags))
 
 
 def _rounded(value: float) -> float:

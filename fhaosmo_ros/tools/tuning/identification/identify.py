@@ -25,14 +25,17 @@ from fhaosmo_ros.tools.tuning.sensor import Sensor
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.stats import chi2
 
 Floats = NDArray[np.float64]
 PIECES = 10
 """The bag is cut into so many pieces; every other one is held out."""
 DERIVATIVES = (0, 1, 2)
-BANDWIDTHS = tuple(float(w) for w in np.geomspace(2e-4, 0.45, 13))
+BANDWIDTHS = tuple(float(w) for w in np.geomspace(2e-4, 2.0, 15))
 """First bandwidths, in rad a sample; at the first number of derivatives and ratio below."""
 COLOURS = (0.0, 0.9)
+COLOURED, SLOWER = 0.75, 0.35
+"""A colour, and a factor on the bandwidth found with white noise, to search a colour from."""
 FIRST_DERIVATIVES, FIRST_RATIO = 1, 0.5
 NEIGHBOURS = ((-0.5, -1.6), (-0.5, 0.3), (0.2, -1.6), (0.2, 0.3))
 """ln bandwidth and ln ratio beside the best of the first, where a search may begin."""
@@ -49,6 +52,9 @@ STILL = 0.03
 """Bandwidth of a filter that takes d for 0, over the bag's length."""
 SHAKES = tuple(float(x) for x in np.geomspace(1e-4, 1e2, 7))
 """Intensities of white noise on a state that are tried; see `Design.shake`."""
+WHITE = 0.05
+"""Probability above which innovations pass for white, so that no colour is searched."""
+LAGS = 20
 DROP = 0.5
 """Fall of the log-likelihood over a step of the second differences, about."""
 FEWEST = 500
@@ -205,14 +211,19 @@ def _prepared(
     for _ in range(1, model.order):
         slow = np.diff(slow) / (block * period)
         sizes.append(3.0 * float(np.sqrt(np.mean(slow**2))))
-    noise = given.get('noise_size') or max(
-        float(np.hypot(sensor.noise_std, sensor.quantisation / math.sqrt(12.0))),
-        1e-9 * float(np.std(y)),
-    )
+    rounding = sensor.quantisation / math.sqrt(12.0)
+    noise = max(math.hypot(sensor.noise_std, rounding), 1e-9 * float(np.std(y)))
     return Likelihood(
-        model, period, samples, training, np.array(sizes), noise,
-        bool(given.get('noise_size')), values['prediction_step'],
-    )  # fmt: skip
+        model,
+        period,
+        samples,
+        training,
+        np.array(sizes),
+        given.get('noise_size') or noise,
+        bool(given.get('noise_size')),
+        values['prediction_step'],
+        rounding,
+    )
 
 
 def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:
@@ -265,36 +276,43 @@ class Search:
         first = [
             self._evaluate(Design(FIRST_DERIVATIVES, w / period, FIRST_RATIO, colour))
             for w in BANDWIDTHS
-            for colour in COLOURS
+            for colour in (COLOURS[:1] if likelihood.fixed else COLOURS)
         ]
         best = max(first, key=lambda e: e.training)
         likelihood.clip = CLIP
         for _ in range(2):
             if math.isfinite(best.training):
                 likelihood.noise = best.noise
-                sizes = np.sqrt(np.nanmean(best.estimates[:, : len(likelihood.sizes)] ** 2, axis=0))
+                sizes = np.sqrt(
+                    np.nanmean(best.estimates[:, : len(likelihood.sizes)] ** 2, axis=0)
+                )
                 likelihood.sizes = np.where(np.isfinite(sizes), sizes, likelihood.sizes)
             best = self._evaluate(best.design)
         return best
 
     def each_order(self, start: Evaluation) -> tuple[dict[int, Evaluation], Evaluation | None]:
         """Fit each number of derivatives; return them, and the best with white noise, if worse."""
-        tried: dict[int, Evaluation] = {}
-        for k in self._orders:
-            tried[k] = self._from_neighbours(start.design._replace(derivatives=k))
-        chosen = _simplest(tried, self.held_out)
-        if start.design.colour > 0.0:
-            white = self._from_neighbours(tried[chosen].design._replace(colour=0.0))
-            return tried, white
-        coloured = self.local(tried[chosen].design._replace(colour=0.5))
-        if (coloured.held_out - tried[chosen].held_out) * self.held_out <= WORTH:
-            return tried, None
-        white = tried[chosen]
-        design = coloured.design
-        return {
-            k: coloured if k == chosen else self.local(design._replace(derivatives=k))
+        white = {
+            k: self._from_neighbours(start.design._replace(derivatives=k, colour=0.0))
             for k in self._orders
-        }, white
+        }
+        chosen = white[_simplest(white, self.held_out)]
+        r = chosen.innovations[self.likelihood.samples.used & np.isfinite(chosen.innovations)]
+        if self.likelihood.fixed or (len(r) and ljung_box(np.clip(r, -CLIP, CLIP))[1] > WHITE):
+            return white, None
+        coloured = {}
+        for k in self._orders:
+            if start.design.colour > 0.0:
+                coloured[k] = self._from_neighbours(start.design._replace(derivatives=k))
+                continue
+            like = white[k].design
+            slower = like._replace(colour=COLOURED, bandwidth=SLOWER * like.bandwidth)
+            several = [self.local(like._replace(colour=0.5)), self._from_neighbours(slower)]
+            coloured[k] = max(several, key=lambda e: e.training)
+        better = coloured[_simplest(coloured, self.held_out)]
+        if not (better.held_out - chosen.held_out) * self.held_out > WORTH:
+            return white, None
+        return coloured, chosen
 
     def _from_neighbours(self, design: Design) -> Evaluation:
         several = [
@@ -335,7 +353,7 @@ class Search:
             value = self._evaluate(self._design(design, x)).training
             return -value if math.isfinite(value) else 1e300
 
-        simplex = np.vstack([x, *(x + step * axis for step, axis in zip(STEPS, np.eye(len(x))))])
+        simplex = np.vstack([x, x + np.diag(STEPS[: len(x)])])
         count = self.likelihood.training.sum()
         found = minimize(
             loss, x, method='Nelder-Mead',
@@ -348,7 +366,10 @@ class Search:
 
     def alternatives(self, best: Evaluation) -> tuple[float, dict[int, float]]:
         """Return `Identified.silent` and `Identified.shaken`."""
-        count, whole = int(self.likelihood.samples.used.sum()), float(self.likelihood.samples.h.sum())
+        count, whole = (
+            int(self.likelihood.samples.used.sum()),
+            float(self.likelihood.samples.h.sum()),
+        )
         still = self._evaluate(best.design._replace(bandwidth=STILL / whole))
         shaken = {}
         for level in range(1, self.likelihood.model.order + 1):
@@ -410,3 +431,12 @@ class Search:
         with np.errstate(invalid='ignore'):
             found = {name: float(np.sqrt(row @ covariance @ row)) for name, row in rows.items()}
         return {'noise': math.sqrt(0.5 / count)} | found
+
+
+def ljung_box(r: Floats, lags: int = LAGS) -> tuple[Floats, float]:
+    """Return autocorrelations of `r`, and their probability for white noise (Ljung, Box 1978)."""
+    r = r - r.mean()
+    count, power = len(r), float(r @ r)
+    found = np.array([r[:-j] @ r[j:] / power for j in range(1, lags + 1)])
+    statistic = count * (count + 2.0) * np.sum(found**2 / (count - np.arange(1, lags + 1)))
+    return found, float(chi2.sf(statistic, lags))

@@ -72,7 +72,13 @@ class Linear(NamedTuple):
 
 @compiled(nogil=True)
 def innovations(
-    law: Law, work: Work, samples: Samples, linear: Linear, longest: float, b: Floats, s: Floats,
+    law: Law,
+    work: Work,
+    samples: Samples,
+    linear: Linear,
+    longest: float,
+    b: Floats,
+    s: Floats,
     x: Floats,
 ) -> None:
     """

@@ -17,7 +17,7 @@ CLIP = 3.0
 """Standard deviations from which on an innovation counts linearly (Huber 1964)."""
 SETTLED = 8.0
 """Time constants of the filter after which its covariance is steady."""
-SLOWEST, QUICKEST = 1e-5, 0.7
+SLOWEST, QUICKEST = 1e-5, 3.0
 """Bandwidths of the filters, in rad a sample."""
 LEAST_RATIO, MOST_RATIO = 1e-3, 30.0
 """Of kappa to the bandwidth."""
@@ -112,6 +112,8 @@ class Likelihood:
         The noise is given: it is not estimated.
     longest : float
         Longest Runge-Kutta step (s).
+    least_noise : float
+        The estimated noise is not smaller: that of an encoder's steps.
     clip : float
         In standard deviations.
 
@@ -125,6 +127,7 @@ class Likelihood:
     noise: float
     fixed: bool = False
     longest: float = 0.0025
+    least_noise: float = 0.0
     clip: float = math.inf
 
     def __post_init__(self) -> None:
@@ -151,7 +154,7 @@ class Likelihood:
         b, s, x = np.empty(count), np.empty(count), np.empty((count, size))
         work = make_work(law, self.model.depth)
         innovations(law, work, self.samples, self._linear(design), self.longest, b, s, x)
-        with np.errstate(invalid='ignore'):
+        with np.errstate(invalid='ignore', over='ignore'):  # of a filter that diverges
             return self._evaluation(design, b, s / self.noise**2, x)
 
     def _linear(self, design: Design) -> Linear:
@@ -183,7 +186,9 @@ class Likelihood:
         counted, used = np.isfinite(r) & self.samples.used, self.samples.used
         if not counted.sum() > LEAST_USED * used.sum():
             return Evaluation(design, math.nan, -math.inf, -math.inf, r, x)
-        noise = self.noise if self.fixed else likeliest_scale(r[counted & self.training])
+        noise = self.noise
+        if not self.fixed:
+            noise = max(likeliest_scale(r[counted & self.training]), self.least_noise)
         means = []
         for chosen in (counted & self.training, counted & ~self.training):
             if not chosen.any():

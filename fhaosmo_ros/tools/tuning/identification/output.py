@@ -8,8 +8,8 @@ from pathlib import Path
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools.tuning import figures
-from fhaosmo_ros.tools.tuning.identification.gains import BEGIN, Gains, LAGS, Run
-from fhaosmo_ros.tools.tuning.identification.identify import Identified
+from fhaosmo_ros.tools.tuning.identification.gains import BEGIN, Gains, Run
+from fhaosmo_ros.tools.tuning.identification.identify import Identified, LAGS
 from fhaosmo_ros.tools.tuning.report import parameter_file
 import numpy as np
 
@@ -18,7 +18,12 @@ FLAT = 2.0
 
 
 def write(
-    folder: Path, found: Identified, gains: Gains, run: Run, notes: Sequence[str], command: str,
+    folder: Path,
+    found: Identified,
+    gains: Gains,
+    run: Run,
+    notes: Sequence[str],
+    command: str,
     origin: str,
 ) -> str:
     """
@@ -38,8 +43,8 @@ def write(
         'Made by',
         f'    python -m fhaosmo_ros {command}',
         f'(fhaosmo_ros {__version__}) from {origin}: {len(y)} samples, {whole:.1f} s.',
-        f'Found: noise {found.best.low_noise:.3g}; d with an RMS of {found.size_of_input:.3g}; its '
-        f'expected error is {gains.expected[-1]:.3g}.',
+        f'Found: noise {found.best.low_noise:.3g}; d with an RMS of {found.size_of_input:.3g}; '
+        f'its expected error is {gains.expected[-1]:.3g}.',
         *(f'Note: {text}' for text in notes),
     ]
     parameters = ESTIMATOR_PARAMETERS.part_of(gains.parameters)
