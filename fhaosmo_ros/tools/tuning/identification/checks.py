@@ -86,9 +86,9 @@ def refuse_unseen(found: Identified, gains: Gains) -> None:
     if share > UNSEEN:
         raise NothingToFind(
             f'd: it changes too fast to be seen through this noise: the expected error is '
-            f'{share:.2f} of its size, and an estimate of 0 has 1.00. Is the order '
-            f'({found.likelihood.model.order}) too high by one? Else a sensor with less noise, '
-            'or a higher rate, is needed'
+            f'{min(share, 1.0):.2f} of its size, and an estimate of 0 has 1.00. Does y drift or '
+            f'jump by itself, or is the order ({found.likelihood.model.order}) too high by one? '
+            'Else a sensor with less noise, or a higher rate, is needed'
         )
 
 
@@ -108,9 +108,10 @@ def _of_noise(found: Identified) -> list[str]:
         gain = (found.best.training - found.white.training) * count
         texts.append(
             f'The noise of y is coloured: neighbouring samples correlate by {design.colour:.2f}, '
-            'as behind a low-pass filter in the sensor. Fixed gains know white noise only. These '
-            f'count on white noise of {found.best.low_noise:.3g}, which has the same power at '
-            'low frequencies; so innovations are smaller than expected, and correlated. '
+            'as behind a low-pass filter in the sensor, or where its zero drifts. Fixed gains '
+            f'know white noise only. These count on white noise of {found.best.low_noise:.3g}, '
+            'which has the same power at low frequencies; so innovations are smaller than '
+            'expected, and correlated. '
             f'`gains: self_tuning` follows the colour itself. (White noise is less likely by '
             f'{gain:.0f} in the logarithm.)'
         )
