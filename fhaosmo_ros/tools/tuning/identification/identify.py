@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The likeliest model of d and of the noise for a recorded y, and how sure it is (D 30)."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -130,7 +130,6 @@ def identify_input(
     model: TriangularModel,
     values: Parameters,
     given: Mapping[str, Any],
-    stopped: Callable[[], bool] = lambda: False,
 ) -> Identified:
     """
     Find the likeliest noise and model of d.
@@ -148,8 +147,6 @@ def identify_input(
     given : mapping
         Those of them that the user set: `noise_size`, `unknown_input_derivatives` and
         `unknown_input_decay` are not estimated then.
-    stopped : callable
-        Asked before each evaluation; True ends the search with the best so far.
 
     Raises
     ------
@@ -158,7 +155,7 @@ def identify_input(
 
     """
     likelihood = _prepared(t, y, u, sensor, model, values, given)
-    search = Search(likelihood, given, stopped)
+    search = Search(likelihood, given)
     with search.bar:
         start = search.start()
         outliers = _leave_out_outliers(likelihood, start)
@@ -255,10 +252,8 @@ def _simplest(tried: Mapping[int, Evaluation], held_out: int) -> int:
 class Search:
     """The search for one recording."""
 
-    def __init__(
-        self, likelihood: Likelihood, given: Mapping[str, Any], stopped: Callable[[], bool]
-    ) -> None:
-        self.likelihood, self._stopped = likelihood, stopped
+    def __init__(self, likelihood: Likelihood, given: Mapping[str, Any]) -> None:
+        self.likelihood = likelihood
         self._decay = given.get('unknown_input_decay') or None
         self._orders = DERIVATIVES
         if 'unknown_input_derivatives' in given:
@@ -348,8 +343,6 @@ class Search:
         x = np.array(self._point(design))
 
         def loss(x: Floats) -> float:
-            if self._stopped():
-                return math.inf
             value = self._evaluate(self._design(design, x)).training
             return -value if math.isfinite(value) else 1e300
 
