@@ -43,7 +43,7 @@ STEPS = (0.3, 0.5, 0.4)
 """Sides of the first simplex in ln bandwidth, ln ratio and logit colour."""
 EVALUATIONS = 90
 WORTH = 3.0
-"""By so much a richer model must raise the log-likelihood of the held-out pieces."""
+"""By so much a richer model must raise the log-likelihood."""
 OUTLIER, LONGEST_RUN = 6.0, 3
 """An outlier has an innovation of so many standard deviations; so many of them may follow."""
 MOST_OUTLIERS = 0.05
@@ -52,7 +52,7 @@ STILL = 0.03
 """Bandwidth of a filter that takes d for 0, over the bag's length."""
 SHAKES = tuple(float(x) for x in np.geomspace(1e-4, 1e2, 7))
 """Intensities of white noise on a state that are tried; see `Design.shake`."""
-WHITE = 0.05
+WHITE = 0.01
 """Probability above which innovations pass for white, so that no colour is searched."""
 LAGS = 20
 DROP = 0.5
@@ -165,9 +165,10 @@ def identify_input(
                 f'y: expected samples that the model can predict, got none that phi = '
                 f'{list(model.phi)} follows: its estimates leave the finite numbers'
             )
-        chosen = _simplest(tried, search.held_out)
         likelihood.training[:] = True
-        best = search.local(tried[chosen].design)
+        whole = {k: search.local(e.design) for k, e in tried.items()}
+        count = int(likelihood.samples.used.sum())
+        best = whole[_simplest({k: e.training * count for k, e in whole.items()})]
         spread = search.spread(best)
         silent, shaken = search.alternatives(best)
     return Identified(likelihood, best, tried, white, silent, shaken, spread, outliers, sensor)
@@ -238,13 +239,13 @@ def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:
     return int(far.sum())
 
 
-def _simplest(tried: Mapping[int, Evaluation], held_out: int) -> int:
+def _simplest(log_likelihoods: Mapping[int, float]) -> int:
     """Return the number of derivatives from which on a larger one gains too little."""
-    orders = sorted(tried)
+    orders = sorted(log_likelihoods)
     chosen = orders[0]
     for k in orders[1:]:
-        gain = (tried[k].held_out - tried[chosen].held_out) * held_out
-        if gain > WORTH or not math.isfinite(tried[chosen].held_out):
+        gain = log_likelihoods[k] - log_likelihoods[chosen]
+        if gain > WORTH or not math.isfinite(log_likelihoods[chosen]):
             chosen = k
     return chosen
 
@@ -291,7 +292,7 @@ class Search:
             k: self._from_neighbours(start.design._replace(derivatives=k, colour=0.0))
             for k in self._orders
         }
-        chosen = white[_simplest(white, self.held_out)]
+        chosen = self._best(white)
         r = chosen.innovations[self.likelihood.samples.used & np.isfinite(chosen.innovations)]
         if self.likelihood.fixed or (len(r) and ljung_box(np.clip(r, -CLIP, CLIP))[1] > WHITE):
             return white, None
@@ -304,10 +305,14 @@ class Search:
             slower = like._replace(colour=COLOURED, bandwidth=SLOWER * like.bandwidth)
             several = [self.local(like._replace(colour=0.5)), self._from_neighbours(slower)]
             coloured[k] = max(several, key=lambda e: e.training)
-        better = coloured[_simplest(coloured, self.held_out)]
+        better = self._best(coloured)
         if not (better.held_out - chosen.held_out) * self.held_out > WORTH:
             return white, None
         return coloured, chosen
+
+    def _best(self, tried: Mapping[int, Evaluation]) -> Evaluation:
+        """Return the simplest of those that predict the held-out pieces well."""
+        return tried[_simplest({k: e.held_out * self.held_out for k, e in tried.items()})]
 
     def _from_neighbours(self, design: Design) -> Evaluation:
         several = [

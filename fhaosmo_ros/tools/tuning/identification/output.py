@@ -71,8 +71,9 @@ def write(
         '![d, and the innovations](estimates.png)',
         '## Held-out pieces',
         _held_out(found),
-        'Every second tenth of the bag was held out while these were fitted; the last fit is to '
-        'all of it. Larger is better; a difference below 3 is chance.',
+        'Every second tenth of the bag was held out while these were fitted. Larger is better; a '
+        'difference below 3 is chance. What is taken was fitted to all of the bag, where it is '
+        'the likeliest.',
         '## Gains',
         '\n'.join(f'    {name}: {value}' for name, value in parameters.items()),
     ]
