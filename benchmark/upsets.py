@@ -42,7 +42,7 @@ WRONG = 'peak at the start, sizes wrong'
 START, UPSET, LATE = 'peak at the start', 'peak after an upset', 'seconds to the usual error'
 PLAIN = 'error with outliers over that of the Kalman filter'
 ROBUST = 'error with outliers over that of the best robust one'
-BARS = {START: 1.5, WRONG: 1.9, UPSET: 2.0, LATE: 0.3, PLAIN: 0.6, ROBUST: 1.0}
+BARS = {START: 1.5, WRONG: 1.5, UPSET: 2.0, LATE: 0.3, PLAIN: 0.6, ROBUST: 1.0}
 """Worst values of the node over all files but the paper's, and what is allowed."""
 
 
