@@ -186,6 +186,17 @@ def test_jump_of_y_leaves_all_but_z1_of_a_plant_without_z1_in_its_model(case):
     assert wrong.max() < max(1.5 * case.usual, 0.6 * case.largest)
 
 
+def test_jump_of_a_few_counts_of_an_encoder():
+    """Some of its samples lie within 6 standard deviations, some beyond."""
+    case = Case(CONFIG / 'models' / 'dc_motor.yaml')
+    y, end = case.y.copy(), HIT + 5 * RATE
+    y[HIT:end] += 10.0 * case.parameters['noise_size']
+    wrong = case.errors(y, case.d)
+    assert wrong[HIT:].max() < 0.1 * case.largest
+    for moment in (HIT, end):
+        assert wrong[moment + 3 * RATE // 10 : moment + RATE].max() < 1.5 * case.usual
+
+
 def test_outliers_and_bursts_are_passed_over(case):
     rng, y = np.random.default_rng(8), case.y.copy()
     for k in np.flatnonzero(rng.random(len(y)) < 2e-3):

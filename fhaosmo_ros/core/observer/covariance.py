@@ -224,7 +224,7 @@ def influence(memory: Floats, b: float, usual: float) -> float:
     """
     c, far = HUBER - memory[NARROWED], 0.0
     if abs(b) <= c * usual:
-        memory[ONE_SIDED] = 0.0
+        memory[ONE_SIDED] = memory[FIRST_MISS] = 0.0
     elif b * memory[ONE_SIDED] > 0.0:
         memory[ONE_SIDED] += math.copysign(1.0, b)
     else:
@@ -234,8 +234,10 @@ def influence(memory: Floats, b: float, usual: float) -> float:
     narrowed = memory[NARROWED] + NARROWING * (far - share * (1.0 - 0.5 * share))
     memory[NARROWED] = min(max(narrowed, 0.0), HUBER - LEAST_HUBER)
     if abs(memory[ONE_SIDED]) > ISOLATED:
+        if memory[FIRST_MISS] * b > 0.0:  # one of them was too far off: y is lost
+            memory[BEYOND], memory[MISS] = max(memory[BEYOND], ISOLATED + 1.0), b
         return b
-    return min(max(b, -c * usual), c * usual) * WITHIN / (1.0 - share)
+    return float(min(max(b, -c * usual), c * usual) * WITHIN / (1.0 - share))
 
 
 @compiled()
