@@ -234,7 +234,8 @@ def influence(memory: Floats, b: float, usual: float) -> float:
     narrowed = memory[NARROWED] + NARROWING * (far - share * (1.0 - 0.5 * share))
     memory[NARROWED] = min(max(narrowed, 0.0), HUBER - LEAST_HUBER)
     if abs(memory[ONE_SIDED]) > ISOLATED:
-        if memory[FIRST_MISS] * b > 0.0:  # one of them was too far off: y is lost
+        first = memory[FIRST_MISS]  # 0 if none was too far off
+        if first * (2.0 * b - first) > 0.0:  # y is lost
             memory[BEYOND], memory[MISS] = max(memory[BEYOND], ISOLATED + 1.0), b
         return b
     return float(min(max(b, -c * usual), c * usual) * WITHIN / (1.0 - share))
