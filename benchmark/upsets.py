@@ -178,7 +178,7 @@ def upset_cases(p: Preset, quick: bool) -> dict[str, Case]:
     """Return the upsets by name; peak and time to the usual error are judged."""
     s = p.sigma or 1e-6
     cases = {'start': p.clean, 'plant reset': p.reset(), 'offset 1, 0.5 s': p.offset(1.0, 0.5)}
-    for size in (10.0, 100.0, 1e3, 1e4)[:: 3 if quick else 1]:
+    for size in (7.0, 10.0, 100.0, 1e3, 1e4)[:: 3 if quick else 1]:
         for seconds in (0.02, 0.5, 5.0)[:: 2 if quick else 1]:
             cases[f'{size:g} sigma, {seconds:g} s'] = p.offset(size * s, seconds)
     return cases
