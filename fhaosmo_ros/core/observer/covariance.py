@@ -301,7 +301,7 @@ def jump(law: Law, work: Work, state: State, u: Floats) -> bool:
                 levels[COVARIANCE + i, j] = x[COVARIANCE + i, j]
         if memory[SETTLED] > 0.0:
             memory[SETTLED] = -LONG_AGO
-    memory[BEYOND] = memory[DRIFT] = 0.0
+    memory[BEYOND] = memory[DRIFT] = memory[ONE_SIDED] = 0.0
     memory[WATCHED] = WATCH
     return True
 
