@@ -46,6 +46,8 @@ Entries of ``State.memory``:
 | FIRST_NOISE | variance of the noise when the members began | of y^2 |
 | LIKELIEST | index of the colour of the likeliest member | 1 |
 | CALM | samples since the noise has grown | 1 |
+| NARROWED | by what the limit of the influence of innovations is below `HUBER` (D 32) | 1 |
+| ONE_SIDED | samples in a row beyond that limit on one side; below 0 on the lower | 1 |
 """
 
 from typing import NamedTuple
@@ -72,7 +74,8 @@ GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSE
 OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
 SAMPLES, FAR_SIGN, QUANTUM, REPEATED, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
 FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM = range(25, 29)
-MEMORY = 29
+NARROWED, ONE_SIDED = range(29, 31)
+MEMORY = 31
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)

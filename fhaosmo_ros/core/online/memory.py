@@ -122,7 +122,7 @@ LABELS_OF_MEMORY = [
     'gamma', 'y', 'pending', 'wait', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread',
     'upset', 'offset', 'jumps', 'first_miss', 'miss', 'watched', 'drift', 'usual', 'samples',
     'far_sign', 'quantum', 'repeated', 'moving', 'unsettled', 'steady_period', 'flow_period',
-    'first_noise', 'likeliest', 'calm',
+    'first_noise', 'likeliest', 'calm', 'narrowed', 'one_sided',
 ]  # fmt: skip
 """Labels of a snapshot's entries: they are in bags, so they stay as they are."""
 MISSING = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}
