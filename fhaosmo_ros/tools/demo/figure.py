@@ -23,8 +23,8 @@ def draw_comparison(
     axes.plot(t, truth, **TRUTH)
     axes.plot(t, estimate, **ESTIMATE)
     late = t >= 0.1 * t[-1]
-    low = min(truth.min(), estimate[late].min())
-    high = max(truth.max(), estimate[late].max())
+    low = min(np.nanmin(truth), estimate[late].min())
+    high = max(np.nanmax(truth), estimate[late].max())
     margin = 0.15 * (high - low) or 1.0
     axes.set_ylim(low - margin, high + margin)
     axes.grid(alpha=0.3)

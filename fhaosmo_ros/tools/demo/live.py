@@ -73,8 +73,9 @@ class LivePage:
             known = deviation[np.isfinite(deviation[:, 1])]
             if len(known) > 1:
                 band = np.interp(estimate[:, 0], known[:, 0], known[:, 1], left=np.nan)
-        true = np.interp(t, when, truth[:, 1])
-        self._write(text, _picture(picture_of_d(t, true, estimate[:, 1], band)))
+        true = np.interp(t, when, truth[:, 1], left=np.nan, right=np.nan)
+        if np.isfinite(true).any():
+            self._write(text, _picture(picture_of_d(t, true, estimate[:, 1], band)))
 
     def finish(self, text: str, figure: Path) -> None:
         """Show the figure of the whole run; the page stays as it is then."""
