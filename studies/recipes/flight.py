@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 Floats = NDArray[np.float64]
 RATE = 100.0
 """Of the simulation and of the sensors (Hz)."""
-NEEDED = 'pip install rotorpy'
+NEEDED = "pip install '.[recipes]'"
 
 
 def fly(

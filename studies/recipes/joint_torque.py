@@ -121,7 +121,8 @@ def momentum_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Fl
     Return the torque by the residual of the generalised momentum, with the measured speeds.
 
     m' = torque - g1 cos q1 - v q1' - c sign q1' + h sin q2 s' q1' for m = p q1' + h cos q2 s', and
-    residual = bandwidth (m - integral of (known + residual))   (De Luca and Mattone 2003).
+    residual = bandwidth (m - integral of (known + residual))   (De Luca and Mattone
+    2003, doi:10.1109/ROBOT.2003.1241665).
     """
     c = {name.partition('.')[2]: x for name, x in p.items() if name.startswith('constants.')}
     speed, (angle, elbow, elbow_speed) = r.y, r.u.T

@@ -33,7 +33,8 @@ def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) ->
     """
     Return d = Q(s) (s² y - Phi_2), Q = (s / bandwidth + 1)^-2, for a model of order 2.
 
-    The low-passed second derivative less what the model explains (Ohnishi 1987; Li et al. 2014).
+    The low-passed second derivative less what the model explains (Chen et al. 2016,
+    doi:10.1109/TIE.2015.2478397).
     """
     model, h = model_of(p), r.period
     velocity = low_passed(r.y, bandwidth, h, 2, 1)
@@ -91,7 +92,8 @@ def complementary_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) ->
     """
     Return d of z1' = Phi(u) + d + 2 w e, d' = w² e with e = y - z1 and w = `bandwidth`.
 
-    In one dimension this is the filter of Mahony et al. (2008) with its estimate of the bias.
+    In one dimension this is the filter of Mahony et al. (2008, doi:10.1109/TAC.2008.923738)
+    with its estimate of the bias.
     """
     model, angle, bias, found = model_of(p), float(r.y[0]), 0.0, np.zeros(len(r.y))
     for k in range(1, len(r.y)):
