@@ -81,6 +81,7 @@ setup(
     extras_require={
         'differentiate': ['cvxpy', 'pynumdiff>=0.3'],
         'docs': DOCS,
+        'recipes': ['rotorpy>=3,<4'],  # a simulator of drones, for studies/recipes
         # Community builds, for machines without ROS. Never beside an installed ROS.
         **{f'ros-{distribution}': wheels(distribution) for distribution in ('jazzy', 'kilted')},
         'tune': TUNE,

@@ -12,6 +12,7 @@ FLOAT = 'std_msgs/msg/Float64'
 ARRAY = 'std_msgs/msg/Float64MultiArray'
 TEXT = 'std_msgs/msg/String'
 TIME = 'builtin_interfaces/msg/Time'
+DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 
 ESTIMATES = {
     'state': ARRAY,
@@ -27,8 +28,11 @@ TYPED_ESTIMATES = {
     'accel': 'geometry_msgs/msg/AccelStamped',
 }
 """Topics below the estimator's name for those who want stamped messages, if asked for."""
-SELF_TUNED = {'standard_deviation': ARRAY, 'tuning': ARRAY}
+STANDARD_DEVIATION = 'standard_deviation'
+SELF_TUNED = {STANDARD_DEVIATION: ARRAY, 'tuning': ARRAY}
 """Further topics of a self-tuning estimator, with each estimate."""
+EVENT = 'event'
+"""Begin and end of each event (DIAGNOSTICS, transient-local), below its name and channel's."""
 SNAPSHOT = 'snapshot'
 """All that an estimator remembers (ARRAY, transient-local), below its name and channel's."""
 PARAMETERS = 'parameters'
@@ -36,7 +40,7 @@ PARAMETERS = 'parameters'
 TRUTH = {'state': ARRAY, 'unknown_input': FLOAT}
 """Topics of the plant below its name: the truth that belongs to each sample of y."""
 OF_ALL_NODES = {
-    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+    '/diagnostics': DIAGNOSTICS,
     '/rosout': 'rcl_interfaces/msg/Log',
     '/parameter_events': 'rcl_interfaces/msg/ParameterEvent',
 }
@@ -44,5 +48,6 @@ OF_ALL_NODES = {
 
 
 def estimates_of(parameters: Mapping[str, Any]) -> dict[str, str]:
-    """Return topics and types of an estimate, by the parameters of its channel."""
-    return ESTIMATES | (SELF_TUNED if parameters['gains'] == 'self_tuning' else {})
+    """Return topics of a channel whose QoS may be chosen, and their types, by its parameters."""
+    tuned = SELF_TUNED if parameters['gains'] == 'self_tuning' else {}
+    return ESTIMATES | tuned | {EVENT: DIAGNOSTICS}

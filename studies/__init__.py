@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Studies: the paper, the comparison, the parameter reference. `make` runs them; not installed."""
+"""Studies: the paper, the comparison, recipes, the parameter reference; not installed."""

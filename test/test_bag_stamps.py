@@ -81,7 +81,7 @@ def test_tune_takes_them_too(late, tmp_path):
     for name, received in (('exact', STAMPS), ('late', late)):
         messages = files.floats(received, Y)
         bag = variants.write(tmp_path / name, messages, 'jazzy', 'mcap', 'zstd', published=STAMPS)
-        sensors.append(from_bag(BagSource(bag), tuning, set(), 1).sensor)
+        sensors.append(from_bag(BagSource(bag), tuning).sensor)
     assert sensors[0] == sensors[1]
 
 

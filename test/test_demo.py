@@ -3,6 +3,8 @@
 
 import os
 from pathlib import Path
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +15,7 @@ import pytest
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.tools.demo.command import TOPICS
+from fhaosmo_ros.tools.demo.command import topics_of
 from fhaosmo_ros.tools.demo.report import read_run
 from rosbags.highlevel import AnyReader
 from waiting import wait_until
@@ -29,7 +31,7 @@ def environment():
 
 def run(*arguments):
     return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=180,
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=400,
         env=environment(), check=False,
     )  # fmt: skip
 
@@ -77,7 +79,7 @@ def test_bag_holds_every_topic_and_can_be_read(finished):
     _, folder = finished
     with AnyReader([folder / 'bag']) as reader:
         topics = {c.topic: c for c in reader.connections}
-        assert set(topics) == {t.topic for t in TOPICS}
+        assert set(topics) == {t.topic for t in topics_of({})}
         assert all(c.digest.startswith('RIHS01_') for c in topics.values())
         assert topics['/y'].msgcount > 1000
 
@@ -96,6 +98,26 @@ def test_estimate_is_near_the_truth(finished):
 def test_figure_is_a_picture(finished):
     _, folder = finished
     assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
+
+
+def test_the_shipped_demonstration_changes_the_plant_and_is_drawn_live(tmp_path):
+    """Self-tuning: what it has found is in the bag, in words and in the figure."""
+    folder = tmp_path / 'out'
+    result = run('--duration', 6, '--output', folder, '--live')
+    assert result.returncode == 0, result.stderr
+    assert 'the noise on y is ten times larger' in result.stdout
+    assert 'd lay within two standard deviations' in result.stdout
+    run_ = read_run(folder / 'bag')
+    begin, end = run_.t < 1.5, run_.t > run_.t[-1] - 0.5
+    true = run_.tuned.true_noise
+    assert np.median(true[end]) > 5.0 * np.median(true[begin])  # the plant did change
+    found = run_.tuned.noise[end]
+    assert np.median(found) > 0.5 * np.median(true[end])  # jitter of a busy machine adds to it
+    page = Path(re.search(r'live figure: file://(\S+)', result.stdout)[1])
+    text = page.read_text()
+    shutil.rmtree(page.parent)
+    assert 'finished' in text
+    assert 'http-equiv' not in text
 
 
 def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(parameters):

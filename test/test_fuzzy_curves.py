@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The curves psi against scikit-fuzzy's own control system, and what they promise."""
 
+from pathlib import Path
+
 from fhaosmo_ros.core import ConfigurationError
 from fhaosmo_ros.core.observer.arrays import INVERSE_WIDTH
 from fhaosmo_ros.core.observer.arrays import psi as read_psi
@@ -336,3 +338,11 @@ def test_sign_is_the_limit_of_a_narrow_psi(level, a):
     assert read_psi(sign, level, a) == (1.0, 0.0)
     if a >= 1e-12:
         np.testing.assert_allclose(psi(narrow, level, a), 1.0, rtol=1e-12)
+
+
+def test_systems_in_the_documents_are_accepted():
+    page = Path(__file__).resolve().parents[1] / 'docs' / 'mathematics.md'
+    example = page.read_text().split('    fuzzy_systems:\n', 1)[1].split('\n\n', 1)[0]
+    systems = [line.strip().removeprefix('- ') for line in example.splitlines()]
+    assert len(systems) == 3
+    law(fuzzy_systems=systems)

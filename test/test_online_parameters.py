@@ -29,6 +29,7 @@ PREDICTING = {'structure': 'levant', 'scheme': 'predict_correct'}
 PREDICTING |= {'lambda': [8.0, 20.0, 30.0, 16.0], 'fuzzy_widths': [1.0]}
 SCHEDULED = PREDICTING | {'noise_size': 0.01, 'correction_period': 1e-3}
 SELF_TUNING = {'gains': 'self_tuning'}
+EVENTS = {'event_threshold': 2.0}
 CHANGES = {
     'unknown_input_decay': Change(50.0),
     'bandwidth': Change(3.0, SELF_TUNING),
@@ -71,6 +72,11 @@ CHANGES = {
     'divergence_time': Change(0.005, {'epsilon': 1e-4}),
     'divergence_limit': Change(1.0),
     'predict_to_now': Change(True, {'measurement_delay': 0.02}),
+    'event_threshold': Change(1e-3),
+    'event_deviations': Change(0.1, SELF_TUNING | {'event_duration': 0.0}),
+    'event_duration': Change(0.0, EVENTS),
+    'event_release': Change(0.1, EVENTS),
+    'event_change_time': Change(0.02, EVENTS),
 }
 
 
@@ -88,7 +94,7 @@ def stream(first: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def outputs(change: Change, name: str | None) -> np.ndarray:
-    """Return the estimates after a run in whose middle `name` changes, or nothing."""
+    """Return estimates and events after a run in whose middle `name` changes, or nothing."""
     estimator = OnlineEstimator(change.base)
     estimator.run(*stream(0, 250))
     estimator.configure(change.prepared)
@@ -103,8 +109,12 @@ def outputs(change: Change, name: str | None) -> np.ndarray:
         assert estimator.parameters[name] == ONLINE_PARAMETERS[name].coerce(change.value)
     if change.reset:
         estimator.reset()
+    estimator.events.taken()
     result = estimator.run(*stream(250, 250))
-    return np.column_stack([result.z, result.unknown_input])
+    active = np.zeros(250)
+    for event in estimator.events.taken():
+        active[event.sample :] += 1 if event.begins else -1
+    return np.column_stack([result.z, result.unknown_input, active])
 
 
 def test_every_live_parameter_is_tried():

@@ -20,7 +20,7 @@ from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import read_ticks, series
-from fhaosmo_ros.tools.demo.command import TOPICS
+from fhaosmo_ros.tools.demo.command import topics_of
 from fhaosmo_ros.topics import ESTIMATES
 import numpy as np
 import rclpy
@@ -109,7 +109,7 @@ def test_bag_is_complete_after_ctrl_c(storage, live, tmp_path):
     assert information['message_count'] == sum(counts.values())
     assert str(information['message_count']) in out
     assert information['duration']['nanoseconds'] > 10**9
-    transient_local = {'/rosout'} | {t.topic for t in TOPICS if t.transient_local}
+    transient_local = {'/rosout'} | {t.topic for t in topics_of({}) if t.transient_local}
     for topic in information['topics_with_message_count']:
         metadata = topic['topic_metadata']
         assert metadata['type_description_hash'].startswith('RIHS01_')

@@ -218,20 +218,40 @@ def test_jitter_counts_where_the_truth_is_for_the_very_samples(tmp_path):
     assert all(float(word) < 0.9 for word in error[:4]), error
 
 
-def test_bag_without_truth_gives_the_sensor(tmp_path):
+def test_bag_without_truth_says_what_its_y_shows(tmp_path, capsys):
     make_bag(tmp_path / 'bag', truth=False)
     out = tmp_path / 'out'
-    quick = [rule for rule in QUICK if 'sample_rate' not in rule]
-    assert main([*quick, '--bag', str(tmp_path / 'bag'), '-o', str(out)]) == 0
-    report = (out / 'report.md').read_text()
-    assert 'simulated family with the sensor of bag bag' in report
-    rows = dict(
-        line.strip(' |').split(' | ')
-        for line in report.splitlines()
-        if line.startswith(('| noise_std', '| sample_rate'))
-    )
-    assert float(rows['noise_std']) == pytest.approx(1e-3, rel=0.2)
-    assert float(rows['sample_rate']) == pytest.approx(200.0, rel=0.01)
+    arguments = ['--bag', str(tmp_path / 'bag'), '-o', str(out), '--topic', '/y']
+    assert main(arguments) == 0
+    files = ['estimates.png', 'gains.yaml', 'report.md']
+    assert sorted(path.name for path in out.iterdir()) == files
+    values = load(out / 'gains.yaml', 'estimator')
+    OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values))
+    assert values['noise_size'] == pytest.approx(1e-3, rel=0.1)
+    assert values['correction_period'] == pytest.approx(1.0 / 200.0, rel=1e-3)
+    assert values['input_topic'] == '/y'
+    report, printed = (out / 'report.md').read_text(), capsys.readouterr().out
+    for row in ('| noise of y', '| size of d', '| expected error of d', '| innovations,'):
+        assert row in report
+        assert row in printed
+    # What this y has shown stands there, and no default of a simulated family.
+    assert f'noise_size: {values["noise_size"]}' in report
+    assert 'noise_std' not in report
+
+
+@pytest.mark.parametrize(
+    ('given', 'message'),
+    [
+        ('structure:=cascade', 'got structure set'),
+        ('noise_std:=1000.0', 'd = 0'),
+    ],
+)
+def test_bag_without_truth_that_can_give_no_gains(tmp_path, capsys, given, message):
+    make_bag(tmp_path / 'bag', truth=False)
+    out = tmp_path / 'out'
+    assert main(['--bag', str(tmp_path / 'bag'), '-o', str(out), '-p', given]) == 2
+    assert message in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_bag_that_is_too_short(tmp_path, capsys):

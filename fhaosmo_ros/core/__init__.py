@@ -7,6 +7,7 @@ from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.batch import EstimatorBatch
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.events import Event, EventDetector
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.plant import Plant
 from fhaosmo_ros.core.simulation.recordings import Family, Recording
@@ -17,6 +18,8 @@ __all__ = [
     'Counters',
     'Estimate',
     'EstimatorBatch',
+    'Event',
+    'EventDetector',
     'Family',
     'Observer',
     'ObserverState',

@@ -9,6 +9,7 @@ from fhaosmo_ros.core.observer.fuzzy import curves, SHAPES
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.online.batch import EstimatorBatch
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.events import EventDetector
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import Plant
@@ -47,6 +48,7 @@ def _call_everything() -> None:
     estimator.advance(1, 0.0)
     estimator.run(np.array([2, 3]), np.zeros(2), np.zeros(2))
     OnlineEstimator({'gains': 'self_tuning'})
+    EventDetector(estimator.parameters | {'event_threshold': 1.0}).take([1], [0.0])
     EstimatorBatch([OnlineEstimator()]).advance([0], [1], [0.0], [0.0])
     t = np.arange(3) * 1e-3
     Observer(ESTIMATOR_PARAMETERS.complete({})).run(t, np.zeros(3), np.zeros(3))

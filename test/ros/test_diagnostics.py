@@ -3,6 +3,7 @@
 
 import itertools
 import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -12,9 +13,11 @@ pytestmark = pytest.mark.ros
 
 from builtin_interfaces.msg import Time  # noqa: E402
 from fhaosmo_ros.core.online.estimator import OnlineEstimator  # noqa: E402
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS  # noqa: E402
+from fhaosmo_ros.core.parameters.files import load  # noqa: E402
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS  # noqa: E402
 from fhaosmo_ros.nodes.estimator.health import Health  # noqa: E402
 from fhaosmo_ros.nodes.middleware.publisher_watch import Publishers  # noqa: E402
+import numpy as np  # noqa: E402
 from rig import EstimatorRig, node_process, Parameters, parameters  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
@@ -218,6 +221,37 @@ def test_a_clock_that_is_slower_than_the_samples_is_said(samples, told):
         for k in range(begin, begin + 1000):
             estimator.update(k // samples * samples * 1_000_000, 0.2)
         report, _ = health.reports(y, Publishers({(1,): '/plant'}, {}), stale=False, name='')
+    status = report.message('estimator', 'none')
+    assert told in status.message
+    assert status.level == (WARN if told else OK)
+
+
+def noise_1e_3() -> dict:
+    path = Path(__file__).resolve().parents[2] / 'config' / 'noise_1e-3.yaml'
+    return load(path, 'estimator', ONLINE_PARAMETERS)
+
+
+@pytest.mark.parametrize(
+    ('period', 'noise', 'jump', 'told'),
+    [
+        (1, 1e-3, 0.0, ''),
+        (2, 1e-3, 0.0, 'gains are for 1000 Hz, y comes at 500 Hz'),
+        (1, 1e-2, 0.0, 'times as large as noise_size says'),
+        (1, 1e-3, 1.0, 'y jumped 1 times'),
+    ],
+    ids=['nothing', 'rate', 'noise', 'jump'],
+)  # fmt: skip
+def test_what_no_longer_fits_is_said(period, noise, jump, told):
+    estimator = OnlineEstimator(noise_1e_3())
+    health = Health(estimator, ESTIMATOR_PARAMETERS.complete(LAX | {'warn_chatter_above': 1e9}))
+    source = SimpleNamespace(topic='/y', message_type='std_msgs/msg/Float64')
+    y = SimpleNamespace(source=source, field=None, stamps='source', error='', lacking=0, why='')
+    rng = np.random.default_rng(1)
+    for k in range(1, 3000):
+        stamp = k * period * 1_000_000
+        estimator.update(stamp, noise * rng.standard_normal() + jump * (k > 2000))
+        health.stamps.append(stamp)
+    _, report = health.reports(y, Publishers({(1,): '/plant'}, {}), stale=False, name='')
     status = report.message('estimator', 'none')
     assert told in status.message
     assert status.level == (WARN if told else OK)

@@ -121,9 +121,11 @@ def names(answer) -> set[str]:
 
 @pytest.mark.parametrize('name', ['estimator', 'plant'])
 def test_policy_allows_exactly_what_the_node_has(client, start, policy, name):
-    # With everything that is optional: a known input, simulated time.
+    # With everything that is optional: a known input, simulated time, self-tuning.
     # In a namespace: other tests leave nodes of this name behind for a while.
-    start(name, *parameters(namespace='/policy', phi="['0', '0', 'u - z3']", use_sim_time='true'))
+    own = {'gains': 'self_tuning'} if name == 'estimator' else {}
+    model = {'phi': "['0', '0', 'u - z3']", 'use_sim_time': 'true'}
+    start(name, *parameters(namespace='/policy', **model, **own))
     node = client.node
     for kind, verb, look in (
         ('topic', 'publish', node.get_publisher_names_and_types_by_node),

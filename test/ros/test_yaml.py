@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameter files: which sections serve which node, and that rcl reads them as we do."""
 
+from pathlib import Path
+
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.files import load, read
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
 from yaml_texts import HOSTILE
+
+CONFIGURATIONS = sorted((Path(__file__).resolve().parents[2] / 'config').glob('**/*.yaml'))
 
 
 @pytest.fixture
@@ -199,6 +203,23 @@ def test_hostile_text_at_the_start_gives_no_more_than_a_line(write, text):
             message = spin._one_line(error)
         assert message.isprintable()
         assert len(message) < 600
+
+
+@pytest.mark.parametrize('path', CONFIGURATIONS, ids=lambda p: p.stem)
+def test_rcl_reads_shipped_files_as_we_do(path):
+    """A bare y, for instance, is true for rcl."""
+    context = rclpy.Context()
+    rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
+    try:
+        node = rclpy.create_node(
+            'estimator', context=context, automatically_declare_parameters_from_overrides=True
+        )
+        for name, value in read(path, 'estimator').items():
+            found = node.get_parameter(name).value
+            assert (list(found) if isinstance(value, list) else found) == value, name
+        node.destroy_node()
+    finally:
+        rclpy.shutdown(context=context)
 
 
 def test_file_without_a_section_for_the_node_is_told(write, capfd):

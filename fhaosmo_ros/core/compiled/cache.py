@@ -43,7 +43,8 @@ KEPT = 4
 UNUSED = 86_400.0
 """Seconds after which a folder counts as no longer in use."""
 NAME = 'fhaosmo_ros'
-COMPILING = 'compiling the numerical core, once; this takes some 20 s ...'
+COMPILE_TIME = '20 to 40 s on an idle machine'
+COMPILING = f'compiling the numerical core, once; this takes {COMPILE_TIME} ...'
 CHECKSUM = 32
 """Bytes of a checksum."""
 
@@ -260,7 +261,7 @@ def cache_folder() -> Path | None:
             return _folder_in(find_base())
         except (OSError, RuntimeError) as raised:  # no home, or a read-only one
             error = raised
-    _warn(f'no place to keep compiled code ({_text(error)}): each start compiles, some 20 s')
+    _warn(f'no place to keep compiled code ({_text(error)}): each start compiles, {COMPILE_TIME}')
     return None
 
 

@@ -40,14 +40,16 @@ Entries of ``State.memory``:
 | FAR_SIGN | sign of the last innovation that was too far off for every member | 1 |
 | QUANTUM | smallest step of y seen | of y |
 | LATTICE | share of the steps of y that are multiples of the smallest | 1 |
-| GROWING | unlikely samples in a row, each farther off than the one before | 1 |
-| FARTHEST | how far off the last unlikely sample was | of y |
 | MOVING | members of each k whose covariances move | 1 |
 | UNSETTLED | time since they began to | s |
 | STEADY_PERIOD, FLOW_PERIOD | interval that the covariances, and the flow, are those of | s |
 | FIRST_NOISE | variance of the noise when the members began | of y^2 |
 | LIKELIEST | index of the colour of the likeliest member | 1 |
 | CALM | samples since the noise has grown | 1 |
+| GROWING | unlikely samples in a row, each farther off than the one before | 1 |
+| FARTHEST | how far off the last unlikely sample was | of y |
+| NARROWED | by what the limit of the influence of innovations is below `HUBER` (D 32) | 1 |
+| ONE_SIDED | samples in a row beyond that limit on one side; below 0 on the lower | 1 |
 """
 
 from typing import NamedTuple
@@ -74,7 +76,8 @@ GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSE
 OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
 SAMPLES, FAR_SIGN, QUANTUM, LATTICE, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
 FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM, GROWING, FARTHEST = range(25, 31)
-MEMORY = 31
+NARROWED, ONE_SIDED = range(31, 33)
+MEMORY = 33
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)

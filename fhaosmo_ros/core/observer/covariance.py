@@ -34,8 +34,10 @@ from fhaosmo_ros.core.observer.arrays import (
     Law,
     LEVANT,
     MISS,
+    NARROWED,
     NEXT_SIZE,
     OFFSET,
+    ONE_SIDED,
     PREDICTING,
     PREDICTION_STEP,
     psi,
@@ -63,8 +65,14 @@ STEP = 0.5
 MOST_STEPS = 100
 LONG = 8.0
 """Time constants of the steady Kalman filter after which its errors are steady."""
-HUBER = 2.0
-"""Innovations of more standard deviations count as so many (D 21)."""
+HUBER, LEAST_HUBER = 2.0, 1.0
+"""Innovations of more standard deviations count as so many, at most and at least (D 32)."""
+WITHIN = 0.9465
+"""1 - beyond(HUBER): with that limit the gains are the tuned ones."""
+NARROWING = 0.01
+"""Standard deviations by which the limit follows one sample."""
+ISOLATED = 20.0
+"""More samples in a row beyond the limit on the same side are no outliers (D 32)."""
 MEDIAN = 0.6745
 """Of |x| where x is normal with variance 1."""
 SPREAD_RATE = 0.005
@@ -83,6 +91,13 @@ remembers, and the sum that is too much: five standard deviations of that of whi
 """
 OF_SIZE = 0.25
 """A jump of y contradicts the model if it changes a Phi by more than this part of z_{i+1} or d."""
+NOISE_DOUBT, DOUBTED = 3.0, 2.0
+"""
+At the start the noise counts as so many times larger than `noise_size`; the logarithm of this
+factor decays within so many time constants of the steady Kalman filter.
+"""
+LONG_AGO = 1e12
+"""Seconds since the start where it does not matter when it was."""
 DOUBLINGS = 60
 BISECTIONS = 60
 DECIDING = (
@@ -138,9 +153,9 @@ def _carry(law: Law, work: Work, h: float, k: int, column: bool) -> None:
 
 
 @compiled()
-def correct_covariance(law: Law, work: Work) -> None:
-    """Take a sample into P (D 20), in place."""
-    n, p, variance = law.gains.shape[1], work.x, law.scalars[VARIANCE]
+def correct_covariance(law: Law, work: Work, doubt: float) -> None:
+    """Take a sample into P (D 20), in place; its noise counts as `doubt` times as large."""
+    n, p, variance = law.gains.shape[1], work.x, doubt * doubt * law.scalars[VARIANCE]
     s = p[COVARIANCE, 0] + variance
     for i in range(1, n):
         for j in range(i, n):
@@ -149,6 +164,19 @@ def correct_covariance(law: Law, work: Work) -> None:
     for j in range(n):
         p[COVARIANCE, j] *= variance / s
         p[COVARIANCE + j, 0] = p[COVARIANCE, j]
+
+
+@compiled(forceinline=True)
+def doubt_of_noise(age: float, speed: float) -> float:
+    """Return the factor of the noise at some time after the start (D 20)."""
+    return float(NOISE_DOUBT ** math.exp(-age * speed / DOUBTED))
+
+
+@compiled(forceinline=True)
+def bandwidth(law: Law, h: float) -> float:
+    """Return the rate (1/s) at which the Kalman filter for samples every `h` forgets."""
+    ratio = law.scalars[INTENSITY] / (law.scalars[VARIANCE] * h)
+    return float(ratio ** (0.5 / law.gains.shape[1]))
 
 
 @compiled(forceinline=True)
@@ -178,6 +206,39 @@ def usual_innovation(memory: Floats, b: float, expected: float) -> float:
         if abs(memory[DRIFT]) > MOST_DRIFT:
             memory[BEYOND] = math.inf
     return usual
+
+
+@compiled(forceinline=True)
+def beyond(c: float) -> float:
+    """Return the share of samples beyond c where c is Huber's minimax limit (D 32)."""
+    q = math.sqrt(2.0 / math.pi) * math.exp(-0.5 * c * c) / c
+    return q / (1.0 + q - math.erfc(c / math.sqrt(2.0)))
+
+
+@compiled(forceinline=True)
+def influence(memory: Floats, b: float, usual: float) -> float:
+    """
+    Return as how large an innovation counts (D 32), and let its limit follow the noise.
+
+    Only the first of several in a row beyond the limit on one side tells of outliers.
+    """
+    c, far = HUBER - memory[NARROWED], 0.0
+    if abs(b) <= c * usual:
+        memory[ONE_SIDED] = memory[FIRST_MISS] = 0.0
+    elif b * memory[ONE_SIDED] > 0.0:
+        memory[ONE_SIDED] += math.copysign(1.0, b)
+    else:
+        memory[ONE_SIDED] = math.copysign(1.0, b)
+        far = 1.0
+    share = beyond(c)
+    narrowed = memory[NARROWED] + NARROWING * (far - share * (1.0 - 0.5 * share))
+    memory[NARROWED] = min(max(narrowed, 0.0), HUBER - LEAST_HUBER)
+    if abs(memory[ONE_SIDED]) > ISOLATED:
+        first = memory[FIRST_MISS]  # 0 if none was too far off
+        if first * (2.0 * b - first) > 0.0:  # y is lost
+            memory[BEYOND], memory[MISS] = max(memory[BEYOND], ISOLATED + 1.0), b
+        return b
+    return float(min(max(b, -c * usual), c * usual) * WITHIN / (1.0 - share))
 
 
 @compiled()
@@ -231,15 +292,16 @@ def jump(law: Law, work: Work, state: State, u: Floats) -> bool:
                 if memory[SETTLED] > 0.0:
                     x[COVARIANCE + i, j] = law.chances[STEADY * n + i, j]
         if memory[SETTLED] > 0.0:
-            correct_covariance(law, work)
+            correct_covariance(law, work, 1.0)
         for i in range(n):
             x[COVARIANCE, i] = x[COVARIANCE + i, 0] = 0.0
         x[COVARIANCE, 0] = b * b
         for i in range(n):
             for j in range(n):
                 levels[COVARIANCE + i, j] = x[COVARIANCE + i, j]
-        memory[SETTLED] = min(memory[SETTLED], 0.0)
-    memory[BEYOND] = memory[DRIFT] = 0.0
+        if memory[SETTLED] > 0.0:
+            memory[SETTLED] = -LONG_AGO
+    memory[BEYOND] = memory[DRIFT] = memory[ONE_SIDED] = 0.0
     memory[WATCHED] = WATCH
     return True
 
@@ -255,7 +317,9 @@ def begin_estimates(
     """
     x, n, stages = work.x, law.gains.shape[1], work.stages
     predict_covariance(law, work, h)
-    s = x[COVARIANCE, 0] + law.scalars[VARIANCE]
+    speed = bandwidth(law, h)
+    doubt = doubt_of_noise(-memory[SETTLED], speed)
+    s = x[COVARIANCE, 0] + doubt * doubt * law.scalars[VARIANCE]
     for i in range(n):
         stages[NOW, 0, i], stages[NOW, 1, i] = x[HAT, i], 0.0
     predict(law, work, h, u, law.scalars[PREDICTION_STEP])
@@ -269,13 +333,12 @@ def begin_estimates(
     for i in range(n - 1):
         x[TILDE, i] = x[HAT, i + 1]
     x[TILDE, n - 1] = 0.0
-    correct_covariance(law, work)
+    correct_covariance(law, work, doubt)
     memory[SETTLED] -= h
-    speed = (law.scalars[INTENSITY] / (law.scalars[VARIANCE] * h)) ** (0.5 / n)
     if -memory[SETTLED] * speed > LONG:
         hand_over(law, work, memory, u)
         memory[SETTLED] = 1.0
-    return (1.0 - x[COVARIANCE, 0] / law.scalars[VARIANCE]) * b * b, 0.0
+    return (1.0 - x[COVARIANCE, 0] / (doubt * doubt * law.scalars[VARIANCE])) * b * b, 0.0
 
 
 @compiled()

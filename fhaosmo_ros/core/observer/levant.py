@@ -52,8 +52,11 @@ from fhaosmo_ros.core.observer.arrays import (
     Work,
 )
 from fhaosmo_ros.core.observer.covariance import (
+    bandwidth,
     correct_covariance,
-    HUBER,
+    doubt_of_noise,
+    influence,
+    LONG_AGO,
     predict_covariance,
     usual_innovation,
 )
@@ -290,15 +293,17 @@ def predict_correct(
     """
     x, n, stages = work.x, law.gains.shape[1], work.stages
     scheduled = law.flags[SCHEDULED] and not holds(law, memory, h)
-    variance = law.scalars[STEADY_VARIANCE]
+    variance, doubt = law.scalars[STEADY_VARIANCE], 1.0
     if scheduled:
         if memory[SETTLED] > 0.0:
             for i in range(n):
                 for j in range(n):
                     x[COVARIANCE + i, j] = law.chances[STEADY * n + i, j]
-            correct_covariance(law, work)
+            correct_covariance(law, work, 1.0)
+            memory[SETTLED] = -LONG_AGO
+        doubt = doubt_of_noise(-memory[SETTLED], bandwidth(law, law.scalars[CORRECTION_PERIOD]))
         predict_covariance(law, work, h)
-        variance = x[COVARIANCE, 0] + law.scalars[VARIANCE]
+        variance = x[COVARIANCE, 0] + doubt * doubt * law.scalars[VARIANCE]
     for i in range(n):
         stages[NOW, 0, i], stages[NOW, 1, i] = x[HAT, i], x[HAT_SENSITIVITY, i]
     predict(law, work, h, u, law.scalars[PREDICTION_STEP])
@@ -312,22 +317,23 @@ def predict_correct(
         return correct(law, work, memory, y, h)
     b, ratio = y - x[HAT, 0], stages[RATIO, 0]
     usual = usual_innovation(memory, b, math.sqrt(variance))
+    if variance < NEARLY_STEADY * law.scalars[STEADY_VARIANCE]:  # a large P counts on all of b
+        y = x[HAT, 0] + influence(memory, b, usual)
     if memory[BEYOND] > 0.0:
         return 0.0, 0.0
-    if variance < NEARLY_STEADY * law.scalars[STEADY_VARIANCE]:  # a large P counts on all of b
-        y = x[HAT, 0] + min(max(b, -HUBER * usual), HUBER * usual)
     even(work)
     if scheduled:
         far, largest = abs(h - period) > NEAR * period, 1.0
         for i in range(n):  # D 20
             inverse = law.chances[SINGLE * n + INVERSE_STEADY, i]
             ratio[i] = x[COVARIANCE, i] * inverse if inverse > 0.0 else ratio[0]
+            ratio[i] /= doubt * doubt
             largest = max(largest, ratio[i])
             far = far or abs(ratio[i] - 1.0) > CLOSE
         for i in range(n):  # from the Kalman filter's gains to the tuned ones
             ratio[i] *= law.chances[SINGLE * n + TUNED_OVER_KALMAN, i] ** (1.0 / largest - 1.0)
-        correct_covariance(law, work)
-        memory[SETTLED] = 0.0 if far else 1.0
+        correct_covariance(law, work, doubt)
+        memory[SETTLED] = memory[SETTLED] - h if far else 1.0
     return correct(law, work, memory, y, period)
 
 

@@ -37,6 +37,7 @@ from fhaosmo_ros.core.observer.arrays import (
     MAX,
     MIN,
     OFFSET,
+    ONE_SIDED,
     PENDING,
     PERIOD,
     PREDICTING,
@@ -265,7 +266,7 @@ def restart(law: Law, state: State, y: float) -> None:
     if law.flags[ADAPTIVE]:
         memory[GAMMA] = law.scalars[GAMMA_INITIAL]
     memory[PENDING] = memory[WAIT] = memory[SATURATED] = memory[BEYOND] = memory[SETTLED] = 0.0
-    memory[UPSET] = memory[OFFSET] = memory[WATCHED] = memory[DRIFT] = 0.0
+    memory[UPSET] = memory[OFFSET] = memory[WATCHED] = memory[DRIFT] = memory[ONE_SIDED] = 0.0
     memory[SCALE] = 1.0
 
 

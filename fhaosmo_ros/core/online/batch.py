@@ -120,7 +120,7 @@ class EstimatorBatch:
             Status word, and estimate of d, after each sample.
 
         """
-        if any(estimator.smooths for estimator in self._estimators):
+        if any(estimator.smooths or estimator.events.on for estimator in self._estimators):
             return self._one_by_one(zip(channel, stamps, y, u, strict=True))
         for c, estimator in enumerate(self._estimators):
             if estimator.arguments is not self._arguments[c]:
@@ -142,7 +142,7 @@ class EstimatorBatch:
     def _one_by_one(
         self, samples: Iterable[tuple[int, int, float, float | Sequence[float]]]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Do the same where an estimator also estimates the past, which a batch can't."""
+        """Do the same where an estimator smooths or finds events, which a batch can't."""
         words, unknown_inputs = [], []
         for c, stamp, value, inputs in samples:
             estimator = self._estimators[c]

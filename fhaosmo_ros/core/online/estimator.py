@@ -20,6 +20,7 @@ from fhaosmo_ros.core.observer.smoothing import make_problem
 from fhaosmo_ros.core.online import delay, policy
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online.counters import Counters
+from fhaosmo_ros.core.online.events import check_events, EventDetector
 from fhaosmo_ros.core.online.memory import EstimatorArrays, make_policy, Memory
 from fhaosmo_ros.core.online.past_estimates import check_lag, PastEstimates
 from fhaosmo_ros.core.online.stamps import forget_samples
@@ -59,6 +60,9 @@ class OnlineEstimator:
     ----------
     observer : Observer
         To read parameters, sizes and state from; samples go through this class.
+    events : EventDetector
+        Judges each estimate of d, as it is before any smoothing; `events.taken()` returns what has
+        begun or ended since it was called last.
 
     Raises
     ------
@@ -78,6 +82,7 @@ class OnlineEstimator:
                 "parameters 'input_delay', 'measurement_delay': expected each at most the next "
                 f'one, got {p["input_delay"]} and {p["measurement_delay"]}'
             )
+        check_events(p)
         self._smoothing: PastEstimates | None = None
         if p['smoothing_lag'] > 0.0:
             check_lag(p)
@@ -90,6 +95,7 @@ class OnlineEstimator:
             past = delay.make_past(len(self.observer.inputs), self._lag)
         self._policy = make_policy(self.observer.initial_state(), past)
         self._ints, self._reals = self._policy
+        self.events = EventDetector(p, self._policy)
         self._eps = self.observer.innovations
         self._u = np.zeros(len(self.observer.inputs))
         self._word = 0
@@ -198,6 +204,7 @@ class OnlineEstimator:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
         parameters = self._parameters.changed_live(changes, 'observer')
         configuration = self.observer.prepare(parameters)
+        check_events(parameters)
         if self._smoothing is not None:
             check_lag(parameters)
             make_problem(configuration)
@@ -210,6 +217,7 @@ class OnlineEstimator:
         self.observer.adopt(change.configuration)
         if self._smoothing is not None:
             self._smoothing.configure()
+        self.events.configure(change.parameters)
         if change.parameters['sampling'] != before:
             self.forget_stamp()
         self._write_settings()
@@ -254,6 +262,7 @@ class OnlineEstimator:
     def reset(self) -> None:
         """Start afresh: the next sample is the first. Counters go on, and so does `freeze`."""
         forget_samples(self._policy, self._arrays.state)
+        self.events.reset()
         if self._smoothing is not None:
             self._smoothing.cut()
 
@@ -463,12 +472,20 @@ class OnlineEstimator:
         try:
             word: int = policy.take_once(stamp, float(y), self._u, *self._arguments)
         except OverflowError:  # beyond 64 bits
-            limit = LARGEST_STAMP if stamp > 0 else -LARGEST_STAMP
-            word = policy.take_once(limit, float(y), self._u, *self._arguments)
+            stamp = LARGEST_STAMP if stamp > 0 else -LARGEST_STAMP
+            word = policy.take_once(stamp, float(y), self._u, *self._arguments)
         self._word = word
+        if self.events.on:
+            self._judge_one(stamp, word)
         if self._smoothing is not None:
             self._smoothing.take_one(self._arrays, self._eps, word, self._u)
         return word
+
+    def _judge_one(self, stamp: int, word: int) -> None:
+        observer = self.observer
+        deviation = observer.standard_deviation[-1:] if observer.self_tuning else None
+        now = self._ints[[at.LATEST]]
+        self.events.take([stamp - self._behind], [observer.unknown_input], deviation, now, [word])
 
     def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
         """
@@ -515,13 +532,16 @@ class OnlineEstimator:
         record = make_record(count, n, count, self.observer.self_tuning)
         carried = bool(self._ints[at.TO_NOW] and self._ints[at.DELAY])
         present = np.empty((count if carried else 0, self.observer.order + 1))
-        rows = 0 if self._smoothing is None else count
+        rows = count if self.events.on or self._smoothing is not None else 0
         times, acting = np.empty(rows, dtype=np.int64), np.empty((rows, len(self._u)))
         policy.run(self._arrays, stamps, y, inputs, record, present, times, acting)
         if count:
             self._u[:], self._word = inputs[-1], int(record.words[-1])
             self._eps[0] = record.eps[-1]
         found = self.observer.trajectory(stamps - self._behind, record)
+        if self.events.on:
+            deviations = found.standard_deviation[:, -1] if self.observer.self_tuning else None
+            self.events.take(found.t, found.unknown_input, deviations, times, record.words)
         if carried:
             found = found._replace(z=present[:, :-1], unknown_input=present[:, -1])
         if self._smoothing is not None:

@@ -59,9 +59,13 @@ STUCK = 30  # 1: it is stuck
 LOST = 31  # 1: eps_1 is above epsilon, or steps fail
 LOST_SINCE = 32
 INTERVALS = 33  # number of intervals in the mean, up to WINDOW
+EVENT = 34  # what the detector of events is doing, see events.py
+EVENT_SINCE = 35  # since when; LATEST of the first sample of an event
+EVENT_STAMP = 36  # the stamp of that sample
+EVENT_TIME = 37  # LATEST of the sample it has taken last
 NAMES = {v: k for k, v in dict(globals()).items() if k.isupper() and isinstance(v, int)}
 """Names of these integers by index: they label the entries of a snapshot."""
-COUNTERS = 34
+COUNTERS = 38
 """Index of the first counter."""
 
 (
@@ -77,7 +81,9 @@ EPSILON = 2
 INTERVAL = 3  # running mean of dt, ns
 JITTER = 4  # running mean of its deviation, ns
 HELD_Y = 5
-STATES = 6  # two copies of a state begin here
+EVENT_MEAN = 6  # running mean of d, for events of its change
+EVENT_DEVIATION = 7  # standard deviation that events are judged by
+STATES = 8  # two copies of a state begin here
 
 
 class Policy(NamedTuple):
@@ -116,13 +122,13 @@ SECOND = 1_000_000_000
 HEAD = ['flags', 'sec', 'nanosec']
 INTEGERS = range(FROZEN, COUNTERS)
 """What of the policy's integers a snapshot holds: neither settings nor counters."""
-LABELS_OF_REALS = ['interval', 'jitter', 'held_y']
+LABELS_OF_REALS = ['interval', 'jitter', 'held_y', 'event_mean', 'event_deviation']
 LABELS_OF_ROWS = ['z_hat', 'z_tilde', 'z_hat_sensitivity', 'z_tilde_sensitivity']
 LABELS_OF_MEMORY = [
     'gamma', 'y', 'pending', 'wait', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread',
     'upset', 'offset', 'jumps', 'first_miss', 'miss', 'watched', 'drift', 'usual', 'samples',
     'far_sign', 'quantum', 'lattice', 'moving', 'unsettled', 'steady_period', 'flow_period',
-    'first_noise', 'likeliest', 'calm', 'growing', 'farthest',
+    'first_noise', 'likeliest', 'calm', 'growing', 'farthest', 'narrowed', 'one_sided',
 ]  # fmt: skip
 """Labels of a snapshot's entries: they are in bags, so they stay as they are."""
 MISSING = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}
@@ -148,7 +154,7 @@ class Memory(NamedTuple):
     ----------
     integers : (len(INTEGERS),) array
         Of `Policy.ints`.
-    reals : (3,) array
+    reals : (5,) array
         Of `Policy.reals`.
     before, now : ((4 + N) N + MEMORY,) arrays
         The observer's state (levels, then memory) before the latest bridged gap, and its state.

@@ -319,6 +319,39 @@ SAMPLING = (
     ),
 )  # fmt: skip
 
+EVENTS = (
+    Parameter(
+        'event_threshold', 0.0,
+        'An event begins where |d|, or its change (event_change_time), exceeds this, and '
+        'event_deviations where that is set too (unit of d). 0: no threshold; no events where '
+        'event_deviations is 0 as well.',
+        lower=0.0, upper=1e12,
+    ),
+    Parameter(
+        'event_deviations', 0.0,
+        'An event begins where |d|, or its change, exceeds so many of its standard deviations. '
+        'Needs gains = self_tuning, which knows them. 0: not used.',
+        lower=0.0, upper=100.0,
+    ),
+    Parameter(
+        'event_duration', 0.05,
+        'It begins only once that has lasted for so long without a break: longer means fewer '
+        'false alarms, and later ones.',
+        unit='s', lower=0.0, upper=3600.0,
+    ),
+    Parameter(
+        'event_release', 0.5,
+        'It ends below this part of what it has to exceed (hysteresis).',
+        lower=0.0, upper=1.0,
+    ),
+    Parameter(
+        'event_change_time', 0.0,
+        '0: |d| is judged. Else its change: how far d lies from its running mean over about this '
+        'time, once that is known. For a d that is never 0, such as friction or an error of Phi.',
+        unit='s', lower=0.0, upper=1e6,
+    ),
+)  # fmt: skip
+
 INPUT = (
     Parameter(
         'input_topic', '',
@@ -561,8 +594,8 @@ PLANT_NODE = (
 )  # fmt: skip
 
 OBSERVER_PARAMETERS = ParameterTable(MODEL, OBSERVER)
-ONLINE_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING)
-CHANNEL = (*MODEL, *OBSERVER, *SAMPLING, *INPUT, *CHANNEL_OUTPUT)
+ONLINE_PARAMETERS = ParameterTable(MODEL, OBSERVER, SAMPLING, EVENTS)
+CHANNEL = (*MODEL, *OBSERVER, *SAMPLING, *EVENTS, *INPUT, *CHANNEL_OUTPUT)
 CHANNEL_PARAMETERS = ParameterTable(CHANNEL)
 """What each channel of an estimator node may have for itself."""
 ESTIMATOR_PARAMETERS = ParameterTable(CHANNEL, ESTIMATOR_NODE, DIAGNOSTICS)

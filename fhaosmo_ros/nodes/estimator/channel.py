@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.observer.status import JUMPED, REJECTED, Status
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
+from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.inputs import known_inputs, make_pairing, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
 from fhaosmo_ros.nodes.estimator.listener import Listener
-from fhaosmo_ros.nodes.estimator.outputs import Outputs, TuningOutputs
+from fhaosmo_ros.nodes.estimator.outputs import EventOutput, Outputs, TuningOutputs
 from fhaosmo_ros.nodes.estimator.snapshots import SnapshotPublisher
 from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import Output, TypedOutputs
@@ -82,6 +83,7 @@ class Channel:
         self._tuning: TuningOutputs | None = None
         if observer.self_tuning:
             self._tuning = TuningOutputs(node, outputs, observer.order)
+        self._events = EventOutput(node, outputs, name)
         self._snapshots = SnapshotPublisher(node, self.estimator, outputs)
         simulated = node.get_parameter('use_sim_time').value
         self._health = Health(self.estimator, values, simulated)
@@ -112,6 +114,8 @@ class Channel:
         self._lost_before = self._y.source.lost
         self._active = True
         self._start_timer()
+        if self.estimator.events.on:
+            self._events.say('no event yet', self._values['hardware_id'])
         observer = self.estimator.observer
         parameters, kind = observer.parameters, 'self-tuning'
         if not observer.self_tuning:
@@ -135,6 +139,7 @@ class Channel:
         self._outputs.destroy()
         if self._tuning is not None:
             self._tuning.destroy()
+        self._events.destroy()
         if self._typed is not None:
             self._typed.destroy()
         self._snapshots.destroy()
@@ -153,9 +158,13 @@ class Channel:
 
     def adopt(self, change: ChannelChange) -> None:
         """Go on with what `prepare` has returned, from the next sample on."""
+        found = self.estimator.events.on
         self.estimator.adopt(change.estimator)
         self._snapshots.changed()
         before, self._values = self._values, change.values
+        if self._active and found != self.estimator.events.on:
+            text = 'events are switched off' if found else 'no event yet'
+            self._events.say(text, change.values['hardware_id'])
         self._health.limits = change.values
         self._read_settings()
         if self._active and change.values['publish_rate'] != before['publish_rate']:
@@ -200,6 +209,9 @@ class Channel:
             )
 
     def _read_settings(self) -> None:
+        self._unit = derivative_unit(
+            self._values['measurement_unit'], self.estimator.observer.order
+        )
         self._clock_stamps = self._values['sampling'] == 'clock'
         self._each = self._values['publish_on'] == 'sample'
 
@@ -250,6 +262,8 @@ class Channel:
         begin, estimator = perf_counter(), self.estimator
         word = estimator.advance(stamp, y)
         self.taken(word, stamp, y, estimator.observer.unknown_input, perf_counter() - begin)
+        if estimator.events.waiting:
+            self.tell_events()
         if self._each and not word & REJECTED:
             self.publish()
 
@@ -281,6 +295,13 @@ class Channel:
             health.unknown_inputs.append(unknown_input)
         if word & TOLD:
             self._tell(word, stamp, y)
+
+    def tell_events(self) -> None:
+        """Publish, and log, the events that have begun or ended."""
+        for event in self.estimator.events.taken():
+            text = self._events.publish(event, self._unit, self._values['hardware_id'])
+            if event.begins:
+                self._logger.warning(f'event: {text}', throttle_duration_sec=QUIET)
 
     def _tell(self, word: int, stamp: int, y: float) -> None:
         counters = self.estimator.counters

@@ -10,6 +10,7 @@ from typing import Any
 from fhaosmo_ros.core.observer.status import REJECTED
 from fhaosmo_ros.core.online.batch import EstimatorBatch
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.events import EventDetector
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import of_channel, UNNAMED
@@ -274,6 +275,8 @@ class ChannelGroup:
         else:
             for index, *sample in zip(queue.channel, *columns, strict=True):
                 self._channels[index].taken(*sample, share)
+        for channel in self._channels:
+            channel.tell_events()
         queue.clear()
 
     def _start_timer(self) -> None:
@@ -324,6 +327,8 @@ def load(estimators: Mapping[str, OnlineEstimator]) -> None:
     else:
         EstimatorBatch([copy]).advance([0], [1], [0.0], [copy.inputs])
     copy.reset()
+    events = EventDetector(copy.parameters | {'event_threshold': 1.0})  # may be set live
+    events.take([1], [0.0])
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.counters import UNUSED_SAMPLES
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.events import described
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
@@ -113,6 +114,7 @@ class Health:
         self.latest = float('nan')
         """Time of the last sample on `perf_counter`."""
         self._before: dict[str, int] = self._counts()
+        self._events_before = 0
 
     def reports(self, y: Listener, publishers: Publishers, stale: bool, name: str) -> list[Report]:
         """
@@ -261,6 +263,7 @@ class Health:
                 'd is followed within [s]': 1.0 / tuning.bandwidth,
                 titled('standard deviation of d', unit): float(observer.standard_deviation[-1]),
             }
+        self._find_events(report, unit)
         if limits['unknown_input_unit']:
             scaled = titled('unknown input, scaled', limits['unknown_input_unit'])
             report.values[scaled] = d_now * limits['unknown_input_scale']
@@ -292,6 +295,23 @@ class Health:
         if 0.0 < self.limits['warn_chatter_above'] < chatter:
             report.find(WARN, f'the estimate of d chatters by {chatter:.3g}')
         return report
+
+    def _find_events(self, report: Report, unit: str) -> None:
+        """Tell of the event that lasts, or of those since the last report."""
+        events = self._estimator.events
+        news, self._events_before = events.count - self._events_before, events.count
+        if not events.on:
+            return
+        report.values['events'] = events.count
+        latest = events.latest
+        if latest is None:
+            return
+        text, _ = described(latest, unit)
+        if events.active and latest.begins:
+            seconds = (self._estimator.latest - latest.since) * NANOSECONDS
+            report.find(WARN, f'event: {text}; it has lasted for {seconds:.3g} s')
+        elif news:
+            report.find(WARN, f'{news} events, the last one {text}')
 
     def _counts(self) -> dict[str, int]:
         counters = self._estimator.counters

@@ -3,8 +3,11 @@
 
 from collections.abc import Mapping
 
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from fhaosmo_ros.core.observer.observer import Estimate, Observer
 from fhaosmo_ros.core.observer.self_tuning.members import ORDERS
+from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.nodes.middleware.messages import (
     array_encoder,
     double_encoder,
@@ -12,7 +15,7 @@ from fhaosmo_ros.nodes.middleware.messages import (
     time_encoder,
 )
 from fhaosmo_ros.nodes.middleware.publishers import create_publisher
-from fhaosmo_ros.topics import ESTIMATES, SELF_TUNED
+from fhaosmo_ros.topics import DIAGNOSTICS, ESTIMATES, EVENT, SELF_TUNED
 import numpy as np
 from rclpy.node import Node
 
@@ -105,3 +108,51 @@ class TuningOutputs(Publishers):
         deviation.publish(self._encode_deviation(observer.standard_deviation))
         noise, correlation, bandwidth, shares = observer.tuning
         tuning.publish(self._encode_tuning(np.array([noise, correlation, bandwidth, *shares])))
+
+
+class EventOutput:
+    """
+    Publisher of events: WARN where one begins, OK where it ends.
+
+    Parameters
+    ----------
+    node : Node
+    prefix : str
+        Prefix of the topic's name.
+    channel : str
+        Name of the channel, '' without names.
+
+    """
+
+    def __init__(self, node: Node, prefix: str, channel: str) -> None:
+        self._node = node
+        self._name = f'{node.get_fully_qualified_name().lstrip("/")}: {channel} event'
+        self._name = self._name.replace(':  ', ': ')
+        kind = message_class(DIAGNOSTICS)
+        self._publisher = create_publisher(node, kind, prefix + EVENT, DEPTH, latched=True)
+
+    def publish(self, event: Event, unit: str, hardware_id: str) -> str:
+        """Publish the begin or the end of an event; return it in words."""
+        text, values = described(event, unit)
+        stamp = Time()
+        stamp.sec, stamp.nanosec = divmod(event.stamp, 1_000_000_000)
+        level = DiagnosticStatus.WARN if event.begins else DiagnosticStatus.OK
+        self._send(stamp, DiagnosticStatus(
+            level=level, name=self._name, message=text, hardware_id=hardware_id,
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        ))  # fmt: skip
+        return text
+
+    def say(self, text: str, hardware_id: str) -> None:
+        """Publish that there is no event, and why."""
+        status = DiagnosticStatus(name=self._name, message=text, hardware_id=hardware_id)
+        self._send(self._node.get_clock().now().to_msg(), status)
+
+    def _send(self, stamp: Time, status: DiagnosticStatus) -> None:
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = stamp
+        self._publisher.publish(message)
+
+    def destroy(self) -> None:
+        """Take the publisher away."""
+        self._node.destroy_publisher(self._publisher)

@@ -6,7 +6,7 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 POLICIES: dict[QoSPolicyKind, tuple[str, ...] | range] = {
@@ -20,12 +20,13 @@ OF_RCLPY = ('/clock.', '/parameter_events.', '/rosout.')
 """Topics whose QoS can be overridden in every node of rclpy."""
 
 
-def create_publisher(node: Node, kind: Any, topic: str, depth: int) -> Any:
-    """Return a publisher, reliable and volatile unless the user wants another QoS."""
+def create_publisher(node: Node, kind: Any, topic: str, depth: int, latched: bool = False) -> Any:
+    """Return a publisher, reliable unless the user wants another QoS; latched: transient-local."""
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
     return node.create_publisher(
         kind,
         topic,
-        QoSProfile(depth=depth),
+        QoSProfile(depth=depth, durability=durability),
         qos_overriding_options=QoSOverridingOptions(POLICIES),
     )
 

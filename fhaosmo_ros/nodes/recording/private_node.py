@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A node that a tool makes for itself."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 import shlex
 from types import TracebackType
+from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.signals import SignalHandlerOptions
 
 ACTING = ('-r', '--remap', '-e', '--enclave')
@@ -41,6 +44,7 @@ class PrivateNode:
 
     def __init__(self, name: str, ros_arguments: Sequence[str] = ()) -> None:
         self._context = Context()
+        self._clients: dict[str, AsyncParameterClient] = {}
         acting = ['--ros-args']
         for flag, word in pairwise(ros_arguments):
             if flag in ACTING:
@@ -72,6 +76,13 @@ class PrivateNode:
     def resolved(self, name: str) -> str:
         """Return the full name of a topic, or of a node, after remapping."""
         return self.node.resolve_topic_name(name)
+
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
+        """Ask another node to change parameters; what it answers is not waited for."""
+        if node not in self._clients:
+            self._clients[node] = AsyncParameterClient(self.node, node)
+        changes = [Parameter(name, value=value) for name, value in values.items()]
+        self._clients[node].set_parameters(changes)
 
     def publishers(self, topic: str) -> int:
         """Return how many publishers of a topic have been discovered."""

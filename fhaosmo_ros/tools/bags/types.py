@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Message types, QoS profiles and messages in CDR, for bags."""
 
+from collections.abc import Mapping
 import os
 from pathlib import Path
 import re
@@ -90,3 +91,20 @@ def labelled_array(names: list[str], values: NDArray[np.float64]) -> bytes:
     )
     layout = types['std_msgs/msg/MultiArrayLayout'](dim=[dimension], data_offset=0)
     return serialise('std_msgs/msg/Float64MultiArray', layout=layout, data=values)
+
+
+def diagnostics(stamp: int, warns: bool, name: str, text: str, values: Mapping[str, str]) -> bytes:
+    """Return a DiagnosticArray of one status in CDR, with its stamp in nanoseconds."""
+    types = TYPES.types
+    second, nanosecond = divmod(stamp, 1_000_000_000)
+    time = types['builtin_interfaces/msg/Time'](sec=second, nanosec=nanosecond)
+    pair = types['diagnostic_msgs/msg/KeyValue']
+    status = types['diagnostic_msgs/msg/DiagnosticStatus'](
+        level=int(warns),
+        name=name,
+        message=text,
+        hardware_id='',
+        values=[pair(key=key, value=value) for key, value in values.items()],
+    )
+    header = types['std_msgs/msg/Header'](stamp=time, frame_id='')
+    return serialise('diagnostic_msgs/msg/DiagnosticArray', header=header, status=[status])

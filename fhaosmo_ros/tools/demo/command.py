@@ -2,14 +2,17 @@
 """The demonstration: plant and estimator as two processes over DDS, recorded and compared."""
 
 import argparse
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 import os
 from pathlib import Path
 import time
+from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.compiled.cache import COMPILE_TIME
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, TopicRecorder
+from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, Sample, TopicRecorder
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.types import LATCHED_QOS, OFFERED_QOS
 from fhaosmo_ros.tools.bags.writer import BagWriter
@@ -19,29 +22,52 @@ from fhaosmo_ros.tools.cli.processes import Children
 from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.cli.share import shipped
 from fhaosmo_ros.tools.demo.figure import save_run
+from fhaosmo_ros.tools.demo.live import LivePage
 from fhaosmo_ros.tools.demo.report import read_run, table
 from fhaosmo_ros.topics import (
     ARRAY,
+    DIAGNOSTICS,
     ESTIMATES,
+    EVENT,
     FLOAT,
     OF_ALL_NODES,
     PARAMETERS,
+    SELF_TUNED,
     SNAPSHOT,
     TEXT,
     TRUTH,
 )
 
+DRAW_PERIOD = 1.0
+"""Seconds between two pictures of --live."""
 START_DEADLINE = 300.0
 """Seconds for a node to appear: the very first start compiles."""
-TOPICS = [
-    ExpectedTopic('/y', FLOAT),
-    *(ExpectedTopic(f'/plant/{name}', kind) for name, kind in TRUTH.items()),
-    *(ExpectedTopic(f'/estimator/{name}', kind) for name, kind in ESTIMATES.items()),
-    ExpectedTopic(f'/estimator/{SNAPSHOT}', ARRAY, transient_local=True),
-    ExpectedTopic(f'/estimator/{PARAMETERS}', TEXT, transient_local=True),
-    *(ExpectedTopic(name, kind) for name, kind in OF_ALL_NODES.items()),
-]
-"""What is recorded."""
+CHANGES = (
+    (1.0 / 3.0, 'the noise on y is ten times larger', {'noise_std': 1e-2}),
+    (2.0 / 3.0, 'd is three times faster', {'disturbance_omega': 3.0}),
+)
+"""What happens to the plant of the shipped file: part of the duration, words, parameters."""
+
+
+class Plan(NamedTuple):
+    """Duration of a run in seconds, and what changes in it, as `CHANGES`."""
+
+    duration: float
+    changes: Sequence[tuple[float, str, Mapping[str, Any]]]
+
+
+def topics_of(estimator: Mapping[str, Any]) -> list[ExpectedTopic]:
+    """Return what is recorded, by the parameters of the estimator."""
+    tuned = SELF_TUNED if estimator.get('gains') == 'self_tuning' else {}
+    return [
+        ExpectedTopic('/y', FLOAT),
+        *(ExpectedTopic(f'/plant/{name}', kind) for name, kind in TRUTH.items()),
+        *(ExpectedTopic(f'/estimator/{name}', kind) for name, kind in (ESTIMATES | tuned).items()),
+        ExpectedTopic(f'/estimator/{EVENT}', DIAGNOSTICS, transient_local=True),
+        ExpectedTopic(f'/estimator/{SNAPSHOT}', ARRAY, transient_local=True),
+        ExpectedTopic(f'/estimator/{PARAMETERS}', TEXT, transient_local=True),
+        *(ExpectedTopic(name, kind) for name, kind in OF_ALL_NODES.items()),
+    ]
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -71,12 +97,17 @@ def _parser() -> argparse.ArgumentParser:
         metavar='FOLDER',
         help='new or empty folder for bag and figure (default: demo_output/TIME)',
     )
+    parser.add_argument(
+        '--live', action='store_true',
+        help='draw d while it runs, in a page for a browser; opened where there is a display',
+    )  # fmt: skip
     parser.add_argument('--force', action='store_true', help='replace an output that exists')
     parser.add_argument(
         '--params-file',
         type=Path,
         metavar='FILE',
-        help='parameters of both nodes (default: the shipped config/demo.yaml)',
+        help='parameters of both nodes (default: the shipped config/self_tuning.yaml, with a '
+        'plant that changes)',
     )
     return parser
 
@@ -86,26 +117,34 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         raise ConfigurationError(
             f'--duration: expected 1 to 3600 seconds, got {arguments.duration:g}'
         )
-    parameters = arguments.params_file or shipped('config/demo.yaml')
-    for node in ('plant', 'estimator'):
-        load(parameters, node)
+    parameters = arguments.params_file or shipped('config/self_tuning.yaml')
+    load(parameters, 'plant')
+    topics = topics_of(load(parameters, 'estimator'))
+    changes = () if arguments.params_file else CHANGES
     _keep_to_this_host()
     print(
         f'plant and estimator with {parameters}, on this host only, '
         f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}'
     )
+    page = LivePage() if arguments.live else None
+    if page is not None:
+        print(f'live figure: {page.path.as_uri()}')
+        page.open()
     with Output(arguments.output or _default_output(), arguments.force) as output:
         folder = output.path
         folder.mkdir()
-        _record(folder, parameters, arguments.duration, stop)
+        plan = Plan(arguments.duration, changes)
+        marks = _record(folder, parameters, topics, plan, page, stop)
         if stop.is_set():
             print('stopped early: reporting what has been recorded')
         run = read_run(folder / 'bag')
-        save_run(run, folder / 'demo.png')
+        save_run(run, folder / 'demo.png', marks)
         text = table(run)
         (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
         print(f'\n{text}\n')
         final = output.keep()
+    if page is not None:
+        page.finish(f'finished; bag and figure: {final}', final / 'demo.png')
     print(f'figure:  {final / "demo.png"}\nbag:     {final / "bag"}')
 
 
@@ -119,25 +158,39 @@ def _default_output() -> Path:
     return Path('demo_output') / time.strftime('%Y-%m-%d_%H-%M-%S')
 
 
-def _record(folder: Path, parameters: Path, duration: float, stop: Stop) -> None:
+def _record(
+    folder: Path,
+    parameters: Path,
+    topics: list[ExpectedTopic],
+    plan: Plan,
+    page: LivePage | None,
+    stop: Stop,
+) -> list[tuple[int, str]]:
+    """Record a run; return when the plant changed (ns), and how."""
+
+    def take(sample: Sample) -> None:
+        bag.write(*sample)
+        if page is not None:
+            page.take(sample)
+
     with (
         BagWriter(folder / 'bag') as bag,
-        TopicRecorder(lambda sample: bag.write(*sample), TOPICS) as recorder,
+        TopicRecorder(take, topics) as recorder,
         Children(folder) as nodes,
     ):
-        for topic, kind, transient_local in TOPICS:
+        for topic, kind, transient_local in topics:
             bag.add(topic, kind, qos=[LATCHED_QOS if transient_local else OFFERED_QOS])
         options = ('--ros-args', '--params-file', str(parameters))
         nodes.start_node('estimator', *options)
         _wait(
-            'the estimator (the first start compiles, some 10 s)',
+            f'the estimator (the very first start compiles, {COMPILE_TIME})',
             lambda: recorder.publishers('/estimator/state') and recorder.subscribers('/y') >= 2,
             nodes,
             stop,
         )
         nodes.start_node('plant', *options)
         _wait('the first estimate', lambda: recorder.counts['/estimator/state'], nodes, stop)
-        _watch(recorder, nodes, duration, stop)
+        return _watch(recorder, nodes, plan, page, stop)
 
 
 def _wait(what: str, ready: Callable[[], object], nodes: Children, stop: Stop) -> None:
@@ -151,9 +204,13 @@ def _wait(what: str, ready: Callable[[], object], nodes: Children, stop: Stop) -
             raise ConfigurationError(f'waited {START_DEADLINE:g} s for {what}, in vain')
 
 
-def _watch(recorder: TopicRecorder, nodes: Children, duration: float, stop: Stop) -> None:
-    """Show a progress bar until the time is over or the user stops it."""
-    begin = time.monotonic()
+def _watch(
+    recorder: TopicRecorder, nodes: Children, plan: Plan, page: LivePage | None, stop: Stop
+) -> list[tuple[int, str]]:
+    """Show a progress bar, and change the plant, until the time is over or the user stops it."""
+    duration, changes = plan
+    begin, coming, marks = time.monotonic(), deque(changes), []
+    drawn = begin
     with progress(
         total=duration, unit='s', bar_format='{l_bar}{bar}| {n:.0f}/{total:.0f} s{postfix}'
     ) as bar:
@@ -162,5 +219,14 @@ def _watch(recorder: TopicRecorder, nodes: Children, duration: float, stop: Stop
             elapsed = min(time.monotonic() - begin, duration)
             bar.set_postfix_str(f'{recorder.counts["/y"]} samples', refresh=False)
             bar.update(elapsed - bar.n)
+            if coming and elapsed >= coming[0][0] * duration:
+                _, words, values = coming.popleft()
+                bar.write(f'{elapsed:4.1f} s: {words}')
+                marks.append((time.time_ns(), words))
+                recorder.set_parameters('/plant', values)
+            if page is not None and time.monotonic() > drawn + DRAW_PERIOD:
+                page.update(f'{elapsed:.0f} of {duration:g} s')
+                drawn = time.monotonic()
             if elapsed >= duration:
-                return
+                break
+    return marks

@@ -6,13 +6,39 @@ from typing import NamedTuple
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.metrics import chatter, rms, settling_time
+from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import messages, read_ticks, series, truth_at
-from fhaosmo_ros.topics import ESTIMATES
+from fhaosmo_ros.topics import ESTIMATES, SELF_TUNED, STANDARD_DEVIATION
 import numpy as np
 from numpy.typing import NDArray
 
+RECENT = 50
+"""Estimates over which the true noise is averaged."""
+SETTLED = 1.0
+"""Seconds of the start that do not count for the share of the band."""
 BAND = 0.1
 """Half-width of the settling band, as a fraction of the range of the truth."""
+
+
+class Tuned(NamedTuple):
+    """
+    What a self-tuning estimator knows beside its estimates, and the noise that there was.
+
+    Attributes
+    ----------
+    deviation : (K, n + 1) array
+        Standard deviations of the estimates; infinite while they are not known.
+    noise, true_noise : (K,) arrays
+        Standard deviation of the noise on y that it has found, and that of the latest samples.
+    bandwidth : (K,) array
+        How fast d is followed, in rad/s.
+
+    """
+
+    deviation: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    true_noise: NDArray[np.float64]
+    bandwidth: NDArray[np.float64]
 
 
 class Run(NamedTuple):
@@ -32,6 +58,10 @@ class Run(NamedTuple):
         Samples of y a second, as published.
     counters : dict of str to str
         What the estimator reported last in its diagnostics.
+    origin : int
+        Stamp of the first estimate, in nanoseconds.
+    tuned : Tuned or None
+        Of a self-tuning estimator.
 
     """
 
@@ -42,6 +72,8 @@ class Run(NamedTuple):
     gamma: NDArray[np.float64]
     sample_rate: float
     counters: dict[str, str]
+    origin: int
+    tuned: Tuned | None
 
 
 def read_run(bag: Path, plant: str = '/plant', estimator: str = '/estimator') -> Run:
@@ -58,7 +90,9 @@ def read_run(bag: Path, plant: str = '/plant', estimator: str = '/estimator') ->
 
     """
     y = series(bag, '/y')
-    ticks = read_ticks(bag, estimator, list(ESTIMATES))
+    with BagReader(bag) as reader:
+        tuned = all(reader.count(f'{estimator}/{part}') for part in SELF_TUNED)
+    ticks = read_ticks(bag, estimator, [*(SELF_TUNED if tuned else {}), *ESTIMATES])
     when = ticks['stamp'].astype(np.int64)
     truth = truth_at(bag, plant, when) if len(when) else None
     if truth is None or not truth.known.any():
@@ -70,7 +104,33 @@ def read_run(bag: Path, plant: str = '/plant', estimator: str = '/estimator') ->
     rate = (len(y.stamps) - 1) / span if span > 0.0 else float('nan')
     names = [*truth.labels, 'd']
     gamma = ticks['gamma'][known]
-    return Run(t, names, truth.values[known], estimate, gamma, rate, _counters(bag))
+    of_tuning = None
+    if tuned:
+        place = np.searchsorted(y.stamps, when[known]).clip(max=len(y.stamps) - 1)
+        wrong = y.values[place] - truth.values[known][:, 0]
+        mean = np.convolve(wrong**2, np.full(RECENT, 1.0 / RECENT))[: len(wrong)]
+        share = np.minimum(1.0, np.arange(1, len(wrong) + 1) / RECENT)
+        noise, _, bandwidth, *_ = ticks['tuning'][known].T
+        of_tuning = Tuned(
+            ticks[STANDARD_DEVIATION][known], noise, np.sqrt(mean / share), bandwidth
+        )
+    origin = int(when[known][0])
+    counters = _counters(bag)
+    return Run(t, names, truth.values[known], estimate, gamma, rate, counters, origin, of_tuning)
+
+
+def _found(run: Run, tuned: Tuned) -> list[str]:
+    """Return what a self-tuning estimator has found, in words."""
+    known = np.isfinite(tuned.deviation[:, -1]) & (run.t > SETTLED)
+    if not known.any():
+        return ['the run was too short for the estimator to find the noise']
+    error = np.abs(run.estimate[:, -1] - run.truth[:, -1])[known]
+    share = float(np.mean(error <= 2.0 * tuned.deviation[known, -1]))
+    return [
+        f'd lay within two standard deviations of its estimate for {share:.0%} of the time',
+        f'noise on y at the end: found {tuned.noise[-1]:.2g}, true {tuned.true_noise[-1]:.2g}; '
+        f'd is followed within {1.0 / tuned.bandwidth[-1]:.2g} s',
+    ]
 
 
 def _counters(bag: Path) -> dict[str, str]:
@@ -98,6 +158,8 @@ def table(run: Run) -> str:
             f'{name:4}{rms(error[half]):12.3g}{rms(truth[half]):12.3g}'
             f'{settled_text:>12}{chatter(estimate[half], truth[half]):10.3g}'
         )
+    if run.tuned is not None:
+        lines += ['', *_found(run, run.tuned)]
     counters = run.counters
     lost, accepted = counters.get('samples lost', '?'), counters.get('samples accepted', '?')
     rejected = counters.get('samples rejected', '?')

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimates of each estimator in a bag, with the truth where the bag has it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,8 +12,8 @@ from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded_parameters import recorded_parameters
-from fhaosmo_ros.tools.bags.topics import read_ticks, series, truth_at
-from fhaosmo_ros.topics import ESTIMATES
+from fhaosmo_ros.tools.bags.topics import messages, read_ticks, series, truth_at
+from fhaosmo_ros.topics import ESTIMATES, EVENT, STANDARD_DEVIATION
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,6 +39,10 @@ class Curves(NamedTuple):
         Threshold of its gates, if it has gates and the bag has its parameters.
     unit : str
         Of y, '' if the bag does not say it.
+    deviation : (K, n + 1) array or None
+        Standard deviations of the estimates, of a self-tuning estimator.
+    events : list of (int, int)
+        Begin and end of each event, in nanoseconds.
 
     """
 
@@ -50,6 +55,8 @@ class Curves(NamedTuple):
     truth: NDArray[np.float64] | None
     epsilon: float | None
     unit: str = ''
+    deviation: NDArray[np.float64] | None = None
+    events: Sequence[tuple[int, int]] = ()
 
     def title(self, name: str) -> str:
         """Return one of `names` with its unit, which follows from that of y."""
@@ -88,7 +95,9 @@ def _read_curves(
             f'bag {path}: expected the topics of an estimator ({", ".join(ESTIMATES)} below its '
             f'name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
         )
-    return [_curves(path, name, plant, *_settings(reader, name)) for name in names or found]
+    return [
+        _curves(path, name, plant, topics, *_settings(reader, name)) for name in names or found
+    ]
 
 
 def _settings(reader: BagReader, name: str) -> tuple[float | None, str]:
@@ -97,12 +106,16 @@ def _settings(reader: BagReader, name: str) -> tuple[float | None, str]:
     if recorded is None:
         return None, ''
     values = ESTIMATOR_PARAMETERS.defaults() | of_channel(recorded.values, recorded.channel)
-    epsilon = values['epsilon'] if values['structure'] == 'cascade' else None
+    gates = values['structure'] == 'cascade' and values['gains'] == 'fixed'
+    epsilon = values['epsilon'] if gates else None
     return epsilon, values['measurement_unit']
 
 
-def _curves(path: Path, name: str, plant: str, epsilon: float | None, unit: str) -> Curves:
-    ticks = read_ticks(path, name, list(ESTIMATES))
+def _curves(
+    path: Path, name: str, plant: str, topics: set[str], epsilon: float | None, unit: str
+) -> Curves:
+    tuned = [STANDARD_DEVIATION] if f'{name}/{STANDARD_DEVIATION}' in topics else []
+    ticks = read_ticks(path, name, [*tuned, *ESTIMATES])
     when = ticks['stamp']
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
     truth = truth_at(path, plant, when)
@@ -121,7 +134,29 @@ def _curves(path: Path, name: str, plant: str, epsilon: float | None, unit: str)
         truth.values if truth else None,
         epsilon,
         unit,
+        ticks[STANDARD_DEVIATION] if tuned else None,
+        read_events(path, name, int(when[-1])) if f'{name}/{EVENT}' in topics else [],
     )
+
+
+def read_events(path: Path, name: str, end: int) -> list[tuple[int, int]]:
+    """Return begin and end of each event of an estimator; one that lasts is given the last end."""
+    spans: list[tuple[int, int]] = []
+    for _, message in messages(path, f'{name}/{EVENT}'):
+        (status,) = message.status
+        since = {pair.key: pair.value for pair in status.values}.get('since')
+        if since is None:  # there has been none
+            continue
+        second, _, nanosecond = since.partition('.')
+        begin = int(second) * 1_000_000_000 + int(nanosecond)
+        ends = message.header.stamp
+        if status.level:
+            spans.append((begin, end))
+        elif spans:
+            spans[-1] = spans[-1][0], ends.sec * 1_000_000_000 + ends.nanosec
+        else:
+            spans.append((begin, ends.sec * 1_000_000_000 + ends.nanosec))
+    return spans
 
 
 def metrics(curves: list[Curves]) -> str:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of runs and of estimates in bags."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -88,6 +88,9 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
             if c.truth is not None and number == 0:
                 row.plot(*thinned(t, c.truth[:, k]), **TRUTH)
             row.plot(*thinned(t, c.estimate[:, k]), **style)
+            if c.deviation is not None:
+                draw_band(row, t, c.estimate[:, k], c.deviation[:, k], thinned, style['color'])
+        shade_events(row_of['d'], c.events, origin, style['color'])
         row_of['gamma'].plot(*thinned(t, c.gamma), **style)
         if epsilon is not None:
             levels = thinned(t, _open_levels(c, epsilon))
@@ -112,6 +115,34 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside upper center', ncols=2, fontsize='small')
     figure.savefig(path, dpi=150)
+
+
+def draw_band(
+    axes: Axes,
+    t: NDArray[np.float64],
+    estimate: NDArray[np.float64],
+    deviation: NDArray[np.float64],
+    thinned: Thinning | None = None,
+    colour: str = '#D55E00',
+) -> None:
+    """Draw the band of two standard deviations, in which the truth is for 95 % of the time."""
+    thinned = thinned or envelope
+    known = np.where(np.isfinite(deviation), deviation, np.nan)
+    low_t, low = thinned(t, estimate - 2.0 * known)
+    high_t, high = thinned(t, estimate + 2.0 * known)
+    grid = np.union1d(low_t, high_t)
+    edges = np.interp(grid, low_t, low), np.interp(grid, high_t, high)
+    axes.fill_between(
+        grid, *edges, color=colour, alpha=0.22, linewidth=0.0, label='± 2 standard deviations'
+    )
+
+
+def shade_events(axes: Axes, events: Sequence[tuple[int, int]], origin: int, colour: str) -> None:
+    """Shade the times of events (ns)."""
+    for begin, end in events:
+        span = (begin - origin) * 1e-9, (end - origin) * 1e-9
+        axes.axvspan(*span, color=colour, alpha=0.15, hatch='//', fill=False, linewidth=0.0)
+        axes.axvspan(*span, color=colour, alpha=0.08, linewidth=0.0)
 
 
 def _draw_innovations(

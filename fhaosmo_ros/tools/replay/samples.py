@@ -8,6 +8,7 @@ from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.observer import Trajectory
 from fhaosmo_ros.core.observer.status import REJECTED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.events import Event
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.messages.fields import Unwrapper
 from fhaosmo_ros.tools.bags.held_input import HeldInputs
@@ -62,6 +63,8 @@ class Samples:
                 estimator.reject_inputs,
             )
         self._whole = arguments.smooth
+        self._tells, self._active = estimator.events.on, 0
+        self._found: list[tuple[int, Event]] = []
         self._waiting, self._dropped = np.zeros((2, 0), dtype=np.int64), 0
         self._first: int | None = None
         self._latest: int | None = None
@@ -147,6 +150,11 @@ class Samples:
 
     def _estimate(self, block: Block, u: np.ndarray | None) -> Iterator[Rows]:
         estimates = self.estimator.run(block.stamps, block.values, u)
+        active = self._active + np.zeros(len(block.times), dtype=np.int64)
+        for event in self.estimator.events.taken():
+            self._active = int(event.begins)
+            active[event.sample :] = self._active
+            self._found.append((int(block.times[event.sample]), event))
         if self.estimator.smooths:
             self._waiting = np.append(self._waiting, [block.times, block.values.view(np.int64)], 1)
             yield from self._due(estimates)
@@ -158,7 +166,13 @@ class Samples:
         if len(keep):
             if len(keep) < len(block.times):
                 estimates = type(estimates)(*(a[keep] for a in estimates))
-            yield Rows(block.times[keep], block.values[keep], estimates)
+            active = active[keep] if self._tells else active[:0]
+            yield Rows(block.times[keep], block.values[keep], estimates, active, self._events())
+
+    def _events(self) -> list[tuple[int, Event]]:
+        """Return the events found since the last call."""
+        found, self._found = self._found, []
+        return found
 
     def _due(self, estimates: Trajectory) -> Iterator[Rows]:
         """Yield the rows whose smoothed estimates are final, with the samples that waited."""
@@ -168,7 +182,8 @@ class Samples:
         if len(numbers[keep]):
             times, y = self._waiting[:, numbers[keep] - self._dropped]
             estimates = Trajectory._make(column[keep] for column in estimates)
-            yield Rows(times, y.view(np.float64), estimates)
+            none = np.zeros(0, dtype=np.int64)
+            yield Rows(times, y.view(np.float64), estimates, none, self._events())
         if len(numbers):
             self._waiting = self._waiting[:, numbers[-1] + 1 - self._dropped :]
             self._dropped = int(numbers[-1]) + 1

@@ -9,11 +9,23 @@ from typing import Any, NamedTuple, Protocol
 import zipfile
 
 from fhaosmo_ros.core.observer.observer import Trajectory
+from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.core.parameters.files import dumps
+from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.tools.bags.mcap.chunks import DATA_AT, MESSAGE, Records
-from fhaosmo_ros.tools.bags.types import labelled_array, LATCHED_QOS, serialise
+from fhaosmo_ros.tools.bags.types import diagnostics, labelled_array, LATCHED_QOS, serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
-from fhaosmo_ros.topics import ESTIMATES, FLOAT, PARAMETERS, TEXT, TIME
+from fhaosmo_ros.topics import (
+    ARRAY,
+    DIAGNOSTICS,
+    ESTIMATES,
+    EVENT,
+    FLOAT,
+    PARAMETERS,
+    STANDARD_DEVIATION,
+    TEXT,
+    TIME,
+)
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,12 +46,18 @@ class Rows(NamedTuple):
     y : (K,) array
     estimates : Trajectory
         ``t`` holds the stamps that dt came from, in nanoseconds.
+    active : (K,) array of int
+        1 while an event lasts; empty where none are asked for.
+    events : list of (int, Event)
+        Those that begin or end, with their stamps in the bag.
 
     """
 
     times: NDArray[np.int64]
     y: NDArray[np.float64]
     estimates: Trajectory
+    active: NDArray[np.int64]
+    events: list[tuple[int, Event]]
 
 
 class Sink(Protocol):
@@ -59,6 +77,11 @@ def columns(rows: Rows) -> dict[str, NDArray]:
     result |= {f'z{i + 1}': e.z[:, i] for i in range(e.z.shape[1])}
     result |= {'unknown_input': e.unknown_input, 'gamma': e.gamma}
     result |= {f'eps{i + 1}': e.innovation[:, i] for i in range(e.innovation.shape[1])}
+    if e.standard_deviation.shape[1]:
+        names = [*(f'z{i + 1}' for i in range(e.z.shape[1])), 'unknown_input']
+        result |= {f'std_{name}': e.standard_deviation[:, i] for i, name in enumerate(names)}
+    if len(rows.active):
+        result['event'] = rows.active
     return result | {'status': e.status, 'open_levels': e.open_levels}
 
 
@@ -87,7 +110,7 @@ class CsvSink:
 
 def _lines(array: NDArray) -> list[bytes]:
     """Return the rows of an array: numbers in their shortest form, separated by commas."""
-    if orjson is None:
+    if orjson is None or not np.isfinite(array).all():  # JSON has no infinity
         return [','.join(map(repr, row)).encode() for row in array.tolist()]
     text = orjson.dumps(np.ascontiguousarray(array), option=orjson.OPT_SERIALIZE_NUMPY)
     return text[2:-2].split(b'],[')  # JSON: [[1.0,2.0],[3.0,4.0]]
@@ -156,7 +179,12 @@ class BagSink:
         self._parameters = f'{name}/{PARAMETERS}', dumps(parameters, name)
         bag.add(self._parameters[0], TEXT, qos=[LATCHED_QOS])
         self._has_parameters = False
-        ids = [bag.add(f'{name}/{topic}', kind) for topic, kind in ESTIMATES.items()]
+        self._name = name
+        self._unit = derivative_unit(parameters.get('measurement_unit', ''), order)
+        self._events = ''
+        tuned = parameters['gains'] == 'self_tuning'
+        topics = ESTIMATES | ({STANDARD_DEVIATION: ARRAY} if tuned else {})
+        ids = [bag.add(f'{name}/{topic}', kind) for topic, kind in topics.items()]
         state = [f'z{i + 1}' for i in range(order)]
         innovation = [f'eps{i + 1}' for i in range(levels)]
         number = serialise(FLOAT, data=0.0)
@@ -168,6 +196,9 @@ class BagSink:
             (labelled_array(innovation, np.zeros(levels)), 8 * levels),
             (serialise(TIME, sec=0, nanosec=0), 8),
         ]
+        if tuned:
+            message = labelled_array([*state, 'd'], np.zeros(order + 1))
+            self._messages.append((message, 8 * (order + 1)))
         self._ids = np.array(ids, dtype=np.int64)
         sizes = [DATA_AT + len(message) for message, _ in self._messages]
         self._ends = np.cumsum(sizes)
@@ -183,7 +214,19 @@ class BagSink:
         return np.frombuffer(out, dtype=np.uint8)
 
     def write(self, rows: Rows) -> None:
-        """Append the messages of each sample."""
+        """Append the messages of each sample, and those of events."""
+        self._write_estimates(rows)
+        for time, event in rows.events:
+            if not self._events:
+                self._events = f'{self._name}/{EVENT}'
+                self._bag.add(self._events, DIAGNOSTICS, qos=[LATCHED_QOS])
+            text, values = described(event, self._unit)
+            name = f'{self._name.lstrip("/")}: event'
+            self._bag.write(
+                self._events, time, diagnostics(event.stamp, event.begins, name, text, values)
+            )
+
+    def _write_estimates(self, rows: Rows) -> None:
         if not self._has_parameters:
             topic, text = self._parameters
             self._bag.write(topic, int(rows.times[0]), serialise(TEXT, data=text))
@@ -196,12 +239,13 @@ class BagSink:
             e.gamma,
             e.innovation,
             np.column_stack([seconds, rest]).astype('<i4'),
+            e.standard_deviation,
         ]
         count = len(rows.times)
         data = np.tile(self._template, (count, 1))
         times = _bytes(rows.times.astype('<i8'), count)
         for start, end, (_, size), values in zip(
-            self._starts, self._ends, self._messages, numbers, strict=True
+            self._starts, self._ends, self._messages, numbers, strict=False
         ):
             data[:, start + DATA_AT - 16 : start + DATA_AT - 8] = times
             data[:, start + DATA_AT - 8 : start + DATA_AT] = times

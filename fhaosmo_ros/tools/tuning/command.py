@@ -18,7 +18,13 @@ from fhaosmo_ros.tools.cli.command import Interrupted, run_command, without_pass
 from fhaosmo_ros.tools.cli.options import add_input_options, assigned, bag_inputs
 from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.source import BagSource, from_bag, simulated, TuningData
+from fhaosmo_ros.tools.tuning.source import (
+    BagSource,
+    from_bag,
+    RecordedOutput,
+    simulated,
+    TuningData,
+)
 
 TRIALS = 1000
 NEEDED = ('optuna>=4,<6', 'cmaes', 'control')
@@ -104,7 +110,8 @@ def _parser() -> argparse.ArgumentParser:
     add(
         '--bag',
         type=Path,
-        help='with the truth in it: tune on it; without: take noise, rate and jitter from its y',
+        help='with the truth in it: tune on it; without: the gains that are likeliest for its y '
+        '(--trials and the other options of the search are not used)',
     )
     add_input_options(add)
     add('--plant', default='/plant', help='whose topics are the truth (%(default)s)')
@@ -125,7 +132,11 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> int:
     with Output(arguments.output, arguments.force) as output:
         values = TUNE_PARAMETERS.complete(tuning)
         with stop.raising():
-            data = _data(arguments, estimator, values, set(tuning))
+            data = _data(arguments, estimator, values)
+        if isinstance(data, RecordedOutput):
+            text = _identify(arguments, data, estimator, tuning, output.path, stop)
+            _say_where(text, output.keep())
+            return 0
         print(
             f'{len(data.training)} recordings to train on, {len(data.held_out)} held out: '
             f'{data.origin}'
@@ -145,9 +156,7 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> int:
             Path(storage).replace(output.path / 'study.journal')
             Path(f'{storage}.lock').unlink(missing_ok=True)
         final = output.keep()
-    print(f'\n{text}\n')
-    print(f'output: {final}/gains.yaml, report.md, figures')
-    print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {final}/gains.yaml')
+    _say_where(text, final)
     if result.failure is None:
         return 0
     print(
@@ -183,15 +192,67 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
     return estimator, tuning
 
 
+def _say_where(text: str, folder: Path) -> None:
+    print(f'\n{text}\n')
+    print(f'output: {folder}/gains.yaml, report.md, figures')
+    print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {folder}/gains.yaml')
+
+
+def _identify(
+    arguments: argparse.Namespace,
+    data: RecordedOutput,
+    estimator: dict[str, Any],
+    tuning: dict[str, Any],
+    folder: Path,
+    stop: Stop,
+) -> str:
+    """Write the gains for what y itself shows; return the report's main part."""
+    from fhaosmo_ros.tools.tuning.identification import checks, gains, output
+    from fhaosmo_ros.tools.tuning.identification.identify import identify_input
+    from fhaosmo_ros.tools.tuning.start.find import chosen_otherwise
+
+    others = chosen_otherwise(estimator)
+    if others:
+        raise ConfigurationError(
+            f'--bag without the truth: expected gains of structure levant and scheme '
+            f'predict_correct, got {", ".join(others)} set. Leave that out; or tune by a '
+            'simulated family: without --bag, with noise_std, rms_of_d and band_of_d as this '
+            'command finds them'
+        )
+    where = {
+        'input_topic': arguments.topic,
+        'input_field': arguments.field,
+        'known_input_topics': arguments.input_topic,
+        'known_input_fields': arguments.input_field,
+    }
+    given = ParameterTable(MODEL).part_of(tuning) | estimator
+    given |= {name: value for name, value in where.items() if value}
+    if 'noise_size' not in given and tuning.get('noise_std'):
+        given['noise_size'] = tuning['noise_std']
+    values = ESTIMATOR_PARAMETERS.complete(given)
+    given |= {name: values[name] for name in ('order', 'phi')}
+    with stop.raising():
+        found = identify_input(
+            data.t, data.y, data.u, data.sensor, TriangularModel.of(values), values, given
+        )
+        checks.refuse(found)
+        made = gains.make_gains(found, given)
+        checks.refuse_unseen(found, made)
+        run = gains.run(found, made)
+    name = f'bag {arguments.bag.resolve().name}'
+    notes = checks.notes(found, made, run)
+    return output.write(folder, found, made, run, notes, arguments.command_line, name)
+
+
 def _data(
-    arguments: argparse.Namespace, estimator: dict[str, Any], values: Parameters, given: set[str]
-) -> TuningData:
+    arguments: argparse.Namespace, estimator: dict[str, Any], values: Parameters
+) -> TuningData | RecordedOutput:
     if arguments.bag is None:
         return simulated(values, arguments.seed)
     used = TriangularModel.of(values).used_inputs
     inputs = bag_inputs(arguments, estimator, used)
     source = BagSource(arguments.bag, *inputs, arguments.plant.rstrip('/'))
-    return from_bag(source, values, given, arguments.seed)
+    return from_bag(source, values)
 
 
 if __name__ == '__main__':

@@ -55,6 +55,61 @@ def save_estimates(
     figure.savefig(path, dpi=150)
 
 
+def save_identified(
+    t: Floats,
+    d: Floats,
+    deviation: float,
+    settled: float,
+    correlations: Floats,
+    chance: float,
+    path: Path,
+) -> None:
+    """
+    Draw the estimate of d along a bag, and how white the innovations are.
+
+    Parameters
+    ----------
+    t, d : (K,) arrays
+    deviation : float
+        Expected standard deviation of the error of d.
+    settled : float
+        The time before is shaded.
+    correlations : (L,) array
+        Of the innovations, from one sample to the next on.
+    chance : float
+        White innovations stay below this 19 times of 20.
+    path : path
+
+    """
+    figure = Figure(figsize=(8.5, 5.0), layout='constrained')
+    above, below = figure.subplots(2, 1, height_ratios=(2, 1))
+    above.fill_between(
+        t, d - 2.0 * deviation, d + 2.0 * deviation, color='#56B4E9', alpha=0.4, lw=0.0,
+        label='expected error (2 standard deviations)',
+    )  # fmt: skip
+    above.plot(t, d, color='#D55E00', linewidth=0.9, label='estimate of d')
+    late = d[t >= settled]
+    margin = 0.25 * float(np.ptp(late)) + 2.0 * deviation or 1.0
+    above.set_ylim(float(late.min()) - margin, float(late.max()) + margin)
+    above.axvspan(t[0], settled, color='grey', alpha=0.12)
+    above.set_xlim(t[0], t[-1])
+    above.set_xlabel('time [s]')
+    above.set_ylabel('unknown\ninput d')
+    above.legend(loc='upper right', fontsize='small')
+    lags = np.arange(1, len(correlations) + 1)
+    below.bar(lags, correlations, color='#0072B2', width=0.5)
+    below.axhspan(-chance, chance, color='grey', alpha=0.3, label='as chance makes it')
+    largest = max(1.3 * float(np.abs(correlations).max()), 3.0 * chance)
+    below.set_ylim(-largest, largest)
+    below.set_xticks(lags[[0, *range(4, len(lags), 5)]])
+    below.set_xlabel('samples between two innovations')
+    below.set_ylabel('correlation')
+    below.legend(loc='upper right', fontsize='small')
+    for axes in (above, below):
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=150)
+
+
 def save_sensitivity(
     curves: Mapping[str, tuple[Floats, Floats]],
     space: Sequence[Dimension],

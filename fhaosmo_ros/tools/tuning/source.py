@@ -78,33 +78,46 @@ def simulated(values: Parameters, seed: int) -> TuningData:
     )
 
 
-def from_bag(source: BagSource, values: Parameters, given: set[str], seed: int) -> TuningData:
+class RecordedOutput(NamedTuple):
     """
-    Return pieces of a bag that holds the truth, else a family with the sensor of its y.
+    A bag's y without the truth.
+
+    Attributes
+    ----------
+    t, y : (K,) arrays
+        Stamps from the first one on (s), and samples.
+    u : (K, m) array
+    sensor : Sensor
+        Estimated from t and y.
+
+    """
+
+    t: NDArray[Any]
+    y: NDArray[Any]
+    u: NDArray[Any]
+    sensor: Sensor
+
+
+def from_bag(source: BagSource, values: Parameters) -> TuningData | RecordedOutput:
+    """
+    Return pieces of a bag that holds the truth, else its y.
 
     Parameters
     ----------
     source : BagSource
     values : Parameters
         Of `TUNE_PARAMETERS`.
-    given : set of str
-        Names that the user set: estimates from the bag do not replace them.
-    seed : int
 
     """
     model = TriangularModel.of(values)
     t, y, u, truth = _read(source, model)
     sensor = identify(t, y)
-    if truth is not None:
-        data = _pieces(t, y, u, truth, values)
-        data.sensor, data.origin = sensor, f'pieces of bag {source.path.resolve().name}'
-        # The truth is that at the time of a sample, not at its stamp, so y - z_1 has no jitter.
-        data.least_noise = max(noise_at_stamps(r.t, r.y) for r in data.training)
-        return data
-    estimated = {k: v for k, v in sensor._asdict().items() if k not in given}
-    data = simulated(values.changed(estimated), seed)
-    data.sensor = sensor
-    data.origin = f'simulated family with the sensor of bag {source.path.resolve().name}'
+    if truth is None:
+        return RecordedOutput(t, y, u, sensor)
+    data = _pieces(t, y, u, truth, values)
+    data.sensor, data.origin = sensor, f'pieces of bag {source.path.resolve().name}'
+    # The truth is that at the time of a sample, not at its stamp, so y - z_1 has no jitter.
+    data.least_noise = max(noise_at_stamps(r.t, r.y) for r in data.training)
     return data
 
 

@@ -132,6 +132,14 @@ class CandidateEvaluator:
         return values[number], several[number]
 
 
+def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
+    """Return the parameters, as set by the user, that ask for something else than `SCHEME`."""
+    found = [k for k in ('structure', 'scheme') if estimator.get(k, SCHEME[k]) != SCHEME[k]]
+    if not estimator.get('unknown_input', True):
+        found.append('unknown_input')
+    return found + [k for k in MEANT_FOR if k in estimator]
+
+
 def with_scheme(
     estimator: Mapping[str, Any], recordings: Sequence[Recording], least_noise: float = 0.0
 ) -> dict[str, Any]:
@@ -142,8 +150,7 @@ def with_scheme(
     they are left out: nothing says how sure the observer is.
     """
     given = dict(estimator)
-    others = any(given.get(k, SCHEME[k]) != SCHEME[k] for k in ('structure', 'scheme'))
-    if others or not given.get('unknown_input', True) or any(k in given for k in MEANT_FOR):
+    if chosen_otherwise(given):
         return given
     period = float(f'{np.median(np.diff(recordings[0].t)):.4g}')
     noise = max(effective_noise(recordings), least_noise)

@@ -134,6 +134,36 @@ def kalman_like(
     """
     n, h = model.size, model.period
     k = model.kalman([h * bandwidth ** (2 * n)])
+    return with_gain(k, h, widths, curves, small, gamma)
+
+
+def with_gain(
+    k: NDArray[np.float64],
+    h: float,
+    widths: ArrayLike,
+    curves: NDArray[np.float64],
+    small: float,
+    gamma: float,
+) -> NDArray[np.float64]:
+    """
+    Return lambda_1 .. lambda_N with which predict_correct has the gains K_1 .. K_N (D 19).
+
+    Parameters
+    ----------
+    k : (N,) array
+        Gains of a linear observer that predicts and then corrects.
+    h : float
+        Sampling period (s).
+    widths, curves, small, gamma
+        As for `kalman_like`.
+
+    Raises
+    ------
+    ConfigurationError
+        psi is 0 there.
+
+    """
+    n = len(k)
     # Every injection is a function of eps = (1 - k_1) b, the innovation after the correction.
     wanted = k / max(1.0 - k[0], SMALLEST)
     injections = np.zeros(n)

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From what a recorded y shows to parameters of the estimator, and what these do with that y."""
+
+from collections.abc import Mapping
+import math
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core.observer.covariance import Uncertainty
+from fhaosmo_ros.core.observer.fuzzy import curves
+from fhaosmo_ros.core.online.counters import Counters
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
+from fhaosmo_ros.tools.tuning.identification.identify import Identified, ljung_box
+from fhaosmo_ros.tools.tuning.start.find import SCHEME
+from fhaosmo_ros.tools.tuning.start.kalman import GAMMA, LEAST, WIDTH
+from fhaosmo_ros.tools.tuning.start.theory import with_gain
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+DIGITS = 4
+FIRST_STAMP = 1_000_000_000
+"""Stamp (ns) of the first sample; 0 would stand for a stamp that is not set."""
+SIZE_OF_USUAL = 0.9616
+"""RMS of a standard normal number among the 99 % that are nearest to 0."""
+BEGIN = 0.1
+"""Part of the bag in which the estimates may still be settling."""
+
+
+class Gains(NamedTuple):
+    """
+    Parameters of the estimator, and what is to be expected of them.
+
+    Attributes
+    ----------
+    parameters : dict
+    expected : (n + 1,) array
+        Standard deviations of the errors of z and d, if the model holds.
+    innovation : float
+        Standard deviation of the innovations, likewise.
+    share : float
+        Part of an innovation that is left after the correction, 1 - K_1.
+
+    """
+
+    parameters: dict[str, Any]
+    expected: Floats
+    innovation: float
+    share: float
+
+
+class Run(NamedTuple):
+    """
+    The estimator with these gains along the bag.
+
+    Attributes
+    ----------
+    t : (K,) array
+        Times (s).
+    unknown_input : (K,) array
+    size : float
+        RMS innovation over the expected one, without the largest hundredth.
+    correlations : (LAGS,) array
+        Autocorrelations of the innovations.
+    probability : float
+        Of correlations as large as these, were the innovations white (Ljung and Box 1978).
+    counters : Counters
+
+    """
+
+    t: Floats
+    unknown_input: Floats
+    size: float
+    correlations: Floats
+    probability: float
+    counters: Counters
+
+
+def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
+    """
+    Return the gains of the steady Kalman filter of what was found (D 17 to D 19).
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such filter in floating-point numbers.
+
+    """
+    likelihood, design = found.likelihood, found.best.design
+    model, period = likelihood.model, _rounded(likelihood.period)
+    noise, begin = _rounded(found.best.low_noise), int(BEGIN * len(likelihood.samples.y))
+    states = found.best.estimates[begin:, : model.order]
+    sizes = np.maximum(np.sqrt(np.nanmean(np.square(states), axis=0)), noise)
+    width = _rounded(WIDTH * noise)
+    values = {
+        **SCHEME,
+        'correction_period': period,
+        'noise_size': noise,
+        'state_sizes': [_rounded(x) for x in sizes],
+        'unknown_input_size': _rounded(found.size_of_input),
+        'unknown_input_derivatives': design.derivatives,
+        'unknown_input_decay': _rounded(design.decay),
+        'fuzzy_widths': [width],
+        'gamma_initial': GAMMA,
+        **given,
+    }
+    checked = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(values))
+    uncertainty = Uncertainty(model, checked, np.array(values['state_sizes']))
+    p = uncertainty.steady(period)
+    total = p[0, 0] + uncertainty.variance
+    k = p[0] / total
+    errors = np.sqrt(np.maximum(np.diag(p - np.outer(p[0], p[0]) / total), 0.0))
+    psi = curves(checked, len(k))
+    small = max(noise, 1e-3 * width)
+    found_lambda = with_gain(
+        k, period, values['fuzzy_widths'][0], psi, small, checked['gamma_initial']
+    )
+    largest = OBSERVER_PARAMETERS['lambda'].upper
+    values['lambda'] = [_rounded(x) for x in found_lambda.clip(LEAST, largest)]
+    return Gains(values, errors[: model.order + 1], math.sqrt(total), 1.0 - float(k[0]))
+
+
+def run(found: Identified, gains: Gains) -> Run:
+    """Let the estimator run over the bag, as the node would, and judge its innovations."""
+    samples = found.likelihood.samples
+    t = np.cumsum(samples.h)
+    estimator = OnlineEstimator(ESTIMATOR_PARAMETERS.complete(gains.parameters))
+    u = samples.u if estimator.observer.uses_input else None
+    stamps = FIRST_STAMP + np.round(t * 1e9).astype(np.int64)
+    trajectory = estimator.run(stamps, samples.y, u)
+    r = trajectory.innovation[:, 0] / (gains.share * gains.innovation)
+    r = r[int(BEGIN * len(r)) :][samples.used[int(BEGIN * len(r)) :]]
+    r = r[np.isfinite(r)]
+    usual = r[np.abs(r) <= np.quantile(np.abs(r), 0.99)]
+    correlations, probability = ljung_box(np.clip(r, -3.0, 3.0))
+    return Run(
+        t,
+        trajectory.unknown_input,
+        float(np.sqrt(np.mean(usual**2))) / SIZE_OF_USUAL,
+        correlations,
+        probability,
+        estimator.counters,
+    )
+
+
+def _rounded(value: float) -> float:
+    return float(f'{value:.{DIGITS}g}')

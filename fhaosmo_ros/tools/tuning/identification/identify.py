@@ -1,0 +1,440 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The likeliest model of d and of the noise for a recorded y, and how sure it is (D 30)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+from typing import Any
+
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.parameters.declaration import Parameters
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.tools.tuning.identification.innovations import Samples
+from fhaosmo_ros.tools.tuning.identification.likelihood import (
+    CLIP,
+    Design,
+    Evaluation,
+    LEAST_RATIO,
+    Likelihood,
+    MOST_RATIO,
+    QUICKEST,
+    SLOWEST,
+)
+from fhaosmo_ros.tools.tuning.sensor import Sensor
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+Floats = NDArray[np.float64]
+PIECES = 10
+"""The bag is cut into so many pieces; every other one is held out."""
+DERIVATIVES = (0, 1, 2)
+BANDWIDTHS = tuple(float(w) for w in np.geomspace(2e-4, 2.0, 15))
+"""First bandwidths, in rad a sample; at the first number of derivatives and ratio below."""
+COLOURS = (0.0, 0.9)
+COLOURED, SLOWER = 0.75, 0.35
+"""A colour, and a factor on the bandwidth found with white noise, to search a colour from."""
+FIRST_DERIVATIVES, FIRST_RATIO = 1, 0.5
+NEIGHBOURS = ((-0.5, -1.6), (-0.5, 0.3), (0.2, -1.6), (0.2, 0.3))
+"""ln bandwidth and ln ratio beside the best of the first, where a search may begin."""
+STEPS = (0.3, 0.5, 0.4)
+"""Sides of the first simplex in ln bandwidth, ln ratio and logit colour."""
+EVALUATIONS = 90
+WORTH = 3.0
+"""By so much a richer model must raise the log-likelihood."""
+OUTLIER, LONGEST_RUN = 6.0, 3
+"""An outlier has an innovation of so many standard deviations; so many of them may follow."""
+MOST_OUTLIERS = 0.05
+MOST_COLOUR = 0.998
+STILL = 0.03
+"""Bandwidth of a filter that takes d for 0, over the bag's length."""
+SHAKES = tuple(float(x) for x in np.geomspace(1e-4, 1e2, 7))
+"""Intensities of white noise on a state that are tried; see `Design.shake`."""
+WHITE = 0.01
+"""Probability above which innovations pass for white, so that no colour is searched."""
+LAGS = 20
+DROP = 0.5
+"""Fall of the log-likelihood over a step of the second differences, about."""
+FEWEST = 500
+"""Samples."""
+
+
+class NothingToFind(ConfigurationError):
+    """There are no gains for this y; the text says why."""
+
+
+@dataclass
+class Identified:
+    """
+    What a recorded y shows.
+
+    Attributes
+    ----------
+    likelihood : Likelihood
+        Of the whole recording.
+    best : Evaluation
+        Of the likeliest design, over the whole recording.
+    tried : dict
+        Evaluations by number of derivatives, fitted to the training pieces alone.
+    white : Evaluation or None
+        The likeliest one with white noise, where the noise was found to be coloured.
+    silent : float
+        Fall of the log-likelihood if d were 0.
+    shaken : dict
+        Rise of the log-likelihood if white noise drove state i = 1 .. n as well.
+    spread : dict
+        Standard deviations of the logarithms of noise, intensity, decay and size of d; NaN where
+        y does not tell.
+    outliers : int
+        Samples that were left out.
+    sensor : Sensor
+        Rate, jitter, losses, resolution.
+
+    """
+
+    likelihood: Likelihood
+    best: Evaluation
+    tried: dict[int, Evaluation]
+    white: Evaluation | None
+    silent: float
+    shaken: dict[int, float]
+    spread: dict[str, float]
+    outliers: int
+    sensor: Sensor
+
+    @property
+    def intensity(self) -> float:
+        """Intensity q of the white noise that drives the last derivative of d."""
+        return self.likelihood.intensity(self.best.design, self.best.noise)
+
+    @property
+    def size_of_input(self) -> float:
+        """The RMS value D of the Matern process of d (D 17)."""
+        return size_of_input(self.best.design, self.intensity)
+
+
+def size_of_input(design: Design, intensity: float) -> float:
+    """Return D of D 17 for a model of d whose last derivative has this intensity."""
+    k = design.derivatives
+    scaled = intensity * math.factorial(2 * k) / math.factorial(k) ** 2
+    return math.sqrt(scaled / (2.0 * design.decay) ** (2 * k + 1))
+
+
+def identify_input(
+    t: Floats,
+    y: Floats,
+    u: Floats,
+    sensor: Sensor,
+    model: TriangularModel,
+    values: Parameters,
+    given: Mapping[str, Any],
+) -> Identified:
+    """
+    Find the likeliest noise and model of d.
+
+    Parameters
+    ----------
+    t, y : (K,) arrays
+        Stamps (s) and samples.
+    u : (K, m) array
+        Known inputs.
+    sensor : Sensor
+    model : TriangularModel
+    values : Parameters
+        Of the estimator, complete.
+    given : mapping
+        Those of them that the user set: `noise_size`, `unknown_input_derivatives` and
+        `unknown_input_decay` are not estimated then.
+
+    Raises
+    ------
+    NothingToFind
+        There are no gains for this y.
+
+    """
+    likelihood = _prepared(t, y, u, sensor, model, values, given)
+    search = Search(likelihood, given)
+    with search.bar:
+        start = search.start()
+        outliers = _leave_out_outliers(likelihood, start)
+        tried, white = search.each_order(start)
+        if not any(math.isfinite(e.held_out) for e in tried.values()):
+            raise NothingToFind(
+                f'y: expected samples that the model can predict, got none that phi = '
+                f'{list(model.phi)} follows: its estimates leave the finite numbers'
+            )
+        likelihood.training[:] = True
+        whole = {k: search.local(e.design) for k, e in tried.items()}
+        count = int(likelihood.samples.used.sum())
+        best = whole[_simplest({k: e.training * count for k, e in whole.items()})]
+        spread = search.spread(best)
+        silent, shaken = search.alternatives(best)
+    return Identified(likelihood, best, tried, white, silent, shaken, spread, outliers, sensor)
+
+
+def _prepared(
+    t: Floats,
+    y: Floats,
+    u: Floats,
+    sensor: Sensor,
+    model: TriangularModel,
+    values: Parameters,
+    given: Mapping[str, Any],
+) -> Likelihood:
+    keep = np.isfinite(y) & np.isfinite(t) & np.isfinite(u).all(axis=1)
+    t, y, u = t[keep], y[keep], u[keep]
+    later = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0.0])
+    t, y, u = t[later], y[later], u[later]
+    count = len(y)
+    if count < FEWEST:
+        raise NothingToFind(f'y: expected at least {FEWEST} samples, got {count}')
+    different = len(np.unique(y))
+    if different < 5 or np.ptp(y) <= 1e-12 * np.abs(y).max():
+        raise NothingToFind(
+            f'y: expected a signal that moves, got {count} samples with {different} different '
+            f'values ({y.min():.6g} to {y.max():.6g}): it is constant, or stuck, and nothing can '
+            'be learned from it. Record while the plant moves'
+        )
+    h = np.diff(t, prepend=t[0])
+    period = float(np.median(h[1:]))
+    periods = np.maximum(np.round(h / period), 1.0).astype(np.int64)
+    periods[(h > max(values['max_gap'], 3.0 * period))] = periods[0] = 0
+    samples = Samples(h, periods, y, np.ascontiguousarray(u), np.ones(count, dtype=bool))
+    training = (np.arange(count) * PIECES // count) % 2 == 0
+    block = max(count // 300, 1)
+    slow = y[: count // block * block].reshape(-1, block).mean(axis=1)
+    sizes = [float(np.sqrt(np.mean(slow**2)))]
+    for _ in range(1, model.order):
+        slow = np.diff(slow) / (block * period)
+        sizes.append(3.0 * float(np.sqrt(np.mean(slow**2))))
+    rounding = sensor.quantisation / math.sqrt(12.0)
+    noise = max(math.hypot(sensor.noise_std, rounding), 1e-9 * float(np.std(y)))
+    return Likelihood(
+        model,
+        period,
+        samples,
+        training,
+        np.array(sizes),
+        given.get('noise_size') or noise,
+        bool(given.get('noise_size')),
+        values['prediction_step'],
+        rounding,
+    )
+
+
+def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:
+    """Mark lonely samples that no other sample supports; return their number."""
+    size = np.abs(np.nan_to_num(start.innovations))
+    # Innovations of a first, coarse fit are not normal: their own median says what is usual.
+    far = size > OUTLIER * max(float(np.median(size)) / 0.6745, 1.0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(np.int8), [0]])))
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        if end - begin > LONGEST_RUN:
+            far[begin:end] = False
+    if far.mean() > MOST_OUTLIERS:
+        return 0
+    likelihood.samples.used[far] = False
+    return int(far.sum())
+
+
+def _simplest(log_likelihoods: Mapping[int, float]) -> int:
+    """Return the number of derivatives from which on a larger one gains too little."""
+    orders = sorted(log_likelihoods)
+    chosen = orders[0]
+    for k in orders[1:]:
+        gain = log_likelihoods[k] - log_likelihoods[chosen]
+        if gain > WORTH or not math.isfinite(log_likelihoods[chosen]):
+            chosen = k
+    return chosen
+
+
+class Search:
+    """The search for one recording."""
+
+    def __init__(self, likelihood: Likelihood, given: Mapping[str, Any]) -> None:
+        self.likelihood = likelihood
+        self._decay = given.get('unknown_input_decay') or None
+        self._orders = DERIVATIVES
+        if 'unknown_input_derivatives' in given:
+            self._orders = (given['unknown_input_derivatives'],)
+        self.held_out = int((~likelihood.training).sum())
+        self.bar = progress(unit='filter', desc='likelihood', leave=False)
+
+    def _evaluate(self, design: Design) -> Evaluation:
+        self.bar.update()
+        return self.likelihood(design)
+
+    def start(self) -> Evaluation:
+        """Scan bandwidths and colours, and bring the scale of clipping and the sizes about."""
+        likelihood, period = self.likelihood, self.likelihood.period
+        first = [
+            self._evaluate(Design(FIRST_DERIVATIVES, w / period, FIRST_RATIO, colour))
+            for w in BANDWIDTHS
+            for colour in (COLOURS[:1] if likelihood.fixed else COLOURS)
+        ]
+        best = max(first, key=lambda e: e.training)
+        likelihood.clip = CLIP
+        for _ in range(2):
+            if math.isfinite(best.training):
+                likelihood.noise = best.noise
+                sizes = np.sqrt(
+                    np.nanmean(best.estimates[:, : len(likelihood.sizes)] ** 2, axis=0)
+                )
+                likelihood.sizes = np.where(np.isfinite(sizes), sizes, likelihood.sizes)
+            best = self._evaluate(best.design)
+        return best
+
+    def each_order(self, start: Evaluation) -> tuple[dict[int, Evaluation], Evaluation | None]:
+        """Fit each number of derivatives; return them, and the best with white noise, if worse."""
+        white = {
+            k: self._from_neighbours(start.design._replace(derivatives=k, colour=0.0))
+            for k in self._orders
+        }
+        chosen = self._best(white)
+        r = chosen.innovations[self.likelihood.samples.used & np.isfinite(chosen.innovations)]
+        if self.likelihood.fixed or (len(r) and ljung_box(np.clip(r, -CLIP, CLIP))[1] > WHITE):
+            return white, None
+        coloured = {}
+        for k in self._orders:
+            if start.design.colour > 0.0:
+                coloured[k] = self._from_neighbours(start.design._replace(derivatives=k))
+                continue
+            like = white[k].design
+            slower = like._replace(colour=COLOURED, bandwidth=SLOWER * like.bandwidth)
+            several = [self.local(like._replace(colour=0.5)), self._from_neighbours(slower)]
+            coloured[k] = max(several, key=lambda e: e.training)
+        better = self._best(coloured)
+        if not (better.held_out - chosen.held_out) * self.held_out > WORTH:
+            return white, None
+        return coloured, chosen
+
+    def _best(self, tried: Mapping[int, Evaluation]) -> Evaluation:
+        """Return the simplest of those that predict the held-out pieces well."""
+        return tried[_simplest({k: e.held_out * self.held_out for k, e in tried.items()})]
+
+    def _from_neighbours(self, design: Design) -> Evaluation:
+        several = [
+            self._evaluate(
+                design._replace(
+                    bandwidth=design.bandwidth * math.exp(a), ratio=FIRST_RATIO * math.exp(b)
+                )
+            )
+            for a, b in NEIGHBOURS
+        ]
+        return self.local(max(several, key=lambda e: e.training).design)
+
+    def _design(self, like: Design, x: Floats) -> Design:
+        period = self.likelihood.period
+        bandwidth = float(np.exp(np.clip(x[0], *np.log([SLOWEST / period, QUICKEST / period]))))
+        ratio = float(np.exp(np.clip(x[1], *np.log([LEAST_RATIO, MOST_RATIO]))))
+        if self._decay:
+            ratio = self._decay / bandwidth
+        colour = 0.0
+        if len(x) > 2:
+            colour = min(1.0 / (1.0 + math.exp(-max(x[2], -9.0))), MOST_COLOUR)
+        return like._replace(bandwidth=bandwidth, ratio=ratio, colour=colour)
+
+    @staticmethod
+    def _point(design: Design) -> list[float]:
+        point = [math.log(design.bandwidth), math.log(design.ratio)]
+        if design.colour > 0.0:
+            point.append(math.log(design.colour / (1.0 - design.colour)))
+        return point
+
+    def local(self, design: Design) -> Evaluation:
+        """Return the likeliest design around this one (Nelder and Mead 1965)."""
+        x = np.array(self._point(design))
+
+        def loss(x: Floats) -> float:
+            value = self._evaluate(self._design(design, x)).training
+            return -value if math.isfinite(value) else 1e300
+
+        simplex = np.vstack([x, x + np.diag(STEPS[: len(x)])])
+        count = self.likelihood.training.sum()
+        found = minimize(
+            loss, x, method='Nelder-Mead',
+            options={
+                'initial_simplex': simplex, 'xatol': 0.02, 'fatol': 0.1 / count,
+                'maxfev': EVALUATIONS,
+            },
+        )  # fmt: skip
+        return self._evaluate(self._design(design, found.x))
+
+    def alternatives(self, best: Evaluation) -> tuple[float, dict[int, float]]:
+        """Return `Identified.silent` and `Identified.shaken`."""
+        count, whole = (
+            int(self.likelihood.samples.used.sum()),
+            float(self.likelihood.samples.h.sum()),
+        )
+        still = self._evaluate(best.design._replace(bandwidth=STILL / whole))
+        shaken = {}
+        for level in range(1, self.likelihood.model.order + 1):
+            trials = [
+                self._evaluate(best.design._replace(shaken=level, shake=shake)).training
+                for shake in SHAKES
+            ]
+            shaken[level] = (max(trials) - best.training) * count
+        return (best.training - still.training) * count, shaken
+
+    def spread(self, best: Evaluation) -> dict[str, float]:
+        """Return standard deviations from the curvature of the log-likelihood at its maximum."""
+        design, count = best.design, int(self.likelihood.samples.used.sum())
+        x = np.array(self._point(design))[: 1 if self._decay else 3]
+        whole = self._point(design)
+
+        def log_likelihood(change: Floats) -> float:
+            point = np.array(whole)
+            point[: len(change)] += change
+            return self._evaluate(self._design(design, point)).training * count
+
+        top, m = best.training * count, len(x)
+        axes = np.eye(m)
+        steps = np.empty(m)
+        for i in range(m):  # so long that the log-likelihood falls by about DROP
+            steps[i] = 0.05
+            for _ in range(6):
+                fall = top - 0.5 * (
+                    log_likelihood(steps[i] * axes[i]) + log_likelihood(-steps[i] * axes[i])
+                )
+                factor = math.sqrt(DROP / fall) if fall > 0.0 else 4.0
+                if 0.5 < factor < 2.0:
+                    break
+                steps[i] *= min(max(factor, 0.2), 5.0)
+        curvature = np.empty((m, m))
+        for i in range(m):
+            for j in range(i, m):
+                a, b = steps[i] * axes[i], steps[j] * axes[j]
+                if i == j:
+                    value = log_likelihood(a) + log_likelihood(-a) - 2.0 * top
+                    curvature[i, i] = value / steps[i] ** 2
+                    continue
+                mixed = (
+                    log_likelihood(a + b) + log_likelihood(-a - b)
+                    - log_likelihood(a - b) - log_likelihood(b - a)
+                )  # fmt: skip
+                curvature[i, j] = curvature[j, i] = mixed / (4.0 * steps[i] * steps[j])
+        names = ('noise', 'intensity', 'decay', 'size')
+        try:
+            covariance = np.linalg.inv(-curvature)
+        except np.linalg.LinAlgError:
+            return dict.fromkeys(names, math.nan)
+        levels, k = self.likelihood.model.order + 1 + design.derivatives, design.derivatives
+        free = m > 1  # ln kappa = ln omega + ln ratio
+        decay = np.array([1.0, 1.0, *[0.0] * (m - 2)]) if free else np.zeros(m)
+        intensity = 2.0 * levels * axes[0]
+        rows = {'intensity': intensity, 'decay': decay}
+        rows['size'] = 0.5 * intensity - (k + 0.5) * decay
+        with np.errstate(invalid='ignore'):
+            found = {name: float(np.sqrt(row @ covariance @ row)) for name, row in rows.items()}
+        return {'noise': math.sqrt(0.5 / count)} | found
+
+
+def ljung_box(r: Floats, lags: int = LAGS) -> tuple[Floats, float]:
+    """Return autocorrelations of `r`, and their probability for white noise (Ljung, Box 1978)."""
+    r = r - r.mean()
+    count, power = len(r), float(r @ r)
+    found = np.array([r[:-j] @ r[j:] / power for j in range(1, lags + 1)])
+    statistic = count * (count + 2.0) * np.sum(found**2 / (count - np.arange(1, lags + 1)))
+    return found, float(chi2.sf(statistic, lags))

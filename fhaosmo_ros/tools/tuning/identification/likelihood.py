@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The likelihood of a recorded y under a model of d and of the noise (D 30)."""
+
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.arrays import FLAGS, GAINS, Law, make_work, SCALARS
+from fhaosmo_ros.core.observer.covariance import stationary, transition
+from fhaosmo_ros.tools.tuning.identification.innovations import innovations, Linear, Samples
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+CLIP = 3.0
+"""Standard deviations from which on an innovation counts linearly (Huber 1964)."""
+SETTLED = 8.0
+"""Time constants of the filter after which its covariance is steady."""
+SLOWEST, QUICKEST = 1e-5, 3.0
+"""Bandwidths of the filters, in rad a sample."""
+LEAST_RATIO, MOST_RATIO = 1e-3, 30.0
+"""Of kappa to the bandwidth."""
+LEAST_USED = 0.9
+"""Part of the samples that needs a finite innovation."""
+SCALE_STEPS = 50
+
+
+class Design(NamedTuple):
+    """
+    A model of d and of the noise, but for the size of both.
+
+    Attributes
+    ----------
+    derivatives : int
+        k of D 17.
+    bandwidth : float
+        omega of the filter in rad/s: q = noise^2 h omega^(2 N), with the noise at low frequencies.
+    ratio : float
+        kappa / omega.
+    colour : float
+        a of the noise v_j = a v_{j-1} + w_j; 0 for white noise.
+    shaken : int
+        State that white noise drives as well, counted from 1; 0 for none.
+    shake : float
+        Its intensity, over noise^2 h omega^(2 `shaken`).
+
+    """
+
+    derivatives: int
+    bandwidth: float
+    ratio: float
+    colour: float = 0.0
+    shaken: int = 0
+    shake: float = 0.0
+
+    @property
+    def decay(self) -> float:
+        """Rate kappa (1/s) of d."""
+        return self.ratio * self.bandwidth
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """
+    How well a design predicts y.
+
+    Attributes
+    ----------
+    design : Design
+    noise : float
+        Standard deviation of the white noise w: the likeliest one for this design.
+    training, held_out : float
+        Mean log-likelihood of a sample.
+    innovations : (K,) array
+        Divided by their expected standard deviations; NaN where there is none.
+    estimates : (K, N) array
+
+    """
+
+    design: Design
+    noise: float
+    training: float
+    held_out: float
+    innovations: Floats
+    estimates: Floats
+
+    @property
+    def low_noise(self) -> float:
+        """Standard deviation of the white noise that has as much power at low frequencies."""
+        return self.noise / (1.0 - self.design.colour)
+
+
+@dataclass
+class Likelihood:
+    """
+    The likelihood of designs for one recording.
+
+    Attributes
+    ----------
+    model : TriangularModel
+    period : float
+        Sampling period (s).
+    samples : Samples
+    training : (K,) array of bool
+        Samples that count; the others are held out.
+    sizes : (n,) array
+        How far off z_1 .. z_n may be where the filter begins.
+    noise : float
+        Standard deviation that innovations are clipped by; see `innovations.Linear`.
+    fixed : bool
+        The noise is given: it is not estimated.
+    longest : float
+        Longest Runge-Kutta step (s).
+    least_noise : float
+        The estimated noise is not smaller: that of an encoder's steps.
+    clip : float
+        In standard deviations.
+
+    """
+
+    model: TriangularModel
+    period: float
+    samples: Samples
+    training: NDArray[np.bool_]
+    sizes: Floats
+    noise: float
+    fixed: bool = False
+    longest: float = 0.0025
+    least_noise: float = 0.0
+    clip: float = math.inf
+
+    def __post_init__(self) -> None:
+        self._jacobian = self.model.jacobian(np.zeros(self.model.order))
+
+    def intensity(self, design: Design, noise: float) -> float:
+        """Return q of the white noise that drives the last derivative of d."""
+        density = (noise / (1.0 - design.colour)) ** 2 * self.period
+        return density * design.bandwidth ** (2 * (self.model.order + 1 + design.derivatives))
+
+    def __call__(self, design: Design) -> Evaluation:
+        """Evaluate a design."""
+        n, k = self.model.order, design.derivatives
+        size = n + 1 + k
+        law = Law(
+            np.zeros(FLAGS, dtype=np.int64),
+            np.zeros((GAINS, size)),
+            np.zeros((size, 2)),
+            np.zeros(SCALARS),
+            np.zeros((1, size)),
+            self.model.with_unknown_input(design.decay, k),
+        )
+        count = len(self.samples.y)
+        b, s, x = np.empty(count), np.empty(count), np.empty((count, size))
+        work = make_work(law, self.model.depth)
+        innovations(law, work, self.samples, self._linear(design), self.longest, b, s, x)
+        with np.errstate(invalid='ignore', over='ignore'):  # of a filter that diverges
+            return self._evaluation(design, b, s / self.noise**2, x)
+
+    def _linear(self, design: Design) -> Linear:
+        n, noise = self.model.order, self.noise**2
+        size, q = n + 1 + design.derivatives, self.intensity(design, self.noise)
+        rates = np.eye(size, k=1)
+        rates[:n, :n] += self._jacobian
+        rates[range(n, size), range(n, size)] = -design.decay
+        a, added, fresh = (np.zeros((size + 1, size + 1)) for _ in range(3))
+        a[:size, :size], added[:size, :size] = transition(rates, q, self.period)
+        if design.shaken:
+            i = design.shaken
+            density = noise / (1.0 - design.colour) ** 2 * self.period
+            w = design.shake * density * design.bandwidth ** (2 * i)
+            added[:i, :i] += transition(rates[:i, :i], w, self.period)[1]
+        fresh[range(1, n), range(1, n)] = np.square(self.sizes[1:])
+        fresh[n:size, n:size] = stationary(rates[n:, n:], q)
+        fresh[0, 0] = noise / (1.0 - design.colour**2)
+        if design.colour > 0.0:  # y = z_1 + v, and the filter begins with z_1 = y
+            a[size, size], added[size, size] = design.colour, noise
+            fresh[size, size] = fresh[0, 0]
+            fresh[0, size] = fresh[size, 0] = -fresh[0, 0]
+            noise = 0.0
+        settled = int(min(SETTLED / (design.bandwidth * self.period), 2.0**40))
+        return Linear(a, added, fresh, noise, self.clip, settled)
+
+    def _evaluation(self, design: Design, b: Floats, s: Floats, x: Floats) -> Evaluation:
+        r = b / np.sqrt(s)
+        counted, used = np.isfinite(r) & self.samples.used, self.samples.used
+        if not counted.sum() > LEAST_USED * used.sum():
+            return Evaluation(design, math.nan, -math.inf, -math.inf, r, x)
+        noise = self.noise
+        if not self.fixed:
+            noise = max(likeliest_scale(r[counted & self.training]), self.least_noise)
+        means = []
+        for chosen in (counted & self.training, counted & ~self.training):
+            if not chosen.any():
+                means.append(math.nan)
+                continue
+            size = np.abs(r[chosen]) / noise
+            loss = np.where(size <= CLIP, size**2, 2.0 * CLIP * size - CLIP**2)
+            means.append(-0.5 * float(np.mean(loss + np.log(s[chosen]))) - math.log(noise))
+        return Evaluation(design, noise, *means, r / noise, x)
+
+
+def likeliest_scale(r: Floats) -> float:
+    """Return the likeliest standard deviation of numbers under Huber's loss."""
+    size = np.abs(r)
+    scale = float(np.sqrt(np.mean(np.minimum(size, np.quantile(size, 0.9)) ** 2)))
+    for _ in range(SCALE_STEPS):
+        if not scale > 0.0:
+            return math.ulp(0.0) ** 0.5
+        change = float(np.mean(np.minimum((size / scale) ** 2, CLIP * size / scale)))
+        scale *= math.sqrt(change)
+        if abs(change - 1.0) < 1e-9:
+            break
+    return scale

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+`python -m studies.events` writes docs/events.png and prints its numbers: delay, false alarms.
+
+A joint, z1' = z2, z2' = -z2 + d, whose angle is measured at 100 Hz. d is a small load that is
+always there, and faults are added to it: steps of 1 for 2 s. False alarms are counted over ten
+hours without faults, delays over one with them, for several thresholds. The filter beside the
+self-tuning estimator is the usual Kalman filter, whose d is a random walk; it is told the noise,
+and the intensity of d is the one with the least delay at one false alarm an hour, found on other
+recordings.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+import sys
+from typing import NamedTuple
+
+from fhaosmo_ros.core import EventDetector, Observer
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.tools.plot.figures import COLOURS
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_are
+from scipy.signal import lfilter, ss2tf
+
+ROOT = Path(__file__).resolve().parents[1]
+H, NOISE, LOAD, FAULT, LASTS, EVERY, SETTLED = 0.01, 1e-3, 0.05, 1.0, 2.0, 20.0, 60.0
+HOURS = 10.0
+MODEL = {'order': 2, 'phi': ['0', '-z2']}
+SELF_TUNING = MODEL | {'gains': 'self_tuning'}
+THRESHOLDS = np.geomspace(0.08, 0.9, 14)
+DEVIATIONS, DURATION = 5.0, 0.03
+FACTORS, NEVER = (1.0, 3.0), 0.05
+INTENSITIES = np.geomspace(1e-3, 1e1, 9)
+Array = NDArray[np.float64]
+Estimates = tuple[Array, Array]
+
+
+class Recording(NamedTuple):
+    """y and d at 100 Hz, and the begins of the faults in seconds."""
+
+    y: Array
+    d: Array
+    faults: Array
+
+
+def record(hours: float, seed: int, noise: float = NOISE, faults: bool = False) -> Recording:
+    """Simulate the joint exactly, d being constant between samples."""
+    rng = np.random.default_rng(seed)
+    count = int(hours * 3600.0 / H)
+    t = H * np.arange(count)
+    rates, phases = rng.uniform(0.2, 1.0, 5), rng.uniform(0.0, 2.0 * np.pi, 5)
+    d = LOAD * np.sqrt(0.4) * sum(np.sin(w * t + p) for w, p in zip(rates, phases, strict=True))
+    begins = np.zeros(0)
+    if faults:
+        begins = np.arange(SETTLED, t[-1] - EVERY, EVERY)
+        begins = np.round((begins + rng.uniform(0.0, EVERY - 2.0 * LASTS, len(begins))) / H) * H
+        for begin, sign in zip(begins, rng.choice([-1.0, 1.0], len(begins)), strict=True):
+            d[(t >= begin - H / 2) & (t < begin + LASTS - H / 2)] += sign * FAULT
+    e = np.exp(-H)
+    z2 = lfilter([0.0, 1.0 - e], [1.0, -e], d)
+    z1 = np.cumsum(np.concatenate([[0.0], ((1.0 - e) * z2 + (H - 1.0 + e) * d)[:-1]]))
+    return Recording(z1 + noise * rng.standard_normal(count), d, begins)
+
+
+def kalman(y: Array, intensity: float) -> tuple[Array, Array]:
+    """Return d and its standard deviation by the filter whose d is a random walk."""
+    e = np.exp(-H)
+    f = np.array([[1.0, 1.0 - e, H - 1.0 + e], [0.0, e, 1.0 - e], [0.0, 0.0, 1.0]])
+    c, q = np.array([[1.0, 0.0, 0.0]]), np.diag([0.0, 0.0, intensity * H])
+    before = solve_discrete_are(f.T, c.T, q, np.array([[NOISE**2]]))
+    k = before @ c.T / (before[0, 0] + NOISE**2)
+    after = before - k @ c @ before
+    stay = np.eye(3) - k @ c
+    # x_k = (I - K C) F x_{k-1} + K y_k, as a filter from y to d
+    numerator, denominator = ss2tf(stay @ f, stay @ f @ k, np.array([[0.0, 0.0, 1.0]]), k[2:3])
+    d = lfilter(numerator[0], denominator, y - y[0])
+    return d, np.full(len(y), np.sqrt(after[2, 2]))
+
+
+def self_tuning(y: Array) -> tuple[Array, Array]:
+    """Return d and its standard deviation by an observer that is told the model and no more."""
+    observer, parts = Observer(SELF_TUNING), []
+    for part in np.array_split(np.arange(len(y)), max(1, len(y) // 100_000)):
+        found = observer.run(np.round(part * H * 1e9).astype(np.int64), y[part])
+        parts.append((found.unknown_input, found.standard_deviation[:, -1]))
+    d, deviation = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return d, deviation
+
+
+def alarms(d: Array, deviation: Array, **settings: float) -> Array:
+    """Return the times at which events begin, after the first minute."""
+    detector = EventDetector(ESTIMATOR_PARAMETERS.defaults() | settings)
+    stamps, found = np.round(1e9 * H * np.arange(len(d))).astype(np.int64), []
+    for part in np.array_split(np.arange(len(d)), max(1, len(d) // 10_000)):
+        detector.take(stamps[part], d[part], deviation[part])
+        found += [event.stamp * 1e-9 for event in detector.taken() if event.begins]
+    times = np.array(found)
+    return times[times > SETTLED]
+
+
+def delays(begun: Array, faults: Array) -> Array:
+    """Return how long after the begin of each fault an event began; infinite if none did."""
+    found = np.append(begun, np.inf)[np.searchsorted(begun, faults)]
+    return np.where(found - faults < LASTS, found - faults, np.inf)
+
+
+class Point(NamedTuple):
+    """One threshold: events an hour without faults, median delay (s), share of faults found."""
+
+    threshold: float
+    false: float
+    delay: float
+    found: float
+
+
+def curve(quiet: Estimates, faulty: Estimates, faults: Array, deviations: float) -> list[Point]:
+    """Return a point for each threshold."""
+    points = []
+    hours = (len(quiet[0]) * H - SETTLED) / 3600.0
+    for threshold in THRESHOLDS:
+        own = {
+            'event_threshold': float(threshold), 'event_deviations': deviations,
+            'event_duration': DURATION,
+        }  # fmt: skip
+        late = delays(alarms(*faulty, **own), faults)
+        points.append(Point(
+            float(threshold), len(alarms(*quiet, **own)) / hours, float(np.median(late)),
+            float(np.mean(np.isfinite(late))),
+        ))  # fmt: skip
+    return points
+
+
+def best(points: Sequence[Point], false: float = 1.0) -> Point:
+    """Return the point of least delay with at most so many false alarms an hour."""
+    fit = [p for p in points if p.false <= false and p.found > 0.99]
+    return min(fit, key=lambda p: p.delay) if fit else points[-1]
+
+
+def tuned_intensity(hours: float) -> float:
+    """Return the intensity of d with which the Kalman filter finds faults soonest."""
+    quiet, faulty = record(hours, 11), record(hours, 12, faults=True)
+    return float(min(
+        INTENSITIES,
+        key=lambda q: best(
+            curve(kalman(quiet.y, q), kalman(faulty.y, q), faulty.faults, 0.0)
+        ).delay,
+    ))  # fmt: skip
+
+
+def main(hours: float = HOURS) -> int:
+    """Write the figure of this checkout, print the numbers."""
+    intensity = tuned_intensity(0.1 * hours)
+    print(f'Kalman filter: intensity of d {intensity:.3g}, noise {NOISE:g}')
+    ways = {
+        'Kalman filter, tuned': (lambda y: kalman(y, intensity), 0.0),
+        'self-tuning': (self_tuning, DEVIATIONS),
+    }
+    figure = Figure(figsize=(9.5, 4.2), layout='constrained')
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    for factor, axes in zip(FACTORS, panels, strict=True):
+        noise = factor * NOISE
+        quiet, faulty = record(hours, 1, noise), record(0.1 * hours, 2, noise, faults=True)
+        for k, (name, (way, deviations)) in enumerate(ways.items()):
+            points = curve(way(quiet.y), way(faulty.y), faulty.faults, deviations)
+            for p in points:
+                print(
+                    f'noise x {factor:g}  {name:22} threshold {p.threshold:.2f}  '
+                    f'{p.false:8.1f} an hour  delay {p.delay:.2f} s  found {p.found:.0%}'
+                )
+            shown = [p for p in points if p.found > 0.9]
+            axes.plot(
+                [max(p.false, NEVER) for p in shown], [p.delay for p in shown], 'o-',
+                color=COLOURS[k], markersize=4, label=name,
+            )  # fmt: skip
+        axes.set_title(f'noise of {noise:g} rad' + (', nothing told' if factor > 1.0 else ''))
+        axes.set_xscale('log')
+        axes.set_xlabel(f'false alarms an hour (leftmost: none in {hours:g} hours)')
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel('median delay [s]')
+    panels[0].set_ylim(0.0, None)
+    panels[0].legend()
+    path = ROOT / 'docs' / 'events.png'
+    figure.savefig(path, dpi=110)
+    print(path)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Force on a nonlinear oscillator: Silverbox, with its input hidden."""
+
+from collections.abc import Mapping
+from math import comb
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from studies.recipes import peers
+from studies.recipes.judging import (
+    FIXED,
+    fixed_gains,
+    Fold,
+    Method,
+    OURS,
+    Recorded,
+    run,
+    self_tuning,
+    simulated,
+)
+
+Floats = NDArray[np.float64]
+TITLE = 'hidden force on an oscillator'
+DATA = 'SNLS80mV.csv of Silverbox'
+QUANTITY, SCALE = 'V1 [V]', 1.0 / 186_024.0
+SHOWN, SHOWN_FOLD, BAND = (5.0, 5.12), 0, False
+PERIOD = 2**14 / 1e7
+MULTISINES, HALF = 45_000, 65_000
+"""Row from which on the input is a multisine; model and peers come from the rows up to `HALF`."""
+END = 85_000
+LAG = 1
+"""Samples: each method is judged by what it says of d that much later."""
+SETTLED, WINDOW = 1.0, 300
+FREQUENCIES = 2 * np.pi * np.arange(10.0, 200.0, 10.0)
+BANDWIDTHS = np.geomspace(500.0, 10000.0, 10).tolist()
+
+
+def identify(y: Floats, force: Floats) -> tuple[list[float], float]:
+    """
+    Return b, k1, k2, k3, c, g of y'' = c + g force - b y' - k1 y - k2 y² - k3 y³, and the R².
+
+    Least squares with modulating functions (Shinbrot 1957): integrals over windows, by parts, so
+    that nothing is differentiated.
+    """
+    t = (np.arange(WINDOW) + 0.5) * PERIOD
+    rate = np.pi / (WINDOW * PERIOD)
+    sin, cos = np.sin(rate * t), np.cos(rate * t)
+    bell = sin**6, 6 * rate * sin**5 * cos, rate**2 * (30 * sin**4 * cos**2 - 6 * sin**6)
+    table, wanted = [], []
+    for w in FREQUENCIES:
+        wave = np.exp(1j * w * t)
+        p0 = bell[0] * wave
+        p1 = (bell[1] + 1j * w * bell[0]) * wave
+        p2 = (bell[2] + 2j * w * bell[1]) * wave - w**2 * p0
+        for begin in range(0, len(y) - WINDOW, WINDOW // 2):
+            part = slice(begin, begin + WINDOW)
+            x, f = y[part], force[part]
+            table.append([p1 @ x, -p0 @ x, -p0 @ x**2, -p0 @ x**3, p0.sum(), p0 @ f])
+            wanted.append(p2 @ x)
+    both = np.concatenate([np.real(table), np.imag(table)])
+    target = np.concatenate([np.real(wanted), np.imag(wanted)])
+    found = np.linalg.lstsq(both, target, rcond=None)[0]
+    explained = 1.0 - np.var(target - both @ found) / np.var(target)
+    return found.tolist(), float(explained)
+
+
+def fixed(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
+    """Return d of the observer with one derivative of d and all four poles at a bandwidth."""
+    gains = fixed_gains(2, bandwidth, r.period) | {
+        'unknown_input_derivatives': 1,
+        'lambda': [comb(4, k) * bandwidth**k for k in range(1, 5)],
+    }
+    return run(dict(p) | gains, r).unknown_input
+
+
+METHODS = {
+    'disturbance observer': Method(peers.disturbance_observer, BANDWIDTHS),
+    'Kalman filter, d a random walk': Method(peers.kalman_filter, BANDWIDTHS),
+    FIXED: Method(fixed, BANDWIDTHS),
+    OURS: Method(self_tuning),
+}
+
+DRAWN = ('disturbance observer', FIXED, OURS)
+
+
+def described(found: list[float]) -> dict[str, Any]:
+    """Return the oscillator as parameters of the estimator."""
+    damping, k1, k2, k3, c, _ = found
+    phi = f'{c!r} - {damping!r}*z2 - {k1!r}*z1 - {k2!r}*z1**2 - {k3!r}*z1**3'
+    return {'order': 2, 'phi': ['0', phi]}
+
+
+def conditions(data: Path) -> tuple[dict[str, list[Fold]], dict[str, float]]:
+    """Return model and peers from one half of the multisines, judged on the other; and remarks."""
+    force, y = np.genfromtxt(data, delimiter=',', skip_header=1, max_rows=END)[:, :2].T
+    found, explained = identify(y[MULTISINES:HALF], force[MULTISINES:HALF])
+    # A third of the first half is enough for one number.
+    training, judged = (
+        recorded(f'rows {a} to {b}', y[a:b], found[-1] * force[a:b])
+        for a, b in ((MULTISINES, MULTISINES + (HALF - MULTISINES) // 3), (HALF, END))
+    )
+    remarks = dict(zip(('b', 'k1', 'k2', 'k3', 'c', 'g'), found, strict=True)) | {'R2': explained}
+    return {'second half': [Fold(described(found), [training], [judged])]}, remarks
+
+
+def recorded(name: str, y: Floats, d: Floats) -> Recorded:
+    """Return a recording whose truth is that of `LAG` samples before."""
+    t = np.arange(len(y)) * PERIOD
+    late = np.concatenate([np.repeat(d[0], LAG), d[:-LAG]])
+    return Recorded(name, t, y, np.zeros((len(y), 0)), late, t > SETTLED)
+
+
+def short() -> dict[str, list[Fold]]:
+    """Return a fold of two short simulated recordings of such an oscillator."""
+    p = {'order': 2, 'phi': ['0', '-42*z2 - 184000*z1 - 728000*z1**3']}
+    family = p | {
+        'duration': 1.5, 'sample_rate': 1 / PERIOD, 'initial_state': 0.0, 'noise_std': 1e-5,
+        'rms_of_d': 4000.0, 'band_of_d': [60.0, 600.0], 'disturbances': ['sines'],
+    }  # fmt: skip
+    both = [recorded(r.name, r.y, r.d) for r in simulated(family, SETTLED, 2)]
+    return {'simulated': [Fold(p, both[:1], both[1:])]}

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bias of a gyroscope, from a heading that has none: flights in RotorPy."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from studies.recipes import peers
+from studies.recipes.flight import fly, gusts
+from studies.recipes.judging import Fold, Method, model, OURS, Recorded, self_tuning, simulated
+
+Floats = NDArray[np.float64]
+TITLE = 'bias of a gyroscope'
+DATA = None
+QUANTITY, SCALE = 'bias [rad/s]', -1.0
+SHOWN, SHOWN_FOLD, BAND = (0.0, 60.0), 0, True
+DURATION, SETTLED, TUNING, JUDGED = 60.0, 10.0, 2, 3
+OUTLIERS, JUMP = 0.01, 0.5
+"""Share of headings that are wrong, by a normal distribution of this standard deviation (rad)."""
+GYROSCOPE = {
+    'noise_density': np.full(3, 5e-4), 'random_walk': np.full(3, 2e-3),
+}  # fmt: skip
+BANDWIDTHS = np.geomspace(0.1, 10.0, 11).tolist()
+METHODS = {
+    'complementary filter': Method(peers.complementary_filter, BANDWIDTHS),
+    'Kalman filter, bias a random walk': Method(peers.kalman_filter, BANDWIDTHS),
+    OURS: Method(self_tuning),
+}
+
+DRAWN = ('complementary filter', OURS)
+
+
+def flight(seed: int) -> Recorded:
+    """Return a flight: heading of motion capture, rate of the gyroscope, minus its bias."""
+    rng = np.random.default_rng(seed)
+    bias = {'initial_bias': rng.uniform(-0.05, 0.05, 3)}
+    found = fly(DURATION, seed, gusts(seed, steps=False), GYROSCOPE | bias)
+    roll, pitch, yaw = Rotation.from_quat(found['attitude']).as_euler('xyz').T
+    t, u = found['t'], np.column_stack([found['rate'][:, 1:], roll, pitch])
+    return Recorded(f'flight {seed}', t, np.unwrap(yaw), u, -found['bias'][:, 2], t > SETTLED)
+
+
+def with_outliers(r: Recorded, seed: int) -> Recorded:
+    """Return the recording with some headings that are far off."""
+    rng = np.random.default_rng(seed)
+    wrong = rng.random(len(r.t)) < OUTLIERS
+    return r._replace(y=r.y + wrong * JUMP * rng.standard_normal(len(r.t)))
+
+
+def conditions(_: Path | None) -> tuple[dict[str, list[Fold]], dict[str, float]]:
+    """Return the flights as simulated, and with outliers; and remarks."""
+    clean = [flight(seed) for seed in range(TUNING + JUDGED)]
+    spoilt = [with_outliers(r, seed) for seed, r in enumerate(clean)]
+    both = {'as simulated': clean, '1 % wrong headings': spoilt}
+    p = model('sensor_bias')
+    return {name: [Fold(p, rs[:TUNING], rs[TUNING:])] for name, rs in both.items()}, {}
+
+
+def short() -> dict[str, list[Fold]]:
+    """Return a fold of two short simulations of the model alone."""
+    family = {
+        'order': 1, 'phi': ['u'], 'duration': 8.0, 'sample_rate': 100.0, 'initial_state': 0.0,
+        'noise_std': 3.5e-3, 'rms_of_d': 0.05, 'band_of_d': [0.1, 0.3], 'disturbances': ['sines'],
+        'rms_of_u': 0.5,
+    }  # fmt: skip
+    both = [
+        r._replace(u=np.column_stack([0.0 * r.u, r.u, np.zeros((len(r.t), 2))]))
+        for r in simulated(family, 2.0, 2)
+    ]
+    return {'simulated': [Fold(model('sensor_bias'), both[:1], both[1:])]}

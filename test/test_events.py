@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Events: what begins and ends one, and that every way of running finds the same ones."""
+
+from fhaosmo_ros.core import ConfigurationError, EstimatorBatch, EventDetector, OnlineEstimator
+from fhaosmo_ros.core.observer.status import REJECTED_SPIKE, RESTARTED
+from fhaosmo_ros.core.online.memory import Flag, labels, pack, Snapshot, unpack
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+H = 10**6
+BEGIN = 1_700_000_000 * 10**9
+DEFAULTS = ESTIMATOR_PARAMETERS.defaults()
+
+
+def found(d, deviations=None, words=None, **parameters):
+    """Return the events in estimates of d at 1 kHz, as (sample, begins)."""
+    detector = EventDetector(DEFAULTS | parameters)
+    stamps = BEGIN + H * np.arange(len(d))
+    detector.take(stamps, d, deviations, words=words)
+    events = detector.taken()
+    for event in events:
+        assert event.stamp == stamps[event.sample]
+        assert event.begins == (abs(event.value) > event.limit)
+    for one, other in zip(events[::2], events[1::2], strict=False):
+        assert one.since == other.since <= one.stamp
+    return [(event.sample, event.begins) for event in events]
+
+
+def pulse(begin, end, count=1000, height=1.0):
+    d = np.zeros(count)
+    d[begin:end] = height
+    return d
+
+
+def test_an_event_lasts_from_the_least_duration_to_the_release():
+    for sign in (1.0, -1.0):
+        d = sign * pulse(300, 600)
+        assert found(d, event_threshold=0.5, event_duration=0.05) == [(350, True), (600, False)]
+    assert found(d, event_threshold=0.5, event_duration=0.0) == [(300, True), (600, False)]
+    assert found(d, event_threshold=1.0) == []  # not more than that
+    assert found(d, event_threshold=0.5, event_duration=0.3) == []
+
+
+def test_what_lasts_for_less_counts_from_its_own_begin():
+    d = pulse(100, 140) + pulse(141, 180) + pulse(200, 300)
+    assert found(d, event_threshold=0.5, event_duration=0.05) == [(250, True), (300, False)]
+
+
+def test_hysteresis_keeps_an_event_together():
+    d = pulse(100, 500) - pulse(200, 210, height=0.6)
+    assert found(d, event_threshold=0.8, event_release=0.3) == [(150, True), (500, False)]
+    apart = [(150, True), (200, False), (260, True), (500, False)]
+    assert found(d, event_threshold=0.8, event_release=1.0) == apart
+
+
+def test_deviations_and_threshold_both_have_to_be_exceeded():
+    d, deviations = pulse(300, 600), np.full(1000, 0.1)
+    both = [(350, True), (600, False)]
+    assert found(d, deviations, event_deviations=4.0) == both
+    assert found(d, deviations, event_deviations=4.0, event_threshold=0.9) == both
+    assert found(d, deviations, event_deviations=4.0, event_threshold=1.1) == []
+    assert found(d, deviations, event_deviations=11.0, event_threshold=0.1) == []
+    deviations[:400] = np.inf  # not known yet
+    assert found(d, deviations, event_deviations=4.0) == [(450, True), (600, False)]
+
+
+def test_a_standard_deviation_that_grows_with_the_event_does_not_hide_it():
+    d, deviations = pulse(300, 900), np.full(1000, 0.1)
+    deviations[300:] = 1.0
+    own = {'event_deviations': 4.0, 'tuning_memory': 1.0}
+    # Half of 0.4 * 10^(1 - e^(-4 t)) is 1 after 0.3 s.
+    (_, begins), (end, ends) = found(d, deviations, **own)
+    assert (begins, ends) == (True, False)
+    assert end == pytest.approx(600, abs=3)
+    own['tuning_memory'] = 100.0
+    d = pulse(300, 600)
+    assert found(d, deviations, **own) == [(350, True), (600, False)]
+    # From the end of an event on it counts as it is.
+    d[700:] = 3.9
+    assert found(d, deviations, **own) == [(350, True), (600, False)]
+    d[700:] = 4.1
+    assert found(d, deviations, **own)[2:] == [(750, True)]
+
+
+def test_a_change_is_judged_against_the_running_mean():
+    d = 5.0 + pulse(1000, 4000, 6000) + 1e-3 * np.sin(np.arange(6000))
+    own = {'event_threshold': 0.5, 'event_change_time': 0.8}
+    events = found(d, **own)
+    # 0.8 ln 4 = 1.1 s after a step of 1 the mean has followed it but for the release of 1/4.
+    assert [begins for _, begins in events] == [True, False, True, False]
+    expected = [1050, 1000 + 800 * np.log(4.0), 4050, 4000 + 800 * np.log(4.0)]
+    np.testing.assert_allclose([k for k, _ in events], expected, atol=60)
+    assert found(d[:1000], **own) == []
+    # Nothing is judged before the mean is known.
+    assert found(5.0 + pulse(0, 400), **own) == []
+
+
+def test_rejected_samples_do_not_count_and_a_restart_ends_an_event():
+    d, words = pulse(300, 600), np.zeros(1000, dtype=np.int64)
+    d[400:420], words[400:420] = 0.0, REJECTED_SPIKE
+    assert found(d, words=words, event_threshold=0.5) == [(350, True), (600, False)]
+    words[500] = RESTARTED
+    detector = EventDetector(DEFAULTS | {'event_threshold': 0.5})
+    detector.take(BEGIN + H * np.arange(1000), d, words=words)
+    restarted = [(e.sample, e.begins) for e in detector.taken()]
+    assert restarted == [(350, True), (500, False), (551, True), (600, False)]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.integers(1, 199), max_size=5),
+    st.integers(0, 2**31),
+    st.sampled_from([0.0, 0.004]),
+    st.sampled_from([0.0, 0.03]),
+)
+def test_a_split_run_finds_what_the_whole_run_finds(cuts, seed, duration, change):
+    rng = np.random.default_rng(seed)
+    d, deviations = np.cumsum(rng.standard_normal(200)), rng.uniform(0.1, 2.0, 200)
+    stamps = BEGIN + np.cumsum(rng.integers(1, 3 * H, 200))
+    words = rng.choice([0, 0, 0, 0, 0, REJECTED_SPIKE, RESTARTED], 200)
+    p = DEFAULTS | {
+        'event_deviations': 2.0, 'event_threshold': 0.7, 'event_duration': duration,
+        'event_change_time': change,
+    }  # fmt: skip
+    whole, split = EventDetector(p), EventDetector(p)
+    whole.take(stamps, d, deviations, words=words)
+    for part in np.split(np.arange(200), sorted(cuts)):
+        split.take(stamps[part], d[part], deviations[part], words=words[part])
+    events = whole.taken()
+    assert [e._replace(sample=0) for e in split.taken()] == [e._replace(sample=0) for e in events]
+    assert [e.begins for e in events] == [k % 2 == 0 for k in range(len(events))]  # in turn
+    assert split.active == whole.active == bool(len(events) % 2)
+    assert all(e.stamp - e.since >= duration * 1e9 for e in events if e.begins)
+
+
+MODEL = {'order': 1, 'phi': ['-z1']}
+FIXED = {
+    'structure': 'levant', 'scheme': 'predict_correct', 'variant': 'fuzzy', 'lambda': [4.0, 5.0],
+    'noise_size': 1e-3, 'correction_period': 0.01, 'fuzzy_widths': [0.1],
+}  # fmt: skip
+CASES = {
+    'fixed': MODEL | FIXED | {'event_threshold': 0.5},
+    'change': MODEL | FIXED | {'event_threshold': 0.4, 'event_change_time': 2.0},
+    'self-tuning': MODEL | {'gains': 'self_tuning', 'event_deviations': 5.0},
+}
+
+
+@pytest.fixture(scope='module')
+def samples():
+    """y of z1' = -z1 + d at 100 Hz with jitter, outliers and a gap, d = 1 from 10 s to 16 s."""
+    rng = np.random.default_rng(4)
+    count = 2400
+    t = 0.01 * np.arange(count) + 1e-3 * rng.uniform(-1, 1, count)
+    t[2000:] += 0.7
+    d = (t > 10.0) & (t < 16.0)
+    z = 0.0
+    y = np.empty(count)
+    for k, h in enumerate(np.diff(t, prepend=t[0])):
+        z = np.exp(-h) * z + (1.0 - np.exp(-h)) * d[k]
+        y[k] = z + 1e-3 * rng.standard_normal()
+    y[[400, 1250, 1251]] += 5.0
+    y[700] = np.nan
+    return BEGIN + (1e9 * t).astype(np.int64), y
+
+
+def without_number(events):
+    return [event._replace(sample=0) for event in events]
+
+
+@pytest.mark.parametrize('case', CASES)
+def test_one_by_one_at_once_in_channels_and_resumed_find_the_same(samples, case):
+    stamps, y = samples
+    at_once = OnlineEstimator(CASES[case])
+    at_once.run(stamps, y)
+    events = without_number(at_once.events.taken())
+    begins = [(e.stamp - BEGIN) * 1e-9 for e in events if e.begins]
+    assert len([t for t in begins if 10.0 < t < 11.0]) == 1  # found
+    assert not [t for t in begins if t < 10.0]  # and nothing else
+    one_by_one, single, other = (OnlineEstimator(CASES[case]) for _ in range(3))
+    batch = EstimatorBatch([single, other])
+    taken, resumed = [], None
+    for k, (stamp, value) in enumerate(zip(stamps.tolist(), y.tolist(), strict=True)):
+        one_by_one.update(stamp, value)
+        if k == 1100:
+            assert one_by_one.events.active
+            vector = pack(Snapshot(one_by_one.latest, Flag(0), one_by_one.memory))
+            memory = one_by_one.memory
+            names = labels(one_by_one.observer.levels, members=len(memory.members))
+            resumed = OnlineEstimator(CASES[case])
+            resumed.remember(unpack(vector, names).memory)
+        batch.advance([0, 1], [stamp, stamp], [value, value], [0.0, 0.0])
+        taken += single.events.taken()
+    assert without_number(one_by_one.events.taken()) == events
+    assert without_number(taken) == events
+    assert without_number(other.events.taken()) == events
+    resumed.run(stamps[1101:], y[1101:])
+    left = [e for e in events if e.stamp > stamps[1100]]
+    assert without_number(resumed.events.taken()) == left
+
+
+def test_a_reset_ends_an_event_and_so_does_switching_off(samples):
+    stamps, y = samples
+    estimator = OnlineEstimator(CASES['fixed'])
+    estimator.run(stamps[:1100], y[:1100])
+    estimator.reset()
+    estimator.run(stamps[1100:1101], y[1100:1101])
+    assert [e.begins for e in estimator.events.taken()] == [True, False]
+    assert not estimator.events.active
+    estimator.run(stamps[1101:1400], y[1101:1400])
+    assert estimator.events.active
+    estimator.configure({'event_threshold': 0.0})
+    assert not estimator.events.active
+    estimator.events.taken()
+    estimator.run(stamps[1400:], y[1400:])
+    assert estimator.events.taken() == []
+
+
+def test_standard_deviations_that_nobody_knows_are_refused():
+    with pytest.raises(ConfigurationError, match=r"'event_deviations'.*self_tuning.*'fixed'"):
+        OnlineEstimator({'event_deviations': 4.0})
+    estimator = OnlineEstimator()
+    with pytest.raises(ConfigurationError, match='event_threshold needs no'):
+        estimator.configure({'event_deviations': 4.0})
+    assert estimator.parameters['event_deviations'] == 0.0

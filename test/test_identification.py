@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `tune` finds in a y without the truth (D 30), and when it refuses."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip('control', reason='python-control is not installed (extra: tune)')
+
+from fhaosmo_ros.core import Observer, TriangularModel
+from fhaosmo_ros.core.observer.covariance import stationary, transition
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.tools.tuning.identification.checks import notes, refuse, refuse_unseen
+from fhaosmo_ros.tools.tuning.identification.gains import make_gains, run
+from fhaosmo_ros.tools.tuning.identification.identify import (
+    identify_input,
+    ljung_box,
+    NothingToFind,
+    size_of_input,
+)
+from fhaosmo_ros.tools.tuning.identification.innovations import Samples
+from fhaosmo_ros.tools.tuning.identification.likelihood import Design, likeliest_scale, Likelihood
+from fhaosmo_ros.tools.tuning.sensor import identify
+from scipy.signal import lfilter
+
+H, K = 5e-3, 4000
+PHI = ['0', '-2*z2']
+NOISE, SIZE, RATE = 1e-3, 1.0, 2.0
+RATES = np.array(
+    [[0.0, 1.0, 0.0, 0.0], [0.0, -2.0, 1.0, 0.0], [0.0, 0.0, -RATE, 1.0], [0.0, 0.0, 0.0, -RATE]]
+)
+"""A plant of order 2 and a Matern d with one derivative (D 17)."""
+T = np.arange(K) * H
+
+
+def plant(seed=1, size=SIZE):
+    """Return the states z1, z2, d, d' of the very process that D 17 describes."""
+    random = np.random.default_rng(seed)
+    q = size**2 * (2.0 * RATE) ** 3 / 2.0
+    a, added = transition(RATES, q, H)
+    x, states = np.zeros(4), np.empty((K, 4))
+    x[2:] = np.linalg.cholesky(stationary(RATES[2:, 2:], q)) @ random.standard_normal(2)
+    shocks = random.standard_normal((K, 4)) @ np.linalg.cholesky(added).T
+    for k in range(K):
+        x = a @ x + shocks[k]
+        states[k] = x
+    return states
+
+
+def noise(seed=2):
+    return NOISE * np.random.default_rng(seed).standard_normal(K)
+
+
+def found_in(y, phi=PHI, **given):
+    given = {'order': len(phi), 'phi': list(phi)} | given
+    values = ESTIMATOR_PARAMETERS.complete(given)
+    model = TriangularModel.of(values)
+    found = identify_input(T, y, np.zeros((K, 1)), identify(T, y), model, values, given)
+    refuse(found)
+    gains = make_gains(found, given)
+    refuse_unseen(found, gains)
+    return found, gains, run(found, gains)
+
+
+@pytest.fixture(scope='module', name='plain')
+def _plain():
+    return found_in(plant()[:, 0] + noise())
+
+
+# the likelihood
+
+
+@pytest.mark.parametrize('colour', [0.0, 0.8])
+def test_innovations_are_those_of_a_textbook_kalman_filter(colour):
+    """Written with matrices, and with the noise as one more state; samples 500 .. 502 are lost."""
+    y = plant()[:600, 0] + lfilter([1.0], [1.0, -colour], noise()[:600])
+    h = np.full(600, H)
+    h[0], h[503] = 0.0, 4.0 * H
+    y = np.delete(y, range(500, 503))
+    h = np.delete(h, range(500, 503))
+    periods = np.round(h / H).astype(np.int64)
+    samples = Samples(h, periods, y, np.zeros((len(y), 1)), np.ones(len(y), dtype=bool))
+    model, design = TriangularModel(PHI, 2), Design(1, 12.0, 0.2, colour)
+    likelihood = Likelihood(
+        model, H, samples, np.ones(len(y), dtype=bool), np.array([0.0, 0.3]), NOISE, fixed=True
+    )
+    r = likelihood(design).innovations
+    rates = RATES.copy()
+    rates[2, 2] = rates[3, 3] = -design.decay
+    a, added = transition(rates, likelihood.intensity(design, NOISE), H)
+    a = np.block([[a, np.zeros((4, 1))], [np.zeros((1, 4)), np.full((1, 1), colour)]])
+    added = np.block([[added, np.zeros((4, 1))], [np.zeros((1, 4)), np.full((1, 1), NOISE**2)]])
+    white = NOISE**2 if colour == 0.0 else 0.0
+    if colour == 0.0:
+        added[4, 4] = 0.0
+    c = np.array([1.0, 0.0, 0.0, 0.0, 1.0])
+    size = NOISE**2 / (1.0 - colour**2)
+    p = np.zeros((5, 5))
+    p[0, 0], p[1, 1] = size, 0.09
+    p[2:4, 2:4] = stationary(rates[2:, 2:], likelihood.intensity(design, NOISE))
+    if colour > 0.0:
+        p[0, 4] = p[4, 0] = -size
+        p[4, 4] = size
+    x, expected = np.array([y[0], 0.0, 0.0, 0.0, 0.0]), [np.nan]
+    for k in range(1, len(y)):
+        for _ in range(periods[k]):
+            x, p = a @ x, a @ p @ a.T + added
+        s = c @ p @ c + white
+        b = y[k] - c @ x
+        expected.append(b / np.sqrt(s))
+        x, p = x + p @ c / s * b, p - np.outer(p @ c, p @ c) / s
+    np.testing.assert_allclose(r[:130], expected[:130], rtol=1e-7)
+    np.testing.assert_allclose(r, expected, atol=2e-2)  # later its covariance counts as steady
+
+
+def test_truth_is_likelier_than_other_designs(plain):
+    likelihood = plain[0].likelihood
+    bandwidth = ((SIZE**2 * (2.0 * RATE) ** 3 / 2.0) / (NOISE**2 * H)) ** (1 / 8)
+    truth = Design(1, bandwidth, RATE / bandwidth)
+    assert size_of_input(truth, likelihood.intensity(truth, NOISE)) == pytest.approx(SIZE)
+    best = likelihood(truth).training
+    for change in ({'bandwidth': 1.5 * bandwidth}, {'ratio': 10.0 * truth.ratio}, {'colour': 0.3}):
+        assert likelihood(truth._replace(**change)).training < best - 3.0 / K
+    assert plain[0].best.training > best - 1.0 / K
+
+
+def test_scale_hardly_minds_outliers():
+    r = np.random.default_rng(3).standard_normal(20_000)
+    assert likeliest_scale(r) == pytest.approx(1.0, rel=0.02)
+    r[::200] *= 50.0
+    assert likeliest_scale(2.5 * r) < 1.5 * 2.5
+
+
+def test_ljung_box_tells_white_from_coloured():
+    r = np.random.default_rng(4).standard_normal(5000)
+    assert ljung_box(r)[1] > 1e-3
+    correlations, probability = ljung_box(lfilter([1.0], [1.0, -0.2], r))
+    assert correlations[0] == pytest.approx(0.2, abs=0.05)
+    assert probability < 1e-9
+
+
+# what is found
+
+
+def test_noise_and_size_of_d_are_found(plain):
+    found, gains, along = plain
+    assert found.best.noise == pytest.approx(NOISE, rel=0.03)
+    assert found.best.design.colour == 0.0
+    assert abs(np.log(found.size_of_input / SIZE)) < 4.0 * found.spread['size'] < 2.0
+    assert 0.3 * RATE < found.best.design.decay < 3.0 * RATE
+    assert along.size == pytest.approx(1.0, abs=0.05)
+    assert along.probability > 1e-3
+    error = along.unknown_input[K // 10 :] - plant()[K // 10 :, 2]
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(gains.expected[-1], rel=0.25)
+
+
+def test_gains_are_those_of_the_likeliest_filter(plain):
+    """The observer of the YAML follows the filter whose likelihood was maximised."""
+    found, gains, _ = plain
+    y = found.likelihood.samples.y
+    estimate = Observer(gains.parameters).run(T, y)
+    late, expected = slice(K // 4, None), found.best.estimates
+    for i, column in enumerate([*estimate.z.T, estimate.unknown_input]):
+        apart = np.sqrt(np.mean((column - expected[:, i])[late] ** 2))
+        assert apart < 0.25 * gains.expected[i], i
+
+
+def test_unit_of_y_does_not_matter(plain):
+    found, gains, _ = found_in(1000.0 * (plant()[:, 0] + noise()))
+    assert found.best.noise == pytest.approx(1000.0 * plain[0].best.noise, rel=0.01)
+    assert gains.expected[-1] == pytest.approx(1000.0 * plain[1].expected[-1], rel=0.1)
+
+
+def test_coloured_noise_is_found_and_told():
+    y = plant()[:, 0] + lfilter([1.0], [1.0, -0.9], 0.3 * noise())
+    found, gains, along = found_in(y)
+    assert found.best.design.colour == pytest.approx(0.9, abs=0.05)
+    assert found.best.low_noise == pytest.approx(3.0 * NOISE, rel=0.4)
+    assert any('coloured' in text for text in notes(found, gains, along))
+    # As good as gains for white noise that had this power at low frequencies.
+    error = along.unknown_input[K // 10 :] - plant()[K // 10 :, 2]
+    assert np.sqrt(np.mean(error**2)) < 1.3 * gains.expected[-1]
+
+
+def test_outliers_are_left_out_and_told(plain):
+    y = plant()[:, 0] + noise()
+    y[7::150] += 50.0 * NOISE * (-1.0) ** np.arange(len(y[7::150]))
+    found, gains, along = found_in(y)
+    assert found.outliers == len(y[7::150])
+    assert found.best.noise == pytest.approx(plain[0].best.noise, rel=0.02)
+    assert gains.expected[-1] == pytest.approx(plain[1].expected[-1], rel=0.15)
+    assert along.counters.divergences == 0
+
+
+def test_given_values_stay():
+    y = plant()[:, 0] + noise()
+    given = {'noise_size': 2e-3, 'unknown_input_derivatives': 0, 'unknown_input_decay': 1.5}
+    found, gains, _ = found_in(y, **given)
+    assert given.items() <= gains.parameters.items()
+    assert found.best.design.decay == pytest.approx(1.5)
+    assert found.best.noise == 2e-3
+
+
+# what is refused, or told
+
+
+@pytest.mark.parametrize(
+    ('y', 'about'),
+    [
+        (lambda: np.full(K, 1.25), 'constant'),
+        (lambda: plant()[:, 0], 'noise'),
+        (noise, 'd:'),
+        (lambda: 3.0 + noise(), 'd:'),
+        (lambda: np.cumsum(noise()), 'wanders|drift'),
+        (lambda: np.where(T < 1.0, noise(), np.nan), 'at least 500 samples'),
+    ],
+)
+@pytest.mark.filterwarnings('error')
+def test_nothing_is_made_of_nothing(y, about):
+    with pytest.raises(NothingToFind, match=about):
+        found_in(y())
+
+
+def test_drift_of_the_sensor_is_told_or_refused():
+    drift = np.cumsum(np.random.default_rng(5).standard_normal(K)) * 2e-3
+    try:
+        found, gains, along = found_in(plant()[:, 0] + noise() + drift)
+    except NothingToFind as error:
+        assert 'drift' in str(error)  # noqa: PT017
+    else:
+        assert any('drift' in text for text in notes(found, gains, along))
+
+
+def test_unstable_model_is_told():
+    found, gains, along = found_in(plant()[:, 0] + noise(), phi=['0', '4*z1 - 2*z2'])
+    assert any('unstable' in text for text in notes(found, gains, along))
+
+
+def test_too_many_states_are_told_or_refused():
+    """A d that moves like a random walk acts on z2'; the model has it act on z3'."""
+    random = np.random.default_rng(6)
+    d = lfilter(
+        [1.0], [1.0, -np.exp(-3.0 * H)], 20.0 * np.sqrt(6.0 * H) * random.standard_normal(K)
+    )
+    z2 = lfilter([H], [1.0, -np.exp(-2.0 * H)], d)
+    y = np.cumsum(z2) * H + noise()
+    try:
+        found, gains, along = found_in(y, phi=['0', '-2*z2', '0'])
+    except NothingToFind as error:
+        assert 'order' in str(error)  # noqa: PT017
+    else:
+        assert any('order' in text for text in notes(found, gains, along))
+
+
+def test_nothing_is_told_where_all_is_well(plain):
+    assert notes(*plain) == []
