@@ -79,10 +79,21 @@ class PrivateNode:
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
         """Ask another node to change parameters; what it answers is not waited for."""
+        changes = [Parameter(name, value=value) for name, value in values.items()]
+        self._client(node).set_parameters(changes)
+
+    def can_set_parameters(self, node: str) -> bool:
+        """
+        Return whether another node offers its parameters.
+
+        Asked early, it makes a client early: the first request of a new one can wait 3 s.
+        """
+        return bool(self._client(node).services_are_ready())
+
+    def _client(self, node: str) -> AsyncParameterClient:
         if node not in self._clients:
             self._clients[node] = AsyncParameterClient(self.node, node)
-        changes = [Parameter(name, value=value) for name, value in values.items()]
-        self._clients[node].set_parameters(changes)
+        return self._clients[node]
 
     def publishers(self, topic: str) -> int:
         """Return how many publishers of a topic have been discovered."""

@@ -189,7 +189,15 @@ def _record(
             stop,
         )
         nodes.start_node('plant', *options)
-        _wait('the first estimate', lambda: recorder.counts['/estimator/state'], nodes, stop)
+        _wait(
+            'the first estimate',
+            lambda: (
+                recorder.counts['/estimator/state']
+                and (not plan.changes or recorder.can_set_parameters('/plant'))
+            ),
+            nodes,
+            stop,
+        )
         return _watch(recorder, nodes, plan, page, stop)
 
 
