@@ -78,7 +78,7 @@ def test_process(heartbeat):
     runs.append('process')
     if runs.count('process') == 1:
         stall(heartbeat, 0.4)
-        subprocess.run([sys.executable, '-c', 'input()'], stdin=subprocess.PIPE, timeout=0.01)
+        subprocess.run([sys.executable, '-c', 'import time; time.sleep(60)'], timeout=0.01)
 
 def test_loss(heartbeat):
     runs.append('loss')
