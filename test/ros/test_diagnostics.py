@@ -171,6 +171,10 @@ def test_share_of_bad_samples_makes_an_error(client, start):
     for level, share in ((ERROR, 0.1), (WARN, 1.0)):
         assert rig.parameters.set(error_bad_share_above=share)[0].successful
         reports = len(rig.diagnostics)
+        rig.client.wait(  # the next report has no good sample of before: all of it is bad
+            lambda before=reports: len(rig.diagnostics) > before, 'report'
+        )
+        reports = len(rig.diagnostics)
         rig.send(math.nan)
         rig.wait_status('input', level, 'rejected measurements 1', start=reports)
 

@@ -13,6 +13,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOURS,
     CORRELATION,
     COUNT,
+    FAR,
     Members,
     ORDERS,
     SCORE,
@@ -119,7 +120,8 @@ def is_likely(members: Members, b: Floats, s: Floats, largest: float) -> bool:
     for k in range(ORDERS):
         for g in range(COUNT):
             variance = s[k, g] * noise[COLOUR[g]]
-            if variance <= largest and b[k, g] * b[k, g] <= GATE * GATE * variance:
+            follows = members.record[FAR, k, g] == 0.0  # one that does not meets y by chance
+            if follows and variance <= largest and b[k, g] * b[k, g] <= GATE * GATE * variance:
                 return True
     return False
 
