@@ -86,10 +86,7 @@ class SampledModel:
             is that of the last state.
 
         """
-        spectrum = np.zeros(self.size)
-        for i, value in enumerate(intensities):
-            spectrum[self.size - 1 - i] = value
-        noise = self._accumulated(spectrum)
+        noise = self.process_noise(intensities)
         # control raises where the eigenvalues do not split into stable and unstable ones.
         try:
             with np.errstate(invalid='ignore'):  # the result is checked below
@@ -98,8 +95,11 @@ class SampledModel:
             raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
         return _finite(p[:, 0] / (p[0, 0] + 1.0) / self._scale)
 
-    def _accumulated(self, spectrum: Matrix) -> Matrix:
-        """Return the covariance that white noise adds over a period (Van Loan 1978)."""
+    def process_noise(self, intensities: Sequence[float]) -> Matrix:
+        """Return what noise as in `kalman` adds to the scaled covariance (Van Loan 1978)."""
+        spectrum = np.zeros(self.size)
+        for i, value in enumerate(intensities):
+            spectrum[self.size - 1 - i] = value
         n, rates = self.size, self._scaled(self._rates) * self.period
         spectrum = spectrum * self._scale**2 * self.period
         largest = float(spectrum.max()) or 1.0

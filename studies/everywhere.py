@@ -1,0 +1,426 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+`python -m studies.everywhere` writes docs/everywhere.md: tuned once, used everywhere.
+
+Estimators of d that are tuned for one condition, or told only the model, in many conditions;
+beside a Kalman filter that is tuned anew with the truth for each.
+"""
+
+import argparse
+from collections.abc import Callable
+import json
+import math
+import os
+from pathlib import Path
+import sys
+import time
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core import OnlineEstimator, Recording, TriangularModel
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.core.simulation.plant import quantised, respond
+from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.tools.cli.command import run_command
+from fhaosmo_ros.tools.cli.processes import Workers
+from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.tools.cli.share import shipped
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+from studies import document
+from studies.comparison.evaluation import METHODS
+from studies.comparison.methods.adaptive import Options, unknown_input
+from studies.comparison.methods.linear import LINEAR_LIMIT
+from studies.comparison.methods.method import Setting
+from studies.comparison.scores import Estimates, JUDGED_FROM, objective
+
+Floats = NDArray[np.float64]
+NAME, RESULTS, DOCS = 'everywhere', 'results.json', Path(__file__).resolve().parents[1] / 'docs'
+STEP, RATE, SEED = 5e-4, 1000.0, 1
+
+
+class Plant(NamedTuple):
+    """A plant, its d and noise as tuned, and the shipped file for it."""
+
+    phi: tuple[str, ...]
+    start: tuple[float, ...]
+    size: float
+    """RMS of d."""
+    speed: float
+    """About how fast d moves, in rad/s."""
+    noise: float
+    file: str
+
+
+PLANTS = {
+    "paper's plant": Plant(
+        ('0', '0', '-z3'), (0.2, 0.2, 0.2), 0.07, 1.0, 1e-3, 'config/noise_1e-3.yaml',
+    ),
+    'pendulum': Plant(
+        ('0', '-19.62*sin(z1) - 0.3*z2 - 0.5*tanh(z2/0.1)'), (0.5, 0.0), 2.8, 2.0, 5e-4,
+        'config/models/pendulum.yaml',
+    ),
+    'motor': Plant(
+        ('0', '-25*z2'), (0.0, 0.0), 70.0, 3.0, 4.4e-4, 'config/models/dc_motor.yaml',
+    ),
+}  # fmt: skip
+
+
+class Condition(NamedTuple):
+    """What differs from the condition of the tuning; factors, but for `rate` and `kind`."""
+
+    noise: float = 1.0
+    later: float = 1.0
+    """On the noise of the second half."""
+    rate: float = RATE
+    speed: float = 1.0
+    size: float = 1.0
+    phi: float = 1.0
+    """On the functions that the estimators are told; the plant stays."""
+    kind: str = 'white'
+
+
+CONDITIONS = {
+    'as tuned': Condition(),
+    'noise x 10': Condition(noise=10.0),
+    'noise / 10': Condition(noise=0.1),
+    'noise x 10 from the middle on': Condition(later=10.0),
+    'noise x 100 from the middle on': Condition(later=100.0),
+    'rate / 2': Condition(rate=500.0),
+    'rate x 2': Condition(rate=2000.0),
+    '100 Hz': Condition(rate=100.0),
+    'd 3 times as fast': Condition(speed=3.0),
+    'd 10 times as fast': Condition(speed=10.0),
+    'd x 10': Condition(size=10.0),
+    'told Phi + 30 %': Condition(phi=1.3),
+    'told Phi - 30 %': Condition(phi=0.7),
+    'Student t noise': Condition(kind='student'),
+    '1 % outliers of 50 sigma': Condition(kind='outliers'),
+    'y in steps of 5 sigma': Condition(kind='steps'),
+    'noise AR(1), 0.75': Condition(kind='0.75'),
+    'noise AR(1), 0.9': Condition(kind='0.9'),
+    'y off by 1 for 0.5 s': Condition(kind='off'),
+}
+TUNED = 'as tuned'
+SELF, ONCE, PRESET = 'self-tuning', 'Kalman, tuned once', 'shipped file'
+HUBER, ADAPTIVE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'
+STYLES = {
+    SELF: ('#D55E00', '*', 90), ONCE: ('#0072B2', 'o', 26), PRESET: ('#009E73', 's', 22),
+    HUBER: ('#56B4E9', '^', 26), ADAPTIVE: ('#CC79A7', 'D', 20), IMM: ('#000000', 'x', 26),
+}  # fmt: skip
+PEERS = {
+    HUBER: [(1.0, Options(huber=limit)) for limit in (1.5, 2.5, 4.0)],
+    ADAPTIVE: [(1.0, Options(memory=seconds)) for seconds in (0.3, 1.0, 10.0)],
+    IMM: [(f, Options(stay=seconds)) for f in (1.5, 2.0, 3.0) for seconds in (1.0, 10.0)],
+}
+"""What the tuning chooses from: a factor between the bandwidths of three models, and options."""
+CEILING = 20.0
+"""Largest ratio that is drawn."""
+
+
+class Size(NamedTuple):
+    """How much is computed."""
+
+    duration: float = 20.0
+    kinds: tuple[str, ...] = ('sine', 'chirp', 'ou', 'square', 'pulses')
+    plants: tuple[str, ...] = tuple(PLANTS)
+    conditions: tuple[str, ...] = tuple(CONDITIONS)
+    bandwidths: int = 9
+
+
+SHORT = Size(7.0, ('sine', 'ou'), ('motor',), (TUNED, 'noise x 10'), 4)
+
+
+class Member(NamedTuple):
+    """A Kalman filter with D 17: its bandwidth (rad/s) is that at `RATE`."""
+
+    derivatives: int
+    bandwidth: float
+    ratio: float
+    """Decay over bandwidth."""
+
+    def intensity(self, order: int) -> float:
+        """Return that of the white noise that drives d (D 17), over the variance of y's noise."""
+        return self.bandwidth ** (2 * (order + 1 + self.derivatives)) / RATE
+
+    def at(self, order: int, rate: float) -> dict[str, float]:
+        """Return the values of this model of d at a rate: its intensity stays (D 17)."""
+        quicker = (rate / RATE) ** (0.5 / (order + 1 + self.derivatives))
+        return {
+            'derivatives': float(self.derivatives), 'bandwidth': self.bandwidth * quicker,
+            'decay': self.ratio * self.bandwidth,
+        }  # fmt: skip
+
+
+class Once(NamedTuple):
+    """What the tuning has found with the truth: a filter, and for each peer which of `PEERS`."""
+
+    member: Member
+    peers: dict[str, int]
+
+
+def wave(kind: str, t: Floats, omega: float, random: np.random.Generator) -> Floats:
+    """Return a signal of unit RMS that moves at about `omega` rad/s."""
+    phase = random.uniform(0.0, 2.0 * np.pi)
+    if kind == 'sine':
+        d = np.sin(omega * t + phase)
+    elif kind == 'square':
+        d = np.sign(np.sin(omega * t + phase))
+    elif kind == 'chirp':  # from 0.3 to 2 omega
+        d = np.sin(omega * t * (0.3 + 0.85 * t / t[-1]) + phase)
+    elif kind == 'ou':
+        d = lfilter([1.0], [1.0, -math.exp(-omega * STEP)], random.standard_normal(len(t)))
+    else:
+        d = np.zeros(len(t))
+        for middle in np.arange(random.uniform(0.0, 3.0), t[-1], 2.6 * np.pi / omega):
+            d += random.standard_normal() * np.exp(-0.5 * (1.5 * omega * (t - middle)) ** 2)
+    return np.asarray(d / np.sqrt(np.mean(d**2)))
+
+
+def recording(plant: Plant, c: Condition, kind: str, duration: float) -> Recording:
+    """Return a recording of the plant; its seed is that of the kind of d."""
+    random = np.random.default_rng([SEED, *kind.encode()])
+    table = wave(kind, np.arange(0.0, duration + STEP, STEP), plant.speed * c.speed, random)
+    t = np.arange(round(duration * c.rate)) / c.rate
+    z, d = respond(TriangularModel(plant.phi), plant.start, t, plant.size * c.size * table, STEP,
+                   step=STEP)  # fmt: skip
+    v, sigma, half = random.standard_normal(len(t)), plant.noise * c.noise, len(t) // 2
+    if c.kind == 'student':
+        v = random.standard_t(3, len(t)) / math.sqrt(3.0)
+    elif c.kind == 'outliers':
+        v[random.uniform(size=len(t)) < 0.01] *= 50.0
+    elif c.kind.startswith('0.'):
+        a = float(c.kind)
+        v = lfilter([math.sqrt(1.0 - a * a)], [1.0, -a], v)
+    v[half:] *= c.later
+    y = z[:, 0] + sigma * v
+    if c.kind == 'steps':
+        y = quantised(z[:, 0], 5.0 * sigma)
+    elif c.kind == 'off':
+        y[half : half + round(0.5 * c.rate)] += 1.0
+    return Recording(t, y, np.zeros(len(t)), z, d, kind)
+
+
+def setting_of(plant: Plant, c: Condition) -> Setting:
+    """Return what the estimators are told in a condition."""
+    told = [text if c.phi == 1.0 else f'{c.phi} * ({text})' for text in plant.phi]
+    return Setting(TriangularModel(told), 1.0 / c.rate, plant.size, plant.noise)
+
+
+def error(r: Recording, d: Floats) -> float:
+    """Return the RMS error of d over its RMS, after the transient."""
+    return objective(r, Estimates(r.z, d))
+
+
+def mean(errors: list[float]) -> float:
+    """Return the geometric mean."""
+    return float(np.exp(np.mean(np.log(errors))))
+
+
+def kalman(setting: Setting, member: Member, recordings: list[Recording]) -> list[float]:
+    """Return the errors of a steady-state Kalman filter; infinite where it does not exist."""
+    try:
+        values = member.at(setting.model.order, 1.0 / setting.period)
+        run = METHODS[LINEAR_LIMIT].prepare(setting, values)
+    except ConfigurationError:
+        return [math.inf] * len(recordings)
+    return [error(r, run(r)['filtered'].d) for r in recordings]
+
+
+def best_member(setting: Setting, recordings: list[Recording], count: int) -> Member:
+    """Tune with the truth: bandwidths for each k, then finer, with decays, for the better two."""
+
+    def judged(member: Member) -> float:
+        return mean(kalman(setting, member, recordings))
+
+    widths = np.geomspace(0.5, 300.0, count).tolist()
+    of_each = [min((Member(k, w, 0.3) for w in widths), key=judged) for k in range(3)]
+    reach = [(widths[1] / widths[0]) ** power for power in (-0.5, -0.25, 0.0, 0.25, 0.5)]
+    finer = [
+        Member(m.derivatives, m.bandwidth * f, r)
+        for m in sorted(of_each, key=judged)[:2]
+        for f in reach
+        for r in (0.05, 0.2, 0.7, 2.0)
+    ]
+    return min([*of_each, *finer], key=judged)
+
+
+def online(r: Recording, parameters: dict[str, Any]) -> tuple[Floats, Floats]:
+    """Return d, and the standard deviations of z and d if there are any, as the node does."""
+    stamps = 10**9 + np.round(r.t * 1e9).astype(np.int64)
+    found = OnlineEstimator(parameters).run(stamps, r.y)
+    return found.unknown_input, found.standard_deviation
+
+
+def peer(
+    name: str, number: int, setting: Setting, member: Member, recordings: list[Recording]
+) -> list[float]:
+    """Return the errors of one of `PEERS` around a tuned filter."""
+    spread, options = PEERS[name][number]
+    intensities = [
+        member._replace(bandwidth=member.bandwidth * factor).intensity(setting.model.order)
+        for factor in ((1.0,) if spread == 1.0 else (1.0 / spread, 1.0, spread))
+    ]
+    decay = member.ratio * member.bandwidth
+    return [
+        error(r, unknown_input(setting, member.derivatives, decay, intensities, options, r))
+        for r in recordings
+    ]
+
+
+def best_peers(setting: Setting, member: Member, recordings: list[Recording]) -> dict[str, int]:
+    """Tune the peers with the truth."""
+
+    def judged(name: str, number: int) -> float:
+        return mean(peer(name, number, setting, member, recordings))
+
+    return {
+        name: min(range(len(choices)), key=lambda number, name=name: judged(name, number))
+        for name, choices in PEERS.items()
+    }  # fmt: skip
+
+
+def cell(name: str, condition: str, size: Size, once: Once | None) -> dict[str, Any]:
+    """Return the errors of all methods in a condition; without `once` tune them here."""
+    plant, c = PLANTS[name], CONDITIONS[condition]
+    recordings = [recording(plant, c, kind, size.duration) for kind in size.kinds]
+    setting = setting_of(plant, c)
+    anew = best_member(setting, recordings, size.bandwidths)
+    once = once or Once(anew, best_peers(setting, anew, recordings))
+    model = {'order': setting.model.order, 'phi': list(setting.model.phi)}
+    preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | model
+    tuning = [online(r, model | {'gains': 'self_tuning'}) for r in recordings]
+    errors = {
+        SELF: [error(r, d) for r, (d, _) in zip(recordings, tuning, strict=True)],
+        ONCE: kalman(setting, once.member, recordings),
+        PRESET: [error(r, online(r, preset)[0]) for r in recordings],
+    }
+    for peer_name, number in once.peers.items():
+        errors[peer_name] = peer(peer_name, number, setting, once.member, recordings)
+    yard = mean(kalman(setting, anew, recordings))
+    inside = [
+        [np.mean((np.abs(d - r.d) < k * s[:, -1])[r.t >= JUDGED_FROM]) for k in (1.0, 1.96)]
+        for r, (d, s) in zip(recordings, tuning, strict=True)
+    ]
+    return {
+        'plant': name, 'condition': condition, 'tuned anew': round(yard, 5),
+        'member': list(anew), 'peers': once.peers,
+        'ratios': {k: float(f'{mean(e) / yard:.4g}') for k, e in errors.items()},
+        'inside': [round(float(x), 3) for x in np.mean(inside, axis=0)],
+    }  # fmt: skip
+
+
+def once_of(found: dict[str, Any]) -> Once:
+    """Return what the cell of the tuning has found."""
+    return Once(Member(*found['member']), found['peers'])
+
+
+def compute(size: Size, jobs: int, stop: Stop) -> list[dict[str, Any]]:
+    """Return all cells: first those of the tuning, then the others."""
+    found: dict[Any, dict[str, Any]] = {}
+    others = [c for c in size.conditions if c != TUNED]
+    total = len(size.plants) * (1 + len(others))
+    with Workers(jobs, stop) as workers, progress(total=total, unit='cell', desc=NAME) as bar:
+        for conditions in ([TUNED], others):
+            calls: dict[Any, tuple[Any, ...]] = {
+                (p, c): (cell, p, c, size, once_of(found[p, TUNED]) if found else None)
+                for p in size.plants
+                for c in conditions
+            }
+            for key, result in workers.results(calls):
+                found[key] = result
+                bar.update()
+    return [found[p, c] for p in size.plants for c in size.conditions]
+
+
+def draw(cells: list[dict[str, Any]]) -> Figure:
+    """Draw the ratios: a panel a plant, a row a condition, a marker a method."""
+    plants = list(dict.fromkeys(c['plant'] for c in cells))
+    figure = Figure(figsize=(11.0, 6.6), layout='constrained')
+    panels = figure.subplots(1, len(plants), sharey=True, squeeze=False)[0]
+    for plant, axes in zip(plants, panels, strict=True):
+        rows = [c for c in cells if c['plant'] == plant]
+        for name, (colour, marker, area) in STYLES.items():
+            x = [min(row['ratios'][name], CEILING) for row in rows]
+            front = 4 if name == SELF else 3
+            axes.scatter(
+                x, range(len(rows)), area, colour, marker=marker, label=name, zorder=front
+            )
+        axes.axvline(1.0, color='#000000', lw=0.8)
+        axes.set(xscale='log', xlim=(0.05, 1.2 * CEILING), title=plant)
+        axes.set_yticks(range(len(rows)), [row['condition'] for row in rows])
+        axes.grid(alpha=0.3)
+    panels[0].invert_yaxis()
+    text = 'error of d over that of a Kalman filter tuned anew with the truth'
+    figure.supxlabel(f'{text} (at {CEILING:g}: that or more)', fontsize='medium')
+    figure.legend(*panels[0].get_legend_handles_labels(), loc='outside upper center', ncols=6)
+    return figure
+
+
+def table(cells: list[dict[str, Any]], entry: Callable[[dict[str, Any]], str]) -> str:
+    """Return a table: a row a condition, a column a plant."""
+    plants = list(dict.fromkeys(c['plant'] for c in cells))
+    lines = ['| condition | ' + ' | '.join(plants) + ' |', '|---' * (1 + len(plants)) + '|']
+    for condition in dict.fromkeys(c['condition'] for c in cells):
+        row = [entry(c) for c in cells if c['condition'] == condition]
+        lines.append(f'| {condition} | ' + ' | '.join(row) + ' |')
+    return '\n'.join(lines)
+
+
+def number(ratio: float) -> str:
+    """Return a ratio as text."""
+    return f'{ratio:.2f}' if ratio < 10.0 else f'{ratio:.0f}' if ratio < 1e4 else 'diverges'
+
+
+def texts(found: dict[str, Any]) -> dict[str, str]:
+    """Return the generated parts of the page."""
+    cells = found['cells']
+    lines = ['| method | geometric mean | worst | cells above 1.25 |', '|---|---|---|---|']
+    for name in STYLES:
+        ratios = [c['ratios'][name] for c in cells]
+        worst = max(cells, key=lambda c, name=name: c['ratios'][name])
+        bad = sum(ratio > 1.25 for ratio in ratios)
+        lines.append(
+            f'| {name} | {number(mean(ratios))} | {number(max(ratios))} '
+            f'({worst["plant"]}, {worst["condition"]}) | {bad} of {len(cells)} |'
+        )
+
+    def both(c: dict[str, Any]) -> str:
+        return ' / '.join(number(c['ratios'][name]) for name in (SELF, ONCE, PRESET))
+
+    def inside(c: dict[str, Any]) -> str:
+        return ' / '.join(f'{100.0 * share:.0f}' for share in c['inside'])
+
+    return {
+        'methods': '\n'.join(lines),
+        'ratios': table(cells, both),
+        'bands': table(cells, inside),
+    }
+
+
+def _study(arguments: argparse.Namespace, stop: Stop) -> None:
+    size = SHORT if arguments.short else Size()
+    output = arguments.output or (Path('everywhere_output') if arguments.short else DOCS)
+    begin = time.monotonic()
+    with document.rewriting(output, NAME, 'Tuned once, used everywhere') as pages:
+        found = {'duration': size.duration, 'cells': compute(size, arguments.jobs, stop)}
+        (pages.folder / RESULTS).write_text(json.dumps(found, indent=1) + '\n')
+        draw(found['cells']).savefig(pages.folder / 'ratios.png', dpi=110)
+        pages.write(texts(found))
+    print(f'{output / NAME}.md ({time.monotonic() - begin:.0f} s)')
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return 0, 2 for a bad argument or output, 130 if it was interrupted."""
+    parser = argparse.ArgumentParser(prog=NAME, description=__doc__)
+    parser.add_argument('--short', action='store_true', help='two cells, for tests')
+    parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1, help='processes')
+    parser.add_argument('--output', type=Path, help='folder for page and results (default: docs)')
+    return run_command(parser, argv, _study)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The study of use without tuning anew: page, filters and command."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from studies import document, everywhere
+from studies.comparison.methods.adaptive import Options, unknown_input
+
+DOCS = Path(__file__).resolve().parents[1] / 'docs'
+MOTOR, TUNED = everywhere.PLANTS['motor'], everywhere.CONDITIONS['as tuned']
+
+
+def test_the_page_says_what_was_computed():
+    found = json.loads((DOCS / everywhere.NAME / everywhere.RESULTS).read_text())
+    assert document.parts((DOCS / 'everywhere.md').read_text()) == everywhere.texts(found)
+    names = {(c['plant'], c['condition']) for c in found['cells']}
+    assert names == {(p, c) for p in everywhere.PLANTS for c in everywhere.CONDITIONS}
+
+
+@pytest.mark.parametrize('derivatives', [0, 2])
+@pytest.mark.parametrize('rate', [100.0, 1000.0])
+def test_peers_without_their_options_are_the_kalman_filter(derivatives, rate):
+    """Its covariance converges to the steady one; two equal models are one."""
+    condition = TUNED._replace(rate=rate)
+    r = everywhere.recording(MOTOR, condition, 'chirp', 10.0)
+    setting = everywhere.setting_of(MOTOR, condition)
+    member = everywhere.Member(derivatives, 15.0, 0.3)
+    [expected] = everywhere.kalman(setting, member, [r])
+    intensity = member.intensity(setting.model.order)
+    for count in (1, 2):
+        d = unknown_input(setting, derivatives, 4.5, [intensity] * count, Options(), r)
+        assert everywhere.error(r, d) == pytest.approx(expected, rel=1e-3)
+
+
+def test_what_differs_between_conditions():
+    usual = everywhere.recording(MOTOR, TUNED, 'sine', 10.0)
+    for name, c in everywhere.CONDITIONS.items():
+        r = everywhere.recording(MOTOR, c, 'sine', 10.0)
+        assert len(r.t) == 10.0 * c.rate, name
+        np.testing.assert_allclose(np.sqrt(np.mean(r.d**2)), c.size * MOTOR.size, rtol=0.05)
+        if c.rate == everywhere.RATE and c.size == c.speed == 1.0:
+            np.testing.assert_array_equal(r.z, usual.z, err_msg=name)
+        noise = np.std((r.y - r.z[:, 0])[: len(r.t) // 2])
+        if c.kind in {'white', '0.75', '0.9', 'off'}:
+            assert noise == pytest.approx(c.noise * MOTOR.noise, rel=0.15), name
+
+
+def test_the_command_in_short(tmp_path, capsys):
+    assert everywhere.main(['--short', '--jobs', '1', '--output', str(tmp_path)]) == 0
+    assert 'everywhere.md' in capsys.readouterr().out
+    found = json.loads((tmp_path / 'everywhere' / 'results.json').read_text())
+    assert len(found['cells']) == 2
+    assert all(0.0 < c['ratios'][everywhere.SELF] < 1.25 for c in found['cells'])
+    assert found['cells'][0]['ratios'][everywhere.ONCE] == 1.0
