@@ -38,6 +38,11 @@ LATTICE_STEPS = 30.0
 """The share of steps of y that are multiples of the smallest is averaged over so many."""
 LATTICE_SHARE = 0.9
 """With a larger share y is quantised."""
+LATE = 3.0
+"""
+A member beyond the gate for so many samples in a row does not judge y; after more unlikely
+samples than that, none does that was beyond it at the last likely one (D 29).
+"""
 HIDDEN = 4.0
 """Noise of so many times the variance of the error of rounding hides the quanta."""
 ROUGH_SAMPLES = 100.0
@@ -114,13 +119,23 @@ def knowing(members: Members, s: Floats) -> float:
 
 
 @compiled()
-def is_likely(members: Members, b: Floats, s: Floats, largest: float) -> bool:
-    """Return True if a member that can judge the sample finds it likely (D 29)."""
-    noise = members.noise[SQUARE]
+def is_likely(members: Members, b: Floats, s: Floats, largest: float, beyond: float) -> bool:
+    """
+    Return True if a member that can judge the sample finds it likely (D 29).
+
+    A member that is far off itself would meet y by chance while y is off by a constant.
+
+    Parameters
+    ----------
+    beyond : float
+        Number of unlikely samples in a row before this one.
+
+    """
+    noise, late = members.noise[SQUARE], LATE if beyond <= LATE else 1.0
     for k in range(ORDERS):
         for g in range(COUNT):
             variance = s[k, g] * noise[COLOUR[g]]
-            follows = members.record[FAR, k, g] == 0.0  # one that does not meets y by chance
+            follows = members.record[FAR, k, g] < late
             if follows and variance <= largest and b[k, g] * b[k, g] <= GATE * GATE * variance:
                 return True
     return False

@@ -200,7 +200,7 @@ def step_members(
     grows = off > 1.1 * memory[FARTHEST] + 2.0 * math.sqrt(members.noise[SQUARE, 0])
     memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and grows else 0.0
     memory[FARTHEST] = off
-    if memory[GROWING] < GROWTHS and not is_likely(members, b, believed, largest):
+    if memory[GROWING] < GROWTHS and not is_likely(members, b, believed, largest, memory[BEYOND]):
         sign = math.copysign(1.0, b[ORDERS - 1, COUNT - 1])
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
             memory[BEYOND] += 1.0
