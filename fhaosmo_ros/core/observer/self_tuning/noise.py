@@ -38,11 +38,8 @@ LATTICE_STEPS = 30.0
 """The share of steps of y that are multiples of the smallest is averaged over so many."""
 LATTICE_SHARE = 0.9
 """With a larger share y is quantised."""
-LATE = 3.0
-"""
-A member beyond the gate for so many samples in a row does not judge y; after more unlikely
-samples than that, none does that was beyond it at the last likely one (D 29).
-"""
+PASSED = 3.0
+"""After more unlikely samples no member judges that was beyond the gate at the last likely one."""
 HIDDEN = 4.0
 """Noise of so many times the variance of the error of rounding hides the quanta."""
 ROUGH_SAMPLES = 100.0
@@ -131,7 +128,7 @@ def is_likely(members: Members, b: Floats, s: Floats, largest: float, beyond: fl
         Number of unlikely samples in a row before this one.
 
     """
-    noise, late = members.noise[SQUARE], LATE if beyond <= LATE else 1.0
+    noise, late = members.noise[SQUARE], math.inf if beyond <= PASSED else 1.0
     for k in range(ORDERS):
         for g in range(COUNT):
             variance = s[k, g] * noise[COLOUR[g]]
