@@ -107,6 +107,7 @@ class MachineCode(_numba.FunctionCache):  # type: ignore[misc]
         super().__init__(function)
         stamp = self._impl.locator.get_source_stamp()
         self._cache_file = CheckedFiles(self._cache_path, self._impl.filename_base, stamp)
+        self._is_core = function.__module__.startswith('fhaosmo_ros.core.')
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return the compiled function, or None if it has to be compiled."""
@@ -117,7 +118,8 @@ class MachineCode(_numba.FunctionCache):  # type: ignore[misc]
             self._remove()
             _warn(f'thrown away a damaged compile cache in {self._cache_path} ({_text(error)})')
         if found is None:
-            _say_that_it_compiles()
+            if self._is_core:  # what tools compile takes a second
+                _say_that_it_compiles()
             compiling.set()
         return found
 
