@@ -28,7 +28,7 @@ from fhaosmo_ros.core.observer.status import DIVERGED, REJECTED, RESTARTED
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 FRESH, LEARNING, QUIET, BEYOND, ACTIVE, LOST = range(6)
 """
@@ -80,6 +80,22 @@ class Event(NamedTuple):
     sample: int = 0
 
 
+@compiled(forceinline=True)
+def write_event(
+    found: Ints,
+    numbers: Floats,
+    index: int,
+    sample: int,
+    ints: Ints,
+    begins: float,
+    signal: float,
+    limit: float,
+) -> None:
+    """Write what `detect` returns of an event to row `index` of its arrays."""
+    found[index, 0], found[index, 1] = sample, ints[at.EVENT_STAMP]
+    numbers[index, BEGINS], numbers[index, SIGNAL], numbers[index, LIMIT] = begins, signal, limit
+
+
 @compiled()
 def detect(
     settings: Floats,
@@ -125,9 +141,7 @@ def detect(
             ints[at.EVENT_SINCE] += elapsed
             elapsed = 0
         if doing == LOST:
-            found[count, 0], found[count, 1] = k, ints[at.EVENT_STAMP]
-            numbers[count, BEGINS], numbers[count, SIGNAL] = 0.0, x
-            numbers[count, LIMIT] = math.inf
+            write_event(found, numbers, count, k, ints, 0.0, x, math.inf)
             count += 1
             ints[at.EVENT] = FRESH
             continue
@@ -156,9 +170,7 @@ def detect(
         limit = max(settings[THRESHOLD], settings[DEVIATIONS] * sigma)
         if doing == ACTIVE:
             if not abs(signal) > settings[RELEASE] * limit:
-                found[count, 0], found[count, 1] = k, ints[at.EVENT_STAMP]
-                numbers[count, BEGINS], numbers[count, SIGNAL] = 0.0, signal
-                numbers[count, LIMIT] = limit
+                write_event(found, numbers, count, k, ints, 0.0, signal, limit)
                 count += 1
                 doing = QUIET
                 reals[at.EVENT_DEVIATION] = deviations[k]
@@ -170,9 +182,7 @@ def detect(
                     ints[at.EVENT_SINCE], ints[at.EVENT_STAMP] = now, stamps[k]
                     doing = BEYOND
                 if now - ints[at.EVENT_SINCE] >= settings[DURATION]:
-                    found[count, 0], found[count, 1] = k, ints[at.EVENT_STAMP]
-                    numbers[count, BEGINS], numbers[count, SIGNAL] = 1.0, signal
-                    numbers[count, LIMIT] = limit
+                    write_event(found, numbers, count, k, ints, 1.0, signal, limit)
                     count += 1
                     doing = ACTIVE
         ints[at.EVENT] = doing
@@ -266,36 +276,20 @@ class EventDetector:
 
         """
         stamps = np.ascontiguousarray(stamps, dtype=np.int64)
-        d = np.asarray(d, dtype=np.float64)
+        d = np.ascontiguousarray(d, dtype=np.float64)
+        times = stamps if times is None else np.asarray(times, dtype=np.int64)
+        words = np.zeros(len(d), dtype=np.int64) if words is None else np.asarray(words, np.int64)
         known = deviations is not None
-        self._take(
-            stamps,
-            stamps if times is None else np.asarray(times, dtype=np.int64),
-            np.zeros(len(d), dtype=np.int64) if words is None else np.asarray(words, np.int64),
-            d,
-            np.asarray(deviations, dtype=np.float64) if known else np.zeros(len(d)),
-            known,
-        )
-
-    def _take(
-        self,
-        stamps: NDArray[np.int64],
-        times: Ints,
-        words: Ints,
-        d: Floats,
-        deviations: Floats,
-        known: bool,
-    ) -> None:
+        sigma = np.ascontiguousarray(deviations if known else np.zeros(len(d)), dtype=np.float64)
         found, numbers = np.empty((len(d), 2), dtype=np.int64), np.empty((len(d), 3))
         count = detect(
-            self._settings, self._ints, self._reals, stamps, times, words, np.ascontiguousarray(d),
-            np.ascontiguousarray(deviations), found, numbers,
-        )  # fmt: skip
+            self._settings, self._ints, self._reals, stamps, times, words, d, sigma, found, numbers
+        )
         for (k, since), (begins, value, limit) in zip(
             found[:count].tolist(), numbers[:count].tolist(), strict=True
         ):
             stamp = int(stamps[k])
-            deviation = float(deviations[k]) if known else math.nan
+            deviation = float(sigma[k]) if known else math.nan
             event = Event(stamp, begins > 0.0, since, value, limit, deviation, k)
             self.waiting.append(event)
             self.latest = event
