@@ -20,6 +20,7 @@ from fhaosmo_ros.tools.tuning.identification.identify import (
 from fhaosmo_ros.tools.tuning.identification.innovations import Samples
 from fhaosmo_ros.tools.tuning.identification.likelihood import Design, likeliest_scale, Likelihood
 from fhaosmo_ros.tools.tuning.sensor import identify
+from fhaosmo_ros.tools.tuning.source import RecordedOutput
 from scipy.signal import lfilter
 
 H, K = 5e-3, 4000
@@ -54,7 +55,8 @@ def found_in(y, phi=PHI, **given):
     given = {'order': len(phi), 'phi': list(phi)} | given
     values = ESTIMATOR_PARAMETERS.complete(given)
     model = TriangularModel.of(values)
-    found = identify_input(T, y, np.zeros((K, 1)), identify(T, y), model, values, given)
+    data = RecordedOutput(T, y, np.zeros((K, 1)), identify(T, y))
+    found = identify_input(data, model, values, given)
     refuse(found)
     gains = make_gains(found, given)
     refuse_unseen(found, gains)

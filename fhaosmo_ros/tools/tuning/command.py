@@ -232,9 +232,7 @@ def _identify(
     values = ESTIMATOR_PARAMETERS.complete(given)
     given |= {name: values[name] for name in ('order', 'phi')}
     with stop.raising():
-        found = identify_input(
-            data.t, data.y, data.u, data.sensor, TriangularModel.of(values), values, given
-        )
+        found = identify_input(data, TriangularModel.of(values), values, given)
         checks.refuse(found)
         made = gains.make_gains(found, given)
         checks.refuse_unseen(found, made)

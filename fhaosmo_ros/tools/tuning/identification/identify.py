@@ -22,6 +22,7 @@ from fhaosmo_ros.tools.tuning.identification.likelihood import (
     SLOWEST,
 )
 from fhaosmo_ros.tools.tuning.sensor import Sensor
+from fhaosmo_ros.tools.tuning.source import RecordedOutput
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
@@ -123,24 +124,14 @@ def size_of_input(design: Design, intensity: float) -> float:
 
 
 def identify_input(
-    t: Floats,
-    y: Floats,
-    u: Floats,
-    sensor: Sensor,
-    model: TriangularModel,
-    values: Parameters,
-    given: Mapping[str, Any],
+    data: RecordedOutput, model: TriangularModel, values: Parameters, given: Mapping[str, Any]
 ) -> Identified:
     """
     Find the likeliest noise and model of d.
 
     Parameters
     ----------
-    t, y : (K,) arrays
-        Stamps (s) and samples.
-    u : (K, m) array
-        Known inputs.
-    sensor : Sensor
+    data : RecordedOutput
     model : TriangularModel
     values : Parameters
         Of the estimator, complete.
@@ -154,7 +145,7 @@ def identify_input(
         There are no gains for this y.
 
     """
-    likelihood = _prepared(t, y, u, sensor, model, values, given)
+    likelihood = _prepared(data, model, values, given)
     search = Search(likelihood, given)
     with search.bar:
         start = search.start()
@@ -171,18 +162,15 @@ def identify_input(
         best = whole[_simplest({k: e.training * count for k, e in whole.items()})]
         spread = search.spread(best)
         silent, shaken = search.alternatives(best)
-    return Identified(likelihood, best, tried, white, silent, shaken, spread, outliers, sensor)
+    return Identified(
+        likelihood, best, tried, white, silent, shaken, spread, outliers, data.sensor
+    )
 
 
 def _prepared(
-    t: Floats,
-    y: Floats,
-    u: Floats,
-    sensor: Sensor,
-    model: TriangularModel,
-    values: Parameters,
-    given: Mapping[str, Any],
+    data: RecordedOutput, model: TriangularModel, values: Parameters, given: Mapping[str, Any]
 ) -> Likelihood:
+    t, y, u, sensor = data
     keep = np.isfinite(y) & np.isfinite(t) & np.isfinite(u).all(axis=1)
     t, y, u = t[keep], y[keep], u[keep]
     later = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0.0])
