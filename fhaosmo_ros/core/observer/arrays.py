@@ -47,7 +47,7 @@ Entries of ``State.memory``:
 | LIKELIEST | index of the colour of the likeliest member | 1 |
 | CALM | samples since the noise has grown | 1 |
 | GROWING | unlikely samples in a row, each farther off than the one before | 1 |
-| FARTHEST | how far off the last unlikely sample was | of y |
+| FARTHEST | how far off the sample before was | of y |
 | NARROWED | by what the limit of the influence of innovations is below `HUBER` (D 32) | 1 |
 | ONE_SIDED | samples in a row beyond that limit on one side; below 0 on the lower | 1 |
 """

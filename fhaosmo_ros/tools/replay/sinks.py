@@ -239,13 +239,14 @@ class BagSink:
             e.gamma,
             e.innovation,
             np.column_stack([seconds, rest]).astype('<i4'),
-            e.standard_deviation,
         ]
+        if e.standard_deviation.shape[1]:
+            numbers.append(e.standard_deviation)
         count = len(rows.times)
         data = np.tile(self._template, (count, 1))
         times = _bytes(rows.times.astype('<i8'), count)
         for start, end, (_, size), values in zip(
-            self._starts, self._ends, self._messages, numbers, strict=False
+            self._starts, self._ends, self._messages, numbers, strict=True
         ):
             data[:, start + DATA_AT - 16 : start + DATA_AT - 8] = times
             data[:, start + DATA_AT - 8 : start + DATA_AT] = times

@@ -159,7 +159,7 @@ def step_members(
     -------
     float
         Square of the innovation of the mean. A sample that is too far off is counted in
-        ``memory[BEYOND]``, and changes nothing else.
+        ``memory[BEYOND]``, and changes no member.
 
     """
     x, n = work.x, law.gains.shape[1] - ORDERS
