@@ -321,7 +321,7 @@ class EstimatorRig:
         name = f'{namespace}/estimator'
         self.parameters = Parameters(client, name)
         self.topics = {t: client.record(f'{name}/{t}', kind) for t, kind in ESTIMATES.items()}
-        self.diagnostics = client.record('/diagnostics', DiagnosticArray)
+        self._all_diagnostics = client.record('/diagnostics', DiagnosticArray)
         self.y = client.record(f'{namespace}/y', Float64)
         self._name = name.lstrip('/')
         self._estimates: list[Estimate] = []
@@ -403,6 +403,15 @@ class EstimatorRig:
 
         self.client.wait(look, what)
         return found[-1]
+
+    @property
+    def diagnostics(self) -> list[Published]:
+        """This estimator's messages on /diagnostics, where all nodes publish theirs."""
+        start = f'{self._name}: '
+        return [
+            published for published in list(self._all_diagnostics)
+            if any(s.name.startswith(start) for s in published.message.status)
+        ]  # fmt: skip
 
     def count(self, key: str) -> int:
         """Return a counter of the latest diagnostics."""

@@ -170,13 +170,17 @@ def test_share_of_bad_samples_makes_an_error(client, start):
     rig.feed(0.2)
     for level, share in ((ERROR, 0.1), (WARN, 1.0)):
         assert rig.parameters.set(error_bad_share_above=share)[0].successful
-        reports = len(rig.diagnostics)
-        rig.client.wait(  # the next report has no good sample of before: all of it is bad
-            lambda before=reports: len(rig.diagnostics) > before, 'report'
-        )
-        reports = len(rig.diagnostics)
-        rig.send(math.nan)
-        rig.wait_status('input', level, 'rejected measurements 1', start=reports)
+        start_at = len(rig.diagnostics)
+
+        def said(level=level, start_at=start_at) -> bool:
+            rig.send(math.nan)  # until a report has no good sample of before
+            return any(
+                s.name == 'f/estimator: input' and s.level == level
+                and 'rejected measurements' in s.message
+                for published in rig.diagnostics[start_at:] for s in published.message.status
+            )  # fmt: skip
+
+        client.wait(said, f'level {level}')
 
 
 def test_a_clock_that_does_not_run_is_said(client, start):
