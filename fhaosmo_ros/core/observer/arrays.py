@@ -62,6 +62,7 @@ from fhaosmo_ros.core.compiled.unowned_arrays import (
     plane_at,
 )
 from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
+from fhaosmo_ros.core.observer.self_tuning.members import ORDERS, scratch_rows
 import numpy as np
 
 RATES, STEADY, FRESH, SINGLE = range(4)
@@ -206,7 +207,10 @@ ARRAYS = 12
 def make_work(law: Law, depth: int) -> Work:
     """Return scratch memory for a law whose expressions need a stack of `depth`."""
     levels, states = law.gains.shape[1], len(law.model.offsets) - 1
-    return Work(np.zeros((ROWS + levels, levels)), np.zeros((2, depth)), np.zeros((4, 2, states)))
+    rows = ROWS + levels
+    if law.flags[SELF_TUNING]:
+        rows += scratch_rows(levels - ORDERS)
+    return Work(np.zeros((rows, levels)), np.zeros((2, depth)), np.zeros((4, 2, states)))
 
 
 @compiled(forceinline=True)

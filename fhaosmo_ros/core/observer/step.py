@@ -42,6 +42,7 @@ from fhaosmo_ros.core.observer.arrays import (
     PERIOD,
     PREDICTING,
     RATE,
+    ROWS,
     SAMPLES,
     SATURATED,
     SCALE,
@@ -193,7 +194,7 @@ def step(
     if not (h > 0.0 and math.isfinite(HEADROOM * h)):
         word |= REJECTED_PERIOD
     if not word:
-        for r in range(x.shape[0]):
+        for r in range(ROWS + n):
             for i in range(n):
                 x[r, i] = levels[r, i]
         whole = h + memory[PENDING]
@@ -236,7 +237,7 @@ def step(
                 if is_upset(law, x if law.flags[IMPLICIT] else levels, used):
                     memory[UPSET] = law.scalars[DELAY]
                 word = adapt(law, x, memory, whole, loss, gradient)
-            for r in range(x.shape[0]):
+            for r in range(ROWS + n):
                 for i in range(n):
                     levels[r, i] = x[r, i]
             memory[Y] = y

@@ -11,16 +11,19 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     COUNT,
     DECAYED,
     FACTORIALS,
+    FAST,
+    fill,
+    grid,
     INTENSITY,
     KAPPA,
     Members,
     ORDERS,
     RESIDUAL,
+    Scratch,
     SQUARE,
     USED,
     VARIANCE,
 )
-import numpy as np
 
 HUBER = 3.0
 """Innovations of more standard deviations count as so many (Huber 1964)."""
@@ -32,28 +35,26 @@ def at(d: int, i: int, j: int) -> int:
     return i * d - i * (i - 1) // 2 + j - i
 
 
-@compiled()
+@compiled(fastmath=FAST)
 def predict_states(
-    members: Members, n: int, k: int, h: float, mean: Floats, predicted: Floats, x: Floats
+    members: Members, n: int, k: int, h: float, mean: Floats, predicted: Floats, ahead: Floats
 ) -> None:
     """Predict the members' estimates: the mean's path, plus the flow of their deviations."""
     flow, kappa, decayed = members.flow, members.rates[KAPPA], members.rates[DECAYED]
-    ahead = np.empty((n, COUNT))
+    x = members.x[k]
+    d, rate, second = x[n], x[n + min(k, 1)], x[n + k]
     for i in range(n):
         base = predicted[i]
         for j in range(n + ORDERS):
             base -= flow[i, j] * mean[j]
-        row = ahead[i]
-        f0, f1, f2, d = flow[i, n], flow[i, n + 1], flow[i, n + 2], x[n]
+        row, f0, f1, f2 = ahead[i], flow[i, n], flow[i, n + 1], flow[i, n + 2]
         for g in range(COUNT):
             c = kappa[g]
             row[g] = base + (f0 - c * (f1 - c * f2)) * d[g]
         if k > 0:
-            rate = x[n + 1]
             for g in range(COUNT):
                 row[g] += (f1 - 2.0 * kappa[g] * f2) * rate[g]
         if k > 1:
-            second = x[n + 2]
             for g in range(COUNT):
                 row[g] += f2 * second[g]
         for j in range(n):
@@ -61,40 +62,40 @@ def predict_states(
             if s != 0.0:
                 for g in range(COUNT):
                     row[g] += s * other[g]
-    for i in range(n):
-        row, target = ahead[i], x[i]
-        for g in range(COUNT):
-            target[g] = row[g]
     for i in range(k + 1):  # exp of D 17: e^(-kappa h) times a polynomial
-        target = x[n + i]
+        row, other = ahead[n + i], x[n + i]
         for g in range(COUNT):
-            target[g] *= decayed[g]
+            row[g] = decayed[g] * other[g]
         for j in range(i + 1, k + 1):
             factor, other = h ** (j - i) / FACTORIALS[j - i], x[n + j]
             for g in range(COUNT):
-                target[g] += decayed[g] * factor * other[g]
+                row[g] += decayed[g] * factor * other[g]
 
 
-@compiled()
+@compiled(fastmath=FAST)
 def predict_covariances(
-    members: Members, n: int, k: int, h: float, p: Floats, moving: int
+    members: Members, n: int, k: int, h: float, ahead: Floats, rest: Floats, moving: int
 ) -> None:
-    """P <- A P A' + Q of the members that move (D 27)."""
-    flow, kappa, decayed = members.flow, members.rates[KAPPA], members.rates[DECAYED]
+    """Write A P A' + Q of the members that move (D 27) to `ahead`."""
+    p, flow = members.p[k], members.flow
+    kappa, decayed = members.rates[KAPPA], members.rates[DECAYED]
     intensity, d = members.record[INTENSITY, k], n + 1 + k
-    product, chain = np.empty((d, d, moving)), np.empty((n, k + 1, moving))
+    product = grid(rest, 0, d * d, moving)  # A P
+    chain = grid(rest, d * d * moving, n * (k + 1), moving)
     for i in range(n):
         f0, f1, f2 = flow[i, n], flow[i, n + 1], flow[i, n + 2]
+        first = chain[i * (k + 1)]
         for g in range(moving):
-            c = kappa[g]
-            chain[i, 0, g] = f0 - c * (f1 - c * f2)
-            if k > 0:
-                chain[i, 1, g] = f1 - 2.0 * c * f2
-            if k > 1:
-                chain[i, 2, g] = f2
-    for j in range(d):  # A P
+            first[g] = f0 - kappa[g] * (f1 - kappa[g] * f2)
+        if k > 0:
+            second = chain[i * (k + 1) + 1]
+            for g in range(moving):
+                second[g] = f1 - 2.0 * kappa[g] * f2
+        if k > 1:
+            chain[i * (k + 1) + 2] = f2
+    for j in range(d):
         for i in range(n):
-            row = product[i, j]
+            row = product[i * d + j]
             for g in range(moving):
                 row[g] = 0.0
             for m in range(n):
@@ -103,11 +104,11 @@ def predict_covariances(
                     for g in range(moving):
                         row[g] += s * other[g]
             for m in range(k + 1):
-                part, other = chain[i, m], p[at(d, min(j, n + m), max(j, n + m))]
+                part, other = chain[i * (k + 1) + m], p[at(d, min(j, n + m), max(j, n + m))]
                 for g in range(moving):
                     row[g] += part[g] * other[g]
         for i in range(k + 1):
-            row = product[n + i, j]
+            row = product[(n + i) * d + j]
             for g in range(moving):
                 row[g] = 0.0
             for m in range(i, k + 1):
@@ -120,31 +121,35 @@ def predict_covariances(
             below = 2 * d - 2 - i - j
             share = h ** (below + 1) / (below + 1)
             share /= FACTORIALS[d - 1 - i] * FACTORIALS[d - 1 - j]
-            row = p[at(d, i, j)]
+            row = ahead[at(d, i, j)]
             for g in range(moving):
                 row[g] = share * intensity[g]
             if j < n:
                 for m in range(n):
-                    s, other = flow[j, m], product[i, m]
+                    s, other = flow[j, m], product[i * d + m]
                     if s != 0.0:
                         for g in range(moving):
                             row[g] += s * other[g]
                 for m in range(k + 1):
-                    part, other = chain[j, m], product[i, n + m]
+                    part, other = chain[j * (k + 1) + m], product[i * d + n + m]
                     for g in range(moving):
                         row[g] += part[g] * other[g]
             else:
                 for m in range(j, d):
-                    factor, other = h ** (m - j) / FACTORIALS[m - j], product[i, m]
+                    factor, other = h ** (m - j) / FACTORIALS[m - j], product[i * d + m]
                     for g in range(moving):
                         row[g] += decayed[g] * factor * other[g]
 
 
-@compiled()
+@compiled(fastmath=FAST)
 def expect_innovations(
     members: Members, n: int, k: int, h: float, p: Floats, gain: Floats, s: Floats, moving: int
 ) -> None:
-    """Write P C', and the variances of the innovations over that of the noise (D 27)."""
+    """
+    Write P C', and the variances of the innovations over that of the noise (D 27).
+
+    Of the members that move; the others keep their variances.
+    """
     d, correlation = n + 1 + k, members.rates[CORRELATION]
     used, top = members.noise[USED], min(3, n + 1 + k)
     for g in range(moving, COUNT):
@@ -168,36 +173,47 @@ def expect_innovations(
         s[g] = 1.0 + max(s[g], 0.0) / used[COLOUR[g]]
 
 
-@compiled()
+@compiled(fastmath=FAST)
 def correct_covariances(
-    members: Members, n: int, k: int, p: Floats, gain: Floats, s: Floats, moving: int
+    members: Members,
+    n: int,
+    k: int,
+    p: Floats,
+    gain: Floats,
+    s: Floats,
+    lines: Floats,
+    moving: int,
 ) -> None:
     """Take a sample into P of the members that move, and turn P C' into their gains (D 27)."""
-    d, used, inverse = n + 1 + k, members.noise[USED], np.empty(moving)
+    d, used, inverse, scaled = n + 1 + k, members.noise[USED], lines[0], lines[1]
     for g in range(moving):
         inverse[g] = 1.0 / (s[g] * used[COLOUR[g]])
     for i in range(d):
-        first = gain[i]
-        for j in range(i, d):
-            second, row = gain[j], p[at(d, i, j)]
-            for g in range(moving):
-                row[g] -= first[g] * second[g] * inverse[g]
-    for i in range(d):
-        row = gain[i]
+        first, corrected = gain[i], members.gain[k][i]
         for g in range(moving):
-            row[g] *= inverse[g]
+            scaled[g] = first[g] * inverse[g]
+        for j in range(i, d):
+            second, row, target = gain[j], p[at(d, i, j)], members.p[k][at(d, i, j)]
+            for g in range(moving):
+                target[g] = row[g] - scaled[g] * second[g]
+        for g in range(moving):
+            corrected[g] = scaled[g]
 
 
-@compiled()
-def correct_states(members: Members, n: int, k: int, y: float, ahead: Floats, b: Floats) -> None:
-    """Correct the members' predictions by their innovations `b`, of bounded influence."""
-    x, gain = members.x[k], members.gain[k]
-    for i in range(n + 1 + k):
-        row, source, factor = x[i], ahead[i], gain[i]
-        for g in range(COUNT):
-            row[g] = source[g] + factor[g] * b[g]
-    residual, correlation = members.record[RESIDUAL, k], members.rates[CORRELATION]
+@compiled(fastmath=FAST)
+def correct_states(members: Members, scratch: Scratch, n: int, y: float) -> None:
+    """Correct the members' predictions by their innovations, of bounded influence."""
+    correlation, limit = members.rates[CORRELATION], scratch.lines[0]
+    fill(limit, members.noise[SQUARE])
     for g in range(COUNT):
-        c = correlation[g]
-        limit = HUBER * math.sqrt(members.noise[SQUARE, COLOUR[g]] / (1.0 - c * c))
-        residual[g] = min(max(y - x[0, g], -limit), limit)
+        limit[g] = HUBER * math.sqrt(limit[g] / (1.0 - correlation[g] * correlation[g]))
+    for k in range(ORDERS):
+        x, predicted, gain = members.x[k], scratch.x[k], members.gain[k]
+        innovation = scratch.b[k]
+        for i in range(n + 1 + k):
+            row, source, factor = x[i], predicted[i], gain[i]
+            for g in range(COUNT):
+                row[g] = source[g] + factor[g] * innovation[g]
+        residual, first = members.record[RESIDUAL, k], x[0]
+        for g in range(COUNT):
+            residual[g] = min(max(y - first[g], -limit[g]), limit[g])

@@ -44,6 +44,9 @@ FACTORIALS = np.array([math.factorial(i) for i in range(2 * LONGEST + 8)], dtype
 FIRST_SAMPLES = 50
 """So many samples tell the period and the noise before the members begin."""
 
+FAST = {'contract', 'nnan', 'nsz', 'reassoc'}
+"""Sums may be taken in any order, so that the compiler makes vector instructions of them."""
+
 KAPPA, TAU, CORRELATION, DECAYED = range(4)
 """Rows of `Members.rates`: kappa, correlation time of the noise, a and exp(-kappa h) for h."""
 WEIGHT, SCORE, VARIANCE, LOG_VARIANCE, RESIDUAL, FAR, SHORT, INTENSITY, PRIOR = range(9)
@@ -109,23 +112,39 @@ def rows_of(order: int) -> int:
 
 
 @compiled(forceinline=True)
-def grid(flat: Floats, at: int, rows: int) -> Floats:
+def grid(flat: Floats, at: int, rows: int, columns: int) -> Floats:
     """Return the array of `rows` rows that begins at `at`."""
-    return flat[at : at + rows * COUNT].reshape((rows, COUNT))
+    return flat[at : at + rows * columns].reshape((rows, columns))
 
 
 @compiled(forceinline=True)
-def of_states(flat: Floats, at: int, d: int) -> OfEach:
+def of_states(flat: Floats, at: int, d: int, columns: int) -> OfEach:
     """Return arrays of d, d + 1 and d + 2 rows, one behind the other."""
-    first, second = d * COUNT, (2 * d + 1) * COUNT
-    return grid(flat, at, d), grid(flat, at + first, d + 1), grid(flat, at + second, d + 2)
+    second, third = at + d * columns, at + (2 * d + 1) * columns
+    return (
+        grid(flat, at, d, columns),
+        grid(flat, second, d + 1, columns),
+        grid(flat, third, d + 2, columns),
+    )
+
+
+@compiled(forceinline=True)
+def of_pairs(flat: Floats, at: int, d: int, columns: int) -> OfEach:
+    """Return arrays of a row for each pair of d, d + 1 and d + 2 states, as `of_states` does."""
+    size = d * (d + 1) // 2
+    second, third = at + size * columns, at + (2 * size + d + 1) * columns
+    return (
+        grid(flat, at, size, columns),
+        grid(flat, second, size + d + 1, columns),
+        grid(flat, third, size + 2 * d + 3, columns),
+    )
 
 
 @compiled(forceinline=True)
 def members_in(rows: Floats, n: int) -> Members:
     """Return the members' arrays in the rows that hold them."""
     flat, c, colours, levels, d = rows.ravel(), COUNT, COLOURS.size, n + ORDERS, n + 2
-    rates, at = grid(flat, 0, 4), 4 * c
+    rates, at = grid(flat, 0, 4, c), 4 * c
     noise = flat[at : at + 2 * colours].reshape((2, colours))
     at += 2 * colours
     rough = flat[at : at + (1 + colours) * d].reshape((1 + colours, d))
@@ -135,17 +154,95 @@ def members_in(rows: Floats, n: int) -> Members:
     flow = flat[at : at + levels * levels].reshape((levels, levels))
     at += levels * levels
     d = n + 1
-    x = of_states(flat, at, d)
-    at += (3 * d + 3) * c
-    size = d * (d + 1) // 2
-    larger, largest = size + d + 1, size + 2 * d + 3
-    p = (
-        grid(flat, at, size),
-        grid(flat, at + size * c, larger),
-        grid(flat, at + (size + larger) * c, largest),
-    )
-    gain = of_states(flat, at + (size + larger + largest) * c, d)
+    states, pairs = 3 * d + 3, 3 * d * (d + 1) // 2 + 3 * d + 4
+    x = of_states(flat, at, d, c)
+    p = of_pairs(flat, at + states * c, d, c)
+    gain = of_states(flat, at + (states + pairs) * c, d, c)
     return Members(rates, noise, rough, record, flow, x, p, gain)
+
+
+class Scratch(NamedTuple):
+    """
+    Memory that a step needs for itself, behind the other rows of ``Work.x``.
+
+    Attributes
+    ----------
+    lines : (7, COUNT) array
+    b, s : (ORDERS, COUNT) arrays
+        Innovations, and their variances over that of the noise.
+    x : tuple of arrays
+        Predictions of the members' estimates.
+    rest : array
+        For what belongs to members that move.
+
+    """
+
+    lines: Floats
+    b: Floats
+    s: Floats
+    x: OfEach
+    rest: Floats
+
+
+LINES = 7
+
+
+def scratch_rows(order: int) -> int:
+    """Return how many rows of N = n + 3 numbers a step needs for itself."""
+    d = order + ORDERS
+    moving: int = moving_size.py_func(order)  # type: ignore[attr-defined]
+    total = LINES + 2 * ORDERS + 3 * d + moving + d * d + order * ORDERS
+    return -(-total * COUNT // d)
+
+
+@compiled(forceinline=True)
+def moving_size(n: int) -> int:
+    """Return how many numbers the gains and covariances of a column are."""
+    d = n + 1
+    return 3 * d + 3 + 3 * d * (d + 1) // 2 + 3 * d + 4
+
+
+@compiled(forceinline=True)
+def scratch_in(rows: Floats, n: int) -> Scratch:
+    """Return the memory of a step in the rows that hold it."""
+    flat, c = rows.ravel(), COUNT
+    lines, at = grid(flat, 0, LINES, c), LINES * c
+    b, s = grid(flat, at, ORDERS, c), grid(flat, at + ORDERS * c, ORDERS, c)
+    at += 2 * ORDERS * c
+    x = of_states(flat, at, n + 1, c)
+    return Scratch(lines, b, s, x, flat[at + (3 * n + 6) * c :])
+
+
+@compiled(forceinline=True)
+def repeat(values: Floats) -> None:
+    """Give the members of all bands the values of the first."""
+    for g in range(IN_BAND, COUNT):
+        values[g] = values[g - IN_BAND]
+
+
+@compiled(forceinline=True)
+def fill(values: Floats, of_colours: Floats) -> None:
+    """Write for each member of a k the value of its colour."""
+    for g in range(IN_BAND):
+        values[g] = of_colours[COLOUR[g]]
+    repeat(values)
+
+
+@compiled(forceinline=True)
+def exponential(x: float) -> float:
+    """Return e^x for x from -30 to 0, to 1e-14, in a way that makes vector instructions."""
+    y = x / 128.0
+    y2 = y * y
+    y4 = y2 * y2
+    value = 1.0 + y + y2 * (1 / 2 + y / 6) + y4 * (1 / 24 + y / 120 + y2 * (1 / 720 + y / 5040))
+    value += y4 * y4 * (1 / 40320 + y / 362880 + y2 * (1 / 3628800 + y / 39916800))
+    value *= value
+    value *= value
+    value *= value
+    value *= value
+    value *= value
+    value *= value
+    return value * value
 
 
 class Tuning(NamedTuple):

@@ -9,19 +9,25 @@ from fhaosmo_ros.core.observer.arrays import FIRST_NOISE, LATTICE, QUANTUM, Y
 from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
+    BANDS,
     COLOUR,
     COLOURS,
     CORRELATION,
     COUNT,
+    exponential,
     FAR,
+    FAST,
+    fill,
+    IN_BAND,
     Members,
     ORDERS,
+    repeat,
     SCORE,
+    Scratch,
     SHAPES,
     SHORT,
     SQUARE,
 )
-import numpy as np
 
 IGNORANT = 9.0
 """A member whose innovations' variance is so many times the smallest one does not judge y."""
@@ -105,13 +111,15 @@ def difference(members: Members, memory: Floats, y: float) -> None:
             members.rough[1 + c, p] = max(members.rough[1 + c, p] * grown, least)
 
 
-@compiled()
-def knowing(members: Members, s: Floats) -> float:
+@compiled(fastmath=FAST)
+def knowing(members: Members, scratch: Scratch, s: Floats) -> float:
     """Return the largest variance of the innovations with which a member can judge a sample."""
-    noise, least = members.noise[SQUARE], math.inf
+    noise, least = scratch.lines[0], math.inf
+    fill(noise, members.noise[SQUARE])
     for k in range(ORDERS):
+        share = s[k]
         for g in range(COUNT):
-            least = min(least, s[k, g] * noise[COLOUR[g]])
+            least = min(least, share[g] * noise[g])
     return IGNORANT * least
 
 
@@ -138,9 +146,30 @@ def is_likely(members: Members, b: Floats, s: Floats, largest: float, beyond: fl
     return False
 
 
-@compiled()
+@compiled(fastmath=FAST)
+def over_colours(values: Floats, largest: bool) -> None:
+    """Replace each member's value by the largest one of its colour, or by their sum."""
+    for band in range(1, BANDS):
+        for i in range(IN_BAND):
+            other = values[band * IN_BAND + i]
+            values[i] = max(values[i], other) if largest else values[i] + other
+    for first in range(0, IN_BAND, SHAPES):
+        for i in range(1, SHAPES):
+            value, other = values[first], values[first + i]
+            values[first] = max(value, other) if largest else value + other
+        for i in range(1, SHAPES):
+            values[first + i] = values[first]
+    repeat(values)
+
+
+@compiled(fastmath=FAST)
 def follow_noise(
-    members: Members, quanta: float, b: Floats, s: Floats, largest: float, count: float
+    members: Members,
+    scratch: Scratch,
+    quanta: float,
+    s: Floats,
+    largest: float,
+    count: float,
 ) -> float:
     """
     Follow the noise of y of each colour, by the innovations of its likeliest members (D 29).
@@ -161,28 +190,37 @@ def follow_noise(
         more than 1 while the noise grows.
 
     """
-    record, noise = members.record, members.noise
-    weights, squares, least = np.zeros(COLOURS.size), np.zeros(COLOURS.size), math.inf
-    best = np.full(COLOURS.size, -math.inf)
-    for k in range(ORDERS):
+    record, noise, least = members.record, members.noise, math.inf
+    variance, size, r, best, weights, squares = (
+        scratch.lines[0], scratch.lines[1], scratch.lines[2],
+        scratch.lines[3], scratch.lines[4], scratch.lines[5],
+    )  # fmt: skip
+    best[:], weights[:], squares[:] = record[SCORE, 0], 0.0, 0.0
+    for k in range(1, ORDERS):
+        score = record[SCORE, k]
         for g in range(COUNT):
-            best[COLOUR[g]] = max(best[COLOUR[g]], record[SCORE, k, g])
+            best[g] = max(best[g], score[g])
+    over_colours(best, True)
+    fill(variance, noise[SQUARE])
     for k in range(ORDERS):
+        score, short, innovation, share = record[SCORE, k], record[SHORT, k], scratch.b[k], s[k]
         for g in range(COUNT):
-            r = b[k, g] * b[k, g] / (s[k, g] * noise[SQUARE, COLOUR[g]])
-            r = min(r, HUBER * HUBER)
-            record[SHORT, k, g] += SHORT_SHARE * (r - record[SHORT, k, g])
-            if s[k, g] * noise[SQUARE, COLOUR[g]] <= largest:
-                least = min(least, record[SHORT, k, g])
-            below = record[SCORE, k, g] - best[COLOUR[g]]
-            if below > -CLOSE:
-                share = math.exp(below)
-                weights[COLOUR[g]] += share
-                squares[COLOUR[g]] += share * r
+            size[g] = share[g] * variance[g]
+            r[g] = min(innovation[g] * innovation[g] / size[g], HUBER * HUBER)
+        for g in range(COUNT):
+            short[g] += SHORT_SHARE * (r[g] - short[g])
+            least = min(least, short[g] if size[g] <= largest else math.inf)
+        for g in range(COUNT):
+            below = score[g] - best[g]
+            weight = exponential(below)
+            weights[g] += weight if below > -CLOSE else 0.0
+            squares[g] += weight * r[g] if below > -CLOSE else 0.0
+    over_colours(weights, False)
+    over_colours(squares, False)
     if least > STEADY:  # every member that can judge says so: the noise has grown
         count = min(count, QUICK_SAMPLES)
     for c in range(COLOURS.size):
-        ratio = squares[c] / weights[c] / CLIPPED
+        ratio = squares[c * SHAPES] / weights[c * SHAPES] / CLIPPED
         noise[SQUARE, c] *= 1.0 + (ratio - 1.0) / count
         most = members.rough[1 + c, 1]
         for p in range(2, members.rough.shape[1]):

@@ -57,9 +57,13 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     LOG_VARIANCE,
     Members,
     members_in,
+    moving_size,
+    of_pairs,
+    of_states,
     ORDERS,
     RATIO,
     RESIDUAL,
+    scratch_in,
     SHORT,
     SQUARE,
     TAU,
@@ -172,30 +176,27 @@ def step_members(
     difference(members, memory, y)
     moving, now = int(memory[MOVING]), work.stages[NOW]
     carry_flow(law, work, members, memory, h, u)
-    mean, predicted = x[HAT].copy(), now[0].copy()
-    b, s, believed = np.empty((3, ORDERS, COUNT))
-    # A sample that is not likely must change none of these.
-    x0, x1, x2 = members.x
-    ahead, p, gain = (x0.copy(), x1.copy(), x2.copy()), members.p, members.gain
-    if moving > 0:
-        p, gain = (
-            (p[0].copy(), p[1].copy(), p[2].copy()),
-            (gain[0].copy(), gain[1].copy(), gain[2].copy()),
-        )
+    # A sample that is not likely changes no member, so that what it makes of them stands apart.
+    scratch, d = unowned(scratch_in(work.x[ROWS + law.gains.shape[1] :], n)), n + 1
+    ahead, b, s, lines, rest = scratch.x, scratch.b, scratch.s, scratch.lines, scratch.rest
+    gain = unowned(of_states(rest, 0, d, moving))
+    p = unowned(of_pairs(rest, (3 * d + 3) * moving, d, moving))
+    rest = unowned(rest[moving_size(n) * moving :])
     for k in range(ORDERS):
-        predict_states(members, n, k, h, mean, predicted, ahead[k])
+        predict_states(members, n, k, h, x[HAT], now[0], ahead[k])
         if moving > 0:
-            predict_covariances(members, n, k, h, p[k], moving)
+            predict_covariances(members, n, k, h, p[k], rest, moving)
         expect_innovations(members, n, k, h, p[k], gain[k], s[k], moving)
-        residual, correlation = members.record[RESIDUAL, k], members.rates[CORRELATION]
+        innovation, first, residual = b[k], ahead[k][0], members.record[RESIDUAL, k]
+        correlation = members.rates[CORRELATION]
         for g in range(COUNT):
-            b[k, g] = y - ahead[k][0, g] - correlation[g] * residual[g]
-            believed[k, g] = s[k, g]
-            if memory[BEYOND] > 0.0:  # P grows meanwhile, and the quick members believe anything
-                believed[k, g] = min(s[k, g], 4.0 * members.record[VARIANCE, k, g])
+            innovation[g] = y - first[g] - correlation[g] * residual[g]
+    believed = s
+    if memory[BEYOND] > 0.0:  # P grows meanwhile, and the quick members believe anything
+        believed = np.minimum(s, 4.0 * members.record[VARIANCE])
     count = min(memory[SAMPLES], NOISE_SAMPLES)
     memory[SAMPLES] = count + 1.0
-    largest = knowing(members, believed)
+    largest = knowing(members, scratch, believed)
     off = abs(b[ORDERS - 1, COUNT - 1])
     grows = off > 1.1 * memory[FARTHEST] + 2.0 * math.sqrt(members.noise[SQUARE, 0])
     memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and grows else 0.0
@@ -206,27 +207,29 @@ def step_members(
             memory[BEYOND] += 1.0
         else:  # noise has both signs, y that is off has one
             memory[BEYOND] = 1.0
-            follow_noise(members, quanta, b, believed, largest, count)
+            follow_noise(members, scratch, quanta, believed, largest, count)
         memory[FAR_SIGN] = sign
         return 0.0
     memory[BEYOND] = 0.0
-    grown = follow_noise(members, quanta, b, believed, largest, count)
+    grown = follow_noise(members, scratch, quanta, believed, largest, count)
     memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
     kept = math.exp(-h / law.scalars[FORGETTING])
-    members.record[VARIANCE, :, :moving] = s[:, :moving]
-    members.record[LOG_VARIANCE, :, :moving] = np.log(s[:, :moving])
+    for k in range(ORDERS):
+        variance, log_variance, found = (
+            members.record[VARIANCE, k], members.record[LOG_VARIANCE, k], s[k]
+        )  # fmt: skip
+        for g in range(moving):
+            variance[g], log_variance[g] = found[g], math.log(found[g])
     judged = memory[CALM] > CALM_SAMPLES
-    judge(members, b, s, grown, kept if judged and quanta == 0.0 else -1.0)
+    judge(members, scratch, grown, kept if judged and quanta == 0.0 else -1.0)
     if judged and quanta > 0.0:
         judge_quantised(members, y, ahead, quanta, kept)
     for k in range(ORDERS):
         if moving > 0:
-            correct_covariances(members, n, k, p[k], gain[k], s[k], moving)
-            members.p[k][:, :moving] = p[k][:, :moving]
-            members.gain[k][:, :moving] = gain[k][:, :moving]
-        correct_states(members, n, k, y, ahead[k], b[k])
+            correct_covariances(members, n, k, p[k], gain[k], s[k], lines, moving)
+    correct_states(members, scratch, n, y)
     memory[LIKELIEST] = weigh(members, QUANTISED_FLOOR if quanta > 0.0 else FLOOR)
-    mix(law, members, x)
+    mix(law, members, scratch, x)
     find_strays(members, n, x)
     return float((y - x[HAT, 0]) ** 2)
 

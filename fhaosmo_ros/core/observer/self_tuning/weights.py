@@ -12,7 +12,10 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     BANDS,
     COLOUR,
     COUNT,
+    exponential,
     FAR,
+    FAST,
+    fill,
     IN_BAND,
     KAPPA,
     LOG_VARIANCE,
@@ -20,7 +23,9 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     OfEach,
     ORDERS,
     PRIOR,
+    repeat,
     SCORE,
+    Scratch,
     SQUARE,
     STEP_OF_BANDS,
     WEIGHT,
@@ -35,8 +40,8 @@ NEGLIGIBLE = 25.0
 """Members whose log-likelihood is so far below the best one have no weight."""
 
 
-@compiled()
-def judge(members: Members, b: Floats, s: Floats, grown: float, kept: float) -> None:
+@compiled(fastmath=FAST)
+def judge(members: Members, scratch: Scratch, grown: float, kept: float) -> None:
     """
     Take a sample into the log-likelihoods, and bound the innovations (D 27, D 28), in place.
 
@@ -46,21 +51,27 @@ def judge(members: Members, b: Floats, s: Floats, grown: float, kept: float) -> 
         Part of the log-likelihoods that is not forgotten; negative to leave them as they are.
 
     """
-    record, colours = members.record, members.noise[SQUARE]
-    log_colours = np.log(colours)
+    noise, log_noise, r = scratch.lines[0], scratch.lines[1], scratch.lines[2]
+    fill(noise, members.noise[SQUARE])
+    for g in range(IN_BAND):
+        log_noise[g] = math.log(noise[g])
+    repeat(log_noise)
     for k in range(ORDERS):
+        far, innovation, share = members.record[FAR, k], scratch.b[k], scratch.s[k]
         for g in range(COUNT):
-            variance = s[k, g] * colours[COLOUR[g]]
-            r = b[k, g] * b[k, g] / variance
-            record[FAR, k, g] = record[FAR, k, g] + 1.0 if r > GATE * GATE else 0.0
-            if kept >= 0.0:
-                prior, log_s = record[PRIOR, k, g], record[LOG_VARIANCE, k, g]
-                likelihood = min(r / grown, HUBER * HUBER) + log_s + log_colours[COLOUR[g]]
-                score = prior + kept * (record[SCORE, k, g] - prior)
-                record[SCORE, k, g] = score - 0.5 * likelihood
-            late = max(record[FAR, k, g] - 1.0, 0.0)  # in a row: not an outlier, but d
-            limit = HUBER * math.sqrt(variance) * (1.0 + late * late)
-            b[k, g] = min(max(b[k, g], -limit), limit)
+            r[g] = innovation[g] * innovation[g] / (share[g] * noise[g])
+            far[g] = far[g] + 1.0 if r[g] > GATE * GATE else 0.0
+        if kept >= 0.0:
+            score, prior = members.record[SCORE, k], members.record[PRIOR, k]
+            log_s = members.record[LOG_VARIANCE, k]
+            for g in range(COUNT):
+                likelihood = min(r[g] / grown, HUBER * HUBER) + log_s[g] + log_noise[g]
+                score[g] = prior[g] + kept * (score[g] - prior[g]) - 0.5 * likelihood
+        for g in range(COUNT):
+            if r[g] > HUBER * HUBER:
+                late = max(far[g] - 1.0, 0.0)  # in a row: not an outlier, but d
+                limit = HUBER * math.sqrt(share[g] * noise[g]) * (1.0 + late * late)
+                innovation[g] = min(max(innovation[g], -limit), limit)
 
 
 @compiled()
@@ -92,66 +103,85 @@ def judge_quantised(members: Members, y: float, ahead: OfEach, quanta: float, ke
             record[SCORE, k, g] = score - 0.5 * likelihood
 
 
-@compiled()
+@compiled(fastmath=FAST)
 def weigh(members: Members, floor: float) -> int:
     """Turn log-likelihoods into weights (D 28); return the colour of the likeliest member."""
-    score, weight, total = members.record[SCORE], members.record[WEIGHT], 0.0
-    best, colour = -math.inf, 0
+    best, total, likeliest = -math.inf, 0.0, 0
     for k in range(ORDERS):
+        score = members.record[SCORE, k]
         for g in range(COUNT):
-            if score[k, g] > best:
-                best, colour = score[k, g], COLOUR[g]
+            best = max(best, score[g])
     for k in range(ORDERS):
+        score, weight = members.record[SCORE, k], members.record[WEIGHT, k]
         for g in range(COUNT):
-            score[k, g] = max(score[k, g] - best, -floor)
-            weight[k, g] = math.exp(score[k, g]) if score[k, g] > -NEGLIGIBLE else 0.0
-            total += weight[k, g]
-    for k in range(ORDERS):
+            score[g] = max(score[g] - best, -floor)
+            share = exponential(score[g])
+            weight[g] = share if score[g] > -NEGLIGIBLE else 0.0
+            total += weight[g]
+    for k in range(ORDERS - 1, -1, -1):
+        score, weight = members.record[SCORE, k], members.record[WEIGHT, k]
         for g in range(COUNT):
-            weight[k, g] /= total
-    return colour
+            weight[g] /= total
+        for g in range(COUNT - 1, -1, -1):
+            if score[g] == 0.0:  # the first of them; before they are judged there are many
+                likeliest = COLOUR[g]
+    return likeliest
 
 
 @compiled()
-def mix(law: Law, members: Members, x: Floats) -> None:
-    """Write the mean of the members' estimates, and its variances, to rows of `x` (D 28)."""
-    n, slider = x.shape[1] - ORDERS, math.log(law.scalars[SLIDER]) / math.log(STEP_OF_BANDS)
+def shift(weight: Floats, slider: float) -> Floats:
+    """Return the weights of the members whose estimates are shown: `slider` bands quicker."""
     whole = math.floor(slider)
-    part = slider - whole
-    weight, kappa = members.record[WEIGHT], members.rates[KAPPA]
-    shown = np.zeros((ORDERS, COUNT))
+    part, shown = slider - whole, np.zeros((ORDERS, COUNT))
     for k in range(ORDERS):
         for g in range(COUNT):
-            w = weight[k, g]
-            if w > 0.0:
-                band = g // IN_BAND
-                low = min(max(band + whole, 0), BANDS - 1) * IN_BAND + g % IN_BAND
-                high = min(max(band + whole + 1, 0), BANDS - 1) * IN_BAND + g % IN_BAND
-                shown[k, low] += (1.0 - part) * w
-                if part > 0.0:
-                    shown[k, high] += part * w
-    for i in range(x.shape[1]):
-        x[HAT, i] = x[COVARIANCE, i] = 0.0
+            band, kind = g // IN_BAND, g % IN_BAND
+            low = min(max(band + whole, 0), BANDS - 1) * IN_BAND + kind
+            high = min(max(band + whole + 1, 0), BANDS - 1) * IN_BAND + kind
+            shown[k, low] += (1.0 - part) * weight[k, g]
+            shown[k, high] += part * weight[k, g]
+    return shown
+
+
+@compiled(fastmath=FAST)
+def weighted(w: Floats, values: Floats) -> float:
+    """Return the sum of w times `values` over the members that have a weight."""
+    total = 0.0
+    for g in range(COUNT):
+        value = w[g] * values[g]
+        total += value if w[g] > 0.0 else 0.0
+    return total
+
+
+@compiled(fastmath=FAST)
+def mix(law: Law, members: Members, scratch: Scratch, x: Floats) -> None:
+    """Write the mean of the members' estimates, and its variances, to rows of `x` (D 28)."""
+    n, kappa, shown = x.shape[1] - ORDERS, members.rates[KAPPA], members.record[WEIGHT]
+    if law.scalars[SLIDER] != 1.0:
+        shown = shift(shown, math.log(law.scalars[SLIDER]) / math.log(STEP_OF_BANDS))
+    x[HAT], x[COVARIANCE], derivative = 0.0, 0.0, scratch.lines[0]
     for k in range(ORDERS):
-        z = members.x[k]
+        w, z = shown[k], members.x[k]
+        for i in range(n + 1):
+            x[HAT, i] += weighted(w, z[i])
+        d, rate, second = z[n], z[n + min(k, 1)], z[n + k]
         for g in range(COUNT):
-            w = shown[k, g]
-            if w > 0.0:
-                for i in range(n + 1):
-                    x[HAT, i] += w * z[i, g]
-                c, d, rate, second = kappa[g], z[n, g], 0.0, 0.0
-                if k > 0:
-                    rate = z[n + 1, g]
-                if k > 1:
-                    second = z[n + 2, g]
-                x[HAT, n + 1] += w * (rate - c * d)
-                x[HAT, n + 2] += w * (second - 2.0 * c * rate + c * c * d)
+            derivative[g] = (rate[g] if k > 0 else 0.0) - kappa[g] * d[g]
+        x[HAT, n + 1] += weighted(w, derivative)
+        for g in range(COUNT):
+            derivative[g] = kappa[g] * kappa[g] * d[g]
+            if k > 0:
+                derivative[g] -= 2.0 * kappa[g] * rate[g]
+            if k > 1:
+                derivative[g] += second[g]
+        x[HAT, n + 2] += weighted(w, derivative)
     for k in range(ORDERS):
-        z = members.x[k]
-        p = members.p[k]
-        for g in range(COUNT):
-            w = shown[k, g]
-            if w > 0.0:
-                for i in range(n + 1):
-                    off = z[i, g] - x[HAT, i]
-                    x[COVARIANCE, i] += w * (max(p[at(n + 1 + k, i, i), g], 0.0) + off * off)
+        w, z = shown[k], members.x[k]
+        for i in range(n + 1):
+            mean, value, variance = x[HAT, i], z[i], members.p[k][at(n + 1 + k, i, i)]
+            total = 0.0
+            for g in range(COUNT):
+                off = value[g] - mean
+                part = w[g] * (max(variance[g], 0.0) + off * off)
+                total += part if w[g] > 0.0 else 0.0
+            x[COVARIANCE, i] += total
