@@ -73,6 +73,53 @@ def predict_states(
 
 
 @compiled(fastmath=FAST)
+def add_chain(
+    row: Floats,
+    share: float,
+    intensity: Floats,
+    chain: Floats,
+    first: int,
+    terms: int,
+    one: Floats,
+    two: Floats,
+    three: Floats,
+    moving: int,
+) -> None:
+    """Begin a sum: a share of the intensity, and up to three terms with weights of `chain`."""
+    a, b, c = chain[first], chain[first + min(1, terms - 1)], chain[first + terms - 1]
+    if terms == 1:
+        for g in range(moving):
+            row[g] = share * intensity[g] + a[g] * one[g]
+    elif terms == 2:
+        for g in range(moving):
+            row[g] = share * intensity[g] + a[g] * one[g] + b[g] * two[g]
+    else:
+        for g in range(moving):
+            row[g] = share * intensity[g] + a[g] * one[g] + b[g] * two[g] + c[g] * three[g]
+
+
+@compiled(fastmath=FAST)
+def decay(
+    row: Floats,
+    share: float,
+    intensity: Floats,
+    decayed: Floats,
+    ramp: float,
+    curve: float,
+    terms: int,
+    one: Floats,
+    two: Floats,
+    three: Floats,
+    moving: int,
+) -> None:
+    """Write a sum as `add_chain` does, with the weights of d and its derivatives (D 17)."""
+    ramp, curve = ramp if terms > 1 else 0.0, curve if terms > 2 else 0.0
+    for g in range(moving):
+        value = one[g] + ramp * two[g] + curve * three[g]
+        row[g] = share * intensity[g] + decayed[g] * value
+
+
+@compiled(fastmath=FAST)
 def predict_covariances(
     members: Members, n: int, k: int, h: float, ahead: Floats, rest: Floats, moving: int
 ) -> None:
@@ -93,52 +140,46 @@ def predict_covariances(
                 second[g] = f1 - 2.0 * kappa[g] * f2
         if k > 1:
             chain[i * (k + 1) + 2] = f2
-    for j in range(d):
-        for i in range(n):
-            row = product[i * d + j]
-            for g in range(moving):
-                row[g] = 0.0
-            for m in range(n):
-                s, other = flow[i, m], p[at(d, min(j, m), max(j, m))]
-                if s != 0.0:
-                    for g in range(moving):
-                        row[g] += s * other[g]
-            for m in range(k + 1):
-                part, other = chain[i * (k + 1) + m], p[at(d, min(j, n + m), max(j, n + m))]
-                for g in range(moving):
-                    row[g] += part[g] * other[g]
-        for i in range(k + 1):
-            row = product[(n + i) * d + j]
-            for g in range(moving):
-                row[g] = 0.0
-            for m in range(i, k + 1):
-                other = p[at(d, min(j, n + m), max(j, n + m))]
-                factor = h ** (m - i) / FACTORIALS[m - i]
-                for g in range(moving):
-                    row[g] += decayed[g] * factor * other[g]
+    ramp, curve, lowest = h, 0.5 * h * h, d
+    for i in range(d - 1, -1, -1):  # A has zeros below its diagonal, most of them
+        lowest = min(lowest, i)
+        for m in range(i if i < n else 0):
+            if flow[i, m] != 0.0:
+                lowest = min(lowest, m)
+        for j in range(lowest, d):
+            row, a = product[i * d + j], max(n, i)
+            terms, e, f = d - a, min(a + 1, d - 1), min(a + 2, d - 1)
+            one = p[at(d, min(j, a), max(j, a))]
+            two, three = p[at(d, min(j, e), max(j, e))], p[at(d, min(j, f), max(j, f))]
+            if i < n:
+                add_chain(row, 0.0, intensity, chain, i * terms, terms, one, two, three, moving)
+                for m in range(n):
+                    s, other = flow[i, m], p[at(d, min(j, m), max(j, m))]
+                    if s != 0.0:
+                        for g in range(moving):
+                            row[g] += s * other[g]
+            else:
+                decay(row, 0.0, intensity, decayed, ramp, curve, terms, one, two, three, moving)
     for i in range(d):  # .. A' + Q, Q as in D 20
         for j in range(i, d):
             below = 2 * d - 2 - i - j
             share = h ** (below + 1) / (below + 1)
             share /= FACTORIALS[d - 1 - i] * FACTORIALS[d - 1 - j]
-            row = ahead[at(d, i, j)]
-            for g in range(moving):
-                row[g] = share * intensity[g]
+            row, a = ahead[at(d, i, j)], max(n, j)
+            terms = d - a
+            one = product[i * d + a]
+            two, three = product[i * d + min(a + 1, d - 1)], product[i * d + min(a + 2, d - 1)]
             if j < n:
+                add_chain(row, share, intensity, chain, j * terms, terms, one, two, three, moving)
                 for m in range(n):
                     s, other = flow[j, m], product[i * d + m]
                     if s != 0.0:
                         for g in range(moving):
                             row[g] += s * other[g]
-                for m in range(k + 1):
-                    part, other = chain[j * (k + 1) + m], product[i * d + n + m]
-                    for g in range(moving):
-                        row[g] += part[g] * other[g]
             else:
-                for m in range(j, d):
-                    factor, other = h ** (m - j) / FACTORIALS[m - j], product[i * d + m]
-                    for g in range(moving):
-                        row[g] += decayed[g] * factor * other[g]
+                decay(
+                    row, share, intensity, decayed, ramp, curve, terms, one, two, three, moving
+                )
 
 
 @compiled(fastmath=FAST)
@@ -150,25 +191,21 @@ def expect_innovations(
 
     Of the members that move; the others keep their variances.
     """
-    d, correlation = n + 1 + k, members.rates[CORRELATION]
-    used, top = members.noise[USED], min(3, n + 1 + k)
+    d, correlation, used = n + 1 + k, members.rates[CORRELATION], members.noise[USED]
     for g in range(moving, COUNT):
         s[g] = members.record[VARIANCE, k, g]
+    # z_1 of the sample before is the state of now, h back
+    third, curve = min(2, d - 1), -0.5 * h * h if d > 2 else 0.0
     for i in range(d):
-        row, other = gain[i], p[at(d, 0, i)]
+        row, one, two = gain[i], p[at(d, 0, i)], p[at(d, min(i, 1), max(i, 1))]
+        three = p[at(d, min(i, third), max(i, third))]
         for g in range(moving):
-            row[g] = (1.0 - correlation[g]) * other[g]
-        for j in range(1, top):  # z_1 of the sample before is the state of now, h back
-            other, factor = p[at(d, min(i, j), max(i, j))], -((-h) ** j) / FACTORIALS[j]
-            for g in range(moving):
-                row[g] += correlation[g] * factor * other[g]
-    first = gain[0]
+            before = one[g] - h * two[g] - curve * three[g]
+            row[g] = one[g] - correlation[g] * before
+    one, two, three = gain[0], gain[1], gain[third]
     for g in range(moving):
-        s[g] = (1.0 - correlation[g]) * first[g]
-    for j in range(1, top):
-        row, factor = gain[j], -((-h) ** j) / FACTORIALS[j]
-        for g in range(moving):
-            s[g] += correlation[g] * factor * row[g]
+        before = one[g] - h * two[g] - curve * three[g]
+        s[g] = one[g] - correlation[g] * before
     for g in range(moving):
         s[g] = 1.0 + max(s[g], 0.0) / used[COLOUR[g]]
 
