@@ -3,9 +3,10 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+import json
 from pathlib import Path
 import re
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.cli.output import Output
@@ -36,6 +37,47 @@ def filled(document: str, texts: Mapping[str, str]) -> str:
             f'got {", ".join(sorted(present))}'
         )
     return PATTERN.sub(lambda match: PART.format(match['name'], texts[match['name']]), document)
+
+
+def refill(
+    page: Path, texts: Mapping[str, str], figure: Any = None, results: Any = None, name: str = ''
+) -> list[Path]:
+    """
+    Fill the generated parts of a page that is there, and write what belongs to it beside it.
+
+    Parameters
+    ----------
+    page : path
+    texts : mapping
+        Generated parts by name.
+    figure : Figure, optional
+        Written as `name`.png.
+    results : optional
+        What JSON can hold; written as `name`.json.
+    name : str
+        Default: that of the page.
+
+    Returns
+    -------
+    list of path
+        What was written.
+
+    """
+    beside = page.with_stem(name or page.stem)
+    text = filled(page.read_text(encoding='utf-8'), texts)
+    made = []
+    if results is not None:
+        with Output(beside.with_suffix('.json'), force=True) as output:
+            output.path.write_text(json.dumps(results, indent=1) + '\n', encoding='utf-8')
+            made.append(output.keep())
+    if figure is not None:
+        with Output(beside.with_suffix('.png'), force=True) as output:
+            figure.savefig(output.path, dpi=110)
+            made.append(output.keep())
+    with Output(page, force=True) as output:
+        output.path.write_text(text, encoding='utf-8')
+        made.append(output.keep())
+    return made
 
 
 class Pages(NamedTuple):

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recipe for events, in short: its file runs, and faults are found as its page says."""
 
+import json
 from pathlib import Path
 
 from fhaosmo_ros.core import OnlineEstimator
 import numpy as np
 import pytest
-from studies import events
+from studies import document, events
 
 PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'events.md'
 
@@ -40,3 +41,38 @@ def test_the_filter_beside_it_is_a_kalman_filter():
     # White noise of its innovations' size in, and as sure as it is: d is nearly at rest here.
     assert np.std((d - r.d)[late]) < 1.3 * deviation[0]
     assert np.std((d - r.d)[late]) < np.std(events.kalman(r.y, 1.0)[0][late] - r.d[late])
+
+
+@pytest.fixture(scope='module')
+def documented():
+    return json.loads(PAGE.with_suffix('.json').read_text())
+
+
+def test_the_page_says_what_was_measured(documented):
+    assert documented['hours'] == events.HOURS
+    assert document.parts(PAGE.read_text()) == events.texts(documented)
+
+
+@pytest.mark.parametrize(
+    ('name', 'seconds', 'late'), [(events.FILTER, 1800.0, 0.02), (events.OURS, 600.0, 0.05)]
+)
+def test_a_short_new_run_agrees_with_the_results(documented, name, seconds, late):
+    """The first part of the same recordings."""
+    factor, count = events.FACTORS[1], round(seconds / events.H)
+    quiet = events.record(seconds / 3600.0, 1, factor * events.NOISE)
+    faulty = events.record(0.1 * events.HOURS, 2, factor * events.NOISE, faults=True)
+    faults = faulty.faults[faulty.faults < seconds - events.LASTS]
+    deviations = events.DEVIATIONS if name == events.OURS else 0.0
+
+    def way(y):
+        if name == events.OURS:
+            return events.self_tuning(y)
+        return events.kalman(y, documented['intensity'])
+
+    new = events.curve(way(quiet.y), way(faulty.y[:count]), faults, deviations)
+    old = events.points_of(documented, factor, name)
+    for k in events.PRINTED[:3]:
+        assert new[k].threshold == pytest.approx(old[k].threshold, rel=1e-5)
+        assert new[k].delay == pytest.approx(old[k].delay, abs=late)
+        expected, counted = (p.false * seconds / 3600.0 for p in (old[k], new[k]))
+        assert abs(counted - expected) < 4.0 * np.sqrt(expected) + 1.5  # Poisson

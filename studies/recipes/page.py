@@ -2,16 +2,14 @@
 """Table, figure and results of a recipe, written into docs/."""
 
 from collections.abc import Mapping
-import json
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.plot.figures import COLOURS, TRUTH
 from matplotlib.figure import Figure
 import numpy as np
-from studies.document import filled
+from studies.document import refill
 from studies.recipes.judging import Fold, OURS, run, SELF_TUNING
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
@@ -24,7 +22,7 @@ def table(results: Results) -> str:
     """Return the errors as a table, and in a sentence who is best."""
     conditions = list(results)
     lines = [
-        '| RMS error of d over the RMS of d | number chosen with the truth | '
+        '| RMS error over the RMS of the truth | number chosen with the truth | '
         + ' | '.join(conditions) + ' |',
         '|---|---|' + '---|' * len(conditions),
     ]  # fmt: skip
@@ -32,9 +30,13 @@ def table(results: Results) -> str:
         rows = [results[condition][name] for condition in conditions]
         numbers = [number for row in rows for number in row['chosen']]
         chosen = f'{_range(numbers)} {rows[0]["unit"]}' if numbers else 'none'
-        errors = ' | '.join(f'{row["error"]:.3f}' for row in rows)
+        errors = ' | '.join(_number(row['error']) for row in rows)
         lines.append(f'| {name} | {chosen} | {errors} |')
     return '\n'.join([*lines, '', *(_verdict(c, results[c], len(results)) for c in conditions)])
+
+
+def _number(x: float) -> str:
+    return f'{x:#.3g}'
 
 
 def _range(numbers: list[float]) -> str:
@@ -92,14 +94,14 @@ def draw(recipe: ModuleType, folds: Mapping[str, list[Fold]], results: Results) 
             place, values, 0.9 * width, color=colours, alpha=1.0 - 0.45 * k / max(1, len(results))
         )
         where = f'  {list(results)[k]}' if len(results) > 1 else ''
-        labels = [f'{value:.3f}{where}' for value in values]
+        labels = [f'{_number(value)}{where}' for value in values]
         errors.bar_label(bars, labels, fontsize='x-small', padding=2)
     errors.set_yticks(np.arange(len(recipe.METHODS)), [_folded(n) for n in recipe.METHODS])
     errors.tick_params(axis='y', labelsize='x-small')
     errors.invert_yaxis()
     top = max(row['error'] for rows in results.values() for row in rows.values())
     errors.set_xlim(0.0, top * (2.5 if len(results) > 1 else 1.25))
-    errors.set_xlabel('RMS error / RMS of d')
+    errors.set_xlabel('RMS error / RMS of the truth')
     for axes in (over_time, errors):
         axes.grid(alpha=0.3)
         axes.set_axisbelow(True)
@@ -115,17 +117,6 @@ def write(
     remarks: Mapping[str, float],
 ) -> list[Path]:  # fmt: skip
     """Write docs/`name`.md (its generated part), .png and .json; return their paths."""
-    page = DOCS / f'{name}.md'
     kept = {'errors': results, 'remarks': {k: float(f'{x:.4g}') for k, x in remarks.items()}}
-    text = filled(page.read_text(encoding='utf-8'), {PART: table(results)})
     figure = draw(recipe, folds, results)
-    made = []
-    for suffix in ('.json', '.png', '.md'):
-        with Output(page.with_suffix(suffix), force=True) as output:
-            if suffix == '.png':
-                figure.savefig(output.path, dpi=110)
-            else:
-                content = json.dumps(kept, indent=1) + '\n' if suffix == '.json' else text
-                output.path.write_text(content, encoding='utf-8')
-            made.append(output.keep())
-    return made
+    return refill(DOCS / f'{name}.md', {PART: table(results)}, figure, kept)
