@@ -73,6 +73,44 @@ def test_new_comparison_of_curves_agrees_with_the_document(documented):
         np.testing.assert_allclose(new.rms_d, old.rms_d, rtol=0.05, err_msg=REWRITE)
 
 
+@pytest.mark.parametrize('table', ['long', 'protection', 'dead_zones'])
+def test_new_long_runs_agree_with_the_document(documented, table):
+    """One cell of each table, all its laws; of the longest runs the first window."""
+    rows = getattr(documented, table)
+    first = rows[-1] if table == 'dead_zones' else rows[0]
+    cell = first[1:5]
+    old = [r for r in rows if r[1:5] == cell]
+    laws = {
+        'long': paper_beyond.LAWS,
+        'protection': paper_beyond.PROTECTIONS,
+        'dead_zones': paper_beyond.dead_zone_laws(),
+    }[table]
+    window = paper.PROTECTION_WINDOW if table == 'protection' else paper_beyond.WINDOW
+    duration = window if table == 'long' else window * len(first.t)
+    new = paper_beyond.long_runs(laws, *cell, duration, window)
+    assert [r.law for r in new] == [r.law for r in old]
+    for a, b in zip(new, old, strict=True):
+        count = len(a.t)
+        np.testing.assert_allclose(a.t, b.t[:count])
+        np.testing.assert_allclose(a.rms_d, b.rms_d[:count], rtol=0.03, err_msg=REWRITE)
+        np.testing.assert_allclose(a.gamma, b.gamma[:count], rtol=0.03, err_msg=REWRITE)
+        if count == len(b.t):
+            assert a.fixed == pytest.approx(b.fixed, rel=0.03), REWRITE
+
+
+def test_new_search_of_half_widths_agrees_with_the_document(documented):
+    """Every sixth width; verdicts may change where one number is just at its limit."""
+    signs = {
+        w: documented.scores[documented.solver][paper_findings.FINE, w]
+        for w in paper_cases.FREQUENCIES
+    }
+    every = 6
+    new = paper_findings.width_map(signs, documented.solver, every, lambda: None)
+    np.testing.assert_allclose(new.widths, documented.widths.widths[::every])
+    differ = new.holds != documented.widths.holds[:, ::every, ::every]
+    assert differ.mean() < 0.05, REWRITE
+
+
 def test_all_findings_come_out_with_the_shipped_half_widths(documented, fresh):
     for solver, scores in fresh.items():
         now = {v.name: v.words for v in paper_findings.verdicts(scores)}

@@ -193,11 +193,16 @@ def long_runs(
     return runs
 
 
+def dead_zone_laws() -> dict[str, dict[str, Any]]:
+    """Return the default law by its dead zone."""
+    return {f'{zone:g}': SAFE | {'gamma_dead_zone': zone} for zone in DEAD_ZONES}
+
+
 def dead_zones(
     frequencies: Sequence[float], duration: float, tick: Callable[[], object]
 ) -> list[LongRun]:
     """Return runs with the default law under both schemes; their `law` is the dead zone."""
-    laws = {f'{zone:g}': SAFE | {'gamma_dead_zone': zone} for zone in DEAD_ZONES}
+    laws = dead_zone_laws()
     found: list[LongRun] = []
     for omega in frequencies:
         for scheme in ('explicit', 'implicit'):
