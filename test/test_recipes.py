@@ -14,8 +14,8 @@ from studies.recipes.judging import FIXED, OURS
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
 CHANNEL = {
-    'motor_load': 'servo', 'joint_torque': 'shoulder', 'wind': 'x', 'sensor_bias': 'yaw',
-    'hidden_force': '',
+    'encoder': 'from_joint_names', 'motor_load': 'servo', 'joint_torque': 'shoulder', 'wind': 'x',
+    'sensor_bias': 'yaw', 'hidden_force': '',
 }  # fmt: skip
 recipes = pytest.mark.parametrize('name', RECIPES)
 

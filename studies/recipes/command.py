@@ -7,10 +7,19 @@ from pathlib import Path
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
-from studies.recipes import hidden_force, joint_torque, motor_load, page, sensor_bias, wind
+from studies.recipes import (
+    encoder,
+    hidden_force,
+    joint_torque,
+    motor_load,
+    page,
+    sensor_bias,
+    wind,
+)
 from studies.recipes.judging import judge
 
 RECIPES = {
+    'encoder': encoder,
     'motor_load': motor_load,
     'wind': wind,
     'joint_torque': joint_torque,

@@ -36,8 +36,8 @@ class Recorded(NamedTuple):
         Known inputs, that of the interval which ends at each sample.
     judged : (N,) array of bool
         Samples that count.
-    extra : dict of (N,) arrays
-        What else was recorded and a peer uses.
+    quantity : str
+        What `d` holds and methods return, in a recipe that judges more than the unknown input.
 
     """
 
@@ -47,7 +47,7 @@ class Recorded(NamedTuple):
     u: Floats
     d: Floats
     judged: NDArray[np.bool_]
-    extra: dict[str, Floats] = {}  # noqa: RUF012
+    quantity: str = 'd'
 
     @property
     def period(self) -> float:
