@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m studies.delay` writes docs/delay.png and prints its numbers: a y that comes late."""
+"""`python -m studies.delay` makes docs/delay.png and the table beside it: a y that comes late."""
 
 from pathlib import Path
 import sys
@@ -10,7 +10,9 @@ from fhaosmo_ros.tools.plot.figures import COLOURS, TRUTH
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
+from studies.document import refill
 
+PAGE, PART = Path(__file__).resolve().parents[1] / 'docs' / 'operation.md', 'delay'
 MODEL = {'order': 2, 'phi': ['0', '8*u - 3*z2 - 5*sin(z1)']}
 PLANT = MODEL | {
     'duration': 12.0, 'sample_rate': 200.0, 'noise_std': 5e-4, 'initial_state': 0.0,
@@ -25,10 +27,13 @@ DELAYS = np.array([0.0, 5.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0]) * 1e-3
 SHOWN = 0.04
 """Delay (s) of the curves over time."""
 SETTLED, RECORDINGS = 3.0, 4
+PRINTED = (0.0, 10.0, 20.0, 40.0, 100.0)
+"""Delays (ms) in the table."""
+UNTOLD, TOLD, PREDICTED = 'delay not told', 'measurement_delay', '... with predict_to_now'
 WAYS = {
-    'delay not told': (COLOURS[0], ':', lambda delay: {}),
-    'measurement_delay': ('#009E73', '--', lambda delay: {'measurement_delay': delay}),
-    '... with predict_to_now': (
+    UNTOLD: (COLOURS[0], ':', lambda delay: {}),
+    TOLD: ('#009E73', '--', lambda delay: {'measurement_delay': delay}),
+    PREDICTED: (
         '#000000', '-', lambda delay: {'measurement_delay': delay, 'predict_to_now': True},
     ),
 }  # fmt: skip
@@ -64,7 +69,7 @@ def draw(wrong: dict[str, NDArray[np.float64]]) -> Figure:
     for row, (name, column, true) in enumerate((('$z_2$', 1, r.z[:, 1]), ('$d$', 2, r.d))):
         over_time, over_delay = axes[row]
         for way, (colour, line, changes) in WAYS.items():
-            if way != 'measurement_delay':
+            if way != TOLD:
                 found = estimates(r, changes(SHOWN))[part, column]
                 over_time.plot(r.t[part], found, color=colour, ls=line, lw=1.2, label=way)
             share = wrong[way][:, column]
@@ -83,15 +88,26 @@ def draw(wrong: dict[str, NDArray[np.float64]]) -> Figure:
     return figure
 
 
+def table(wrong: dict[str, NDArray[np.float64]]) -> str:
+    """Return the errors at some delays as a table."""
+    columns = [(2, UNTOLD), (2, TOLD), (1, UNTOLD), (1, TOLD), (1, PREDICTED)]
+    lines = [
+        '| y late by | d now: nobody told | `measurement_delay` | velocity now: nobody told '
+        '| `measurement_delay` | with `predict_to_now` |',
+        '|---' * 6 + '|',
+    ]
+    for delay in PRINTED:
+        k = int(np.argmin(abs(DELAYS * 1e3 - delay)))
+        cells = [f'{wrong[way][k, column]:.2g}' for column, way in columns]
+        lines.append(f'| {delay:g} ms | {" | ".join(cells)} |')
+    return '\n'.join(lines)
+
+
 def main() -> int:
-    """Write the figure of this checkout, print the errors."""
+    """Write the figure and the table of this checkout."""
     wrong = errors()
-    for way, found in wrong.items():
-        for delay, row in zip(DELAYS, found, strict=True):
-            print(f'{way:25} {delay * 1e3:4g} ms  ' + '  '.join(f'{e:.4g}' for e in row))
-    path = Path(__file__).resolve().parents[1] / 'docs' / 'delay.png'
-    draw(wrong).savefig(path, dpi=110)
-    print(path)
+    for path in refill(PAGE, {PART: table(wrong)}, draw(wrong), name='delay'):
+        print(path)
     return 0
 
 

@@ -22,21 +22,23 @@ def parts(document: str) -> dict[str, str]:
 
 def filled(document: str, texts: Mapping[str, str]) -> str:
     """
-    Return the document with its parts replaced.
+    Return the document with these parts replaced; others stay.
 
     Raises
     ------
     ConfigurationError
-        The document's markers and `texts` do not have the same names.
+        The document has no markers of one of the names.
 
     """
     present = set(parts(document))
-    if present != set(texts):
+    if not set(texts) <= present:
         raise ConfigurationError(
             f'markers of the document: expected {", ".join(sorted(texts))}, '
-            f'got {", ".join(sorted(present))}'
+            f'got {", ".join(sorted(present)) or "none"}'
         )
-    return PATTERN.sub(lambda match: PART.format(match['name'], texts[match['name']]), document)
+    return PATTERN.sub(
+        lambda match: PART.format(match['name'], texts.get(match['name'], match['text'])), document
+    )
 
 
 def refill(

@@ -9,6 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from studies import delay as study
+from studies import document
 
 PERIOD, LATE = 2_000_000, 20
 """Nanoseconds, and periods by which y is late."""
@@ -211,3 +213,14 @@ def test_trial_knows_of_the_delay():
     unknown = error({'measurement_delay': 0.0})
     assert (then < 0.2 * unknown).all()  # z1, z2, d
     assert (now[:2] < 0.2 * unknown[:2]).all()
+
+
+def test_the_page_says_what_the_study_measures(monkeypatch):
+    rows = [
+        [float(cell) for cell in line.split('|')[2:-1]]
+        for line in document.parts(study.PAGE.read_text())[study.PART].splitlines()[2:]
+    ]
+    monkeypatch.setattr(study, 'DELAYS', np.array(study.PRINTED) * 1e-3)
+    new = study.table(study.errors()).splitlines()[2:]
+    for line, old in zip(new, rows, strict=True):
+        assert [float(cell) for cell in line.split('|')[2:-1]] == pytest.approx(old, rel=0.06)
