@@ -1,34 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-`python -m studies.differentiation` compares the smoother with PyNumDiff for docs/smoothing.md.
+`python -m studies.differentiation` makes the tables of docs/smoothing.md: what smoothing brings.
 
+First with the shipped files, on a simulation of the plant in the same file; then beside PyNumDiff.
 PyNumDiff's simulated systems with its own noise, each of its methods tuned by its own optimiser:
 without the truth, as a user has to (it is told the bandwidth of the signal), and with the truth.
 Ours has y' as unknown input. Without the truth it is told nothing: it takes the noise, the size
 and the correlation time of y', and the number of derivatives, that make its innovations likeliest.
 
-It takes hours; `--check` computes our columns alone and compares them with what the page says.
+The second takes hours; `--check` computes our columns alone and compares them with what the page
+says; `--files` makes the first table alone.
 """
 
 import argparse
 import json
 from pathlib import Path
 import sys
+from time import process_time
 from typing import Any
 import warnings
 
-from fhaosmo_ros.core import Observer, OnlineEstimator
+from fhaosmo_ros.core import Observer, OnlineEstimator, Plant
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.covariance import Uncertainty
 from fhaosmo_ros.core.observer.levant import deadbeat_shares
 from fhaosmo_ros.core.observer.smoother import Smoother
 from fhaosmo_ros.core.observer.smoothing import MEASURED
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
+from fhaosmo_ros.tools.cli.share import shipped
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from studies.document import filled
+from studies.document import refill
 
+FILES = ('noise_1e-4', 'noise_1e-3', 'noise_1e-2', 'models/pendulum')
+DURATION, LAGS, TIMED = 20.0, (0.05, 0.2, 0.5), 'noise_1e-3'
+"""Of the recordings (s); lags (s); the file whose time a sample is printed."""
 DT, LAG = 0.01, 0.2
 BANDLIMITS = {
     'sine': 3.0, 'triangle': 4.0, 'pop_dyn': 2.0, 'linear_autonomous': 4.0,
@@ -42,8 +51,54 @@ METHODS = (
 )  # fmt: skip
 """Without those that need convex optimisation, each of which takes minutes a signal."""
 DERIVATIVES = (1, 2, 3)
-DOCS = Path(__file__).resolve().parents[1] / 'docs'
+PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'smoothing.md'
 Cell = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def with_file(name: str) -> list[float]:
+    """Return errors of d over d: those of the observer, of `LAGS`, of the whole recording."""
+    path = shipped(f'config/{name}.yaml')
+    p = OnlineEstimator.from_yaml(path).parameters
+    plant = load(path, 'plant', PLANT_PARAMETERS) | {'noise_std': p['noise_size']}
+    t = np.arange(0.0, DURATION, 1e-3)
+    stamps, truth = np.round(t * 1e9).astype(np.int64) + 1, Plant(plant).simulate(t)
+    estimates = [
+        OnlineEstimator(p | {'smoothing_lag': lag}).run(stamps, truth.y).unknown_input
+        for lag in (0.0, *LAGS)
+    ]
+    estimates.append(Observer(p).smooth(t, truth.y).unknown_input)
+    errors = [rms(d - truth.unknown_input[: len(d)]) for d in estimates]
+    return [float(f'{error / rms(truth.unknown_input):.4g}') for error in errors]
+
+
+def costs() -> list[float]:
+    """Return CPU a sample (µs): live without and with `LAGS`, and of a whole recording."""
+    p = OnlineEstimator.from_yaml(shipped(f'config/{TIMED}.yaml')).parameters
+    y = p['noise_size'] * np.random.default_rng(1).standard_normal(6000)
+    found = []
+    for lag in (0.0, *LAGS):
+        estimator = OnlineEstimator(p | {'smoothing_lag': lag})
+        for k, sample in enumerate(y):
+            if k == len(y) // 2:  # compiled, and the lag is over
+                begin = process_time()
+            estimator.update(10**9 + 10**6 * k, sample)
+        found.append((process_time() - begin) / (len(y) // 2))
+    observer = Observer(p)
+    for _ in range(2):
+        begin = process_time()
+        observer.smooth(1e-3 * np.arange(len(y)), y)
+        spent = (process_time() - begin) / len(y)
+    return [float(f'{1e6 * x:.3g}') for x in (*found, spent)]
+
+
+def files_table(results: dict[str, Any]) -> str:
+    """Return what smoothing brings with the shipped files, and what it costs."""
+    lags = ' | '.join(f'lag of {1e3 * lag:g} ms' for lag in LAGS)
+    lines = [f'| file | observer | {lags} | whole recording |', '|---' * (3 + len(LAGS)) + '|']
+    for name, errors in results['files'].items():
+        lines.append(f'| {name} | {" | ".join(f"{x:.2g}" for x in errors)} |')
+    spent = ' | '.join(f'{x:.2g} µs' for x in results['microseconds'])
+    return '\n'.join([*lines, f'| CPU a sample, {TIMED} | {spent} |'])
 
 
 def cell(system: str, noise: float) -> Cell:
@@ -186,19 +241,27 @@ def table(results: dict[str, Any]) -> str:
     return '\n'.join(lines)
 
 
+def texts(results: dict[str, Any]) -> dict[str, str]:
+    """Return the generated parts of the page."""
+    return {'files': files_table(results), 'table': table(results['systems'])}
+
+
 def main() -> int:
     """Compute what is missing in the results, write them and the page."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
     parser.add_argument('--check', action='store_true', help='compute our columns, compare')
+    parser.add_argument('--files', action='store_true', help='the shipped files alone')
     parser.add_argument('--methods', nargs='*', default=METHODS, help='of PyNumDiff')
     arguments = parser.parse_args()
-    path, page = DOCS / 'smoothing.json', DOCS / 'smoothing.md'
-    results = json.loads(path.read_text()) if path.exists() else {}
-    for noise in NOISES:
+    path = PAGE.with_suffix('.json')
+    results = json.loads(path.read_text()) if path.exists() else {'systems': {}}
+    if not arguments.check:
+        results |= {'files': {f: with_file(f) for f in FILES}, 'microseconds': costs()}
+    for noise in () if arguments.files else NOISES:
         for system, bandlimit in BANDLIMITS.items():
             y, rate = cell(system, noise)
             name = f'{system}, {noise:g}'
-            row = results.setdefault(name, {'loss': {}, 'truth': {}})
+            row = results['systems'].setdefault(name, {'loss': {}, 'truth': {}})
             mine = ours(y, rate)
             print(name, mine, flush=True)
             if arguments.check and abs(mine['smoothed'] / row['ours']['smoothed'] - 1.0) > 0.02:
@@ -210,10 +273,11 @@ def main() -> int:
                     if method not in row[way]:
                         row[way][method] = theirs(y, rate, bandlimit, method, way == 'truth')
                         print(name, method, way, row[way][method], flush=True)
-            path.write_text(json.dumps(results, indent=1) + '\n')
+            if not arguments.check:
+                path.write_text(json.dumps(results, indent=1) + '\n')
     if not arguments.check:
-        text = page.read_text(encoding='utf-8')
-        page.write_text(filled(text, {'table': table(results)}), encoding='utf-8')
+        for made in refill(PAGE, texts(results), results=results):
+            print(made)
     return 0
 
 

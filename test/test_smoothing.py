@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimates from the samples before and after: theorems of smoothing, faults of data, lags."""
 
+import json
+
 from fhaosmo_ros.core import Observer, OnlineEstimator, Plant
 from fhaosmo_ros.core.observer import smoother
 from fhaosmo_ros.core.observer.covariance import INPUT_DOUBT, STATES_DOUBT
@@ -9,6 +11,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from studies import differentiation, document
 
 CONFIG = 'config/noise_1e-3.yaml'
 MS = 1_000_000
@@ -290,3 +293,14 @@ def test_any_data_gives_finite_estimates(seed):
             rows = estimator.run(stamps, y)
             assert np.isfinite(rows.z).all()
             assert np.isfinite(estimator.finish().unknown_input).all()
+
+
+# docs/smoothing.md
+
+
+def test_the_page_says_what_was_measured():
+    results = json.loads(differentiation.PAGE.with_suffix('.json').read_text())
+    shown = document.parts(differentiation.PAGE.read_text())
+    assert shown == differentiation.texts(results)
+    name = 'models/pendulum'
+    assert differentiation.with_file(name) == pytest.approx(results['files'][name], rel=0.02)
