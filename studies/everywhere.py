@@ -180,9 +180,11 @@ def wave(kind: str, t: Floats, omega: float, random: np.random.Generator) -> Flo
     return np.asarray(d / np.sqrt(np.mean(d**2)))
 
 
-def recording(plant: Plant, c: Condition, kind: str, duration: float) -> Recording:
-    """Return a recording of the plant; its seed is that of the kind of d."""
-    random = np.random.default_rng([SEED, *kind.encode()])
+def recording(
+    plant: Plant, c: Condition, kind: str, duration: float, seed: int = SEED
+) -> Recording:
+    """Return a recording of the plant; its seeds are this one and the kind of d."""
+    random = np.random.default_rng([seed, *kind.encode()])
     table = wave(kind, np.arange(0.0, duration + STEP, STEP), plant.speed * c.speed, random)
     t = np.arange(round(duration * c.rate)) / c.rate
     z, d = respond(TriangularModel(plant.phi), plant.start, t, plant.size * c.size * table, STEP,

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/tuning.md against its results file, and that file against a short new run."""
+
+import json
+
+import pytest
+
+pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
+pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
+pytest.importorskip('control', reason='python-control is not installed (extra: tune)')
+
+from studies import document, tuning
+
+REWRITE = 'run python -m studies.tuning'
+
+
+@pytest.fixture(scope='module')
+def documented():
+    return json.loads(tuning.PAGE.with_suffix('.json').read_text())
+
+
+def test_the_page_says_what_was_measured(documented):
+    assert document.parts(tuning.PAGE.read_text()) == tuning.texts(documented), REWRITE
+
+
+@pytest.mark.slow
+def test_a_bag_gives_gains_of_the_documented_error(documented):
+    name, kind = 'motor', 'square'
+    error = tuning.error_with(tuning.gains_of_bag(name, kind), tuning.judging(name, kind))
+    assert error == pytest.approx(documented['bags'][name][kind]['error'], rel=0.05), REWRITE
+
+
+def test_a_search_starts_where_the_page_says(documented):
+    name = 'pendulum, noise 5e-4'
+    tuner, start = tuning.problem_of(name)
+    found = [tuner.training(start).objective, tuner.held_out(start).objective]
+    assert found == pytest.approx(documented['samplers'][name]['start'], rel=0.01), REWRITE
+
+
+def test_a_preset_has_the_documented_error(documented):
+    noise = tuning.NOISES[1]
+    for title, values in tuning.presets_at(noise, lambda: None, scan=False).items():
+        assert values == pytest.approx(documented['presets'][noise][title], rel=0.02), REWRITE
