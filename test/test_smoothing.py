@@ -304,3 +304,15 @@ def test_the_page_says_what_was_measured():
     assert shown == differentiation.texts(results)
     name = 'models/pendulum'
     assert differentiation.with_file(name) == pytest.approx(results['files'][name], rel=0.02)
+
+
+def test_the_study_finds_parameters_by_their_likelihood():
+    t = np.arange(400) * differentiation.DT
+    y = np.sin(2.0 * t) + 0.1 * np.random.default_rng(3).standard_normal(len(t))
+
+    def unfitness(noise, size):
+        return differentiation.unfitness(y, differentiation.parameters(1, noise, size, 3.0), None)
+
+    best = unfitness(0.1, 1.4)
+    for other in ((0.2, 1.4), (0.05, 1.4), (0.1, 100.0), (0.1, 0.01)):
+        assert unfitness(*other) > best + 10.0
