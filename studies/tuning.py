@@ -3,7 +3,7 @@
 `python -m studies.tuning` measures what docs/tuning.md says of tune: bags, samplers, presets.
 
 bags: gains that `tune --bag` finds without the truth, on other recordings of the same kind, beside
-Kalman filters that were chosen with the truth of these. samplers: CMA-ES against TPE, the same
+a Kalman filter that is tuned with the truth of these. samplers: CMA-ES against TPE, the same
 problems, starts and numbers of trials. presets: config/noise_*.yaml on held-out recordings, beside
 Kalman filters whose model of d (a random walk; a decaying one) and bandwidth were scanned on the
 presets' own training recordings.
@@ -44,6 +44,9 @@ from fhaosmo_ros.tools.tuning.start.theory import kalman_like
 from fhaosmo_ros.tools.tuning.tuner import Tuner
 import numpy as np
 from studies import everywhere
+from studies.comparison.evaluation import METHODS, tune
+from studies.comparison.methods.linear import LINEAR_LIMIT
+from studies.comparison.methods.method import Setting
 from studies.document import refill
 from studies.everywhere import Condition
 
@@ -61,6 +64,7 @@ BAGS = {
 steady-state Kalman filter for a slow d takes so long to start."""
 BAG, JUDGED, SEEDS = 60.0, 30.0, (2, 3)
 """Duration of a bag and of the recordings that judge (s); seeds of these."""
+FILTER_TRIALS = 80
 
 SAMPLERS = ('cmaes', 'tpe')
 TRIALS, STUDIES = 600, 3
@@ -114,6 +118,14 @@ def error_with(gains: dict[str, Any], recordings: list[Recording]) -> float:
     ])  # fmt: skip
 
 
+def least_error(setting: Setting, recordings: list[Recording]) -> float:
+    """Return the error of d of the Kalman filter that is tuned with the truth, as compared."""
+    method = METHODS[LINEAR_LIMIT]
+    values = tune(method, setting, recordings, FILTER_TRIALS, everywhere.SEED).values
+    run = method.prepare(setting, values)
+    return everywhere.mean([everywhere.error(r, run(r)['filtered'].d) for r in recordings])
+
+
 def bags(tick: Tick) -> dict[str, Any]:
     """Return the errors by case and kind of d, and the ratios; also with the gains of the sine."""
     results: dict[str, Any] = {}
@@ -124,8 +136,7 @@ def bags(tick: Tick) -> dict[str, Any]:
         for kind in KINDS:
             recordings = judging(name, kind)
             own = of_sine if kind == 'sine' else gains_of_bag(name, kind)
-            best = everywhere.best_member(setting, recordings, 9)
-            yard = everywhere.mean(everywhere.kalman(setting, best, recordings))
+            yard = least_error(setting, recordings)
             error, other = error_with(own, recordings), error_with(of_sine, recordings)
             rows[kind] = {
                 'error': _kept(error), 'ratio': _kept(error / yard),
