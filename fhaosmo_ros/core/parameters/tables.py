@@ -5,12 +5,30 @@ Every parameter of the package, declared once.
 YAML checks, ROS descriptors, docs/parameters.md and error messages derive from these tables.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
 
 MAX_ORDER = 12
 CONSTANTS = 'constants.'
 """Begin of the names of constants in expressions."""
 PER_LEVEL = '1 (used for every level) or one a level'
+
+SELF_TUNING_USES = {
+    'order', 'phi', 'inputs', 'unknown_input', 'gains', 'bandwidth', 'tuning_memory',
+    'prediction_step', 'noise_size', 'state_sizes', 'start_from_measurement',
+}  # fmt: skip
+"""Of the observer's parameters; the others belong to fixed gains."""
+
+
+def choose_gains(given: Mapping[str, Any]) -> str:
+    """Return the default of gains: self_tuning where only a model of the user's is given."""
+    only_model = 'phi' in given and not any(
+        name in OBSERVER_PARAMETERS and name not in SELF_TUNING_USES for name in given
+    )
+    return 'self_tuning' if only_model and given.get('unknown_input', True) else 'fixed'
+
 
 MODEL = (
     Parameter(
@@ -64,8 +82,9 @@ OBSERVER = (
         'fixed: those below. self_tuning: none; many observers run side by side and are weighted '
         'by how well they predict y, so that noise, size and speed of d are found and followed. '
         'Of the parameters from structure to gamma_leakage_delay it uses prediction_step, '
-        'noise_size and state_sizes alone.',
-        choices=('fixed', 'self_tuning'), live=False,
+        'noise_size and state_sizes alone. The default is self_tuning where phi is given and no '
+        'parameter that belongs to fixed gains alone.',
+        choices=('fixed', 'self_tuning'), live=False, choose=choose_gains,
     ),
     Parameter(
         'bandwidth', 1.0,
