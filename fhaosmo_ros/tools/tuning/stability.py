@@ -17,8 +17,11 @@ from fhaosmo_ros.core.observer.observer import Observer
 import numpy as np
 from scipy.linalg import expm
 
-SIZES = (0.0, 0.5, 1.0, 2.0, 4.0, 6.0)
-"""Of innovations, in their standard deviations; farther ones are rejected (D 21)."""
+SIZES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 12.0, 16.0)
+"""
+Of innovations, in the standard deviations of what is expected. With a d that is faster than
+expected their spread grows, and so do the limits of D 21 and D 32.
+"""
 SMALLEST = 1e-3
 """Stands for an innovation of 0."""
 DEADBEAT = 1e-12
