@@ -2,6 +2,8 @@
 """
 Start, upsets, outliers and other rates: every preset beside Kalman filters.
 
+    python benchmark/upsets.py              # measures, and writes the tables in docs/operation.md
+
 The Kalman filters know the true sizes of the noise, of the states and of d, and have the model of
 d that the preset has. Their bandwidth is scanned on a recording without upsets.
 """
@@ -23,15 +25,19 @@ from fhaosmo_ros.core.simulation.plant import Plant
 from kalman_filter import KalmanFilter
 import numpy as np
 from numpy.typing import NDArray
-from table import Row, Table
+from studies.document import filled
+from table import render, Row, Table
 
 Floats = NDArray[np.float64]
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
 NOISE = {
     'noise_1e-2': 1e-2, 'noise_1e-3': 1e-3, 'noise_1e-4': 1e-4, 'paper_plant': 1e-5,
-    'pendulum': 5e-4, 'dc_motor': 4.4e-4, 'demo': 3e-6, 'levant': 3e-6, 'paper': 0.0,
+    'pendulum': 5e-4, 'dc_motor': 4.4e-4, 'demo': 3e-6, 'levant': 3e-6, 'paper': 3e-6,
 }  # fmt: skip
-"""Standard deviation of the noise on y that each preset is for; of dc_motor: of its quantum."""
+"""
+Standard deviation of the noise on y that each preset is for; of dc_motor: of its quantum; of the
+last three, which are for a y without noise: of what the jitter of stamps is like.
+"""
 LENGTH, HIT = 16.0, 6.0
 """Seconds of a run, and when the upset begins."""
 SETTLED = 3.0
@@ -42,8 +48,15 @@ WRONG = 'peak at the start, sizes wrong'
 START, UPSET, LATE = 'peak at the start', 'peak after an upset', 'seconds to the usual error'
 PLAIN = 'error with outliers over that of the Kalman filter'
 ROBUST = 'error with outliers over that of the best robust one'
-BARS = {START: 1.5, WRONG: 1.5, UPSET: 2.0, LATE: 0.3, PLAIN: 0.6, ROBUST: 1.0}
-"""Worst values of the node over all files but the paper's, and what is allowed."""
+STUDENT = 'error with Student t noise over that of the best robust one'
+BARS = {START: 1.5, WRONG: 1.5, UPSET: 2.0, LATE: 0.3, PLAIN: 0.6, ROBUST: 1.0, STUDENT: 1.0}
+"""Worst values of the node over all files, and what is allowed."""
+PAGE = CONFIG.parent / 'docs' / 'operation.md'
+SHOWN = {
+    'start': 'start', 'plant reset': 'plant set back by 3 s',
+    'offset 1, 0.5 s': 'y 1 off for 0.5 s',
+}  # fmt: skip
+"""Upsets that the page shows."""
 
 
 class Case(NamedTuple):
@@ -210,14 +223,36 @@ def steady_cases(p: Preset) -> dict[str, Case]:
     return cases
 
 
+class Judged:
+    """The worst value of each bar and file, and in which case it is."""
+
+    def __init__(self) -> None:
+        self._worst: dict[tuple[str, str], tuple[float, str]] = {}
+
+    def add(self, bar: str, file: str, value: float, case: str) -> None:
+        """Take a value of a case."""
+        found = (float(value), f'{file}, {case}')
+        self._worst[bar, file] = max(self._worst.get((bar, file), found), found)
+
+    def rows(self) -> list[Row]:
+        """Return the worst of all files."""
+        found = {b: max(v for (name, _), v in self._worst.items() if name == b) for b in BARS}
+        return [Row(name, found[name][0], '', bar, found[name][1]) for name, bar in BARS.items()]
+
+    def table(self) -> Table:
+        """Return a line for each bar, a column for each file."""
+        files = list(dict.fromkeys(file for _, file in self._worst))
+        lines = []
+        for name, bar in BARS.items():
+            found = (self._worst.get((name, file)) for file in files)
+            cells = ('-' if worst is None else f'{worst[0]:.2f}' for worst in found)
+            lines.append((name, f'{bar:g}', *cells))
+        return Table('Worst values by file.', ('', 'allowed', *files), lines)
+
+
 def measure(quick: bool) -> list[Row | Table]:
-    """Return the two tables."""
-    upsets, steady = [], []
-    worst = dict.fromkeys(BARS, (0.0, ''))
-
-    def judge(bar: str, value: float, note: str) -> None:
-        worst[bar] = max(worst[bar], (value, note))
-
+    """Return the bars, the worst values by file, and the two tables."""
+    upsets, steady, judged = [], [], Judged()
     with np.errstate(all='ignore'):
         for p in presets():
             runs = methods(p)
@@ -233,9 +268,9 @@ def measure(quick: bool) -> list[Row | Table]:
                     peak = np.abs(error[case.t >= (HIT if case.back else 0.0)]).max() / largest
                     late = time_to_usual(error, case, 1.1 * usual[name])
                     line.append(f'{peak:.2g} {late:.2g}')
-                    if name == 'node' and p.name != 'paper':
-                        judge(UPSET if case.back else START, float(peak), f'{p.name}, {title}')
-                        judge(LATE, late, f'{p.name}, {title}')
+                    if name == 'node':
+                        judged.add(UPSET if case.back else START, p.name, peak, title)
+                        judged.add(LATE, p.name, late, title)
                 upsets.append(tuple(line))
             for title, other in wrong_sizes(p).items():
                 line, case = [p.name, title], p.clean
@@ -244,19 +279,20 @@ def measure(quick: bool) -> list[Row | Table]:
                     peak = float(np.abs(error).max() / largest)
                     late = time_to_usual(error, case, 1.1 * usual['node'])
                     line.append(f'{peak:.2g} {late:.2g}')
-                    judge(WRONG, peak, f'{p.name}, {title}')
+                    judged.add(WRONG, p.name, peak, title)
                 upsets.append((*line, *['-'] * (len(runs) - 2)))
             for title, case in steady_cases(p).items():
                 size = rms(p.clean.d, p.clean.t)
                 found = [rms(run(case) - case.d, case.t) / size for run in runs.values()]
-                line = [f'{value:.3g}' for value in found]
-                if '%' in title and p.name != 'paper':
-                    judge(PLAIN, found[0] / found[2], f'{p.name}, {title}')
-                    judge(ROBUST, found[0] / min(found[3:]), f'{p.name}, {title}')
-                steady.append((p.name, title, *line))
-    rows = [Row(name, *worst[name][:1], '', bar, worst[name][1]) for name, bar in BARS.items()]
+                if '%' in title:
+                    judged.add(PLAIN, p.name, found[0] / found[2], title)
+                    judged.add(ROBUST, p.name, found[0] / min(found[3:]), title)
+                elif 'Student' in title:
+                    judged.add(STUDENT, p.name, found[0] / min(found[3:]), title)
+                steady.append((p.name, title, *(f'{value:.3g}' for value in found)))
     return [
-        *rows,
+        *judged.rows(),
+        judged.table(),
         Table(
             'Upsets: largest error of d over the largest d, and seconds from the end of the upset '
             'until the error is the usual one for good.',
@@ -265,3 +301,31 @@ def measure(quick: bool) -> list[Row | Table]:
         ),
         Table('RMS error of d over RMS of d.', ('preset', 'case', *runs), steady),
     ]
+
+
+def markdown(header: tuple[str, ...], lines: list[tuple[str, ...]]) -> str:
+    """Return a table for the page."""
+    ruled = [header, ('---',) * len(header), *lines]
+    return '\n'.join(f'| {" | ".join(line)} |' for line in ruled)
+
+
+def main() -> None:
+    """Measure, print, and write the tables of the page."""
+    results = measure(False)
+    rows = [r for r in results if isinstance(r, Row)]
+    bars, upsets, steady = (t for t in results if isinstance(t, Table))
+    print('\n\n'.join([render(rows), *(t.render() for t in (bars, upsets, steady))]))
+    shown = {
+        file: [line[2].replace(' ', ', ') for line in upsets.lines
+               if line[0] == file and line[1] in SHOWN]
+        for file in NOISE
+    }  # fmt: skip
+    texts = {
+        'upsets': markdown(('', *SHOWN.values()), [(f, *cells) for f, cells in shown.items()]),
+        'bars': markdown(bars.header, bars.lines),
+    }
+    PAGE.write_text(filled(PAGE.read_text(encoding='utf-8'), texts), encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()

@@ -18,7 +18,9 @@ from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.tools.tuning.command import main
 from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.search.space import changes
 from fhaosmo_ros.tools.tuning.source import simulated
+from fhaosmo_ros.tools.tuning.stability import least_damping
 from fhaosmo_ros.tools.tuning.start.find import SCHEME, with_scheme
 from fhaosmo_ros.tools.tuning.start.kalman import grid, KalmanGains
 from fhaosmo_ros.tools.tuning.start.sampled_model import SampledModel
@@ -231,6 +233,38 @@ def test_presets_fit_the_noise_in_their_name(noise):
     late = r.t >= tuning['settled']
     error = np.sqrt(np.mean((found.unknown_input - r.d)[late] ** 2))
     assert error == pytest.approx(judged[0].scores.error[0, 0, -1], rel=1e-3)
+
+
+# damping of the errors
+
+
+@pytest.mark.parametrize('levels', [2, 3, 4])
+def test_damping_of_a_chain_of_integrators_is_butterworths(levels):
+    period, width, noise = 1e-3, 1e3, 1e-3
+    model = SampledModel(TriangularModel(['0'], 1), period, levels - 1)
+    psi = curves(OBSERVER_PARAMETERS.defaults(), levels)
+    gains = kalman_like(model, 15.0, width, psi, noise, 1e-4)
+    values = dict(SCHEME) | {
+        'order': 1, 'phi': ['0'], 'unknown_input_derivatives': levels - 2,
+        'correction_period': period, 'noise_size': noise, 'lambda': gains.tolist(),
+        'fuzzy_widths': [width], 'gamma_initial': 1e-4,
+    }  # fmt: skip
+    expected = np.sin(np.pi / (2.0 * levels))
+    assert least_damping(Observer(values)) == pytest.approx(expected, rel=0.03)
+
+
+def test_search_avoids_gains_whose_errors_grow(tuner):
+    start = {d.name: d.start for d in tuner.space}
+    before = tuner.training(changes(start)).objective
+    assert tuner.evaluate(start).objective == before
+    last = max(name for name in start if name.startswith('lambda'))
+    worse = start | {last: 100.0 * start[last]}
+    assert tuner.evaluate(worse).objective > 1.5 * tuner.training(changes(worse)).objective
+
+
+@pytest.mark.parametrize('path', sorted((ROOT / 'config').glob('**/*.yaml')), ids=lambda p: p.stem)
+def test_errors_with_shipped_gains_are_damped(path):
+    assert least_damping(Observer(load(path, 'estimator', OBSERVER_PARAMETERS))) > 0.05
 
 
 @pytest.mark.parametrize('name', ['paper_plant', 'pendulum', 'dc_motor'])

@@ -17,6 +17,7 @@ from fhaosmo_ros.tools.tuning.search.minimise import minimise, StudyOptions, Val
 from fhaosmo_ros.tools.tuning.search.space import changes, make_space
 from fhaosmo_ros.tools.tuning.search.study import FinishedTrial
 from fhaosmo_ros.tools.tuning.source import TuningData
+from fhaosmo_ros.tools.tuning.stability import least_damping
 from fhaosmo_ros.tools.tuning.start.find import find_start, StartProblem, with_scheme
 
 DIGITS = 4
@@ -24,6 +25,8 @@ DIGITS = 4
 LOSS = 5e-3
 NEAR, FAR = 0.5, 3.0
 """`decades` around a start that a Kalman filter gave, and around any other one."""
+LEAST_DAMPING, DAMPING_WEIGHT = 0.1, 10.0
+"""Of the errors' dynamics: gains with less suit their recordings and fail on others."""
 PARETO_WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Weights of the second objective; each has a search of its own."""
 
@@ -143,6 +146,7 @@ class Tuner:
         searched = changes({d.name: d.start for d in self.space})
         self.before = given or searched
         self.fixed = {k: v for k, v in self.estimator.items() if k not in searched}
+        self._damping = min(LEAST_DAMPING, self._damped(searched))
 
     def _objective(self, estimator: Mapping[str, Any]) -> Objective:
         complete = ESTIMATOR_PARAMETERS.complete(estimator)
@@ -161,7 +165,15 @@ class Tuner:
 
     def evaluate(self, values: Values) -> TrialScores:
         """Return the scores of a point of the space on the training recordings."""
-        return self._evaluate(changes(values))
+        gains = changes(values)
+        scores = self._evaluate(gains)
+        if math.isinf(scores.objective):
+            return scores
+        missing = max(self._damping - self._damped(gains), 0.0)
+        return scores._replace(objective=scores.objective * (1.0 + DAMPING_WEIGHT * missing))
+
+    def _damped(self, gains: Mapping[str, Any]) -> float:
+        return least_damping(Observer(ESTIMATOR_PARAMETERS.complete(self.estimator | dict(gains))))
 
     def _evaluate(self, gains: Mapping[str, Any]) -> TrialScores:
         try:
