@@ -269,11 +269,9 @@ def test_named_inputs_and_constants_stand_for_their_values():
 
 
 def test_named_model_is_the_same_as_one_with_numbers():
-    names = Observer(MOTOR)
-    numbers = Observer(
-        {'order': 2, 'phi': ['0', '(3.0*u - 0.5*z2 - 2.0*9.81*sin(z1) + v)/2.0']}
-        | {'inputs': ['u', 'v']}
-    )
+    numbers = {'order': 2, 'phi': ['0', '(3.0*u - 0.5*z2 - 2.0*9.81*sin(z1) + v)/2.0']}
+    numbers |= {'inputs': ['u', 'v'], 'gains': 'fixed'}
+    names, numbers = Observer(MOTOR | {'gains': 'fixed'}), Observer(numbers)
     rng = np.random.default_rng(1)
     t, y, u = np.arange(300) * 1e-3, rng.standard_normal(300), rng.standard_normal((300, 2))
     for mine, other in zip(names.run(t, y, u), numbers.run(t, y, u), strict=True):

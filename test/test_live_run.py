@@ -192,7 +192,7 @@ def test_parameters_of_another_version_are_said(tmp_path, capsys):
 def test_input_that_came_before_the_recording_holds(begin, tmp_path, capsys):
     """Such as a set-point that is published once: only the live estimator knows it."""
     stamps, y = files.signal(COUNT)
-    live = Live(parameters={'phi': ['0', '0', 'u - z3']})
+    live = Live(parameters={'phi': ['0', '0', 'u - z3'], 'gains': 'fixed'})
     live.estimator.set_input(0.7)
     live.run(stamps, y, 0, 3000)
     live.estimator.set_input(-0.4)
@@ -200,7 +200,9 @@ def test_input_that_came_before_the_recording_holds(begin, tmp_path, capsys):
     live.run(stamps, y, 3000, COUNT)
     bag = write(tmp_path / 'bag', stamps, y, live, begin=begin)
     out = tmp_path / 'o.npz'
-    code, _, error = run(capsys, bag, '-o', out, '-p', "phi:=['0', '0', 'u - z3']")
+    code, _, error = run(
+        capsys, bag, '-o', out, '-p', "phi:=['0', '0', 'u - z3']", '-p', 'gains:=fixed'
+    )
     assert code == 0, error
     found = rows(out)
     assert len(found) >= COUNT - 1000

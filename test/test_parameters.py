@@ -4,6 +4,7 @@
 from array import array
 
 from fhaosmo_ros.core import ConfigurationError, Observer
+from fhaosmo_ros.core.parameters import files
 from fhaosmo_ros.core.parameters.declaration import KINDS, Parameter, ParameterTable
 from fhaosmo_ros.core.parameters.tables import (
     ESTIMATOR_PARAMETERS,
@@ -218,3 +219,17 @@ def test_list_of_the_wrong_length_is_refused(name, value, allowed):
         assert message.isprintable()
         for part in (f"'{name}'", allowed, repr(value) if name != 'phi' else 'got 2'):
             assert part in message
+
+
+def test_gains_of_a_model_alone_tune_themselves():
+    """Unless something is given that only fixed gains use; in a node each channel for itself."""
+    model = {'order': 2, 'phi': ['0', '-k*z2'], 'constants.k': 2.0, 'noise_size': 0.1}
+    complete = ESTIMATOR_PARAMETERS.complete
+    assert complete(model)['gains'] == 'self_tuning'
+    for other in ({'lambda': [3.0]}, {'gains': 'fixed'}, {'unknown_input': False}):
+        assert complete(model | other)['gains'] == 'fixed'
+    assert complete({'noise_size': 0.1})['gains'] == 'fixed'
+    values = files.complete(
+        {'channels': ['a', 'b'], **model, 'b.lambda': [3.0]}, ESTIMATOR_PARAMETERS
+    )
+    assert (values['a.gains'], values['b.gains']) == ('self_tuning', 'fixed')

@@ -97,8 +97,9 @@ def test_output_bag_holds_the_estimators_topics(storage, tmp_path):
     stamps, y = files.signal(300)
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
     out = tmp_path / 'out'
-    assert run(bag, '-o', out, '--storage', storage, '-p', 'order:=2', '-p', 'phi:=["0","0"]') == 0
-    rows = expected(stamps, y, {'order': 2, 'phi': ['0', '0']})
+    model = ['-p', 'order:=2', '-p', 'phi:=["0","0"]', '-p', 'gains:=fixed']
+    assert run(bag, '-o', out, '--storage', storage, *model) == 0
+    rows = expected(stamps, y, {'order': 2, 'phi': ['0', '0'], 'gains': 'fixed'})
     state = series(out, '/estimator/state')
     np.testing.assert_array_equal(state.values, rows[:, :2])
     assert state.labels == ['z1', 'z2']
@@ -256,6 +257,7 @@ def test_bag_of_ros1_is_read_as_one_of_ros2(tmp_path, capsys):
         files.write(tmp_path / 'new', messages),
     )
     options = ['--topic', '/joints', '--field', 'position[1]', '-p', "phi:=['0','0','u-z3']"]
+    options += ['-p', 'gains:=fixed']
     tables = []
     for bag in bags:
         out = tmp_path / f'{bag.stem}.npz'

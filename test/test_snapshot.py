@@ -89,7 +89,7 @@ def test_what_an_older_version_did_not_remember_is_0():
 
 
 def test_snapshot_of_several_inputs():
-    parameters = {'order': 2, 'phi': ['0', 'a - b'], 'inputs': ['a', 'b']}
+    parameters = {'order': 2, 'phi': ['0', 'a - b'], 'inputs': ['a', 'b'], 'gains': 'fixed'}
     first, second = OnlineEstimator(parameters), OnlineEstimator(parameters)
     first.set_input(0.5, 0)
     first.set_input(-2.0, 1)
@@ -107,7 +107,9 @@ def test_memory_of_another_size_is_refused_and_changes_nothing():
     feed(estimator, 0, 100)
     before = estimator.memory
     with pytest.raises(ConfigurationError, match='4 levels'):
-        estimator.remember(OnlineEstimator({'order': 2, 'phi': ['0', '0']}).memory)
+        estimator.remember(
+            OnlineEstimator({'order': 2, 'phi': ['0', '0'], 'gains': 'fixed'}).memory
+        )
     for mine, was in zip(estimator.memory, before, strict=True):
         np.testing.assert_array_equal(mine, was)
 

@@ -19,14 +19,13 @@ SELF_TUNING_USES = {
     'order', 'phi', 'inputs', 'unknown_input', 'gains', 'bandwidth', 'tuning_memory',
     'prediction_step', 'noise_size', 'state_sizes', 'start_from_measurement',
 }  # fmt: skip
-"""Of the observer's parameters; the others belong to fixed gains."""
+"""Of the observer's parameters; the others, but for constants, belong to fixed gains."""
 
 
 def choose_gains(given: Mapping[str, Any]) -> str:
     """Return the default of gains: self_tuning where only a model of the user's is given."""
-    only_model = 'phi' in given and not any(
-        name in OBSERVER_PARAMETERS and name not in SELF_TUNING_USES for name in given
-    )
+    of_fixed_gains = OBSERVER_PARAMETERS.keys() - SELF_TUNING_USES
+    only_model = 'phi' in given and of_fixed_gains.isdisjoint(given)
     return 'self_tuning' if only_model and given.get('unknown_input', True) else 'fixed'
 
 

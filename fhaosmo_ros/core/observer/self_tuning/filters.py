@@ -177,9 +177,7 @@ def predict_covariances(
                         for g in range(moving):
                             row[g] += s * other[g]
             else:
-                decay(
-                    row, share, intensity, decayed, ramp, curve, terms, one, two, three, moving
-                )
+                decay(row, share, intensity, decayed, ramp, curve, terms, one, two, three, moving)
 
 
 @compiled(fastmath=FAST)
