@@ -133,7 +133,8 @@ OBSERVER = (
         'Standard deviation of the noise on y. With it, and with a correction_period, '
         'predict_correct knows how sure it is: at the start, and where samples come at another '
         'rate, the gains are those of a Kalman filter; unlikely samples are rejected, and y that '
-        'stays unlikely counts as lost. 0: not known.',
+        'stays unlikely counts as lost. self_tuning: the least that the noise is taken for. '
+        '0: not known.',
         lower=0.0, upper=1e12,
     ),
     Parameter(

@@ -166,7 +166,7 @@ def over_colours(values: Floats, largest: bool) -> None:
 def follow_noise(
     members: Members,
     scratch: Scratch,
-    quanta: float,
+    floor: float,
     s: Floats,
     largest: float,
     count: float,
@@ -176,8 +176,8 @@ def follow_noise(
 
     Parameters
     ----------
-    quanta : float
-        Variance of the error of rounding, the least that the noise can have.
+    floor : float
+        The least that the variance of the noise can be.
     largest : float
         See `knowing`.
     count : float
@@ -225,5 +225,5 @@ def follow_noise(
         most = members.rough[1 + c, 1]
         for p in range(2, members.rough.shape[1]):
             most = min(most, members.rough[1 + c, p])
-        noise[SQUARE, c] = max(min(noise[SQUARE, c], ROUGH * most), quanta)
+        noise[SQUARE, c] = max(min(noise[SQUARE, c], ROUGH * most), floor)
     return max(least, 1.0)

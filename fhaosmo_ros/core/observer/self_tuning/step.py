@@ -21,6 +21,7 @@ from fhaosmo_ros.core.observer.arrays import (
     GROWING,
     HAT,
     Law,
+    LEAST_NOISE,
     LIKELIEST,
     LINEAR,
     MOVING,
@@ -197,6 +198,7 @@ def step_members(
     count = min(memory[SAMPLES], NOISE_SAMPLES)
     memory[SAMPLES] = count + 1.0
     largest = knowing(members, scratch, believed)
+    floor = max(quanta, law.scalars[LEAST_NOISE] ** 2)
     off = abs(b[ORDERS - 1, COUNT - 1])
     grows = off > 1.1 * memory[FARTHEST] + 2.0 * math.sqrt(members.noise[SQUARE, 0])
     memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and grows else 0.0
@@ -207,11 +209,11 @@ def step_members(
             memory[BEYOND] += 1.0
         else:  # noise has both signs, y that is off has one
             memory[BEYOND] = 1.0
-            follow_noise(members, scratch, quanta, believed, largest, count)
+            follow_noise(members, scratch, floor, believed, largest, count)
         memory[FAR_SIGN] = sign
         return 0.0
     memory[BEYOND] = 0.0
-    grown = follow_noise(members, scratch, quanta, believed, largest, count)
+    grown = follow_noise(members, scratch, floor, believed, largest, count)
     memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
     kept = math.exp(-h / law.scalars[FORGETTING])
     for k in range(ORDERS):
