@@ -156,12 +156,12 @@ def methods_for(sensor: Sensor) -> list[str]:
 
 
 def seconds_a_sample(name: str, tuned: Tuned, sensor: Sensor) -> float:
-    """Return the time that a tuned method takes for a sample; the least of some runs."""
+    """Return the processor time that a tuned method takes for a sample; the least of some runs."""
     recording = sensor.training(1)[0]
     run = METHODS[name].prepare(sensor.setting(), tuned.values)
     best = float('inf')
     for _ in range(REPEATS):
-        begin = time.perf_counter()
+        begin = time.process_time()
         run(recording)
-        best = min(best, time.perf_counter() - begin)
+        best = min(best, time.process_time() - begin)
     return best / len(recording.t)

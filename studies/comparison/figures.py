@@ -94,8 +94,9 @@ def against_linear(chosen: Chosen, *, jumps: bool) -> Figure:
         axes.grid(alpha=0.3)
     panels[0].invert_yaxis()
     figure.supxlabel(
-        f'error of d over that of the best linear filter ({FLOOR:g}, {CEILING:g}: that or '
-        "beyond); at the right edge the linear filter's own error over the RMS of d",
+        f'd {"with" if jumps else "without"} jumps: error of d over that of the best linear '
+        f"filter ({FLOOR:g}, {CEILING:g}: that or beyond); at the right edge the linear filter's "
+        'own error over the RMS of d',
         fontsize='medium',
     )
     _legend(figure, RIVALS)
@@ -127,10 +128,10 @@ def time_series(results: Results) -> Figure:
     chosen = results.best_of_kinds()
     noisy = [c for c in chosen if c.sensor.noise == 1e-3 and c.sensor.timing == 'even']
     first = {(c.sensor.plant, c.disturbance): c for c in reversed(noisy)}
-    cells = [first[name] for name in SHOWN if name in first]
-    figure = Figure(figsize=(9.0, 2.2 * max(len(cells), 1) + 0.8), layout='constrained')
-    panels = figure.subplots(max(len(cells), 1), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, cell in zip(panels, cells, strict=False):
+    cells = [first[name] for name in SHOWN if name in first] or list(chosen)[:1]
+    figure = Figure(figsize=(9.0, 2.2 * len(cells) + 0.8), layout='constrained')
+    panels = figure.subplots(len(cells), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, cell in zip(panels, cells, strict=True):
         _estimates(axes, results, cell, chosen[cell][LINEAR][0])
         axes.set_title(f'{cell.plant}, {cell.disturbance}, {_row(cell)}', fontsize=9)
         axes.set_ylabel('d')

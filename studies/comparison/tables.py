@@ -136,11 +136,13 @@ def _shapes(chosen: Chosen) -> str:
 
 
 def _losses(chosen: Chosen) -> str:
-    """Return the cells in which our observers are most behind the best other kind."""
+    """Return the cells with noise in which our observers are most behind the best other kind."""
     rows = []
     for kind in (OURS, SELF_TUNING):
         behind = {}
         for cell, row in chosen.items():
+            if cell.sensor.noise == 0.0:
+                continue
             others = {k: v for k, v in row.items() if k not in (OURS, SELF_TUNING)}
             best = min(others, key=lambda k, others=others: others[k][1].d)
             behind[cell] = (row[kind][1].d / others[best][1].d, row[kind][1].d, others[best])
