@@ -17,6 +17,7 @@ from studies.comparison.methods.method import (
     ROBUST,
     SELF_TUNING,
     SLIDING,
+    USUAL,
 )
 from studies.comparison.results import Cell, Chosen, Results
 from studies.comparison.scores import mean
@@ -24,8 +25,9 @@ from studies.comparison.tables import number, ratios, RIVALS, sampling
 
 BLACK = '#000000'
 STYLES = {
-    LINEAR: ('#0072B2', 'o', 26), ROBUST: ('#56B4E9', '^', 26), SLIDING: ('#CC79A7', 'D', 20),
-    PAPER: ('#999999', 'x', 26), OURS: ('#009E73', 's', 24), SELF_TUNING: ('#D55E00', '*', 90),
+    LINEAR: ('#0072B2', 'o', 26), USUAL: (BLACK, 'o', 22), ROBUST: ('#56B4E9', '^', 26),
+    SLIDING: ('#CC79A7', 'D', 20), PAPER: ('#999999', 'x', 26), OURS: ('#009E73', 's', 24),
+    SELF_TUNING: ('#D55E00', '*', 90),
 }  # fmt: skip
 """Okabe-Ito, and a grey; marker and its area."""
 FLOOR, CEILING, EDGE = 0.1, 10.0, 40.0

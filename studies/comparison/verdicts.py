@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 from studies.comparison.evaluation import METHODS
 from studies.comparison.methods.linear import LINEAR_LIMIT
-from studies.comparison.methods.method import LINEAR, OURS
+from studies.comparison.methods.method import LINEAR, OURS, USUAL
 from studies.comparison.results import Cell, Table
 from studies.comparison.scores import Scores
 
 KALMAN = 'Kalman'
-PEERS = [name for name, m in METHODS.items() if m.kind == LINEAR and name != LINEAR_LIMIT]
+PEERS = [name for name, m in METHODS.items() if m.kind in (LINEAR, USUAL) and name != LINEAR_LIMIT]
 """The linear filters with a name of their own."""
 
 

@@ -16,7 +16,7 @@ from fhaosmo_ros.tools.tuning.start.find import DERIVATIVES
 from fhaosmo_ros.tools.tuning.start.sampled_model import pair, SampledModel
 import numpy as np
 from studies.comparison.methods.constant_gain import estimates
-from studies.comparison.methods.method import LINEAR, Method, Run, Search, Setting, Values
+from studies.comparison.methods.method import LINEAR, Method, Run, Search, Setting, USUAL, Values
 from studies.comparison.scores import Estimates
 
 LINEAR_LIMIT = 'Kalman, Matern'
@@ -132,7 +132,7 @@ FILTERS = (
     Method(
         'Kalman',
         'steady-state Kalman filter, d a random walk',
-        LINEAR,
+        USUAL,
         lambda s: (_bandwidth('bandwidth', s),),
         _prepare(1, _kalman),
     ),

@@ -13,9 +13,10 @@ ROUNDING = 1e-15
 """Noise of a y about 1."""
 DEADBEAT = 3.0
 """Bandwidth times period of an observer that forgets all but the last few samples."""
-LINEAR, ROBUST, SLIDING, PAPER = 'linear filter', 'adaptive filter', 'sliding mode', 'paper'
-OURS, SELF_TUNING = 'ours, tuned', 'ours, self-tuning'
-KINDS = (LINEAR, ROBUST, SLIDING, PAPER, OURS, SELF_TUNING)
+LINEAR, USUAL, ROBUST = 'linear filter', 'usual Kalman filter', 'adaptive filter'
+SLIDING, PAPER, OURS, SELF_TUNING = 'sliding mode', 'paper', 'ours, tuned', 'ours, self-tuning'
+KINDS = (LINEAR, USUAL, ROBUST, SLIDING, PAPER, OURS, SELF_TUNING)
+"""Kinds of methods; the usual Kalman filter, whose d is a random walk, is one of its own."""
 Values = Mapping[str, Any]
 Run = Callable[[Recording], dict[str, Estimates]]
 """Estimates by readout: one method may offer several (filtered and internal states)."""
