@@ -30,8 +30,9 @@ STYLES = {
     SELF_TUNING: ('#D55E00', '*', 90),
 }  # fmt: skip
 """Okabe-Ito, and a grey; marker and its area."""
-FLOOR, CEILING, EDGE = 0.1, 10.0, 40.0
+FLOOR, CEILING, EDGE = 0.3, 10.0, 35.0
 """Smallest and largest ratio that is drawn, and where the linear filter's error stands."""
+TICKS = (0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
 SHOWN = (('paper', 'mix'), ('pendulum', 'noise'), ('motor', 'sawtooth'))
 """Plants and disturbances whose estimates are drawn."""
 
@@ -92,7 +93,8 @@ def against_linear(chosen: Chosen, *, jumps: bool) -> Figure:
         axes.axvline(1.0, color=BLACK, linewidth=0.8)
         axes.set(xscale='log', xlim=(0.9 * FLOOR, 1.1 * EDGE), title=PLANTS[plant].text)
         axes.set_yticks(range(len(rows)), rows)
-        axes.xaxis.set_major_formatter('{x:g}')
+        axes.set_xticks(TICKS, [f'{x:g}' for x in TICKS])
+        axes.xaxis.set_minor_formatter('')
         axes.grid(alpha=0.3)
     panels[0].invert_yaxis()
     figure.supxlabel(
