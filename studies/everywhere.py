@@ -31,11 +31,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 from studies import document
-from studies.comparison.evaluation import METHODS
-from studies.comparison.methods.adaptive import Options, unknown_input
+from studies.comparison.evaluation import METHODS, tune
+from studies.comparison.methods.adaptive import HUBER, IMM, NOISE
 from studies.comparison.methods.linear import LINEAR_LIMIT
-from studies.comparison.methods.method import Setting
-from studies.comparison.scores import Estimates, JUDGED_FROM, objective
+from studies.comparison.methods.method import Setting, Values
+from studies.comparison.scores import Estimates, JUDGED_FROM, mean, objective
+from studies.waves import wave
 
 Floats = NDArray[np.float64]
 NAME, RESULTS, DOCS = 'everywhere', 'results.json', Path(__file__).resolve().parents[1] / 'docs'
@@ -106,17 +107,16 @@ CONDITIONS = {
 }
 TUNED = 'as tuned'
 SELF, ONCE, PRESET = 'self-tuning', 'Kalman, tuned once', 'shipped file'
-HUBER, ADAPTIVE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'
 STYLES = {
     SELF: ('#D55E00', '*', 90), ONCE: ('#0072B2', 'o', 26), PRESET: ('#009E73', 's', 22),
-    HUBER: ('#56B4E9', '^', 26), ADAPTIVE: ('#CC79A7', 'D', 20), IMM: ('#000000', 'x', 26),
+    HUBER: ('#56B4E9', '^', 26), NOISE: ('#CC79A7', 'D', 20), IMM: ('#000000', 'x', 26),
 }  # fmt: skip
-PEERS = {
-    HUBER: [(1.0, Options(huber=limit)) for limit in (1.5, 2.5, 4.0)],
-    ADAPTIVE: [(1.0, Options(memory=seconds)) for seconds in (0.3, 1.0, 10.0)],
-    IMM: [(f, Options(stay=seconds)) for f in (1.5, 2.0, 3.0) for seconds in (1.0, 10.0)],
+PEERS: dict[str, list[dict[str, float]]] = {
+    HUBER: [{'huber': limit} for limit in (1.5, 2.5, 4.0)],
+    NOISE: [{'memory': seconds} for seconds in (0.3, 1.0, 10.0)],
+    IMM: [{'spread': f, 'stay': seconds} for f in (1.5, 2.0, 3.0) for seconds in (1.0, 10.0)],
 }
-"""What the tuning chooses from: a factor between the bandwidths of three models, and options."""
+"""What the tuning chooses from, around the filter that it has found."""
 CEILING = 20.0
 """Largest ratio that is drawn."""
 
@@ -128,10 +128,10 @@ class Size(NamedTuple):
     kinds: tuple[str, ...] = ('sine', 'chirp', 'ou', 'square', 'pulses')
     plants: tuple[str, ...] = tuple(PLANTS)
     conditions: tuple[str, ...] = tuple(CONDITIONS)
-    bandwidths: int = 9
+    trials: int = 160
 
 
-SHORT = Size(7.0, ('sine', 'ou'), ('motor',), (TUNED, 'noise x 10'), 4)
+SHORT = Size(7.0, ('sine', 'ou'), ('motor',), (TUNED, 'noise x 10'), 24)
 
 
 class Member(NamedTuple):
@@ -139,20 +139,18 @@ class Member(NamedTuple):
 
     derivatives: int
     bandwidth: float
-    ratio: float
-    """Decay over bandwidth."""
+    decay: float
 
-    def intensity(self, order: int) -> float:
-        """Return that of the white noise that drives d (D 17), over the variance of y's noise."""
-        return self.bandwidth ** (2 * (order + 1 + self.derivatives)) / RATE
-
-    def at(self, order: int, rate: float) -> dict[str, float]:
+    def at(self, order: int, rate: float) -> Values:
         """Return the values of this model of d at a rate: its intensity stays (D 17)."""
-        quicker = (rate / RATE) ** (0.5 / (order + 1 + self.derivatives))
         return {
-            'derivatives': float(self.derivatives), 'bandwidth': self.bandwidth * quicker,
-            'decay': self.ratio * self.bandwidth,
+            'derivatives': float(self.derivatives), 'decay': self.decay,
+            'bandwidth': self.bandwidth * self.quicker(order, rate),
         }  # fmt: skip
+
+    def quicker(self, order: int, rate: float) -> float:
+        """Return the bandwidth at a rate over that at `RATE`."""
+        return float((rate / RATE) ** (0.5 / (order + 1 + self.derivatives)))
 
 
 class Once(NamedTuple):
@@ -160,24 +158,6 @@ class Once(NamedTuple):
 
     member: Member
     peers: dict[str, int]
-
-
-def wave(kind: str, t: Floats, omega: float, random: np.random.Generator) -> Floats:
-    """Return a signal of unit RMS that moves at about `omega` rad/s."""
-    phase = random.uniform(0.0, 2.0 * np.pi)
-    if kind == 'sine':
-        d = np.sin(omega * t + phase)
-    elif kind == 'square':
-        d = np.sign(np.sin(omega * t + phase))
-    elif kind == 'chirp':  # from 0.3 to 2 omega
-        d = np.sin(omega * t * (0.3 + 0.85 * t / t[-1]) + phase)
-    elif kind == 'ou':
-        d = lfilter([1.0], [1.0, -math.exp(-omega * STEP)], random.standard_normal(len(t)))
-    else:
-        d = np.zeros(len(t))
-        for middle in np.arange(random.uniform(0.0, 3.0), t[-1], 2.6 * np.pi / omega):
-            d += random.standard_normal() * np.exp(-0.5 * (1.5 * omega * (t - middle)) ** 2)
-    return np.asarray(d / np.sqrt(np.mean(d**2)))
 
 
 def recording(
@@ -217,37 +197,23 @@ def error(r: Recording, d: Floats) -> float:
     return objective(r, Estimates(r.z, d))
 
 
-def mean(errors: list[float]) -> float:
-    """Return the geometric mean."""
-    return float(np.exp(np.mean(np.log(errors))))
-
-
-def kalman(setting: Setting, member: Member, recordings: list[Recording]) -> list[float]:
-    """Return the errors of a steady-state Kalman filter; infinite where it does not exist."""
+def errors_of(
+    name: str, setting: Setting, values: Values, recordings: list[Recording]
+) -> list[float]:
+    """Return the errors of a method of the comparison; infinite where it does not exist."""
     try:
-        values = member.at(setting.model.order, 1.0 / setting.period)
-        run = METHODS[LINEAR_LIMIT].prepare(setting, values)
+        run = METHODS[name].prepare(setting, values)
     except ConfigurationError:
         return [math.inf] * len(recordings)
     return [error(r, run(r)['filtered'].d) for r in recordings]
 
 
-def best_member(setting: Setting, recordings: list[Recording], count: int) -> Member:
-    """Tune with the truth: bandwidths for each k, then finer, with decays, for the better two."""
-
-    def judged(member: Member) -> float:
-        return mean(kalman(setting, member, recordings))
-
-    widths = np.geomspace(0.5, 300.0, count).tolist()
-    of_each = [min((Member(k, w, 0.3) for w in widths), key=judged) for k in range(3)]
-    reach = [(widths[1] / widths[0]) ** power for power in (-0.5, -0.25, 0.0, 0.25, 0.5)]
-    finer = [
-        Member(m.derivatives, m.bandwidth * f, r)
-        for m in sorted(of_each, key=judged)[:2]
-        for f in reach
-        for r in (0.05, 0.2, 0.7, 2.0)
-    ]
-    return min([*of_each, *finer], key=judged)
+def best_member(setting: Setting, recordings: list[Recording], trials: int) -> Member:
+    """Tune the Kalman filter with the truth, as the comparison does."""
+    found = tune(METHODS[LINEAR_LIMIT], setting, recordings, trials, SEED).values
+    member = Member(int(found['derivatives']), found['bandwidth'], found['decay'])
+    quicker = member.quicker(setting.model.order, 1.0 / setting.period)
+    return member._replace(bandwidth=member.bandwidth / quicker)
 
 
 def online(r: Recording, parameters: dict[str, Any]) -> tuple[Floats, Floats]:
@@ -257,27 +223,11 @@ def online(r: Recording, parameters: dict[str, Any]) -> tuple[Floats, Floats]:
     return found.unknown_input, found.standard_deviation
 
 
-def peer(
-    name: str, number: int, setting: Setting, member: Member, recordings: list[Recording]
-) -> list[float]:
-    """Return the errors of one of `PEERS` around a tuned filter."""
-    spread, options = PEERS[name][number]
-    intensities = [
-        member._replace(bandwidth=member.bandwidth * factor).intensity(setting.model.order)
-        for factor in ((1.0,) if spread == 1.0 else (1.0 / spread, 1.0, spread))
-    ]
-    decay = member.ratio * member.bandwidth
-    return [
-        error(r, unknown_input(setting, member.derivatives, decay, intensities, options, r))
-        for r in recordings
-    ]
-
-
-def best_peers(setting: Setting, member: Member, recordings: list[Recording]) -> dict[str, int]:
+def best_peers(setting: Setting, values: Values, recordings: list[Recording]) -> dict[str, int]:
     """Tune the peers with the truth."""
 
     def judged(name: str, number: int) -> float:
-        return mean(peer(name, number, setting, member, recordings))
+        return mean(errors_of(name, setting, {**values, **PEERS[name][number]}, recordings))
 
     return {
         name: min(range(len(choices)), key=lambda number, name=name: judged(name, number))
@@ -290,26 +240,28 @@ def cell(name: str, condition: str, size: Size, once: Once | None) -> dict[str, 
     plant, c = PLANTS[name], CONDITIONS[condition]
     recordings = [recording(plant, c, kind, size.duration) for kind in size.kinds]
     setting = setting_of(plant, c)
-    anew = best_member(setting, recordings, size.bandwidths)
-    once = once or Once(anew, best_peers(setting, anew, recordings))
+    found = best_member(setting, recordings, size.trials)
+    anew = found.at(setting.model.order, c.rate)
+    once = once or Once(found, best_peers(setting, anew, recordings))
+    values = once.member.at(setting.model.order, c.rate)
     model = {'order': setting.model.order, 'phi': list(setting.model.phi)}
     preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | model
     tuning = [online(r, model | {'gains': 'self_tuning'}) for r in recordings]
     errors = {
         SELF: [error(r, d) for r, (d, _) in zip(recordings, tuning, strict=True)],
-        ONCE: kalman(setting, once.member, recordings),
+        ONCE: errors_of(LINEAR_LIMIT, setting, values, recordings),
         PRESET: [error(r, online(r, preset)[0]) for r in recordings],
     }
-    for peer_name, number in once.peers.items():
-        errors[peer_name] = peer(peer_name, number, setting, once.member, recordings)
-    yard = mean(kalman(setting, anew, recordings))
+    for peer, number in once.peers.items():
+        errors[peer] = errors_of(peer, setting, {**values, **PEERS[peer][number]}, recordings)
+    yard = mean(errors_of(LINEAR_LIMIT, setting, anew, recordings))
     inside = [
         [np.mean((np.abs(d - r.d) < k * s[:, -1])[r.t >= JUDGED_FROM]) for k in (1.0, 1.96)]
         for r, (d, s) in zip(recordings, tuning, strict=True)
     ]
     return {
         'plant': name, 'condition': condition, 'tuned anew': round(yard, 5),
-        'member': list(anew), 'peers': once.peers,
+        'member': list(found), 'peers': once.peers,
         'ratios': {k: float(f'{mean(e) / yard:.4g}') for k, e in errors.items()},
         'inside': [round(float(x), 3) for x in np.mean(inside, axis=0)],
     }  # fmt: skip

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from studies.comparison.evaluation import METHODS
-from studies.comparison.methods.linear import LINEAR
+from studies.comparison.methods.adaptive import ADAPTIVE
+from studies.comparison.methods.linear import FILTERS
 from studies.comparison.methods.method import Setting
 
 MODELS = {
@@ -84,7 +85,7 @@ def test_kalman_gain_is_the_limit_of_the_riccati_recursion(name, chain, decay):
 @pytest.mark.parametrize('period', PERIODS)
 @pytest.mark.parametrize('name', ['paper', 'motor'])
 @pytest.mark.parametrize(
-    'peer', [m.name for m in LINEAR if all(word not in m.name for word in ('decaying', 'Matern'))]
+    'peer', [m.name for m in FILTERS if all(word not in m.name for word in ('decaying', 'Matern'))]
 )
 def test_error_of_each_linear_peer_decays_exactly_to_zero(peer, name, period):
     """Without noise and with constant d the error is the transition's power, so it vanishes."""
@@ -108,6 +109,20 @@ def test_prediction_bridges_a_gap():
     after = t > 5.2
     np.testing.assert_allclose(found.d[after], 0.8, atol=1e-6)
     np.testing.assert_allclose(found.z[after], r.z[after], atol=1e-6)
+
+
+@pytest.mark.parametrize('name', [m.name for m in ADAPTIVE])
+def test_adaptive_filters_know_the_input_and_bridge_a_gap(name):
+    """A constant d from a noise-free y with a known input: all they say of the noise is wrong."""
+    model, method = MODELS['motor'], METHODS[name]
+    setting = Setting(model, 1e-2, 1.0, 1e-4)
+    t = np.concatenate([np.arange(0.0, 5.0, 1e-2), np.arange(5.3, 8.0, 1e-2)])
+    r = recording(model, t, [0.3, -0.2], 0.8, u=0.02)
+    values = {d.name: d.start for d in method.space(setting)} | {'decay': 1e-6}
+    found = method.prepare(setting, values)(r)['filtered']
+    after = t > 4.0
+    np.testing.assert_allclose(found.d[after], 0.8, atol=1e-3)
+    np.testing.assert_allclose(found.z[after], r.z[after], atol=1e-3)
 
 
 def test_prediction_equals_the_matrix_exponential():

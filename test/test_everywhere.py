@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from studies import document, everywhere
-from studies.comparison.methods.adaptive import Options, unknown_input
+from studies.comparison.methods.adaptive import HUBER, IMM
+from studies.comparison.methods.linear import LINEAR_LIMIT
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
 MOTOR, TUNED = everywhere.PLANTS['motor'], everywhere.CONDITIONS['as tuned']
@@ -23,16 +24,15 @@ def test_the_page_says_what_was_computed():
 @pytest.mark.parametrize('derivatives', [0, 2])
 @pytest.mark.parametrize('rate', [100.0, 1000.0])
 def test_peers_without_their_options_are_the_kalman_filter(derivatives, rate):
-    """Its covariance converges to the steady one; two equal models are one."""
+    """Its covariance converges to the steady one; three equal models are one."""
     condition = TUNED._replace(rate=rate)
     r = everywhere.recording(MOTOR, condition, 'chirp', 10.0)
     setting = everywhere.setting_of(MOTOR, condition)
-    member = everywhere.Member(derivatives, 15.0, 0.3)
-    [expected] = everywhere.kalman(setting, member, [r])
-    intensity = member.intensity(setting.model.order)
-    for count in (1, 2):
-        d = unknown_input(setting, derivatives, 4.5, [intensity] * count, Options(), r)
-        assert everywhere.error(r, d) == pytest.approx(expected, rel=1e-3)
+    values = everywhere.Member(derivatives, 15.0, 4.5).at(setting.model.order, rate)
+    [expected] = everywhere.errors_of(LINEAR_LIMIT, setting, values, [r])
+    for name, options in ((HUBER, {}), (IMM, {'spread': 1.0 + 1e-9, 'stay': 1.0})):
+        [found] = everywhere.errors_of(name, setting, values | options, [r])
+        assert found == pytest.approx(expected, rel=1e-3)
 
 
 def test_what_differs_between_conditions():

@@ -122,6 +122,16 @@ def test_start_is_as_good_as_the_best_kalman_filter(tuner):
     assert tuner.training(tuner.before).objective == pytest.approx(tuner.tried[chosen])
 
 
+def test_gains_that_are_written_are_as_good_as_those_that_were_judged_without_noise():
+    """Written are also rules for when y is lost, which half-widths have to leave room for."""
+    quiet = {'noise_std': 0.0, 'sample_rate': 1000.0, 'disturbances': ['sines']}
+    values = VALUES.changed(quiet)
+    tuner = Tuner(simulated(values, 1), {}, values, 1, jobs=2)
+    judged = tuner.training(tuner.before).error
+    assert judged < 0.1
+    assert tuner.training(tuner.parameters(tuner.before)).error < 1.01 * judged
+
+
 def test_bounds_are_near_a_start_by_kalman_and_far_from_others(tuner):
     def decades(some, name):
         return next(np.log10(d.high / d.low) for d in some.space if d.name == name)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cells of the comparison: plant, disturbance, noise, rate, timing; and their recordings."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 import math
 from typing import Any, NamedTuple
@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
-from fhaosmo_ros.core.simulation.plant import Plant
-from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
-from fhaosmo_ros.core.simulation.recordings import Family, Recording
+from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS, SHAPES
+from fhaosmo_ros.core.simulation.recordings import Family, Floats, Recording
 from fhaosmo_ros.tools.cli.share import shipped
 import numpy as np
 from studies.comparison.methods.method import Setting
+from studies.waves import wave
 
 NOISES = (0.0, 1e-4, 1e-3, 1e-2)
 RATES = (1000.0, 100.0)
@@ -26,6 +26,9 @@ TIMINGS: dict[str, dict[str, float]] = {
     'dropouts': {'dropout': 0.1, 'dropout_length': 0.05},  # the length in seconds
     'outliers': {'outliers': 0.01, 'outlier_std': 50.0},  # in standard deviations of the noise
 }
+JUMPS = ('steps', 'sawtooth', 'impulses', 'stick-slip')
+STAND_IN = 'chirp'
+"""Shape that `Unseen` replaces."""
 STEP = 5e-4
 """Of the simulations, in seconds: Runge-Kutta steps whose error is far below any estimate's."""
 TRAINING_SEED, HELD_OUT_SEED = 1, 1001
@@ -40,8 +43,18 @@ class Disturbance(NamedTuple):
     trained: str
     """Shape that the tuning sees."""
     judged: str
-    """Shape that judges; 'sine' is one that no family has."""
-    band: tuple[float, float]
+    """Shape that judges: one of the family's, or of waves.py, which no tuning sees."""
+    band: tuple[float, float] = WIDE
+
+    @property
+    def jumps(self) -> bool:
+        """True for a d that jumps."""
+        return self.judged in JUMPS
+
+    @property
+    def seen(self) -> bool:
+        """True if the tuning sees this shape."""
+        return self.judged == self.trained
 
 
 class PlantCase(NamedTuple):
@@ -57,33 +70,50 @@ class PlantCase(NamedTuple):
 
 
 BOTH = ('sines', 'steps')
+SMOOTH = {
+    'mix': Disturbance('sines', 'sines'),
+    'chirp': Disturbance('sines', 'chirp'),
+    'noise': Disturbance('sines', 'ou'),
+    'pulses': Disturbance('sines', 'pulses'),
+}
+JUMPING = {'steps': Disturbance('steps', 'steps')} | {
+    name: Disturbance('steps', name) for name in ('sawtooth', 'impulses', 'stick-slip')
+}
+SINES = {'low sine': LOW, 'high sine': HIGH}
 PLANTS = {
     'paper': PlantCase(
         "the paper's plant", 'paper_plant', 0.07, 0.0, False,
-        {
-            'low sine': Disturbance('sines', 'sine', LOW),
-            'high sine': Disturbance('sines', 'sine', HIGH),
-            'mix': Disturbance('sines', 'sines', WIDE),
-            'steps': Disturbance('steps', 'steps', WIDE),
-        },
+        {name: Disturbance('sines', 'sine', band) for name, band in SINES.items()}
+        | SMOOTH | JUMPING,
     ),
-    'pendulum': PlantCase(
-        'pendulum', 'pendulum', 2.5, 0.0, True,
-        {
-            'mix': Disturbance('sines', 'sines', WIDE),
-            'steps': Disturbance('steps', 'steps', WIDE),
-            'chirp': Disturbance('sines', 'chirp', WIDE),
-        },
-    ),
-    'motor': PlantCase(
-        'DC motor', 'dc_motor', 70.0, 1.0, True,
-        {
-            'mix': Disturbance('sines', 'sines', WIDE),
-            'steps': Disturbance('steps', 'steps', WIDE),
-            'chirp': Disturbance('sines', 'chirp', WIDE),
-        },
-    ),
+    'pendulum': PlantCase('pendulum', 'pendulum', 2.5, 0.0, True, SMOOTH | JUMPING),
+    'motor': PlantCase('DC motor', 'dc_motor', 70.0, 1.0, True, SMOOTH | JUMPING),
 }  # fmt: skip
+
+
+class Unseen(Family):
+    """
+    A family whose d has a shape of waves.py.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Of `Family`; its shape is `STAND_IN`.
+    kind : str
+        See `wave`.
+    omega : float
+        rad/s.
+
+    """
+
+    def __init__(self, parameters: Mapping[str, Any], kind: str, omega: float) -> None:
+        super().__init__(parameters)
+        self._kind, self._omega = kind, omega
+
+    def _wave(self, shape: str, t: Floats, random: np.random.Generator) -> Floats:
+        if shape == STAND_IN:
+            return wave(self._kind, t, self._omega, random)
+        return super()._wave(shape, t, random)
 
 
 class Sensor(NamedTuple):
@@ -139,20 +169,26 @@ class Sensor(NamedTuple):
             count *= MORE
         if self.setting().noise == 0.0:
             count = max(1, count // 2)
-        return self._family(shapes, self.disturbances[0]).recordings(count, TRAINING_SEED)
+        values = self._family(shapes, self.disturbances[0])
+        return Family(values).recordings(count, TRAINING_SEED)
 
     @lru_cache(maxsize=6)  # noqa: B019
     def held_out(self, disturbance: str, count: int = HELD_OUT) -> list[Recording]:
         """Return the recordings that judge."""
-        judged = self.case.disturbances[disturbance].judged
-        if judged == 'sine':
-            return [self._sine(disturbance, k) for k in range(count)]
-        return self._family((judged,), disturbance).recordings(count, HELD_OUT_SEED)
+        _, judged, (low, high) = self.case.disturbances[disturbance]
+        if judged in SHAPES:
+            return Family(self._family((judged,), disturbance)).recordings(count, HELD_OUT_SEED)
+        omegas = low * (high / low) ** ((np.arange(count) + 0.5) / count)
+        values = self._family((STAND_IN,), disturbance)
+        return [
+            Unseen(values, judged, float(omega)).recording(k, HELD_OUT_SEED)
+            for k, omega in enumerate(omegas)
+        ]
 
     def _noise(self) -> float:
         return self.noise * (amplitude(self.plant) if self.case.relative else 1.0)
 
-    def _family(self, shapes: Sequence[str], disturbance: str) -> Family:
+    def _family(self, shapes: Sequence[str], disturbance: str) -> dict[str, Any]:
         timing = dict(TIMINGS[self.timing])
         if 'period_jitter' in timing:
             timing['period_jitter'] /= self.rate
@@ -160,36 +196,14 @@ class Sensor(NamedTuple):
             timing['dropout_length'] *= self.rate
         if 'outlier_std' in timing:
             timing['outlier_std'] *= self._noise()
-        return Family(
-            family_values(self.plant)
-            | {
-                'disturbances': list(shapes),
-                'band_of_d': list(self.case.disturbances[disturbance].band),
-                'noise_std': self._noise(),
-                'sample_rate': self.rate,
-            }
-            | timing
-        )
-
-    def _sine(self, disturbance: str, number: int) -> Recording:
-        """Return a recording whose d is one sine, with its own frequency and phase."""
-        random = np.random.default_rng([HELD_OUT_SEED, number])
-        low, high = self.case.disturbances[disturbance].band
-        plant = Plant(
-            self.values()
-            | {
-                'disturbance': 'sine',
-                'disturbance_amplitude': np.sqrt(2.0) * self.case.rms_of_d,
-                'disturbance_omega': low * (high / low) ** ((number + 0.5) / HELD_OUT),
-                'disturbance_phase': random.uniform(0.0, 2.0 * np.pi),
-                'noise_std': self._noise(),
-                'noise_seed': HELD_OUT_SEED + number,
-                'integration_step': STEP,
-            }
-        )
-        t = np.arange(int(20.0 * self.rate) + 1) / self.rate
-        truth = plant.simulate(t)
-        return Recording(t, truth.y, np.zeros(len(t)), truth.z, truth.unknown_input, 'sine')
+        return {
+            **family_values(self.plant),
+            'disturbances': list(shapes),
+            'band_of_d': list(self.case.disturbances[disturbance].band),
+            'noise_std': self._noise(),
+            'sample_rate': self.rate,
+            **timing,
+        }
 
 
 @lru_cache
@@ -222,20 +236,20 @@ def sensors(quick: bool = False) -> list[Sensor]:
     """Return all sensors of the comparison, the ones that cost most first."""
     if quick:
         return [
-            Sensor('paper', ('steps',), 1e-3, 100.0),
+            Sensor('paper', ('steps', 'impulses'), 1e-3, 100.0),
             Sensor('paper', ('low sine',), 0.0, 100.0),
-            Sensor('motor', ('mix', 'steps', 'chirp'), 1e-3, 100.0),
+            Sensor('motor', ('mix', 'steps', 'pulses'), 1e-3, 100.0),
         ]
     chosen = []
     for rate in RATES:
         for noise in NOISES:
             chosen += [
-                Sensor('paper', (name,), noise, rate) for name in PLANTS['paper'].disturbances
+                Sensor('paper', names, noise, rate)
+                for names in (('low sine',), ('high sine',), tuple(SMOOTH), tuple(JUMPING))
             ]
             # Without noise gains for steps are deadbeat, and gains for smooth d are not.
-            groups = (
-                (('mix', 'chirp'), ('steps',)) if noise == 0.0 else (('mix', 'steps', 'chirp'),)
-            )
+            both = (tuple(SMOOTH | JUMPING),)
+            groups = (tuple(SMOOTH), tuple(JUMPING)) if noise == 0.0 else both
             chosen += [
                 Sensor(plant, names, noise, rate)
                 for plant in ('pendulum', 'motor')

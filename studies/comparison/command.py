@@ -14,14 +14,14 @@ from fhaosmo_ros.tools.cli.progress import progress
 from studies import document
 from studies.comparison import figures, results, tables
 from studies.comparison.cells import Sensor, sensors
-from studies.comparison.evaluation import evaluate, METHODS, seconds_a_sample
+from studies.comparison.evaluation import evaluate, METHODS, methods_for, seconds_a_sample
 from studies.comparison.methods import steps_bound
 from studies.comparison.results import Entry, Results
 from studies.comparison.verdicts import verdicts
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 FOLDER, RESULTS = 'comparison', 'results.json'
-TRIALS, QUICK_TRIALS = 160, 15
+TRIALS, QUICK_TRIALS = 200, 15
 TRAINING, QUICK_TRAINING = 4, 1
 
 
@@ -94,7 +94,7 @@ def tune_all(
     chosen: list[Sensor], trials: int, training: int, workers: Workers
 ) -> tuple[list[Entry], dict[Sensor, float]]:
     """Tune and evaluate all methods for these sensors, and bound the error for step signals."""
-    tasks = [(sensor, name) for sensor in chosen for name in METHODS]
+    tasks = [(sensor, name) for sensor in chosen for name in methods_for(sensor)]
     known = [sensor for sensor in chosen if steps_bound.applies(sensor)]
     calls: dict[Any, tuple[Any, ...]] = {
         task: (_tune_and_evaluate, *task, trials, training) for task in tasks
@@ -109,8 +109,8 @@ def tune_all(
 
 
 def sample_times(entries: list[Entry]) -> dict[str, float]:
-    """Return the time (s) that each method takes for a sample of the first sensor."""
-    first = entries[0].sensor
+    """Return the time (s) that each method takes for a sample of a sensor for all of them."""
+    first = next(e.sensor for e in entries if methods_for(e.sensor) == list(METHODS))
     return {
         e.method: seconds_a_sample(e.method, e.tuned, first) for e in entries if e.sensor == first
     }

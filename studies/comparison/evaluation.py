@@ -2,30 +2,35 @@
 """Tune a method for a sensor, and judge it on what the tuning has not seen."""
 
 from collections.abc import Callable, Sequence
+import math
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.tools.tuning.objective import SMALLEST
 from fhaosmo_ros.tools.tuning.search.minimise import BAD, Dimension, minimise, StudyOptions
 import numpy as np
 from studies.comparison.cells import Sensor
-from studies.comparison.methods.linear import LINEAR
-from studies.comparison.methods.method import Method, Setting, Values
-from studies.comparison.methods.ours import OUR_METHOD
-from studies.comparison.methods.sliding import SLIDING
+from studies.comparison.methods.adaptive import ADAPTIVE
+from studies.comparison.methods.linear import FILTERS
+from studies.comparison.methods.method import Method, Search, Setting, Values
+from studies.comparison.methods.ours import OUR_METHODS
+from studies.comparison.methods.sliding import OBSERVERS
 from studies.comparison.scores import Estimates, objective, Scores, scores
 
 REPEATS = 5
 HOPELESS = 1.5
 """A trial this many times worse than the best one so far is not run on more recordings."""
-METHODS: dict[str, Method] = {method.name: method for method in (*LINEAR, *SLIDING, OUR_METHOD)}
+METHODS: dict[str, Method] = {
+    method.name: method for method in (*FILTERS, *ADAPTIVE, *OBSERVERS, *OUR_METHODS)
+}
 
 
 class Tuned(NamedTuple):
     """A method's best values on the training recordings, and which of its readouts was best."""
 
-    values: dict[str, float]
+    values: dict[str, Any]
     readout: str
     training: float
 
@@ -37,8 +42,8 @@ class Outcome(NamedTuple):
     Attributes
     ----------
     value : float
-        Average of the objective over the recordings, of the best readout; an estimate where
-        not all of them were run.
+        Geometric mean of the objective over the recordings, of the best readout; an estimate
+        where not all of them were run.
     readout : str
         Its name.
     averages : list of float
@@ -72,9 +77,10 @@ def trial(
     averages: list[float] = []
     for count, recording in enumerate(recordings, 1):
         for name, estimates in run(recording).items():
-            totals[name] = totals.get(name, 0.0) + objective(recording, estimates)
+            logarithm = math.log(max(objective(recording, estimates), SMALLEST))
+            totals[name] = totals.get(name, 0.0) + logarithm
         best = min(totals, key=totals.__getitem__)
-        averages.append(totals[best] / count)
+        averages.append(math.exp(totals[best] / count))
         if not averages[-1] <= (HOPELESS * rival[count - 1] if rival else BAD):
             break
     value = averages[-1]
@@ -99,7 +105,7 @@ def tune(
         return found.value
 
     if method.tune is not None:
-        values = method.tune(judged, setting, trials, seed)
+        values = method.tune(Search(judged, setting, recordings, trials, seed))
     elif len(space) == 1:
         values = _scan(judged, space[0], trials)
     elif space:
@@ -143,13 +149,19 @@ def evaluate(sensor: Sensor, name: str, training: int, trials: int) -> tuple[Tun
     ]
 
 
+def methods_for(sensor: Sensor) -> list[str]:
+    """Return the methods that are compared for a sensor."""
+    quiet = sensor.setting().noise == 0.0
+    return [name for name, method in METHODS.items() if not (quiet and method.needs_noise)]
+
+
 def seconds_a_sample(name: str, tuned: Tuned, sensor: Sensor) -> float:
-    """Return the time that a tuned method takes for a sample; the least of some runs."""
+    """Return the processor time that a tuned method takes for a sample; the least of some runs."""
     recording = sensor.training(1)[0]
     run = METHODS[name].prepare(sensor.setting(), tuned.values)
     best = float('inf')
     for _ in range(REPEATS):
-        begin = time.perf_counter()
+        begin = time.process_time()
         run(recording)
-        best = min(best, time.perf_counter() - begin)
+        best = min(best, time.process_time() - begin)
     return best / len(recording.t)

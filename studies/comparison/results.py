@@ -7,8 +7,8 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from studies.comparison.cells import PLANTS, Sensor
-from studies.comparison.evaluation import Tuned
+from studies.comparison.cells import Disturbance, PLANTS, Sensor
+from studies.comparison.evaluation import METHODS, Tuned
 from studies.comparison.scores import Scores
 
 
@@ -32,9 +32,17 @@ class Cell(NamedTuple):
         """Return the plant's name in words."""
         return PLANTS[self.sensor.plant].text
 
+    @property
+    def kind(self) -> Disturbance:
+        """Return the kind of d."""
+        return self.sensor.case.disturbances[self.disturbance]
+
 
 Table = dict[Cell, dict[str, Scores]]
 """Scores by cell and method, both in the order of the comparison."""
+
+Chosen = dict[Cell, dict[str, tuple[str, Scores]]]
+"""By cell and kind of method: a method's name and its scores."""
 
 
 class Results(NamedTuple):
@@ -70,6 +78,16 @@ class Results(NamedTuple):
                     ):
                         table.setdefault(Cell(entry.sensor, disturbance), {})[name] = s
         return dict(sorted(table.items(), key=lambda item: _place(item[0])))
+
+    def best_of_kinds(self) -> Chosen:
+        """Return for each cell the method of each kind whose error in training is smallest."""
+        trained = {(e.sensor, e.method): e.tuned.training for e in self.entries}
+        chosen: Chosen = {}
+        for cell, scores in self.table(list(METHODS)).items():
+            for name in sorted(scores, key=lambda name, c=cell: trained[c.sensor, name]):
+                kind = METHODS[name].kind
+                chosen.setdefault(cell, {}).setdefault(kind, (name, scores[name]))
+        return chosen
 
     def find(self, sensor: Sensor, method: str) -> Entry | None:
         """Return an entry."""

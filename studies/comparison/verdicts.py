@@ -6,12 +6,13 @@ from typing import NamedTuple
 
 from studies.comparison.evaluation import METHODS
 from studies.comparison.methods.linear import LINEAR_LIMIT
-from studies.comparison.methods.ours import OURS
+from studies.comparison.methods.method import LINEAR, OURS, USUAL
 from studies.comparison.results import Cell, Table
 from studies.comparison.scores import Scores
 
 KALMAN = 'Kalman'
-LINEAR = [name for name, method in METHODS.items() if method.linear and name != LINEAR_LIMIT]
+PEERS = [name for name, m in METHODS.items() if m.kind in (LINEAR, USUAL) and name != LINEAR_LIMIT]
+"""The linear filters with a name of their own."""
 
 
 class Bar(NamedTuple):
@@ -40,7 +41,7 @@ def _kalman(scores: dict[str, Scores]) -> float:
 
 
 def _best_linear(scores: dict[str, Scores]) -> float:
-    return min(scores[name].d for name in LINEAR if name in scores)
+    return min(scores[name].d for name in PEERS if name in scores)
 
 
 BARS = (

@@ -19,6 +19,7 @@ from fhaosmo_ros.tools.tuning.search.study import FinishedTrial
 from fhaosmo_ros.tools.tuning.source import TuningData
 from fhaosmo_ros.tools.tuning.stability import least_damping
 from fhaosmo_ros.tools.tuning.start.find import find_start, StartProblem, with_scheme
+import numpy as np
 
 DIGITS = 4
 """Of the gains that are written, unless rounding raises their objective by more than `LOSS`."""
@@ -29,6 +30,13 @@ LEAST_DAMPING, DAMPING_WEIGHT = 0.1, 10.0
 """Of the errors' dynamics: gains with less suit their recordings and fail on others."""
 PARETO_WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
 """Weights of the second objective; each has a search of its own."""
+
+LOST_TIME, LOST_SAMPLES = 0.1, 20
+"""
+Seconds, and at least so many samples, for which the innovation exceeds the largest half-width
+before the estimator restarts. With all levels saturated the chain of integrators may oscillate
+without end.
+"""
 
 
 class TrialScores(NamedTuple):
@@ -181,6 +189,26 @@ class Tuner:
         except ConfigurationError:  # a value out of its bounds, or values that do not fit
             return TrialScores(*(math.inf,) * 4)
         return TrialScores(*evaluation[:4])
+
+    def with_readout(self, gains: Mapping[str, Any]) -> dict[str, Any]:
+        """Return gains with internal or filtered variables; held-out recordings do not decide."""
+        return {'estimate_from': self.training(gains).estimate_from, **gains}
+
+    def parameters(self, gains: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what the estimator needs: what is fixed, and these gains."""
+        values = self.fixed | self.with_readout(gains)
+        shown = ESTIMATOR_PARAMETERS.complete(values)
+        fuzzy = shown['structure'] == 'levant' and shown['variant'].startswith('fuzzy')
+        if fuzzy and not shown['noise_size']:
+            period = float(np.median(np.diff(self.data.training[0].t)))
+            values = {
+                'epsilon': max(shown['fuzzy_widths']),
+                'divergence_time': float(f'{max(LOST_TIME, LOST_SAMPLES * period):.4g}'),
+            } | values
+        # The gains fit these only, so the file has them even where they are the defaults.
+        for name in ('variant', 'scheme', 'unknown_input'):
+            values[name] = shown[name]
+        return ESTIMATOR_PARAMETERS.part_of(values)
 
     def search(
         self,

@@ -28,12 +28,6 @@ REACH = 1.0
 """Distance of the outermost values from the best, in decades or (linear) half ranges."""
 SHOWN = 3
 """Recordings in the figure of estimates."""
-LOST_TIME, LOST_SAMPLES = 0.1, 20
-"""
-Seconds, and at least so many samples, for which the innovation exceeds the largest half-width
-before the estimator restarts. With all levels saturated the chain of integrators may oscillate
-without end.
-"""
 SECOND = {
     'chatter': 'chatter of d, powers of ten',
     'settling': 'settling, share of the time',
@@ -51,18 +45,16 @@ def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str
 
     """
     folder.mkdir()
-    gains = changes(result.best)
-    # The training recordings decide for internal or filtered variables; the held-out ones do not.
-    gains['estimate_from'] = tuner.training(gains).estimate_from
+    gains = tuner.with_readout(changes(result.best))
     name = 'given' if tuner.before_is_given else 'start'
-    before = {'estimate_from': tuner.training(tuner.before).estimate_from} | tuner.before
+    before = tuner.with_readout(tuner.before)
     columns = [
         report.Column(f'{title}, {data}', objective(values), objective)
         for title, values in ((name, before), ('tuned', gains))
         for data, objective in (('training', tuner.training), ('held out', tuner.held_out))
     ]
     tuned = columns[2:]
-    parameters = _parameters(tuner, gains)
+    parameters = tuner.parameters(gains)
     comments = _comments(tuner, result, command, tuned)
     (folder / 'gains.yaml').write_text(report.parameter_file(parameters, comments), 'utf-8')
     cautions = report.warnings(tuner.space, result.best, tuned, tuner.data)
@@ -91,23 +83,6 @@ def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str
 def _pairs(several: Iterable[TrialScores], second: str) -> np.ndarray:
     """Return error and second objective, a row each."""
     return np.array([(scores.error, getattr(scores, second)) for scores in several])
-
-
-def _parameters(tuner: Tuner, gains: dict[str, Any]) -> dict[str, Any]:
-    """Return what the estimator needs: what was set for it, and what was result."""
-    values = tuner.fixed | gains
-    shown = ESTIMATOR_PARAMETERS.complete(values)
-    fuzzy = shown['structure'] == 'levant' and shown['variant'].startswith('fuzzy')
-    if fuzzy and not shown['noise_size']:
-        period = float(np.median(np.diff(tuner.data.training[0].t)))
-        values = {
-            'epsilon': max(shown['fuzzy_widths']),
-            'divergence_time': float(f'{max(LOST_TIME, LOST_SAMPLES * period):.4g}'),
-        } | values
-    # The gains fit these only, so the file has them even where they are the defaults.
-    for name in ('variant', 'scheme', 'unknown_input'):
-        values[name] = shown[name]
-    return ESTIMATOR_PARAMETERS.part_of(values)
 
 
 def _comments(

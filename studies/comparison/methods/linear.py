@@ -16,11 +16,11 @@ from fhaosmo_ros.tools.tuning.start.find import DERIVATIVES
 from fhaosmo_ros.tools.tuning.start.sampled_model import pair, SampledModel
 import numpy as np
 from studies.comparison.methods.constant_gain import estimates
-from studies.comparison.methods.method import Method, Run, Setting, Values
+from studies.comparison.methods.method import LINEAR, Method, Run, Search, Setting, USUAL, Values
 from studies.comparison.scores import Estimates
 
 LINEAR_LIMIT = 'Kalman, Matern'
-"""Our observer equals this filter for small innovations: a reference, not a competitor."""
+"""Our observer equals this filter for small innovations."""
 REACH = 10.0
 """How far a search for the bandwidth goes, as a factor to both sides."""
 LONGEST = 1.5
@@ -107,66 +107,68 @@ def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...
     )
 
 
-def _tune_matern(
-    objective: Callable[[Values], float], setting: Setting, trials: int, seed: int
-) -> dict[str, float]:
-    """Search with each number of derivatives of d, as ours does first."""
-    best: tuple[float, dict[str, float]] = (float('inf'), {})
-    for k in DERIVATIVES:
-        fixed = {'derivatives': float(k)}
-        found = minimise(
-            lambda v, fixed=fixed: objective(fixed | v),
-            matern_space(setting, k),
-            max(1, trials // len(DERIVATIVES)),
-            StudyOptions(seed),
-            jobs=1,
-        )
-        if not best[1] or found.value < best[0]:
-            best = found.value, fixed | found.best
-    return best[1]
+def each_order(*more: Dimension) -> Callable[[Search], Values]:
+    """Return a search of bandwidth, decay and `more`, with each number of derivatives of d."""
+
+    def tune(search: Search) -> Values:
+        best: tuple[float, Values] = (float('inf'), {})
+        for k in DERIVATIVES:
+            fixed = {'derivatives': float(k)}
+            found = minimise(
+                lambda v, fixed=fixed: search.judged(fixed | v),
+                (*matern_space(search.setting, k), *more),
+                max(1, search.trials // len(DERIVATIVES)),
+                StudyOptions(search.seed),
+                jobs=1,
+            )
+            if not best[1] or found.value < best[0]:
+                best = found.value, fixed | found.best
+        return best[1]
+
+    return tune
 
 
-LINEAR = (
+FILTERS = (
     Method(
         'Kalman',
         'steady-state Kalman filter, d a random walk',
-        True,
+        USUAL,
         lambda s: (_bandwidth('bandwidth', s),),
         _prepare(1, _kalman),
     ),
     Method(
         'Kalman, ramp',
         'steady-state Kalman filter, d and its derivative random walks',
-        True,
+        LINEAR,
         lambda s: (_bandwidth('bandwidth', s), _bandwidth('drift_bandwidth', s)),
         _prepare(2, _kalman_ramp),
     ),
     Method(
         'Kalman, decaying',
         'steady-state Kalman filter, d a random walk that decays',
-        True,
+        LINEAR,
         matern_space,
         _prepare(1, _kalman),
     ),
     Method(
         LINEAR_LIMIT,
         'steady-state Kalman filter, d a Matern process as in ours',
-        True,
+        LINEAR,
         matern_space,
         _prepare(1, _kalman),
-        _tune_matern,
+        each_order(),
     ),
     Method(
         'ESO',
         'high-gain (extended state) observer, all poles at one place',
-        True,
+        LINEAR,
         lambda s: (_bandwidth('bandwidth', s),),
         _prepare(1, _eso, integrators_only=True),
     ),
     Method(
         'Luenberger',
         'Luenberger observer with disturbance state, all poles free',
-        True,
+        LINEAR,
         _luenberger_space,
         _prepare(1, _luenberger),
     ),

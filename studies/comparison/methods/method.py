@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every method of the comparison is: parameters with logarithmic ranges, and a run."""
 
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.simulation.recordings import Recording
@@ -13,7 +13,11 @@ ROUNDING = 1e-15
 """Noise of a y about 1."""
 DEADBEAT = 3.0
 """Bandwidth times period of an observer that forgets all but the last few samples."""
-Values = Mapping[str, float]
+LINEAR, USUAL, ROBUST = 'linear filter', 'usual Kalman filter', 'adaptive filter'
+SLIDING, PAPER, OURS, SELF_TUNING = 'sliding mode', 'paper', 'ours, tuned', 'ours, self-tuning'
+KINDS = (LINEAR, USUAL, ROBUST, SLIDING, PAPER, OURS, SELF_TUNING)
+"""Kinds of methods; the usual Kalman filter, whose d is a random walk, is one of its own."""
+Values = Mapping[str, Any]
 Run = Callable[[Recording], dict[str, Estimates]]
 """Estimates by readout: one method may offer several (filtered and internal states)."""
 
@@ -57,6 +61,29 @@ class Setting(NamedTuple):
         return float(min(ratio ** (1.0 / (levels - 0.5)), DEADBEAT / self.period))
 
 
+class Search(NamedTuple):
+    """
+    What a method is tuned with.
+
+    Attributes
+    ----------
+    judged : callable
+        From values to the objective over all recordings.
+    setting : Setting
+    recordings : sequence of Recording
+    trials : int
+        How often an objective may be evaluated.
+    seed : int
+
+    """
+
+    judged: Callable[[Values], float]
+    setting: Setting
+    recordings: Sequence[Recording]
+    trials: int
+    seed: int
+
+
 class Method(NamedTuple):
     """
     A way to estimate z and d.
@@ -67,22 +94,24 @@ class Method(NamedTuple):
         Key in results, and head of its column.
     text : str
         What it is, in a line.
-    linear : bool
-        True for a linear peer.
+    kind : str
+        One of `KINDS`.
     space : callable
         Parameters to tune for a setting; empty where none is.
     prepare : callable
         From a setting and values to a run; raises ConfigurationError for values that make no
         observer.
     tune : callable, optional
-        A search of its own: from an objective, a setting, a number of trials and a seed to
-        values.
+        A search of its own.
+    needs_noise : bool
+        True for one that is about the noise, which there has to be.
 
     """
 
     name: str
     text: str
-    linear: bool
+    kind: str
     space: Callable[[Setting], tuple[Dimension, ...]]
     prepare: Callable[[Setting, Values], Run]
-    tune: Callable[[Callable[[Values], float], Setting, int, int], dict[str, float]] | None = None
+    tune: Callable[[Search], Values] | None = None
+    needs_noise: bool = False

@@ -17,7 +17,7 @@ from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.cli.share import shipped
 from fhaosmo_ros.tools.tuning.search.minimise import Dimension
 import numpy as np
-from studies.comparison.methods.method import Method, Run, Setting, Values
+from studies.comparison.methods.method import Method, PAPER, Run, Setting, SLIDING, Values
 from studies.comparison.scores import Estimates
 
 Parameters = Callable[[Setting, Values], Mapping[str, Any]]
@@ -89,39 +89,39 @@ def _none(setting: Setting) -> list[Dimension]:
     return []
 
 
-SLIDING = (
+OBSERVERS = (
     Method(
         'Levant, explicit',
         "Levant's robust exact differentiator with Phi, explicit Euler",
-        False,
+        SLIDING,
         _levant_space,
         prepared(_levant('explicit')),
     ),
     Method(
         'Levant, implicit',
         'the same, implicit Euler',
-        False,
+        SLIDING,
         _levant_space,
         prepared(_levant('implicit')),
     ),
     Method(
         'paper: sign',
         "sign observer with the paper's gains",
-        False,
+        PAPER,
         _none,
         prepared(_papers_gains('sign')),
     ),
     Method(
         'paper: fuzzy',
         "fuzzy observer with the paper's gains",
-        False,
+        PAPER,
         _none,
         prepared(_papers_gains('fuzzy')),
     ),
     Method(
         'paper: adaptive',
         "fuzzy observer with adapted gamma and the paper's gains",
-        False,
+        PAPER,
         _none,
         prepared(_papers_gains('fuzzy_adaptive')),
     ),

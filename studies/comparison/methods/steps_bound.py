@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from studies.comparison.cells import family_values, Sensor
 from studies.comparison.methods.method import Setting
-from studies.comparison.scores import JUDGED_FROM
+from studies.comparison.scores import JUDGED_FROM, mean
 
 BLOCK = 0.01
 """Length of a block of samples in seconds."""
@@ -39,19 +39,18 @@ Floats = NDArray[np.float64]
 def applies(sensor: Sensor) -> bool:
     """Return True for a linear plant, evenly sampled with no or Gaussian noise, whose d steps."""
     return (
-        sensor.plant == 'paper' and sensor.disturbances == ('steps',) and sensor.timing == 'even'
+        sensor.plant == 'paper' and sensor.disturbances[0] == 'steps' and sensor.timing == 'even'
     )
 
 
 def bound(sensor: Sensor) -> float:
-    """Return the RMS error of d over the RMS of d on the recordings that judge."""
+    """Return the error of d on the recordings that judge, as `scores` does."""
     recordings = sensor.held_out('steps')
     if sensor.noise == 0.0:
-        return rms(np.array([_one_sample_late(r) for r in recordings]))
+        return mean(_one_sample_late(r) for r in recordings)
     values = FAMILY_PARAMETERS.defaults() | family_values(sensor.plant)
     interval = values['step_interval']
-    errors = [_error(sensor.setting(), r, interval) for r in recordings]
-    return rms(np.array(errors))
+    return mean(_error(sensor.setting(), r, interval) for r in recordings)
 
 
 def _one_sample_late(recording: Recording) -> float:

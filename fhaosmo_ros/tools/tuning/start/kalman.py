@@ -40,7 +40,7 @@ class KalmanDesign(NamedTuple):
     factor : float
         Bandwidth, relative to the one that this d and the noise ask for.
     width : float
-        Half-width of all levels, in units of the noise.
+        Half-width of all levels, in units of the noise (without any: of y's change in a period).
 
     """
 
@@ -101,7 +101,10 @@ class KalmanGains:
         self._size = float(size[-1])
         # Without noise the fastest observer is deadbeat: this noise is too small to slow it down.
         least = 0.1 * self._size * self._period**model.order
-        self._noise = max(effective_noise(recordings), least_noise, least)
+        noise = max(effective_noise(recordings), least_noise)
+        self._noise = max(noise, least)
+        # Then the start has the largest innovations: what z_2 moves y by in a period.
+        self._unit = noise if noise > least else max(float(size[1]) * self._period, least)
 
     def bandwidth(self, rate: float) -> float:
         """Return the bandwidth (rad/s) of the Kalman filter for a Matern d of this rate (D 17)."""
@@ -121,7 +124,7 @@ class KalmanGains:
 
         """
         decay = self._fixed.get('unknown_input_decay', design.rate)
-        width = design.width * self._noise
+        width = design.width * self._unit
         width = self._fixed.get('fuzzy_widths', [width])[0]
         bandwidth = min(design.factor * self.bandwidth(design.rate), FASTEST / self._period)
         small = max(self._noise, 1e-3 * width)
