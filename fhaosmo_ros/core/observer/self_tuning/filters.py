@@ -35,6 +35,14 @@ def at(d: int, i: int, j: int) -> int:
     return i * d - i * (i - 1) // 2 + j - i
 
 
+@compiled(forceinline=True, fastmath=FAST)
+def add_scaled(row: Floats, factor: float, other: Floats, columns: int) -> None:
+    """Add `other` times a factor, which is often 0, to the first columns of a row."""
+    if factor != 0.0:
+        for g in range(columns):
+            row[g] += factor * other[g]
+
+
 @compiled(fastmath=FAST)
 def predict_states(
     members: Members, n: int, k: int, h: float, mean: Floats, predicted: Floats, ahead: Floats
@@ -58,10 +66,7 @@ def predict_states(
             for g in range(COUNT):
                 row[g] += f2 * second[g]
         for j in range(n):
-            s, other = flow[i, j], x[j]
-            if s != 0.0:
-                for g in range(COUNT):
-                    row[g] += s * other[g]
+            add_scaled(row, flow[i, j], x[j], COUNT)
     for i in range(k + 1):  # exp of D 17: e^(-kappa h) times a polynomial
         row, other = ahead[n + i], x[n + i]
         for g in range(COUNT):
@@ -99,27 +104,6 @@ def add_chain(
 
 
 @compiled(fastmath=FAST)
-def decay(
-    row: Floats,
-    share: float,
-    intensity: Floats,
-    decayed: Floats,
-    ramp: float,
-    curve: float,
-    terms: int,
-    one: Floats,
-    two: Floats,
-    three: Floats,
-    moving: int,
-) -> None:
-    """Write a sum as `add_chain` does, with the weights of d and its derivatives (D 17)."""
-    ramp, curve = ramp if terms > 1 else 0.0, curve if terms > 2 else 0.0
-    for g in range(moving):
-        value = one[g] + ramp * two[g] + curve * three[g]
-        row[g] = share * intensity[g] + decayed[g] * value
-
-
-@compiled(fastmath=FAST)
 def predict_covariances(
     members: Members, n: int, k: int, h: float, ahead: Floats, rest: Floats, moving: int
 ) -> None:
@@ -128,7 +112,8 @@ def predict_covariances(
     kappa, decayed = members.rates[KAPPA], members.rates[DECAYED]
     intensity, d = members.record[INTENSITY, k], n + 1 + k
     product = grid(rest, 0, d * d, moving)  # A P
-    chain = grid(rest, d * d * moving, n * (k + 1), moving)
+    # By what d and its derivatives act on each z, and in the last rows on d itself (D 17)
+    chain = grid(rest, d * d * moving, (n + 1) * (k + 1), moving)
     for i in range(n):
         f0, f1, f2 = flow[i, n], flow[i, n + 1], flow[i, n + 2]
         first = chain[i * (k + 1)]
@@ -140,7 +125,11 @@ def predict_covariances(
                 second[g] = f1 - 2.0 * kappa[g] * f2
         if k > 1:
             chain[i * (k + 1) + 2] = f2
-    ramp, curve, lowest = h, 0.5 * h * h, d
+    for i in range(k + 1):
+        row, factor = chain[n * (k + 1) + i], h**i / FACTORIALS[i]
+        for g in range(moving):
+            row[g] = factor * decayed[g]
+    lowest = d
     for i in range(d - 1, -1, -1):  # A has zeros below its diagonal, most of them
         lowest = min(lowest, i)
         for m in range(i if i < n else 0):
@@ -151,15 +140,10 @@ def predict_covariances(
             terms, e, f = d - a, min(a + 1, d - 1), min(a + 2, d - 1)
             one = p[at(d, min(j, a), max(j, a))]
             two, three = p[at(d, min(j, e), max(j, e))], p[at(d, min(j, f), max(j, f))]
-            if i < n:
-                add_chain(row, 0.0, intensity, chain, i * terms, terms, one, two, three, moving)
-                for m in range(n):
-                    s, other = flow[i, m], p[at(d, min(j, m), max(j, m))]
-                    if s != 0.0:
-                        for g in range(moving):
-                            row[g] += s * other[g]
-            else:
-                decay(row, 0.0, intensity, decayed, ramp, curve, terms, one, two, three, moving)
+            first_weight = min(i, n) * (k + 1)
+            add_chain(row, 0.0, intensity, chain, first_weight, terms, one, two, three, moving)
+            for m in range(n if i < n else 0):
+                add_scaled(row, flow[i, m], p[at(d, min(j, m), max(j, m))], moving)
     for i in range(d):  # .. A' + Q, Q as in D 20
         for j in range(i, d):
             below = 2 * d - 2 - i - j
@@ -169,15 +153,10 @@ def predict_covariances(
             terms = d - a
             one = product[i * d + a]
             two, three = product[i * d + min(a + 1, d - 1)], product[i * d + min(a + 2, d - 1)]
-            if j < n:
-                add_chain(row, share, intensity, chain, j * terms, terms, one, two, three, moving)
-                for m in range(n):
-                    s, other = flow[j, m], product[i * d + m]
-                    if s != 0.0:
-                        for g in range(moving):
-                            row[g] += s * other[g]
-            else:
-                decay(row, share, intensity, decayed, ramp, curve, terms, one, two, three, moving)
+            first_weight = min(j, n) * (k + 1)
+            add_chain(row, share, intensity, chain, first_weight, terms, one, two, three, moving)
+            for m in range(n if j < n else 0):
+                add_scaled(row, flow[j, m], product[i * d + m], moving)
 
 
 @compiled(fastmath=FAST)

@@ -191,7 +191,7 @@ def scratch_rows(order: int) -> int:
     """Return how many rows of N = n + 3 numbers a step needs for itself."""
     d = order + ORDERS
     moving: int = moving_size.py_func(order)  # type: ignore[attr-defined]
-    total = LINES + 2 * ORDERS + 3 * d + moving + d * d + order * ORDERS
+    total = LINES + 2 * ORDERS + 3 * d + moving + d * d + (order + 1) * ORDERS
     return -(-total * COUNT // d)
 
 
