@@ -88,7 +88,7 @@ def find_quantum(members: Members, memory: Floats, y: float) -> float:
 
 
 @compiled()
-def difference(members: Members, memory: Floats, y: float) -> None:
+def difference(members: Members, memory: Floats, y: float) -> float:
     """
     Follow what the differences of y say that the noise of each colour is at most (D 29).
 
@@ -97,6 +97,7 @@ def difference(members: Members, memory: Floats, y: float) -> None:
     """
     last, orders = members.rough[0], members.rough.shape[1]
     value, binomial, least = y, 1.0, 1e-12 * memory[FIRST_NOISE]
+    smallest, shown = math.inf, 0.0
     for p in range(orders):
         before, value_before = last[p], value
         last[p] = value
@@ -107,8 +108,12 @@ def difference(members: Members, memory: Floats, y: float) -> None:
         for c in range(COLOURS.size):
             white = value_before - members.rates[CORRELATION, c * SHAPES] * before
             r = white * white / (members.rough[1 + c, p] * binomial)
+            if c == 0 and members.rough[1, p] < smallest:
+                smallest, shown = members.rough[1, p], r
             grown = 1.0 + (min(r, HUBER * HUBER) / CLIPPED - 1.0) / ROUGH_SAMPLES
             members.rough[1 + c, p] = max(members.rough[1 + c, p] * grown, least)
+    members.rough[1, 0] += SHORT_SHARE * (min(shown, HUBER * HUBER) - members.rough[1, 0])
+    return shown
 
 
 @compiled(fastmath=FAST)
@@ -118,8 +123,9 @@ def knowing(members: Members, scratch: Scratch, s: Floats) -> float:
     fill(noise, members.noise[SQUARE])
     for k in range(ORDERS):
         share = s[k]
+        score = members.record[SCORE, k]
         for g in range(COUNT):
-            least = min(least, share[g] * noise[g])
+            least = min(least, share[g] * noise[g] if score[g] > -CLOSE else math.inf)
     return IGNORANT * least
 
 
@@ -217,6 +223,7 @@ def follow_noise(
             squares[g] += weight * r[g] if below > -CLOSE else 0.0
     over_colours(weights, False)
     over_colours(squares, False)
+    least = min(least, members.rough[1, 0])
     if least > STEADY:  # every member that can judge says so: the noise has grown
         count = min(count, QUICK_SAMPLES)
     for c in range(COLOURS.size):

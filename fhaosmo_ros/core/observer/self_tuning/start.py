@@ -6,6 +6,7 @@ import math
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.observer.arrays import (
+    CALM,
     COVARIANCE,
     FIRST_NOISE,
     FLOW_PERIOD,
@@ -168,6 +169,8 @@ def begin(
         rates[CORRELATION, g] = colour
     members.rough[0] = 0.0
     members.rough[1:] = noise * noise
+    members.rough[1, 0] = 1.0
+    memory[CALM] = 41.0
     for j in range(count):
         difference(members, memory, samples[j])
     least = math.inf

@@ -41,6 +41,7 @@ from fhaosmo_ros.core.observer.self_tuning.filters import (
     correct_covariances,
     correct_states,
     expect_innovations,
+    HUBER,
     predict_covariances,
     predict_states,
 )
@@ -174,7 +175,7 @@ def step_members(
         return 0.0
     quanta = find_quantum(members, memory, y)
     follow_period(law, members, memory, h)
-    difference(members, memory, y)
+    stands_out = difference(members, memory, y) > HUBER * HUBER or memory[BEYOND] > 0.0
     moving, now = int(memory[MOVING]), work.stages[NOW]
     carry_flow(law, work, members, memory, h, u)
     # A sample that is not likely changes no member, so that what it makes of them stands apart.
@@ -203,7 +204,7 @@ def step_members(
     grows = off > 1.1 * memory[FARTHEST] + 2.0 * math.sqrt(members.noise[SQUARE, 0])
     memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and grows else 0.0
     memory[FARTHEST] = off
-    if memory[GROWING] < GROWTHS and not is_likely(members, b, believed, largest, memory[BEYOND]):
+    if stands_out and memory[GROWING] < GROWTHS and not is_likely(members, b, believed, largest, memory[BEYOND]):
         sign = math.copysign(1.0, b[ORDERS - 1, COUNT - 1])
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
             memory[BEYOND] += 1.0
