@@ -200,12 +200,12 @@ def step_members(
     memory[SAMPLES] = count + 1.0
     largest = knowing(members, scratch, believed)
     floor = max(quanta, law.scalars[LEAST_NOISE] ** 2)
-    off = abs(b[ORDERS - 1, COUNT - 1])
+    off = abs((y - now[0, 0]))
     grows = off > 1.1 * memory[FARTHEST] + 2.0 * math.sqrt(members.noise[SQUARE, 0])
     memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and grows else 0.0
     memory[FARTHEST] = off
     if stands_out and memory[GROWING] < GROWTHS and not is_likely(members, b, believed, largest, memory[BEYOND]):
-        sign = math.copysign(1.0, b[ORDERS - 1, COUNT - 1])
+        sign = math.copysign(1.0, (y - now[0, 0]))
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
             memory[BEYOND] += 1.0
         else:  # noise has both signs, y that is off has one
