@@ -175,7 +175,7 @@ def step_members(
         return 0.0
     quanta = find_quantum(members, memory, y)
     follow_period(law, members, memory, h)
-    stands_out = difference(members, memory, y) > HUBER * HUBER or memory[BEYOND] > 0.0
+    usual = difference(members, memory, y) <= HUBER * HUBER
     moving, now = int(memory[MOVING]), work.stages[NOW]
     carry_flow(law, work, members, memory, h, u)
     # A sample that is not likely changes no member, so that what it makes of them stands apart.
@@ -204,7 +204,7 @@ def step_members(
     grows = off > 1.1 * memory[FARTHEST] + 2.0 * math.sqrt(members.noise[SQUARE, 0])
     memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and grows else 0.0
     memory[FARTHEST] = off
-    if stands_out and memory[GROWING] < GROWTHS and not is_likely(members, b, believed, largest, memory[BEYOND]):
+    if memory[GROWING] < GROWTHS and not is_likely(members, b, believed, largest, memory[BEYOND]):
         sign = math.copysign(1.0, (y - now[0, 0]))
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
             memory[BEYOND] += 1.0
@@ -223,7 +223,7 @@ def step_members(
         )  # fmt: skip
         for g in range(moving):
             variance[g], log_variance[g] = found[g], math.log(found[g])
-    judged = memory[CALM] > CALM_SAMPLES
+    judged = usual and memory[CALM] > CALM_SAMPLES
     judge(members, scratch, grown, kept if judged and quanta == 0.0 else -1.0)
     if judged and quanta > 0.0:
         judge_quantised(members, y, ahead, quanta, kept)
