@@ -29,7 +29,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     SQUARE,
 )
 
-IGNORANT = 9.0
+IGNORANT = 3.0
 """A member whose innovations' variance is so many times the smallest one does not judge y."""
 CLIPPED = 0.9733
 """Mean of min(x^2, 9) where x is normal with variance 1."""
