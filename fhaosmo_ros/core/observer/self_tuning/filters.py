@@ -188,6 +188,20 @@ def expect_innovations(
 
 
 @compiled(fastmath=FAST)
+def allow_jump(n: int, k: int, h: float, b: Floats, p: Floats) -> None:
+    """Add to P that d may have jumped during the last interval, by as much as `b` says (D 33)."""
+    d, reach = n + 1 + k, h**n / FACTORIALS[n]
+    for i in range(n + 1):
+        for j in range(i, n + 1):
+            above = 2 * n - i - j
+            share = h**above / (FACTORIALS[n - i] * FACTORIALS[n - j]) / (reach * reach)
+            share *= 1.0 + 1.0 / (above + 1.0)  # at its begin, or at any time of it
+            row = p[at(d, i, j)]
+            for g in range(COUNT):
+                row[g] += share * b[g] * b[g]
+
+
+@compiled(fastmath=FAST)
 def correct_covariances(
     members: Members,
     n: int,

@@ -37,6 +37,7 @@ from fhaosmo_ros.core.observer.arrays import (
 from fhaosmo_ros.core.observer.levant import NEAR
 from fhaosmo_ros.core.observer.prediction import predict
 from fhaosmo_ros.core.observer.self_tuning.filters import (
+    allow_jump,
     at,
     correct_covariances,
     correct_states,
@@ -176,6 +177,8 @@ def step_members(
     quanta = find_quantum(members, memory, y)
     follow_period(law, members, memory, h)
     usual = difference(members, memory, y) <= HUBER * HUBER
+    if memory[GROWING] >= GROWTHS - 1.0:
+        memory[MOVING] = COUNT
     moving, now = int(memory[MOVING]), work.stages[NOW]
     carry_flow(law, work, members, memory, h, u)
     # A sample that is not likely changes no member, so that what it makes of them stands apart.
@@ -214,6 +217,13 @@ def step_members(
         memory[FAR_SIGN] = sign
         return 0.0
     memory[BEYOND] = 0.0
+    if memory[GROWING] >= GROWTHS:
+        for k in range(ORDERS):
+            allow_jump(n, k, h, b[k], p[k])
+            expect_innovations(members, n, k, h, p[k], gain[k], s[k], moving)
+            members.record[FAR, k] = 0.0
+        believed = s
+        memory[UNSETTLED] = 0.0
     grown = follow_noise(members, scratch, floor, believed, largest, count)
     memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
     kept = math.exp(-h / law.scalars[FORGETTING])
