@@ -88,7 +88,7 @@ def find_quantum(members: Members, memory: Floats, y: float) -> float:
 
 
 @compiled()
-def difference(members: Members, memory: Floats, y: float) -> float:
+def difference(members: Members, memory: Floats, y: float) -> tuple[float, float]:
     """
     Follow what the differences of y say that the noise of each colour is at most (D 29).
 
@@ -97,7 +97,7 @@ def difference(members: Members, memory: Floats, y: float) -> float:
     """
     last, orders = members.rough[0], members.rough.shape[1]
     value, binomial, least = y, 1.0, 1e-12 * memory[FIRST_NOISE]
-    smallest, shown = math.inf, 0.0
+    smallest, shown, square = math.inf, 0.0, math.inf
     for p in range(orders):
         before, value_before = last[p], value
         last[p] = value
@@ -108,12 +108,14 @@ def difference(members: Members, memory: Floats, y: float) -> float:
         for c in range(COLOURS.size):
             white = value_before - members.rates[CORRELATION, c * SHAPES] * before
             r = white * white / (members.rough[1 + c, p] * binomial)
+            if c == 0:
+                square = min(square, white * white / binomial)
             if c == 0 and members.rough[1, p] < smallest:
                 smallest, shown = members.rough[1, p], r
             grown = 1.0 + (min(r, HUBER * HUBER) / CLIPPED - 1.0) / ROUGH_SAMPLES
             members.rough[1 + c, p] = max(members.rough[1 + c, p] * grown, least)
     members.rough[1, 0] += SHORT_SHARE * (min(shown, HUBER * HUBER) - members.rough[1, 0])
-    return shown
+    return shown, square
 
 
 @compiled(fastmath=FAST)
@@ -146,7 +148,7 @@ def is_likely(members: Members, b: Floats, s: Floats, largest: float, beyond: fl
     for k in range(ORDERS):
         for g in range(COUNT):
             variance = s[k, g] * noise[COLOUR[g]]
-            follows = members.record[FAR, k, g] < late
+            follows = members.record[FAR, k, g] < late and members.record[SCORE, k, g] > -CLOSE
             if follows and variance <= largest and b[k, g] * b[k, g] <= GATE * GATE * variance:
                 return True
     return False

@@ -27,6 +27,7 @@ from fhaosmo_ros.core.observer.arrays import (
     MOVING,
     observer_at,
     PREDICTION_STEP,
+    RECENT,
     ROWS,
     SAMPLES,
     STEADY_PERIOD,
@@ -176,8 +177,9 @@ def step_members(
         return 0.0
     quanta = find_quantum(members, memory, y)
     follow_period(law, members, memory, h)
-    usual = difference(members, memory, y) <= HUBER * HUBER
-    if memory[GROWING] >= GROWTHS - 1.0:
+    ratio, square = difference(members, memory, y)
+    usual = ratio <= HUBER * HUBER
+    if memory[GROWING] >= GROWTHS - 1.0 or memory[RECENT] > 0.0:
         memory[MOVING] = COUNT
     moving, now = int(memory[MOVING]), work.stages[NOW]
     carry_flow(law, work, members, memory, h, u)
@@ -205,9 +207,13 @@ def step_members(
     floor = max(quanta, law.scalars[LEAST_NOISE] ** 2)
     off = abs((y - now[0, 0]))
     grows = off > 1.1 * memory[FARTHEST] + 2.0 * math.sqrt(members.noise[SQUARE, 0])
+    grows = grows and off * off > 100.0 * square
     memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and grows else 0.0
     memory[FARTHEST] = off
-    if memory[GROWING] < GROWTHS and not is_likely(members, b, believed, largest, memory[BEYOND]):
+    likely = is_likely(members, b, believed, largest, memory[BEYOND])
+    memory[RECENT] -= 1.0
+    jumped = not likely and (memory[GROWING] >= GROWTHS or memory[RECENT] > 0.0)
+    if not likely and not jumped:
         sign = math.copysign(1.0, (y - now[0, 0]))
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
             memory[BEYOND] += 1.0
@@ -217,7 +223,9 @@ def step_members(
         memory[FAR_SIGN] = sign
         return 0.0
     memory[BEYOND] = 0.0
-    if memory[GROWING] >= GROWTHS:
+    if jumped:
+        if memory[GROWING] >= GROWTHS:
+            memory[RECENT] = 10.0
         for k in range(ORDERS):
             allow_jump(n, k, h, b[k], p[k])
             expect_innovations(members, n, k, h, p[k], gain[k], s[k], moving)
