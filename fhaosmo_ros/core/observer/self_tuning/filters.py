@@ -188,17 +188,23 @@ def expect_innovations(
 
 
 @compiled(fastmath=FAST)
-def allow_jump(n: int, k: int, h: float, b: Floats, p: Floats) -> None:
-    """Add to P that d may have jumped during the last interval, by as much as `b` says (D 33)."""
-    d, reach = n + 1 + k, h**n / FACTORIALS[n]
+def allow_jump(
+    members: Members, scratch: Scratch, n: int, k: int, y: float, tau: float, p: Floats
+) -> None:
+    """Raise P as far as innovations are larger than expected: d has jumped, `tau` ago (D 33)."""
+    noise, more, d = scratch.lines[0], scratch.lines[1], n + 1 + k
+    b, s, first = scratch.b[k], scratch.s[k], scratch.x[k][0]
+    fill(noise, members.noise[SQUARE])
+    for g in range(COUNT):
+        r = b[g] * b[g] / (s[g] * noise[g])
+        off = y - first[g]
+        more[g] = off * off * (1.0 - 1.0 / r) if r > 1.0 else 0.0
     for i in range(n + 1):
         for j in range(i, n + 1):
-            above = 2 * n - i - j
-            share = h**above / (FACTORIALS[n - i] * FACTORIALS[n - j]) / (reach * reach)
-            share *= 1.0 + 1.0 / (above + 1.0)  # at its begin, or at any time of it
-            row = p[at(d, i, j)]
-            for g in range(COUNT):
-                row[g] += share * b[g] * b[g]
+            share = tau ** (-i - j) / (FACTORIALS[n - i] * FACTORIALS[n - j])
+            share *= FACTORIALS[n] * FACTORIALS[n]
+            share *= 0.5 + 0.5 * (2.0 * n + 1.0) / (2.0 * n + 1.0 - i - j)
+            add_scaled(p[at(d, i, j)], share, more, COUNT)
 
 
 @compiled(fastmath=FAST)

@@ -27,6 +27,7 @@ from fhaosmo_ros.core.observer.arrays import (
     MOVING,
     observer_at,
     PREDICTION_STEP,
+    ONSET,
     RECENT,
     ROWS,
     SAMPLES,
@@ -35,6 +36,7 @@ from fhaosmo_ros.core.observer.arrays import (
     Work,
     Y,
 )
+from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.levant import NEAR
 from fhaosmo_ros.core.observer.prediction import predict
 from fhaosmo_ros.core.observer.self_tuning.filters import (
@@ -212,7 +214,8 @@ def step_members(
     memory[FARTHEST] = off
     likely = is_likely(members, b, believed, largest, memory[BEYOND])
     memory[RECENT] -= 1.0
-    jumped = not likely and (memory[GROWING] >= GROWTHS or memory[RECENT] > 0.0)
+    begins = not likely and memory[GROWING] >= GROWTHS
+    jumped = begins or memory[RECENT] > 0.0
     if not likely and not jumped:
         sign = math.copysign(1.0, (y - now[0, 0]))
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
@@ -224,10 +227,14 @@ def step_members(
         return 0.0
     memory[BEYOND] = 0.0
     if jumped:
-        if memory[GROWING] >= GROWTHS:
+        if begins:  # when it was that d left the prediction, below the noise
+            hidden = min(GATE * math.sqrt(members.noise[SQUARE, 0]) / off, 0.9)
+            memory[ONSET] = h / (1.0 - hidden ** (1.0 / n))
             memory[RECENT] = 10.0
+        else:
+            memory[ONSET] += h
         for k in range(ORDERS):
-            allow_jump(n, k, h, b[k], p[k])
+            allow_jump(members, scratch, n, k, y, memory[ONSET], p[k])
             expect_innovations(members, n, k, h, p[k], gain[k], s[k], moving)
             members.record[FAR, k] = 0.0
         believed = s
