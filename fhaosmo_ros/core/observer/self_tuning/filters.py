@@ -189,22 +189,25 @@ def expect_innovations(
 
 @compiled(fastmath=FAST)
 def allow_jump(
-    members: Members, scratch: Scratch, n: int, k: int, y: float, tau: float, p: Floats
+    members: Members, scratch: Scratch, n: int, k: int, y: float, tau: float, p: Floats, gain: Floats
 ) -> None:
     """Raise P as far as innovations are larger than expected: d has jumped, `tau` ago (D 33)."""
-    noise, more, d = scratch.lines[0], scratch.lines[1], n + 1 + k
-    b, s, first = scratch.b[k], scratch.s[k], scratch.x[k][0]
-    fill(noise, members.noise[SQUARE])
-    for g in range(COUNT):
-        r = b[g] * b[g] / (s[g] * noise[g])
-        off = y - first[g]
-        more[g] = off * off * (1.0 - 1.0 / r) if r > 1.0 else 0.0
+    used, more, d = scratch.lines[0], scratch.lines[1], n + 1 + k
+    b, s, first, correlation = scratch.b[k], scratch.s[k], scratch.x[k][0], members.rates[CORRELATION]
+    fill(used, members.noise[USED])
+    for g in range(COUNT):  # what the noise was before does not count
+        b[g] = y - first[g]
+        s[g] = p[0, g] + used[g] / (1.0 - correlation[g] * correlation[g])
+        more[g] = max(b[g] * b[g] - s[g], 0.0)
+        s[g] = max(s[g], b[g] * b[g]) / used[g]
     for i in range(n + 1):
         for j in range(i, n + 1):
             share = tau ** (-i - j) / (FACTORIALS[n - i] * FACTORIALS[n - j])
             share *= FACTORIALS[n] * FACTORIALS[n]
             share *= 0.5 + 0.5 * (2.0 * n + 1.0) / (2.0 * n + 1.0 - i - j)
             add_scaled(p[at(d, i, j)], share, more, COUNT)
+    for i in range(d):
+        gain[i, :] = p[at(d, 0, i)]
 
 
 @compiled(fastmath=FAST)

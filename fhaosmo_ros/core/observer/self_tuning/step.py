@@ -234,8 +234,7 @@ def step_members(
         else:
             memory[ONSET] += h
         for k in range(ORDERS):
-            allow_jump(members, scratch, n, k, y, memory[ONSET], p[k])
-            expect_innovations(members, n, k, h, p[k], gain[k], s[k], moving)
+            allow_jump(members, scratch, n, k, y, memory[ONSET], p[k], gain[k])
             members.record[FAR, k] = 0.0
         believed = s
         memory[UNSETTLED] = 0.0
