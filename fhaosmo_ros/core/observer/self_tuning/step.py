@@ -206,7 +206,7 @@ def step_members(
     count = min(memory[SAMPLES], NOISE_SAMPLES)
     memory[SAMPLES] = count + 1.0
     largest = knowing(members, scratch, believed)
-    floor = max(quanta, law.scalars[LEAST_NOISE] ** 2)
+    floor = max(quanta, law.scalars[LEAST_NOISE] ** 2, 1e-10 * members.rough[1, 1])
     off = abs((y - now[0, 0]))
     grows = off > 1.1 * memory[FARTHEST] + 2.0 * math.sqrt(members.noise[SQUARE, 0])
     grows = grows and off * off > 100.0 * square
