@@ -178,7 +178,7 @@ def follow_noise(
     s: Floats,
     largest: float,
     count: float,
-) -> float:
+) -> tuple[float, float]:
     """
     Follow the noise of y of each colour, by the innovations of its likeliest members (D 29).
 
@@ -198,7 +198,7 @@ def follow_noise(
         more than 1 while the noise grows.
 
     """
-    record, noise, least = members.record, members.noise, math.inf
+    record, noise, least, now = members.record, members.noise, math.inf, math.inf
     variance, size, r, best, weights, squares = (
         scratch.lines[0], scratch.lines[1], scratch.lines[2],
         scratch.lines[3], scratch.lines[4], scratch.lines[5],
@@ -219,6 +219,9 @@ def follow_noise(
             short[g] += SHORT_SHARE * (r[g] - short[g])
             least = min(least, short[g] if size[g] <= largest else math.inf)
         for g in range(COUNT):
+            explains = size[g] <= largest and score[g] > -CLOSE
+            now = min(now, r[g] if explains else math.inf)
+        for g in range(COUNT):
             below = score[g] - best[g]
             weight = exponential(below)
             weights[g] += weight if below > -CLOSE else 0.0
@@ -235,4 +238,4 @@ def follow_noise(
         for p in range(2, members.rough.shape[1]):
             most = min(most, members.rough[1 + c, p])
         noise[SQUARE, c] = max(min(noise[SQUARE, c], ROUGH * most), floor)
-    return max(least, 1.0)
+    return max(least, 1.0), now

@@ -238,7 +238,7 @@ def step_members(
             members.record[FAR, k] = 0.0
         believed = s
         memory[UNSETTLED] = 0.0
-    grown = follow_noise(members, scratch, floor, believed, largest, count)
+    grown, explained = follow_noise(members, scratch, floor, believed, largest, count)
     memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
     kept = math.exp(-h / law.scalars[FORGETTING])
     for k in range(ORDERS):
@@ -247,7 +247,7 @@ def step_members(
         )  # fmt: skip
         for g in range(moving):
             variance[g], log_variance[g] = found[g], math.log(found[g])
-    judged = usual and memory[CALM] > CALM_SAMPLES
+    judged = usual and (memory[CALM] > CALM_SAMPLES or explained < HUBER * HUBER)
     judge(members, scratch, grown, kept if judged and quanta == 0.0 else -1.0)
     if judged and quanta > 0.0:
         judge_quantised(members, y, ahead, quanta, kept)
