@@ -198,8 +198,9 @@ def allow_jump(
     for g in range(COUNT):  # what the noise was before does not count
         b[g] = y - first[g]
         s[g] = p[0, g] + used[g] / (1.0 - correlation[g] * correlation[g])
-        more[g] = max(b[g] * b[g] - s[g], 0.0)
-        s[g] = max(s[g], b[g] * b[g]) / used[g]
+        square = b[g] * b[g]
+        more[g] = square - s[g] if square > HUBER * HUBER * s[g] else 0.0
+        s[g] = (s[g] + more[g]) / used[g]
     for i in range(n + 1):
         for j in range(i, n + 1):
             share = tau ** (-i - j) / (FACTORIALS[n - i] * FACTORIALS[n - j])
