@@ -208,10 +208,11 @@ def step_members(
     largest = knowing(members, scratch, believed)
     floor = max(quanta, law.scalars[LEAST_NOISE] ** 2, 1e-10 * members.rough[1, 1])
     off = abs((y - now[0, 0]))
-    grows = off > 1.1 * memory[FARTHEST] + 2.0 * math.sqrt(members.noise[SQUARE, 0])
+    grows = off > 1.3 * memory[FARTHEST] + 3.0 * math.sqrt(members.noise[SQUARE, 0])
     grows = grows and off * off > 100.0 * square
     memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and grows else 0.0
-    memory[FARTHEST] = off
+    if memory[BEYOND] == 0.0:
+        memory[FARTHEST] = off
     likely = is_likely(members, b, believed, largest, memory[BEYOND])
     memory[RECENT] -= 1.0
     begins = not likely and memory[GROWING] >= GROWTHS
@@ -221,7 +222,7 @@ def step_members(
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
             memory[BEYOND] += 1.0
         else:  # noise has both signs, y that is off has one
-            memory[BEYOND] = 1.0
+            memory[BEYOND], memory[FARTHEST] = 1.0, off
             follow_noise(members, scratch, floor, believed, largest, count)
         memory[FAR_SIGN] = sign
         return 0.0
