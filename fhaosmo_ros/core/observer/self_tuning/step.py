@@ -180,7 +180,7 @@ def step_members(
     quanta = find_quantum(members, memory, y)
     follow_period(law, members, memory, h)
     ratio, square = difference(members, memory, y)
-    usual = ratio <= HUBER * HUBER
+    usual = ratio <= HUBER * HUBER or quanta > 0.0
     if memory[GROWING] >= GROWTHS - 1.0 or memory[RECENT] > 0.0:
         memory[MOVING] = COUNT
     moving, now = int(memory[MOVING]), work.stages[NOW]
