@@ -46,10 +46,13 @@ Entries of ``State.memory``:
 | FIRST_NOISE | variance of the noise when the members began | of y^2 |
 | LIKELIEST | index of the colour of the likeliest member | 1 |
 | CALM | samples since the noise has grown | 1 |
-| GROWING | unlikely samples in a row, each farther off than the one before | 1 |
-| FARTHEST | how far off the sample before was | of y |
+| GROWING | unlikely samples in a row that are farther and farther off, without being noise | 1 |
+| FIRST_OFF | how far off the first of the unlikely samples in a row was | of y |
 | NARROWED | by what the limit of the influence of innovations is below `HUBER` (D 32) | 1 |
 | ONE_SIDED | samples in a row beyond that limit on one side; below 0 on the lower | 1 |
+| RECENT | samples left that count as part of a jump of d (D 33) | 1 |
+| ONSET | time since d jumped | s |
+| ROUGHNESS | short mean of the squared differences of y, over their usual size | 1 |
 """
 
 from typing import NamedTuple
@@ -76,9 +79,9 @@ ROWS = 4
 GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSET = range(11)
 OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
 SAMPLES, FAR_SIGN, QUANTUM, LATTICE, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
-FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM, GROWING, FARTHEST = range(25, 31)
-NARROWED, ONE_SIDED, RECENT, ONSET = range(31, 35)
-MEMORY = 35
+FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM, GROWING, FIRST_OFF = range(25, 31)
+NARROWED, ONE_SIDED, RECENT, ONSET, ROUGHNESS = range(31, 36)
+MEMORY = 36
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)

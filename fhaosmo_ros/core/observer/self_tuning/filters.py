@@ -189,24 +189,40 @@ def expect_innovations(
 
 @compiled(fastmath=FAST)
 def allow_jump(
-    members: Members, scratch: Scratch, n: int, k: int, y: float, tau: float, p: Floats, gain: Floats
+    members: Members,
+    scratch: Scratch,
+    n: int,
+    k: int,
+    y: float,
+    tau: float,
+    p: Floats,
+    gain: Floats,
 ) -> None:
-    """Raise P as far as innovations are larger than expected: d has jumped, `tau` ago (D 33)."""
+    """
+    Let the members believe that d has jumped: raise P as far as the sample asks for it (D 33).
+
+    What the noise was before does not count, so that coloured noise begins afresh. Innovations,
+    their variances, `p` and `gain` are replaced.
+
+    Parameters
+    ----------
+    tau : float
+        Time since the jump.
+
+    """
     used, more, d = scratch.lines[0], scratch.lines[1], n + 1 + k
-    b, s, first, correlation = scratch.b[k], scratch.s[k], scratch.x[k][0], members.rates[CORRELATION]
+    b, s, first, a = scratch.b[k], scratch.s[k], scratch.x[k][0], members.rates[CORRELATION]
     fill(used, members.noise[USED])
-    for g in range(COUNT):  # what the noise was before does not count
+    for g in range(COUNT):
         b[g] = y - first[g]
-        s[g] = p[0, g] + used[g] / (1.0 - correlation[g] * correlation[g])
-        square = b[g] * b[g]
-        more[g] = square - s[g] if square > HUBER * HUBER * s[g] else 0.0
-        s[g] = (s[g] + more[g]) / used[g]
+        variance, square = p[0, g] + used[g] / (1.0 - a[g] * a[g]), b[g] * b[g]
+        more[g] = square - variance if square > HUBER * HUBER * variance else 0.0
+        s[g] = (variance + more[g]) / used[g]
     for i in range(n + 1):
         for j in range(i, n + 1):
-            share = tau ** (-i - j) / (FACTORIALS[n - i] * FACTORIALS[n - j])
-            share *= FACTORIALS[n] * FACTORIALS[n]
+            share = FACTORIALS[n] / FACTORIALS[n - i] * FACTORIALS[n] / FACTORIALS[n - j]
             share *= 0.5 + 0.5 * (2.0 * n + 1.0) / (2.0 * n + 1.0 - i - j)
-            add_scaled(p[at(d, i, j)], share, more, COUNT)
+            add_scaled(p[at(d, i, j)], share / tau ** (i + j), more, COUNT)
     for i in range(d):
         gain[i, :] = p[at(d, 0, i)]
 

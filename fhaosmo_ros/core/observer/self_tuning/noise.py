@@ -5,7 +5,7 @@ import math
 
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
-from fhaosmo_ros.core.observer.arrays import FIRST_NOISE, LATTICE, QUANTUM, Y
+from fhaosmo_ros.core.observer.arrays import FIRST_NOISE, LATTICE, QUANTUM, ROUGHNESS, Y
 from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
@@ -34,10 +34,18 @@ IGNORANT = 3.0
 CLIPPED = 0.9733
 """Mean of min(x^2, 9) where x is normal with variance 1."""
 CLOSE = 8.0
-"""Members whose log-likelihood is so far below the best of their colour do not tell the noise."""
+"""
+Members whose log-likelihood is so far below the best one do not say whether a sample is likely,
+and those so far below the best one of their colour do not tell the noise.
+"""
 SHORT_SHARE = 0.05
 STEADY = 1.5
-"""If squared innovations over S are larger of late for every member, the noise has grown."""
+"""
+If squared innovations over S are larger of late for every member that can judge, and squared
+differences of y are too, the noise has grown.
+"""
+CALM_SAMPLES = 40.0
+"""Until so many samples after that a sample judges the members only if one of them explains it."""
 QUICK_SAMPLES = 30.0
 """It is averaged over so many samples then."""
 LATTICE_STEPS = 30.0
@@ -94,10 +102,19 @@ def difference(members: Members, memory: Floats, y: float) -> tuple[float, float
 
     White noise w adds C(2p, p) times its variance to that of a difference of order p. What y does
     besides adds to it, so that the smallest of the variances is an upper bound.
+
+    Returns
+    -------
+    float
+        Square of the difference of the order that bounds white noise, over its usual size.
+    float
+        The smallest of the squared differences, as a variance of white noise: of the order of the
+        noise if noise is why y is off its prediction, and far less if d has moved it there.
+
     """
     last, orders = members.rough[0], members.rough.shape[1]
     value, binomial, least = y, 1.0, 1e-12 * memory[FIRST_NOISE]
-    smallest, shown, square = math.inf, 0.0, math.inf
+    bound, ratio, smallest = math.inf, 0.0, math.inf
     for p in range(orders):
         before, value_before = last[p], value
         last[p] = value
@@ -109,25 +126,31 @@ def difference(members: Members, memory: Floats, y: float) -> tuple[float, float
             white = value_before - members.rates[CORRELATION, c * SHAPES] * before
             r = white * white / (members.rough[1 + c, p] * binomial)
             if c == 0:
-                square = min(square, white * white / binomial)
-            if c == 0 and members.rough[1, p] < smallest:
-                smallest, shown = members.rough[1, p], r
+                smallest = min(smallest, white * white / binomial)
+                if members.rough[1, p] < bound:
+                    bound, ratio = members.rough[1, p], r
             grown = 1.0 + (min(r, HUBER * HUBER) / CLIPPED - 1.0) / ROUGH_SAMPLES
             members.rough[1 + c, p] = max(members.rough[1 + c, p] * grown, least)
-    members.rough[1, 0] += SHORT_SHARE * (min(shown, HUBER * HUBER) - members.rough[1, 0])
-    return shown, square
+    memory[ROUGHNESS] += SHORT_SHARE * (min(ratio, HUBER * HUBER) - memory[ROUGHNESS])
+    return ratio, smallest
 
 
 @compiled(fastmath=FAST)
 def knowing(members: Members, scratch: Scratch, s: Floats) -> float:
-    """Return the largest variance of the innovations with which a member can judge a sample."""
+    """
+    Return the largest variance of the innovations with which a member can judge a sample.
+
+    Members that have been found unlikely do not set it: without noise on y they expect innovations
+    that are far too small.
+    """
     noise, least = scratch.lines[0], math.inf
     fill(noise, members.noise[SQUARE])
     for k in range(ORDERS):
         share = s[k]
         score = members.record[SCORE, k]
         for g in range(COUNT):
-            least = min(least, share[g] * noise[g] if score[g] > -CLOSE else math.inf)
+            variance = share[g] * noise[g]
+            least = min(least, variance if score[g] > -CLOSE else math.inf)
     return IGNORANT * least
 
 
@@ -136,7 +159,7 @@ def is_likely(members: Members, b: Floats, s: Floats, largest: float, beyond: fl
     """
     Return True if a member that can judge the sample finds it likely (D 29).
 
-    A member that is far off itself would meet y by chance while y is off by a constant.
+    A member that is far off itself, or unlikely, would meet y by chance.
 
     Parameters
     ----------
@@ -148,8 +171,9 @@ def is_likely(members: Members, b: Floats, s: Floats, largest: float, beyond: fl
     for k in range(ORDERS):
         for g in range(COUNT):
             variance = s[k, g] * noise[COLOUR[g]]
-            follows = members.record[FAR, k, g] < late and members.record[SCORE, k, g] > -CLOSE
-            if follows and variance <= largest and b[k, g] * b[k, g] <= GATE * GATE * variance:
+            follows = members.record[FAR, k, g] < late
+            judges = variance <= largest and members.record[SCORE, k, g] > -CLOSE
+            if judges and follows and b[k, g] * b[k, g] <= GATE * GATE * variance:
                 return True
     return False
 
@@ -178,6 +202,7 @@ def follow_noise(
     s: Floats,
     largest: float,
     count: float,
+    roughness: float,
 ) -> tuple[float, float]:
     """
     Follow the noise of y of each colour, by the innovations of its likeliest members (D 29).
@@ -190,15 +215,19 @@ def follow_noise(
         See `knowing`.
     count : float
         Number of samples to average over.
+    roughness : float
+        Squared differences of y over their usual size, of late.
 
     Returns
     -------
     float
-        How much larger than expected squared innovations have been of late, for every member:
-        more than 1 while the noise grows.
+        How much larger than expected squared innovations have been of late, for every member, and
+        squared differences too: more than 1 while the noise grows.
+    float
+        The least squared innovation, over its variance, of the members that can judge.
 
     """
-    record, noise, least, now = members.record, members.noise, math.inf, math.inf
+    record, noise, least, best_fit = members.record, members.noise, roughness, math.inf
     variance, size, r, best, weights, squares = (
         scratch.lines[0], scratch.lines[1], scratch.lines[2],
         scratch.lines[3], scratch.lines[4], scratch.lines[5],
@@ -219,8 +248,8 @@ def follow_noise(
             short[g] += SHORT_SHARE * (r[g] - short[g])
             least = min(least, short[g] if size[g] <= largest else math.inf)
         for g in range(COUNT):
-            explains = size[g] <= largest and score[g] > -CLOSE
-            now = min(now, r[g] if explains else math.inf)
+            judges = size[g] <= largest and score[g] > -CLOSE
+            best_fit = min(best_fit, r[g] if judges else math.inf)
         for g in range(COUNT):
             below = score[g] - best[g]
             weight = exponential(below)
@@ -228,8 +257,7 @@ def follow_noise(
             squares[g] += weight * r[g] if below > -CLOSE else 0.0
     over_colours(weights, False)
     over_colours(squares, False)
-    least = min(least, members.rough[1, 0])
-    if least > STEADY:  # every member that can judge says so: the noise has grown
+    if least > STEADY:  # every member that can judge says so, and the differences do
         count = min(count, QUICK_SAMPLES)
     for c in range(COLOURS.size):
         ratio = squares[c * SHAPES] / weights[c * SHAPES] / CLIPPED
@@ -238,4 +266,4 @@ def follow_noise(
         for p in range(2, members.rough.shape[1]):
             most = min(most, members.rough[1 + c, p])
         noise[SQUARE, c] = max(min(noise[SQUARE, c], ROUGH * most), floor)
-    return max(least, 1.0), now
+    return max(least, 1.0), best_fit

@@ -18,6 +18,7 @@ from fhaosmo_ros.core.observer.arrays import (
     LIKELIEST,
     MOVING,
     QUANTUM,
+    ROUGHNESS,
     SAMPLES,
     STEADY_PERIOD,
     UNSETTLED,
@@ -50,7 +51,12 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     USED,
     VARIANCE,
 )
-from fhaosmo_ros.core.observer.self_tuning.noise import difference, is_multiple, LATTICE_SHARE
+from fhaosmo_ros.core.observer.self_tuning.noise import (
+    CALM_SAMPLES,
+    difference,
+    is_multiple,
+    LATTICE_SHARE,
+)
 from fhaosmo_ros.core.observer.self_tuning.weights import FLOOR, weigh
 import numpy as np
 
@@ -169,8 +175,7 @@ def begin(
         rates[CORRELATION, g] = colour
     members.rough[0] = 0.0
     members.rough[1:] = noise * noise
-    members.rough[1, 0] = 1.0
-    memory[CALM] = 41.0
+    memory[ROUGHNESS], memory[CALM] = 1.0, CALM_SAMPLES + 1.0
     for j in range(count):
         difference(members, memory, samples[j])
     least = math.inf

@@ -13,8 +13,8 @@ from fhaosmo_ros.core.observer.arrays import (
     BEYOND,
     CALM,
     FAR_SIGN,
-    FARTHEST,
     FIRST_NOISE,
+    FIRST_OFF,
     FLOW_PERIOD,
     FORGETTING,
     FRESH,
@@ -26,9 +26,10 @@ from fhaosmo_ros.core.observer.arrays import (
     LINEAR,
     MOVING,
     observer_at,
-    PREDICTION_STEP,
     ONSET,
+    PREDICTION_STEP,
     RECENT,
+    ROUGHNESS,
     ROWS,
     SAMPLES,
     STEADY_PERIOD,
@@ -77,6 +78,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     VARIANCE,
 )
 from fhaosmo_ros.core.observer.self_tuning.noise import (
+    CALM_SAMPLES,
     difference,
     find_quantum,
     follow_noise,
@@ -100,9 +102,16 @@ import numpy as np
 NOISE_SAMPLES = 1000.0
 """The noise is averaged over so many samples."""
 GROWTHS = 3.0
-"""A sample that is farther off than the one before, so many times in a row, is due to d."""
-CALM_SAMPLES = 40.0
-"""Until so many samples after that no sample judges the members."""
+"""If so many samples in a row are farther off than the first one, d has jumped (D 33)."""
+FARTHER, SMOOTH = 1.3, 10.0
+"""
+Farther means: so many times as far, and 3 sigma more. It is not noise if y is off by so many times
+its differences.
+"""
+JUMP_SAMPLES = 10.0
+"""What is beyond 3 sigma in so many samples after that is due to the jump, too."""
+EXACT = 1e-5
+"""y is taken to be no more exact than this, in parts of what it moves between samples (RMS)."""
 ANOTHER, FAR_OFF = 1.3, 3.0
 """Factors on the variance of the noise, of the likeliest colour and others, that make P move."""
 LONG = 12.0
@@ -179,8 +188,7 @@ def step_members(
         return 0.0
     quanta = find_quantum(members, memory, y)
     follow_period(law, members, memory, h)
-    ratio, square = difference(members, memory, y)
-    usual = ratio <= HUBER * HUBER or quanta > 0.0
+    roughness, smallest = difference(members, memory, y)
     if memory[GROWING] >= GROWTHS - 1.0 or memory[RECENT] > 0.0:
         memory[MOVING] = COUNT
     moving, now = int(memory[MOVING]), work.stages[NOW]
@@ -206,32 +214,31 @@ def step_members(
     count = min(memory[SAMPLES], NOISE_SAMPLES)
     memory[SAMPLES] = count + 1.0
     largest = knowing(members, scratch, believed)
-    floor = max(quanta, law.scalars[LEAST_NOISE] ** 2, 1e-10 * members.rough[1, 1])
-    off = abs((y - now[0, 0]))
-    grows = off > 1.3 * memory[FARTHEST] + 3.0 * math.sqrt(members.noise[SQUARE, 0])
-    grows = grows and off * off > 100.0 * square
-    memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and grows else 0.0
+    floor = max(quanta, law.scalars[LEAST_NOISE] ** 2, EXACT * EXACT * members.rough[1, 1])
+    off, sigma = abs(y - now[0, 0]), math.sqrt(members.noise[SQUARE, 0])
     if memory[BEYOND] == 0.0:
-        memory[FARTHEST] = off
+        memory[FIRST_OFF] = off
+    far = max(FARTHER * memory[FIRST_OFF] + HUBER * sigma, SMOOTH * math.sqrt(smallest))
+    memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and off > far else 0.0
     likely = is_likely(members, b, believed, largest, memory[BEYOND])
-    memory[RECENT] -= 1.0
+    memory[RECENT] = max(memory[RECENT] - 1.0, 0.0)
     begins = not likely and memory[GROWING] >= GROWTHS
     jumped = begins or memory[RECENT] > 0.0
     if not likely and not jumped:
-        sign = math.copysign(1.0, (y - now[0, 0]))
+        sign = math.copysign(1.0, y - now[0, 0])
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
             memory[BEYOND] += 1.0
         else:  # noise has both signs, y that is off has one
-            memory[BEYOND], memory[FARTHEST] = 1.0, off
-            follow_noise(members, scratch, floor, believed, largest, count)
+            memory[BEYOND], memory[FIRST_OFF] = 1.0, off
+            follow_noise(members, scratch, floor, believed, largest, count, memory[ROUGHNESS])
         memory[FAR_SIGN] = sign
         return 0.0
     memory[BEYOND] = 0.0
     if jumped:
-        if begins:  # when it was that d left the prediction, below the noise
-            hidden = min(GATE * math.sqrt(members.noise[SQUARE, 0]) / off, 0.9)
+        if begins:  # while it was within the gate, it could not be seen
+            hidden = min(GATE * sigma / off, 0.9)
             memory[ONSET] = h / (1.0 - hidden ** (1.0 / n))
-            memory[RECENT] = 10.0
+            memory[RECENT] = JUMP_SAMPLES
         else:
             memory[ONSET] += h
         for k in range(ORDERS):
@@ -239,7 +246,9 @@ def step_members(
             members.record[FAR, k] = 0.0
         believed = s
         memory[UNSETTLED] = 0.0
-    grown, explained = follow_noise(members, scratch, floor, believed, largest, count)
+    grown, best_fit = follow_noise(
+        members, scratch, floor, believed, largest, count, memory[ROUGHNESS]
+    )
     memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
     kept = math.exp(-h / law.scalars[FORGETTING])
     for k in range(ORDERS):
@@ -248,7 +257,8 @@ def step_members(
         )  # fmt: skip
         for g in range(moving):
             variance[g], log_variance[g] = found[g], math.log(found[g])
-    judged = usual and (memory[CALM] > CALM_SAMPLES or explained < HUBER * HUBER)
+    judged = memory[CALM] > CALM_SAMPLES or best_fit < HUBER * HUBER
+    judged = judged and (roughness <= HUBER * HUBER or quanta > 0.0)
     judge(members, scratch, grown, kept if judged and quanta == 0.0 else -1.0)
     if judged and quanta > 0.0:
         judge_quantised(members, y, ahead, quanta, kept)
@@ -285,7 +295,7 @@ def restart_members(law: Law, levels: Floats, memory: Floats, rows: Floats, y: f
     """Begin afresh from `y`: z is not known any more, d and the noise are (D 29)."""
     n = law.gains.shape[1] - ORDERS
     members = members_in(rows, n)
-    memory[UNSETTLED], memory[BEYOND] = 0.0, 0.0
+    memory[UNSETTLED] = memory[BEYOND] = memory[GROWING] = memory[RECENT] = 0.0
     levels[HAT, 0] = memory[Y] = y
     for k in range(ORDERS):
         z = members.x[k]
