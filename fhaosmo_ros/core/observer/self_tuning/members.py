@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 ORDERS = 3
 """Members have k = 0, 1, 2 derivatives of d."""
-BANDS = 18
+BANDS = 15
 """Bandwidths of the members of each k."""
-SLOWEST, QUICKEST = 1e-4, 0.5 * 5000.0 ** (3.0 / 14.0)
+SLOWEST, QUICKEST = 6e-4, 3.0
 """Their range, in rad a sample."""
 COLOURS = np.array([0.0, 0.7, 0.92, 0.98])
 """Correlations a of the noise of neighbouring samples."""
