@@ -126,7 +126,8 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
         deviations = np.sqrt(np.diag(expected)[:size])
         assert (np.abs(estimate - found[:size]) < 1e-6 * deviations).all(), k
         triangle = after.p[k][:, g]
-        np.testing.assert_allclose(triangle, expected[:size, :size][upper], rtol=1e-6)
+        # Q of D 20 leaves out what decays within an interval, a part of kappa h
+        np.testing.assert_allclose(triangle, expected[:size, :size][upper], rtol=1e-4)
 
 
 def test_a_sample_that_is_not_likely_changes_no_member(case):
