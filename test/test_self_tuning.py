@@ -281,13 +281,25 @@ def test_a_large_d_is_not_taken_for_noise():
     assert rms((run.unknown_input - d)[5000:]) < 0.015 * rms(d)
 
 
-def test_jumps_of_d_at_a_low_rate():
-    """Each jump moves y by 45 times the noise in one sample: no limit cycle, no loss of y."""
-    t, y, d = swept(FRICTION, 70.0, 1e-2, 40.0, lambda phase: np.sign(np.sin(phase)))
-    y = y + 4.4e-4 * np.random.default_rng(7).standard_normal(len(t))
-    run = Observer(MOTOR).run(t, y)
-    assert rms((run.unknown_input - d)[500:]) < 0.85 * rms(d)
-    assert abs(run.unknown_input).max() < 5.0 * 70.0  # a limit cycle has 8
+@pytest.mark.parametrize('period', [1e-3, 1e-2])
+@pytest.mark.parametrize('noise', [0.0, 4.4e-7, 4.4e-5, 4.4e-4])
+def test_little_noise_or_none(noise, period):
+    """A smooth d moves y by up to 1e5 times the noise in a sample; d is found, with its jumps."""
+    for shape, limit in ((np.sin, 0.05), (lambda phase: np.sign(np.sin(phase)), 0.6)):
+        t, y, d = swept(FRICTION, 70.0, period, 20.0, shape)
+        y = y + noise * np.random.default_rng(7).standard_normal(len(t))
+        run = Observer(MOTOR).run(t, y)
+        assert rms((run.unknown_input - d)[t > 3.0]) < limit * rms(d)
+
+
+def test_a_jump_of_d_is_followed_at_once():
+    """After a jump of 2,000 times the noise a sample, d is right again within ten samples."""
+    t, y, d = swept(FRICTION, 70.0, 1e-2, 10.0, lambda phase: np.where(phase < 15.0, 1.0, -1.0))
+    y = y + 4.4e-6 * np.random.default_rng(8).standard_normal(len(t))
+    off = abs(Observer(MOTOR).run(t, y).unknown_input - d) / 70.0
+    jump = int(np.argmax(d < 0.0))
+    assert (off[jump : jump + 3] > 1.0).any()
+    assert (off[jump + 10 : jump + 300] < 0.1).all()
 
 
 def test_quanta_bound_the_noise():

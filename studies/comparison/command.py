@@ -36,12 +36,13 @@ def _compare(arguments: argparse.Namespace, stop: Stop) -> None:
     trials = arguments.trials or (QUICK_TRIALS if quick else TRIALS)
     training = QUICK_TRAINING if quick else TRAINING
     begin = time.monotonic()
+    before = results.load(output / FOLDER / RESULTS) if arguments.only else None
     with document.rewriting(output, FOLDER, 'Comparison') as pages:
         with Workers(arguments.jobs, stop) as workers:
-            entries, bounds = tune_all(sensors(quick), trials, training, workers)
+            entries, bounds = tune_all(sensors(quick), trials, training, workers, arguments.only)
         with stop.raising():
             found = Results(entries, sample_times(entries), trials, training, bounds)
-            write(found, pages)
+            write(before.with_new(found) if before else found, pages)
     print(f'\n{tables.verdict_table(verdicts(found.table(list(METHODS))))}\n')
     print(
         f'document: {output / "comparison.md"}, figures: {output / FOLDER} '
@@ -61,6 +62,12 @@ def _parser() -> argparse.ArgumentParser:
         type=_positive,
         metavar='N',
         help=f'trials of each tuning (default: {TRIALS}, {QUICK_TRIALS} with --quick)',
+    )
+    parser.add_argument(
+        '--only',
+        choices=list(METHODS),
+        metavar='METHOD',
+        help='measure this method anew, and take the others from the results that are there',
     )
     parser.add_argument(
         '--jobs',
@@ -91,11 +98,21 @@ def _default_output(quick: bool) -> Path:
 
 
 def tune_all(
-    chosen: list[Sensor], trials: int, training: int, workers: Workers
+    chosen: list[Sensor],
+    trials: int,
+    training: int,
+    workers: Workers,
+    only: str | None = None,
 ) -> tuple[list[Entry], dict[Sensor, float]]:
-    """Tune and evaluate all methods for these sensors, and bound the error for step signals."""
-    tasks = [(sensor, name) for sensor in chosen for name in methods_for(sensor)]
-    known = [sensor for sensor in chosen if steps_bound.applies(sensor)]
+    """
+    Tune and evaluate all methods for these sensors, and bound the error for step signals.
+
+    With `only`, do it for this method, without the bound.
+    """
+    tasks = [
+        (sensor, name) for sensor in chosen for name in methods_for(sensor) if only in (None, name)
+    ]
+    known = [sensor for sensor in chosen if only is None and steps_bound.applies(sensor)]
     calls: dict[Any, tuple[Any, ...]] = {
         task: (_tune_and_evaluate, *task, trials, training) for task in tasks
     }

@@ -89,6 +89,12 @@ class Results(NamedTuple):
                 chosen.setdefault(cell, {}).setdefault(kind, (name, scores[name]))
         return chosen
 
+    def with_new(self, new: 'Results') -> 'Results':
+        """Return these results with the entries and times of `new` in place of the old ones."""
+        by_key = {(e.sensor, e.method): e for e in new.entries}
+        entries = [by_key.get((e.sensor, e.method), e) for e in self.entries]
+        return self._replace(entries=entries, seconds=self.seconds | new.seconds)
+
     def find(self, sensor: Sensor, method: str) -> Entry | None:
         """Return an entry."""
         found = (e for e in self.entries if (e.sensor, e.method) == (sensor, method))
