@@ -51,7 +51,6 @@ Entries of ``State.memory``:
 | NARROWED | by what the limit of the influence of innovations is below `HUBER` (D 32) | 1 |
 | ONE_SIDED | samples in a row beyond that limit on one side; below 0 on the lower | 1 |
 | RECENT | samples left that count as part of a jump of d (D 33) | 1 |
-| ONSET | time since d jumped | s |
 | ROUGHNESS | short mean of the squared differences of y, over their usual size | 1 |
 """
 
@@ -80,8 +79,8 @@ GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSE
 OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
 SAMPLES, FAR_SIGN, QUANTUM, LATTICE, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
 FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM, GROWING, FIRST_OFF = range(25, 31)
-NARROWED, ONE_SIDED, RECENT, ONSET, ROUGHNESS = range(31, 36)
-MEMORY = 36
+NARROWED, ONE_SIDED, RECENT, ROUGHNESS = range(31, 35)
+MEMORY = 35
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)

@@ -207,7 +207,7 @@ def allow_jump(
     Parameters
     ----------
     tau : float
-        Time since the jump.
+        Time since the jump; 0 for the samples that follow, for which P knows what is uncertain.
 
     """
     used, more, d = scratch.lines[0], scratch.lines[1], n + 1 + k
@@ -218,7 +218,13 @@ def allow_jump(
         variance, square = p[0, g] + used[g] / (1.0 - a[g] * a[g]), b[g] * b[g]
         more[g] = square - variance if square > HUBER * HUBER * variance else 0.0
         s[g] = (variance + more[g]) / used[g]
-    for i in range(n + 1):
+    if tau == 0.0:
+        for g in range(COUNT):
+            more[g] = 1.0 + more[g] / p[0, g]
+        for row in p:
+            for g in range(COUNT):
+                row[g] *= more[g]
+    for i in range(n + 1 if tau > 0.0 else 0):  # at its begin, or at any time of it
         for j in range(i, n + 1):
             share = FACTORIALS[n] / FACTORIALS[n - i] * FACTORIALS[n] / FACTORIALS[n - j]
             share *= 0.5 + 0.5 * (2.0 * n + 1.0) / (2.0 * n + 1.0 - i - j)

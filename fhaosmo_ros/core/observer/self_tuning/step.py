@@ -26,7 +26,6 @@ from fhaosmo_ros.core.observer.arrays import (
     LINEAR,
     MOVING,
     observer_at,
-    ONSET,
     PREDICTION_STEP,
     RECENT,
     ROUGHNESS,
@@ -223,7 +222,7 @@ def step_members(
     likely = is_likely(members, b, believed, largest, memory[BEYOND])
     memory[RECENT] = max(memory[RECENT] - 1.0, 0.0)
     begins = not likely and memory[GROWING] >= GROWTHS
-    jumped = begins or memory[RECENT] > 0.0
+    jumped = begins or (memory[RECENT] > 0.0 and roughness <= HUBER * HUBER)
     if not likely and not jumped:
         sign = math.copysign(1.0, y - now[0, 0])
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
@@ -235,14 +234,12 @@ def step_members(
         return 0.0
     memory[BEYOND] = 0.0
     if jumped:
+        tau = 0.0
         if begins:  # while it was within the gate, it could not be seen
-            hidden = min(GATE * sigma / off, 0.9)
-            memory[ONSET] = h / (1.0 - hidden ** (1.0 / n))
+            tau = h / (1.0 - min(GATE * sigma / off, 0.9) ** (1.0 / n))
             memory[RECENT] = JUMP_SAMPLES
-        else:
-            memory[ONSET] += h
         for k in range(ORDERS):
-            allow_jump(members, scratch, n, k, y, memory[ONSET], p[k], gain[k])
+            allow_jump(members, scratch, n, k, y, tau, p[k], gain[k])
             members.record[FAR, k] = 0.0
         believed = s
         memory[UNSETTLED] = 0.0
