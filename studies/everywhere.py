@@ -244,27 +244,62 @@ def cell(name: str, condition: str, size: Size, once: Once | None) -> dict[str, 
     anew = found.at(setting.model.order, c.rate)
     once = once or Once(found, best_peers(setting, anew, recordings))
     values = once.member.at(setting.model.order, c.rate)
-    model = {'order': setting.model.order, 'phi': list(setting.model.phi)}
+    model = model_of(setting)
     preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | model
-    tuning = [online(r, model | {'gains': 'self_tuning'}) for r in recordings]
+    own, inside = self_tuned(model, recordings)
     errors = {
-        SELF: [error(r, d) for r, (d, _) in zip(recordings, tuning, strict=True)],
+        SELF: own,
         ONCE: errors_of(LINEAR_LIMIT, setting, values, recordings),
         PRESET: [error(r, online(r, preset)[0]) for r in recordings],
     }
     for peer, number in once.peers.items():
         errors[peer] = errors_of(peer, setting, {**values, **PEERS[peer][number]}, recordings)
     yard = mean(errors_of(LINEAR_LIMIT, setting, anew, recordings))
-    inside = [
-        [np.mean((np.abs(d - r.d) < k * s[:, -1])[r.t >= JUDGED_FROM]) for k in (1.0, 1.96)]
-        for r, (d, s) in zip(recordings, tuning, strict=True)
-    ]
     return {
         'plant': name, 'condition': condition, 'tuned anew': round(yard, 5),
         'member': list(found), 'peers': once.peers,
         'ratios': {k: float(f'{mean(e) / yard:.4g}') for k, e in errors.items()},
-        'inside': [round(float(x), 3) for x in np.mean(inside, axis=0)],
+        'inside': inside,
     }  # fmt: skip
+
+
+def model_of(setting: Setting) -> dict[str, Any]:
+    """Return what the estimators are told, as parameters."""
+    return {'order': setting.model.order, 'phi': list(setting.model.phi)}
+
+
+def self_tuned(
+    model: dict[str, Any], recordings: list[Recording]
+) -> tuple[list[float], list[float]]:
+    """Return the errors of self-tuning, and the shares of d within 1 and 1.96 deviations."""
+    tuning = [online(r, model | {'gains': 'self_tuning'}) for r in recordings]
+    inside = [
+        [np.mean((np.abs(d - r.d) < k * s[:, -1])[r.t >= JUDGED_FROM]) for k in (1.0, 1.96)]
+        for r, (d, s) in zip(recordings, tuning, strict=True)
+    ]
+    errors = [error(r, d) for r, (d, _) in zip(recordings, tuning, strict=True)]
+    return errors, [round(float(x), 3) for x in np.mean(inside, axis=0)]
+
+
+def again(before: dict[str, Any], size: Size) -> dict[str, Any]:
+    """Return a cell with self-tuning measured anew, and all else as it was."""
+    plant, c = PLANTS[before['plant']], CONDITIONS[before['condition']]
+    recordings = [recording(plant, c, kind, size.duration) for kind in size.kinds]
+    errors, inside = self_tuned(model_of(setting_of(plant, c)), recordings)
+    ratio = float(f'{mean(errors) / before["tuned anew"]:.4g}')
+    return before | {'ratios': before['ratios'] | {SELF: ratio}, 'inside': inside}
+
+
+def compute_again(folder: Path, size: Size, jobs: int, stop: Stop) -> list[dict[str, Any]]:
+    """Return the cells of the results in a folder with self-tuning measured anew."""
+    before = json.loads((folder / RESULTS).read_text())['cells']
+    calls: dict[Any, tuple[Any, ...]] = {i: (again, c, size) for i, c in enumerate(before)}
+    found: dict[int, dict[str, Any]] = {}
+    with Workers(jobs, stop) as workers, progress(total=len(calls), unit='cell', desc=NAME) as bar:
+        for key, result in workers.results(calls):
+            found[key] = result
+            bar.update()
+    return [found[i] for i in range(len(before))]
 
 
 def once_of(found: dict[str, Any]) -> Once:
@@ -360,7 +395,11 @@ def _study(arguments: argparse.Namespace, stop: Stop) -> None:
     output = arguments.output or (Path('everywhere_output') if arguments.short else DOCS)
     begin = time.monotonic()
     with document.rewriting(output, NAME, 'Tuned once, used everywhere') as pages:
-        found = {'duration': size.duration, 'cells': compute(size, arguments.jobs, stop)}
+        if arguments.only_self_tuning:
+            cells = compute_again(output / NAME, size, arguments.jobs, stop)
+        else:
+            cells = compute(size, arguments.jobs, stop)
+        found = {'duration': size.duration, 'cells': cells}
         (pages.folder / RESULTS).write_text(json.dumps(found, indent=1) + '\n')
         draw(found['cells']).savefig(pages.folder / 'ratios.png', dpi=110)
         pages.write(texts(found))
@@ -371,6 +410,10 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0, 2 for a bad argument or output, 130 if it was interrupted."""
     parser = argparse.ArgumentParser(prog=NAME, description=__doc__)
     parser.add_argument('--short', action='store_true', help='two cells, for tests')
+    parser.add_argument(
+        '--only-self-tuning', action='store_true',
+        help='measure self-tuning anew, and take the rest from the results that are there',
+    )  # fmt: skip
     parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1, help='processes')
     parser.add_argument('--output', type=Path, help='folder for page and results (default: docs)')
     return run_command(parser, argv, _study)
