@@ -42,7 +42,8 @@ def _compare(arguments: argparse.Namespace, stop: Stop) -> None:
             entries, bounds = tune_all(sensors(quick), trials, training, workers, arguments.only)
         with stop.raising():
             found = Results(entries, sample_times(entries), trials, training, bounds)
-            write(before.with_new(found) if before else found, pages)
+            found = before.with_new(found) if before else found
+            write(found, pages)
     print(f'\n{tables.verdict_table(verdicts(found.table(list(METHODS))))}\n')
     print(
         f'document: {output / "comparison.md"}, figures: {output / FOLDER} '
