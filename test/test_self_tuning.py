@@ -292,6 +292,17 @@ def test_little_noise_or_none(noise, period):
         assert rms((run.unknown_input - d)[t > 3.0]) < limit * rms(d)
 
 
+@pytest.mark.parametrize('noise', [0.0, 4.4e-5])
+def test_inexact_stamps_are_not_taken_for_jumps(noise):
+    """As of a simulation that is stamped at reception: differences of y do not show it."""
+    random = np.random.default_rng(9)
+    t, y, d = swept(FRICTION, 70.0, PERIOD, 15.0, np.sin)
+    y = y + noise * random.standard_normal(len(t))
+    late = np.maximum.accumulate(t + 1e-4 * abs(random.standard_normal(len(t))))
+    run = Observer(MOTOR).run(late + 1e-7 * np.arange(len(t)), y)
+    assert rms((run.unknown_input - d)[t > 3.0]) < 0.05 * rms(d)
+
+
 def test_a_jump_of_d_is_followed_at_once():
     """After a jump of 2,000 times the noise a sample, d is right again within 25 samples."""
     t, y, d = swept(FRICTION, 70.0, 1e-2, 10.0, lambda phase: np.where(phase < 15.0, 1.0, -1.0))

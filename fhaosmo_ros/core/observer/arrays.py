@@ -52,6 +52,8 @@ Entries of ``State.memory``:
 | ONE_SIDED | samples in a row beyond that limit on one side; below 0 on the lower | 1 |
 | RECENT | samples left that count as part of a jump of d (D 33) | 1 |
 | ROUGHNESS | short mean of the squared differences of y, over their usual size | 1 |
+| INTERVAL | last interval between two samples that were taken | s |
+| JITTER | variance of the stamps of late, over the square of the interval | 1 |
 """
 
 from typing import NamedTuple
@@ -79,8 +81,8 @@ GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSE
 OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
 SAMPLES, FAR_SIGN, QUANTUM, LATTICE, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
 FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM, GROWING, FIRST_OFF = range(25, 31)
-NARROWED, ONE_SIDED, RECENT, ROUGHNESS = range(31, 35)
-MEMORY = 35
+NARROWED, ONE_SIDED, RECENT, ROUGHNESS, INTERVAL, JITTER = range(31, 37)
+MEMORY = 37
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)

@@ -5,7 +5,16 @@ import math
 
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
-from fhaosmo_ros.core.observer.arrays import FIRST_NOISE, LATTICE, QUANTUM, ROUGHNESS, Y
+from fhaosmo_ros.core.observer.arrays import (
+    BEYOND,
+    FIRST_NOISE,
+    INTERVAL,
+    JITTER,
+    LATTICE,
+    QUANTUM,
+    ROUGHNESS,
+    Y,
+)
 from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
@@ -135,6 +144,21 @@ def difference(members: Members, memory: Floats, y: float) -> tuple[float, float
     return ratio, smallest
 
 
+@compiled()
+def stamp_noise(members: Members, memory: Floats, h: float) -> float:
+    """
+    Follow how irregular the intervals are; return the variance of y if the stamps are why (D 29).
+
+    Differences of y do not show that its stamps are wrong, but innovations do.
+    """
+    if memory[BEYOND] == 0.0:  # else the interval is that since the last sample taken
+        if memory[INTERVAL] > 0.0:  # three stamps, one of them twice: 1 + 4 + 1
+            change = (h - memory[INTERVAL]) ** 2 / (6.0 * h * memory[INTERVAL])
+            memory[JITTER] += (change - memory[JITTER]) / ROUGH_SAMPLES
+        memory[INTERVAL] = h
+    return float(2.0 * memory[JITTER] * members.rough[1, 1])
+
+
 @compiled(fastmath=FAST)
 def knowing(members: Members, scratch: Scratch, s: Floats) -> float:
     """
@@ -203,6 +227,7 @@ def follow_noise(
     largest: float,
     count: float,
     roughness: float,
+    of_stamps: float,
 ) -> tuple[float, float]:
     """
     Follow the noise of y of each colour, by the innovations of its likeliest members (D 29).
@@ -217,6 +242,8 @@ def follow_noise(
         Number of samples to average over.
     roughness : float
         Squared differences of y over their usual size, of late.
+    of_stamps : float
+        See `stamp_noise`.
 
     Returns
     -------
@@ -265,5 +292,5 @@ def follow_noise(
         most = members.rough[1 + c, 1]
         for p in range(2, members.rough.shape[1]):
             most = min(most, members.rough[1 + c, p])
-        noise[SQUARE, c] = max(min(noise[SQUARE, c], ROUGH * most), floor)
+        noise[SQUARE, c] = max(min(noise[SQUARE, c], ROUGH * (most + of_stamps)), floor)
     return max(least, 1.0), best_fit

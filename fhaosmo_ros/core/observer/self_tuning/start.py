@@ -12,6 +12,8 @@ from fhaosmo_ros.core.observer.arrays import (
     FLOW_PERIOD,
     FRESH,
     HAT,
+    INTERVAL,
+    JITTER,
     LATTICE,
     Law,
     LEAST_NOISE,
@@ -91,6 +93,7 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
         period += first[1, i] / (count - 1)
     differences, values = first[0, :count].copy(), np.empty(count)
     noise, largest, binomial, quantum = math.inf, 0.0, 1.0, math.inf
+    rough = np.zeros(n + 2)
     for i in range(count):
         largest = max(largest, abs(first[0, i]))
     for order in range(1, n + 2):
@@ -104,6 +107,7 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
         size = middle(values, length) / MEDIAN / math.sqrt(binomial)
         if size > 0.0:
             noise = min(noise, size)
+        rough[order] = size * size
     if quantum == math.inf and least == 0.0:
         return
     if quantum < math.inf:
@@ -113,8 +117,13 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
             noise = max(quantum / math.sqrt(12.0), noise if noise < math.inf else 0.0)
     if noise == math.inf:
         noise = quantum
-    noise = max(noise, least, 1e-9 * largest, 1e-150)
-    begin(law, memory, members, count, y, period, noise)
+    jitter = 0.0
+    for i in range(2, count):
+        h, before = first[1, i], first[1, i - 1]
+        jitter += (h - before) ** 2 / (6.0 * h * before) / (count - 2)
+    memory[JITTER], memory[INTERVAL] = jitter, h
+    noise = max(noise, math.sqrt(2.0 * jitter * rough[1]), least, 1e-9 * largest, 1e-150)
+    begin(law, memory, members, count, y, period, noise, rough)
     memory[SAMPLES] = FIRST_SAMPLES + 1
 
 
@@ -147,7 +156,14 @@ def middle(values: Floats, count: int) -> float:
 
 @compiled()
 def begin(
-    law: Law, memory: Floats, members: Members, count: int, y: float, period: float, noise: float
+    law: Law,
+    memory: Floats,
+    members: Members,
+    count: int,
+    y: float,
+    period: float,
+    noise: float,
+    rough: Floats,
 ) -> None:
     """Let the members begin at `y` (D 28)."""
     n = law.gains.shape[1] - ORDERS
@@ -174,7 +190,8 @@ def begin(
         rates[TAU, g] = -period / math.log(colour) if colour > 0.0 else 0.0
         rates[CORRELATION, g] = colour
     members.rough[0] = 0.0
-    members.rough[1:] = noise * noise
+    for order in range(rough.size):
+        members.rough[1:, order] = max(rough[order], noise * noise)
     memory[ROUGHNESS], memory[CALM] = 1.0, CALM_SAMPLES + 1.0
     for j in range(count):
         difference(members, memory, samples[j])

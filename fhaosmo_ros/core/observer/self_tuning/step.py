@@ -83,6 +83,7 @@ from fhaosmo_ros.core.observer.self_tuning.noise import (
     follow_noise,
     is_likely,
     knowing,
+    stamp_noise,
     STEADY,
 )
 from fhaosmo_ros.core.observer.self_tuning.start import gather
@@ -188,6 +189,7 @@ def step_members(
     quanta = find_quantum(members, memory, y)
     follow_period(law, members, memory, h)
     roughness, smallest = difference(members, memory, y)
+    of_stamps = stamp_noise(members, memory, h)
     if memory[GROWING] >= GROWTHS - 1.0 or memory[RECENT] > 0.0:
         memory[MOVING] = COUNT
     moving, now = int(memory[MOVING]), work.stages[NOW]
@@ -217,7 +219,8 @@ def step_members(
     off, sigma = abs(y - now[0, 0]), math.sqrt(members.noise[SQUARE, 0])
     if memory[BEYOND] == 0.0:
         memory[FIRST_OFF] = off
-    far = max(FARTHER * memory[FIRST_OFF] + HUBER * sigma, SMOOTH * math.sqrt(smallest))
+    far = FARTHER * memory[FIRST_OFF] + HUBER * sigma
+    far = max(far, SMOOTH * math.sqrt(smallest + of_stamps))
     memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and off > far else 0.0
     likely = is_likely(members, b, believed, largest, memory[BEYOND])
     memory[RECENT] = max(memory[RECENT] - 1.0, 0.0)
@@ -229,7 +232,9 @@ def step_members(
             memory[BEYOND] += 1.0
         else:  # noise has both signs, y that is off has one
             memory[BEYOND], memory[FIRST_OFF] = 1.0, off
-            follow_noise(members, scratch, floor, believed, largest, count, memory[ROUGHNESS])
+            follow_noise(
+                members, scratch, floor, believed, largest, count, memory[ROUGHNESS], of_stamps
+            )
         memory[FAR_SIGN] = sign
         return 0.0
     memory[BEYOND] = 0.0
@@ -244,7 +249,7 @@ def step_members(
         believed = s
         memory[UNSETTLED] = 0.0
     grown, best_fit = follow_noise(
-        members, scratch, floor, believed, largest, count, memory[ROUGHNESS]
+        members, scratch, floor, believed, largest, count, memory[ROUGHNESS], of_stamps
     )
     memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
     kept = math.exp(-h / law.scalars[FORGETTING])
