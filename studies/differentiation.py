@@ -143,7 +143,9 @@ def unfitness(
     kinds = np.full(count, MEASURED)
     kinds[0] = BEGINS
     estimates = np.zeros((count, 2, observer.levels))
-    smoother.take(*observer.arrays[:2], estimates, samples, np.arange(count), kinds)
+    smoother.take(
+        *observer.arrays[:2], estimates, samples, np.arange(count), kinds, np.empty((count, 0))
+    )
     e, variance = smoother.innovations()
     return 0.5 * float(np.sum(np.log(variance) + e**2 / variance))
 

@@ -11,7 +11,7 @@ Rows of ``State.levels`` and ``Work.x``, column i - 1 for level i:
 |---|---|---|
 | HAT | filtered estimate z_hat_i | of z_i |
 | TILDE | internal state z_tilde_{i+1}; theta at the last level | of z_{i+1} |
-| HAT_SENSITIVITY | p_i = d z_hat_i / d gamma | of z_i |
+| HAT_SENSITIVITY | p_i = d z_hat_i / d gamma; self-tuning: `MODEL` | of z_i |
 | TILDE_SENSITIVITY | q_i = d z_tilde_{i+1} / d gamma | of z_{i+1} |
 | COVARIANCE .. | covariance P of the errors, N rows; not used without `noise_size` | product |
 
@@ -44,7 +44,7 @@ Entries of ``State.memory``:
 | UNSETTLED | time since they began to | s |
 | STEADY_PERIOD, FLOW_PERIOD | interval that the covariances, and the flow, are those of | s |
 | FIRST_NOISE | variance of the noise when the members began | of y^2 |
-| LIKELIEST | index of the colour of the likeliest member | 1 |
+| LIKELIEST | the likeliest member: k times their number, plus its index | 1 |
 | CALM | samples since the noise has grown | 1 |
 | GROWING | unlikely samples in a row that are farther and farther off, without being noise | 1 |
 | FIRST_OFF | how far off the first of the unlikely samples in a row was | of y |
@@ -77,6 +77,12 @@ SINGLES = 5
 HAT, TILDE, HAT_SENSITIVITY, TILDE_SENSITIVITY, COVARIANCE = range(5)
 ROWS = 4
 """Number of rows before the covariance."""
+MODEL = HAT_SENSITIVITY
+NOISE, DRIVE, LOSS, DERIVATIVES = range(4)
+"""
+Columns of `MODEL`, the likeliest model of d, 0 before the members have begun: the variance of the
+noise, if it were white; q, kappa and k of D 26, the last one k - 3 where d has jumped (D 33).
+"""
 GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSET = range(11)
 OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
 SAMPLES, FAR_SIGN, QUANTUM, LATTICE, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)

@@ -79,6 +79,10 @@ class Trajectory(NamedTuple):
     standard_deviation : (K, n + 1) array
         Of the errors of z and, in the last column, of the unknown input, as a self-tuning observer
         expects them; (K, 0) with fixed gains.
+    model : (K, 4) array
+        The likeliest model of d (D 26) of a self-tuning observer, which a smoother goes by: the
+        variance of the noise, if it were white; q; kappa (1/s); the number k of derivatives, or
+        k - 3 where d has jumped. 0 before it knows the noise; (K, 0) with fixed gains.
 
     """
 
@@ -92,6 +96,7 @@ class Trajectory(NamedTuple):
     z_hat: NDArray[np.float64]
     z_tilde: NDArray[np.float64]
     standard_deviation: NDArray[np.float64]
+    model: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -115,11 +120,11 @@ class ObserverState:
 
 
 def make_record(
-    rows: int, levels: int, rows_of_eps: int, variances: bool = False
+    rows: int, levels: int, rows_of_eps: int, self_tuning: bool = False
 ) -> recursion.Record:
     """Return memory for a compiled run to record into."""
     return recursion.Record(
-        np.empty((rows, 2 + variances, levels)),
+        np.empty((rows, 4 if self_tuning else 2, levels)),
         np.empty(rows),
         np.empty((rows_of_eps, levels)),
         np.empty(rows, dtype=np.int64),
@@ -521,12 +526,14 @@ class Observer:
         Returns
         -------
         Trajectory
-            A row for each sample, with `z` and `unknown_input` smoothed; the rest as `run` has it.
+            A row for each sample, with `z`, `unknown_input` and `standard_deviation` smoothed; the
+            rest as `run` has it.
 
         Raises
         ------
         ConfigurationError
-            As `run`; or `noise_size` is 0, which says how much to trust a sample.
+            As `run`; or gains are fixed and `noise_size` is 0, which says how much to trust a
+            sample.
 
         """
         return smoothed(Observer(self._configuration.parameters), t, y, u)
@@ -537,7 +544,10 @@ class Observer:
         if len(words):
             self._word = int(words[-1])
         z, d = self.select(levels)
-        known = self.order + 1 if self.self_tuning else 0
+        deviations = model = np.empty((len(words), 0))
+        if self.self_tuning:
+            deviations = np.sqrt(levels[:, recursion.VARIANCES, : self.order + 1])
+            model = levels[:, recursion.LIKELIEST_MODEL, :4]
         return Trajectory(
             t,
             z,
@@ -548,7 +558,8 @@ class Observer:
             words >> LEVEL_SHIFT,
             levels[:, arrays.HAT],
             levels[:, arrays.TILDE],
-            np.sqrt(levels[:, -1, :known]),
+            deviations,
+            model,
         )
 
     def _periods(self, t: NDArray[Any], first: int) -> NDArray[np.float64]:

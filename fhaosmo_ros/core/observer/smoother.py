@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Smoothed estimates in the order of their samples, with bounded memory; see smoothing.py."""
 
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
 from fhaosmo_ros.core.model.inputs import known_inputs_of_run
-from fhaosmo_ros.core.observer.arrays import HAT, Law, MEMORY, TILDE, Work
+from fhaosmo_ros.core.observer.arrays import DERIVATIVES, DRIVE, HAT, Law, MEMORY, TILDE, Work
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.self_tuning.members import ORDERS
 from fhaosmo_ros.core.observer.smoothing import (
     BEGINS,
     JUMPS,
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
 
 BLOCK = 8192
 """Rows after which a recording is smoothed as far as later samples no longer matter."""
+BEGINNING = 1000
+"""
+First rows of a recording for which a self-tuning observer's model is what it knows after them.
+"""
 
 
 class Smoother:
@@ -53,6 +58,9 @@ class Smoother:
     def __init__(self, configuration: ObserverConfiguration, lag: int | None = None) -> None:
         self.configure(configuration)
         self._lag, levels = lag, configuration.levels
+        self._planes = 2 if configuration.self_tuning else 1
+        self._held: tuple[Law, Work, tuple[Any, ...]] | None = None
+        self._model: Floats | None = None
         self._rows = Rows.empty(64, levels)
         self._memory, self._point = np.zeros(MEMORY), np.zeros((4 + levels, levels))
         self._count = self._done = self._new = self._began = 0
@@ -101,6 +109,7 @@ class Smoother:
         samples: tuple[Floats, Floats, Floats],
         times: Ints,
         kinds: Ints,
+        models: Floats,
     ) -> None:
         """
         Append rows.
@@ -113,27 +122,61 @@ class Smoother:
             As `Samples` of a run, with y less its offset (D 23).
         times, kinds : (K,) arrays
             As in `Rows`; see `kinds`.
+        models : (K, 4) or (K, 0) array
+            As in `Trajectory`; a copy.
 
         """
+        estimates = levels[:, HAT].copy()
+        if self._internal:
+            estimates[:, 1:] = levels[:, TILDE, :-1]
+        columns: tuple[Any, ...] = (estimates, *samples, times, kinds, models)
+        if self._held is not None:
+            columns = tuple(map(np.concatenate, zip(self._held[2], columns, strict=True)))
+            self._held = None
+        if self._planes > 1 and self._model is None:
+            known = np.flatnonzero(columns[-1][:, DRIVE])
+            enough = 0 if self._lag is not None else BEGINNING
+            if not len(known) or len(columns[-1]) <= enough:
+                self._held = law, work, columns
+                return
+        self._go(law, work, columns)
+
+    def _go(self, law: Law, work: Work, columns: tuple[Any, ...]) -> None:
+        """Go forward through rows: estimates, y, h, u, times, kinds, models."""
+        if self._planes > 1:
+            self._complete(columns[0], columns[-1])
+        estimates, y, h, u, times, kinds, models = columns
         count = len(times)
         if not count:
             return
         self._make_room(count)
         part = slice(self._count, self._count + count)
         self._rows.times[part], self._rows.kinds[part] = times, kinds
-        estimates = levels[:, HAT].copy()
-        if self._internal:
-            estimates[:, 1:] = levels[:, TILDE, :-1]
-        y, h, u = samples
         take_rows(
-            law, work, self._problem, self._rows, self._count, estimates, h, y, u, self._memory,
-            self._point,
+            law, work, self._problem, self._rows, self._count, estimates, h, y, u, models,
+            self._memory, self._point,
         )  # fmt: skip
         began = np.flatnonzero(kinds == BEGINS)
         if len(began):
             self._began = self._count + int(began[-1])
         self._new = self._count
         self._count += count
+
+    def _complete(self, estimates: Floats, models: Floats) -> None:
+        """Let what a self-tuning observer knows stand for what it did not know before (D 34)."""
+        known = models[:, DRIVE] > 0.0
+        if self._model is None:
+            first = int(np.argmax(known))
+            estimates[:first, 1:] = estimates[first, 1:]
+            stands = first if self._lag is not None else min(BEGINNING, len(models) - 1)
+            models[:stands], known[:stands] = models[stands], True
+            models[:stands, DERIVATIVES] %= ORDERS  # d has not jumped at each of them
+            self._model = models[stands]
+        for k in np.flatnonzero(~known):
+            models[k] = models[k - 1] if k else self._model
+        if len(models):
+            self._model = models[-1].copy()
+        estimates[:, self._rows.base.shape[1] - ORDERS + 1 :] = 0.0  # derivatives of d
 
     def _make_room(self, count: int) -> None:
         """Drop rows that are done, all but two to go on from, and get more memory if needed."""
@@ -151,9 +194,17 @@ class Smoother:
             self._began -= drop
 
     def due(self) -> Floats:
-        """Return the estimates, (K, N), that have become final since the last call."""
+        """
+        Return the estimates that have become final since the last call.
+
+        Returns
+        -------
+        (K, 1 or 2, N) array
+            With the variances of their errors, for a self-tuning observer.
+
+        """
         if self._lag is not None:
-            out = np.empty((self._count - self._done, self._rows.base.shape[1]))
+            out = self._room(self._count - self._done)
             done = smooth_lagging(self._rows, self._new, self._count, self._done, self._lag, out)
             out = out[: done - self._done]
             self._done, self._new = done, self._count
@@ -166,16 +217,27 @@ class Smoother:
         return out
 
     def finish(self) -> Floats:
-        """Return the estimates of all rows that wait: nothing comes after them."""
+        """Return the estimates of all rows that wait, as `due` does: nothing comes after them."""
+        if self._held is not None:
+            law, work, columns = self._held
+            self._held, estimates = None, columns[0]
+            if not columns[-1].any():  # the observer knows nothing but y
+                out = self._room(len(estimates))
+                out[:, 0], out[:, 1] = estimates, np.inf
+                return out
+            self._go(law, work, columns)
         return self._smooth(self._count)
 
     def _smooth(self, end: int) -> Floats:
         """Return the estimates of the rows before `end` that wait, by all that is known."""
-        out = np.empty((end - self._done, self._rows.base.shape[1]))
+        out = self._room(end - self._done)
         if len(out):
             smooth_rows(self._rows, self._count - 1, self._done, end - 1, out)
         self._done = end
         return out
+
+    def _room(self, count: int) -> Floats:
+        return np.empty((count, self._planes, self._rows.base.shape[1]))
 
     def innovations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return e and S of the samples that are remembered, for their likelihood."""
@@ -212,12 +274,15 @@ def smoothed(observer: 'Observer', t: ArrayLike, y: ArrayLike, u: ArrayLike) -> 
         levels = np.stack([part.z_hat, part.z_tilde], axis=1)[rows.start - start :]
         used = (part.z_hat + part.innovation)[rows.start - start :, 0]
         numbers = np.arange(rows.start, rows.stop)
-        smoother.take(*observer.arrays[:2], levels, (used, h, inputs), numbers, kinds)
+        models = part.model[rows.start - start :].copy()
+        smoother.take(*observer.arrays[:2], levels, (used, h, inputs), numbers, kinds, models)
         found.append(smoother.due())
     found.append(smoother.finish())
     whole = type(parts[0])(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     if first is None:
         return whole
     estimates, n = np.concatenate(found), observer.order
-    whole.z[first:], whole.unknown_input[first:] = estimates[:, :n], estimates[:, n]
+    whole.z[first:], whole.unknown_input[first:] = estimates[:, 0, :n], estimates[:, 0, n]
+    if observer.self_tuning:
+        whole.standard_deviation[first:] = np.sqrt(estimates[:, 1, : n + 1])
     return whole

@@ -6,7 +6,9 @@ The observer runs forward as ever. About its estimates the model is linearised, 
 model of d, and the smoothing problem of this linear model is solved (D 24, D 25): forward by the
 Kalman filter of the deviation from the observer's estimates, backward by the recursion of Rauch,
 Tung and Striebel in the form of Bierman, which inverts no matrix. For a nonlinear Phi this is one
-Gauss-Newton step towards the most likely trajectory, begun at the observer's (Bell 1994).
+Gauss-Newton step towards the most likely trajectory, begun at the observer's (Bell 1994). With a
+self-tuning observer the noise and the model of d are those of its likeliest member at each sample
+(D 34).
 
 Rauch, Tung and Striebel 1965, doi:10.2514/3.3166; Bierman 1973, Int. J. Control 18 (1);
 Bell 1994, doi:10.1137/0804035.
@@ -19,8 +21,13 @@ from fhaosmo_ros.core.compiled.unowned_arrays import unowned
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
 from fhaosmo_ros.core.model.integrate import NOW
 from fhaosmo_ros.core.observer.arrays import (
+    DERIVATIVES,
+    DRIVE,
+    FRESH,
     FROM_MEASUREMENT,
     Law,
+    LOSS,
+    NOISE,
     PREDICTION_STEP,
     SPREAD,
     Work,
@@ -29,11 +36,13 @@ from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.covariance import (
     HUBER,
     MOST_STEPS,
+    STATES_DOUBT,
     STEP,
     Uncertainty,
     usual_innovation,
 )
 from fhaosmo_ros.core.observer.prediction import predict
+from fhaosmo_ros.core.observer.self_tuning.members import ORDERS
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 
@@ -44,6 +53,8 @@ alone (D 23), the first of a fresh start.
 """
 TOLERANCE = 1e-9
 """What later samples may still change, in standard deviations of the filter's errors."""
+ROUNDING = 1e-12
+"""No variance is less than this part of that of the prediction, from which it is subtracted."""
 
 
 class Problem(NamedTuple):
@@ -54,6 +65,10 @@ class Problem(NamedTuple):
     ----------
     variance, intensity, fastest : float
         Of the noise on y; of the white noise that drives the last level; of the model (1/s).
+    decay : float
+        kappa of D 26 (1/s), with d and its derivatives as in D 26 too; 0: the law has them all.
+    last : int
+        The level that white noise drives.
     fresh : (N, N) array
         Covariance of the errors of a fresh observer.
     first : (N,) array
@@ -64,6 +79,8 @@ class Problem(NamedTuple):
     variance: float
     intensity: float
     fastest: float
+    decay: float
+    last: int
     fresh: Floats
     first: Floats
 
@@ -117,12 +134,12 @@ def make_problem(configuration: ObserverConfiguration) -> Problem:
         The parameters do not say how large noise and d are.
 
     """
-    p = configuration.parameters
+    p, levels = configuration.parameters, configuration.levels
+    first = configuration.initial_estimate.copy()
     if configuration.self_tuning:
-        raise ConfigurationError(
-            "smoothing, 'gains': expected fixed (`tune` finds them and what else it needs), got "
-            "'self_tuning'"
-        )
+        slopes = configuration.model.jacobian(np.zeros(configuration.model.order))
+        fastest = np.abs(np.linalg.eigvals(np.nan_to_num(slopes, posinf=0.0, neginf=0.0))).max()
+        return Problem(0.0, 0.0, float(fastest), 0.0, 0, np.zeros((levels, levels)), first)
     if not (p['noise_size'] > 0.0 and p['unknown_input']):
         raise ConfigurationError(
             "smoothing: expected 'noise_size' > 0 (standard deviation of the noise on y; `tune` "
@@ -130,14 +147,43 @@ def make_problem(configuration: ObserverConfiguration) -> Problem:
             f'{str(p["unknown_input"]).lower()}'
         )
     its = Uncertainty(configuration.model, p, configuration.state_sizes)
-    first = configuration.initial_estimate.copy()
-    return Problem(its.variance, its.intensity, its.fastest, its.fresh, first)
+    return Problem(its.variance, its.intensity, its.fastest, 0.0, levels - 1, its.fresh, first)
+
+
+@compiled(forceinline=True)
+def of_model(problem: Problem, model: Floats) -> Problem:
+    """Return the problem with the noise and the model of d of a self-tuning observer (D 34)."""
+    return Problem(
+        model[NOISE], model[DRIVE], problem.fastest, model[LOSS],
+        problem.fresh.shape[0] - ORDERS + int(model[DERIVATIVES]) % ORDERS, problem.fresh,
+        problem.first,
+    )  # fmt: skip
+
+
+@compiled()
+def doubt(law: Law, problem: Problem, estimates: Floats) -> None:
+    """Write to `fresh` how far off a self-tuning observer with these estimates may be (D 34)."""
+    fresh, n = problem.fresh, problem.fresh.shape[0]
+    z, k = n - ORDERS, problem.last - n + ORDERS
+    fresh[:] = 0.0
+    fresh[0, 0] = problem.variance
+    for i in range(1, z):
+        size = max(law.chances[FRESH * n + i, i], estimates[i] * estimates[i])
+        fresh[i, i] = STATES_DOUBT * STATES_DOUBT * size
+    for i in range(k + 1):
+        for j in range(k + 1):
+            below, share = 2 * k - i - j, problem.intensity
+            for m in range(1, k - i + 1):  # (2k - i - j)! / ((k - i)! (k - j)!)
+                share *= (k - j + m) / m
+            fresh[z + i, z + j] = share / (2.0 * problem.decay) ** (below + 1)
 
 
 @compiled()
 def begin(law: Law, problem: Problem, rows: Rows, k: int, y: float) -> None:
     """Let nothing before row k matter: its estimate is that of a fresh observer."""
-    n = rows.base.shape[1]
+    n, tunes = rows.base.shape[1], problem.decay > 0.0
+    if tunes:
+        doubt(law, problem, rows.base[k])
     rows.pull[k] = rows.certainty[k] = rows.noise[k] = 0.0
     rows.kinds[k] = BEGINS
     for i in range(n):
@@ -145,7 +191,7 @@ def begin(law: Law, problem: Problem, rows: Rows, k: int, y: float) -> None:
         for j in range(n):
             rows.transition[k, i, j] = 0.0
             rows.covariance[k, i, j] = problem.fresh[i, j]
-    if law.flags[FROM_MEASUREMENT]:
+    if law.flags[FROM_MEASUREMENT] or tunes:
         rows.deviation[k, 0] = y - rows.base[k, 0]
 
 
@@ -199,18 +245,25 @@ def predict_row(
     """
     n, stages = rows.base.shape[1], work.stages
     p, f, x, power = rows.covariance[k], rows.transition[k], point[0], point[3]
+    last = problem.last
     filtered(rows, k - 1, point[1], p)
     for i in range(n):
         x[i] = rows.base[k - 1, i]
         for j in range(n):
             f[i, j] = 1.0 if i == j else 0.0
-    count = max(int(min(np.ceil(h * problem.fastest / STEP), MOST_STEPS)), 1)
+    fastest = max(problem.fastest, problem.decay)
+    count = max(int(min(np.ceil(h * fastest / STEP), MOST_STEPS)), 1)
     h /= count
-    power[n - 1] = 1.0
-    for i in range(n - 1, 0, -1):
-        power[i - 1] = power[i] * h / (n - i)
-    slope = point[4:]
+    power[:] = 0.0
+    power[last] = 1.0
+    for i in range(last, 0, -1):
+        power[i - 1] = power[i] * h / (last + 1 - i)
+    slope, kappa = point[4:], problem.decay
     for _ in range(count):
+        if kappa > 0.0:
+            second = x[n - 1] - kappa * (2.0 * x[n - 2] - kappa * x[n - 3])
+            chain = x[n - 3], x[n - 2], x[n - 1]
+            x[n - 2], x[n - 1] = x[n - 2] - kappa * x[n - 3], second
         for j in range(n):  # exact derivative of the Runge-Kutta steps along each state
             for i in range(n):
                 stages[NOW, 0, i], stages[NOW, 1, i] = x[i], 1.0 if i == j else 0.0
@@ -219,12 +272,15 @@ def predict_row(
                 slope[i, j] = stages[NOW, 1, i]
         for i in range(n):
             x[i] = stages[NOW, 0, i]
+        if kappa > 0.0:
+            x[n - 3], x[n - 2], x[n - 1] = chain
+            follow_chain(slope, x, kappa, h)
         multiply(slope, f, point[2], False)
         multiply(slope, p, point[2], False)
         multiply(slope, p, point[2], True)
-        for i in range(n):
-            for j in range(n):
-                q = power[i] * power[j] / (2 * n - 1 - i - j)
+        for i in range(last + 1):
+            for j in range(last + 1):
+                q = power[i] * power[j] / (2 * last + 1 - i - j)
                 p[i, j] += problem.intensity * h * q
     for i in range(n):
         total = x[i]
@@ -233,6 +289,24 @@ def predict_row(
         rows.deviation[k, i] = total
         for j in range(i):
             p[i, j] = p[j, i] = 0.5 * (p[i, j] + p[j, i])
+
+
+@compiled()
+def follow_chain(slope: Floats, x: Floats, kappa: float, h: float) -> None:
+    """Let d and its derivatives be those of D 26 in a step of a law that knows plain ones."""
+    n, z, decayed = x.shape[0], x.shape[0] - ORDERS, np.exp(-kappa * h)
+    for i in range(z):
+        f0, f1, f2 = slope[i, z], slope[i, z + 1], slope[i, z + 2]
+        slope[i, z] = f0 - kappa * (f1 - kappa * f2)
+        slope[i, z + 1] = f1 - 2.0 * kappa * f2
+    for i in range(z, n):
+        slope[i, :] = 0.0
+        slope[i, i] = decayed
+        for j in range(i + 1, n):
+            slope[i, j] = slope[i, j - 1] * h / (j - i)
+        x[i] *= decayed
+        for j in range(i + 1, n):
+            x[i] += slope[i, j] * x[j]
 
 
 @compiled(forceinline=True)
@@ -263,6 +337,7 @@ def take_rows(
     h: Floats,
     y: Floats,
     u: Floats,
+    models: Floats,
     memory: Floats,
     point: Floats,
 ) -> None:
@@ -275,6 +350,8 @@ def take_rows(
         The observer's.
     h, y, u : (K,), (K,), (K, m) arrays
         Time (s) since the row before, sample, and known inputs meanwhile.
+    models : (K, 4) or (K, 0) array
+        `MODEL` of a self-tuning observer.
     memory : (MEMORY,) array
         Remembers the size of the innovations (D 21).
     point : (4 + N, N) array
@@ -282,9 +359,11 @@ def take_rows(
 
     """
     law, work, rows, u = unowned(law), unowned(work), unowned(rows), unowned(u)
-    n = rows.base.shape[1]
+    n, tunes = rows.base.shape[1], models.shape[1] > 0
     for place in range(y.shape[0]):
         k, step = first + place, h[place]
+        if tunes:
+            problem = of_model(problem, models[place])
         for i in range(n):
             rows.base[k, i] = estimates[place, i]
         used = rows.kinds[k] == MEASURED or rows.kinds[k] == JUMPS
@@ -326,10 +405,23 @@ def take_rows(
         elif rows.kinds[k] == MEASURED:
             e = y[place] - rows.base[k, 0] - rows.deviation[k, 0]
             usual = usual_innovation(memory, e, np.sqrt(s))
-            noise = problem.variance * max(abs(e) / (HUBER * usual), 1.0)
+            factor = max(abs(e) / (HUBER * usual), 1.0)
+            if tunes and models[place, DERIVATIVES] < 0.0 and factor > 1.0:
+                allow_jump(rows.covariance[k], rows.transition[k], e * e - s)
+                factor = 1.0
+            noise = problem.variance * factor
             rows.noise[k] = noise
             rows.certainty[k] = 1.0 / (rows.covariance[k, 0, 0] + noise)
             rows.pull[k] = e * rows.certainty[k]
+
+
+@compiled()
+def allow_jump(p: Floats, f: Floats, missing: float) -> None:
+    """Raise the variance of the predicted y by `missing`: d has jumped meanwhile (D 34)."""
+    n, z = p.shape[0], p.shape[0] - ORDERS
+    for i in range(n):
+        for j in range(n):
+            p[i, j] += missing * f[i, z] / f[0, z] * (f[j, z] / f[0, z])
 
 
 @compiled(forceinline=True)
@@ -361,21 +453,52 @@ def smooth_rows(rows: Rows, last: int, stop: int, top: int, out: Floats) -> None
 
     Parameters
     ----------
-    out : (top - stop + 1, N) array
+    out : (top - stop + 1, 1 or 2, N) array
+        Gets the estimates, and the variances of their errors where there is room for them.
 
     """
     rows, out = unowned(rows), unowned(out)
-    n = rows.base.shape[1]
-    costate, line = np.zeros(n), np.zeros(n)
+    n, sure = rows.base.shape[1], out.shape[1] > 1
+    costate, line, known = np.zeros(n), np.zeros(n), np.zeros((n, n))
     for k in range(last, stop - 1, -1):
+        p = rows.covariance[k]
         back(rows, k, costate)
+        if sure:
+            know_sample(rows, k, known, line)
         if k <= top:
             for i in range(n):
                 total = rows.base[k, i] + rows.deviation[k, i]
                 for j in range(n):
-                    total -= rows.covariance[k, i, j] * costate[j]
-                out[k - stop, i] = total
+                    total -= p[i, j] * costate[j]
+                out[k - stop, 0, i] = total
+            for i in range(n if sure else 0):
+                total = p[i, i]
+                for j in range(n):
+                    for m in range(n):
+                        total -= p[i, j] * known[j, m] * p[m, i]
+                out[k - stop, 1, i] = max(total, ROUNDING * p[i, i])
         back_over(rows, k, costate, line)
+        if sure:
+            for j in range(n):
+                back_over(rows, k, known[:, j], line)
+            for i in range(n):
+                back_over(rows, k, known[i], line)
+
+
+@compiled()
+def know_sample(rows: Rows, k: int, known: Floats, line: Floats) -> None:
+    """Add to the inverse covariance of the costate what the sample of row k tells (D 25)."""
+    n, c, total = known.shape[0], rows.certainty[k], rows.certainty[k]
+    for i in range(n):
+        line[i] = 0.0
+        for j in range(n):
+            line[i] += c * known[i, j] * rows.covariance[k, j, 0]
+    for i in range(n):
+        total += c * rows.covariance[k, i, 0] * line[i]
+    for i in range(n):
+        known[0, i] -= line[i]
+        known[i, 0] -= line[i]
+    known[0, 0] += total
 
 
 @compiled()
@@ -415,7 +538,8 @@ def smooth_lagging(rows: Rows, new: int, count: int, done: int, lag: int, out: F
     ----------
     done : int
         Rows that were due before.
-    out : (count - done, N) array
+    out : (count - done, 1 or 2, N) array
+        As in `smooth_rows`.
 
     Returns
     -------

@@ -36,6 +36,7 @@ from fhaosmo_ros.core.observer.arrays import (
     LEVANT,
     MAX,
     MIN,
+    MODEL,
     OFFSET,
     ONE_SIDED,
     PENDING,
@@ -79,8 +80,8 @@ from fhaosmo_ros.core.observer.status import (
     SENSITIVITY_RESET,
 )
 
-VARIANCES = 2
-"""Index in `Record.levels`."""
+VARIANCES, LIKELIEST_MODEL = 2, 3
+"""Indices in `Record.levels`."""
 SENSITIVITY_LIMIT = 1e9
 """Sensitivities beyond it are set to 0."""
 LOST_SAMPLES = 20
@@ -117,8 +118,8 @@ class Record(NamedTuple):
 
     Attributes
     ----------
-    levels : (rows, 2 or 3, N) array
-        `HAT` and `TILDE`, and the variances of a self-tuning observer.
+    levels : (rows, 2 or 4, N) array
+        `HAT` and `TILDE`, and the variances and the `MODEL` of a self-tuning observer.
     gamma : (rows,) array
     eps : (rows or rows + 1, N) array
         Innovations; a run that skips samples needs the row more.
@@ -374,6 +375,17 @@ def step_once(
     return step(law, work, state, y, h, unowned(u), unowned(eps), 0)
 
 
+@compiled(forceinline=True)
+def record_levels(record: Record, row: int, levels: Floats) -> None:
+    """Record the levels of a state."""
+    for i in range(levels.shape[1]):
+        record.levels[row, HAT, i] = levels[HAT, i]
+        record.levels[row, TILDE, i] = levels[TILDE, i]
+        if record.levels.shape[1] > VARIANCES:
+            record.levels[row, VARIANCES, i] = levels[COVARIANCE, i]
+            record.levels[row, LIKELIEST_MODEL, i] = levels[MODEL, i]
+
+
 @compiled()
 def run(
     law: Law, work: Work, state: State, samples: Samples, record: Record, first: int, every: int
@@ -394,11 +406,7 @@ def run(
             word = start(law, state, samples.y[k], eps, row)
         seen |= word & FLAGS_MASK
         if (k + 1) % every == 0:
-            for i in range(levels.shape[1]):
-                record.levels[row, HAT, i] = levels[HAT, i]
-                record.levels[row, TILDE, i] = levels[TILDE, i]
-                if record.levels.shape[1] > VARIANCES:
-                    record.levels[row, VARIANCES, i] = levels[COVARIANCE, i]
+            record_levels(record, row, levels)
             record.gamma[row] = memory[GAMMA]
             record.words[row] = (word >> LEVEL_SHIFT << LEVEL_SHIFT) | seen
             seen = 0

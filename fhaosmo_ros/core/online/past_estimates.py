@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
-from fhaosmo_ros.core.observer.arrays import GAMMA
+from fhaosmo_ros.core.observer.arrays import COVARIANCE, GAMMA, HAT, MODEL, TILDE
 from fhaosmo_ros.core.observer.observer import Estimate, Observer, Trajectory
 from fhaosmo_ros.core.observer.smoother import Smoother
 from fhaosmo_ros.core.observer.status import LEVEL_SHIFT, REJECTED
@@ -47,6 +47,7 @@ class PastEstimates:
         self._parts: deque[tuple[Trajectory, Ints]] = deque()
         self._time: int | None = None
         self._taken = 0
+        self._planes = [HAT, TILDE, COVARIANCE, MODEL] if observer.self_tuning else [HAT, TILDE]
         self.estimate: Estimate | None = None
         self.stamp = 0
         self.numbers = np.zeros(0, dtype=np.int64)
@@ -79,7 +80,7 @@ class PastEstimates:
         """Take the sample that an estimator has just taken, with its status word."""
         ints, (levels, memory) = e.policy.ints, e.state
         record = Record(
-            levels[np.newaxis, :2].copy(), memory[[GAMMA]], eps.copy(), np.array([word])
+            levels[np.newaxis, self._planes], memory[[GAMMA]], eps.copy(), np.array([word])
         )
         found = self._observer.trajectory(ints[[at.STAMP]] - ints[at.DELAY], record)
         if ints[at.LAG] > 0:
@@ -105,7 +106,7 @@ class PastEstimates:
             levels = np.stack([found.z_hat, found.z_tilde], axis=1)
             law, work, _ = self._observer.arrays
             y = found.z_hat[:, 0] + found.innovation[:, 0]  # less its offset (D 23)
-            self._smoother.take(law, work, levels, (y, h, u), times, kinds)
+            self._smoother.take(law, work, levels, (y, h, u), times, kinds, found.model.copy())
             self._parts.append((found, numbers))
 
     def _handed_out(self, smoothed: NDArray[np.float64]) -> Trajectory:
@@ -125,7 +126,9 @@ class PastEstimates:
         parts = zip(*(part for part, _ in taken), strict=True)
         rows = Trajectory._make(map(np.concatenate, parts))
         self.numbers = np.concatenate([numbers for _, numbers in taken])
-        rows = rows._replace(z=smoothed[:, :n], unknown_input=smoothed[:, n])
+        rows = rows._replace(z=smoothed[:, 0, :n], unknown_input=smoothed[:, 0, n])
+        if self._observer.self_tuning:
+            rows = rows._replace(standard_deviation=np.sqrt(smoothed[:, 1, : n + 1]))
         word = int(rows.status[-1]) | int(rows.open_levels[-1]) << LEVEL_SHIFT
         self.stamp = int(rows.t[-1])
         self.estimate = Estimate(
@@ -137,20 +140,11 @@ class PastEstimates:
         return rows
 
     def _nothing(self) -> Trajectory:
-        n, levels, none = self._observer.order, self._observer.levels, np.zeros(0)
+        levels, planes = self._observer.levels, len(self._planes)
+        none = np.zeros(0)
         integers, wide = np.zeros(0, dtype=np.int64), np.zeros((0, levels))
-        return Trajectory(
-            integers,
-            np.zeros((0, n)),
-            none,
-            none,
-            wide,
-            integers,
-            integers,
-            wide,
-            wide,
-            wide[:, :0],
-        )
+        record = Record(np.zeros((0, planes, levels)), none, wide, integers)
+        return self._observer.trajectory(integers, record)
 
 
 def part_of(rows: Trajectory, index: Any) -> Trajectory:

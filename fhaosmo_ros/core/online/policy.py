@@ -9,13 +9,11 @@ from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.compiled.unowned_arrays import unowned
 from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
 from fhaosmo_ros.core.observer.arrays import (
-    COVARIANCE,
     GAMMA,
     HAT,
     Law,
     OFFSET,
     State,
-    TILDE,
     Work,
     Y,
 )
@@ -31,7 +29,7 @@ from fhaosmo_ros.core.observer.status import (
     REJECTED_STUCK,
     RESTARTED,
 )
-from fhaosmo_ros.core.observer.step import innovations, Record, start, VARIANCES
+from fhaosmo_ros.core.observer.step import innovations, Record, record_levels, start
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online.delay import (
     forget_past,
@@ -199,11 +197,7 @@ def run(
     levels, memory = e.state.levels, e.state.memory
     for k in range(y.shape[0]):
         record.words[k] = take(e, stamps[k], y[k], u[k], eps, k)
-        for i in range(levels.shape[1]):
-            record.levels[k, HAT, i] = levels[HAT, i]
-            record.levels[k, TILDE, i] = levels[TILDE, i]
-            if record.levels.shape[1] > VARIANCES:
-                record.levels[k, VARIANCES, i] = levels[COVARIANCE, i]
+        record_levels(record, k, levels)
         record.gamma[k] = memory[GAMMA]
         if present.shape[0] > 0:
             published(e, e.policy.ints[at.FILTERED], present[k])

@@ -93,6 +93,7 @@ from fhaosmo_ros.core.observer.self_tuning.weights import (
     judge_quantised,
     mix,
     QUANTISED_FLOOR,
+    tell_model,
     weigh,
 )
 from fhaosmo_ros.core.observer.step import LOST_SAMPLES
@@ -128,7 +129,7 @@ def follow_period(law: Law, members: Members, memory: Floats, h: float) -> None:
             tau = rates[TAU, g]
             rates[CORRELATION, g] = math.exp(-h / tau) if tau > 0.0 else 0.0
     changed = abs(h - memory[STEADY_PERIOD]) > NEAR * memory[STEADY_PERIOD]
-    likeliest = int(memory[LIKELIEST])
+    likeliest = COLOUR[int(memory[LIKELIEST]) % COUNT]
     for c in range(COLOURS.size):
         ratio, limit = noise[SQUARE, c] / noise[USED, c], ANOTHER if c == likeliest else FAR_OFF
         changed = changed or not 1.0 / limit < ratio < limit
@@ -270,6 +271,7 @@ def step_members(
     correct_states(members, scratch, n, y)
     memory[LIKELIEST] = weigh(members, QUANTISED_FLOOR if quanta > 0.0 else FLOOR)
     mix(law, members, scratch, x)
+    tell_model(law, members, int(memory[LIKELIEST]), h, jumped, x)
     find_strays(members, n, x)
     return float((y - x[HAT, 0]) ** 2)
 

@@ -5,18 +5,30 @@ import math
 
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
-from fhaosmo_ros.core.observer.arrays import COVARIANCE, HAT, Law, SLIDER
+from fhaosmo_ros.core.observer.arrays import (
+    COVARIANCE,
+    DERIVATIVES,
+    DRIVE,
+    HAT,
+    Law,
+    LOSS,
+    MODEL,
+    NOISE,
+    SLIDER,
+)
 from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import at, HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
     BANDS,
     COLOUR,
+    CORRELATION,
     COUNT,
     exponential,
     FAR,
     FAST,
     fill,
     IN_BAND,
+    INTENSITY,
     KAPPA,
     LOG_VARIANCE,
     Members,
@@ -105,7 +117,7 @@ def judge_quantised(members: Members, y: float, ahead: OfEach, quanta: float, ke
 
 @compiled(fastmath=FAST)
 def weigh(members: Members, floor: float) -> int:
-    """Turn log-likelihoods into weights (D 28); return the colour of the likeliest member."""
+    """Turn log-likelihoods into weights (D 28); return which member is the likeliest."""
     best, total, likeliest = -math.inf, 0.0, 0
     for k in range(ORDERS):
         score = members.record[SCORE, k]
@@ -124,8 +136,27 @@ def weigh(members: Members, floor: float) -> int:
             weight[g] /= total
         for g in range(COUNT - 1, -1, -1):
             if score[g] == 0.0:  # the first of them; before they are judged there are many
-                likeliest = COLOUR[g]
+                likeliest = k * COUNT + g
     return likeliest
+
+
+@compiled()
+def tell_model(
+    law: Law, members: Members, likeliest: int, h: float, jumped: bool, x: Floats
+) -> None:
+    """
+    Write the model of d and the noise of the likeliest member to `x`, for a smoother (D 34).
+
+    Coloured noise counts as white noise that is as dense where the member's bandwidth ends.
+    """
+    k, g, slider = likeliest // COUNT, likeliest % COUNT, law.scalars[SLIDER]
+    row, twice = x[MODEL], 2.0 * (x.shape[1] - ORDERS + 1 + k)
+    noise, a = members.noise[SQUARE, COLOUR[g]], members.rates[CORRELATION, g]
+    drive = members.record[INTENSITY, k, g] * slider**twice
+    edge = min((drive / (noise * h)) ** (1.0 / twice) * h, math.pi)
+    row[NOISE] = noise / (1.0 + a * (a - 2.0 * math.cos(edge)))
+    row[DRIVE], row[LOSS] = drive, members.rates[KAPPA, g] * slider
+    row[DERIVATIVES] = k - ORDERS if jumped else k
 
 
 @compiled()
