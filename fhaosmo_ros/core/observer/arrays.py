@@ -54,6 +54,7 @@ Entries of ``State.memory``:
 | ROUGHNESS | short mean of the squared differences of y, over their usual size | 1 |
 | INTERVAL | last interval between two samples that were taken | s |
 | JITTER | variance of the stamps of late, over the square of the interval | 1 |
+| TURNS | share of the samples of late that were unlikely and on a new side | 1 |
 """
 
 from typing import NamedTuple
@@ -87,8 +88,8 @@ GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSE
 OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
 SAMPLES, FAR_SIGN, QUANTUM, LATTICE, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
 FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM, GROWING, FIRST_OFF = range(25, 31)
-NARROWED, ONE_SIDED, RECENT, ROUGHNESS, INTERVAL, JITTER = range(31, 37)
-MEMORY = 37
+NARROWED, ONE_SIDED, RECENT, ROUGHNESS, INTERVAL, JITTER, TURNS = range(31, 38)
+MEMORY = 38
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)

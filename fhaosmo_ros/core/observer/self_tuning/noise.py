@@ -165,9 +165,9 @@ def knowing(members: Members, scratch: Scratch, s: Floats) -> float:
     Return the largest variance of the innovations with which a member can judge a sample.
 
     Members that have been found unlikely do not set it: without noise on y they expect innovations
-    that are far too small.
+    that are far too small. The likeliest one always can.
     """
-    noise, least = scratch.lines[0], math.inf
+    noise, least, likeliest = scratch.lines[0], math.inf, math.inf
     fill(noise, members.noise[SQUARE])
     for k in range(ORDERS):
         share = s[k]
@@ -175,7 +175,8 @@ def knowing(members: Members, scratch: Scratch, s: Floats) -> float:
         for g in range(COUNT):
             variance = share[g] * noise[g]
             least = min(least, variance if score[g] > -CLOSE else math.inf)
-    return IGNORANT * least
+            likeliest = min(likeliest, variance if score[g] == 0.0 else math.inf)
+    return max(IGNORANT * least, likeliest)
 
 
 @compiled()
@@ -198,6 +199,17 @@ def is_likely(members: Members, b: Floats, s: Floats, largest: float, beyond: fl
             follows = members.record[FAR, k, g] < late
             judges = variance <= largest and members.record[SCORE, k, g] > -CLOSE
             if judges and follows and b[k, g] * b[k, g] <= GATE * GATE * variance:
+                return True
+    return False
+
+
+@compiled()
+def is_explained(members: Members, b: Floats, s: Floats) -> bool:
+    """Return True if any member finds a sample usual, however unlikely the member itself is."""
+    for k in range(ORDERS):
+        for g in range(COUNT):
+            variance = s[k, g] * members.noise[SQUARE, COLOUR[g]]
+            if b[k, g] * b[k, g] <= HUBER * HUBER * variance:
                 return True
     return False
 

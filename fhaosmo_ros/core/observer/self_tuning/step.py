@@ -32,6 +32,7 @@ from fhaosmo_ros.core.observer.arrays import (
     ROWS,
     SAMPLES,
     STEADY_PERIOD,
+    TURNS,
     UNSETTLED,
     Work,
     Y,
@@ -81,6 +82,7 @@ from fhaosmo_ros.core.observer.self_tuning.noise import (
     difference,
     find_quantum,
     follow_noise,
+    is_explained,
     is_likely,
     knowing,
     stamp_noise,
@@ -111,6 +113,11 @@ its differences.
 """
 JUMP_SAMPLES = 10.0
 """What is beyond 3 sigma in so many samples after that is due to the jump, too."""
+TURNS_SAMPLES, OFTEN = 40.0, 0.07
+"""
+If unlikely samples are on the other side than the last one in a larger share of so many samples,
+and y itself moves as ever, members are judged by them too: those that were likely are wrong.
+"""
 EXACT = 1e-5
 """y is taken to be no more exact than this, in parts of what it moves between samples (RMS)."""
 ANOTHER, FAR_OFF = 1.3, 3.0
@@ -227,8 +234,15 @@ def step_members(
     memory[RECENT] = max(memory[RECENT] - 1.0, 0.0)
     begins = not likely and memory[GROWING] >= GROWTHS
     jumped = begins or (memory[RECENT] > 0.0 and roughness <= HUBER * HUBER)
+    kept = math.exp(-h / law.scalars[FORGETTING])
+    sign = math.copysign(1.0, y - now[0, 0])
+    turned = not likely and sign != memory[FAR_SIGN]
+    memory[TURNS] += ((1.0 if turned else 0.0) - memory[TURNS]) / TURNS_SAMPLES
+    doubted = memory[TURNS] > OFTEN and memory[ROUGHNESS] < HUBER and quanta == 0.0
     if not likely and not jumped:
-        sign = math.copysign(1.0, y - now[0, 0])
+        if doubted and is_explained(members, b, believed):
+            judge(members, scratch, 1.0, kept)
+            memory[LIKELIEST] = weigh(members, FLOOR)
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
             memory[BEYOND] += 1.0
         else:  # noise has both signs, y that is off has one
@@ -253,7 +267,6 @@ def step_members(
         members, scratch, floor, believed, largest, count, memory[ROUGHNESS], of_stamps
     )
     memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
-    kept = math.exp(-h / law.scalars[FORGETTING])
     for k in range(ORDERS):
         variance, log_variance, found = (
             members.record[VARIANCE, k], members.record[LOG_VARIANCE, k], s[k]
@@ -261,7 +274,7 @@ def step_members(
         for g in range(moving):
             variance[g], log_variance[g] = found[g], math.log(found[g])
     judged = memory[CALM] > CALM_SAMPLES or best_fit < HUBER * HUBER
-    judged = judged and (roughness <= HUBER * HUBER or quanta > 0.0)
+    judged = (judged or doubted) and (roughness <= HUBER * HUBER or quanta > 0.0)
     judge(members, scratch, grown, kept if judged and quanta == 0.0 else -1.0)
     if judged and quanta > 0.0:
         judge_quantised(members, y, ahead, quanta, kept)
@@ -300,6 +313,7 @@ def restart_members(law: Law, levels: Floats, memory: Floats, rows: Floats, y: f
     n = law.gains.shape[1] - ORDERS
     members = members_in(rows, n)
     memory[UNSETTLED] = memory[BEYOND] = memory[GROWING] = memory[RECENT] = 0.0
+    memory[TURNS] = 0.0
     levels[HAT, 0] = memory[Y] = y
     for k in range(ORDERS):
         z = members.x[k]

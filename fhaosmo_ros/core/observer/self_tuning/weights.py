@@ -77,7 +77,9 @@ def judge(members: Members, scratch: Scratch, grown: float, kept: float) -> None
             score, prior = members.record[SCORE, k], members.record[PRIOR, k]
             log_s = members.record[LOG_VARIANCE, k]
             for g in range(COUNT):
-                likelihood = min(r[g] / grown, HUBER * HUBER) + log_s[g] + log_noise[g]
+                late = max(far[g] - 1.0, 0.0)  # in a row: not outliers, but the member's fault
+                most = HUBER * HUBER * (1.0 + late * late)
+                likelihood = min(r[g] / grown, most) + log_s[g] + log_noise[g]
                 score[g] = prior[g] + kept * (score[g] - prior[g]) - 0.5 * likelihood
         for g in range(COUNT):
             if r[g] > HUBER * HUBER:
