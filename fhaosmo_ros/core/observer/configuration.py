@@ -148,7 +148,9 @@ class ObserverConfiguration:
         levels, memory = np.zeros((rows, self.levels)), np.zeros(arrays.MEMORY)
         levels[arrays.HAT] = self.initial_estimate
         levels[arrays.TILDE] = self.initial_internal
-        if not self.self_tuning:
+        if self.self_tuning:
+            levels[arrays.COVARIANCE] = np.inf
+        else:
             levels[arrays.COVARIANCE :] = self.law.chances[arrays.part(arrays.FRESH, self.levels)]
         memory[arrays.GAMMA] = self.gamma_initial
         memory[arrays.Y] = np.nan

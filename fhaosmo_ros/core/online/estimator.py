@@ -555,6 +555,17 @@ class OnlineEstimator:
             return self._smoothing.estimate
         return self._published(self._word) if self._ints[at.VALID] else None
 
+    @property
+    def standard_deviation(self) -> NDArray[np.float64]:
+        """
+        Standard deviations of the errors of `estimate`: of z and d, (n + 1,).
+
+        As a self-tuning observer expects them; NaN with fixed gains.
+        """
+        if self._smoothing is not None:
+            return self._smoothing.standard_deviation
+        return self.observer.standard_deviation
+
     def _published(self, word: int) -> Estimate:
         estimate = self.observer.report(word)
         if not (self._ints[at.TO_NOW] and self._ints[at.DELAY]):

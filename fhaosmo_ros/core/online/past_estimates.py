@@ -36,6 +36,8 @@ class PastEstimates:
         The latest one that was due.
     stamp : int
         Of its sample, in nanoseconds.
+    standard_deviation : (n + 1,) array
+        Of its errors, as a self-tuning observer expects; NaN with fixed gains.
     numbers : (K,) array
         Which of all samples that were taken the rows are that were handed out last.
 
@@ -50,6 +52,7 @@ class PastEstimates:
         self._planes = [HAT, TILDE, COVARIANCE, MODEL] if observer.self_tuning else [HAT, TILDE]
         self.estimate: Estimate | None = None
         self.stamp = 0
+        self.standard_deviation = np.full(observer.order + 1, np.nan)
         self.numbers = np.zeros(0, dtype=np.int64)
 
     def configure(self) -> None:
@@ -129,6 +132,7 @@ class PastEstimates:
         rows = rows._replace(z=smoothed[:, 0, :n], unknown_input=smoothed[:, 0, n])
         if self._observer.self_tuning:
             rows = rows._replace(standard_deviation=np.sqrt(smoothed[:, 1, : n + 1]))
+            self.standard_deviation = rows.standard_deviation[-1]
         word = int(rows.status[-1]) | int(rows.open_levels[-1]) << LEVEL_SHIFT
         self.stamp = int(rows.t[-1])
         self.estimate = Estimate(

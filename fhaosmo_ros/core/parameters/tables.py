@@ -332,8 +332,8 @@ SAMPLING = (
     Parameter(
         'smoothing_lag', 0.0,
         'Estimate each time from the samples before it and for so long after it: less noise, '
-        'known so much later, and stamped with the time that it tells of. Needs noise_size. 0: '
-        'off.',
+        'known so much later, and stamped with the time that it tells of. Fixed gains need '
+        'noise_size. 0: off.',
         unit='s', lower=0.0, upper=60.0, live=False,
     ),
 )  # fmt: skip

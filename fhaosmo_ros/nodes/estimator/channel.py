@@ -374,7 +374,7 @@ class Channel:
         stamp = estimator.stamp
         self._outputs.publish(estimate, stamp)
         if self._tuning is not None:
-            self._tuning.publish(estimator.observer)
+            self._tuning.publish(estimator)
         return Output(self.label, stamp, estimate, self._values)
 
     @property

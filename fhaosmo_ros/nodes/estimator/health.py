@@ -261,7 +261,9 @@ class Health:
                 'noise of y': tuning.noise,
                 'correlation of the noise': tuning.correlation,
                 'd is followed within [s]': 1.0 / tuning.bandwidth,
-                titled('standard deviation of d', unit): float(observer.standard_deviation[-1]),
+                titled('standard deviation of d', unit): float(
+                    self._estimator.standard_deviation[-1]
+                ),
             }
         self._find_events(report, unit)
         if limits['unknown_input_unit']:

@@ -5,8 +5,9 @@ from collections.abc import Mapping
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from fhaosmo_ros.core.observer.observer import Estimate, Observer
+from fhaosmo_ros.core.observer.observer import Estimate
 from fhaosmo_ros.core.observer.self_tuning.members import ORDERS
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.nodes.middleware.messages import (
     array_encoder,
@@ -102,11 +103,11 @@ class TuningOutputs(Publishers):
             'noise', 'correlation', 'bandwidth', *(f'derivatives{k}' for k in range(ORDERS)),
         ])  # fmt: skip
 
-    def publish(self, observer: Observer) -> None:
+    def publish(self, estimator: OnlineEstimator) -> None:
         """Publish the standard deviations of the latest estimate, and the tuning."""
         deviation, tuning = self._publishers
-        deviation.publish(self._encode_deviation(observer.standard_deviation))
-        noise, correlation, bandwidth, shares = observer.tuning
+        deviation.publish(self._encode_deviation(estimator.standard_deviation))
+        noise, correlation, bandwidth, shares = estimator.observer.tuning
         tuning.publish(self._encode_tuning(np.array([noise, correlation, bandwidth, *shares])))
 
 

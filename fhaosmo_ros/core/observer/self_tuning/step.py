@@ -12,6 +12,7 @@ from fhaosmo_ros.core.observer.arrays import (
     ARRAYS,
     BEYOND,
     CALM,
+    COVARIANCE,
     FAR_SIGN,
     FIRST_NOISE,
     FIRST_OFF,
@@ -315,6 +316,10 @@ def restart_members(law: Law, levels: Floats, memory: Floats, rows: Floats, y: f
     memory[UNSETTLED] = memory[BEYOND] = memory[GROWING] = memory[RECENT] = 0.0
     memory[TURNS] = 0.0
     levels[HAT, 0] = memory[Y] = y
+    levels[COVARIANCE, 0] = members.noise[SQUARE, 0]
+    for i in range(1, n):
+        size = law.chances[FRESH * law.gains.shape[1] + i, i]
+        levels[COVARIANCE, i] = max(size, levels[HAT, i] ** 2)
     for k in range(ORDERS):
         z = members.x[k]
         p = members.p[k]
