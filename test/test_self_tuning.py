@@ -20,6 +20,16 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from studies.everywhere import (
+    Condition,
+    model_of,
+    online,
+    recording,
+    setting_of,
+)
+from studies.everywhere import (
+    PLANTS as PLANTS_OF_STUDY,
+)
 
 PERIOD = 1e-3
 SELF_TUNING = {'gains': 'self_tuning'}
@@ -375,13 +385,6 @@ def test_it_needs_the_unknown_input():
         Observer({**SELF_TUNING, 'unknown_input': False})
 
 
-def test_it_is_not_smoothed():
-    """The smoother needs the parameters of fixed gains."""
-    observer = Observer({**SELF_TUNING, 'noise_size': 1e-3})
-    with pytest.raises(ConfigurationError, match='self_tuning'):
-        observer.smooth(np.arange(3) * PERIOD, np.zeros(3))
-
-
 def test_noise_is_at_least_what_is_said(case):
     """So that y without any noise, which no member is quick enough for, can be used."""
     t, z, d, _ = case
@@ -389,3 +392,16 @@ def test_noise_is_at_least_what_is_said(case):
     run = observer.run(t, z[:, 0])
     assert observer.tuning.noise >= 1e-4
     assert rms((run.unknown_input - d)[5000:]) < 0.9 * rms(d)
+
+
+@pytest.mark.parametrize(
+    ('name', 'seed'), [("paper's plant", 20), ('motor', 14), ('motor', 10), ('pendulum', 3)]
+)
+def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, seed):
+    """A hundredfold noise has samples farther and farther off by chance (D 33)."""
+    plant, condition = PLANTS_OF_STUDY[name], Condition(later=100.0)
+    kind = ('sine', 'chirp', 'ou', 'square')[seed % 4]
+    r = recording(plant, condition, kind, 8.0, seed)
+    p = model_of(setting_of(plant, condition)) | SELF_TUNING
+    found, _ = online(r, p)
+    assert np.abs(found - r.d).max() < 4.0 * np.abs(r.d).max()

@@ -54,7 +54,7 @@ Entries of ``State.memory``:
 | ROUGHNESS | short mean of the squared differences of y, over their usual size | 1 |
 | INTERVAL | last interval between two samples that were taken | s |
 | JITTER | variance of the stamps of late, over the square of the interval | 1 |
-| TURNS | share of the samples of late that were unlikely and on a new side | 1 |
+| TURNS | of late, the share of samples that were unlikely, on a new side, not rough | 1 |
 """
 
 from typing import NamedTuple

@@ -101,6 +101,8 @@ class Rows(NamedTuple):
         e / S, 1 / S, and the variance that the sample is taken to have; 0 without a sample.
     times, kinds : (R,) arrays
         In ns; `MEASURED`, `UNMEASURED`, `JUMPS` or `BEGINS`.
+    decay, last : (R,) arrays
+        Of the row's `Problem`, in whose terms its levels of d are.
 
     """
 
@@ -113,14 +115,16 @@ class Rows(NamedTuple):
     noise: Floats
     times: Ints
     kinds: Ints
+    decay: Floats
+    last: Ints
 
     @classmethod
     def empty(cls, room: int, levels: int) -> 'Rows':
         """Return room for so many rows."""
-        matrix, integers = (room, levels, levels), np.zeros((2, room), dtype=np.int64)
+        matrix, integers = (room, levels, levels), np.zeros((3, room), dtype=np.int64)
         return cls(
             np.zeros((room, levels)), np.zeros(matrix), np.zeros((room, levels)),
-            np.zeros(matrix), *np.zeros((3, room)), *integers,
+            np.zeros(matrix), *np.zeros((3, room)), *integers[:2], np.zeros(room), integers[2],
         )  # fmt: skip
 
 
@@ -172,10 +176,38 @@ def doubt(law: Law, problem: Problem, estimates: Floats) -> None:
         fresh[i, i] = STATES_DOUBT * STATES_DOUBT * size
     for i in range(k + 1):
         for j in range(k + 1):
-            below, share = 2 * k - i - j, problem.intensity
-            for m in range(1, k - i + 1):  # (2k - i - j)! / ((k - i)! (k - j)!)
-                share *= (k - j + m) / m
-            fresh[z + i, z + j] = share / (2.0 * problem.decay) ** (below + 1)
+            fresh[z + i, z + j] = usual(problem, k - i, k - j)
+
+
+@compiled(forceinline=True)
+def usual(problem: Problem, i: int, j: int) -> float:
+    """Return the covariance of the levels i and j before the last one, as ever in D 26."""
+    share = problem.intensity
+    for m in range(1, i + 1):  # (i + j)! / (i! j!)
+        share *= (j + m) / m
+    return float(share / (2.0 * problem.decay) ** (i + j + 1))
+
+
+@compiled()
+def change_model(problem: Problem, rows: Rows, k: int, x: Floats, p: Floats, f: Floats) -> None:
+    """
+    Express the levels of d of row k - 1 as the model of row k has them (D 34), in place.
+
+    A level that the model before did not have is as large as ever.
+    """
+    n, z = x.shape[0], x.shape[0] - ORDERS
+    more = problem.decay - rows.decay[k - 1]
+    for row in range(ORDERS - 1, 0, -1):  # (D + kappa + more)^j, by the binomial theorem
+        share = 1.0
+        for column in range(row - 1, -1, -1):
+            share *= more * (column + 1) / (row - column)
+            f[z + row, z + column] = share
+            x[z + row] += share * x[z + column]
+    line = np.empty(n)
+    multiply(f, p, line, False)
+    multiply(f, p, line, True)
+    for i in range(rows.last[k - 1] + 1, problem.last + 1):
+        p[i, i] += usual(problem, problem.last - i, problem.last - i)
 
 
 @compiled()
@@ -211,6 +243,7 @@ def repeat(rows: Rows, k: int) -> None:
     filtered(rows, k - 1, rows.deviation[k], rows.covariance[k])
     rows.pull[k] = rows.certainty[k] = rows.noise[k] = 0.0
     rows.kinds[k], rows.times[k] = UNMEASURED, rows.times[k - 1]
+    rows.decay[k], rows.last[k] = rows.decay[k - 1], rows.last[k - 1]
     for i in range(n):
         rows.base[k, i] = rows.base[k - 1, i]
         for j in range(n):
@@ -251,6 +284,8 @@ def predict_row(
         x[i] = rows.base[k - 1, i]
         for j in range(n):
             f[i, j] = 1.0 if i == j else 0.0
+    if problem.decay != rows.decay[k - 1] or last != rows.last[k - 1]:
+        change_model(problem, rows, k, x, p, f)
     fastest = max(problem.fastest, problem.decay)
     count = max(int(min(np.ceil(h * fastest / STEP), MOST_STEPS)), 1)
     h /= count
@@ -366,6 +401,7 @@ def take_rows(
             problem = of_model(problem, models[place])
         for i in range(n):
             rows.base[k, i] = estimates[place, i]
+        rows.decay[k], rows.last[k] = problem.decay, problem.last
         used = rows.kinds[k] == MEASURED or rows.kinds[k] == JUMPS
         if used and step <= 0.0 and rows.kinds[k - 1] != BEGINS:
             # The policy has withdrawn the sample before: its stamp was ahead.
@@ -422,6 +458,8 @@ def allow_jump(p: Floats, f: Floats, missing: float) -> None:
     for i in range(n):
         for j in range(n):
             p[i, j] += missing * f[i, z] / f[0, z] * (f[j, z] / f[0, z])
+        if 0 < i <= z:  # when it has jumped is not known
+            p[i, i] += missing * (f[i, z] / f[0, z]) ** 2
 
 
 @compiled(forceinline=True)

@@ -86,6 +86,8 @@ from fhaosmo_ros.core.observer.self_tuning.noise import (
     is_explained,
     is_likely,
     knowing,
+    ROUGH,
+    SHORT_SHARE,
     stamp_noise,
     STEADY,
 )
@@ -110,14 +112,15 @@ GROWTHS = 3.0
 FARTHER, SMOOTH = 1.3, 10.0
 """
 Farther means: so many times as far, and 3 sigma more. It is not noise if y is off by so many times
-its differences.
+its differences, and if these were not larger than usual before.
 """
 JUMP_SAMPLES = 10.0
 """What is beyond 3 sigma in so many samples after that is due to the jump, too."""
-TURNS_SAMPLES, OFTEN = 40.0, 0.07
+TURNS_SAMPLES, OFTEN, ROUGH_TURN = 40.0, 0.07, -0.5
 """
 If unlikely samples are on the other side than the last one in a larger share of so many samples,
 and y itself moves as ever, members are judged by them too: those that were likely are wrong.
+A sample whose difference is large counts as `ROUGH_TURN` of these: noise may have grown.
 """
 EXACT = 1e-5
 """y is taken to be no more exact than this, in parts of what it moves between samples (RMS)."""
@@ -233,16 +236,20 @@ def step_members(
     memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and off > far else 0.0
     likely = is_likely(members, b, believed, largest, memory[BEYOND])
     memory[RECENT] = max(memory[RECENT] - 1.0, 0.0)
-    begins = not likely and memory[GROWING] >= GROWTHS
+    before = memory[ROUGHNESS] - SHORT_SHARE * HUBER * HUBER * (memory[BEYOND] + 1.0)
+    begins = not likely and memory[GROWING] >= GROWTHS and before < ROUGH
     jumped = begins or (memory[RECENT] > 0.0 and roughness <= HUBER * HUBER)
     kept = math.exp(-h / law.scalars[FORGETTING])
-    sign = math.copysign(1.0, y - now[0, 0])
-    turned = not likely and sign != memory[FAR_SIGN]
-    memory[TURNS] += ((1.0 if turned else 0.0) - memory[TURNS]) / TURNS_SAMPLES
+    sign, turn = math.copysign(1.0, y - now[0, 0]), 0.0
+    if roughness > HUBER * HUBER:
+        turn = ROUGH_TURN
+    elif not likely and sign != memory[FAR_SIGN]:
+        turn = 1.0
+    memory[TURNS] = max(memory[TURNS] + (turn - memory[TURNS]) / TURNS_SAMPLES, 0.0)
     doubted = memory[TURNS] > OFTEN and memory[ROUGHNESS] < HUBER and quanta == 0.0
     if not likely and not jumped:
         if doubted and is_explained(members, b, believed):
-            judge(members, scratch, 1.0, kept)
+            judge(members, scratch, 1.0, kept, True)
             memory[LIKELIEST] = weigh(members, FLOOR)
         if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
             memory[BEYOND] += 1.0
@@ -274,9 +281,10 @@ def step_members(
         )  # fmt: skip
         for g in range(moving):
             variance[g], log_variance[g] = found[g], math.log(found[g])
-    judged = memory[CALM] > CALM_SAMPLES or best_fit < HUBER * HUBER
-    judged = (judged or doubted) and (roughness <= HUBER * HUBER or quanta > 0.0)
-    judge(members, scratch, grown, kept if judged and quanta == 0.0 else -1.0)
+    calm = memory[CALM] > CALM_SAMPLES or doubted
+    judged = calm or best_fit < HUBER * HUBER
+    judged = judged and (roughness <= HUBER * HUBER or quanta > 0.0)
+    judge(members, scratch, grown, kept if judged and quanta == 0.0 else -1.0, calm)
     if judged and quanta > 0.0:
         judge_quantised(members, y, ahead, quanta, kept)
     for k in range(ORDERS):

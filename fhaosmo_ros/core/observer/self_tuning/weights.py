@@ -53,7 +53,7 @@ NEGLIGIBLE = 25.0
 
 
 @compiled(fastmath=FAST)
-def judge(members: Members, scratch: Scratch, grown: float, kept: float) -> None:
+def judge(members: Members, scratch: Scratch, grown: float, kept: float, calm: bool) -> None:
     """
     Take a sample into the log-likelihoods, and bound the innovations (D 27, D 28), in place.
 
@@ -61,6 +61,9 @@ def judge(members: Members, scratch: Scratch, grown: float, kept: float) -> None
     ----------
     kept : float
         Part of the log-likelihoods that is not forgotten; negative to leave them as they are.
+    calm : bool
+        True if the noise has not grown of late: then samples in a row that are far off a member
+        are not outliers, but its fault.
 
     """
     noise, log_noise, r = scratch.lines[0], scratch.lines[1], scratch.lines[2]
@@ -77,7 +80,7 @@ def judge(members: Members, scratch: Scratch, grown: float, kept: float) -> None
             score, prior = members.record[SCORE, k], members.record[PRIOR, k]
             log_s = members.record[LOG_VARIANCE, k]
             for g in range(COUNT):
-                late = max(far[g] - 1.0, 0.0)  # in a row: not outliers, but the member's fault
+                late = max(far[g] - 1.0, 0.0) if calm else 0.0
                 most = HUBER * HUBER * (1.0 + late * late)
                 likelihood = min(r[g] / grown, most) + log_s[g] + log_noise[g]
                 score[g] = prior[g] + kept * (score[g] - prior[g]) - 0.5 * likelihood
