@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events and standard deviations of a replay: in bags, in tables and in figures."""
+"""Events, standard deviations and tuning of a replay: in bags, in tables and in figures."""
 
 import bag_files as files
 from fhaosmo_ros.core import OnlineEstimator
+from fhaosmo_ros.core.observer.self_tuning.members import FIRST_SAMPLES, TUNING
 from fhaosmo_ros.core.observer.status import REJECTED
-from fhaosmo_ros.tools.bags.topics import messages
+from fhaosmo_ros.tools.bags.topics import messages, series
 from fhaosmo_ros.tools.plot import command as plot
 from fhaosmo_ros.tools.plot.curves import read_curves
 from fhaosmo_ros.tools.replay import command as replay
@@ -37,6 +38,36 @@ def recorded(tmp_path_factory):
     for event in events:
         lasts[event.sample :] = event.begins
     return outputs, rows.standard_deviation[used], lasts[used], events
+
+
+@pytest.fixture(scope='module')
+def tuning(recorded):
+    """What a node's estimator has found after each sample that it uses, one by one."""
+    (bag, *_), *_ = recorded
+    estimator, found = OnlineEstimator(MODEL), []
+    y = series(bag, '/y')
+    for stamp, value in zip(y.stamps.tolist(), y.values.tolist(), strict=True):
+        if not estimator.update(stamp, value).status.rejected:
+            noise, correlation, bandwidth, shares = estimator.observer.tuning
+            found.append([noise, correlation, bandwidth, *shares])
+    return np.array(found)
+
+
+def test_tuning_is_the_nodes_to_the_last_bit(recorded, tuning):
+    (bag, csv, npz), *_ = recorded
+    of_bag = series(bag, '/estimator/tuning')
+    assert of_bag.labels == TUNING
+    np.testing.assert_array_equal(of_bag.values, tuning)
+    known = np.isfinite(tuning).all(axis=1)
+    assert 0 < np.argmax(known) <= FIRST_SAMPLES
+    assert known[FIRST_SAMPLES:].all()
+    np.testing.assert_allclose(tuning[known, 3:].sum(axis=1), 1.0, rtol=1e-12)
+    assert tuning[-1, 0] == pytest.approx(1e-3, rel=0.1)
+    of_csv = np.genfromtxt(csv, delimiter=',', names=True)
+    with np.load(npz) as of_npz:
+        for name, column in zip(TUNING, tuning.T, strict=True):
+            np.testing.assert_array_equal(of_npz[f'tuning_{name}'], column)
+            np.testing.assert_array_equal(of_csv[f'tuning_{name}'], column)
 
 
 def test_the_bag_has_what_the_library_finds(recorded):

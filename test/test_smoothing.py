@@ -174,6 +174,26 @@ def test_one_by_one_is_the_same_as_a_run():
     assert one.stamp == stamps[-1] - 100 * MS
 
 
+def test_tuning_is_that_of_the_sample_not_of_the_present():
+    t, y, _ = recording(0.5)
+    stamps = np.round(t * 1e9).astype(np.int64) + 5
+    settings = {'gains': 'self_tuning'}
+    present = OnlineEstimator(settings).run(stamps, y)
+    past = OnlineEstimator(settings | {'smoothing_lag': 0.1})
+    heard = {}
+    for stamp, sample in zip(stamps.tolist(), y.tolist(), strict=True):
+        if past.update(stamp, sample) is not None:
+            heard[past.stamp] = [*past.tuning[:3], *past.tuning.derivatives]
+    rows = OnlineEstimator(settings | {'smoothing_lag': 0.1}).run(stamps, y)
+    used = np.flatnonzero((present.status & REJECTED) == 0)[: len(rows.t)]
+    np.testing.assert_array_equal(rows.t, present.t[used])
+    np.testing.assert_array_equal(rows.tuning, present.tuning[used])
+    known = dict(zip(rows.t.tolist(), rows.tuning, strict=True))
+    assert len(heard) > 200
+    for stamp, tuning in heard.items():
+        np.testing.assert_array_equal(tuning, known[stamp])
+
+
 def test_nothing_is_smoothed_across_a_restart():
     t, y, _ = recording(4.0)
     stamps = np.round(t * 1e9).astype(np.int64) + 5

@@ -5,6 +5,7 @@ import bisect
 import math
 import signal
 
+from fhaosmo_ros.core.observer.self_tuning.members import TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np
@@ -130,6 +131,25 @@ def test_equals_a_replay_of_the_same_samples(client, folder, namespace, options)
             np.testing.assert_allclose(
                 e.unknown_input, expected[e.stamp].unknown_input, rtol=0.0, atol=1e-12
             )
+
+
+def test_tuning_is_that_of_a_replay(client, folder):
+    settings = {'gains': 'self_tuning', 'max_gap': 60.0}
+    arguments = parameters(namespace='/tuned', publish_on='sample', **settings)
+    with node_process(folder(), 'estimator', *arguments):
+        found = client.record('/tuned/estimator/tuning', Float64MultiArray)
+        rig, replay = EstimatorRig(client, '/tuned'), OnlineEstimator(settings)
+        client.wait(lambda: client.node.count_publishers('/tuned/estimator/tuning'), 'tuning')
+        rig.feed(0.2)  # no sample from before the reset is on its way any more
+        rig.reset()
+        for k in range(80):
+            estimate = rig.feed(0.2 + 0.1 * math.sin(0.1 * k))
+            replay.update(estimate.stamp, rig.y[-1].message.data)
+        noise, correlation, bandwidth, shares = replay.observer.tuning
+        assert bandwidth > 0.0
+        expected = [noise, correlation, bandwidth, *shares]
+        client.wait(lambda: found and list(found[-1].message.data) == expected, 'same tuning')
+        assert found[-1].message.layout.dim[0].label == ','.join(TUNING)
 
 
 FALLBACK = """

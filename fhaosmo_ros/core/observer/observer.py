@@ -13,7 +13,7 @@ from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer import step as recursion
 from fhaosmo_ros.core.observer.arrays import Law, make_work, State, Work
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.self_tuning.members import FIRST_SAMPLES, Tuning, tuning_in, UNKNOWN
+from fhaosmo_ros.core.observer.self_tuning.members import TUNING, Tuning
 from fhaosmo_ros.core.observer.self_tuning.step import step_address
 from fhaosmo_ros.core.observer.smoother import smoothed
 from fhaosmo_ros.core.observer.status import flags, FLAGS_MASK, LEVEL_SHIFT, open_levels, Status
@@ -83,6 +83,9 @@ class Trajectory(NamedTuple):
         The likeliest model of d (D 26) of a self-tuning observer, which a smoother goes by: the
         variance of the noise, if it were white; q; kappa (1/s); the number k of derivatives, or
         k - 3 where d has jumped. 0 before it knows the noise; (K, 0) with fixed gains.
+    tuning : (K, 6) array
+        What a self-tuning observer has found, with columns as `Tuning.of` takes them; NaN before
+        it knows the noise; (K, 0) with fixed gains.
 
     """
 
@@ -97,6 +100,7 @@ class Trajectory(NamedTuple):
     z_tilde: NDArray[np.float64]
     standard_deviation: NDArray[np.float64]
     model: NDArray[np.float64]
+    tuning: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -128,6 +132,7 @@ def make_record(
         np.empty(rows),
         np.empty((rows_of_eps, levels)),
         np.empty(rows, dtype=np.int64),
+        np.empty((rows, len(TUNING) if self_tuning else 0)),
     )
 
 
@@ -237,9 +242,9 @@ class Observer:
     @property
     def tuning(self) -> Tuning:
         """What a self-tuning observer has found; NaN before it knows the noise."""
-        rows = self._state.levels[arrays.ROWS + self.levels :]
-        known = self.self_tuning and self._state.memory[arrays.SAMPLES] > FIRST_SAMPLES
-        return tuning_in(rows, self.order) if known else UNKNOWN
+        found = np.empty(len(TUNING))
+        recursion.tell_tuning(self._law.flags, self._state.memory, found)
+        return Tuning.of(found)
 
     @property
     def uses_input(self) -> bool:
@@ -560,6 +565,7 @@ class Observer:
             levels[:, arrays.TILDE],
             deviations,
             model,
+            record.tuning,
         )
 
     def _periods(self, t: NDArray[Any], first: int) -> NDArray[np.float64]:

@@ -65,6 +65,7 @@ from fhaosmo_ros.core.observer.arrays import (
     Y,
 )
 from fhaosmo_ros.core.observer.covariance import begin_estimates, is_unlikely, jump
+from fhaosmo_ros.core.observer.self_tuning.members import FIRST_SAMPLES
 from fhaosmo_ros.core.observer.status import (
     DIVERGED,
     FLAGS_MASK,
@@ -125,6 +126,8 @@ class Record(NamedTuple):
         Innovations; a run that skips samples needs the row more.
     words : (rows,) array
         Status words.
+    tuning : (rows, 6 or 0) array
+        What a self-tuning observer has found (`TUNING`).
 
     """
 
@@ -132,6 +135,7 @@ class Record(NamedTuple):
     gamma: Floats
     eps: Floats
     words: Ints
+    tuning: Floats
 
 
 @compiled(forceinline=True)
@@ -376,14 +380,27 @@ def step_once(
 
 
 @compiled(forceinline=True)
-def record_levels(record: Record, row: int, levels: Floats) -> None:
-    """Record the levels of a state."""
+def tell_tuning(flags: Ints, memory: Floats, found: Floats) -> None:
+    """Write what a self-tuning observer has found (`TUNING`); NaN before it knows the noise."""
+    if memory[SAMPLES] > FIRST_SAMPLES:
+        call_at(flags[STEP_AT], flags[TABLE_AT], 0.0, -1.0, found.ctypes.data, found.size)
+    else:
+        found[:] = math.nan
+
+
+@compiled(forceinline=True)
+def record_state(law: Law, state: State, record: Record, row: int) -> None:
+    """Record what an observer knows, all but innovations and status word."""
+    levels, memory = state.levels, state.memory
     for i in range(levels.shape[1]):
         record.levels[row, HAT, i] = levels[HAT, i]
         record.levels[row, TILDE, i] = levels[TILDE, i]
         if record.levels.shape[1] > VARIANCES:
             record.levels[row, VARIANCES, i] = levels[COVARIANCE, i]
             record.levels[row, LIKELIEST_MODEL, i] = levels[MODEL, i]
+    record.gamma[row] = memory[GAMMA]
+    if record.tuning.shape[1] > 0:
+        tell_tuning(law.flags, memory, record.tuning[row])
 
 
 @compiled()
@@ -397,7 +414,7 @@ def run(
     samples since the row before it.
     """
     law, work, state = unowned(law), unowned(work), unowned(state)
-    levels, memory, eps = state.levels, state.memory, unowned(record.eps)
+    eps = unowned(record.eps)
     u, row, seen = unowned(samples.u), 0, 0
     for k in range(samples.y.shape[0]):
         if k >= first:
@@ -406,8 +423,7 @@ def run(
             word = start(law, state, samples.y[k], eps, row)
         seen |= word & FLAGS_MASK
         if (k + 1) % every == 0:
-            record_levels(record, row, levels)
-            record.gamma[row] = memory[GAMMA]
+            record_state(law, state, record, row)
             record.words[row] = (word >> LEVEL_SHIFT << LEVEL_SHIFT) | seen
             seen = 0
             row += 1

@@ -16,6 +16,7 @@ from fhaosmo_ros.core.observer.observer import (
     ObserverState,
     Trajectory,
 )
+from fhaosmo_ros.core.observer.self_tuning.members import Tuning
 from fhaosmo_ros.core.observer.smoothing import make_problem
 from fhaosmo_ros.core.online import delay, policy
 from fhaosmo_ros.core.online import memory as at
@@ -565,6 +566,13 @@ class OnlineEstimator:
         if self._smoothing is not None:
             return self._smoothing.standard_deviation
         return self.observer.standard_deviation
+
+    @property
+    def tuning(self) -> Tuning:
+        """What a self-tuning observer had found at the sample of `estimate`."""
+        if self._smoothing is not None:
+            return Tuning.of(self._smoothing.tuning)
+        return self.observer.tuning
 
     def _published(self, word: int) -> Estimate:
         estimate = self.observer.report(word)

@@ -7,10 +7,11 @@ from typing import Any
 
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
 from fhaosmo_ros.core.observer.arrays import COVARIANCE, GAMMA, HAT, MODEL, TILDE
-from fhaosmo_ros.core.observer.observer import Estimate, Observer, Trajectory
+from fhaosmo_ros.core.observer.observer import Estimate, make_record, Observer, Trajectory
+from fhaosmo_ros.core.observer.self_tuning.members import TUNING
 from fhaosmo_ros.core.observer.smoother import Smoother
 from fhaosmo_ros.core.observer.status import LEVEL_SHIFT, REJECTED
-from fhaosmo_ros.core.observer.step import Record
+from fhaosmo_ros.core.observer.step import Record, tell_tuning
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online.delay import INPUTS, past_of
 from fhaosmo_ros.core.online.memory import EstimatorArrays
@@ -38,6 +39,8 @@ class PastEstimates:
         Of its sample, in nanoseconds.
     standard_deviation : (n + 1,) array
         Of its errors, as a self-tuning observer expects; NaN with fixed gains.
+    tuning : (6,) array
+        What it had found by then; NaN with fixed gains.
     numbers : (K,) array
         Which of all samples that were taken the rows are that were handed out last.
 
@@ -53,6 +56,7 @@ class PastEstimates:
         self.estimate: Estimate | None = None
         self.stamp = 0
         self.standard_deviation = np.full(observer.order + 1, np.nan)
+        self.tuning = np.full(len(TUNING), np.nan)
         self.numbers = np.zeros(0, dtype=np.int64)
 
     def configure(self) -> None:
@@ -82,8 +86,11 @@ class PastEstimates:
     def take_one(self, e: EstimatorArrays, eps: Floats, word: int, u: Floats) -> None:
         """Take the sample that an estimator has just taken, with its status word."""
         ints, (levels, memory) = e.policy.ints, e.state
+        tuning = np.empty((1, len(TUNING) if self._observer.self_tuning else 0))
+        if self._observer.self_tuning:
+            tell_tuning(e.law.flags, memory, tuning[0])
         record = Record(
-            levels[np.newaxis, self._planes], memory[[GAMMA]], eps.copy(), np.array([word])
+            levels[np.newaxis, self._planes], memory[[GAMMA]], eps.copy(), np.array([word]), tuning
         )
         found = self._observer.trajectory(ints[[at.STAMP]] - ints[at.DELAY], record)
         if ints[at.LAG] > 0:
@@ -132,7 +139,7 @@ class PastEstimates:
         rows = rows._replace(z=smoothed[:, 0, :n], unknown_input=smoothed[:, 0, n])
         if self._observer.self_tuning:
             rows = rows._replace(standard_deviation=np.sqrt(smoothed[:, 1, : n + 1]))
-            self.standard_deviation = rows.standard_deviation[-1]
+            self.standard_deviation, self.tuning = rows.standard_deviation[-1], rows.tuning[-1]
         word = int(rows.status[-1]) | int(rows.open_levels[-1]) << LEVEL_SHIFT
         self.stamp = int(rows.t[-1])
         self.estimate = Estimate(
@@ -144,11 +151,8 @@ class PastEstimates:
         return rows
 
     def _nothing(self) -> Trajectory:
-        levels, planes = self._observer.levels, len(self._planes)
-        none = np.zeros(0)
-        integers, wide = np.zeros(0, dtype=np.int64), np.zeros((0, levels))
-        record = Record(np.zeros((0, planes, levels)), none, wide, integers)
-        return self._observer.trajectory(integers, record)
+        record = make_record(0, self._observer.levels, 0, self._observer.self_tuning)
+        return self._observer.trajectory(record.words, record)
 
 
 def part_of(rows: Trajectory, index: Any) -> Trajectory:

@@ -9,7 +9,6 @@ from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.compiled.unowned_arrays import unowned
 from fhaosmo_ros.core.model.bytecode import Bytecode, Floats, Ints
 from fhaosmo_ros.core.observer.arrays import (
-    GAMMA,
     HAT,
     Law,
     OFFSET,
@@ -29,7 +28,7 @@ from fhaosmo_ros.core.observer.status import (
     REJECTED_STUCK,
     RESTARTED,
 )
-from fhaosmo_ros.core.observer.step import innovations, Record, record_levels, start
+from fhaosmo_ros.core.observer.step import innovations, Record, record_state, start
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online.delay import (
     forget_past,
@@ -194,11 +193,9 @@ def run(
 
     """
     e, u, eps = unowned(e), unowned(u), unowned(record.eps)
-    levels, memory = e.state.levels, e.state.memory
     for k in range(y.shape[0]):
         record.words[k] = take(e, stamps[k], y[k], u[k], eps, k)
-        record_levels(record, k, levels)
-        record.gamma[k] = memory[GAMMA]
+        record_state(e.law, e.state, record, k)
         if present.shape[0] > 0:
             published(e, e.policy.ints[at.FILTERED], present[k])
         if times.shape[0] > 0:

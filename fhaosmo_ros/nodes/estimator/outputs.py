@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from fhaosmo_ros.core.observer.observer import Estimate
-from fhaosmo_ros.core.observer.self_tuning.members import ORDERS
+from fhaosmo_ros.core.observer.self_tuning.members import TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.nodes.middleware.messages import (
@@ -99,15 +99,13 @@ class TuningOutputs(Publishers):
     def __init__(self, node: Node, prefix: str, order: int) -> None:
         super().__init__(node, prefix, SELF_TUNED)
         self._encode_deviation = array_encoder([*(f'z{i + 1}' for i in range(order)), 'd'])
-        self._encode_tuning = array_encoder([
-            'noise', 'correlation', 'bandwidth', *(f'derivatives{k}' for k in range(ORDERS)),
-        ])  # fmt: skip
+        self._encode_tuning = array_encoder(TUNING)
 
     def publish(self, estimator: OnlineEstimator) -> None:
-        """Publish the standard deviations of the latest estimate, and the tuning."""
+        """Publish the standard deviations of the latest estimate, and the tuning at its sample."""
         deviation, tuning = self._publishers
         deviation.publish(self._encode_deviation(estimator.standard_deviation))
-        noise, correlation, bandwidth, shares = estimator.observer.tuning
+        noise, correlation, bandwidth, shares = estimator.tuning
         tuning.publish(self._encode_tuning(np.array([noise, correlation, bandwidth, *shares])))
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import zipfile
 
 from fhaosmo_ros.core.observer.observer import Trajectory
+from fhaosmo_ros.core.observer.self_tuning.members import TUNING
 from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.units import derivative_unit
@@ -16,13 +17,12 @@ from fhaosmo_ros.tools.bags.mcap.chunks import DATA_AT, MESSAGE, Records
 from fhaosmo_ros.tools.bags.types import diagnostics, labelled_array, LATCHED_QOS, serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.topics import (
-    ARRAY,
     DIAGNOSTICS,
     ESTIMATES,
     EVENT,
     FLOAT,
     PARAMETERS,
-    STANDARD_DEVIATION,
+    SELF_TUNED,
     TEXT,
     TIME,
 )
@@ -80,6 +80,7 @@ def columns(rows: Rows) -> dict[str, NDArray]:
     if e.standard_deviation.shape[1]:
         names = [*(f'z{i + 1}' for i in range(e.z.shape[1])), 'unknown_input']
         result |= {f'std_{name}': e.standard_deviation[:, i] for i, name in enumerate(names)}
+        result |= {f'tuning_{name}': e.tuning[:, i] for i, name in enumerate(TUNING)}
     if len(rows.active):
         result['event'] = rows.active
     return result | {'status': e.status, 'open_levels': e.open_levels}
@@ -183,7 +184,7 @@ class BagSink:
         self._unit = derivative_unit(parameters.get('measurement_unit', ''), order)
         self._events = ''
         tuned = parameters['gains'] == 'self_tuning'
-        topics = ESTIMATES | ({STANDARD_DEVIATION: ARRAY} if tuned else {})
+        topics = ESTIMATES | (SELF_TUNED if tuned else {})
         ids = [bag.add(f'{name}/{topic}', kind) for topic, kind in topics.items()]
         state = [f'z{i + 1}' for i in range(order)]
         innovation = [f'eps{i + 1}' for i in range(levels)]
@@ -197,8 +198,9 @@ class BagSink:
             (serialise(TIME, sec=0, nanosec=0), 8),
         ]
         if tuned:
-            message = labelled_array([*state, 'd'], np.zeros(order + 1))
-            self._messages.append((message, 8 * (order + 1)))
+            for labels in [*state, 'd'], TUNING:
+                message = labelled_array(labels, np.zeros(len(labels)))
+                self._messages.append((message, 8 * len(labels)))
         self._ids = np.array(ids, dtype=np.int64)
         sizes = [DATA_AT + len(message) for message, _ in self._messages]
         self._ends = np.cumsum(sizes)
@@ -241,7 +243,7 @@ class BagSink:
             np.column_stack([seconds, rest]).astype('<i4'),
         ]
         if e.standard_deviation.shape[1]:
-            numbers.append(e.standard_deviation)
+            numbers += [e.standard_deviation, e.tuning]
         count = len(rows.times)
         data = np.tile(self._template, (count, 1))
         times = _bytes(rows.times.astype('<i8'), count)

@@ -267,22 +267,33 @@ class Tuning(NamedTuple):
     bandwidth: float
     derivatives: NDArray[np.float64]
 
+    @classmethod
+    def of(cls, found: NDArray[np.float64]) -> 'Tuning':
+        """Return what the six numbers mean that `TUNING` names."""
+        noise, correlation, bandwidth = found[:3].tolist()
+        return cls(noise, correlation, bandwidth, found[3:])
 
-UNKNOWN = Tuning(math.nan, math.nan, math.nan, np.full(ORDERS, math.nan))
-"""Before the members have begun."""
+
+TUNING = ['noise', 'correlation', 'bandwidth', *(f'derivatives{k}' for k in range(ORDERS))]
+"""Names of these numbers, in the order in which `find_tuning` writes them."""
 
 
-def tuning_in(rows: NDArray[np.float64], order: int) -> Tuning:
-    """Return what the members in `rows` say, for a model with n = `order` states."""
-    members: Members = members_in.py_func(rows, order)  # type: ignore[attr-defined]
-    weight = members.record[WEIGHT]
-    of_member = weight.sum(axis=0)
-    correlation = members.rates[CORRELATION]
-    variance = members.noise[SQUARE, COLOUR] / (1.0 - correlation**2)
-    bandwidth = members.rates[KAPPA] / RATIO
-    return Tuning(
-        float(np.sqrt(of_member @ variance)),
-        float(of_member @ correlation),
-        float(np.exp(of_member @ np.log(bandwidth))),
-        weight.sum(axis=1),
-    )
+@compiled(fastmath=FAST)
+def find_tuning(members: Members, found: Floats) -> None:
+    """Write what the members say to `found`, as `TUNING` names it."""
+    weight, rates = members.record[WEIGHT], members.rates
+    variance = correlation = bands = 0.0
+    found[3:] = 0.0
+    for g in range(IN_BAND):  # the members of a kind differ in their bandwidths alone
+        of_kind = 0.0
+        for k in range(ORDERS):
+            for band in range(BANDS):
+                w = weight[k, band * IN_BAND + g]
+                of_kind += w
+                bands += w * band
+                found[3 + k] += w
+        a = rates[CORRELATION, g]
+        variance += of_kind * members.noise[SQUARE, COLOUR[g]] / (1.0 - a * a)
+        correlation += of_kind * a
+    found[0], found[1] = math.sqrt(variance), correlation
+    found[2] = rates[KAPPA, 0] / RATIO[0] * math.exp(bands * math.log(STEP_OF_BANDS))

@@ -59,6 +59,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     COUNT,
     DECAYED,
     FAR,
+    find_tuning,
     FIRST_SAMPLES,
     IN_BAND,
     KAPPA,
@@ -346,11 +347,19 @@ def restart_members(law: Law, levels: Floats, memory: Floats, rows: Floats, y: f
 
 
 def _step_at(table: int, y: float, h: float, inputs: int, count: int) -> float:
-    """Do what `step_members` does, or with h = 0 `restart_members`, on the arrays of a table."""
+    """
+    Do what `step_members` does on the arrays of a table.
+
+    With h = 0 do what `restart_members` does, with h < 0 what `find_tuning` does, into `inputs`.
+    """
     law, work, (levels, memory) = observer_at(integers_at(table, (ARRAYS, 3)), 0)
     rows = levels[ROWS + law.gains.shape[1] :]
     if h > 0.0:
         return step_members(law, work, memory, rows, y, h, doubles_at(inputs, count))
+    if h < 0.0:
+        members = members_in(rows, law.gains.shape[1] - ORDERS)
+        find_tuning(members, doubles_at(inputs, count))
+        return 0.0
     restart_members(law, levels, memory, rows, y)
     return 0.0
 
