@@ -11,7 +11,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.tables import PLANT_NODE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import Plant
-from fhaosmo_ros.nodes.middleware.loading import Loading
+from fhaosmo_ros.nodes.middleware.loading import Loading, without_blas
 from fhaosmo_ros.nodes.middleware.messages import array_encoder, double_encoder
 from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
 from fhaosmo_ros.nodes.middleware.publishers import check_overrides, create_publisher
@@ -77,7 +77,12 @@ class PlantNode(Node):
         self._timer: Any = None
         self._node_parameters.on_change(self._prepare, self._adopt)
         copy = deepcopy(self.plant)
-        self._loading = Loading(self, lambda: copy.sample(0.0), self._begin)
+
+        def load() -> None:
+            with without_blas():
+                copy.sample(0.0)
+
+        self._loading = Loading(self, load, self._begin)
 
     def _begin(self) -> None:
         values = self._node_parameters.values

@@ -10,6 +10,7 @@ rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2
 pytestmark = pytest.mark.ros
 
 from fhaosmo_ros.core.compiled import cache  # noqa: E402
+from fhaosmo_ros.core.observer import observer  # noqa: E402
 from fhaosmo_ros.nodes import plant  # noqa: E402
 from fhaosmo_ros.nodes.estimator import node as estimator  # noqa: E402
 from fhaosmo_ros.nodes.middleware import loading  # noqa: E402
@@ -92,6 +93,23 @@ def test_it_does_not_begin_once_it_is_finalized(node, compiler):
         compiler.ended.set()
         wait_until(lambda: not node.not_ready, 'end of the compiler')
     assert node.state == 'finalized'
+
+
+def test_it_answers_while_the_members_of_a_self_tuning_observer_compile(
+    context, compiler, monkeypatch
+):
+    address = observer.step_address()
+    monkeypatch.setattr(observer, 'step_address', lambda: compiler() or address)
+    options = {'parameter_overrides': [Parameter('gains', value='self_tuning')]}
+    node = estimator.EstimatorNode(context=context, use_global_arguments=False, **options)
+    try:
+        assert loading.is_loading()
+        assert node.state == 'unconfigured'
+        with Spinner(node):
+            compiler.ended.set()
+            wait_until(lambda: node.state == 'active', 'start')
+    finally:
+        node.destroy_node()
 
 
 def test_an_error_of_the_compiler_ends_the_node(node, compiler):

@@ -28,7 +28,7 @@ from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
-from fhaosmo_ros.nodes.middleware.loading import Loading
+from fhaosmo_ros.nodes.middleware.loading import Loading, without_blas
 from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
 from fhaosmo_ros.nodes.middleware.publishers import check_overrides
 from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
@@ -84,13 +84,19 @@ class EstimatorNode(ManagedNode):
         self._node_parameters.on_change(self._prepare, self._adopt, self._inheritance.followers)
         self._made: tuple[Parameters, dict[str, OnlineEstimator]] | None = None
         try:
-            estimators = self._make_estimators()  # raises now what configure would raise
-            self._made = values, estimators  # for the first configure
             self.not_ready = 'the core is still being compiled'
-            self._loading = Loading(self, lambda: load(estimators), self._begin)
+            self._loading = Loading(self, self._load, self._begin)
         except Exception:
             self.destroy_node()
             raise
+
+    def _load(self) -> None:
+        """Raise what configure would raise; compile what is new. Making estimators may compile."""
+        values = self._node_parameters.values
+        estimators = self._make_estimators()
+        self._made = values, estimators  # for the first configure
+        with without_blas():
+            load(estimators)
 
     def _begin(self) -> None:
         """Configure and activate the node if that is its own task."""

@@ -79,8 +79,7 @@ class Loading:
 
     def _run(self) -> None:
         try:
-            with without_blas():
-                self._load()
+            self._load()
         except BaseException as error:
             self._error = error
 
