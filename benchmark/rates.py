@@ -4,10 +4,11 @@
 from collections import defaultdict
 import importlib.util
 import os
-from time import monotonic, sleep, time_ns
+from time import monotonic, process_time, sleep, time_ns
 from typing import NamedTuple
 
 from children import Child, Children
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 import numpy as np
 from table import CannotMeasureError, Row, Table
 from tqdm import tqdm
@@ -31,10 +32,21 @@ MATCHED = 30.0
 ON_SAMPLES = ('-p', 'publish_on:=sample')
 COMMANDS = {
     'estimator': ('-m', 'fhaosmo_ros', 'estimator', '--ros-args'),
+    'self_tuning': (
+        '-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-r', '__node:=self_tuning',
+        '-p', 'gains:=self_tuning',
+    ),
     'empty_node': ('benchmark/empty_node.py',),
     'plain': ('benchmark/empty_node.py', '--plain'),
-}
-TITLES = {'estimator': 'estimator', 'empty_node': 'empty', 'plain': 'empty, rclpy.spin'}
+}  # fmt: skip
+TITLES = {
+    'estimator': 'estimator', 'self_tuning': 'self-tuning', 'empty_node': 'empty',
+    'plain': 'empty, rclpy.spin',
+}  # fmt: skip
+ESTIMATORS = 'estimator', 'self_tuning'
+SELF_TUNING = {'gains': 'self_tuning'}
+JITTER = 1e-4
+"""Of the stamps that a self-tuning step is timed at, in seconds."""
 HEADER = (
     'y Hz', 'out Hz', 'held', 'node', 'CPU %', 'lost', 'of',
     'jitter p50', 'p99', 'max', 'latency p50', 'p99', 'max ms',
@@ -137,10 +149,51 @@ def joints(quick: bool) -> list[Row | Table]:
     return [*rows, _table(runs, seconds, repetitions)]
 
 
+def self_tuning(quick: bool) -> list[Row | Table]:
+    """Return the CPU of a self-tuning estimator over that of an empty node and its steps."""
+    isolate()
+    seconds, repetitions = (2.0, 1) if quick else (8.0, 3)
+    names = ('self_tuning', 'empty_node')
+    rows: list[Row | Table] = []
+    runs: dict[tuple[float, float, str], list[Figures]] = defaultdict(list)
+    steps: list[float] = []
+    for out in (GOAL, 100.0):
+        ratios = []
+        for k in tqdm(range(repetitions), desc=f'self-tuning {out:g} Hz', unit='run', leave=False):
+            figures = observe(GOAL, out, names if k % 2 == 0 else names[::-1], seconds)
+            steps.append(_step_seconds(seconds))
+            for name in names:
+                runs[GOAL, out, name].append(figures[name])
+            if min(f.held for f in figures.values()) >= HELD:
+                expected = figures['empty_node'].cpu + GOAL * steps[-1]
+                ratios.append(figures['self_tuning'].cpu / expected)
+        title = f'CPU, self-tuning / (empty node + steps), y {GOAL:g} Hz, estimates {out:g} Hz'
+        rows.append(_ratio(title, ratios, BAR))
+        lost = sum(f.sent - f.taken for f in runs[GOAL, out, 'self_tuning'])
+        sent = sum(f.sent for f in runs[GOAL, out, 'self_tuning'])
+        rows.append(Row(f'samples lost, self-tuning, estimates {out:g} Hz', lost, bar=0.0,
+                        note=f'of {sent:,}, over {repetitions} runs'))  # fmt: skip
+    note = f'{", ".join(f"{1e6 * s:.1f}" for s in steps)}; one after each run, of a replay'
+    rows.append(Row('step, self-tuning', 1e6 * float(np.median(steps)), 'us', note=note))
+    return [*rows, _table(runs, seconds, repetitions)]
+
+
+def _step_seconds(seconds: float) -> float:
+    """Return the CPU time of a self-tuning step, at stamps that jitter as the source's do."""
+    t = np.arange(round(seconds * GOAL)) / GOAL
+    stamps = np.sort(t + JITTER * np.abs(np.random.default_rng(0).standard_normal(len(t))))
+    stamps, y = np.round((1.0 + stamps) * 1e9).astype(np.int64), 0.2 + 0.1 * np.sin(t)
+    OnlineEstimator(SELF_TUNING).run(stamps[:100], y[:100])  # loads the machine code
+    estimator = OnlineEstimator(SELF_TUNING)
+    begin = process_time()
+    estimator.run(stamps, y)
+    return (process_time() - begin) / len(y)
+
+
 def _arguments(name: str, out: float, joints: int) -> list[str]:
     """Return the command of a node that publishes at a rate, 0 for on samples."""
     words = list(COMMANDS[name])
-    if name == 'estimator':
+    if name in ESTIMATORS:
         words += ['-p', f'publish_rate:={out}'] if out else ON_SAMPLES
         words += ['-p', 'channels:=[from_joint_names]'] if joints else []
     else:
@@ -159,7 +212,7 @@ def observe(
     with Children() as children, Watch(sorted(watched.values())) as watch:
         nodes = {name: children.start(name, *_arguments(name, out, joints)) for name in names}
         for name, node in nodes.items():
-            node.wait_for(ready if name == 'estimator' else 'computing nothing')
+            node.wait_for(ready if name in ESTIMATORS else 'computing nothing')
         source = children.start(
             'source', 'benchmark/source.py', '--rate', str(rate), '--joints', str(joints),
             '--subscribers', str(len(nodes)),

@@ -26,6 +26,7 @@ PARTS = {
     'simulation': simulation.measure,
     'rates': rates.measure,
     'joints': rates.joints,
+    'self_tuning': rates.self_tuning,
     'channels': channels.measure,
     'startup': startup.measure,
     'replay': replay.measure,

@@ -48,10 +48,8 @@ class Watch:
         for status in deserialize_message(data, DiagnosticArray).status:
             values = {item.key: item.value for item in status.values}
             if 'samples accepted' in values:
-                self._reports[status.name.split(':')[0]] = (
-                    published,
-                    int(values['samples accepted']),
-                )
+                taken = int(values['samples accepted']) + int(values.get('samples rejected', 0))
+                self._reports[status.name.split(':')[0]] = published, taken
 
     def report(self, name: str) -> tuple[int, int]:
         """Return when a node reported last, in nanoseconds, and how many samples it had taken."""
