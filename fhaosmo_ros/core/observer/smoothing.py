@@ -99,10 +99,10 @@ class Rows(NamedTuple):
         Predicted from the rows before: of the state from the base, and P of its error.
     pull, certainty, noise : (R,) arrays
         e / S, 1 / S, and the variance that the sample is taken to have; 0 without a sample.
-    times, kinds : (R,) arrays
-        In ns; `MEASURED`, `UNMEASURED`, `JUMPS` or `BEGINS`.
     decay, last : (R,) arrays
         Of the row's `Problem`, in whose terms its levels of d are.
+    times, kinds : (R,) arrays
+        In ns; `MEASURED`, `UNMEASURED`, `JUMPS` or `BEGINS`.
 
     """
 
@@ -113,9 +113,9 @@ class Rows(NamedTuple):
     pull: Floats
     certainty: Floats
     noise: Floats
+    decay: Floats
     times: Ints
     kinds: Ints
-    decay: Floats
     last: Ints
 
     @classmethod
@@ -124,7 +124,7 @@ class Rows(NamedTuple):
         matrix, integers = (room, levels, levels), np.zeros((3, room), dtype=np.int64)
         return cls(
             np.zeros((room, levels)), np.zeros(matrix), np.zeros((room, levels)),
-            np.zeros(matrix), *np.zeros((3, room)), *integers[:2], np.zeros(room), integers[2],
+            np.zeros(matrix), *np.zeros((4, room)), *integers,
         )  # fmt: skip
 
 
