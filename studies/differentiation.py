@@ -55,20 +55,29 @@ PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'smoothing.md'
 Cell = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def with_file(name: str) -> list[float]:
-    """Return errors of d over d: those of the observer, of `LAGS`, of the whole recording."""
+def with_file(name: str, self_tuning: bool = False) -> list[float]:
+    """
+    Return errors of d over d: those of the observer, of `LAGS`, of the whole recording.
+
+    With gains of the file, or told its model alone; then followed by the share of the d that are
+    within a standard deviation of those of the whole recording.
+    """
     path = shipped(f'config/{name}.yaml')
     p = OnlineEstimator.from_yaml(path).parameters
     plant = load(path, 'plant', PLANT_PARAMETERS) | {'noise_std': p['noise_size']}
+    if self_tuning:
+        p = {key: p[key] for key in ('order', 'phi')} | {'gains': 'self_tuning'}
     t = np.arange(0.0, DURATION, 1e-3)
     stamps, truth = np.round(t * 1e9).astype(np.int64) + 1, Plant(plant).simulate(t)
-    estimates = [
-        OnlineEstimator(p | {'smoothing_lag': lag}).run(stamps, truth.y).unknown_input
-        for lag in (0.0, *LAGS)
+    found = [
+        OnlineEstimator(p | {'smoothing_lag': lag}).run(stamps, truth.y) for lag in (0.0, *LAGS)
     ]
-    estimates.append(Observer(p).smooth(t, truth.y).unknown_input)
-    errors = [rms(d - truth.unknown_input[: len(d)]) for d in estimates]
-    return [float(f'{error / rms(truth.unknown_input):.4g}') for error in errors]
+    found.append(Observer(p).smooth(t, truth.y))
+    off = [f.unknown_input - truth.unknown_input[: len(f.t)] for f in found]
+    numbers = [rms(wrong) / rms(truth.unknown_input) for wrong in off]
+    if self_tuning:
+        numbers.append(float(np.mean(abs(off[-1]) < found[-1].standard_deviation[:, -1])))
+    return [float(f'{number:.4g}') for number in numbers]
 
 
 def costs() -> list[float]:
@@ -94,11 +103,17 @@ def costs() -> list[float]:
 def files_table(results: dict[str, Any]) -> str:
     """Return what smoothing brings with the shipped files, and what it costs."""
     lags = ' | '.join(f'lag of {1e3 * lag:g} ms' for lag in LAGS)
-    lines = [f'| file | observer | {lags} | whole recording |', '|---' * (3 + len(LAGS)) + '|']
+    lines = [
+        f'| file | observer | {lags} | whole recording | true d within its σ |',
+        '|---' * (4 + len(LAGS)) + '|',
+    ]
     for name, errors in results['files'].items():
-        lines.append(f'| {name} | {" | ".join(f"{x:.2g}" for x in errors)} |')
+        lines.append(f'| {name} | {" | ".join(f"{x:.2g}" for x in errors)} | |')
+        *errors, inside = results['self-tuning'][name]
+        numbers = ' | '.join(f'{x:.2g}' for x in errors)
+        lines.append(f'| its model, self-tuning | {numbers} | {100.0 * inside:.0f} % |')
     spent = ' | '.join(f'{x:.2g} µs' for x in results['microseconds'])
-    return '\n'.join([*lines, f'| CPU a sample, {TIMED} | {spent} |'])
+    return '\n'.join([*lines, f'| CPU a sample, {TIMED} | {spent} | |'])
 
 
 def cell(system: str, noise: float) -> Cell:
@@ -142,10 +157,8 @@ def unfitness(
     samples = y, np.full(count, DT), np.zeros((count, 1))
     kinds = np.full(count, MEASURED)
     kinds[0] = BEGINS
-    estimates = np.zeros((count, 2, observer.levels))
-    smoother.take(
-        *observer.arrays[:2], estimates, samples, np.arange(count), kinds, np.empty((count, 0))
-    )
+    estimates, none = np.zeros((count, 2, observer.levels)), np.empty((count, 0))
+    smoother.take(*observer.arrays[:2], estimates, samples, np.arange(count), kinds, none, none)
     e, variance = smoother.innovations()
     return 0.5 * float(np.sum(np.log(variance) + e**2 / variance))
 
@@ -268,7 +281,9 @@ def main() -> int:
     path = PAGE.with_suffix('.json')
     results = json.loads(path.read_text()) if path.exists() else {'systems': {}}
     if not arguments.check:
-        results |= {'files': {f: with_file(f) for f in FILES}, 'microseconds': costs()}
+        results['files'] = {f: with_file(f) for f in FILES}
+        results['self-tuning'] = {f: with_file(f, self_tuning=True) for f in FILES}
+        results['microseconds'] = costs()
     for noise in () if arguments.files else NOISES:
         for system, bandlimit in BANDLIMITS.items():
             y, rate = cell(system, noise)

@@ -324,6 +324,8 @@ def test_the_page_says_what_was_measured():
     assert shown == differentiation.texts(results)
     name = 'models/pendulum'
     assert differentiation.with_file(name) == pytest.approx(results['files'][name], rel=0.02)
+    found = differentiation.with_file(name, self_tuning=True)
+    assert found == pytest.approx(results['self-tuning'][name], rel=0.05)
 
 
 def test_the_study_finds_parameters_by_their_likelihood():

@@ -54,6 +54,7 @@ Entries of ``State.memory``:
 | ROUGHNESS | short mean of the squared differences of y, over their usual size | 1 |
 | INTERVAL | last interval between two samples that were taken | s |
 | JITTER | variance of the stamps of late, over the square of the interval | 1 |
+| TOLD | the member whose model a smoother goes by, as LIKELIEST | 1 |
 | TURNS | of late, the share of samples that were unlikely, on a new side, not rough | 1 |
 """
 
@@ -88,8 +89,8 @@ GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSE
 OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
 SAMPLES, FAR_SIGN, QUANTUM, LATTICE, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
 FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM, GROWING, FIRST_OFF = range(25, 31)
-NARROWED, ONE_SIDED, RECENT, ROUGHNESS, INTERVAL, JITTER, TURNS = range(31, 38)
-MEMORY = 38
+NARROWED, ONE_SIDED, RECENT, ROUGHNESS, INTERVAL, JITTER, TURNS, TOLD = range(31, 39)
+MEMORY = 39
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)

@@ -110,6 +110,7 @@ class Smoother:
         times: Ints,
         kinds: Ints,
         models: Floats,
+        deviations: Floats,
     ) -> None:
         """
         Append rows.
@@ -122,14 +123,14 @@ class Smoother:
             As `Samples` of a run, with y less its offset (D 23).
         times, kinds : (K,) arrays
             As in `Rows`; see `kinds`.
-        models : (K, 4) or (K, 0) array
-            As in `Trajectory`; a copy.
+        models, deviations : (K, 4), (K, n + 1) or (K, 0) arrays
+            `model`, a copy, and `standard_deviation` of a `Trajectory`.
 
         """
         estimates = levels[:, HAT].copy()
         if self._internal:
             estimates[:, 1:] = levels[:, TILDE, :-1]
-        columns: tuple[Any, ...] = (estimates, *samples, times, kinds, models)
+        columns: tuple[Any, ...] = (estimates, *samples, times, kinds, deviations, models)
         if self._held is not None:
             columns = tuple(map(np.concatenate, zip(self._held[2], columns, strict=True)))
             self._held = None
@@ -142,10 +143,10 @@ class Smoother:
         self._go(law, work, columns)
 
     def _go(self, law: Law, work: Work, columns: tuple[Any, ...]) -> None:
-        """Go forward through rows: estimates, y, h, u, times, kinds, models."""
+        """Go forward through rows: estimates, y, h, u, times, kinds, deviations, models."""
         if self._planes > 1:
             self._complete(columns[0], columns[-1])
-        estimates, y, h, u, times, kinds, models = columns
+        estimates, y, h, u, times, kinds, deviations, models = columns
         count = len(times)
         if not count:
             return
@@ -154,7 +155,7 @@ class Smoother:
         self._rows.times[part], self._rows.kinds[part] = times, kinds
         take_rows(
             law, work, self._problem, self._rows, self._count, estimates, h, y, u, models,
-            self._memory, self._point,
+            deviations, self._memory, self._point,
         )  # fmt: skip
         began = np.flatnonzero(kinds == BEGINS)
         if len(began):
@@ -275,7 +276,10 @@ def smoothed(observer: 'Observer', t: ArrayLike, y: ArrayLike, u: ArrayLike) -> 
         used = (part.z_hat + part.innovation)[rows.start - start :, 0]
         numbers = np.arange(rows.start, rows.stop)
         models = part.model[rows.start - start :].copy()
-        smoother.take(*observer.arrays[:2], levels, (used, h, inputs), numbers, kinds, models)
+        deviations = part.standard_deviation[rows.start - start :]
+        smoother.take(
+            *observer.arrays[:2], levels, (used, h, inputs), numbers, kinds, models, deviations
+        )
         found.append(smoother.due())
     found.append(smoother.finish())
     whole = type(parts[0])(*(np.concatenate(column) for column in zip(*parts, strict=True)))

@@ -53,6 +53,8 @@ alone (D 23), the first of a fresh start.
 """
 TOLERANCE = 1e-9
 """What later samples may still change, in standard deviations of the filter's errors."""
+SURER = 4.0
+"""A model of d that ends has been wrong if it has so much smaller a variance than the observer."""
 ROUNDING = 1e-12
 """No variance is less than this part of that of the prediction, from which it is subtracted."""
 
@@ -189,11 +191,14 @@ def usual(problem: Problem, i: int, j: int) -> float:
 
 
 @compiled()
-def change_model(problem: Problem, rows: Rows, k: int, x: Floats, p: Floats, f: Floats) -> None:
+def change_model(
+    problem: Problem, rows: Rows, k: int, x: Floats, p: Floats, f: Floats, deviations: Floats
+) -> None:
     """
     Express the levels of d of row k - 1 as the model of row k has them (D 34), in place.
 
-    A level that the model before did not have is as large as ever.
+    A level that the model before did not have is as large as ever; one that the model has not any
+    more is 0. If it was far surer of z and d than the observer is now, it was wrong.
     """
     n, z = x.shape[0], x.shape[0] - ORDERS
     more = problem.decay - rows.decay[k - 1]
@@ -203,11 +208,18 @@ def change_model(problem: Problem, rows: Rows, k: int, x: Floats, p: Floats, f: 
             share *= more * (column + 1) / (row - column)
             f[z + row, z + column] = share
             x[z + row] += share * x[z + column]
+    for i in range(problem.last + 1, n):
+        x[i] = 0.0
+        f[i, :] = 0.0
     line = np.empty(n)
     multiply(f, p, line, False)
     multiply(f, p, line, True)
     for i in range(rows.last[k - 1] + 1, problem.last + 1):
-        p[i, i] += usual(problem, problem.last - i, problem.last - i)
+        p[i, i] = max(p[i, i], usual(problem, problem.last - i, problem.last - i))
+    for i in range(z + 1):
+        variance = deviations[i] * deviations[i]
+        if SURER * p[i, i] < variance < np.inf:
+            p[i, i] = variance
 
 
 @compiled()
@@ -265,13 +277,23 @@ def filtered(rows: Rows, k: int, deviation: Floats, p: Floats) -> None:
 
 @compiled()
 def predict_row(
-    law: Law, work: Work, problem: Problem, rows: Rows, k: int, h: float, u: Floats, point: Floats
+    law: Law,
+    work: Work,
+    problem: Problem,
+    rows: Rows,
+    k: int,
+    h: float,
+    u: Floats,
+    deviations: Floats,
+    point: Floats,
 ) -> None:
     """
     Predict row k from row k - 1 (D 24): F, the deviation and P; leave the model's z in `point`.
 
     Parameters
     ----------
+    deviations : (n + 1,) or (0,) array
+        Of the observer's estimates of z and d.
     point : (4 + N, N) array
         Scratch memory: z in row 0, the deviation in row 1, a row of F or P, Q's powers, and F.
 
@@ -285,7 +307,7 @@ def predict_row(
         for j in range(n):
             f[i, j] = 1.0 if i == j else 0.0
     if problem.decay != rows.decay[k - 1] or last != rows.last[k - 1]:
-        change_model(problem, rows, k, x, p, f)
+        change_model(problem, rows, k, x, p, f, deviations)
     fastest = max(problem.fastest, problem.decay)
     count = max(int(min(np.ceil(h * fastest / STEP), MOST_STEPS)), 1)
     h /= count
@@ -373,6 +395,7 @@ def take_rows(
     y: Floats,
     u: Floats,
     models: Floats,
+    deviations: Floats,
     memory: Floats,
     point: Floats,
 ) -> None:
@@ -385,8 +408,8 @@ def take_rows(
         The observer's.
     h, y, u : (K,), (K,), (K, m) arrays
         Time (s) since the row before, sample, and known inputs meanwhile.
-    models : (K, 4) or (K, 0) array
-        `MODEL` of a self-tuning observer.
+    models, deviations : (K, 4), (K, n + 1) or (K, 0) arrays
+        `MODEL` of a self-tuning observer, and the standard deviations of its z and d.
     memory : (MEMORY,) array
         Remembers the size of the innovations (D 21).
     point : (4 + N, N) array
@@ -419,7 +442,7 @@ def take_rows(
             if jumps:
                 jump_row(problem, rows, k, y[place])
             continue
-        predict_row(law, work, problem, rows, k, step, u[place], point)
+        predict_row(law, work, problem, rows, k, step, u[place], deviations[place], point)
         if rows.kinds[k] == UNMEASURED:
             for i in range(n):
                 rows.base[k, i] = point[0, i]
@@ -514,7 +537,7 @@ def smooth_rows(rows: Rows, last: int, stop: int, top: int, out: Floats) -> None
                 for j in range(n):
                     for m in range(n):
                         total -= p[i, j] * known[j, m] * p[m, i]
-                out[k - stop, 1, i] = max(total, ROUNDING * p[i, i])
+                out[k - stop, 1, i] = max(total, ROUNDING * abs(p[i, i]))
         back_over(rows, k, costate, line)
         if sure:
             for j in range(n):

@@ -116,7 +116,8 @@ class PastEstimates:
             levels = np.stack([found.z_hat, found.z_tilde], axis=1)
             law, work, _ = self._observer.arrays
             y = found.z_hat[:, 0] + found.innovation[:, 0]  # less its offset (D 23)
-            self._smoother.take(law, work, levels, (y, h, u), times, kinds, found.model.copy())
+            models, deviations = found.model.copy(), found.standard_deviation
+            self._smoother.take(law, work, levels, (y, h, u), times, kinds, models, deviations)
             self._parts.append((found, numbers))
 
     def _handed_out(self, smoothed: NDArray[np.float64]) -> Trajectory:

@@ -23,6 +23,7 @@ from fhaosmo_ros.core.observer.arrays import (
     ROUGHNESS,
     SAMPLES,
     STEADY_PERIOD,
+    TOLD,
     UNSETTLED,
     Work,
     Y,
@@ -228,4 +229,4 @@ def begin(
             record[VARIANCE, k, g] = 1.0
             record[LOG_VARIANCE, k, g] = record[RESIDUAL, k, g] = record[FAR, k, g] = 0.0
             record[SHORT, k, g] = 1.0
-    memory[LIKELIEST] = weigh(members, FLOOR)
+    memory[LIKELIEST] = memory[TOLD] = weigh(members, FLOOR)

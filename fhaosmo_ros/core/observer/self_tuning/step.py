@@ -294,7 +294,7 @@ def step_members(
     correct_states(members, scratch, n, y)
     memory[LIKELIEST] = weigh(members, QUANTISED_FLOOR if quanta > 0.0 else FLOOR)
     mix(law, members, scratch, x)
-    tell_model(law, members, int(memory[LIKELIEST]), h, jumped, x)
+    tell_model(law, members, memory, h, jumped, x)
     find_strays(members, n, x)
     return float((y - x[HAT, 0]) ** 2)
 

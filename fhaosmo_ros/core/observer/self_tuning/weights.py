@@ -11,10 +11,12 @@ from fhaosmo_ros.core.observer.arrays import (
     DRIVE,
     HAT,
     Law,
+    LIKELIEST,
     LOSS,
     MODEL,
     NOISE,
     SLIDER,
+    TOLD,
 )
 from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import at, HUBER
@@ -48,6 +50,8 @@ FLOOR, QUANTISED_FLOOR = 30.0, 100.0
 """No log-likelihood falls further below the best one (D 28, D 31)."""
 VAGUE = 0.04
 """Part of the square of half a quantum by which predictions are less certain than their P says."""
+CLEARLY = 2.0
+"""A member is clearly likelier than another one if its log-likelihood is so much larger."""
 NEGLIGIBLE = 25.0
 """Members whose log-likelihood is so far below the best one have no weight."""
 
@@ -147,14 +151,19 @@ def weigh(members: Members, floor: float) -> int:
 
 @compiled()
 def tell_model(
-    law: Law, members: Members, likeliest: int, h: float, jumped: bool, x: Floats
+    law: Law, members: Members, memory: Floats, h: float, jumped: bool, x: Floats
 ) -> None:
     """
     Write the model of d and the noise of the likeliest member to `x`, for a smoother (D 34).
 
-    Coloured noise counts as white noise that is as dense where the member's bandwidth ends.
+    It stays until another one is clearly likelier. Coloured noise counts as white noise that is as
+    dense where the member's bandwidth ends.
     """
-    k, g, slider = likeliest // COUNT, likeliest % COUNT, law.scalars[SLIDER]
+    k, g = divmod(int(memory[TOLD]), COUNT)
+    if members.record[SCORE, k, g] < -CLEARLY:
+        memory[TOLD] = memory[LIKELIEST]
+        k, g = divmod(int(memory[TOLD]), COUNT)
+    slider = law.scalars[SLIDER]
     row, twice = x[MODEL], 2.0 * (x.shape[1] - ORDERS + 1 + k)
     noise, a = members.noise[SQUARE, COLOUR[g]], members.rates[CORRELATION, g]
     drive = members.record[INTENSITY, k, g] * slider**twice
