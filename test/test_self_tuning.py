@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The self-tuning observer: its members are Kalman filters; together they fit y by themselves."""
 
+import copy
 import math
 
 from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Status
@@ -365,6 +366,22 @@ def test_a_memory_goes_on_where_it_was(case):
     run = whole.run(stamps[2000:], y[2000:])
     assert run.unknown_input[-1] == other.estimate.unknown_input
     assert (whole.memory.members == other.memory.members).all()
+
+
+@pytest.mark.parametrize('kind', [Observer, OnlineEstimator])
+def test_a_copy_is_independent(case, kind):
+    """Neither changes the other, and both go on as one that was not copied."""
+    t, z, _, noise = case
+    y, stamps = z[:800, 0] + 1e-3 * noise[:800], np.round(t[:800] * 1e9).astype(np.int64) + 1
+    original, alone = kind(SELF_TUNING), kind(SELF_TUNING)
+    for one in (original, alone):
+        one.run(stamps[:400], y[:400])
+    other = copy.deepcopy(original)
+    other.run(stamps[400:600], y[400:600] + 1.0)
+    expected = alone.run(stamps[400:], y[400:]).unknown_input
+    again = copy.deepcopy(original)
+    for one in (original, again):
+        np.testing.assert_array_equal(one.run(stamps[400:], y[400:]).unknown_input, expected)
 
 
 def test_weights_are_shares(case):

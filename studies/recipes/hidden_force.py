@@ -14,6 +14,7 @@ from studies.recipes.judging import (
     fixed_gains,
     Fold,
     Method,
+    model,
     OURS,
     Recorded,
     run,
@@ -124,8 +125,8 @@ def recorded(name: str, y: Floats, d: Floats) -> Recorded:
 
 
 def short() -> dict[str, list[Fold]]:
-    """Return a fold of two short simulated recordings of such an oscillator."""
-    p = {'order': 2, 'phi': ['0', '-42*z2 - 184000*z1 - 728000*z1**3']}
+    """Return a fold of two short simulated recordings of the file's own oscillator."""
+    p = model('hidden_force')
     family = p | {
         'duration': 1.5, 'sample_rate': 1 / PERIOD, 'initial_state': 0.0, 'noise_std': 1e-5,
         'rms_of_d': 4000.0, 'band_of_d': [60.0, 600.0], 'disturbances': ['sines'],

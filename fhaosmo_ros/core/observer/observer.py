@@ -336,10 +336,18 @@ class Observer:
         self._work = self.make_work()
         flat_law = (law.flags, law.gains, law.curves, law.scalars, law.chances, *law.model)
         self._arguments = (*flat_law, *self._work, *self._state)
+        self._set_addresses()
+
+    def _set_addresses(self) -> None:
         if self.self_tuning:
-            self._table = table_of(self._arguments)
-            law.flags[arrays.STEP_AT] = step_address()
-            law.flags[arrays.TABLE_AT] = self._table.ctypes.data
+            flags, self._table = self._law.flags, table_of(self._arguments)
+            flags[arrays.STEP_AT] = step_address()
+            flags[arrays.TABLE_AT] = self._table.ctypes.data
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Complete a copy: its arrays are elsewhere than those that it was made from."""
+        self.__dict__.update(state)
+        self._set_addresses()
 
     def _write(self, levels: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
         self._state.levels[:] = levels
