@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a channel costs in one process of many, over what a process for it alone costs."""
 
-from time import monotonic, sleep
+from time import monotonic, sleep, time_ns
 
 from children import Child, Children
 import numpy as np
-from rates import isolate
+from rates import end_source, isolate, wait_until
 from table import CannotMeasureError, Row
 from tqdm import tqdm
 
@@ -58,7 +58,53 @@ def measure(quick: bool) -> list[Row]:
     note = f'{memory[0]:.0f} MB / {channels} and {memory[1]:.0f} MB'
     rows.append(Row(f'memory, a channel of {channels} / a process each',
                     memory[0] / channels / memory[1], note=note))  # fmt: skip
-    return rows
+    return [*rows, *_self_tuning(channels, seconds)]
+
+
+def _self_tuning(channels: int, seconds: float) -> list[Row]:
+    """Return the CPU of a process with so many self-tuning channels, and the samples it lost."""
+    from watch import Watch  # needs ROS
+
+    names = [f'c{k}' for k in range(channels)]
+    topics = [f'many/{name}' for name in names]
+    with Children() as children, Watch(topics) as watch:
+        many = _many(children, names, '-p', 'gains:=self_tuning')
+        many.wait_for('estimating')
+        source = _source(children, names)
+        sleep(WARM_UP)
+        watch.forget()
+        before, start = many.cpu_seconds(), monotonic()
+        sleep(seconds)
+        used, elapsed = many.cpu_seconds() - before, monotonic() - start
+        rate = watch.count(topics[0]) / elapsed
+        memory = many.resident_megabytes()
+        sent, ended = end_source(source), time_ns()
+        wait_until(
+            lambda: all(watch.report(name)[0] > ended for name in topics), 'no report of all'
+        )
+        lost = len(names) * sent - sum(watch.report(name)[1] for name in topics)
+    title = f'{channels} self-tuning channels, {RATE:g} Hz, one process'
+    return [
+        Row(f'CPU of {title}', 100.0 * used / elapsed, '%',
+            note=f'of a core; estimates at {rate:.0f} Hz; {memory:.0f} MB'),
+        Row(f'samples lost by {title}', lost, bar=0.0, note=f'of {len(names) * sent:,}'),
+    ]  # fmt: skip
+
+
+def _many(children: Children, names: list[str], *arguments: str) -> Child:
+    return children.start(
+        'many', '-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-r', '__node:=many',
+        '-p', f'publish_rate:={RATE}', '-p', f'channels:=[{", ".join(names)}]', *arguments,
+    )  # fmt: skip
+
+
+def _source(children: Children, names: list[str]) -> Child:
+    source = children.start(
+        'source', 'benchmark/source.py', '--rate', str(RATE),
+        '--topics', *(f'{name}/y' for name in names),
+    )  # fmt: skip
+    source.wait_for('publishing')
+    return source
 
 
 def observe(channels: int, seconds: float, listen: bool) -> np.ndarray:
@@ -67,17 +113,14 @@ def observe(channels: int, seconds: float, listen: bool) -> np.ndarray:
 
     names = [f'c{k}' for k in range(channels)]
     singles = names[: min(SINGLES, channels)]
-    publish = ('-p', f'publish_rate:={RATE}')
     watched = [f'many/{names[0]}', f'single_{names[0]}']
     with Children() as children, Watch(watched) as watch:
-        many = children.start(
-            'many', '-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-r', '__node:=many', *publish,
-            '-p', f'channels:=[{", ".join(names)}]',
-        )  # fmt: skip
+        many = _many(children, names)
         alone = [
             children.start(
                 f'single_{name}', '-m', 'fhaosmo_ros', 'estimator', '--ros-args',
-                '-r', f'__node:=single_{name}', '-r', f'y:={name}/y', *publish,
+                '-r', f'__node:=single_{name}', '-r', f'y:={name}/y',
+                '-p', f'publish_rate:={RATE}',
             )
             for name in singles
         ]  # fmt: skip
@@ -87,11 +130,7 @@ def observe(channels: int, seconds: float, listen: bool) -> np.ndarray:
             topics = [f'many/{name}/unknown_input' for name in names]
             topics += [f'single_{name}/unknown_input' for name in singles]
             children.start('listener', 'benchmark/listener.py', *topics).wait_for('listening')
-        source = children.start(
-            'source', 'benchmark/source.py', '--rate', str(RATE),
-            '--topics', *(f'{name}/y' for name in names),
-        )  # fmt: skip
-        source.wait_for('publishing')
+        _source(children, names)
         sleep(WARM_UP)
         watch.forget()
         before, start = _used(many, alone), monotonic()

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One step of the core, beside the same step in C."""
+"""One step of the core, beside the same step in C; and of the self-tuning observer."""
 
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
+from fhaosmo_ros.core import OnlineEstimator, Plant
 from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 import numpy as np
 from reference import assert_agreement, CASE, compile_reference, in_c, in_numba, output, PERIOD
 from table import CannotMeasureError, Row
@@ -17,13 +20,20 @@ from tqdm import tqdm
 BAR = 1.5
 VARIANTS = ('sign', 'fuzzy', 'fuzzy_adaptive')
 SCHEMES = ('explicit', 'implicit')
+MODELS = Path(__file__).parents[1] / 'config' / 'models'
+SELF_TUNING_BARS = {'paper_plant': 12.0, 'dc_motor': 12.0, 'pendulum': 100.0}
+"""Microseconds a step, of files in `MODELS`."""
+LENGTH, WINDOW = 300, 30
+"""Seconds of a run at 1 kHz, and of its beginning and its end."""
+NOISE = 1e-4
+"""Of y, where the file has no quantum."""
 
 
 def measure(quick: bool) -> list[Row]:
     """Return the ratio to C, and nanoseconds a step of every variant and scheme."""
     samples, rounds, calls = (40_000, 5, 2_000) if quick else (400_000, 15, 20_000)
     y = output(samples + 1)
-    total = rounds + len(VARIANTS) * len(SCHEMES) + len(SCHEMES) + 1
+    total = rounds + len(VARIANTS) * len(SCHEMES) + len(SCHEMES) + 1 + len(SELF_TUNING_BARS)
     with tqdm(total=total, desc='core', unit='round', leave=False) as progress:
         rows = [_against_c(y, rounds, progress)]
         for variant, scheme in product(VARIANTS, SCHEMES):
@@ -36,6 +46,9 @@ def measure(quick: bool) -> list[Row]:
         progress.update()
         for scheme in SCHEMES:
             rows.append(_live(CASE | {'scheme': scheme}, y[:calls]))
+            progress.update()
+        for model, bar in SELF_TUNING_BARS.items():
+            rows += _self_tuning(model, None if quick else bar, 5 if quick else LENGTH)
             progress.update()
     return rows
 
@@ -86,6 +99,35 @@ def _live(parameters: dict[str, Any], y: np.ndarray) -> Row:
     seconds = min(_seconds(run) for _ in range(3))
     name = f'Observer.step, one call, {parameters["scheme"]}'
     return Row(name, seconds / len(samples) * 1e6, 'us', note='fuzzy_adaptive')
+
+
+def _self_tuning(model: str, bar: float | None, length: int) -> list[Row]:
+    """Return microseconds a step at the beginning of a recording and at its end."""
+    path = MODELS / f'{model}.yaml'
+    plant = {k: v for k, v in load(path, 'plant').items() if k in PLANT_PARAMETERS}
+    noise = {} if plant.get('quantisation') else {'noise_std': NOISE}
+    t = np.arange(round(length / PERIOD)) * PERIOD
+    y = Plant(plant | noise).simulate(t).y
+    stamps = 10**9 + np.round(t * 1e9).astype(np.int64)
+    found = load(path, 'estimator')
+    told = {k: found[k] for k in found if k in ('order', 'phi') or k.startswith('constants')}
+    OnlineEstimator(told | {'gains': 'self_tuning'}).run(stamps[:100], y[:100])  # may compile
+    estimator = OnlineEstimator(told | {'gains': 'self_tuning'})
+    parts = np.array_split(np.arange(len(t)), max(2, length // WINDOW))
+    spent = []
+    for part in parts:
+        begin = process_time()
+        estimator.run(stamps[part], y[part])
+        spent.append(1e6 * (process_time() - begin) / len(part))
+    seconds = length / len(parts)
+    states = f'{told["order"]} states; 1 kHz, stamps exact'
+    return [
+        Row(f'step, self-tuning, {model}, {when}', value, 'us', bar, note)
+        for when, value, note in (
+            ('at first', spent[0], f'first {seconds:g} s; {states}'),
+            ('later', spent[-1], f'last {seconds:g} s of {length} s'),
+        )
+    ]
 
 
 def _seconds(run: Callable[[], object]) -> float:

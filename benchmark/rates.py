@@ -2,6 +2,7 @@
 """CPU, lost samples, jitter and latency of an estimator beside a node that computes nothing."""
 
 from collections import defaultdict
+from collections.abc import Callable
 import importlib.util
 import os
 from time import monotonic, process_time, sleep, time_ns
@@ -230,10 +231,10 @@ def observe(
             name: (*watch.jitter(topic, asked), *watch.latency(topic))
             for name, topic in watched.items()
         }
-        sent = _end(source)
+        sent = end_source(source)
         ended, taken = time_ns(), {}
         for name in names:
-            _wait(lambda name=name: watch.report(name)[0] > ended, f'no report of {name}')
+            wait_until(lambda name=name: watch.report(name)[0] > ended, f'no report of {name}')
             taken[name] = watch.report(name)[1]
     return {
         name: Figures(used[name] / elapsed, held[name], sent, taken[name], times[name])
@@ -241,13 +242,15 @@ def observe(
     }
 
 
-def _end(source: Child) -> int:
+def end_source(source: Child) -> int:
+    """End the source and return how many samples it has published on each topic."""
     source.interrupt()
     source.end()
     return int(source.output().split()[-1])
 
 
-def _wait(condition, complaint: str) -> None:
+def wait_until(condition: Callable[[], bool], complaint: str) -> None:
+    """Wait for a condition; raise with a complaint if it does not come."""
     deadline = monotonic() + MATCHED
     while not condition():
         if monotonic() > deadline:

@@ -2,17 +2,19 @@
 """
 Measure speed as ratios within one run, and say which bars are met (`make bench`).
 
+With `--page`, docs/speed.md and the tables of upsets in docs/operation.md are written anew, each
+part as soon as it is measured.
+
 Exit code 0 if all bars are met, 1 if one is missed, 130 after Ctrl-C.
 """
 
 import argparse
-import os
-import platform
 import signal
 import sys
 
 import channels
 import core_step
+import page
 import rates
 import replay
 import simulation
@@ -42,23 +44,23 @@ def main(argv: list[str] | None = None) -> int:
         '--quick', action='store_true', help='small sizes, and missed bars do not fail'
     )
     parser.add_argument('--only', choices=PARTS, help='one part only')
+    parser.add_argument('--page', action='store_true', help='write the tables in docs/ anew')
     arguments = parser.parse_args(argv)
+    if arguments.page and arguments.quick:
+        parser.error('--page shows full measurements: expected no --quick, got --quick')
     # A job in the background starts with SIGINT ignored; SIGTERM must end the children as well.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     results: list[Row | Table] = []
+    where = page.machine()
     try:
         for part in [arguments.only] if arguments.only else PARTS:
-            results += _measure(part, arguments.quick)
+            results += _measure(part, arguments.quick, arguments.page)
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
-    load = os.getloadavg()[0]
     rows = [result for result in results if isinstance(result, Row)]
-    print(
-        f'{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, '
-        f'load {load:.1f}\n\n{render(rows)}'
-    )
+    print(f'{where}\n\n{render(rows)}')
     for table in results:
         if isinstance(table, Table):
             print(f'\n{table.render()}')
@@ -68,12 +70,18 @@ def main(argv: list[str] | None = None) -> int:
     return 1 if missed and not arguments.quick else 0
 
 
-def _measure(part: str, quick: bool) -> list[Row | Table]:
+def _measure(part: str, quick: bool, to_page: bool) -> list[Row | Table]:
+    where = page.machine()
     try:
-        return PARTS[part](quick)
+        results = PARTS[part](quick)
     except CannotMeasureError as error:
         print(f'{part}: {error}', file=sys.stderr)
         return [Row(part, None, bar=0.0, note=str(error))]
+    if to_page and part == 'upsets':
+        upsets.page(results)
+    elif to_page:
+        page.write({part: page.part(results, where)})
+    return results
 
 
 if __name__ == '__main__':

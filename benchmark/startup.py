@@ -13,33 +13,37 @@ READY = 'estimating'
 
 
 def measure(quick: bool) -> list[Row]:
-    """Return the seconds until the estimator is ready."""
+    """Return the seconds until the estimator is ready: with fixed gains, and self-tuning."""
     isolate()
-    empty_starts, filled_starts = (1, 1) if quick else (3, 5)
-    empty, filled = [], []
+    starts = 1 if quick else 5
+    gains = ('fixed',) if quick else ('fixed', 'self_tuning')
+    rows = []
     with tqdm(
-        total=empty_starts + filled_starts, desc='startup', unit='start', leave=False
+        total=len(gains) * (1 + starts), desc='startup', unit='start', leave=False
     ) as progress:
-        for _ in range(empty_starts):
+        for kind in gains:
+            times = []
             with TemporaryDirectory() as cache:
-                empty.append(_start(cache))
-                progress.update()
-                for _ in range(filled_starts if len(empty) == empty_starts else 0):
-                    filled.append(_start(cache))
+                for _ in range(1 + starts):
+                    times.append(_start(cache, kind))
                     progress.update()
-    return [
-        Row('estimator start, empty numba cache', float(np.median(empty)), 's', note=_all(empty)),
-        Row('estimator start, cached', float(np.median(filled)), 's', note=_all(filled)),
-    ]
+            for name, found in (('empty', times[:1]), ('filled', times[1:])):
+                wall, processor = np.median(found, axis=0)
+                note = f'to its first word; {processor:.2g} s of CPU; {_all(found)}'
+                title = f'estimator start, gains {kind}, {name} cache of machine code'
+                rows.append(Row(title, float(wall), 's', note=note))
+    return rows
 
 
-def _start(cache: str) -> float:
+def _start(cache: str, gains: str) -> tuple[float, float]:
+    """Return the seconds and the CPU time until the estimator is ready."""
     with Children() as children:
         estimator = children.start(
-            'estimator', '-m', 'fhaosmo_ros', 'estimator', environment={'NUMBA_CACHE_DIR': cache}
-        )
-        return estimator.wait_for(READY)
+            'estimator', '-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-p', f'gains:={gains}',
+            environment={'NUMBA_CACHE_DIR': cache},
+        )  # fmt: skip
+        return estimator.wait_for(READY), estimator.cpu_seconds()
 
 
-def _all(times: list[float]) -> str:
-    return 'from process start to ready: ' + ', '.join(f'{t:.2f}' for t in times)
+def _all(times: list[tuple[float, float]]) -> str:
+    return ', '.join(f'{wall:.2f}' for wall, _ in times)

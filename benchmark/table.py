@@ -38,6 +38,13 @@ class Row(NamedTuple):
         """True if there is a bar and the value is not within it."""
         return self.bar is not None and (self.value is None or not self.value <= self.bar)
 
+    def cells(self) -> tuple[str, str, str, str, str]:
+        """Return name, value, bar, verdict and note as a reader sees them."""
+        value = '-' if self.value is None else f'{_short(self.value)} {self.unit}'.strip()
+        if self.bar is None:
+            return self.name, value, '', '', self.note
+        return self.name, value, f'<= {self.bar:g}', 'MISSED' if self.missed else 'pass', self.note
+
 
 class Table(NamedTuple):
     """
@@ -63,15 +70,15 @@ class Table(NamedTuple):
         rows = ('  '.join(f'{c:>{w}}' for c, w in zip(r, widths, strict=True)) for r in cells)
         return '\n'.join([*textwrap.wrap(self.title, 99), '', *rows])
 
+    def markdown(self) -> str:
+        """Return the columns for a page."""
+        ruled = [self.header, ('---',) * len(self.header), *self.lines]
+        return '\n'.join(f'| {" | ".join(line)} |' for line in ruled)
+
 
 def render(rows: list[Row]) -> str:
     """Return the rows as an aligned table."""
-    cells = [('', 'measured', 'bar', '', '')]
-    for row in rows:
-        value = '-' if row.value is None else f'{_short(row.value)} {row.unit}'.strip()
-        bar = '' if row.bar is None else f'<= {row.bar:g}'
-        verdict = '' if row.bar is None else ('MISSED' if row.missed else 'pass')
-        cells.append((row.name, value, bar, verdict, row.note))
+    cells = [('', 'measured', 'allowed', '', ''), *(row.cells() for row in rows)]
     widths = [max(len(line[k]) for line in cells) for k in range(len(cells[0]))]
     return '\n'.join(
         f'{name:<{widths[0]}}  {value:>{widths[1]}}  {bar:<{widths[2]}}  '

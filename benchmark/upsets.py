@@ -2,13 +2,11 @@
 """
 Start, upsets, outliers and other rates: every preset beside Kalman filters.
 
-    python benchmark/upsets.py              # measures, and writes the tables in docs/operation.md
-
 The Kalman filters know the true sizes of the noise, of the states and of d, and have the model of
 d that the preset has. Their bandwidth is scanned on a recording without upsets.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,8 +23,8 @@ from fhaosmo_ros.core.simulation.plant import Plant
 from kalman_filter import KalmanFilter
 import numpy as np
 from numpy.typing import NDArray
-from studies.document import filled
-from table import render, Row, Table
+from studies.document import refill
+from table import Row, Table
 
 Floats = NDArray[np.float64]
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
@@ -303,29 +301,15 @@ def measure(quick: bool) -> list[Row | Table]:
     ]
 
 
-def markdown(header: tuple[str, ...], lines: list[tuple[str, ...]]) -> str:
-    """Return a table for the page."""
-    ruled = [header, ('---',) * len(header), *lines]
-    return '\n'.join(f'| {" | ".join(line)} |' for line in ruled)
-
-
-def main() -> None:
-    """Measure, print, and write the tables of the page."""
-    results = measure(False)
-    rows = [r for r in results if isinstance(r, Row)]
-    bars, upsets, steady = (t for t in results if isinstance(t, Table))
-    print('\n\n'.join([render(rows), *(t.render() for t in (bars, upsets, steady))]))
+def page(results: Sequence[Row | Table]) -> None:
+    """Write the tables of the page."""
+    bars, upsets, _ = (t for t in results if isinstance(t, Table))
     shown = {
         file: [line[2].replace(' ', ', ') for line in upsets.lines
                if line[0] == file and line[1] in SHOWN]
         for file in NOISE
     }  # fmt: skip
-    texts = {
-        'upsets': markdown(('', *SHOWN.values()), [(f, *cells) for f, cells in shown.items()]),
-        'bars': markdown(bars.header, bars.lines),
-    }
-    PAGE.write_text(filled(PAGE.read_text(encoding='utf-8'), texts), encoding='utf-8')
-
-
-if __name__ == '__main__':
-    main()
+    lines = [(file, *cells) for file, cells in shown.items()]
+    refill(PAGE, {
+        'upsets': Table('', ('', *SHOWN.values()), lines).markdown(), 'bars': bars.markdown(),
+    })  # fmt: skip

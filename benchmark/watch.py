@@ -49,10 +49,12 @@ class Watch:
             values = {item.key: item.value for item in status.values}
             if 'samples accepted' in values:
                 taken = int(values['samples accepted']) + int(values.get('samples rejected', 0))
-                self._reports[status.name.split(':')[0]] = published, taken
+                node, _, what = status.name.partition(': ')  # what: [channel] input
+                for name in (node, f'{node}/{what.split()[0]}'):
+                    self._reports[name] = published, taken
 
     def report(self, name: str) -> tuple[int, int]:
-        """Return when a node reported last, in nanoseconds, and how many samples it had taken."""
+        """Return when a node or NODE/CHANNEL reported last (ns), and the samples taken so far."""
         return self._reports.get(name, (0, 0))
 
     def forget(self) -> None:
