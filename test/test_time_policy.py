@@ -14,6 +14,7 @@ from fhaosmo_ros.core.online.gaps import MOST_SUB_STEPS
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from studies import stamps
 
 MS = 1_000_000
 START = 1_700_000_000 * 10**9
@@ -357,14 +358,52 @@ def test_clock_that_ticks_slower_than_samples_come_spreads_them():
     assert counters.restarts == counters.far_stamps == counters.backward_stamps == 0
 
 
-def test_clock_that_stands_still_never_runs_ahead_of_its_next_tick():
+def times_by(readings):
+    """Return the times of samples that came when the clock read so; 0 before there is one."""
+    estimator = OnlineEstimator({'sampling': 'clock'})
+    found = []
+    for reading in readings.tolist():
+        estimator.update(reading, 0.2)
+        found.append(estimator.stamp)
+    assert estimator.counters.restarts == 0
+    return np.array(found)
+
+
+TRUE = START + MS * np.arange(10_000)
+SLOW = START + MS * (np.arange(10_000) // 25 * 25)
+"""Times at 1 kHz, and what a clock of 40 Hz reads then."""
+
+
+@pytest.mark.parametrize('late', [0.0, 1e-5, 1e-4, 1e-3])
+def test_late_ticks_and_samples_hardly_move_the_times(late):
+    for seed in range(3):
+        times = times_by(stamps.clock_readings(TRUE, 25, late, seed))[5000:]
+        assert np.diff(times) == pytest.approx(MS, rel=0.002)
+        assert times == pytest.approx(TRUE[5000:], abs=MS)
+
+
+@pytest.mark.parametrize('order', ['ticks first', 'samples first'])
+def test_node_that_stands_for_a_moment_moves_no_times(order):
+    """For 90 ms; then what has come is taken at once."""
+    readings = SLOW.copy()
+    readings[5005:5095] = SLOW[5090 if order == 'ticks first' else 5005]
+    assert np.diff(times_by(readings)[2000:]) == pytest.approx(MS, rel=0.002)
+
+
+def test_samples_are_back_at_the_clock_after_a_gap():
+    times = times_by(np.delete(SLOW, np.s_[5005:5405]))
+    assert times[5005] == pytest.approx(TRUE[5405], abs=30 * MS)
+    assert times[5500:] == pytest.approx(TRUE[5900:], abs=30 * MS)
+
+
+def test_clock_that_stands_still_is_two_samples_ahead_of_its_next_tick_at_most():
     estimator = OnlineEstimator({'sampling': 'clock'})
     for tick in range(3):
         for _ in range(5):
             estimator.update(START + tick * 10 * MS, 0.2)
     for _ in range(1000):  # paused: samples go on
         estimator.update(START + 20 * MS, 0.2)
-    assert estimator.stamp < START + 30 * MS
+    assert estimator.stamp <= START + (30 + 2 * 2) * MS  # 2 ms between samples
     assert not estimator.update(START + 30 * MS, 0.2).status.rejected
 
 

@@ -43,7 +43,7 @@ KEPT = 4
 UNUSED = 86_400.0
 """Seconds after which a folder counts as no longer in use."""
 NAME = 'fhaosmo_ros'
-COMPILE_TIME = '20 to 40 s on an idle machine'
+COMPILE_TIME = '20 s to 3 minutes'
 COMPILING = f'compiling the numerical core, once; this takes {COMPILE_TIME} ...'
 CHECKSUM = 32
 """Bytes of a checksum."""

@@ -46,7 +46,7 @@ NOW = 17  # the clock that counts nominal periods
 TICK = 18  # CLOCK: latest clock reading
 TICK_LENGTH = 19  # from the reading before it
 TICK_COUNT = 20  # samples at it
-SPACING = 21  # of samples at one reading; 0: not known yet
+SPACING = 21  # of samples at one reading, in parts of a ns, see stamps.py; 0: not known yet
 PLACED = 22  # where the latest one was put
 HELD = 23  # 1: a sample far away waits for the next one's word
 HELD_STAMP = 24
@@ -63,9 +63,14 @@ EVENT = 34  # what the detector of events is doing, see events.py
 EVENT_SINCE = 35  # since when; LATEST of the first sample of an event
 EVENT_STAMP = 36  # the stamp of that sample
 EVENT_TIME = 37  # LATEST of the sample it has taken last
+PHASE = 38  # CLOCK: time of the first sample at that reading
+TICKS = 39  # ticks that the line through them remembers; 0: there is no line
+DEVIATION = 40  # running mean of how far ticks are off it
+PACE = 41  # interval of the times that follow the line, in the parts of SPACING
+FITTED = 42  # latest tick that was on the line
 NAMES = {v: k for k, v in dict(globals()).items() if k.isupper() and isinstance(v, int)}
 """Names of these integers by index: they label the entries of a snapshot."""
-COUNTERS = 38
+COUNTERS = 43
 """Index of the first counter."""
 
 (
