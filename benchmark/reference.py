@@ -13,8 +13,9 @@ from typing import Any
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer import step as recursion
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.estimates import ObserverState
 from fhaosmo_ros.core.observer.fuzzy import KNOTS
-from fhaosmo_ros.core.observer.observer import make_record, Observer, ObserverState
+from fhaosmo_ros.core.observer.observer import make_record, Observer
 from fhaosmo_ros.core.observer.status import LEVEL_SHIFT
 from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np

@@ -2,7 +2,8 @@
 """The observer as a plain Python library: no middleware, no bag reader, no plotting."""
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.observer.observer import Estimate, Observer, ObserverState, Trajectory
+from fhaosmo_ros.core.observer.estimates import Estimate, ObserverState, Trajectory
+from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.batch import EstimatorBatch
 from fhaosmo_ros.core.online.counters import Counters

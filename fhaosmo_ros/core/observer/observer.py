@@ -2,9 +2,8 @@
 """The observer: one sample at a time, or arrays of samples, by the same compiled recursion."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.compiled.unowned_arrays import table_of
 from fhaosmo_ros.core.model.inputs import known_inputs, known_inputs_of_run
@@ -13,114 +12,17 @@ from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer import step as recursion
 from fhaosmo_ros.core.observer.arrays import Law, make_work, State, Work
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.estimates import Estimate, ObserverState, Trajectory
 from fhaosmo_ros.core.observer.self_tuning.members import TUNING, Tuning
 from fhaosmo_ros.core.observer.self_tuning.step import step_address
-from fhaosmo_ros.core.observer.smoother import smoothed
-from fhaosmo_ros.core.observer.status import flags, FLAGS_MASK, LEVEL_SHIFT, open_levels, Status
+from fhaosmo_ros.core.observer.smoother import BLOCK, Smoother
+from fhaosmo_ros.core.observer.status import FLAGS_MASK, LEVEL_SHIFT, REJECTED
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import make_from_file
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-
-class Estimate(NamedTuple):
-    """
-    What the observer knows after a sample.
-
-    Attributes
-    ----------
-    z : (n,) array
-        Estimated states; z[0] is z_hat_1, the others follow `estimate_from`.
-    unknown_input : float
-        Estimated d.
-    gamma : float
-        Power gamma in use.
-    innovation : (N,) array
-        eps_i = m_i - z_hat_i.
-    word : int
-        Status word; see `status` and `open_levels`.
-
-    """
-
-    z: NDArray[np.float64]
-    unknown_input: float
-    gamma: float
-    innovation: NDArray[np.float64]
-    word: int
-
-    @property
-    def status(self) -> Status:
-        """Flags of the step."""
-        return flags(self.word)
-
-    @property
-    def open_levels(self) -> int:
-        """Number of levels that run (the paper's E_i)."""
-        return open_levels(self.word)
-
-
-class Trajectory(NamedTuple):
-    """
-    Estimates of a run; row k belongs to ``t[k]``. Attributes as in `Estimate`.
-
-    Attributes
-    ----------
-    t : (K,) array
-        Times as given.
-    z : (K, n) array
-    unknown_input, gamma : (K,) arrays
-    innovation : (K, N) array
-    status, open_levels : (K,) integer arrays
-        Where `every` > 1, a row's flags are those of all samples since the row before it.
-    z_hat, z_tilde : (K, N) arrays
-        Filtered and internal states; z_tilde[:, i] belongs to z_{i+2}.
-    standard_deviation : (K, n + 1) array
-        Of the errors of z and, in the last column, of the unknown input, as a self-tuning observer
-        expects them; (K, 0) with fixed gains.
-    model : (K, 4) array
-        The likeliest model of d (D 26) of a self-tuning observer, which a smoother goes by: the
-        variance of the noise, if it were white; q; kappa (1/s); the number k of derivatives, or
-        k - 3 where d has jumped. 0 before it knows the noise; (K, 0) with fixed gains.
-    tuning : (K, 6) array
-        What a self-tuning observer has found, with columns as `Tuning.of` takes them; NaN before
-        it knows the noise; (K, 0) with fixed gains.
-
-    """
-
-    t: NDArray[Any]
-    z: NDArray[np.float64]
-    unknown_input: NDArray[np.float64]
-    gamma: NDArray[np.float64]
-    innovation: NDArray[np.float64]
-    status: NDArray[np.int64]
-    open_levels: NDArray[np.int64]
-    z_hat: NDArray[np.float64]
-    z_tilde: NDArray[np.float64]
-    standard_deviation: NDArray[np.float64]
-    model: NDArray[np.float64]
-    tuning: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class ObserverState:
-    """
-    All that an observer remembers; a copy, safe to keep.
-
-    Attributes
-    ----------
-    levels : (4 + N, N) array
-    memory : (MEMORY,) array
-        See `fhaosmo_ros.core.observer.arrays`.
-    t : float or int or None
-        Time of the last sample of `Observer.run`, in its unit (s, or ns for integers).
-
-    """
-
-    levels: NDArray[np.float64]
-    memory: NDArray[np.float64]
-    t: float | int | None = None
 
 
 def make_record(
@@ -549,7 +451,47 @@ class Observer:
             sample.
 
         """
-        return smoothed(Observer(self._configuration.parameters), t, y, u)
+        t, y = np.asarray(t), np.asarray(y, dtype=np.float64)
+        u = known_inputs_of_run(u, len(t), self.inputs).copy()
+        observer = Observer(self._configuration.parameters)
+        smoother = Smoother(observer.configuration)
+        parts = [observer.run(t[:0], y[:0], u[:0])]
+        found, first = [], None
+        for start in range(0, len(t), BLOCK):
+            block = slice(start, start + BLOCK)
+            part = observer.run(t[block], y[block], u[block])
+            parts.append(part)
+            if first is None and observer.started:
+                first = start + int(np.argmax((part.status & REJECTED) == 0))
+                latest, held = t[first], u[first]
+            if first is None:
+                continue
+            rows = slice(max(first, start), start + len(part.t))
+            status, inputs = part.status[rows.start - start :], u[rows]
+            for k in np.flatnonzero(~np.isfinite(inputs).all(axis=1)):  # the last ones are held
+                inputs[k] = inputs[k - 1] if k else held
+            times = np.fmax.accumulate(np.append(latest, t[rows]))
+            h = np.diff(times) * (1e-9 if np.issubdtype(t.dtype, np.integer) else 1.0)
+            latest, held = times[-1], inputs[-1]
+            kinds = smoother.kinds(status)
+            levels = np.stack([part.z_hat, part.z_tilde], axis=1)[rows.start - start :]
+            used = (part.z_hat + part.innovation)[rows.start - start :, 0]
+            numbers = np.arange(rows.start, rows.stop)
+            models = part.model[rows.start - start :].copy()
+            deviations = part.standard_deviation[rows.start - start :]
+            smoother.take(
+                *observer.arrays[:2], levels, (used, h, inputs), numbers, kinds, models, deviations
+            )
+            found.append(smoother.due())
+        found.append(smoother.finish())
+        whole = Trajectory(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        if first is None:
+            return whole
+        estimates, n = np.concatenate(found), observer.order
+        whole.z[first:], whole.unknown_input[first:] = estimates[:, 0, :n], estimates[:, 0, n]
+        if observer.self_tuning:
+            whole.standard_deviation[first:] = np.sqrt(estimates[:, 1, : n + 1])
+        return whole
 
     def trajectory(self, t: NDArray[Any], record: recursion.Record) -> Trajectory:
         """Return what a compiled run has recorded; the last row is where this observer stands."""

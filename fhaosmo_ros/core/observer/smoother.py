@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Smoothed estimates in the order of their samples, with bounded memory; see smoothing.py."""
 
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
-from fhaosmo_ros.core.model.inputs import known_inputs_of_run
 from fhaosmo_ros.core.observer.arrays import DERIVATIVES, DRIVE, HAT, Law, MEMORY, TILDE, Work
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.self_tuning.members import ORDERS
@@ -22,10 +21,7 @@ from fhaosmo_ros.core.observer.smoothing import (
 )
 from fhaosmo_ros.core.observer.status import DIVERGED, JUMPED, REJECTED, RESTARTED
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-if TYPE_CHECKING:
-    from fhaosmo_ros.core.observer.observer import Observer, Trajectory
+from numpy.typing import NDArray
 
 BLOCK = 8192
 """Rows after which a recording is smoothed as far as later samples no longer matter."""
@@ -246,47 +242,3 @@ class Smoother:
         used = self._rows.certainty[rows] > 0.0
         variance = 1.0 / self._rows.certainty[rows][used]
         return self._rows.pull[rows][used] * variance, variance
-
-
-def smoothed(observer: 'Observer', t: ArrayLike, y: ArrayLike, u: ArrayLike) -> 'Trajectory':
-    """Return what `Observer.smooth` returns; `observer` is a fresh one."""
-    t, y = np.asarray(t), np.asarray(y, dtype=np.float64)
-    u = known_inputs_of_run(u, len(t), observer.inputs).copy()
-    smoother = Smoother(observer.configuration)
-    parts: list[Trajectory] = [observer.run(t[:0], y[:0], u[:0])]
-    found, first = [], None
-    for start in range(0, len(t), BLOCK):
-        block = slice(start, start + BLOCK)
-        part = observer.run(t[block], y[block], u[block])
-        parts.append(part)
-        if first is None and observer.started:
-            first = start + int(np.argmax((part.status & REJECTED) == 0))
-            latest, held = t[first], u[first]
-        if first is None:
-            continue
-        rows = slice(max(first, start), start + len(part.t))
-        status, inputs = part.status[rows.start - start :], u[rows]
-        for k in np.flatnonzero(~np.isfinite(inputs).all(axis=1)):  # the last ones are held
-            inputs[k] = inputs[k - 1] if k else held
-        times = np.fmax.accumulate(np.append(latest, t[rows]))
-        h = np.diff(times) * (1e-9 if np.issubdtype(t.dtype, np.integer) else 1.0)
-        latest, held = times[-1], inputs[-1]
-        kinds = smoother.kinds(status)
-        levels = np.stack([part.z_hat, part.z_tilde], axis=1)[rows.start - start :]
-        used = (part.z_hat + part.innovation)[rows.start - start :, 0]
-        numbers = np.arange(rows.start, rows.stop)
-        models = part.model[rows.start - start :].copy()
-        deviations = part.standard_deviation[rows.start - start :]
-        smoother.take(
-            *observer.arrays[:2], levels, (used, h, inputs), numbers, kinds, models, deviations
-        )
-        found.append(smoother.due())
-    found.append(smoother.finish())
-    whole = type(parts[0])(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    if first is None:
-        return whole
-    estimates, n = np.concatenate(found), observer.order
-    whole.z[first:], whole.unknown_input[first:] = estimates[:, 0, :n], estimates[:, 0, n]
-    if observer.self_tuning:
-        whole.standard_deviation[first:] = np.sqrt(estimates[:, 1, : n + 1])
-    return whole

@@ -9,13 +9,8 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.model.inputs import known_inputs_of_run
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.observer import (
-    Estimate,
-    make_record,
-    Observer,
-    ObserverState,
-    Trajectory,
-)
+from fhaosmo_ros.core.observer.estimates import Estimate, ObserverState, Trajectory
+from fhaosmo_ros.core.observer.observer import make_record, Observer
 from fhaosmo_ros.core.observer.self_tuning.members import Tuning
 from fhaosmo_ros.core.observer.smoothing import make_problem
 from fhaosmo_ros.core.online import delay, policy

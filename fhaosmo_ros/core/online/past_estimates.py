@@ -7,7 +7,8 @@ from typing import Any
 
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
 from fhaosmo_ros.core.observer.arrays import COVARIANCE, GAMMA, HAT, MODEL, TILDE
-from fhaosmo_ros.core.observer.observer import Estimate, make_record, Observer, Trajectory
+from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory
+from fhaosmo_ros.core.observer.observer import make_record, Observer
 from fhaosmo_ros.core.observer.self_tuning.members import TUNING
 from fhaosmo_ros.core.observer.smoother import Smoother
 from fhaosmo_ros.core.observer.status import LEVEL_SHIFT, REJECTED

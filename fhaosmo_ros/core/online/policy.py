@@ -30,6 +30,7 @@ from fhaosmo_ros.core.observer.status import (
 )
 from fhaosmo_ros.core.observer.step import innovations, Record, record_state, start
 from fhaosmo_ros.core.online import memory as at
+from fhaosmo_ros.core.online.clock import clock_time
 from fhaosmo_ros.core.online.delay import (
     forget_past,
     INPUTS,
@@ -43,7 +44,7 @@ from fhaosmo_ros.core.online.delay import (
 from fhaosmo_ros.core.online.gaps import step_over
 from fhaosmo_ros.core.online.memory import EstimatorArrays, Policy
 from fhaosmo_ros.core.online.outliers import has_diverged, is_stuck
-from fhaosmo_ros.core.online.stamps import clock_time, difference, forget, refresh, settle
+from fhaosmo_ros.core.online.stamps import difference, forget, refresh, settle
 
 
 @compiled(inline='always')

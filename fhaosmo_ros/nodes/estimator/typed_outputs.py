@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import struct
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.observer.observer import Estimate
+from fhaosmo_ros.core.observer.estimates import Estimate
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.messages import message_class, TIME
 from fhaosmo_ros.topics import TYPED_ESTIMATES

@@ -5,7 +5,7 @@ import argparse
 from collections.abc import Iterator
 
 from fhaosmo_ros.core.observer import arrays
-from fhaosmo_ros.core.observer.observer import Trajectory
+from fhaosmo_ros.core.observer.estimates import Trajectory
 from fhaosmo_ros.core.observer.status import REJECTED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import Event

@@ -8,7 +8,7 @@ import shutil
 from typing import Any, NamedTuple, Protocol
 import zipfile
 
-from fhaosmo_ros.core.observer.observer import Trajectory
+from fhaosmo_ros.core.observer.estimates import Trajectory
 from fhaosmo_ros.core.observer.self_tuning.members import TUNING
 from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.core.parameters.files import dumps
