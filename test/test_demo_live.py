@@ -2,8 +2,10 @@
 """demo --live: the page that a browser shows while the demonstration runs."""
 
 import base64
+from contextlib import suppress
 from html.parser import HTMLParser
 import io
+import shutil
 
 import pytest
 
@@ -15,6 +17,7 @@ from fhaosmo_ros.tools.bags.types import labelled_array
 from fhaosmo_ros.tools.demo.live import LivePage
 import matplotlib.image
 import numpy as np
+from waiting import wait_until
 
 pytestmark = pytest.mark.ros
 STEP = 10_000_000
@@ -108,3 +111,54 @@ def test_it_is_opened_where_there_is_a_display(page, monkeypatch, display):
     monkeypatch.setenv('DISPLAY', display)
     page.open()
     assert opened == ([page.path.as_uri()] if display else [])
+
+
+@pytest.fixture(name='browser')
+def _browser():
+    webdriver = pytest.importorskip('selenium.webdriver')
+    chromium, driver = shutil.which('chromium'), shutil.which('chromedriver')
+    if not (chromium and driver):
+        pytest.skip('no chromium with its chromedriver (Debian: chromium-driver)')
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for option in ('--headless=new', '--no-sandbox', '--disable-dev-shm-usage'):
+        options.add_argument(option)
+    service = webdriver.ChromeService(executable_path=driver)
+    browser = webdriver.Chrome(options=options, service=service)
+    yield browser
+    browser.quit()
+
+
+SHOWN = """
+const text = document.querySelector('p'), picture = document.querySelector('img');
+return [text ? text.textContent : '', picture ? picture.naturalWidth : 0, performance.timeOrigin];
+"""
+
+
+def test_a_browser_loads_it_again_by_itself_until_the_end(page, browser, tmp_path):
+    """And can decode its pictures."""
+    errors = pytest.importorskip('selenium.common.exceptions')
+
+    def wait_for(wanted):
+        def seen():
+            with suppress(errors.WebDriverException):  # it is being loaded
+                text, width, loaded = browser.execute_script(SHOWN)
+                if text == wanted and width > 0:
+                    times.append(loaded)
+            return len(times) > before
+
+        before = len(times)
+        wait_until(seen, f'picture below {wanted!r}')
+
+    times = []
+    browser.get(page.path.as_uri())
+    for k, height in enumerate((1.0, -1.0)):
+        feed(page, 50 * k, 50 * (k + 1), height)
+        page.update(f'{k + 1} of 20 s')
+        wait_for(f'{k + 1} of 20 s')
+    figure = tmp_path / 'figure.png'
+    matplotlib.image.imsave(figure, np.ones((3, 4)))
+    page.finish('finished', figure)
+    wait_for('finished')
+    assert times == sorted(set(times))  # each was another load
+    assert not browser.get_log('browser')  # no errors, no warnings
