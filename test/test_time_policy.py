@@ -390,6 +390,15 @@ def test_node_that_stands_for_a_moment_moves_no_times(order):
     assert np.diff(times_by(readings)[2000:]) == pytest.approx(MS, rel=0.002)
 
 
+@pytest.mark.parametrize('tick', [1, 25])
+def test_times_of_a_sensor_that_is_not_steady_are_those_of_the_clock(tick):
+    """Its samples are no line; each time is right within two ticks and two samples."""
+    intervals = np.random.default_rng(0).exponential(2 * MS, 8000).astype(np.int64)
+    true = START + np.cumsum(np.maximum(intervals, 1000))
+    times = times_by(true // (tick * MS) * (tick * MS))
+    assert np.median(np.abs(times - true)[4000:]) < 2 * (tick + 2) * MS
+
+
 def test_samples_are_back_at_the_clock_after_a_gap():
     times = times_by(np.delete(SLOW, np.s_[5005:5405]))
     assert times[5005] == pytest.approx(TRUE[5405], abs=30 * MS)

@@ -11,6 +11,11 @@ FOLLOWED, UNUSUAL = 2, 4
 A tick belongs to the line through those before it if it is off by at most so many intervals of the
 samples, and so many times as far as they usually are.
 """
+STEADY, AGAIN = 2.0, 5000
+"""
+Samples whose ticks are off by more than so many intervals on average are not steady: for so many
+ticks there is no line.
+"""
 PATIENCE, KNOWN = 200_000_000, 16
 """
 For so long (ns) a line that remembers so many ticks goes on without one that belongs to it: when
@@ -41,7 +46,7 @@ def clock_time(ints: Ints, stamp: int) -> int:
         on_line = ints[at.PHASE] + int(ints[at.TICK_COUNT] * spacing)
         ints[at.TICK_COUNT] += 1
         end = stamp + ints[at.TICK_LENGTH]
-        if not ints[at.TICKS]:
+        if ints[at.TICKS] <= 0:
             shift = min(int(spacing), (end - placed) // 2)
         else:
             shift, end = follow(ints, on_line), end + limit(ints) + patience(ints)
@@ -61,13 +66,15 @@ def clock_time(ints: Ints, stamp: int) -> int:
     ints[at.TICK_LENGTH] = length
     expected = ints[at.PHASE] + int(count * spacing)
     error = difference(stamp, expected)
-    if ints[at.TICKS] and abs(error) <= limit(ints):
+    if ints[at.TICKS] > 0 and abs(error) <= limit(ints):
         ints[at.FITTED] = stamp
         ints[at.TICKS] = n = min(ints[at.TICKS] + 1, 1 + MOST_SAMPLES // count)
         ints[at.PHASE] = expected + int((4 * n - 2) / (n * (n + 1)) * error)
         ints[at.SPACING] += int(FINE * 6.0 / (n * (n + 1)) * error / count)
         ints[at.DEVIATION] += (abs(error) - ints[at.DEVIATION]) // min(n, WINDOW)
         ints[at.PLACED] += follow(ints, ints[at.PHASE])
+        if n > WINDOW and ints[at.DEVIATION] > STEADY * spacing:
+            ints[at.TICKS] = -AGAIN
         return int(ints[at.PLACED])
     if difference(stamp, ints[at.FITTED]) <= patience(ints):
         ints[at.PHASE] = expected
@@ -76,7 +83,7 @@ def clock_time(ints: Ints, stamp: int) -> int:
     if ints[at.TICKS] >= KNOWN:  # a gap: the samples come as before, but later
         ints[at.TICKS] = KNOWN - 1
     else:  # a line goes through this tick and the one before, if samples had the same reading
-        ints[at.TICKS] = 2 if count > 1 else 0
+        ints[at.TICKS] = ints[at.TICKS] + 1 if ints[at.TICKS] < 0 else 2 if count > 1 else 0
         ints[at.SPACING] = FINE * length // count
     ints[at.PACE] = ints[at.SPACING]
     ints[at.DEVIATION], ints[at.FITTED] = 0, stamp
