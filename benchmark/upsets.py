@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Start, upsets, outliers and other rates: every preset beside Kalman filters.
+Start, upsets, outliers and other rates: presets and self-tuning observers beside Kalman filters.
 
 The Kalman filters know the true sizes of the noise, of the states and of d, and have the model of
 d that the preset has. Their bandwidth is scanned on a recording without upsets.
@@ -36,6 +36,9 @@ NOISE = {
 Standard deviation of the noise on y that each preset is for; of dc_motor: of its quantum; of the
 last three, which are for a y without noise: of what the jitter of stamps is like.
 """
+MODEL = ('order', 'phi')
+SELF_TUNING = ('noise_1e-3', 'pendulum', 'dc_motor')
+"""For the plants of these, an observer that is told nothing but the model, too."""
 LENGTH, HIT = 16.0, 6.0
 """Seconds of a run, and when the upset begins."""
 SETTLED = 3.0
@@ -70,19 +73,30 @@ class Preset:
     """
     A parameter file, the plant in it, and the noise that it is for.
 
+    Parameters
+    ----------
+    path : Path
+    self_tuning : bool
+        Whether the estimator is told nothing but the model in the file.
+
     Attributes
     ----------
     estimator : dict
         Online parameters.
+    tuned : dict
+        Those of the file.
     sigma : float
         Standard deviation of the noise on y.
 
     """
 
-    def __init__(self, path: Path) -> None:
-        self.name = path.stem
-        self.estimator = load(path, 'estimator', ONLINE_PARAMETERS)
-        self.sigma = NOISE[self.name]
+    def __init__(self, path: Path, self_tuning: bool = False) -> None:
+        self.name = f'{path.stem}, self-tuning' if self_tuning else path.stem
+        self.estimator = self.tuned = load(path, 'estimator', ONLINE_PARAMETERS)
+        if self_tuning:
+            told = {k: v for k, v in self.tuned.items() if k in MODEL or k.startswith('constants')}
+            self.estimator = {**told, 'gains': 'self_tuning'}
+        self.sigma = NOISE[path.stem]
         values = load(path, 'plant')
         self._plant = {k: v for k, v in values.items() if k in PLANT_PARAMETERS}
         if not self._plant.get('quantisation'):
@@ -130,9 +144,10 @@ class Preset:
 
 
 def presets() -> list[Preset]:
-    """Return the tuned presets, and then the others."""
+    """Return the tuned presets, the others, and the self-tuning ones."""
     paths = {path.stem: path for path in CONFIG.glob('**/*.yaml') if path.stem in NOISE}
-    return [Preset(paths[name]) for name in NOISE]
+    found = [Preset(paths[name]) for name in NOISE]
+    return found + [Preset(paths[name], self_tuning=True) for name in SELF_TUNING]
 
 
 def in_node(p: Preset, case: Case) -> tuple[Floats, OnlineEstimator]:
@@ -150,7 +165,7 @@ def bare(p: Preset, case: Case) -> Floats:
 
 def kalman(p: Preset) -> KalmanFilter:
     """Return the best Kalman filter with the preset's model of d on the clean run."""
-    e, truth = p.estimator, p.clean.d
+    e, truth = p.tuned, p.clean.d
     d = float(np.sqrt(np.mean(truth**2)))
     noise = max(p.sigma, 1e-9)
     decays = [e.get('unknown_input_decay') or 1.0]
@@ -307,7 +322,7 @@ def page(results: Sequence[Row | Table]) -> None:
     shown = {
         file: [line[2].replace(' ', ', ') for line in upsets.lines
                if line[0] == file and line[1] in SHOWN]
-        for file in NOISE
+        for file in dict.fromkeys(line[0] for line in upsets.lines)
     }  # fmt: skip
     lines = [(file, *cells) for file, cells in shown.items()]
     refill(PAGE, {

@@ -7,6 +7,7 @@ import math
 from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
+from fhaosmo_ros.core.observer.self_tuning.jumps import otherwise, SHAPE
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOUR,
     INTENSITY,
@@ -17,6 +18,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     TAU,
     USED,
     WEIGHT,
+    WINDOW,
 )
 import numpy as np
 import pytest
@@ -222,6 +224,48 @@ def test_outliers_and_jumps_of_y(case):
         error = Observer(SELF_TUNING).run(t, y).unknown_input - d
         assert rms(error[5000:]) < 1.25 * expected
         assert np.abs(error).max() < 2.0 * np.abs(d).max()
+
+
+@pytest.mark.parametrize('sigmas', [3.5, 5.0, 6.5, 8.0, -5.0])
+@pytest.mark.parametrize('seconds', [0.02, 0.5])
+def test_an_offset_of_y_is_not_taken_for_d(case, sigmas, seconds):
+    """Just within, and just beyond what counts as lost; before D 35 d was off by 100s of times."""
+    t, z, d, noise = case
+    y = z[:, 0] + 1e-3 * noise + 1e-3 * sigmas * ((t > 15.0) & (t < 15.0 + seconds))
+    run = Observer(SELF_TUNING).run(t, y)
+    assert np.abs(run.unknown_input - d).max() < 1.5 * np.abs(d).max()
+    if abs(sigmas) < 4.0:  # larger ones are sometimes lost samples, and y begins afresh
+        jumps = t[(run.status & Status.JUMPED) > 0]
+        assert len(jumps) == 2
+        np.testing.assert_allclose(jumps, [15.0, 15.0 + seconds], atol=0.016)
+        k = np.searchsorted(t, jumps[0] + 0.001)
+        if seconds > 0.1:  # z_1 follows y, for nothing says which of them is right
+            off = run.z[k, 0] - z[k, 0]
+            assert off == pytest.approx(1e-3 * sigmas, abs=2.5e-3)
+
+
+def test_d_and_noise_are_not_taken_for_jumps_of_y(case):
+    """A d that moves, larger noise, heavy tails."""
+    t, z, _, noise = case
+    loud = np.where(t < 15.0, 1e-3, 1e-2)
+    tails = np.random.default_rng(3).standard_t(3.0, len(t))
+    for y in (z[:, 0] + 1e-3 * noise, z[:, 0] + loud * noise, z[:, 0] + 1e-3 * tails):
+        assert not (Observer(SELF_TUNING).run(t, y).status & Status.JUMPED).any()
+
+
+@pytest.mark.parametrize('n', [1, 2, 3])
+def test_only_a_constant_explains_a_jump(n):
+    """Powers of time, a line and larger noise explain themselves; a step is none of these."""
+    since, rng = np.arange(WINDOW) - 20, np.random.default_rng(n)
+    shapes = [np.where(since > 0, since.clip(0) ** p, 0.0) for p in range(1, n + 1)]
+    for shape in (*shapes, np.linspace(-3.0, 5.0, WINDOW), np.full(WINDOW, 3.0)):
+        r = 8.0 * shape / np.abs(shape).max()
+        assert otherwise(r, n) == pytest.approx(r @ r, rel=1e-9)
+    loud = 8.0 * np.where(since >= 0, rng.standard_normal(WINDOW), 0.0)
+    step = 4.0 * (since >= 0)
+    means = [np.sum(r[20:]) ** 2 / 12 for r in (loud, step)]
+    assert means[0] < otherwise(loud, n)
+    assert means[1] > otherwise(step, n) + SHAPE
 
 
 def test_another_rate_and_lost_samples(case):

@@ -31,7 +31,7 @@ Entries of ``State.memory``:
 | SPREAD | size of the innovations over that expected, at least 1 (D 21) | 1 |
 | UPSET | time for which gamma has yet to rest after |eps_1| > w_1 (D 8) | s |
 | OFFSET | what y is more than z_1, since a jump that the model contradicts (D 23) | of y |
-| JUMPS | sum of the jumps of y, 0 once it is back (D 23) | of y |
+| JUMPS | sum of the jumps of y, 0 once it is back (D 23); self-tuning: the last one | of y |
 | FIRST_MISS, MISS | first and last prediction error of the unlikely samples in a row | of y |
 | WATCHED | samples for which it has yet to be watched whether only y jumped (D 23) | 1 |
 | DRIFT | sum of the recent prediction errors over their usual size, while watched | 1 |

@@ -32,7 +32,9 @@ class Status(IntFlag):
     GAP = 1024  # a long interval was bridged in sub-steps
     RESTARTED = 2048  # started afresh after a gap or a jump of the clock
     DIVERGED = 4096  # the estimate had lost y and was restarted from it
-    JUMPED = 8192  # with REJECTED_SPIKE: y alone has jumped; the other estimates go on
+    JUMPED = (
+        8192  # y alone has jumped; the other estimates go on (at once, or with the next sample)
+    )
 
     @property
     def rejected(self) -> bool:

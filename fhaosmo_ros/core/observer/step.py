@@ -31,6 +31,7 @@ from fhaosmo_ros.core.observer.arrays import (
     HAT_SENSITIVITY,
     IMPLICIT,
     INVERSE_WIDTH,
+    JUMPS,
     Law,
     LEAKAGE,
     LEVANT,
@@ -242,6 +243,9 @@ def step(
                 if is_upset(law, x if law.flags[IMPLICIT] else levels, used):
                     memory[UPSET] = law.scalars[DELAY]
                 word = adapt(law, x, memory, whole, loss, gradient)
+            if law.flags[SELF_TUNING] and memory[JUMPS] != 0.0:
+                memory[JUMPS] = 0.0
+                word |= JUMPED
             for r in range(ROWS + n):
                 for i in range(n):
                     levels[r, i] = x[r, i]

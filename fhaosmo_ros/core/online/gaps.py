@@ -114,6 +114,7 @@ def step_over(e: EstimatorArrays, elapsed: int, y: float, u: Floats, eps: Floats
             break
     if not word & REJECTED:
         update_mean(policy, elapsed)
+        ints[at.JUMPS] += (word & JUMPED) > 0
     elif kept:
         restore(policy, state)
         memory[Y] = corrected  # as where a single step fails

@@ -369,7 +369,7 @@ class Channel:
         estimator = self.estimator
         estimate = estimator.estimate
         # Reset, and no sample since; or y has jumped, and the next sample gives the stamp.
-        if estimate is None or estimate.word & JUMPED:
+        if estimate is None or (estimate.word & JUMPED and estimate.word & REJECTED):
             return None
         stamp = estimator.stamp
         self._outputs.publish(estimate, stamp)

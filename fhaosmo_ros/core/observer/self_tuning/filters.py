@@ -14,10 +14,12 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     FAST,
     fill,
     grid,
+    IN_BAND,
     INTENSITY,
     KAPPA,
     Members,
     ORDERS,
+    repeat,
     RESIDUAL,
     Scratch,
     SQUARE,
@@ -264,9 +266,10 @@ def correct_covariances(
 def correct_states(members: Members, scratch: Scratch, n: int, y: float) -> None:
     """Correct the members' predictions by their innovations, of bounded influence."""
     correlation, limit = members.rates[CORRELATION], scratch.lines[0]
-    fill(limit, members.noise[SQUARE])
-    for g in range(COUNT):
-        limit[g] = HUBER * math.sqrt(limit[g] / (1.0 - correlation[g] * correlation[g]))
+    for g in range(IN_BAND):
+        square = members.noise[SQUARE, COLOUR[g]]
+        limit[g] = HUBER * math.sqrt(square / (1.0 - correlation[g] * correlation[g]))
+    repeat(limit)
     for k in range(ORDERS):
         x, predicted, gain = members.x[k], scratch.x[k], members.gain[k]
         innovation = scratch.b[k]

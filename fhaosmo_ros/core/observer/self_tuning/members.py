@@ -26,11 +26,11 @@ SLOWEST, QUICKEST = 6e-4, 3.0
 """Their range, in rad a sample."""
 COLOURS = np.array([0.0, 0.7, 0.92, 0.98])
 """Correlations a of the noise of neighbouring samples."""
-RATIOS = (0.1, 0.5, 1.5)
-SHAPES = len(RATIOS)
-KINDS = np.array([[c, r] for c in range(len(COLOURS)) for r in RATIOS])
+KINDS = np.array([(0, 0.1), (0, 0.5), (0, 1.5), *((c, 0.1) for c in range(1, len(COLOURS)))])
 """Members of each bandwidth omega: index of the colour, and kappa / omega."""
 IN_BAND = len(KINDS)
+FIRST = np.searchsorted(KINDS[:, 0], np.arange(len(COLOURS)))
+"""The first of each colour."""
 COUNT = BANDS * IN_BAND
 """Members of each k."""
 STEP_OF_BANDS = (QUICKEST / SLOWEST) ** (1.0 / (BANDS - 1))
@@ -41,6 +41,8 @@ RATIO = np.tile(KINDS[:, 1], BANDS)
 LONGEST = 13
 """Largest number of states and known chains: order 12 and d."""
 FACTORIALS = np.array([math.factorial(i) for i in range(2 * LONGEST + 8)], dtype=np.float64)
+WINDOW = 32
+"""A jump of y is looked for in so many samples (D 35)."""
 FIRST_SAMPLES = 50
 """So many samples tell the period and the noise before the members begin."""
 
@@ -78,6 +80,12 @@ class Members(NamedTuple):
     record : (PLANES, ORDERS, COUNT) array
     flow : (N, N) array
         Derivative of the prediction to the next sample.
+    recent : (WINDOW,) array
+        Innovations of the last samples over their standard deviations, of one member (D 35).
+    watch : (2,) array
+        Which member that is, and how many samples ago ``before[0]`` was.
+    before : (2, ORDERS, COUNT) array
+        Scores of two earlier samples, `WINDOW` apart.
     x : tuple of (n + 1 + k, COUNT) arrays
         Estimates of z, d and its derivatives, of the members with k = 0, 1, 2.
     p : tuple of ((n + 1 + k) (n + 2 + k) / 2, COUNT) arrays
@@ -91,6 +99,9 @@ class Members(NamedTuple):
     rough: Floats
     record: Floats
     flow: Floats
+    recent: Floats
+    watch: Floats
+    before: Floats
     x: OfEach
     p: OfEach
     gain: OfEach
@@ -99,7 +110,7 @@ class Members(NamedTuple):
 def size_of(order: int) -> int:
     """Return how many numbers the members of a model with n = `order` states need."""
     total = 4 * COUNT + 2 * len(COLOURS) + PLANES * ORDERS * COUNT + (order + ORDERS) ** 2
-    total += (1 + len(COLOURS)) * (order + 2)
+    total += (1 + len(COLOURS)) * (order + 2) + WINDOW + 2 + 2 * ORDERS * COUNT
     for k in range(ORDERS):
         d = order + 1 + k
         total += (2 * d + d * (d + 1) // 2) * COUNT
@@ -153,12 +164,16 @@ def members_in(rows: Floats, n: int) -> Members:
     at += PLANES * ORDERS * c
     flow = flat[at : at + levels * levels].reshape((levels, levels))
     at += levels * levels
+    recent, watch = flat[at : at + WINDOW], flat[at + WINDOW : at + WINDOW + 2]
+    at += WINDOW + 2
+    before = flat[at : at + 2 * ORDERS * c].reshape((2, ORDERS, c))
+    at += 2 * ORDERS * c
     d = n + 1
     states, pairs = 3 * d + 3, 3 * d * (d + 1) // 2 + 3 * d + 4
     x = of_states(flat, at, d, c)
     p = of_pairs(flat, at + states * c, d, c)
     gain = of_states(flat, at + (states + pairs) * c, d, c)
-    return Members(rates, noise, rough, record, flow, x, p, gain)
+    return Members(rates, noise, rough, record, flow, recent, watch, before, x, p, gain)
 
 
 class Scratch(NamedTuple):

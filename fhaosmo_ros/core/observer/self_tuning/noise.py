@@ -15,7 +15,6 @@ from fhaosmo_ros.core.observer.arrays import (
     ROUGHNESS,
     Y,
 )
-from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
     BANDS,
@@ -27,13 +26,13 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     FAR,
     FAST,
     fill,
+    FIRST,
     IN_BAND,
     Members,
     ORDERS,
     repeat,
     SCORE,
     Scratch,
-    SHAPES,
     SHORT,
     SQUARE,
 )
@@ -132,7 +131,7 @@ def difference(members: Members, memory: Floats, y: float) -> tuple[float, float
             continue
         binomial *= (4.0 * p - 2.0) / p
         for c in range(COLOURS.size):
-            white = value_before - members.rates[CORRELATION, c * SHAPES] * before
+            white = value_before - members.rates[CORRELATION, FIRST[c]] * before
             r = white * white / (members.rough[1 + c, p] * binomial)
             if c == 0:
                 smallest = min(smallest, white * white / binomial)
@@ -180,7 +179,9 @@ def knowing(members: Members, scratch: Scratch, s: Floats) -> float:
 
 
 @compiled()
-def is_likely(members: Members, b: Floats, s: Floats, largest: float, beyond: float) -> bool:
+def is_likely(
+    members: Members, b: Floats, s: Floats, largest: float, beyond: float, gate: float
+) -> bool:
     """
     Return True if a member that can judge the sample finds it likely (D 29).
 
@@ -198,7 +199,7 @@ def is_likely(members: Members, b: Floats, s: Floats, largest: float, beyond: fl
             variance = s[k, g] * noise[COLOUR[g]]
             follows = members.record[FAR, k, g] < late
             judges = variance <= largest and members.record[SCORE, k, g] > -CLOSE
-            if judges and follows and b[k, g] * b[k, g] <= GATE * GATE * variance:
+            if judges and follows and b[k, g] * b[k, g] <= gate * gate * variance:
                 return True
     return False
 
@@ -221,12 +222,13 @@ def over_colours(values: Floats, largest: bool) -> None:
         for i in range(IN_BAND):
             other = values[band * IN_BAND + i]
             values[i] = max(values[i], other) if largest else values[i] + other
-    for first in range(0, IN_BAND, SHAPES):
-        for i in range(1, SHAPES):
-            value, other = values[first], values[first + i]
+    for i in range(IN_BAND):
+        first = FIRST[COLOUR[i]]
+        if i > first:
+            value, other = values[first], values[i]
             values[first] = max(value, other) if largest else value + other
-        for i in range(1, SHAPES):
-            values[first + i] = values[first]
+    for i in range(IN_BAND):
+        values[i] = values[FIRST[COLOUR[i]]]
     repeat(values)
 
 
@@ -299,7 +301,7 @@ def follow_noise(
     if least > STEADY:  # every member that can judge says so, and the differences do
         count = min(count, QUICK_SAMPLES)
     for c in range(COLOURS.size):
-        ratio = squares[c * SHAPES] / weights[c * SHAPES] / CLIPPED
+        ratio = squares[FIRST[c]] / weights[FIRST[c]] / CLIPPED
         noise[SQUARE, c] *= 1.0 + (ratio - 1.0) / count
         most = members.rough[1 + c, 1]
         for p in range(2, members.rough.shape[1]):

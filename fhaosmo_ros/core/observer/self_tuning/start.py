@@ -30,6 +30,7 @@ from fhaosmo_ros.core.observer.arrays import (
 )
 from fhaosmo_ros.core.observer.covariance import MEDIAN
 from fhaosmo_ros.core.observer.self_tuning.filters import at
+from fhaosmo_ros.core.observer.self_tuning.jumps import watch
 from fhaosmo_ros.core.observer.self_tuning.members import (
     BANDWIDTHS,
     COLOUR,
@@ -230,3 +231,4 @@ def begin(
             record[LOG_VARIANCE, k, g] = record[RESIDUAL, k, g] = record[FAR, k, g] = 0.0
             record[SHORT, k, g] = 1.0
     memory[LIKELIEST] = memory[TOLD] = weigh(members, FLOOR)
+    watch(members, memory[TOLD])

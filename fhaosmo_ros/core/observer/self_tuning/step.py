@@ -33,6 +33,7 @@ from fhaosmo_ros.core.observer.arrays import (
     ROWS,
     SAMPLES,
     STEADY_PERIOD,
+    TOLD,
     TURNS,
     UNSETTLED,
     Work,
@@ -50,6 +51,12 @@ from fhaosmo_ros.core.observer.self_tuning.filters import (
     HUBER,
     predict_covariances,
     predict_states,
+)
+from fhaosmo_ros.core.observer.self_tuning.jumps import (
+    follow_innovations,
+    follow_jump,
+    samples_since_jump,
+    watch,
 )
 from fhaosmo_ros.core.observer.self_tuning.members import (
     BANDS,
@@ -191,7 +198,8 @@ def step_members(
     -------
     float
         Square of the innovation of the mean. A sample that is too far off is counted in
-        ``memory[BEYOND]``, and changes no member.
+        ``memory[BEYOND]``, and changes no member. Where y has jumped, ``memory[JUMPS]`` is by
+        what.
 
     """
     x, n = work.x, law.gains.shape[1] - ORDERS
@@ -235,13 +243,16 @@ def step_members(
     far = FARTHER * memory[FIRST_OFF] + HUBER * sigma
     far = max(far, SMOOTH * math.sqrt(smallest + of_stamps))
     memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and off > far else 0.0
-    likely = is_likely(members, b, believed, largest, memory[BEYOND])
+    sign, turn = math.copysign(1.0, y - now[0, 0]), 0.0
+    goes_on = memory[BEYOND] > 0.0 and sign == memory[FAR_SIGN]
+    goes_on = goes_on and roughness <= HUBER * HUBER and memory[ROUGHNESS] < HUBER
+    gate = HUBER if goes_on else GATE
+    likely = is_likely(members, b, believed, largest, memory[BEYOND], gate)
     memory[RECENT] = max(memory[RECENT] - 1.0, 0.0)
     before = memory[ROUGHNESS] - SHORT_SHARE * HUBER * HUBER * (memory[BEYOND] + 1.0)
     begins = not likely and memory[GROWING] >= GROWTHS and before < ROUGH
     jumped = begins or (memory[RECENT] > 0.0 and roughness <= HUBER * HUBER)
     kept = math.exp(-h / law.scalars[FORGETTING])
-    sign, turn = math.copysign(1.0, y - now[0, 0]), 0.0
     if roughness > HUBER * HUBER:
         turn = ROUGH_TURN
     elif not likely and sign != memory[FAR_SIGN]:
@@ -285,6 +296,7 @@ def step_members(
     calm = memory[CALM] > CALM_SAMPLES or doubted
     judged = calm or best_fit < HUBER * HUBER
     judged = judged and (roughness <= HUBER * HUBER or quanta > 0.0)
+    follow_innovations(members, b, s, quanta)
     judge(members, scratch, grown, kept if judged and quanta == 0.0 else -1.0, calm)
     if judged and quanta > 0.0:
         judge_quantised(members, y, ahead, quanta, kept)
@@ -293,6 +305,10 @@ def step_members(
             correct_covariances(members, n, k, p[k], gain[k], s[k], lines, moving)
     correct_states(members, scratch, n, y)
     memory[LIKELIEST] = weigh(members, QUANTISED_FLOOR if quanta > 0.0 else FLOOR)
+    since_jump = 0 if jumped else samples_since_jump(members, n, memory[TOLD])
+    if since_jump > 2:  # two outliers are no jump
+        follow_jump(members, memory, n, since_jump, s, y)
+        memory[LIKELIEST] = weigh(members, FLOOR)
     mix(law, members, scratch, x)
     tell_model(law, members, memory, h, jumped, x)
     find_strays(members, n, x)
@@ -324,6 +340,7 @@ def restart_members(law: Law, levels: Floats, memory: Floats, rows: Floats, y: f
     members = members_in(rows, n)
     memory[UNSETTLED] = memory[BEYOND] = memory[GROWING] = memory[RECENT] = 0.0
     memory[TURNS] = 0.0
+    watch(members, memory[TOLD])
     levels[HAT, 0] = memory[Y] = y
     levels[COVARIANCE, 0] = members.noise[SQUARE, 0]
     for i in range(1, n):

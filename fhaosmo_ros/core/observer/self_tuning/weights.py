@@ -48,6 +48,11 @@ import numpy as np
 
 FLOOR, QUANTISED_FLOOR = 30.0, 100.0
 """No log-likelihood falls further below the best one (D 28, D 31)."""
+STEEP = 5.0
+"""
+It may fall further for members of quicker bands than the likeliest one's, by this for each band:
+their estimates of d are larger by orders of magnitude, so they need more reason to be believed.
+"""
 VAGUE = 0.04
 """Part of the square of half a quantum by which predictions are less certain than their P says."""
 CLEARLY = 2.0
@@ -132,20 +137,26 @@ def weigh(members: Members, floor: float) -> int:
         score = members.record[SCORE, k]
         for g in range(COUNT):
             best = max(best, score[g])
+    for k in range(ORDERS - 1, -1, -1):
+        score = members.record[SCORE, k]
+        for g in range(COUNT - 1, -1, -1):
+            if score[g] == best:  # the first of them; before they are judged there are many
+                likeliest = k * COUNT + g
+    slower = likeliest % COUNT // IN_BAND
     for k in range(ORDERS):
         score, weight = members.record[SCORE, k], members.record[WEIGHT, k]
+        for band in range(BANDS):
+            least = -floor - STEEP * max(band - slower, 0)
+            for g in range(band * IN_BAND, (band + 1) * IN_BAND):
+                score[g] = max(score[g] - best, least)
         for g in range(COUNT):
-            score[g] = max(score[g] - best, -floor)
-            share = exponential(score[g])
+            share = exponential(max(score[g], -NEGLIGIBLE))
             weight[g] = share if score[g] > -NEGLIGIBLE else 0.0
             total += weight[g]
-    for k in range(ORDERS - 1, -1, -1):
-        score, weight = members.record[SCORE, k], members.record[WEIGHT, k]
+    for k in range(ORDERS):
+        weight = members.record[WEIGHT, k]
         for g in range(COUNT):
             weight[g] /= total
-        for g in range(COUNT - 1, -1, -1):
-            if score[g] == 0.0:  # the first of them; before they are judged there are many
-                likeliest = k * COUNT + g
     return likeliest
 
 
@@ -205,7 +216,10 @@ def mix(law: Law, members: Members, scratch: Scratch, x: Floats) -> None:
     if law.scalars[SLIDER] != 1.0:
         shown = shift(shown, math.log(law.scalars[SLIDER]) / math.log(STEP_OF_BANDS))
     x[HAT], x[COVARIANCE], derivative = 0.0, 0.0, scratch.lines[0]
+    shares = [shown[k].sum() for k in range(ORDERS)]
     for k in range(ORDERS):
+        if shares[k] == 0.0:
+            continue
         w, z = shown[k], members.x[k]
         for i in range(n + 1):
             x[HAT, i] += weighted(w, z[i])
@@ -221,6 +235,8 @@ def mix(law: Law, members: Members, scratch: Scratch, x: Floats) -> None:
                 derivative[g] += second[g]
         x[HAT, n + 2] += weighted(w, derivative)
     for k in range(ORDERS):
+        if shares[k] == 0.0:
+            continue
         w, z = shown[k], members.x[k]
         for i in range(n + 1):
             mean, value, variance = x[HAT, i], z[i], members.p[k][at(n + 1 + k, i, i)]
