@@ -14,6 +14,7 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 import numpy as np
 from reference import assert_agreement, CASE, compile_reference, in_c, in_numba, output, PERIOD
+from studies.model import model_alone, SELF_TUNING
 from table import CannotMeasureError, Row
 from tqdm import tqdm
 
@@ -110,9 +111,9 @@ def _self_tuning(model: str, bar: float | None, length: int) -> list[Row]:
     y = Plant(plant | noise).simulate(t).y
     stamps = 10**9 + np.round(t * 1e9).astype(np.int64)
     found = load(path, 'estimator')
-    told = {k: found[k] for k in found if k in ('order', 'phi') or k.startswith('constants')}
-    OnlineEstimator(told | {'gains': 'self_tuning'}).run(stamps[:100], y[:100])  # may compile
-    estimator = OnlineEstimator(told | {'gains': 'self_tuning'})
+    told = model_alone(found) | SELF_TUNING
+    OnlineEstimator(told).run(stamps[:100], y[:100])  # may compile
+    estimator = OnlineEstimator(told)
     parts = np.array_split(np.arange(len(t)), max(2, length // WINDOW))
     spent = []
     for part in parts:

@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from studies.document import refill
+from studies.model import model_alone, SELF_TUNING
 
 FILES = ('noise_1e-4', 'noise_1e-3', 'noise_1e-2', 'models/pendulum')
 DURATION, LAGS, TIMED = 20.0, (0.05, 0.2, 0.5), 'noise_1e-3'
@@ -66,7 +67,7 @@ def with_file(name: str, self_tuning: bool = False) -> list[float]:
     p = OnlineEstimator.from_yaml(path).parameters
     plant = load(path, 'plant', PLANT_PARAMETERS) | {'noise_std': p['noise_size']}
     if self_tuning:
-        p = {key: p[key] for key in ('order', 'phi')} | {'gains': 'self_tuning'}
+        p = model_alone(p) | SELF_TUNING
     t = np.arange(0.0, DURATION, 1e-3)
     stamps, truth = np.round(t * 1e9).astype(np.int64) + 1, Plant(plant).simulate(t)
     found = [

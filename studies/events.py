@@ -27,12 +27,13 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter, ss2tf
 from studies.document import refill
+from studies.model import SELF_TUNING
 
 PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'events.md'
 H, NOISE, LOAD, FAULT, LASTS, EVERY, SETTLED = 0.01, 1e-3, 0.05, 1.0, 2.0, 20.0, 60.0
 HOURS = 10.0
 MODEL = {'order': 2, 'phi': ['0', '-z2']}
-SELF_TUNING = MODEL | {'gains': 'self_tuning'}
+SELF_TUNED = MODEL | SELF_TUNING
 THRESHOLDS = np.geomspace(0.08, 0.9, 14)
 DEVIATIONS, DURATION = 5.0, 0.03
 FACTORS, NEVER = (1.0, 3.0), 0.05
@@ -88,7 +89,7 @@ def kalman(y: Array, intensity: float) -> tuple[Array, Array]:
 
 def self_tuning(y: Array) -> tuple[Array, Array]:
     """Return d and its standard deviation by an observer that is told the model and no more."""
-    observer, parts = Observer(SELF_TUNING), []
+    observer, parts = Observer(SELF_TUNED), []
     for part in np.array_split(np.arange(len(y)), max(1, len(y) // 100_000)):
         found = observer.run(np.round(part * H * 1e9).astype(np.int64), y[part])
         parts.append((found.unknown_input, found.standard_deviation[:, -1]))

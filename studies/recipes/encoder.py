@@ -10,6 +10,7 @@ from fhaosmo_ros.core import Family
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter, savgol_coeffs
+from studies.model import SELF_TUNING
 from studies.recipes import peers
 from studies.recipes.judging import (
     FIXED,
@@ -20,7 +21,6 @@ from studies.recipes.judging import (
     OURS,
     Recorded,
     run,
-    SELF_TUNING,
 )
 
 Floats = NDArray[np.float64]

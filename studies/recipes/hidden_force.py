@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from studies.model import SELF_TUNING
 from studies.recipes import peers
 from studies.recipes.judging import (
     FIXED,
@@ -18,7 +19,6 @@ from studies.recipes.judging import (
     OURS,
     Recorded,
     run,
-    SELF_TUNING,
     self_tuning,
     simulated,
 )

@@ -9,11 +9,10 @@ from fhaosmo_ros.core import Family, OnlineEstimator, Trajectory
 from fhaosmo_ros.core.parameters.files import load
 import numpy as np
 from numpy.typing import NDArray
+from studies.model import model_alone, SELF_TUNING
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'recipes'
 OURS, FIXED = 'this observer, self-tuning', 'this observer, fixed gains'
-MODEL = ('order', 'phi', 'inputs')
-SELF_TUNING = {'gains': 'self_tuning'}
 BUTTERWORTH = {2: (np.sqrt(2.0), 1.0), 3: (2.0, 2.0, 1.0)}
 """Coefficients of Butterworth polynomials of degree N, without the first one."""
 FAR = 1.0
@@ -87,8 +86,7 @@ class Method(NamedTuple):
 def model(name: str, constants: Mapping[str, float] | None = None) -> dict[str, Any]:
     """Return the model in config/recipes/`name`.yaml, with other constants."""
     p = load(CONFIG / f'{name}.yaml', 'estimator')
-    found = {k: v for k, v in p.items() if k in MODEL or k.startswith('constants.')}
-    return found | {f'constants.{k}': float(v) for k, v in (constants or {}).items()}
+    return model_alone(p) | {f'constants.{k}': float(v) for k, v in (constants or {}).items()}
 
 
 def run(parameters: Mapping[str, Any], r: Recorded) -> Trajectory:

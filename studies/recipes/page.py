@@ -11,7 +11,8 @@ from fhaosmo_ros.tools.plot.figures import COLOURS, TRUTH
 from matplotlib.figure import Figure
 import numpy as np
 from studies.document import refill
-from studies.recipes.judging import Fold, OURS, run, SELF_TUNING
+from studies.model import SELF_TUNING
+from studies.recipes.judging import Fold, OURS, run
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 PART = 'results'
