@@ -7,6 +7,7 @@ import math
 from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
+from fhaosmo_ros.core.observer.self_tuning.filters import at
 from fhaosmo_ros.core.observer.self_tuning.jumps import otherwise, SHAPE
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOUR,
@@ -376,6 +377,21 @@ def test_a_jump_of_d_is_followed_at_once():
     assert (off[jump + 25 : jump + 300] < 0.1).all()
 
 
+@pytest.mark.parametrize('noise', [0.0, 4.4e-7])
+def test_covariances_stay_positive(noise):
+    """Also where y is far more exact than its prediction, as after a jump of d."""
+    t, y, _ = swept(FRICTION, 70.0, PERIOD, 10.0, lambda phase: np.sign(np.sin(phase)))
+    y, observer = y + noise * np.random.default_rng(7).standard_normal(len(t)), Observer(MOTOR)
+    for part in np.array_split(np.arange(len(t)), 150):
+        observer.run(t[part], y[part])
+        members = members_of(observer)
+        assert np.isfinite(members.record).all()
+        for p in members.p:
+            size = round(math.sqrt(2 * len(p) + 0.25) - 0.5)
+            diagonal = [at.py_func(size, i, i) for i in range(size)]
+            assert (p[diagonal] > 0.0).all()
+
+
 def test_quanta_bound_the_noise():
     """An encoder at rest repeats itself: the noise does not fall below the error of rounding."""
     t, y, d = swept(FRICTION, 70.0, PERIOD, 15.0, lambda phase: np.sin(phase) ** 31)
@@ -456,13 +472,17 @@ def test_noise_is_at_least_what_is_said(case):
 
 
 @pytest.mark.parametrize(
-    ('name', 'seed'), [("paper's plant", 20), ('motor', 14), ('motor', 10), ('pendulum', 3)]
-)
-def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, seed):
+    ('name', 'kind', 'seed', 'seconds'),
+    [
+        ("paper's plant", 'sine', 20, 8.0), ('motor', 'ou', 14, 8.0), ('motor', 'ou', 10, 8.0),
+        ('pendulum', 'square', 3, 8.0), ('motor', 'sine', 0, 20.0), ('motor', 'chirp', 13, 20.0),
+        ('motor', 'ou', 1, 20.0), ('motor', 'ou', 7, 20.0),
+    ],
+)  # fmt: skip
+def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, kind, seed, seconds):
     """A hundredfold noise has samples farther and farther off by chance (D 33)."""
     plant, condition = PLANTS_OF_STUDY[name], Condition(later=100.0)
-    kind = ('sine', 'chirp', 'ou', 'square')[seed % 4]
-    r = recording(plant, condition, kind, 8.0, seed)
+    r = recording(plant, condition, kind, seconds, seed)
     p = model_of(setting_of(plant, condition)) | SELF_TUNING
     found, _ = online(r, p)
     assert np.abs(found - r.d).max() < 4.0 * np.abs(r.d).max()

@@ -48,6 +48,8 @@ Entries of ``State.memory``:
 | CALM | samples since the noise has grown | 1 |
 | GROWING | unlikely samples in a row that are farther and farther off, without being noise | 1 |
 | FIRST_OFF | how far off the first of the unlikely samples in a row was | of y |
+| UNEVEN | mean square of the highest difference of y in these samples | of y, squared |
+| FIRST_ROUGH | what ROUGHNESS was before the first of them | 1 |
 | NARROWED | by what the limit of the influence of innovations is below `HUBER` (D 32) | 1 |
 | ONE_SIDED | samples in a row beyond that limit on one side; below 0 on the lower | 1 |
 | RECENT | samples left that count as part of a jump of d (D 33) | 1 |
@@ -89,8 +91,8 @@ GAMMA, Y, PENDING, WAIT, SCALE, SATURATED, BEYOND, SETTLED, PERIOD, SPREAD, UPSE
 OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
 SAMPLES, FAR_SIGN, QUANTUM, LATTICE, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
 FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM, GROWING, FIRST_OFF = range(25, 31)
-NARROWED, ONE_SIDED, RECENT, ROUGHNESS, INTERVAL, JITTER, TURNS, TOLD = range(31, 39)
-MEMORY = 39
+NARROWED, ONE_SIDED, RECENT, ROUGHNESS, INTERVAL, JITTER, TURNS, TOLD, UNEVEN = range(31, 40)
+FIRST_ROUGH, MEMORY = range(40, 42)
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)

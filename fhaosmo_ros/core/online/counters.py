@@ -55,7 +55,7 @@ class Counters(NamedTuple):
     divergences: int = 0
     """Times that the observer had lost y and was restarted from it."""
     jumps: int = 0
-    """Times that y jumped, and all estimates but that of z_1 went on (D 23)."""
+    """Times that y jumped, and all estimates but that of z_1 went on (D 23, D 35)."""
 
     @property
     def rejected(self) -> int:

@@ -134,7 +134,8 @@ LABELS_OF_MEMORY = [
     'upset', 'offset', 'jumps', 'first_miss', 'miss', 'watched', 'drift', 'usual', 'samples',
     'far_sign', 'quantum', 'lattice', 'moving', 'unsettled', 'steady_period', 'flow_period',
     'first_noise', 'likeliest', 'calm', 'growing', 'farthest', 'narrowed', 'one_sided',
-    'recent', 'roughness', 'last_interval', 'stamp_jitter', 'turns', 'told',
+    'recent', 'roughness', 'last_interval', 'stamp_jitter', 'turns', 'told', 'uneven',
+    'first_rough',
 ]  # fmt: skip
 """Labels of a snapshot's entries: they are in bags, so they stay as they are."""
 MISSING = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}

@@ -29,6 +29,11 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
 
 HUBER = 3.0
 """Innovations of more standard deviations count as so many (Huber 1964)."""
+INEXACT = 1.0 + 1e-10
+"""
+By this factor S is too large, so that P stays positive where y is by many orders of magnitude more
+exact than its prediction: what is left of P then is more than what rounding makes of it.
+"""
 
 
 @compiled(forceinline=True)
@@ -79,7 +84,7 @@ def predict_states(
                 row[g] += decayed[g] * factor * other[g]
 
 
-@compiled(fastmath=FAST)
+@compiled(forceinline=True, fastmath=FAST)
 def add_chain(
     row: Floats,
     share: float,
@@ -186,7 +191,7 @@ def expect_innovations(
         before = one[g] - h * two[g] - curve * three[g]
         s[g] = one[g] - correlation[g] * before
     for g in range(moving):
-        s[g] = 1.0 + max(s[g], 0.0) / used[COLOUR[g]]
+        s[g] = INEXACT * (1.0 + max(s[g], 0.0) / used[COLOUR[g]])
 
 
 @compiled(fastmath=FAST)
@@ -219,7 +224,7 @@ def allow_jump(
         b[g] = y - first[g]
         variance, square = p[0, g] + used[g] / (1.0 - a[g] * a[g]), b[g] * b[g]
         more[g] = square - variance if square > HUBER * HUBER * variance else 0.0
-        s[g] = (variance + more[g]) / used[g]
+        s[g] = INEXACT * (variance + more[g]) / used[g]
     if tau == 0.0:
         for g in range(COUNT):
             more[g] = 1.0 + more[g] / p[0, g]
@@ -248,18 +253,19 @@ def correct_covariances(
 ) -> None:
     """Take a sample into P of the members that move, and turn P C' into their gains (D 27)."""
     d, used, inverse, scaled = n + 1 + k, members.noise[USED], lines[0], lines[1]
+    corrected, gains = members.p[k], members.gain[k]
     for g in range(moving):
         inverse[g] = 1.0 / (s[g] * used[COLOUR[g]])
     for i in range(d):
-        first, corrected = gain[i], members.gain[k][i]
+        first, row = gain[i], gains[i]
         for g in range(moving):
             scaled[g] = first[g] * inverse[g]
         for j in range(i, d):
-            second, row, target = gain[j], p[at(d, i, j)], members.p[k][at(d, i, j)]
+            second, before, after = gain[j], p[at(d, i, j)], corrected[at(d, i, j)]
             for g in range(moving):
-                target[g] = row[g] - scaled[g] * second[g]
+                after[g] = before[g] - scaled[g] * second[g]
         for g in range(moving):
-            corrected[g] = scaled[g]
+            row[g] = scaled[g]
 
 
 @compiled(fastmath=FAST)

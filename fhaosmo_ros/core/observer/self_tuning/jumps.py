@@ -1,17 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Jumps of y that are too small to be lost samples, and that no d explains (D 35).
+Jumps: of d (D 33), and of y that are too small to be lost samples and that no d explains (D 35).
 
-A sensor that slips puts an offset on y. A few samples of it are enough for quick members to become
-likely, whose d explains anything, and is larger by orders of magnitude. So the innovations of the
-member that was likely are tested for a mean (Willsky and Jones 1976).
+After a jump of d y is farther and farther off. A sensor that slips puts an offset on y. A few
+samples of it are enough for quick members to become likely, whose d explains anything, and is
+larger by orders of magnitude. So the innovations of the member that was likely are tested for a
+mean (Willsky and Jones 1976).
 """
 
 import math
 
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
-from fhaosmo_ros.core.observer.arrays import JUMPS, UNSETTLED
+from fhaosmo_ros.core.observer.arrays import (
+    BEYOND,
+    FIRST_OFF,
+    FIRST_ROUGH,
+    GROWING,
+    JUMPS,
+    UNEVEN,
+    UNSETTLED,
+)
 from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
@@ -22,12 +31,25 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     KAPPA,
     Members,
     ORDERS,
+    put,
     RESIDUAL,
     SCORE,
     SQUARE,
     WINDOW,
 )
+from fhaosmo_ros.core.observer.self_tuning.noise import ROUGH
+import numpy as np
 
+GROWTHS = 3.0
+"""If so many samples in a row are farther off than the first one, d has jumped (D 33)."""
+FARTHER, POWER, SMOOTH, SMOOTHEST = 1.3, 0.7, 5.0, 30.0
+"""
+Farther means: so many times as far, and 3 sigma more; so much of what a jump of d makes of it; and
+so many times the highest differences of y, which noise does not get to. Differences must not have
+been larger than usual before, unless y is farther off by the last factor.
+"""
+OLDEST = 20
+"""Samples after which y would be lost: no jump of d that shows now is older."""
 SHAPE, BELIEVED = 2.0, 8.0
 """
 By so much, in twice the log-likelihood, a jump has to explain the innovations better than growing
@@ -35,6 +57,88 @@ ones or more noise, and than any other member; and white noise to be likelier th
 """
 MEMBER, AGE = range(2)
 """Entries of `Members.watch`."""
+
+
+@compiled()
+def begin_growth(memory: Floats, off: float, highest: float, roughness: float) -> None:
+    """Take the first of the unlikely samples in a row."""
+    memory[FIRST_OFF], memory[UNEVEN], memory[FIRST_ROUGH] = off, highest, roughness
+
+
+@compiled()
+def respond(flow: Floats, n: int, z: Floats, before: Floats) -> float:
+    """Carry what a jump of d by 1 has done to z to the next sample, in place; return z_1."""
+    before[:] = z
+    for i in range(n):
+        z[i] = flow[i, n]
+        for j in range(n):
+            z[i] += flow[i, j] * before[j]
+    return float(z[0])
+
+
+@compiled()
+def growth(flow: Floats, n: int, hidden: float, count: float) -> float:
+    """
+    Return how many times as far y is off, `count` samples later, because d has jumped.
+
+    It is the less, the longer ago d has jumped: so long that y was off by at most the part
+    `hidden` of what it is now in the sample before.
+    """
+    z, before = np.zeros(n), np.zeros(n)
+    first = respond(flow, n, z, before)
+    off = respond(flow, n, z, before)
+    for _ in range(OLDEST):
+        if first > hidden * off:
+            break
+        first, off = off, respond(flow, n, z, before)
+    for _ in range(int(count) - 1):
+        off = respond(flow, n, z, before)
+    return off / first if first > 0.0 else 1.0
+
+
+@compiled()
+def follow_growth(
+    memory: Floats,
+    flow: Floats,
+    n: int,
+    off: float,
+    sigma: float,
+    hidden: float,
+    highest: float,
+    roughness: float,
+) -> bool:
+    """
+    Return True if unlikely samples are farther and farther off, so that d has jumped (D 33).
+
+    Parameters
+    ----------
+    flow : (N, N) array
+        Derivative of the prediction to this sample.
+    off : float
+        How far y is off the mean's prediction.
+    sigma : float
+        Standard deviation of the noise.
+    hidden : float
+        How far y could be off without being unlikely.
+    highest : float
+        Square of the highest difference of y, as a variance of white noise.
+    roughness : float
+        Squared differences of y over their usual size, of late, without this sample.
+
+    """
+    count = memory[BEYOND]
+    if count == 0.0:
+        begin_growth(memory, off, highest, roughness)
+    first = memory[FIRST_OFF]
+    memory[UNEVEN] += (highest - memory[UNEVEN]) / (count + 1.0)
+    least = FARTHER * first + HUBER * sigma
+    if count > 0.0:
+        least = max(least, POWER * first * growth(flow, n, hidden / first, count))
+    uneven = math.sqrt(memory[UNEVEN])
+    least = max(least, SMOOTH * uneven)
+    memory[GROWING] = memory[GROWING] + 1.0 if count > 0.0 and off > least else 0.0
+    calm = memory[FIRST_ROUGH] < ROUGH or off > SMOOTHEST * uneven
+    return bool(memory[GROWING] >= GROWTHS and calm)
 
 
 @compiled()
@@ -131,27 +235,22 @@ def follow_jump(members: Members, memory: Floats, n: int, count: int, s: Floats,
     variance, total = s[k, g] * members.noise[SQUARE, 0], 0.0
     for j in range(WINDOW - count, WINDOW):
         total += members.recent[j] * math.sqrt(variance)
-    state = members.x[k][:, g] - total * members.gain[k][:, g]  # nothing of the jump is in z or d
-    state[0] += total / count
-    c, d = members.rates[KAPPA, g], state[n]
-    rate, second = -c * d, c * c * d
+    before = members.x[k][:, g] - total * members.gain[k][:, g]  # nothing of the jump is in z or d
+    kappa, estimate = members.rates[KAPPA, g], np.zeros(n + ORDERS)
+    estimate[: n + 1] = before[: n + 1]
+    estimate[0] += total / count
     if k > 0:
-        rate, second = rate + state[n + 1], second - 2.0 * c * state[n + 1]
+        estimate[n + 1] = before[n + 1]
     if k > 1:
-        second += state[n + 2]
+        estimate[n + 2] = before[n + 2] - 2.0 * kappa * before[n + 1]
+    estimate[n + 2] += kappa * kappa * before[n]
+    estimate[n + 1] -= kappa * before[n]
     for i in range(ORDERS):
-        x, p = members.x[i], members.p[i]
+        p, residual, far = members.p[i], members.record[RESIDUAL, i], members.record[FAR, i]
         for m in range(COUNT):
-            kappa = members.rates[KAPPA, m]
-            for j in range(n + 1):
-                x[j, m] = state[j]
-            if i > 0:
-                x[n + 1, m] = rate + kappa * d
-            if i > 1:
-                x[n + 2, m] = second + kappa * (2.0 * rate + kappa * d)
+            put(members, n, i, m, estimate)
             p[0, m] += variance / count
-            members.record[RESIDUAL, i, m] = y - state[0]
-            members.record[FAR, i, m] = 0.0
+            residual[m], far[m] = y - estimate[0], 0.0
     members.record[SCORE] = members.before[1]
     memory[UNSETTLED], memory[JUMPS] = 0.0, total / count
     watch(members, members.watch[MEMBER])

@@ -244,20 +244,15 @@ def fill(values: Floats, of_colours: Floats) -> None:
 
 
 @compiled(forceinline=True)
-def exponential(x: float) -> float:
-    """Return e^x for x from -30 to 0, to 1e-14, in a way that makes vector instructions."""
-    y = x / 128.0
-    y2 = y * y
-    y4 = y2 * y2
-    value = 1.0 + y + y2 * (1 / 2 + y / 6) + y4 * (1 / 24 + y / 120 + y2 * (1 / 720 + y / 5040))
-    value += y4 * y4 * (1 / 40320 + y / 362880 + y2 * (1 / 3628800 + y / 39916800))
-    value *= value
-    value *= value
-    value *= value
-    value *= value
-    value *= value
-    value *= value
-    return value * value
+def put(members: Members, n: int, k: int, g: int, estimate: Floats) -> None:
+    """Put a member to an estimate of z, d, d' and d''; its own states are (D + kappa)^j d."""
+    x, kappa = members.x[k], members.rates[KAPPA, g]
+    for i in range(n + 1):
+        x[i, g] = estimate[i]
+    if k > 0:
+        x[n + 1, g] = estimate[n + 1] + kappa * estimate[n]
+    if k > 1:
+        x[n + 2, g] = estimate[n + 2] + kappa * (2.0 * estimate[n + 1] + kappa * estimate[n])
 
 
 class Tuning(NamedTuple):

@@ -22,7 +22,6 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOURS,
     CORRELATION,
     COUNT,
-    exponential,
     FAR,
     FAST,
     fill,
@@ -116,13 +115,13 @@ def difference(members: Members, memory: Floats, y: float) -> tuple[float, float
     float
         Square of the difference of the order that bounds white noise, over its usual size.
     float
-        The smallest of the squared differences, as a variance of white noise: of the order of the
+        The square of the highest difference, as a variance of white noise: of the order of the
         noise if noise is why y is off its prediction, and far less if d has moved it there.
 
     """
     last, orders = members.rough[0], members.rough.shape[1]
     value, binomial, least = y, 1.0, 1e-12 * memory[FIRST_NOISE]
-    bound, ratio, smallest = math.inf, 0.0, math.inf
+    bound, ratio, highest = math.inf, 0.0, 0.0
     for p in range(orders):
         before, value_before = last[p], value
         last[p] = value
@@ -134,13 +133,13 @@ def difference(members: Members, memory: Floats, y: float) -> tuple[float, float
             white = value_before - members.rates[CORRELATION, FIRST[c]] * before
             r = white * white / (members.rough[1 + c, p] * binomial)
             if c == 0:
-                smallest = min(smallest, white * white / binomial)
+                highest = white * white / binomial
                 if members.rough[1, p] < bound:
                     bound, ratio = members.rough[1, p], r
             grown = 1.0 + (min(r, HUBER * HUBER) / CLIPPED - 1.0) / ROUGH_SAMPLES
             members.rough[1 + c, p] = max(members.rough[1 + c, p] * grown, least)
     memory[ROUGHNESS] += SHORT_SHARE * (min(ratio, HUBER * HUBER) - memory[ROUGHNESS])
-    return ratio, smallest
+    return ratio, highest
 
 
 @compiled()
@@ -216,17 +215,14 @@ def is_explained(members: Members, b: Floats, s: Floats) -> bool:
 
 
 @compiled(fastmath=FAST)
-def over_colours(values: Floats, largest: bool) -> None:
-    """Replace each member's value by the largest one of its colour, or by their sum."""
+def over_colours(values: Floats) -> None:
+    """Replace each member's value by the largest one of its colour."""
     for band in range(1, BANDS):
         for i in range(IN_BAND):
-            other = values[band * IN_BAND + i]
-            values[i] = max(values[i], other) if largest else values[i] + other
+            values[i] = max(values[i], values[band * IN_BAND + i])
     for i in range(IN_BAND):
         first = FIRST[COLOUR[i]]
-        if i > first:
-            value, other = values[first], values[i]
-            values[first] = max(value, other) if largest else value + other
+        values[first] = max(values[first], values[i])
     for i in range(IN_BAND):
         values[i] = values[FIRST[COLOUR[i]]]
     repeat(values)
@@ -273,12 +269,12 @@ def follow_noise(
         scratch.lines[0], scratch.lines[1], scratch.lines[2],
         scratch.lines[3], scratch.lines[4], scratch.lines[5],
     )  # fmt: skip
-    best[:], weights[:], squares[:] = record[SCORE, 0], 0.0, 0.0
+    best[:], weights[:], squares[:] = record[SCORE, 0], 0.0, 0.0  # the last two: of each colour
     for k in range(1, ORDERS):
         score = record[SCORE, k]
         for g in range(COUNT):
             best[g] = max(best[g], score[g])
-    over_colours(best, True)
+    over_colours(best)
     fill(variance, noise[SQUARE])
     for k in range(ORDERS):
         score, short, innovation, share = record[SCORE, k], record[SHORT, k], scratch.b[k], s[k]
@@ -292,16 +288,14 @@ def follow_noise(
             judges = size[g] <= largest and score[g] > -CLOSE
             best_fit = min(best_fit, r[g] if judges else math.inf)
         for g in range(COUNT):
-            below = score[g] - best[g]
-            weight = exponential(below)
-            weights[g] += weight if below > -CLOSE else 0.0
-            squares[g] += weight * r[g] if below > -CLOSE else 0.0
-    over_colours(weights, False)
-    over_colours(squares, False)
+            if score[g] - best[g] > -CLOSE:  # few of them
+                weight = math.exp(score[g] - best[g])
+                weights[COLOUR[g]] += weight
+                squares[COLOUR[g]] += weight * r[g]
     if least > STEADY:  # every member that can judge says so, and the differences do
         count = min(count, QUICK_SAMPLES)
     for c in range(COLOURS.size):
-        ratio = squares[FIRST[c]] / weights[FIRST[c]] / CLIPPED
+        ratio = squares[c] / weights[c] / CLIPPED
         noise[SQUARE, c] *= 1.0 + (ratio - 1.0) / count
         most = members.rough[1 + c, 1]
         for p in range(2, members.rough.shape[1]):

@@ -15,7 +15,6 @@ from fhaosmo_ros.core.observer.arrays import (
     COVARIANCE,
     FAR_SIGN,
     FIRST_NOISE,
-    FIRST_OFF,
     FLOW_PERIOD,
     FORGETTING,
     FRESH,
@@ -53,8 +52,11 @@ from fhaosmo_ros.core.observer.self_tuning.filters import (
     predict_states,
 )
 from fhaosmo_ros.core.observer.self_tuning.jumps import (
+    begin_growth,
+    follow_growth,
     follow_innovations,
     follow_jump,
+    GROWTHS,
     samples_since_jump,
     watch,
 )
@@ -77,6 +79,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     of_pairs,
     of_states,
     ORDERS,
+    put,
     RATIO,
     RESIDUAL,
     scratch_in,
@@ -94,8 +97,6 @@ from fhaosmo_ros.core.observer.self_tuning.noise import (
     is_explained,
     is_likely,
     knowing,
-    ROUGH,
-    SHORT_SHARE,
     stamp_noise,
     STEADY,
 )
@@ -115,13 +116,6 @@ import numpy as np
 
 NOISE_SAMPLES = 1000.0
 """The noise is averaged over so many samples."""
-GROWTHS = 3.0
-"""If so many samples in a row are farther off than the first one, d has jumped (D 33)."""
-FARTHER, SMOOTH = 1.3, 10.0
-"""
-Farther means: so many times as far, and 3 sigma more. It is not noise if y is off by so many times
-its differences, and if these were not larger than usual before.
-"""
 JUMP_SAMPLES = 10.0
 """What is beyond 3 sigma in so many samples after that is due to the jump, too."""
 TURNS_SAMPLES, OFTEN, ROUGH_TURN = 40.0, 0.07, -0.5
@@ -132,9 +126,9 @@ A sample whose difference is large counts as `ROUGH_TURN` of these: noise may ha
 """
 EXACT = 1e-5
 """y is taken to be no more exact than this, in parts of what it moves between samples (RMS)."""
-ANOTHER, FAR_OFF = 1.3, 3.0
+ANOTHER, FAR_OFF = 1.5, 3.0
 """Factors on the variance of the noise, of the likeliest colour and others, that make P move."""
-LONG = 12.0
+LONG = 8.0
 """Time constants of a member after which its P is steady."""
 
 
@@ -209,7 +203,8 @@ def step_members(
         return 0.0
     quanta = find_quantum(members, memory, y)
     follow_period(law, members, memory, h)
-    roughness, smallest = difference(members, memory, y)
+    before = memory[ROUGHNESS]
+    roughness, highest = difference(members, memory, y)
     of_stamps = stamp_noise(members, memory, h)
     if memory[GROWING] >= GROWTHS - 1.0 or memory[RECENT] > 0.0:
         memory[MOVING] = COUNT
@@ -238,19 +233,17 @@ def step_members(
     largest = knowing(members, scratch, believed)
     floor = max(quanta, law.scalars[LEAST_NOISE] ** 2, EXACT * EXACT * members.rough[1, 1])
     off, sigma = abs(y - now[0, 0]), math.sqrt(members.noise[SQUARE, 0])
-    if memory[BEYOND] == 0.0:
-        memory[FIRST_OFF] = off
-    far = FARTHER * memory[FIRST_OFF] + HUBER * sigma
-    far = max(far, SMOOTH * math.sqrt(smallest + of_stamps))
-    memory[GROWING] = memory[GROWING] + 1.0 if memory[BEYOND] > 0.0 and off > far else 0.0
+    hidden = GATE * math.sqrt(largest)
+    growing = follow_growth(
+        memory, members.flow, n, off, sigma, hidden, highest + of_stamps, before
+    )
     sign, turn = math.copysign(1.0, y - now[0, 0]), 0.0
     goes_on = memory[BEYOND] > 0.0 and sign == memory[FAR_SIGN]
     goes_on = goes_on and roughness <= HUBER * HUBER and memory[ROUGHNESS] < HUBER
     gate = HUBER if goes_on else GATE
     likely = is_likely(members, b, believed, largest, memory[BEYOND], gate)
     memory[RECENT] = max(memory[RECENT] - 1.0, 0.0)
-    before = memory[ROUGHNESS] - SHORT_SHARE * HUBER * HUBER * (memory[BEYOND] + 1.0)
-    begins = not likely and memory[GROWING] >= GROWTHS and before < ROUGH
+    begins = not likely and growing
     jumped = begins or (memory[RECENT] > 0.0 and roughness <= HUBER * HUBER)
     kept = math.exp(-h / law.scalars[FORGETTING])
     if roughness > HUBER * HUBER:
@@ -263,10 +256,13 @@ def step_members(
         if doubted and is_explained(members, b, believed):
             judge(members, scratch, 1.0, kept, True)
             memory[LIKELIEST] = weigh(members, FLOOR)
-        if sign == memory[FAR_SIGN] or memory[BEYOND] == 0.0:
-            memory[BEYOND] += 1.0
-        else:  # noise has both signs, y that is off has one
-            memory[BEYOND], memory[FIRST_OFF] = 1.0, off
+        other_side = memory[BEYOND] > 0.0 and sign != memory[FAR_SIGN]
+        if other_side:
+            begin_growth(memory, off, highest + of_stamps, before)
+            memory[BEYOND] = 0.0
+        memory[BEYOND] += 1.0
+        rougher = memory[ROUGHNESS] > HUBER and memory[RECENT] == 0.0
+        if other_side or rougher:  # a y that is off is so on one side, and evenly
             follow_noise(
                 members, scratch, floor, believed, largest, count, memory[ROUGHNESS], of_stamps
             )
@@ -311,26 +307,19 @@ def step_members(
         memory[LIKELIEST] = weigh(members, FLOOR)
     mix(law, members, scratch, x)
     tell_model(law, members, memory, h, jumped, x)
-    find_strays(members, n, x)
+    find_strays(members, n, x[HAT])
     return float((y - x[HAT, 0]) ** 2)
 
 
 @compiled()
-def find_strays(members: Members, n: int, x: Floats) -> None:
+def find_strays(members: Members, n: int, mean: Floats) -> None:
     """Put members that have been far off for long to the mean."""
-    far, kappa = members.record[FAR], members.rates[KAPPA]
+    far = members.record[FAR]
     for k in range(ORDERS):
-        z = members.x[k]
         for g in range(COUNT):
             if far[k, g] > LOST_SAMPLES:
                 far[k, g] = 0.0
-                for i in range(n + 1):
-                    z[i, g] = x[HAT, i]
-                rate = x[HAT, n + 1] + kappa[g] * x[HAT, n]
-                if k > 0:
-                    z[n + 1, g] = rate
-                if k > 1:
-                    z[n + 2, g] = x[HAT, n + 2] + kappa[g] * (2.0 * rate - kappa[g] * x[HAT, n])
+                put(members, n, k, g, mean)
 
 
 @compiled()

@@ -25,7 +25,6 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOUR,
     CORRELATION,
     COUNT,
-    exponential,
     FAR,
     FAST,
     fill,
@@ -47,11 +46,9 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
 import numpy as np
 
 FLOOR, QUANTISED_FLOOR = 30.0, 100.0
-"""No log-likelihood falls further below the best one (D 28, D 31)."""
-STEEP = 5.0
 """
-It may fall further for members of quicker bands than the likeliest one's, by this for each band:
-their estimates of d are larger by orders of magnitude, so they need more reason to be believed.
+No log-likelihood falls further below the best one (D 28, D 31), but by what the member's prior is
+below that of the likeliest: a larger d needs more reason to be believed.
 """
 VAGUE = 0.04
 """Part of the square of half a quantum by which predictions are less certain than their P says."""
@@ -129,7 +126,7 @@ def judge_quantised(members: Members, y: float, ahead: OfEach, quanta: float, ke
             record[SCORE, k, g] = score - 0.5 * likelihood
 
 
-@compiled(fastmath=FAST)
+@compiled(fastmath=FAST - {'nnan'})
 def weigh(members: Members, floor: float) -> int:
     """Turn log-likelihoods into weights (D 28); return which member is the likeliest."""
     best, total, likeliest = -math.inf, 0.0, 0
@@ -142,17 +139,17 @@ def weigh(members: Members, floor: float) -> int:
         for g in range(COUNT - 1, -1, -1):
             if score[g] == best:  # the first of them; before they are judged there are many
                 likeliest = k * COUNT + g
-    slower = likeliest % COUNT // IN_BAND
+    usual = members.record[PRIOR, likeliest // COUNT, likeliest % COUNT]
     for k in range(ORDERS):
         score, weight = members.record[SCORE, k], members.record[WEIGHT, k]
-        for band in range(BANDS):
-            least = -floor - STEEP * max(band - slower, 0)
-            for g in range(band * IN_BAND, (band + 1) * IN_BAND):
-                score[g] = max(score[g] - best, least)
+        prior = members.record[PRIOR, k]
         for g in range(COUNT):
-            share = exponential(max(score[g], -NEGLIGIBLE))
-            weight[g] = share if score[g] > -NEGLIGIBLE else 0.0
-            total += weight[g]
+            score[g] = max(score[g] - best, min(prior[g] - usual, 0.0) - floor)
+            weight[g] = 0.0
+        for g in range(COUNT):
+            if score[g] > -NEGLIGIBLE:  # few of them
+                weight[g] = math.exp(score[g])
+                total += weight[g]
     for k in range(ORDERS):
         weight = members.record[WEIGHT, k]
         for g in range(COUNT):
@@ -237,9 +234,9 @@ def mix(law: Law, members: Members, scratch: Scratch, x: Floats) -> None:
     for k in range(ORDERS):
         if shares[k] == 0.0:
             continue
-        w, z = shown[k], members.x[k]
+        w, z, p = shown[k], members.x[k], members.p[k]
         for i in range(n + 1):
-            mean, value, variance = x[HAT, i], z[i], members.p[k][at(n + 1 + k, i, i)]
+            mean, value, variance = x[HAT, i], z[i], p[at(n + 1 + k, i, i)]
             total = 0.0
             for g in range(COUNT):
                 off = value[g] - mean
