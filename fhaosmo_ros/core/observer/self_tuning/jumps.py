@@ -38,6 +38,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     WINDOW,
 )
 from fhaosmo_ros.core.observer.self_tuning.noise import ROUGH
+from fhaosmo_ros.core.observer.step import LOST_SAMPLES
 import numpy as np
 
 GROWTHS = 3.0
@@ -48,8 +49,6 @@ Farther means: so many times as far, and 3 sigma more; so much of what a jump of
 so many times the highest differences of y, which noise does not get to. Differences must not have
 been larger than usual before, unless y is farther off by the last factor.
 """
-OLDEST = 20
-"""Samples after which y would be lost: no jump of d that shows now is older."""
 SHAPE, BELIEVED = 2.0, 8.0
 """
 By so much, in twice the log-likelihood, a jump has to explain the innovations better than growing
@@ -87,7 +86,7 @@ def growth(flow: Floats, n: int, hidden: float, count: float) -> float:
     z, before = np.zeros(n), np.zeros(n)
     first = respond(flow, n, z, before)
     off = respond(flow, n, z, before)
-    for _ in range(OLDEST):
+    for _ in range(LOST_SAMPLES):  # after so many y would be lost
         if first > hidden * off:
             break
         first, off = off, respond(flow, n, z, before)

@@ -203,7 +203,7 @@ def step_members(
         return 0.0
     quanta = find_quantum(members, memory, y)
     follow_period(law, members, memory, h)
-    before = memory[ROUGHNESS]
+    roughness_before = memory[ROUGHNESS]
     roughness, highest = difference(members, memory, y)
     of_stamps = stamp_noise(members, memory, h)
     if memory[GROWING] >= GROWTHS - 1.0 or memory[RECENT] > 0.0:
@@ -235,7 +235,7 @@ def step_members(
     off, sigma = abs(y - now[0, 0]), math.sqrt(members.noise[SQUARE, 0])
     hidden = GATE * math.sqrt(largest)
     growing = follow_growth(
-        memory, members.flow, n, off, sigma, hidden, highest + of_stamps, before
+        memory, members.flow, n, off, sigma, hidden, highest + of_stamps, roughness_before
     )
     sign, turn = math.copysign(1.0, y - now[0, 0]), 0.0
     goes_on = memory[BEYOND] > 0.0 and sign == memory[FAR_SIGN]
@@ -258,7 +258,7 @@ def step_members(
             memory[LIKELIEST] = weigh(members, FLOOR)
         other_side = memory[BEYOND] > 0.0 and sign != memory[FAR_SIGN]
         if other_side:
-            begin_growth(memory, off, highest + of_stamps, before)
+            begin_growth(memory, off, highest + of_stamps, roughness_before)
             memory[BEYOND] = 0.0
         memory[BEYOND] += 1.0
         rougher = memory[ROUGHNESS] > HUBER and memory[RECENT] == 0.0
