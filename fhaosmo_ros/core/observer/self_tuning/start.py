@@ -66,6 +66,12 @@ import numpy as np
 
 REPEATED = 0.3
 """If a larger share of the first samples repeat the one before, y is quantised."""
+WITHIN_SAMPLES, MORE_REASON = 0.6, 50.0
+"""
+Members with a larger bandwidth (rad a sample) tell d from the last two or three samples. There
+errors of rounding, which are not white, look like such a d: where y is quantised, log-likelihoods
+of these members are smaller by `MORE_REASON`.
+"""
 
 
 @compiled()
@@ -197,7 +203,7 @@ def begin(
     memory[ROUGHNESS], memory[CALM] = 1.0, CALM_SAMPLES + 1.0
     for j in range(count):
         difference(members, memory, samples[j])
-    least = math.inf
+    least, quantised = math.inf, memory[LATTICE] > LATTICE_SHARE
     for k in range(ORDERS):
         x = members.x[k]
         p = members.p[k]
@@ -226,6 +232,8 @@ def begin(
     for k in range(ORDERS):
         for g in range(COUNT):
             record[PRIOR, k, g] += 0.5 * least
+            if quantised and BANDWIDTHS[g] > WITHIN_SAMPLES:
+                record[PRIOR, k, g] -= MORE_REASON
             record[SCORE, k, g] = record[PRIOR, k, g]
             record[VARIANCE, k, g] = 1.0
             record[LOG_VARIANCE, k, g] = record[RESIDUAL, k, g] = record[FAR, k, g] = 0.0
