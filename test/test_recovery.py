@@ -186,6 +186,24 @@ def test_jump_of_y_leaves_all_but_z1_of_a_plant_without_z1_in_its_model(case):
     assert wrong.max() < max(1.5 * case.usual, 0.6 * case.largest)
 
 
+def test_after_a_jump_of_y_the_next_sample_gives_the_time_of_the_estimate():
+    """Only z1 follows the jump at once: that is wrong under the stamp of the sample before."""
+    estimator = OnlineEstimator(load(CONFIG / 'noise_1e-3.yaml', 'estimator', ONLINE_PARAMETERS))
+    stamps, word = iter(range(1_000_000, 10**9, 1_000_000)), 0
+    for _ in range(RATE // 2):
+        estimator.advance(next(stamps), 0.0)
+    while not word & Status.JUMPED:
+        word = estimator.advance(next(stamps), 1.0)
+    assert estimator.estimate is None
+    assert estimator.stamp is None
+    estimator.advance(next(stamps), float('nan'))
+    assert estimator.estimate is None
+    last = next(stamps)
+    estimator.advance(last, 1.0)
+    assert estimator.stamp == last
+    np.testing.assert_allclose(estimator.estimate.z[0], 1.0, atol=0.01)
+
+
 def test_jump_of_a_few_counts_of_an_encoder():
     """Some of its samples lie within 6 standard deviations, some beyond."""
     case = Case(CONFIG / 'models' / 'dc_motor.yaml')

@@ -162,7 +162,7 @@ class OnlineEstimator:
     @property
     def stamp(self) -> int | None:
         """
-        Time of the latest estimate in nanoseconds, None before there is one.
+        Time of the latest estimate in nanoseconds; None where `estimate` is None.
 
         The stamp of its sample, less `measurement_delay` unless the estimate is carried over it.
         With `smoothing_lag` its sample is the one that is so old.
@@ -546,7 +546,12 @@ class OnlineEstimator:
 
     @property
     def estimate(self) -> Estimate | None:
-        """The latest estimate, None before the first sample (that is `smoothing_lag` old)."""
+        """
+        The latest estimate.
+
+        None before the first sample (that is `smoothing_lag` old), and from a jump of y, which z_1
+        follows at once, until the next sample that is used.
+        """
         if self._smoothing is not None:
             return self._smoothing.estimate
         return self._published(self._word) if self._ints[at.VALID] else None

@@ -38,7 +38,7 @@ TO_NOW = 10  # 1: estimates are carried over the delay
 FILTERED = 11  # 1: estimates are z_hat
 FROZEN = 12  # 1: gamma is held
 # Remembered
-VALID = 13  # 1: there is an estimate
+VALID = 13  # 1: there is an estimate, of the time STAMP
 STAMP = 14  # of the sample behind it
 TIMED = 15  # 0: the next sample's stamp is of another clock
 LATEST = 16  # time up to which the observer has been stepped

@@ -19,6 +19,7 @@ from fhaosmo_ros.core.observer.arrays import (
 from fhaosmo_ros.core.observer.status import (
     DIVERGED,
     FLAGS_MASK,
+    JUMPED,
     LEVEL_SHIFT,
     REJECTED,
     REJECTED_MEASUREMENT,
@@ -133,6 +134,8 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: Floats, eps: Floats, row: 
     elif word & REJECTED_STEP:
         ints[at.REJECTED_STEPS] += 1
     else:
+        if word & JUMPED:  # z_1 has followed y, and only the next sample gives it a time
+            ints[at.VALID] = 0
         last = memory[Y] if memory[Y] == memory[Y] else levels[HAT, 0]
         word |= innovations(law, state, last, eps, row) << LEVEL_SHIFT
     return word

@@ -6,7 +6,7 @@ from math import isfinite
 from time import perf_counter, time_ns
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.observer.status import JUMPED, REJECTED, Status
+from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit
@@ -368,8 +368,7 @@ class Channel:
         """Publish the numbers of the latest estimate; return it for the typed messages."""
         estimator = self.estimator
         estimate = estimator.estimate
-        # Reset, and no sample since; or y has jumped, and the next sample gives the stamp.
-        if estimate is None or (estimate.word & JUMPED and estimate.word & REJECTED):
+        if estimate is None:
             return None
         stamp = estimator.stamp
         self._outputs.publish(estimate, stamp)
