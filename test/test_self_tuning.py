@@ -8,6 +8,7 @@ from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Stat
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.self_tuning.filters import at
+from fhaosmo_ros.core.observer.self_tuning.intervals import within
 from fhaosmo_ros.core.observer.self_tuning.jumps import otherwise, SHAPE
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOUR,
@@ -24,8 +25,10 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.stats import norm, truncnorm
 from studies.everywhere import (
     Condition,
+    CONDITIONS,
     model_of,
     online,
     recording,
@@ -390,6 +393,69 @@ def test_covariances_stay_positive(noise):
             size = round(math.sqrt(2 * len(p) + 0.25) - 0.5)
             diagonal = [at.py_func(size, i, i) for i in range(size)]
             assert (p[diagonal] > 0.0).all()
+
+
+@pytest.mark.parametrize('width', [1e-6, 0.02, 0.04, 0.5, 2.0, 9.0, 30.0])
+@pytest.mark.parametrize('middle', [-5.0, -1.3, 0.0, 0.4, 3.0, 5.0])
+def test_moments_of_a_truncated_normal_distribution(middle, width):
+    low, high = middle - 0.5 * width, middle + 0.5 * width
+    chance, mean, lost = within(low, high)
+    with np.errstate(all='ignore'):
+        expected = truncnorm.stats(low, high, moments='mv')
+    np.testing.assert_allclose([mean, 1.0 - lost], expected, rtol=1e-3, atol=1e-4)
+    share = norm.cdf(high) - norm.cdf(low) if middle < 0.0 else norm.sf(low) - norm.sf(high)
+    np.testing.assert_allclose(math.exp(chance), share, rtol=1e-3)
+
+
+@pytest.mark.parametrize('sign', [-1.0, 1.0])
+def test_an_interval_far_off_counts_as_its_nearer_end(sign):
+    low, high = sorted((sign * 20.0, sign * 21.0))
+    chance, mean, lost = within(low, high)
+    assert 20.0 <= sign * mean <= 20.1
+    assert chance == pytest.approx(-200.0)
+    assert 0.0 < lost < 1.0
+
+
+SLOW = np.arange(30_000) * PERIOD
+
+
+@pytest.mark.parametrize('counts', [1024, 4096, 65536])
+def test_slow_motion_over_an_encoder(counts):
+    """It stands still for most of the time; a count that comes then is no jump of d."""
+    quantum = 2.0 * np.pi / counts
+    z, d = 0.3 + 0.02 * np.sin(0.5 * SLOW), -0.005 * np.sin(0.5 * SLOW)
+    observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
+    found = observer.run(SLOW, np.round(z / quantum) * quantum)
+    late = SLOW > 2.0
+    wrong = np.abs(found.unknown_input - d)[late]
+    assert wrong.max() < 2.0 * 0.005
+    assert np.sqrt(np.mean(wrong**2)) < np.sqrt(np.mean(d[late] ** 2))
+
+
+@pytest.mark.parametrize('plant', PLANTS_OF_STUDY)
+def test_how_sure_it_is_of_a_quantised_y(plant):
+    """A mean over kinds of d; with one of the seeds members had once narrowed without end."""
+    steps = CONDITIONS['y in steps of 5 sigma']
+    inside, model = [], model_of(setting_of(PLANTS_OF_STUDY[plant], steps))
+    for kind in ('sine', 'chirp', 'ou', 'square', 'pulses'):
+        r = recording(PLANTS_OF_STUDY[plant], steps, kind, 20.0, 3)
+        d, deviation = online(r, model | SELF_TUNING)
+        late = r.t > 3.0
+        wrong = np.abs(d - r.d)[late]
+        assert np.sqrt(np.mean(wrong**2)) < 1.2 * np.sqrt(np.mean(r.d[late] ** 2))
+        inside.append(np.mean(wrong < deviation[late, -1]))
+    assert 0.5 < np.mean(inside) < 0.9
+
+
+def test_y_that_stands_still_says_no_more_with_every_sample():
+    """Within the quantum every z1 is as likely as any other one: a deviation of 0.29 q."""
+    y = np.full(20_000, 0.3)
+    y[:100] += 0.001 * (np.arange(100) // 10 % 2)
+    observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
+    found = observer.run(np.arange(len(y)) * PERIOD, y)
+    deviation = found.standard_deviation[1000:, 0] / 0.001
+    assert deviation.min() > 0.1
+    assert deviation.max() < 0.5
 
 
 def test_quanta_bound_the_noise():

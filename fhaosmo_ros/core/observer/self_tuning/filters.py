@@ -247,25 +247,27 @@ def correct_covariances(
     k: int,
     p: Floats,
     gain: Floats,
-    s: Floats,
     lines: Floats,
     moving: int,
 ) -> None:
-    """Take a sample into P of the members that move, and turn P C' into their gains (D 27)."""
-    d, used, inverse, scaled = n + 1 + k, members.noise[USED], lines[0], lines[1]
+    """
+    Take a sample into P of the members that move, and turn P C' into their gains (D 27).
+
+    By factors for each member in `lines`: gains are P C' times the first of them, and P loses
+    P C' C P times the third.
+    """
+    d, inverse, scaled, taken = n + 1 + k, lines[0], lines[1], lines[2]
     corrected, gains = members.p[k], members.gain[k]
-    for g in range(moving):
-        inverse[g] = 1.0 / (s[g] * used[COLOUR[g]])
     for i in range(d):
         first, row = gain[i], gains[i]
         for g in range(moving):
-            scaled[g] = first[g] * inverse[g]
+            scaled[g] = first[g] * taken[g]
         for j in range(i, d):
             second, before, after = gain[j], p[at(d, i, j)], corrected[at(d, i, j)]
             for g in range(moving):
                 after[g] = before[g] - scaled[g] * second[g]
         for g in range(moving):
-            row[g] = scaled[g]
+            row[g] = first[g] * inverse[g]
 
 
 @compiled(fastmath=FAST)

@@ -51,6 +51,7 @@ from fhaosmo_ros.core.observer.self_tuning.filters import (
     predict_covariances,
     predict_states,
 )
+from fhaosmo_ros.core.observer.self_tuning.intervals import take_interval
 from fhaosmo_ros.core.observer.self_tuning.jumps import (
     begin_growth,
     follow_growth,
@@ -104,7 +105,6 @@ from fhaosmo_ros.core.observer.self_tuning.start import gather
 from fhaosmo_ros.core.observer.self_tuning.weights import (
     FLOOR,
     judge,
-    judge_quantised,
     mix,
     QUANTISED_FLOOR,
     tell_model,
@@ -206,8 +206,10 @@ def step_members(
     roughness_before = memory[ROUGHNESS]
     roughness, highest = difference(members, memory, y)
     of_stamps = stamp_noise(members, memory, h)
-    if memory[GROWING] >= GROWTHS - 1.0 or memory[RECENT] > 0.0:
+    if memory[GROWING] >= GROWTHS - 1.0 or memory[RECENT] > 0.0 or quanta > 0.0:
         memory[MOVING] = COUNT
+    if quanta > 0.0:  # P depends on the samples
+        memory[UNSETTLED] = 0.0
     moving, now = int(memory[MOVING]), work.stages[NOW]
     carry_flow(law, work, members, memory, h, u)
     # A sample that is not likely changes no member, so that what it makes of them stands apart.
@@ -294,11 +296,15 @@ def step_members(
     judged = judged and (roughness <= HUBER * HUBER or quanta > 0.0)
     follow_innovations(members, b, s, quanta)
     judge(members, scratch, grown, kept if judged and quanta == 0.0 else -1.0, calm)
-    if judged and quanta > 0.0:
-        judge_quantised(members, y, ahead, quanta, kept)
     for k in range(ORDERS):
+        if quanta > 0.0:
+            its = kept if judged else -1.0
+            take_interval(members, scratch, k, y, y == memory[Y], p[k], quanta, its)
+        else:
+            for g in range(moving):
+                lines[0, g] = lines[2, g] = 1.0 / (s[k, g] * members.noise[USED, COLOUR[g]])
         if moving > 0:
-            correct_covariances(members, n, k, p[k], gain[k], s[k], lines, moving)
+            correct_covariances(members, n, k, p[k], gain[k], lines, moving)
     correct_states(members, scratch, n, y)
     memory[LIKELIEST] = weigh(members, QUANTISED_FLOOR if quanta > 0.0 else FLOOR)
     since_jump = 0 if jumped else samples_since_jump(members, n, memory[TOLD])

@@ -33,7 +33,6 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     KAPPA,
     LOG_VARIANCE,
     Members,
-    OfEach,
     ORDERS,
     PRIOR,
     repeat,
@@ -50,8 +49,6 @@ FLOOR, QUANTISED_FLOOR = 30.0, 100.0
 No log-likelihood falls further below the best one (D 28, D 31), but by what the member's prior is
 below that of the likeliest: a larger d needs more reason to be believed.
 """
-VAGUE = 0.04
-"""Part of the square of half a quantum by which predictions are less certain than their P says."""
 CLEARLY = 2.0
 """A member is clearly likelier than another one if its log-likelihood is so much larger."""
 NEGLIGIBLE = 25.0
@@ -95,35 +92,6 @@ def judge(members: Members, scratch: Scratch, grown: float, kept: float, calm: b
                 late = max(far[g] - 1.0, 0.0)  # in a row: not an outlier, but d
                 limit = HUBER * math.sqrt(share[g] * noise[g]) * (1.0 + late * late)
                 innovation[g] = min(max(innovation[g], -limit), limit)
-
-
-@compiled()
-def judge_quantised(members: Members, y: float, ahead: OfEach, quanta: float, kept: float) -> None:
-    """
-    Take a quantised sample into the log-likelihoods (D 31), in place.
-
-    A prediction that would be rounded to `y` is not worse than another one that would be.
-
-    Parameters
-    ----------
-    ahead : tuple of arrays
-        The members' predictions of z and d.
-    quanta : float
-        Variance of the error of rounding.
-
-    """
-    record, half = members.record, math.sqrt(3.0 * quanta)
-    least = max(members.noise[SQUARE, 0] - quanta, 0.0) + VAGUE * half * half
-    box = half * math.sqrt(2.0 / math.pi)
-    for k in range(ORDERS):
-        for g in range(COUNT):
-            variance = members.p[k][0, g] + least
-            off = max(abs(y - ahead[k][0, g]) - half, 0.0)
-            likelihood = min(off * off / variance, HUBER * HUBER)
-            likelihood += 2.0 * math.log(math.sqrt(variance) + box)
-            prior = record[PRIOR, k, g]
-            score = prior + kept * (record[SCORE, k, g] - prior)
-            record[SCORE, k, g] = score - 0.5 * likelihood
 
 
 @compiled(fastmath=FAST - {'nnan'})

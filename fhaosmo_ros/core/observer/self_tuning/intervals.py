@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The members where y is quantised: a sample says within which interval z_1 lies (D 31).
+
+Estimate and covariance become those of the normal distribution with the mean and the variance that
+the truncated one has (Curry, Vander Velde and Potter 1970, IEEE Transactions on Information Theory
+16, 152-161).
+"""
+
+import math
+
+from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.model.bytecode import Floats
+from fhaosmo_ros.core.observer.self_tuning.filters import HUBER, INEXACT
+from fhaosmo_ros.core.observer.self_tuning.members import (
+    COLOUR,
+    COUNT,
+    FAR,
+    Members,
+    PRIOR,
+    SCORE,
+    Scratch,
+    SQUARE,
+)
+
+VAGUE = 0.1
+"""Part of the quantum by which predictions of z_1 are less certain than their P says."""
+LEAST_CHANCE = -6.0
+"""Logarithm of the least probability that a sample counts with."""
+LEAST_STAYED = math.log(0.5)
+"""That of the least probability with which z_1 lies in its interval after a sample."""
+KNOWN = math.log(0.88)
+"""
+A sample that repeats the one before, and that a member expects with a larger probability, tells it
+nothing. A normal number with the variance of an even distribution in the interval lies in it with
+a probability of 0.917: each such sample would narrow it again.
+"""
+NARROW = 0.03
+"""In an interval of so few standard deviations the density is taken to be constant."""
+FAR_TAIL = 5.5
+"""An interval that is so many standard deviations off counts as its nearer end."""
+UNUSED = -1e6
+"""Log-likelihood of members with coloured noise, which errors of rounding are not."""
+
+
+@compiled(forceinline=True)
+def chance_below(x: float) -> float:
+    """Return the probability that a normal number of variance 1 is less than `x`."""
+    return 0.5 * math.erfc(-x / math.sqrt(2.0))
+
+
+@compiled(forceinline=True)
+def density(x: float) -> float:
+    """Return the density of a normal number of variance 1."""
+    return math.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)
+
+
+@compiled(inline='always')
+def within(low: float, high: float) -> tuple[float, float, float]:
+    """
+    Return what is known of a normal number of mean 0 and variance 1 that lies between two others.
+
+    Returns
+    -------
+    chance : float
+        The logarithm of the probability that it does.
+    mean : float
+    lost : float
+        Its variance is smaller than 1 by this.
+
+    """
+    nearer, farther = (low, high) if low + high > 0.0 else (-high, -low)
+    width = high - low
+    if nearer < -FAR_TAIL:
+        return 0.0, 0.0, 0.0
+    if width < NARROW:
+        mean = 0.5 * (nearer + farther)
+        chance = math.log(width * density(mean))
+        lost = 1.0 - width * width / 12.0
+    elif nearer > FAR_TAIL:
+        mean = nearer + 1.0 / nearer
+        chance = -0.5 * nearer * nearer
+        lost = 1.0 - 1.0 / (nearer * nearer)
+    else:
+        share = chance_below(-nearer) - chance_below(-farther)
+        left, right = density(nearer), density(farther)
+        mean = (left - right) / share
+        lost = mean * mean - (nearer * left - farther * right) / share
+        chance = math.log(share)
+    return chance, mean if low + high > 0.0 else -mean, min(max(lost, 0.0), 1.0)
+
+
+@compiled()
+def take_interval(
+    members: Members,
+    scratch: Scratch,
+    k: int,
+    y: float,
+    repeated: bool,
+    p: Floats,
+    quanta: float,
+    kept: float,
+) -> None:
+    """
+    Take a quantised sample into the log-likelihoods, and find how it corrects members (D 31).
+
+    For `correct_states` and `correct_covariances`: innovations in ``scratch.b``, and their factors
+    in ``scratch.lines``. Members with coloured noise go on as with any sample.
+
+    Parameters
+    ----------
+    repeated : bool
+        True if the sample before was the same.
+    p : array
+        Predicted covariances.
+    quanta : float
+        Variance of the error of rounding.
+    kept : float
+        Part of the log-likelihoods that is not forgotten; negative to leave them as they are.
+
+    """
+    half = math.sqrt(3.0 * quanta)
+    least = max(members.noise[SQUARE, 0] - quanta, 0.0) + (2.0 * VAGUE * half) ** 2
+    inverse, taken, innovation = scratch.lines[0], scratch.lines[2], scratch.b[k]
+    score, prior, far = members.record[SCORE, k], members.record[PRIOR, k], members.record[FAR, k]
+    first, noise = scratch.x[k][0], members.noise[SQUARE]
+    for g in range(COUNT):
+        if COLOUR[g] != 0:
+            inverse[g] = taken[g] = 1.0 / (scratch.s[k, g] * noise[COLOUR[g]])
+            score[g] = UNUSED
+            continue
+        variance = INEXACT * (p[0, g] + least)
+        size, off = math.sqrt(variance), y - first[g]
+        chance, mean, lost = within((off - half) / size, (off + half) / size)
+        likelihood = max(chance, LEAST_CHANCE)
+        if repeated:  # it was there before
+            size, off = math.sqrt(members.p[k][0, g] + least), y - members.x[k][0, g]
+            stayed, _, _ = within((off - half) / size, (off + half) / size)
+            likelihood = min(likelihood - max(stayed, LEAST_STAYED), 0.0)
+        if kept >= 0.0:
+            score[g] = prior[g] + kept * (score[g] - prior[g]) + likelihood
+        if repeated and chance > KNOWN:
+            innovation[g] = inverse[g] = taken[g] = 0.0
+        else:
+            late = max(far[g] - 1.0, 0.0)
+            limit = HUBER * (1.0 + late * late)
+            innovation[g] = min(max(mean, -limit), limit) * math.sqrt(variance)
+            inverse[g], taken[g] = 1.0 / variance, lost / variance
