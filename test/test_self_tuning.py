@@ -387,12 +387,15 @@ def test_covariances_stay_positive(noise):
     y, observer = y + noise * np.random.default_rng(7).standard_normal(len(t)), Observer(MOTOR)
     for part in np.array_split(np.arange(len(t)), 150):
         observer.run(t[part], y[part])
-        members = members_of(observer)
-        assert np.isfinite(members.record).all()
-        for p in members.p:
-            size = round(math.sqrt(2 * len(p) + 0.25) - 0.5)
-            diagonal = [at.py_func(size, i, i) for i in range(size)]
-            assert (p[diagonal] > 0.0).all()
+        expect_positive(members_of(observer))
+
+
+def expect_positive(members):
+    assert np.isfinite(members.record).all()
+    for p in members.p:
+        size = round(math.sqrt(2 * len(p) + 0.25) - 0.5)
+        diagonal = [at.py_func(size, i, i) for i in range(size)]
+        assert (p[diagonal] > 0.0).all()
 
 
 @pytest.mark.parametrize('width', [1e-6, 0.02, 0.04, 0.5, 2.0, 9.0, 30.0])
@@ -414,6 +417,14 @@ def test_an_interval_far_off_counts_as_its_nearer_end(sign):
     assert 20.0 <= sign * mean <= 20.1
     assert chance == pytest.approx(-200.0)
     assert 0.0 < lost < 1.0
+
+
+@pytest.mark.parametrize('counts', [1024, 2**20])
+def test_covariances_stay_positive_where_y_is_quantised(counts):
+    quantum, t = 2.0 * np.pi / counts, np.arange(4000) * PERIOD
+    observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
+    observer.run(t, np.round(np.sin(5.0 * t) / quantum) * quantum)
+    expect_positive(members_of(observer))
 
 
 SLOW = np.arange(30_000) * PERIOD

@@ -21,6 +21,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     SCORE,
     Scratch,
     SQUARE,
+    USED,
 )
 
 VAGUE = 0.1
@@ -123,10 +124,10 @@ def take_interval(
     least = max(members.noise[SQUARE, 0] - quanta, 0.0) + (2.0 * VAGUE * half) ** 2
     inverse, taken, innovation = scratch.lines[0], scratch.lines[2], scratch.b[k]
     score, prior, far = members.record[SCORE, k], members.record[PRIOR, k], members.record[FAR, k]
-    first, noise = scratch.x[k][0], members.noise[SQUARE]
+    first, used = scratch.x[k][0], members.noise[USED]
     for g in range(COUNT):
         if COLOUR[g] != 0:
-            inverse[g] = taken[g] = 1.0 / (scratch.s[k, g] * noise[COLOUR[g]])
+            inverse[g] = taken[g] = 1.0 / (scratch.s[k, g] * used[COLOUR[g]])
             score[g] = UNUSED
             continue
         variance = INEXACT * (p[0, g] + least)
