@@ -150,7 +150,6 @@ class Client:
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self.node = Node('test_client', context=self._context, use_global_arguments=False)
         self._changed = threading.Condition()
-        self._received = 0
         self._services: dict[str, object] = {}
         self._spinner = Spinner(self.node)
 
@@ -170,7 +169,6 @@ class Client:
         def receive(message: object, info: dict) -> None:
             with self._changed:
                 messages.append(Published(info['source_timestamp'], message))
-                self._received += 1
                 self._changed.notify_all()
 
         subscribe_with_info(self.node, message_type, topic, receive, qos)
@@ -189,15 +187,13 @@ class Client:
 
     def wait(self, condition, what: str, timeout: float = DEADLINE) -> None:
         """Wait until `condition` holds; it is looked at on every message, and now and then."""
-        end, seen = time.monotonic() + timeout, -1
+        end = time.monotonic() + timeout
         # Without the lock: a condition that calls a service needs the thread that receives.
         while not condition():
             if time.monotonic() > end:
                 raise TimeoutError(f'no {what} within {timeout} s')
             with self._changed:
-                if self._received == seen:
-                    self._changed.wait(0.05)
-                seen = self._received
+                self._changed.wait(0.05)
 
     def call_later(self, service: str, service_type: type, request: object, wait: bool = True):
         """Send a request and return the future of its answer; `wait` for the service first."""
