@@ -12,9 +12,12 @@ from fhaosmo_ros.core.observer.self_tuning.intervals import within
 from fhaosmo_ros.core.observer.self_tuning.jumps import otherwise, SHAPE
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOUR,
-    INTENSITY,
+    COUNT,
+    IN_BAND,
     KAPPA,
+    Members,
     members_in,
+    ORDER,
     ORDERS,
     SCORE,
     TAU,
@@ -25,6 +28,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.signal import lfilter
 from scipy.stats import norm, truncnorm
 from studies.everywhere import (
     Condition,
@@ -86,10 +90,10 @@ def rms(values):
 
 
 def members_of(observer):
-    """Return the members of an observer."""
-    return members_in.py_func(
-        observer.state.levels[arrays.ROWS + observer.levels :], observer.order
-    )
+    """Return copies of the members' arrays."""
+    rows = observer.state.levels[arrays.ROWS + observer.levels :]
+    count, *views = members_in(rows, observer.order, COUNT)
+    return Members(count, *(view.copy() for view in views))
 
 
 def filtered(y, periods, rates, intensity, variance, first, covariance):
@@ -129,21 +133,27 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
         observer.step(measured, h)
     after = members_of(observer)
     for k in range(ORDERS):
-        g = np.argmax(np.where(COLOUR == 0, members.record[SCORE, k], -np.inf)[: moving - 12])
-        size, first = 4 + k, members.x[k][:, g]
-        covariance, upper = np.zeros((size, size)), np.triu_indices(size)
-        covariance[upper] = members.p[k][:, g]
-        covariance += np.triu(covariance, 1).T
+        scores = np.where((COLOUR == 0) & (k == ORDER), members.record[SCORE], -np.inf)
+        g = np.argmax(scores[: moving - 2 * IN_BAND])
+        size, first, upper = 4 + k, members.x[: 4 + k, g], np.triu_indices(3 + ORDERS)
+        covariance = np.zeros((3 + ORDERS, 3 + ORDERS))
+        covariance[upper] = members.p[:, g]
+        covariance = (covariance + np.triu(covariance, 1).T)[:size, :size]
         rates = np.eye(size, k=1)
         rates[2, 2] = -1.0
         rates[range(3, size), range(3, size)] = -members.rates[KAPPA, g]
-        drive, variance = members.record[INTENSITY, k, g], members.noise[USED, 0]
+        drive, variance = members.drive[k, g], members.noise[USED, 0]
         found, expected = filtered(samples, periods, rates, drive, variance, first, covariance)
-        estimate = after.x[k][:, g]
+        estimate = after.x[:, g]
         deviations = np.sqrt(np.diag(expected)[:size])
-        assert (np.abs(estimate - found[:size]) < 1e-6 * deviations).all(), k
-        triangle = after.p[k][:, g]
-        np.testing.assert_allclose(triangle, expected[:size, :size][upper], rtol=1e-6)
+        assert (np.abs(estimate[:size] - found[:size]) < 1e-6 * deviations).all(), k
+        triangle = np.zeros_like(expected, shape=(3 + ORDERS, 3 + ORDERS))
+        triangle[upper] = after.p[:, g]
+        np.testing.assert_allclose(
+            triangle[:size, :size], np.triu(expected[:size, :size]), rtol=1e-6
+        )
+        assert not estimate[size:].any()
+        assert not triangle[:, size:].any()
 
 
 def test_a_sample_that_is_not_likely_changes_no_member(case):
@@ -155,10 +165,8 @@ def test_a_sample_that_is_not_likely_changes_no_member(case):
     before = members_of(observer)
     assert observer.step(y[300] + 10.0, PERIOD).status & Status.REJECTED_SPIKE
     after = members_of(observer)
-    for one, other in zip(
-        before.x + before.p + before.gain, after.x + after.p + after.gain, strict=True
-    ):
-        np.testing.assert_array_equal(one, other)
+    for name in ('x', 'p', 'gain'):
+        np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
 
 
 @pytest.mark.parametrize(
@@ -392,10 +400,10 @@ def test_covariances_stay_positive(noise):
 
 def expect_positive(members):
     assert np.isfinite(members.record).all()
-    for p in members.p:
-        size = round(math.sqrt(2 * len(p) + 0.25) - 0.5)
-        diagonal = [at.py_func(size, i, i) for i in range(size)]
-        assert (p[diagonal] > 0.0).all()
+    size = len(members.x)
+    for i in range(size):
+        of_state = i - (size - ORDERS) <= ORDER  # other models of d do not have it
+        assert (members.p[at.py_func(size, i, i), of_state] > 0.0).all()
 
 
 @pytest.mark.parametrize('width', [1e-6, 0.02, 0.04, 0.5, 2.0, 9.0, 30.0])
@@ -424,6 +432,21 @@ def test_covariances_stay_positive_where_y_is_quantised(counts):
     quantum, t = 2.0 * np.pi / counts, np.arange(4000) * PERIOD
     observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
     observer.run(t, np.round(np.sin(5.0 * t) / quantum) * quantum)
+    expect_positive(members_of(observer))
+
+
+def test_coloured_noise_is_found_where_y_is_quantised_no_more():
+    """Members with coloured noise take no part before, and go on from the others then."""
+    quantum, t = 1e-2, np.arange(8000) * PERIOD
+    observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
+    y = np.round(np.sin(2.0 * t) / quantum) * quantum
+    observer.run(t[:4000], y[:4000])
+    assert observer.tuning.correlation == 0.0
+    assert observer.state.memory[arrays.ACTIVE] < COUNT
+    noise = 0.1 * lfilter([1.0], [1.0, -0.9], np.random.default_rng(3).standard_normal(4000))
+    observer.run(t[4000:], np.sin(2.0 * t[4000:]) + noise)
+    assert observer.state.memory[arrays.ACTIVE] == COUNT
+    assert observer.tuning.correlation > 0.6
     expect_positive(members_of(observer))
 
 

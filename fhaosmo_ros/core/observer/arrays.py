@@ -40,11 +40,12 @@ Entries of ``State.memory``:
 | FAR_SIGN | sign of the last innovation that was too far off for every member | 1 |
 | QUANTUM | smallest step of y seen | of y |
 | LATTICE | share of the steps of y that are multiples of the smallest | 1 |
-| MOVING | members of each k whose covariances move | 1 |
+| MOVING | members of each half whose covariances move | 1 |
+| ACTIVE | members that take part; 0 before the members have begun | 1 |
 | UNSETTLED | time since they began to | s |
 | STEADY_PERIOD, FLOW_PERIOD | interval that the covariances, and the flow, are those of | s |
 | FIRST_NOISE | variance of the noise when the members began | of y^2 |
-| LIKELIEST | the likeliest member: k times their number, plus its index | 1 |
+| LIKELIEST | the likeliest member | 1 |
 | CALM | samples since the noise has grown | 1 |
 | GROWING | unlikely samples in a row that are farther and farther off, without being noise | 1 |
 | FIRST_OFF | how far off the first of the unlikely samples in a row was | of y |
@@ -56,7 +57,7 @@ Entries of ``State.memory``:
 | ROUGHNESS | short mean of the squared differences of y, over their usual size | 1 |
 | INTERVAL | last interval between two samples that were taken | s |
 | JITTER | variance of the stamps of late, over the square of the interval | 1 |
-| TOLD | the member whose model a smoother goes by, as LIKELIEST | 1 |
+| TOLD | the member whose model a smoother goes by | 1 |
 | TURNS | of late, the share of samples that were unlikely, on a new side, not rough | 1 |
 """
 
@@ -92,7 +93,7 @@ OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
 SAMPLES, FAR_SIGN, QUANTUM, LATTICE, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
 FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM, GROWING, FIRST_OFF = range(25, 31)
 NARROWED, ONE_SIDED, RECENT, ROUGHNESS, INTERVAL, JITTER, TURNS, TOLD, UNEVEN = range(31, 40)
-FIRST_ROUGH, MEMORY = range(40, 42)
+FIRST_ROUGH, ACTIVE, MEMORY = range(40, 43)
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)

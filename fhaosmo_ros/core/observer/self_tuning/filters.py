@@ -2,30 +2,30 @@
 """The members as filters: prediction and correction of estimates and covariances (D 27)."""
 
 import math
+from typing import Any
 
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.observer.self_tuning.members import (
-    COLOUR,
+    COLOURS,
     CORRELATION,
-    COUNT,
     DECAYED,
     FACTORIALS,
     FAST,
     fill,
-    grid,
-    IN_BAND,
-    INTENSITY,
+    FIRST,
+    HALF,
     KAPPA,
+    LOG_VARIANCE,
     Members,
     ORDERS,
-    repeat,
     RESIDUAL,
     Scratch,
     SQUARE,
     USED,
     VARIANCE,
 )
+import numpy as np
 
 HUBER = 3.0
 """Innovations of more standard deviations count as so many (Huber 1964)."""
@@ -38,178 +38,170 @@ exact than its prediction: what is left of P then is more than what rounding mak
 
 @compiled(forceinline=True)
 def at(d: int, i: int, j: int) -> int:
-    """Return the row of P_ij, i <= j, in an upper triangle of d rows."""
-    return i * d - i * (i - 1) // 2 + j - i
+    """Return the row of P_ij in an upper triangle of d rows."""
+    low, high = min(i, j), max(i, j)
+    return low * d - low * (low - 1) // 2 + high - low
 
 
 @compiled(forceinline=True, fastmath=FAST)
-def add_scaled(row: Floats, factor: float, other: Floats, columns: int) -> None:
-    """Add `other` times a factor, which is often 0, to the first columns of a row."""
-    if factor != 0.0:
-        for g in range(columns):
-            row[g] += factor * other[g]
+def add_three(
+    row: Floats,
+    a: float,
+    one: Floats,
+    b: float,
+    two: Floats,
+    c: float,
+    three: Floats,
+    first: int,
+    last: int,
+) -> None:
+    """Add three rows times factors, which are often 0, to the columns `first` .. `last` - 1."""
+    if a != 0.0 or b != 0.0 or c != 0.0:
+        for g in range(first, last):
+            row[g] += a * one[g] + b * two[g] + c * three[g]
+
+
+@compiled(forceinline=True)
+def by_model(flow: Floats, i: int, m: int, n: int) -> tuple[float, float, float, int, int]:
+    """Return what z_m and the next two do to z_i, 0 beyond z_n; and which those two are."""
+    e, f = min(m + 1, n - 1), min(m + 2, n - 1)
+    return flow[i, m], flow[i, e] if e > m else 0.0, flow[i, f] if f > m + 1 else 0.0, e, f
 
 
 @compiled(fastmath=FAST)
 def predict_states(
-    members: Members, n: int, k: int, h: float, mean: Floats, predicted: Floats, ahead: Floats
+    members: Members, scratch: Scratch, n: int, h: float, mean: Floats, predicted: Floats
 ) -> None:
     """Predict the members' estimates: the mean's path, plus the flow of their deviations."""
     flow, kappa, decayed = members.flow, members.rates[KAPPA], members.rates[DECAYED]
-    x = members.x[k]
-    d, rate, second = x[n], x[n + min(k, 1)], x[n + k]
+    x, ahead = members.x, scratch.x
+    d, rate, second = x[n], x[n + 1], x[n + 2]
     for i in range(n):
         base = predicted[i]
         for j in range(n + ORDERS):
             base -= flow[i, j] * mean[j]
         row, f0, f1, f2 = ahead[i], flow[i, n], flow[i, n + 1], flow[i, n + 2]
-        for g in range(COUNT):
+        for g in range(members.active):
             c = kappa[g]
-            row[g] = base + (f0 - c * (f1 - c * f2)) * d[g]
-        if k > 0:
-            for g in range(COUNT):
-                row[g] += (f1 - 2.0 * kappa[g] * f2) * rate[g]
-        if k > 1:
-            for g in range(COUNT):
-                row[g] += f2 * second[g]
-        for j in range(n):
-            add_scaled(row, flow[i, j], x[j], COUNT)
-    for i in range(k + 1):  # exp of D 17: e^(-kappa h) times a polynomial
-        row, other = ahead[n + i], x[n + i]
-        for g in range(COUNT):
-            row[g] = decayed[g] * other[g]
-        for j in range(i + 1, k + 1):
-            factor, other = h ** (j - i) / FACTORIALS[j - i], x[n + j]
-            for g in range(COUNT):
-                row[g] += decayed[g] * factor * other[g]
-
-
-@compiled(forceinline=True, fastmath=FAST)
-def add_chain(
-    row: Floats,
-    share: float,
-    intensity: Floats,
-    chain: Floats,
-    first: int,
-    terms: int,
-    one: Floats,
-    two: Floats,
-    three: Floats,
-    moving: int,
-) -> None:
-    """Begin a sum: a share of the intensity, and up to three terms with weights of `chain`."""
-    a, b, c = chain[first], chain[first + min(1, terms - 1)], chain[first + terms - 1]
-    if terms == 1:
-        for g in range(moving):
-            row[g] = share * intensity[g] + a[g] * one[g]
-    elif terms == 2:
-        for g in range(moving):
-            row[g] = share * intensity[g] + a[g] * one[g] + b[g] * two[g]
-    else:
-        for g in range(moving):
-            row[g] = share * intensity[g] + a[g] * one[g] + b[g] * two[g] + c[g] * three[g]
+            by_d, by_rate = f0 - c * (f1 - c * f2), f1 - 2.0 * c * f2
+            row[g] = base + by_d * d[g] + by_rate * rate[g] + f2 * second[g]
+        for m in range(0, n, 3):
+            a, b, c, e, f = by_model(flow, i, m, n)
+            add_three(row, a, x[m], b, x[e], c, x[f], 0, members.active)
+    # exp of D 17: e^(-kappa h) times a polynomial
+    row, other, last, half = ahead[n], ahead[n + 1], ahead[n + 2], 0.5 * h * h
+    for g in range(members.active):
+        row[g] = decayed[g] * (d[g] + h * rate[g] + half * second[g])
+    for g in range(members.active):
+        other[g] = decayed[g] * (rate[g] + h * second[g])
+        last[g] = decayed[g] * second[g]
 
 
 @compiled(fastmath=FAST)
-def predict_covariances(
-    members: Members, n: int, k: int, h: float, ahead: Floats, rest: Floats, moving: int
-) -> None:
-    """Write A P A' + Q of the members that move (D 27) to `ahead`."""
-    p, flow = members.p[k], members.flow
-    kappa, decayed = members.rates[KAPPA], members.rates[DECAYED]
-    intensity, d = members.record[INTENSITY, k], n + 1 + k
-    product = grid(rest, 0, d * d, moving)  # A P
-    # By what d and its derivatives act on each z, and in the last rows on d itself (D 17)
-    chain = grid(rest, d * d * moving, (n + 1) * (k + 1), moving)
-    for i in range(n):
-        f0, f1, f2 = flow[i, n], flow[i, n + 1], flow[i, n + 2]
-        first = chain[i * (k + 1)]
-        for g in range(moving):
-            first[g] = f0 - kappa[g] * (f1 - kappa[g] * f2)
-        if k > 0:
-            second = chain[i * (k + 1) + 1]
-            for g in range(moving):
-                second[g] = f1 - 2.0 * kappa[g] * f2
-        if k > 1:
-            chain[i * (k + 1) + 2] = f2
-    for i in range(k + 1):
-        row, factor = chain[n * (k + 1) + i], h**i / FACTORIALS[i]
-        for g in range(moving):
-            row[g] = factor * decayed[g]
+def multiply(members: Members, scratch: Scratch, n: int, h: float, first: int, last: int) -> None:
+    """Write A P of the columns `first` .. `last` - 1, as far as A P A' needs it."""
+    p, flow, product, chain = members.p, members.flow, scratch.product, scratch.chain
+    kappa, decayed, d = members.rates[KAPPA], members.rates[DECAYED], n + ORDERS
     lowest = d
     for i in range(d - 1, -1, -1):  # A has zeros below its diagonal, most of them
         lowest = min(lowest, i)
         for m in range(i if i < n else 0):
             if flow[i, m] != 0.0:
                 lowest = min(lowest, m)
+        if i >= n:
+            b, c = h if i < d - 1 else 0.0, 0.5 * h * h if i < d - 2 else 0.0
+            for j in range(lowest, d):
+                row, one = product[i * d + j], p[at(d, j, i)]
+                two, three = p[at(d, j, min(i + 1, d - 1))], p[at(d, j, d - 1)]
+                for g in range(first, last):
+                    row[g] = decayed[g] * (one[g] + b * two[g] + c * three[g])
+            continue
+        f0, f1, f2 = flow[i, n], flow[i, n + 1], flow[i, n + 2]
+        by_d, by_rate = chain[2 * i], chain[2 * i + 1]
+        for g in range(first, last):
+            by_d[g] = f0 - kappa[g] * (f1 - kappa[g] * f2)
+            by_rate[g] = f1 - 2.0 * kappa[g] * f2
         for j in range(lowest, d):
-            row, a = product[i * d + j], max(n, i)
-            terms, e, f = d - a, min(a + 1, d - 1), min(a + 2, d - 1)
-            one = p[at(d, min(j, a), max(j, a))]
-            two, three = p[at(d, min(j, e), max(j, e))], p[at(d, min(j, f), max(j, f))]
-            first_weight = min(i, n) * (k + 1)
-            add_chain(row, 0.0, intensity, chain, first_weight, terms, one, two, three, moving)
-            for m in range(n if i < n else 0):
-                add_scaled(row, flow[i, m], p[at(d, min(j, m), max(j, m))], moving)
-    for i in range(d):  # .. A' + Q, Q as in D 20
+            row = product[i * d + j]
+            one, two, three = p[at(d, j, n)], p[at(d, j, n + 1)], p[at(d, j, n + 2)]
+            for g in range(first, last):
+                row[g] = by_d[g] * one[g] + by_rate[g] * two[g] + f2 * three[g]
+            for m in range(0, n, 3):
+                a, b, c, e, f = by_model(flow, i, m, n)
+                one, two, three = p[at(d, j, m)], p[at(d, j, e)], p[at(d, j, f)]
+                add_three(row, a, one, b, two, c, three, first, last)
+
+
+@compiled(forceinline=True)
+def share(powers: Floats, h: float, a: int, b: int) -> float:
+    """Return the integral of t^(a + b) / (a! b!) over h: what q adds to a covariance (D 20)."""
+    return powers[a] * powers[b] * h / (a + b + 1) if a >= 0 and b >= 0 else 0.0
+
+
+@compiled(fastmath=FAST)
+def predict_covariances(
+    members: Members, scratch: Scratch, n: int, h: float, first: int, last: int
+) -> None:
+    """Write A P A' + Q of the columns `first` .. `last` - 1 (D 27)."""
+    multiply(members, scratch, n, h, first, last)
+    product, chain, flow, drive = scratch.product, scratch.chain, members.flow, members.drive
+    none, slope, curve = drive[0], drive[1], drive[2]
+    decayed, d, powers = members.rates[DECAYED], n + ORDERS, scratch.lines[0]
+    powers[0] = 1.0  # h^j / j!
+    for i in range(1, d):
+        powers[i] = powers[i - 1] * h / i
+    for i in range(d):
         for j in range(i, d):
-            below = 2 * d - 2 - i - j
-            share = h ** (below + 1) / (below + 1)
-            share /= FACTORIALS[d - 1 - i] * FACTORIALS[d - 1 - j]
-            row, a = ahead[at(d, i, j)], max(n, j)
-            terms = d - a
-            one = product[i * d + a]
-            two, three = product[i * d + min(a + 1, d - 1)], product[i * d + min(a + 2, d - 1)]
-            first_weight = min(j, n) * (k + 1)
-            add_chain(row, share, intensity, chain, first_weight, terms, one, two, three, moving)
-            for m in range(n if j < n else 0):
-                add_scaled(row, flow[j, m], product[i * d + m], moving)
+            row = scratch.p[at(d, i, j)]
+            q0 = share(powers, h, n - i, n - j)
+            q1 = share(powers, h, n + 1 - i, n + 1 - j)
+            q2 = share(powers, h, n + 2 - i, n + 2 - j)
+            if j >= n:
+                b, c = h if j < d - 1 else 0.0, 0.5 * h * h if j < d - 2 else 0.0
+                one, two = product[i * d + j], product[i * d + min(j + 1, d - 1)]
+                three = product[i * d + d - 1]
+                for g in range(first, last):
+                    q = q0 * none[g] + q1 * slope[g] + q2 * curve[g]
+                    row[g] = q + decayed[g] * (one[g] + b * two[g] + c * three[g])
+                continue
+            by_d, by_rate, f2 = chain[2 * j], chain[2 * j + 1], flow[j, n + 2]
+            one, two, three = product[i * d + n], product[i * d + n + 1], product[i * d + n + 2]
+            for g in range(first, last):
+                q = q0 * none[g] + q1 * slope[g] + q2 * curve[g]
+                row[g] = q + by_d[g] * one[g] + by_rate[g] * two[g] + f2 * three[g]
+            for m in range(0, n, 3):
+                a, b, c, e, f = by_model(flow, j, m, n)
+                one, two, three = product[i * d + m], product[i * d + e], product[i * d + f]
+                add_three(row, a, one, b, two, c, three, first, last)
 
 
 @compiled(fastmath=FAST)
 def expect_innovations(
-    members: Members, n: int, k: int, h: float, p: Floats, gain: Floats, s: Floats, moving: int
+    members: Members, scratch: Scratch, n: int, h: float, first: int, last: int
 ) -> None:
-    """
-    Write P C', and the variances of the innovations over that of the noise (D 27).
-
-    Of the members that move; the others keep their variances.
-    """
-    d, correlation, used = n + 1 + k, members.rates[CORRELATION], members.noise[USED]
-    for g in range(moving, COUNT):
-        s[g] = members.record[VARIANCE, k, g]
-    # z_1 of the sample before is the state of now, h back
-    third, curve = min(2, d - 1), -0.5 * h * h if d > 2 else 0.0
-    for i in range(d):
-        row, one, two = gain[i], p[at(d, 0, i)], p[at(d, min(i, 1), max(i, 1))]
-        three = p[at(d, min(i, third), max(i, third))]
-        for g in range(moving):
-            before = one[g] - h * two[g] - curve * three[g]
+    """Write P C', and variances of the innovations over that of the noise, of columns (D 27)."""
+    d, correlation, used = n + ORDERS, members.rates[CORRELATION], scratch.lines[0]
+    p, gain, s = scratch.p, scratch.gain, scratch.s
+    fill(used, members.noise[USED])
+    half = 0.5 * h * h
+    for i in range(d):  # z_1 of the sample before is the state of now, h back
+        row, one, two, three = gain[i], p[at(d, 0, i)], p[at(d, 1, i)], p[at(d, 2, i)]
+        for g in range(first, last):
+            before = one[g] - h * two[g] + half * three[g]
             row[g] = one[g] - correlation[g] * before
-    one, two, three = gain[0], gain[1], gain[third]
-    for g in range(moving):
-        before = one[g] - h * two[g] - curve * three[g]
-        s[g] = one[g] - correlation[g] * before
-    for g in range(moving):
-        s[g] = INEXACT * (1.0 + max(s[g], 0.0) / used[COLOUR[g]])
+    one, two, three = gain[0], gain[1], gain[2]
+    for g in range(first, last):
+        before = one[g] - h * two[g] + half * three[g]
+        s[g] = INEXACT * (1.0 + max(one[g] - correlation[g] * before, 0.0) / used[g])
 
 
 @compiled(fastmath=FAST)
-def allow_jump(
-    members: Members,
-    scratch: Scratch,
-    n: int,
-    k: int,
-    y: float,
-    tau: float,
-    p: Floats,
-    gain: Floats,
-) -> None:
+def allow_jump(members: Members, scratch: Scratch, n: int, y: float, tau: float) -> None:
     """
     Let the members believe that d has jumped: raise P as far as the sample asks for it (D 33).
 
     What the noise was before does not count, so that coloured noise begins afresh. Innovations,
-    their variances, `p` and `gain` are replaced.
+    their variances, and the predicted P and P C' are replaced.
 
     Parameters
     ----------
@@ -217,74 +209,114 @@ def allow_jump(
         Time since the jump; 0 for the samples that follow, for which P knows what is uncertain.
 
     """
-    used, more, d = scratch.lines[0], scratch.lines[1], n + 1 + k
-    b, s, first, a = scratch.b[k], scratch.s[k], scratch.x[k][0], members.rates[CORRELATION]
+    used, more, d = scratch.lines[0], scratch.lines[1], n + ORDERS
+    b, s, p, first, a = scratch.b, scratch.s, scratch.p, scratch.x[0], members.rates[CORRELATION]
     fill(used, members.noise[USED])
-    for g in range(COUNT):
+    for g in range(members.active):
         b[g] = y - first[g]
         variance, square = p[0, g] + used[g] / (1.0 - a[g] * a[g]), b[g] * b[g]
         more[g] = square - variance if square > HUBER * HUBER * variance else 0.0
         s[g] = INEXACT * (variance + more[g]) / used[g]
     if tau == 0.0:
-        for g in range(COUNT):
+        for g in range(members.active):
             more[g] = 1.0 + more[g] / p[0, g]
         for row in p:
-            for g in range(COUNT):
+            for g in range(members.active):
                 row[g] *= more[g]
     for i in range(n + 1 if tau > 0.0 else 0):  # at its begin, or at any time of it
         for j in range(i, n + 1):
-            share = FACTORIALS[n] / FACTORIALS[n - i] * FACTORIALS[n] / FACTORIALS[n - j]
-            share *= 0.5 + 0.5 * (2.0 * n + 1.0) / (2.0 * n + 1.0 - i - j)
-            add_scaled(p[at(d, i, j)], share / tau ** (i + j), more, COUNT)
+            part = FACTORIALS[n] / FACTORIALS[n - i] * FACTORIALS[n] / FACTORIALS[n - j]
+            part *= 0.5 + 0.5 * (2.0 * n + 1.0) / (2.0 * n + 1.0 - i - j)
+            row = p[at(d, i, j)]
+            for g in range(members.active):
+                row[g] += part / tau ** (i + j) * more[g]
     for i in range(d):
-        gain[i, :] = p[at(d, 0, i)]
+        scratch.gain[i, :] = p[at(d, 0, i)]
 
 
 @compiled(fastmath=FAST)
-def correct_covariances(
-    members: Members,
-    n: int,
-    k: int,
-    p: Floats,
-    gain: Floats,
-    lines: Floats,
-    moving: int,
-) -> None:
+def correct_covariances(members: Members, scratch: Scratch, n: int, first: int, last: int) -> None:
     """
-    Take a sample into P of the members that move, and turn P C' into their gains (D 27).
+    Take a sample into P of the columns `first` .. `last` - 1, and turn P C' into gains (D 27).
 
-    By factors for each member in `lines`: gains are P C' times the first of them, and P loses
-    P C' C P times the third.
+    By factors for each member in lines 0 and 2 of the scratch: gains are P C' times the first of
+    them, and P loses P C' C P times the other.
     """
-    d, inverse, scaled, taken = n + 1 + k, lines[0], lines[1], lines[2]
-    corrected, gains = members.p[k], members.gain[k]
+    inverse, scaled, taken, d = scratch.lines[0], scratch.lines[1], scratch.lines[2], n + ORDERS
     for i in range(d):
-        first, row = gain[i], gains[i]
-        for g in range(moving):
-            scaled[g] = first[g] * taken[g]
+        one, row = scratch.gain[i], members.gain[i]
+        for g in range(first, last):
+            scaled[g] = one[g] * taken[g]
+            row[g] = one[g] * inverse[g]
         for j in range(i, d):
-            second, before, after = gain[j], p[at(d, i, j)], corrected[at(d, i, j)]
-            for g in range(moving):
-                after[g] = before[g] - scaled[g] * second[g]
-        for g in range(moving):
-            row[g] = first[g] * inverse[g]
+            two, before, after = scratch.gain[j], scratch.p[at(d, i, j)], members.p[at(d, i, j)]
+            for g in range(first, last):
+                after[g] = before[g] - scaled[g] * two[g]
 
 
 @compiled(fastmath=FAST)
 def correct_states(members: Members, scratch: Scratch, n: int, y: float) -> None:
     """Correct the members' predictions by their innovations, of bounded influence."""
-    correlation, limit = members.rates[CORRELATION], scratch.lines[0]
-    for g in range(IN_BAND):
-        square = members.noise[SQUARE, COLOUR[g]]
-        limit[g] = HUBER * math.sqrt(square / (1.0 - correlation[g] * correlation[g]))
-    repeat(limit)
-    for k in range(ORDERS):
-        x, predicted, gain = members.x[k], scratch.x[k], members.gain[k]
-        innovation = scratch.b[k]
-        for i in range(n + 1 + k):
-            row, source, factor = x[i], predicted[i], gain[i]
-            for g in range(COUNT):
-                row[g] = source[g] + factor[g] * innovation[g]
-        residual, first = members.record[RESIDUAL, k], x[0]
-        for g in range(COUNT):
-            residual[g] = min(max(y - first[g], -limit[g]), limit[g])
+    limit, limits = scratch.lines[0], scratch.lines[1]
+    for c in range(COLOURS.size):
+        a = members.rates[CORRELATION, FIRST[c]]
+        limits[c] = HUBER * math.sqrt(members.noise[SQUARE, c] / (1.0 - a * a))
+    fill(limit, limits)
+    x, residual, b = members.x, members.record[RESIDUAL], scratch.b
+    for i in range(n + ORDERS):
+        row, predicted, gain = x[i], scratch.x[i], members.gain[i]
+        for g in range(members.active):
+            row[g] = predicted[g] + gain[g] * b[g]
+    first = x[0]
+    for g in range(members.active):
+        residual[g] = min(max(y - first[g], -limit[g]), limit[g])
+
+
+@compiled(forceinline=True)
+def of_moving(members: Members, moving: int) -> tuple[int, int]:
+    """Return how many runs of columns move, the second one from `HALF` on, and their length."""
+    if moving == HALF:
+        return 1, members.active
+    return members.active // HALF if moving > 0 else 0, moving
+
+
+@compiled(forceinline=True)
+def column(index: int) -> Any:
+    """Return an index that the compiler knows not to count from the end, as -1 would."""
+    return np.uint64(index)
+
+
+@compiled(fastmath=FAST)
+def expect(members: Members, scratch: Scratch, n: int, h: float, y: float, moving: int) -> None:
+    """Write what the members expect of a sample, and by what it is off, to `scratch`."""
+    b, s, first, residual = scratch.b, scratch.s, scratch.x[0], members.record[RESIDUAL]
+    correlation, variance = members.rates[CORRELATION], members.record[VARIANCE]
+    for g in range(members.active):
+        b[g] = y - first[g] - correlation[g] * residual[g]
+    for g in range(members.active):
+        s[g] = variance[g]
+    runs, length = of_moving(members, moving)
+    for run in range(runs):
+        begin, end = column(run * HALF), column(run * HALF + length)
+        predict_covariances(members, scratch, n, h, begin, end)
+        expect_innovations(members, scratch, n, h, begin, end)
+
+
+@compiled(fastmath=FAST)
+def correct(members: Members, scratch: Scratch, n: int, moving: int, by_interval: bool) -> None:
+    """Take a sample into the covariances that move, by the factors of `take_interval` or not."""
+    inverse, used, taken, s = scratch.lines[0], scratch.lines[1], scratch.lines[2], scratch.s
+    variance, log_variance = members.record[VARIANCE], members.record[LOG_VARIANCE]
+    runs, length = of_moving(members, moving)
+    if runs > 0 and not by_interval:
+        fill(used, members.noise[USED])
+    for run in range(runs):
+        first, last = column(run * HALF), column(run * HALF + length)
+        for g in range(first, last):
+            variance[g] = s[g]
+        if not by_interval:
+            for g in range(first, last):
+                inverse[g] = taken[g] = 1.0 / (s[g] * used[g])
+            for g in range(first, last):
+                log_variance[g] = math.log(s[g])
+        correct_covariances(members, scratch, n, first, last)

@@ -11,17 +11,25 @@ import math
 
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
+from fhaosmo_ros.core.observer.arrays import ACTIVE, UNSETTLED
+from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import HUBER, INEXACT
 from fhaosmo_ros.core.observer.self_tuning.members import (
-    COLOUR,
     COUNT,
     FAR,
+    HALF,
+    KINDS,
+    LOG_VARIANCE,
     Members,
     PRIOR,
+    RESIDUAL,
     SCORE,
     Scratch,
+    SHORT,
     SQUARE,
     USED,
+    VARIANCE,
+    WEIGHT,
 )
 
 VAGUE = 0.1
@@ -95,10 +103,8 @@ def within(low: float, high: float) -> tuple[float, float, float]:
 def take_interval(
     members: Members,
     scratch: Scratch,
-    k: int,
     y: float,
     repeated: bool,
-    p: Floats,
     quanta: float,
     kept: float,
 ) -> None:
@@ -106,36 +112,31 @@ def take_interval(
     Take a quantised sample into the log-likelihoods, and find how it corrects members (D 31).
 
     For `correct_states` and `correct_covariances`: innovations in ``scratch.b``, and their factors
-    in ``scratch.lines``. Members with coloured noise go on as with any sample.
+    in ``scratch.lines``. Members with coloured noise do not take part.
 
     Parameters
     ----------
     repeated : bool
         True if the sample before was the same.
-    p : array
-        Predicted covariances.
     quanta : float
         Variance of the error of rounding.
     kept : float
         Part of the log-likelihoods that is not forgotten; negative to leave them as they are.
 
     """
-    half = math.sqrt(3.0 * quanta)
-    least = max(members.noise[SQUARE, 0] - quanta, 0.0) + (2.0 * VAGUE * half) ** 2
-    inverse, taken, innovation = scratch.lines[0], scratch.lines[2], scratch.b[k]
-    score, prior, far = members.record[SCORE, k], members.record[PRIOR, k], members.record[FAR, k]
-    first, used = scratch.x[k][0], members.noise[USED]
-    for g in range(COUNT):
-        if COLOUR[g] != 0:
-            inverse[g] = taken[g] = 1.0 / (scratch.s[k, g] * used[COLOUR[g]])
-            score[g] = UNUSED
-            continue
-        variance = INEXACT * (p[0, g] + least)
-        size, off = math.sqrt(variance), y - first[g]
+    half, p, noise = math.sqrt(3.0 * quanta), scratch.p[0], members.noise[SQUARE, 0]
+    least = max(noise - quanta, 0.0) + (2.0 * VAGUE * half) ** 2
+    inverse, taken, innovation = scratch.lines[0], scratch.lines[2], scratch.b
+    score, prior, far = members.record[SCORE], members.record[PRIOR], members.record[FAR]
+    for g in range(members.active):
+        square = innovation[g] * innovation[g]
+        far[g] = far[g] + 1.0 if square > GATE * GATE * scratch.s[g] * noise else 0.0
+        variance = INEXACT * (p[g] + least)
+        size, off = math.sqrt(variance), y - scratch.x[0, g]
         chance, mean, lost = within((off - half) / size, (off + half) / size)
         likelihood = max(chance, LEAST_CHANCE)
         if repeated:  # it was there before
-            size, off = math.sqrt(members.p[k][0, g] + least), y - members.x[k][0, g]
+            size, off = math.sqrt(members.p[0, g] + least), y - members.x[0, g]
             stayed, _, _ = within((off - half) / size, (off + half) / size)
             likelihood = min(likelihood - max(stayed, LEAST_STAYED), 0.0)
         if kept >= 0.0:
@@ -147,3 +148,29 @@ def take_interval(
             limit = HUBER * (1.0 + late * late)
             innovation[g] = min(max(mean, -limit), limit) * math.sqrt(variance)
             inverse[g], taken[g] = 1.0 / variance, lost / variance
+
+
+@compiled()
+def choose_members(members: Members, memory: Floats, quanta: float) -> int:
+    """
+    Return how many members take part: where y is quantised, those with white noise (D 31).
+
+    Errors of rounding are not coloured noise. When y is quantised no more, members with coloured
+    noise go on from those with white noise.
+    """
+    before, count = memory[ACTIVE], HALF if quanta > 0.0 else COUNT
+    memory[ACTIVE] = count
+    if count < before:
+        for g in range(HALF, COUNT):
+            members.record[WEIGHT, g], members.record[SCORE, g] = 0.0, UNUSED
+    elif count > before:
+        memory[UNSETTLED] = 0.0
+        members.noise[SQUARE] = members.noise[USED] = members.noise[SQUARE, 0]
+        for g in range(HALF, COUNT):
+            white = (g - HALF) // KINDS * KINDS  # of the same band, k and kappa
+            members.x[:, g], members.p[:, g] = members.x[:, white], members.p[:, white]
+            members.gain[:, g], members.record[RESIDUAL, g] = members.gain[:, white], 0.0
+            members.record[VARIANCE, g] = members.record[VARIANCE, white]
+            members.record[LOG_VARIANCE, g] = members.record[LOG_VARIANCE, white]
+            members.record[SHORT, g], members.record[FAR, g] = 1.0, 0.0
+    return count

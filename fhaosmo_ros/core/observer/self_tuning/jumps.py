@@ -28,9 +28,9 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOUR,
     COUNT,
     FAR,
+    HALF,
     KAPPA,
     Members,
-    ORDERS,
     put,
     RESIDUAL,
     SCORE,
@@ -156,13 +156,13 @@ def follow_innovations(members: Members, b: Floats, s: Floats, quanta: float) ->
     Only of members with white noise, since coloured noise explains jumps; and of a y that is not
     quantised, whose errors of rounding have a mean for many samples.
     """
-    recent, (k, g) = members.recent, divmod(int(members.watch[MEMBER]), COUNT)
+    recent, g = members.recent, int(members.watch[MEMBER])
     if quanta > 0.0 or COLOUR[g] > 0:
         recent[:] = 0.0
     else:
         for j in range(WINDOW - 1):
             recent[j] = recent[j + 1]
-        recent[WINDOW - 1] = b[k, g] / math.sqrt(s[k, g] * members.noise[SQUARE, 0])
+        recent[WINDOW - 1] = b[g] / math.sqrt(s[g] * members.noise[SQUARE, 0])
     members.watch[AGE] += 1.0
     if members.watch[AGE] >= WINDOW:
         members.watch[AGE] = 0.0
@@ -183,19 +183,17 @@ def samples_since_jump(members: Members, n: int, told: float) -> int:
         members.recent[:] = 0.0
         members.watch[MEMBER] = told
         return 0
-    k, g = divmod(int(members.watch[MEMBER]), COUNT)
+    g = int(members.watch[MEMBER])
     if best <= GATE * GATE or not recent or BANDWIDTHS[g] * WINDOW > 1.0:
         return 0
     if best <= otherwise(r, n) + SHAPE:
         return 0
     score, before = members.record[SCORE], members.before[0 if members.watch[AGE] >= count else 1]
-    gained, most, coloured = score[k, g] - before[k, g], 0.0, -math.inf
-    for i in range(ORDERS):
-        for m in range(COUNT):
-            if COLOUR[m] > 0:
-                coloured = max(coloured, 2.0 * (before[i, m] - before[k, g]))
-            else:
-                most = max(most, 2.0 * (score[i, m] - before[i, m] - gained))
+    gained, most, coloured = score[g] - before[g], 0.0, -math.inf
+    for m in range(HALF):
+        most = max(most, 2.0 * (score[m] - before[m] - gained))
+    for m in range(HALF, COUNT):
+        coloured = max(coloured, 2.0 * (before[m] - before[g]))
     return count if best > most + BELIEVED and coloured < -BELIEVED else 0
 
 
@@ -230,26 +228,19 @@ def otherwise(r: Floats, n: int) -> float:
 @compiled()
 def follow_jump(members: Members, memory: Floats, n: int, count: int, s: Floats, y: float) -> None:
     """Let all members go on from the one that is followed, as if only z_1 had jumped (D 35)."""
-    k, g = divmod(int(members.watch[MEMBER]), COUNT)
-    variance, total = s[k, g] * members.noise[SQUARE, 0], 0.0
+    g = int(members.watch[MEMBER])
+    variance, total = s[g] * members.noise[SQUARE, 0], 0.0
     for j in range(WINDOW - count, WINDOW):
         total += members.recent[j] * math.sqrt(variance)
-    before = members.x[k][:, g] - total * members.gain[k][:, g]  # nothing of the jump is in z or d
-    kappa, estimate = members.rates[KAPPA, g], np.zeros(n + ORDERS)
-    estimate[: n + 1] = before[: n + 1]
+    before = members.x[:, g] - total * members.gain[:, g]  # nothing of the jump is in z or d
+    kappa, estimate = members.rates[KAPPA, g], before.copy()
     estimate[0] += total / count
-    if k > 0:
-        estimate[n + 1] = before[n + 1]
-    if k > 1:
-        estimate[n + 2] = before[n + 2] - 2.0 * kappa * before[n + 1]
-    estimate[n + 2] += kappa * kappa * before[n]
     estimate[n + 1] -= kappa * before[n]
-    for i in range(ORDERS):
-        p, residual, far = members.p[i], members.record[RESIDUAL, i], members.record[FAR, i]
-        for m in range(COUNT):
-            put(members, n, i, m, estimate)
-            p[0, m] += variance / count
-            residual[m], far[m] = y - estimate[0], 0.0
+    estimate[n + 2] -= kappa * (2.0 * before[n + 1] - kappa * before[n])
+    for m in range(COUNT):
+        put(members, n, m, estimate)
+        members.p[0, m] += variance / count
+        members.record[RESIDUAL, m], members.record[FAR, m] = y - estimate[0], 0.0
     members.record[SCORE] = members.before[1]
     memory[UNSETTLED], memory[JUMPS] = 0.0, total / count
     watch(members, members.watch[MEMBER])

@@ -3,9 +3,10 @@
 The members of the self-tuning observer: which they are, and where they lie in memory (D 26).
 
 A member is an observer with its own model of d (D 17: k = 0, 1 or 2 derivatives, intensity q,
-decay kappa) and of the noise (white, or coloured: v_j = a v_{j-1} + w_j). Members of the same k
-form an array, the slowest first. Arrays have one column a member, so that a step of all members is
-a few loops that the compiler turns into vector instructions.
+decay kappa) and of the noise (white, or coloured: v_j = a v_{j-1} + w_j). All have N = n + 3
+states, of which those of derivatives that a model does not have stay 0. Arrays have one column a
+member, so that a step of all members is a few long loops that the compiler turns into vector
+instructions. Members with white noise come first, and of each half the slowest.
 
 The members lie in the rows of ``State.levels`` behind the covariance, one array after the other.
 """
@@ -14,6 +15,7 @@ import math
 from typing import NamedTuple
 
 from fhaosmo_ros.core.compiled.cache import compiled
+from fhaosmo_ros.core.compiled.unowned_arrays import doubles_at
 from fhaosmo_ros.core.model.bytecode import Floats
 import numpy as np
 from numpy.typing import NDArray
@@ -21,23 +23,28 @@ from numpy.typing import NDArray
 ORDERS = 3
 """Members have k = 0, 1, 2 derivatives of d."""
 BANDS = 15
-"""Bandwidths of the members of each k."""
+"""Bandwidths omega of the members of each k."""
 SLOWEST, QUICKEST = 6e-4, 3.0
 """Their range, in rad a sample."""
+DECAYS = np.array([0.1, 0.5, 1.5])
+"""kappa / omega of the members with white noise; with coloured noise it is the first."""
 COLOURS = np.array([0.0, 0.7, 0.92, 0.98])
 """Correlations a of the noise of neighbouring samples."""
-KINDS = np.array([(0, 0.1), (0, 0.5), (0, 1.5), *((c, 0.1) for c in range(1, len(COLOURS)))])
-"""Members of each bandwidth omega: index of the colour, and kappa / omega."""
-IN_BAND = len(KINDS)
-FIRST = np.searchsorted(KINDS[:, 0], np.arange(len(COLOURS)))
-"""The first of each colour."""
-COUNT = BANDS * IN_BAND
-"""Members of each k."""
+KINDS = len(DECAYS)
+"""Members of each bandwidth and k in each half: kappa differs, or the colour."""
+IN_BAND = ORDERS * KINDS
+HALF = BANDS * IN_BAND
+"""Members with white noise, and with coloured noise."""
+COUNT = 2 * HALF
 STEP_OF_BANDS = (QUICKEST / SLOWEST) ** (1.0 / (BANDS - 1))
-BANDWIDTHS = np.repeat(np.geomspace(SLOWEST, QUICKEST, BANDS), IN_BAND)
+BANDWIDTHS = np.tile(np.repeat(np.geomspace(SLOWEST, QUICKEST, BANDS), IN_BAND), 2)
 """omega of each member, in rad a sample."""
-COLOUR = np.tile(KINDS[:, 0], BANDS).astype(np.int64)
-RATIO = np.tile(KINDS[:, 1], BANDS)
+ORDER = np.tile(np.repeat(np.arange(ORDERS), KINDS), 2 * BANDS)
+"""k of each member."""
+COLOUR = np.append(np.zeros(HALF, int), np.tile(np.arange(1, len(COLOURS)), HALF // KINDS))
+RATIO = np.append(np.tile(DECAYS, HALF // KINDS), np.full(HALF, DECAYS[0]))
+FIRST = np.searchsorted(COLOUR[: HALF + KINDS], np.arange(len(COLOURS)))
+"""The first member of each colour."""
 LONGEST = 13
 """Largest number of states and known chains: order 12 and d."""
 FACTORIALS = np.array([math.factorial(i) for i in range(2 * LONGEST + 8)], dtype=np.float64)
@@ -51,19 +58,15 @@ FAST = {'contract', 'nnan', 'nsz', 'reassoc'}
 
 KAPPA, TAU, CORRELATION, DECAYED = range(4)
 """Rows of `Members.rates`: kappa, correlation time of the noise, a and exp(-kappa h) for h."""
-WEIGHT, SCORE, VARIANCE, LOG_VARIANCE, RESIDUAL, FAR, SHORT, INTENSITY, PRIOR = range(9)
+WEIGHT, SCORE, VARIANCE, LOG_VARIANCE, RESIDUAL, FAR, SHORT, PRIOR = range(8)
 """
-Planes of `Members.record`: weights; log-likelihoods relative to the best; variances S of the
+Rows of `Members.record`: weights; log-likelihoods relative to the best; variances S of the
 innovations over that of the noise, and their logarithms; last residuals of y; samples in a row
-beyond the gate; short means of squared innovations; intensities q; scores without samples.
+beyond the gate; short means of squared innovations; scores without samples.
 """
-PLANES = 9
+RECORDS = 8
 SQUARE, USED = range(2)
 """Rows of `Members.noise`: variance of the noise of each colour, and the one that P counts on."""
-
-
-OfEach = tuple[Floats, Floats, Floats]
-"""An array for each k."""
 
 
 class Members(NamedTuple):
@@ -72,49 +75,52 @@ class Members(NamedTuple):
 
     Attributes
     ----------
+    active : int
+        How many take part: all, or those with white noise where y is quantised.
     rates : (4, COUNT) array
     noise : (2, colours) array
     rough : (1 + colours, n + 2) array
         Differences of y at the last sample, of order 0 to n + 1, and for each colour what those
         of order 1 to n + 1 say that the variance of the noise is at most.
-    record : (PLANES, ORDERS, COUNT) array
+    record : (RECORDS, COUNT) array
+    drive : (ORDERS, COUNT) array
+        Intensities q, each in the row of the member's k; 0 elsewhere.
     flow : (N, N) array
         Derivative of the prediction to the next sample.
     recent : (WINDOW,) array
         Innovations of the last samples over their standard deviations, of one member (D 35).
     watch : (2,) array
         Which member that is, and how many samples ago ``before[0]`` was.
-    before : (2, ORDERS, COUNT) array
+    before : (2, COUNT) array
         Scores of two earlier samples, `WINDOW` apart.
-    x : tuple of (n + 1 + k, COUNT) arrays
-        Estimates of z, d and its derivatives, of the members with k = 0, 1, 2.
-    p : tuple of ((n + 1 + k) (n + 2 + k) / 2, COUNT) arrays
+    x, gain : (N, COUNT) arrays
+        Estimates of z, d and (D + kappa)^j d; and by what an innovation corrects them.
+    p : (N (N + 1) / 2, COUNT) array
         Upper triangles of their covariances, row by row.
-    gain : tuple of (n + 1 + k, COUNT) arrays
 
     """
 
+    active: int
     rates: Floats
     noise: Floats
     rough: Floats
     record: Floats
+    drive: Floats
     flow: Floats
     recent: Floats
     watch: Floats
     before: Floats
-    x: OfEach
-    p: OfEach
-    gain: OfEach
+    x: Floats
+    p: Floats
+    gain: Floats
 
 
 def size_of(order: int) -> int:
     """Return how many numbers the members of a model with n = `order` states need."""
-    total = 4 * COUNT + 2 * len(COLOURS) + PLANES * ORDERS * COUNT + (order + ORDERS) ** 2
-    total += (1 + len(COLOURS)) * (order + 2) + WINDOW + 2 + 2 * ORDERS * COUNT
-    for k in range(ORDERS):
-        d = order + 1 + k
-        total += (2 * d + d * (d + 1) // 2) * COUNT
-    return total
+    d = order + ORDERS
+    columns = 4 + RECORDS + ORDERS + 2 + 2 * d + d * (d + 1) // 2
+    total = columns * COUNT + 2 * len(COLOURS) + d * d + WINDOW + 2
+    return total + (1 + len(COLOURS)) * (order + 2)
 
 
 def rows_of(order: int) -> int:
@@ -123,57 +129,33 @@ def rows_of(order: int) -> int:
 
 
 @compiled(forceinline=True)
-def grid(flat: Floats, at: int, rows: int, columns: int) -> Floats:
-    """Return the array of `rows` rows that begins at `at`."""
-    return flat[at : at + rows * columns].reshape((rows, columns))
+def grid(address: int, at: int, rows: int) -> Floats:
+    """Return the array of `rows` rows of COUNT columns, `at` numbers behind an address."""
+    array: Floats = doubles_at(address + 8 * at, (rows, COUNT))
+    return array
 
 
 @compiled(forceinline=True)
-def of_states(flat: Floats, at: int, d: int, columns: int) -> OfEach:
-    """Return arrays of d, d + 1 and d + 2 rows, one behind the other."""
-    second, third = at + d * columns, at + (2 * d + 1) * columns
-    return (
-        grid(flat, at, d, columns),
-        grid(flat, second, d + 1, columns),
-        grid(flat, third, d + 2, columns),
+def members_in(rows: Floats, n: int, active: int) -> Members:
+    """Return the members' arrays in the rows that hold them, which the caller keeps alive."""
+    address, c, colours, d = rows.ctypes.data, COUNT, COLOURS.size, n + ORDERS
+    rates, at = grid(address, 0, 4), 4 * c
+    record, at = grid(address, at, RECORDS), at + RECORDS * c
+    drive, at = grid(address, at, ORDERS), at + ORDERS * c
+    before, at = grid(address, at, 2), at + 2 * c
+    x, at = grid(address, at, d), at + d * c
+    gain, at = grid(address, at, d), at + d * c
+    p, at = grid(address, at, d * (d + 1) // 2), at + d * (d + 1) // 2 * c
+    address += 8 * at
+    noise, address = doubles_at(address, (2, colours)), address + 16 * colours
+    rough, address = (
+        doubles_at(address, (1 + colours, n + 2)), address + 8 * (1 + colours) * (n + 2)
+    )  # fmt: skip
+    flow, address = doubles_at(address, (d, d)), address + 8 * d * d
+    recent, watch = doubles_at(address, WINDOW), doubles_at(address + 8 * WINDOW, 2)
+    return Members(
+        active, rates, noise, rough, record, drive, flow, recent, watch, before, x, p, gain
     )
-
-
-@compiled(forceinline=True)
-def of_pairs(flat: Floats, at: int, d: int, columns: int) -> OfEach:
-    """Return arrays of a row for each pair of d, d + 1 and d + 2 states, as `of_states` does."""
-    size = d * (d + 1) // 2
-    second, third = at + size * columns, at + (2 * size + d + 1) * columns
-    return (
-        grid(flat, at, size, columns),
-        grid(flat, second, size + d + 1, columns),
-        grid(flat, third, size + 2 * d + 3, columns),
-    )
-
-
-@compiled(forceinline=True)
-def members_in(rows: Floats, n: int) -> Members:
-    """Return the members' arrays in the rows that hold them."""
-    flat, c, colours, levels, d = rows.ravel(), COUNT, COLOURS.size, n + ORDERS, n + 2
-    rates, at = grid(flat, 0, 4, c), 4 * c
-    noise = flat[at : at + 2 * colours].reshape((2, colours))
-    at += 2 * colours
-    rough = flat[at : at + (1 + colours) * d].reshape((1 + colours, d))
-    at += (1 + colours) * d
-    record = flat[at : at + PLANES * ORDERS * c].reshape((PLANES, ORDERS, c))
-    at += PLANES * ORDERS * c
-    flow = flat[at : at + levels * levels].reshape((levels, levels))
-    at += levels * levels
-    recent, watch = flat[at : at + WINDOW], flat[at + WINDOW : at + WINDOW + 2]
-    at += WINDOW + 2
-    before = flat[at : at + 2 * ORDERS * c].reshape((2, ORDERS, c))
-    at += 2 * ORDERS * c
-    d = n + 1
-    states, pairs = 3 * d + 3, 3 * d * (d + 1) // 2 + 3 * d + 4
-    x = of_states(flat, at, d, c)
-    p = of_pairs(flat, at + states * c, d, c)
-    gain = of_states(flat, at + (states + pairs) * c, d, c)
-    return Members(rates, noise, rough, record, flow, recent, watch, before, x, p, gain)
 
 
 class Scratch(NamedTuple):
@@ -182,21 +164,26 @@ class Scratch(NamedTuple):
 
     Attributes
     ----------
-    lines : (7, COUNT) array
-    b, s : (ORDERS, COUNT) arrays
+    lines : (LINES, COUNT) array
+    b, s : (COUNT,) arrays
         Innovations, and their variances over that of the noise.
-    x : tuple of arrays
-        Predictions of the members' estimates.
-    rest : array
-        For what belongs to members that move.
+    x, gain, p : arrays
+        Predictions of the members' estimates and covariances, and P C'.
+    product : (N N, COUNT) array
+        A P, row by row.
+    chain : (2 n, COUNT) array
+        By what d and (D + kappa) d act on each z.
 
     """
 
     lines: Floats
     b: Floats
     s: Floats
-    x: OfEach
-    rest: Floats
+    x: Floats
+    gain: Floats
+    p: Floats
+    product: Floats
+    chain: Floats
 
 
 LINES = 7
@@ -205,53 +192,64 @@ LINES = 7
 def scratch_rows(order: int) -> int:
     """Return how many rows of N = n + 3 numbers a step needs for itself."""
     d = order + ORDERS
-    moving: int = moving_size.py_func(order)  # type: ignore[attr-defined]
-    total = LINES + 2 * ORDERS + 3 * d + moving + d * d + (order + 1) * ORDERS
-    return -(-total * COUNT // d)
-
-
-@compiled(forceinline=True)
-def moving_size(n: int) -> int:
-    """Return how many numbers the gains and covariances of a column are."""
-    d = n + 1
-    return 3 * d + 3 + 3 * d * (d + 1) // 2 + 3 * d + 4
+    columns = LINES + 2 + 2 * d + d * (d + 1) // 2 + d * d + 2 * order
+    return -(-columns * COUNT // d)
 
 
 @compiled(forceinline=True)
 def scratch_in(rows: Floats, n: int) -> Scratch:
-    """Return the memory of a step in the rows that hold it."""
-    flat, c = rows.ravel(), COUNT
-    lines, at = grid(flat, 0, LINES, c), LINES * c
-    b, s = grid(flat, at, ORDERS, c), grid(flat, at + ORDERS * c, ORDERS, c)
-    at += 2 * ORDERS * c
-    x = of_states(flat, at, n + 1, c)
-    return Scratch(lines, b, s, x, flat[at + (3 * n + 6) * c :])
+    """Return the memory of a step in the rows that hold it, which the caller keeps alive."""
+    address, c, d = rows.ctypes.data, COUNT, n + ORDERS
+    lines, at = grid(address, 0, LINES), LINES * c
+    b, s = doubles_at(address + 8 * at, c), doubles_at(address + 8 * (at + c), c)
+    at += 2 * c
+    x, at = grid(address, at, d), at + d * c
+    gain, at = grid(address, at, d), at + d * c
+    p, at = grid(address, at, d * (d + 1) // 2), at + d * (d + 1) // 2 * c
+    product, at = grid(address, at, d * d), at + d * d * c
+    return Scratch(lines, b, s, x, gain, p, product, grid(address, at, 2 * n))
 
 
-@compiled(forceinline=True)
-def repeat(values: Floats) -> None:
-    """Give the members of all bands the values of the first."""
-    for g in range(IN_BAND, COUNT):
+@compiled(forceinline=True, fastmath=FAST)
+def fill(values: Floats, of_colours: Floats) -> None:
+    """Write for each member the value of its colour."""
+    for g in range(HALF):
+        values[g] = of_colours[0]
+    for g in range(HALF, HALF + IN_BAND):
+        values[g] = of_colours[COLOUR[g]]
+    for g in range(HALF + IN_BAND, COUNT):
         values[g] = values[g - IN_BAND]
 
 
-@compiled(forceinline=True)
-def fill(values: Floats, of_colours: Floats) -> None:
-    """Write for each member of a k the value of its colour."""
-    for g in range(IN_BAND):
-        values[g] = of_colours[COLOUR[g]]
-    repeat(values)
+@compiled(fastmath=FAST)
+def largest_of(values: Floats, spare: Floats, count: int, period: int = 1) -> float:
+    """
+    Return the largest of the first `count` values.
+
+    With a `period` the largest of those that are so many apart are in ``spare[:period]`` then. By
+    halves: the compiler makes no vector instructions of a loop over the largest one so far.
+    """
+    half = (count // period + 1) // 2 * period
+    for g in range(count - half):
+        spare[g] = max(values[g], values[half + g])
+    for g in range(count - half, half):
+        spare[g] = values[g]
+    while half > period:
+        count, half = half, (half // period + 1) // 2 * period
+        for g in range(count - half):
+            spare[g] = max(spare[g], spare[half + g])
+    return float(spare[0])
 
 
 @compiled(forceinline=True)
-def put(members: Members, n: int, k: int, g: int, estimate: Floats) -> None:
+def put(members: Members, n: int, g: int, estimate: Floats) -> None:
     """Put a member to an estimate of z, d, d' and d''; its own states are (D + kappa)^j d."""
-    x, kappa = members.x[k], members.rates[KAPPA, g]
+    x, kappa = members.x, members.rates[KAPPA, g]
     for i in range(n + 1):
         x[i, g] = estimate[i]
-    if k > 0:
+    if ORDER[g] > 0:
         x[n + 1, g] = estimate[n + 1] + kappa * estimate[n]
-    if k > 1:
+    if ORDER[g] > 1:
         x[n + 2, g] = estimate[n + 2] + kappa * (2.0 * estimate[n + 1] + kappa * estimate[n])
 
 
@@ -294,16 +292,11 @@ def find_tuning(members: Members, found: Floats) -> None:
     weight, rates = members.record[WEIGHT], members.rates
     variance = correlation = bands = 0.0
     found[3:] = 0.0
-    for g in range(IN_BAND):  # the members of a kind differ in their bandwidths alone
-        of_kind = 0.0
-        for k in range(ORDERS):
-            for band in range(BANDS):
-                w = weight[k, band * IN_BAND + g]
-                of_kind += w
-                bands += w * band
-                found[3 + k] += w
-        a = rates[CORRELATION, g]
-        variance += of_kind * members.noise[SQUARE, COLOUR[g]] / (1.0 - a * a)
-        correlation += of_kind * a
+    for g in range(COUNT):
+        w, a = weight[g], rates[CORRELATION, g]
+        variance += w * members.noise[SQUARE, COLOUR[g]] / (1.0 - a * a)
+        correlation += w * a
+        bands += w * (g % HALF // IN_BAND)
+        found[3 + ORDER[g]] += w
     found[0], found[1] = math.sqrt(variance), correlation
     found[2] = rates[KAPPA, 0] / RATIO[0] * math.exp(bands * math.log(STEP_OF_BANDS))

@@ -17,19 +17,17 @@ from fhaosmo_ros.core.observer.arrays import (
 )
 from fhaosmo_ros.core.observer.self_tuning.filters import HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
-    BANDS,
     COLOUR,
     COLOURS,
     CORRELATION,
-    COUNT,
     FAR,
     FAST,
     fill,
     FIRST,
-    IN_BAND,
+    HALF,
+    KINDS,
+    largest_of,
     Members,
-    ORDERS,
-    repeat,
     SCORE,
     Scratch,
     SHORT,
@@ -158,23 +156,20 @@ def stamp_noise(members: Members, memory: Floats, h: float) -> float:
 
 
 @compiled(fastmath=FAST)
-def knowing(members: Members, scratch: Scratch, s: Floats) -> float:
+def knowing(members: Members, scratch: Scratch, s: Floats, likeliest: int) -> float:
     """
     Return the largest variance of the innovations with which a member can judge a sample.
 
     Members that have been found unlikely do not set it: without noise on y they expect innovations
     that are far too small. The likeliest one always can.
     """
-    noise, least, likeliest = scratch.lines[0], math.inf, math.inf
+    noise, less, spare = scratch.lines[0], scratch.lines[1], scratch.lines[2]
     fill(noise, members.noise[SQUARE])
-    for k in range(ORDERS):
-        share = s[k]
-        score = members.record[SCORE, k]
-        for g in range(COUNT):
-            variance = share[g] * noise[g]
-            least = min(least, variance if score[g] > -CLOSE else math.inf)
-            likeliest = min(likeliest, variance if score[g] == 0.0 else math.inf)
-    return max(IGNORANT * least, likeliest)
+    score = members.record[SCORE]
+    for g in range(members.active):
+        less[g] = -s[g] * noise[g] if score[g] > -CLOSE else -math.inf
+    least = -largest_of(less, spare, members.active)
+    return float(max(IGNORANT * least, s[likeliest] * noise[likeliest]))
 
 
 @compiled()
@@ -193,39 +188,22 @@ def is_likely(
 
     """
     noise, late = members.noise[SQUARE], math.inf if beyond <= PASSED else 1.0
-    for k in range(ORDERS):
-        for g in range(COUNT):
-            variance = s[k, g] * noise[COLOUR[g]]
-            follows = members.record[FAR, k, g] < late
-            judges = variance <= largest and members.record[SCORE, k, g] > -CLOSE
-            if judges and follows and b[k, g] * b[k, g] <= gate * gate * variance:
-                return True
+    for g in range(members.active):
+        variance = s[g] * noise[COLOUR[g]]
+        follows = members.record[FAR, g] < late
+        judges = variance <= largest and members.record[SCORE, g] > -CLOSE
+        if judges and follows and b[g] * b[g] <= gate * gate * variance:
+            return True
     return False
 
 
 @compiled()
 def is_explained(members: Members, b: Floats, s: Floats) -> bool:
     """Return True if any member finds a sample usual, however unlikely the member itself is."""
-    for k in range(ORDERS):
-        for g in range(COUNT):
-            variance = s[k, g] * members.noise[SQUARE, COLOUR[g]]
-            if b[k, g] * b[k, g] <= HUBER * HUBER * variance:
-                return True
+    for g in range(members.active):
+        if b[g] * b[g] <= HUBER * HUBER * s[g] * members.noise[SQUARE, COLOUR[g]]:
+            return True
     return False
-
-
-@compiled(fastmath=FAST)
-def over_colours(values: Floats) -> None:
-    """Replace each member's value by the largest one of its colour."""
-    for band in range(1, BANDS):
-        for i in range(IN_BAND):
-            values[i] = max(values[i], values[band * IN_BAND + i])
-    for i in range(IN_BAND):
-        first = FIRST[COLOUR[i]]
-        values[first] = max(values[first], values[i])
-    for i in range(IN_BAND):
-        values[i] = values[FIRST[COLOUR[i]]]
-    repeat(values)
 
 
 @compiled(fastmath=FAST)
@@ -264,37 +242,38 @@ def follow_noise(
         The least squared innovation, over its variance, of the members that can judge.
 
     """
-    record, noise, least, best_fit = members.record, members.noise, roughness, math.inf
-    variance, size, r, best, weights, squares = (
-        scratch.lines[0], scratch.lines[1], scratch.lines[2],
-        scratch.lines[3], scratch.lines[4], scratch.lines[5],
+    noise, score, short = members.noise, members.record[SCORE], members.record[SHORT]
+    size, r, less, spare = (
+        scratch.lines[0], scratch.lines[1], scratch.lines[2], scratch.lines[3]
     )  # fmt: skip
-    best[:], weights[:], squares[:] = record[SCORE, 0], 0.0, 0.0  # the last two: of each colour
-    for k in range(1, ORDERS):
-        score = record[SCORE, k]
-        for g in range(COUNT):
-            best[g] = max(best[g], score[g])
-    over_colours(best)
-    fill(variance, noise[SQUARE])
-    for k in range(ORDERS):
-        score, short, innovation, share = record[SCORE, k], record[SHORT, k], scratch.b[k], s[k]
-        for g in range(COUNT):
-            size[g] = share[g] * variance[g]
-            r[g] = min(innovation[g] * innovation[g] / size[g], HUBER * HUBER)
-        for g in range(COUNT):
-            short[g] += SHORT_SHARE * (r[g] - short[g])
-            least = min(least, short[g] if size[g] <= largest else math.inf)
-        for g in range(COUNT):
-            judges = size[g] <= largest and score[g] > -CLOSE
-            best_fit = min(best_fit, r[g] if judges else math.inf)
-        for g in range(COUNT):
-            if score[g] - best[g] > -CLOSE:  # few of them
-                weight = math.exp(score[g] - best[g])
-                weights[COLOUR[g]] += weight
-                squares[COLOUR[g]] += weight * r[g]
+    best, weights, squares = scratch.lines[4], scratch.lines[5], scratch.lines[6]  # of colours
+    weights[: COLOURS.size], squares[: COLOURS.size] = 0.0, 0.0
+    best[0] = largest_of(score, spare, HALF)
+    if members.active > HALF:
+        largest_of(score[HALF:], spare, HALF, KINDS)
+        best[1:4] = spare[:KINDS]
+    fill(less, noise[SQUARE])
+    for g in range(members.active):
+        size[g] = s[g] * less[g]
+    for g in range(members.active):
+        r[g] = min(scratch.b[g] * scratch.b[g] / size[g], HUBER * HUBER)
+    for g in range(members.active):
+        short[g] += SHORT_SHARE * (r[g] - short[g])
+    for g in range(members.active):
+        less[g] = -short[g] if size[g] <= largest else -math.inf
+    least = min(roughness, -largest_of(less, spare, members.active))
+    for g in range(members.active):
+        less[g] = -r[g] if (size[g] <= largest) & (score[g] > -CLOSE) else -math.inf
+    best_fit = -largest_of(less, spare, members.active)
+    for g in range(members.active):
+        off = score[g] - best[COLOUR[g]]
+        if off > -CLOSE:
+            weight = math.exp(off) if off < 0.0 else 1.0
+            weights[COLOUR[g]] += weight
+            squares[COLOUR[g]] += weight * r[g]
     if least > STEADY:  # every member that can judge says so, and the differences do
         count = min(count, QUICK_SAMPLES)
-    for c in range(COLOURS.size):
+    for c in range(COLOURS.size if members.active > HALF else 1):
         ratio = squares[c] / weights[c] / CLIPPED
         noise[SQUARE, c] *= 1.0 + (ratio - 1.0) / count
         most = members.rough[1 + c, 1]

@@ -6,6 +6,7 @@ import math
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.observer.arrays import (
+    ACTIVE,
     CALM,
     COVARIANCE,
     FIRST_NOISE,
@@ -40,10 +41,11 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     FACTORIALS,
     FAR,
     FIRST_SAMPLES,
-    INTENSITY,
+    HALF,
     KAPPA,
     LOG_VARIANCE,
     Members,
+    ORDER,
     ORDERS,
     PRIOR,
     RATIO,
@@ -77,7 +79,7 @@ of these members are smaller by `MORE_REASON`.
 @compiled()
 def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: float) -> None:
     """Collect the first samples, which tell the period, the noise and the sizes (D 28)."""
-    n, x, first = law.gains.shape[1] - ORDERS, work.x, members.p[2]
+    n, x, first = law.gains.shape[1] - ORDERS, work.x, members.p
     count = int(memory[SAMPLES])
     if count == 0:
         first[0, 0], first[1, 0] = memory[Y], 0.0
@@ -175,7 +177,7 @@ def begin(
 ) -> None:
     """Let the members begin at `y` (D 28)."""
     n = law.gains.shape[1] - ORDERS
-    sizes, samples = np.empty(n), members.p[2][0, :count].copy()
+    sizes, samples = np.empty(n), members.p[0, :count].copy()
     first = samples.copy()
     stride = max((count - 1) // n, 1)
     for i in range(n):  # how large z_i may be: its setting, or what differences say
@@ -184,7 +186,7 @@ def begin(
             for j in range(count - i * stride):
                 first[j] = (first[j + stride] - first[j]) / (stride * period)
                 sizes[i] = max(sizes[i], first[j] * first[j])
-    memory[MOVING] = COUNT
+    memory[MOVING] = HALF
     memory[STEADY_PERIOD] = period
     memory[UNSETTLED] = 0.0
     memory[FLOW_PERIOD] = 0.0
@@ -203,40 +205,34 @@ def begin(
     memory[ROUGHNESS], memory[CALM] = 1.0, CALM_SAMPLES + 1.0
     for j in range(count):
         difference(members, memory, samples[j])
-    least, quantised = math.inf, memory[LATTICE] > LATTICE_SHARE
-    for k in range(ORDERS):
-        x = members.x[k]
-        p = members.p[k]
-        d = n + 1 + k
-        x[:] = 0.0
-        p[:] = 0.0
-        for g in range(COUNT):
-            omega, kappa = BANDWIDTHS[g] / period, rates[KAPPA, g]
-            intensity = noise * noise * period * omega ** (2 * d)
-            record[INTENSITY, k, g] = intensity
-            x[0, g] = y
-            p[0, g] = noise * noise
-            for i in range(1, n):
-                p[at(d, i, i), g] = sizes[i]
-            for i in range(k + 1):
-                for j in range(i, k + 1):
-                    below = 2 * k - i - j
-                    p[at(d, n + i, n + j), g] = (
-                        intensity
-                        * FACTORIALS[below]
-                        / (FACTORIALS[k - i] * FACTORIALS[k - j] * (2.0 * kappa) ** (below + 1))
-                    )
-            size = math.log(p[at(d, n, n), g])
-            record[PRIOR, k, g] = -0.5 * size
-            least = min(least, size)
-    for k in range(ORDERS):
-        for g in range(COUNT):
-            record[PRIOR, k, g] += 0.5 * least
-            if quantised and BANDWIDTHS[g] > WITHIN_SAMPLES:
-                record[PRIOR, k, g] -= MORE_REASON
-            record[SCORE, k, g] = record[PRIOR, k, g]
-            record[VARIANCE, k, g] = 1.0
-            record[LOG_VARIANCE, k, g] = record[RESIDUAL, k, g] = record[FAR, k, g] = 0.0
-            record[SHORT, k, g] = 1.0
+    x, p, d, least = members.x, members.p, n + ORDERS, math.inf
+    quantised = memory[LATTICE] > LATTICE_SHARE
+    x[:], p[:], members.drive[:] = 0.0, 0.0, 0.0
+    for g in range(COUNT):
+        omega, kappa, k = BANDWIDTHS[g] / period, rates[KAPPA, g], ORDER[g]
+        intensity = noise * noise * period * omega ** (2 * (n + 1 + k))
+        members.drive[k, g] = intensity
+        x[0, g], p[0, g] = y, noise * noise
+        for i in range(1, n):
+            p[at(d, i, i), g] = sizes[i]
+        for i in range(k + 1):
+            for j in range(i, k + 1):
+                below = 2 * k - i - j
+                p[at(d, n + i, n + j), g] = (
+                    intensity
+                    * FACTORIALS[below]
+                    / (FACTORIALS[k - i] * FACTORIALS[k - j] * (2.0 * kappa) ** (below + 1))
+                )
+        size = math.log(p[at(d, n, n), g])
+        record[PRIOR, g] = -0.5 * size
+        least = min(least, size)
+    for g in range(COUNT):
+        record[PRIOR, g] += 0.5 * least
+        if quantised and BANDWIDTHS[g] > WITHIN_SAMPLES:
+            record[PRIOR, g] -= MORE_REASON
+        record[SCORE, g] = record[PRIOR, g]
+        record[VARIANCE, g] = record[SHORT, g] = 1.0
+        record[LOG_VARIANCE, g] = record[RESIDUAL, g] = record[FAR, g] = 0.0
+    memory[ACTIVE] = COUNT
     memory[LIKELIEST] = memory[TOLD] = weigh(members, FLOOR)
     watch(members, memory[TOLD])

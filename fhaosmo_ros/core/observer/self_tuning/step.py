@@ -3,12 +3,14 @@
 
 from functools import cache
 import math
+from typing import NamedTuple
 
 from fhaosmo_ros.core.compiled.cache import compiled, compiled_callback
-from fhaosmo_ros.core.compiled.unowned_arrays import doubles_at, integers_at, unowned
+from fhaosmo_ros.core.compiled.unowned_arrays import doubles_at, integers_at
 from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.model.integrate import NOW
 from fhaosmo_ros.core.observer.arrays import (
+    ACTIVE,
     ARRAYS,
     BEYOND,
     CALM,
@@ -44,14 +46,13 @@ from fhaosmo_ros.core.observer.prediction import predict
 from fhaosmo_ros.core.observer.self_tuning.filters import (
     allow_jump,
     at,
-    correct_covariances,
+    correct,
     correct_states,
-    expect_innovations,
+    expect,
     HUBER,
-    predict_covariances,
     predict_states,
 )
-from fhaosmo_ros.core.observer.self_tuning.intervals import take_interval
+from fhaosmo_ros.core.observer.self_tuning.intervals import choose_members, take_interval
 from fhaosmo_ros.core.observer.self_tuning.jumps import (
     begin_growth,
     follow_growth,
@@ -62,7 +63,6 @@ from fhaosmo_ros.core.observer.self_tuning.jumps import (
     watch,
 )
 from fhaosmo_ros.core.observer.self_tuning.members import (
-    BANDS,
     COLOUR,
     COLOURS,
     CORRELATION,
@@ -71,18 +71,16 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     FAR,
     find_tuning,
     FIRST_SAMPLES,
+    HALF,
     IN_BAND,
     KAPPA,
-    LOG_VARIANCE,
     Members,
     members_in,
-    moving_size,
-    of_pairs,
-    of_states,
     ORDERS,
     put,
     RATIO,
     RESIDUAL,
+    Scratch,
     scratch_in,
     SHORT,
     SQUARE,
@@ -142,7 +140,7 @@ def follow_period(law: Law, members: Members, memory: Floats, h: float) -> None:
             tau = rates[TAU, g]
             rates[CORRELATION, g] = math.exp(-h / tau) if tau > 0.0 else 0.0
     changed = abs(h - memory[STEADY_PERIOD]) > NEAR * memory[STEADY_PERIOD]
-    likeliest = COLOUR[int(memory[LIKELIEST]) % COUNT]
+    likeliest = COLOUR[int(memory[LIKELIEST])]
     for c in range(COLOURS.size):
         ratio, limit = noise[SQUARE, c] / noise[USED, c], ANOTHER if c == likeliest else FAR_OFF
         changed = changed or not 1.0 / limit < ratio < limit
@@ -157,9 +155,8 @@ def follow_period(law: Law, members: Members, memory: Floats, h: float) -> None:
     for c in range(COLOURS.size):
         slowed = min(slowed, (memory[FIRST_NOISE] / noise[USED, c]) ** (0.5 / (n + 1)))
     moving = 0
-    for band in range(BANDS):
-        kappa, ratio = rates[KAPPA, band * IN_BAND], RATIO[band * IN_BAND]
-        if kappa / ratio * slowed * memory[UNSETTLED] < LONG:
+    for first in range(0, HALF, IN_BAND):
+        if rates[KAPPA, first] / RATIO[first] * slowed * memory[UNSETTLED] < LONG:
             moving += IN_BAND
     memory[MOVING] = moving
 
@@ -181,6 +178,106 @@ def carry_flow(
     memory[FLOW_PERIOD] = h
 
 
+class Sample(NamedTuple):
+    """
+    What is known of a sample before it is used or passed over.
+
+    Attributes
+    ----------
+    y : float
+    off : float
+        By what it is off the prediction of the mean.
+    quanta : float
+        See `find_quantum`.
+    roughness, roughness_before : float
+        Square of its difference over the usual one; the mean of those before.
+    uneven : float
+        Square of the highest difference as a variance of y, and that of the stamps.
+    of_stamps : float
+        See `stamp_noise`.
+    floor : float
+        The least that the variance of the noise can be.
+    largest : float
+        See `knowing`.
+    samples : float
+        Number of samples to average the noise over.
+    kept : float
+        Part of the log-likelihoods that is not forgotten.
+
+    """
+
+    y: float
+    off: float
+    quanta: float
+    roughness: float
+    roughness_before: float
+    uneven: float
+    of_stamps: float
+    floor: float
+    largest: float
+    samples: float
+    kept: float
+
+
+@compiled()
+def pass_over(
+    members: Members,
+    scratch: Scratch,
+    memory: Floats,
+    believed: Floats,
+    sample: Sample,
+    doubted: bool,
+) -> None:
+    """Count a sample that is not likely; where it may be noise that has grown, follow that."""
+    if doubted and is_explained(members, scratch.b, believed):
+        judge(members, scratch, 1.0, sample.kept, True)
+        memory[LIKELIEST] = weigh(members, FLOOR)
+    sign = math.copysign(1.0, sample.off)
+    other_side = memory[BEYOND] > 0.0 and sign != memory[FAR_SIGN]
+    if other_side:
+        begin_growth(memory, abs(sample.off), sample.uneven, sample.roughness_before)
+        memory[BEYOND] = 0.0
+    memory[BEYOND] += 1.0
+    rougher = memory[ROUGHNESS] > HUBER and memory[RECENT] == 0.0
+    if other_side or rougher:  # a y that is off is so on one side, and evenly
+        follow_noise(
+            members, scratch, sample.floor, believed, sample.largest, sample.samples,
+            memory[ROUGHNESS], sample.of_stamps,
+        )  # fmt: skip
+    memory[FAR_SIGN] = sign
+
+
+@compiled()
+def take(
+    members: Members,
+    scratch: Scratch,
+    memory: Floats,
+    n: int,
+    believed: Floats,
+    sample: Sample,
+    doubted: bool,
+) -> None:
+    """Correct the members by a sample, and weigh them."""
+    y, quanta = sample.y, sample.quanta
+    grown, best_fit = follow_noise(
+        members, scratch, sample.floor, believed, sample.largest, sample.samples,
+        memory[ROUGHNESS], sample.of_stamps,
+    )  # fmt: skip
+    memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
+    calm = memory[CALM] > CALM_SAMPLES or doubted
+    judged = calm or best_fit < HUBER * HUBER
+    judged = judged and (sample.roughness <= HUBER * HUBER or quanta > 0.0)
+    kept = sample.kept if judged else -1.0
+    follow_innovations(members, scratch.b, scratch.s, quanta)
+    if quanta > 0.0:
+        take_interval(members, scratch, y, y == memory[Y], quanta, kept)
+    correct(members, scratch, n, int(memory[MOVING]), quanta > 0.0)
+    if quanta == 0.0:
+        judge(members, scratch, grown, kept, calm)
+    correct_states(members, scratch, n, y)
+    memory[LIKELIEST] = weigh(members, QUANTISED_FLOOR if quanta > 0.0 else FLOOR)
+
+
 @compiled()
 def step_members(
     law: Law, work: Work, memory: Floats, rows: Floats, y: float, h: float, u: Floats
@@ -197,57 +294,53 @@ def step_members(
 
     """
     x, n = work.x, law.gains.shape[1] - ORDERS
-    members = unowned(members_in(rows, n))
+    every = members_in(rows, n, COUNT)
     if memory[SAMPLES] <= FIRST_SAMPLES:
-        gather(law, work, memory, members, y, h)
+        gather(law, work, memory, every, y, h)
         return 0.0
-    quanta = find_quantum(members, memory, y)
+    quanta = find_quantum(every, memory, y)
+    before, count = memory[ACTIVE], choose_members(every, memory, quanta)
+    members = members_in(rows, n, count)
+    if count != before:
+        memory[LIKELIEST] = weigh(members, FLOOR)
     follow_period(law, members, memory, h)
     roughness_before = memory[ROUGHNESS]
     roughness, highest = difference(members, memory, y)
     of_stamps = stamp_noise(members, memory, h)
     if memory[GROWING] >= GROWTHS - 1.0 or memory[RECENT] > 0.0 or quanta > 0.0:
-        memory[MOVING] = COUNT
+        memory[MOVING] = HALF
     if quanta > 0.0:  # P depends on the samples
         memory[UNSETTLED] = 0.0
-    moving, now = int(memory[MOVING]), work.stages[NOW]
+    now = work.stages[NOW]
     carry_flow(law, work, members, memory, h, u)
     # A sample that is not likely changes no member, so that what it makes of them stands apart.
-    scratch, d = unowned(scratch_in(work.x[ROWS + law.gains.shape[1] :], n)), n + 1
-    ahead, b, s, lines, rest = scratch.x, scratch.b, scratch.s, scratch.lines, scratch.rest
-    gain = unowned(of_states(rest, 0, d, moving))
-    p = unowned(of_pairs(rest, (3 * d + 3) * moving, d, moving))
-    rest = unowned(rest[moving_size(n) * moving :])
-    for k in range(ORDERS):
-        predict_states(members, n, k, h, x[HAT], now[0], ahead[k])
-        if moving > 0:
-            predict_covariances(members, n, k, h, p[k], rest, moving)
-        expect_innovations(members, n, k, h, p[k], gain[k], s[k], moving)
-        innovation, first, residual = b[k], ahead[k][0], members.record[RESIDUAL, k]
-        correlation = members.rates[CORRELATION]
-        for g in range(COUNT):
-            innovation[g] = y - first[g] - correlation[g] * residual[g]
+    scratch = scratch_in(work.x[ROWS + law.gains.shape[1] :], n)
+    s = scratch.s
+    predict_states(members, scratch, n, h, x[HAT], now[0])
+    expect(members, scratch, n, h, y, int(memory[MOVING]))
     believed = s
     if memory[BEYOND] > 0.0:  # P grows meanwhile, and the quick members believe anything
         believed = np.minimum(s, 4.0 * members.record[VARIANCE])
-    count = min(memory[SAMPLES], NOISE_SAMPLES)
-    memory[SAMPLES] = count + 1.0
-    largest = knowing(members, scratch, believed)
-    floor = max(quanta, law.scalars[LEAST_NOISE] ** 2, EXACT * EXACT * members.rough[1, 1])
-    off, sigma = abs(y - now[0, 0]), math.sqrt(members.noise[SQUARE, 0])
+    largest = knowing(members, scratch, believed, int(memory[LIKELIEST]))
+    sample = Sample(
+        y, y - now[0, 0], quanta, roughness, roughness_before, highest + of_stamps, of_stamps,
+        max(quanta, law.scalars[LEAST_NOISE] ** 2, EXACT * EXACT * members.rough[1, 1]), largest,
+        min(memory[SAMPLES], NOISE_SAMPLES), math.exp(-h / law.scalars[FORGETTING]),
+    )  # fmt: skip
+    memory[SAMPLES] = sample.samples + 1.0
+    off, sigma = abs(sample.off), math.sqrt(members.noise[SQUARE, 0])
     hidden = GATE * math.sqrt(largest)
     growing = follow_growth(
-        memory, members.flow, n, off, sigma, hidden, highest + of_stamps, roughness_before
+        memory, members.flow, n, off, sigma, hidden, sample.uneven, roughness_before
     )
-    sign, turn = math.copysign(1.0, y - now[0, 0]), 0.0
+    sign, turn = math.copysign(1.0, sample.off), 0.0
     goes_on = memory[BEYOND] > 0.0 and sign == memory[FAR_SIGN]
     goes_on = goes_on and roughness <= HUBER * HUBER and memory[ROUGHNESS] < HUBER
     gate = HUBER if goes_on else GATE
-    likely = is_likely(members, b, believed, largest, memory[BEYOND], gate)
+    likely = is_likely(members, scratch.b, believed, largest, memory[BEYOND], gate)
     memory[RECENT] = max(memory[RECENT] - 1.0, 0.0)
     begins = not likely and growing
     jumped = begins or (memory[RECENT] > 0.0 and roughness <= HUBER * HUBER)
-    kept = math.exp(-h / law.scalars[FORGETTING])
     if roughness > HUBER * HUBER:
         turn = ROUGH_TURN
     elif not likely and sign != memory[FAR_SIGN]:
@@ -255,20 +348,7 @@ def step_members(
     memory[TURNS] = max(memory[TURNS] + (turn - memory[TURNS]) / TURNS_SAMPLES, 0.0)
     doubted = memory[TURNS] > OFTEN and memory[ROUGHNESS] < HUBER and quanta == 0.0
     if not likely and not jumped:
-        if doubted and is_explained(members, b, believed):
-            judge(members, scratch, 1.0, kept, True)
-            memory[LIKELIEST] = weigh(members, FLOOR)
-        other_side = memory[BEYOND] > 0.0 and sign != memory[FAR_SIGN]
-        if other_side:
-            begin_growth(memory, off, highest + of_stamps, roughness_before)
-            memory[BEYOND] = 0.0
-        memory[BEYOND] += 1.0
-        rougher = memory[ROUGHNESS] > HUBER and memory[RECENT] == 0.0
-        if other_side or rougher:  # a y that is off is so on one side, and evenly
-            follow_noise(
-                members, scratch, floor, believed, largest, count, memory[ROUGHNESS], of_stamps
-            )
-        memory[FAR_SIGN] = sign
+        pass_over(members, scratch, memory, believed, sample, doubted)
         return 0.0
     memory[BEYOND] = 0.0
     if jumped:
@@ -276,37 +356,11 @@ def step_members(
         if begins:  # while it was within the gate, it could not be seen
             tau = h / (1.0 - min(GATE * sigma / off, 0.9) ** (1.0 / n))
             memory[RECENT] = JUMP_SAMPLES
-        for k in range(ORDERS):
-            allow_jump(members, scratch, n, k, y, tau, p[k], gain[k])
-            members.record[FAR, k] = 0.0
+        allow_jump(members, scratch, n, y, tau)
+        members.record[FAR] = 0.0
         believed = s
         memory[UNSETTLED] = 0.0
-    grown, best_fit = follow_noise(
-        members, scratch, floor, believed, largest, count, memory[ROUGHNESS], of_stamps
-    )
-    memory[CALM] = memory[CALM] + 1.0 if grown <= STEADY else 0.0
-    for k in range(ORDERS):
-        variance, log_variance, found = (
-            members.record[VARIANCE, k], members.record[LOG_VARIANCE, k], s[k]
-        )  # fmt: skip
-        for g in range(moving):
-            variance[g], log_variance[g] = found[g], math.log(found[g])
-    calm = memory[CALM] > CALM_SAMPLES or doubted
-    judged = calm or best_fit < HUBER * HUBER
-    judged = judged and (roughness <= HUBER * HUBER or quanta > 0.0)
-    follow_innovations(members, b, s, quanta)
-    judge(members, scratch, grown, kept if judged and quanta == 0.0 else -1.0, calm)
-    for k in range(ORDERS):
-        if quanta > 0.0:
-            its = kept if judged else -1.0
-            take_interval(members, scratch, k, y, y == memory[Y], p[k], quanta, its)
-        else:
-            for g in range(moving):
-                lines[0, g] = lines[2, g] = 1.0 / (s[k, g] * members.noise[USED, COLOUR[g]])
-        if moving > 0:
-            correct_covariances(members, n, k, p[k], gain[k], lines, moving)
-    correct_states(members, scratch, n, y)
-    memory[LIKELIEST] = weigh(members, QUANTISED_FLOOR if quanta > 0.0 else FLOOR)
+    take(members, scratch, memory, n, believed, sample, doubted)
     since_jump = 0 if jumped else samples_since_jump(members, n, memory[TOLD])
     if since_jump > 2:  # two outliers are no jump
         follow_jump(members, memory, n, since_jump, s, y)
@@ -321,41 +375,33 @@ def step_members(
 def find_strays(members: Members, n: int, mean: Floats) -> None:
     """Put members that have been far off for long to the mean."""
     far = members.record[FAR]
-    for k in range(ORDERS):
-        for g in range(COUNT):
-            if far[k, g] > LOST_SAMPLES:
-                far[k, g] = 0.0
-                put(members, n, k, g, mean)
+    for g in range(members.active):
+        if far[g] > LOST_SAMPLES:
+            far[g] = 0.0
+            put(members, n, g, mean)
 
 
 @compiled()
 def restart_members(law: Law, levels: Floats, memory: Floats, rows: Floats, y: float) -> None:
     """Begin afresh from `y`: z is not known any more, d and the noise are (D 29)."""
     n = law.gains.shape[1] - ORDERS
-    members = members_in(rows, n)
+    members, d = members_in(rows, n, COUNT), n + ORDERS
     memory[UNSETTLED] = memory[BEYOND] = memory[GROWING] = memory[RECENT] = 0.0
     memory[TURNS] = 0.0
     watch(members, memory[TOLD])
     levels[HAT, 0] = memory[Y] = y
     levels[COVARIANCE, 0] = members.noise[SQUARE, 0]
-    for i in range(1, n):
+    members.x[0] = y
+    for i in range(n):
         size = law.chances[FRESH * law.gains.shape[1] + i, i]
-        levels[COVARIANCE, i] = max(size, levels[HAT, i] ** 2)
-    for k in range(ORDERS):
-        z = members.x[k]
-        p = members.p[k]
-        d = n + 1 + k
-        for g in range(COUNT):
-            c = members.rates[CORRELATION, g]
-            z[0, g] = y
-            for i in range(n):
-                size = law.chances[FRESH * law.gains.shape[1] + i, i]
-                p[at(d, i, i), g] = max(size, levels[HAT, i] ** 2)
-                for j in range(i + 1, d):
-                    p[at(d, i, j), g] = 0.0
-            p[0, g] = members.noise[SQUARE, COLOUR[g]] / (1.0 - c * c)
-            members.record[RESIDUAL, k, g] = members.record[FAR, k, g] = 0.0
-            members.record[SHORT, k, g] = 1.0
+        if i > 0:
+            levels[COVARIANCE, i] = max(size, levels[HAT, i] ** 2)
+        for j in range(i, d):
+            members.p[at(d, i, j)] = max(size, levels[HAT, i] ** 2) if i == j else 0.0
+    for g in range(COUNT):
+        a = members.rates[CORRELATION, g]
+        members.p[0, g] = members.noise[SQUARE, COLOUR[g]] / (1.0 - a * a)
+    members.record[RESIDUAL], members.record[FAR], members.record[SHORT] = 0.0, 0.0, 1.0
 
 
 def _step_at(table: int, y: float, h: float, inputs: int, count: int) -> float:
@@ -369,7 +415,7 @@ def _step_at(table: int, y: float, h: float, inputs: int, count: int) -> float:
     if h > 0.0:
         return step_members(law, work, memory, rows, y, h, doubles_at(inputs, count))
     if h < 0.0:
-        members = members_in(rows, law.gains.shape[1] - ORDERS)
+        members = members_in(rows, law.gains.shape[1] - ORDERS, COUNT)
         find_tuning(members, doubles_at(inputs, count))
         return 0.0
     restart_members(law, levels, memory, rows, y)

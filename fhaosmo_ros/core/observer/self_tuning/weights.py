@@ -23,19 +23,21 @@ from fhaosmo_ros.core.observer.self_tuning.filters import at, HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
     BANDS,
     COLOUR,
+    COLOURS,
     CORRELATION,
     COUNT,
     FAR,
     FAST,
     fill,
+    HALF,
     IN_BAND,
-    INTENSITY,
     KAPPA,
+    largest_of,
     LOG_VARIANCE,
     Members,
+    ORDER,
     ORDERS,
     PRIOR,
-    repeat,
     SCORE,
     Scratch,
     SQUARE,
@@ -69,59 +71,49 @@ def judge(members: Members, scratch: Scratch, grown: float, kept: float, calm: b
         are not outliers, but its fault.
 
     """
-    noise, log_noise, r = scratch.lines[0], scratch.lines[1], scratch.lines[2]
+    noise, log_noise, r, logs = (
+        scratch.lines[0], scratch.lines[1], scratch.lines[2], scratch.lines[3]
+    )  # fmt: skip
     fill(noise, members.noise[SQUARE])
-    for g in range(IN_BAND):
-        log_noise[g] = math.log(noise[g])
-    repeat(log_noise)
-    for k in range(ORDERS):
-        far, innovation, share = members.record[FAR, k], scratch.b[k], scratch.s[k]
-        for g in range(COUNT):
-            r[g] = innovation[g] * innovation[g] / (share[g] * noise[g])
-            far[g] = far[g] + 1.0 if r[g] > GATE * GATE else 0.0
-        if kept >= 0.0:
-            score, prior = members.record[SCORE, k], members.record[PRIOR, k]
-            log_s = members.record[LOG_VARIANCE, k]
-            for g in range(COUNT):
-                late = max(far[g] - 1.0, 0.0) if calm else 0.0
-                most = HUBER * HUBER * (1.0 + late * late)
-                likelihood = min(r[g] / grown, most) + log_s[g] + log_noise[g]
-                score[g] = prior[g] + kept * (score[g] - prior[g]) - 0.5 * likelihood
-        for g in range(COUNT):
-            if r[g] > HUBER * HUBER:
-                late = max(far[g] - 1.0, 0.0)  # in a row: not an outlier, but d
-                limit = HUBER * math.sqrt(share[g] * noise[g]) * (1.0 + late * late)
-                innovation[g] = min(max(innovation[g], -limit), limit)
+    for c in range(COLOURS.size):
+        logs[c] = math.log(members.noise[SQUARE, c])
+    fill(log_noise, logs)
+    far, innovation, share = members.record[FAR], scratch.b, scratch.s
+    for g in range(members.active):
+        r[g] = innovation[g] * innovation[g] / (share[g] * noise[g])
+        far[g] = far[g] + 1.0 if r[g] > GATE * GATE else 0.0
+    if kept >= 0.0:
+        score, prior = members.record[SCORE], members.record[PRIOR]
+        log_s, slack = members.record[LOG_VARIANCE], 1.0 if calm else 0.0
+        for g in range(members.active):
+            late = slack * max(far[g] - 1.0, 0.0)
+            most = HUBER * HUBER * (1.0 + late * late)
+            likelihood = min(r[g] / grown, most) + log_s[g] + log_noise[g]
+            score[g] = prior[g] + kept * (score[g] - prior[g]) - 0.5 * likelihood
+    for g in range(members.active):
+        if r[g] > HUBER * HUBER:
+            late = max(far[g] - 1.0, 0.0)  # in a row: not an outlier, but d
+            limit = HUBER * math.sqrt(share[g] * noise[g]) * (1.0 + late * late)
+            innovation[g] = min(max(innovation[g], -limit), limit)
 
 
 @compiled(fastmath=FAST - {'nnan'})
 def weigh(members: Members, floor: float) -> int:
     """Turn log-likelihoods into weights (D 28); return which member is the likeliest."""
-    best, total, likeliest = -math.inf, 0.0, 0
-    for k in range(ORDERS):
-        score = members.record[SCORE, k]
-        for g in range(COUNT):
-            best = max(best, score[g])
-    for k in range(ORDERS - 1, -1, -1):
-        score = members.record[SCORE, k]
-        for g in range(COUNT - 1, -1, -1):
-            if score[g] == best:  # the first of them; before they are judged there are many
-                likeliest = k * COUNT + g
-    usual = members.record[PRIOR, likeliest // COUNT, likeliest % COUNT]
-    for k in range(ORDERS):
-        score, weight = members.record[SCORE, k], members.record[WEIGHT, k]
-        prior = members.record[PRIOR, k]
-        for g in range(COUNT):
-            score[g] = max(score[g] - best, min(prior[g] - usual, 0.0) - floor)
-            weight[g] = 0.0
-        for g in range(COUNT):
-            if score[g] > -NEGLIGIBLE:  # few of them
-                weight[g] = math.exp(score[g])
-                total += weight[g]
-    for k in range(ORDERS):
-        weight = members.record[WEIGHT, k]
-        for g in range(COUNT):
-            weight[g] /= total
+    score, weight, prior = members.record[SCORE], members.record[WEIGHT], members.record[PRIOR]
+    best, total, likeliest = largest_of(score, weight, members.active), 0.0, 0
+    while score[likeliest] < best:  # the first of them; before they are judged there are many
+        likeliest += 1
+    usual = prior[likeliest]
+    for g in range(members.active):
+        score[g] = max(score[g] - best, min(prior[g] - usual, 0.0) - floor)
+        weight[g] = 0.0
+    for g in range(members.active):
+        if score[g] > -NEGLIGIBLE:  # few of them
+            weight[g] = math.exp(score[g])
+            total += weight[g]
+    for g in range(members.active):
+        weight[g] /= total
     return likeliest
 
 
@@ -135,14 +127,13 @@ def tell_model(
     It stays until another one is clearly likelier. Coloured noise counts as white noise that is as
     dense where the member's bandwidth ends.
     """
-    k, g = divmod(int(memory[TOLD]), COUNT)
-    if members.record[SCORE, k, g] < -CLEARLY:
+    if members.record[SCORE, int(memory[TOLD])] < -CLEARLY:
         memory[TOLD] = memory[LIKELIEST]
-        k, g = divmod(int(memory[TOLD]), COUNT)
-    slider = law.scalars[SLIDER]
+    g = int(memory[TOLD])
+    slider, k = law.scalars[SLIDER], ORDER[g]
     row, twice = x[MODEL], 2.0 * (x.shape[1] - ORDERS + 1 + k)
     noise, a = members.noise[SQUARE, COLOUR[g]], members.rates[CORRELATION, g]
-    drive = members.record[INTENSITY, k, g] * slider**twice
+    drive = members.drive[k, g] * slider**twice
     edge = min((drive / (noise * h)) ** (1.0 / twice) * h, math.pi)
     row[NOISE] = noise / (1.0 + a * (a - 2.0 * math.cos(edge)))
     row[DRIVE], row[LOSS] = drive, members.rates[KAPPA, g] * slider
@@ -153,22 +144,21 @@ def tell_model(
 def shift(weight: Floats, slider: float) -> Floats:
     """Return the weights of the members whose estimates are shown: `slider` bands quicker."""
     whole = math.floor(slider)
-    part, shown = slider - whole, np.zeros((ORDERS, COUNT))
-    for k in range(ORDERS):
-        for g in range(COUNT):
-            band, kind = g // IN_BAND, g % IN_BAND
-            low = min(max(band + whole, 0), BANDS - 1) * IN_BAND + kind
-            high = min(max(band + whole + 1, 0), BANDS - 1) * IN_BAND + kind
-            shown[k, low] += (1.0 - part) * weight[k, g]
-            shown[k, high] += part * weight[k, g]
+    part, shown = slider - whole, np.zeros(COUNT)
+    for g in range(COUNT):
+        band = g % HALF // IN_BAND
+        low = min(max(band + whole, 0), BANDS - 1) - band
+        high = min(max(band + whole + 1, 0), BANDS - 1) - band
+        shown[g + low * IN_BAND] += (1.0 - part) * weight[g]
+        shown[g + high * IN_BAND] += part * weight[g]
     return shown
 
 
 @compiled(fastmath=FAST)
-def weighted(w: Floats, values: Floats) -> float:
+def weighted(w: Floats, values: Floats, count: int) -> float:
     """Return the sum of w times `values` over the members that have a weight."""
     total = 0.0
-    for g in range(COUNT):
+    for g in range(count):
         value = w[g] * values[g]
         total += value if w[g] > 0.0 else 0.0
     return total
@@ -177,37 +167,25 @@ def weighted(w: Floats, values: Floats) -> float:
 @compiled(fastmath=FAST)
 def mix(law: Law, members: Members, scratch: Scratch, x: Floats) -> None:
     """Write the mean of the members' estimates, and its variances, to rows of `x` (D 28)."""
-    n, kappa, shown = x.shape[1] - ORDERS, members.rates[KAPPA], members.record[WEIGHT]
+    n, kappa, w, count = (
+        x.shape[1] - ORDERS, members.rates[KAPPA], members.record[WEIGHT], members.active
+    )  # fmt: skip
     if law.scalars[SLIDER] != 1.0:
-        shown = shift(shown, math.log(law.scalars[SLIDER]) / math.log(STEP_OF_BANDS))
-    x[HAT], x[COVARIANCE], derivative = 0.0, 0.0, scratch.lines[0]
-    shares = [shown[k].sum() for k in range(ORDERS)]
-    for k in range(ORDERS):
-        if shares[k] == 0.0:
-            continue
-        w, z = shown[k], members.x[k]
-        for i in range(n + 1):
-            x[HAT, i] += weighted(w, z[i])
-        d, rate, second = z[n], z[n + min(k, 1)], z[n + k]
-        for g in range(COUNT):
-            derivative[g] = (rate[g] if k > 0 else 0.0) - kappa[g] * d[g]
-        x[HAT, n + 1] += weighted(w, derivative)
-        for g in range(COUNT):
-            derivative[g] = kappa[g] * kappa[g] * d[g]
-            if k > 0:
-                derivative[g] -= 2.0 * kappa[g] * rate[g]
-            if k > 1:
-                derivative[g] += second[g]
-        x[HAT, n + 2] += weighted(w, derivative)
-    for k in range(ORDERS):
-        if shares[k] == 0.0:
-            continue
-        w, z, p = shown[k], members.x[k], members.p[k]
-        for i in range(n + 1):
-            mean, value, variance = x[HAT, i], z[i], p[at(n + 1 + k, i, i)]
-            total = 0.0
-            for g in range(COUNT):
-                off = value[g] - mean
-                part = w[g] * (max(variance[g], 0.0) + off * off)
-                total += part if w[g] > 0.0 else 0.0
-            x[COVARIANCE, i] += total
+        w = shift(w, math.log(law.scalars[SLIDER]) / math.log(STEP_OF_BANDS))
+    z, p, derivative, second = members.x, members.p, scratch.lines[0], scratch.lines[1]
+    d, its_first, its_second = z[n], z[n + 1], z[n + 2]
+    for g in range(count):
+        derivative[g] = its_first[g] - kappa[g] * d[g]
+    for g in range(count):
+        second[g] = its_second[g] - kappa[g] * (2.0 * its_first[g] - kappa[g] * d[g])
+    x[COVARIANCE] = 0.0
+    for i in range(n + 1):
+        x[HAT, i] = weighted(w, z[i], count)
+    x[HAT, n + 1], x[HAT, n + 2] = weighted(w, derivative, count), weighted(w, second, count)
+    for i in range(n + 1):
+        mean, value, variance, total = x[HAT, i], z[i], p[at(n + ORDERS, i, i)], 0.0
+        for g in range(count):
+            off = value[g] - mean
+            part = w[g] * (max(variance[g], 0.0) + off * off)
+            total += part if w[g] > 0.0 else 0.0
+        x[COVARIANCE, i] = total
