@@ -13,6 +13,7 @@ from fhaosmo_ros.core.observer.self_tuning.jumps import otherwise, SHAPE
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOUR,
     COUNT,
+    HALF,
     IN_BAND,
     KAPPA,
     Members,
@@ -134,7 +135,8 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
     after = members_of(observer)
     for k in range(ORDERS):
         scores = np.where((COLOUR == 0) & (k == ORDER), members.record[SCORE], -np.inf)
-        g = np.argmax(scores[: moving - 2 * IN_BAND])
+        scores[: HALF - moving + 2 * IN_BAND] = -np.inf
+        g = np.argmax(scores)
         size, first, upper = 4 + k, members.x[: 4 + k, g], np.triu_indices(3 + ORDERS)
         covariance = np.zeros((3 + ORDERS, 3 + ORDERS))
         covariance[upper] = members.p[:, g]

@@ -214,8 +214,9 @@ def test_a_quick_d_that_comes_back_is_not_taken_for_noise(seed):
     assert rms(found.unknown_input[late] - d[number[late]]) < 0.2 * rms(d)
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', [0, 1, 2, 13])
 def test_any_data_gives_finite_estimates(seed):
+    """Also where outliers are among the first samples, and the model grows without a limit."""
     random = np.random.default_rng(seed)
     count = 3000
     y = random.standard_normal(count).cumsum()

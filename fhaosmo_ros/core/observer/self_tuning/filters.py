@@ -273,33 +273,28 @@ def correct_states(members: Members, scratch: Scratch, n: int, y: float) -> None
 
 
 @compiled(forceinline=True)
-def of_moving(members: Members, moving: int) -> tuple[int, int]:
-    """Return how many runs of columns move, the second one from `HALF` on, and their length."""
-    if moving == HALF:
-        return 1, members.active
-    return members.active // HALF if moving > 0 else 0, moving
+def of_moving(members: Members, moving: int) -> tuple[Any, Any]:
+    """
+    Return the first of the columns that move, and the one behind the last.
 
-
-@compiled(forceinline=True)
-def column(index: int) -> Any:
-    """Return an index that the compiler knows not to count from the end, as -1 would."""
-    return np.uint64(index)
+    As unsigned numbers: the compiler knows then that they do not count from the end, as -1 would.
+    """
+    return np.uint64(HALF - moving), np.uint64(min(HALF + moving, members.active))
 
 
 @compiled(fastmath=FAST)
 def expect(members: Members, scratch: Scratch, n: int, h: float, y: float, moving: int) -> None:
     """Write what the members expect of a sample, and by what it is off, to `scratch`."""
-    b, s, first, residual = scratch.b, scratch.s, scratch.x[0], members.record[RESIDUAL]
+    b, s, z, residual = scratch.b, scratch.s, scratch.x[0], members.record[RESIDUAL]
     correlation, variance = members.rates[CORRELATION], members.record[VARIANCE]
     for g in range(members.active):
-        b[g] = y - first[g] - correlation[g] * residual[g]
+        b[g] = y - z[g] - correlation[g] * residual[g]
     for g in range(members.active):
         s[g] = variance[g]
-    runs, length = of_moving(members, moving)
-    for run in range(runs):
-        begin, end = column(run * HALF), column(run * HALF + length)
-        predict_covariances(members, scratch, n, h, begin, end)
-        expect_innovations(members, scratch, n, h, begin, end)
+    if moving > 0:
+        first, last = of_moving(members, moving)
+        predict_covariances(members, scratch, n, h, first, last)
+        expect_innovations(members, scratch, n, h, first, last)
 
 
 @compiled(fastmath=FAST)
@@ -307,16 +302,15 @@ def correct(members: Members, scratch: Scratch, n: int, moving: int, by_interval
     """Take a sample into the covariances that move, by the factors of `take_interval` or not."""
     inverse, used, taken, s = scratch.lines[0], scratch.lines[1], scratch.lines[2], scratch.s
     variance, log_variance = members.record[VARIANCE], members.record[LOG_VARIANCE]
-    runs, length = of_moving(members, moving)
-    if runs > 0 and not by_interval:
+    if moving == 0:
+        return
+    first, last = of_moving(members, moving)
+    for g in range(first, last):
+        variance[g] = s[g]
+    if not by_interval:
         fill(used, members.noise[USED])
-    for run in range(runs):
-        first, last = column(run * HALF), column(run * HALF + length)
         for g in range(first, last):
-            variance[g] = s[g]
-        if not by_interval:
-            for g in range(first, last):
-                inverse[g] = taken[g] = 1.0 / (s[g] * used[g])
-            for g in range(first, last):
-                log_variance[g] = math.log(s[g])
-        correct_covariances(members, scratch, n, first, last)
+            inverse[g] = taken[g] = 1.0 / (s[g] * used[g])
+        for g in range(first, last):
+            log_variance[g] = math.log(s[g])
+    correct_covariances(members, scratch, n, first, last)

@@ -18,7 +18,6 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     COUNT,
     FAR,
     HALF,
-    KINDS,
     LOG_VARIANCE,
     Members,
     PRIOR,
@@ -30,6 +29,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     USED,
     VARIANCE,
     WEIGHT,
+    WHITE,
 )
 
 VAGUE = 0.1
@@ -167,7 +167,7 @@ def choose_members(members: Members, memory: Floats, quanta: float) -> int:
         memory[UNSETTLED] = 0.0
         members.noise[SQUARE] = members.noise[USED] = members.noise[SQUARE, 0]
         for g in range(HALF, COUNT):
-            white = (g - HALF) // KINDS * KINDS  # of the same band, k and kappa
+            white = WHITE[g]
             members.x[:, g], members.p[:, g] = members.x[:, white], members.p[:, white]
             members.gain[:, g], members.record[RESIDUAL, g] = members.gain[:, white], 0.0
             members.record[VARIANCE, g] = members.record[VARIANCE, white]

@@ -6,7 +6,9 @@ A member is an observer with its own model of d (D 17: k = 0, 1 or 2 derivatives
 decay kappa) and of the noise (white, or coloured: v_j = a v_{j-1} + w_j). All have N = n + 3
 states, of which those of derivatives that a model does not have stay 0. Arrays have one column a
 member, so that a step of all members is a few long loops that the compiler turns into vector
-instructions. Members with white noise come first, and of each half the slowest.
+instructions. Members with white noise come first, from the quickest to the slowest; those with
+coloured noise follow from the slowest to the quickest: where only slow members' covariances move,
+theirs are neighbours.
 
 The members lie in the rows of ``State.levels`` behind the covariance, one array after the other.
 """
@@ -37,7 +39,9 @@ HALF = BANDS * IN_BAND
 """Members with white noise, and with coloured noise."""
 COUNT = 2 * HALF
 STEP_OF_BANDS = (QUICKEST / SLOWEST) ** (1.0 / (BANDS - 1))
-BANDWIDTHS = np.tile(np.repeat(np.geomspace(SLOWEST, QUICKEST, BANDS), IN_BAND), 2)
+BAND = np.repeat(np.append(np.arange(BANDS)[::-1], np.arange(BANDS)), IN_BAND)
+"""Number of each member's bandwidth, from the slowest."""
+BANDWIDTHS = np.geomspace(SLOWEST, QUICKEST, BANDS)[BAND]
 """omega of each member, in rad a sample."""
 ORDER = np.tile(np.repeat(np.arange(ORDERS), KINDS), 2 * BANDS)
 """k of each member."""
@@ -45,6 +49,8 @@ COLOUR = np.append(np.zeros(HALF, int), np.tile(np.arange(1, len(COLOURS)), HALF
 RATIO = np.append(np.tile(DECAYS, HALF // KINDS), np.full(HALF, DECAYS[0]))
 FIRST = np.searchsorted(COLOUR[: HALF + KINDS], np.arange(len(COLOURS)))
 """The first member of each colour."""
+WHITE = HALF - IN_BAND * (1 + BAND) + KINDS * ORDER
+"""The first member with white noise of each member's bandwidth and k; it has the least kappa."""
 LONGEST = 13
 """Largest number of states and known chains: order 12 and d."""
 FACTORIALS = np.array([math.factorial(i) for i in range(2 * LONGEST + 8)], dtype=np.float64)
@@ -296,7 +302,8 @@ def find_tuning(members: Members, found: Floats) -> None:
         w, a = weight[g], rates[CORRELATION, g]
         variance += w * members.noise[SQUARE, COLOUR[g]] / (1.0 - a * a)
         correlation += w * a
-        bands += w * (g % HALF // IN_BAND)
+        bands += w * BAND[g]
         found[3 + ORDER[g]] += w
     found[0], found[1] = math.sqrt(variance), correlation
-    found[2] = rates[KAPPA, 0] / RATIO[0] * math.exp(bands * math.log(STEP_OF_BANDS))
+    slowest = rates[KAPPA, HALF] / RATIO[HALF]
+    found[2] = slowest * math.exp(bands * math.log(STEP_OF_BANDS))

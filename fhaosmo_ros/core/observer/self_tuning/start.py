@@ -66,6 +66,8 @@ from fhaosmo_ros.core.observer.self_tuning.noise import (
 from fhaosmo_ros.core.observer.self_tuning.weights import FLOOR, weigh
 import numpy as np
 
+MOST = 0.8
+"""Share of the first samples' differences that say how large z may be; others may be outliers."""
 REPEATED = 0.3
 """If a larger share of the first samples repeat the one before, y is quantised."""
 WITHIN_SAMPLES, MORE_REASON = 0.6, 50.0
@@ -114,7 +116,7 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
             values[i] = abs(differences[i])
             if order == 1 and values[i] > 1e-12 * largest:
                 quantum = min(quantum, values[i])
-        size = middle(values, length) / MEDIAN / math.sqrt(binomial)
+        size = ranked(values, length, 0.5) / MEDIAN / math.sqrt(binomial)
         if size > 0.0:
             noise = min(noise, size)
         rough[order] = size * size
@@ -153,15 +155,15 @@ def share_of_multiples(values: Floats, quantum: float) -> float:
 
 
 @compiled()
-def middle(values: Floats, count: int) -> float:
-    """Return the median of the first `count` values, which are sorted in place."""
+def ranked(values: Floats, count: int, share: float) -> float:
+    """Return the value that a share of the first `count` ones is below; sorts these in place."""
     for i in range(1, count):
         value, j = values[i], i
         while j > 0 and values[j - 1] > value:
             values[j] = values[j - 1]
             j -= 1
         values[j] = value
-    return float(values[count // 2])
+    return float(values[int(share * count)])
 
 
 @compiled()
@@ -183,9 +185,12 @@ def begin(
     for i in range(n):  # how large z_i may be: its setting, or what differences say
         sizes[i] = law.chances[FRESH * law.gains.shape[1] + i, i]
         if i > 0:
-            for j in range(count - i * stride):
+            length = count - i * stride
+            values = np.empty(length)
+            for j in range(length):
                 first[j] = (first[j + stride] - first[j]) / (stride * period)
-                sizes[i] = max(sizes[i], first[j] * first[j])
+                values[j] = first[j] * first[j]
+            sizes[i] = max(sizes[i], ranked(values, length, MOST))
     memory[MOVING] = HALF
     memory[STEADY_PERIOD] = period
     memory[UNSETTLED] = 0.0

@@ -101,6 +101,7 @@ from fhaosmo_ros.core.observer.self_tuning.noise import (
 )
 from fhaosmo_ros.core.observer.self_tuning.start import gather
 from fhaosmo_ros.core.observer.self_tuning.weights import (
+    are_finite,
     FLOOR,
     judge,
     mix,
@@ -128,6 +129,8 @@ ANOTHER, FAR_OFF = 1.5, 3.0
 """Factors on the variance of the noise, of the likeliest colour and others, that make P move."""
 LONG = 8.0
 """Time constants of a member after which its P is steady."""
+EVEN = 8
+"""Covariances of so many members, or of a multiple, move: whole vectors of the processor."""
 
 
 @compiled()
@@ -155,10 +158,10 @@ def follow_period(law: Law, members: Members, memory: Floats, h: float) -> None:
     for c in range(COLOURS.size):
         slowed = min(slowed, (memory[FIRST_NOISE] / noise[USED, c]) ** (0.5 / (n + 1)))
     moving = 0
-    for first in range(0, HALF, IN_BAND):
-        if rates[KAPPA, first] / RATIO[first] * slowed * memory[UNSETTLED] < LONG:
+    for g in range(HALF, COUNT, IN_BAND):
+        if rates[KAPPA, g] / RATIO[g] * slowed * memory[UNSETTLED] < LONG:
             moving += IN_BAND
-    memory[MOVING] = moving
+    memory[MOVING] = min(-(-moving // EVEN) * EVEN, HALF)
 
 
 @compiled()
@@ -366,6 +369,8 @@ def step_members(
         follow_jump(members, memory, n, since_jump, s, y)
         memory[LIKELIEST] = weigh(members, FLOOR)
     mix(law, members, scratch, x)
+    if not are_finite(members):
+        x[HAT, 0] = math.nan  # so that the step is rejected, and the members begin afresh
     tell_model(law, members, memory, h, jumped, x)
     find_strays(members, n, x[HAT])
     return float((y - x[HAT, 0]) ** 2)

@@ -21,6 +21,7 @@ from fhaosmo_ros.core.observer.arrays import (
 from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import at, HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
+    BAND,
     BANDS,
     COLOUR,
     COLOURS,
@@ -117,6 +118,15 @@ def weigh(members: Members, floor: float) -> int:
     return likeliest
 
 
+@compiled(fastmath=FAST - {'nnan'})
+def are_finite(members: Members) -> bool:
+    """Return False if any member, or its weight, is lost: where Phi or P grows without a limit."""
+    total, z, p, weight = 0.0, members.x[0], members.p[0], members.record[WEIGHT]
+    for g in range(members.active):
+        total += z[g] * weight[g] + p[g]
+    return total - total == 0.0
+
+
 @compiled()
 def tell_model(
     law: Law, members: Members, memory: Floats, h: float, jumped: bool, x: Floats
@@ -146,11 +156,11 @@ def shift(weight: Floats, slider: float) -> Floats:
     whole = math.floor(slider)
     part, shown = slider - whole, np.zeros(COUNT)
     for g in range(COUNT):
-        band = g % HALF // IN_BAND
+        band, quicker = BAND[g], -IN_BAND if g < HALF else IN_BAND
         low = min(max(band + whole, 0), BANDS - 1) - band
         high = min(max(band + whole + 1, 0), BANDS - 1) - band
-        shown[g + low * IN_BAND] += (1.0 - part) * weight[g]
-        shown[g + high * IN_BAND] += part * weight[g]
+        shown[g + low * quicker] += (1.0 - part) * weight[g]
+        shown[g + high * quicker] += part * weight[g]
     return shown
 
 
