@@ -8,7 +8,7 @@ from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Stat
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.self_tuning.filters import at
-from fhaosmo_ros.core.observer.self_tuning.intervals import within
+from fhaosmo_ros.core.observer.self_tuning.intervals import passage, within
 from fhaosmo_ros.core.observer.self_tuning.jumps import otherwise, SHAPE
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOUR,
@@ -588,3 +588,15 @@ def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, kind, seed, seconds
     p = model_of(setting_of(plant, condition)) | SELF_TUNING
     found, _ = online(r, p)
     assert np.abs(found - r.d).max() < 4.0 * np.abs(r.d).max()
+
+
+@pytest.mark.parametrize('distance', [-0.5, 0.0, 1.0, 2.5])
+@pytest.mark.parametrize(('moved', 'deviation'), [(0.02, 0.0), (-0.01, 0.02), (0.0, 0.05)])
+def test_passing_an_edge_is_as_likely_as_among_many_numbers(distance, moved, deviation):
+    """Normal numbers of variance 1 that move a little: how many pass an edge from below."""
+    random = np.random.default_rng(5)
+    number = random.standard_normal(4_000_000)
+    move = moved + deviation * random.standard_normal(number.size)
+    passed = np.mean((number < distance) & (number + move > distance))
+    found = passage.py_func(distance, 1.0, moved, deviation**2)
+    assert found == pytest.approx(passed, rel=0.25, abs=2e-5)

@@ -42,7 +42,7 @@ from fhaosmo_ros.core.observer.covariance import (
     usual_innovation,
 )
 from fhaosmo_ros.core.observer.prediction import predict
-from fhaosmo_ros.core.observer.self_tuning.members import ORDERS
+from fhaosmo_ros.core.observer.self_tuning.members import by_binomials, ORDERS
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 
@@ -318,9 +318,8 @@ def predict_row(
     slope, kappa = point[4:], problem.decay
     for _ in range(count):
         if kappa > 0.0:
-            second = x[n - 1] - kappa * (2.0 * x[n - 2] - kappa * x[n - 3])
-            chain = x[n - 3], x[n - 2], x[n - 1]
-            x[n - 2], x[n - 1] = x[n - 2] - kappa * x[n - 3], second
+            chain = x[n - ORDERS :].copy()
+            by_binomials(x[n - ORDERS :], -kappa)
         for j in range(n):  # exact derivative of the Runge-Kutta steps along each state
             for i in range(n):
                 stages[NOW, 0, i], stages[NOW, 1, i] = x[i], 1.0 if i == j else 0.0
@@ -330,7 +329,7 @@ def predict_row(
         for i in range(n):
             x[i] = stages[NOW, 0, i]
         if kappa > 0.0:
-            x[n - 3], x[n - 2], x[n - 1] = chain
+            x[n - ORDERS :] = chain
             follow_chain(slope, x, kappa, h)
         multiply(slope, f, point[2], False)
         multiply(slope, p, point[2], False)
@@ -353,9 +352,9 @@ def follow_chain(slope: Floats, x: Floats, kappa: float, h: float) -> None:
     """Let d and its derivatives be those of D 26 in a step of a law that knows plain ones."""
     n, z, decayed = x.shape[0], x.shape[0] - ORDERS, np.exp(-kappa * h)
     for i in range(z):
-        f0, f1, f2 = slope[i, z], slope[i, z + 1], slope[i, z + 2]
-        slope[i, z] = f0 - kappa * (f1 - kappa * f2)
-        slope[i, z + 1] = f1 - 2.0 * kappa * f2
+        for last in range(n - 1, z, -1):  # D^j d by those of (D + kappa)^j d: binomials
+            for j in range(last, n):
+                slope[i, j - 1] -= kappa * slope[i, j]
     for i in range(z, n):
         slope[i, :] = 0.0
         slope[i, i] = decayed

@@ -9,6 +9,7 @@ from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOURS,
     CORRELATION,
+    COUNT,
     DECAYED,
     FACTORIALS,
     FAST,
@@ -43,6 +44,24 @@ def at(d: int, i: int, j: int) -> int:
     return low * d - low * (low - 1) // 2 + high - low
 
 
+@compiled(forceinline=True)
+def by_chain(flow: Floats, i: int, n: int) -> tuple[float, float, float, float]:
+    """Return what d and its derivatives do to z_i."""
+    return flow[i, n], flow[i, n + 1], flow[i, n + 2], flow[i, n + 3]
+
+
+@compiled(forceinline=True)
+def decaying(h: float, i: int, d: int) -> tuple[float, float, float, int, int, int]:
+    """Return what the levels behind level i do to it (D 17), but for its decay; and which."""
+    a, b, c = min(i + 1, d - 1), min(i + 2, d - 1), min(i + 3, d - 1)
+    return (
+        h if i + 1 < d else 0.0,
+        h * h / 2.0 if i + 2 < d else 0.0,
+        h * h * h / 6.0 if i + 3 < d else 0.0,
+        a, b, c,
+    )  # fmt: skip
+
+
 @compiled(forceinline=True, fastmath=FAST)
 def add_three(
     row: Floats,
@@ -75,26 +94,30 @@ def predict_states(
     """Predict the members' estimates: the mean's path, plus the flow of their deviations."""
     flow, kappa, decayed = members.flow, members.rates[KAPPA], members.rates[DECAYED]
     x, ahead = members.x, scratch.x
-    d, rate, second = x[n], x[n + 1], x[n + 2]
+    d, first, second, third = x[n], x[n + 1], x[n + 2], x[n + 3]
     for i in range(n):
         base = predicted[i]
         for j in range(n + ORDERS):
             base -= flow[i, j] * mean[j]
-        row, f0, f1, f2 = ahead[i], flow[i, n], flow[i, n + 1], flow[i, n + 2]
+        row = ahead[i]
+        f0, f1, f2, f3 = by_chain(flow, i, n)
         for g in range(members.active):
             c = kappa[g]
-            by_d, by_rate = f0 - c * (f1 - c * f2), f1 - 2.0 * c * f2
-            row[g] = base + by_d * d[g] + by_rate * rate[g] + f2 * second[g]
+            by_d, by_first = f0 - c * (f1 - c * (f2 - c * f3)), f1 - c * (2.0 * f2 - 3.0 * c * f3)
+            by_second = f2 - 3.0 * c * f3
+            row[g] = (
+                base + by_d * d[g] + by_first * first[g] + by_second * second[g] + f3 * third[g]
+            )
         for m in range(0, n, 3):
             a, b, c, e, f = by_model(flow, i, m, n)
             add_three(row, a, x[m], b, x[e], c, x[f], 0, members.active)
     # exp of D 17: e^(-kappa h) times a polynomial
-    row, other, last, half = ahead[n], ahead[n + 1], ahead[n + 2], 0.5 * h * h
-    for g in range(members.active):
-        row[g] = decayed[g] * (d[g] + h * rate[g] + half * second[g])
-    for g in range(members.active):
-        other[g] = decayed[g] * (rate[g] + h * second[g])
-        last[g] = decayed[g] * second[g]
+    for i in range(n, n + ORDERS):
+        row, one = ahead[i], x[i]
+        a, b, c, at_a, at_b, at_c = decaying(h, i, n + ORDERS)
+        two, three, four = x[at_a], x[at_b], x[at_c]
+        for g in range(members.active):
+            row[g] = decayed[g] * (one[g] + a * two[g] + b * three[g] + c * four[g])
 
 
 @compiled(fastmath=FAST)
@@ -109,23 +132,27 @@ def multiply(members: Members, scratch: Scratch, n: int, h: float, first: int, l
             if flow[i, m] != 0.0:
                 lowest = min(lowest, m)
         if i >= n:
-            b, c = h if i < d - 1 else 0.0, 0.5 * h * h if i < d - 2 else 0.0
+            a, b, c, at_a, at_b, at_c = decaying(h, i, d)
             for j in range(lowest, d):
-                row, one = product[i * d + j], p[at(d, j, i)]
-                two, three = p[at(d, j, min(i + 1, d - 1))], p[at(d, j, d - 1)]
+                row, one, two = product[i * d + j], p[at(d, j, i)], p[at(d, j, at_a)]
+                three, four = p[at(d, j, at_b)], p[at(d, j, at_c)]
                 for g in range(first, last):
-                    row[g] = decayed[g] * (one[g] + b * two[g] + c * three[g])
+                    row[g] = decayed[g] * (one[g] + a * two[g] + b * three[g] + c * four[g])
             continue
-        f0, f1, f2 = flow[i, n], flow[i, n + 1], flow[i, n + 2]
-        by_d, by_rate = chain[2 * i], chain[2 * i + 1]
+        f0, f1, f2, f3 = by_chain(flow, i, n)
+        by_d, by_first, by_second = chain[3 * i], chain[3 * i + 1], chain[3 * i + 2]
         for g in range(first, last):
-            by_d[g] = f0 - kappa[g] * (f1 - kappa[g] * f2)
-            by_rate[g] = f1 - 2.0 * kappa[g] * f2
+            c = kappa[g]
+            by_d[g] = f0 - c * (f1 - c * (f2 - c * f3))
+            by_first[g] = f1 - c * (2.0 * f2 - 3.0 * c * f3)
+            by_second[g] = f2 - 3.0 * c * f3
         for j in range(lowest, d):
             row = product[i * d + j]
-            one, two, three = p[at(d, j, n)], p[at(d, j, n + 1)], p[at(d, j, n + 2)]
+            one, two = p[at(d, j, n)], p[at(d, j, n + 1)]
+            three, four = p[at(d, j, n + 2)], p[at(d, j, n + 3)]
             for g in range(first, last):
-                row[g] = by_d[g] * one[g] + by_rate[g] * two[g] + f2 * three[g]
+                more = by_d[g] * one[g] + by_first[g] * two[g]
+                row[g] = more + by_second[g] * three[g] + f3 * four[g]
             for m in range(0, n, 3):
                 a, b, c, e, f = by_model(flow, i, m, n)
                 one, two, three = p[at(d, j, m)], p[at(d, j, e)], p[at(d, j, f)]
@@ -139,36 +166,57 @@ def share(powers: Floats, h: float, a: int, b: int) -> float:
 
 
 @compiled(fastmath=FAST)
-def predict_covariances(
+def integrate_drive(
     members: Members, scratch: Scratch, n: int, h: float, first: int, last: int
 ) -> None:
-    """Write A P A' + Q of the columns `first` .. `last` - 1 (D 27)."""
-    multiply(members, scratch, n, h, first, last)
-    product, chain, flow, drive = scratch.product, scratch.chain, members.flow, members.drive
-    none, slope, curve = drive[0], drive[1], drive[2]
-    decayed, d, powers = members.rates[DECAYED], n + ORDERS, scratch.lines[0]
+    """Write Q of the columns `first` .. `last` - 1 (D 27), unless it is there already."""
+    drive, holds, d, powers = members.drive, scratch.holds, n + ORDERS, scratch.lines[0]
+    none, slope, curve, jerk = drive[0], drive[1], drive[2], drive[3]
+    one, other = none[0], jerk[COUNT - 1]  # all others follow from these two (D 26)
+    there = holds[0] == h and holds[1] == one and holds[2] == other
+    if there and holds[3] <= first and last <= holds[4]:
+        return
+    holds[0], holds[1], holds[2], holds[3], holds[4] = h, one, other, first, last
     powers[0] = 1.0  # h^j / j!
     for i in range(1, d):
         powers[i] = powers[i - 1] * h / i
     for i in range(d):
         for j in range(i, d):
-            row = scratch.p[at(d, i, j)]
+            row = scratch.q[at(d, i, j)]
             q0 = share(powers, h, n - i, n - j)
             q1 = share(powers, h, n + 1 - i, n + 1 - j)
             q2 = share(powers, h, n + 2 - i, n + 2 - j)
-            if j >= n:
-                b, c = h if j < d - 1 else 0.0, 0.5 * h * h if j < d - 2 else 0.0
-                one, two = product[i * d + j], product[i * d + min(j + 1, d - 1)]
-                three = product[i * d + d - 1]
-                for g in range(first, last):
-                    q = q0 * none[g] + q1 * slope[g] + q2 * curve[g]
-                    row[g] = q + decayed[g] * (one[g] + b * two[g] + c * three[g])
-                continue
-            by_d, by_rate, f2 = chain[2 * j], chain[2 * j + 1], flow[j, n + 2]
-            one, two, three = product[i * d + n], product[i * d + n + 1], product[i * d + n + 2]
+            q3 = share(powers, h, n + 3 - i, n + 3 - j)
             for g in range(first, last):
-                q = q0 * none[g] + q1 * slope[g] + q2 * curve[g]
-                row[g] = q + by_d[g] * one[g] + by_rate[g] * two[g] + f2 * three[g]
+                row[g] = q0 * none[g] + q1 * slope[g] + q2 * curve[g] + q3 * jerk[g]
+
+
+@compiled(fastmath=FAST)
+def predict_covariances(
+    members: Members, scratch: Scratch, n: int, h: float, first: int, last: int
+) -> None:
+    """Write A P A' + Q of the columns `first` .. `last` - 1 (D 27)."""
+    multiply(members, scratch, n, h, first, last)
+    integrate_drive(members, scratch, n, h, first, last)
+    product, chain, flow = scratch.product, scratch.chain, members.flow
+    decayed, d = members.rates[DECAYED], n + ORDERS
+    for i in range(d):
+        for j in range(i, d):
+            row, q = scratch.p[at(d, i, j)], scratch.q[at(d, i, j)]
+            if j >= n:
+                a, b, c, at_a, at_b, at_c = decaying(h, j, d)
+                one, two = product[i * d + j], product[i * d + at_a]
+                three, four = product[i * d + at_b], product[i * d + at_c]
+                for g in range(first, last):
+                    row[g] = q[g] + decayed[g] * (one[g] + a * two[g] + b * three[g] + c * four[g])
+                continue
+            by_d, by_first, by_second = chain[3 * j], chain[3 * j + 1], chain[3 * j + 2]
+            f3, at_d = flow[j, n + 3], i * d + n
+            one, two = product[at_d], product[at_d + 1]
+            three, four = product[at_d + 2], product[at_d + 3]
+            for g in range(first, last):
+                more = by_d[g] * one[g] + by_first[g] * two[g]
+                row[g] = q[g] + more + by_second[g] * three[g] + f3 * four[g]
             for m in range(0, n, 3):
                 a, b, c, e, f = by_model(flow, j, m, n)
                 one, two, three = product[i * d + m], product[i * d + e], product[i * d + f]

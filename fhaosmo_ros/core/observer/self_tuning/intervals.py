@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The members where y is quantised: a sample says within which interval z_1 lies (D 31).
+The members where y is quantised: a sample says within which interval z_1 lies (D 31, D 36).
 
 Estimate and covariance become those of the normal distribution with the mean and the variance that
 the truncated one has (Curry, Vander Velde and Potter 1970, IEEE Transactions on Information Theory
@@ -13,7 +13,7 @@ from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.observer.arrays import ACTIVE, UNSETTLED
 from fhaosmo_ros.core.observer.covariance import GATE
-from fhaosmo_ros.core.observer.self_tuning.filters import HUBER, INEXACT
+from fhaosmo_ros.core.observer.self_tuning.filters import at, HUBER, INEXACT
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COUNT,
     FAR,
@@ -36,8 +36,17 @@ VAGUE = 0.1
 """Part of the quantum by which predictions of z_1 are less certain than their P says."""
 LEAST_CHANCE = -6.0
 """Logarithm of the least probability that a sample counts with."""
-LEAST_STAYED = math.log(0.5)
-"""That of the least probability with which z_1 lies in its interval after a sample."""
+LEAST_PASSAGE = -12.0
+"""That of the least probability with which z_1 passes an edge at just this sample."""
+SLOW = 0.25
+"""
+That probability is so small that it has to be found from the speed if z_1 moves, squared, by less
+than this part of its variance.
+"""
+EVENLY = math.log(0.917)
+"""Of a normal number with the variance of an even distribution in the interval."""
+HALF_SURE = math.log(0.5)
+"""A repeated sample counts for what is less likely than this, and for z_1 not passing an edge."""
 KNOWN = math.log(0.88)
 """
 A sample that repeats the one before, and that a member expects with a larger probability, tells it
@@ -99,12 +108,35 @@ def within(low: float, high: float) -> tuple[float, float, float]:
     return chance, mean if low + high > 0.0 else -mean, min(max(lost, 0.0), 1.0)
 
 
+@compiled(inline='always')
+def passage(to_edge: float, variance: float, moved: float, spread: float) -> float:
+    """
+    Return the probability that a normal number passes an edge above it between two samples.
+
+    By the mean rate of upcrossings, density times mean speed (D 36, Rice 1945): the mean of v
+    where v > 0 and of 0 elsewhere, for a normal v, is about (m + sqrt(m^2 + 2 s^2 / pi)) / 2.
+
+    Parameters
+    ----------
+    to_edge : float
+        How far the edge is from the mean of the number.
+    variance : float
+        Of the number.
+    moved, spread : float
+        How far it moves up between the samples, and the variance of that.
+
+    """
+    density = math.exp(-0.5 * to_edge * to_edge / variance) / math.sqrt(2.0 * math.pi * variance)
+    return density * 0.5 * (moved + math.sqrt(moved * moved + 2.0 / math.pi * spread))
+
+
 @compiled()
 def take_interval(
     members: Members,
     scratch: Scratch,
     y: float,
-    repeated: bool,
+    before: float,
+    h: float,
     quanta: float,
     kept: float,
 ) -> None:
@@ -116,8 +148,10 @@ def take_interval(
 
     Parameters
     ----------
-    repeated : bool
-        True if the sample before was the same.
+    before : float
+        The sample before.
+    h : float
+        Time since then.
     quanta : float
         Variance of the error of rounding.
     kept : float
@@ -128,6 +162,9 @@ def take_interval(
     least = max(noise - quanta, 0.0) + (2.0 * VAGUE * half) ** 2
     inverse, taken, innovation = scratch.lines[0], scratch.lines[2], scratch.b
     score, prior, far = members.record[SCORE], members.record[PRIOR], members.record[FAR]
+    repeated, one_step = y == before, 0.0 < abs(y - before) < 3.0 * half
+    side = 1.0 if y > before else -1.0
+    speed = members.p[at(len(members.x), 1, 1)]  # variance of the state behind z_1
     for g in range(members.active):
         square = innovation[g] * innovation[g]
         far[g] = far[g] + 1.0 if square > GATE * GATE * scratch.s[g] * noise else 0.0
@@ -135,10 +172,19 @@ def take_interval(
         size, off = math.sqrt(variance), y - scratch.x[0, g]
         chance, mean, lost = within((off - half) / size, (off + half) / size)
         likelihood = max(chance, LEAST_CHANCE)
-        if repeated:  # it was there before
-            size, off = math.sqrt(members.p[0, g] + least), y - members.x[0, g]
-            stayed, _, _ = within((off - half) / size, (off + half) / size)
-            likelihood = min(likelihood - max(stayed, LEAST_STAYED), 0.0)
+        moved, spread = scratch.x[0, g] - members.x[0, g], h * h * speed[g]
+        was = members.p[0, g] + least
+        if (repeated or one_step) and moved * moved + spread < SLOW * was:
+            off = side * (before - members.x[0, g])
+            passed = passage(off + half, was, side * moved, spread)
+            if repeated:
+                passed += passage(half - off, was, -side * moved, spread)
+                likelihood = min(likelihood - HALF_SURE, -passed)
+            elif passed < 1.0:
+                passed = math.log(max(passed, 1e-9))
+                likelihood = min(likelihood, max(passed, LEAST_PASSAGE))
+        elif repeated:
+            likelihood = min(likelihood - EVENLY, 0.0)
         if kept >= 0.0:
             score[g] = prior[g] + kept * (score[g] - prior[g]) + likelihood
         if repeated and chance > KNOWN:

@@ -25,6 +25,7 @@ from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
     BANDWIDTHS,
+    by_binomials,
     COLOUR,
     COUNT,
     FAR,
@@ -233,10 +234,9 @@ def follow_jump(members: Members, memory: Floats, n: int, count: int, s: Floats,
     for j in range(WINDOW - count, WINDOW):
         total += members.recent[j] * math.sqrt(variance)
     before = members.x[:, g] - total * members.gain[:, g]  # nothing of the jump is in z or d
-    kappa, estimate = members.rates[KAPPA, g], before.copy()
+    estimate = before.copy()
     estimate[0] += total / count
-    estimate[n + 1] -= kappa * before[n]
-    estimate[n + 2] -= kappa * (2.0 * before[n + 1] - kappa * before[n])
+    by_binomials(estimate[n:], -members.rates[KAPPA, g])
     for m in range(COUNT):
         put(members, n, m, estimate)
         members.p[0, m] += variance / count

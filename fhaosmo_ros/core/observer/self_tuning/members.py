@@ -2,8 +2,8 @@
 """
 The members of the self-tuning observer: which they are, and where they lie in memory (D 26).
 
-A member is an observer with its own model of d (D 17: k = 0, 1 or 2 derivatives, intensity q,
-decay kappa) and of the noise (white, or coloured: v_j = a v_{j-1} + w_j). All have N = n + 3
+A member is an observer with its own model of d (D 17: k = 0 to 3 derivatives, intensity q,
+decay kappa) and of the noise (white, or coloured: v_j = a v_{j-1} + w_j). All have N = n + 4
 states, of which those of derivatives that a model does not have stay 0. Arrays have one column a
 member, so that a step of all members is a few long loops that the compiler turns into vector
 instructions. Members with white noise come first, from the quickest to the slowest; those with
@@ -22,17 +22,22 @@ from fhaosmo_ros.core.model.bytecode import Floats
 import numpy as np
 from numpy.typing import NDArray
 
-ORDERS = 3
-"""Members have k = 0, 1, 2 derivatives of d."""
+ORDERS = 4
+"""Members have k = 0, 1, 2, 3 derivatives of d."""
 BANDS = 15
 """Bandwidths omega of the members of each k."""
 SLOWEST, QUICKEST = 6e-4, 3.0
 """Their range, in rad a sample."""
-DECAYS = np.array([0.1, 0.5, 1.5])
-"""kappa / omega of the members with white noise; with coloured noise it is the first."""
-COLOURS = np.array([0.0, 0.7, 0.92, 0.98])
-"""Correlations a of the noise of neighbouring samples."""
-KINDS = len(DECAYS)
+DECAYS = np.array([[0.1, 0.6], [0.1, 1.5]])
+"""
+kappa / omega of the members of every second bandwidth, and of the others; with coloured noise it
+is the first of two.
+"""
+COLOURS = np.array([0.0, 0.75, 0.92, 0.98])
+"""Correlations a of the noise of neighbouring samples; the first is white noise."""
+COLOURED = np.array([[1, 3], [1, 2]])
+"""Which of these the members with coloured noise have, by bandwidths as `DECAYS`."""
+KINDS = len(DECAYS[0])
 """Members of each bandwidth and k in each half: kappa differs, or the colour."""
 IN_BAND = ORDERS * KINDS
 HALF = BANDS * IN_BAND
@@ -45,9 +50,12 @@ BANDWIDTHS = np.geomspace(SLOWEST, QUICKEST, BANDS)[BAND]
 """omega of each member, in rad a sample."""
 ORDER = np.tile(np.repeat(np.arange(ORDERS), KINDS), 2 * BANDS)
 """k of each member."""
-COLOUR = np.append(np.zeros(HALF, int), np.tile(np.arange(1, len(COLOURS)), HALF // KINDS))
-RATIO = np.append(np.tile(DECAYS, HALF // KINDS), np.full(HALF, DECAYS[0]))
-FIRST = np.searchsorted(COLOUR[: HALF + KINDS], np.arange(len(COLOURS)))
+KIND = np.tile(np.arange(KINDS), COUNT // KINDS)
+IS_WHITE = np.arange(COUNT) < HALF
+COLOUR = np.where(IS_WHITE, 0, COLOURED[BAND % 2, KIND])
+RATIO = DECAYS[BAND % 2, np.where(IS_WHITE, KIND, 0)]
+"""kappa / omega of each member."""
+FIRST = np.array([np.argmax(c == COLOUR) for c in range(len(COLOURS))])
 """The first member of each colour."""
 WHITE = HALF - IN_BAND * (1 + BAND) + KINDS * ORDER
 """The first member with white noise of each member's bandwidth and k; it has the least kappa."""
@@ -130,7 +138,7 @@ def size_of(order: int) -> int:
 
 
 def rows_of(order: int) -> int:
-    """Return how many rows of N = n + 3 numbers hold the members."""
+    """Return how many rows of N numbers hold the members."""
     return -(-size_of(order) // (order + ORDERS))
 
 
@@ -177,8 +185,12 @@ class Scratch(NamedTuple):
         Predictions of the members' estimates and covariances, and P C'.
     product : (N N, COUNT) array
         A P, row by row.
-    chain : (2 n, COUNT) array
-        By what d and (D + kappa) d act on each z.
+    chain : ((ORDERS - 1) n, COUNT) array
+        By what d, (D + kappa) d and (D + kappa)^2 d act on each z.
+    q : array
+        What the intensities add to predicted covariances.
+    holds : (5,) array
+        Of which interval, intensities (two) and columns (first, last) `q` is.
 
     """
 
@@ -190,16 +202,18 @@ class Scratch(NamedTuple):
     p: Floats
     product: Floats
     chain: Floats
+    q: Floats
+    holds: Floats
 
 
 LINES = 7
 
 
 def scratch_rows(order: int) -> int:
-    """Return how many rows of N = n + 3 numbers a step needs for itself."""
+    """Return how many rows of N numbers a step needs for itself."""
     d = order + ORDERS
-    columns = LINES + 2 + 2 * d + d * (d + 1) // 2 + d * d + 2 * order
-    return -(-columns * COUNT // d)
+    columns = LINES + 2 + 2 * d + d * (d + 1) + d * d + (ORDERS - 1) * order
+    return -(-(columns * COUNT + 5) // d)
 
 
 @compiled(forceinline=True)
@@ -213,7 +227,9 @@ def scratch_in(rows: Floats, n: int) -> Scratch:
     gain, at = grid(address, at, d), at + d * c
     p, at = grid(address, at, d * (d + 1) // 2), at + d * (d + 1) // 2 * c
     product, at = grid(address, at, d * d), at + d * d * c
-    return Scratch(lines, b, s, x, gain, p, product, grid(address, at, 2 * n))
+    chain, at = grid(address, at, (ORDERS - 1) * n), at + (ORDERS - 1) * n * c
+    q, at = grid(address, at, d * (d + 1) // 2), at + d * (d + 1) // 2 * c
+    return Scratch(lines, b, s, x, gain, p, product, chain, q, doubles_at(address + 8 * at, 5))
 
 
 @compiled(forceinline=True, fastmath=FAST)
@@ -221,42 +237,48 @@ def fill(values: Floats, of_colours: Floats) -> None:
     """Write for each member the value of its colour."""
     for g in range(HALF):
         values[g] = of_colours[0]
-    for g in range(HALF, HALF + IN_BAND):
+    for g in range(HALF, HALF + 2 * IN_BAND):
         values[g] = of_colours[COLOUR[g]]
-    for g in range(HALF + IN_BAND, COUNT):
-        values[g] = values[g - IN_BAND]
+    for g in range(HALF + 2 * IN_BAND, COUNT):
+        values[g] = values[g - 2 * IN_BAND]
 
 
 @compiled(fastmath=FAST)
-def largest_of(values: Floats, spare: Floats, count: int, period: int = 1) -> float:
+def largest_of(values: Floats, spare: Floats, count: int) -> float:
     """
     Return the largest of the first `count` values.
 
-    With a `period` the largest of those that are so many apart are in ``spare[:period]`` then. By
-    halves: the compiler makes no vector instructions of a loop over the largest one so far.
+    By halves: the compiler makes no vector instructions of a loop over the largest one so far.
     """
-    half = (count // period + 1) // 2 * period
+    half = (count + 1) // 2
     for g in range(count - half):
         spare[g] = max(values[g], values[half + g])
     for g in range(count - half, half):
         spare[g] = values[g]
-    while half > period:
-        count, half = half, (half // period + 1) // 2 * period
+    while half > 1:
+        count, half = half, (half + 1) // 2
         for g in range(count - half):
             spare[g] = max(spare[g], spare[half + g])
     return float(spare[0])
 
 
 @compiled(forceinline=True)
+def by_binomials(chain: Floats, more: float) -> None:
+    """Turn (D + c)^j d, j = 0, 1, .., into (D + c + more)^j d, in place."""
+    for first in range(1, chain.size):
+        for j in range(chain.size - 1, first - 1, -1):
+            chain[j] += more * chain[j - 1]
+
+
+@compiled(forceinline=True)
 def put(members: Members, n: int, g: int, estimate: Floats) -> None:
-    """Put a member to an estimate of z, d, d' and d''; its own states are (D + kappa)^j d."""
-    x, kappa = members.x, members.rates[KAPPA, g]
-    for i in range(n + 1):
+    """Put a member to an estimate of z, d, d', ..; its own states are (D + kappa)^j d."""
+    x = members.x
+    for i in range(n + ORDERS):
         x[i, g] = estimate[i]
-    if ORDER[g] > 0:
-        x[n + 1, g] = estimate[n + 1] + kappa * estimate[n]
-    if ORDER[g] > 1:
-        x[n + 2, g] = estimate[n + 2] + kappa * (2.0 * estimate[n + 1] + kappa * estimate[n])
+    by_binomials(x[n:, g], members.rates[KAPPA, g])
+    for i in range(n + 1 + ORDER[g], n + ORDERS):
+        x[i, g] = 0.0
 
 
 class Tuning(NamedTuple):
@@ -271,8 +293,8 @@ class Tuning(NamedTuple):
         Correlation of the noise of neighbouring samples; 0 for white noise.
     bandwidth : float
         How fast d is followed, in rad/s.
-    derivatives : (3,) array
-        Shares of the models of d with 0, 1 and 2 derivatives.
+    derivatives : (4,) array
+        Shares of the models of d with 0 to 3 derivatives.
 
     """
 
@@ -283,7 +305,7 @@ class Tuning(NamedTuple):
 
     @classmethod
     def of(cls, found: NDArray[np.float64]) -> 'Tuning':
-        """Return what the six numbers mean that `TUNING` names."""
+        """Return what the numbers mean that `TUNING` names."""
         noise, correlation, bandwidth = found[:3].tolist()
         return cls(noise, correlation, bandwidth, found[3:])
 

@@ -25,7 +25,6 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     fill,
     FIRST,
     HALF,
-    KINDS,
     largest_of,
     Members,
     SCORE,
@@ -248,10 +247,9 @@ def follow_noise(
     )  # fmt: skip
     best, weights, squares = scratch.lines[4], scratch.lines[5], scratch.lines[6]  # of colours
     weights[: COLOURS.size], squares[: COLOURS.size] = 0.0, 0.0
-    best[0] = largest_of(score, spare, HALF)
-    if members.active > HALF:
-        largest_of(score[HALF:], spare, HALF, KINDS)
-        best[1:4] = spare[:KINDS]
+    best[0], best[1 : COLOURS.size] = largest_of(score, spare, HALF), -math.inf
+    for g in range(HALF, members.active):
+        best[COLOUR[g]] = max(best[COLOUR[g]], score[g])
     fill(less, noise[SQUARE])
     for g in range(members.active):
         size[g] = s[g] * less[g]

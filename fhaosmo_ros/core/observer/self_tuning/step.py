@@ -70,12 +70,15 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     DECAYED,
     FAR,
     find_tuning,
+    FIRST,
     FIRST_SAMPLES,
     HALF,
     IN_BAND,
     KAPPA,
+    KINDS,
     Members,
     members_in,
+    ORDER,
     ORDERS,
     put,
     RATIO,
@@ -87,6 +90,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     TAU,
     USED,
     VARIANCE,
+    WHITE,
 )
 from fhaosmo_ros.core.observer.self_tuning.noise import (
     CALM_SAMPLES,
@@ -127,21 +131,36 @@ EXACT = 1e-5
 """y is taken to be no more exact than this, in parts of what it moves between samples (RMS)."""
 ANOTHER, FAR_OFF = 1.5, 3.0
 """Factors on the variance of the noise, of the likeliest colour and others, that make P move."""
+SAME = 1e-9
+"""Intervals that differ by this part are equal: seconds of a clock, as floats, are not exact."""
 LONG = 8.0
 """Time constants of a member after which its P is steady."""
-EVEN = 8
+EVEN = 16
 """Covariances of so many members, or of a multiple, move: whole vectors of the processor."""
+
+
+@compiled(forceinline=True)
+def is_same(h: float, memory: Floats) -> bool:
+    """Return True if what depends on the interval is known, but for a part of `SAME`."""
+    return bool(abs(h - memory[FLOW_PERIOD]) <= SAME * memory[FLOW_PERIOD])
 
 
 @compiled()
 def follow_period(law: Law, members: Members, memory: Floats, h: float) -> None:
     """Decide which covariances move, and what depends on the period (D 27)."""
     rates, noise = members.rates, members.noise
-    if h != memory[FLOW_PERIOD]:
-        for g in range(COUNT):
-            rates[DECAYED, g] = math.exp(-rates[KAPPA, g] * h)
-            tau = rates[TAU, g]
-            rates[CORRELATION, g] = math.exp(-h / tau) if tau > 0.0 else 0.0
+    if not is_same(h, memory):
+        for g in range(HALF):
+            if ORDER[g] == 0:
+                rates[DECAYED, g] = math.exp(-rates[KAPPA, g] * h)
+            else:
+                rates[DECAYED, g] = rates[DECAYED, g - KINDS]
+        of_colours = np.zeros(COLOURS.size)
+        for c in range(1, COLOURS.size):
+            of_colours[c] = math.exp(-h / rates[TAU, FIRST[c]])
+        for g in range(HALF, COUNT):
+            rates[DECAYED, g] = rates[DECAYED, WHITE[g]]
+            rates[CORRELATION, g] = of_colours[COLOUR[g]]
     changed = abs(h - memory[STEADY_PERIOD]) > NEAR * memory[STEADY_PERIOD]
     likeliest = COLOUR[int(memory[LIKELIEST])]
     for c in range(COLOURS.size):
@@ -170,7 +189,7 @@ def carry_flow(
 ) -> None:
     """Predict the mean, with its derivative by each of its entries (D 27); to ``stages[NOW]``."""
     levels, now = law.gains.shape[1], work.stages[NOW]
-    known = law.flags[LINEAR] and h == memory[FLOW_PERIOD]
+    known = law.flags[LINEAR] and is_same(h, memory)
     for j in range(levels - 1 if known else 0, levels):
         for i in range(levels):
             now[0, i], now[1, i] = work.x[HAT, i], 0.0
@@ -178,7 +197,8 @@ def carry_flow(
         predict(law, work, h, u, law.scalars[PREDICTION_STEP])
         for i in range(levels):
             members.flow[i, j] = now[1, i]
-    memory[FLOW_PERIOD] = h
+    if not is_same(h, memory):
+        memory[FLOW_PERIOD] = h
 
 
 class Sample(NamedTuple):
@@ -187,7 +207,8 @@ class Sample(NamedTuple):
 
     Attributes
     ----------
-    y : float
+    y, h : float
+        The sample, and the time since the one before.
     off : float
         By what it is off the prediction of the mean.
     quanta : float
@@ -210,6 +231,7 @@ class Sample(NamedTuple):
     """
 
     y: float
+    h: float
     off: float
     quanta: float
     roughness: float
@@ -273,7 +295,7 @@ def take(
     kept = sample.kept if judged else -1.0
     follow_innovations(members, scratch.b, scratch.s, quanta)
     if quanta > 0.0:
-        take_interval(members, scratch, y, y == memory[Y], quanta, kept)
+        take_interval(members, scratch, y, memory[Y], sample.h, quanta, kept)
     correct(members, scratch, n, int(memory[MOVING]), quanta > 0.0)
     if quanta == 0.0:
         judge(members, scratch, grown, kept, calm)
@@ -326,7 +348,7 @@ def step_members(
         believed = np.minimum(s, 4.0 * members.record[VARIANCE])
     largest = knowing(members, scratch, believed, int(memory[LIKELIEST]))
     sample = Sample(
-        y, y - now[0, 0], quanta, roughness, roughness_before, highest + of_stamps, of_stamps,
+        y, h, y - now[0, 0], quanta, roughness, roughness_before, highest + of_stamps, of_stamps,
         max(quanta, law.scalars[LEAST_NOISE] ** 2, EXACT * EXACT * members.rough[1, 1]), largest,
         min(memory[SAMPLES], NOISE_SAMPLES), math.exp(-h / law.scalars[FORGETTING]),
     )  # fmt: skip

@@ -182,16 +182,21 @@ def mix(law: Law, members: Members, scratch: Scratch, x: Floats) -> None:
     )  # fmt: skip
     if law.scalars[SLIDER] != 1.0:
         w = shift(w, math.log(law.scalars[SLIDER]) / math.log(STEP_OF_BANDS))
-    z, p, derivative, second = members.x, members.p, scratch.lines[0], scratch.lines[1]
-    d, its_first, its_second = z[n], z[n + 1], z[n + 2]
-    for g in range(count):
-        derivative[g] = its_first[g] - kappa[g] * d[g]
-    for g in range(count):
-        second[g] = its_second[g] - kappa[g] * (2.0 * its_first[g] - kappa[g] * d[g])
+    z, p, derivative = members.x, members.p, scratch.lines[0]
+    d, first, second, third = z[n], z[n + 1], z[n + 2], z[n + 3]
     x[COVARIANCE] = 0.0
     for i in range(n + 1):
         x[HAT, i] = weighted(w, z[i], count)
-    x[HAT, n + 1], x[HAT, n + 2] = weighted(w, derivative, count), weighted(w, second, count)
+    for g in range(count):
+        derivative[g] = first[g] - kappa[g] * d[g]
+    x[HAT, n + 1] = weighted(w, derivative, count)
+    for g in range(count):
+        derivative[g] = second[g] - kappa[g] * (2.0 * first[g] - kappa[g] * d[g])
+    x[HAT, n + 2] = weighted(w, derivative, count)
+    for g in range(count):
+        c = kappa[g]
+        derivative[g] = third[g] - c * (3.0 * second[g] - c * (3.0 * first[g] - c * d[g]))
+    x[HAT, n + 3] = weighted(w, derivative, count)
     for i in range(n + 1):
         mean, value, variance, total = x[HAT, i], z[i], p[at(n + ORDERS, i, i)], 0.0
         for g in range(count):
