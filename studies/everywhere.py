@@ -117,6 +117,8 @@ PEERS: dict[str, list[dict[str, float]]] = {
     IMM: [{'spread': f, 'stay': seconds} for f in (1.5, 2.0, 3.0) for seconds in (1.0, 10.0)],
 }
 """What the tuning chooses from, around the filter that it has found."""
+KNOWN = 'every z known'
+"""What a wrong Phi makes of d, whoever estimates it."""
 CEILING = 20.0
 """Largest ratio that is drawn."""
 
@@ -208,6 +210,13 @@ def errors_of(
     return [error(r, run(r)['filtered'].d) for r in recordings]
 
 
+def implied(plant: Plant, c: Condition, recordings: list[Recording]) -> float:
+    """Return the error of the d that a wrong Phi implies, where every z is known exactly."""
+    phi = TriangularModel(plant.phi)
+    off = [(1.0 - c.phi) * np.array([phi.evaluate(z)[-1] for z in r.z]) for r in recordings]
+    return mean([error(r, r.d + e) for r, e in zip(recordings, off, strict=True)])
+
+
 def best_member(setting: Setting, recordings: list[Recording], trials: int) -> Member:
     """Tune the Kalman filter with the truth, as the comparison does."""
     found = tune(METHODS[LINEAR_LIMIT], setting, recordings, trials, SEED).values
@@ -255,6 +264,8 @@ def cell(name: str, condition: str, size: Size, once: Once | None) -> dict[str, 
     for peer, number in once.peers.items():
         errors[peer] = errors_of(peer, setting, {**values, **PEERS[peer][number]}, recordings)
     yard = mean(errors_of(LINEAR_LIMIT, setting, anew, recordings))
+    if c.phi != 1.0:
+        errors[KNOWN] = [implied(plant, c, recordings)]
     return {
         'plant': name, 'condition': condition, 'tuned anew': round(yard, 5),
         'member': list(found), 'peers': once.peers,
@@ -286,8 +297,11 @@ def again(before: dict[str, Any], size: Size) -> dict[str, Any]:
     plant, c = PLANTS[before['plant']], CONDITIONS[before['condition']]
     recordings = [recording(plant, c, kind, size.duration) for kind in size.kinds]
     errors, inside = self_tuned(model_of(setting_of(plant, c)), recordings)
-    ratio = float(f'{mean(errors) / before["tuned anew"]:.4g}')
-    return before | {'ratios': before['ratios'] | {SELF: ratio}, 'inside': inside}
+    anew = {SELF: mean(errors)}
+    if c.phi != 1.0:
+        anew[KNOWN] = implied(plant, c, recordings)
+    ratios = {k: float(f'{e / before["tuned anew"]:.4g}') for k, e in anew.items()}
+    return before | {'ratios': before['ratios'] | ratios, 'inside': inside}
 
 
 def compute_again(folder: Path, size: Size, jobs: int, stop: Stop) -> list[dict[str, Any]]:
@@ -383,8 +397,12 @@ def texts(found: dict[str, Any]) -> dict[str, str]:
     def inside(c: dict[str, Any]) -> str:
         return ' / '.join(f'{100.0 * share:.0f}' for share in c['inside'])
 
+    wrong = [c for c in cells if KNOWN in c['ratios']]
     return {
         'methods': '\n'.join(lines),
+        'wrong': table(
+            wrong, lambda c: f'{number(c["ratios"][SELF])} / {number(c["ratios"][KNOWN])}'
+        ),
         'ratios': table(cells, both),
         'bands': table(cells, inside),
     }
