@@ -43,16 +43,16 @@ SLOW = 0.25
 That probability is so small that it has to be found from the speed if z_1 moves, squared, by less
 than this part of its variance.
 """
-EVENLY = math.log(0.917)
-"""Of a normal number with the variance of an even distribution in the interval."""
 HALF_SURE = math.log(0.5)
 """A repeated sample counts for what is less likely than this, and for z_1 not passing an edge."""
-KNOWN = math.log(0.88)
+EVENLY, KNOWN = math.log(0.917), math.log(0.88)
 """
-A sample that repeats the one before, and that a member expects with a larger probability, tells it
-nothing. A normal number with the variance of an even distribution in the interval lies in it with
-a probability of 0.917: each such sample would narrow it again.
+A normal number with the variance of an even distribution in the interval lies in it with the first
+probability. So a sample that repeats the one before, and that a member expects with more than the
+second one, tells it nothing: each such sample would narrow it again.
 """
+WELL_WITHIN = 1.75
+"""If both edges are so many standard deviations off, z_1 is within them more likely than both."""
 NARROW = 0.03
 """In an interval of so few standard deviations the density is taken to be constant."""
 FAR_TAIL = 5.5
@@ -170,7 +170,9 @@ def take_interval(
         far[g] = far[g] + 1.0 if square > GATE * GATE * scratch.s[g] * noise else 0.0
         variance = INEXACT * (p[g] + least)
         size, off = math.sqrt(variance), y - scratch.x[0, g]
-        chance, mean, lost = within((off - half) / size, (off + half) / size)
+        chance = mean = lost = 0.0
+        if not repeated or half - abs(off) < WELL_WITHIN * size:
+            chance, mean, lost = within((off - half) / size, (off + half) / size)
         likelihood = max(chance, LEAST_CHANCE)
         moved, spread = scratch.x[0, g] - members.x[0, g], h * h * speed[g]
         was = members.p[0, g] + least
