@@ -26,7 +26,7 @@ GATE, MOST = 12.0, 20
 @compiled()
 def _run(
     model: Bytecode, stack: Floats, stages: Floats, t: Floats, y: Floats, which: Floats,
-    transitions: Floats, prior: Floats, settings: Floats, out: Floats,
+    transitions: Floats, prior: Floats, settings: Floats, outliers: Floats, out: Floats,
 ) -> None:  # fmt: skip
     """Filter; `transitions` holds A and Q of each different interval, `which` chooses them."""
     n, r, huber, lost = prior.shape[0], settings[0], settings[1], settings[2] > 0.0
@@ -44,7 +44,7 @@ def _run(
                 take_slope(CLASSICAL, stage, (t[k] - t[k - 1]) / steps, stages)
         p = a @ p @ a.T + q
         b, s = y[k] - x[0], p[0, 0] + r
-        skip = False
+        skip = outliers[k] > 0.0
         if lost:
             beyond = beyond + 1 if abs(b) > GATE * math.sqrt(s) else 0
             skip = beyond > 0
@@ -104,8 +104,11 @@ class KalmanFilter:
         self._prior[0, 0] = noise**2
         self._expressions = self._model.with_unknown_input(decay, k)
 
-    def run(self, t: Floats, y: Floats, huber: float = 0.0, lost: bool = False) -> Floats:
-        """Return the estimates of d."""
+    def run(
+        self, t: Floats, y: Floats, huber: float = 0.0, lost: bool = False,
+        outliers: Floats | None = None,
+    ) -> Floats:  # fmt: skip
+        """Return the estimates of d; samples where `outliers` is 1 are left out."""
         total = len(self._rates)
         periods = np.round(np.diff(t, prepend=t[0]), 7)
         different, which = np.unique(periods, return_inverse=True)
@@ -122,6 +125,6 @@ class KalmanFilter:
         stack, stages = np.zeros((2, self._model.depth)), np.zeros((4, 2, total))
         _run(
             self._expressions, stack, stages, t, y, which.astype(float), transitions, self._prior,
-            settings, out,
+            settings, np.zeros(len(y)) if outliers is None else outliers, out,
         )  # fmt: skip
         return out[:, 0]

@@ -70,7 +70,7 @@ MOST = 0.8
 """Share of the first samples' differences that say how large z may be; others may be outliers."""
 REPEATED = 0.3
 """If a larger share of the first samples repeat the one before, y is quantised."""
-WITHIN_SAMPLES, MORE_REASON = 0.6, 50.0
+WITHIN_SAMPLES, MORE_REASON = 1.0, 50.0
 """
 Members with a larger bandwidth (rad a sample) tell d from the last two or three samples. There
 errors of rounding, which are not white, look like such a d: where y is quantised, log-likelihoods

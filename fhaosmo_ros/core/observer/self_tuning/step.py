@@ -28,6 +28,7 @@ from fhaosmo_ros.core.observer.arrays import (
     LINEAR,
     MOVING,
     observer_at,
+    PERIOD,
     PREDICTION_STEP,
     RECENT,
     ROUGHNESS,
@@ -133,6 +134,8 @@ ANOTHER, FAR_OFF = 1.5, 3.0
 """Factors on the variance of the noise, of the likeliest colour and others, that make P move."""
 SAME = 1e-9
 """Intervals that differ by this part are equal: seconds of a clock, as floats, are not exact."""
+GAP = 2.5
+"""After an interval of so many usual ones P is not the steady one; after shorter ones nearly."""
 LONG = 8.0
 """Time constants of a member after which its P is steady."""
 EVEN = 16
@@ -161,7 +164,8 @@ def follow_period(law: Law, members: Members, memory: Floats, h: float) -> None:
         for g in range(HALF, COUNT):
             rates[DECAYED, g] = rates[DECAYED, WHITE[g]]
             rates[CORRELATION, g] = of_colours[COLOUR[g]]
-    changed = abs(h - memory[STEADY_PERIOD]) > NEAR * memory[STEADY_PERIOD]
+    steady, mean = memory[STEADY_PERIOD], memory[PERIOD] if memory[PERIOD] > 0.0 else h
+    changed = abs(mean - steady) > NEAR * steady or h > GAP * steady
     likeliest = COLOUR[int(memory[LIKELIEST])]
     for c in range(COLOURS.size):
         ratio, limit = noise[SQUARE, c] / noise[USED, c], ANOTHER if c == likeliest else FAR_OFF
@@ -170,7 +174,7 @@ def follow_period(law: Law, members: Members, memory: Floats, h: float) -> None:
         noise[USED] = noise[SQUARE]
     if changed or not law.flags[LINEAR]:
         memory[UNSETTLED] = 0.0
-        memory[STEADY_PERIOD] = h
+        memory[STEADY_PERIOD] = mean
     memory[UNSETTLED] += h
     n = law.gains.shape[1] - ORDERS
     slowed = 1.0
