@@ -328,6 +328,7 @@ def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(client, folder, 
             y = client.publisher('/arm2/q', JointState)
             u = client.publisher('/motor/state', JointState)
             client.wait(lambda: y.matched() == u.matched() == 2, 'estimator and recorder')
+            client.wait(lambda: rig.diagnostics, 'message: the estimator writes to this client')
             expected = OnlineEstimator(model)
             for k, stamp in enumerate(stamps):
                 y(joint_state(stamp, a=0.01 * k))
