@@ -127,7 +127,7 @@ class Record(NamedTuple):
         Innovations; a run that skips samples needs the row more.
     words : (rows,) array
         Status words.
-    tuning : (rows, 6 or 0) array
+    tuning : (rows, 7 or 0) array
         What a self-tuning observer has found (`TUNING`).
 
     """
