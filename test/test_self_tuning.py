@@ -26,6 +26,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     WEIGHT,
     WINDOW,
 )
+from fhaosmo_ros.core.observer.self_tuning.noise import LATTICE_SHARE
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -238,6 +239,33 @@ def test_outliers_and_jumps_of_y(case):
         error = Observer(SELF_TUNING).run(t, y).unknown_input - d
         assert rms(error[5000:]) < 1.25 * expected
         assert np.abs(error).max() < 2.0 * np.abs(d).max()
+
+
+@pytest.mark.parametrize('size', [0.05, 1.0, -2.0])
+@pytest.mark.parametrize('seconds', [0.05, 0.5, 5.0])
+def test_a_wrong_angle_is_no_wrong_gravity(size, seconds):
+    """Believed, it would be a d of up to 19.6: y less its offset is used instead (D 23)."""
+    pendulum = PLANTS_OF_STUDY['pendulum']
+    r = recording(pendulum, CONDITIONS['as tuned'], 'sine', 20.0, 5)
+    off = (r.t > 9.0) & (r.t < 9.0 + seconds)
+    values = model_of(setting_of(pendulum, CONDITIONS['as tuned'])) | SELF_TUNING
+    run = OnlineEstimator(values).run(np.round(r.t * 1e9).astype(np.int64), r.y + size * off)
+    jumps = r.t[(run.status & Status.JUMPED) > 0]
+    np.testing.assert_allclose(jumps, [9.0, 9.0 + seconds], atol=0.03)
+    wrong = np.abs(run.unknown_input - r.d)[r.t > 5.0]
+    assert wrong.max() < 0.1 * np.abs(r.d).max()
+    assert np.abs(run.z[:, 0] - r.y)[r.t > 5.0].max() < 0.01
+
+
+def test_a_plant_that_is_elsewhere_is_no_jump_of_y():
+    """z_2 differs from then on, so that y leaves its prediction after a jump that was believed."""
+    t, y, d = swept(FRICTION, 70.0, PERIOD, 20.0, np.sin)
+    order = np.concatenate([np.arange(12_000), np.arange(11_000, 19_000)])
+    y = y[order] + 4.4e-4 * np.random.default_rng(3).standard_normal(len(t))
+    run = Observer(MOTOR).run(t, y)
+    wrong = np.abs(run.unknown_input - d[order])
+    assert wrong.max() < 2.0 * np.abs(d).max()
+    assert rms(wrong[13_000:]) < 0.05 * rms(d)
 
 
 @pytest.mark.parametrize('sigmas', [3.5, 5.0, 6.5, 8.0, -5.0])
@@ -481,6 +509,21 @@ def test_how_sure_it_is_of_a_quantised_y(plant):
         assert np.sqrt(np.mean(wrong**2)) < 1.2 * np.sqrt(np.mean(r.d[late] ** 2))
         inside.append(np.mean(wrong < deviation[late, -1]))
     assert 0.5 < np.mean(inside) < 0.9
+
+
+def test_outliers_do_not_hide_the_quanta():
+    """Steps to them are no multiples; taken for the quantum, y would be smooth for ever."""
+    t, clean, d = swept(FRICTION, 70.0, PERIOD, 20.0, np.sin)
+    clean = np.round(clean / 1.5e-3) * 1.5e-3
+    expected = rms((Observer(MOTOR).run(t, clean).unknown_input - d)[5000:])
+    y = clean.copy()
+    for k in range(10, len(t), 700):  # the first one before the members begin
+        y[k : k + 15] += 0.0224 * (-1) ** k
+    observer = Observer(MOTOR)
+    run = observer.run(t, y)
+    assert observer.state.memory[arrays.QUANTUM] == pytest.approx(1.5e-3, rel=1e-6)
+    assert observer.state.memory[arrays.LATTICE] > LATTICE_SHARE
+    assert rms((run.unknown_input - d)[5000:]) < 1.5 * expected
 
 
 def test_y_that_stands_still_says_no_more_with_every_sample():

@@ -37,6 +37,14 @@ def joint_state(stamp: int, **position: float) -> JointState:
     )  # fmt: skip
 
 
+def replay(*arguments: object) -> None:
+    process = subprocess.run(
+        [sys.executable, '-m', 'fhaosmo_ros', 'replay', *map(str, arguments)],
+        cwd=ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert process.returncode == 0, process.stdout + process.stderr
+
+
 # The robot, live, recorded and replayed.
 
 
@@ -82,11 +90,7 @@ def test_robot_is_estimated_live_as_in_a_replay(client, folder, tmp_path):
     error = np.sqrt(np.mean((d - truth)[plateau] ** 2))
     assert error <= 0.07
     # Nothing is said to replay: the bag says what y is.
-    subprocess.run(
-        [sys.executable, '-m', 'fhaosmo_ros', 'replay', tmp_path / 'bag', '--afresh',
-         '-o', tmp_path / 'o.npz'],
-        cwd=ROOT, check=True, capture_output=True,
-    )  # fmt: skip
+    replay(tmp_path / 'bag', '--afresh', '-o', tmp_path / 'o.npz')
     with np.load(tmp_path / 'o.npz') as replayed:
         live = {e.stamp: [*e.z, e.unknown_input, e.gamma] for e in rig.estimates}
         names = ['z1', 'z2', 'unknown_input', 'gamma']
@@ -350,11 +354,7 @@ def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(client, folder, 
         recorder.end()
     finally:
         recorder.kill()
-    subprocess.run(
-        [sys.executable, '-m', 'fhaosmo_ros', 'replay', tmp_path / 'bag',
-         '-o', tmp_path / 'o.npz'],
-        cwd=ROOT, check=True, capture_output=True,
-    )  # fmt: skip
+    replay(tmp_path / 'bag', '-o', tmp_path / 'o.npz')
     with np.load(tmp_path / 'o.npz') as replayed:
         assert replayed['stamp_ns'].tolist() == [*stamps, stamps[-1] + 2_000_000]
         np.testing.assert_allclose(

@@ -30,16 +30,17 @@ Entries of ``State.memory``:
 | PERIOD | running mean of the intervals between samples | s |
 | SPREAD | size of the innovations over that expected, at least 1 (D 21) | 1 |
 | UPSET | time for which gamma has yet to rest after |eps_1| > w_1 (D 8) | s |
+| UPSET | self-tuning: 1 at a sample that tells that y has jumped (D 35) | 1 |
 | OFFSET | what y is more than z_1, since a jump that the model contradicts (D 23) | of y |
-| JUMPS | sum of the jumps of y, 0 once it is back (D 23); self-tuning: the last one | of y |
+| JUMPS | sum of the jumps of y, 0 once it is back (D 23) | of y |
 | FIRST_MISS, MISS | first and last prediction error of the unlikely samples in a row | of y |
 | WATCHED | samples for which it has yet to be watched whether only y jumped (D 23) | 1 |
 | DRIFT | sum of the recent prediction errors over their usual size, while watched | 1 |
 | USUAL | running median of sqrt(L) (D 8) | of the innovations |
 | SAMPLES | self-tuning: samples gathered; more than FIRST_SAMPLES once the members run | 1 |
 | FAR_SIGN | sign of the last innovation that was too far off for every member | 1 |
-| QUANTUM | smallest step of y seen | of y |
-| LATTICE | share of the steps of y that are multiples of the smallest | 1 |
+| QUANTUM | step of y of which the others may be multiples | of y |
+| LATTICE | of late, the share of the steps of y that are | 1 |
 | MOVING | members of each half whose covariances move | 1 |
 | ACTIVE | members that take part; 0 before the members have begun | 1 |
 | UNSETTLED | time since they began to | s |
@@ -114,6 +115,8 @@ VARIANCE, INTENSITY, FASTEST, STEADY_VARIANCE = range(12, 16)
 FORGETTING, SLIDER, LEAST_NOISE = range(16, 19)
 SCALARS = 19
 """Number of scalars of a law."""
+RESTART, TELL, JUMP = 0.0, -1.0, -2.0
+"""What the self-tuning step is called for, in place of an interval, when not for a step."""
 
 NEWTON_STEPS = 60
 NEWTON_TOLERANCE = 3e-8

@@ -41,6 +41,7 @@ from fhaosmo_ros.core.observer.arrays import (
     PREDICTING,
     PREDICTION_STEP,
     psi,
+    SELF_TUNING,
     SETTLED,
     SIGN,
     SINGLE,
@@ -89,8 +90,13 @@ WATCH, REMEMBERED, MOST_DRIFT = 1000.0, 100.0, 35.0
 Samples after a jump of y in which prediction errors may not sum up, how many of them the sum
 remembers, and the sum that is too much: five standard deviations of that of white noise (D 23).
 """
-OF_SIZE = 0.25
-"""A jump of y contradicts the model if it changes a Phi by more than this part of z_{i+1} or d."""
+OF_SIZE, OF_DEVIATION = 0.25, 3.0
+"""
+A jump of y contradicts the model if it changes a Phi by more than this part of the size of z_{i+1}
+or d; where they are known, by so many of their standard deviations.
+"""
+MUCH_SMALLER = 0.5
+"""If a jump of y would make |z_{i+1}| or |d| so much smaller, y was wrong before it."""
 NOISE_DOUBT, DOUBTED = 3.0, 2.0
 """
 At the start the noise counts as so many times larger than `noise_size`; the logarithm of this
@@ -265,15 +271,17 @@ def jump(law: Law, work: Work, state: State, u: Floats) -> bool:
     for i in range(n):
         m[0, i], m[1, i] = x[HAT, i], 0.0
     for i in range(n):
-        size = law.chances[SINGLE * n + NEXT_SIZE, i]
+        most = OF_SIZE * law.chances[SINGLE * n + NEXT_SIZE, i]
+        if law.flags[SELF_TUNING]:
+            most = OF_DEVIATION * math.sqrt(x[COVARIANCE, i + 1]) if i + 1 < n else math.inf
         m[0, 0] = x[HAT, 0]
         change = evaluate(law.model, i, m, u, work.stack)[0]
         m[0, 0] = x[HAT, 0] + offset
         change -= evaluate(law.model, i, m, u, work.stack)[0]
-        if not abs(change) <= OF_SIZE * size:
+        if not abs(change) <= most:
             contradicted = True
             d = x[HAT, i + 1] if i + 1 < n else 0.0
-            larger = larger and not abs(d + change) <= abs(d)
+            larger = larger and not abs(d + change) <= MUCH_SMALLER * abs(d)
     memory[JUMPS] = 0.0 if is_back else total
     if contradicted and not is_back:
         if not larger:
@@ -285,7 +293,7 @@ def jump(law: Law, work: Work, state: State, u: Floats) -> bool:
         memory[OFFSET] = 0.0
         levels[HAT, 0] += offset
         memory[Y] += offset
-    if law.flags[PREDICTING] or memory[SETTLED] <= 0.0:
+    if not law.flags[SELF_TUNING] and (law.flags[PREDICTING] or memory[SETTLED] <= 0.0):
         for i in range(n):
             for j in range(n):
                 x[COVARIANCE + i, j] = levels[COVARIANCE + i, j]

@@ -264,7 +264,7 @@ class Observer:
             memory[arrays.GAMMA] = self._configuration.gamma_initial
         if not flags[arrays.SENSITIVE]:
             levels[arrays.HAT_SENSITIVITY : arrays.ROWS] = 0.0
-        if not flags[arrays.SCHEDULED] and memory[arrays.OFFSET]:
+        if not (flags[arrays.SCHEDULED] or flags[arrays.SELF_TUNING]) and memory[arrays.OFFSET]:
             memory[arrays.Y] += memory[arrays.OFFSET]
             memory[arrays.OFFSET] = memory[arrays.JUMPS] = 0.0
 

@@ -31,7 +31,7 @@ from fhaosmo_ros.core.observer.arrays import (
     HAT_SENSITIVITY,
     IMPLICIT,
     INVERSE_WIDTH,
-    JUMPS,
+    JUMP,
     Law,
     LEAKAGE,
     LEVANT,
@@ -44,6 +44,7 @@ from fhaosmo_ros.core.observer.arrays import (
     PERIOD,
     PREDICTING,
     RATE,
+    RESTART,
     ROWS,
     SAMPLES,
     SATURATED,
@@ -56,6 +57,7 @@ from fhaosmo_ros.core.observer.arrays import (
     State,
     STEP_AT,
     TABLE_AT,
+    TELL,
     TILDE,
     TILDE_SENSITIVITY,
     UPSET,
@@ -223,11 +225,10 @@ def step(
             memory[SAMPLES] = 0.0  # the members begin afresh
             if not law.flags[IMPLICIT]:
                 memory[Y] = y
-        elif (
-            memory[BEYOND] > LOST_SAMPLES
-            and not law.flags[SELF_TUNING]
-            and jump(law, work, state, u)
-        ):
+        elif memory[BEYOND] > LOST_SAMPLES and jump(law, work, state, u):
+            if law.flags[SELF_TUNING]:
+                at, table = law.flags[STEP_AT], law.flags[TABLE_AT]
+                call_at(at, table, levels[HAT, 0] - x[HAT, 0], JUMP, 0, 0)
             memory[PENDING] = whole
             word = REJECTED_SPIKE | JUMPED
         elif memory[BEYOND] > LOST_SAMPLES:
@@ -243,8 +244,8 @@ def step(
                 if is_upset(law, x if law.flags[IMPLICIT] else levels, used):
                     memory[UPSET] = law.scalars[DELAY]
                 word = adapt(law, x, memory, whole, loss, gradient)
-            if law.flags[SELF_TUNING] and memory[JUMPS] != 0.0:
-                memory[JUMPS] = 0.0
+            if law.flags[SELF_TUNING] and memory[UPSET] > 0.0:
+                memory[UPSET] = 0.0
                 word |= JUMPED
             for r in range(ROWS + n):
                 for i in range(n):
@@ -263,8 +264,8 @@ def restart(law: Law, state: State, y: float) -> None:
     """Begin afresh from `y`; the time of the next sample counts from it."""
     levels, memory, n = state.levels, state.memory, law.gains.shape[1]
     if law.flags[SELF_TUNING]:
-        call_at(law.flags[STEP_AT], law.flags[TABLE_AT], y, 0.0, 0, 0)
-        memory[PENDING] = 0.0
+        call_at(law.flags[STEP_AT], law.flags[TABLE_AT], y, RESTART, 0, 0)
+        memory[PENDING] = memory[OFFSET] = memory[WATCHED] = memory[DRIFT] = 0.0
         return
     for i in range(n):
         levels[HAT, i] = law.chances[SINGLE * n + FIRST_HAT, i]
@@ -387,7 +388,7 @@ def step_once(
 def tell_tuning(flags: Ints, memory: Floats, found: Floats) -> None:
     """Write what a self-tuning observer has found (`TUNING`); NaN before it knows the noise."""
     if memory[SAMPLES] > FIRST_SAMPLES:
-        call_at(flags[STEP_AT], flags[TABLE_AT], 0.0, -1.0, found.ctypes.data, found.size)
+        call_at(flags[STEP_AT], flags[TABLE_AT], 0.0, TELL, found.ctypes.data, found.size)
     else:
         found[:] = math.nan
 

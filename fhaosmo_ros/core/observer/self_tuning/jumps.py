@@ -17,9 +17,10 @@ from fhaosmo_ros.core.observer.arrays import (
     FIRST_OFF,
     FIRST_ROUGH,
     GROWING,
-    JUMPS,
+    MISS,
     UNEVEN,
     UNSETTLED,
+    UPSET,
 )
 from fhaosmo_ros.core.observer.covariance import GATE
 from fhaosmo_ros.core.observer.self_tuning.filters import HUBER
@@ -242,5 +243,26 @@ def follow_jump(members: Members, memory: Floats, n: int, count: int, s: Floats,
         members.p[0, m] += variance / count
         members.record[RESIDUAL, m], members.record[FAR, m] = y - estimate[0], 0.0
     members.record[SCORE] = members.before[1]
-    memory[UNSETTLED], memory[JUMPS] = 0.0, total / count
+    memory[UNSETTLED], memory[UPSET] = 0.0, 1.0
+    watch(members, members.watch[MEMBER])
+
+
+@compiled()
+def shift(members: Members, memory: Floats, of_state: float, variance: float) -> None:
+    """
+    Let all members go on after a jump of y that has lost it (D 23).
+
+    Parameters
+    ----------
+    of_state : float
+        By what z_1 is another one now; 0 where y's offset is.
+    variance : float
+        That of the innovation which told the jump.
+
+    """
+    for g in range(COUNT):
+        members.x[0, g] += of_state
+        members.p[0, g] += variance
+    members.rough[0, 0] += of_state - memory[MISS]
+    memory[UNSETTLED] = memory[GROWING] = 0.0
     watch(members, members.watch[MEMBER])

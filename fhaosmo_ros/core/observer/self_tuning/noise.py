@@ -53,9 +53,9 @@ CALM_SAMPLES = 40.0
 QUICK_SAMPLES = 30.0
 """It is averaged over so many samples then."""
 LATTICE_STEPS = 30.0
-"""The share of steps of y that are multiples of the smallest is averaged over so many."""
-LATTICE_SHARE = 0.9
-"""With a larger share y is quantised."""
+"""The share of steps of y that are multiples of the quantum is averaged over so many."""
+LATTICE_SHARE, NO_LATTICE = 0.9, 0.5
+"""With a larger share y is quantised; with a smaller one that smallest step means nothing."""
 PASSED = 3.0
 """After more unlikely samples no member judges that was beyond the gate at the last likely one."""
 HIDDEN = 4.0
@@ -74,26 +74,29 @@ def is_multiple(step: float, quantum: float, y: float) -> bool:
 
 
 @compiled()
-def find_quantum(members: Members, memory: Floats, y: float) -> float:
+def follow_quantum(members: Members, memory: Floats, y: float) -> None:
     """
-    Follow the smallest step of y, and whether the others are multiples of it (D 29).
+    Take a sample that is used: is the step to it a multiple of the quantum? (D 29).
 
-    Returns
-    -------
-    float
-        Variance of the error of rounding; 0 unless y is quantised, and noise does not hide it.
-
+    A step like the one before says nothing: so does y move at a constant speed. Another quantum is
+    believed where it divides this one, or where this one is none.
     """
     step, quantum = abs(y - memory[Y]), memory[QUANTUM]
-    if step > 1e-12 * abs(y):
-        fits = 1.0
-        if quantum == 0.0 or step < 0.99 * quantum:
-            memory[QUANTUM] = step
-            if quantum > 0.0 and not is_multiple(quantum, step, y):
-                memory[LATTICE] = fits = 0.0
-        elif not is_multiple(step, quantum, y):
-            fits = 0.0
-        memory[LATTICE] += (fits - memory[LATTICE]) / LATTICE_STEPS
+    if step <= 1e-12 * abs(y):
+        return
+    fits = is_multiple(step, quantum, y)
+    if not fits and (is_multiple(quantum, step, y) or memory[LATTICE] < NO_LATTICE):
+        fits = is_multiple(quantum, step, y)
+        memory[QUANTUM] = step
+    if not fits:
+        memory[LATTICE] -= memory[LATTICE] / LATTICE_STEPS
+    elif abs(members.rough[0, 2]) > 0.5 * memory[QUANTUM]:
+        memory[LATTICE] += (1.0 - memory[LATTICE]) / LATTICE_STEPS
+
+
+@compiled(forceinline=True)
+def rounding(members: Members, memory: Floats) -> float:
+    """Return the variance of the error of rounding; 0 if y is not quantised, or noise hides it."""
     quanta = memory[QUANTUM] ** 2 / 12.0
     hidden = HIDDEN * quanta < members.noise[SQUARE, 0]
     return 0.0 if hidden or memory[LATTICE] < LATTICE_SHARE else float(quanta)

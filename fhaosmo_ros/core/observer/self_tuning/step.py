@@ -15,17 +15,21 @@ from fhaosmo_ros.core.observer.arrays import (
     BEYOND,
     CALM,
     COVARIANCE,
+    DRIFT,
     FAR_SIGN,
+    FIRST_MISS,
     FIRST_NOISE,
     FLOW_PERIOD,
     FORGETTING,
     FRESH,
     GROWING,
     HAT,
+    JUMP,
     Law,
     LEAST_NOISE,
     LIKELIEST,
     LINEAR,
+    MISS,
     MOVING,
     observer_at,
     PERIOD,
@@ -35,13 +39,15 @@ from fhaosmo_ros.core.observer.arrays import (
     ROWS,
     SAMPLES,
     STEADY_PERIOD,
+    TELL,
     TOLD,
     TURNS,
     UNSETTLED,
+    WATCHED,
     Work,
     Y,
 )
-from fhaosmo_ros.core.observer.covariance import GATE
+from fhaosmo_ros.core.observer.covariance import GATE, MOST_DRIFT, REMEMBERED
 from fhaosmo_ros.core.observer.levant import NEAR
 from fhaosmo_ros.core.observer.prediction import predict
 from fhaosmo_ros.core.observer.self_tuning.filters import (
@@ -61,6 +67,7 @@ from fhaosmo_ros.core.observer.self_tuning.jumps import (
     follow_jump,
     GROWTHS,
     samples_since_jump,
+    shift,
     watch,
 )
 from fhaosmo_ros.core.observer.self_tuning.members import (
@@ -96,11 +103,12 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
 from fhaosmo_ros.core.observer.self_tuning.noise import (
     CALM_SAMPLES,
     difference,
-    find_quantum,
     follow_noise,
+    follow_quantum,
     is_explained,
     is_likely,
     knowing,
+    rounding,
     stamp_noise,
     STEADY,
 )
@@ -216,7 +224,7 @@ class Sample(NamedTuple):
     off : float
         By what it is off the prediction of the mean.
     quanta : float
-        See `find_quantum`.
+        See `rounding`.
     roughness, roughness_before : float
         Square of its difference over the usual one; the mean of those before.
     uneven : float
@@ -267,6 +275,9 @@ def pass_over(
         begin_growth(memory, abs(sample.off), sample.uneven, sample.roughness_before)
         memory[BEYOND] = 0.0
     memory[BEYOND] += 1.0
+    memory[MISS] = sample.off
+    if memory[BEYOND] == 1.0:
+        memory[FIRST_MISS] = sample.off
     rougher = memory[ROUGHNESS] > HUBER and memory[RECENT] == 0.0
     if other_side or rougher:  # a y that is off is so on one side, and evenly
         follow_noise(
@@ -327,7 +338,7 @@ def step_members(
     if memory[SAMPLES] <= FIRST_SAMPLES:
         gather(law, work, memory, every, y, h)
         return 0.0
-    quanta = find_quantum(every, memory, y)
+    quanta = rounding(every, memory)
     before, count = memory[ACTIVE], choose_members(every, memory, quanta)
     members = members_in(rows, n, count)
     if count != before:
@@ -350,7 +361,9 @@ def step_members(
     believed = s
     if memory[BEYOND] > 0.0:  # P grows meanwhile, and the quick members believe anything
         believed = np.minimum(s, 4.0 * members.record[VARIANCE])
-    largest = knowing(members, scratch, believed, int(memory[LIKELIEST]))
+    likeliest = int(memory[LIKELIEST])
+    largest = knowing(members, scratch, believed, likeliest)
+    expected = believed[likeliest] * members.noise[SQUARE, COLOUR[likeliest]]
     sample = Sample(
         y, h, y - now[0, 0], quanta, roughness, roughness_before, highest + of_stamps, of_stamps,
         max(quanta, law.scalars[LEAST_NOISE] ** 2, EXACT * EXACT * members.rough[1, 1]), largest,
@@ -378,8 +391,17 @@ def step_members(
     doubted = memory[TURNS] > OFTEN and memory[ROUGHNESS] < HUBER and quanta == 0.0
     if not likely and not jumped:
         pass_over(members, scratch, memory, believed, sample, doubted)
+        x[COVARIANCE, 0] = expected
         return 0.0
     memory[BEYOND] = 0.0
+    if (
+        memory[WATCHED] > 0.0
+        and not jumped
+        and quanta == 0.0
+        and drifts(memory, sample.off, expected)
+    ):
+        memory[BEYOND] = math.inf
+        return 0.0
     if jumped:
         tau = 0.0
         if begins:  # while it was within the gate, it could not be seen
@@ -390,6 +412,7 @@ def step_members(
         believed = s
         memory[UNSETTLED] = 0.0
     take(members, scratch, memory, n, believed, sample, doubted)
+    follow_quantum(members, memory, y)
     since_jump = 0 if jumped else samples_since_jump(members, n, memory[TOLD])
     if since_jump > 2:  # two outliers are no jump
         follow_jump(members, memory, n, since_jump, s, y)
@@ -400,6 +423,14 @@ def step_members(
     tell_model(law, members, memory, h, jumped, x)
     find_strays(members, n, x[HAT])
     return float((y - x[HAT, 0]) ** 2)
+
+
+@compiled(forceinline=True)
+def drifts(memory: Floats, off: float, variance: float) -> bool:
+    """Return True if y has left its prediction since it jumped: the plant has jumped (D 23)."""
+    memory[WATCHED] -= 1.0
+    memory[DRIFT] += off / math.sqrt(variance) - memory[DRIFT] / REMEMBERED
+    return bool(abs(memory[DRIFT]) > MOST_DRIFT)
 
 
 @compiled()
@@ -439,17 +470,20 @@ def _step_at(table: int, y: float, h: float, inputs: int, count: int) -> float:
     """
     Do what `step_members` does on the arrays of a table.
 
-    With h = 0 do what `restart_members` does, with h < 0 what `find_tuning` does, into `inputs`.
+    With `RESTART` for h do what `restart_members` does, with `TELL` what `find_tuning` does, into
+    `inputs`, and with `JUMP` what `shift` does, by y.
     """
     law, work, (levels, memory) = observer_at(integers_at(table, (ARRAYS, 3)), 0)
     rows = levels[ROWS + law.gains.shape[1] :]
     if h > 0.0:
         return step_members(law, work, memory, rows, y, h, doubles_at(inputs, count))
-    if h < 0.0:
-        members = members_in(rows, law.gains.shape[1] - ORDERS, COUNT)
+    members = members_in(rows, law.gains.shape[1] - ORDERS, COUNT)
+    if h == TELL:
         find_tuning(members, doubles_at(inputs, count))
-        return 0.0
-    restart_members(law, levels, memory, rows, y)
+    elif h == JUMP:
+        shift(members, memory, y, work.x[COVARIANCE, 0])
+    else:
+        restart_members(law, levels, memory, rows, y)
     return 0.0
 
 
