@@ -556,6 +556,19 @@ def test_slider(case):
     assert roughness[0] < 0.5 * roughness[1] < 0.25 * roughness[2]
 
 
+def test_a_constant_changes_live():
+    """Members of a linear model keep what it makes of them in a period: of the new one then."""
+    t, y, d = swept(np.array([[0.0, 1.0], [0.0, -5.0]]), 70.0, PERIOD, 20.0, np.sin)
+    y = y + 1e-4 * np.random.default_rng(8).standard_normal(len(t))
+    observer = Observer({**SELF_TUNING, 'order': 2, 'phi': ['0', '-b*z2'], 'constants.b': 25.0})
+    observer.run(t[:8000], y[:8000])
+    observer.configure({'constants.b': 5.0})
+    observer.run(t[8000:8001], y[8000:8001])
+    assert members_of(observer).flow[1, 1] == pytest.approx(math.exp(-5.0 * PERIOD), rel=1e-9)
+    run = observer.run(t[8001:], y[8001:])
+    assert rms((run.unknown_input - d[8001:])[4000:]) < 0.02 * rms(d)
+
+
 def test_a_memory_goes_on_where_it_was(case):
     """Bit for bit, through bad samples, and live as offline."""
     t, z, _, noise = case

@@ -218,11 +218,17 @@ class Observer:
 
     def adopt(self, configuration: ObserverConfiguration) -> None:
         """Go on with a configuration that `prepare` has returned, from the next sample on."""
-        before, chances = self._law.flags, self._law.chances
+        law = self._law
+        before, chances = law.flags, law.chances
         self._configuration = configuration
         self._set_law()
         self._fit_memory()
         after = self._law.flags
+        step = arrays.PREDICTION_STEP
+        same = np.array_equal(law.model.code, self._law.model.code)
+        if not same or law.scalars[step] != self._law.scalars[step]:
+            # What self-tuning members know of the model (D 27) is that of another one.
+            self._state.memory[[arrays.FLOW_PERIOD, arrays.UNSETTLED]] = 0.0
         if not before[arrays.SENSITIVE] or before[arrays.LEVANT] != after[arrays.LEVANT]:
             self._state.levels[arrays.HAT_SENSITIVITY : arrays.ROWS] = 0.0  # not carried along
         steady = arrays.part(arrays.STEADY, self.levels)
