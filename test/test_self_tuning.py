@@ -511,6 +511,20 @@ def test_how_sure_it_is_of_a_quantised_y(plant):
     assert 0.5 < np.mean(inside) < 0.9
 
 
+@pytest.mark.parametrize('quantum', [2.0, 10.0])
+@pytest.mark.parametrize('part', [0.03, 0.1, 0.3, 0.5])
+def test_noise_on_a_quantised_y(quantum, part):
+    """y goes to a neighbouring count and back: by noise, which is no motion of d."""
+    plant = PLANTS_OF_STUDY["paper's plant"]
+    r = recording(plant, CONDITIONS['as tuned'], 'sine', 20.0, 31)
+    q = quantum * plant.noise
+    y = r.z[:, 0] + part * q * np.random.default_rng(131).standard_normal(len(r.t))
+    values = model_of(setting_of(plant, CONDITIONS['as tuned'])) | SELF_TUNING
+    stamps = np.round(r.t * 1e9).astype(np.int64)
+    found = OnlineEstimator(values).run(stamps, np.round(y / q) * q).unknown_input
+    assert rms((found - r.d)[r.t > 4.0]) < rms(r.d)
+
+
 def test_outliers_do_not_hide_the_quanta():
     """Steps to them are no multiples; taken for the quantum, y would be smooth for ever."""
     t, clean, d = swept(FRICTION, 70.0, PERIOD, 20.0, np.sin)
@@ -647,12 +661,17 @@ def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, kind, seed, seconds
 
 
 @pytest.mark.parametrize('distance', [-0.5, 0.0, 1.0, 2.5])
-@pytest.mark.parametrize(('moved', 'deviation'), [(0.02, 0.0), (-0.01, 0.02), (0.0, 0.05)])
-def test_passing_an_edge_is_as_likely_as_among_many_numbers(distance, moved, deviation):
-    """Normal numbers of variance 1 that move a little: how many pass an edge from below."""
+@pytest.mark.parametrize(
+    ('moved', 'deviation', 'noise'),
+    [(0.02, 0.0, 0.0), (-0.01, 0.02, 0.0), (0.0, 0.05, 0.0), (0.0, 0.0, 0.1), (0.02, 0.01, 0.05)],
+)
+def test_passing_an_edge_is_as_likely_as_among_many_numbers(distance, moved, deviation, noise):
+    """Normal numbers that move a little, with noise: how many pass an edge from below."""
     random = np.random.default_rng(5)
-    number = random.standard_normal(4_000_000)
+    number = math.sqrt(1.0 - noise**2) * random.standard_normal(4_000_000)
+    before = number + noise * random.standard_normal(number.size)
     move = moved + deviation * random.standard_normal(number.size)
-    passed = np.mean((number < distance) & (number + move > distance))
-    found = passage.py_func(distance, 1.0, moved, deviation**2)
+    after = number + move + noise * random.standard_normal(number.size)
+    passed = np.mean((before < distance) & (after > distance))
+    found = passage.py_func(distance, 1.0, moved, deviation**2 + 2.0 * noise**2)
     assert found == pytest.approx(passed, rel=0.25, abs=2e-5)

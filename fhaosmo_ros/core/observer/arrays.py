@@ -41,6 +41,7 @@ Entries of ``State.memory``:
 | FAR_SIGN | sign of the last innovation that was too far off for every member | 1 |
 | QUANTUM | step of y of which the others may be multiples | of y |
 | LATTICE | of late, the share of the steps of y that are | 1 |
+| GOES_BACK | of late, the share of the steps of y that go back at once | 1 |
 | MOVING | members of each half whose covariances move | 1 |
 | ACTIVE | members that take part; 0 before the members have begun | 1 |
 | UNSETTLED | time since they began to | s |
@@ -94,7 +95,7 @@ OFFSET, JUMPS, FIRST_MISS, MISS, WATCHED, DRIFT, USUAL = range(11, 18)
 SAMPLES, FAR_SIGN, QUANTUM, LATTICE, MOVING, UNSETTLED, STEADY_PERIOD = range(18, 25)
 FLOW_PERIOD, FIRST_NOISE, LIKELIEST, CALM, GROWING, FIRST_OFF = range(25, 31)
 NARROWED, ONE_SIDED, RECENT, ROUGHNESS, INTERVAL, JITTER, TURNS, TOLD, UNEVEN = range(31, 40)
-FIRST_ROUGH, ACTIVE, MEMORY = range(40, 43)
+FIRST_ROUGH, ACTIVE, GOES_BACK, MEMORY = range(40, 44)
 
 SIGN, IMPLICIT, ADAPTIVE, FROM_MEASUREMENT, LEVANT, PREDICTING, SENSITIVE, SCHEDULED = range(8)
 SELF_TUNING, LINEAR, STEP_AT, TABLE_AT = range(8, 12)

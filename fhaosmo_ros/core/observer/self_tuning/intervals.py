@@ -38,6 +38,11 @@ LEAST_CHANCE = -6.0
 """Logarithm of the least probability that a sample counts with."""
 LEAST_PASSAGE = -12.0
 """That of the least probability with which z_1 passes an edge at just this sample."""
+OF_BACK = 3.0
+"""
+If more than one in so many of y's steps go back at once, noise of as much as `VAGUE` carries z_1
+over edges. Innovations do not show noise that is far smaller than the quantum.
+"""
 SLOW = 0.25
 """
 That probability is so small that it has to be found from the speed if z_1 moves, squared, by less
@@ -123,7 +128,8 @@ def passage(to_edge: float, variance: float, moved: float, spread: float) -> flo
     variance : float
         Of the number.
     moved, spread : float
-        How far it moves up between the samples, and the variance of that.
+        How far it moves up between the samples, and the variance of that; noise on each of them
+        counts twice.
 
     """
     density = math.exp(-0.5 * to_edge * to_edge / variance) / math.sqrt(2.0 * math.pi * variance)
@@ -139,6 +145,7 @@ def take_interval(
     h: float,
     quanta: float,
     kept: float,
+    back: float,
 ) -> None:
     """
     Take a quantised sample into the log-likelihoods, and find how it corrects members (D 31).
@@ -156,10 +163,13 @@ def take_interval(
         Variance of the error of rounding.
     kept : float
         Part of the log-likelihoods that is not forgotten; negative to leave them as they are.
+    back : float
+        Share of y's steps, of late, that go back where the sample before came from.
 
     """
     half, p, noise = math.sqrt(3.0 * quanta), scratch.p[0], members.noise[SQUARE, 0]
-    least = max(noise - quanta, 0.0) + (2.0 * VAGUE * half) ** 2
+    apart, vague = max(noise - quanta, 0.0), (2.0 * VAGUE * half) ** 2  # not of rounding
+    least, carried = apart + vague, 2.0 * (apart + min(OF_BACK * back, 1.0) * vague)
     inverse, taken, innovation = scratch.lines[0], scratch.lines[2], scratch.b
     score, prior, far = members.record[SCORE], members.record[PRIOR], members.record[FAR]
     repeated, one_step = y == before, 0.0 < abs(y - before) < 3.0 * half
@@ -178,9 +188,9 @@ def take_interval(
         was = members.p[0, g] + least
         if (repeated or one_step) and moved * moved + spread < SLOW * was:
             off = side * (before - members.x[0, g])
-            passed = passage(off + half, was, side * moved, spread)
+            passed = passage(off + half, was, side * moved, spread + carried)
             if repeated:
-                passed += passage(half - off, was, -side * moved, spread)
+                passed += passage(half - off, was, -side * moved, spread + carried)
                 likelihood = min(likelihood - HALF_SURE, -passed)
             elif passed < 1.0:
                 passed = math.log(max(passed, 1e-9))

@@ -8,6 +8,7 @@ from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.observer.arrays import (
     BEYOND,
     FIRST_NOISE,
+    GOES_BACK,
     INTERVAL,
     JITTER,
     LATTICE,
@@ -84,13 +85,16 @@ def follow_quantum(members: Members, memory: Floats, y: float) -> None:
     step, quantum = abs(y - memory[Y]), memory[QUANTUM]
     if step <= 1e-12 * abs(y):
         return
+    change = abs(members.rough[0, 2])  # from the step before, which may be 0
+    goes_back = 1.0 if change > 1.5 * step else 0.0
+    memory[GOES_BACK] += (goes_back - memory[GOES_BACK]) / LATTICE_STEPS
     fits = is_multiple(step, quantum, y)
     if not fits and (is_multiple(quantum, step, y) or memory[LATTICE] < NO_LATTICE):
         fits = is_multiple(quantum, step, y)
         memory[QUANTUM] = step
     if not fits:
         memory[LATTICE] -= memory[LATTICE] / LATTICE_STEPS
-    elif abs(members.rough[0, 2]) > 0.5 * memory[QUANTUM]:
+    elif change > 0.5 * memory[QUANTUM]:
         memory[LATTICE] += (1.0 - memory[LATTICE]) / LATTICE_STEPS
 
 

@@ -22,6 +22,7 @@ from fhaosmo_ros.core.observer.arrays import (
     FLOW_PERIOD,
     FORGETTING,
     FRESH,
+    GOES_BACK,
     GROWING,
     HAT,
     JUMP,
@@ -310,7 +311,8 @@ def take(
     kept = sample.kept if judged else -1.0
     follow_innovations(members, scratch.b, scratch.s, quanta)
     if quanta > 0.0:
-        take_interval(members, scratch, y, memory[Y], sample.h, quanta, kept)
+        back = memory[GOES_BACK]
+        take_interval(members, scratch, y, memory[Y], sample.h, quanta, kept, back)
     correct(members, scratch, n, int(memory[MOVING]), quanta > 0.0)
     if quanta == 0.0:
         judge(members, scratch, grown, kept, calm)
