@@ -135,7 +135,7 @@ LABELS_OF_MEMORY = [
     'far_sign', 'quantum', 'lattice', 'moving', 'unsettled', 'steady_period', 'flow_period',
     'first_noise', 'likeliest', 'calm', 'growing', 'farthest', 'narrowed', 'one_sided',
     'recent', 'roughness', 'last_interval', 'stamp_jitter', 'turns', 'told', 'uneven',
-    'first_rough', 'active',
+    'first_rough', 'active', 'goes_back',
 ]  # fmt: skip
 """Labels of a snapshot's entries: they are in bags, so they stay as they are."""
 MISSING = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}
