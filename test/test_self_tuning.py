@@ -525,6 +525,34 @@ def test_noise_on_a_quantised_y(quantum, part):
     assert rms((found - r.d)[r.t > 4.0]) < rms(r.d)
 
 
+@pytest.mark.parametrize('plant', PLANTS_OF_STUDY)
+@pytest.mark.parametrize(('samples', 'noise'), [(5, 1.0), (10, 1.0), (10, 0.0), (20, 1.0)])
+def test_a_sensor_that_is_slower_than_its_topic(plant, samples, noise):
+    """It repeats each value; believed, that would be a d that jumps with each new one."""
+    p = PLANTS_OF_STUDY[plant]
+    r = recording(p, CONDITIONS['as tuned'], 'sine', 20.0, 31)
+    y = r.z[:, 0] + noise * p.noise * np.random.default_rng(9).standard_normal(len(r.t))
+    held = np.arange(len(y)) // samples * samples
+    values = model_of(setting_of(p, CONDITIONS['as tuned'])) | SELF_TUNING
+    stamps = 10**9 + np.round(r.t * 1e9).astype(np.int64)
+    run = OnlineEstimator(values).run(stamps, y[held])
+    late = r.t > 10.0
+    alone = OnlineEstimator(values).run(stamps[::samples], y[::samples])
+    expected = rms((alone.unknown_input - r.d[::samples])[late[::samples]])
+    repeats = (run.status & Status.REPEATED) > 0
+    assert np.mean(repeats[late]) == pytest.approx(1.0 - 1.0 / samples, abs=1e-3)
+    assert rms((run.unknown_input - r.d)[late & ~repeats]) < 1.5 * expected + 0.1 * rms(r.d)
+
+
+def test_y_that_really_stands_still_is_not_taken_for_held():
+    """Without noise it repeats itself, too, and the d that holds it there is found."""
+    t, y, _ = swept(FRICTION, 70.0, PERIOD, 6.0, np.sin)
+    y[4000:] = y[4000]
+    run = OnlineEstimator(MOTOR).run(10**9 + np.arange(len(t)) * 10**6, y)
+    assert not np.any(run.status & Status.REPEATED)
+    assert np.abs(run.unknown_input[5500:]).max() < 1.0
+
+
 def test_outliers_do_not_hide_the_quanta():
     """Steps to them are no multiples; taken for the quantum, y would be smooth for ever."""
     t, clean, d = swept(FRICTION, 70.0, PERIOD, 20.0, np.sin)

@@ -19,7 +19,7 @@ from fhaosmo_ros.core.observer.smoothing import (
     take_rows,
     UNMEASURED,
 )
-from fhaosmo_ros.core.observer.status import DIVERGED, JUMPED, REJECTED, RESTARTED
+from fhaosmo_ros.core.observer.status import DIVERGED, JUMPED, RESTARTED, UNUSED
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,7 +78,7 @@ class Smoother:
 
         A jump of y, and a restart, are those of the next sample that is used.
         """
-        kinds = np.where(status & REJECTED, UNMEASURED, MEASURED)
+        kinds = np.where(status & UNUSED, UNMEASURED, MEASURED)
         used = np.flatnonzero(kinds == MEASURED)
         for kind, flags in ((JUMPS, JUMPED), (BEGINS, RESTARTED | DIVERGED)):
             marks = self._expected[kind] + np.cumsum((status & flags) > 0)

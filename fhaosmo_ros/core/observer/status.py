@@ -36,6 +36,8 @@ class Status(IntFlag):
         8192  # y alone has jumped; the other estimates go on (at once, or with the next sample)
     )
 
+    REPEATED = 16384  # y repeats a value that its sensor holds: nothing is learned from it
+
     @property
     def rejected(self) -> bool:
         """True if the sample was not used."""
@@ -58,6 +60,7 @@ GAP = int(Status.GAP)
 RESTARTED = int(Status.RESTARTED)
 DIVERGED = int(Status.DIVERGED)
 JUMPED = int(Status.JUMPED)
+REPEATED = int(Status.REPEATED)
 REJECTED = (
     REJECTED_MEASUREMENT
     | REJECTED_PERIOD
@@ -67,6 +70,8 @@ REJECTED = (
     | REJECTED_STUCK
 )
 """Mask of the flags that say that a sample was not used."""
+UNUSED = REJECTED | REPEATED
+"""The same, and that it repeats a value which its sensor holds: the estimate is of that one."""
 
 
 def flags(word: int) -> Status:

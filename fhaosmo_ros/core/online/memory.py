@@ -68,9 +68,13 @@ TICKS = 39  # ticks that the line through them remembers; 0: no line; < 0: none 
 DEVIATION = 40  # running mean of how far ticks are off it
 PACE = 41  # interval of the times that follow the line, in the parts of SPACING
 FITTED = 42  # latest tick that was on the line
+REPEATS = 43  # samples in a row that repeat the one before
+HELD_FOR = 44  # how many of them there usually are
+REGULAR = 45  # evidence that y's sensor holds each value for so long
+HOLDS = 46  # 1: it does
 NAMES = {v: k for k, v in dict(globals()).items() if k.isupper() and isinstance(v, int)}
 """Names of these integers by index: they label the entries of a snapshot."""
-COUNTERS = 43
+COUNTERS = 47
 """Index of the first counter."""
 
 (
@@ -88,7 +92,9 @@ JITTER = 4  # running mean of its deviation, ns
 HELD_Y = 5
 EVENT_MEAN = 6  # running mean of d, for events of its change
 EVENT_DEVIATION = 7  # standard deviation that events are judged by
-STATES = 8  # two copies of a state begin here
+SAMPLE = 8  # the latest y, used or not
+CHANGE = 9  # the latest one of it that is not 0
+STATES = 10  # two copies of a state begin here
 
 
 class Policy(NamedTuple):
@@ -127,7 +133,9 @@ SECOND = 1_000_000_000
 HEAD = ['flags', 'sec', 'nanosec']
 INTEGERS = range(FROZEN, COUNTERS)
 """What of the policy's integers a snapshot holds: neither settings nor counters."""
-LABELS_OF_REALS = ['interval', 'jitter', 'held_y', 'event_mean', 'event_deviation']
+LABELS_OF_REALS = [
+    'interval', 'jitter', 'held_y', 'event_mean', 'event_deviation', 'sample', 'change',
+]  # fmt: skip
 LABELS_OF_ROWS = ['z_hat', 'z_tilde', 'z_hat_sensitivity', 'z_tilde_sensitivity']
 LABELS_OF_MEMORY = [
     'gamma', 'y', 'pending', 'wait', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread',
@@ -161,7 +169,7 @@ class Memory(NamedTuple):
     ----------
     integers : (len(INTEGERS),) array
         Of `Policy.ints`.
-    reals : (5,) array
+    reals : (7,) array
         Of `Policy.reals`.
     before, now : ((4 + N) N + MEMORY,) arrays
         The observer's state (levels, then memory) before the latest bridged gap, and its state.

@@ -2,10 +2,15 @@
 """The policy's rules for values (see policy.py), each a small compiled function."""
 
 from fhaosmo_ros.core.compiled.cache import compiled
-from fhaosmo_ros.core.observer.arrays import HAT, TILDE
+from fhaosmo_ros.core.observer.arrays import HAT, SAMPLES, SELF_TUNING, TILDE
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online.memory import EstimatorArrays, Policy
 from fhaosmo_ros.core.online.stamps import difference
+
+MULTIPLE, SINGLE = 1e-4, 6e-7
+"""A step of y is a multiple of another one up to this, and up to rounding of y to 32 bits."""
+ENOUGH_REGULAR, MOST_REGULAR = 4, 12
+"""After so many regular changes y's sensor holds its values; so many are remembered."""
 
 
 @compiled()
@@ -25,6 +30,40 @@ def is_stuck(policy: Policy, last: float, y: float, now: int) -> bool:
         ints[at.STUCK_EVENTS] += 1
     ints[at.REJECTED_STUCK_] += 1
     return True
+
+
+@compiled()
+def is_held(e: EstimatorArrays, y: float, now: int) -> bool:
+    """
+    Return True if y repeats a value because its sensor holds it, being slower than the topic.
+
+    Only for self-tuning, which would take every change after it for one of d. A sensor holds
+    values if they change after as many samples as before, about, and not by multiples, as an
+    encoder's counts do. y may also really stand still: then it repeats itself for longer.
+    """
+    ints, reals = e.policy.ints, e.policy.reals
+    if not e.law.flags[SELF_TUNING]:
+        return False
+    change, usual = y - reals[at.SAMPLE], ints[at.HELD_FOR]
+    reals[at.SAMPLE] = y
+    if change == 0.0:
+        ints[at.REPEATS] += 1
+        short = ints[at.REPEATS] <= 2 * usual + 1
+        short = short and 2 * abs(difference(now, ints[at.LATEST])) < ints[at.MAX_GAP]
+        return bool(ints[at.HOLDS] and short)
+    low, high = min(abs(change), abs(reals[at.CHANGE])), max(abs(change), abs(reals[at.CHANGE]))
+    others = high / low if low > 0.0 else 0.0
+    if ints[at.REPEATS] == 0 or 4 * abs(ints[at.REPEATS] - usual) > max(usual, 4):
+        ints[at.REGULAR] = max(ints[at.REGULAR] - 2, 0)
+    elif low > 0.0 and abs(others - round(others)) > MULTIPLE + SINGLE * abs(y) / low:
+        ints[at.REGULAR] = min(ints[at.REGULAR] + 1, MOST_REGULAR)
+    if ints[at.REGULAR] == 0:
+        ints[at.HELD_FOR], ints[at.HOLDS] = ints[at.REPEATS], 0
+    elif ints[at.REGULAR] >= ENOUGH_REGULAR and not ints[at.HOLDS]:
+        ints[at.HOLDS] = 1
+        e.state.memory[SAMPLES] = 0.0  # the members begin afresh, with the sensor's own period
+    ints[at.REPEATS], reals[at.CHANGE] = 0, change
+    return False
 
 
 @compiled()

@@ -11,7 +11,7 @@ from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory
 from fhaosmo_ros.core.observer.observer import make_record, Observer
 from fhaosmo_ros.core.observer.self_tuning.members import TUNING
 from fhaosmo_ros.core.observer.smoother import Smoother
-from fhaosmo_ros.core.observer.status import LEVEL_SHIFT, REJECTED
+from fhaosmo_ros.core.observer.status import LEVEL_SHIFT, UNUSED
 from fhaosmo_ros.core.observer.step import Record, tell_tuning
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online.delay import INPUTS, past_of
@@ -103,7 +103,7 @@ class PastEstimates:
         return self._handed_out(self._smoother.finish())
 
     def _append(self, found: Trajectory, times: Ints, u: Floats) -> None:
-        kept = np.flatnonzero((found.status & REJECTED) == 0)
+        kept = np.flatnonzero((found.status & UNUSED) == 0)
         numbers = self._taken + kept
         self._taken += len(times)
         kinds = self._smoother.kinds(found.status)

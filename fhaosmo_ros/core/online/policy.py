@@ -27,7 +27,9 @@ from fhaosmo_ros.core.observer.status import (
     REJECTED_SPIKE,
     REJECTED_STEP,
     REJECTED_STUCK,
+    REPEATED,
     RESTARTED,
+    UNUSED,
 )
 from fhaosmo_ros.core.observer.step import innovations, Record, record_state, start
 from fhaosmo_ros.core.online import memory as at
@@ -44,7 +46,7 @@ from fhaosmo_ros.core.online.delay import (
 )
 from fhaosmo_ros.core.online.gaps import step_over
 from fhaosmo_ros.core.online.memory import EstimatorArrays, Policy
-from fhaosmo_ros.core.online.outliers import has_diverged, is_stuck
+from fhaosmo_ros.core.online.outliers import has_diverged, is_held, is_stuck
 from fhaosmo_ros.core.online.stamps import difference, forget, refresh, settle
 
 
@@ -87,6 +89,8 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: Floats, eps: Floats, row: 
         ints[at.ZERO_STAMPS] += 1
     elif ints[at.STUCK_TIME] and is_stuck(policy, memory[Y], y - memory[OFFSET], now):
         word = REJECTED_STUCK
+    elif is_held(e, y, now):
+        word = REPEATED
     elif memory[Y] == memory[Y]:
         if not ints[at.TIMED]:
             forget(policy, now)
@@ -109,7 +113,7 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: Floats, eps: Floats, row: 
             withdraw_inputs(past, elapsed, u.shape[0])
     elif elapsed > 0:
         word |= step_over(e, elapsed, y, u, eps, row)
-    elif not word & REJECTED:  # first sample, or first after a restart
+    elif not word & UNUSED:  # first sample, or first after a restart
         word |= start(law, state, y, eps, row)
         ints[at.LATEST] = ints[at.CHANGED] = ints[at.SEEN] = now
         ints[at.TIMED] = 1
@@ -125,7 +129,10 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: Floats, eps: Floats, row: 
             ints[at.DIVERGENCES] += 1
             word = word & (FLAGS_MASK ^ REJECTED_STEP) | DIVERGED
             word |= innovations(law, state, y, eps, row) << LEVEL_SHIFT
-    if not word & REJECTED:
+    if word & REPEATED:  # the estimate stays that of the sample which it repeats
+        ints[at.ACCEPTED] += 1
+        word |= innovations(law, state, memory[Y], eps, row) << LEVEL_SHIFT
+    elif not word & REJECTED:
         ints[at.ACCEPTED] += 1
         ints[at.VALID] = 1
         if ints[at.DELAY] > 0:

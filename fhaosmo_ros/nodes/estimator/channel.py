@@ -6,7 +6,7 @@ from math import isfinite
 from time import perf_counter, time_ns
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.observer.status import REJECTED, Status
+from fhaosmo_ros.core.observer.status import REJECTED, Status, UNUSED
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit
@@ -264,7 +264,7 @@ class Channel:
         self.taken(word, stamp, y, estimator.observer.unknown_input, perf_counter() - begin)
         if estimator.events.waiting:
             self.tell_events()
-        if self._each and not word & REJECTED:
+        if self._each and not word & UNUSED:
             self.publish()
 
     def taken(
@@ -286,7 +286,7 @@ class Channel:
 
         """
         self._health.durations.append(duration)
-        if not word & REJECTED:
+        if not word & UNUSED:
             health = self._health
             self._arrived = True
             self._snapshots.accepted(stamp)

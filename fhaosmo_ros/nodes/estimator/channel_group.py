@@ -7,7 +7,7 @@ from copy import deepcopy
 from time import perf_counter
 from typing import Any
 
-from fhaosmo_ros.core.observer.status import REJECTED
+from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.batch import EstimatorBatch
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import EventDetector
@@ -103,14 +103,14 @@ class QueuedChannel(Channel):
     ) -> None:
         """Remember, and log, what became of a sample; see `Channel.taken`."""
         super().taken(word, stamp, y, unknown_input, duration)
-        if not word & REJECTED:
+        if not word & UNUSED:
             self.fresh = True
 
     def all_taken(
         self, words: list[int], stamps: list[int], unknown_inputs: list[float], duration: float
     ) -> bool:
         """Do what `taken` does for each of some samples, and return True, if all were used."""
-        if any(word & TOLD for word in words):
+        if any(word & (TOLD | UNUSED) for word in words):
             return False
         health = self._health
         health.durations.extend([duration] * len(words))

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.estimates import Trajectory
-from fhaosmo_ros.core.observer.status import REJECTED
+from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import Event
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -159,7 +159,7 @@ class Samples:
             self._waiting = np.append(self._waiting, [block.times, block.values.view(np.int64)], 1)
             yield from self._due(estimates)
             return
-        keep = np.flatnonzero((estimates.status & REJECTED) == 0)
+        keep = np.flatnonzero((estimates.status & UNUSED) == 0)
         count = len(keep)
         keep = keep[(self._every - 1 - self._seen) % self._every :: self._every]
         self._seen += count
