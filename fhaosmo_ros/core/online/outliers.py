@@ -42,8 +42,8 @@ def is_held(e: EstimatorArrays, y: float, now: int) -> bool:
     encoder's counts do. y may also really stand still: then it repeats itself for longer.
     """
     ints, reals = e.policy.ints, e.policy.reals
-    if not e.law.flags[SELF_TUNING]:
-        return False
+    if not e.law.flags[SELF_TUNING] or (ints[at.TIMED] and difference(now, ints[at.LATEST]) <= 0):
+        return False  # a sample that comes twice is no repetition
     change, usual = y - reals[at.SAMPLE], ints[at.HELD_FOR]
     reals[at.SAMPLE] = y
     if change == 0.0:
