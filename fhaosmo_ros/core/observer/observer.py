@@ -225,8 +225,8 @@ class Observer:
         self._fit_memory()
         after = self._law.flags
         step = arrays.PREDICTION_STEP
-        same = np.array_equal(law.model.code, self._law.model.code)
-        if not same or law.scalars[step] != self._law.scalars[step]:
+        same_model = np.array_equal(law.model.code, self._law.model.code)
+        if not same_model or law.scalars[step] != self._law.scalars[step]:
             # What self-tuning members know of the model (D 27) is that of another one.
             self._state.memory[[arrays.FLOW_PERIOD, arrays.UNSETTLED]] = 0.0
         if not before[arrays.SENSITIVE] or before[arrays.LEVANT] != after[arrays.LEVANT]:

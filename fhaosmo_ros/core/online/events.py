@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats, Ints
-from fhaosmo_ros.core.observer.status import DIVERGED, REJECTED, RESTARTED
+from fhaosmo_ros.core.observer.status import DIVERGED, RESTARTED, UNUSED
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
@@ -130,7 +130,7 @@ def detect(
     """
     count, change = 0, settings[CHANGE]
     for k in range(d.shape[0]):
-        if words[k] & REJECTED:
+        if words[k] & UNUSED:
             continue
         doing, now, x = ints[at.EVENT], times[k], d[k]
         elapsed = now - ints[at.EVENT_TIME]

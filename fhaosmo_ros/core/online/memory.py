@@ -93,7 +93,7 @@ HELD_Y = 5
 EVENT_MEAN = 6  # running mean of d, for events of its change
 EVENT_DEVIATION = 7  # standard deviation that events are judged by
 SAMPLE = 8  # the latest y, used or not
-CHANGE = 9  # the latest one of it that is not 0
+CHANGE = 9  # by what it last differed from the one before
 STATES = 10  # two copies of a state begin here
 
 

@@ -56,7 +56,7 @@ QUICK_SAMPLES = 30.0
 LATTICE_STEPS = 30.0
 """The share of steps of y that are multiples of the quantum is averaged over so many."""
 LATTICE_SHARE, NO_LATTICE = 0.9, 0.5
-"""With a larger share y is quantised; with a smaller one that smallest step means nothing."""
+"""With a share above the first y is quantised; with one below the other the quantum is none."""
 PASSED = 3.0
 """After more unlikely samples no member judges that was beyond the gate at the last likely one."""
 HIDDEN = 4.0
@@ -89,9 +89,10 @@ def follow_quantum(members: Members, memory: Floats, y: float) -> None:
     goes_back = 1.0 if change > 1.5 * step else 0.0
     memory[GOES_BACK] += (goes_back - memory[GOES_BACK]) / LATTICE_STEPS
     fits = is_multiple(step, quantum, y)
-    if not fits and (is_multiple(quantum, step, y) or memory[LATTICE] < NO_LATTICE):
+    if not fits:
         fits = is_multiple(quantum, step, y)
-        memory[QUANTUM] = step
+        if fits or memory[LATTICE] < NO_LATTICE:
+            memory[QUANTUM] = step
     if not fits:
         memory[LATTICE] -= memory[LATTICE] / LATTICE_STEPS
     elif change > 0.5 * memory[QUANTUM]:
