@@ -7,11 +7,15 @@ from pathlib import Path
 import signal
 import tempfile
 
+from domains import take_domain
 from hypothesis import settings
 import pytest
 
 # Before numpy is imported: on small matrices, the threads of OpenBLAS only wait for each other.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+os.environ['ROS_DOMAIN_ID'] = str(take_domain())
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 # Same examples in every run; no deadline, because the first call of a kernel may compile it.
 settings.register_profile('fixed', derandomize=True, deadline=None, database=None)

@@ -142,6 +142,19 @@ def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(parameters):
     assert nodes_of(parameters) == []
 
 
+def test_another_plant_in_the_same_domain_is_refused(tmp_path):
+    """The bag would hold the samples and estimates of both."""
+    with subprocess.Popen([*COMMAND[:-1], 'plant'], env=environment()) as plant:
+        try:
+            result = run('--duration', 600, '--output', tmp_path / 'out')
+        finally:
+            plant.send_signal(signal.SIGINT)
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}' in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [

@@ -20,13 +20,11 @@ from fhaosmo_ros.tools.bags.reader import BagReader
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[1]
-DOMAIN = str(20 + os.getpid() % 60)
 
 
 def start(*arguments, folder=None):
     environment = {
         **os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path]),
-        'ROS_DOMAIN_ID': DOMAIN, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
     }  # fmt: skip
     return subprocess.Popen(
         [sys.executable, '-m', 'fhaosmo_ros', *map(str, arguments)], env=environment,

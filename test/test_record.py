@@ -17,6 +17,7 @@ import pytest
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 from builtin_interfaces.msg import Time
+from domains import take_domain
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import read_ticks, series
@@ -37,8 +38,8 @@ import yaml
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND = [sys.executable, '-m', 'fhaosmo_ros']
-DOMAIN = str(101 + os.getpid() % 60)
-APART = str(161 + os.getpid() % 60)
+DOMAIN = os.environ['ROS_DOMAIN_ID']
+APART = str(take_domain())
 """A domain without the plant that the other tests share."""
 NODES = ['--ros-args', '--params-file', str(ROOT / 'config' / 'demo.yaml')]
 
@@ -46,7 +47,7 @@ NODES = ['--ros-args', '--params-file', str(ROOT / 'config' / 'demo.yaml')]
 def environment(domain=DOMAIN):
     return {
         **os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path]),
-        'ROS_DOMAIN_ID': domain, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'ROS_DOMAIN_ID': domain,
     }  # fmt: skip
 
 

@@ -1,38 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ROS domain for each test process, so that no two of them, nor a robot, hear each other."""
+"""Nodes for the tests of a module."""
 
 import contextlib
-import fcntl
-import os
-from pathlib import Path
-import tempfile
 
 import pytest
 
 pytest.register_assert_rewrite('rig')
-
-# Domain ids up to 101 keep clear of Linux' ephemeral ports.
-DOMAINS = range(20, 102)
-_locks = []
-
-
-def _take_domain() -> int:
-    """Return a domain that no other test process of this machine has; held until the end."""
-    for number in DOMAINS:
-        path = Path(tempfile.gettempdir()) / f'fhaosmo_ros_test_domain_{number}.lock'
-        lock = path.open('w')
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            lock.close()
-            continue
-        _locks.append(lock)
-        return number
-    raise RuntimeError(f'all ROS domains {DOMAINS} are taken by test processes')
-
-
-os.environ['ROS_DOMAIN_ID'] = str(_take_domain())
-os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 
 @pytest.fixture(scope='module')

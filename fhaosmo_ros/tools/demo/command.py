@@ -185,6 +185,7 @@ def _record(
         _wait(
             f'the estimator (the very first start compiles, {COMPILE_TIME})',
             lambda: recorder.publishers('/estimator/state') and recorder.subscribers('/y') >= 2,
+            recorder,
             nodes,
             stop,
         )
@@ -195,17 +196,36 @@ def _record(
                 recorder.counts['/estimator/state']
                 and (not plan.changes or recorder.can_set_parameters('/plant'))
             ),
+            recorder,
             nodes,
             stop,
         )
         return _watch(recorder, nodes, plan, page, stop)
 
 
-def _wait(what: str, ready: Callable[[], object], nodes: Children, stop: Stop) -> None:
+def _check_alone(recorder: TopicRecorder) -> None:
+    """Raise if another node publishes what is recorded: the bag would hold a mixture."""
+    for topic in ('/y', '/estimator/state'):
+        if recorder.publishers(topic) > 1:
+            domain = os.environ['ROS_DOMAIN_ID']
+            raise ConfigurationError(
+                f'expected one publisher of {topic}, got another one on this host with '
+                f'ROS_DOMAIN_ID={domain}; set another ROS_DOMAIN_ID'
+            )
+
+
+def _wait(
+    what: str,
+    ready: Callable[[], object],
+    recorder: TopicRecorder,
+    nodes: Children,
+    stop: Stop,
+) -> None:
     deadline = time.monotonic() + START_DEADLINE
     print(f'waiting for {what} ...', flush=True)
     while not ready():
         nodes.check()
+        _check_alone(recorder)
         if stop.wait(0.02):
             raise Interrupted('before the first estimate, nothing written')
         if time.monotonic() > deadline:
@@ -224,6 +244,7 @@ def _watch(
     ) as bar:
         while not stop.wait(0.1):
             nodes.check()
+            _check_alone(recorder)
             elapsed = min(time.monotonic() - begin, duration)
             bar.set_postfix_str(f'{recorder.counts["/y"]} samples', refresh=False)
             bar.update(elapsed - bar.n)
