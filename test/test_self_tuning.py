@@ -7,8 +7,15 @@ import math
 from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer import arrays
-from fhaosmo_ros.core.observer.self_tuning.filters import at
-from fhaosmo_ros.core.observer.self_tuning.intervals import passage, within
+from fhaosmo_ros.core.observer.self_tuning.covariances import at
+from fhaosmo_ros.core.observer.self_tuning.intervals import (
+    CHANCE,
+    FAR_TAIL,
+    LOST,
+    MEAN,
+    passage,
+    truncate,
+)
 from fhaosmo_ros.core.observer.self_tuning.jumps import otherwise, SHAPE
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOUR,
@@ -21,12 +28,15 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     ORDER,
     ORDERS,
     SCORE,
+    scratch_in,
+    scratch_rows,
     TAU,
     USED,
     WEIGHT,
     WINDOW,
 )
 from fhaosmo_ros.core.observer.self_tuning.noise import LATTICE_SHARE
+from fhaosmo_ros.core.observer.self_tuning.normal import exponential, FARTHEST, mills
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -436,6 +446,15 @@ def expect_positive(members):
         assert (members.p[at.py_func(size, i, i), of_state] > 0.0).all()
 
 
+def within(low, high):
+    """What `truncate` finds of a normal number of variance 1 between two others."""
+    rows = np.zeros((scratch_rows(1), 1 + ORDERS))
+    scratch = scratch_in(rows, 1)
+    half, scratch.b[0], scratch.p[0, 0] = 0.5 * (high - low), 0.5 * (low + high), 1.0
+    truncate(scratch, half, 0.0, FAR_TAIL, 1)
+    return [scratch.lines[row, 0] for row in (CHANCE, MEAN, LOST)]
+
+
 @pytest.mark.parametrize('width', [1e-6, 0.02, 0.04, 0.5, 2.0, 9.0, 30.0])
 @pytest.mark.parametrize('middle', [-5.0, -1.3, 0.0, 0.4, 3.0, 5.0])
 def test_moments_of_a_truncated_normal_distribution(middle, width):
@@ -446,6 +465,14 @@ def test_moments_of_a_truncated_normal_distribution(middle, width):
     np.testing.assert_allclose([mean, 1.0 - lost], expected, rtol=1e-3, atol=1e-4)
     share = norm.cdf(high) - norm.cdf(low) if middle < 0.0 else norm.sf(low) - norm.sf(high)
     np.testing.assert_allclose(math.exp(chance), share, rtol=1e-3)
+
+
+def test_normal_distribution_by_additions_and_multiplications():
+    x = np.linspace(0.0, FARTHEST, 1001)
+    found = [exponential(-0.5 * value * value) for value in x]
+    np.testing.assert_allclose(found, np.exp(-0.5 * x * x), rtol=1e-12)
+    np.testing.assert_allclose([mills(value) for value in x], norm.sf(x) / norm.pdf(x), rtol=1e-11)
+    assert exponential(-1e9) == exponential(-100.0)
 
 
 @pytest.mark.parametrize('sign', [-1.0, 1.0])

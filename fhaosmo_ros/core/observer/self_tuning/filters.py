@@ -1,15 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The members as filters: prediction and correction of estimates and covariances (D 27)."""
+"""The members as filters: prediction and correction of estimates, and jumps of d (D 27, D 33)."""
 
 import math
 from typing import Any
 
 from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
+from fhaosmo_ros.core.observer.self_tuning.covariances import (
+    add_three,
+    at,
+    by_chain,
+    by_derivatives,
+    by_model,
+    correct_covariances,
+    expect_innovations,
+    INEXACT,
+    neighbours,
+    predict_covariances,
+)
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COLOURS,
     CORRELATION,
-    COUNT,
     DECAYED,
     FACTORIALS,
     FAST,
@@ -30,61 +41,6 @@ import numpy as np
 
 HUBER = 3.0
 """Innovations of more standard deviations count as so many (Huber 1964)."""
-INEXACT = 1.0 + 1e-10
-"""
-By this factor S is too large, so that P stays positive where y is by many orders of magnitude more
-exact than its prediction: what is left of P then is more than what rounding makes of it.
-"""
-
-
-@compiled(forceinline=True)
-def at(d: int, i: int, j: int) -> int:
-    """Return the row of P_ij in an upper triangle of d rows."""
-    low, high = min(i, j), max(i, j)
-    return low * d - low * (low - 1) // 2 + high - low
-
-
-@compiled(forceinline=True)
-def by_chain(flow: Floats, i: int, n: int) -> tuple[float, float, float, float]:
-    """Return what d and its derivatives do to z_i."""
-    return flow[i, n], flow[i, n + 1], flow[i, n + 2], flow[i, n + 3]
-
-
-@compiled(forceinline=True)
-def decaying(h: float, i: int, d: int) -> tuple[float, float, float, int, int, int]:
-    """Return what the levels behind level i do to it (D 17), but for its decay; and which."""
-    a, b, c = min(i + 1, d - 1), min(i + 2, d - 1), min(i + 3, d - 1)
-    return (
-        h if i + 1 < d else 0.0,
-        h * h / 2.0 if i + 2 < d else 0.0,
-        h * h * h / 6.0 if i + 3 < d else 0.0,
-        a, b, c,
-    )  # fmt: skip
-
-
-@compiled(forceinline=True, fastmath=FAST)
-def add_three(
-    row: Floats,
-    a: float,
-    one: Floats,
-    b: float,
-    two: Floats,
-    c: float,
-    three: Floats,
-    first: int,
-    last: int,
-) -> None:
-    """Add three rows times factors, which are often 0, to the columns `first` .. `last` - 1."""
-    if a != 0.0 or b != 0.0 or c != 0.0:
-        for g in range(first, last):
-            row[g] += a * one[g] + b * two[g] + c * three[g]
-
-
-@compiled(forceinline=True)
-def by_model(flow: Floats, i: int, m: int, n: int) -> tuple[float, float, float, int, int]:
-    """Return what z_m and the next two do to z_i, 0 beyond z_n; and which those two are."""
-    e, f = min(m + 1, n - 1), min(m + 2, n - 1)
-    return flow[i, m], flow[i, e] if e > m else 0.0, flow[i, f] if f > m + 1 else 0.0, e, f
 
 
 @compiled(fastmath=FAST)
@@ -112,135 +68,13 @@ def predict_states(
             a, b, c, e, f = by_model(flow, i, m, n)
             add_three(row, a, x[m], b, x[e], c, x[f], 0, members.active)
     # exp of D 17: e^(-kappa h) times a polynomial
-    for i in range(n, n + ORDERS):
-        row, one = ahead[i], x[i]
-        a, b, c, at_a, at_b, at_c = decaying(h, i, n + ORDERS)
-        two, three, four = x[at_a], x[at_b], x[at_c]
-        for g in range(members.active):
-            row[g] = decayed[g] * (one[g] + a * two[g] + b * three[g] + c * four[g])
-
-
-@compiled(fastmath=FAST)
-def multiply(members: Members, scratch: Scratch, n: int, h: float, first: int, last: int) -> None:
-    """Write A P of the columns `first` .. `last` - 1, as far as A P A' needs it."""
-    p, flow, product, chain = members.p, members.flow, scratch.product, scratch.chain
-    kappa, decayed, d = members.rates[KAPPA], members.rates[DECAYED], n + ORDERS
-    lowest = d
-    for i in range(d - 1, -1, -1):  # A has zeros below its diagonal, most of them
-        lowest = min(lowest, i)
-        for m in range(i if i < n else 0):
-            if flow[i, m] != 0.0:
-                lowest = min(lowest, m)
-        if i >= n:
-            a, b, c, at_a, at_b, at_c = decaying(h, i, d)
-            for j in range(lowest, d):
-                row, one, two = product[i * d + j], p[at(d, j, i)], p[at(d, j, at_a)]
-                three, four = p[at(d, j, at_b)], p[at(d, j, at_c)]
-                for g in range(first, last):
-                    row[g] = decayed[g] * (one[g] + a * two[g] + b * three[g] + c * four[g])
-            continue
-        f0, f1, f2, f3 = by_chain(flow, i, n)
-        by_d, by_first, by_second = chain[3 * i], chain[3 * i + 1], chain[3 * i + 2]
-        for g in range(first, last):
-            c = kappa[g]
-            by_d[g] = f0 - c * (f1 - c * (f2 - c * f3))
-            by_first[g] = f1 - c * (2.0 * f2 - 3.0 * c * f3)
-            by_second[g] = f2 - 3.0 * c * f3
-        for j in range(lowest, d):
-            row = product[i * d + j]
-            one, two = p[at(d, j, n)], p[at(d, j, n + 1)]
-            three, four = p[at(d, j, n + 2)], p[at(d, j, n + 3)]
-            for g in range(first, last):
-                more = by_d[g] * one[g] + by_first[g] * two[g]
-                row[g] = more + by_second[g] * three[g] + f3 * four[g]
-            for m in range(0, n, 3):
-                a, b, c, e, f = by_model(flow, i, m, n)
-                one, two, three = p[at(d, j, m)], p[at(d, j, e)], p[at(d, j, f)]
-                add_three(row, a, one, b, two, c, three, first, last)
-
-
-@compiled(forceinline=True)
-def share(powers: Floats, h: float, a: int, b: int) -> float:
-    """Return the integral of t^(a + b) / (a! b!) over h: what q adds to a covariance (D 20)."""
-    return powers[a] * powers[b] * h / (a + b + 1) if a >= 0 and b >= 0 else 0.0
-
-
-@compiled(fastmath=FAST)
-def integrate_drive(
-    members: Members, scratch: Scratch, n: int, h: float, first: int, last: int
-) -> None:
-    """Write Q of the columns `first` .. `last` - 1 (D 27), unless it is there already."""
-    drive, holds, d, powers = members.drive, scratch.holds, n + ORDERS, scratch.lines[0]
-    none, slope, curve, jerk = drive[0], drive[1], drive[2], drive[3]
-    one, other = none[0], jerk[COUNT - 1]  # all others follow from these two (D 26)
-    there = holds[0] == h and holds[1] == one and holds[2] == other
-    if there and holds[3] <= first and last <= holds[4]:
-        return
-    holds[0], holds[1], holds[2], holds[3], holds[4] = h, one, other, first, last
-    powers[0] = 1.0  # h^j / j!
-    for i in range(1, d):
-        powers[i] = powers[i - 1] * h / i
-    for i in range(d):
-        for j in range(i, d):
-            row = scratch.q[at(d, i, j)]
-            q0 = share(powers, h, n - i, n - j)
-            q1 = share(powers, h, n + 1 - i, n + 1 - j)
-            q2 = share(powers, h, n + 2 - i, n + 2 - j)
-            q3 = share(powers, h, n + 3 - i, n + 3 - j)
-            for g in range(first, last):
-                row[g] = q0 * none[g] + q1 * slope[g] + q2 * curve[g] + q3 * jerk[g]
-
-
-@compiled(fastmath=FAST)
-def predict_covariances(
-    members: Members, scratch: Scratch, n: int, h: float, first: int, last: int
-) -> None:
-    """Write A P A' + Q of the columns `first` .. `last` - 1 (D 27)."""
-    multiply(members, scratch, n, h, first, last)
-    integrate_drive(members, scratch, n, h, first, last)
-    product, chain, flow = scratch.product, scratch.chain, members.flow
-    decayed, d = members.rates[DECAYED], n + ORDERS
-    for i in range(d):
-        for j in range(i, d):
-            row, q = scratch.p[at(d, i, j)], scratch.q[at(d, i, j)]
-            if j >= n:
-                a, b, c, at_a, at_b, at_c = decaying(h, j, d)
-                one, two = product[i * d + j], product[i * d + at_a]
-                three, four = product[i * d + at_b], product[i * d + at_c]
-                for g in range(first, last):
-                    row[g] = q[g] + decayed[g] * (one[g] + a * two[g] + b * three[g] + c * four[g])
-                continue
-            by_d, by_first, by_second = chain[3 * j], chain[3 * j + 1], chain[3 * j + 2]
-            f3, at_d = flow[j, n + 3], i * d + n
-            one, two = product[at_d], product[at_d + 1]
-            three, four = product[at_d + 2], product[at_d + 3]
-            for g in range(first, last):
-                more = by_d[g] * one[g] + by_first[g] * two[g]
-                row[g] = q[g] + more + by_second[g] * three[g] + f3 * four[g]
-            for m in range(0, n, 3):
-                a, b, c, e, f = by_model(flow, j, m, n)
-                one, two, three = product[i * d + m], product[i * d + e], product[i * d + f]
-                add_three(row, a, one, b, two, c, three, first, last)
-
-
-@compiled(fastmath=FAST)
-def expect_innovations(
-    members: Members, scratch: Scratch, n: int, h: float, first: int, last: int
-) -> None:
-    """Write P C', and variances of the innovations over that of the noise, of columns (D 27)."""
-    d, correlation, used = n + ORDERS, members.rates[CORRELATION], scratch.lines[0]
-    p, gain, s = scratch.p, scratch.gain, scratch.s
-    fill(used, members.noise[USED])
-    half = 0.5 * h * h
-    for i in range(d):  # z_1 of the sample before is the state of now, h back
-        row, one, two, three = gain[i], p[at(d, 0, i)], p[at(d, 1, i)], p[at(d, 2, i)]
-        for g in range(first, last):
-            before = one[g] - h * two[g] + half * three[g]
-            row[g] = one[g] - correlation[g] * before
-    one, two, three = gain[0], gain[1], gain[2]
-    for g in range(first, last):
-        before = one[g] - h * two[g] + half * three[g]
-        s[g] = INEXACT * (1.0 + max(one[g] - correlation[g] * before, 0.0) / used[g])
+    (a, b, c), now, after = by_derivatives(h), neighbours(x, n, 4), neighbours(ahead, n, 4)
+    for g in range(members.active):
+        slope, second, third = now[1, g], now[2, g], now[3, g]
+        after[0, g] = decayed[g] * (now[0, g] + a * slope + b * second + c * third)
+        after[1, g] = decayed[g] * (slope + a * second + b * third)
+        after[2, g] = decayed[g] * (second + a * third)
+        after[3, g] = decayed[g] * third
 
 
 @compiled(fastmath=FAST)
@@ -280,26 +114,6 @@ def allow_jump(members: Members, scratch: Scratch, n: int, y: float, tau: float)
                 row[g] += part / tau ** (i + j) * more[g]
     for i in range(d):
         scratch.gain[i, :] = p[at(d, 0, i)]
-
-
-@compiled(fastmath=FAST)
-def correct_covariances(members: Members, scratch: Scratch, n: int, first: int, last: int) -> None:
-    """
-    Take a sample into P of the columns `first` .. `last` - 1, and turn P C' into gains (D 27).
-
-    By factors for each member in lines 0 and 2 of the scratch: gains are P C' times the first of
-    them, and P loses P C' C P times the other.
-    """
-    inverse, scaled, taken, d = scratch.lines[0], scratch.lines[1], scratch.lines[2], n + ORDERS
-    for i in range(d):
-        one, row = scratch.gain[i], members.gain[i]
-        for g in range(first, last):
-            scaled[g] = one[g] * taken[g]
-            row[g] = one[g] * inverse[g]
-        for j in range(i, d):
-            two, before, after = scratch.gain[j], scratch.p[at(d, i, j)], members.p[at(d, i, j)]
-            for g in range(first, last):
-                after[g] = before[g] - scaled[g] * two[g]
 
 
 @compiled(fastmath=FAST)

@@ -13,10 +13,12 @@ from fhaosmo_ros.core.compiled.cache import compiled
 from fhaosmo_ros.core.model.bytecode import Floats
 from fhaosmo_ros.core.observer.arrays import ACTIVE, UNSETTLED
 from fhaosmo_ros.core.observer.covariance import GATE
-from fhaosmo_ros.core.observer.self_tuning.filters import at, HUBER, INEXACT
+from fhaosmo_ros.core.observer.self_tuning.covariances import at, INEXACT
+from fhaosmo_ros.core.observer.self_tuning.filters import HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
     COUNT,
     FAR,
+    FAST,
     HALF,
     LOG_VARIANCE,
     Members,
@@ -31,13 +33,17 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     WEIGHT,
     WHITE,
 )
+from fhaosmo_ros.core.observer.self_tuning.normal import exponential, FARTHEST, mills, ROOT
 
+SIZE, CHANCE, MEAN, LOST, SPARE = 1, 3, 4, 5, 6
+"""Lines of the scratch."""
 VAGUE = 0.1
 """Part of the quantum by which predictions of z_1 are less certain than their P says."""
 LEAST_CHANCE = -6.0
 """Logarithm of the least probability that a sample counts with."""
 LEAST_PASSAGE = -12.0
 """That of the least probability with which z_1 passes an edge at just this sample."""
+LEAST_PASSED = math.exp(LEAST_PASSAGE)
 OF_BACK = 3.0
 """
 If more than one in so many of y's steps go back at once, noise of as much as `VAGUE` carries z_1
@@ -58,62 +64,67 @@ second one, tells it nothing: each such sample would narrow it again.
 """
 WELL_WITHIN = 1.75
 """If both edges are so many standard deviations off, z_1 is within them more likely than both."""
-NARROW = 0.03
-"""In an interval of so few standard deviations the density is taken to be constant."""
+HALF_NARROW = 0.015
+"""In an interval of twice so few standard deviations the density is taken to be constant."""
 FAR_TAIL = 5.5
 """An interval that is so many standard deviations off counts as its nearer end."""
 UNUSED = -1e6
 """Log-likelihood of members with coloured noise, which errors of rounding are not."""
 
 
-@compiled(forceinline=True)
-def chance_below(x: float) -> float:
-    """Return the probability that a normal number of variance 1 is less than `x`."""
-    return 0.5 * math.erfc(-x / math.sqrt(2.0))
-
-
-@compiled(forceinline=True)
-def density(x: float) -> float:
-    """Return the density of a normal number of variance 1."""
-    return math.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)
-
-
-@compiled(inline='always')
-def within(low: float, high: float) -> tuple[float, float, float]:
+@compiled(fastmath=FAST)
+def truncate(scratch: Scratch, half: float, least: float, well_within: float, count: int) -> None:
     """
-    Return what is known of a normal number of mean 0 and variance 1 that lies between two others.
+    Find what is known of the members' z_1 if it lies within half a quantum of a sample.
 
-    Returns
-    -------
-    chance : float
-        The logarithm of the probability that it does.
-    mean : float
-    lost : float
-        Its variance is smaller than 1 by this.
+    That is what is known of a normal number of mean 0 and variance 1 that lies between two others:
+    its mean, by what its variance is smaller than 1, and the logarithm of the probability that it
+    lies there, in the lines `MEAN`, `LOST` and `CHANCE` of the scratch. `SIZE` is the standard
+    deviation of which these are parts.
+
+    Parameters
+    ----------
+    half : float
+        Half the quantum.
+    least : float
+        What is added to the variance of z_1.
+    well_within : float
+        If both edges are farther off than so many standard deviations, the sample tells nothing.
 
     """
-    nearer, farther = (low, high) if low + high > 0.0 else (-high, -low)
-    width = high - low
-    if nearer < -FAR_TAIL:
-        return 0.0, 0.0, 0.0
-    if width < NARROW:
-        mean = 0.5 * (nearer + farther)
-        chance = math.log(width * density(mean))
-        lost = 1.0 - width * width / 12.0
-    elif nearer > FAR_TAIL:
-        mean = nearer + 1.0 / nearer
-        chance = -0.5 * nearer * nearer
-        lost = 1.0 - 1.0 / (nearer * nearer)
-    else:
-        share = chance_below(-nearer) - chance_below(-farther)
-        left, right = density(nearer), density(farther)
-        mean = (left - right) / share
-        lost = mean * mean - (nearer * left - farther * right) / share
-        chance = math.log(share)
-    return chance, mean if low + high > 0.0 else -mean, min(max(lost, 0.0), 1.0)
+    p, b, lines, size = scratch.p[0], scratch.b, scratch.lines, scratch.lines[SIZE]
+    chance, smaller, mean, lost = lines[CHANCE], lines[SPARE], lines[MEAN], lines[LOST]
+    for g in range(count):
+        size[g] = math.sqrt(INEXACT * (p[g] + least))
+        inverse = 1.0 / size[g]
+        off, width = abs(b[g]) * inverse, half * inverse
+        near, far = off - width, min(off + width, FARTHEST)
+        to_near = min(abs(near), FARTHEST)
+        left, right = exponential(-0.5 * to_near * to_near), exponential(-0.5 * far * far)
+        beyond = left * mills(to_near)
+        share = (beyond if near > 0.0 else ROOT - beyond) - right * mills(far)
+        inverse, by_near = 1.0 / share, 1.0 / near
+        center = (left - right) * inverse
+        less = center * center - (near * left - far * right) * inverse
+        nearly, tail, flat = near + by_near, 1.0 - by_near * by_near, 1.0 - width * width / 3.0
+        narrow, outside, inside = width < HALF_NARROW, near > FAR_TAIL, near < -well_within
+        share = ROOT if inside | outside else share
+        chance[g] = (2.0 * width if narrow else share) * (1.0 / ROOT)
+        square = near * near if outside else 0.0
+        smaller[g] = off * off if narrow else square
+        center = nearly if outside else center
+        center = off if narrow else center
+        mean[g] = 0.0 if inside else math.copysign(center, b[g])
+        less = tail if outside else less
+        less = flat if narrow else less
+        lost[g] = 0.0 if inside else min(max(less, 0.0), 1.0)
+    for g in range(count):
+        chance[g] = math.log(chance[g]) if chance[g] != 1.0 else 0.0
+    for g in range(count):
+        chance[g] -= 0.5 * smaller[g]
 
 
-@compiled(inline='always')
+@compiled(forceinline=True)
 def passage(to_edge: float, variance: float, moved: float, spread: float) -> float:
     """
     Return the probability that a normal number passes an edge above it between two samples.
@@ -132,11 +143,65 @@ def passage(to_edge: float, variance: float, moved: float, spread: float) -> flo
         counts twice.
 
     """
-    density = math.exp(-0.5 * to_edge * to_edge / variance) / math.sqrt(2.0 * math.pi * variance)
+    density = exponential(-0.5 * to_edge * to_edge / variance) / (ROOT * math.sqrt(variance))
     return density * 0.5 * (moved + math.sqrt(moved * moved + 2.0 / math.pi * spread))
 
 
-@compiled()
+@compiled(fastmath=FAST)
+def bound_chances(
+    members: Members,
+    scratch: Scratch,
+    before: float,
+    side: float,
+    h: float,
+    half: float,
+    least: float,
+    carried: float,
+) -> None:
+    """
+    Find what slow members say of whether z_1 passes an edge at just this sample (D 36).
+
+    With one that comes again, the logarithms of the probabilities are made larger first, since a
+    member that expects it is to lose nothing. Then `SPARE` of the scratch bounds them.
+
+    Parameters
+    ----------
+    before : float
+        The sample before.
+    side : float
+        1 if y has risen by one quantum, -1 if it has fallen, 0 if the sample comes again.
+    h : float
+        Time since then.
+    half : float
+        Half the quantum.
+    least : float
+        What is added to the variance of z_1.
+    carried : float
+        What noise adds to the variance of its motion.
+
+    """
+    chance, bound = scratch.lines[CHANCE], scratch.lines[SPARE]
+    z, ahead, p = members.x[0], scratch.x[0], members.p[0]
+    speed = members.p[at(len(members.x), 1, 1)]  # variance of the state behind z_1
+    if side == 0.0:
+        for g in range(members.active):
+            moved, spread, was = ahead[g] - z[g], h * h * speed[g], p[g] + least
+            up = passage(before + half - z[g], was, moved, spread + carried)
+            down = passage(z[g] + half - before, was, -moved, spread + carried)
+            slow = moved * moved + spread < SLOW * was
+            bound[g] = -(up + down) if slow else 0.0
+            chance[g] = max(chance[g], LEAST_CHANCE) - (HALF_SURE if slow else EVENLY)
+        return
+    for g in range(members.active):
+        moved, spread, was = side * (ahead[g] - z[g]), h * h * speed[g], p[g] + least
+        passed = passage(side * (before - z[g]) + half, was, moved, spread + carried)
+        slow = moved * moved + spread < SLOW * was
+        bound[g] = min(passed, 1.0) if slow else 1.0
+    for g in range(members.active):
+        bound[g] = math.log(bound[g]) if bound[g] > LEAST_PASSED else LEAST_PASSAGE
+
+
+@compiled(fastmath=FAST)
 def take_interval(
     members: Members,
     scratch: Scratch,
@@ -167,45 +232,37 @@ def take_interval(
         Share of y's steps, of late, that go back where the sample before came from.
 
     """
-    half, p, noise = math.sqrt(3.0 * quanta), scratch.p[0], members.noise[SQUARE, 0]
+    half, noise = math.sqrt(3.0 * quanta), members.noise[SQUARE, 0]
     apart, vague = max(noise - quanta, 0.0), (2.0 * VAGUE * half) ** 2  # not of rounding
-    least, carried = apart + vague, 2.0 * (apart + min(OF_BACK * back, 1.0) * vague)
-    inverse, taken, innovation = scratch.lines[0], scratch.lines[2], scratch.b
+    least, carried = apart + vague, 2.0 * min(OF_BACK * back, 1.0) * (apart + vague)
+    inverse, taken, innovation, s = scratch.lines[0], scratch.lines[2], scratch.b, scratch.s
+    size, chance, mean, lost, bound = (
+        scratch.lines[SIZE], scratch.lines[CHANCE], scratch.lines[MEAN], scratch.lines[LOST],
+        scratch.lines[SPARE],
+    )  # fmt: skip
     score, prior, far = members.record[SCORE], members.record[PRIOR], members.record[FAR]
-    repeated, one_step = y == before, 0.0 < abs(y - before) < 3.0 * half
-    side = 1.0 if y > before else -1.0
-    speed = members.p[at(len(members.x), 1, 1)]  # variance of the state behind z_1
     for g in range(members.active):
         square = innovation[g] * innovation[g]
-        far[g] = far[g] + 1.0 if square > GATE * GATE * scratch.s[g] * noise else 0.0
-        variance = INEXACT * (p[g] + least)
-        size, off = math.sqrt(variance), y - scratch.x[0, g]
-        chance = mean = lost = 0.0
-        if not repeated or half - abs(off) < WELL_WITHIN * size:
-            chance, mean, lost = within((off - half) / size, (off + half) / size)
-        likelihood = max(chance, LEAST_CHANCE)
-        moved, spread = scratch.x[0, g] - members.x[0, g], h * h * speed[g]
-        was = members.p[0, g] + least
-        if (repeated or one_step) and moved * moved + spread < SLOW * was:
-            off = side * (before - members.x[0, g])
-            passed = passage(off + half, was, side * moved, spread + carried)
-            if repeated:
-                passed += passage(half - off, was, -side * moved, spread + carried)
-                likelihood = min(likelihood - HALF_SURE, -passed)
-            elif passed < 1.0:
-                passed = math.log(max(passed, 1e-9))
-                likelihood = min(likelihood, max(passed, LEAST_PASSAGE))
-        elif repeated:
-            likelihood = min(likelihood - EVENLY, 0.0)
-        if kept >= 0.0:
-            score[g] = prior[g] + kept * (score[g] - prior[g]) + likelihood
-        if repeated and chance > KNOWN:
-            innovation[g] = inverse[g] = taken[g] = 0.0
-        else:
-            late = max(far[g] - 1.0, 0.0)
-            limit = HUBER * (1.0 + late * late)
-            innovation[g] = min(max(mean, -limit), limit) * math.sqrt(variance)
-            inverse[g], taken[g] = 1.0 / variance, lost / variance
+        far[g] = far[g] + 1.0 if square > GATE * GATE * s[g] * noise else 0.0
+    repeated = y == before
+    known = KNOWN if repeated else math.inf
+    truncate(scratch, half, least, WELL_WITHIN if repeated else FAR_TAIL, members.active)
+    for g in range(members.active):
+        late = max(far[g] - 1.0, 0.0)
+        limit = HUBER * (1.0 + late * late)
+        told = chance[g] <= known
+        innovation[g] = min(max(mean[g], -limit), limit) * size[g] if told else 0.0
+        inverse[g] = 1.0 / (size[g] * size[g]) if told else 0.0
+        taken[g] = lost[g] * inverse[g]
+    if kept < 0.0:
+        return
+    bound[: members.active] = 0.0
+    if abs(y - before) < 3.0 * half:
+        side = 0.0 if repeated else math.copysign(1.0, y - before)
+        bound_chances(members, scratch, before, side, h, half, least, carried)
+    for g in range(members.active):
+        likelihood = min(max(chance[g], LEAST_CHANCE), bound[g])
+        score[g] = prior[g] + kept * (score[g] - prior[g]) + likelihood
 
 
 @compiled()

@@ -30,7 +30,7 @@ from fhaosmo_ros.core.observer.arrays import (
     Y,
 )
 from fhaosmo_ros.core.observer.covariance import MEDIAN
-from fhaosmo_ros.core.observer.self_tuning.filters import at
+from fhaosmo_ros.core.observer.self_tuning.covariances import at
 from fhaosmo_ros.core.observer.self_tuning.jumps import watch
 from fhaosmo_ros.core.observer.self_tuning.members import (
     BANDWIDTHS,

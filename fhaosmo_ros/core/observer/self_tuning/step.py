@@ -51,9 +51,9 @@ from fhaosmo_ros.core.observer.arrays import (
 from fhaosmo_ros.core.observer.covariance import GATE, MOST_DRIFT, REMEMBERED
 from fhaosmo_ros.core.observer.levant import NEAR
 from fhaosmo_ros.core.observer.prediction import predict
+from fhaosmo_ros.core.observer.self_tuning.covariances import at
 from fhaosmo_ros.core.observer.self_tuning.filters import (
     allow_jump,
-    at,
     correct,
     correct_states,
     expect,

@@ -19,7 +19,8 @@ from fhaosmo_ros.core.observer.arrays import (
     TOLD,
 )
 from fhaosmo_ros.core.observer.covariance import GATE
-from fhaosmo_ros.core.observer.self_tuning.filters import at, HUBER
+from fhaosmo_ros.core.observer.self_tuning.covariances import at
+from fhaosmo_ros.core.observer.self_tuning.filters import HUBER
 from fhaosmo_ros.core.observer.self_tuning.members import (
     BAND,
     BANDS,
