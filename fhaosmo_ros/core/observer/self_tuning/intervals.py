@@ -22,6 +22,7 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     HALF,
     LOG_VARIANCE,
     Members,
+    ORDERS,
     PRIOR,
     RESIDUAL,
     SCORE,
@@ -61,6 +62,11 @@ EVENLY, KNOWN = math.log(0.917), math.log(0.88)
 A normal number with the variance of an even distribution in the interval lies in it with the first
 probability. So a sample that repeats the one before, and that a member expects with more than the
 second one, tells it nothing: each such sample would narrow it again.
+"""
+FEW_STATES = 3
+"""
+In models of more states a repeated sample narrows no member: many of them in a row would narrow
+one whose z_1 is wrong, and one with a d that is thousands of times too large would be likelier.
 """
 WELL_WITHIN = 1.75
 """If both edges are so many standard deviations off, z_1 is within them more likely than both."""
@@ -246,6 +252,7 @@ def take_interval(
         far[g] = far[g] + 1.0 if square > GATE * GATE * s[g] * noise else 0.0
     repeated = y == before
     known = KNOWN if repeated else math.inf
+    narrowing = 0.0 if repeated and len(members.x) > FEW_STATES + ORDERS else 1.0
     truncate(scratch, half, least, WELL_WITHIN if repeated else FAR_TAIL, members.active)
     for g in range(members.active):
         late = max(far[g] - 1.0, 0.0)
@@ -253,7 +260,7 @@ def take_interval(
         told = chance[g] <= known
         innovation[g] = min(max(mean[g], -limit), limit) * size[g] if told else 0.0
         inverse[g] = 1.0 / (size[g] * size[g]) if told else 0.0
-        taken[g] = lost[g] * inverse[g]
+        taken[g] = lost[g] * inverse[g] * narrowing
     if kept < 0.0:
         return
     bound[: members.active] = 0.0
