@@ -8,6 +8,7 @@ import pytest
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
+from builtin_interfaces.msg import Time  # noqa: E402
 from fhaosmo_ros.nodes import plant  # noqa: E402
 from fhaosmo_ros.nodes.estimator import node as estimator  # noqa: E402
 from rclpy.context import Context  # noqa: E402
@@ -15,7 +16,7 @@ from rclpy.node import Node  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from rclpy.signals import SignalHandlerOptions  # noqa: E402
 from rig import EstimatorRig, node_process, one_line_error, Parameters, parameters  # noqa: E402
-from std_msgs.msg import Float64, Int64  # noqa: E402
+from std_msgs.msg import Float64, Float64MultiArray, Int64  # noqa: E402
 
 OK, WARN, ERROR, STALE = b'\0', b'\1', b'\2', b'\3'
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -123,6 +124,20 @@ def test_outputs_qos_can_be_overridden(client, listen):
     assert infos['gamma'].durability == DurabilityPolicy.TRANSIENT_LOCAL
     assert infos['stamp'].durability == DurabilityPolicy.VOLATILE
     assert rig.parameters.get(f'qos_overrides.{prefix}/innovation.publisher.depth') == 10
+
+
+def test_who_comes_later_hears_the_latched_estimates_too(client, start):
+    """An estimate that nobody listens to is not made, unless its publisher keeps the last ones."""
+    name = '/test_who_comes_later/estimator'
+    latched = {f'qos_overrides.{name}/gamma.publisher.durability': 'transient_local'}
+    start('estimator', *parameters(namespace='/test_who_comes_later', **latched))
+    stamps, publish = client.record(f'{name}/stamp', Time), client.publisher(f'{name[:-10]}/y')
+    client.wait(lambda: publish(0.5) or len(stamps) > 10, 'estimates')
+    before = stamps[-1].stamp
+    gamma = client.record(f'{name}/gamma', Float64, LATCHED)
+    state = client.record(f'{name}/state', Float64MultiArray)
+    client.wait(lambda: publish(0.5) or (gamma and len(state) > 10), 'gamma and state')
+    assert gamma[0].stamp < before < state[0].stamp
 
 
 def test_topics_of_a_self_tuning_estimator_have_policies_too(listen):

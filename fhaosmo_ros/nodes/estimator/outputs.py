@@ -15,7 +15,7 @@ from fhaosmo_ros.nodes.middleware.messages import (
     message_class,
     time_encoder,
 )
-from fhaosmo_ros.nodes.middleware.publishers import create_publisher
+from fhaosmo_ros.nodes.middleware.publishers import create_publisher, listeners_of
 from fhaosmo_ros.topics import DIAGNOSTICS, ESTIMATES, EVENT, SELF_TUNED
 import numpy as np
 from rclpy.node import Node
@@ -26,6 +26,8 @@ DEPTH = 10
 class Publishers:
     """
     Publishers of some topics, each with ROS' parameters qos_overrides./TOPIC.publisher.POLICY.
+
+    What nobody listens to is not made: a message costs as much as a step with fixed gains.
 
     Parameters
     ----------
@@ -43,6 +45,7 @@ class Publishers:
             create_publisher(node, message_class(kind), prefix + name, DEPTH)
             for name, kind in kinds.items()
         ]
+        self._listeners = [listeners_of(publisher) for publisher in self._publishers]
 
     def destroy(self) -> None:
         """Take the publishers away."""
@@ -66,20 +69,21 @@ class Outputs(Publishers):
 
     def __init__(self, node: Node, prefix: str, order: int, levels: int) -> None:
         super().__init__(node, prefix, ESTIMATES)
-        self._state, self._unknown_input, self._gamma, self._innovation, self._stamp = (
-            publisher.publish for publisher in self._publishers
-        )
-        self._encode_state = array_encoder([f'z{i + 1}' for i in range(order)])
-        self._encode_innovation = array_encoder([f'eps{i + 1}' for i in range(levels)])
-        self._encode_double, self._encode_time = double_encoder(), time_encoder()
+        encoders = (
+            array_encoder([f'z{i + 1}' for i in range(order)]), double_encoder(), double_encoder(),
+            array_encoder([f'eps{i + 1}' for i in range(levels)]), time_encoder(),
+        )  # fmt: skip
+        publish = [publisher.publish for publisher in self._publishers]
+        self._parts = list(zip(self._listeners, publish, encoders, strict=True))
 
     def publish(self, estimate: Estimate, stamp: int) -> None:
         """Publish an estimate and, last, the stamp of its sample in nanoseconds."""
-        self._state(self._encode_state(estimate.z))
-        self._unknown_input(self._encode_double(estimate.unknown_input))
-        self._gamma(self._encode_double(estimate.gamma))
-        self._innovation(self._encode_innovation(estimate.innovation))
-        self._stamp(self._encode_time(stamp))
+        values = (
+            estimate.z, estimate.unknown_input, estimate.gamma, estimate.innovation, stamp
+        )  # fmt: skip
+        for (listeners, publish, encode), value in zip(self._parts, values, strict=True):
+            if listeners():
+                publish(encode(value))
 
 
 class TuningOutputs(Publishers):
@@ -103,10 +107,12 @@ class TuningOutputs(Publishers):
 
     def publish(self, estimator: OnlineEstimator) -> None:
         """Publish the standard deviations of the latest estimate, and the tuning at its sample."""
-        deviation, tuning = self._publishers
-        deviation.publish(self._encode_deviation(estimator.standard_deviation))
-        noise, correlation, bandwidth, shares = estimator.tuning
-        tuning.publish(self._encode_tuning(np.array([noise, correlation, bandwidth, *shares])))
+        (deviation, tuning), (of_deviation, of_tuning) = self._publishers, self._listeners
+        if of_deviation():
+            deviation.publish(self._encode_deviation(estimator.standard_deviation))
+        if of_tuning():
+            noise, correlation, bandwidth, shares = estimator.tuning
+            tuning.publish(self._encode_tuning(np.array([noise, correlation, bandwidth, *shares])))
 
 
 class EventOutput:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.observer.estimates import Estimate
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.messages import message_class, TIME
+from fhaosmo_ros.nodes.middleware.publishers import listeners_of
 from fhaosmo_ros.topics import TYPED_ESTIMATES
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -58,12 +59,13 @@ class TypedOutputs:
                 kind = message_class(TYPED_ESTIMATES[name])
                 publisher = node.create_publisher(kind, f'~/{name}', QoSProfile(depth=DEPTH))
                 self._publishers.append(publisher)
-                self._publish.append((publisher.publish, encoders[name]))
+                self._publish.append((listeners_of(publisher), publisher.publish, encoders[name]))
 
     def publish(self, outputs: Sequence[Output]) -> None:
         """Publish the latest estimates of some channels, with the latest of their stamps."""
-        for publish, encode in self._publish:
-            publish(encode(outputs))
+        for listeners, publish, encode in self._publish:
+            if listeners():
+                publish(encode(outputs))
 
     def destroy(self) -> None:
         """Take the publishers away."""

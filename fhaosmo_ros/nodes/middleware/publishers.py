@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishers whose QoS a user may override by parameters qos_overrides./TOPIC.publisher.POLICY."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -29,6 +29,18 @@ def create_publisher(node: Node, kind: Any, topic: str, depth: int, latched: boo
         QoSProfile(depth=depth, durability=durability),
         qos_overriding_options=QoSOverridingOptions(POLICIES),
     )
+
+
+def listeners_of(publisher: Any) -> Callable[[], int]:
+    """
+    Return a function that tells how many listen, so that nothing is encoded for nobody.
+
+    A transient-local publisher always has one: whoever comes later gets its last messages.
+    """
+    if publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+        return lambda: 1
+    count: Callable[[], int] = publisher.handle.get_subscription_count
+    return count
 
 
 def check_overrides(node: Node, topics: Iterable[str]) -> None:
