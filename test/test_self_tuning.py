@@ -563,6 +563,49 @@ def test_noise_on_a_quantised_y(quantum, part):
     assert rms((found - r.d)[r.t > 4.0]) < rms(r.d)
 
 
+def run_on(plant, y):
+    """Self-tuning estimates of d, of one of the study's plants, and the estimator."""
+    values = model_of(setting_of(PLANTS_OF_STUDY[plant], CONDITIONS['as tuned'])) | SELF_TUNING
+    estimator = OnlineEstimator(values)
+    return estimator.run(10**9 + 10**6 * np.arange(len(y)), y), estimator
+
+
+@pytest.mark.parametrize('plant', PLANTS_OF_STUDY)
+def test_a_sensor_that_is_stuck_or_at_the_end_of_its_range(plant):
+    """Believed, that would be a plant that stands still."""
+    r = recording(PLANTS_OF_STUDY[plant], CONDITIONS['as tuned'], 'sine', 20.0, 31)
+    late = r.t > 4.0
+    clipped = np.clip(r.y, *np.quantile(r.y, [0.05, 0.95]))
+    stuck = np.where((r.t > 8.0) & (r.t < 8.3), r.y[8001], r.y)
+    for y in (clipped, stuck):
+        found, estimator = run_on(plant, y)
+        repeated = np.count_nonzero(np.diff(y)[4000:] == 0.0)  # many once, near the range's end
+        assert 0.6 * repeated < estimator.counters.rejected_stuck
+        assert rms((found.unknown_input - r.d)[late]) < 0.5 * rms(r.d)
+
+
+@pytest.mark.parametrize('late', [0.0, 2e-4], ids=['exact', 'late stamps'])
+def test_a_simulated_y_without_noise_that_comes_to_rest_is_not_stuck(late):
+    t = np.arange(16_000) * PERIOD
+    slow = np.cumsum(np.cos(2.0 * t) * np.where(t < 8.0, 1.0, np.exp(48.0 - 6.0 * t))) * PERIOD
+    sudden = np.sin(2.0 * np.minimum(t, 8.3))
+    stamps = t + late * np.abs(np.random.default_rng(0).standard_normal(len(t)))
+    for y in (slow, sudden):
+        estimator = OnlineEstimator({'order': 2, 'phi': ['0', '-z2'], **SELF_TUNING})
+        estimator.run(10**9 + np.sort(np.round(1e9 * stamps).astype(np.int64)), y)
+        assert np.count_nonzero(np.diff(y) == 0.0) > 1000
+        assert estimator.counters.rejected_stuck == 0
+
+
+@pytest.mark.parametrize('plant', PLANTS_OF_STUDY)
+def test_a_sensor_that_says_nothing_but_0_until_it_is_ready(plant):
+    r = recording(PLANTS_OF_STUDY[plant], CONDITIONS['as tuned'], 'sine', 20.0, 31)
+    found, _ = run_on(plant, np.where(r.t < 2.0, 0.0, r.y))
+    late = r.t > 5.0
+    assert rms((found.unknown_input - r.d)[late]) < 0.5 * rms(r.d)
+    assert np.abs(found.unknown_input).max() < 50.0 * np.abs(r.d).max()
+
+
 @pytest.mark.parametrize('plant', PLANTS_OF_STUDY)
 @pytest.mark.parametrize(('samples', 'noise'), [(5, 1.0), (10, 1.0), (10, 0.0), (20, 1.0)])
 def test_a_sensor_that_is_slower_than_its_topic(plant, samples, noise):

@@ -27,7 +27,9 @@ class Status(IntFlag):
     GAMMA_AT_MAX = 32
     SENSITIVITY_RESET = 64  # the sensitivities grew beyond use and start again at 0
     REJECTED_SPIKE = 128  # y is further than spike_gate from its prediction
-    REJECTED_STUCK = 256  # y has not changed for stuck_time
+    REJECTED_STUCK = (
+        256  # y has not changed for stuck_time, or repeats itself although it has noise
+    )
     HELD = 512  # with REJECTED_PERIOD: a jump of the stamp; the next sample decides
     GAP = 1024  # a long interval was bridged in sub-steps
     RESTARTED = 2048  # started afresh after a gap or a jump of the clock

@@ -19,7 +19,7 @@ class Counters(NamedTuple):
     rejected_spikes: int = 0
     """y lay further than spike_gate from its prediction."""
     rejected_stuck: int = 0
-    """y had not changed for stuck_time."""
+    """y had not changed for stuck_time, or repeated itself although it has noise (self-tuning)."""
     rejected_steps: int = 0
     """The step would have left the finite numbers."""
     duplicate_stamps: int = 0

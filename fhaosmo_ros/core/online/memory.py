@@ -94,7 +94,9 @@ EVENT_MEAN = 6  # running mean of d, for events of its change
 EVENT_DEVIATION = 7  # standard deviation that events are judged by
 SAMPLE = 8  # the latest y, used or not
 CHANGE = 9  # by what it last differed from the one before
-STATES = 10  # two copies of a state begin here
+REPEATED = 10  # the y that has repeated itself last
+ELSEWHERE = 11  # of the values of y, of late, the share that repeat themselves, another one each
+STATES = 12  # two copies of a state begin here
 
 
 class Policy(NamedTuple):
@@ -135,6 +137,7 @@ INTEGERS = range(FROZEN, COUNTERS)
 """What of the policy's integers a snapshot holds: neither settings nor counters."""
 LABELS_OF_REALS = [
     'interval', 'jitter', 'held_y', 'event_mean', 'event_deviation', 'sample', 'change',
+    'repeated', 'elsewhere',
 ]  # fmt: skip
 LABELS_OF_ROWS = ['z_hat', 'z_tilde', 'z_hat_sensitivity', 'z_tilde_sensitivity']
 LABELS_OF_MEMORY = [

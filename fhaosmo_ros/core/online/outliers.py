@@ -2,7 +2,16 @@
 """The policy's rules for values (see policy.py), each a small compiled function."""
 
 from fhaosmo_ros.core.compiled.cache import compiled
-from fhaosmo_ros.core.observer.arrays import HAT, SAMPLES, SELF_TUNING, TILDE
+from fhaosmo_ros.core.observer.arrays import (
+    ACTIVE,
+    FIRST_NOISE,
+    HAT,
+    ROWS,
+    SAMPLES,
+    SELF_TUNING,
+    TILDE,
+)
+from fhaosmo_ros.core.observer.self_tuning.members import COUNT, members_in, ORDERS
 from fhaosmo_ros.core.online import memory as at
 from fhaosmo_ros.core.online.memory import EstimatorArrays, Policy
 from fhaosmo_ros.core.online.stamps import difference
@@ -11,6 +20,20 @@ MULTIPLE, SINGLE = 1e-4, 6e-7
 """A step of y is a multiple of another one up to this, and up to rounding of y to 32 bits."""
 ENOUGH_REGULAR, MOST_REGULAR = 4, 12
 """After so many regular changes y's sensor holds its values; so many are remembered."""
+
+CHANCE_REPEATS = 2
+"""A y with noise may repeat itself so often in a row by chance, if it is a float of 32 bits."""
+RARELY, CHANGES = 0.05, 50.0
+"""
+Of late, less than this share of so many of its values were repeated, but for one: at the end of a
+range it is always the same one.
+"""
+LEAST_NOISE = 1e-3
+"""A y has noise if its differences are all more than this part of its first difference, RMS."""
+NO_NOISE = 1e-9
+"""It has none if these are less than this part of the noise at the start, as variances."""
+ROUNDED = 1e-12
+"""Differences that are smaller than this part of y may be errors of its rounding to 64 bits."""
 
 
 @compiled()
@@ -44,7 +67,8 @@ def is_held(e: EstimatorArrays, y: float, now: int) -> bool:
     ints, reals = e.policy.ints, e.policy.reals
     if not e.law.flags[SELF_TUNING] or (ints[at.TIMED] and difference(now, ints[at.LATEST]) <= 0):
         return False  # a sample that comes twice is no repetition
-    change, usual = y - reals[at.SAMPLE], ints[at.HELD_FOR]
+    before, usual = reals[at.SAMPLE], ints[at.HELD_FOR]
+    change = y - before
     reals[at.SAMPLE] = y
     if change == 0.0:
         ints[at.REPEATS] += 1
@@ -53,6 +77,11 @@ def is_held(e: EstimatorArrays, y: float, now: int) -> bool:
         return bool(ints[at.HOLDS] and short)
     low, high = min(abs(change), abs(reals[at.CHANGE])), max(abs(change), abs(reals[at.CHANGE]))
     others = high / low if low > 0.0 else 0.0
+    ints[at.STUCK] = 0
+    elsewhere = 0.0
+    if ints[at.REPEATS] > 0 and before != reals[at.REPEATED]:
+        elsewhere, reals[at.REPEATED] = 1.0, before
+    reals[at.ELSEWHERE] += (elsewhere - reals[at.ELSEWHERE]) / CHANGES
     if ints[at.REPEATS] == 0 or 4 * abs(ints[at.REPEATS] - usual) > max(usual, 4):
         ints[at.REGULAR] = max(ints[at.REGULAR] - 2, 0)
     elif low > 0.0 and abs(others - round(others)) > MULTIPLE + SINGLE * abs(y) / low:
@@ -64,6 +93,29 @@ def is_held(e: EstimatorArrays, y: float, now: int) -> bool:
         e.state.memory[SAMPLES] = 0.0  # the members begin afresh, with the sensor's own period
     ints[at.REPEATS], reals[at.CHANGE] = 0, change
     return False
+
+
+@compiled()
+def repeats_noise(e: EstimatorArrays) -> bool:
+    """
+    Return True, and count it, if y repeats itself although it has noise; after `is_held`.
+
+    The sensor is stuck then, or at the end of its range: that y stands still is no motion. Only
+    for self-tuning, which knows whether y has noise, and is not quantised.
+    """
+    (levels, memory), ints, n = e.state, e.policy.ints, e.law.gains.shape[1] - ORDERS
+    if ints[at.REPEATS] == CHANCE_REPEATS + 1 and memory[ACTIVE] == COUNT:
+        rough = members_in(levels[ROWS + n + ORDERS :], n, COUNT).rough[1]  # by white noise
+        least = max(LEAST_NOISE**2 * rough[1], NO_NOISE * memory[FIRST_NOISE])
+        least = max(least, (ROUNDED * e.policy.reals[at.SAMPLE]) ** 2)
+        noisy = True
+        for p in range(1, rough.size):
+            noisy = noisy and rough[p] > least
+        if noisy and e.policy.reals[at.ELSEWHERE] < RARELY:
+            ints[at.STUCK] = 1
+            ints[at.STUCK_EVENTS] += 1
+    ints[at.REJECTED_STUCK_] += ints[at.STUCK]
+    return bool(ints[at.STUCK])
 
 
 @compiled()

@@ -46,7 +46,7 @@ from fhaosmo_ros.core.online.delay import (
 )
 from fhaosmo_ros.core.online.gaps import step_over
 from fhaosmo_ros.core.online.memory import EstimatorArrays, Policy
-from fhaosmo_ros.core.online.outliers import has_diverged, is_held, is_stuck
+from fhaosmo_ros.core.online.outliers import has_diverged, is_held, is_stuck, repeats_noise
 from fhaosmo_ros.core.online.stamps import difference, forget, refresh, settle
 
 
@@ -91,6 +91,8 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: Floats, eps: Floats, row: 
         word = REJECTED_STUCK
     elif is_held(e, y, now):
         word = REPEATED
+    elif ints[at.REPEATS] and repeats_noise(e):
+        word = REJECTED_STUCK
     elif memory[Y] == memory[Y]:
         if not ints[at.TIMED]:
             forget(policy, now)

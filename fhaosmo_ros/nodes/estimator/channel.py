@@ -431,7 +431,7 @@ class Channel:
             ),
             (Status.REJECTED_PERIOD, late),
             (Status.REJECTED_SPIKE, f'y = {y} lies beyond spike_gate'),
-            (Status.REJECTED_STUCK, f'y = {y} has not changed for stuck_time'),
+            (Status.REJECTED_STUCK, f'y = {y} repeats itself: its sensor is stuck'),
             (
                 Status.REJECTED_MEASUREMENT,
                 f'expected a finite y of at most divergence_limit, got {y}',

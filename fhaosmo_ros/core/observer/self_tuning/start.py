@@ -68,6 +68,11 @@ import numpy as np
 
 MOST = 0.8
 """Share of the first samples' differences that say how large z may be; others may be outliers."""
+CHANGING = 8
+"""
+y may be constant until its sensor is ready. So many samples from its first change on tell whether
+it is quantised; if not, the first samples are those from there on.
+"""
 REPEATED = 0.3
 """If a larger share of the first samples repeat the one before, y is quantised."""
 WITHIN_SAMPLES, MORE_REASON = 1.0, 50.0
@@ -86,7 +91,7 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
     if count == 0:
         first[0, 0], first[1, 0] = memory[Y], 0.0
         count = 1
-    if count == FIRST_SAMPLES:  # y has not changed since
+    if count == FIRST_SAMPLES:  # y had not changed by then
         for i in range(count - 1):
             first[0, i], first[1, i] = first[0, i + 1], first[1, i + 1]
         count -= 1
@@ -108,6 +113,20 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
     rough = np.zeros(n + 2)
     for i in range(count):
         largest = max(largest, abs(first[0, i]))
+    changed = 1  # number of the first sample that is another one
+    while changed < count and abs(first[0, changed] - first[0, 0]) <= 1e-12 * largest:
+        changed += 1
+    if changed > 1 and least == 0.0:
+        repeated = 0.0
+        for i in range(changed, count):
+            repeated += 1.0 if first[0, i] == first[0, i - 1] else 0.0
+        if count - changed < CHANGING:
+            return
+        if repeated <= REPEATED * (count - changed):
+            for i in range(count - changed + 1):
+                first[0, i], first[1, i] = first[0, i + changed - 1], first[1, i + changed - 1]
+            memory[SAMPLES] = count - changed + 1
+            return
     for order in range(1, n + 2):
         length = count - order
         binomial *= (4.0 * order - 2.0) / order  # (2 order)! / order!^2
@@ -120,8 +139,6 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
         if size > 0.0:
             noise = min(noise, size)
         rough[order] = size * size
-    if quantum == math.inf and least == 0.0:
-        return
     if quantum < math.inf:
         memory[QUANTUM] = quantum
         memory[LATTICE] = share_of_multiples(first[0, :count], quantum)
