@@ -2,7 +2,8 @@
 """
 The covariances of the members: prediction and correction (D 27).
 
-Only those of a range of columns, which move; the others rest at their steady values.
+Only those of a range of columns, which move; the others rest at their steady values. What d and
+its three derivatives have is written out, so that a loop does all of it for a member.
 """
 
 from fhaosmo_ros.core.compiled.cache import compiled
@@ -21,6 +22,8 @@ from fhaosmo_ros.core.observer.self_tuning.members import (
     USED,
 )
 
+OF_DRIVE = ORDERS * (ORDERS + 1) // 2
+"""Covariances of d and its derivatives: the last rows of P."""
 INEXACT = 1.0 + 1e-10
 """
 By this factor S is too large, so that P stays positive where y is by many orders of magnitude more
@@ -119,10 +122,10 @@ def by_derivatives(h: float) -> tuple[float, float, float]:
 def predict_drive(
     members: Members, scratch: Scratch, n: int, h: float, first: int, last: int
 ) -> None:
-    """Predict the covariances of d and its derivatives: the last ten rows of P."""
+    """Predict the covariances of d and its derivatives."""
     d, (a, b, c), decayed = at(n + ORDERS, n, n), by_derivatives(h), members.rates[DECAYED]
-    p, q = neighbours(members.p, d, 10), neighbours(scratch.q, d, 10)
-    after = neighbours(scratch.p, d, 10)
+    p, q = neighbours(members.p, d, OF_DRIVE), neighbours(scratch.q, d, OF_DRIVE)
+    after = neighbours(scratch.p, d, OF_DRIVE)
     for g in range(first, last):
         p11, p12, p13, p22, p23, p33 = p[4, g], p[5, g], p[6, g], p[7, g], p[8, g], p[9, g]
         twice = decayed[g] * decayed[g]
@@ -147,7 +150,10 @@ def predict_drive(
 def multiply(members: Members, scratch: Scratch, n: int, i: int, first: int, last: int) -> None:
     """Write row i of A P, of a state z_i, and what d and its derivatives do to it."""
     d, flow, kappa, rows = n + ORDERS, members.flow, members.rates[KAPPA], members.p
-    p, product = neighbours(rows, at(d, n, n), 10), neighbours(scratch.product, i * d + n, ORDERS)
+    p, product = (
+        neighbours(rows, at(d, n, n), OF_DRIVE),
+        neighbours(scratch.product, i * d + n, ORDERS),
+    )
     chain = neighbours(scratch.chain, 3 * i, 3)
     f0, f1, f2, f3 = by_chain(flow, i, n)
     for g in range(first, last):
@@ -164,8 +170,8 @@ def multiply(members: Members, scratch: Scratch, n: int, i: int, first: int, las
     for m in range(0, n, 3):
         a, b, c, e, f = by_model(flow, i, m, n)
         if a != 0.0 or b != 0.0 or c != 0.0:
-            one, two = neighbours(rows, at(d, m, n), 4), neighbours(rows, at(d, e, n), 4)
-            three = neighbours(rows, at(d, f, n), 4)
+            one, two = neighbours(rows, at(d, m, n), ORDERS), neighbours(rows, at(d, e, n), ORDERS)
+            three = neighbours(rows, at(d, f, n), ORDERS)
             for g in range(first, last):
                 product[0, g] += a * one[0, g] + b * two[0, g] + c * three[0, g]
                 product[1, g] += a * one[1, g] + b * two[1, g] + c * three[1, g]
@@ -196,10 +202,10 @@ def predict_covariances(
     )  # fmt: skip
     for i in range(n):
         product, q = (
-            neighbours(scratch.product, i * d + n, 4),
-            neighbours(scratch.q, at(d, i, n), 4),
+            neighbours(scratch.product, i * d + n, ORDERS),
+            neighbours(scratch.q, at(d, i, n), ORDERS),
         )
-        after = neighbours(scratch.p, at(d, i, n), 4)
+        after = neighbours(scratch.p, at(d, i, n), ORDERS)
         for g in range(first, last):
             slope, second, third = product[1, g], product[2, g], product[3, g]
             none = product[0, g] + a * slope + b * second + c * third
@@ -253,7 +259,7 @@ def correct_covariances(members: Members, scratch: Scratch, n: int, first: int, 
     them, and P loses P C' C P times the other.
     """
     inverse, taken, d = scratch.lines[0], scratch.lines[2], n + ORDERS
-    of_drive = neighbours(scratch.gain, n, 4)
+    of_drive = neighbours(scratch.gain, n, ORDERS)
     for i in range(d):
         one, row = scratch.gain[i], members.gain[i]
         for g in range(first, last):
@@ -264,14 +270,20 @@ def correct_covariances(members: Members, scratch: Scratch, n: int, first: int, 
             two, before, after = scratch.gain[j], scratch.p[at(d, i, j)], members.p[at(d, i, j)]
             for g in range(first, last):
                 after[g] = before[g] - taken[g] * one[g] * two[g]
-        four, left = neighbours(scratch.p, at(d, i, n), 4), neighbours(members.p, at(d, i, n), 4)
+        four, left = (
+            neighbours(scratch.p, at(d, i, n), ORDERS),
+            neighbours(members.p, at(d, i, n), ORDERS),
+        )
         for g in range(first, last):
             scaled = taken[g] * one[g]
             left[0, g] = four[0, g] - scaled * of_drive[0, g]
             left[1, g] = four[1, g] - scaled * of_drive[1, g]
             left[2, g] = four[2, g] - scaled * of_drive[2, g]
             left[3, g] = four[3, g] - scaled * of_drive[3, g]
-    p, corrected = neighbours(scratch.p, at(d, n, n), 10), neighbours(members.p, at(d, n, n), 10)
+    p, corrected = (
+        neighbours(scratch.p, at(d, n, n), OF_DRIVE),
+        neighbours(members.p, at(d, n, n), OF_DRIVE),
+    )
     for g in range(first, last):
         none, slope, second = of_drive[0, g], of_drive[1, g], of_drive[2, g]
         third, scaled = of_drive[3, g], taken[g] * none

@@ -68,7 +68,11 @@ def predict_states(
             a, b, c, e, f = by_model(flow, i, m, n)
             add_three(row, a, x[m], b, x[e], c, x[f], 0, members.active)
     # exp of D 17: e^(-kappa h) times a polynomial
-    (a, b, c), now, after = by_derivatives(h), neighbours(x, n, 4), neighbours(ahead, n, 4)
+    (a, b, c), now, after = (
+        by_derivatives(h),
+        neighbours(x, n, ORDERS),
+        neighbours(ahead, n, ORDERS),
+    )
     for g in range(members.active):
         slope, second, third = now[1, g], now[2, g], now[3, g]
         after[0, g] = decayed[g] * (now[0, g] + a * slope + b * second + c * third)

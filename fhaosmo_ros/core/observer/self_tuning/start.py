@@ -116,17 +116,13 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
     changed = 1  # number of the first sample that is another one
     while changed < count and abs(first[0, changed] - first[0, 0]) <= 1e-12 * largest:
         changed += 1
-    if changed > 1 and least == 0.0:
-        repeated = 0.0
-        for i in range(changed, count):
-            repeated += 1.0 if first[0, i] == first[0, i - 1] else 0.0
-        if count - changed < CHANGING:
-            return
-        if repeated <= REPEATED * (count - changed):
-            for i in range(count - changed + 1):
+    since = count - changed
+    if changed > 1 and least == 0.0 and not (since >= CHANGING and on_lattice(first[0], count)):
+        if since >= CHANGING:
+            for i in range(since + 1):
                 first[0, i], first[1, i] = first[0, i + changed - 1], first[1, i + changed - 1]
-            memory[SAMPLES] = count - changed + 1
-            return
+            memory[SAMPLES] = since + 1
+        return
     for order in range(1, n + 2):
         length = count - order
         binomial *= (4.0 * order - 2.0) / order  # (2 order)! / order!^2
@@ -154,6 +150,25 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
     noise = max(noise, math.sqrt(2.0 * jitter * rough[1]), least, 1e-9 * largest, 1e-150)
     begin(law, memory, members, count, y, period, noise, rough)
     memory[SAMPLES] = FIRST_SAMPLES + 1
+
+
+@compiled()
+def on_lattice(values: Floats, count: int) -> bool:
+    """Return True if the last `CHANGING` steps seem to be those of a quantised y."""
+    quantum, repeated = math.inf, 0.0
+    for i in range(count - CHANGING, count):
+        step = abs(values[i] - values[i - 1])
+        if step > 0.0:
+            quantum = min(quantum, step)
+        else:
+            repeated += 1.0
+    if repeated > REPEATED * CHANGING:
+        return True
+    for i in range(count - CHANGING, count):
+        step = abs(values[i] - values[i - 1])
+        if step > 0.0 and not is_multiple(step, quantum, values[i]):
+            return False
+    return True
 
 
 @compiled()
