@@ -62,7 +62,8 @@ def is_held(e: EstimatorArrays, y: float, now: int) -> bool:
 
     Only for self-tuning, which would take every change after it for one of d. A sensor holds
     values if they change after as many samples as before, about, and not by multiples, as an
-    encoder's counts do. y may also really stand still: then it repeats itself for longer.
+    encoder's counts do. y may also really stand still: then it repeats itself for longer. What is
+    counted here serves `repeats_noise`, too.
     """
     ints, reals = e.policy.ints, e.policy.reals
     if not e.law.flags[SELF_TUNING] or (ints[at.TIMED] and difference(now, ints[at.LATEST]) <= 0):

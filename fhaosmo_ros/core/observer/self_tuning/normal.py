@@ -3,7 +3,7 @@
 The normal distribution by additions and multiplications alone, for loops over members.
 
 The compiler makes vector instructions of these; a call of the C library's `erfc` or `exp` for each
-member took more time than all the rest of a step.
+member took almost half of the time of a step.
 """
 
 import math
@@ -38,7 +38,7 @@ MILLS = _fit()
 """
 Coefficients of Mills' ratio of x in t = (x - MIDDLE) / (x + MIDDLE), for 0 <= x <= FARTHEST.
 
-The variable is that of Shepherd and Laframboise (1981, Mathematics of Computation 36, 249-253).
+Such bilinear maps: Schonfelder (1978, Mathematics of Computation 32, 1232-1240).
 """
 
 
