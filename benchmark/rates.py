@@ -219,6 +219,8 @@ def observe(
             '--subscribers', str(len(nodes)),
         )  # fmt: skip
         source.wait_for('publishing')
+        for topic in watched.values():
+            wait_until(lambda topic=topic: watch.count(topic), f'no stamp of {topic}')
         sleep(WARM_UP)
         watch.forget()
         before, start = {name: node.cpu_seconds() for name, node in nodes.items()}, monotonic()
