@@ -23,9 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def start(*arguments, folder=None):
-    environment = {
-        **os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path]),
-    }  # fmt: skip
+    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])}
     return subprocess.Popen(
         [sys.executable, '-m', 'fhaosmo_ros', *map(str, arguments)], env=environment,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,

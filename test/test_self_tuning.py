@@ -584,6 +584,19 @@ def test_a_sensor_that_is_stuck_or_at_the_end_of_its_range(plant):
         assert rms((found.unknown_input - r.d)[late]) < 0.5 * rms(r.d)
 
 
+def test_a_clock_that_jumps_back_while_the_sensor_is_stuck():
+    """As where a bag begins again: the next other y starts afresh, whatever its stamp."""
+    y = 0.01 * np.random.default_rng(3).standard_normal(4000)
+    y[3000:] = y[3000]
+    estimator = OnlineEstimator({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
+    stamps = 10**11 + 10**6 * np.arange(len(y))
+    estimator.run(stamps, y)
+    assert estimator.counters.rejected_stuck == 997
+    estimator.run(stamps[:3000] - 10**10, y[:3000])
+    assert estimator.counters.rejected_stuck == 997
+    assert estimator.counters.restarts_backward == 1
+
+
 @pytest.mark.parametrize('late', [0.0, 2e-4], ids=['exact', 'late stamps'])
 def test_a_simulated_y_without_noise_that_comes_to_rest_is_not_stuck(late):
     t = np.arange(16_000) * PERIOD

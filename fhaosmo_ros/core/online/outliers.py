@@ -97,7 +97,7 @@ def is_held(e: EstimatorArrays, y: float, now: int) -> bool:
 
 
 @compiled()
-def repeats_noise(e: EstimatorArrays) -> bool:
+def repeats_noise(e: EstimatorArrays, y: float) -> bool:
     """
     Return True, and count it, if y repeats itself although it has noise; after `is_held`.
 
@@ -105,7 +105,9 @@ def repeats_noise(e: EstimatorArrays) -> bool:
     for self-tuning, which knows whether y has noise, and is not quantised.
     """
     (levels, memory), ints, n = e.state, e.policy.ints, e.law.gains.shape[1] - ORDERS
-    if ints[at.REPEATS] == CHANCE_REPEATS + 1 and memory[ACTIVE] == COUNT:
+    if ints[at.REPEATS] <= CHANCE_REPEATS or y != e.policy.reals[at.SAMPLE]:
+        return False  # also of another y whose stamp is not later: `is_held` leaves that alone
+    if ints[at.REPEATS] == CHANCE_REPEATS + 1 and not ints[at.STUCK] and memory[ACTIVE] == COUNT:
         rough = members_in(levels[ROWS + n + ORDERS :], n, COUNT).rough[1]  # by white noise
         least = max(LEAST_NOISE**2 * rough[1], NO_NOISE * memory[FIRST_NOISE])
         least = max(least, (ROUNDED * e.policy.reals[at.SAMPLE]) ** 2)

@@ -91,7 +91,7 @@ def take(e: EstimatorArrays, stamp: int, y: float, u: Floats, eps: Floats, row: 
         word = REJECTED_STUCK
     elif is_held(e, y, now):
         word = REPEATED
-    elif ints[at.REPEATS] and repeats_noise(e):
+    elif repeats_noise(e, y):
         word = REJECTED_STUCK
     elif memory[Y] == memory[Y]:
         if not ints[at.TIMED]:

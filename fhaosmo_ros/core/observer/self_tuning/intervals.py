@@ -125,9 +125,7 @@ def truncate(scratch: Scratch, half: float, least: float, well_within: float, co
         less = flat if narrow else less
         lost[g] = 0.0 if inside else min(max(less, 0.0), 1.0)
     for g in range(count):
-        chance[g] = math.log(chance[g]) if chance[g] != 1.0 else 0.0
-    for g in range(count):
-        chance[g] -= 0.5 * smaller[g]
+        chance[g] = (math.log(chance[g]) if chance[g] != 1.0 else 0.0) - 0.5 * smaller[g]
 
 
 @compiled(forceinline=True)

@@ -73,6 +73,8 @@ CHANGING = 8
 y may be constant until its sensor is ready. So many samples from its first change on tell whether
 it is quantised; if not, the first samples are those from there on.
 """
+ALL_BUT_ONE = 0.8
+"""Of so few steps: all are multiples of the smallest one, which does not count."""
 REPEATED = 0.3
 """If a larger share of the first samples repeat the one before, y is quantised."""
 WITHIN_SAMPLES, MORE_REASON = 1.0, 50.0
@@ -155,20 +157,12 @@ def gather(law: Law, work: Work, memory: Floats, members: Members, y: float, h: 
 @compiled()
 def on_lattice(values: Floats, count: int) -> bool:
     """Return True if the last `CHANGING` steps seem to be those of a quantised y."""
-    quantum, repeated = math.inf, 0.0
+    quantum = math.inf
     for i in range(count - CHANGING, count):
         step = abs(values[i] - values[i - 1])
         if step > 0.0:
             quantum = min(quantum, step)
-        else:
-            repeated += 1.0
-    if repeated > REPEATED * CHANGING:
-        return True
-    for i in range(count - CHANGING, count):
-        step = abs(values[i] - values[i - 1])
-        if step > 0.0 and not is_multiple(step, quantum, values[i]):
-            return False
-    return True
+    return bool(share_of_multiples(values[count - CHANGING - 1 : count], quantum) > ALL_BUT_ONE)
 
 
 @compiled()
