@@ -25,9 +25,7 @@ RUN . venv/bin/activate \
     && rosdep update --rosdistro jazzy \
     && rosdep install --from-paths src --ignore-src -y \
     && rm -rf /var/lib/apt/lists/* \
-    && python3 -m colcon build \
-    && . install/setup.bash \
-    && ros2 run fhaosmo_ros compile
+    && python3 -m colcon build
 
 COPY scripts/container_entry.sh /container_entry.sh
 ENTRYPOINT ["/bin/bash", "/container_entry.sh"]

@@ -42,6 +42,7 @@ lint:
 	"$$python" -m ruff check --output-format concise . && \
 	"$$python" -m ruff format --check . && \
 	"$$python" -m mypy && \
+	PATH="$${python%/*}:$$PATH" cython-lint fhaosmo_ros studies && \
 	"$${python%/*}/lint-imports" --no-logo
 
 test: lint
@@ -60,3 +61,4 @@ clean:
 	rm -rf .venv .venv-ros .venv-kilted build install log *.egg-info .coverage .hypothesis \
 	    .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find . -name .git -prune -o -name __pycache__ -type d -exec rm -rf {} +
+	find fhaosmo_ros studies \( -name '*.so' -o -name '*.c' \) -exec rm {} +

@@ -8,18 +8,111 @@ to bin, on everybody's PATH: there `record`, `play`, `plot` and others would hid
 same name (sox and ImageMagick have some), so a wheel has one script, `fhaosmo COMMAND`.
 """
 
+import multiprocessing
+import os
 from pathlib import Path
 import sys
 
 from fhaosmo_ros import __version__
 from fhaosmo_ros.commands import COMMANDS
-from setuptools import find_packages, setup
+from setuptools import Extension, find_packages, setup
+from setuptools.command.build_ext import build_ext
 
 NAME = 'fhaosmo_ros'
 FOR_ROS2_RUN = bool({'install', 'develop'} & set(sys.argv))
 CHECK = ['hypothesis', 'pytest', 'pytest-rerunfailures', 'pytest-xdist']
 TUNE = ['cmaes', 'control', 'optuna>=4,<6']
 DOCS = ['myst-parser', 'sphinx', 'sphinx-rtd-theme']
+
+
+def extensions():
+    """
+    Return one extension for each .pyx file; `build_ext` below translates and compiles them.
+
+    In the environment, FHAOSMO_DEBUG=1 builds with bounds checks, and FHAOSMO_ASAN=1 with the
+    compiler's AddressSanitizer. Loops over the members of the self-tuning observer are sums that
+    may be taken in any order, so that they become vector instructions; see
+    core/observer/self_tuning/vectors.pxd. All else gives the same bits on each processor (no
+    product and sum are contracted), and -O3 makes it no faster. Methods of studies/ are built in a
+    checkout, never installed.
+    """
+    debug = os.environ.get('FHAOSMO_DEBUG') == '1'
+    sanitize = ['-fsanitize=address'] if os.environ.get('FHAOSMO_ASAN') == '1' else []
+    found = []
+    for path in sorted([*Path(NAME).rglob('*.pyx'), *Path('studies').rglob('*.pyx')]):
+        options = ['-O1', '-g'] if debug else ['-O2', '-g0']
+        options += ['-fno-math-errno', *sanitize]
+        if 'self_tuning' in path.parts:
+            options += ['-fno-trapping-math', '-fno-signed-zeros', '-fassociative-math']
+            options += [] if debug else ['-O3']
+        else:
+            options.append('-ffp-contract=off')
+        extension = Extension('.'.join(path.with_suffix('').parts), [str(path)])
+        extension.extra_compile_args = options
+        extension.extra_link_args = sanitize
+        extension.cython_directives = {
+            'language_level': 3,
+            'boundscheck': debug,
+            'wraparound': False,
+            'initializedcheck': debug,
+            'cdivision': True,
+            'show_performance_hints': False,
+        }
+        found.append(extension)
+    return found
+
+
+class BuildExtensions(build_ext):
+    """Translates by Cython what has changed, or what it cimports, and compiles on all cores."""
+
+    def finalize_options(self):
+        """Leave out the studies unless the extensions are built within the checkout."""
+        if not (self.inplace or self.editable_mode):
+            self.distribution.ext_modules[:] = [
+                e for e in self.distribution.ext_modules if e.name.startswith(NAME)
+            ]
+        super().finalize_options()
+        self.parallel = self.parallel or os.cpu_count()
+
+    def run(self):
+        """Build; all of it if options, compiler or Cython are not those of the last build."""
+        try:
+            from Cython import __version__ as version
+            from Cython.Build import cythonize
+        except ImportError:
+            sys.exit("error: Cython is needed to build: pip install 'Cython>=3'")
+        # The mark of scripts/environment.sh that what lies in the checkout is up to date.
+        Path('build/in_place').unlink(missing_ok=True)
+        self._forget_other_builds(version)
+        # Processes, not threads: Cython is Python. They must not run this file again.
+        multiprocessing.set_start_method('fork', force=True)
+        translated = cythonize(
+            list(self.extensions),
+            nthreads=self.parallel,
+            quiet=True,
+            force=self.force,
+            build_dir=self.build_temp,
+            compiler_directives=self.extensions[0].cython_directives,
+        )
+        for extension, c in zip(self.extensions, translated, strict=True):
+            extension.sources = c.sources
+        super().run()
+
+    def _forget_other_builds(self, version):
+        """Remove what was built with other options, another compiler or another Cython."""
+        options = {(*e.extra_compile_args, *e.cython_directives.items()) for e in self.extensions}
+        compiler = [os.environ.get(name) for name in ('CC', 'CFLAGS', 'LDFLAGS')]
+        made_with = repr((version, compiler, sorted(options, key=repr)))
+        mark = Path(self.build_temp, 'made_with')
+        if mark.is_file() and mark.read_text() == made_with:
+            return
+        for extension in self.extensions:
+            c = Path(self.build_temp, extension.sources[0]).with_suffix('.c')
+            library = Path(self.build_lib, self.get_ext_filename(extension.name))
+            for path in (c, library):
+                path.unlink(missing_ok=True)
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        mark.write_text(made_with)
 
 
 def wheels(distribution):
@@ -50,6 +143,9 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={'': ['*.csv', '*.pxd', '*.pyi']},
+    ext_modules=extensions(),
+    cmdclass={'build_ext': BuildExtensions},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -66,7 +162,6 @@ setup(
     install_requires=[
         'matplotlib',
         'networkx',  # this, packaging and scipy: scikit-fuzzy imports them but declares nothing
-        'numba',
         'numpy',
         'orjson',
         'packaging',
@@ -74,7 +169,6 @@ setup(
         'rosbags>=0.11.9,<0.12',  # tools/bags uses its internals
         'scikit-fuzzy',
         'scipy',
-        'setuptools',
         'tqdm',
     ],
     # Not tests_require: colcon then finds no tests.
@@ -92,6 +186,7 @@ setup(
             *DOCS,
             *TUNE,
             'colcon-common-extensions',
+            'cython-lint',
             'import-linter',
             'mcap',
             'mcap-ros2-support',

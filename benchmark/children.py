@@ -12,8 +12,8 @@ from table import CannotMeasureError
 
 ROOT = Path(__file__).parents[1]
 POLL = 0.002
-READY = 180.0
-"""Seconds that a child has to say that it is ready; it may have to compile first."""
+READY = 60.0
+"""Seconds that a child has to say that it is ready."""
 
 
 class Child(processes.Child):

@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
- * The same recursion as fhaosmo_ros/core/kernels.py in C, for one case: n = 3,
+ * The same recursion as fhaosmo_ros/core/observer/cascade.pyx in C, for one case: n = 3,
  * Phi = (0, 0, -z3), N = 4 levels, fuzzy_adaptive, explicit. It is written as one would write it
  * for speed (the model is inlined by hand), and serves the benchmark only.
  *
- * State: z_hat[4], z_tilde[4], p[4], q[4], gamma, y, pending, wait. Same order as core/layout.py.
+ * State: z_hat[4], z_tilde[4], p[4], q[4], gamma, y, pending, wait: PARTS in reference.py.
  */
 #include <math.h>
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recursion in C (reference.c) and in numba, on the same case, as callables to time."""
+"""The recursion in C (reference.c) and in the core, on the same case, as callables to time."""
 
 from collections.abc import Callable
 import ctypes
@@ -10,12 +10,10 @@ import shutil
 import subprocess
 from typing import Any
 
-from fhaosmo_ros.core.observer import arrays
-from fhaosmo_ros.core.observer import step as recursion
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.estimates import ObserverState
 from fhaosmo_ros.core.observer.fuzzy import KNOTS
-from fhaosmo_ros.core.observer.observer import make_record, Observer
+from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.observer.record import run as run_structure
 from fhaosmo_ros.core.observer.status import LEVEL_SHIFT
 from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np
@@ -25,13 +23,16 @@ from table import CannotMeasureError
 SOURCE = Path(__file__).with_name('reference.c')
 OPTIONS = ('-O3', '-shared', '-fPIC', f'-DLEVEL_SHIFT={LEVEL_SHIFT}')
 PERIOD = 1e-3
-REMEMBERED = 4
-"""Entries of the memory that matter to a cascade."""
 CASE = {'variant': 'fuzzy_adaptive', 'scheme': 'explicit', 'fuzzy_widths': [0.1]}
 """Wide fuzzy sets: no chatter, so that rounding does not grow and both end at the same state."""
 
+PARTS = ('z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending', 'wait')
+"""What a cascade remembers, in the order of the state of reference.c."""
+LAW = ('min', 'max', 'dead_zone', 'leakage', 'leakage_delay')
+"""Parameters of gamma at the end of its law."""
+
 State = NDArray[np.float64]
-"""HAT, TILDE and their sensitivities (4 N), then gamma, y, pending, wait; see arrays.py."""
+"""The numbers of `PARTS`, the first four of them for each level."""
 
 
 def find_compiler() -> list[str]:
@@ -68,11 +69,17 @@ def output(count: int) -> NDArray[np.float64]:
     return np.asarray(plant.simulate(np.arange(count) * PERIOD).y)
 
 
-def first_state(parameters: dict[str, Any], y: float) -> ObserverState:
-    """Return the state of a fresh observer after its first sample."""
+def started(parameters: dict[str, Any], y: float) -> Observer:
+    """Return an observer after its first sample."""
     observer = Observer(parameters)
     observer.start(y)
-    return observer.state
+    return observer
+
+
+def state_of(observer: Observer) -> State:
+    """Return the numbers of `PARTS`."""
+    found = observer.structure.state_dict()
+    return np.concatenate([np.atleast_1d(found[name]) for name in PARTS])
 
 
 def in_c(library: ctypes.CDLL, y: NDArray[np.float64]) -> Callable[[], tuple[State, int]]:
@@ -85,17 +92,19 @@ def in_c(library: ctypes.CDLL, y: NDArray[np.float64]) -> Callable[[], tuple[Sta
         Returns the final state and the last status word.
 
     """
-    law = ObserverConfiguration(CASE).law
-    if law.curves.shape != (4, KNOTS) or KNOTS != 193:
+    c = ObserverConfiguration(CASE)
+    if c.curves.shape != (4, KNOTS) or KNOTS != 193:
         raise CannotMeasureError(
-            f'reference.c expects 4 levels and 193 knots, the core has {law.curves.shape}'
+            f'reference.c expects 4 levels and 193 knots, the core has {c.curves.shape}'
         )
-    packed = np.concatenate([law.gains[:3].ravel(), law.curves[:2].ravel(), law.scalars])
-    start = first_state(CASE, y[0])
+    gains = np.concatenate([c.lambdas, c.alphas, 1.0 / c.widths, c.curves[:2].ravel()])
+    gamma = [c.gamma_initial, *(c.parameters[f'gamma_{name}'] for name in ('rate', *LAW))]
+    packed = np.array([*gains, c.epsilon, *gamma])
+    start = state_of(started(CASE, y[0]))
     rest, eps = np.ascontiguousarray(y[1:]), np.empty(4)
 
     def run() -> tuple[State, int]:
-        state = np.concatenate([start.levels[: arrays.ROWS].ravel(), start.memory[:REMEMBERED]])
+        state = start.copy()
         word = library.run(
             packed.ctypes.data, state.ctypes.data, rest.ctypes.data, PERIOD, len(rest),
             eps.ctypes.data,
@@ -105,29 +114,22 @@ def in_c(library: ctypes.CDLL, y: NDArray[np.float64]) -> Callable[[], tuple[Sta
     return run
 
 
-def in_numba(
-    parameters: dict[str, Any], y: NDArray[np.float64]
-) -> Callable[[], tuple[State, int]]:
-    """Return the same of the compiled function behind `Observer.run`, for any parameters."""
-    configuration = ObserverConfiguration(parameters)
-    count, levels = len(y), configuration.levels
-    work = arrays.make_work(configuration.law, configuration.model.depth)
-    start = first_state(parameters, y[0])
+def in_core(parameters: dict[str, Any], y: NDArray[np.float64]) -> Callable[[], tuple[State, int]]:
+    """Return the same of the compiled loop behind `Observer.run`, for any parameters."""
+    observer, rest = started(parameters, y[0]), np.ascontiguousarray(y[1:])
+    start, count = observer.state, len(rest)
     h, u = np.full(count, PERIOD), np.zeros((count, 1))
-    record = make_record(1, levels, 2)
 
     def run() -> tuple[State, int]:
-        state = arrays.State(start.levels.copy(), start.memory.copy())
-        samples = recursion.Samples(y, h, u)
-        recursion.run(configuration.law, work, state, samples, record, 1, count)
-        levels, memory = state.levels[: arrays.ROWS], state.memory[:REMEMBERED]
-        return np.concatenate([levels.ravel(), memory]), int(record.words[0])
+        observer.restore(start)
+        record = run_structure(observer.structure, rest, h, u, 0, count)
+        return state_of(observer), int(record.columns['words'][0])
 
     return run
 
 
 def assert_agreement(library: ctypes.CDLL, y: NDArray[np.float64]) -> None:
-    """Raise AssertionError unless C and numba end at the same state, gamma and status word."""
-    (expected, word_c), (actual, word) = in_c(library, y)(), in_numba(CASE, y)()
+    """Raise AssertionError unless C and the core end at the same state, gamma and status word."""
+    (expected, word_c), (actual, word) = in_c(library, y)(), in_core(CASE, y)()
     np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-15)
     np.testing.assert_equal(word, word_c)

@@ -2,10 +2,8 @@
 """The paper's first simulation: 20 s at a step of 1e-5, plant and sign observer."""
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter
 
-from children import Children
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
@@ -21,35 +19,21 @@ BAR = 10.0
 
 
 def measure(quick: bool) -> list[Row]:
-    """Return the seconds that the simulation takes, and those of the first compilation."""
+    """Return the seconds that the simulation takes."""
     duration = 1.0 if quick else DURATION
     repetitions = 1 if quick else 3
-    with tqdm(total=repetitions + 1, desc='simulation', unit='run', leave=False) as progress:
-        compilation = None if quick else _first_call()
-        simulate(100 * STEP)
-        progress.update()
+    with tqdm(total=repetitions, desc='simulation', unit='run', leave=False) as progress:
         times = []
         for _ in range(repetitions):
             times.append(simulate(duration)[2])
             progress.update()
     note = f'{round(duration / STEP):,} steps, sign, explicit; RK4 plant; median of {len(times)}'
-    rows = [
+    return [
         Row(
             f'paper simulation, {duration:g} s at {STEP:g}', float(np.median(times)), 's',
             bar=None if quick else BAR, note=note,
         ),
     ]  # fmt: skip
-    if compilation is not None:
-        note = 'compiles plant and observer; later runs load them (see estimator start)'
-        rows.append(Row('first call before it, empty numba cache', compilation, 's', note=note))
-    return rows
-
-
-def _first_call() -> float:
-    with TemporaryDirectory() as cache, Children() as children:
-        child = children.start('simulation', __file__, environment={'NUMBA_CACHE_DIR': cache})
-        child.wait_for('seconds')
-        return float(child.output().split()[-2])  # the last words are N seconds
 
 
 def simulate(duration: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -77,7 +61,3 @@ def simulate(duration: float) -> tuple[np.ndarray, np.ndarray, float]:
     truth = plant.simulate(t)
     estimate = observer.run(t, truth.y)
     return truth.unknown_input, estimate.unknown_input, perf_counter() - start
-
-
-if __name__ == '__main__':
-    print(simulate(100 * STEP)[2], 'seconds')

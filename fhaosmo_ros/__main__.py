@@ -64,7 +64,7 @@ def run(name: str, arguments: list[str] | None = None) -> int:
     for number in ending_signals():
         signal.signal(number, lambda *_: os._exit(code))
     try:
-        # Imported only now: a node needs ROS, and the help must not wait for numba.
+        # Imported only now: a node needs ROS, and the help must not wait for numpy.
         gc.disable()  # nearly all that an import makes stays; looking for garbage takes 0.1 s
         module = importlib.import_module(COMMANDS[name][0])
         gc.freeze()
@@ -75,7 +75,7 @@ def run(name: str, arguments: list[str] | None = None) -> int:
             raise
         print(
             f'error: {name!r} needs the Python module {error.name!r}, which is not installed: '
-            'start it through make, or source a ROS 2 Jazzy first (see docs/ros.md)',
+            'start it through make, or source a ROS 2 Jazzy first (see docs/start.md)',
             file=sys.stderr,
         )
         return 1

@@ -23,7 +23,6 @@ COMMANDS = {
     ),
     'plot': ('fhaosmo_ros.tools.plot.command', 'draw the estimates in bags, print their metrics'),
     'play': ('fhaosmo_ros.tools.play', "publish a bag's topics in its own time, with /clock"),
-    'compile': ('fhaosmo_ros.tools.compile', 'compile the numerical core before the first start'),
     'tune': ('fhaosmo_ros.tools.tuning.command', 'find gains that fit the sensor and the plant'),
 }
 STUDIES = ('compare', 'paper')

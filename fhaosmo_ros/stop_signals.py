@@ -12,8 +12,6 @@ import socket
 import threading
 from types import FrameType
 
-RETRY = 0.02
-"""Seconds after which a signal that came at a bad moment comes again."""
 LOOK = 0.05
 """Seconds between two looks at whether a block has ended."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -64,9 +62,6 @@ class Stop:
     def signal(self, number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
         """Handle a signal: `set`, and raise `Stopped` if within `raising`, but only once."""
         raises = self._raises and not self._set
-        if raises and _called_by_compiler(frame):
-            threading.Timer(RETRY, signal.raise_signal, (number,)).start()
-            return
         self.set()
         if raises:
             raise Stopped
@@ -76,9 +71,9 @@ class Stop:
         """
         Let the first signal interrupt the block; for long work that leaves nothing behind.
 
-        Python takes a signal between two of its instructions only, and one that compiles can last
-        for seconds: where the block has not ended `patience` seconds after the signal, the process
-        ends here, with exit code 0.
+        Python takes a signal between two of its instructions only, and a call of a library can
+        last for seconds: where the block has not ended `patience` seconds after the signal, the
+        process ends here, with exit code 0.
         """
         self._raises = True
         left = threading.Event()
@@ -110,15 +105,6 @@ class Stop:
                 break
             self._reader.recv(1)  # a signal's byte; its handler runs before the next look
         return self._set
-
-
-def _called_by_compiler(frame: FrameType | None) -> bool:
-    """Return True below a call from C (llvmlite), which prints an exception and loses it."""
-    while frame is not None:
-        if 'llvmlite' in frame.f_code.co_filename:
-            return True
-        frame = frame.f_back
-    return False
 
 
 def stop_on_signals() -> Stop:

@@ -1,6 +1,7 @@
 #!/bin/sh
 # SPDX-License-Identifier: Apache-2.0
-# Print the path of a Python that can run this checkout, after making its environment if need be.
+# Print the path of a Python that can run this checkout, after making its environment and compiling
+# the core if need be.
 #
 #   sh scripts/environment.sh [--print-plan] [EXTRA ...]    EXTRA of setup.py, such as: test
 #
@@ -10,7 +11,8 @@
 # process crash.
 #
 # Only the dependencies are installed, not the package: an editable install leaves egg-info in
-# the tree and stale copies of the data files in the venv. A .pth file names the checkout instead.
+# the tree and stale copies of the data files in the venv. A .pth file names the checkout instead,
+# and the core is compiled in place.
 set -eu
 cd "$(dirname "$0")/.."
 root=$(pwd)
@@ -21,8 +23,19 @@ say() { printf '%s\n' "$*" >&2; }
 fail() { say "error: $*"; exit 1; }
 
 command -v "$python" >/dev/null || fail "no $python here: install Python 3.10 or later, or $other"
-"$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' ||
+answers=$("$python" -c '
+import sys, sysconfig
+print(sysconfig.get_path("include"), sysconfig.get_config_var("CC"), sep="\n")
+print(sys.base_prefix, sys.version)
+sys.exit(sys.version_info < (3, 10))') ||
     fail "Python 3.10 or later is needed, $python is $("$python" -V 2>&1): $other"
+{ read -r headers; read -r own_compiler; read -r interpreter; } <<END
+$answers
+END
+compiler=
+for name in "${CC:-$own_compiler}" gcc clang; do
+    command -v "${name%% *}" >/dev/null && compiler=$name && break
+done
 
 if [ -n "${ROS_DISTRO:-}" ] && "$python" -c 'import rclpy' 2>/dev/null; then
     venv=.venv-ros options=--system-site-packages wheels=no distribution=$ROS_DISTRO
@@ -41,14 +54,24 @@ else
     cost='about a minute and 750 MB'
 fi
 if [ "${1:-}" = --print-plan ]; then
-    printf 'venv: %s\nwheels: %s\n' "$venv" "$wheels"
+    printf 'venv: %s\nwheels: %s\ncompiler: %s\n' "$venv" "$wheels" "${compiler:-ziglang}"
     exit
 fi
 
 bin=$root/$venv/bin
 # What an environment was made from; when this changes, it is made anew.
-interpreter=$("$python" -c 'import sys; print(sys.base_prefix, sys.version)')
 origin="$root $interpreter $distribution $(cksum <setup.py)"
+
+# What the core in this checkout was compiled from, and what came of it: compiled when this changes.
+compiled() {
+    { echo "$interpreter ${FHAOSMO_DEBUG:-} ${FHAOSMO_ASAN:-}"
+      find fhaosmo_ros studies -name '*.pyx' -o -name '*.pxd' | LC_ALL=C sort | xargs cksum setup.py
+      find fhaosmo_ros studies -name '*.so' | LC_ALL=C sort; } | cksum
+}
+is_compiled() { [ "$(cat build/in_place 2>/dev/null)" = "$(compiled)" ]; }
+is_compiled || [ -f "$headers/Python.h" ] ||
+    fail "Python's headers are needed to compile the core, and $headers/Python.h is missing:" \
+        "install them (Debian, Ubuntu: apt install ${headers##*/}-dev), or $other"
 
 current() { [ -x "$bin/python" ] && [ "$(cat "$venv/made-$1" 2>/dev/null)" = "$origin" ]; }
 
@@ -63,9 +86,9 @@ make_venv() {
     else
         fail "$python has neither ensurepip nor pip: install one (Debian: apt install python3-venv)"
     fi
-    # To read setup.py with (below); no venv has it from Python 3.12 on.
-    "$bin/python" -m pip install -qq 'setuptools>=68,<80' ||
-        fail "pip could not install setuptools (see above); is there a network?"
+    # To read setup.py with, and to compile (below).
+    "$bin/python" -m pip install -qq 'Cython>=3' 'setuptools>=68,<80' ||
+        fail "pip could not install Cython and setuptools (see above); is there a network?"
     # ROS's compiled modules want the numpy they were built against; the wheels' venv has none yet.
     "$bin/python" -c 'import numpy; print("numpy==" + numpy.__version__)' \
         >"$venv/constraints.txt" 2>/dev/null || :
@@ -89,6 +112,20 @@ print(*setup.install_requires if name == "run" else setup.extras_require[name], 
             "the ROS 2 wheels are for Linux on x86-64, elsewhere source a ROS 2 Jazzy"
 }
 
+compile() {
+    if [ -z "$compiler" ]; then
+        say 'There is no C compiler here: adding ziglang, which has one ...'
+        "$bin/python" -m pip install -qq --disable-pip-version-check ziglang ||
+            fail "pip could not install ziglang (see above): install gcc or clang"
+        compiler="'$bin/python' -m ziglang cc"
+    fi
+    [ "$compiler" = "$own_compiler" ] || export CC="$compiler" LDSHARED="$compiler -shared"
+    say 'Compiling the core; this takes about a minute ...'
+    "$bin/python" setup.py -q build_ext --inplace >&2 ||
+        fail "the core could not be compiled (see above)"
+    compiled >build/in_place
+}
+
 if ! current run; then
     say "Making the environment $venv, once; this takes $cost ..."
     make_venv
@@ -104,4 +141,5 @@ for extra; do
         printf '%s' "$origin" >"$venv/made-$extra"
     fi
 done
+is_compiled || compile
 printf '%s\n' "$bin/python"

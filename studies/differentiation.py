@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-`python -m studies.differentiation` makes the tables of docs/smoothing.md: what smoothing brings.
+`python -m studies.differentiation` measures what smoothing brings, and writes docs/smoothing.json.
 
 First with the shipped files, on a simulation of the plant in the same file; then beside PyNumDiff.
 PyNumDiff's simulated systems with its own noise, each of its methods tuned by its own optimiser:
@@ -8,8 +8,8 @@ without the truth, as a user has to (it is told the bandwidth of the signal), an
 Ours has y' as unknown input. Without the truth it is told nothing: it takes the noise, the size
 and the correlation time of y', and the number of derivatives, that make its innovations likeliest.
 
-The second takes hours; `--check` computes our columns alone and compares them with what the page
-says; `--files` makes the first table alone.
+The second takes hours; `--check` computes our columns alone and compares them with those that were
+written; `--files` makes the first table alone.
 """
 
 import argparse
@@ -21,9 +21,8 @@ from typing import Any
 import warnings
 
 from fhaosmo_ros.core import Observer, OnlineEstimator, Plant
-from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.covariance import Uncertainty
-from fhaosmo_ros.core.observer.levant import deadbeat_shares
+from fhaosmo_ros.core.observer.configuration import deadbeat_shares, ObserverConfiguration
+from fhaosmo_ros.core.observer.kalman import Uncertainty
 from fhaosmo_ros.core.observer.smoother import Smoother
 from fhaosmo_ros.core.observer.smoothing import BEGINS, MEASURED
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -33,7 +32,6 @@ from fhaosmo_ros.tools.cli.share import shipped
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from studies.document import refill
 from studies.model import model_alone, SELF_TUNING
 
 FILES = ('noise_1e-4', 'noise_1e-3', 'noise_1e-2', 'models/pendulum')
@@ -52,7 +50,7 @@ METHODS = (
 )  # fmt: skip
 """Without those that need convex optimisation, each of which takes minutes a signal."""
 DERIVATIVES, NEAR = (1, 2, 3), 1.1
-PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'smoothing.md'
+RESULTS = Path(__file__).resolve().parents[1] / 'docs' / 'smoothing.json'
 Cell = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
@@ -89,7 +87,7 @@ def costs() -> list[float]:
     for lag in (0.0, *LAGS):
         estimator = OnlineEstimator(p | {'smoothing_lag': lag})
         for k, sample in enumerate(y):
-            if k == len(y) // 2:  # compiled, and the lag is over
+            if k == len(y) // 2:  # the lag is over
                 begin = process_time()
             estimator.update(10**9 + 10**6 * k, sample)
         found.append((process_time() - begin) / (len(y) // 2))
@@ -158,8 +156,8 @@ def unfitness(
     samples = y, np.full(count, DT), np.zeros((count, 1))
     kinds = np.full(count, MEASURED)
     kinds[0] = BEGINS
-    estimates, none = np.zeros((count, 2, observer.levels)), np.empty((count, 0))
-    smoother.take(*observer.arrays[:2], estimates, samples, np.arange(count), kinds, none, none)
+    zero, none = np.zeros((count, observer.levels)), np.empty((count, 0))
+    smoother.take(zero, zero, samples, np.arange(count), kinds, none, none)
     e, variance = smoother.innovations()
     return 0.5 * float(np.sum(np.log(variance) + e**2 / variance))
 
@@ -268,19 +266,18 @@ def table(results: dict[str, Any]) -> str:
 
 
 def texts(results: dict[str, Any]) -> dict[str, str]:
-    """Return the generated parts of the page."""
+    """Return the tables by name."""
     return {'files': files_table(results), 'table': table(results['systems'])}
 
 
 def main() -> int:
-    """Compute what is missing in the results, write them and the page."""
+    """Compute what is missing in the results, write them and tell them."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
     parser.add_argument('--check', action='store_true', help='compute our columns, compare')
     parser.add_argument('--files', action='store_true', help='the shipped files alone')
     parser.add_argument('--methods', nargs='*', default=METHODS, help='of PyNumDiff')
     arguments = parser.parse_args()
-    path = PAGE.with_suffix('.json')
-    results = json.loads(path.read_text()) if path.exists() else {'systems': {}}
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {'systems': {}}
     if not arguments.check:
         results['files'] = {f: with_file(f) for f in FILES}
         results['self-tuning'] = {f: with_file(f, self_tuning=True) for f in FILES}
@@ -302,10 +299,10 @@ def main() -> int:
                         row[way][method] = theirs(y, rate, bandlimit, method, way == 'truth')
                         print(name, method, way, row[way][method], flush=True)
             if not arguments.check:
-                path.write_text(json.dumps(results, indent=1) + '\n')
+                RESULTS.write_text(json.dumps(results, indent=1) + '\n')
     if not arguments.check:
-        for made in refill(PAGE, texts(results), results=results):
-            print(made)
+        RESULTS.write_text(json.dumps(results, indent=1) + '\n')
+        print(*texts(results).values(), sep='\n\n')
     return 0
 
 

@@ -33,7 +33,7 @@ next sample on and without a jump of the estimate. The others are read when the 
 configured, and can be set while it is unconfigured (`ros2 lifecycle set /estimator cleanup`);
 the plant, and `autostart`, read them at the start.
 `tune` reads its parameters from a section `tune` of the same files; of the plant's it uses
-`initial_state`, `integration_step`, `noise_std`, `noise_seed` and `sample_rate` (docs/tuning.md).
+`initial_state`, `integration_step`, `noise_std`, `noise_seed` and `sample_rate` (docs/offline.md).
 """
 GROUPS = (
     ('Model (estimator and plant)', MODEL),

@@ -9,6 +9,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import get_typestore, Stores
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
+FLOAT = 'std_msgs/msg/Float64'
 ORIGIN = 1_700_000_000_123_456_789
 
 
@@ -80,4 +81,4 @@ def _fill(bag, messages):
 
 def floats(stamps, values, topic='/y'):
     rows = zip(stamps.tolist(), values.tolist(), strict=True)
-    return [(topic, 'std_msgs/msg/Float64', stamp, float64(value)) for stamp, value in rows]
+    return [(topic, FLOAT, stamp, float64(value)) for stamp, value in rows]

@@ -44,7 +44,18 @@ def concatenated(runs):
     return [np.concatenate(parts) for parts in zip(*runs, strict=True)]
 
 
+def levels_of(observer):
+    """Return rows z_hat, z_tilde, p and q of all levels, a copy."""
+    values = observer.state.values
+    return np.array([values[name] for name in ('z_hat', 'z_tilde', 'p', 'q')])
+
+
+def remembered(observer, name):
+    return observer.state.values[name]
+
+
 def assert_same_state(one, other):
-    for field in ('levels', 'memory'):
-        np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
+    assert one.values.keys() == other.values.keys()
+    for name, value in one.values.items():
+        np.testing.assert_array_equal(value, other.values[name])
     np.testing.assert_equal(one.t, other.t)

@@ -4,6 +4,7 @@
 from fhaosmo_ros.core import Observer, Plant
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 import numpy as np
+from observer_cases import levels_of
 import pytest
 
 # The paper's example and gains.
@@ -76,8 +77,7 @@ def smooth_errors(scheme, variant, steps):
         t = np.arange(round(1.0 / step) + 1) * step
         observer = Observer(p)
         result = observer.run(t, np.sin(2.0 * t))
-        levels = observer.state.levels
-        return np.concatenate([levels.ravel(), [result.gamma[-1]]])
+        return np.concatenate([levels_of(observer).ravel(), [result.gamma[-1]]])
 
     finest = 1e-5
     exact = 2.0 * end(finest) - end(2.0 * finest)  # Richardson

@@ -11,12 +11,15 @@ FORBIDDEN = ('rclpy', 'rosbags', 'matplotlib', 'optuna', 'fhaosmo_ros.nodes', 'f
 
 
 def test_core_loads_nothing_that_it_may_not():
-    files = [path.relative_to(ROOT).with_suffix('') for path in CORE.rglob('*.py')]
+    files = [
+        path.relative_to(ROOT).with_suffix('')
+        for path in (*CORE.rglob('*.py'), *CORE.rglob('*.pyx'))
+    ]
     modules = ['.'.join(path.parts).removesuffix('.__init__') for path in files]
     code = f'import sys, {", ".join(modules)}; print(*sys.modules)'
     done = subprocess.run(
         [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=True
     )
     loaded = set(done.stdout.split())
-    assert 'fhaosmo_ros.core.observer.step' in loaded
+    assert 'fhaosmo_ros.core.observer.structure' in loaded
     assert loaded.isdisjoint(FORBIDDEN)

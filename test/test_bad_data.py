@@ -2,11 +2,10 @@
 """Samples that no sensor should send: rejected, reported, and without harm to what follows."""
 
 from fhaosmo_ros.core import Observer, Status
-from fhaosmo_ros.core.observer.arrays import GAMMA, HAT, PENDING, Y
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
-from observer_cases import any_law, assert_same_state, laws, SMALL
+from observer_cases import any_law, assert_same_state, laws, levels_of, remembered, SMALL
 import pytest
 
 USABLE = 1e-8 * np.finfo(float).max
@@ -21,11 +20,9 @@ def test_state_stays_finite_and_rejected_samples_leave_it_alone(law, inputs):
     observer = Observer(SMALL | law)
     observer.start(0.3)
     for y, dt, u in inputs:
-        before = observer.state
+        levels, gamma = levels_of(observer), remembered(observer, 'gamma')
         estimate = observer.step(y, dt, u)
-        after = observer.state
-        assert np.all(np.isfinite(after.levels))
-        assert np.all(np.isfinite(after.memory))
+        assert all(np.isfinite(value).all() for value in observer.state.values.values())
         assert np.all(np.isfinite(estimate.z))
         assert np.all(np.isfinite(estimate.innovation))
         assert np.isfinite(estimate.unknown_input)
@@ -35,11 +32,11 @@ def test_state_stays_finite_and_rejected_samples_leave_it_alone(law, inputs):
         assert bool(status & Status.REJECTED_INPUT) == (not np.isfinite(u))
         assert bool(status & Status.REJECTED_MEASUREMENT) == (not abs(y) < USABLE)
         if status.rejected:
-            np.testing.assert_array_equal(after.levels, before.levels)
-            assert after.memory[GAMMA] == before.memory[GAMMA]
+            np.testing.assert_array_equal(levels_of(observer), levels)
+            assert remembered(observer, 'gamma') == gamma
         else:
-            assert after.memory[Y] == y
-            assert after.memory[PENDING] == 0.0
+            assert remembered(observer, 'y') == y
+            assert remembered(observer, 'pending') == 0.0
 
 
 @given(any_law, st.lists(wild_sample, max_size=8))
@@ -47,11 +44,11 @@ def test_observer_recovers_from_wild_data(law, inputs):
     observer = Observer(SMALL | law)
     observer.start(0.3)
     for y, dt, u in inputs:
-        levels = observer.state.levels
+        before = observer.state
         # A wild sample that is accepted is the truth, and the state goes where it leads: what is
         # tested here is that one that is not accepted leaves no trap behind.
         if not observer.step(y, dt, u).status.rejected:
-            observer.restore(type(observer.state)(levels, observer.state.memory))
+            observer.restore(before)
     observer.step(0.3, 1e-3)
     assert not observer.step(0.3, 1e-3).status.rejected
 
@@ -63,7 +60,7 @@ def test_spike_that_the_model_cannot_digest_is_rejected_once(law, spike):
     observer.start(0.1)
     words = [observer.step(y, 1e-3).status for y in (0.1, spike, 0.1, 0.1, 0.1)]
     assert sum(word.rejected for word in words) == 1
-    assert abs(observer.state.levels[HAT, 0]) < 1.0
+    assert abs(levels_of(observer)[0, 0]) < 1.0
 
 
 @laws
@@ -79,11 +76,11 @@ def test_time_of_a_rejected_sample_is_carried_over(law):
     assert one.step(np.nan, np.nan, np.inf).status == (
         Status.REJECTED_MEASUREMENT | Status.REJECTED_PERIOD | Status.REJECTED_INPUT
     )
-    np.testing.assert_allclose(one.state.memory[PENDING], 4e-3)
+    np.testing.assert_allclose(remembered(one, 'pending'), 4e-3)
     one.step(0.4, 2e-3)
     other.step(0.4, 1e-3 + 2e-3 + 1e-3 + 2e-3)
-    np.testing.assert_allclose(one.state.levels, other.state.levels, rtol=1e-12)
-    assert one.state.memory[PENDING] == 0.0
+    np.testing.assert_allclose(levels_of(one), levels_of(other), rtol=1e-12)
+    assert remembered(one, 'pending') == 0.0
 
 
 @pytest.mark.parametrize('dt', [0.0, -0.0, -1e-3, np.nan, np.inf, -np.inf])
@@ -118,5 +115,5 @@ def test_time_that_no_step_can_take_is_dropped(law):
     levant, sign = law['structure'] == 'levant', law['variant'].startswith('sign')
     slides = law['scheme'] == 'implicit' and (sign or levant)
     assert bool(observer.step(5.0, 1e-3).status & Status.REJECTED_STEP) != slides
-    assert observer.state.memory[PENDING] == 0.0
+    assert remembered(observer, 'pending') == 0.0
     assert not observer.step(5.0, 1e-3).status.rejected

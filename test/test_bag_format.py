@@ -2,17 +2,22 @@
 """Bags have what Jazzy's rosbag2 writes and reads, as seen by readers that are not rosbags."""
 
 import sqlite3
+import struct
 
 import bag_files as files
-from fhaosmo_ros.tools.bags.types import make_qos
+from fhaosmo_ros.tools.bags.types import LATCHED_QOS, make_qos
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.replay import command as replay
-from mcap.reader import make_reader
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.reader import make_reader, NonSeekingReader
+from mcap.records import Chunk, MessageIndex
 from mcap_ros2.decoder import DecoderFactory
 import numpy as np
 import pytest
 import yaml
 
+KIND = 'std_msgs/msg/Float64'
 FLOAT_HASH = 'RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a'
 """Of std_msgs/msg/Float64 in Jazzy."""
 FOREVER = {'sec': 9223372036, 'nsec': 854775807}
@@ -30,8 +35,8 @@ def make(path, storage):
         'UNKNOWN', 0, 'RELIABLE', 'TRANSIENT_LOCAL', 2**63 - 1, 2**63 - 1, 'AUTOMATIC', 2**63 - 1
     )
     with BagWriter(path, storage) as bag:
-        bag.add('/y', 'std_msgs/msg/Float64')
-        bag.add('/late', 'std_msgs/msg/Float64', qos=[latched])
+        bag.add('/y', KIND)
+        bag.add('/late', KIND, qos=[latched])
         bag.write('/y', 5, files.float64(1.5))
         bag.write('/late', 7, files.float64(-2.5))
         bag.write('/y', 9, files.float64(2.5))
@@ -40,32 +45,23 @@ def make(path, storage):
 
 def check(information, storage, file):
     """Every field that rosbag2's parser asks for in version 9, of its type."""
-    assert set(information) == {
-        'version', 'storage_identifier', 'duration', 'starting_time', 'message_count',
-        'topics_with_message_count', 'compression_format', 'compression_mode',
-        'relative_file_paths', 'files', 'custom_data', 'ros_distro',
-    }  # fmt: skip
-    assert information['version'] == 9
-    assert information['storage_identifier'] == storage
-    assert information['ros_distro'] == 'jazzy'
-    assert information['custom_data'] is None  # how yaml-cpp writes an empty map
+    topics = {t['topic_metadata']['name']: t for t in information['topics_with_message_count']}
     times = {'starting_time': {'nanoseconds_since_epoch': 5}, 'duration': {'nanoseconds': 4}}
-    assert {key: information[key] for key in times} == times
-    assert information['message_count'] == 3
-    assert information['files'] == [{'path': file, 'message_count': 3} | times]
-    assert information['relative_file_paths'] == [file]
-    assert information['compression_format'] == information['compression_mode'] == ''
-    topics = {
-        topic['topic_metadata']['name']: topic
-        for topic in information['topics_with_message_count']
-    }
+    assert information == {
+        'version': 9, 'storage_identifier': storage, 'message_count': 3, **times,
+        'topics_with_message_count': list(topics.values()),
+        'compression_format': '', 'compression_mode': '', 'relative_file_paths': [file],
+        'files': [{'path': file, 'message_count': 3} | times],
+        'custom_data': None,  # how yaml-cpp writes an empty map
+        'ros_distro': 'jazzy',
+    }  # fmt: skip
     expected = {'/y': (2, RELIABLE), '/late': (1, LATCHED)}
     assert set(topics) == set(expected)
     for name, (count, qos) in expected.items():
         assert topics[name] == {
             'message_count': count,
             'topic_metadata': {
-                'name': name, 'type': 'std_msgs/msg/Float64', 'serialization_format': 'cdr',
+                'name': name, 'type': KIND, 'serialization_format': 'cdr',
                 'offered_qos_profiles': [qos], 'type_description_hash': FLOAT_HASH,
             },
         }  # fmt: skip
@@ -76,18 +72,16 @@ def test_metadata_file(storage, tmp_path):
     bag = make(tmp_path / 'bag', storage)
     content = yaml.safe_load((bag / 'metadata.yaml').read_text())
     assert list(content) == ['rosbag2_bagfile_information']
-    suffix = {'mcap': 'mcap', 'sqlite3': 'db3'}[storage]
-    check(content['rosbag2_bagfile_information'], storage, f'bag_0.{suffix}')
-    assert sorted(p.name for p in bag.iterdir()) == [f'bag_0.{suffix}', 'metadata.yaml']
+    file = 'bag_0.mcap' if storage == 'mcap' else 'bag_0.db3'
+    check(content['rosbag2_bagfile_information'], storage, file)
+    assert sorted(p.name for p in bag.iterdir()) == [file, 'metadata.yaml']
 
 
 def test_mcap_file(tmp_path):
     bag = make(tmp_path / 'bag', 'mcap')
     with (bag / 'bag_0.mcap').open('rb') as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        assert reader.get_header().profile == 'ros2'
         summary = reader.get_summary()
-        assert summary.statistics.message_count == 3
         for channel in summary.channels.values():
             qos = LATCHED if channel.topic == '/late' else RELIABLE
             assert channel.message_encoding == 'cdr'
@@ -95,11 +89,10 @@ def test_mcap_file(tmp_path):
             assert channel.metadata['topic_type_hash'] == FLOAT_HASH
             assert yaml.safe_load(channel.metadata['offered_qos_profiles']) == [qos]
             schema = summary.schemas[channel.schema_id]
-            assert (schema.name, schema.encoding) == ('std_msgs/msg/Float64', 'ros2msg')
+            assert (schema.name, schema.encoding) == (KIND, 'ros2msg')
         (metadata,) = reader.iter_metadata()
         assert metadata.name == 'rosbag2'
-        information = yaml.safe_load(metadata.metadata['serialized_metadata'])
-        check(information, 'mcap', 'bag_0.mcap')
+        check(yaml.safe_load(metadata.metadata['serialized_metadata']), 'mcap', 'bag_0.mcap')
         got = [
             (channel.topic, message.log_time, message.publish_time, decoded.data)
             for _, channel, message, decoded in reader.iter_decoded_messages()
@@ -124,39 +117,111 @@ def test_sqlite_file(tmp_path):
         assert {t[2] for t in topics} == {FLOAT_HASH}
         definitions = rows('SELECT topic_type, encoding, type_description_hash'
                            ' FROM message_definitions')  # fmt: skip
-        assert definitions == [('std_msgs/msg/Float64', 'ros2msg', FLOAT_HASH)]
+        assert definitions == [(KIND, 'ros2msg', FLOAT_HASH)]
         got = rows('SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp')
     database.close()
-    assert got == [(1, 5, files.float64(1.5)), (2, 7, files.float64(-2.5)),
-                   (1, 9, files.float64(2.5))]  # fmt: skip
+    values = [(1, 5, 1.5), (2, 7, -2.5), (1, 9, 2.5)]
+    assert got == [(topic, stamp, files.float64(value)) for topic, stamp, value in values]
+
+
+def recorded(path):
+    """Topics appear in between, as in `record`; it flushes twice a second."""
+    with BagWriter(path) as bag:
+        bag.flush()
+        bag.add('/y', KIND)
+        bag.flush()
+        for k in range(500):
+            bag.write('/y', 1000 + k, files.float64(k))
+        bag.add('/late', 'sensor_msgs/msg/JointState')
+        bag.flush()
+        bag.flush()
+        bag.add('/description', 'std_msgs/msg/String', qos=[LATCHED_QOS])
+        bag.write('/description', 900, files.cdr('std_msgs/msg/String', data='<robot/>'))
+        bag.write('/y', 1700, files.float64(5.0))
+
+
+def without_messages(path):
+    with BagWriter(path) as bag:
+        bag.add('/y', KIND)
+        bag.flush()
+
+
+def many_messages(path):
+    with BagWriter(path) as bag:
+        bag.add('/y', KIND)
+        for k in range(60_000):
+            bag.write('/y', k, files.float64(k))
+
+
+def replayed(path):
+    stamps, y = files.signal(3000)
+    bag = files.write(path.with_name('source'), files.floats(stamps, y))
+    assert replay.main([str(bag), '-o', str(path)]) == 0
+
+
+@pytest.mark.parametrize('write', [recorded, without_messages, many_messages, replayed])
+def test_file_is_one_that_the_cpp_reader_takes(write, tmp_path):
+    """It refuses files with a chunk that has no complete message index (mcap 1.3.0)."""
+    write(tmp_path / 'bag')
+    with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == 'ros2'
+        summary = reader.get_summary()
+        places = [index.chunk_start_offset for index in summary.chunk_indexes]
+        assert places == sorted(places)
+        counts = dict.fromkeys(summary.channels, 0)
+        for index in summary.chunk_indexes:
+            found = indexed(file, index)
+            assert found
+            times = [time for _, time in found]
+            assert (index.message_start_time, index.message_end_time) == (min(times), max(times))
+            for channel, _ in found:
+                counts[channel] += 1
+        statistics = summary.statistics
+        assert statistics.channel_message_counts == {c: n for c, n in counts.items() if n}
+        assert statistics.message_count == sum(counts.values())
+        assert statistics.chunk_count == len(places)
+        file.seek(0)  # without the index, as a stream: channels come before their messages
+        messages = list(NonSeekingReader(file, validate_crcs=True).iter_messages())
+        assert len(messages) == statistics.message_count
+
+
+def indexed(file, index):
+    """Return channel and time of the messages that the indexes of a chunk list: all of them."""
+    file.seek(index.chunk_start_offset + 9)
+    chunk = Chunk.read(ReadDataStream(file))
+    assert chunk.uncompressed_crc
+    found = []
+    for channel, offset in index.message_index_offsets.items():
+        file.seek(offset)
+        stream = ReadDataStream(file)
+        assert stream.read1() == Opcode.MESSAGE_INDEX
+        stream.read8()
+        for time, place in MessageIndex.read(stream).records:
+            head = struct.unpack_from('<BQHIQ', chunk.data, place)
+            assert (head[0], head[2], head[4]) == (Opcode.MESSAGE, channel, time)
+            found.append((place, channel, time))
+    found.sort()
+    for (place, *_), (following, *_) in zip(found, [*found[1:], [len(chunk.data)]], strict=True):
+        assert place + 9 + struct.unpack_from('<Q', chunk.data, place + 1)[0] == following
+    return [(channel, time) for _, channel, time in found]
 
 
 def test_replayed_bag_is_read_by_another_reader(tmp_path):
-    """Chunks that go from file to file as a whole, and those made of estimates."""
     stamps, y = files.signal(3000)
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
     assert replay.main([str(bag), '-o', str(tmp_path / 'out')]) == 0
     with (tmp_path / 'out' / 'out_0.mcap').open('rb') as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()], validate_crcs=True)
-        statistics = reader.get_summary().statistics
-        names = {i: c.topic for i, c in reader.get_summary().channels.items()}
-        counts = {names[i]: n for i, n in statistics.channel_message_counts.items()}
-        assert counts.pop('/y') == 3000
-        assert counts.pop('/estimator/parameters') == 1
-        assert set(counts.values()) == {3000}
-        assert len(counts) == 5
-        assert (statistics.message_start_time, statistics.message_end_time) == (
-            stamps[0], stamps[-1],
-        )  # fmt: skip
-        got = [
-            (message.log_time, decoded.data)
-            for _, _, message, decoded in reader.iter_decoded_messages(topics=['/y'])
-        ]
-        assert got == list(zip(stamps.tolist(), y.tolist(), strict=True))
-        labels = {
-            decoded.layout.dim[0].label
-            for _, _, _, decoded in reader.iter_decoded_messages(topics=['/estimator/state'])
-        }
-        assert labels == {'z1,z2,z3'}
-        states = reader.iter_decoded_messages(topics=['/estimator/state'])
-        assert np.isfinite([decoded.data for _, _, _, decoded in states]).all()
+        found = {}
+        for _, channel, message, decoded in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((message.log_time, decoded))
+    assert [(t, m.data) for t, m in found.pop('/y')] == list(
+        zip(stamps.tolist(), y.tolist(), strict=True)
+    )
+    assert len(found.pop('/estimator/parameters')) == 1
+    assert len(found) == 5
+    assert {len(rows) for rows in found.values()} == {3000}
+    states = [message for _, message in found['/estimator/state']]
+    assert {m.layout.dim[0].label for m in states} == {'z1,z2,z3'}
+    assert np.isfinite([m.data for m in states]).all()

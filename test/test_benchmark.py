@@ -30,7 +30,7 @@ def test_c_reference_takes_the_same_steps(reference, tmp_path):
     """So that the ratio compares equal work, with all levels open and gamma moving."""
     y = reference.output(20_001)
     reference.assert_agreement(reference.compile_reference(tmp_path), y)
-    state, word = reference.in_numba(reference.CASE, y)()
+    state, word = reference.in_core(reference.CASE, y)()
     assert open_levels(word) == 4
     assert not np.isclose(state[16], 0.5)
 
@@ -39,8 +39,8 @@ def test_disagreement_is_noticed(reference, tmp_path, monkeypatch):
     monkeypatch.setattr(reference, 'CASE', reference.CASE | {'gamma_rate': 0.004})
     library = reference.compile_reference(tmp_path)
     other = reference.CASE | {'gamma_rate': 0.0041}
-    in_numba = reference.in_numba
-    monkeypatch.setattr(reference, 'in_numba', lambda _, y: in_numba(other, y))
+    in_core = reference.in_core
+    monkeypatch.setattr(reference, 'in_core', lambda _, y: in_core(other, y))
     with pytest.raises(AssertionError):
         reference.assert_agreement(library, reference.output(2_001))
 

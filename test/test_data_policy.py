@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of values: each case of docs/operation.md and its counter; freezing and seeding."""
+"""Faults of values: each case of docs/node.md and its counter; freezing and seeding."""
 
 import math
 
 from fhaosmo_ros.core import ConfigurationError
-from fhaosmo_ros.core.observer.arrays import HAT, TILDE
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 import numpy as np
-from observer_cases import laws
+from observer_cases import laws, levels_of
 import pytest
 
 MS = 1_000_000
@@ -56,7 +55,7 @@ def test_bad_value_is_rejected_and_as_if_it_had_not_come(bad):
     for f in (feed, other):
         f(0.21)
     np.testing.assert_array_equal(
-        feed.estimator.observer.state.levels, other.estimator.observer.state.levels
+        levels_of(feed.estimator.observer), levels_of(other.estimator.observer)
     )
     assert feed.events == {'rejected_measurements': 1}
 
@@ -84,7 +83,7 @@ def test_spike_is_rejected_and_changes_nothing():
     for f in (feed, other):
         f.sine(5)
     np.testing.assert_array_equal(
-        feed.estimator.observer.state.levels, other.estimator.observer.state.levels
+        levels_of(feed.estimator.observer), levels_of(other.estimator.observer)
     )
     assert feed.events == {'rejected_spikes': 1}
 
@@ -273,9 +272,9 @@ def test_seed_takes_derivatives_of_the_unknown_input_for_zero(structure):
     estimate = estimator.estimate
     np.testing.assert_array_equal(estimate.z, [0.2, 1.0, 2.0])
     assert estimate.unknown_input == 3.0
-    levels = estimator.observer.state.levels
-    np.testing.assert_array_equal(levels[HAT], [0.2, 1.0, 2.0, 3.0, 0.0, 0.0])
-    np.testing.assert_array_equal(levels[TILDE], [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
+    values = estimator.observer.state.values
+    np.testing.assert_array_equal(values['z_hat'], [0.2, 1.0, 2.0, 3.0, 0.0, 0.0])
+    np.testing.assert_array_equal(values['z_tilde'], [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
 
 
 def after_a_gap() -> Feed:
@@ -344,10 +343,10 @@ def test_seed_is_where_an_observer_starts_after_a_reset():
 def test_seed_that_does_not_fit_is_refused(z, d):
     feed = Feed()
     feed.sine(10)
-    before = feed.estimator.observer.state.levels
+    before = levels_of(feed.estimator.observer)
     with pytest.raises(ConfigurationError, match='seed: expected 3 states'):
         feed.estimator.seed(z, d)
-    np.testing.assert_array_equal(feed.estimator.observer.state.levels, before)
+    np.testing.assert_array_equal(levels_of(feed.estimator.observer), before)
 
 
 @pytest.mark.parametrize('from_measurement', [True, False])
@@ -365,7 +364,7 @@ def test_parameters_and_a_reset_seed_the_start(from_measurement):
     estimate = feed.estimator.update(START + 100 * MS, 0.7)
     np.testing.assert_array_equal(estimate.z, [0.7 if from_measurement else 0.5, 1.0, 2.0])
     assert estimate.unknown_input == 3.0
-    assert feed.estimator.observer.state.levels[HAT, 0] == estimate.z[0]
+    assert feed.estimator.observer.state.values['z_hat'][0] == estimate.z[0]
 
 
 def test_reset_keeps_counters_and_forgets_the_rest():

@@ -2,15 +2,13 @@
 """A known delay of y: the inputs that acted then, the estimate's time, and the present."""
 
 from fhaosmo_ros.core import ConfigurationError, Family, OnlineEstimator, Trial
-from fhaosmo_ros.core.online import delay
-from fhaosmo_ros.core.online.memory import Flag, labels, pack, Snapshot, unpack
+from fhaosmo_ros.core.online.delay import PIECES
+from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot, unpack
 from fhaosmo_ros.core.simulation.plant import respond
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from studies import delay as study
-from studies import document
 
 PERIOD, LATE = 2_000_000, 20
 """Nanoseconds, and periods by which y is late."""
@@ -78,49 +76,58 @@ def test_prediction_ends_at_the_present_state(share, estimate_from):
     assert np.abs(then.z[at_end, 1] - z[at_end, 1]).max() > 0.02  # so the delay matters
 
 
-def ring(pieces, inputs=2):
-    past = delay.make_past(inputs, 1)
-    for duration, *u in pieces:
-        delay.note_inputs(past, duration, np.array(u, dtype=float))
-    return past
+TWO = {
+    'order': 1, 'phi': ['0*a*b'], 'inputs': ['a', 'b'], 'gains': 'fixed', 'variant': 'sign',
+    'max_step': 10.0, 'spike_gate': 1.0, 'spike_gate_samples': 1000,
+}  # fmt: skip
+FIRST = 10**18
+
+
+def acting(pieces, lag, elapsed, now, spikes=()):
+    """Return the inputs that act in a step of `elapsed` ns, after pieces of (duration, a, b)."""
+    estimator = OnlineEstimator(TWO | {'measurement_delay': lag * 1e-9})
+    rows = [(0, 0.0, 0.0, 0.0)] + [(duration, *u, 0.0) for duration, *u in pieces]
+    rows += [(duration, 5.0, 5.0, 9.0) for duration in spikes]  # samples that are rejected
+    rows = np.array([*rows, (elapsed, *now, 0.0)])
+    stamps = FIRST + np.cumsum(rows[:, 0]).astype(np.int64)
+    if len(spikes):  # each was as if it had not come
+        begin = stamps[len(pieces)]
+        stamps[len(pieces) + 1 :] = begin + rows[len(pieces) + 1 :, 0].astype(np.int64)
+    *_, found = estimator.policy.run(stamps, rows[:, 3].copy(), rows[:, 1:3].copy(), True)
+    assert estimator.counters.rejected_spikes == len(spikes)
+    return found[-1]
 
 
 durations = st.integers(1, 50)
 known = st.lists(st.tuples(durations, st.integers(-2, 2), st.integers(-2, 2)), max_size=30)
 
 
-@given(known, st.integers(0, 200), durations)
+@given(known, st.integers(1, 200), durations)
 def test_inputs_of_an_interval_are_their_mean(pieces, lag, elapsed):
     now = np.array([9.0, -9.0])
     series = [np.array(u, dtype=float) for duration, *u in pieces for _ in range(duration)]
-    oldest = series[0] if series else now
-    series = np.array([oldest] * (lag + elapsed) + series)
+    series += [now] * elapsed
+    series = np.array([series[0]] * (lag + elapsed) + series)
     wanted = series[len(series) - lag - elapsed : len(series) - lag].mean(axis=0)
-    found = delay.inputs_before(ring(pieces), lag, elapsed, now)
-    np.testing.assert_allclose(found, wanted, atol=1e-12)
+    np.testing.assert_allclose(acting(pieces, lag, elapsed, now), wanted, atol=1e-12)
 
 
-@given(known, durations)
-def test_what_is_withdrawn_has_not_been(pieces, elapsed):
-    past, now = ring(pieces), np.array([5.0, 5.0])
-    delay.note_inputs(past, elapsed, now)
-    delay.withdraw_inputs(past, elapsed, 2)
-    for lag in (0, 7, 40):
-        np.testing.assert_array_equal(
-            delay.inputs_before(past, lag, 10, now),
-            delay.inputs_before(ring(pieces), lag, 10, now),
-        )
+@given(known, st.integers(1, 60), durations)
+def test_what_is_withdrawn_has_not_been(pieces, lag, elapsed):
+    now = np.array([9.0, -9.0])
+    found = acting(pieces, lag, 61, now, spikes=[elapsed, 60])
+    np.testing.assert_array_equal(found, acting(pieces, lag, 61, now))
 
 
 def test_more_pieces_than_there_is_room_for_lose_the_oldest():
-    count = delay.PIECES + 100
-    past = ring([(10, k, -k) for k in range(count)])
+    count = PIECES + 100
+    pieces = [(10, k, -k) for k in range(count)]
     now = np.zeros(2)
-    for back in (0, 100, delay.PIECES - 1):
+    for back in (1, 100, PIECES - 2):
         newest = count - 1 - back
-        found = delay.inputs_before(past, 10 * back, 10, now)
+        found = acting(pieces, 10 * (back + 1), 10, now)
         np.testing.assert_array_equal(found, [newest, -newest])
-    np.testing.assert_array_equal(delay.inputs_before(past, 10 * count, 10, now)[0], 100)
+    np.testing.assert_array_equal(acting(pieces, 10 * count, 10, now)[0], 101)
 
 
 CASES = {
@@ -164,10 +171,8 @@ def test_one_by_one_many_and_resumed_are_the_same(parameters):
             np.testing.assert_array_equal(one.estimate.z, e.z)
     many = OnlineEstimator(parameters)
     many.run(stamps[:700], y[:700], u[:700])
-    memory = many.memory
-    names = labels(3, many.observer.inputs, len(memory.past))
-    vector = pack(Snapshot(many.latest, Flag(0), memory))
-    resumed.remember(unpack(vector, names).memory)
+    labels, vector = pack(Snapshot(many.latest, Flag(0), many.state_dict()))
+    resumed.load_state_dict(unpack(vector, labels).values)
     rest = resumed.run(stamps[700:], y[700:], u[700:])
     np.testing.assert_array_equal(rest.z, found.z[700:])
 
@@ -181,15 +186,14 @@ def test_a_withdrawn_gap_leaves_no_trace_in_the_past_of_the_inputs():
     keep = np.delete(np.arange(202), 200)
     without.run(stamps[keep], y[keep], u[keep])
     assert with_it.counters.withdrawn_gaps == 1
-    out = [delay.inputs_before(e.memory.past, lag * 10**6, PERIOD, np.zeros(1))[0]
-           for e in (with_it, without) for lag in range(0, 100, 3)]  # fmt: skip
-    half = len(out) // 2
-    np.testing.assert_array_equal(out[:half], out[half:])
+    rest = slice(202, 300)
+    found, wanted = (e.run(stamps[rest], y[rest], u[rest]) for e in (with_it, without))
+    np.testing.assert_array_equal(found.z, wanted.z)
 
 
 def test_memory_of_another_delay_is_refused():
     with pytest.raises(ConfigurationError, match='measurement_delay'):
-        OnlineEstimator(DELAYED).remember(OnlineEstimator(MOTOR).memory)
+        OnlineEstimator(DELAYED).load_state_dict(OnlineEstimator(MOTOR).state_dict())
 
 
 def test_input_later_than_y_is_refused():
@@ -213,14 +217,3 @@ def test_trial_knows_of_the_delay():
     unknown = error({'measurement_delay': 0.0})
     assert (then < 0.2 * unknown).all()  # z1, z2, d
     assert (now[:2] < 0.2 * unknown[:2]).all()
-
-
-def test_the_page_says_what_the_study_measures(monkeypatch):
-    rows = [
-        [float(cell) for cell in line.split('|')[2:-1]]
-        for line in document.parts(study.PAGE.read_text())[study.PART].splitlines()[2:]
-    ]
-    monkeypatch.setattr(study, 'DELAYS', np.array(study.PRINTED) * 1e-3)
-    new = study.table(study.errors()).splitlines()[2:]
-    for line, old in zip(new, rows, strict=True):
-        assert [float(cell) for cell in line.split('|')[2:-1]] == pytest.approx(old, rel=0.06)

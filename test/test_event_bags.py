@@ -3,7 +3,7 @@
 
 import bag_files as files
 from fhaosmo_ros.core import OnlineEstimator
-from fhaosmo_ros.core.observer.self_tuning.members import FIRST_SAMPLES, TUNING
+from fhaosmo_ros.core.observer.estimates import TUNING
 from fhaosmo_ros.core.observer.status import REJECTED
 from fhaosmo_ros.tools.bags.topics import messages, series
 from fhaosmo_ros.tools.plot import command as plot
@@ -12,6 +12,8 @@ from fhaosmo_ros.tools.replay import command as replay
 import numpy as np
 import pytest
 
+FIRST_SAMPLES = 50
+"""Samples from which a self-tuning estimator begins, at most."""
 MODEL = {'order': 1, 'phi': ['-z1'], 'gains': 'self_tuning', 'event_deviations': 5.0}
 OPTIONS = [word for name, value in MODEL.items() for word in ('-p', f'{name}:={value}')]
 

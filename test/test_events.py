@@ -3,7 +3,7 @@
 
 from fhaosmo_ros.core import ConfigurationError, EstimatorBatch, EventDetector, OnlineEstimator
 from fhaosmo_ros.core.observer.status import REJECTED_SPIKE, RESTARTED
-from fhaosmo_ros.core.online.memory import Flag, labels, pack, Snapshot, unpack
+from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot, unpack
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -186,11 +186,10 @@ def test_one_by_one_at_once_in_channels_and_resumed_find_the_same(samples, case)
         one_by_one.update(stamp, value)
         if k == 1100:
             assert one_by_one.events.active
-            vector = pack(Snapshot(one_by_one.latest, Flag(0), one_by_one.memory))
-            memory = one_by_one.memory
-            names = labels(one_by_one.observer.levels, members=len(memory.members))
+            values = one_by_one.state_dict()
+            labels, vector = pack(Snapshot(one_by_one.latest, Flag(0), values))
             resumed = OnlineEstimator(CASES[case])
-            resumed.remember(unpack(vector, names).memory)
+            resumed.load_state_dict(unpack(vector, labels).values)
         batch.advance([0, 1], [stamp, stamp], [value, value], [0.0, 0.0])
         taken += single.events.taken()
     assert without_number(one_by_one.events.taken()) == events

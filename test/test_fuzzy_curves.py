@@ -4,10 +4,17 @@
 from pathlib import Path
 
 from fhaosmo_ros.core import ConfigurationError
-from fhaosmo_ros.core.observer.arrays import INVERSE_WIDTH
-from fhaosmo_ros.core.observer.arrays import psi as read_psi
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.fuzzy import curve, infer, KNOTS, read_system, SHAPES
+from fhaosmo_ros.core.observer.fuzzy import (
+    curve,
+    default_curves,
+    infer,
+    inferred,
+    KNOTS,
+    read_system,
+    SHAPES,
+)
+from fhaosmo_ros.core.observer.observer import make_structure
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -25,12 +32,12 @@ normalised = pytest.mark.parametrize('normalise', [True, False])
 
 def law(level_widths=(0.02,), **options):
     p = {'variant': 'fuzzy', 'fuzzy_widths': list(level_widths)}
-    return ObserverConfiguration(p | options).law
+    return make_structure(ObserverConfiguration(p | options))
 
 
 def psi(law, level, x):
     """Return psi of a signed x, as the compiled functions read it."""
-    value, _ = read_psi(law, level, abs(x))
+    value, _ = law.curve(level, abs(x))
     return np.copysign(value, x)
 
 
@@ -268,8 +275,16 @@ def test_normalised_curve_is_the_raw_one_scaled(terms, shape):
     np.testing.assert_allclose(scaled, raw / raw[-1], rtol=1e-15)
 
 
+@even
+def test_shipped_curve_is_the_inferred_one(terms, shape):
+    """Else `python -m studies.fuzzy_curves` writes the file anew."""
+    text = f'terms {terms}'
+    system = read_system(text, shape)
+    np.testing.assert_allclose(default_curves()[system], inferred(text, system), atol=1e-14)
+
+
 def test_level_1_has_5_terms_and_the_others_7():
-    curves = law().curves
+    curves = law().configuration.curves
     np.testing.assert_array_equal(curves[0], curve('terms 5', 'triangle', True))
     for row in curves[1:]:
         np.testing.assert_array_equal(row, curve('terms 7', 'triangle', True))
@@ -278,12 +293,12 @@ def test_level_1_has_5_terms_and_the_others_7():
 def test_more_systems_than_levels_are_refused():
     with pytest.raises(ConfigurationError, match='1 to 4 values'):
         law(fuzzy_systems=['terms 5'] * 5)
-    assert len(law(order=1, phi=['0'], unknown_input=False).curves) == 1  # the default is not
+    assert law(order=1, phi=['0'], unknown_input=False).levels == 1  # the default is not
 
 
 def test_last_width_serves_the_levels_that_follow():
-    inverse = law((0.1, 0.4)).gains[INVERSE_WIDTH]
-    np.testing.assert_array_equal(inverse, [10.0, 2.5, 2.5, 2.5])
+    widths = law((0.1, 0.4)).configuration.widths
+    np.testing.assert_array_equal(widths, [0.1, 0.4, 0.4, 0.4])
 
 
 LAWS = {
@@ -305,19 +320,19 @@ def test_psi_is_bounded_and_monotone(law, level, a, b):
 @given(any_law, levels, inputs, inputs)
 def test_psi_is_continuous(law, level, a, b):
     # Lipschitz: the steepest piece of the curve is less than 5 times steeper than the diagonal.
-    steepest = 5.0 * law.gains[INVERSE_WIDTH, level]
+    steepest = 5.0 / law.configuration.widths[level]
     difference = abs(psi(law, level, a) - psi(law, level, b))
     assert difference <= steepest * abs(a - b) + 1e-12
 
 
 @given(any_law, levels, st.floats(1e-6, 2.0))
 def test_slope_is_that_of_psi(law, level, share):
-    width = 1.0 / law.gains[INVERSE_WIDTH, level]
+    width = law.configuration.widths[level]
     position = share * (KNOTS - 1)
     if abs(position - round(position)) < 1e-3:
         return  # two pieces meet
     a, step = share * width, 1e-6 * width
-    _, slope = read_psi(law, level, a)
+    _, slope = law.curve(level, a)
     rise = psi(law, level, a + step) - psi(law, level, a - step)
     np.testing.assert_allclose(slope, rise / (2.0 * step), rtol=1e-6, atol=1e-6 / width)
 
@@ -335,7 +350,7 @@ def test_width_scales_the_input(options, level, share, width):
 def test_sign_is_the_limit_of_a_narrow_psi(level, a):
     narrow = law((1e-12,))
     sign = law(variant='sign')
-    assert read_psi(sign, level, a) == (1.0, 0.0)
+    assert sign.curve(level, a) == (1.0, 0.0)
     if a >= 1e-12:
         np.testing.assert_allclose(psi(narrow, level, a), 1.0, rtol=1e-12)
 

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip('control', reason='python-control is not installed (extra: tune)')
 
 from fhaosmo_ros.core import Observer, TriangularModel
-from fhaosmo_ros.core.observer.covariance import stationary, transition
+from fhaosmo_ros.core.observer.kalman import LinearModel, stationary
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools.tuning.identification.checks import notes, refuse, refuse_unseen
 from fhaosmo_ros.tools.tuning.identification.gains import make_gains, run
@@ -17,8 +17,12 @@ from fhaosmo_ros.tools.tuning.identification.identify import (
     NothingToFind,
     size_of_input,
 )
-from fhaosmo_ros.tools.tuning.identification.innovations import Samples
-from fhaosmo_ros.tools.tuning.identification.likelihood import Design, likeliest_scale, Likelihood
+from fhaosmo_ros.tools.tuning.identification.likelihood import (
+    Design,
+    likeliest_scale,
+    Likelihood,
+    Samples,
+)
 from fhaosmo_ros.tools.tuning.sensor import identify
 from fhaosmo_ros.tools.tuning.source import RecordedOutput
 from scipy.signal import lfilter
@@ -37,7 +41,7 @@ def plant(seed=1, size=SIZE):
     """Return the states z1, z2, d, d' of the very process that D 17 describes."""
     random = np.random.default_rng(seed)
     q = size**2 * (2.0 * RATE) ** 3 / 2.0
-    a, added = transition(RATES, q, H)
+    a, added = LinearModel(RATES, q).transition(H)
     x, states = np.zeros(4), np.empty((K, 4))
     x[2:] = np.linalg.cholesky(stationary(RATES[2:, 2:], q)) @ random.standard_normal(2)
     shocks = random.standard_normal((K, 4)) @ np.linalg.cholesky(added).T
@@ -88,7 +92,7 @@ def test_innovations_are_those_of_a_textbook_kalman_filter(colour):
     r = likelihood(design).innovations
     rates = RATES.copy()
     rates[2, 2] = rates[3, 3] = -design.decay
-    a, added = transition(rates, likelihood.intensity(design, NOISE), H)
+    a, added = LinearModel(rates, likelihood.intensity(design, NOISE)).transition(H)
     a = np.block([[a, np.zeros((4, 1))], [np.zeros((1, 4)), np.full((1, 1), colour)]])
     added = np.block([[added, np.zeros((4, 1))], [np.zeros((1, 4)), np.full((1, 1), NOISE**2)]])
     white = NOISE**2 if colour == 0.0 else 0.0

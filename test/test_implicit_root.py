@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The scalar equation of an implicit level: its residual is small wherever one looks."""
 
-from fhaosmo_ros.core.observer.arrays import ALPHA, LAMBDA, psi
-from fhaosmo_ros.core.observer.cascade import root
+from fhaosmo_ros.core.observer.cascade import Cascade
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -12,7 +11,7 @@ import pytest
 
 def law(variant, lambda_, alpha, width, shape='triangle'):
     p = {'variant': variant, 'lambda': lambda_, 'alpha': alpha, 'fuzzy_widths': width}
-    return ObserverConfiguration(p | {'fuzzy_shape': shape}).law
+    return Cascade(ObserverConfiguration(p | {'fuzzy_shape': shape}))
 
 
 def powers(low, high):
@@ -21,17 +20,16 @@ def powers(low, high):
 
 
 def check(law, b, h, gamma, level):
-    arguments = law, level
-    eps, s = root(*arguments, b, h, gamma)
+    eps, s = law.solve(level, b, h, gamma)
     assert 0.0 <= eps <= b * (1.0 + 1e-15)
     assert 0.0 <= s <= 1.0
-    damping = h * law.gains[LAMBDA, level]
-    stiffness = h * h * law.gains[ALPHA, level]
+    damping = h * law.configuration.lambdas[level]
+    stiffness = h * h * law.configuration.alphas[level]
     terms = np.array([eps, damping * eps**gamma * s, stiffness * s])
     # A relative error of x in eps leaves a residual of at most 2 x times the largest term.
     np.testing.assert_allclose(terms.sum(), b, rtol=1e-12)
     if eps > 0.0:  # s is in psi(eps)
-        np.testing.assert_allclose(s, psi(*arguments, eps)[0], rtol=1e-12)
+        np.testing.assert_allclose(s, law.curve(level, eps)[0], rtol=1e-12)
     return eps, s
 
 
@@ -67,14 +65,14 @@ def test_sign_root(b, h, lambda_, alpha):
 @pytest.mark.parametrize('variant', ['sign', 'fuzzy_adaptive'])
 def test_no_innovation_needs_no_injection(variant):
     for b in (0.0, 5e-324, 1e-310):
-        eps, s = root(law(variant, 15.0, 30.0, 0.02), 0, b, 1e-3, 0.5)
+        eps, s = law(variant, 15.0, 30.0, 0.02).solve(0, b, 1e-3, 0.5)
         assert abs(eps) <= b
         assert abs(s) <= 1e-200
 
 
 @given(sizes, st.floats(1.0, 10.0), periods, st.sampled_from(['sign', 'fuzzy_adaptive']))
 def test_root_increases_with_the_right_side(b, factor, h, variant):
-    arguments = law(variant, 15.0, 30.0, 0.02), 0
-    (eps, s), (more, t) = (root(*arguments, x, h, 0.5) for x in (b, b * factor))
+    cascade = law(variant, 15.0, 30.0, 0.02)
+    (eps, s), (more, t) = (cascade.solve(0, x, h, 0.5) for x in (b, b * factor))
     assert more >= eps * (1.0 - 1e-12)
     assert t >= s * (1.0 - 1e-12)

@@ -10,10 +10,9 @@ test_sensitivity.py.
 import math
 
 from fhaosmo_ros.core import ConfigurationError, Observer, Plant
-from fhaosmo_ros.core.observer.arrays import LAMBDA, psi
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.fuzzy import curves
-from fhaosmo_ros.core.observer.levant import root
+from fhaosmo_ros.core.observer.levant import Levant
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.plant_and_observer import simulate
@@ -277,18 +276,17 @@ def powers(low, high):
 )  # fmt: skip
 def test_root(variant, b, h, gamma, lambdas, width):
     p = {'structure': 'levant', 'variant': variant, 'lambda': lambdas, 'fuzzy_widths': width}
-    law = ObserverConfiguration(p).law
-    weights = np.zeros((2, 4))
-    weights[0] = law.gains[LAMBDA] * h ** np.arange(1, 5)
-    eps, w, top = root(law, weights, b, gamma)
-    s = np.array([psi(law, i, eps)[0] for i in range(4)]) if eps > 0.0 else np.zeros(4)
+    levant = Levant(ObserverConfiguration(p))
+    weights = np.array(lambdas) * h ** np.arange(1, 5)
+    eps, w, top = levant.solve(weights, b, gamma)
+    s = np.array([levant.curve(i, eps)[0] for i in range(4)]) if eps > 0.0 else np.zeros(4)
     if eps > 0.0:
         assert s[3] == top
         if eps > 1e-299:
             np.testing.assert_allclose(w, eps ** (gamma / 2.0), rtol=1e-12)
     s[3] = top
     assert np.all((s >= 0.0) & (s <= 1.0))
-    terms = np.append(weights[0] * w ** np.arange(3, -1, -1) * s, eps)
+    terms = np.append(weights * w ** np.arange(3, -1, -1) * s, eps)
     np.testing.assert_allclose(terms.sum(), b, rtol=1e-11)
 
 

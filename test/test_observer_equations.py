@@ -13,7 +13,7 @@ import math
 from fhaosmo_ros.core import Observer
 from fhaosmo_ros.core.observer.fuzzy import curves
 import numpy as np
-from observer_cases import VARIANTS
+from observer_cases import levels_of, VARIANTS
 import pytest
 from scipy.optimize import brentq
 
@@ -357,7 +357,7 @@ def test_level_holds_while_a_level_before_it_is_off_by_more_than_epsilon():
         observer = Observer(p | {'scheme': scheme, 'initial_estimate': [0.0, 0.5, 0.7]})
         observer.start(10.0)
         estimate = observer.step(10.0, 1e-3)
-        levels = observer.state.levels
+        levels = levels_of(observer)
         assert estimate.open_levels == 1
         np.testing.assert_array_equal(levels[0, 1:], [0.5, 0.7])  # z_hat_2, z_hat_3
         np.testing.assert_array_equal(levels[1, 1:], [0.0, 0.0])  # z_tilde_3, theta

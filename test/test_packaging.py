@@ -23,7 +23,8 @@ SOURCED = ('AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'ROS_
 
 
 def clean_environment(**extra: str) -> dict[str, str]:
-    return {k: v for k, v in os.environ.items() if k not in SOURCED} | extra
+    kept = {k: v for k, v in os.environ.items() if k not in SOURCED}
+    return kept | {'FHAOSMO_DEBUG': '1'} | extra  # compiles in half the time
 
 
 def run(*command: object, **options) -> str:
@@ -76,7 +77,7 @@ def test_colcon_installs_executables_and_data(installed, checkout):
     for command in COMMANDS:
         assert os.access(prefix / 'lib' / NAME / command, os.X_OK)
     assert not (prefix / 'bin').exists()
-    for other in ('studies', 'benchmark', 'test'):
+    for other in ('studies', 'benchmark', 'test', '*.c', '*.pyx'):
         assert not list(prefix.rglob(other))
     share = prefix / 'share' / NAME
     for pattern in ('config/**/*.yaml', 'config/*.xml', 'launch/*.py', 'package.xml', 'docs/*.md'):
@@ -136,6 +137,106 @@ def test_wheel_has_one_script_and_only_this_package(checkout, tmp_path):
     )
     assert printed.startswith('usage: fhaosmo COMMAND')
     assert all(command in printed for command in COMMANDS)
+    core = packages / NAME / 'core'
+    sources = {path.relative_to(checkout) for path in (checkout / NAME).rglob('*.pyx')}
+    compiled = {path.relative_to(packages) for path in core.rglob('*.so')}
+    assert {path.with_suffix('') for path in sources} == {
+        path.with_name(path.name.split('.')[0]) for path in compiled
+    }
+    assert (core / 'observer' / 'structure.pxd').is_file()  # others can cimport the observer
+    assert not [*packages.rglob('*.c'), *packages.rglob('*.pyx')]
+    estimate = f'from {NAME}.core import Observer; print(Observer().step(0.0, 1.0).accepted)'
+    environment = clean_environment(PYTHONPATH=str(packages))
+    assert run(sys.executable, '-c', estimate, cwd=tmp_path, env=environment) == 'True\n'
+
+
+# setup.py build_ext
+
+SMALL = {
+    'fhaosmo_ros/__init__.py': "__version__ = '0'",
+    'fhaosmo_ros/commands.py': 'COMMANDS = {}',
+    'fhaosmo_ros/number.pxd': (
+        'cdef enum: NUMBER = 3\ncdef class Numbers:\n    cdef double[4] values'
+    ),
+    'fhaosmo_ros/number.pyx': """
+cdef class Numbers:
+    def __getitem__(self, Py_ssize_t index):
+        cdef double[:] values = self.values
+        return values[index]
+""",
+    'fhaosmo_ros/taken.pyx': (
+        'from fhaosmo_ros.number cimport NUMBER\ndef number():\n    return NUMBER'
+    ),
+}
+OUT_OF_BOUNDS = """
+from fhaosmo_ros.number import Numbers
+try:
+    Numbers()[4]
+except IndexError:
+    print('checked')
+else:
+    print('unchecked')
+"""
+
+
+@pytest.fixture
+def small(tmp_path) -> Path:
+    """Return a package of two small extensions with this package's setup.py."""
+    for name, text in SMALL.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    for name in ('setup.py', 'setup.cfg'):
+        shutil.copy(ROOT / name, tmp_path)
+    return tmp_path
+
+
+def build(folder: Path, **environment: str) -> None:
+    command = (sys.executable, 'setup.py', '-q', 'build_ext', '--inplace')
+    printed = run(*command, cwd=folder, env=clean_environment(**environment))
+    assert printed == ''
+
+
+def built(folder: Path) -> dict[str, int]:
+    """Return when each extension was compiled (ns)."""
+    libraries = (folder / 'build').glob('lib*/**/*.so')
+    return {path.name.split('.')[0]: path.stat().st_mtime_ns for path in libraries}
+
+
+def test_only_what_has_changed_is_built(small):
+    build(small)
+    first = built(small)
+    assert set(first) == {'number', 'taken'}
+    assert not list((small / NAME).rglob('*.c'))
+    build(small)
+    assert built(small) == first
+    taken = small / NAME / 'taken.pyx'
+    taken.write_text(taken.read_text() + ' + 0')
+    build(small)
+    second = built(small)
+    assert second['number'] == first['number']
+    assert second['taken'] > first['taken']
+    declarations = small / NAME / 'number.pxd'
+    declarations.write_text(declarations.read_text().replace('NUMBER = 3', 'NUMBER = 4'))
+    build(small)
+    asked = run(
+        sys.executable, '-c', f'from {NAME}.taken import number; print(number())', cwd=small
+    )
+    assert asked == '4\n'
+
+
+def test_a_debug_build_checks_bounds_and_is_not_taken_for_a_normal_one(small):
+    for debug, expected in (('1', 'checked\n'), ('0', 'unchecked\n')):
+        build(small, FHAOSMO_DEBUG=debug)
+        assert run(sys.executable, '-c', OUT_OF_BOUNDS, cwd=small) == expected
+
+
+def test_without_cython_the_build_says_so(small):
+    (small / 'Cython.py').write_text('raise ImportError')
+    command = (sys.executable, 'setup.py', '-q', 'build_ext')
+    environment = clean_environment(PYTHONPATH=str(small))
+    done = subprocess.run(command, cwd=small, env=environment, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr == "error: Cython is needed to build: pip install 'Cython>=3'\n"
 
 
 # package.xml
@@ -149,7 +250,8 @@ def test_package_xml():
     assert package.findtext('license') == 'Apache-2.0'
     assert package.findtext('export/build_type') == 'ament_python'
     needed = {tag.text for tag in package.findall('exec_depend')}
-    assert {'rclpy', 'std_msgs', 'std_srvs', 'launch_ros', 'python3-numba'} <= needed
+    assert {'rclpy', 'std_msgs', 'std_srvs', 'launch_ros', 'python3-numpy'} <= needed
+    assert {'cython3', 'python3-dev'} <= {tag.text for tag in package.findall('build_depend')}
     assert 'python3-pytest' in {tag.text for tag in package.findall('test_depend')}
 
 
@@ -346,19 +448,51 @@ def fake_ros(tmp_path) -> Path:
 
 
 def test_plan_without_ros_takes_the_wheels():
-    assert plan().stdout == 'venv: .venv\nwheels: jazzy\n'
-    assert plan(ROS_WHEELS='kilted').stdout == 'venv: .venv-kilted\nwheels: kilted\n'
+    assert plan().stdout.startswith('venv: .venv\nwheels: jazzy\n')
+    assert plan(ROS_WHEELS='kilted').stdout.startswith('venv: .venv-kilted\nwheels: kilted\n')
+
+
+def test_plan_without_a_compiler_takes_ziglang(tmp_path):
+    """`dirname` is all that the plan needs of the system."""
+    (tmp_path / 'dirname').symlink_to(shutil.which('dirname'))
+    done = subprocess.run(
+        [shutil.which('sh'), ROOT / 'scripts' / 'environment.sh', '--print-plan'],
+        env={'PATH': str(tmp_path), 'PYTHON': sys.executable},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout == 'venv: .venv\nwheels: jazzy\ncompiler: ziglang\n', done.stderr
+    assert plan(CC=sys.executable).stdout.endswith(f'compiler: {sys.executable}\n')
+
+
+def test_without_the_headers_of_python_nothing_is_begun(checkout, tmp_path):
+    (tmp_path / 'sitecustomize.py').write_text(
+        'import sysconfig\nsysconfig.get_path = lambda name: "/nowhere/python3.99"\n'
+    )
+    folder = tmp_path / 'copy'
+    shutil.copytree(checkout, folder)
+    done = subprocess.run(
+        ['sh', folder / 'scripts' / 'environment.sh'],
+        env=clean_environment(PYTHON=sys.executable, PYTHONPATH=str(tmp_path)),
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert '/nowhere/python3.99/Python.h is missing' in done.stderr
+    assert 'apt install python3.99-dev' in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (folder / '.venv').exists()
 
 
 def test_plan_with_sourced_jazzy_takes_its_rclpy(fake_ros):
     done = plan(ROS_DISTRO='jazzy', PYTHONPATH=str(fake_ros))
-    assert done.stdout == 'venv: .venv-ros\nwheels: no\n'
+    assert done.stdout.startswith('venv: .venv-ros\nwheels: no\n')
     assert done.stderr == ''
 
 
 def test_plan_with_another_distribution_warns(fake_ros):
     done = plan(ROS_DISTRO='rolling', PYTHONPATH=str(fake_ros))
-    assert done.stdout == 'venv: .venv-ros\nwheels: no\n'
+    assert done.stdout.startswith('venv: .venv-ros\nwheels: no\n')
     assert 'only ROS 2 Jazzy and Kilted are tested, sourced is rolling' in done.stderr
 
 

@@ -4,31 +4,11 @@
 import math
 from pathlib import Path
 
-from fhaosmo_ros.core.observer.arrays import (
-    CORRECTION_PERIOD,
-    COVARIANCE,
-    INTENSITY,
-    MEMORY,
-    NARROWED,
-    OFFSET,
-    SCALE,
-    VARIANCE,
-)
-from fhaosmo_ros.core.observer.covariance import (
-    bandwidth,
-    beyond,
-    doubt_of_noise,
-    HUBER,
-    influence,
-    ISOLATED,
-    stationary,
-    transition,
-    WITHIN,
-)
-from fhaosmo_ros.core.observer.levant import SATURATED_SAMPLES
+from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.kalman import stationary
+from fhaosmo_ros.core.observer.levant import Levant
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.status import Status
-from fhaosmo_ros.core.observer.step import LOST_SAMPLES
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import (
@@ -38,6 +18,7 @@ from fhaosmo_ros.core.parameters.tables import (
 )
 from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np
+from observer_cases import remembered
 import pytest
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
@@ -47,6 +28,8 @@ FILES = [
     if path != PAPER and 'noise_size' in load(path, 'estimator', ONLINE_PARAMETERS)
 ]  # fmt: skip
 RATE = 1000
+LOST_SAMPLES = 20
+"""More unlikely samples in a row say that y is lost (D 21)."""
 HIT, BACK, SOON = 6 * RATE, 13 * RATE // 2, RATE
 """Samples: when it happens, when it is over, and when the error is usual again after that."""
 
@@ -140,10 +123,10 @@ def test_offset_that_the_model_contradicts_is_taken_off_and_forgotten():
     y[HIT:] += 1.0
     end = HIT + 5 * RATE
     found, observer = pendulum(case.t[:end], y[:end])
-    assert observer.state.memory[OFFSET] == pytest.approx(1.0, abs=0.01)
+    assert observer.structure.offset == pytest.approx(1.0, abs=0.01)
     np.testing.assert_allclose(found.z[HIT + RATE :, 0], case.z[HIT + RATE : end, 0], atol=0.01)
     observer.run(case.t[end:], case.y[end:])
-    assert observer.state.memory[OFFSET] == 0.0
+    assert observer.structure.offset == 0.0
 
 
 def test_jumps_are_counted_and_a_snapshot_goes_on_from_them():
@@ -156,7 +139,7 @@ def test_jumps_are_counted_and_a_snapshot_goes_on_from_them():
     one, other = OnlineEstimator(case.parameters), OnlineEstimator(case.parameters)
     one.run(stamps[:middle], y[:middle], np.zeros(middle))
     assert one.offset == pytest.approx(1.0, abs=0.01)
-    other.remember(one.memory)
+    other.load_state_dict(one.state_dict())
     found = other.run(stamps[middle:], y[middle:], np.zeros(len(y) - middle))
     np.testing.assert_array_equal(found.unknown_input, expected.unknown_input[middle:])
 
@@ -167,7 +150,7 @@ def test_sensor_that_is_put_right_is_believed():
     y = case.y.copy()
     y[:HIT] += 1.0
     found, observer = pendulum(case.t, y)
-    assert observer.state.memory[OFFSET] == 0.0
+    assert observer.structure.offset == 0.0
     wrong = np.abs(found.unknown_input - case.d)[HIT + SOON :]
     assert wrong.max() < max(1.5 * case.usual, 0.1 * case.largest)
 
@@ -180,7 +163,7 @@ def test_jump_of_y_leaves_all_but_z1_of_a_plant_without_z1_in_its_model(case):
     found = observer.run(case.t, y)
     jumped = np.flatnonzero(found.status & Status.JUMPED)
     assert jumped.tolist() == [HIT + LOST_SAMPLES]
-    if observer.state.memory[OFFSET] == 0.0:
+    if observer.structure.offset == 0.0:
         np.testing.assert_allclose(found.z[HIT + RATE :, 0], y[HIT + RATE :], atol=0.1)
     wrong = np.abs(found.unknown_input - case.d)[HIT:]
     assert wrong.max() < max(1.5 * case.usual, 0.6 * case.largest)
@@ -289,33 +272,33 @@ def test_covariance_is_that_of_a_kalman_filter():
     values = load(CONFIG / 'models' / 'pendulum.yaml', 'estimator', OBSERVER_PARAMETERS)
     observer, rng = Observer(values), np.random.default_rng(2)
     observer.start(0.5)
-    n, law = observer.levels, observer.law
+    schedule = observer.configuration.schedule
     noise = values['noise_size'] ** 2
-    p, age = observer.state.levels[COVARIANCE:].copy(), 0.0
-    speed = bandwidth(law, law.scalars[CORRECTION_PERIOD])
+    p, age = remembered(observer, 'covariance').copy(), 0.0
     size, rate = values['unknown_input_size'], values['unknown_input_decay']
     intensity = size**2 * (2.0 * rate) ** 7 * 36.0 / 720.0
+    speed = (intensity / (noise * values['correction_period'])) ** (0.5 / observer.levels)
     for _ in range(40):
         h = float(rng.uniform(0.5e-3, 3e-3))
         predicted = observer.step(float('nan'), 0.0)  # changes nothing
         assert predicted.status
-        phi, q = transition(law.chances[:n], intensity, h)
+        phi, q = schedule.linear.transition(h)
         p = phi @ p @ phi.T + q
-        gain = p[:, 0] / (p[0, 0] + doubt_of_noise(age, speed) ** 2 * noise)
+        doubt = 3.0 ** math.exp(-0.5 * age * speed)
+        gain = p[:, 0] / (p[0, 0] + doubt**2 * noise)
         p, age = p - np.outer(gain, p[0]), age + h
         observer.step(0.5, h)
         scale = np.sqrt(np.outer(np.diag(p), np.diag(p)))
         np.testing.assert_allclose(
-            observer.state.levels[COVARIANCE:] / scale, p / scale, atol=1e-6
+            remembered(observer, 'covariance') / scale, p / scale, atol=1e-6
         )
 
 
 def test_steady_covariance_solves_its_equation():
-    law = Observer(load(CONFIG / 'noise_1e-4.yaml', 'estimator', OBSERVER_PARAMETERS)).law
-    n = law.gains.shape[1]
-    a, steady = law.chances[:n], law.chances[n : 2 * n]
-    phi, q = transition(a, law.scalars[INTENSITY], 1e-3)
-    gain = steady[:, 0] / (steady[0, 0] + law.scalars[VARIANCE])
+    values = load(CONFIG / 'noise_1e-4.yaml', 'estimator', OBSERVER_PARAMETERS)
+    schedule = Observer(values).configuration.schedule
+    steady, (phi, q) = schedule.steady, schedule.linear.transition(1e-3)
+    gain = steady[:, 0] / (steady[0, 0] + schedule.variance)
     again = phi @ (steady - np.outer(gain, steady[0])) @ phi.T + q
     scale = np.sqrt(np.outer(np.diag(steady), np.diag(steady)))
     np.testing.assert_allclose(again / scale, steady / scale, atol=1e-8)
@@ -330,10 +313,18 @@ def test_fresh_covariance_is_stationary():
 # influence of innovations (D 32)
 
 
+HUBER, WITHIN, ISOLATED = 2.0, 0.9465, 20
+"""Largest limit, share within it where the noise is normal, samples on one side (D 32)."""
+
+
 def influences(noise):
-    memory = np.zeros(MEMORY)
-    counted = np.array([influence(memory, b, 1.0) for b in noise])
-    return counted, memory
+    """Return as how large innovations of usual size 1 count, and the limits after each."""
+    p = {'structure': 'levant', 'scheme': 'predict_correct', 'correction_period': 1e-3}
+    levant, counted, limits = Levant(ObserverConfiguration(p)), [], []
+    for b in noise:
+        counted.append(levant.bounded(b, 1.0))
+        limits.append(HUBER - levant.narrowed)
+    return np.array(counted), np.array(limits)
 
 
 @pytest.mark.parametrize('contamination', [0.01, 0.05, 0.1])
@@ -346,26 +337,22 @@ def test_limit_is_hubers_for_the_share_of_outliers(contamination):
     tails = np.array([math.erfc(c / math.sqrt(2.0)) for c in expected])
     odds = contamination / (1.0 - contamination)
     limit = expected[np.abs(density - tails - odds).argmin()]  # Huber 1964
-    memory, found = np.zeros(MEMORY), []
-    for b in noise:
-        influence(memory, b, 1.0)
-        found.append(HUBER - memory[NARROWED])
+    _, found = influences(noise)
     assert np.mean(found[count // 3 :]) == pytest.approx(limit, abs=0.12)
 
 
 def test_limit_hardly_matters_with_normal_noise():
     noise = np.random.default_rng(1).standard_normal(30_000)
-    counted, memory = influences(noise)
-    assert memory[NARROWED] < 0.2
+    counted, limits = influences(noise)
+    assert limits[-1] > HUBER - 0.2
     assert np.mean(counted * noise) / np.mean(noise**2) == pytest.approx(WITHIN, abs=0.02)
-    assert 1.0 - beyond(HUBER) == pytest.approx(WITHIN, abs=1e-4)
 
 
 def test_innovations_that_stay_on_one_side_are_no_outliers():
-    counted, memory = influences(np.full(2 * int(ISOLATED), 4.0))
-    assert (counted[: int(ISOLATED)] < 2.1).all()
-    assert (counted[int(ISOLATED) :] == 4.0).all()
-    assert memory[NARROWED] < 0.05
+    counted, limits = influences(np.full(2 * ISOLATED, 4.0))
+    assert (counted[:ISOLATED] < 2.1).all()
+    assert (counted[ISOLATED:] == 4.0).all()
+    assert limits[-1] > HUBER - 0.05
 
 
 # growth (D 22)
@@ -391,8 +378,8 @@ def test_growth_begins_after_so_many_samples():
     values = dict(load(CONFIG / 'noise_1e-3.yaml', 'estimator', OBSERVER_PARAMETERS))
     observer = Observer(values | {'noise_size': 0.0})
     observer.start(0.0)
-    for _ in range(SATURATED_SAMPLES - 1):
+    for _ in range(20 - 1):
         observer.step(1e6, 1e-3)
-    assert observer.state.memory[SCALE] == 1.0
+    assert remembered(observer, 'scale') == 1.0
     observer.step(1e6, 1e-3)
-    assert observer.state.memory[SCALE] == 2.0
+    assert remembered(observer, 'scale') == 2.0

@@ -2,8 +2,8 @@
 """The forward sensitivities and the gamma law, against finite differences of whole runs."""
 
 from fhaosmo_ros.core import Observer
-from fhaosmo_ros.core.observer.arrays import GAMMA, HAT, HAT_SENSITIVITY, TILDE, TILDE_SENSITIVITY
 import numpy as np
+from observer_cases import levels_of
 import pytest
 
 MODELS = {
@@ -13,6 +13,8 @@ MODELS = {
 }
 # Of (s + 4)^N.
 LEVANT_GAINS = {1: [8.0, 16.0], 3: [16.0, 96.0, 256.0, 256.0]}
+Z_HAT, Z_TILDE, P, Q = range(4)
+"""Rows of `levels_of`."""
 HOLD = 1e-300
 """A learning rate that carries the sensitivities along and moves nothing; 0 does neither."""
 DELTA = 1e-8
@@ -74,11 +76,11 @@ def test_sensitivities_are_the_derivatives_of_the_states(model, structure, schem
     opened, moved = set(), np.zeros(observers[0].levels)
     for part in np.array_split(np.arange(len(t)), 40):
         runs = [observer.run(t[part], y[part], u[part]) for observer in observers]
-        middle, below, above = (observer.state.levels for observer in observers)
-        p = (above[HAT] - below[HAT]) / (2.0 * delta)
-        q = (above[TILDE] - below[TILDE]) / (2.0 * delta)
-        np.testing.assert_allclose(middle[HAT_SENSITIVITY], p, **close)
-        np.testing.assert_allclose(middle[TILDE_SENSITIVITY], q, **close)
+        middle, below, above = (levels_of(observer) for observer in observers)
+        p = (above[Z_HAT] - below[Z_HAT]) / (2.0 * delta)
+        q = (above[Z_TILDE] - below[Z_TILDE]) / (2.0 * delta)
+        np.testing.assert_allclose(middle[P], p, **close)
+        np.testing.assert_allclose(middle[Q], q, **close)
         moved = np.maximum(moved, np.abs(p))
         opened |= set(runs[0].open_levels)
     # There was something to compare, at every level (levant's last one has no power: off the
@@ -100,7 +102,7 @@ def test_gamma_moves_down_the_gradient_of_the_loss(model, structure, scheme, gam
         adaptive.run(t[:k], y[:k], u[:k])
         adaptive.configure({'gamma_rate': rate})
         adaptive.run(t[k : k + 1], y[k : k + 1], u[k : k + 1])
-        moved = adaptive.state.memory[GAMMA] - gamma
+        moved = adaptive.structure.gamma - gamma
 
         # Explicit: L at the beginning of the interval, as everything in forward Euler.
         at = k - 1 if scheme == 'explicit' else k
@@ -130,11 +132,11 @@ def test_change_of_variant_starts_the_sensitivities_at_zero(scheme):
     t, y, u = signals('paper')
     observer = make('paper', scheme, 0.5)
     observer.run(t[:100], y[:100], u[:100])
-    assert np.any(observer.state.levels[HAT_SENSITIVITY] != 0.0)
+    assert np.any(levels_of(observer)[P] != 0.0)
     observer.configure({'variant': 'fuzzy'})
     observer.run(t[100:200], y[100:200], u[100:200])
     observer.configure({'variant': 'fuzzy_adaptive'})
-    np.testing.assert_array_equal(observer.state.levels[HAT_SENSITIVITY:], 0.0)
+    np.testing.assert_array_equal(levels_of(observer)[P:], 0.0)
 
 
 @kinds
@@ -148,7 +150,7 @@ def test_without_learning_nothing_is_carried_along_and_the_estimates_are_the_sam
     one, other = (observer.run(t, y, u) for observer in (learning, resting))
     np.testing.assert_array_equal(one.z_hat, other.z_hat)
     np.testing.assert_array_equal(one.z_tilde, other.z_tilde)
-    assert np.any(learning.state.levels[HAT_SENSITIVITY:] != 0.0)
-    np.testing.assert_array_equal(resting.state.levels[HAT_SENSITIVITY:], 0.0)
+    assert np.any(levels_of(learning)[P:] != 0.0)
+    np.testing.assert_array_equal(levels_of(resting)[P:], 0.0)
     learning.configure({'gamma_rate': 0.0})
-    np.testing.assert_array_equal(learning.state.levels[HAT_SENSITIVITY:], 0.0)
+    np.testing.assert_array_equal(levels_of(learning)[P:], 0.0)

@@ -32,4 +32,4 @@ def test_site_builds_and_its_links_lead_somewhere(tmp_path):
             if not target.exists() or (place and place not in places.get(target.name, {place})):
                 lost.append((path.name, link))
     assert not lost
-    assert 'Observer.smooth' in (tmp_path / 'site' / 'api.html').read_text()
+    assert 'Observer.smooth' in (tmp_path / 'site' / 'offline.html').read_text()

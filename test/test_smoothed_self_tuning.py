@@ -4,7 +4,7 @@
 import math
 
 from fhaosmo_ros.core import Observer, OnlineEstimator
-from fhaosmo_ros.core.observer.covariance import STATES_DOUBT
+from fhaosmo_ros.core.observer.kalman import STATES_DOUBT
 import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov
@@ -212,6 +212,25 @@ def test_a_quick_d_that_comes_back_is_not_taken_for_noise(seed):
     number = np.searchsorted(stamps, found.t)
     late = number > pause.stop + 200
     assert rms(found.unknown_input[late] - d[number[late]]) < 0.2 * rms(d)
+
+
+@pytest.mark.parametrize('lag', [0.0, 0.05])
+def test_an_input_beyond_all_numbers_is_forgotten(lag):
+    """The observer rejects it or begins afresh; its own estimates stand where no number can."""
+    y = 1e-3 * np.random.default_rng(1).standard_normal(3000)
+    u = np.zeros(3000)
+    u[2000:2005] = 1e308
+    estimator = online(phi=['0', 'u - 3*z2'], smoothing_lag=lag)
+    if not lag:
+        estimator.smooth()
+    rows = [estimator.run(MS * np.arange(1, 3001), y, u), estimator.finish()]
+    for row in rows:
+        assert np.isfinite(row.z).all()
+        assert np.isfinite(row.unknown_input).all()
+        assert not np.isnan(row.standard_deviation).any()
+    d = np.concatenate([row.unknown_input for row in rows])
+    assert len(d) > 2990
+    assert np.abs(d[-900:]).max() < 10.0
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2, 13])

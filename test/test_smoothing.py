@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimates from the samples before and after: theorems of smoothing, faults of data, lags."""
 
+import copy
 import json
+import pickle
 
 from fhaosmo_ros.core import Observer, OnlineEstimator, Plant
 from fhaosmo_ros.core.observer import smoother
-from fhaosmo_ros.core.observer.covariance import INPUT_DOUBT, STATES_DOUBT
+from fhaosmo_ros.core.observer.kalman import INPUT_DOUBT, STATES_DOUBT
+from fhaosmo_ros.core.observer.smoothing import BEGINS, MEASURED
 from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from studies import differentiation, document
+from studies import differentiation
 
 CONFIG = 'config/noise_1e-3.yaml'
 MS = 1_000_000
@@ -315,13 +318,83 @@ def test_any_data_gives_finite_estimates(seed):
             assert np.isfinite(estimator.finish().unknown_input).all()
 
 
-# docs/smoothing.md
+def rows_of(observer, y):
+    """Return what `Smoother.take` takes: samples at 1 kHz of an observer that estimates 0."""
+    count, levels = len(y), observer.levels
+    z, none = np.zeros((count, levels)), np.empty((count, 0))
+    samples = y, np.full(count, 1e-3), np.zeros((count, len(observer.inputs)))
+    kinds = np.full(count, MEASURED)
+    kinds[0] = BEGINS
+    return [z, np.zeros_like(z), samples, MS * np.arange(count), kinds, none, none]
 
 
-def test_the_page_says_what_was_measured():
-    results = json.loads(differentiation.PAGE.with_suffix('.json').read_text())
-    shown = document.parts(differentiation.PAGE.read_text())
-    assert shown == differentiation.texts(results)
+@pytest.mark.parametrize('lag', [None, 5 * MS])
+@pytest.mark.parametrize('bad', ['y', 'u', 'h', 'estimate'])
+def test_what_is_not_finite_leaves_the_observers_own_estimates(bad, lag):
+    """Where numbers overflow the observer's estimate stands; elsewhere it is smoothed."""
+    observer = Observer(Observer.from_yaml(CONFIG).parameters | {'phi': ['0', '0', 'u - z3']})
+    y = NOISE * np.random.default_rng(1).standard_normal(400)
+    clean, broken = rows_of(observer, y), rows_of(observer, y.copy())
+    if bad == 'y':
+        broken[2][0][200] = np.nan
+    elif bad == 'u':
+        broken[2][2][200:205] = 1e308
+    elif bad == 'h':
+        broken[2][1][200] = 1e300
+    else:
+        broken[0][200] = 1e200
+    found = []
+    for rows in (clean, broken):
+        smoothing = smoother.Smoother(observer.configuration, lag)
+        smoothing.take(*rows)
+        found.append(np.concatenate([smoothing.due(), smoothing.finish()])[:, 0])
+    assert np.isfinite(found[1]).all()
+    assert len(found[1]) == len(y)
+    others = np.arange(len(y)) != 200
+    assert np.abs(found[1][others] - found[0][others])[:, 0].max() < 3.0 * NOISE
+    # Where nothing passes, y is smoothed on both sides: the estimates are not just the observer's.
+    assert np.abs(found[1][210:, 0]).min() > 0.0
+
+
+def test_arrays_of_wrong_sizes_are_refused():
+    observer = Observer.from_yaml(CONFIG)
+    smoothing = smoother.Smoother(observer.configuration)
+    rows = rows_of(observer, np.zeros(5))
+    for index in (0, 4, 3):
+        wrong = list(rows)
+        wrong[index] = wrong[index][:3]
+        with pytest.raises(ValueError, match='shape'):
+            smoothing.take(*wrong)
+    with pytest.raises(ValueError, match='another model'):
+        smoothing.configure(Observer.from_yaml('config/models/pendulum.yaml').configuration)
+    assert smoothing.waiting == 0
+    smoothing.take(*rows)
+    assert len(smoothing.finish()) == 5
+
+
+COPIES = (copy.copy, copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e)))  # noqa: S301
+
+
+@pytest.mark.parametrize('way', COPIES)
+@pytest.mark.parametrize('gains', ['fixed', 'self_tuning'])
+def test_a_copy_goes_on_alike(way, gains):
+    t, y, _ = recording(1.5)
+    stamps = np.round(t * 1e9).astype(np.int64) + MS
+    one = online(smoothing_lag=0.05)
+    if gains == 'self_tuning':
+        one = OnlineEstimator({'gains': 'self_tuning', 'smoothing_lag': 0.05})
+    one.run(stamps[:900], y[:900])
+    found = [e.run(stamps[900:], y[900:]) for e in (way(one), one)]
+    for name in ('t', 'unknown_input', 'standard_deviation'):
+        np.testing.assert_array_equal(getattr(found[0], name), getattr(found[1], name))
+    assert len(found[0].t) == len(t) - 900
+
+
+# docs/smoothing.json
+
+
+def test_the_results_are_what_the_study_measures():
+    results = json.loads(differentiation.RESULTS.read_text())
     name = 'models/pendulum'
     assert differentiation.with_file(name) == pytest.approx(results['files'][name], rel=0.02)
     found = differentiation.with_file(name, self_tuning=True)

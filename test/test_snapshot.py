@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A snapshot holds all that an estimator needs to go on bit for bit."""
 
+import re
+
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.online.memory import Flag, labels, pack, Snapshot, unpack
+from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot, unpack
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 import pytest
@@ -32,13 +34,13 @@ def test_another_estimator_goes_on_bit_for_bit(parameters):
     first, second = OnlineEstimator(parameters), OnlineEstimator(parameters)
     feed(first, 0, 1500)
     first.set_input(0.25)
-    kept = pack(Snapshot(first.latest, Flag.CHANGED, first.memory))
-    assert len(kept) == len(labels(first.observer.levels))
-    snapshot = unpack(kept.tolist(), labels(first.observer.levels))
+    labels, kept = pack(Snapshot(first.latest, Flag.CHANGED, first.state_dict()))
+    assert len(kept) == len(labels)
+    snapshot = unpack(kept.tolist(), labels)
     assert snapshot.stamp == first.stamp
     assert snapshot.flags == Flag.CHANGED
     feed(second, 0, 100)  # whatever it was before
-    second.remember(snapshot.memory)
+    second.load_state_dict(snapshot.values)
     assert second.inputs == (0.25,)
     assert second.stamp == first.stamp
     np.testing.assert_array_equal(feed(second, 1500, 3000), feed(first, 1500, 3000))
@@ -47,45 +49,75 @@ def test_another_estimator_goes_on_bit_for_bit(parameters):
 def test_labels_name_what_stands_there():
     estimator = OnlineEstimator()
     feed(estimator, 0, 700)
-    vector = pack(Snapshot(estimator.latest, Flag(0), estimator.memory))
-    entries = dict(zip(labels(estimator.observer.levels), vector.tolist(), strict=True))
+    labels, vector = pack(Snapshot(estimator.latest, Flag(0), estimator.state_dict()))
+    entries = dict(zip(labels, vector.tolist(), strict=True))
     assert len(entries) == len(vector)  # no name twice
-    state = estimator.observer.state
-    assert entries['z_hat2'] == state.levels[0, 1]
-    assert entries['z_tilde1'] == state.levels[1, 0]
+    assert labels[0] == 'version'
+    state = estimator.observer.state.values
+    assert entries['z_hat2'] == state['z_hat'][1]
+    assert entries['z_tilde1'] == state['z_tilde'][0]
     assert entries['gamma'] == estimator.estimate.gamma
-    assert entries['y'] == state.memory[1]
+    assert entries['y'] == state['y']
     assert int(entries['stamp_upper']) * 2**32 + int(entries['stamp_lower']) == estimator.stamp
     assert int(entries['sec']) * 10**9 + int(entries['nanosec']) == estimator.stamp
 
 
 @pytest.mark.parametrize('integer', [0, 1, -1, 2**63 - 1, -(2**63), 1_700_000_000_123_456_789])
 def test_integers_come_back_exactly(integer):
-    memory = OnlineEstimator().memory
-    memory.integers[:] = integer
-    back = unpack(pack(Snapshot(5, Flag(0), memory)), labels(4))
-    np.testing.assert_array_equal(back.memory.integers, memory.integers)
+    times = ('stamp', 'latest', 'now', 'held_stamp', 'seen', 'tick', 'placed', 'event_since')
+    values = OnlineEstimator().state_dict() | dict.fromkeys(times, integer)
+    labels, vector = pack(Snapshot(5, Flag(0), values))
+    back = unpack(vector, labels).values
+    assert [back[name] for name in times] == [integer] * len(times)
+    estimator = OnlineEstimator()
+    estimator.load_state_dict(back)
+    assert estimator.state_dict()['latest'] == integer
 
 
-@pytest.mark.parametrize('names', [
-    [], ['flags'], [*labels(4)[:-1], 'u', 'u'], [*labels(4), 'mystery'], [*labels(4), 'z_hat9'],
+LATE = {'gains': 'fixed', 'measurement_delay': 0.1, 'phi': ['u', '0', '0']}
+
+
+def damaged(change):
+    """Return the state of an estimator after a change of its dictionary."""
+    estimator = OnlineEstimator(LATE)
+    feed(estimator, 0, 100)
+    values = estimator.state_dict()
+    change(values)
+    return values
+
+
+@pytest.mark.parametrize(('name', 'number'), [
+    ('past_place', -1), ('past_place', 512), ('past_count', 513), ('event', 6), ('intervals', 33),
+    ('regular', -1), ('frozen', 2), ('latest', 2**63), ('latest', 0.5), ('latest', 'x'),
+    ('mean_interval', -1.0), ('mean_interval', np.nan), ('held_y', np.inf), ('z_hat', np.zeros(3)),
+    ('z_hat', np.full(4, np.nan)), ('past_pieces', np.full((512, 2), np.inf)), ('u', np.zeros(2)),
+    ('past_latest', None), ('version', 3), ('spread', 0.0),
 ])  # fmt: skip
-def test_vector_of_other_entries_is_refused(names):
-    with pytest.raises(ValueError, match='entries'):
-        unpack(np.zeros(len(names)), names)
-    with pytest.raises(ValueError, match='8 entries'):
-        unpack(np.zeros(8), labels(4))
+def test_a_number_that_can_not_be_is_refused_and_changes_nothing(name, number):
+    estimator = OnlineEstimator(LATE)
+    feed(estimator, 0, 50)
+    before = estimator.state_dict()
+    for values in (damaged(lambda d: d.update({name: number})), damaged(lambda d: d.pop(name))):
+        with pytest.raises(ConfigurationError, match='snapshot'):
+            estimator.load_state_dict(values)
+        after = estimator.state_dict()
+        assert before.keys() == after.keys()
+        for key, value in before.items():
+            np.testing.assert_array_equal(value, after[key])
 
 
-def test_what_an_older_version_did_not_remember_is_0():
-    vector = pack(Snapshot(5, Flag(0), OnlineEstimator().memory)) + 1.0
-    names = labels(4)
-    k = names.index('lost_since_upper')
-    old = np.delete(vector, [k, k + 1])
-    found = unpack(old, names[:k] + names[k + 2 :])
-    wanted = np.array(vector)
-    wanted[[k, k + 1]] = 0.0
-    np.testing.assert_array_equal(pack(found), wanted)
+def test_vector_of_other_entries_is_refused():
+    labels, vector = pack(Snapshot(5, Flag(0), OnlineEstimator().state_dict()))
+    with pytest.raises(ConfigurationError, match='entries'):
+        unpack(np.zeros(8), labels)
+    with pytest.raises(ConfigurationError, match='entries'):
+        unpack(vector, [*labels[:-1], labels[0]])
+    for names in ([], ['flags'], labels[4:]):
+        with pytest.raises(ConfigurationError, match='version'):
+            unpack(np.zeros(len(names)), names)
+    for name in ('z_hat9999999', 'z_hat6', 'z_hat0', 'covariance1', 'z_hat1_1'):
+        with pytest.raises(ConfigurationError, match='snapshot'):
+            unpack([*vector, 0.0], [*labels, name])
 
 
 def test_snapshot_of_several_inputs():
@@ -94,39 +126,71 @@ def test_snapshot_of_several_inputs():
     first.set_input(0.5, 0)
     first.set_input(-2.0, 1)
     feed(first, 0, 50)
-    names = labels(first.observer.levels, first.observer.inputs)
-    second.remember(unpack(pack(Snapshot(first.latest, Flag(0), first.memory)), names).memory)
+    labels, vector = pack(Snapshot(first.latest, Flag(0), first.state_dict()))
+    second.load_state_dict(unpack(vector, labels).values)
     assert second.inputs == (0.5, -2.0)
     np.testing.assert_array_equal(feed(second, 50, 90), feed(first, 50, 90))
-    with pytest.raises(ConfigurationError, match='1 known inputs, got 2'):
-        OnlineEstimator(parameters | {'inputs': ['u'], 'phi': ['0', 'u']}).remember(first.memory)
+    other = OnlineEstimator(parameters | {'inputs': ['u'], 'phi': ['0', 'u']})
+    with pytest.raises(ConfigurationError, match='expected finite numbers of shape'):
+        other.load_state_dict(first.state_dict())
 
 
-def test_memory_of_another_size_is_refused_and_changes_nothing():
+def test_state_of_another_size_is_refused_and_changes_nothing():
     estimator = OnlineEstimator()
     feed(estimator, 0, 100)
-    before = estimator.memory
-    with pytest.raises(ConfigurationError, match='4 levels'):
-        estimator.remember(
-            OnlineEstimator({'order': 2, 'phi': ['0', '0'], 'gains': 'fixed'}).memory
-        )
-    for mine, was in zip(estimator.memory, before, strict=True):
-        np.testing.assert_array_equal(mine, was)
+    before = estimator.state_dict()
+    small = OnlineEstimator({'order': 2, 'phi': ['0', '0'], 'gains': 'fixed'})
+    with pytest.raises(ConfigurationError, match=r'\(4,\)'):
+        estimator.load_state_dict(small.state_dict())
+    for name, value in estimator.state_dict().items():
+        np.testing.assert_array_equal(value, before[name])
+
+
+def as_of_version_1(estimator, left_out=()):
+    """Return labels and vector as bags of version 1 have them, which may lack some entries."""
+    labels, vector = pack(Snapshot(estimator.latest, Flag.CHANGED, estimator.state_dict()))
+    entries = dict(zip(labels, vector.tolist(), strict=True))
+    del entries['version'], entries['past_latest1']
+    entries['u'] = entries.pop('u1')
+    old = {'p': 'z_hat_sensitivity', 'q': 'z_tilde_sensitivity', 'mean_interval': 'interval'}
+    renamed = {}
+    for label, value in entries.items():
+        before, name, place = re.fullmatch('(before_)?(.*?)([0-9_]*)', label).groups('')
+        renamed[before + old.get(name, name) + place] = value
+    kept = {k: v for k, v in renamed.items() if not k.removeprefix('before_').startswith(left_out)}
+    return list(kept), list(kept.values())
 
 
 @pytest.mark.parametrize('scheme', ['implicit', 'explicit'])
-def test_snapshot_without_the_covariance_is_followed(scheme):
-    """As of an older version, which remembered less."""
+@pytest.mark.parametrize('left_out', [
+    ('none',), ('covariance', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread'),
+    ('lost_since', 'event', 'repeats', 'sample'),
+])  # fmt: skip
+def test_snapshot_of_an_older_version_is_followed(scheme, left_out):
+    """The oldest ones remembered less."""
     parameters = {'scheme': scheme, 'structure': 'levant', 'lambda': [8.0, 20.0, 30.0, 16.0]}
     first, second = OnlineEstimator(parameters), OnlineEstimator(parameters)
     feed(first, 0, 1500)
-    later = ('covariance', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread')
-    vector = pack(Snapshot(first.latest, Flag.CHANGED, first.memory))
-    kept = {
-        label: value
-        for label, value in zip(labels(first.observer.levels), vector, strict=True)
-        if not label.removeprefix('before_').startswith(later)
-    }
-    assert len(kept) < len(vector)
-    second.remember(unpack(list(kept.values()), list(kept)).memory)
+    labels, vector = as_of_version_1(first, left_out)
+    second.load_state_dict(unpack(vector, labels).values)
     np.testing.assert_array_equal(feed(second, 1500, 3000), feed(first, 1500, 3000))
+
+
+def test_members_of_an_older_version_are_said_not_to_be_followed():
+    estimator = OnlineEstimator()
+    feed(estimator, 0, 2)
+    labels, vector = as_of_version_1(estimator)
+    with pytest.raises(ConfigurationError, match='members of version 1 can not be followed'):
+        unpack([*vector, 0.0], [*labels, 'm1'])
+
+
+@pytest.mark.parametrize('parameters', [
+    {}, {'structure': 'levant'}, {'order': 2, 'phi': ['0', '0'], 'gains': 'self_tuning'},
+])  # fmt: skip
+def test_no_name_means_two_things(parameters):
+    estimator = OnlineEstimator(parameters)
+    feed(estimator, 0, 200)
+    parts = [estimator.observer.structure.state_dict(), estimator.policy.memory]
+    names = [name for part in (*parts, estimator.events.memory) for name in part]
+    assert len(names) == len(set(names))
+    assert set(estimator.state_dict()) >= set(names)

@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of time: each case of docs/operation.md, its effect and its counter."""
+"""Faults of time: each case of docs/node.md, its effect and its counter."""
 
 import itertools
 import math
 
 from fhaosmo_ros.core import Observer, Plant
-from fhaosmo_ros.core.observer.arrays import make_work, TILDE, Y
-from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.prediction import predicted_measurement
 from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.online.gaps import MOST_SUB_STEPS
+from fhaosmo_ros.core.online.policy import MOST_SUB_STEPS
 import numpy as np
+from observer_cases import levels_of
 import pytest
 from scipy.integrate import solve_ivp
 from studies import stamps
@@ -42,7 +40,7 @@ def only(estimator: OnlineEstimator, **expected: int) -> None:
 
 
 def same(estimator: OnlineEstimator, other: OnlineEstimator) -> None:
-    np.testing.assert_array_equal(estimator.observer.state.levels, other.observer.state.levels)
+    np.testing.assert_array_equal(levels_of(estimator.observer), levels_of(other.observer))
     assert estimator.estimate.gamma == other.estimate.gamma
 
 
@@ -200,15 +198,19 @@ def test_prediction_is_the_plant_to_fourth_order(decay):
         return [z[1] + u - z[0], z[2] + np.sin(z[0]), z[3] - z[2] * z[1], -decay * z[3]]
 
     truth = solve_ivp(slope, (0.0, 0.5), [*start, d], rtol=1e-12, atol=1e-12).y[0, -1]
-    p = {'phi': ['u - z1', 'sin(z1)', '-z3*z2'], 'unknown_input_decay': decay}
-    configuration = ObserverConfiguration(p)
-    state = configuration.initial_state()
-    state.memory[Y], state.levels[TILDE] = start[0], [start[1], start[2], d, 9.9]
-    law, work = configuration.law, make_work(configuration.law, configuration.model.depth)
-    errors = [
-        abs(predicted_measurement(law, work, state, 0.5 / n, np.array([u]), n) - truth)
-        for n in (10, 20, 40)
-    ]
+
+    def predicted(n):
+        estimator = OnlineEstimator({
+            'phi': ['u - z1', 'sin(z1)', '-z3*z2'], 'unknown_input_decay': decay,
+            'gains': 'fixed', 'predict_to_now': True, 'prediction_step': 0.5 / n,
+            'measurement_delay': 0.5, 'input_delay': 0.5,
+        })  # fmt: skip
+        estimator.set_input(u)
+        estimator.update(START, 0.0)
+        estimator.seed(start, d)
+        return estimator.estimate.z[0]
+
+    errors = [abs(predicted(n) - truth) for n in (10, 20, 40)]
     assert errors[-1] < 1e-8
     np.testing.assert_allclose(np.array(errors[:-1]) / errors[1:], 16.0, rtol=0.2)
 
@@ -253,7 +255,7 @@ def test_bridge_ends_where_steps_at_the_predicted_samples_end():
     estimator.update(START + 40 * MS, 0.9)
     for y in (0.6, 0.7, 0.8, 0.9):
         observer.step(y, 0.01)
-    np.testing.assert_allclose(estimator.observer.state.levels, observer.state.levels, atol=1e-12)
+    np.testing.assert_allclose(levels_of(estimator.observer), levels_of(observer), atol=1e-12)
 
 
 def test_model_that_has_no_prediction_is_bridged_in_a_straight_line():
@@ -271,10 +273,10 @@ def test_step_that_fails_within_a_bridge_leaves_the_state_as_it_was():
     )
     estimator.update(START, 0.5)
     estimator.update(START + 5 * MS, 0.6)
-    before = estimator.observer.state.levels
+    before = levels_of(estimator.observer)
     status = estimator.update(START + 45 * MS, 1e9).status
     assert status == Status.GAP | Status.REJECTED_STEP
-    np.testing.assert_array_equal(estimator.observer.state.levels, before)
+    np.testing.assert_array_equal(levels_of(estimator.observer), before)
 
 
 def test_number_of_sub_steps_is_bounded():

@@ -27,7 +27,7 @@ from fhaosmo_ros.tools.tuning.start.sampled_model import SampledModel
 from fhaosmo_ros.tools.tuning.start.theory import kalman_like
 from fhaosmo_ros.tools.tuning.tuner import Tuner
 import numpy as np
-from studies.comparison.methods.constant_gain import estimates
+from studies.comparison.methods.linear import estimates
 
 ROOT = Path(__file__).resolve().parents[1]
 PHI = ['0', '0', '-z3']

@@ -83,6 +83,50 @@ class Field(NamedTuple):
         """Name of the element of a list that is meant, '' if it is not meant by name."""
         return next((s.name for s in reversed(self.steps) if isinstance(s, Key)), '')
 
+    def value(self, message: Any) -> float:
+        """
+        Return the number in a message object, of rclpy or of rosbags.
+
+        Raises
+        ------
+        MissingElementError
+            A list of the message is too short, or lacks the name.
+
+        """
+        around, node = message, message
+        for step in self.steps:
+            if isinstance(step, str):
+                around, node = node, getattr(node, step)
+                continue
+            index = step if isinstance(step, int) else self._index(step, around)
+            if index >= len(node):
+                problem = (
+                    'expected an index below the number of elements, '
+                    f'{len(node)} in one message, got {index}'
+                )
+                if isinstance(step, Key):  # the same text wherever the name stands
+                    problem = f'expected an element for each name, got none for {step.name!r}'
+                raise MissingElementError(f'field {self.text!r}: {problem}')
+            node = node[index]
+        if self.angle:
+            return angle_of(self.angle, around.x, around.y, around.z, around.w)
+        return float(node)
+
+    def _index(self, key: Key, around: Any) -> int:
+        names = getattr(around, key.names)
+        if key.name not in names:
+            raise MissingElementError(
+                f'field {self.text!r}: expected a name that is in the message '
+                f'({", ".join(names) or "which has none"}), got {key.name!r}'
+                f'{suggestion(key.name, names)}'
+            )
+        return int(names.index(key.name))
+
+    def stamp(self, message: Any) -> int:
+        """Return the stamp of the header that the message begins with, in nanoseconds."""
+        stamp = getattr(message, self.types[self.message_type][1][0][0]).stamp
+        return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
 
 class MissingElementError(ConfigurationError):
     """One message does not have the element of a list that is meant; others may."""

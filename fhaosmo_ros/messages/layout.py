@@ -52,9 +52,9 @@ class Layout(NamedTuple):
     missing: str = ''
 
 
-def locate(field: Field, data: bytes, width: int = 1) -> Layout:
+def locate(field: Field, data: bytes) -> Layout:
     """
-    Find a field, the first of `width` neighbours, in a message.
+    Find a field in a message.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def locate(field: Field, data: bytes, width: int = 1) -> Layout:
     """
     if len(data) < HEADER:
         raise ValueError(SHORTER)
-    walk = _Walk(field, data, width)
+    walk = _Walk(field, data)
     offset, missing = -1, ''
     try:
         offset = walk.to_number()
@@ -72,7 +72,7 @@ def locate(field: Field, data: bytes, width: int = 1) -> Layout:
         missing = str(error)
     except (struct.error, IndexError, UnicodeDecodeError):
         offset = len(data)
-    if offset + max(width, field.width) * field.kind.itemsize > len(data):
+    if offset + field.width * field.kind.itemsize > len(data):
         raise ValueError(SHORTER)
     same = [(0, data[:HEADER]), *sorted(walk.same.items())]
     return Layout(offset, same, walk.order, missing)
@@ -81,8 +81,8 @@ def locate(field: Field, data: bytes, width: int = 1) -> Layout:
 class _Walk:
     """Parses a message as far as the field; positions count from behind its first four bytes."""
 
-    def __init__(self, field: Field, data: bytes, width: int) -> None:
-        self._field, self._data, self._width = field, data, width
+    def __init__(self, field: Field, data: bytes) -> None:
+        self._field, self._data = field, data
         self.order = '<' if data[1] & 1 else '>'
         self.same: dict[int, bytes] = {}
 
@@ -99,11 +99,10 @@ class _Walk:
             count = node[1][1]
             if node[0] == SEQUENCE:
                 count, position = self._length(position)
-            last = index + self._width - 1
-            if last >= count:
+            if index >= count:
                 problem = (
                     'expected an index below the number of elements, '
-                    f'{count} in one message, got {last}'
+                    f'{count} in one message, got {index}'
                 )
                 if isinstance(step, Key):  # the same text wherever the name stands
                     problem = f'expected an element for each name, got none for {step.name!r}'
@@ -199,7 +198,7 @@ def names_in(types: Any, message_type: str, data: bytes, names: str = 'name') ->
 
     """
     field = Field(names, [], np.dtype('u1'), False, types, message_type)
-    walk = _Walk(field, data, 1)
+    walk = _Walk(field, data)
     try:
         return walk.names(*walk.to(message_type, names, 0))
     except (struct.error, IndexError, UnicodeDecodeError):

@@ -2,7 +2,6 @@
 """The plant node: simulates a triangular system and publishes y and the truth."""
 
 from collections.abc import Mapping
-from copy import deepcopy
 from functools import partial
 import math
 from typing import Any, NamedTuple
@@ -11,7 +10,6 @@ from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.tables import PLANT_NODE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import Plant
-from fhaosmo_ros.nodes.middleware.loading import Loading, without_blas
 from fhaosmo_ros.nodes.middleware.messages import array_encoder, double_encoder
 from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
 from fhaosmo_ros.nodes.middleware.publishers import check_overrides, create_publisher
@@ -74,18 +72,7 @@ class PlantNode(Node):
             if name in self.plant.model.used_inputs:
                 take = partial(self._on_input, index, name)
                 self.create_subscription(Float64, name, take, 10)
-        self._timer: Any = None
         self._node_parameters.on_change(self._prepare, self._adopt)
-        copy = deepcopy(self.plant)
-
-        def load() -> None:
-            with without_blas():
-                copy.sample(0.0)
-
-        self._loading = Loading(self, load, self._begin)
-
-    def _begin(self) -> None:
-        values = self._node_parameters.values
         self.plant.sample(0.0)
         self._timer = self._start_timer(values['sample_rate'])
         self.get_logger().info(
@@ -158,7 +145,7 @@ class PlantNode(Node):
             self.plant.configure(change.simulation)
         else:
             self.plant.adopt(change.simulation)
-        if 'sample_rate' in change.changes and self._timer is not None:
+        if 'sample_rate' in change.changes:
             self.destroy_timer(self._timer)
             self._timer = self._start_timer(change.changes['sample_rate'])
 

@@ -109,7 +109,7 @@ def _once(
     begin, now = time.monotonic_ns(), None
     total = sum(reader.count(topic) for topic in topics)
     with progress(total=total, unit='message', desc=f'play {turn}', unit_scale=True) as bar:
-        for topic, stamp, data in reader.messages(topics):
+        for topic, stamp, data, _ in reader.messages(topics):
             if now is None:
                 first = now = stamp
                 player.tick(now)

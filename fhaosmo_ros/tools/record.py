@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record y and the estimator's topics to a bag, or repair a bag that is cut or damaged."""
+"""Record y and the estimator's topics to a bag."""
 
 import argparse
 from collections.abc import Callable, Mapping
@@ -19,11 +19,10 @@ from fhaosmo_ros.core.parameters.per_channel import channel_names, of_channel
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.bags.repair import repair
 from fhaosmo_ros.tools.bags.types import make_qos, TYPES
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import run_command
-from fhaosmo_ros.tools.cli.output import named, Output
+from fhaosmo_ros.tools.cli.output import named
 from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.topics import OF_ALL_NODES
 from tqdm import tqdm
@@ -40,16 +39,12 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.repair:
-        final = arguments.output or Path(f'{arguments.repair.resolve().stem}_repaired')
-        with Output(final, arguments.force) as output:
-            with stop.raising():
-                count, missing = repair(arguments.repair, output.path, arguments.storage)
-            output.keep()
-        for part in missing:
-            print(f'record: missing: {part}', file=sys.stderr)
-        print(f'saved {count} messages: {final}')
-    else:
-        _record(arguments, stop)
+        raise ConfigurationError(
+            '--repair: expected another tool, since record repairs no more: a file that was cut '
+            'is read as it is; `mcap recover` or .recover of sqlite3 saves what is whole of a '
+            'damaged one, and `ros2 bag reindex` makes its metadata.yaml'
+        )
+    _record(arguments, stop)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -64,12 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     choice = parser.add_mutually_exclusive_group()
     choice.add_argument('--topics', nargs='+', metavar='TOPIC', help='these topics only')
     choice.add_argument('--all', action='store_true', help='every topic that has a publisher')
-    choice.add_argument(
-        '--repair',
-        type=Path,
-        metavar='BAG',
-        help='record nothing: save what is whole of a bag that is cut or damaged',
-    )
+    choice.add_argument('--repair', help=argparse.SUPPRESS)
     add(
         '--names',
         nargs='+',
@@ -102,7 +92,7 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
         for topic in arguments.topics:
             if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', topic):
                 raise ConfigurationError(f'--topics: expected a name such as /y, got {topic!r}')
-    # Here, so that --help and --repair need no ROS.
+    # Here, so that --help needs no ROS.
     from fhaosmo_ros.nodes.recording.topic_recorder import TopicRecorder
 
     names = [f'/{name.strip("/")}' for name in arguments.names]
@@ -123,7 +113,7 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
             count = _drain(queue, recorder.problems, bag, arguments.duration, stop)
             lost = dict(recorder.lost)
     except (OSError, sqlite3.Error) as error:
-        hint = f'; record --repair {path} saves what is there' if path.exists() else ''
+        hint = '; its storage file can be read as far as it goes' if path.exists() else ''
         raise ConfigurationError(
             f'output {path}: expected a place that can be written, got: '
             f'{getattr(error, "strerror", None) or error}{hint}'

@@ -76,8 +76,6 @@ def measure(solvers: tuple[str, ...], tick: Any) -> dict[str, findings.Scores]:
     """Return the scores of the paper's four observers and of ours by solver."""
     scores: dict[str, findings.Scores] = {solver: {} for solver in solvers}
     tasks = [(name, w, s) for s in solvers for name in OBSERVERS for w in cases.FREQUENCIES]
-    # The last one first and in this thread, where Ctrl-C can end the compiler.
-    findings.run(*tasks[-1])
     pool = ThreadPoolExecutor(os.cpu_count())  # the integration releases the GIL
     try:
         runs = pool.map(lambda task: findings.run(*task), tasks)

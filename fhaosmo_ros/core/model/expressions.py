@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Expressions from outside, parsed into bytecode by a whitelist.
+Expressions from outside, parsed into the operations of `phi.Expressions` by a whitelist.
 
 Python's own parser reads the text (as syntax only); every node that is not on the list is refused.
 Nothing is evaluated by Python, so an expression can't run anything.
@@ -15,10 +15,9 @@ from types import MappingProxyType
 from typing import NamedTuple
 import warnings
 
-from fhaosmo_ros.core.model import bytecode
+from fhaosmo_ros.core.model import phi
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-import numpy as np
 
 MAX_LENGTH = 500
 MAX_NESTING = 50
@@ -33,32 +32,32 @@ MAX_FUNCTIONS = 30
 """Functions of one expression."""
 
 FUNCTIONS = {
-    'sin': bytecode.SIN,
-    'cos': bytecode.COS,
-    'tan': bytecode.TAN,
-    'exp': bytecode.EXP,
-    'log': bytecode.LOG,
-    'sqrt': bytecode.SQRT,
-    'abs': bytecode.ABS,
-    'tanh': bytecode.TANH,
-    'sign': bytecode.SIGN,
+    'sin': phi.SIN,
+    'cos': phi.COS,
+    'tan': phi.TAN,
+    'exp': phi.EXP,
+    'log': phi.LOG,
+    'sqrt': phi.SQRT,
+    'abs': phi.ABS,
+    'tanh': phi.TANH,
+    'sign': phi.SIGN,
 }
 """Functions of one argument."""
 FUNCTIONS_OF_SEVERAL = {
-    'atan2': bytecode.ATAN2,
-    'min': bytecode.MIN,
-    'max': bytecode.MAX,
+    'atan2': phi.ATAN2,
+    'min': phi.MIN,
+    'max': phi.MAX,
 }
 """Functions of two arguments; min and max also take more."""
 NUMBERS = {'pi': math.pi}
 """Names of numbers."""
 KNOWN = [*FUNCTIONS, *FUNCTIONS_OF_SEVERAL, *NUMBERS]
 OPERATORS: dict[type[ast.operator], int] = {
-    ast.Add: bytecode.ADD,
-    ast.Sub: bytecode.SUB,
-    ast.Mult: bytecode.MUL,
-    ast.Div: bytecode.DIV,
-    ast.Pow: bytecode.POW,
+    ast.Add: phi.ADD,
+    ast.Sub: phi.SUB,
+    ast.Mult: phi.MUL,
+    ast.Div: phi.DIV,
+    ast.Pow: phi.POW,
 }
 
 
@@ -150,7 +149,7 @@ def parse(text: str, level: int, names: Names = ONLY_U) -> list[Instruction]:
         raise parser.error('this is not an arithmetic expression') from None
     parser.check_work(body)
     instructions = parser.emit(body, 0)
-    return [] if instructions == [Instruction(bytecode.CONST, 0.0)] else instructions
+    return [] if instructions == [Instruction(phi.CONST, 0.0)] else instructions
 
 
 class _Parser:
@@ -158,10 +157,10 @@ class _Parser:
         self.text = text
         self.level = level
         self.others = [*names.inputs, *names.constants]
-        self.names = {f'z{j + 1}': Instruction(bytecode.STATE, j) for j in range(level)}
-        self.names |= {n: Instruction(bytecode.INPUT, k) for k, n in enumerate(names.inputs)}
+        self.names = {f'z{j + 1}': Instruction(phi.STATE, j) for j in range(level)}
+        self.names |= {n: Instruction(phi.INPUT, k) for k, n in enumerate(names.inputs)}
         for name, number in (NUMBERS | dict(names.constants)).items():
-            self.names[name] = Instruction(bytecode.CONST, number)
+            self.names[name] = Instruction(phi.CONST, number)
 
     def check_work(self, body: ast.expr) -> None:
         """Refuse an expression that would take long at every evaluation."""
@@ -189,7 +188,7 @@ class _Parser:
                 return self.emit(operand, nesting + 1)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 inner = self.emit(operand, nesting + 1)
-                return self.fold([*inner, Instruction(bytecode.NEG)])
+                return self.fold([*inner, Instruction(phi.NEG)])
             case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
                 a, b = self.emit(left, nesting + 1), self.emit(right, nesting + 1)
                 return self.fold([*a, *b, Instruction(OPERATORS[type(op)])])
@@ -221,7 +220,7 @@ class _Parser:
             value = math.inf
         if not math.isfinite(value):
             raise self.error('a number is too large')
-        return Instruction(bytecode.CONST, value)
+        return Instruction(phi.CONST, value)
 
     def name(self, name: str) -> Instruction:
         if name in self.names:
@@ -240,15 +239,12 @@ class _Parser:
 
     def fold(self, instructions: list[Instruction]) -> list[Instruction]:
         """Replace an operation on constants by its result."""
-        if any(i.code != bytecode.CONST for i in instructions[:-1]):
+        if any(i.code != phi.CONST for i in instructions[:-1]):
             return instructions
-        stack = np.zeros((2, len(instructions)))
-        value, _ = bytecode.evaluate(
-            assembled([instructions]), 0, np.zeros((2, 1)), np.zeros(1), stack
-        )
+        value = float(phi.Expressions([instructions], 0, 0).along([0.0], [0.0], [0.0])[0, 0])
         if not math.isfinite(value):
             raise self.error('a constant part of it is not a finite number')
-        return [Instruction(bytecode.CONST, float(value))]
+        return [Instruction(phi.CONST, value)]
 
     def error(self, reason: str) -> ConfigurationError:
         states = 'z1' if self.level == 1 else f'z1..z{self.level}'
@@ -265,9 +261,21 @@ def _needs(name: str) -> str:
     return f'{name} needs two arguments{"" if name == "atan2" else " or more"}'
 
 
-def assembled(expressions: Sequence[Sequence[Instruction]]) -> bytecode.Bytecode:
-    """Return several expressions as bytecode, one behind the other."""
-    instructions = [instruction for expression in expressions for instruction in expression]
-    code = np.array(instructions, dtype=np.float64).reshape(-1, 2)
-    offsets = np.cumsum([0, *map(len, expressions)], dtype=np.int64)
-    return bytecode.Bytecode(code, offsets)
+def is_linear(tokens: Sequence[tuple[int, float]]) -> bool:
+    """Return True if an expression is sums of states times numbers, and of anything else."""
+    # 0: a number, 1: a number or known inputs, 2: linear in the states, 3: anything else
+    stack: list[int] = []
+    for code, _ in tokens:
+        if code <= phi.INPUT:
+            stack.append({phi.CONST: 0, phi.INPUT: 1, phi.STATE: 2}[int(code)])
+        elif code <= phi.MAX:
+            b, a = stack.pop(), stack.pop()
+            most = max(a, b)
+            is_kept = (
+                code in (phi.ADD, phi.SUB) or (code == phi.MUL and 0 in (a, b)) or (code == phi.DIV and b == 0)
+            )
+            stack.append(most if is_kept or most < 2 else 3)
+        else:
+            a = stack.pop()
+            stack.append(a if code == phi.NEG or a < 2 else 3)
+    return max(stack, default=0) < 3

@@ -4,16 +4,13 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fhaosmo_ros.core.model.bytecode import Bytecode, evaluate, INPUT, is_linear
-from fhaosmo_ros.core.model.expressions import assembled, Names, ONLY_U, parse
+from fhaosmo_ros.core.model.expressions import is_linear, Names, ONLY_U, parse
 from fhaosmo_ros.core.model.inputs import known_inputs
+from fhaosmo_ros.core.model.phi import Expressions, INPUT
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import CONSTANTS
 import numpy as np
 from numpy.typing import ArrayLike
-
-ROOM_FOR_DECAY = 4
-"""Stack size that is enough for the expression in `TriangularModel.with_unknown_input`."""
 
 
 class TriangularModel:
@@ -33,12 +30,10 @@ class TriangularModel:
     ----------
     order : int
         Number of states n.
-    expressions : Bytecode
-        Phi_1 .. Phi_n, and an empty one for the level of the unknown input, whose Phi is 0.
+    expressions : Expressions
+        Phi_1 .. Phi_n.
     inputs : tuple of str
         Names of the known inputs u_1 .. u_m, in the order of their values.
-    depth : int
-        Size of the stack that the expressions need, those of `with_unknown_input` included.
 
     Raises
     ------
@@ -60,8 +55,7 @@ class TriangularModel:
         names.check()
         self.inputs = tuple(names.inputs)
         self._parsed = [parse(text, i + 1, names) for i, text in enumerate(self.phi)]
-        self.expressions = assembled([*self._parsed, []])
-        self.depth = max(ROOM_FOR_DECAY, *map(len, self._parsed))
+        self.expressions = Expressions(self._parsed, self.order, len(self.inputs))
 
     @classmethod
     def of(cls, parameters: Mapping[str, Any]) -> 'TriangularModel':
@@ -72,8 +66,7 @@ class TriangularModel:
     @property
     def used_inputs(self) -> tuple[str, ...]:
         """Names of the known inputs that a Phi uses."""
-        codes, operands = self.expressions.code.T
-        used = set(operands[codes == INPUT].tolist())
+        used = {index for tokens in self._parsed for code, index in tokens if code == INPUT}
         return tuple(name for k, name in enumerate(self.inputs) if k in used)
 
     @property
@@ -86,7 +79,7 @@ class TriangularModel:
         """True if every Phi is a linear function of the states, whatever the known inputs."""
         return all(is_linear(tokens) for tokens in self._parsed)
 
-    def with_unknown_input(self, decay: float, derivatives: int) -> Bytecode:
+    def with_unknown_input(self, decay: float, derivatives: int) -> Expressions:
         """
         Return the expressions with the model of the unknown input behind those of the states.
 
@@ -100,23 +93,23 @@ class TriangularModel:
         """
         levels = range(self.order + 1, self.order + 2 + derivatives)
         behind = [parse(f'-{decay!r} * z{i}', i) if decay > 0.0 else [] for i in levels]
-        return assembled([*self._parsed, *behind])
+        expressions = [*self._parsed, *behind]
+        return Expressions(expressions, len(expressions), len(self.inputs))
+
+    def known_inputs(self, u: ArrayLike) -> np.ndarray:
+        """Return values of the known inputs as an array (m,); see `inputs.known_inputs`."""
+        return known_inputs(u, self.inputs)
 
     def evaluate(self, z: np.ndarray, u: ArrayLike = 0.0) -> np.ndarray:
         """Return Phi(z, u), shape (n,); u is a number or an array (m,)."""
-        return self._along(z, np.zeros(self.order), u)[0]
+        values, _ = self.expressions.along(z, np.zeros(self.order), self.known_inputs(u))
+        return np.asarray(values)
 
     def jacobian(self, z: np.ndarray, u: ArrayLike = 0.0) -> np.ndarray:
         """Return the exact Jacobian dPhi_i/dz_j, shape (n, n), lower triangular."""
-        columns = [self._along(z, e, u)[1] for e in np.eye(self.order)]
+        inputs = self.known_inputs(u)
+        columns = [self.expressions.along(z, e, inputs)[1] for e in np.eye(self.order)]
         return np.stack(columns, axis=1)
-
-    def _along(self, z: np.ndarray, dz: np.ndarray, u: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        point = np.array([z, dz], dtype=np.float64)
-        stack, inputs = np.empty((2, self.depth)), known_inputs(u, self.inputs)
-        pairs = [evaluate(self.expressions, i, point, inputs, stack) for i in range(self.order)]
-        values, slopes = np.array(pairs).T
-        return values, slopes
 
 
 def constants_of(parameters: Mapping[str, Any]) -> dict[str, float]:

@@ -1,32 +1,84 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From checked parameters to the arrays of a law; here values are checked as a set."""
+"""From checked parameters to what a structure is made from; here they are checked as a set."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import constants_of, TriangularModel
-from fhaosmo_ros.core.observer import arrays
-from fhaosmo_ros.core.observer.covariance import Uncertainty
-from fhaosmo_ros.core.observer.fuzzy import curves, KNOTS, of_level, read_system
-from fhaosmo_ros.core.observer.levant import deadbeat_shares
-from fhaosmo_ros.core.observer.self_tuning.members import ORDERS, rows_of
+from fhaosmo_ros.core.observer.fuzzy import curves, of_level, read_system
+from fhaosmo_ros.core.observer.kalman import LinearModel, Uncertainty
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 import numpy as np
+from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
 FIXED_GAMMA = 0.5
 """Power of the variants that do not adapt (paper eq. triangularObserver, fuzzysuper)."""
+DERIVATIVES = 3
+"""Derivatives of d that a self-tuning observer has behind it (D 26)."""
+
+
+class Schedule(NamedTuple):
+    """
+    What gains that follow the covariance P are computed from (D 20).
+
+    Attributes
+    ----------
+    linear : LinearModel
+        The model with D 17, linearised at rest.
+    variance : float
+        Of the noise on y.
+    fresh, steady : (N, N) arrays
+        P of a fresh observer, and of the predictions once P is steady (0 where no scheme needs
+        it).
+    tuned_over_kalman : (N,) array
+        The tuned corrections of a small innovation over those of the Kalman filter.
+    next_sizes : (N,) array
+        Sizes of z_2 .. z_n and d, 0 behind them.
+
+    """
+
+    linear: LinearModel
+    variance: float
+    fresh: Floats
+    steady: Floats
+    tuned_over_kalman: Floats
+    next_sizes: Floats
 
 
 class ObserverConfiguration:
     """
-    A valid set of observer parameters and the compiled law that it stands for.
+    A valid set of observer parameters, and what follows from it for each level.
 
     Parameters
     ----------
     parameters : mapping
         Values by name, checked here unless they are `Parameters`; defaults for the rest.
+
+    Attributes
+    ----------
+    model : TriangularModel
+    expressions : Expressions
+        Phi_1 .. Phi_n, and the model of the unknown input behind them (D 17).
+    levels : int
+        N.
+    self_tuning, levant, adaptive, is_sign : bool
+        Which observer it is: with gains found by itself; of Levant's structure; with adaptive
+        gamma; with sign instead of a fuzzy curve.
+    predicting, implicit, internal : bool
+        It follows the model between samples; a step uses the sample at its end; estimates are the
+        internal states.
+    epsilon, gamma_initial : float
+    state_sizes : (n,) array
+    initial_estimate, initial_internal : (N,) arrays
+    lambdas, alphas, widths, decays : (N,) arrays
+        Gains, half-widths of psi, and decay of the internal states; with fixed gains only.
+    curves : (N, K) array
+        psi of each level at K points of [0, half-width]; with fixed gains only.
+    schedule : Schedule or None
+        None where gains are always the tuned ones.
 
     Raises
     ------
@@ -34,6 +86,12 @@ class ObserverConfiguration:
         An unknown name, a bad value, or values that do not fit together.
 
     """
+
+    lambdas: Floats
+    alphas: Floats
+    widths: Floats
+    decays: Floats
+    curves: Floats
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
         self.parameters = OBSERVER_PARAMETERS.complete(parameters)
@@ -71,11 +129,67 @@ class ObserverConfiguration:
                 f'next one, got {p["gamma_min"]}, {p["gamma_initial"]}, {p["gamma_max"]}'
             )
         self.self_tuning = p['gains'] == 'self_tuning'
+        self.schedule: Schedule | None = None
+        sizes = OBSERVER_PARAMETERS['state_sizes']
+        self.state_sizes = per_level(sizes, p['state_sizes'], self.model.order)
         if self.self_tuning:
             self._complete_self_tuning()
-            return
+        else:
+            self._complete_fixed_gains()
+
+    def _complete_self_tuning(self) -> None:
+        if not self.parameters['unknown_input']:
+            raise ConfigurationError(
+                "parameters 'gains', 'unknown_input': self_tuning follows the unknown input, "
+                'expected unknown_input = true, got false'
+            )
+        self.levant = self.predicting = self.implicit = True
+        self.internal = self.adaptive = self.is_sign = False
+        self.gamma_initial, self.epsilon = 0.0, np.inf  # no power, no gates
+        self.levels = self.model.order + 1 + DERIVATIVES
+        self.initial_estimate = self.initial_internal = np.zeros(self.levels)
+        self.expressions = self.model.with_unknown_input(0.0, DERIVATIVES)
+
+    def _complete_fixed_gains(self) -> None:
+        p, n = self.parameters, self.model.order
+        self._check_structure()
         self.levant = p['structure'] == 'levant'
-        if self.levant and not p['unknown_input']:
+        self.predicting = p['scheme'] == 'predict_correct'
+        self.implicit = p['scheme'] != 'explicit'
+        self.internal = p['estimate_from'] == 'internal'
+        self.adaptive = p['variant'].endswith('_adaptive')
+        self.is_sign = p['variant'].startswith('sign')
+        self.gamma_initial = p['gamma_initial'] if self.adaptive else FIXED_GAMMA
+        self.epsilon = np.inf if self.levant else p['epsilon']  # one innovation has no gates
+        self.levels = levels = n + (1 + p['unknown_input_derivatives']) * p['unknown_input']
+        self.initial_estimate = self._per_level('initial_estimate')
+        self.initial_internal = self._per_level('initial_internal')
+        if self.levant:
+            self.initial_internal = np.append(self.initial_estimate[1:], 0.0)
+        for name in ('fuzzy_widths', 'fuzzy_systems'):
+            declared = OBSERVER_PARAMETERS[name]
+            if len(p[name]) > levels and p[name] != declared.default:
+                raise declared.error(p[name], f'1 to {levels} values (N = {levels} levels)')
+        self.widths = np.array([of_level(p['fuzzy_widths'], i) for i in range(levels)])
+        if self.is_sign:  # no curve is read
+            for text in p['fuzzy_systems']:
+                read_system(text, p['fuzzy_shape'])
+            self.curves = np.ones((levels, 2))
+        else:
+            self.curves = curves(p, levels)
+        self.lambdas, self.alphas = self._per_level('lambda'), self._per_level('alpha')
+        self.decays = np.zeros(levels)  # D 17: of d, d', .. but not of theta
+        self.decays[n - 1 : -1 if p['unknown_input'] else None] = p['unknown_input_decay']
+        self.expressions = self.model.with_unknown_input(
+            p['unknown_input_decay'], p['unknown_input_derivatives']
+        )
+        known_period = p['correction_period'] > 0.0 or not self.predicting
+        if p['noise_size'] > 0.0 and p['unknown_input'] and known_period:
+            self.schedule = self._make_schedule()
+
+    def _check_structure(self) -> None:
+        p = self.parameters
+        if p['structure'] == 'levant' and not p['unknown_input']:
             raise ConfigurationError(
                 "parameters 'structure', 'unknown_input': levant estimates the unknown input as "
                 'its last level, expected unknown_input = true, got false'
@@ -86,183 +200,79 @@ class ObserverConfiguration:
                 'behind that of the unknown input, expected unknown_input = true or '
                 f'unknown_input_derivatives = 0, got false and {p["unknown_input_derivatives"]}'
             )
-        if p['scheme'] == 'predict_correct' and not self.levant:
+        if p['scheme'] == 'predict_correct' and p['structure'] != 'levant':
             raise ConfigurationError(
                 "parameters 'scheme', 'structure': predict_correct is a scheme of levant alone, "
                 "expected structure = 'levant' or another scheme (explicit, implicit), got "
                 f'{p["structure"]!r} and {p["scheme"]!r}'
             )
-        self.adaptive = p['variant'].endswith('_adaptive')
-        self.gamma_initial = p['gamma_initial'] if self.adaptive else FIXED_GAMMA
-        self.levels = self.model.order
-        if p['unknown_input']:
-            self.levels += 1 + p['unknown_input_derivatives']
-        self.initial_estimate = self._per_level('initial_estimate')
-        self.initial_internal = self._per_level('initial_internal')
-        sizes = OBSERVER_PARAMETERS['state_sizes']
-        self.state_sizes = per_level(sizes, p['state_sizes'], self.model.order)
-        if self.levant:
-            self.initial_internal = np.append(self.initial_estimate[1:], 0.0)
-        self.internal = p['estimate_from'] == 'internal'
-        n = self.model.order
-        filtered = not self.internal and self.levels > n
-        self.unknown_input_at = (arrays.HAT, n) if filtered else (arrays.TILDE, n - 1)
-        self.law = self._make_law()
 
-    def _complete_self_tuning(self) -> None:
-        p, n = self.parameters, self.model.order
-        if not p['unknown_input']:
-            raise ConfigurationError(
-                "parameters 'gains', 'unknown_input': self_tuning follows the unknown input, "
-                'expected unknown_input = true, got false'
-            )
-        self.levant, self.internal, self.adaptive, self.gamma_initial = True, False, False, 0.0
-        self.levels = n + ORDERS
-        self.initial_estimate = self.initial_internal = np.zeros(self.levels)
-        self.state_sizes = per_level(OBSERVER_PARAMETERS['state_sizes'], p['state_sizes'], n)
-        self.unknown_input_at = arrays.HAT, n
-        flags = np.zeros(arrays.FLAGS, dtype=np.int64)
-        for flag in (arrays.IMPLICIT, arrays.LEVANT, arrays.PREDICTING, arrays.SELF_TUNING):
-            flags[flag] = 1
-        flags[arrays.FROM_MEASUREMENT] = p['start_from_measurement']
-        flags[arrays.LINEAR] = self.model.is_linear
-        scalars = np.zeros(arrays.SCALARS)
-        scalars[[arrays.EPSILON, arrays.WIDEST]] = np.inf  # no gates, no growth
-        scalars[arrays.PREDICTION_STEP] = p['prediction_step']
-        scalars[arrays.FORGETTING] = p['tuning_memory']
-        scalars[arrays.SLIDER] = p['bandwidth']
-        scalars[arrays.LEAST_NOISE] = p['noise_size']
-        chances = np.zeros((arrays.SINGLE * self.levels + arrays.SINGLES, self.levels))
-        diagonal = arrays.FRESH * self.levels + np.arange(n), np.arange(n)
-        chances[diagonal] = self.state_sizes**2
-        gains = np.ones((arrays.GAINS, self.levels))
-        model = self.model.with_unknown_input(0.0, ORDERS - 1)
-        curves = np.ones((self.levels, KNOTS))
-        self.law = arrays.Law(flags, gains, curves, scalars, chances, model)
-
-    def initial_state(self) -> arrays.State:
-        """Return the state of an observer that has seen no sample."""
-        rows = arrays.ROWS + self.levels
-        if self.self_tuning:
-            rows += rows_of(self.model.order)
-        levels, memory = np.zeros((rows, self.levels)), np.zeros(arrays.MEMORY)
-        levels[arrays.HAT] = self.initial_estimate
-        levels[arrays.TILDE] = self.initial_internal
-        if self.self_tuning:
-            levels[arrays.COVARIANCE] = np.inf
-        else:
-            levels[arrays.COVARIANCE :] = self.law.chances[arrays.part(arrays.FRESH, self.levels)]
-        memory[arrays.GAMMA] = self.gamma_initial
-        memory[arrays.Y] = np.nan
-        memory[arrays.SCALE] = memory[arrays.SPREAD] = 1.0
-        memory[arrays.SETTLED] = 1.0 - self.law.flags[arrays.SCHEDULED]
-        return arrays.State(levels, memory)
-
-    def _per_level(self, name: str) -> np.ndarray:
+    def _per_level(self, name: str) -> Floats:
         return per_level(OBSERVER_PARAMETERS[name], self.parameters[name], self.levels)
 
-    def _make_law(self) -> arrays.Law:
-        p, levels = self.parameters, self.levels
-        for name in ('fuzzy_widths', 'fuzzy_systems'):
-            declared = OBSERVER_PARAMETERS[name]
-            if len(p[name]) > levels and p[name] != declared.default:
-                raise declared.error(p[name], f'1 to {levels} values (N = {levels} levels)')
-        widths = [of_level(p['fuzzy_widths'], i) for i in range(levels)]
-        flags = np.zeros(arrays.FLAGS, dtype=np.int64)
-        flags[arrays.SIGN] = p['variant'].startswith('sign')
-        flags[arrays.IMPLICIT] = p['scheme'] != 'explicit'
-        flags[arrays.PREDICTING] = p['scheme'] == 'predict_correct'
-        flags[arrays.ADAPTIVE] = self.adaptive
-        flags[arrays.SENSITIVE] = self.adaptive and p['gamma_rate'] > 0.0
-        flags[arrays.FROM_MEASUREMENT] = p['start_from_measurement']
-        flags[arrays.LEVANT] = self.levant
-        if flags[arrays.SIGN]:  # the curves are not read
-            for text in p['fuzzy_systems']:
-                read_system(text, p['fuzzy_shape'])
-            psi = np.ones((levels, KNOTS))
-        else:
-            psi = curves(p, levels)
-        gains = np.zeros((arrays.GAINS, levels))
-        gains[arrays.LAMBDA] = self._per_level('lambda')
-        gains[arrays.ALPHA] = self._per_level('alpha')
-        gains[arrays.INVERSE_WIDTH] = 1.0 / np.array(widths)
-        decay, n = p['unknown_input_decay'], self.model.order
-        modelled = slice(n - 1, -1 if p['unknown_input'] else None)  # d, d', .. but not theta
-        gains[arrays.DECAY, modelled] = decay  # D 17, internal states
-        model = self.model.with_unknown_input(decay, p['unknown_input_derivatives'])
-        scalars = np.zeros(arrays.SCALARS)
-        scalars[arrays.EPSILON] = np.inf if self.levant else p['epsilon']  # no gates
-        scalars[arrays.GAMMA_INITIAL] = p['gamma_initial']
-        scalars[arrays.RATE] = p['gamma_rate']
-        scalars[arrays.MIN] = p['gamma_min']
-        scalars[arrays.MAX] = p['gamma_max']
-        scalars[arrays.DEAD_ZONE] = p['gamma_dead_zone']
-        scalars[arrays.LEAKAGE] = p['gamma_leakage']
-        scalars[arrays.DELAY] = p['gamma_leakage_delay']
-        scalars[arrays.PREDICTION_STEP] = p['prediction_step']
-        scalars[arrays.CORRECTION_PERIOD] = p['correction_period']
-        if self.levant and p['fuzzy_growth'] and not flags[arrays.SIGN]:
-            scalars[arrays.WIDEST] = max(widths)
-            speed = (gains[arrays.LAMBDA, -1] / widths[-1]) ** (1.0 / levels)
-            scalars[arrays.RELAXATION] = speed / 3.0
-        else:
-            scalars[arrays.WIDEST] = np.inf
-        flags[arrays.SCHEDULED] = (
-            p['noise_size'] > 0.0
-            and p['unknown_input']
-            and (p['correction_period'] > 0.0 or not flags[arrays.PREDICTING])
-        )
-        single = arrays.SINGLE * levels
-        chances = np.zeros((single + arrays.SINGLES, levels))
-        chances[single + arrays.FIRST_HAT] = self.initial_estimate
-        chances[single + arrays.FIRST_TILDE] = self.initial_internal
-        if flags[arrays.SCHEDULED]:
-            self._schedule(arrays.Law(flags, gains, psi, scalars, chances, model))
-        return arrays.Law(flags, gains, psi, scalars, chances, model)
-
-    def _schedule(self, law: arrays.Law) -> None:
-        """Write what the covariance is computed from (D 20)."""
-        p, n, scalars, chances = self.parameters, self.levels, law.scalars, law.chances
-        period = p['correction_period']
+    def _make_schedule(self) -> Schedule:
+        p, n, order = self.parameters, self.levels, self.model.order
         uncertainty = Uncertainty(self.model, p, self.state_sizes)
-        chances[arrays.part(arrays.RATES, n)] = uncertainty.rates
-        chances[arrays.part(arrays.FRESH, n)] = uncertainty.fresh
-        order = self.model.order
-        sizes = [*self.state_sizes[1:], p['unknown_input_size']]
-        chances[arrays.SINGLE * n + arrays.NEXT_SIZE, :order] = sizes
-        scalars[arrays.VARIANCE] = uncertainty.variance
-        scalars[arrays.INTENSITY] = uncertainty.intensity
-        scalars[arrays.FASTEST] = uncertainty.fastest
-        if not law.flags[arrays.PREDICTING]:
-            return
-        steady = uncertainty.steady(period)
-        chances[arrays.part(arrays.STEADY, n)] = steady
-        single = chances[arrays.SINGLE * n :]
-        known = steady[0] > 0.0
-        single[arrays.INVERSE_STEADY, known] = 1.0 / steady[0, known]
-        tuned = tuned_corrections(law, p['noise_size'], period, self.gamma_initial)
-        wanted = steady[0] / uncertainty.variance
-        alike = (wanted > 0.0) & (tuned > 0.0)
-        ratio = single[arrays.TUNED_OVER_KALMAN]
-        ratio[:] = 1.0
-        ratio[alike] = np.clip(tuned[alike] / wanted[alike], 1e-6, 1e6)
-        scalars[arrays.STEADY_VARIANCE] = steady[0, 0] + uncertainty.variance
+        sizes, steady, ratio = np.zeros(n), np.zeros((n, n)), np.ones(n)
+        sizes[:order] = [*self.state_sizes[1:], p['unknown_input_size']]
+        if self.predicting:
+            period = p['correction_period']
+            steady = uncertainty.steady(period)
+            tuned = self.tuned_corrections(p['noise_size'], period)
+            wanted = steady[0] / uncertainty.variance
+            alike = (wanted > 0.0) & (tuned > 0.0)
+            ratio[alike] = np.clip(tuned[alike] / wanted[alike], 1e-6, 1e6)
+        return Schedule(
+            uncertainty.linear, uncertainty.variance, uncertainty.fresh, steady, ratio, sizes
+        )
+
+    def tuned_corrections(self, small: float, period: float) -> Floats:
+        """Return S_1 .. S_N of D 19 with which an innovation of the size `small` is corrected."""
+        n = self.levels
+        level, grid = np.arange(1, n + 1), np.linspace(0.0, 1.0, self.curves.shape[1])
+        injections = self.lambdas * small ** (2.0 * self.gamma_initial * (n - level) / n - 1.0)
+        injections *= [
+            np.interp(small / width, grid, curve)
+            for width, curve in zip(self.widths, self.curves, strict=True)
+        ]
+        shares = deadbeat_shares(n)
+        return np.array([
+            sum(shares[j, i] * period ** (j - i + 1) * injections[j] for j in range(i, n))
+            for i in range(n)
+        ])  # fmt: skip
 
 
-def tuned_corrections(law: arrays.Law, small: float, period: float, gamma: float) -> np.ndarray:
-    """Return S_1 .. S_N of D 19 with which an innovation of the size `small` is corrected."""
-    n = law.gains.shape[1]
-    level = np.arange(1, n + 1)
-    injections = law.gains[arrays.LAMBDA] * small ** (2.0 * gamma * (n - level) / n - 1.0)
-    injections *= [arrays.psi(law, i, small)[0] for i in range(n)]
-    shares = deadbeat_shares(n)
-    return np.array([
-        sum(shares[j, i] * period ** (j - i + 1) * injections[j] for j in range(i, n))
-        for i in range(n)
-    ])  # fmt: skip
+def deadbeat_shares(count: int) -> Floats:
+    """
+    Return the weights of a correction that is deadbeat for a chain of integrators (D 18).
+
+    The i-th derivative's backward difference formula is (-ln(1 - B))^i / h^i, B y_k = y_k -
+    y_{k-1}. Cut off after B^j it is exact for polynomials of degree j. Row j of the result says
+    what a chain of j + 1 integrators has to take over of a prediction error of its first state,
+    so that such a polynomial is known exactly after j + 1 samples.
+
+    Parameters
+    ----------
+    count : int
+        Largest number of integrators.
+
+    Returns
+    -------
+    (count, count) array
+        Weight of the error / h^i in the i-th derivative, row j; 0 for i > j.
+
+    """
+    logarithm = np.zeros(count)  # of the power series -ln(1 - x)
+    logarithm[1:] = 1.0 / np.arange(1, count)
+    power = np.eye(count)[0]
+    result = np.zeros((count, count))
+    for i in range(count):
+        result[:, i] = np.cumsum(power)
+        power = np.convolve(power, logarithm)[:count]
+    return result
 
 
-def per_level(parameter: Parameter, values: list[float], count: int) -> np.ndarray:
+def per_level(parameter: Parameter, values: list[float], count: int) -> Floats:
     """Return one value a level from a list of 1 or `count` values, or raise."""
     if len(values) not in (1, count):
         raise parameter.error(values, f'1 or {count} values')

@@ -1,48 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the observer gives: after a sample, of a run, and all that it remembers."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.observer.status import flags, open_levels, Status
+from fhaosmo_ros.core.observer.status import FLAGS_MASK, LEVEL_SHIFT
+from fhaosmo_ros.core.observer.structure import Estimate as Estimate
 import numpy as np
 from numpy.typing import NDArray
 
 
-class Estimate(NamedTuple):
+class Tuning(NamedTuple):
     """
-    What the observer knows after a sample.
+    What a self-tuning observer has found.
 
     Attributes
     ----------
-    z : (n,) array
-        Estimated states; z[0] is z_hat_1, the others follow `estimate_from`.
-    unknown_input : float
-        Estimated d.
-    gamma : float
-        Power gamma in use.
-    innovation : (N,) array
-        eps_i = m_i - z_hat_i.
-    word : int
-        Status word; see `status` and `open_levels`.
+    noise : float
+        Standard deviation of the noise on y (unit of y).
+    correlation : float
+        Correlation of the noise of neighbouring samples; 0 for white noise.
+    bandwidth : float
+        How fast d is followed, in rad/s.
+    derivatives : (4,) array
+        Shares of the models of d with 0 to 3 derivatives.
 
     """
 
-    z: NDArray[np.float64]
-    unknown_input: float
-    gamma: float
-    innovation: NDArray[np.float64]
-    word: int
+    noise: float
+    correlation: float
+    bandwidth: float
+    derivatives: NDArray[np.float64]
 
-    @property
-    def status(self) -> Status:
-        """Flags of the step."""
-        return flags(self.word)
+    @classmethod
+    def of(cls, found: NDArray[np.float64]) -> 'Tuning':
+        """Return what the numbers mean that `TUNING` names."""
+        noise, correlation, bandwidth = found[:3].tolist()
+        return cls(noise, correlation, bandwidth, found[3:])
 
-    @property
-    def open_levels(self) -> int:
-        """Number of levels that run (the paper's E_i)."""
-        return open_levels(self.word)
+
+TUNING = ['noise', 'correlation', 'bandwidth', *(f'derivatives{k}' for k in range(4))]
+"""Names of these numbers in the columns of `Trajectory.tuning`."""
 
 
 class Trajectory(NamedTuple):
@@ -66,10 +65,10 @@ class Trajectory(NamedTuple):
     model : (K, 4) array
         The likeliest model of d (D 26) of a self-tuning observer, which a smoother goes by: the
         variance of the noise, if it were white; q; kappa (1/s); the number k of derivatives, or
-        k - 3 where d has jumped. 0 before it knows the noise; (K, 0) with fixed gains.
-    tuning : (K, 6) array
-        What a self-tuning observer has found, with columns as `Tuning.of` takes them; NaN before
-        it knows the noise; (K, 0) with fixed gains.
+        k - 4 where d has jumped. 0 before it knows the noise; (K, 0) with fixed gains.
+    tuning : (K, 7) array
+        What a self-tuning observer has found, with columns as `TUNING` names them; NaN before it
+        knows the noise; (K, 0) with fixed gains.
 
     """
 
@@ -86,6 +85,30 @@ class Trajectory(NamedTuple):
     model: NDArray[np.float64]
     tuning: NDArray[np.float64]
 
+    @classmethod
+    def of(cls, structure: Any, t: NDArray[Any], record: Any) -> 'Trajectory':
+        """
+        Return what a run has recorded.
+
+        Parameters
+        ----------
+        structure : Structure
+        t : (K,) array
+        record : Record
+
+        """
+        columns = record.columns
+        z_hat, z_tilde, n = columns['z_hat'], columns['z_tilde'], structure.order
+        z, words = z_hat[:, :n].copy(), columns['words']
+        if structure.configuration.internal:
+            z[:, 1:] = z_tilde[:, : n - 1]
+        d = z_tilde[:, n - 1] if structure.d_is_internal else z_hat[:, n]
+        return cls(
+            t, z, d.copy(), columns['gamma'], columns['innovation'], words & FLAGS_MASK,
+            words >> LEVEL_SHIFT, z_hat, z_tilde, np.sqrt(columns['variance']),
+            columns['model'], columns['tuning'],
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class ObserverState:
@@ -94,14 +117,12 @@ class ObserverState:
 
     Attributes
     ----------
-    levels : (4 + N, N) array
-    memory : (MEMORY,) array
-        See `fhaosmo_ros.core.observer.arrays`.
+    values : mapping
+        Numbers and arrays by name; see `Structure.state_dict`.
     t : float or int or None
         Time of the last sample of `Observer.run`, in its unit (s, or ns for integers).
 
     """
 
-    levels: NDArray[np.float64]
-    memory: NDArray[np.float64]
+    values: Mapping[str, Any]
     t: float | int | None = None

@@ -5,19 +5,19 @@ From fuzzy systems, the paper's or the user's, to curves psi that a step reads i
 A system is one text of `fuzzy_systems`, a level each (`read_system`). The default is the paper's:
 psi_1 has 5 terms (NB NS ZR PS PB), psi_2 and psi_3 have 7 (NBB .. PBB); rule k maps term k of the
 input to term k of the output (paper, section 3). scikit-fuzzy makes the membership functions and
-defuzzifies; this is the only module that imports it, and only where a curve is not kept beside
-the machine code yet, because importing it takes longer than reading a curve. Input and output
-universes are [-1, 1]; a half-width scales the input, so that a width can change without a new
-inference.
+defuzzifies; this is the only module that imports it. It brings scipy along, half a second and
+40 MB, so the curves of the default systems are read from fuzzy_curves.csv, and scikit-fuzzy is
+imported when another one is first wanted. Input and output universes are [-1, 1]; a half-width
+scales the input, so that a width can change without a new inference.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
-import hashlib
+import csv
+from functools import cache, lru_cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.compiled.cache import kept
 from fhaosmo_ros.core.parameters.declaration import shown
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
@@ -43,6 +43,9 @@ UNIVERSE = np.linspace(-1.0, 1.0, 2049)
 """Output universe; its grid holds every peak of 5 terms, and 0 and +-1 of 7."""
 ODD = 1e-6
 """psi(x) + psi(-x) of an odd curve may differ from 0 by this; a smaller psi(1) is 0."""
+
+DEFAULT_CURVES = Path(__file__).with_name('fuzzy_curves.csv')
+"""A column for each default system and shape, a row for each knot; see studies/fuzzy_curves.py."""
 
 Curve = NDArray[np.float64]
 
@@ -303,8 +306,8 @@ def curve(text: str, shape: str, normalise: bool) -> Curve:
     """
     system = read_system(text, shape)
     if isinstance(system, FuzzySystem):
-        digest = hashlib.sha256(repr(system).encode()).hexdigest()[:16]
-        psi = kept(f'psi_{digest}', lambda: _inferred(text, system))
+        shipped = default_curves().get(system)
+        psi = inferred(text, system) if shipped is None else shipped.copy()
     else:
         psi = np.interp(np.linspace(0.0, 1.0, KNOTS), np.linspace(0.0, 1.0, len(system)), system)
     _expect_rising(text, psi)
@@ -340,7 +343,18 @@ def of_level(values: Sequence[Any], level: int) -> Any:
     return values[min(level, len(values) - 1)]
 
 
-def _inferred(text: str, system: FuzzySystem) -> Curve:
+@cache
+def default_curves() -> dict[FuzzySystem, Curve]:
+    """Return the curves of the default systems, not normalised, as `inferred` made them."""
+    with DEFAULT_CURVES.open(newline='') as file:
+        header, *rows = csv.reader(file)
+    columns = np.array(rows, dtype=float).T
+    systems = (read_system(text, SHAPES[0]) for text in header)
+    return {s: c for s, c in zip(systems, columns, strict=True) if isinstance(s, FuzzySystem)}
+
+
+def inferred(text: str, system: FuzzySystem) -> Curve:
+    """Return psi of a system at the knots, not normalised; raise if it is not odd."""
     x = np.linspace(0.0, 1.0, KNOTS)
     psi = infer(x, system)
     if not _is_mirrored(system):

@@ -1,28 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Smoothed estimates in the order of their samples, with bounded memory; see smoothing.py."""
+"""Smoothed estimates in the order of their samples, with bounded memory; see smoothing.pyx."""
 
 from typing import Any
 
-from fhaosmo_ros.core.model.bytecode import Floats, Ints
-from fhaosmo_ros.core.observer.arrays import DERIVATIVES, DRIVE, HAT, Law, MEMORY, TILDE, Work
-from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.self_tuning.members import ORDERS
-from fhaosmo_ros.core.observer.smoothing import (
-    BEGINS,
-    JUMPS,
-    make_problem,
-    MEASURED,
-    Rows,
-    settled_row,
-    smooth_lagging,
-    smooth_rows,
-    take_rows,
-    UNMEASURED,
-)
-from fhaosmo_ros.core.observer.status import DIVERGED, JUMPED, RESTARTED, UNUSED
+from fhaosmo_ros.core.model.inputs import known_inputs_of_run
+from fhaosmo_ros.core.observer.configuration import DERIVATIVES, Floats, ObserverConfiguration
+from fhaosmo_ros.core.observer.estimates import Trajectory
+from fhaosmo_ros.core.observer.smoothing import BEGINS, JUMPS, MEASURED, Rows, UNMEASURED
+from fhaosmo_ros.core.observer.status import DIVERGED, JUMPED, REJECTED, RESTARTED, UNUSED
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+Ints = NDArray[np.int64]
 BLOCK = 8192
 """Rows after which a recording is smoothed as far as later samples no longer matter."""
 BEGINNING = 1000
@@ -36,7 +25,7 @@ class Smoother:
     Smoothed estimates of an observer's samples, handed out in their order.
 
     Memory is bounded: a row is dropped once its estimate is final, `lag` later or, for a whole
-    recording, when later samples can no longer change it by more than `TOLERANCE`.
+    recording, when later samples can no longer change it by more than 1e-9 standard deviations.
 
     Parameters
     ----------
@@ -52,21 +41,16 @@ class Smoother:
     """
 
     def __init__(self, configuration: ObserverConfiguration, lag: int | None = None) -> None:
-        self.configure(configuration)
-        self._lag, levels = lag, configuration.levels
-        self._planes = 2 if configuration.self_tuning else 1
-        self._held: tuple[Law, Work, tuple[Any, ...]] | None = None
-        self._model: Floats | None = None
-        self._rows = Rows.empty(64, levels)
-        self._memory, self._point = np.zeros(MEMORY), np.zeros((4 + levels, levels))
-        self._count = self._done = self._new = self._began = 0
+        self._rows = Rows(configuration)
+        self._lag, self._tunes = lag, configuration.self_tuning
+        self._held: list[NDArray[Any]] | None = None
+        self._model: Floats | None = None  # the latest one of a self-tuning observer
         self._wait = BLOCK
         self._expected = {JUMPS: 0, BEGINS: 1}
 
     def configure(self, configuration: ObserverConfiguration) -> None:
-        """Go on with other parameters from the next row on."""
-        self._problem = make_problem(configuration)
-        self._internal = configuration.internal
+        """Go on with other parameters from the next row on; raise as the constructor."""
+        self._rows.configure(configuration)
 
     def cut(self) -> None:
         """Let the next row begin: it has nothing to do with those before it."""
@@ -78,7 +62,7 @@ class Smoother:
 
         A jump of y, and a restart, are those of the next sample that is used.
         """
-        kinds = np.where(status & UNUSED, UNMEASURED, MEASURED)
+        kinds: Ints = np.where(status & UNUSED, UNMEASURED, MEASURED)
         used = np.flatnonzero(kinds == MEASURED)
         for kind, flags in ((JUMPS, JUMPED), (BEGINS, RESTARTED | DIVERGED)):
             marks = self._expected[kind] + np.cumsum((status & flags) > 0)
@@ -90,18 +74,17 @@ class Smoother:
     @property
     def goes_on(self) -> bool:
         """True if a row has been handed out since the latest one that begins."""
-        return self._done > self._began
+        return bool(self._rows.done > self._rows.began)
 
     @property
     def waiting(self) -> int:
         """Number of rows that have not been handed out."""
-        return self._count - self._done
+        return int(self._rows.count - self._rows.done)
 
     def take(
         self,
-        law: Law,
-        work: Work,
-        levels: Floats,
+        z_hat: Floats,
+        z_tilde: Floats,
         samples: tuple[Floats, Floats, Floats],
         times: Ints,
         kinds: Ints,
@@ -113,82 +96,53 @@ class Smoother:
 
         Parameters
         ----------
-        levels : (K, 2, N) array
-            `HAT` and `TILDE` of the observer after each.
+        z_hat, z_tilde : (K, N) arrays
+            Levels of the observer after each.
         samples : (y, h, u)
-            As `Samples` of a run, with y less its offset (D 23).
+            (K,), (K,) and (K, m) arrays: samples less their offset (D 23), time since the row
+            before (s), and known inputs meanwhile.
         times, kinds : (K,) arrays
-            As in `Rows`; see `kinds`.
+            In ns; see `kinds`.
         models, deviations : (K, 4), (K, n + 1) or (K, 0) arrays
-            `model`, a copy, and `standard_deviation` of a `Trajectory`.
+            `model` and `standard_deviation` of a `Trajectory`.
 
         """
-        estimates = levels[:, HAT].copy()
-        if self._internal:
-            estimates[:, 1:] = levels[:, TILDE, :-1]
-        columns: tuple[Any, ...] = (estimates, *samples, times, kinds, deviations, models)
+        estimates = z_hat.copy()
+        if self._rows.configuration.internal:
+            estimates[:, 1:] = z_tilde[:, :-1]
+        columns = [estimates, *samples, times, kinds, models.copy(), deviations]
         if self._held is not None:
-            columns = tuple(map(np.concatenate, zip(self._held[2], columns, strict=True)))
+            columns = [np.concatenate(pair) for pair in zip(self._held, columns, strict=True)]
             self._held = None
-        if self._planes > 1 and self._model is None:
-            known = np.flatnonzero(columns[-1][:, DRIVE])
-            enough = 0 if self._lag is not None else BEGINNING
-            if not len(known) or len(columns[-1]) <= enough:
-                self._held = law, work, columns
+        if self._tunes and self._model is None:
+            early = self._lag is None and len(columns[0]) <= BEGINNING
+            if early or not columns[6].any():
+                self._held = columns
                 return
-        self._go(law, work, columns)
+        self._go(columns)
 
-    def _go(self, law: Law, work: Work, columns: tuple[Any, ...]) -> None:
-        """Go forward through rows: estimates, y, h, u, times, kinds, deviations, models."""
-        if self._planes > 1:
-            self._complete(columns[0], columns[-1])
-        estimates, y, h, u, times, kinds, deviations, models = columns
-        count = len(times)
-        if not count:
-            return
-        self._make_room(count)
-        part = slice(self._count, self._count + count)
-        self._rows.times[part], self._rows.kinds[part] = times, kinds
-        take_rows(
-            law, work, self._problem, self._rows, self._count, estimates, h, y, u, models,
-            deviations, self._memory, self._point,
-        )  # fmt: skip
-        began = np.flatnonzero(kinds == BEGINS)
-        if len(began):
-            self._began = self._count + int(began[-1])
-        self._new = self._count
-        self._count += count
+    def _go(self, columns: list[NDArray[Any]]) -> None:
+        """Go forward through rows."""
+        estimates, y, h, u, times, kinds, models, deviations = columns
+        if self._tunes:
+            self._complete(estimates, models)
+        self._rows.append(estimates, (y, h, u), times, kinds, models, deviations)
 
     def _complete(self, estimates: Floats, models: Floats) -> None:
         """Let what a self-tuning observer knows stand for what it did not know before (D 34)."""
-        known = models[:, DRIVE] > 0.0
+        known = models[:, 1] > 0.0  # it has a q
         if self._model is None:
             first = int(np.argmax(known))
             estimates[:first, 1:] = estimates[first, 1:]
             stands = first if self._lag is not None else min(BEGINNING, len(models) - 1)
             models[:stands], known[:stands] = models[stands], True
-            models[:stands, DERIVATIVES] %= ORDERS  # d has not jumped at each of them
+            models[:stands, 3] %= DERIVATIVES + 1  # d has not jumped at each of them
             self._model = models[stands]
         for k in np.flatnonzero(~known):
             models[k] = models[k - 1] if k else self._model
         if len(models):
             self._model = models[-1].copy()
-        estimates[:, self._rows.base.shape[1] - ORDERS + 1 :] = 0.0  # derivatives of d
-
-    def _make_room(self, count: int) -> None:
-        """Drop rows that are done, all but two to go on from, and get more memory if needed."""
-        drop = max(min(self._done, self._count - 2), 0)
-        room = len(self._rows.times)
-        if self._count + count > room:
-            kept = self._count - drop
-            rows = self._rows
-            if kept + count > room // 2:
-                rows = Rows.empty(2 * (kept + count), rows.base.shape[1])
-            for target, source in zip(rows, self._rows, strict=True):
-                target[:kept] = source[drop : self._count].copy()
-            self._rows = rows
-            self._count, self._done = kept, self._done - drop
-            self._began -= drop
+        estimates[:, -DERIVATIVES:] = 0.0  # those of d are not relied on
 
     def due(self) -> Floats:
         """
@@ -200,45 +154,68 @@ class Smoother:
             With the variances of their errors, for a self-tuning observer.
 
         """
+        rows, end = self._rows, self._rows.done
         if self._lag is not None:
-            out = self._room(self._count - self._done)
-            done = smooth_lagging(self._rows, self._new, self._count, self._done, self._lag, out)
-            out = out[: done - self._done]
-            self._done, self._new = done, self._count
-            return out
-        if self.waiting < self._wait:
-            return self._smooth(self._done)
-        settled = settled_row(self._rows, self._count - 1, self._done)
-        out = self._smooth(settled + 1)
-        self._wait = self.waiting + BLOCK
-        return out
+            return rows.smooth_lagging(self._lag)  # type: ignore[no-any-return]
+        if self.waiting >= self._wait:
+            end = rows.settled()
+            self._wait = rows.count - end + BLOCK
+        return rows.smooth(end)  # type: ignore[no-any-return]
 
     def finish(self) -> Floats:
         """Return the estimates of all rows that wait, as `due` does: nothing comes after them."""
         if self._held is not None:
-            law, work, columns = self._held
-            self._held, estimates = None, columns[0]
-            if not columns[-1].any():  # the observer knows nothing but y
-                out = self._room(len(estimates))
-                out[:, 0], out[:, 1] = estimates, np.inf
-                return out
-            self._go(law, work, columns)
-        return self._smooth(self._count)
+            columns, self._held = self._held, None
+            estimates = columns[0]
+            if not columns[6].any():  # the observer knows nothing but y
+                return np.stack([estimates, np.full_like(estimates, np.inf)], axis=1)
+            self._go(columns)
+        return self._rows.smooth(self._rows.count)  # type: ignore[no-any-return]
 
-    def _smooth(self, end: int) -> Floats:
-        """Return the estimates of the rows before `end` that wait, by all that is known."""
-        out = self._room(end - self._done)
-        if len(out):
-            smooth_rows(self._rows, self._count - 1, self._done, end - 1, out)
-        self._done = end
-        return out
-
-    def _room(self, count: int) -> Floats:
-        return np.empty((count, self._planes, self._rows.base.shape[1]))
-
-    def innovations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def innovations(self) -> tuple[Floats, Floats]:
         """Return e and S of the samples that are remembered, for their likelihood."""
-        rows = slice(0, self._count)
-        used = self._rows.certainty[rows] > 0.0
-        variance = 1.0 / self._rows.certainty[rows][used]
-        return self._rows.pull[rows][used] * variance, variance
+        return self._rows.innovations()  # type: ignore[no-any-return]
+
+
+def smooth(observer: Any, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0) -> Trajectory:
+    """
+    Let a fresh observer go forward through samples; estimate each from all of them.
+
+    See `Observer.smooth`.
+    """
+    t, y = np.asarray(t), np.asarray(y, dtype=np.float64)
+    u = known_inputs_of_run(u, len(t), observer.inputs).copy()
+    smoother = Smoother(observer.configuration)
+    parts = [observer.run(t[:0], y[:0], u[:0])]
+    found, first = [], None
+    for start in range(0, len(t), BLOCK):
+        block = slice(start, start + BLOCK)
+        part = observer.run(t[block], y[block], u[block])
+        parts.append(part)
+        if first is None and observer.started:
+            first = start + int(np.argmax((part.status & REJECTED) == 0))
+            latest, held = t[first], u[first]
+        if first is None:
+            continue
+        rows = slice(max(first, start), start + len(part.t))
+        part = Trajectory._make(column[rows.start - start :] for column in part)
+        inputs = u[rows]
+        for k in np.flatnonzero(~np.isfinite(inputs).all(axis=1)):  # the last ones are held
+            inputs[k] = inputs[k - 1] if k else held
+        times = np.fmax.accumulate(np.append(latest, t[rows]))
+        h = np.diff(times) * (1e-9 if np.issubdtype(t.dtype, np.integer) else 1.0)
+        latest, held = times[-1], inputs[-1]
+        samples = (part.z_hat + part.innovation)[:, 0], h, inputs
+        smoother.take(
+            part.z_hat, part.z_tilde, samples, np.arange(rows.start, rows.stop),
+            smoother.kinds(part.status), part.model, part.standard_deviation,
+        )  # fmt: skip
+        found.append(smoother.due())
+    found.append(smoother.finish())
+    whole = Trajectory(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    if first is not None:
+        estimates, n = np.concatenate(found), observer.order
+        whole.z[first:], whole.unknown_input[first:] = estimates[:, 0, :n], estimates[:, 0, n]
+        if observer.self_tuning:
+            whole.standard_deviation[first:] = np.sqrt(estimates[:, 1, : n + 1])
+    return whole

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has happened to the samples, one number for each case of docs/operation.md."""
+"""What has happened to the samples, one number for each case of docs/node.md."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ class Counters(NamedTuple):
     """
     Numbers since the estimator was made; a snapshot. A reset does not clear them.
 
-    The compiled policy (policy.py) counts into an array in this order.
+    The policy counts into a struct with these names (memory.pxd).
     """
 
     accepted: int = 0

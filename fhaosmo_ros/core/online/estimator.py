@@ -2,24 +2,21 @@
 """The update path of time-stamped samples, shared by the node and by replays of bags."""
 
 from collections.abc import Mapping
+from copy import deepcopy
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.inputs import known_inputs_of_run
-from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.estimates import Estimate, ObserverState, Trajectory
-from fhaosmo_ros.core.observer.observer import make_record, Observer
-from fhaosmo_ros.core.observer.self_tuning.members import Tuning
-from fhaosmo_ros.core.observer.smoothing import make_problem
-from fhaosmo_ros.core.online import delay, policy
-from fhaosmo_ros.core.online import memory as at
+from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, Tuning
+from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.online.counters import Counters
+from fhaosmo_ros.core.online.delay import PastInputs
 from fhaosmo_ros.core.online.events import check_events, EventDetector
-from fhaosmo_ros.core.online.memory import EstimatorArrays, make_policy, Memory
 from fhaosmo_ros.core.online.past_estimates import check_lag, PastEstimates
-from fhaosmo_ros.core.online.stamps import forget_samples
+from fhaosmo_ros.core.online.policy import Policy
+from fhaosmo_ros.core.online.snapshots import array_of, checked, completed, VERSION
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import make_from_file
@@ -29,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 NANOSECONDS = 1e-9
 LARGEST_STAMP = 2**63 - 1
+Ints = NDArray[np.int64]
 
 
 class Change(NamedTuple):
@@ -44,7 +42,8 @@ class OnlineEstimator:
 
     Bad data does not raise and never makes an estimate that is not finite: it is rejected or
     survived, counted, and told by the status word. The policy, case by case, is in
-    docs/operation.md; it is compiled (policy.py), and this class holds its memory.
+    docs/node.md; it is compiled (policy.pyx). A second thread that uses one while it runs
+    gets a RuntimeError.
 
     Parameters
     ----------
@@ -56,6 +55,8 @@ class OnlineEstimator:
     ----------
     observer : Observer
         To read parameters, sizes and state from; samples go through this class.
+    policy : Policy
+        What decides about samples; compiled functions step by it.
     events : EventDetector
         Judges each estimate of d, as it is before any smoothing; `events.taken()` returns what has
         begun or ended since it was called last.
@@ -81,21 +82,16 @@ class OnlineEstimator:
         check_events(p)
         self._smoothing: PastEstimates | None = None
         if p['smoothing_lag'] > 0.0:
-            check_lag(p)
+            check_lag(p, self.observer.configuration)
             self._smoothing = PastEstimates(self.observer, round(p['smoothing_lag'] / NANOSECONDS))
-        self._lag = 0
-        if self.observer.uses_input:
-            self._lag = round((p['measurement_delay'] - p['input_delay']) / NANOSECONDS)
-        past = np.zeros(0)
-        if self.observer.uses_input and p['measurement_delay']:
-            past = delay.make_past(len(self.observer.inputs), self._lag)
-        self._policy = make_policy(self.observer.initial_state(), past)
-        self._ints, self._reals = self._policy
-        self.events = EventDetector(p, self._policy)
-        self._eps = self.observer.innovations
         self._u = np.zeros(len(self.observer.inputs))
-        self._word = 0
-        self._write_settings()
+        settings = self._settings(p)
+        past = PastInputs(len(self._u), settings['lag'] > 0)
+        self.policy = Policy(self.observer.structure, settings, past)
+        self.events = EventDetector(p, p['max_gap'])
+
+    def __copy__(self) -> 'OnlineEstimator':
+        return deepcopy(self)
 
     @classmethod
     def from_yaml(
@@ -122,24 +118,6 @@ class OnlineEstimator:
         return make_from_file(cls, path, node, channel)
 
     @property
-    def arguments(self) -> tuple[NDArray[Any], ...]:
-        """
-        Arrays that `policy.take_once` works on, in its order.
-
-        Always the same tuple until `configure`, which makes another one.
-        """
-        return self._arguments
-
-    def taken(self, word: int) -> None:
-        """Remember the status word of a sample that `policy.take_once` was given by others."""
-        self._word = word
-
-    @property
-    def arrays(self) -> EstimatorArrays:
-        """The same arrays, and its settings and memory, as bundles: for runs of many samples."""
-        return self._arrays
-
-    @property
     def smooths(self) -> bool:
         """True if estimates are of the past."""
         return self._smoothing is not None
@@ -147,7 +125,7 @@ class OnlineEstimator:
     @property
     def uses_stamps(self) -> bool:
         """True if dt comes from the samples' stamps."""
-        return not self._ints[at.NOMINAL]
+        return bool(self._parameters['sampling'] != 'nominal')
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -157,7 +135,7 @@ class OnlineEstimator:
     @property
     def counters(self) -> Counters:
         """What has happened to the samples so far."""
-        return Counters(*self._ints[at.COUNTERS :].tolist())
+        return Counters(**self.policy.counters)
 
     @property
     def stamp(self) -> int | None:
@@ -169,32 +147,34 @@ class OnlineEstimator:
         """
         if self._smoothing is not None:
             return self._smoothing.stamp if self._smoothing.estimate else None
-        return int(self._ints[at.STAMP]) - self._behind if self._ints[at.VALID] else None
+        course = self.policy.course
+        return course['stamp'] - self._behind if course['valid'] else None
 
     @property
     def _behind(self) -> int:
         """How long before the stamp of its sample an estimate belongs, in nanoseconds."""
-        return 0 if self._ints[at.TO_NOW] else int(self._ints[at.DELAY])
+        p = self._parameters
+        return 0 if p['predict_to_now'] else round(p['measurement_delay'] / NANOSECONDS)
 
     @property
     def period(self) -> float:
         """Running mean of the intervals between samples, in seconds; 0 before there are any."""
-        return float(self._reals[at.INTERVAL]) * NANOSECONDS
+        return float(self.policy.course['mean_interval'] * NANOSECONDS)
 
     @property
     def jitter(self) -> float:
         """Running mean of the intervals' distance from their mean, in seconds."""
-        return float(self._reals[at.JITTER]) * NANOSECONDS
+        return float(self.policy.course['mean_jitter'] * NANOSECONDS)
 
     @property
     def spread(self) -> float:
         """Size of the innovations over that expected from noise_size, at least 1 (D 21)."""
-        return float(self._arrays.state.memory[arrays.SPREAD])
+        return float(self.observer.structure.spread)
 
     @property
     def offset(self) -> float:
         """What y is taken to be too large by, since a jump that the model contradicts (D 23)."""
-        return float(self._arrays.state.memory[arrays.OFFSET])
+        return float(self.observer.structure.offset)
 
     def prepare(self, changes: Mapping[str, Any]) -> Change:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
@@ -202,21 +182,20 @@ class OnlineEstimator:
         configuration = self.observer.prepare(parameters)
         check_events(parameters)
         if self._smoothing is not None:
-            check_lag(parameters)
-            make_problem(configuration)
+            check_lag(parameters, configuration)
         return Change(parameters, configuration)
 
     def adopt(self, change: Change) -> None:
         """Go on with a change that `prepare` has returned, from the next sample on."""
         before = self._parameters['sampling']
-        self._parameters = change.parameters
         self.observer.adopt(change.configuration)
+        self.policy.configure(self.observer.structure, self._settings(change.parameters))
+        self._parameters = change.parameters
         if self._smoothing is not None:
             self._smoothing.configure()
-        self.events.configure(change.parameters)
+        self.events.configure(change.parameters, change.parameters['max_gap'])
         if change.parameters['sampling'] != before:
             self.forget_stamp()
-        self._write_settings()
 
     def configure(self, changes: Mapping[str, Any]) -> None:
         """
@@ -230,34 +209,25 @@ class OnlineEstimator:
         """
         self.adopt(self.prepare(changes))
 
-    def _write_settings(self) -> None:
-        """Write what the compiled policy reads."""
-        p, ints, reals = self._parameters, self._ints, self._reals
-        ints[at.NOMINAL] = p['sampling'] == 'nominal'
-        ints[at.CLOCK] = p['sampling'] == 'clock'
-        for index, name in (
-            (at.PERIOD, 'nominal_period'), (at.MAX_GAP, 'max_gap'), (at.MAX_STEP, 'max_step'),
-            (at.STUCK_TIME, 'stuck_time'), (at.DIVERGENCE_TIME, 'divergence_time'),
-            (at.DELAY, 'measurement_delay'),
-        ):  # fmt: skip
-            ints[index] = round(p[name] / NANOSECONDS)
-        ints[at.LAG] = self._lag
-        ints[at.TO_NOW] = p['predict_to_now']
-        ints[at.FILTERED] = p['estimate_from'] == 'filtered'
-        ints[at.GATE_SAMPLES] = p['spike_gate_samples']
-        reals[at.GATE] = p['spike_gate']
-        reals[at.LIMIT] = p['divergence_limit']
-        reals[at.EPSILON] = math.inf if self.observer.self_tuning else p['epsilon']
-        ints[at.BRIDGED] = 0  # the state before a gap is that of the parameters before
-        levels, memory = self.observer.initial_state()
-        size = levels.size + memory.size
-        reals[at.STATES : at.STATES + size] = np.concatenate([levels.ravel(), memory])
-        self._arguments = (self._eps, ints, reals, *self.observer.arguments)
-        self._arrays = EstimatorArrays(*self.observer.arrays, self._policy)
+    def _settings(self, p: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what the policy reads of parameters; times in nanoseconds."""
+        times = {
+            'period': p['nominal_period'], 'max_gap': p['max_gap'], 'max_step': p['max_step'],
+            'stuck_time': p['stuck_time'], 'divergence_time': p['divergence_time'],
+            'delay': p['measurement_delay'],
+            'lag': (p['measurement_delay'] - p['input_delay']) * self.observer.uses_input,
+        }  # fmt: skip
+        return {name: round(seconds / NANOSECONDS) for name, seconds in times.items()} | {
+            'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
+            'to_now': p['predict_to_now'], 'filtered': p['estimate_from'] == 'filtered',
+            'gate': p['spike_gate'], 'gate_samples': p['spike_gate_samples'],
+            'limit': p['divergence_limit'],
+            'epsilon': math.inf if self.observer.self_tuning else p['epsilon'],
+        }  # fmt: skip
 
     def reset(self) -> None:
         """Start afresh: the next sample is the first. Counters go on, and so does `freeze`."""
-        forget_samples(self._policy, self._arrays.state)
+        self.policy.reset()
         self.events.reset()
         if self._smoothing is not None:
             self._smoothing.cut()
@@ -275,7 +245,7 @@ class OnlineEstimator:
             `noise_size` is 0, which says how much to trust a sample; or `predict_to_now`.
 
         """
-        check_lag(self._parameters)
+        check_lag(self._parameters, self.observer.configuration)
         self._smoothing = PastEstimates(self.observer, None)
 
     @property
@@ -292,71 +262,53 @@ class OnlineEstimator:
     @property
     def latest(self) -> int | None:
         """Stamp of the latest sample that was used, in nanoseconds; a reset does not forget it."""
-        return int(self._ints[at.STAMP]) or None
+        return self.policy.course['stamp'] or None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that it remembers, by name, but for counters and parameters; a copy."""
+        return {
+            'version': VERSION, **self.observer.structure.state_dict(), **self.policy.memory,
+            **self.events.memory, **{name: array.copy() for name, array in self._inputs.items()},
+        }  # fmt: skip
 
     @property
-    def memory(self) -> Memory:
-        """All that it remembers; a copy."""
-        state, named = self.observer.state, self._named
-        size = state.levels.size + state.memory.size
-        before = self._reals[at.STATES + size : at.STATES + 2 * size]
-        levels = state.levels.ravel()
-        return Memory(
-            integers=self._ints[at.FROZEN : at.COUNTERS].copy(),
-            reals=self._reals[at.INTERVAL : at.STATES].copy(),
-            before=np.concatenate([before[:named], before[levels.size :]]),
-            now=np.concatenate([levels[:named], state.memory]),
-            u=self._u.copy(),
-            past=self._reals[at.STATES + 2 * size :].copy(),
-            members=levels[named:],
-        )
+    def _inputs(self) -> dict[str, NDArray[np.float64]]:
+        """The known inputs that it remembers; not copies."""
+        past = self.policy.past
+        return {'u': self._u, 'past_latest': past.latest, 'past_pieces': past.pieces}
 
-    @property
-    def _named(self) -> int:
-        """How many of the state's levels are not those of members."""
-        n = self.observer.levels
-        return (arrays.ROWS + n) * n
-
-    def remember(self, memory: Memory) -> None:
+    def load_state_dict(self, values: Mapping[str, Any]) -> None:
         """
-        Go on where an estimator was that had this memory; parameters and counters stay.
+        Go on where an estimator was; parameters and counters stay.
+
+        Parameters
+        ----------
+        values : mapping
+            As `state_dict` returns them, of an estimator with the same model and delays.
 
         Raises
         ------
         ConfigurationError
-            The memory is of an observer with another number of levels, or of known inputs.
+            Something is missing, of another size, or out of its range. Then nothing has changed.
 
         """
-        levels, scalars = self._arrays.state
-        named, size = self._named, levels.size + scalars.size
-        if (
-            len(memory.now) + len(memory.members) != size
-            or len(memory.now) != named + scalars.size
-        ):
+        version = checked(values, {'version': VERSION})['version']
+        if version < VERSION and self.observer.self_tuning:
+            raise ConfigurationError(f'snapshot: expected version {VERSION}, for self-tuning')
+        if version < VERSION:
+            values = completed(values, self.state_dict())
+        memory = checked(values, self.policy.memory)
+        events = checked(values, self.events.memory)
+        if np.size(values.get('past_pieces', ())) != self.policy.past.pieces.size:
             raise ConfigurationError(
-                f'memory: expected that of {self.observer.levels} levels and '
-                f'{levels.size - named} numbers of members, got {len(memory.now)} and '
-                f'{len(memory.members)} numbers'
+                'snapshot: expected that of an estimator with the same measurement_delay'
             )
-        if len(memory.u) != len(self._u):
-            raise ConfigurationError(
-                f'memory: expected {len(self._u)} known inputs, got {len(memory.u)}'
-            )
-        past = self._reals[at.STATES + 2 * size :]
-        if memory.past.shape != past.shape:
-            raise ConfigurationError(
-                'memory: expected the past of the known inputs for measurement_delay = '
-                f'{self._parameters["measurement_delay"]:g} s ({len(past)} numbers), got '
-                f'{len(memory.past)} numbers'
-            )
-        self._ints[at.FROZEN : at.COUNTERS] = memory.integers
-        self._reals[at.INTERVAL : at.STATES] = memory.reals
-        saved = self._reals[at.STATES + size : at.STATES + 2 * size]
-        saved[:named], saved[levels.size :] = memory.before[:named], memory.before[named:]
-        past[:] = memory.past
-        state = np.concatenate([memory.now[:named], memory.members])
-        self.observer.restore(ObserverState(state.reshape(levels.shape), memory.now[named:]))
-        self._u[:] = memory.u
+        inputs = {name: array_of(values, name, old.shape) for name, old in self._inputs.items()}
+        self.observer.structure.load_state_dict(values)
+        self.policy.change(**memory)
+        self.events.memory = events
+        for name, array in self._inputs.items():
+            array[:] = inputs[name]
         if self._smoothing is not None:
             self._smoothing.cut()
 
@@ -387,29 +339,23 @@ class OnlineEstimator:
                 f'seed: expected {n} states and an unknown input, finite and of at most '
                 f'{limit:g} (divergence_limit), got {z!r} and {unknown_input!r}'
             )
-        levels, scalars = self._arrays.state
-        levels[: arrays.ROWS] = 0.0
-        scalars[arrays.SETTLED] = 1.0
-        known = min(n + 1, self.observer.levels)  # derivatives of d, behind it, are 0
-        levels[arrays.HAT, :known] = values[:known]
-        levels[arrays.TILDE, :n] = values[1:]
-        self._ints[at.BRIDGED] = 0
+        self.observer.structure.seed(values)
+        self.policy.change(bridged=False)
         if self._smoothing is not None:
             self._smoothing.cut()
 
     def freeze(self, held: bool) -> None:
         """Hold gamma where it is, or let it adapt again; no parameter changes."""
-        self._ints[at.FROZEN] = held
-        self._ints[at.BRIDGED] = 0  # the state before a gap has another gamma
+        self.policy.change(frozen=held, bridged=False)  # another gamma than before a gap
 
     @property
     def frozen(self) -> bool:
         """True while gamma is held."""
-        return bool(self._ints[at.FROZEN])
+        return bool(self.policy.course['frozen'])
 
     def forget_stamp(self) -> None:
         """Expect stamps of another clock: the next sample takes the usual period."""
-        self._ints[at.TIMED] = self._ints[at.TICK_COUNT] = 0
+        self.policy.change(timed=False, tick_count=0)
 
     @property
     def inputs(self) -> tuple[float, ...]:
@@ -432,7 +378,7 @@ class OnlineEstimator:
             False if it is not finite: then the one before is held, and this one counted.
 
         """
-        if not np.isfinite(u):
+        if not math.isfinite(u):
             self.reject_inputs(1)
             return False
         self._u[index] = u
@@ -440,7 +386,8 @@ class OnlineEstimator:
 
     def reject_inputs(self, count: int) -> None:
         """Count values of u that were not finite."""
-        self._ints[at.REJECTED_INPUTS] += count
+        rejected = self.policy.counters['rejected_inputs'] + count
+        self.policy.counters |= {'rejected_inputs': rejected}
 
     def update(self, stamp: int, y: float) -> Estimate | None:
         """
@@ -460,28 +407,27 @@ class OnlineEstimator:
             `smoothing_lag` that of the time so long ago; None while there is none.
 
         """
-        word = self.advance(int(stamp), y)
-        return self._published(word) if self._smoothing is None else self.estimate
+        self.advance(int(stamp), y)
+        return self.policy.report() if self._smoothing is None else self.estimate
 
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
-        try:
-            word: int = policy.take_once(stamp, float(y), self._u, *self._arguments)
-        except OverflowError:  # beyond 64 bits
-            stamp = LARGEST_STAMP if stamp > 0 else -LARGEST_STAMP
-            word = policy.take_once(stamp, float(y), self._u, *self._arguments)
-        self._word = word
-        if self.events.on:
-            self._judge_one(stamp, word)
-        if self._smoothing is not None:
-            self._smoothing.take_one(self._arrays, self._eps, word, self._u)
-        return word
+        return self.advance_with(stamp, y, self._u)
 
-    def _judge_one(self, stamp: int, word: int) -> None:
-        observer = self.observer
+    def advance_with(self, stamp: int, y: float, u: NDArray[np.float64]) -> int:
+        """Do the same with other known inputs, (m,) and all finite, than those that are held."""
+        if self._smoothing is None and not self.events.on:
+            return self.policy.advance(stamp, y, u)  # type: ignore[no-any-return]
+        stamps = np.array([min(max(int(stamp), -LARGEST_STAMP), LARGEST_STAMP)])
+        if self._smoothing is not None:
+            self._run(stamps, np.array([y], dtype=np.float64), u[np.newaxis])
+            return self.policy.word  # type: ignore[no-any-return]
+        word: int = self.policy.advance(stamp, y, u)
+        observer, latest = self.observer, self.policy.course['latest']
         deviation = observer.standard_deviation[-1:] if observer.self_tuning else None
-        now = self._ints[[at.LATEST]]
-        self.events.take([stamp - self._behind], [observer.unknown_input], deviation, now, [word])
+        d = [observer.unknown_input]
+        self.events.take(stamps - self._behind, d, deviation, [latest], [word])
+        return word
 
     def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
         """
@@ -518,27 +464,26 @@ class OnlineEstimator:
                 'run: expected stamps and y with one dimension and equal length, got shapes '
                 f'{stamps.shape} and {y.shape}'
             )
-        count, n = len(y), self.observer.levels
+        count = len(y)
         inputs = np.tile(self._u, (count, 1))
         if u is not None:
             inputs = known_inputs_of_run(u, count, self.observer.inputs).copy()
             for k, j in np.argwhere(~np.isfinite(inputs)):
                 inputs[k, j] = inputs[k - 1, j] if k else self._u[j]
                 self.reject_inputs(1)
-        record = make_record(count, n, count, self.observer.self_tuning)
-        carried = bool(self._ints[at.TO_NOW] and self._ints[at.DELAY])
-        present = np.empty((count if carried else 0, self.observer.order + 1))
-        rows = count if self.events.on or self._smoothing is not None else 0
-        times, acting = np.empty(rows, dtype=np.int64), np.empty((rows, len(self._u)))
-        policy.run(self._arrays, stamps, y, inputs, record, present, times, acting)
         if count:
-            self._u[:], self._word = inputs[-1], int(record.words[-1])
-            self._eps[0] = record.eps[-1]
-        found = self.observer.trajectory(stamps - self._behind, record)
+            self._u[:] = inputs[-1]
+        return self._run(stamps, y, inputs)
+
+    def _run(self, stamps: Ints, y: NDArray[np.float64], u: NDArray[np.float64]) -> Trajectory:
+        """Take samples with their known inputs, and look at them for events and for smoothing."""
+        watched = self.events.on or self._smoothing is not None
+        record, present, times, acting = self.policy.run(stamps, y, u, watched)
+        found = Trajectory.of(self.observer.structure, stamps - self._behind, record)
         if self.events.on:
             deviations = found.standard_deviation[:, -1] if self.observer.self_tuning else None
-            self.events.take(found.t, found.unknown_input, deviations, times, record.words)
-        if carried:
+            self.events.take(found.t, found.unknown_input, deviations, times, found.status)
+        if len(present):
             found = found._replace(z=present[:, :-1], unknown_input=present[:, -1])
         if self._smoothing is not None:
             return self._smoothing.take(found, times, acting)
@@ -554,7 +499,7 @@ class OnlineEstimator:
         """
         if self._smoothing is not None:
             return self._smoothing.estimate
-        return self._published(self._word) if self._ints[at.VALID] else None
+        return self.policy.report() if self.policy.course['valid'] else None
 
     @property
     def standard_deviation(self) -> NDArray[np.float64]:
@@ -573,11 +518,3 @@ class OnlineEstimator:
         if self._smoothing is not None:
             return Tuning.of(self._smoothing.tuning)
         return self.observer.tuning
-
-    def _published(self, word: int) -> Estimate:
-        estimate = self.observer.report(word)
-        if not (self._ints[at.TO_NOW] and self._ints[at.DELAY]):
-            return estimate
-        present = np.empty(self.observer.order + 1)
-        delay.published_once(self._arrays, present)
-        return estimate._replace(z=present[:-1], unknown_input=float(present[-1]))

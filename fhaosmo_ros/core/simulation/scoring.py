@@ -2,25 +2,18 @@
 """
 How good an observer is on recordings whose truth is known: one compiled call, no trajectories.
 
-Samples take the way of the node's: through the policy of core/online. The call releases the GIL
-and allocates nothing that grows with the recordings, so that trials run in as many threads as
-there are cores.
+Samples take the way of the node's, through the policy of core/online. The call releases the GIL,
+so that trials run in as many threads as there are cores.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.compiled.cache import compiled
-from fhaosmo_ros.core.compiled.unowned_arrays import unowned
-from fhaosmo_ros.core.model.bytecode import Floats, Ints
-from fhaosmo_ros.core.model.inputs import known_inputs_of_run
-from fhaosmo_ros.core.online.delay import published
+from fhaosmo_ros.core.model.inputs import Floats, known_inputs_of_run
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.online.memory import EstimatorArrays
-from fhaosmo_ros.core.online.policy import take
-from fhaosmo_ros.core.online.stamps import forget_samples
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.core.simulation.judgement import judge
 from fhaosmo_ros.core.simulation.metrics import total_variation
 from fhaosmo_ros.core.simulation.recordings import Recording
 import numpy as np
@@ -28,7 +21,6 @@ from numpy.typing import NDArray
 
 CHOICES = ('internal', 'filtered')
 """Values of `estimate_from`; both are judged in the same run."""
-TRANSIENT, VARIATION = range(2)
 NANOSECONDS = 1e-9
 FIRST_STAMP = 1_000_000_000
 """Stamp (ns) of a recording's first sample; 0 would stand for a stamp that is not set."""
@@ -51,26 +43,11 @@ class Truth(NamedTuple):
 
     """
 
-    stamps: Ints
+    stamps: NDArray[np.int64]
     y: Floats
     u: Floats
     truth: Floats
-    begins: Ints
-
-
-class Rules(NamedTuple):
-    """
-    How estimates are read and judged.
-
-    Attributes
-    ----------
-    settled, band : float
-        See `Trial`.
-
-    """
-
-    settled: float
-    band: float
+    begins: NDArray[np.int64]
 
 
 class Scores(NamedTuple):
@@ -89,46 +66,9 @@ class Scores(NamedTuple):
 
     """
 
-    error: NDArray[np.float64]
-    transient: NDArray[np.float64]
-    variation: NDArray[np.float64]
-
-
-class _Sums(NamedTuple):
-    """What is added up: squared errors (R, 2, n + 1), and TRANSIENT and VARIATION (R, 2, 2)."""
-
-    squares: Floats
-    extra: Floats
-
-
-@compiled(nogil=True)
-def _judge(e: EstimatorArrays, recordings: Truth, rules: Rules, sums: _Sums, eps: Floats) -> None:
-    """Run through all recordings and add up."""
-    e, recordings, eps = unowned(e), unowned(recordings), unowned(eps)
-    stamps, count = recordings.stamps, recordings.truth.shape[1]
-    u, last, values = unowned(recordings.u), np.empty(2), np.empty(count)
-    for r in range(recordings.begins.shape[0] - 1):
-        begin = recordings.begins[r]
-        forget_samples(e.policy, e.state)
-        for k in range(begin, recordings.begins[r + 1]):
-            take(e, stamps[k], recordings.y[k], u[k], eps, 0)
-            time = (stamps[k] - stamps[begin]) * NANOSECONDS
-            late = time >= rules.settled
-            for choice in range(2):
-                published(e, choice, values)
-                value = values[count - 1]
-                for j in range(count):
-                    if late:
-                        wrong = values[j] - recordings.truth[k, j]
-                        sums.squares[r, choice, j] += wrong * wrong
-                if late:
-                    if k > begin and last[choice] == last[choice]:
-                        sums.extra[r, choice, VARIATION] += abs(value - last[choice])
-                    last[choice] = value
-                else:
-                    last[choice] = np.nan
-                    if not abs(value - recordings.truth[k, count - 1]) <= rules.band:
-                        sums.extra[r, choice, TRANSIENT] = time
+    error: Floats
+    transient: Floats
+    variation: Floats
 
 
 class Trial:
@@ -197,7 +137,7 @@ class Trial:
         )
         squares = np.square(self.truth[np.concatenate(late)])
         self.scale = np.sqrt(squares.mean(axis=0))
-        self._rules = Rules(float(settled), float(band))
+        self._settled, self._band = settled, band
 
     def __call__(self, changes: Mapping[str, Any]) -> Scores:
         """
@@ -209,13 +149,9 @@ class Trial:
             As `OnlineEstimator`.
 
         """
-        estimator = OnlineEstimator(self._fixed.changed(changes))
-        count, quantities = len(self.recordings), self.truth.shape[1]
-        sums = _Sums(np.zeros((count, 2, quantities)), np.zeros((count, 2, 2)))
-        eps = np.zeros((1, estimator.observer.levels))
-        _judge(estimator.arrays, self._data, self._rules, sums, eps)
-        error = np.sqrt(sums.squares / self._counts[:, None, None])
-        return Scores(error, sums.extra[:, :, TRANSIENT], sums.extra[:, :, VARIATION])
+        policy = OnlineEstimator(self._fixed.changed(changes)).policy
+        squares, *others = judge(policy, self._data, self._settled, self._band)
+        return Scores(np.sqrt(squares / self._counts[:, None, None]), *others)
 
 
 def _as_samples(

@@ -3,17 +3,15 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from copy import deepcopy
 from time import perf_counter
 from typing import Any
 
 from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.batch import EstimatorBatch
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.online.events import EventDetector
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.per_channel import of_channel, UNNAMED
+from fhaosmo_ros.core.parameters.per_channel import of_channel
 from fhaosmo_ros.nodes.estimator.channel import Channel, ChannelChange, TOLD
 from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import TypedOutputs
@@ -313,22 +311,6 @@ def make_estimators(values: Parameters, names: Iterable[str]) -> dict[str, Onlin
         with naming_channel(name):
             estimators[name] = OnlineEstimator(of_channel(values, name))
     return estimators
-
-
-def load(estimators: Mapping[str, OnlineEstimator]) -> None:
-    """
-    Call the compiled functions that estimators need: it loads or compiles them.
-
-    A copy takes the sample, so that the estimators remain as new, their counters too.
-    """
-    copy = deepcopy(next(iter(estimators.values())))
-    if list(estimators) == UNNAMED:
-        copy.advance(1, 0.0)
-    else:
-        EstimatorBatch([copy]).advance([0], [1], [0.0], [copy.inputs])
-    copy.reset()
-    events = EventDetector(copy.parameters | {'event_threshold': 1.0})  # may be set live
-    events.take([1], [0.0])
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from fhaosmo_ros.core.parameters.per_channel import (
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import measured_output, with_joints
 from fhaosmo_ros.nodes.estimator.channel import Channel
-from fhaosmo_ros.nodes.estimator.channel_group import ChannelGroup, load, make_estimators
+from fhaosmo_ros.nodes.estimator.channel_group import ChannelGroup, make_estimators
 from fhaosmo_ros.nodes.estimator.channel_inheritance import ChannelInheritance
 from fhaosmo_ros.nodes.estimator.listener import check_inputs
 from fhaosmo_ros.nodes.estimator.parameter_topic import ParameterTopic
@@ -28,7 +28,6 @@ from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
-from fhaosmo_ros.nodes.middleware.loading import Loading, without_blas
 from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
 from fhaosmo_ros.nodes.middleware.publishers import check_overrides
 from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
@@ -82,29 +81,19 @@ class EstimatorNode(ManagedNode):
             self, self._reports, values['diagnostics_period'], values['hardware_id']
         )
         self._node_parameters.on_change(self._prepare, self._adopt, self._inheritance.followers)
+        # For the first configure; made now, so that bad parameters end the node in any case.
         self._made: tuple[Parameters, dict[str, OnlineEstimator]] | None = None
         try:
-            self.not_ready = 'the core is still being compiled'
-            self._loading = Loading(self, self._load, self._begin)
+            self._made = self._node_parameters.values, self._make_estimators()
+            if values['autostart']:
+                self.start()
+            else:
+                self.get_logger().info(
+                    'waiting to be configured, for instance by ros2 lifecycle set'
+                )
         except Exception:
             self.destroy_node()
             raise
-
-    def _load(self) -> None:
-        """Raise what configure would raise; compile what is new. Making estimators may compile."""
-        values = self._node_parameters.values
-        estimators = self._make_estimators()
-        self._made = values, estimators  # for the first configure
-        with without_blas():
-            load(estimators)
-
-    def _begin(self) -> None:
-        """Configure and activate the node if that is its own task."""
-        self.not_ready = ''
-        if not self._node_parameters.values['autostart']:
-            self.get_logger().info('waiting to be configured, for instance by ros2 lifecycle set')
-        elif self.state == 'unconfigured':
-            self.start()
 
     def _make_estimators(self) -> dict[str, OnlineEstimator]:
         """Return new estimators; raise for parameters that do not fit together."""
@@ -262,7 +251,7 @@ class EstimatorNode(ManagedNode):
     def _reports(self) -> list[Report]:
         state = Report('state')
         active = self.state == 'active'
-        state.find(OK if active else STALE, ': '.join(filter(None, (self.state, self.not_ready))))
+        state.find(OK if active else STALE, self.state)
         for level, text in self._clock_watch.look():
             state.find(level, text)
         if active and self._channels is None:

@@ -5,8 +5,7 @@ from collections.abc import Mapping
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from fhaosmo_ros.core.observer.estimates import Estimate
-from fhaosmo_ros.core.observer.self_tuning.members import TUNING
+from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.nodes.middleware.messages import (

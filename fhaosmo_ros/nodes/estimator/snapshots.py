@@ -2,13 +2,14 @@
 """An estimator's memory on a topic, so that a replay can follow a live run exactly."""
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.online.memory import Flag, labels, pack, Snapshot
+from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
 from fhaosmo_ros.nodes.middleware.messages import array_encoder, message_class
 from fhaosmo_ros.topics import ARRAY, SNAPSHOT
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-PERIOD, PERIOD_WITH_MEMBERS = 1.0, 30.0
+PERIOD, PERIOD_OF_SELF_TUNING = 1.0, 30.0
+"""In seconds; a self-tuning estimator remembers thousands of numbers."""
 QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """A recorder that starts later still gets the latest ones."""
 
@@ -29,11 +30,10 @@ class SnapshotPublisher:
     def __init__(self, node: Node, estimator: OnlineEstimator, prefix: str) -> None:
         self._node, self._estimator = node, estimator
         self._due, self._first = True, True
-        observer, memory = estimator.observer, estimator.memory
-        past, members = len(memory.past), len(memory.members)
-        self._encode = array_encoder(labels(observer.levels, observer.inputs, past, members))
+        self._labels: list[str] = []
         self._publisher = node.create_publisher(message_class(ARRAY), prefix + SNAPSHOT, QOS)
-        self._timer = node.create_timer(PERIOD_WITH_MEMBERS if members else PERIOD, self._request)
+        period = PERIOD_OF_SELF_TUNING if estimator.observer.self_tuning else PERIOD
+        self._timer = node.create_timer(period, self._request)
 
     def _request(self) -> None:
         self._due = True
@@ -57,8 +57,10 @@ class SnapshotPublisher:
     def _publish(self, flags: Flag) -> None:
         stamp = self._estimator.latest
         if stamp is not None:
-            snapshot = Snapshot(stamp, flags, self._estimator.memory)
-            self._publisher.publish(self._encode(pack(snapshot)))
+            labels, vector = pack(Snapshot(stamp, flags, self._estimator.state_dict()))
+            if labels != self._labels:  # a state before a gap is there only after one
+                self._labels, self._encode = labels, array_encoder(labels)
+            self._publisher.publish(self._encode(vector))
             self._due = self._first = False
 
     def destroy(self) -> None:

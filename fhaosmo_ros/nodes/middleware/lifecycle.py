@@ -8,7 +8,6 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.simulated_time import reject_negative_time
-from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -22,15 +21,7 @@ class ManagedNode(LifecycleNode):
 
     A transition fails if `configure`, `activate` or `deactivate` of a subclass raises. After a
     failed configure or activate, what it has made is destroyed again.
-
-    Attributes
-    ----------
-    not_ready : str
-        Why it cannot be configured yet, if it cannot.
-
     """
-
-    not_ready = ''
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
@@ -118,12 +109,6 @@ class ManagedNode(LifecycleNode):
         ) -> ChangeState.Response:
             self._error = None
             before, wanted = self.state, request.transition.label or request.transition.id
-            if self.not_ready and wanted in ('configure', Transition.TRANSITION_CONFIGURE):
-                self.get_logger().warning(
-                    f'transition {wanted} refused: {self.not_ready}; try again'
-                )
-                response.success = False
-                return response
             try:
                 response = callback(request, response)
             except rclpy_implementation.RCLError:

@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+import gc
 from itertools import pairwise
 import os
 import re
@@ -29,7 +30,6 @@ from fhaosmo_ros.core.parameters.files import (
 from fhaosmo_ros.core.parameters.tables import FIRST, NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import parse
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
-from fhaosmo_ros.nodes.middleware.loading import is_loading, settle_memory
 from fhaosmo_ros.stop_signals import stop_on_signals, Stopped
 import rclpy
 from rclpy.exceptions import InvalidHandle
@@ -172,7 +172,9 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
             rclpy.init(args=[name, *argv], signal_handler_options=SignalHandlerOptions.NO)
             overrides = [RosParameter(name, value=value) for name, value in lists.items()]
             node = factory(parameter_overrides=overrides) if overrides else factory()
-        settle_memory()
+        # What there is now lives to the end: garbage collections need not look at it.
+        gc.collect()
+        gc.freeze()
         with Spinner(node, on_end=ended.set) as spinner:
             ended.wait()
         if spinner.stuck:  # a node has nothing to save
@@ -196,9 +198,6 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
                 node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
-        if is_loading():  # a compiler that runs while Python ends can crash
-            sys.stderr.flush()
-            os._exit(0)
 
 
 def _check_arguments(

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading, writing, copying and repairing bags, without ROS."""
+"""Reading and writing bags, without ROS."""

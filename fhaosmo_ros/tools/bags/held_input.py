@@ -9,9 +9,13 @@ from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.inputs import Input, make_pairing
+from fhaosmo_ros.pairing import StampPairing
 from fhaosmo_ros.tools.bags.reader import BagReader, Block
 import numpy as np
 from numpy.typing import NDArray
+
+WithInputs = tuple[Block, NDArray[np.float64]]
+"""A block of y, and the known inputs at its samples, (K, m)."""
 
 
 class HeldInputs:
@@ -45,16 +49,32 @@ class HeldInputs:
         values: Mapping[str, Any],
         reject: Callable[[int], None] = lambda _: None,
     ) -> None:
-        used = model.used_inputs
+        self._reader, self._reject = reader, reject
         self._names, self._wanted, self._values = model.inputs, wanted, values
-        self._columns = [model.inputs.index(name) for name in used]
-        self._inputs = [_RecordedInput(reader, wanted[name], reject) for name in used]
+        self._inputs = [self._recorded(name, wanted[name]) for name in model.used_inputs]
+
+    def _recorded(self, name: str, wanted: Input) -> Iterator[tuple[int, int, int, float]]:
+        """Return time in the bag, number of the input, stamp and value of each of its messages."""
+        field = self._reader.field(wanted.topic, wanted.field, wanted.name)
+        stamp = 'header' if wanted.stamp == 'header' else 'bag'
+        blocks = self._reader.blocks(wanted.topic, field, stamp)
+        return self._finite(self._names.index(name), blocks)
+
+    def _finite(self, j: int, blocks: Iterator[Block]) -> Iterator[tuple[int, int, int, float]]:
+        for block in blocks:
+            good = np.isfinite(block.values)
+            self._reject(int((~good).sum()))
+            for time, stamp, u in zip(*(part[good].tolist() for part in block), strict=True):
+                yield time, j, stamp, u
 
     def along(
         self, blocks: Iterable[Block], held: Callable[[], Sequence[float]] | None = None
-    ) -> Iterator[tuple[Block, NDArray[np.float64]]]:
+    ) -> Iterator[WithInputs]:
         """
-        Yield each block with the known inputs at its samples, (K, m).
+        Yield each block with the known inputs at its samples.
+
+        Samples and inputs are taken in the order of the bag, as the node takes them in that of
+        arrival.
 
         Parameters
         ----------
@@ -69,38 +89,15 @@ class HeldInputs:
         if first is None:
             return
         before = list(held()) if held else [0.0] * len(self._names)
-        pairing = make_pairing(self._values, self._names, self._wanted, before)
-        following = chain([first], blocks)
-        if pairing is None:
-            yield from ((block, self._held(block.times, before)) for block in following)
-        else:
-            yield from self._paired(following, pairing)
-
-    def _held(self, times: NDArray[np.int64], before: list[float]) -> NDArray[np.float64]:
-        """Return the last finite ones that the bag has at these times."""
-        u = np.tile(before, (len(times), 1))
-        for j, recorded in zip(self._columns, self._inputs, strict=True):
-            u[:, j] = recorded.held(times, before[j])
-            before[j] = u[-1, j]
-        return u
-
-    def _paired(
-        self, blocks: Iterable[Block], pairing: Any
-    ) -> Iterator[tuple[Block, NDArray[np.float64]]]:
-        """Take samples and inputs in the order of the bag, as the node in that of arrival."""
-        inputs = merge(*(r.events(j) for j, r in zip(self._columns, self._inputs, strict=True)))
+        # Without inputs by their headers' stamps, samples do not wait.
+        pairing = make_pairing(self._values, self._names, self._wanted, before) or StampPairing(
+            [False] * len(before), 0, 0, before
+        )
+        inputs = merge(*self._inputs)
+        event = next(inputs, None)
         rows: list[list[float]] = []
         waiting: deque[Block] = deque()
-        event = next(inputs, None)
-
-        def complete() -> Iterator[tuple[Block, NDArray[np.float64]]]:
-            while waiting and len(waiting[0].times) <= len(rows):
-                block = waiting.popleft()
-                count = len(block.times)
-                yield block, np.array(rows[:count])
-                del rows[:count]
-
-        for block in blocks:
+        for block in chain([first], blocks):
             waiting.append(block)
             for time, stamp in zip(block.times.tolist(), block.stamps.tolist(), strict=True):
                 while event is not None and event[0] <= time:
@@ -109,48 +106,20 @@ class HeldInputs:
                     event = next(inputs, None)
                 pairing.take_sample(stamp, None)
                 rows += [u for _, u in pairing.released()]
-            yield from complete()
+            yield from _complete(waiting, rows)
         while event is not None and waiting:
             pairing.take_input(*event[1:])
             rows += [u for _, u in pairing.released()]
             event = next(inputs, None)
-            yield from complete()
+            yield from _complete(waiting, rows)
         rows += [u for _, u in pairing.released(at_once=True)]
-        yield from complete()
+        yield from _complete(waiting, rows)
 
 
-class _RecordedInput:
-    """One of them."""
-
-    def __init__(self, reader: BagReader, wanted: Input, reject: Callable[[int], None]) -> None:
-        field = reader.field(wanted.topic, wanted.field, wanted.name)
-        stamp = 'header' if wanted.stamp == 'header' else 'bag'
-        self._blocks = self._finite(reader.blocks(wanted.topic, field, stamp, every=False))
-        self._reject = reject
-        self._times = np.zeros(0, dtype=np.int64)
-        self._values = np.zeros(0)
-
-    def _finite(self, blocks: Iterator[Block]) -> Iterator[Block]:
-        for block in blocks:
-            good = np.isfinite(block.values)
-            self._reject(int((~good).sum()))
-            yield Block(*(column[good] for column in block))
-
-    def events(self, j: int) -> Iterator[tuple[int, int, int, float]]:
-        """Yield time in the bag, `j`, stamp and value of each."""
-        for block in self._blocks:
-            for time, stamp, value in zip(*(column.tolist() for column in block), strict=True):
-                yield time, j, stamp, value
-
-    def held(self, times: NDArray[np.int64], before: float) -> NDArray[np.float64]:
-        """Return the last one at each time; times follow those of the call before."""
-        while not len(self._times) or self._times[-1] <= times[-1]:
-            block = next(self._blocks, None)
-            if block is None:
-                break
-            self._times = np.concatenate([self._times, block.times])
-            self._values = np.concatenate([self._values, block.values])
-        last = np.searchsorted(self._times, times, side='right')
-        u = np.concatenate([[before], self._values])[last]
-        self._times, self._values = self._times[last[-1] :], self._values[last[-1] :]
-        return u
+def _complete(waiting: deque[Block], rows: list[list[float]]) -> Iterator[WithInputs]:
+    """Yield the blocks whose samples all have their inputs, and forget them."""
+    while waiting and len(waiting[0].times) <= len(rows):
+        block = waiting.popleft()
+        count = len(block.times)
+        yield block, np.array(rows[:count])
+        del rows[:count]

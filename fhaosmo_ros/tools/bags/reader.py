@@ -1,40 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Reading bags as a stream: all storages, compressions and message types that rosbags knows.
-
-rosbags opens the bag and knows its types, connections and chunks. Its own API hands out one Python
-object a message, which takes 1.9 microseconds for a Float64; here a field of all messages of a
-chunk becomes one array (mcap/chunks.py, cdr.py), which takes 0.05 microseconds a sample. sqlite3
-goes message by message.
-"""
+"""Reading bags as a stream: all storages, compressions and message types that rosbags knows."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager, ExitStack
+from functools import cache
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path
+import shutil
+import sqlite3
+import sys
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.messages.fields import Field, find_field
-from fhaosmo_ros.tools.bags.cdr import expect_all, numbers
-from fhaosmo_ros.tools.bags.mcap import chunks
-from fhaosmo_ros.tools.bags.mcap.pieces import check_summary, find_pieces, load
-from fhaosmo_ros.tools.bags.ros1 import Ros1Storage, with_header_of_ros2
+from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError
+from fhaosmo_ros.tools.bags.mcap_file import check_summary, copy_whole_part, is_cut, Reading, Row
 from fhaosmo_ros.tools.bags.types import LATCHED_QOS, OFFERED_QOS, TYPES
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2.storage_mcap import McapReader
+from rosbags.typesys import get_typestore, Stores
+import zstandard
 
 BLOCK = 16_384
-"""Samples in a block where the bag has no chunks of its own."""
-
-
+"""Samples in a block."""
 STAMPS = ('auto', 'header', 'source', 'bag')
 """Stamps to choose from; see `BagReader.blocks`."""
+ZSTD = b'\x28\xb5\x2f\xfd'
+"""Begin of what zstd has compressed; a message in CDR begins with a zero."""
+HEADER = 'std_msgs/msg/Header'
 
 
 class Block(NamedTuple):
@@ -47,7 +46,7 @@ class Block(NamedTuple):
         Stamps that the bag keeps with the messages (mcap: log time), in nanoseconds.
     stamps : (K,) array of int
         The stamps that were asked for, in nanoseconds.
-    values : (K,) or (K, width) array
+    values : (K,) array
 
     """
 
@@ -61,7 +60,8 @@ class BagReader:
     An open bag: a folder with metadata.yaml, one storage file of it, or a bag of ROS 1.
 
     Where the file has CRCs, what is read agrees with them; and a topic that is read to its end has
-    as many messages as the bag lists.
+    as many messages as the bag lists. A storage file that was cut, or whose writer was killed, is
+    read up to there, which is said on stderr.
 
     Attributes
     ----------
@@ -82,41 +82,39 @@ class BagReader:
         _expect_bag(path)
         self.unchecked = False
         self.lacking: Counter[str] = Counter()
+        self._stack = ExitStack()
 
     def __enter__(self) -> 'BagReader':
-        try:
-            for file in [self.path] if self.path.is_file() else self.path.glob('*.mcap'):
-                if file.suffix == '.mcap':
-                    check_summary(file)
-            self._reader = AnyReader([self.path], default_typestore=TYPES)
-            self._reader.open()
-        except Exception as error:  # rosbags also lets IndexError, struct.error, ... through
-            raise _unreadable(self.path, error) from None
+        with _readable(self.path), ExitStack() as stack:
+            self._open(stack)
+            self._stack = stack.pop_all()
+        return self
+
+    def _open(self, stack: ExitStack) -> None:
+        path = self.path
+        if path.suffix in ('.mcap', '.db3') and path.is_file():
+            path = _whole_part(path, Path(stack.enter_context(TemporaryDirectory())))
+        for file in [path] if path.is_file() else path.glob('*.mcap'):
+            if file.suffix == '.mcap':
+                check_summary(file)
+        self._reader = stack.enter_context(AnyReader([path], default_typestore=TYPES))
         self._types = self._reader.typestore
         first: Any = self._reader.readers[0]
         if self._reader.is2:
             self._storages = list(getattr(first.storage, 'storages', [])) or [first.storage]
         else:
-            self._types = with_header_of_ros2(self._types)
-            self._storages = [Ros1Storage(first, self._types)]
+            # Headers of ROS 2 have no sequence number.
+            self._types = get_typestore(Stores.EMPTY)
+            types = self._reader.typestore.fielddefs | {HEADER: TYPES.fielddefs[HEADER]}
+            self._types.register(types)
+            self._storages = [first]
         stored = [c for s in self._storages for c in s.connections]
-        try:
-            for topic in {c.topic for c in self.connections}:
-                there = sum(c.msgcount for c in stored if c.topic == topic)
-                self._expect(topic, self.count(topic), there)
-        except ConfigurationError:
-            self._reader.close()
-            raise
-        return self
-
-    def _expect(self, topic: str, listed: int, there: int) -> None:
-        """Compare the messages that are there with those that metadata or index list."""
-        if there != listed:
-            error = ValueError(f'{there} messages on {topic} where {listed} are listed')
-            raise _unreadable(self.path, error)
+        for topic in {c.topic for c in self.connections}:
+            there = sum(c.msgcount for c in stored if c.topic == topic)
+            _expect(topic, self.count(topic), there)
 
     def __exit__(self, *_: object) -> None:
-        self._reader.close()
+        self._stack.close()
 
     @property
     def connections(self) -> list[Connection]:
@@ -133,11 +131,6 @@ class BagReader:
     def types(self) -> Any:
         """The bag's own type definitions: a rosbags typestore."""
         return self._types
-
-    @property
-    def span(self) -> tuple[int, int]:
-        """First and last stamp in nanoseconds."""
-        return self._reader.start_time, self._reader.end_time - 1
 
     def count(self, topic: str) -> int:
         """Return how many messages a topic has."""
@@ -166,63 +159,67 @@ class BagReader:
             f'got {topic!r}{suggestion(topic, known)}'
         )
 
-    def messages(self, topics: list[str] | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """Yield topic, stamp (ns) and CDR of the messages of some topics, or of all."""
-        try:
+    def messages(
+        self, topics: Collection[str] | None = None
+    ) -> Iterator[tuple[str, int, bytes, int]]:
+        """
+        Yield topic, stamp (ns), CDR and publish time of the messages of some topics, or of all.
+
+        The publish time is 0 where it is not known, which only mcap has.
+        """
+        with _readable(self.path):
             for storage in self._storages:
                 # By the storage's own connections: AnyReader.messages() yields nothing, and says
                 # nothing, where the QoS of metadata.yaml differs from the storage file's.
                 chosen = [c for c in storage.connections if topics is None or c.topic in topics]
                 if not chosen:
                     continue
-                self.unchecked |= not isinstance(storage, McapReader)
-                counts: Counter[int] = Counter()
-                for connection, stamp, data in storage.messages(chosen):
-                    counts[connection.id] += 1
-                    yield connection.topic, stamp, chunks.decompress_message(data)
+                names = {c.id: c.topic for c in chosen}
+                counts = dict.fromkeys(names, 0)
+                for time, published, channel, data in self._rows(storage, chosen):
+                    counts[channel] += 1
+                    if data[: len(ZSTD)] == ZSTD:  # metadata.yaml says so, but it may be lost
+                        data = zstandard.decompress(data)
+                    yield names[channel], time, data, published
                 for c in chosen:
-                    self._expect(c.topic, c.msgcount, counts[c.id])
-        except Exception as error:
-            raise _unreadable(self.path, error) from None
+                    _expect(c.topic, c.msgcount, counts[c.id])
+
+    def _rows(self, storage: Any, chosen: list[Connection]) -> Iterator[Row]:
+        if isinstance(storage, McapReader):
+            reading = Reading(storage, {c.id for c in chosen})
+            yield from reading
+            self.unchecked |= reading.unchecked
+            return
+        self.unchecked = True
+        for c, stamp, data in storage.messages(chosen):
+            if not self._reader.is2:
+                data = bytes(self._types.ros1_to_cdr(data, c.msgtype))
+            yield stamp, 0, c.id, data
+
+    def objects(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any, int]]:
+        """Yield topic, stamp (ns), message and publish time of the messages of some topics."""
+        types = {c.topic: str(c.msgtype) for c in self.connections}
+        read = self._types.deserialize_cdr
+        with _readable(self.path):
+            for topic, time, data, published in self.messages(topics):
+                yield topic, time, read(data, types[topic]), published
 
     def read_all(self, topics: Collection[str]) -> list[tuple[str, int, Any]]:
         """Return topic, stamp (ns) and message, by stamp, of topics that have few messages."""
-        types = {c.topic: str(c.msgtype) for c in self.connections if c.topic in topics}
-        if self.has_chunks:  # most chunks hold none of them; rosbags goes through every message
-            found = [
-                (names[channel], time, data[start + chunks.DATA_AT : end].tobytes())
-                for names, data, r in self._chunks_of(list(types))
-                for time, channel, start, end in zip(*(x.tolist() for x in r), strict=True)
-            ]
-        else:
-            found = list(self.messages(list(types)))
-        found.sort(key=itemgetter(1))
-        try:
-            return [
-                (topic, time, self._types.deserialize_cdr(data, types[topic]))
-                for topic, time, data in found
-            ]
-        except Exception as error:
-            raise _unreadable(self.path, error) from None
-
-    def first(self, topic: str) -> Any:
-        """Return the first message of a topic that has one."""
-        _, _, data = next(self.messages([topic]))
-        return self._types.deserialize_cdr(data, self.message_type(topic))
-
-    def _chunks_of(self, topics: list[str]) -> Iterator[tuple[dict[int, str], Any, Any]]:
-        for storage, _, data, records in self.chunk_records(topics):
-            yield {c.id: c.topic for c in storage.connections}, data, records
+        return sorted((row[:3] for row in self.objects(topics)), key=itemgetter(1))
 
     def field(self, topic: str, text: str | None, name: str = '') -> Field:
         """Find a numeric field of a topic; see `find_field`."""
-        return find_field(self.types.fielddefs, self.message_type(topic), text, name)
+        kind = self.message_type(topic)
+        if kind not in self.types.fielddefs:
+            raise ConfigurationError(f'bag {self.path}: expected a definition of {kind}, got none')
+        return find_field(self.types.fielddefs, kind, text, name)
 
-    def blocks(
-        self, topic: str, field: Field, stamp: str = 'bag', width: int = 1, every: bool = True
-    ) -> Iterator[Block]:
+    def blocks(self, topic: str, field: Field, stamp: str = 'bag') -> Iterator[Block]:
         """
         Yield a field's samples in order, in blocks; memory does not grow with the bag.
+
+        Messages whose lists are too short or lack the name are left out, as by the node.
 
         Parameters
         ----------
@@ -232,15 +229,11 @@ class BagReader:
             'header': of the messages. 'source': the publish time, which only mcap has; `ros2 bag
             record` writes the publisher's source stamp there. 'bag': of the bag (mcap: log time),
             for `ros2 bag record` the time of reception. 'auto': the first of these that there is.
-        width : int
-            Read so many neighbours in a list, from the field on.
-        every : bool
-            False: leave out messages whose lists are too short or lack the name, as the node does.
 
         Raises
         ------
         ConfigurationError
-            The messages have no header, or the bag no publish times; a message lacks the field.
+            The messages have no header, or the bag no publish times.
 
         """
         if stamp == 'header' and not field.has_header:
@@ -248,98 +241,37 @@ class BagReader:
                 f'--stamp header: expected messages with a header on {topic}, '
                 f'got {self.message_type(topic)}'
             )
-        if stamp == 'source' and not self.has_chunks:
+        if stamp == 'source' and not all(isinstance(s, McapReader) for s in self._storages):
             raise ConfigurationError(
                 f'--stamp source: expected an mcap bag, got {self.path} without publish times'
             )
         if stamp == 'auto':
             stamp = 'header' if field.has_header else 'source'
-        read = self._by_chunk if self.has_chunks else self._by_message
-        return read(topic, _Wanted(field, stamp, width, every))
+        samples = self._samples(topic, field, stamp)
+        with _readable(self.path):
+            while rows := list(islice(samples, BLOCK)):
+                times, stamps, values = zip(*rows, strict=True)
+                yield Block(
+                    np.array(times, np.int64), np.array(stamps, np.int64), np.array(values)
+                )
 
-    @property
-    def has_chunks(self) -> bool:
-        """Return True for an mcap bag: its messages are taken a chunk at a time."""
-        return all(isinstance(s, McapReader) for s in self._storages)
-
-    def chunk_records(
-        self, topics: list[str] | None = None
-    ) -> Iterator[tuple[Any, int, NDArray[np.uint8], chunks.Records]]:
-        """
-        Yield a chunk's storage, the first stamp of the chunk after it, its bytes and messages.
-
-        Chunks come by their first stamp, but may overlap: what lies behind the next chunk's first
-        stamp is not yet in order.
-        """
-        for storage in self._storages:
-            chosen = [c for c in storage.connections if topics is None or c.topic in topics]
-            ids = [c.id for c in chosen]
-            counts: Counter[int] = Counter()
+    def _samples(self, topic: str, field: Field, stamp: str) -> Iterator[tuple[int, int, float]]:
+        for _, time, message, published in self.objects([topic]):
             try:
-                found = [p for p in find_pieces(storage) if any(p.counts.get(i) for i in ids)]
-                found.sort(key=lambda p: (p.first, p.offset))
-                nexts = [*(p.first for p in found[1:]), 2**63 - 1]
-                for piece, following in zip(found, nexts, strict=False):
-                    data, proven = load(storage, piece)
-                    self.unchecked |= not proven
-                    records = chunks.scan(data, ids)
-                    present = np.unique(records.channels, return_counts=True)
-                    counts.update(dict(zip(*(x.tolist() for x in present), strict=True)))
-                    yield storage, following, *chunks.decompress_messages(data, records)
-            except Exception as error:
-                raise _unreadable(self.path, error) from None
-            for c in chosen:
-                self._expect(c.topic, c.msgcount, counts[c.id])
-
-    def _by_chunk(self, topic: str, wanted: '_Wanted') -> Iterator[Block]:
-        rest = None  # samples that a message of the next chunk may still precede
-        for _, following, data, records in self.chunk_records([topic]):
-            block = self._block(data, records, wanted)
-            if rest is not None:
-                block = Block(*(np.concatenate(pair) for pair in zip(rest, block, strict=True)))
-            order = np.argsort(block.times, kind='stable')
-            ready = int(np.searchsorted(block.times[order], following))
-            yield Block(*(part[order[:ready]] for part in block))
-            rest = Block(*(part[order[ready:]] for part in block))
-        if rest is not None and len(rest.times):
-            yield rest
-
-    def _by_message(self, topic: str, wanted: '_Wanted') -> Iterator[Block]:
-        found = self.messages([topic])
-        while rows := list(islice(found, BLOCK)):
-            _, times, texts = zip(*rows, strict=True)
-            yield self._block(*chunks.pack([0] * len(rows), times, texts), wanted)
-
-    def _block(self, data: chunks.Bytes, records: chunks.Records, wanted: '_Wanted') -> Block:
-        times, starts, ends = records.times, records.starts, records.ends
-        try:
-            column = numbers(wanted.field, data, starts + chunks.DATA_AT, ends, wanted.width)
-            if wanted.every:
-                expect_all(column)
-        except Exception as error:
-            raise _unreadable(self.path, error) from None
-        stamps = column.stamps
-        if wanted.stamp == 'source':
-            stamps = chunks.gather(data, starts + chunks.PUBLISHED_AT, np.dtype('<i8'))
-            stamps = np.where(stamps > 0, stamps, times)  # 0: its writer did not know
-        elif wanted.stamp == 'bag':
-            stamps = times
-        block = Block(times, stamps, column.values)
-        if not column.missing:
-            return block
-        self.lacking.update(column.missing.values())
-        keep = np.ones(len(times), bool)
-        keep[list(column.missing)] = False
-        return Block(*(part[keep] for part in block))
+                value = field.value(message)
+            except MissingElementError as error:
+                self.lacking[str(error)] += 1
+                continue
+            if stamp == 'header':
+                yield time, field.stamp(message), value
+            else:
+                yield time, (published if stamp == 'source' else 0) or time, value
 
 
-class _Wanted(NamedTuple):
-    """What to read of each message: see `BagReader.blocks`; without 'auto'."""
-
-    field: Field
-    stamp: str
-    width: int
-    every: bool
+def _expect(topic: str, listed: int, there: int) -> None:
+    """Compare the messages that are there with those that metadata or index list."""
+    if there != listed:
+        raise ValueError(f'{there} messages on {topic} where {listed} are listed')
 
 
 def _expect_bag(path: Path) -> None:
@@ -348,16 +280,46 @@ def _expect_bag(path: Path) -> None:
         raise ConfigurationError(f'bag {path}: {allowed}, got a path that does not exist')
     if path.is_dir() and not (path / 'metadata.yaml').exists():
         files = sorted(p.name for p in path.iterdir() if p.suffix in ('.mcap', '.db3'))
-        hint = f' but {files[0]}: name that file, or run record --repair' if files else ''
+        hint = f' but {files[0]}: name that file, or run ros2 bag reindex' if files else ''
         raise ConfigurationError(f'bag {path}: {allowed}, got a folder without it{hint}')
     if path.is_file() and path.suffix not in ('.mcap', '.db3', '.bag'):
         raise ConfigurationError(f'bag {path}: {allowed}, got a file that is none')
 
 
-def _unreadable(path: Path, error: Exception) -> ConfigurationError:
-    if isinstance(error, ConfigurationError):
-        return error
-    text = ' '.join(str(error).split()) or type(error).__name__
-    return ConfigurationError(
-        f'bag {path}: expected a whole bag, got: {text} (record --repair saves what is whole)'
-    )
+def _whole_part(path: Path, folder: Path) -> Path:
+    """Return a storage file; if its writer was killed or it was cut, a copy of what is whole."""
+    copy = folder / path.name
+    journals = [p for end in ('-journal', '-wal') if (p := Path(f'{path}{end}')).exists()]
+    if path.suffix == '.mcap' and is_cut(path):
+        if not copy_whole_part(path, copy):
+            raise ValueError('a file that was cut before its first chunk ended')
+    elif journals:
+        for part in (path, *journals):
+            shutil.copy(part, folder)
+        database = sqlite3.connect(copy)  # takes back what was not committed
+        database.execute('SELECT count(*) FROM messages')
+        database.close()
+    else:
+        return path
+    _say_once(f'bag {path}: cut, or its writer was killed; read up to its last whole part')
+    return copy
+
+
+@cache
+def _say_once(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Say in one line what is wrong with a bag, whatever rosbags, mcap or sqlite3 raise."""
+    try:
+        yield
+    except ConfigurationError:
+        raise
+    except Exception as error:
+        text = ' '.join(str(error).split()) or type(error).__name__
+        raise ConfigurationError(
+            f'bag {path}: expected a whole bag, got: {text} (`mcap recover`, or .recover of '
+            'sqlite3, saves what is whole)'
+        ) from None

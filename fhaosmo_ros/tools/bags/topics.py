@@ -7,10 +7,12 @@ at its begin and at its end. What was published together is found by its stamps 
 """
 
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.tools.bags.reader import BagReader, BLOCK
 from fhaosmo_ros.topics import TRUTH
 import numpy as np
 from numpy.typing import NDArray
@@ -68,30 +70,38 @@ def messages(path: Path, topic: str) -> list[tuple[int, Any]]:
 
 
 def series(path: Path, topic: str) -> Series:
-    """Read a topic of numbers; empty arrays if it has no message."""
+    """
+    Read a topic of numbers; empty arrays if it has no message.
+
+    Raises
+    ------
+    ConfigurationError
+        Its messages have lists of different lengths.
+
+    """
+    stamps, values = [np.zeros(0, np.int64)], []
+    labels: list[str] = []
     with BagReader(path) as reader:
-        if not reader.count(topic):
-            return Series(np.zeros(0, np.int64), np.zeros(0), [])
-        first = reader.first(topic)
-        if hasattr(first, 'nanosec'):
-            stamps, seconds = _read(reader, topic, 'sec')
-            _, rest = _read(reader, topic, 'nanosec')
-            values = seconds.astype(np.int64) * 1_000_000_000 + rest.astype(np.int64)
-            return Series(stamps, values, [])
-        if not hasattr(first, 'layout'):
-            return Series(*_read(reader, topic, 'data'), [])
-        width = len(first.data)
-        stamps, values = _read(reader, topic, 'data[0]', width)
-        labels = first.layout.dim[0].label.split(',') if first.layout.dim else []
-        return Series(stamps, values.reshape(-1, width), labels)
+        rows = reader.objects([topic]) if reader.count(topic) else iter(())
+        while block := list(islice(rows, BLOCK)):  # arrays take less memory than messages
+            stamps.append(np.array([stamp for _, stamp, _, _ in block]))
+            try:
+                values.append(np.array([_numbers(message) for _, _, message, _ in block]))
+            except ValueError:
+                raise ConfigurationError(
+                    f'topic {topic!r}: expected lists of one length, got several'
+                ) from None
+            first = block[0][2]
+            if not labels and hasattr(first, 'layout') and first.layout.dim:
+                labels = first.layout.dim[0].label.split(',')
+    return Series(np.concatenate(stamps), np.concatenate(values or [np.zeros(0)]), labels)
 
 
-def _read(
-    reader: BagReader, topic: str, field: str, width: int = 1
-) -> tuple[NDArray[np.int64], NDArray[Any]]:
-    blocks = list(reader.blocks(topic, reader.field(topic, field), width=width))
-    times, _, values = (np.concatenate(part) for part in zip(*blocks, strict=True))
-    return times, values
+def _numbers(message: Any) -> Any:
+    """Return the data of a message, or a Time in nanoseconds."""
+    if hasattr(message, 'nanosec'):
+        return message.sec * 1_000_000_000 + message.nanosec
+    return message.data
 
 
 def read_ticks(path: Path, name: str, parts: Sequence[str]) -> dict[str, NDArray[Any]]:

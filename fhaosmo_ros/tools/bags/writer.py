@@ -2,21 +2,20 @@
 """
 Bags written as Jazzy's rosbag2 writes them.
 
-rosbags writes metadata.yaml and sqlite3. This module changes three things of it: the storage file
-is named `NAME_0` as rosbag2 does, so that `ros2 bag reindex` finds it; the distribution is ROS's,
-not rosbags; and messages can be flushed, so that a kill does not take them back. mcap files are
-written by mcap/writer.py. `write_chunk` takes the records of a whole chunk and `write_many` many
-messages, because rosbags' own call takes 6 microseconds a message.
+rosbags writes metadata.yaml and sqlite3. Three things of it are changed: the storage file is named
+`NAME_0` as by rosbag2, so that `ros2 bag reindex` finds it; the distribution is ROS's, not
+rosbags; and messages can be flushed, so that a kill does not take them back. mcap files are
+written by mcap_file.py.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import os
 from pathlib import Path
 import sqlite3
 from typing import Any, ClassVar
 
-from fhaosmo_ros.tools.bags.mcap.chunks import pack, Records
-from fhaosmo_ros.tools.bags.mcap.writer import McapFile
+from fhaosmo_ros.tools.bags.mcap_file import McapFile
+from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.types import learn, OFFERED_QOS, TYPES
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +27,15 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 DISTRIBUTION = os.environ.get('ROS_DISTRO') or 'jazzy'
 VERSION = 9
 """Version of the metadata that Jazzy writes."""
+BATCH = 8192
+"""Messages that are copied at a time."""
 
 
-class _SqliteWriter(Sqlite3Writer):
+def _with_distribution(metadata: str) -> str:
+    return metadata.replace('ros_distro: rosbags', f'ros_distro: {DISTRIBUTION}')
+
+
+class _SqliteFile(Sqlite3Writer):
     def __init__(self, path: Path, _: Any) -> None:
         # Not rosbags' own __init__, which fixes another name of the file.
         self.path = path / f'{path.name}_0.db3'
@@ -38,34 +43,42 @@ class _SqliteWriter(Sqlite3Writer):
         self.conn.executescript(self.SQLITE_SCHEMA.replace("'rosbags'", f"'{DISTRIBUTION}'"))
         self.cursor = self.conn.cursor()
 
-    def close(self, version: int, metadata: str) -> None:
-        super().close(version, _with_distribution(metadata))
+    def write(self, connection: Connection, stamp: int, data: bytes, _: int) -> None:
+        super().write(connection, stamp, data)
+
+    def write_columns(
+        self, times: NDArray[np.int64], columns: Sequence[tuple[Connection, NDArray[np.uint8]]]
+    ) -> None:
+        for k, time in enumerate(times.tolist()):
+            for connection, messages in columns:
+                super().write(connection, time, messages[k].tobytes())
 
     def flush(self) -> None:
         self.conn.commit()
 
-
-class _McapFile(McapFile):
-    def close(self, version: int, metadata: str) -> None:
-        super().close(version, _with_distribution(metadata))
+    def totals(self) -> tuple[dict[int, int], int, int]:
+        rows = self.conn.execute(
+            'SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages '
+            'GROUP BY topic_id'
+        ).fetchall()
+        first, last = min((r[2] for r in rows), default=0), max((r[3] for r in rows), default=0)
+        return {row[0]: row[1] for row in rows}, first, last
 
 
 class _Writer(Writer):
     STORAGE_PLUGINS: ClassVar = {
-        StoragePlugin.SQLITE3: _SqliteWriter,
-        StoragePlugin.MCAP: _McapFile,
+        StoragePlugin.SQLITE3: _SqliteFile,
+        StoragePlugin.MCAP: McapFile,
     }
 
     def close(self) -> None:
+        close = self.storage.close
+        self.storage.close = lambda version, text: close(version, _with_distribution(text))
         super().close()
         text = _with_distribution(self.metapath.read_text(encoding='utf-8'))
         part = self.metapath.with_suffix('.part')
         part.write_text(text, encoding='utf-8')
         part.replace(self.metapath)
-
-
-def _with_distribution(metadata: str) -> str:
-    return metadata.replace('ros_distro: rosbags', f'ros_distro: {DISTRIBUTION}')
 
 
 class BagWriter:
@@ -97,74 +110,75 @@ class BagWriter:
         types: Any = TYPES,
         qos: Sequence[Qos] = (OFFERED_QOS,),
         digest: str = '',
-    ) -> int:
-        """Add a topic if the bag does not have it yet; return its channel number."""
-        if topic not in self._connections:
-            if message_type not in types.fielddefs and types is TYPES:
-                learn(message_type)
-            if message_type not in types.fielddefs:
-                # A type that is not installed, or an old bag without definitions. Readers compare
-                # the hash with the definition, so both are those of a message without fields.
-                types, digest = get_typestore(Stores.EMPTY), ''
-                types.register(get_types_from_msg('', message_type))
-            definition = types.generate_msgdef(message_type, ros_version=2)[0]
-            digest = digest or types.hash_rihs01(message_type)
-            self._connections[topic] = self._writer.add_connection(
-                topic,
-                message_type,
-                msgdef=definition,
-                rihs01=digest,
-                offered_qos_profiles=list(qos),
-            )
-        return self._connections[topic].id
-
-    def write(self, topic: str, stamp: int, data: bytes) -> None:
-        """Append one message in CDR, with its stamp in nanoseconds."""
-        self._writer.write(self._connections[topic], stamp, data)
-
-    def write_many(
-        self, ids: Sequence[int], stamps: Sequence[int], texts: Sequence[bytes]
     ) -> None:
-        """Append messages in CDR, by channel number, all at once."""
-        if not len(ids):
+        """Add a topic if the bag does not have it yet."""
+        if topic in self._connections:
             return
-        if self.takes_chunks:
-            self.write_chunk(*pack(ids, stamps, texts))
-            return
-        self._writer.storage.conn.executemany(
-            'INSERT INTO messages (topic_id, timestamp, data) VALUES(?, ?, ?)',
-            zip(ids, stamps, texts, strict=True),
+        if message_type not in types.fielddefs and types is TYPES:
+            learn(message_type)
+        if message_type not in types.fielddefs:
+            # A type that is not installed, or an old bag without definitions. Readers compare
+            # the hash with the definition, so both are those of a message without fields.
+            types, digest = get_typestore(Stores.EMPTY), ''
+            types.register(get_types_from_msg('', message_type))
+        self._connections[topic] = self._writer.add_connection(
+            topic,
+            message_type,
+            msgdef=types.generate_msgdef(message_type, ros_version=2)[0],
+            rihs01=digest or types.hash_rihs01(message_type),
+            offered_qos_profiles=list(qos),
         )
-        self._count(ids, stamps)
 
-    @property
-    def count(self) -> int:
-        """Return the number of messages so far."""
-        return sum(self._writer.counts.values())
+    def write(self, topic: str, stamp: int, data: bytes, published: int | None = None) -> None:
+        """
+        Append one message in CDR.
 
-    @property
-    def takes_chunks(self) -> bool:
-        """Return True for an mcap bag."""
-        return self._writer.storage_plugin == StoragePlugin.MCAP
+        Parameters
+        ----------
+        topic : str
+        stamp : int
+            In nanoseconds.
+        data : bytes
+        published : int, optional
+            Publish time, which mcap keeps beside the stamp; default: the stamp.
 
-    def write_chunk(self, data: NDArray[np.uint8], records: Records) -> None:
-        """Append the message records of an mcap chunk as they are, as one chunk."""
-        if len(records.times):
-            self._writer.storage.write_chunk(data, records)
-            self._count(records.channels, records.times)
+        """
+        connection = self._connections[topic]
+        sent = stamp if published is None else published
+        self._writer.storage.write(connection, stamp, data, sent)
 
-    def _count(self, ids: Any, stamps: Any) -> None:
-        writer = self._writer
-        for channel, count in zip(*np.unique(ids, return_counts=True), strict=True):
-            writer.counts[int(channel)] += int(count)
-        writer.min_timestamp = min(int(np.min(stamps)), writer.min_timestamp)
-        writer.max_timestamp = max(int(np.max(stamps)), writer.max_timestamp)
+    def write_columns(
+        self, times: NDArray[np.int64], columns: Sequence[tuple[str, NDArray[np.uint8]]]
+    ) -> None:
+        """
+        Append a message of each topic at each time, all at once.
+
+        Parameters
+        ----------
+        times : (K,) array of int
+            In nanoseconds.
+        columns : sequence of (str, (K, size) array)
+            Topics, and the bytes of their messages in CDR.
+
+        """
+        found = [(self._connections[topic], messages) for topic, messages in columns]
+        self._writer.storage.write_columns(times, found)
+
+    def copy(self, reader: BagReader) -> Iterator[None]:
+        """Copy every topic as it is; yield now and then, so that the caller can stop."""
+        for c in reader.connections:
+            self.add(c.topic, c.msgtype, reader.types, *reader.offered(c))
+        for k, (topic, stamp, data, published) in enumerate(reader.messages()):
+            self.write(topic, stamp, data, published)
+            if k % BATCH == 0:
+                yield
 
     def flush(self) -> None:
         """Hand what has been written to the operating system: a later kill cannot take it back."""
         self._writer.storage.flush()
 
     def __exit__(self, *_: object) -> None:
-        if not self.count:  # rosbags would begin an empty bag at 2**63 - 1
-            self._writer.min_timestamp = self._writer.max_timestamp = 0
-        self._writer.close()
+        writer = self._writer
+        counts, writer.min_timestamp, writer.max_timestamp = writer.storage.totals()
+        writer.counts |= counts
+        writer.close()

@@ -161,7 +161,7 @@ class Workers:
         self._stop = stop
         for variable in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
             os.environ.setdefault(variable, '1')
-        # spawn: a fork after rclpy or numba have started threads can hang.
+        # spawn: a fork after rclpy has started threads can hang.
         context = multiprocessing.get_context('spawn')
         # This starts multiprocessing's resource tracker, which inherits the mask: it handles
         # SIGINT and SIGTERM only, so that a SIGHUP to the group would kill it.

@@ -13,7 +13,6 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.bags.copy import copy_topics
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
 from fhaosmo_ros.tools.bags.writer import BagWriter
@@ -27,7 +26,12 @@ from fhaosmo_ros.tools.cli.options import (
 )
 from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.cli.progress import progress
-from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun, read_events
+from fhaosmo_ros.tools.replay.live_run import (
+    find_estimator,
+    LiveRun,
+    read_events,
+    UnknownSnapshot,
+)
 from fhaosmo_ros.tools.replay.samples import Samples
 from fhaosmo_ros.tools.replay.sinks import BagSink, CsvSink, NpzSink, Sink
 from fhaosmo_ros.topics import ESTIMATES
@@ -111,8 +115,12 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             estimator.smooth()
         live = None
         if followed is not None:
-            events = read_events(reader, followed, named(arguments))
-            live = LiveRun(followed, events, estimator)
+            try:
+                events = read_events(reader, followed, named(arguments))
+                live = LiveRun(followed, events, estimator)
+            except UnknownSnapshot as error:
+                text = f'{error}; {followed} is not followed, this begins at the first sample'
+                print(f'replay: warning: {text}', file=sys.stderr)
         namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
         used = estimator.observer.used_inputs
         present = {c.topic for c in reader.connections}
@@ -193,7 +201,7 @@ def _write(
             else:
                 bag = stack.enter_context(BagWriter(output.path, storage=arguments.storage))
                 sinks.append(BagSink(bag, name, observer.order, observer.levels, parameters))
-                for _ in copy_topics(reader, bag):
+                for _ in bag.copy(reader):
                     _check_stop(stop)
         with progress(total=samples.total, unit='sample', unit_scale=True, desc='replay') as bar:
             for count, rows in samples:

@@ -6,9 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.observer.arrays import MEMORY, WAIT
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.online.memory import Flag, FROZEN, INTEGERS, Snapshot, unpack
+from fhaosmo_ros.core.online.snapshots import Flag, Snapshot, unpack
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import split
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
@@ -22,6 +21,8 @@ TRIES = 30
 """Snapshots that may have no sample in the bag, before replay stops looking for the first one."""
 AGREEMENT = 1e-12
 """Relative or absolute difference up to which two memories count as the same."""
+COMPARED = 'z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending', 'wait'
+"""What snapshots of every version hold of a state."""
 VALUE_FIELDS = {
     1: 'bool_value', 2: 'integer_value', 3: 'double_value', 4: 'string_value',
     6: 'bool_array_value', 7: 'integer_array_value', 8: 'double_array_value',
@@ -30,16 +31,16 @@ VALUE_FIELDS = {
 """Field of a rcl_interfaces/msg/ParameterValue that holds the value, by the number of its type."""
 
 
-OLDEST = WAIT + 1 - MEMORY
-"""What snapshots of every version hold of a state ends here."""
-
-
 class Event(NamedTuple):
     """A snapshot of the live estimator, and the parameters that changed before it (stamp: ns)."""
 
     time: int
     snapshot: Snapshot
     changes: dict[str, Any]
+
+
+class UnknownSnapshot(ConfigurationError):
+    """The bag has snapshots that this version can not read."""
 
 
 def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> str | None:
@@ -87,6 +88,11 @@ def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Even
     fixed : iterable of str
         Parameters whose live changes are not repeated.
 
+    Raises
+    ------
+    UnknownSnapshot
+        A snapshot is of another version, or damaged.
+
     """
     events: list[Event] = []
     changes: dict[str, Any] = {}
@@ -100,11 +106,8 @@ def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Even
         try:
             names = message.layout.dim[0].label.split(',')
             snapshot = unpack(message.data, names)
-        except (IndexError, ValueError) as error:
-            raise ConfigurationError(
-                f'topic {topic!r}: expected snapshots of this version ({error}); --afresh does '
-                'without them'
-            ) from None
+        except (IndexError, ConfigurationError) as error:
+            raise UnknownSnapshot(f'topic {topic!r}: {error}') from None
         # The node publishes the change first, then the snapshot.
         took_them = not events or snapshot.flags & (Flag.CHANGED | Flag.STARTED)
         events.append(Event(time, snapshot, changes if took_them else {}))
@@ -146,6 +149,7 @@ class LiveRun:
         self._name, self._events, self._estimator = name, deque(events), estimator
         self.left_out = 0
         self._followed = self._resumed = False
+        self._unfit = ''
         self._same = self._other = 0
 
     def begin(self, blocks: Iterator[Block]) -> Iterator[Block]:
@@ -179,14 +183,16 @@ class LiveRun:
         """Take the memory after the event's sample; return True if the run goes on behind it."""
         if event.snapshot.flags & Flag.STARTED:
             # First sample of the live estimator, or first after a restart: it may hold inputs.
-            for index, u in enumerate(event.snapshot.memory.u[: len(self._estimator.inputs)]):
+            held = np.ravel(event.snapshot.values.get('u', ()))
+            for index, u in enumerate(held[: len(self._estimator.inputs)].tolist()):
                 self._estimator.set_input(u, index)
             return False
         self._configure(event)
         self._events.popleft()
         try:
-            self._estimator.remember(event.snapshot.memory)
-        except ConfigurationError:  # the memory is that of an observer of another size
+            self._estimator.load_state_dict(event.snapshot.values)
+        except ConfigurationError as error:  # as of an observer of another size
+            self._unfit = f'; its state does not fit ({error})'
             return False
         self._resumed = True
         return True
@@ -221,12 +227,12 @@ class LiveRun:
 
     def _repeat(self, event: Event) -> None:
         """Do what was done to the live estimator after the event's sample."""
-        _, flags, memory = event.snapshot
+        _, flags, values = event.snapshot
         if not flags & Flag.STARTED:
             self._configure(event)
         if flags & Flag.RESET:
             self._estimator.reset()
-        self._estimator.freeze(bool(memory.integers[INTEGERS.index(FROZEN)]))
+        self._estimator.freeze(bool(np.any(values.get('frozen', False))))
 
     def _configure(self, event: Event) -> None:
         if not event.changes:
@@ -240,11 +246,12 @@ class LiveRun:
             ) from None
 
     def _compare(self, snapshot: Snapshot) -> None:
-        ours, theirs = self._estimator.memory.now, snapshot.memory.now
+        ours, theirs = (
+            np.concatenate([np.ravel(values.get(name, ())) for name in COMPARED])
+            for values in (self._estimator.state_dict(), snapshot.values)
+        )
         same = self._estimator.latest == snapshot.stamp and ours.shape == theirs.shape
-        if same and np.allclose(
-            ours[:OLDEST], theirs[:OLDEST], rtol=AGREEMENT, atol=AGREEMENT, equal_nan=True
-        ):
+        if same and np.allclose(ours, theirs, rtol=AGREEMENT, atol=AGREEMENT, equal_nan=True):
             self._same += 1
         else:
             self._other += 1
@@ -259,6 +266,7 @@ class LiveRun:
         begin = 'from the state it had' if self._resumed else 'afresh'
         count = self._same + self._other
         text = f'followed {self._name} {begin} after {self.left_out} samples of the bag'
+        text += self._unfit
         text += f'; {self._same} of {count} snapshots are the same to {AGREEMENT:g}'
         if self._other:
             text += ' (parameters differ, or one of the two missed samples)'

@@ -4,7 +4,6 @@
 import argparse
 from collections.abc import Iterator
 
-from fhaosmo_ros.core.observer import arrays
 from fhaosmo_ros.core.observer.estimates import Trajectory
 from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -114,13 +113,12 @@ class Samples:
         unwrap = Unwrapper()
         for k, block in enumerate(blocks):
             if k == 0 and self.estimator.latest is not None:
-                memory = self.estimator.arrays.state.memory
-                unwrap.begin_near(memory[arrays.Y] + memory[arrays.OFFSET])
+                unwrap.begin_near(self.estimator.state_dict()['y'] + self.estimator.offset)
             values = np.array([unwrap(value) for value in block.values.tolist()])
             yield block._replace(values=values)
 
     def _checked(self) -> Iterator[Block]:
-        for block in self._reader.blocks(self.topic, self._field, self._stamp, every=False):
+        for block in self._reader.blocks(self.topic, self._field, self._stamp):
             if len(block.times):
                 self._check(block)
                 yield block

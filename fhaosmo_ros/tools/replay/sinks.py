@@ -8,12 +8,10 @@ import shutil
 from typing import Any, NamedTuple, Protocol
 import zipfile
 
-from fhaosmo_ros.core.observer.estimates import Trajectory
-from fhaosmo_ros.core.observer.self_tuning.members import TUNING
+from fhaosmo_ros.core.observer.estimates import Trajectory, TUNING
 from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.units import derivative_unit
-from fhaosmo_ros.tools.bags.mcap.chunks import DATA_AT, MESSAGE, Records
 from fhaosmo_ros.tools.bags.types import diagnostics, labelled_array, LATCHED_QOS, serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.topics import (
@@ -157,9 +155,8 @@ class BagSink:
     """
     The estimator's topics in an open bag: a message on each for every sample.
 
-    rosbags writes about 160,000 messages a second: 30 microseconds for the five of a sample. All
-    messages of a topic have the same length, so the records of one sample are made once, and
-    copied for each sample with its stamp and its numbers.
+    All messages of a topic have the same length. So they are made a block at a time: the bytes of
+    one, and behind them each sample's numbers.
 
     Parameters
     ----------
@@ -176,106 +173,46 @@ class BagSink:
     def __init__(
         self, bag: BagWriter, name: str, order: int, levels: int, parameters: Mapping[str, Any]
     ) -> None:
-        self._bag = bag
-        self._parameters = f'{name}/{PARAMETERS}', dumps(parameters, name)
-        bag.add(self._parameters[0], TEXT, qos=[LATCHED_QOS])
+        self._bag, self._name, self._order = bag, name, order
+        self._parameters = dumps(parameters, name)
         self._has_parameters = False
-        self._name = name
         self._unit = derivative_unit(parameters.get('measurement_unit', ''), order)
-        self._events = ''
+        state = [f'z{i + 1}' for i in range(order)]
+        labels = [state, [f'eps{i + 1}' for i in range(levels)], [*state, 'd'], TUNING]
+        lists = [labelled_array(names, np.zeros(len(names))) for names in labels]
+        number, stamp = serialise(FLOAT, data=0.0), serialise(TIME, sec=0, nanosec=0)
+        self._messages = [lists[0], number, number, lists[1], stamp, *lists[2:]]
+        bag.add(f'{name}/{PARAMETERS}', TEXT, qos=[LATCHED_QOS])
         tuned = parameters['gains'] == 'self_tuning'
         topics = ESTIMATES | (SELF_TUNED if tuned else {})
-        ids = [bag.add(f'{name}/{topic}', kind) for topic, kind in topics.items()]
-        state = [f'z{i + 1}' for i in range(order)]
-        innovation = [f'eps{i + 1}' for i in range(levels)]
-        number = serialise(FLOAT, data=0.0)
-        # Each message, and how many bytes at its end are the numbers.
-        self._messages = [
-            (labelled_array(state, np.zeros(order)), 8 * order),
-            (number, 8),
-            (number, 8),
-            (labelled_array(innovation, np.zeros(levels)), 8 * levels),
-            (serialise(TIME, sec=0, nanosec=0), 8),
-        ]
-        if tuned:
-            for labels in [*state, 'd'], TUNING:
-                message = labelled_array(labels, np.zeros(len(labels)))
-                self._messages.append((message, 8 * len(labels)))
-        self._ids = np.array(ids, dtype=np.int64)
-        sizes = [DATA_AT + len(message) for message, _ in self._messages]
-        self._ends = np.cumsum(sizes)
-        self._starts = self._ends - sizes
-        self._template = self._make_template(ids)
-
-    def _make_template(self, ids: list[int]) -> NDArray[np.uint8]:
-        """Return the records of one sample with zeros for its stamp and its numbers."""
-        out = b''
-        for channel, (message, _) in zip(ids, self._messages, strict=True):
-            out += bytes([MESSAGE]) + (DATA_AT - 9 + len(message)).to_bytes(8, 'little')
-            out += channel.to_bytes(2, 'little') + bytes(DATA_AT - 11) + message
-        return np.frombuffer(out, dtype=np.uint8)
+        for topic, kind in topics.items():
+            bag.add(f'{name}/{topic}', kind)
+        self._topics = [f'{name}/{topic}' for topic in topics]
 
     def write(self, rows: Rows) -> None:
         """Append the messages of each sample, and those of events."""
-        self._write_estimates(rows)
-        for time, event in rows.events:
-            if not self._events:
-                self._events = f'{self._name}/{EVENT}'
-                self._bag.add(self._events, DIAGNOSTICS, qos=[LATCHED_QOS])
-            text, values = described(event, self._unit)
-            name = f'{self._name.lstrip("/")}: event'
-            self._bag.write(
-                self._events, time, diagnostics(event.stamp, event.begins, name, text, values)
-            )
-
-    def _write_estimates(self, rows: Rows) -> None:
         if not self._has_parameters:
-            topic, text = self._parameters
-            self._bag.write(topic, int(rows.times[0]), serialise(TEXT, data=text))
+            text = serialise(TEXT, data=self._parameters)
+            self._bag.write(f'{self._name}/{PARAMETERS}', int(rows.times[0]), text)
             self._has_parameters = True
         e = rows.estimates
-        seconds, rest = np.divmod(e.t, 1_000_000_000)
-        numbers = [
-            e.z,
-            e.unknown_input,
-            e.gamma,
-            e.innovation,
-            np.column_stack([seconds, rest]).astype('<i4'),
-        ]
-        if e.standard_deviation.shape[1]:
-            numbers += [e.standard_deviation, e.tuning]
-        count = len(rows.times)
-        data = np.tile(self._template, (count, 1))
-        times = _bytes(rows.times.astype('<i8'), count)
-        for start, end, (_, size), values in zip(
-            self._starts, self._ends, self._messages, numbers, strict=True
-        ):
-            data[:, start + DATA_AT - 16 : start + DATA_AT - 8] = times
-            data[:, start + DATA_AT - 8 : start + DATA_AT] = times
-            data[:, end - size : end] = _bytes(values, count)
-        if self._bag.takes_chunks:
-            shift = np.arange(count)[:, np.newaxis] * self._template.size
-            self._bag.write_chunk(
-                data.reshape(-1),
-                Records(
-                    np.repeat(rows.times, len(self._ids)),
-                    np.tile(self._ids, count),
-                    (shift + self._starts).reshape(-1),
-                    (shift + self._ends).reshape(-1),
-                ),
-            )
-            return
-        text, width = data.tobytes(), self._template.size
-        places = list(zip(self._starts.tolist(), self._ends.tolist(), strict=True))
-        self._bag.write_many(
-            self._ids.tolist() * count,
-            np.repeat(rows.times, len(self._ids)).tolist(),
-            [
-                text[at + start + DATA_AT : at + end]
-                for at in range(0, count * width, width)
-                for start, end in places
-            ],
-        )
+        stamp = np.column_stack(np.divmod(e.t, 1_000_000_000)).astype('<i4')
+        numbers = [e.z, e.unknown_input, e.gamma, e.innovation, stamp]
+        numbers += [e.standard_deviation, e.tuning]
+        columns = []
+        for topic, message, values in zip(self._topics, self._messages, numbers, strict=False):
+            ends = _bytes(values, len(rows.times))
+            begin = np.frombuffer(message[: len(message) - ends.shape[1]], np.uint8)
+            begins = np.tile(begin, (len(rows.times), 1))
+            columns.append((topic, np.hstack([begins, ends])))
+        self._bag.write_columns(rows.times, columns)
+        for time, event in rows.events:
+            topic = f'{self._name}/{EVENT}'
+            self._bag.add(topic, DIAGNOSTICS, qos=[LATCHED_QOS])
+            text, values = described(event, self._unit)
+            name = f'{self._name.lstrip("/")}: event'
+            message = diagnostics(event.stamp, event.begins, name, text, values)
+            self._bag.write(topic, time, message)
 
     def close(self) -> None:
         """Do nothing: who opened the bag closes it."""

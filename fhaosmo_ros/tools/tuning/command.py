@@ -54,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
         prog='tune',
         description=__doc__,
         epilog='Everything else (model, noise, rate, disturbances, what to search, weights) is a '
-        'parameter: docs/tuning.md.',
+        'parameter: docs/offline.md.',
     )
     add = parser.add_argument
     add(

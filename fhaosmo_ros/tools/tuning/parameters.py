@@ -54,7 +54,7 @@ TUNING = (
     Parameter(
         'decades', 0.0,
         'Bounds of a search in logarithms, where none are given: powers of ten around its start. '
-        "0: 0.5 around a Kalman filter's gains (docs/tuning.md), 3 around others.",
+        "0: 0.5 around a Kalman filter's gains (docs/offline.md), 3 around others.",
         lower=0.0, upper=12.0, live=False,
     ),
 )  # fmt: skip

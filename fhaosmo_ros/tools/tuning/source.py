@@ -127,7 +127,7 @@ def _read(
     with BagReader(source.path) as reader:
         topic = source.y.absolute('')
         found = reader.field(topic, source.y.field, source.y.name)
-        blocks = list(reader.blocks(topic, found, source.stamp, every=False))
+        blocks = list(reader.blocks(topic, found, source.stamp))
         times, stamps, y = (np.concatenate([block[k] for block in blocks]) for k in range(3))
         if found.wraps:
             y = np.array(list(map(Unwrapper(), y.tolist())))

@@ -1,18 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """How well the errors of the estimates are damped, for small and for large innovations."""
 
-from fhaosmo_ros.core.observer.arrays import (
-    CORRECTION_PERIOD,
-    GAMMA_INITIAL,
-    INVERSE_WIDTH,
-    LAMBDA,
-    part,
-    PREDICTING,
-    RATES,
-    SCHEDULED,
-    STEADY_VARIANCE,
-)
-from fhaosmo_ros.core.observer.levant import deadbeat_shares
+from fhaosmo_ros.core.observer.configuration import deadbeat_shares
+from fhaosmo_ros.core.observer.kalman import Uncertainty
 from fhaosmo_ros.core.observer.observer import Observer
 import numpy as np
 from scipy.linalg import expm
@@ -36,19 +26,21 @@ def least_damping(observer: Observer) -> float:
     Below 0 the errors grow by themselves. 1 without `noise_size` or with another scheme, where
     other rules hold.
     """
-    law = observer.law
-    if not (law.flags[PREDICTING] and law.flags[SCHEDULED]):
+    c = observer.configuration
+    if not c.predicting or c.schedule is None:
         return 1.0
-    n, h = observer.levels, law.scalars[CORRECTION_PERIOD]
-    transition, shares = expm(law.chances[part(RATES, n)] * h), deadbeat_shares(n)
-    level, grid = np.arange(n), np.linspace(0.0, 1.0, law.curves.shape[1])
-    power = 2.0 * law.scalars[GAMMA_INITIAL] * (n - 1 - level) / n
+    n, h = c.levels, c.parameters['correction_period']
+    rates = Uncertainty(c.model, c.parameters, c.state_sizes).rates
+    transition, shares = expm(rates * h), deadbeat_shares(n)
+    level, grid = np.arange(n), np.linspace(0.0, 1.0, c.curves.shape[1])
+    power = 2.0 * c.gamma_initial * (n - 1 - level) / n
+    expected = np.sqrt(c.schedule.steady[0, 0] + c.schedule.variance)
     worst = 1.0
     for size in SIZES:
-        a = max(size, SMALLEST) * np.sqrt(law.scalars[STEADY_VARIANCE])
-        inputs = np.minimum(a * law.gains[INVERSE_WIDTH], 1.0)
-        psi = np.array([np.interp(x, grid, c) for x, c in zip(inputs, law.curves, strict=True)])
-        slopes = law.gains[LAMBDA] * a ** (power - 1.0) * psi
+        a = max(size, SMALLEST) * expected
+        inputs = np.minimum(a / c.widths, 1.0)
+        psi = np.array([np.interp(x, grid, y) for x, y in zip(inputs, c.curves, strict=True)])
+        slopes = c.lambdas * a ** (power - 1.0) * psi
         wanted = np.array(
             [sum(shares[j, i] * h ** (j - i + 1) * slopes[j] for j in range(i, n)) for i in level]
         )

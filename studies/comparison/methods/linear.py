@@ -2,20 +2,30 @@
 """
 The linear peers: constant gains from python-control, the same model and Phi as ours.
 
+    z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d
+    d' = d_1 - decay d, d_1' = d_2 - decay d_1, ..., d_{m-1}' = -decay d_{m-1}
+    x(t_k) = prediction(t_k) + K (y_k - prediction_1(t_k))
+
+For a linear Phi the prediction equals the zero-order-hold discretisation, up to an error that
+decreases with the longest step.
+
 The extended state observer (ESO): J. Han, IEEE Transactions on Industrial Electronics 56(3), 2009,
 doi:10.1109/TIE.2008.2011621.
 """
 
 from collections.abc import Callable
 from functools import lru_cache
+from typing import NamedTuple
 
+from fhaosmo_ros.core.model.inputs import known_inputs_of_run
+from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.search.minimise import Dimension, minimise, StudyOptions
 from fhaosmo_ros.tools.tuning.start.find import DERIVATIVES
 from fhaosmo_ros.tools.tuning.start.sampled_model import pair, SampledModel
 import numpy as np
-from studies.comparison.methods.constant_gain import estimates
+from studies.comparison.methods.filters import constant_gain
 from studies.comparison.methods.method import LINEAR, Method, Run, Search, Setting, USUAL, Values
 from studies.comparison.scores import Estimates
 
@@ -26,6 +36,42 @@ REACH = 10.0
 LONGEST = 1.5
 """Nominal periods that one step of a prediction may take."""
 Gain = Callable[[SampledModel, Values], np.ndarray]
+
+
+class Samples(NamedTuple):
+    """Samples y (K,), times h (K,) since the one before (s), and known inputs u (K, m) since."""
+
+    y: np.ndarray
+    h: np.ndarray
+    u: np.ndarray
+
+    @classmethod
+    def of(cls, r: Recording, model: TriangularModel) -> 'Samples':
+        """Return those of a recording."""
+        u = known_inputs_of_run(r.u, len(r.y), model.inputs)
+        return cls(np.ascontiguousarray(r.y), np.diff(r.t, prepend=r.t[0]), u)
+
+
+def estimates(
+    model: TriangularModel, gain: np.ndarray, decay: float, r: Recording, longest: float
+) -> np.ndarray:
+    """
+    Return the estimates of z, d, d_1, .. of a recording, a row for each sample.
+
+    Parameters
+    ----------
+    model : TriangularModel
+    gain : (n + m,) array
+        K.
+    decay : float
+        See the top of this file; 0 for a random walk.
+    r : Recording
+    longest : float
+        Longest step of the prediction in seconds; a longer interval takes several.
+
+    """
+    expressions = model.with_unknown_input(decay, len(gain) - model.order - 1)
+    return constant_gain(Prediction(expressions, longest), Samples.of(r, model), gain)
 
 
 @lru_cache(maxsize=64)

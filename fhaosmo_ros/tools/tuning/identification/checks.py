@@ -131,7 +131,7 @@ def _of_noise(found: Identified) -> list[str]:
     if found.sensor.quantisation > 2.0 * found.best.noise:
         texts.append(
             f'y comes in steps of {found.sensor.quantisation:.3g}, larger than its noise: the '
-            'error of the steps is not random. docs/encoder.md says what helps.'
+            'error of the steps is not random. docs/recipes.md says what helps.'
         )
     if found.outliers:
         texts.append(

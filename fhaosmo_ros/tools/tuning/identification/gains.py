@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import math
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.observer.covariance import Uncertainty
 from fhaosmo_ros.core.observer.fuzzy import curves
+from fhaosmo_ros.core.observer.kalman import Uncertainty
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS

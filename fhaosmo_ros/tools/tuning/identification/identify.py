@@ -10,7 +10,6 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.cli.progress import progress
-from fhaosmo_ros.tools.tuning.identification.innovations import Samples
 from fhaosmo_ros.tools.tuning.identification.likelihood import (
     CLIP,
     Design,
@@ -19,6 +18,7 @@ from fhaosmo_ros.tools.tuning.identification.likelihood import (
     Likelihood,
     MOST_RATIO,
     QUICKEST,
+    Samples,
     SLOWEST,
 )
 from fhaosmo_ros.tools.tuning.sensor import Sensor

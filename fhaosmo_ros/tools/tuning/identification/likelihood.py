@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
+from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.observer.arrays import FLAGS, GAINS, Law, make_work, SCALARS
-from fhaosmo_ros.core.observer.covariance import stationary, transition
-from fhaosmo_ros.tools.tuning.identification.innovations import innovations, Linear, Samples
+from fhaosmo_ros.core.observer.kalman import innovations, LinearModel, stationary
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +23,58 @@ LEAST_RATIO, MOST_RATIO = 1e-3, 30.0
 LEAST_USED = 0.9
 """Part of the samples that needs a finite innovation."""
 SCALE_STEPS = 50
+
+
+class Samples(NamedTuple):
+    """
+    A recorded y.
+
+    Attributes
+    ----------
+    h : (K,) array
+        Time since the sample before (s); 0 for the first one.
+    periods : (K,) array
+        The same in sampling periods, rounded; 0 where the filter begins afresh.
+    y : (K,) array
+    u : (K, m) array
+        Known inputs of the interval that ends at each sample.
+    used : (K,) array of bool
+        False for samples that do not correct: outliers.
+
+    """
+
+    h: Floats
+    periods: NDArray[np.int64]
+    y: Floats
+    u: Floats
+    used: NDArray[np.bool_]
+
+
+class Linear(NamedTuple):
+    """
+    The linear model of a sampling period, of N + 1 states: z, d, its derivatives, and v.
+
+    Attributes
+    ----------
+    a, q : (N + 1, N + 1) arrays
+        Transition, and the covariance that a period adds.
+    fresh : (N + 1, N + 1) array
+        Covariance of the errors where the filter begins.
+    variance : float
+        Of the white noise on y.
+    clip : float
+        Innovations of more standard deviations correct as so many (Huber 1964).
+    settled : int
+        Samples without a gap after which the covariance counts as steady.
+
+    """
+
+    a: Floats
+    q: Floats
+    fresh: Floats
+    variance: float
+    clip: float
+    settled: int
 
 
 class Design(NamedTuple):
@@ -107,7 +158,7 @@ class Likelihood:
     sizes : (n,) array
         How far off z_1 .. z_n may be where the filter begins.
     noise : float
-        Standard deviation that innovations are clipped by; see `innovations.Linear`.
+        Standard deviation that innovations are clipped by; see `Linear`.
     fixed : bool
         The noise is given: it is not estimated.
     longest : float
@@ -140,20 +191,9 @@ class Likelihood:
 
     def __call__(self, design: Design) -> Evaluation:
         """Evaluate a design."""
-        n, k = self.model.order, design.derivatives
-        size = n + 1 + k
-        law = Law(
-            np.zeros(FLAGS, dtype=np.int64),
-            np.zeros((GAINS, size)),
-            np.zeros((size, 2)),
-            np.zeros(SCALARS),
-            np.zeros((1, size)),
-            self.model.with_unknown_input(design.decay, k),
-        )
-        count = len(self.samples.y)
-        b, s, x = np.empty(count), np.empty(count), np.empty((count, size))
-        work = make_work(law, self.model.depth)
-        innovations(law, work, self.samples, self._linear(design), self.longest, b, s, x)
+        model = self.model.with_unknown_input(design.decay, design.derivatives)
+        prediction = Prediction(model, self.longest)
+        b, s, x = innovations(prediction, self.samples, self._linear(design))
         with np.errstate(invalid='ignore', over='ignore'):  # of a filter that diverges
             return self._evaluation(design, b, s / self.noise**2, x)
 
@@ -164,12 +204,12 @@ class Likelihood:
         rates[:n, :n] += self._jacobian
         rates[range(n, size), range(n, size)] = -design.decay
         a, added, fresh = (np.zeros((size + 1, size + 1)) for _ in range(3))
-        a[:size, :size], added[:size, :size] = transition(rates, q, self.period)
+        a[:size, :size], added[:size, :size] = LinearModel(rates, q).transition(self.period)
         if design.shaken:
             i = design.shaken
             density = noise / (1.0 - design.colour) ** 2 * self.period
             w = design.shake * density * design.bandwidth ** (2 * i)
-            added[:i, :i] += transition(rates[:i, :i], w, self.period)[1]
+            added[:i, :i] += LinearModel(rates[:i, :i], w).transition(self.period)[1]
         fresh[range(1, n), range(1, n)] = np.square(self.sizes[1:])
         fresh[n:size, n:size] = stationary(rates[n:, n:], q)
         fresh[0, 0] = noise / (1.0 - design.colour**2)

@@ -29,7 +29,7 @@ from itertools import product
 from math import comb
 from typing import Any
 
-from fhaosmo_ros.core.observer.levant import deadbeat_shares
+from fhaosmo_ros.core.observer.configuration import deadbeat_shares
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.start.sampled_model import SampledModel

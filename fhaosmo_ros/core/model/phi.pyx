@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Phi_1 .. Phi_n as bytecode, and its interpreter: value and exact derivative in one pass.
+
+Bytecode is plain data (operations in postfix order), so a model from a YAML file needs no code
+generation, and nothing from outside is ever executed. The derivative along dz is carried by
+forward-mode differentiation (dual numbers).
+"""
+
+from libc.math cimport (
+    atan2, copysign, cos, exp, fabs, hypot, isnan, log, pow, sin, sqrt, tan, tanh
+)
+from libc.stdlib cimport free, malloc
+
+import numpy as np
+
+
+cdef inline double sign_of(double a) noexcept nogil:
+    """Return -1, 0 or 1; NaN for NaN."""
+    return a if a == 0.0 or isnan(a) else copysign(1.0, a)
+
+
+cdef class Expressions:
+    """
+    Several expressions; immutable, so that threads can share it.
+
+    Parameters
+    ----------
+    source : sequence of sequences of (int, float)
+        Each expression's operations in postfix order: `CONST` .. `SIGN`, and the constant, or the
+        index of the state or input, that belongs to it. An empty expression is the constant 0.
+    states, inputs : int
+        How many states and known inputs there are.
+
+    Raises
+    ------
+    ValueError
+        An operation that there is not, an index out of range, or operands that do not fit.
+
+    """
+
+    def __cinit__(self, source, int states, int inputs):
+        cdef int k = 0, i
+        self.source = tuple(tuple((int(c), float(x)) for c, x in one) for one in source)
+        self.count, self.states, self.inputs = len(self.source), states, inputs
+        self.code = <Instruction*>malloc(
+            (1 + sum(map(len, self.source))) * sizeof(Instruction)
+        )
+        self.offsets = <int*>malloc((self.count + 1) * sizeof(int))
+        if self.code == NULL or self.offsets == NULL:
+            raise MemoryError
+        for i, expression in enumerate(self.source):
+            self.offsets[i] = k
+            self.check(expression)
+            for code, operand in expression:
+                self.code[k].code = code
+                self.code[k].index = <int>operand if code in (STATE, INPUT) else 0
+                self.code[k].constant = operand
+                k += 1
+        self.offsets[self.count] = k
+
+    def __dealloc__(self):
+        free(self.code)
+        free(self.offsets)
+
+    def __reduce__(self):
+        return Expressions, (self.source, self.states, self.inputs)
+
+    cdef check(self, expression):
+        """Raise ValueError unless an expression leaves one value on a stack of bounded size."""
+        cdef int depth = 0
+        for code, operand in expression:
+            limit = {STATE: self.states, INPUT: self.inputs}.get(code)
+            if not CONST <= code <= SIGN or (limit is not None and not 0 <= operand < limit):
+                raise ValueError(f'no operation ({code}, {operand})')
+            needed = 0 if code <= INPUT else 2 if code <= MAX else 1
+            if depth < needed:
+                raise ValueError(f'operation {code} needs {needed} operands, has {depth}')
+            depth += 1 - needed
+            if depth > MOST_OPERANDS:
+                raise ValueError(f'more than {MOST_OPERANDS} operands')
+        if depth > 1 or (depth == 0 and expression):
+            raise ValueError(f'an expression leaves {depth} values')
+
+    cdef Dual evaluate(
+        self, int i, const double* z, const double* dz, const double* u
+    ) noexcept nogil:
+        """
+        Return Phi_{i+1}(z, u) and its derivative along dz.
+
+        Outside its domain an operation gives NaN or infinity.
+        """
+        cdef Dual stack[MOST_OPERANDS]
+        cdef Instruction* instruction
+        cdef Instruction* end = self.code + self.offsets[i + 1]
+        cdef Dual* top = stack
+        cdef int code
+        cdef double a, da, b, db, v, d
+        instruction = self.code + self.offsets[i]
+        if instruction == end:
+            return Dual(0.0, 0.0)
+        top -= 1
+        while instruction != end:
+            code = instruction.code
+            if code <= INPUT:
+                top += 1
+                if code == CONST:
+                    top.value, top.slope = instruction.constant, 0.0
+                elif code == STATE:
+                    top.value, top.slope = z[instruction.index], dz[instruction.index]
+                else:
+                    top.value, top.slope = u[instruction.index], 0.0
+            elif code <= MAX:
+                b, db = top.value, top.slope
+                top -= 1
+                a, da = top.value, top.slope
+                if code == ADD:
+                    top.value, top.slope = a + b, da + db
+                elif code == SUB:
+                    top.value, top.slope = a - b, da - db
+                elif code == MUL:
+                    top.value, top.slope = a * b, da * b + a * db
+                elif code == DIV:
+                    v = a / b
+                    top.value, top.slope = v, (da - v * db) / b
+                elif code == POW:
+                    v, d = pow(a, b), 0.0
+                    if da != 0.0 and b != 0.0:
+                        d += b * pow(a, b - 1.0) * da
+                    if db != 0.0 and v != 0.0:
+                        d += v * log(a) * db
+                    top.value, top.slope = v, d
+                elif code == ATAN2:
+                    v, d = hypot(a, b), 0.0  # a is sin, b is cos of the angle, times v
+                    if da != 0.0 or db != 0.0:
+                        d = (b / v * da - a / v * db) / v
+                    top.value, top.slope = atan2(a, b), d
+                elif a == b:  # the middle of the subdifferential, as for abs
+                    top.slope = 0.5 * (da + db)
+                elif isnan(b) or (b < a if code == MIN else b > a):  # else a stays, NaN too
+                    top.value, top.slope = b, db
+            else:
+                a, da = top.value, top.slope
+                if code == NEG:
+                    top.value, top.slope = -a, -da
+                elif code == SIN:
+                    top.value, top.slope = sin(a), cos(a) * da
+                elif code == COS:
+                    top.value, top.slope = cos(a), -sin(a) * da
+                elif code == TAN:
+                    v = tan(a)
+                    top.value, top.slope = v, (1.0 + v * v) * da
+                elif code == EXP:
+                    v = exp(a)
+                    top.value, top.slope = v, v * da
+                elif code == LOG:
+                    top.value, top.slope = log(a), da / a if da != 0.0 else 0.0
+                elif code == SQRT:
+                    v = sqrt(a)
+                    top.value, top.slope = v, 0.5 * da / v if da != 0.0 else 0.0
+                elif code == ABS:
+                    top.value, top.slope = fabs(a), sign_of(a) * da
+                elif code == TANH:
+                    v = tanh(a)
+                    top.value, top.slope = v, (1.0 - v * v) * da
+                else:
+                    top.value, top.slope = sign_of(a), 0.0
+            instruction += 1
+        return stack[0]
+
+    def along(self, z, dz, u):
+        """
+        Return all expressions and their derivatives along dz.
+
+        Parameters
+        ----------
+        z, dz : (n,) arrays
+        u : (m,) array
+
+        Returns
+        -------
+        (2, count) array
+            Values, and derivatives.
+
+        Raises
+        ------
+        ValueError
+            Arrays that are too short.
+
+        """
+        cdef double[::1] states = np.ascontiguousarray(z, dtype=np.float64)
+        cdef double[::1] tangent = np.ascontiguousarray(dz, dtype=np.float64)
+        cdef double[::1] inputs = np.ascontiguousarray(u, dtype=np.float64)
+        cdef double[:, ::1] found = np.empty((2, self.count))
+        cdef Dual phi
+        cdef int i
+        if min(states.shape[0], tangent.shape[0]) < self.states or inputs.shape[0] < self.inputs:
+            raise ValueError(f'expected {self.states} states and {self.inputs} inputs')
+        for i in range(self.count):
+            phi = self.evaluate(i, &states[0], &tangent[0], &inputs[0])
+            found[0, i], found[1, i] = phi.value, phi.slope
+        return np.asarray(found)

@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The Kalman filter of a triangular model with a chain of integrators that makes d (D 17, D 20).
+
+Prediction and correction of a covariance P, its steady value, and the innovations of a recorded y:
+for the scheduled gains, the smoother and the identification of a recording. The self-tuning
+observer has 240 filters side by side and the same formulas with one more index
+(self_tuning/covariances.pyx).
+"""
+
+from libc.math cimport NAN, ceil, sqrt
+from libc.string cimport memcpy, memset
+
+from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
+
+import math
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+import numpy as np
+
+# Part of the time constant of the fastest motion that one step of a covariance may take, and the
+# most steps of one prediction.
+cdef double STEP = 0.5
+cdef double MOST_STEPS = 100.0
+# At the start states count as so many times larger than `state_sizes`, d as so much smaller than
+# `unknown_input_size`: the start hardly depends on sizes of states that are too large, or on a
+# size of d that is too small, but it does on the opposite.
+STATES_DOUBT, INPUT_DOUBT = 5.0, 0.4
+DOUBLINGS = 60
+# Parameters that decide whether there is a steady covariance.
+DECIDING = (
+    'noise_size', 'unknown_input_size', 'unknown_input_rate', 'unknown_input_decay',
+    'correction_period', 'structure', 'scheme', 'phi',
+)
+
+
+cdef int sub_steps(double h, double fastest) noexcept nogil:
+    """Return in how many steps a covariance goes over `h`."""
+    return <int>max(min(ceil(h * fastest / STEP), MOST_STEPS), 1.0)
+
+
+cdef void multiply(int n, const Row* f, Row* p) noexcept nogil:
+    """P <- F P, in place."""
+    cdef int i, j, k
+    cdef double column[MOST_LEVELS]
+    cdef double total
+    for j in range(n):
+        for i in range(n):
+            column[i] = p[i][j]
+        for i in range(n):
+            total = 0.0
+            for k in range(n):
+                total += f[i][k] * column[k]
+            p[i][j] = total
+
+
+cdef void carry(int n, const Row* f, Row* p) noexcept nogil:
+    """P <- F P F', in place."""
+    cdef int i, j, k
+    cdef double line[MOST_LEVELS]
+    cdef double total
+    multiply(n, f, p)
+    for i in range(n):
+        memcpy(line, p[i], n * sizeof(double))
+        for j in range(n):
+            total = 0.0
+            for k in range(n):
+                total += line[k] * f[j][k]
+            p[i][j] = total
+
+
+cdef void add_drive(int last, double intensity, double h, Row* p) noexcept nogil:
+    """P <- P + Q over `h`: white noise drives state `last` of a chain (Van Loan 1978)."""
+    cdef double power[MOST_LEVELS]  # h^j / j!, j integrations before the last state
+    cdef int i, j
+    power[last] = 1.0
+    for i in range(last, 0, -1):
+        power[i - 1] = power[i] * h / (last + 1 - i)
+    for i in range(last + 1):
+        for j in range(last + 1):
+            p[i][j] += intensity * h * power[i] * power[j] / (2 * last + 1 - i - j)
+
+
+cdef void correct(int n, Row* p, double variance) noexcept nogil:
+    """Take a sample y = x_1 + noise into P, in place, without a difference of large numbers."""
+    cdef double s = p[0][0] + variance
+    cdef int i, j
+    for i in range(1, n):
+        for j in range(i, n):
+            p[i][j] -= p[0][i] * p[0][j] / s
+            p[j][i] = p[i][j]
+    for j in range(n):
+        p[0][j] *= variance / s
+        p[j][0] = p[0][j]
+
+
+cdef class LinearModel:
+    """
+    A linear model whose last state is driven by white noise.
+
+    Parameters
+    ----------
+    rates : (N, N) array
+        A of x' = A x (1/s).
+    intensity : float
+        Of the white noise.
+
+    """
+
+    def __cinit__(self, rates, double intensity):
+        cdef int i, j
+        self.n, self.intensity = len(rates), intensity
+        if self.n > MOST_LEVELS:
+            raise ValueError(f'expected at most {MOST_LEVELS} states, got {self.n}')
+        for i in range(self.n):
+            for j in range(self.n):
+                self.rates[i][j] = rates[i, j]
+        self.fastest = np.abs(np.linalg.eigvals(rates)).max()
+
+    def __reduce__(self):
+        rates = np.array(self.rates)[:self.n, :self.n].copy()
+        return LinearModel, (rates, self.intensity)
+
+    cdef void flow(self, double h, Row* f) noexcept nogil:
+        """Write exp(A h), by the first N terms of its series."""
+        cdef int i, j, order, n = self.n
+        cdef double term[MOST_LEVELS]
+        cdef double after[MOST_LEVELS]
+        cdef int k
+        for j in range(n):
+            for i in range(n):
+                f[i][j] = term[i] = 1.0 if i == j else 0.0
+            for order in range(1, n + 1):
+                for i in range(n):
+                    after[i] = 0.0
+                    for k in range(min(i + 2, n)):  # A is a lower Hessenberg matrix
+                        after[i] += self.rates[i][k] * term[k]
+                for i in range(n):
+                    term[i] = after[i] * h / order
+                    f[i][j] += term[i]
+
+    cdef void predict(self, Row* p, double h) noexcept nogil:
+        """P <- exp(A h) P exp(A h)' + Q, in place (D 20)."""
+        cdef Row f[MOST_LEVELS]
+        cdef int _, count = sub_steps(h, self.fastest)
+        self.flow(h / count, f)
+        for _ in range(count):
+            carry(self.n, f, p)
+            add_drive(self.n - 1, self.intensity, h / count, p)
+
+    def transition(self, double h):
+        """Return exp(A h) and Q over `h`, (N, N) each."""
+        cdef Row f[MOST_LEVELS]
+        cdef Row whole[MOST_LEVELS]
+        cdef Row q[MOST_LEVELS]
+        cdef int k, count = sub_steps(h, self.fastest), n = self.n
+        memset(q, 0, sizeof(q))
+        self.flow(h / count, f)
+        memcpy(whole, f, sizeof(f))
+        for k in range(count):
+            carry(n, f, q)
+            add_drive(n - 1, self.intensity, h / count, q)
+            if k > 0:
+                multiply(n, f, whole)
+        return np.array(whole)[:n, :n].copy(), np.array(q)[:n, :n].copy()
+
+
+class Uncertainty:
+    """
+    What the covariance of an observer follows from, by parameters (D 20).
+
+    Parameters
+    ----------
+    model : TriangularModel
+    p : mapping
+        Parameters of the observer, with noise_size > 0.
+    sizes : (n,) array
+        Of the states.
+
+    Attributes
+    ----------
+    linear : LinearModel
+        The model with D 17, linearised at rest.
+    rates : (N, N) array
+        Its A.
+    variance, intensity : float
+        Of the noise on y; of the white noise that drives the last level.
+    fresh : (N, N) array
+        Covariance of the errors of a fresh observer.
+
+    Raises
+    ------
+    ConfigurationError
+        The model has no finite slope at rest.
+
+    """
+
+    def __init__(self, model, p, sizes):
+        n, k = model.order, p['unknown_input_derivatives']
+        size, decay = p['unknown_input_size'], p['unknown_input_decay']
+        levels = n + 1 + k
+        jacobian = model.jacobian(np.zeros(n))
+        if not np.isfinite(jacobian).all():
+            raise ConfigurationError(
+                "parameters 'noise_size', 'phi': expected a model whose slopes at z = 0 are "
+                f'finite, or noise_size = 0, got {jacobian.tolist()}'
+            )
+        rates = np.eye(levels, k=1)
+        rates[:n, :n] += jacobian
+        rates[range(n, levels), range(n, levels)] = -decay
+        rate = decay or p['unknown_input_rate']
+        factor = (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2 / math.factorial(2 * k)
+        self.rates = rates
+        self.variance, self.intensity = p['noise_size'] ** 2, size**2 * factor
+        self.linear = LinearModel(rates, self.intensity)
+        self.fresh = np.zeros((levels, levels))
+        self.fresh[range(n), range(n)] = np.square(STATES_DOUBT * sizes)
+        if p['start_from_measurement']:
+            self.fresh[0, 0] = self.variance
+        chain = np.eye(k + 1, k=1) - rate * np.eye(k + 1)
+        self.fresh[n:, n:] = INPUT_DOUBT**2 * stationary(chain, self.intensity)
+
+    def steady(self, period):
+        """
+        Return the covariance of the errors of the predictions once P has become steady.
+
+        By the structure-preserving doubling algorithm (Chu, Fan, Lin and Wang 2004,
+        doi:10.1080/00207170410001714988), in units in which the filter has a bandwidth of 1.
+
+        Raises
+        ------
+        ConfigurationError
+            There is no such covariance in floating-point numbers.
+
+        """
+        try:
+            with np.errstate(all='ignore'):
+                h, unit = self._doubled(period)
+        except (ArithmeticError, np.linalg.LinAlgError):
+            h = unit = np.full((1, 1), math.nan)
+        if not np.isfinite(h).all() or not h[0, 0] > 0.0:
+            raise ConfigurationError(
+                f'parameters {", ".join(map(repr, DECIDING))}: expected values for which there is '
+                'a Kalman filter in floating-point numbers, or noise_size = 0, got a noise of '
+                f'{math.sqrt(self.variance):g} and an intensity of {self.intensity:g}'
+            )
+        return h * np.outer(unit, unit)
+
+    def _doubled(self, period):
+        """Return the covariance in the filter's own units, and the units."""
+        n = len(self.rates)
+        speed = (self.intensity / (self.variance * period)) ** (0.5 / n)
+        unit = math.sqrt(self.variance) * speed ** np.arange(n)
+        phi, q = self.linear.transition(period)
+        a = (phi * unit[None, :] / unit[:, None]).T
+        h = q / np.outer(unit, unit)
+        g = np.zeros((n, n))
+        g[0, 0] = 1.0
+        for _ in range(DOUBLINGS):
+            shared = np.linalg.solve(np.eye(n) + g @ h, np.column_stack([a, g]))
+            before = h
+            g = g + a @ shared[:, n:] @ a.T
+            h = h + a.T @ h @ shared[:, :n]
+            a = a @ shared[:, :n]
+            h = 0.5 * (h + h.T)
+            if np.allclose(h, before, rtol=1e-12, atol=0.0):
+                break
+        return h, unit
+
+
+def stationary(chain, intensity):
+    """Return the covariance of a chain whose last state is driven by white noise."""
+    size = len(chain)
+    drive = np.zeros((size, size))
+    drive[-1, -1] = intensity
+    eye = np.eye(size)
+    whole = np.kron(chain, eye) + np.kron(eye, chain)
+    return np.linalg.solve(whole, -drive.ravel()).reshape(size, size)
+
+
+def innovations(Prediction prediction, samples, linear):
+    """
+    Run the filter of one model of d and of the noise along a recorded y (D 30).
+
+    States follow the model by Runge-Kutta steps, their covariance follows a linear model of one
+    sampling period. The last state is the coloured part of the noise, v_j = a v_{j-1} + w_j, which
+    is 0 for white noise.
+
+    Parameters
+    ----------
+    prediction : Prediction
+        Of N states.
+    samples
+        With `h`, `y` of shape (K,): time since the sample before (s), sample; `periods` (K,): the
+        time in sampling periods, 0 where the filter begins afresh; `u` (K, m): known inputs;
+        `used` (K,): False for samples that do not correct.
+    linear
+        With `a`, `q`, `fresh` of shape (N + 1, N + 1): transition, added covariance of a period,
+        and covariance where the filter begins; `variance` of the white noise on y; `clip`:
+        innovations of more standard deviations correct as so many (Huber 1964); `settled`:
+        samples without a gap after which the covariance counts as steady.
+
+    Returns
+    -------
+    b, s : (K,) arrays
+        Innovations and their variances; NaN where the filter begins.
+    x : (K, N) array
+        Estimates.
+
+    """
+    cdef const double[::1] h = samples.h
+    cdef const double[::1] y = samples.y
+    cdef const double[:, ::1] u = samples.u
+    cdef const long long[::1] periods = samples.periods
+    cdef const unsigned char[::1] used = np.asarray(samples.used, dtype=np.uint8)
+    cdef int n = prediction.n, size = prediction.n + 1, settled = min(linear.settled, 2**30)
+    cdef Py_ssize_t k, count = y.shape[0]
+    cdef double[::1] b = np.empty(count), s = np.empty(count)
+    cdef double[:, ::1] x = np.empty((count, n))
+    cdef double clip = linear.clip, white = linear.variance
+    cdef Row a[MOST_LEVELS]
+    cdef Row q[MOST_LEVELS]
+    cdef Row fresh[MOST_LEVELS]
+    cdef Row p[MOST_LEVELS]
+    cdef double gain[MOST_LEVELS]
+    cdef double noise = 0.0, variance = 0.0, residual, limit
+    cdef long long since = 0, _
+    cdef int i, j
+    if size > MOST_LEVELS or u.shape[1] < max(prediction.phi.inputs, 1) or not (
+        h.shape[0] == u.shape[0] == periods.shape[0] == used.shape[0] == count
+    ):
+        raise ValueError('innovations: arrays of sizes that do not fit')
+    for i in range(size):
+        for j in range(size):
+            a[i][j], q[i][j], fresh[i][j] = linear.a[i, j], linear.q[i, j], linear.fresh[i, j]
+    with nogil:
+        for k in range(count):
+            if periods[k] == 0:
+                memcpy(p, fresh, sizeof(p))
+                memset(prediction.x, 0, sizeof(prediction.x))
+                prediction.z[0] = y[k]
+                noise, since, b[k], s[k] = 0.0, 0, NAN, NAN
+                for i in range(n):
+                    x[k, i] = prediction.z[i]
+                continue
+            prediction.over(h[k], &u[k, 0])
+            if periods[k] > 1:
+                since = 0
+            for _ in range(periods[k]):
+                noise *= a[n][n]
+                if since <= settled:
+                    carry(size, a, p)
+                    for i in range(size):
+                        for j in range(size):
+                            p[i][j] += q[i][j]
+            if since <= settled:
+                variance = p[0][0] + 2.0 * p[0][n] + p[n][n] + white
+                for i in range(size):
+                    gain[i] = (p[i][0] + p[i][n]) / variance
+            residual = y[k] - prediction.z[0] - noise
+            b[k], s[k] = residual, variance
+            if used[k]:
+                limit = clip * sqrt(variance)
+                residual = min(max(residual, -limit), limit)
+                for i in range(n):
+                    prediction.z[i] += gain[i] * residual
+                noise += gain[n] * residual
+                if since <= settled:
+                    for i in range(size):
+                        for j in range(size):
+                            p[i][j] -= gain[i] * gain[j] * variance
+                    since += 1
+            else:
+                since = 0
+            for i in range(n):
+                x[k, i] = prediction.z[i]
+    return np.asarray(b), np.asarray(s), np.asarray(x)

@@ -1,0 +1,367 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Levant's arbitrary-order differentiator with the paper's curves and power, all three schemes.
+
+One innovation drives every level: eps = y - z_hat_1. Equations are cited by their numbers in
+docs/mathematics.md (D). The internal states mirror the estimates, z_tilde_{i+1} = z_hat_{i+1}, so
+that whatever reads a cascade's state reads this one; theta is 0.
+
+Levant 2003, doi:10.1080/0020717031000099029.
+"""
+
+from libc.math cimport INFINITY, M_2_PI, copysign, erfc, exp, fabs, log, log1p, pow, sqrt
+from libc.string cimport memcpy
+
+from fhaosmo_ros.core.model.phi cimport Dual, evaluate
+from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
+from fhaosmo_ros.core.observer.kalman cimport Row
+from fhaosmo_ros.core.observer.sliding_mode cimport (
+    SlidingMode, doubt_of_noise, follow_spread, psi
+)
+from fhaosmo_ros.core.observer.structure cimport Level, Memory
+
+from fhaosmo_ros.core.observer.configuration import deadbeat_shares
+
+# Newton's method ends at such a relative change; its square, about 1e-15, is the error left.
+cdef int NEWTON_STEPS = 60
+cdef double NEWTON_TOLERANCE = 3e-8
+# Innovations below this are taken for 0: their powers would underflow.
+cdef double TINY = 1e-300
+# An interval that differs from the tuned one by at most this part of it needs no other gains.
+cdef double NEAR = 0.25
+# Gains that differ from the tuned ones by at most this part of them are replaced by them.
+cdef double CLOSE = 0.02
+# Up to so many times the steady variance of the innovation, their influence is limited (D 21).
+cdef double NEARLY_STEADY = 1.5
+# So many samples in a row beyond all half-widths widen them.
+cdef double SATURATED_SAMPLES = 20.0
+# Seconds since the start where it does not matter when it was.
+cdef double LONG_AGO = 1e12
+# Innovations of more standard deviations count as so many, at most and at least (D 32).
+cdef double HUBER = 2.0
+cdef double LEAST_HUBER = 1.0
+# The share within the largest limit if the noise is normal: with it the gains are the tuned ones.
+cdef double WITHIN = 0.9465
+# Standard deviations by which the limit follows one sample.
+cdef double NARROWING = 0.01
+# More samples in a row beyond the limit on the same side are no outliers (D 32).
+cdef double ISOLATED = 20.0
+
+
+cdef inline double beyond(double c) noexcept nogil:
+    """Return the share of samples beyond c where c is Huber's minimax limit (D 32)."""
+    cdef double q = sqrt(M_2_PI) * exp(-0.5 * c * c) / c
+    return q / (1.0 + q - erfc(c / sqrt(2.0)))
+
+
+cdef class Levant(SlidingMode):
+    """Levant's differentiator: one innovation, of the powers of D 11, drives all levels."""
+
+    def __cinit__(self, configuration):
+        cdef int i, j, n = self.levels
+        p = configuration.parameters
+        self.widest = INFINITY
+        if p['fuzzy_growth'] and not self.is_sign:
+            self.widest = max(configuration.widths)
+            speed = (configuration.lambdas[n - 1] / configuration.widths[n - 1]) ** (1.0 / n)
+            self.relaxation = speed / 3.0
+        shares = deadbeat_shares(n)
+        for i in range(n):
+            self.ratio[i] = 1.0
+            for j in range(n):
+                self.share[j][i] = shares[j, i] if self.predicting else 1.0
+
+    cdef void follow(self, double y, double h, const double* u) noexcept nogil:
+        """Advance `trial` by the scheme."""
+        if self.predicting:
+            self.predict_correct(y, h, u)
+        elif self.implicit:
+            self.backward(y, h, u)
+        else:
+            self.explicit(self.memory.y, h, u)
+
+    cdef void mirror(self) noexcept nogil:
+        """Write the internal states that stand for the estimates."""
+        cdef int i, n = self.levels
+        for i in range(n - 1):
+            self.trial[i].z_tilde, self.trial[i].q = self.trial[i + 1].z_hat, self.trial[i + 1].p
+        self.trial[n - 1].z_tilde = self.trial[n - 1].q = 0.0
+
+    cdef Dual injection(self, int i, double a, double power, double p) noexcept nogil:
+        """Return psi(a) |eps|^p and its slope along a = |eps|, given |eps|^p."""
+        cdef Dual curve
+        if a > 0.0:
+            curve = psi(self, i, a)
+            return Dual(power * curve.value, power * (p * curve.value / a + curve.slope))
+        if self.is_sign or p > 0.0:
+            return Dual(0.0, 0.0)
+        return Dual(0.0, psi(self, i, 0.0).slope)
+
+    cdef void explicit(self, double y, double h, const double* u) noexcept nogil:
+        """Forward Euler of D 11; `y` is the sample at the interval's beginning."""
+        cdef Level* level
+        cdef double m[MOST_LEVELS]
+        cdef double dm[MOST_LEVELS]
+        cdef double gamma = self.memory.gamma, power = 1.0, follower = 0.0, dfollower = 0.0
+        cdef double eps = y - self.trial[0].z_hat, s = -self.trial[0].p, a = fabs(eps)
+        cdef double log_a = log(a) if a > 0.0 else 0.0, dp, hat, dhat
+        cdef int i, n = self.levels
+        cdef double root_power = pow(a, 2.0 * gamma / n)
+        cdef Dual phi, v
+        m[0], dm[0] = y, 0.0
+        for i in range(1, n):
+            m[i], dm[i] = self.trial[i].z_hat, self.trial[i].p
+        for i in range(n - 1, -1, -1):
+            level = &self.trial[i]
+            phi = evaluate(self.prediction.phi, i, m, dm, u)
+            dp = 2.0 * (n - 1 - i) / n
+            v = self.injection(i, a, power, gamma * dp)
+            hat, dhat = level.z_hat, level.p
+            level.z_hat += h * (
+                follower + phi.value + self.gains[i].lambda_ * copysign(v.value, eps)
+            )
+            if self.sensitive:  # D 13
+                level.p += h * (
+                    dfollower + phi.slope
+                    + self.gains[i].lambda_ * (copysign(v.value, eps) * log_a * dp + v.slope * s)
+                )
+            follower, dfollower = hat, dhat
+            power *= root_power
+        self.mirror()
+        self.loss, self.gradient = eps * eps, 2.0 * eps * s
+
+    cdef void backward(self, double y, double h, const double* u) noexcept nogil:
+        """
+        Backward Euler of D 11, one scalar equation for all levels (D 12).
+
+        Phi is taken at the new sample `y`, at the interval's end, and the old estimates.
+        """
+        cdef double m[MOST_LEVELS]
+        cdef double dm[MOST_LEVELS]
+        cdef double above = 0.0, dabove = 0.0
+        cdef Dual phi
+        cdef int i, n = self.levels
+        m[0], dm[0] = y, 0.0
+        for i in range(1, n):
+            m[i], dm[i] = self.trial[i].z_hat, self.trial[i].p
+        for i in range(n - 1, -1, -1):
+            phi = evaluate(self.prediction.phi, i, m, dm, u)
+            above = self.trial[i].z_hat + h * (above + phi.value)
+            dabove = self.trial[i].p + h * (dabove + phi.slope)
+            self.trial[i].z_hat, self.trial[i].p = above, dabove
+        self.correct_levels(y, h)
+
+    cdef void predict_correct(self, double y, double h, const double* u) noexcept nogil:
+        """Follow the model to the sample `y`, then correct (D 18)."""
+        cdef Memory* memory = &self.memory
+        cdef Row* p = self.trial_covariance
+        cdef int i, n = self.levels
+        cdef double period = self.correction_period, variance = self.steady_variance, doubt = 1.0
+        cdef double b, usual, largest = 1.0
+        cdef bint far, holds = memory.settled > 0.0 and fabs(h - period) <= NEAR * period
+        cdef bint scheduling = self.scheduled and not holds
+        if self.scheduled:
+            memcpy(p, self.covariance, n * sizeof(Row))
+        if scheduling:
+            if memory.settled > 0.0:
+                memcpy(p, self.steady, n * sizeof(Row))
+                self.correct_trial(1.0)
+                memory.settled = -LONG_AGO
+            doubt = doubt_of_noise(-memory.settled, self.bandwidth(period))
+            self.linear.predict(p, h)
+            variance = p[0][0] + doubt * doubt * self.noise_variance
+        for i in range(n):
+            self.prediction.z[i], self.prediction.dz[i] = self.trial[i].z_hat, self.trial[i].p
+        self.prediction.over(h, u)
+        for i in range(n):
+            self.trial[i].z_hat, self.trial[i].p = self.prediction.z[i], self.prediction.dz[i]
+            self.ratio[i] = 1.0
+        if not self.scheduled:
+            if period > 0.0:  # not below the mean interval: another rate is no gap
+                h = min(h, max(period, memory.period))
+            self.correct_levels(y, h)
+            return
+        b = y - self.trial[0].z_hat
+        usual = follow_spread(memory, b, sqrt(variance))
+        if variance < NEARLY_STEADY * self.steady_variance:  # a large P counts on all of b
+            y = self.trial[0].z_hat + self.influence(b, usual)
+        if memory.beyond > 0.0:
+            return
+        if scheduling:
+            far = fabs(h - period) > NEAR * period
+            for i in range(n):  # D 20
+                if self.steady[0][i] > 0.0:
+                    self.ratio[i] = p[0][i] / self.steady[0][i] / (doubt * doubt)
+                else:
+                    self.ratio[i] = self.ratio[0] / (doubt * doubt)
+                largest = max(largest, self.ratio[i])
+                far = far or fabs(self.ratio[i] - 1.0) > CLOSE
+            for i in range(n):  # from the Kalman filter's gains to the tuned ones
+                self.ratio[i] *= pow(self.tuned_over_kalman[i], 1.0 / largest - 1.0)
+            self.correct_trial(doubt)
+            memory.settled = memory.settled - h if far else 1.0
+        self.correct_levels(y, period)
+
+    cdef void correct_levels(self, double y, double h) noexcept nogil:
+        """Turn predicted levels into corrected ones by the solution of D 12 or D 18."""
+        cdef double weight[MOST_LEVELS]  # h^i lambda_i
+        cdef double power_of_h[MOST_LEVELS]  # h^i
+        cdef double gamma = self.memory.gamma, scale = self.memory.scale
+        cdef double b = (y - self.trial[0].z_hat) / scale, db = -self.trial[0].p / scale  # D 22
+        cdef double log_a = 0.0, deps = 0.0, power = 1.0, numerator, denominator, dp, to_gamma
+        cdef double share, a
+        cdef int i, j, n = self.levels
+        cdef Root root
+        cdef Dual v
+        cdef bint sliding
+        for i in range(n):
+            power_of_h[i] = h if i == 0 else power_of_h[i - 1] * h
+            weight[i] = self.ratio[0] * power_of_h[i] * self.gains[i].lambda_
+        root = self.root(weight, fabs(b), gamma)
+        a = root.eps
+        sliding = self.is_sign and a == 0.0
+        if self.sensitive and not sliding:  # D 14: implicit function theorem
+            log_a = log(a) if a > 0.0 else 0.0
+            numerator, denominator = db, 1.0
+            for i in range(n - 1, -1, -1):
+                dp = 2.0 * (n - 1 - i) / n
+                v = self.injection(i, a, power, gamma * dp)
+                numerator -= weight[i] * copysign(v.value, b) * log_a * dp
+                denominator += weight[i] * v.slope
+                power *= root.w
+            deps = numerator / denominator
+        power = 1.0
+        for i in range(n - 1, -1, -1):  # v_i and its derivative along gamma
+            dp = 2.0 * (n - 1 - i) / n
+            v = self.injection(i, a, power, gamma * dp)
+            to_gamma = copysign(v.value, b) * log_a * dp
+            if i == n - 1:
+                v.value = root.s
+                if sliding:
+                    to_gamma = db / weight[i]
+            self.trial[i].z_tilde = self.gains[i].lambda_ * copysign(v.value, b)
+            if self.sensitive:
+                self.trial[i].q = self.gains[i].lambda_ * (to_gamma + v.slope * deps)
+            power *= root.w
+        for i in range(n):
+            for j in range(i, n):
+                share = scale * self.ratio[i] * power_of_h[j - i] * self.share[j][i]
+                self.trial[i].z_hat += share * self.trial[j].z_tilde
+                if self.sensitive:
+                    self.trial[i].p += share * self.trial[j].q
+        self.grow(a, h)
+        a, deps = scale * a, scale * deps
+        self.trial[0].z_hat = y - copysign(a, b)  # what the sum above is but for rounding
+        if self.sensitive:
+            self.trial[0].p = -deps
+        self.mirror()
+        self.loss, self.gradient = a * a, 2.0 * copysign(a, b) * deps
+
+    cdef Root root(self, const double* weight, double b, double gamma) noexcept nogil:
+        """
+        Solve eps + sum_i h^i lambda_i |eps|^{p_i} s_i = b, s_i in psi_i(eps), b >= 0 (D 12).
+
+        Newton's method on the logarithms of both sides over that of eps: there a sum of powers is
+        convex and nearly straight, at any gamma and over any range. Powers are those of w, as
+        |eps|^{p_i} = w^{N-i}, but eps does not come from w, which tells nothing of it as gamma
+        goes to 0. The left side increases with eps.
+        """
+        cdef int i, _, n = self.levels
+        cdef double constant = 0.0, target, q = 2.0 * gamma / n, x, low, high, w = 1.0, e
+        cdef double f, slope, power, change, moved
+        cdef Dual curve
+        if b < TINY:
+            return Root(0.0, 0.0, 0.0)
+        if self.is_sign:
+            constant = weight[n - 1]
+            if b <= constant:  # sliding: the set-valued sign takes what is needed
+                return Root(0.0, 0.0, b / constant)
+        target = b - constant
+        x = log(target)  # of eps; the other terms only make it less
+        low, high = log(TINY), x
+        for _ in range(NEWTON_STEPS):
+            w = exp(q * x)
+            e = pow(w, n) if gamma == 0.5 else exp(x)
+            # The left side but for sign's constant, and its derivative along x.
+            f, slope, power = e, e, 1.0
+            for i in range(n - 1, -1, -1):
+                if i < n - 1 or not self.is_sign:
+                    curve = psi(self, i, e)
+                    f += weight[i] * power * curve.value
+                    slope += weight[i] * power * (q * (n - 1 - i) * curve.value + e * curve.slope)
+                power *= w
+            if f > target:
+                high = x
+            else:
+                low = x
+            change = log1p((f - target) / target) * f / slope
+            moved = x - change
+            if fabs(change) <= NEWTON_TOLERANCE:
+                x = moved
+                break
+            # For sign the way from above is monotone. A fuzzy curve has corners: bisect then.
+            x = moved if self.is_sign or low < moved < high else 0.5 * (low + high)
+        e = max(exp(x), TINY)
+        return Root(e, exp(q * x), psi(self, n - 1, e).value)
+
+    cdef void grow(self, double a, double h) noexcept nogil:
+        """Widen the fuzzy sets while all of them have been saturated for long (D 22)."""
+        cdef Memory* memory = &self.memory
+        if a > self.widest:
+            memory.saturated += 1.0
+            if memory.saturated >= SATURATED_SAMPLES:
+                memory.scale *= 2.0
+        else:
+            memory.saturated = 0.0
+            memory.scale = 1.0 + (memory.scale - 1.0) / (1.0 + h * self.relaxation)
+
+    cdef double influence(self, double b, double usual) noexcept nogil:
+        """
+        Return as how large an innovation counts (D 32), and let its limit follow the noise.
+
+        Only the first of several in a row beyond the limit on one side tells of outliers.
+        """
+        cdef Memory* memory = &self.memory
+        cdef double c = HUBER - memory.narrowed, far = 0.0, share, narrowed, first
+        if fabs(b) <= c * usual:
+            memory.one_sided = memory.first_miss = 0.0
+        elif b * memory.one_sided > 0.0:
+            memory.one_sided += copysign(1.0, b)
+        else:
+            memory.one_sided = copysign(1.0, b)
+            far = 1.0
+        share = beyond(c)
+        narrowed = memory.narrowed + NARROWING * (far - share * (1.0 - 0.5 * share))
+        memory.narrowed = min(max(narrowed, 0.0), HUBER - LEAST_HUBER)
+        if fabs(memory.one_sided) > ISOLATED:
+            first = memory.first_miss  # 0 if none was too far off
+            if first * (2.0 * b - first) > 0.0:  # y is lost
+                memory.beyond, memory.miss = max(memory.beyond, ISOLATED + 1.0), b
+            return b
+        return min(max(b, -c * usual), c * usual) * WITHIN / (1.0 - share)
+
+    def solve(self, weights, double b, double gamma):
+        """Return |eps|, its power 2 gamma / N and s_N of D 12, for weights h^i lambda_i."""
+        cdef double numbers[MOST_LEVELS]
+        cdef Root found
+        if len(weights) != self.levels:
+            raise ValueError(f'solve: expected {self.levels} weights, got {len(weights)}')
+        for i, weight in enumerate(weights):
+            numbers[i] = weight
+        found = self.root(numbers, b, gamma)
+        return found.eps, found.w, found.s
+
+    def bounded(self, double b, double usual):
+        """Return as how large an innovation `b` counts whose usual size is `usual` (D 32)."""
+        return self.influence(b, usual)
+
+    @property
+    def narrowed(self):
+        """By what the limit of the influence of innovations is below the largest one (D 32)."""
+        return self.memory.narrowed
+
+    cdef double predicted_y(self, double h, const double* u) noexcept nogil:
+        """Return y after one Euler step of the estimates (D 21)."""
+        cdef double still = 0.0, y = self.memory.y
+        cdef double phi = evaluate(self.prediction.phi, 0, &y, &still, u).value
+        return self.trial[0].z_hat + h * (self.trial[0].z_tilde + phi)

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The members where y is quantised: a sample says within which interval z_1 lies (D 31, D 36).
+
+Estimate and covariance become those of the normal distribution with the mean and the variance that
+the truncated one has (Curry, Vander Velde and Potter 1970, IEEE Transactions on Information Theory
+16, 152-161).
+"""
+
+from libc.math cimport INFINITY, M_2_PI, M_PI, copysign, exp, fabs, fmax, fmin, log, sqrt
+
+from fhaosmo_ros.core.observer.self_tuning.filters cimport GATE, HUBER, INEXACT
+from fhaosmo_ros.core.observer.self_tuning.members cimport (
+    COLOURS, COUNT, GRID, HALF, Members, ORDERS, Work, entry, state
+)
+from fhaosmo_ros.core.observer.self_tuning.normal cimport exponential, mills
+from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+
+cdef double ROOT = sqrt(2.0 * M_PI)
+cdef double FARTHEST = 12.0  # standard deviations; numbers that are farther off count as so far
+# Part of the quantum by which predictions of z_1 are less certain than their P says.
+cdef double VAGUE = 0.1
+# Logarithms of the least probability that a sample counts with, and of the least one with which
+# z_1 passes an edge at just this sample.
+cdef double LEAST_CHANCE = -6.0, LEAST_PASSAGE = -12.0
+# If more than one in so many of y's steps go back at once, noise of as much as VAGUE carries z_1
+# over edges. Innovations do not show noise that is far smaller than the quantum.
+cdef double OF_BACK = 3.0
+# That probability is so small that it has to be found from the speed if z_1 moves, squared, by
+# less than this part of its variance.
+cdef double SLOW = 0.25
+# A repeated sample counts for what is less likely than this, and for z_1 not passing an edge.
+cdef double HALF_SURE = log(0.5)
+# A normal number with the variance of an even distribution in the interval lies in it with the
+# first probability. So a sample that repeats the one before, and that a member expects with more
+# than the second one, tells it nothing: each such sample would narrow it again.
+cdef double EVENLY = log(0.917), KNOWN = log(0.88)
+# In models of more states a repeated sample narrows no member: many of them in a row would narrow
+# one whose z_1 is wrong, and one with a d that is thousands of times too large would be likelier.
+cdef int FEW_STATES = 3
+# If both edges are so many standard deviations off, z_1 is within them more likely than both.
+cdef double WELL_WITHIN = 1.75
+# In an interval of twice so few standard deviations the density is taken to be constant.
+cdef double HALF_NARROW = 0.015
+# An interval that is so many standard deviations off counts as its nearer end.
+cdef double FAR_TAIL = 5.5
+# Log-likelihood of members with coloured noise, which errors of rounding are not.
+cdef double UNUSED = -1e6
+
+
+cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) noexcept nogil:
+    """
+    Find what is known of the members' z_1 if it lies within `half` a quantum of a sample.
+
+    That is what is known of a normal number of mean 0 and variance 1 that lies between two others:
+    its `mean`, by what its variance is smaller than 1 (`lost`), and the logarithm of the
+    probability that it lies there (`chance`). `size` is the standard deviation of which these are
+    parts; `least` is added to the variance of z_1. From it follow `b` and its factors.
+    """
+    cdef Work* w = &m.work
+    cdef double inverse, off, width, near, far, to_near, left, right, beyond, share, by_near
+    cdef double center, less, square
+    cdef double well_within = WELL_WITHIN if repeated else FAR_TAIL
+    cdef double known = KNOWN if repeated else INFINITY
+    cdef double narrowing = 0.0 if repeated and m.n > FEW_STATES else 1.0
+    cdef Py_ssize_t g, active = m.shared.active
+    for g in range(active):
+        w.size[g] = sqrt(INEXACT * (w.p.zz[0][g] + least))
+        inverse = 1.0 / w.size[g]
+        off, width = fabs(w.b[g]) * inverse, half * inverse
+        near, far = off - width, off + width
+        far = far if far < FARTHEST else FARTHEST
+        to_near = fabs(near)
+        to_near = to_near if to_near < FARTHEST else FARTHEST
+        left, right = exponential(-0.5 * to_near * to_near), exponential(-0.5 * far * far)
+        beyond = left * mills(to_near)
+        share = (beyond if near > 0.0 else ROOT - beyond) - right * mills(far)
+        inverse, by_near = 1.0 / share, 1.0 / near
+        center = (left - right) * inverse
+        less = center * center - (near * left - far * right) * inverse
+        # In a narrow interval the density is constant; one far off is its nearer end.
+        share = share if near > -well_within else ROOT
+        share = share if near < FAR_TAIL else ROOT
+        share = share if width > HALF_NARROW else 2.0 * width
+        w.chance[g] = share / ROOT
+        square = near * near if near > FAR_TAIL else 0.0
+        w.one[g] = square if width > HALF_NARROW else off * off
+        center = center if near < FAR_TAIL else near + by_near
+        center = center if width > HALF_NARROW else off
+        center = copysign(center, w.b[g])
+        w.mean[g] = center if near > -well_within else 0.0
+        less = less if near < FAR_TAIL else 1.0 - by_near * by_near
+        less = less if width > HALF_NARROW else 1.0 - width * width / 3.0
+        less = less if less > 0.0 else 0.0
+        less = less if less < 1.0 else 1.0
+        w.lost[g] = less if near > -well_within else 0.0
+    for g in range(active):
+        share = (log(w.chance[g]) if w.chance[g] != 1.0 else 0.0) - 0.5 * w.one[g]
+        w.chance[g] = share if share > LEAST_CHANCE else LEAST_CHANCE
+    for g in range(active):
+        off = m.far[g] - 1.0 if m.far[g] > 1.0 else 0.0
+        off = HUBER * (1.0 + off * off)
+        center = w.mean[g] if w.mean[g] > -off else -off
+        center = center if center < off else off
+        w.b[g] = center * w.size[g] if w.chance[g] <= known else 0.0
+        w.inverse[g] = 1.0 / (w.size[g] * w.size[g]) if w.chance[g] <= known else 0.0
+        w.taken[g] = w.lost[g] * w.inverse[g] * narrowing
+
+
+cdef inline double passage(
+    double to_edge, double variance, double moved, double spread
+) noexcept nogil:
+    """
+    Return the probability that a normal number passes an edge above it between two samples.
+
+    By the mean rate of upcrossings, density times mean speed (D 36, Rice 1945): the mean of v
+    where v > 0 and of 0 elsewhere, for a normal v, is about (m + sqrt(m^2 + 2 s^2 / pi)) / 2. m is
+    how far it has `moved`, and s^2 how far that is `spread`; noise on each sample counts twice.
+    """
+    cdef double density = exponential(-0.5 * to_edge * to_edge / variance)
+    density /= ROOT * sqrt(variance)
+    return density * 0.5 * (moved + sqrt(moved * moved + M_2_PI * spread))
+
+
+cdef VECTORISED stay(
+    Members* m, const double* speed, double half, double least, double carried
+) noexcept nogil:
+    """Bound `chance` of a sample that comes again by that of z_1 passing neither edge (D 36)."""
+    cdef Work* w = &m.work
+    cdef double before = w.sample.before, h = w.sample.h
+    cdef double z, moved, variance, up, down, chance, spread
+    cdef bint slow
+    cdef Py_ssize_t g, active = m.shared.active
+    for g in range(active):
+        z, variance = m.x.z[0][g], m.p.zz[0][g] + least
+        moved = w.x.z[0][g] - z
+        spread = h * h * speed[g]
+        up = passage(before + half - z, variance, moved, spread + carried)
+        down = passage(z + half - before, variance, -moved, spread + carried)
+        slow = moved * moved + spread < SLOW * variance
+        chance = w.chance[g] - (HALF_SURE if slow else EVENLY)  # who expects it loses nothing
+        up = -(up + down) if slow else 0.0
+        w.chance[g] = chance if chance < up else up
+
+
+cdef VECTORISED go_on(
+    Members* m, const double* speed, double half, double least, double carried
+) noexcept nogil:
+    """Bound `chance` of a step by one quantum by that of z_1 passing the edge just now (D 36)."""
+    cdef Work* w = &m.work
+    cdef double before = w.sample.before, h = w.sample.h
+    cdef double side = copysign(1.0, w.sample.y - before), least_passed = exp(LEAST_PASSAGE)
+    cdef double z, moved, variance, passed, spread
+    cdef Py_ssize_t g, active = m.shared.active
+    for g in range(active):
+        z, variance = m.x.z[0][g], m.p.zz[0][g] + least
+        moved = side * (w.x.z[0][g] - z)
+        spread = h * h * speed[g]
+        passed = passage(side * (before - z) + half, variance, moved, spread + carried)
+        passed = passed if passed < 1.0 else 1.0
+        w.one[g] = passed if moved * moved + spread < SLOW * variance else 1.0
+    for g in range(active):
+        passed = log(w.one[g]) if w.one[g] > least_passed else LEAST_PASSAGE
+        w.chance[g] = w.chance[g] if w.chance[g] < passed else passed
+
+
+cdef VECTORISED take_interval(Members* m, double kept) noexcept nogil:
+    """
+    Take a quantised sample into the log-likelihoods, and find how it corrects members (D 31).
+
+    For `correct` and `correct_states`. Members with coloured noise do not take part. `kept` is as
+    `judge` has it.
+    """
+    cdef Work* w = &m.work
+    cdef Py_ssize_t g, active = m.shared.active
+    cdef double y = w.sample.y, before = w.sample.before, half = sqrt(3.0 * w.sample.quanta)
+    cdef double vague = 2.0 * VAGUE * half
+    # Noise that is not of rounding, and what no P knows.
+    cdef double least = fmax(m.noise[0] - w.sample.quanta, 0.0) + vague * vague
+    cdef double carried = 2.0 * fmin(OF_BACK * m.shared.goes_back, 1.0) * least
+    cdef double* speed = entry(&m.p, m.n, 1, 1)  # variance of the state behind z_1
+    for g in range(active):
+        m.far[g] = (
+            m.far[g] + 1.0 if w.b[g] * w.b[g] > GATE * GATE * w.s[g] * m.noise[0] else 0.0
+        )
+    truncate(m, half, least, y == before)
+    if kept < 0.0:
+        return
+    if y == before:
+        stay(m, speed, half, least, carried)
+    elif fabs(y - before) < 3.0 * half:
+        go_on(m, speed, half, least, carried)
+    for g in range(active):
+        m.score[g] = m.prior[g] + kept * (m.score[g] - m.prior[g]) + (
+            w.chance[g] if w.chance[g] < 0.0 else 0.0
+        )
+
+
+cdef bint choose_members(Members* m, double quanta) noexcept nogil:
+    """
+    Choose who takes part: where y is quantised, those with white noise (D 31).
+
+    Errors of rounding are not coloured noise. When y is quantised no more, members with coloured
+    noise go on from those with white noise. Return True if it is others than before.
+    """
+    cdef int before = m.shared.active, i, j, g, white
+    m.shared.active = HALF if quanta > 0.0 else COUNT
+    if m.shared.active < before:
+        for g in range(HALF, COUNT):
+            m.weight[g], m.score[g] = 0.0, UNUSED
+    elif m.shared.active > before:
+        m.shared.unsettled = 0.0
+        for i in range(COLOURS):
+            m.noise[i] = m.used_noise[i] = m.noise[0]
+        for g in range(HALF, COUNT):
+            white = GRID.white[g]
+            for i in range(m.n + ORDERS):
+                state(&m.x, m.n, i)[g] = state(&m.x, m.n, i)[white]
+                state(&m.gain, m.n, i)[g] = state(&m.gain, m.n, i)[white]
+                for j in range(i, m.n + ORDERS):
+                    entry(&m.p, m.n, i, j)[g] = entry(&m.p, m.n, i, j)[white]
+            m.variance[g], m.log_variance[g] = m.variance[white], m.log_variance[white]
+            m.residual[g], m.short_mean[g], m.far[g] = 0.0, 1.0, 0.0
+    return m.shared.active != before

@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Jumps of d (D 33), and of y that are too small to be lost samples (D 35)."""
+
+from fhaosmo_ros.core.observer.self_tuning.members cimport Members
+
+cdef double GROWTHS
+cdef int LOST_SAMPLES
+
+cdef void begin_growth(Members* m) noexcept nogil
+cdef bint follow_growth(Members* m, double beyond) noexcept nogil
+cdef void watch(Members* m, int member) noexcept nogil
+cdef void follow_innovations(Members* m) noexcept nogil
+cdef int samples_since_jump(Members* m) noexcept nogil
+cdef void follow_jump(Members* m, int count) noexcept nogil
+cdef void shift(Members* m, double of_state, double miss, double variance) noexcept nogil

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Jumps: of d (D 33), and of y that are too small to be lost samples and that no d explains (D 35).
+
+After a jump of d y is farther and farther off. A sensor that slips puts an offset on y. A few
+samples of it are enough for quick members to become likely, whose d explains anything, and is
+larger by orders of magnitude. So the innovations of the member that was likely are tested for a
+mean (Willsky and Jones 1976).
+"""
+
+from libc.math cimport INFINITY, fabs, fmax, log, sqrt
+from libc.string cimport memcpy, memset
+
+from fhaosmo_ros.core.observer.self_tuning.filters cimport GATE, HUBER
+from fhaosmo_ros.core.observer.self_tuning.members cimport (
+    COUNT, GRID, HALF, Line, MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW,
+    by_binomials, put, state
+)
+from fhaosmo_ros.core.observer.self_tuning.noise cimport ROUGH
+
+cdef int LOST_SAMPLES = 20  # more unlikely samples in a row say that y is lost (D 21)
+# If so many samples in a row are farther off than the first one, d has jumped (D 33).
+cdef double GROWTHS = 3.0
+# Farther means: so many times as far, and 3 sigma more; so much of what a jump of d makes of it;
+# and so many times the highest differences of y, which noise does not get to. Differences must not
+# have been larger than usual before, unless y is farther off by the last factor.
+cdef double FARTHER = 1.3, POWER = 0.7, SMOOTH = 5.0, SMOOTHEST = 30.0
+# By so much, in twice the log-likelihood, a jump has to explain the innovations better than
+# growing ones or more noise, and than any other member; and white noise to be likelier than
+# coloured noise.
+cdef double SHAPE = 2.0, BELIEVED = 8.0
+
+
+cdef void begin_growth(Members* m) noexcept nogil:
+    """Take the first of the unlikely samples in a row."""
+    m.shared.first_off = fabs(m.work.sample.off)
+    m.shared.uneven, m.shared.first_rough = m.work.sample.uneven, m.work.sample.roughness_before
+
+
+cdef double respond(Members* m, double* z) noexcept nogil:
+    """Carry what a jump of d by 1 has done to z to the next sample, in place; return z_1."""
+    cdef double before[MOST_ORDER]
+    cdef int n = m.n, i, j
+    memcpy(before, z, n * sizeof(double))
+    for i in range(n):
+        z[i] = m.flow[i][n]
+        for j in range(n):
+            z[i] += m.flow[i][j] * before[j]
+    return z[0]
+
+
+cdef double growth(Members* m, double hidden, int count) noexcept nogil:
+    """
+    Return how many times as far y is off, `count` samples later, because d has jumped.
+
+    It is the less, the longer ago d has jumped: so long that y was off by at most the part
+    `hidden` of what it is now in the sample before.
+    """
+    cdef double z[MOST_ORDER]
+    cdef double first, off
+    memset(z, 0, sizeof(z))
+    first = respond(m, z)
+    off = respond(m, z)
+    for _ in range(LOST_SAMPLES):  # after so many y would be lost
+        if first > hidden * off:
+            break
+        first, off = off, respond(m, z)
+    for _ in range(count - 1):
+        off = respond(m, z)
+    return off / first if first > 0.0 else 1.0
+
+
+cdef bint follow_growth(Members* m, double beyond) noexcept nogil:
+    """
+    Return True if unlikely samples are farther and farther off, so that d has jumped (D 33).
+
+    `beyond` samples in a row before this one were unlikely.
+    """
+    cdef Shared* shared = &m.shared
+    cdef Sample* sample = &m.work.sample
+    cdef double off = fabs(sample.off), hidden = GATE * sqrt(sample.largest), least, uneven
+    cdef int count = <int>beyond if beyond < LOST_SAMPLES else LOST_SAMPLES
+    if count == 0:
+        begin_growth(m)
+    shared.uneven += (sample.uneven - shared.uneven) / (count + 1.0)
+    least = FARTHER * shared.first_off + HUBER * sqrt(m.noise[0])
+    if count > 0:
+        least = fmax(
+            least, POWER * shared.first_off * growth(m, hidden / shared.first_off, count)
+        )
+    uneven = sqrt(shared.uneven)
+    least = fmax(least, SMOOTH * uneven)
+    shared.growing = shared.growing + 1.0 if count > 0 and off > least else 0.0
+    return shared.growing >= GROWTHS and (
+        shared.first_rough < ROUGH or off > SMOOTHEST * uneven
+    )
+
+
+cdef void watch(Members* m, int member) noexcept nogil:
+    """Begin to follow the innovations of a member."""
+    memset(m.window, 0, sizeof(m.window))
+    m.shared.followed, m.shared.since_mark = member, 0
+    memcpy(m.score_before[0], m.score, sizeof(Line))
+    memcpy(m.score_before[1], m.score, sizeof(Line))
+
+
+cdef void follow_innovations(Members* m) noexcept nogil:
+    """
+    Take a sample into the window.
+
+    Only of members with white noise, since coloured noise explains jumps; and of a y that is not
+    quantised, whose errors of rounding have a mean for many samples.
+    """
+    cdef Shared* shared = &m.shared
+    cdef int g = shared.followed, j
+    if m.work.sample.quanta > 0.0 or GRID.colour[g] > 0:
+        memset(m.window, 0, sizeof(m.window))
+    else:
+        for j in range(WINDOW - 1):
+            m.window[j] = m.window[j + 1]
+        m.window[WINDOW - 1] = m.work.b[g] / sqrt(m.work.s[g] * m.noise[0])
+    shared.since_mark += 1
+    if shared.since_mark >= WINDOW:
+        shared.since_mark = 0
+        memcpy(m.score_before[1], m.score_before[0], sizeof(Line))
+        memcpy(m.score_before[0], m.score, sizeof(Line))
+
+
+cdef int samples_since_jump(Members* m) noexcept nogil:
+    """Return for how many samples y has been off by a constant (D 35); 0 if it is not."""
+    cdef Shared* shared = &m.shared
+    cdef double best = 0.0, total = 0.0, gained, most = 0.0, coloured = -INFINITY
+    cdef double* before
+    cdef int first = 0, g, j, count
+    for j in range(WINDOW - 1, -1, -1):
+        total += m.window[j]
+        if total * total > best * (WINDOW - j):
+            best, first = total * total / (WINDOW - j), j
+    count = WINDOW - first
+    if (best <= HUBER * HUBER or first < WINDOW // 2) and shared.followed != shared.told:
+        memset(m.window, 0, sizeof(m.window))
+        shared.followed = shared.told
+        return 0
+    g = shared.followed
+    if best <= GATE * GATE or first < WINDOW // 2 or GRID.bandwidth[g] * WINDOW > 1.0:
+        return 0
+    if best <= otherwise(m.window, m.n) + SHAPE:
+        return 0
+    before = &m.score_before[0 if shared.since_mark >= count else 1][0]
+    gained = m.score[g] - before[g]
+    for j in range(HALF):
+        most = fmax(most, 2.0 * (m.score[j] - before[j] - gained))
+    for j in range(HALF, COUNT):
+        coloured = fmax(coloured, 2.0 * (before[j] - before[g]))
+    return count if best > most + BELIEVED and coloured < -BELIEVED else 0
+
+
+cdef double otherwise(const double* r, int n) noexcept nogil:
+    """
+    Return how well anything but a jump explains innovations: twice the gain of log-likelihood.
+
+    A line through all of the window; powers, up to n, of the time since any sample of it, as a d
+    that has jumped gives them; and noise that has grown since any sample.
+    """
+    cdef double middle = 0.5 * (WINDOW - 1), level = 0.0, slope = 0.0, size = 0.0, squares = 0.0
+    cdef double most, along, shape
+    cdef int j, m, count, power
+    for j in range(WINDOW):
+        level += r[j]
+        slope += (j - middle) * r[j]
+        size += (j - middle) * (j - middle)
+    most = level * level / WINDOW + slope * slope / size
+    for m in range(WINDOW - 1, -1, -1):
+        count = WINDOW - m
+        squares += r[m] * r[m]
+        most = fmax(most, squares - count * (1.0 + log(fmax(squares / count, 1.0))))
+        for power in range(1, n + 1 if count > 1 else 1):
+            along = size = 0.0
+            for j in range(m, WINDOW):
+                shape = 1.0
+                for _ in range(power):
+                    shape *= j - m + 1
+                along += shape * r[j]
+                size += shape * shape
+            most = fmax(most, along * along / size)
+    return most
+
+
+cdef void follow_jump(Members* m, int count) noexcept nogil:
+    """Let all members go on from the one that is followed, as if only z_1 had jumped (D 35)."""
+    cdef double estimate[MOST_STATES]
+    cdef double variance = m.work.s[m.shared.followed] * m.noise[0], total = 0.0
+    cdef int n = m.n, g = m.shared.followed, i
+    for i in range(WINDOW - count, WINDOW):
+        total += m.window[i] * sqrt(variance)
+    for i in range(n + ORDERS):  # nothing of the jump is in z or d
+        estimate[i] = state(&m.x, n, i)[g] - total * state(&m.gain, n, i)[g]
+    estimate[0] += total / count
+    by_binomials(estimate + n, ORDERS, -m.kappa[g])
+    for g in range(COUNT):
+        put(m, g, estimate)
+        m.p.zz[0][g] += variance / count
+        m.residual[g], m.far[g] = m.work.sample.y - estimate[0], 0.0
+    memcpy(m.score, m.score_before[1], sizeof(Line))
+    m.shared.unsettled = 0.0
+    watch(m, m.shared.followed)
+
+
+cdef void shift(Members* m, double of_state, double miss, double variance) noexcept nogil:
+    """
+    Let all members go on after a jump of y that has lost it (D 23).
+
+    z_1 is another one by `of_state`; 0 where y's offset is. The innovation which told the jump is
+    `miss`, and `variance` is its own.
+    """
+    cdef int g
+    for g in range(COUNT):
+        m.x.z[0][g] += of_state
+        m.p.zz[0][g] += variance
+    m.difference[0] += of_state - miss
+    m.shared.unsettled = m.shared.growing = 0.0
+    watch(m, m.shared.followed)

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The members of the self-tuning observer: which they are, and what they remember (D 26).
+
+A member is an observer with its own model of d (D 17: k = 0 to 3 derivatives, intensity q,
+decay kappa) and of the noise (white, or coloured: v_j = a v_{j-1} + w_j). All have n + 4 states,
+of which those of derivatives that a model does not have stay 0. Each quantity is a line of one
+number a member, so that a step of all members is a few long loops that the compiler turns into
+vector instructions. Members with white noise come first, from the quickest to the slowest; those
+with coloured noise follow from the slowest to the quickest: where only slow members' covariances
+move, theirs are neighbours.
+"""
+
+from libc.math cimport exp, log, sqrt
+
+from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+
+import numpy as np
+
+SLOWEST, QUICKEST = 6e-4, 3.0  # range of the bandwidths (rad a sample)
+# kappa / omega of the members of every second bandwidth, and of the others; with coloured noise it
+# is the first of two.
+DECAYS = [[0.1, 0.6], [0.1, 1.5]]
+CORRELATIONS = [0.0, 0.75, 0.92, 0.98]  # a of the colours of the noise
+COLOURED = [[1, 3], [1, 2]]  # colours of the members, by bandwidths as `DECAYS`
+cdef enum:
+    LANES = 24  # numbers that are compared side by side
+
+
+def fill_grid():
+    """Write which the members are."""
+    global BAND_STEP
+    cdef int g, band, kind
+    BAND_STEP = (QUICKEST / SLOWEST) ** (1.0 / (BANDS - 1))
+    bandwidths = np.geomspace(SLOWEST, QUICKEST, BANDS)
+    for g in range(COUNT - 1, -1, -1):
+        band, kind = g // IN_BAND, g % KINDS
+        band = BANDS - 1 - band if g < HALF else band - BANDS
+        GRID.band[g], GRID.bandwidth[g] = band, bandwidths[band]
+        GRID.order[g] = g // KINDS % ORDERS
+        GRID.white[g] = HALF - IN_BAND * (1 + band) + KINDS * GRID.order[g]
+        GRID.colour[g] = 0 if g < HALF else COLOURED[band % 2][kind]
+        GRID.ratio[g] = DECAYS[band % 2][kind if g < HALF else 0]
+        GRID.first[GRID.colour[g]] = g
+    for g in range(COLOURS):
+        GRID.correlation[g] = CORRELATIONS[g]
+
+
+fill_grid()
+
+
+cdef VECTORISED fill(double* values, const double* of_colours) noexcept nogil:
+    """Write for each member the value of its colour."""
+    cdef Py_ssize_t g
+    cdef double white = of_colours[0]
+    for g in range(HALF):
+        values[g] = white
+    for g in range(HALF, HALF + 2 * IN_BAND):
+        values[g] = of_colours[GRID.colour[g]]
+    for g in range(HALF + 2 * IN_BAND, COUNT):  # the colours are those of two bands before
+        values[g] = values[g - 2 * IN_BAND]
+
+
+cdef double largest(const double* values, Py_ssize_t count) noexcept nogil:
+    """Return the largest of `count` values, a multiple of LANES."""
+    cdef double best[LANES]
+    cdef Py_ssize_t k
+    for k in range(LANES):
+        best[k] = values[k]
+    for _ in range(1, count // LANES):
+        values += LANES
+        for k in range(LANES):
+            best[k] = values[k] if values[k] > best[k] else best[k]
+    for k in range(1, LANES):
+        best[0] = best[k] if best[k] > best[0] else best[0]
+    return best[0]
+
+
+cdef double factorial(int i) noexcept nogil:
+    """Return i!."""
+    cdef double product = 1.0
+    cdef int k
+    for k in range(2, i + 1):
+        product *= k
+    return product
+
+
+cdef void by_binomials(double* chain, int count, double more) noexcept nogil:
+    """Turn (D + c)^j d, j = 0, 1, .., into (D + c + more)^j d, in place."""
+    cdef int first, j
+    for first in range(1, count):
+        for j in range(count - 1, first - 1, -1):
+            chain[j] += more * chain[j - 1]
+
+
+cdef void put(Members* m, int g, const double* estimate) noexcept nogil:
+    """Put a member to an estimate of z, d, d', ..; its own states are (D + kappa)^j d."""
+    cdef double chain[ORDERS]
+    cdef int i
+    for i in range(m.n):
+        m.x.z[i][g] = estimate[i]
+    for i in range(ORDERS):
+        chain[i] = estimate[m.n + i]
+    by_binomials(chain, ORDERS, m.kappa[g])
+    for i in range(ORDERS):
+        m.x.d[i][g] = chain[i] if i <= GRID.order[g] else 0.0
+
+
+cdef void find_tuning(Members* m, double* found) noexcept nogil:
+    """Write noise, correlation, bandwidth and shares of models: the fields of `Tuning`."""
+    cdef double variance = 0.0, correlation = 0.0, bands = 0.0, w, a
+    cdef int g
+    for g in range(ORDERS):
+        found[3 + g] = 0.0
+    for g in range(COUNT):
+        w, a = m.weight[g], m.correlation[g]
+        variance += w * m.noise[GRID.colour[g]] / (1.0 - a * a)
+        correlation += w * a
+        bands += w * GRID.band[g]
+        found[3 + GRID.order[g]] += w
+    found[0], found[1] = sqrt(variance), correlation
+    found[2] = m.kappa[HALF] / GRID.ratio[HALF] * exp(bands * log(BAND_STEP))

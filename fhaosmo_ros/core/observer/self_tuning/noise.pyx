@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The noise of y, its quantum, and whether a sample is likely (D 29)."""
+
+from libc.math cimport INFINITY, exp, fabs, fmax, fmin, round
+
+from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
+from fhaosmo_ros.core.observer.self_tuning.members cimport (
+    COLOURS, GRID, HALF, Members, Sample, Shared, Work, fill, largest
+)
+from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+
+cdef double IGNORANT = 3.0  # who expects S of so many times the smallest one does not judge y
+cdef double CLIPPED = 0.9733  # mean of min(x^2, 9) where x is normal with variance 1
+# Members whose log-likelihood is so far below the best one do not say whether a sample is likely,
+# and those so far below the best one of their colour do not tell the noise.
+cdef double CLOSE = 8.0
+cdef double SHORT_SHARE = 0.05  # of the last sample in short means
+# If squared innovations over S are larger of late for every member that can judge, and squared
+# differences of y are too, the noise has grown. It is averaged over QUICK_SAMPLES then. Until
+# CALM_SAMPLES later a sample judges the members only if one of them explains it.
+cdef double STEADY = 1.5, CALM_SAMPLES = 40.0, QUICK_SAMPLES = 30.0
+# The share of steps of y that are multiples of the quantum is averaged over so many. With a share
+# above the second y is quantised; with one below the third the quantum is none.
+cdef double LATTICE_STEPS = 30.0, LATTICE_SHARE = 0.9, NO_LATTICE = 0.5
+# After more unlikely samples no member judges that was beyond the gate at the last likely one.
+cdef double PASSED = 3.0
+cdef double HIDDEN = 4.0  # noise of so many times the variance of rounding hides the quanta
+cdef double ROUGH_SAMPLES = 100.0  # squared differences of y are averaged over so many
+cdef double ROUGH = 2.0  # the variance of the noise is at most so many times what they say
+
+
+cdef bint is_multiple(double step, double quantum, double y) noexcept nogil:
+    """Return True if `step` is a multiple of `quantum`, up to the rounding of y to 32 bits."""
+    cdef double tolerance = 1e-3 * quantum + 3e-7 * fabs(y)
+    cdef double off = step - round(step / quantum) * quantum
+    return tolerance < 0.1 * quantum and fabs(off) <= tolerance
+
+
+cdef void follow_quantum(Members* m) noexcept nogil:
+    """
+    Take a sample that is used: is the step to it a multiple of the quantum? (D 29).
+
+    A step like the one before says nothing: so does y move at a constant speed. Another quantum is
+    believed where it divides this one, or where this one is none.
+    """
+    cdef Shared* shared = &m.shared
+    cdef double y = m.work.sample.y, step = fabs(y - m.work.sample.before), change
+    cdef bint fits
+    if step <= 1e-12 * fabs(y):
+        return
+    change = fabs(m.difference[2])  # from the step before, which may be 0
+    shared.goes_back += ((1.0 if change > 1.5 * step else 0.0) - shared.goes_back) / LATTICE_STEPS
+    fits = is_multiple(step, shared.quantum, y)
+    if not fits:
+        fits = is_multiple(shared.quantum, step, y)
+        if fits or shared.lattice < NO_LATTICE:
+            shared.quantum = step
+    if not fits:
+        shared.lattice -= shared.lattice / LATTICE_STEPS
+    elif change > 0.5 * shared.quantum:
+        shared.lattice += (1.0 - shared.lattice) / LATTICE_STEPS
+
+
+cdef double rounding(Members* m) noexcept nogil:
+    """Return the variance of the error of rounding; 0 if y is not quantised, or noise hides it."""
+    cdef double quanta = m.shared.quantum * m.shared.quantum / 12.0
+    cdef bint hidden = HIDDEN * quanta < m.noise[0]
+    return 0.0 if hidden or m.shared.lattice < LATTICE_SHARE else quanta
+
+
+cdef void follow_differences(Members* m, double y) noexcept nogil:
+    """
+    Follow what the differences of y say that the noise of each colour is at most (D 29).
+
+    White noise w adds C(2p, p) times its variance to that of a difference of order p. What y does
+    besides adds to it, so that the smallest of the variances is an upper bound. In the sample,
+    `roughness` is the square of the difference of the order that bounds white noise, over its
+    usual size; `uneven` that of the highest one, as a variance of white noise: of the order of the
+    noise if noise is why y is off its prediction, and far less if d has moved it there.
+    """
+    cdef Sample* sample = &m.work.sample
+    cdef double value = y, binomial = 1.0, least = 1e-12 * m.shared.first_noise
+    cdef double bound = INFINITY, before, value_before, white, r, grown
+    cdef int p, c
+    sample.roughness, sample.roughness_before = 0.0, m.shared.roughness
+    for p in range(m.n + 2):
+        before, value_before = m.difference[p], value
+        m.difference[p] = value
+        value = value_before - before
+        if p == 0:
+            continue
+        binomial *= (4.0 * p - 2.0) / p
+        for c in range(COLOURS):
+            white = value_before - m.correlation[GRID.first[c]] * before
+            r = white * white / (m.rough[c][p] * binomial)
+            if c == 0:
+                sample.uneven = white * white / binomial
+                if m.rough[0][p] < bound:
+                    bound, sample.roughness = m.rough[0][p], r
+            grown = 1.0 + (fmin(r, HUBER * HUBER) / CLIPPED - 1.0) / ROUGH_SAMPLES
+            m.rough[c][p] = fmax(m.rough[c][p] * grown, least)
+    m.shared.roughness += SHORT_SHARE * (
+        fmin(sample.roughness, HUBER * HUBER) - m.shared.roughness
+    )
+
+
+cdef double stamp_noise(Members* m, double h, bint in_sequence) noexcept nogil:
+    """
+    Follow how irregular the intervals are; return the variance of y if the stamps are why (D 29).
+
+    Differences of y do not show that its stamps are wrong, but innovations do. Unless the sample
+    is `in_sequence`, the interval is that since the last one taken.
+    """
+    cdef Shared* shared = &m.shared
+    cdef double change
+    if in_sequence:
+        if shared.interval > 0.0:  # three stamps, one of them twice: 1 + 4 + 1
+            change = (h - shared.interval) * (h - shared.interval) / (6.0 * h * shared.interval)
+            shared.jitter += (change - shared.jitter) / ROUGH_SAMPLES
+        shared.interval = h
+    return 2.0 * shared.jitter * m.rough[0][1]
+
+
+cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil:
+    """
+    Write the largest variance of the innovations with which a member can judge the sample.
+
+    Members that have been found unlikely do not set it: without noise on y they expect innovations
+    that are far too small. The likeliest one always can. While y is unlikely P grows, and the
+    quick members would believe anything: S is believed up to a factor of 4 then.
+    """
+    cdef Work* w = &m.work
+    cdef Py_ssize_t g, active = m.shared.active
+    cdef double least, own, most = 4.0 if unlikely_before else INFINITY
+    fill(w.noise, m.noise)
+    for g in range(active):
+        w.believed[g] = w.s[g] if w.s[g] < most * m.variance[g] else most * m.variance[g]
+        w.one[g] = -w.believed[g] * w.noise[g] if m.score[g] > -CLOSE else -INFINITY
+    least = -largest(w.one, active)
+    own = w.believed[m.shared.likeliest] * w.noise[m.shared.likeliest]
+    w.sample.largest = fmax(IGNORANT * least, own)
+
+
+cdef bint is_likely(Members* m, double beyond, double gate) noexcept nogil:
+    """
+    Return True if a member that can judge the sample finds it likely (D 29).
+
+    A member that is far off itself, or unlikely, would meet y by chance. `beyond` samples in a row
+    before this one were unlikely.
+    """
+    cdef Work* w = &m.work
+    cdef double late = INFINITY if beyond <= PASSED else 1.0, variance
+    cdef int g
+    for g in range(m.shared.active):
+        variance = w.believed[g] * w.noise[g]
+        if (w.b[g] * w.b[g] <= gate * gate * variance and variance <= w.sample.largest
+                and m.score[g] > -CLOSE and m.far[g] < late):
+            return True
+    return False
+
+
+cdef bint is_explained(Members* m) noexcept nogil:
+    """Return True if any member finds a sample usual, however unlikely the member itself is."""
+    cdef Work* w = &m.work
+    cdef int g
+    for g in range(m.shared.active):
+        if w.b[g] * w.b[g] <= HUBER * HUBER * w.believed[g] * w.noise[g]:
+            return True
+    return False
+
+
+cdef VECTORISED follow_noise(Members* m) noexcept nogil:
+    """
+    Follow the noise of y of each colour, by the innovations of its likeliest members (D 29).
+
+    In the sample, `grown` is how much larger than expected squared innovations have been of late,
+    for every member, and squared differences too: more than 1 while the noise grows. `best_fit` is
+    the least squared innovation, over its variance, of the members that can judge.
+    """
+    cdef Work* w = &m.work
+    cdef Sample* sample = &w.sample
+    cdef double best[COLOURS]
+    cdef double weights[COLOURS]
+    cdef double squares[COLOURS]
+    cdef double variance, ratio, off, weight, least, most, average = sample.average
+    cdef double widest = sample.largest
+    cdef int c, p
+    cdef Py_ssize_t g, active = m.shared.active
+    for g in range(active):
+        variance = w.believed[g] * w.noise[g]
+        ratio = w.b[g] * w.b[g] / variance
+        ratio = ratio if ratio < HUBER * HUBER else HUBER * HUBER
+        m.short_mean[g] += SHORT_SHARE * (ratio - m.short_mean[g])
+        w.ratio[g] = ratio
+        w.one[g] = -m.short_mean[g] if variance <= widest else -INFINITY
+        w.two[g] = -ratio if variance <= widest and m.score[g] > -CLOSE else -INFINITY
+    least = fmin(m.shared.roughness, -largest(w.one, active))
+    sample.grown, sample.best_fit = fmax(least, 1.0), -largest(w.two, active)
+    for c in range(COLOURS):
+        best[c], weights[c], squares[c] = -INFINITY, 0.0, 0.0
+    best[0] = largest(m.score, HALF)
+    for g in range(HALF, active):
+        c = GRID.colour[g]
+        best[c] = m.score[g] if m.score[g] > best[c] else best[c]
+    for g in range(active):
+        c = GRID.colour[g]
+        off = m.score[g] - best[c]
+        if off > -CLOSE:
+            weight = exp(off) if off < 0.0 else 1.0
+            weights[c] += weight
+            squares[c] += weight * w.ratio[g]
+    if least > STEADY:  # every member that can judge says so, and the differences do
+        average = fmin(average, QUICK_SAMPLES)
+    for c in range(COLOURS if active > HALF else 1):
+        m.noise[c] *= 1.0 + (squares[c] / weights[c] / CLIPPED - 1.0) / average
+        most = m.rough[c][1]
+        for p in range(2, m.n + 2):
+            most = fmin(most, m.rough[c][p])
+        m.noise[c] = fmax(fmin(m.noise[c], ROUGH * (most + sample.of_stamps)), sample.floor)
+    fill(w.noise, m.noise)

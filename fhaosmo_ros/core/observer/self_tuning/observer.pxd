@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The self-tuning observer: members side by side, weighted by how well they predict y."""
+
+from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
+from fhaosmo_ros.core.observer.self_tuning.members cimport Members
+from fhaosmo_ros.core.observer.self_tuning.weights cimport Model
+from fhaosmo_ros.core.observer.structure cimport Structure
+
+
+cdef class SelfTuning(Structure):
+    # What the parameters say.
+    cdef bint is_linear  # the model
+    cdef double forgetting  # time constant of the log-likelihoods (s)
+    cdef double slider  # estimates are those of members so much quicker
+    cdef double least_noise  # least standard deviation of the noise on y; 0: any
+    cdef double sizes[MOST_LEVELS]  # squares of the sizes of z
+    # What it remembers.
+    cdef Members* members
+    cdef Model model  # the likeliest model of d, which a smoother goes by (D 34)
+    cdef double variances[MOST_LEVELS]  # of the errors of z, d, ..; infinite before it begins
+    cdef bint y_jumped  # a sample tells that y has jumped (D 35)
+    # A step's own.
+    cdef Model trial_model
+    cdef double trial_variances[MOST_LEVELS]
+    # For the policy.
+    cdef bint is_noisy(self, double y) noexcept nogil
+    cdef void begin_afresh(self) noexcept nogil
+    # Parts of a step.
+    cdef void step_members(self, double y, double h, const double* u) noexcept nogil
+    cdef void follow_period(self, double h) noexcept nogil
+    cdef void carry_flow(self, double h, const double* u) noexcept nogil
+    cdef void pass_over(self, bint doubted) noexcept nogil
+    cdef void take_sample(self, bint doubted) noexcept nogil
+    cdef bint drifts(self, double off, double variance) noexcept nogil
+    cdef bint has_begun(self) noexcept nogil
+    # Snapshots.
+    cdef dict places(self)
+    cdef within(self, values, str name, tuple shape)

@@ -1,0 +1,543 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The self-tuning observer: members side by side, weighted by how well they predict y (D 26)."""
+
+from libc.math cimport INFINITY, NAN, copysign, exp, fabs, fmax, fmin, pow, sqrt
+from libc.stdlib cimport calloc, free
+from libc.string cimport memcpy, memset
+
+from fhaosmo_ros.core.observer.self_tuning.filters cimport (
+    GATE, HUBER, allow_jump, correct, correct_states, expect, predict_states
+)
+from fhaosmo_ros.core.observer.self_tuning.intervals cimport choose_members, take_interval
+from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
+    GROWTHS, LOST_SAMPLES, begin_growth, follow_growth, follow_innovations, follow_jump,
+    samples_since_jump, shift, watch
+)
+from fhaosmo_ros.core.observer.self_tuning.members cimport (
+    BANDS, COLOURS, COUNT, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, IN_BAND, KINDS, Line,
+    MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
+)
+from fhaosmo_ros.core.observer.self_tuning.noise cimport (
+    CALM_SAMPLES, STEADY, find_knowing, follow_differences, follow_noise, follow_quantum,
+    is_explained, is_likely, rounding, stamp_noise
+)
+from fhaosmo_ros.core.observer.self_tuning.start cimport gather
+from fhaosmo_ros.core.observer.self_tuning.weights cimport (
+    FLOOR, Model, QUANTISED_FLOOR, judge, mix, tell_model, weigh
+)
+from fhaosmo_ros.core.observer.status cimport JUMPED
+from fhaosmo_ros.core.observer.structure cimport Memory, Structure
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+import numpy as np
+
+cdef double NOISE_SAMPLES = 1000.0  # the noise is averaged over so many
+# What is beyond 3 sigma in so many samples after a jump of d is due to it, too.
+cdef double JUMP_SAMPLES = 10.0
+# If unlikely samples are on the other side than the last one in a larger share of so many samples,
+# and y itself moves as ever, members are judged by them too: those that were likely are wrong. A
+# sample whose difference is large counts as ROUGH_TURN of these: noise may have grown.
+cdef double TURNS_SAMPLES = 40.0, OFTEN = 0.07, ROUGH_TURN = -0.5
+# y is taken to be no more exact than this, in parts of what it moves between samples (RMS).
+cdef double EXACT = 1e-5
+# Factors on the variance of the noise, of the likeliest colour and others, that make P move.
+cdef double ANOTHER = 1.5, FAR_OFF = 3.0
+# Intervals that differ by this part are equal: seconds of a clock, as floats, are not exact.
+cdef double SAME = 1e-9
+# P is not the steady one if the mean interval has changed by more than the first part of it, nor
+# after an interval of GAP usual ones; after shorter ones nearly.
+cdef double NEAR = 0.25, GAP = 2.5
+cdef double LONG = 8.0  # time constants of a member after which its P is steady
+# Covariances of so many members, or of a multiple, move: whole vectors of the processor.
+cdef int EVEN = 16
+# How many prediction errors after a jump of y their sum remembers, and the sum that is too much:
+# five standard deviations of that of white noise (D 23).
+cdef double REMEMBERED = 100.0, MOST_DRIFT = 35.0
+# A jump of y contradicts the model if it changes a Phi by so many standard deviations (D 23).
+cdef double OF_DEVIATION = 3.0
+# A y has noise if its differences are all more than the first part of its first difference, RMS;
+# none if they are less than the second part of the noise at the start, as variances. Those that
+# are smaller than the last part of y may be errors of its rounding to 64 bits.
+cdef double LEAST_NOISE = 1e-3, NO_NOISE = 1e-9, ROUNDED = 1e-12
+cdef double LARGEST = 1e300  # no number of a snapshot is larger, nor is an error of a prediction
+# Ranges of the numbers of a snapshot; others are from 0 to LARGEST.
+RANGES = {'likeliest': (0, COUNT - 1), 'told': (0, COUNT - 1), 'followed': (0, COUNT - 1)}
+RANGES |= {'samples': (0, NOISE_SAMPLES + 1), 'moving': (0, HALF), 'active': (0, COUNT)}
+RANGES |= {'since_mark': (0, WINDOW - 1), 'far_sign': (-1, 1), 'correlation': (0, 1)}
+RANGES |= dict.fromkeys((
+    'first_y', 'difference', 'flow', 'window', 'prior', 'score', 'log_variance', 'residual',
+    'score_before', 'z', 'd', 'gain_z', 'gain_d', 'p_zz', 'p_zd', 'p_dd',
+), (-LARGEST, LARGEST))
+# What counts before the members run, too.
+EARLY = ('first_y', 'first_h', 'noise', 'used_noise', 'difference', 'rough', 'window')
+
+
+cdef class SelfTuning(Structure):
+    """
+    An observer that finds its gains by itself (D 26 to D 36); nothing is given but the model.
+
+    Parameters
+    ----------
+    configuration : ObserverConfiguration
+
+    """
+
+    def __cinit__(self, configuration):
+        cdef int i
+        if self.order > MOST_ORDER:
+            raise ConfigurationError(
+                f"parameter 'order': expected at most {MOST_ORDER}, got {self.order}"
+            )
+        p = configuration.parameters
+        self.is_linear = configuration.model.is_linear
+        self.forgetting, self.slider = p['tuning_memory'], p['bandwidth']
+        self.least_noise = p['noise_size']
+        for i in range(self.order):
+            self.sizes[i] = configuration.state_sizes[i] ** 2
+        self.members = <Members*>calloc(1, sizeof(Members))
+        if self.members == NULL:
+            raise MemoryError
+        self.members.n = self.order
+
+    def __dealloc__(self):
+        free(self.members)
+
+    cdef void reset(self) noexcept nogil:
+        """Go back to the state before any sample."""
+        cdef int i
+        Structure.reset(self)
+        memset(&self.members.shared, 0, sizeof(Shared))
+        memset(&self.model, 0, sizeof(self.model))
+        self.y_jumped = False
+        for i in range(self.levels):
+            self.variances[i] = INFINITY
+
+    cdef bint keep(self) noexcept nogil:
+        """Return False: the members are too many to be kept."""
+        return False
+
+    cdef bint has_begun(self) noexcept nogil:
+        """Return True once the members run."""
+        return self.members.shared.samples > FIRST_SAMPLES
+
+    cdef void begin_afresh(self) noexcept nogil:
+        """Let the members begin afresh, by the next samples."""
+        self.members.shared.samples = 0
+
+    cdef void fail(self, double y) noexcept nogil:
+        """Let the members begin afresh after a step that has left the finite numbers."""
+        self.begin_afresh()
+
+    cdef bint is_noisy(self, double y) noexcept nogil:
+        """Return True if all differences of y show noise, so that it does not repeat itself."""
+        cdef double* rough = &self.members.rough[0][0]  # by white noise
+        cdef double least = fmax(
+            NO_NOISE * self.members.shared.first_noise, LEAST_NOISE * LEAST_NOISE * rough[1]
+        )
+        cdef int p
+        for p in range(1, self.order + 2):
+            if not rough[p] > fmax(least, ROUNDED * y * (ROUNDED * y)):
+                return False
+        return self.members.shared.active == COUNT  # else y is quantised, or none has begun
+
+    # What a structure implements
+
+    cdef void advance(self, double y, double h, const double* u) noexcept nogil:
+        """See `Structure.advance`."""
+        cdef Sample* sample = &self.members.work.sample
+        cdef int i, n = self.levels
+        self.trial_model = self.model
+        sample.y, sample.before, sample.h = y, self.memory.y, h
+        if self.has_begun():
+            memcpy(self.trial_variances, self.variances, sizeof(self.variances))
+            self.step_members(y, h, u)
+        else:
+            for i in range(n):
+                self.trial[i].z_hat, self.trial_variances[i] = 0.0, INFINITY
+            self.trial[0].z_hat = y
+            gather(self.members, self.sizes, self.least_noise)
+        for i in range(n):  # the internal states stand for the estimates
+            self.trial[i].z_tilde = self.trial[i + 1].z_hat if i + 1 < n else 0.0
+
+    cdef int accept(self, double y, double h) noexcept nogil:
+        """Make `trial` the state; return status flags."""
+        cdef int word = JUMPED if self.y_jumped else 0
+        Structure.accept(self, y, h)
+        memcpy(self.variances, self.trial_variances, sizeof(self.variances))
+        self.model, self.y_jumped = self.trial_model, False
+        return word
+
+    cdef void restart(self, double y) noexcept nogil:
+        """Begin afresh from `y`: z is not known any more, d and the noise are (D 29)."""
+        cdef Members* m = self.members
+        cdef Shared* shared = &m.shared
+        cdef Memory* memory = &self.memory
+        cdef int n = self.order, i, j, g
+        cdef double size, z, a
+        memory.pending = memory.offset = memory.watched = memory.drift = memory.beyond = 0.0
+        shared.unsettled = shared.growing = shared.recent = shared.turns = 0.0
+        self.level[0].z_hat = memory.y = y
+        if not self.has_begun():
+            self.begin_afresh()
+            return
+        watch(m, shared.told)
+        self.variances[0] = m.noise[0]
+        for i in range(n):
+            z = self.level[i].z_hat
+            size = fmax(self.sizes[i], z * z)
+            if i > 0:
+                self.variances[i] = size
+            for j in range(i, n + ORDERS):
+                for g in range(COUNT):
+                    entry(&m.p, n, i, j)[g] = size if i == j else 0.0
+        for g in range(COUNT):
+            a = m.correlation[g]
+            m.x.z[0][g], m.p.zz[0][g] = y, m.noise[GRID.colour[g]] / (1.0 - a * a)
+            m.residual[g], m.far[g], m.short_mean[g] = 0.0, 0.0, 1.0
+
+    cdef double innovation_variance(self) noexcept nogil:
+        """Return the variance that the latest innovation was expected to have."""
+        return self.trial_variances[0]
+
+    cdef double most_change(self, int i) noexcept nogil:
+        """Return how much Phi_{i+1} may change in a jump of y that it does not contradict."""
+        if i + 1 == self.levels:
+            return INFINITY
+        return OF_DEVIATION * sqrt(self.trial_variances[i + 1])
+
+    cdef void go_on_after_jump(self, double of_state) noexcept nogil:
+        """Let the members go on after y has jumped (D 23)."""
+        shift(self.members, of_state, self.memory.miss, self.trial_variances[0])
+
+    cdef double variance(self, int i) noexcept nogil:
+        """Return the variance of the error of z_{i+1}, or of d for i = n."""
+        return self.variances[i]
+
+    cdef void tell(self, double* model, double* tuning) noexcept nogil:
+        """Write the likeliest model of d, and what has been found; NaN before it is known."""
+        cdef int i
+        model[0], model[1] = self.model.noise, self.model.drive
+        model[2], model[3] = self.model.loss, self.model.derivatives
+        if self.has_begun():
+            find_tuning(self.members, tuning)
+        else:
+            for i in range(3 + ORDERS):
+                tuning[i] = NAN
+
+    # A step of all members
+
+    cdef void step_members(self, double y, double h, const double* u) noexcept nogil:
+        """
+        Advance the members, and the estimates of `trial`, to the sample `y`.
+
+        A sample that is too far off is counted in `Memory.beyond`, and changes no member.
+        """
+        cdef Members* m = self.members
+        cdef Shared* shared = &m.shared
+        cdef Work* w = &m.work
+        cdef Sample* sample = &w.sample
+        cdef Memory* memory = &self.memory
+        cdef double mean[MOST_STATES]
+        cdef double expected, off, sign, turn = 0.0, tau = 0.0
+        cdef bint growing, goes_on, likely, begins, jumped, doubted, rough
+        cdef int i, n = self.order, since_jump = 0
+        sample.quanta = rounding(m)
+        if choose_members(m, sample.quanta):
+            weigh(m, FLOOR)
+        self.follow_period(h)
+        follow_differences(m, y)
+        sample.of_stamps = stamp_noise(m, h, memory.beyond == 0.0)
+        sample.uneven += sample.of_stamps
+        rough = sample.roughness > HUBER * HUBER
+        if shared.growing >= GROWTHS - 1.0 or shared.recent > 0.0 or sample.quanta > 0.0:
+            shared.moving = HALF
+        if sample.quanta > 0.0:  # P depends on the samples
+            shared.unsettled = 0.0
+        w.first, w.last = HALF - shared.moving, min(HALF + shared.moving, shared.active)
+        self.carry_flow(h, u)
+        sample.off = y - self.prediction.z[0]
+        if not fabs(sample.off) <= LARGEST:
+            self.trial[0].z_hat = NAN  # the step is rejected, and the members begin afresh
+            return
+        # A sample that is not likely changes no member: what it makes of them stands apart.
+        for i in range(self.levels):
+            mean[i] = self.trial[i].z_hat
+        predict_states(m, h, mean, self.prediction.z)
+        expect(m, h, y)
+        find_knowing(m, memory.beyond > 0.0)
+        expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
+        sample.floor = fmax(
+            fmax(sample.quanta, self.least_noise * self.least_noise),
+            EXACT * EXACT * m.rough[0][1],
+        )
+        sample.average = fmin(shared.samples, NOISE_SAMPLES)
+        sample.kept = exp(-h / self.forgetting)
+        shared.samples = <int>sample.average + 1
+        growing = follow_growth(m, memory.beyond)
+        off, sign = fabs(sample.off), copysign(1.0, sample.off)
+        goes_on = (
+            memory.beyond > 0.0 and sign == shared.far_sign and not rough
+            and shared.roughness < HUBER
+        )
+        likely = is_likely(m, memory.beyond, HUBER if goes_on else GATE)
+        shared.recent = fmax(shared.recent - 1.0, 0.0)
+        begins = growing and not likely
+        jumped = begins or (shared.recent > 0.0 and not rough)
+        if rough:
+            turn = ROUGH_TURN
+        elif not likely and sign != shared.far_sign:
+            turn = 1.0
+        shared.turns = fmax(shared.turns + (turn - shared.turns) / TURNS_SAMPLES, 0.0)
+        doubted = shared.turns > OFTEN and shared.roughness < HUBER and sample.quanta == 0.0
+        if not likely and not jumped:
+            self.pass_over(doubted)
+            self.trial_variances[0] = expected
+            return
+        memory.beyond = 0.0
+        if not jumped and sample.quanta == 0.0 and self.drifts(sample.off, expected):
+            memory.beyond = INFINITY
+            return
+        if jumped:
+            if begins:  # while it was within the gate, it could not be seen
+                tau = h / (1.0 - pow(fmin(GATE * sqrt(m.noise[0]) / off, 0.9), 1.0 / n))
+                shared.recent = JUMP_SAMPLES
+            allow_jump(m, y, tau)
+            memset(m.far, 0, sizeof(m.far))
+            memcpy(w.believed, w.s, sizeof(Line))
+            shared.unsettled = 0.0
+        self.take_sample(doubted)
+        follow_quantum(m)
+        if not jumped:
+            since_jump = samples_since_jump(m)
+        if since_jump > 2:  # two outliers are no jump
+            follow_jump(m, since_jump)
+            self.y_jumped = True
+            weigh(m, FLOOR)
+        mix(m, self.slider, mean, self.trial_variances)
+        for i in range(self.levels):
+            self.trial[i].z_hat = mean[i]
+        tell_model(m, self.slider, jumped, &self.trial_model)
+        for i in range(shared.active):
+            if m.far[i] > LOST_SAMPLES:  # far off for long
+                m.far[i] = 0.0
+                put(m, i, mean)
+
+    cdef void follow_period(self, double h) noexcept nogil:
+        """Decide which covariances move, and what depends on the period (D 27)."""
+        cdef Members* m = self.members
+        cdef Shared* shared = &m.shared
+        cdef double of_colours[COLOURS]
+        cdef double mean = self.memory.period if self.memory.period > 0.0 else h, ratio, limit
+        cdef double slowed = 1.0
+        cdef int g, c, moving = 0
+        cdef bint changed
+        if not fabs(h - shared.flow_period) <= SAME * shared.flow_period:
+            for g in range(HALF):  # kappa does not depend on k
+                m.decayed[g] = (
+                    m.decayed[g - KINDS] if GRID.order[g] > 0 else exp(-m.kappa[g] * h)
+                )
+            for c in range(COLOURS):
+                of_colours[c] = exp(-h / m.tau[GRID.first[c]]) if c > 0 else 0.0
+            for g in range(HALF, COUNT):
+                m.decayed[g] = m.decayed[GRID.white[g]]
+                m.correlation[g] = of_colours[GRID.colour[g]]
+        changed = (
+            fabs(mean - shared.steady_period) > NEAR * shared.steady_period
+            or h > GAP * shared.steady_period
+        )
+        for c in range(COLOURS):
+            ratio = m.noise[c] / m.used_noise[c]
+            limit = ANOTHER if c == GRID.colour[shared.likeliest] else FAR_OFF
+            changed = changed or not 1.0 / limit < ratio < limit
+        if changed:
+            m.used_noise = m.noise
+        if changed or not self.is_linear:
+            shared.unsettled, shared.steady_period = 0.0, mean
+        shared.unsettled += h
+        for c in range(COLOURS):
+            slowed = fmin(
+                slowed, pow(shared.first_noise / m.used_noise[c], 0.5 / (self.order + 1))
+            )
+        for c in range(BANDS):
+            g = HALF + c * IN_BAND
+            if m.kappa[g] / GRID.ratio[g] * slowed * shared.unsettled < LONG:
+                moving += IN_BAND
+        shared.moving = min((moving + EVEN - 1) // EVEN * EVEN, HALF)
+
+    cdef void carry_flow(self, double h, const double* u) noexcept nogil:
+        """Predict the mean, with its derivative by each of its entries (D 27)."""
+        cdef Shared* shared = &self.members.shared
+        cdef bint same = fabs(h - shared.flow_period) <= SAME * shared.flow_period
+        cdef int i, j
+        for j in range(self.levels - 1 if self.is_linear and same else 0, self.levels):
+            for i in range(self.levels):
+                self.prediction.z[i], self.prediction.dz[i] = self.trial[i].z_hat, 0.0
+            self.prediction.dz[j] = 1.0
+            self.prediction.over(h, u)
+            for i in range(self.levels):
+                self.members.flow[i][j] = self.prediction.dz[i]
+        if not same:
+            shared.flow_period = h
+
+    cdef void pass_over(self, bint doubted) noexcept nogil:
+        """Count a sample that is not likely; where it may be noise that has grown, follow that."""
+        cdef Members* m = self.members
+        cdef Shared* shared = &m.shared
+        cdef Sample* sample = &m.work.sample
+        cdef Memory* memory = &self.memory
+        cdef double sign = copysign(1.0, sample.off)
+        cdef bint other_side = memory.beyond > 0.0 and sign != shared.far_sign
+        if doubted and is_explained(m):
+            judge(m, 1.0, sample.kept, True)
+            weigh(m, FLOOR)
+        if other_side:
+            begin_growth(m)
+            memory.beyond = 0.0
+        memory.beyond += 1.0
+        memory.miss = sample.off
+        if memory.beyond == 1.0:
+            memory.first_miss = sample.off
+        # A y that is off is so on one side, and evenly.
+        if other_side or (shared.roughness > HUBER and shared.recent == 0.0):
+            follow_noise(m)
+        shared.far_sign = sign
+
+    cdef void take_sample(self, bint doubted) noexcept nogil:
+        """Correct the members by a sample, and weigh them."""
+        cdef Members* m = self.members
+        cdef Shared* shared = &m.shared
+        cdef Sample* sample = &m.work.sample
+        cdef bint quantised = sample.quanta > 0.0, calm, judged
+        cdef double kept
+        follow_noise(m)
+        shared.calm = shared.calm + 1.0 if sample.grown <= STEADY else 0.0
+        calm = shared.calm > CALM_SAMPLES or doubted
+        judged = (calm or sample.best_fit < HUBER * HUBER) and (
+            sample.roughness <= HUBER * HUBER or quantised
+        )
+        kept = sample.kept if judged else -1.0
+        follow_innovations(m)
+        if quantised:
+            take_interval(m, kept)
+        correct(m, quantised)
+        if not quantised:
+            judge(m, sample.grown, kept, calm)
+        correct_states(m, sample.y)
+        weigh(m, QUANTISED_FLOOR if quantised else FLOOR)
+
+    cdef bint drifts(self, double off, double variance) noexcept nogil:
+        """Return True if y has left its prediction since it jumped: the plant did (D 23)."""
+        cdef Memory* memory = &self.memory
+        if not memory.watched > 0.0:
+            return False
+        memory.watched = fmax(memory.watched - 1.0, 0.0)
+        memory.drift += off / sqrt(variance) - memory.drift / REMEMBERED
+        return fabs(memory.drift) > MOST_DRIFT
+
+    # Live changes, snapshots and copies
+
+    def take_over(self, Structure before not None):
+        """Go on with the state of an observer that has other live parameters."""
+        cdef SelfTuning other = before
+        before.enter()
+        self.level, self.memory, self.innovation = before.level, before.memory, before.innovation
+        memcpy(self.variances, other.variances, sizeof(self.variances))
+        self.y_jumped = other.y_jumped
+        self.members.shared = other.members.shared
+        of = other.places()
+        for name, (to, shape) in self.places().items():
+            memcpy(<void*><size_t>to, <void*><size_t>of[name][0], 8 * np.prod(shape))
+        source = self.configuration.expressions.source
+        if (source != before.configuration.expressions.source
+                or self.prediction.longest != before.prediction.longest):
+            # What members know of the model (D 27) is that of another one.
+            self.members.shared.flow_period = self.members.shared.unsettled = 0.0
+
+    cdef dict places(self):
+        """Return where the arrays lie: name -> (address, shape)."""
+        cdef Members* m = self.members
+        n = self.order
+        found = {
+            'kappa': <size_t>m.kappa, 'tau': <size_t>m.tau, 'weight': <size_t>m.weight,
+            'correlation': <size_t>m.correlation, 'decayed': <size_t>m.decayed,
+            'prior': <size_t>m.prior, 'score': <size_t>m.score, 'far': <size_t>m.far,
+            'variance': <size_t>m.variance, 'log_variance': <size_t>m.log_variance,
+            'residual': <size_t>m.residual, 'short_mean': <size_t>m.short_mean,
+        }
+        return {name: (at, (COUNT,)) for name, at in found.items()} | {
+            'score_before': (<size_t>m.score_before, (2, COUNT)),
+            'drive': (<size_t>m.drive, (ORDERS, COUNT)),
+            'z': (<size_t>m.x.z, (n, COUNT)),
+            'd': (<size_t>m.x.d, (ORDERS, COUNT)),
+            'gain_z': (<size_t>m.gain.z, (n, COUNT)),
+            'gain_d': (<size_t>m.gain.d, (ORDERS, COUNT)),
+            'p_zz': (<size_t>m.p.zz, (n * (n + 1) // 2, COUNT)),
+            'p_zd': (<size_t>m.p.zd, (n, ORDERS, COUNT)),
+            'p_dd': (<size_t>m.p.dd, (ORDERS, ORDERS, COUNT)),
+            'first_y': (<size_t>m.first_y, (FIRST_SAMPLES,)),
+            'first_h': (<size_t>m.first_h, (FIRST_SAMPLES,)),
+            'noise': (<size_t>m.noise, (COLOURS,)),
+            'used_noise': (<size_t>m.used_noise, (COLOURS,)),
+            'difference': (<size_t>m.difference, (DIFFERENCES,)),
+            'rough': (<size_t>m.rough, (COLOURS, DIFFERENCES)),
+            'window': (<size_t>m.window, (WINDOW,)),
+            'flow': (<size_t>m.flow, (MOST_STATES, MOST_STATES)),
+        }
+
+    def state_dict(self):
+        """
+        Return all that it remembers: name -> number or array.
+
+        Arrays of `COUNT` columns have one for each member; there are none before the members run.
+        """
+        cdef dict shared = self.members.shared, model = self.model
+        whole, found = Structure.state_dict(self), {}
+        for name, (at, shape) in self.places().items():
+            numbers = np.frombuffer((<char*><size_t>at)[:8 * int(np.prod(shape))])
+            found[name] = numbers.reshape(shape)
+        if not all((np.abs(numbers) <= LARGEST).all() for numbers in found.values()):
+            shared['samples'] = 0  # members are lost, as the next step would find
+        if shared['samples'] <= FIRST_SAMPLES:
+            found = {name: found[name] for name in EARLY}
+        found |= shared | {'model': list(model.values())}
+        found = {name: np.clip(np.nan_to_num(x), -LARGEST, LARGEST) for name, x in found.items()}
+        found['variances'] = np.array([self.variances[i] for i in range(self.levels)])
+        return whole | found
+
+    def load_state_dict(self, values):
+        """Go on where an observer of the same size was; see `Structure.load_state_dict`."""
+        cdef Shared shared = self.members.shared
+        cdef int i
+        self.enter()
+        shared = {name: self.within(values, name, ()).item() for name in (<dict>shared)}
+        names = self.places()
+        if shared.samples <= FIRST_SAMPLES:
+            names = {name: names[name] for name in EARLY}
+        if shared.active % HALF > 0 or (shared.samples > FIRST_SAMPLES and shared.active == 0):
+            raise ConfigurationError(
+                f"snapshot: 'active': expected {HALF} or {COUNT} members, got {shared.active}"
+            )
+        found = {name: self.within(values, name, shape) for name, (_, shape) in names.items()}
+        variances = self.number(values, 'variances', (self.levels,))
+        if not (variances >= 0.0).all():
+            raise ConfigurationError("snapshot: 'variances': expected numbers of at least 0")
+        numbers = self.finite(values, 'model', (4,))
+        Structure.load_state_dict(self, values)
+        self.members.shared, self.members.work.q_interval = shared, 0.0
+        self.model = Model(numbers[0], numbers[1], numbers[2], numbers[3])
+        self.is_kept = self.y_jumped = False
+        for name, number in found.items():
+            data = number.tobytes()
+            memcpy(<void*><size_t>names[name][0], <char*>data, len(data))
+        for i in range(self.levels):
+            self.variances[i] = variances[i]
+
+    cdef within(self, values, str name, tuple shape):
+        """Return what a snapshot has of a name, after a check that it is within its range."""
+        numbers = self.number(values, name, shape)
+        low, high = RANGES.get(name, (0.0, LARGEST))
+        if not ((numbers >= low) & (numbers <= high)).all():
+            raise ConfigurationError(
+                f"snapshot: '{name}': expected numbers from {low:g} to {high:g}"
+            )
+        return numbers

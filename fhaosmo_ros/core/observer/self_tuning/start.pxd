@@ -1,0 +1,6 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The first samples, and members that begin with what these tell (D 26, D 28)."""
+
+from fhaosmo_ros.core.observer.self_tuning.members cimport Members
+
+cdef void gather(Members* m, const double* sizes, double least_noise) noexcept nogil

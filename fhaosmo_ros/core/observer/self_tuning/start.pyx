@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The first samples, and members that begin with what these tell (D 26, D 28)."""
+
+from libc.math cimport INFINITY, fabs, fmax, fmin, log, pow, sqrt
+from libc.string cimport memset
+
+from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
+from fhaosmo_ros.core.observer.self_tuning.members cimport (
+    COLOURS, COUNT, DIFFERENCES, Estimates, FIRST_SAMPLES, GRID, HALF, Line,
+    MOST_ORDER, Members, ORDERS, Shared, factorial, pair
+)
+from fhaosmo_ros.core.observer.self_tuning.noise cimport (
+    CALM_SAMPLES, LATTICE_SHARE, follow_differences, is_multiple
+)
+from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, weigh
+
+cdef double MEDIAN = 0.6745  # of |x| where x is normal with variance 1
+# Share of the first samples' differences that say how large z may be; others may be outliers.
+cdef double MOST = 0.8
+# y may be constant until its sensor is ready. So many samples from its first change on tell
+# whether it is quantised; if not, the first samples are those from there on.
+cdef int CHANGING = 8
+# Of so few steps: all are multiples of the smallest one, which does not count.
+cdef double ALL_BUT_ONE = 0.8
+# If a larger share of the first samples repeat the one before, y is quantised.
+cdef double REPEATED = 0.3
+# Members with a larger bandwidth (rad a sample) tell d from the last two or three samples. There
+# errors of rounding, which are not white, look like such a d: where y is quantised,
+# log-likelihoods of these members are smaller by MORE_REASON.
+cdef double WITHIN_SAMPLES = 1.0, MORE_REASON = 50.0
+
+
+cdef void gather(Members* m, const double* sizes, double least_noise) noexcept nogil:
+    """
+    Collect the first samples; once there are enough, let the members begin (D 28).
+
+    `sizes` are the squares of those of z. With a `least_noise` fewer samples are enough.
+    """
+    cdef Shared* shared = &m.shared
+    cdef double largest = 0.0
+    cdef int count = shared.samples, changed = 1, since, i
+    if count == 0:
+        m.first_y[0], m.first_h[0] = m.work.sample.before, 0.0
+        count = 1
+    if count == FIRST_SAMPLES:  # y had not changed by then
+        drop_first(m, 1, count)
+        count -= 1
+    m.first_y[count], m.first_h[count] = m.work.sample.y, m.work.sample.h
+    shared.samples = count = count + 1
+    if count < FIRST_SAMPLES and not (least_noise > 0.0 and count > 2 * m.n + 4):
+        return
+    for i in range(count):
+        largest = fmax(largest, fabs(m.first_y[i]))
+    # Number of the first sample that is another one.
+    while changed < count and fabs(m.first_y[changed] - m.first_y[0]) <= 1e-12 * largest:
+        changed += 1
+    since = count - changed
+    if changed > 1 and least_noise == 0.0 and not (
+        since >= CHANGING and on_lattice(m.first_y + count - CHANGING - 1)
+    ):
+        if since >= CHANGING:
+            drop_first(m, changed - 1, count)
+            shared.samples = since + 1
+        return
+    begin(m, sizes, find_noise(m, fmax(least_noise, fmax(1e-9 * largest, 1e-150)), largest))
+    shared.samples = FIRST_SAMPLES + 1
+
+
+cdef void drop_first(Members* m, int dropped, int count) noexcept nogil:
+    """Drop the first ones of `count` samples."""
+    cdef int i
+    for i in range(count - dropped):
+        m.first_y[i], m.first_h[i] = m.first_y[i + dropped], m.first_h[i + dropped]
+
+
+cdef bint on_lattice(const double* values) noexcept nogil:
+    """Return True if `CHANGING` steps seem to be those of a quantised y."""
+    cdef double quantum = INFINITY, step
+    cdef int i
+    for i in range(CHANGING):
+        step = fabs(values[i + 1] - values[i])
+        if step > 0.0:
+            quantum = fmin(quantum, step)
+    return share_of_multiples(values, CHANGING + 1, quantum) > ALL_BUT_ONE
+
+
+cdef double share_of_multiples(const double* values, int count, double quantum) noexcept nogil:
+    """Return the share of multiples of `quantum` among the steps; 1 if many samples repeat."""
+    cdef double steps = 0.0, repeated = 0.0, step
+    cdef double multiples = -1.0  # the smallest step is one in any case
+    cdef int i
+    for i in range(1, count):
+        step = fabs(values[i] - values[i - 1])
+        if step < 0.99 * quantum:
+            repeated += 1.0
+        else:
+            steps += 1.0
+            multiples += is_multiple(step, quantum, values[i])
+    return 1.0 if repeated > REPEATED * (count - 1) else multiples / steps
+
+
+cdef double ranked(double* values, int count, double share) noexcept nogil:
+    """Return the value that a share of `count` ones is below; sorts these in place."""
+    cdef double value
+    cdef int i, j
+    for i in range(1, count):
+        value, j = values[i], i
+        while j > 0 and values[j - 1] > value:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = value
+    return values[<int>(share * count)]
+
+
+cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
+    """
+    Return the standard deviation of the noise on the first samples, at least `least`.
+
+    Also write the quantum, how exact the stamps are, the mean interval, and what differences of y
+    say that the noise is at most.
+    """
+    cdef Shared* shared = &m.shared
+    cdef double differences[FIRST_SAMPLES]
+    cdef double values[FIRST_SAMPLES]
+    cdef double rough[DIFFERENCES]
+    cdef double noise = INFINITY, binomial = 1.0, quantum = INFINITY, size, period = 0.0, h
+    cdef double before, jitter = 0.0
+    cdef int count = shared.samples, order, i, c
+    for i in range(count):
+        differences[i] = m.first_y[i]
+    rough[0] = 0.0
+    for order in range(1, m.n + 2):
+        binomial *= (4.0 * order - 2.0) / order  # (2 order)! / order!^2
+        for i in range(count - order):
+            differences[i] = differences[i + 1] - differences[i]
+            values[i] = fabs(differences[i])
+            if order == 1 and values[i] > 1e-12 * largest:
+                quantum = fmin(quantum, values[i])
+        size = ranked(values, count - order, 0.5) / MEDIAN / sqrt(binomial)
+        if size > 0.0:
+            noise = fmin(noise, size)
+        rough[order] = size * size
+    if quantum < INFINITY:
+        shared.quantum = quantum
+        shared.lattice = share_of_multiples(m.first_y, count, quantum)
+        if shared.lattice > LATTICE_SHARE:
+            noise = fmax(quantum / sqrt(12.0), noise if noise < INFINITY else 0.0)
+    if noise == INFINITY:
+        noise = quantum
+    for i in range(1, count):
+        h, before = m.first_h[i], m.first_h[i - 1]
+        period += h / (count - 1)
+        if i > 1:
+            jitter += (h - before) * (h - before) / (6.0 * h * before) / (count - 2)
+    shared.steady_period, shared.jitter = period, jitter
+    shared.interval = m.first_h[count - 1]
+    noise = fmax(fmax(noise, sqrt(2.0 * jitter * rough[1])), least)
+    for order in range(m.n + 2):
+        for c in range(COLOURS):
+            m.rough[c][order] = fmax(rough[order], noise * noise)
+    return noise
+
+
+cdef void find_sizes(Members* m, double* sizes) noexcept nogil:
+    """Raise the squares of the sizes of z to what differences of the first samples say."""
+    cdef double first[FIRST_SAMPLES]
+    cdef double values[FIRST_SAMPLES]
+    cdef int count = m.shared.samples, stride = max((count - 1) // m.n, 1), length, i, j
+    for j in range(count):
+        first[j] = m.first_y[j]
+    for i in range(1, m.n):
+        length = count - i * stride
+        for j in range(length):
+            first[j] = (first[j + stride] - first[j]) / (stride * m.shared.steady_period)
+            values[j] = first[j] * first[j]
+        sizes[i] = fmax(sizes[i], ranked(values, length, MOST))
+
+
+cdef void begin(Members* m, const double* least_sizes, double noise) noexcept nogil:
+    """Let the members begin at the last sample (D 28)."""
+    cdef Shared* shared = &m.shared
+    cdef double sizes[MOST_ORDER]
+    cdef double y = m.first_y[shared.samples - 1], period = shared.steady_period
+    cdef double omega, kappa, intensity, size, least = INFINITY
+    cdef int n = m.n, g, i, j, k, below, c
+    for i in range(n):
+        sizes[i] = least_sizes[i]
+    find_sizes(m, sizes)
+    shared.moving, shared.active = HALF, COUNT
+    shared.unsettled = shared.flow_period = 0.0
+    shared.first_noise = noise * noise
+    for c in range(COLOURS):
+        m.noise[c] = m.used_noise[c] = noise * noise
+    for g in range(COUNT):
+        c, omega = GRID.colour[g], GRID.bandwidth[g] / period
+        m.kappa[g], m.correlation[g] = GRID.ratio[g] * omega, GRID.correlation[c]
+        m.tau[g] = -period / log(GRID.correlation[c]) if c > 0 else 0.0
+    memset(m.difference, 0, sizeof(m.difference))
+    shared.roughness, shared.calm = 1.0, CALM_SAMPLES + 1.0
+    for j in range(shared.samples):
+        follow_differences(m, m.first_y[j])
+    memset(&m.x, 0, sizeof(Estimates))
+    memset(m.p.zz, 0, n * (n + 1) // 2 * sizeof(Line))
+    memset(m.p.zd, 0, n * ORDERS * sizeof(Line))
+    memset(m.p.dd, 0, sizeof(m.p.dd))
+    memset(m.drive, 0, sizeof(m.drive))
+    for g in range(COUNT):
+        omega, kappa, k = GRID.bandwidth[g] / period, m.kappa[g], GRID.order[g]
+        intensity = noise * noise * period * pow(omega, 2 * (n + 1 + k))
+        m.drive[k][g] = intensity
+        m.x.z[0][g], m.p.zz[0][g] = y, noise * noise
+        for i in range(1, n):
+            m.p.zz[pair(i, i)][g] = sizes[i]
+        for i in range(k + 1):
+            for j in range(i, k + 1):
+                below = 2 * k - i - j
+                m.p.dd[i][j][g] = intensity * factorial(below) / (
+                    factorial(k - i) * factorial(k - j) * pow(2.0 * kappa, below + 1)
+                )
+        size = log(m.p.dd[0][0][g])
+        m.prior[g] = -0.5 * size
+        least = fmin(least, size)
+    for g in range(COUNT):
+        m.prior[g] += 0.5 * least
+        if shared.lattice > LATTICE_SHARE and GRID.bandwidth[g] > WITHIN_SAMPLES:
+            m.prior[g] -= MORE_REASON
+        m.score[g] = m.prior[g]
+        m.variance[g] = m.short_mean[g] = 1.0
+        m.log_variance[g] = m.residual[g] = m.far[g] = 0.0
+    weigh(m, FLOOR)
+    shared.told = shared.likeliest
+    watch(m, shared.told)

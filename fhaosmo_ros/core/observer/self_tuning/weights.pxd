@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How likely each member is, and the mean of all (D 28)."""
+
+from fhaosmo_ros.core.observer.self_tuning.members cimport Members
+from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+
+
+cdef struct Model:
+    # The likeliest model of d (D 26, D 34); all 0 before the members have begun.
+    double noise  # variance of the noise, if it were white
+    double drive  # q
+    double loss  # kappa (1/s)
+    double derivatives  # k; k - 4 where d has jumped (D 33)
+
+
+cdef double FLOOR, QUANTISED_FLOOR
+
+cdef VECTORISED judge(Members* m, double grown, double kept, bint calm) noexcept nogil
+cdef VECTORISED weigh(Members* m, double floor) noexcept nogil
+cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) noexcept nogil
+cdef void tell_model(Members* m, double slider, bint jumped, Model* model) noexcept nogil

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How likely each member is, and the mean of all (D 28)."""
+
+from libc.math cimport M_PI, NAN, cos, exp, floor as floor_of, fmin, isfinite, log, pow, sqrt
+
+from fhaosmo_ros.core.observer.self_tuning.filters cimport GATE, HUBER
+from fhaosmo_ros.core.observer.self_tuning.members cimport (
+    BANDS, BAND_STEP, COLOURS, COUNT, GRID, HALF, IN_BAND, Members, ORDERS, Shared, Work, entry,
+    fill, largest
+)
+from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+
+# No log-likelihood falls further below the best one (D 28, D 31), but by what the member's prior
+# is below that of the likeliest: a larger d needs more reason to be believed.
+cdef double FLOOR = 30.0, QUANTISED_FLOOR = 100.0
+# A member is clearly likelier than another one if its log-likelihood is so much larger.
+cdef double CLEARLY = 2.0
+# Members whose log-likelihood is so far below the best one have no weight.
+cdef double NEGLIGIBLE = 25.0
+
+
+cdef VECTORISED judge(Members* m, double grown, double kept, bint calm) noexcept nogil:
+    """
+    Take a sample into the log-likelihoods, and bound the innovations (D 27, D 28), in place.
+
+    `kept` is the part of the log-likelihoods that is not forgotten; negative to leave them as they
+    are. If the noise has been calm of late, samples in a row that are far off a member are not
+    outliers, but its fault.
+    """
+    cdef Work* w = &m.work
+    cdef Py_ssize_t g, active = m.shared.active
+    cdef double slack = 1.0 if calm else 0.0, late, likelihood, most, limit
+    cdef double logs[COLOURS]
+    for g in range(active):
+        w.ratio[g] = w.b[g] * w.b[g] / (w.s[g] * w.noise[g])
+        m.far[g] = m.far[g] + 1.0 if w.ratio[g] > GATE * GATE else 0.0
+    if kept >= 0.0:
+        for g in range(COLOURS):
+            logs[g] = log(m.noise[g])
+        fill(w.one, logs)
+        for g in range(active):
+            late = slack * (m.far[g] - 1.0 if m.far[g] > 1.0 else 0.0)
+            most = HUBER * HUBER * (1.0 + late * late)
+            likelihood = w.ratio[g] / grown
+            likelihood = likelihood if likelihood < most else most
+            likelihood += m.log_variance[g] + w.one[g]
+            m.score[g] = m.prior[g] + kept * (m.score[g] - m.prior[g]) - 0.5 * likelihood
+    for g in range(active):
+        if w.ratio[g] > HUBER * HUBER:
+            late = m.far[g] - 1.0 if m.far[g] > 1.0 else 0.0  # in a row: not an outlier, but d
+            limit = HUBER * sqrt(w.s[g] * w.noise[g]) * (1.0 + late * late)
+            w.b[g] = limit if w.b[g] > limit else -limit if w.b[g] < -limit else w.b[g]
+
+
+cdef VECTORISED weigh(Members* m, double floor) noexcept nogil:
+    """Turn log-likelihoods into weights (D 28), and say which member is the likeliest."""
+    cdef Py_ssize_t g, active = m.shared.active, likeliest = 0
+    cdef double best = largest(m.score, active), total = 0.0, usual, score, least
+    while likeliest < active - 1 and m.score[likeliest] < best:  # the first: at first many are
+        likeliest += 1
+    m.shared.likeliest, usual = <int>likeliest, m.prior[likeliest]
+    for g in range(active):
+        score, least = m.score[g] - best, m.prior[g] - usual
+        least = (least if least < 0.0 else 0.0) - floor
+        m.score[g] = score if score > least else least
+        m.weight[g] = 0.0
+    for g in range(active):
+        if m.score[g] > -NEGLIGIBLE:  # few of them
+            m.weight[g] = exp(m.score[g])
+            total += m.weight[g]
+    for g in range(active):
+        m.weight[g] *= 1.0 / total
+
+
+cdef void tell_model(Members* m, double slider, bint jumped, Model* model) noexcept nogil:
+    """
+    Write the model of d and the noise of the likeliest member, for a smoother (D 34).
+
+    It stays until another one is clearly likelier. Coloured noise counts as white noise that is as
+    dense where the member's bandwidth ends.
+    """
+    cdef Shared* shared = &m.shared
+    cdef int g, k
+    cdef double noise, a, twice, edge, h = m.work.sample.h
+    if m.score[shared.told] < -CLEARLY:
+        shared.told = shared.likeliest
+    g = shared.told
+    k, noise, a = GRID.order[g], m.noise[GRID.colour[g]], m.correlation[g]
+    twice = 2.0 * (m.n + 1 + k)
+    model.drive, model.loss = m.drive[k][g] * pow(slider, twice), m.kappa[g] * slider
+    edge = fmin(pow(model.drive / (noise * h), 1.0 / twice) * h, M_PI)
+    model.noise = noise / (1.0 + a * (a - 2.0 * cos(edge)))
+    model.derivatives = k - ORDERS if jumped else k
+
+
+cdef void shift(const double* weight, double slider, double* shown) noexcept nogil:
+    """Write the weights of the members whose estimates are shown: `slider` bands quicker."""
+    cdef int whole = <int>floor_of(slider), g, j, band, quicker
+    cdef double part = slider - whole
+    for g in range(COUNT):
+        shown[g] = 0.0
+    for g in range(COUNT):
+        band, quicker = GRID.band[g], -IN_BAND if g < HALF else IN_BAND
+        for j in range(2):
+            shown[g + (min(max(band + whole + j, 0), BANDS - 1) - band) * quicker] += (
+                weight[g] * (part if j else 1.0 - part)
+            )
+
+
+cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) noexcept nogil:
+    """
+    Write the mean of the members' estimates of z, d, d', .., and its variances (D 28).
+
+    The first one is NaN if a member, or its weight, is lost: where Phi or P grows without a limit.
+    """
+    cdef Work* w = &m.work
+    cdef int n = m.n, i
+    cdef Py_ssize_t g, active = m.shared.active
+    cdef double* weight = &m.weight[0]
+    cdef double* z
+    cdef double* p
+    cdef double c, total, off, lost = 0.0
+    if slider != 1.0:
+        weight = &w.two[0]
+        shift(m.weight, log(slider) / log(BAND_STEP), weight)
+    for g in range(active):
+        c = m.kappa[g]
+        w.d[0][g] = m.x.d[0][g]
+        w.d[1][g] = m.x.d[1][g] - c * m.x.d[0][g]
+        w.d[2][g] = m.x.d[2][g] - c * (2.0 * m.x.d[1][g] - c * m.x.d[0][g])
+        w.d[3][g] = m.x.d[3][g] - c * (
+            3.0 * m.x.d[2][g] - c * (3.0 * m.x.d[1][g] - c * m.x.d[0][g])
+        )
+        lost += m.x.z[0][g] * m.weight[g] + m.p.zz[0][g]
+    for i in range(n + ORDERS):
+        z = &m.x.z[i][0] if i < n else &w.d[i - n][0]
+        p, total = entry(&m.p, n, i, i), 0.0
+        for g in range(active):  # a member without weight may be anywhere
+            total += weight[g] * z[g] if weight[g] > 0.0 else 0.0
+        mean[i], total = total, 0.0
+        if i <= n:
+            for g in range(active):
+                off = z[g] - mean[i]
+                off = (p[g] if p[g] > 0.0 else 0.0) + off * off
+                total += weight[g] * off if weight[g] > 0.0 else 0.0
+        variances[i] = total
+    if not isfinite(lost):
+        mean[0] = NAN

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the two structures with fixed gains share: psi, the law of gamma, scheduled gains."""
+
+from fhaosmo_ros.core.model.phi cimport Dual
+from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
+from fhaosmo_ros.core.observer.kalman cimport LinearModel, Row
+from fhaosmo_ros.core.observer.structure cimport Level, Memory, Structure
+
+
+cdef struct Gains:
+    double lambda_  # of the power |eps|^gamma
+    double alpha  # of the integrated psi
+    double inverse_width  # 1 / half-width of psi (1 / unit of y)
+    double decay  # rate of the internal state, if that is of d or a derivative of it (1/s)
+
+
+cdef class SlidingMode(Structure):
+    # What the parameters say.
+    cdef readonly bint is_sign  # psi is sign
+    cdef readonly bint adaptive  # gamma adapts
+    cdef readonly bint sensitive  # sensitivities are carried along
+    cdef readonly bint scheduled  # gains follow P at first and after gaps (D 20)
+    cdef Gains gains[MOST_LEVELS]
+    cdef double* curves  # psi of each level at `knots` points of [0, half-width]
+    cdef int knots
+    cdef Level first[MOST_LEVELS]  # levels of a fresh observer
+    cdef double gamma_initial, gamma_rate, gamma_min, gamma_max  # law of gamma (D 7)
+    cdef double dead_zone  # no adaptation while sqrt(L) is smaller (D 8, unit of y)
+    cdef double leakage  # of gamma (1/s), after a wait of leakage_delay (s)
+    cdef double leakage_delay
+    cdef double correction_period  # interval that the gains are tuned for (s); 0: any
+    # For scheduled gains (D 20).
+    cdef LinearModel linear
+    cdef double noise_variance  # of the noise on y
+    cdef double steady_variance  # of the innovations once P is steady
+    cdef Row steady[MOST_LEVELS]  # P of the predictions then
+    cdef Row fresh[MOST_LEVELS]  # P of a fresh observer
+    cdef double tuned_over_kalman[MOST_LEVELS]  # corrections of a small innovation
+    cdef double next_size[MOST_LEVELS]  # sizes of z_2 .. z_n, d
+    cdef void follow(self, double y, double h, const double* u) noexcept nogil
+    cdef double predicted_y(self, double h, const double* u) noexcept nogil
+    cdef void hand_over(self, const double* u) noexcept nogil
+    cdef int adapt(self, double h) noexcept nogil
+    cdef void begin_estimates(self, double y, double h, const double* u) noexcept nogil
+    cdef void fit(self) noexcept
+    cdef void forget_sensitivities(self) noexcept
+    cdef double bandwidth(self, double h) noexcept nogil
+    cdef void correct_trial(self, double doubt) noexcept nogil
+
+
+cdef double doubt_of_noise(double age, double speed) noexcept nogil
+cdef double follow_spread(Memory* memory, double b, double expected) noexcept nogil
+
+
+cdef inline Dual psi(SlidingMode law, int i, double a) noexcept nogil:
+    """Return psi_i at a = |eps| >= 0 and its slope; psi is odd, so negative eps need no more."""
+    cdef int last = law.knots - 1, j
+    cdef double* curve = law.curves + i * law.knots
+    cdef double scale, position, rise
+    if law.is_sign:
+        return Dual(1.0, 0.0)
+    scale = law.gains[i].inverse_width * last
+    position = a * scale
+    if not position < last:
+        return Dual(curve[last], 0.0)
+    j = <int>position
+    rise = curve[j + 1] - curve[j]
+    return Dual(curve[j] + (position - j) * rise, rise * scale)

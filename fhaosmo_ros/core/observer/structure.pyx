@@ -1,0 +1,559 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What every observer remembers, and the step that all of them share.
+
+Equations are cited as P (paper: label of the equation) and D (number in docs/mathematics.md).
+"""
+
+from libc.math cimport INFINITY, NAN, fabs, isfinite, isnan, sqrt
+from libc.string cimport memset
+
+from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
+from fhaosmo_ros.core.observer.status cimport (
+    DIVERGED, JUMPED, LEVEL_SHIFT, REJECTED_INPUT, REJECTED_MEASUREMENT,
+    REJECTED_PERIOD, REJECTED_SPIKE, REJECTED_STEP
+)
+
+from fhaosmo_ros.core.observer.status import flags, open_levels
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+import numpy as np
+
+# More samples in a row that are too far from the prediction say that y is lost (D 21).
+cdef int LOST_SAMPLES = 20
+# Intervals that the running mean remembers.
+cdef double MEAN_OF = 32.0
+# Values above the largest double over this are rejected, so that differences cannot overflow.
+cdef double HEADROOM = 1e8
+# Innovations of so many standard deviations are too unlikely to be used (D 21).
+cdef double GATE = 6.0
+# Samples after a jump of y in which prediction errors may not sum up (D 23).
+cdef double WATCH = 1000.0
+# If a jump of y would make |z_{i+1}| or |d| so much smaller, y was wrong before it (D 23).
+cdef double MUCH_SMALLER = 0.5
+# No number of a snapshot is larger, and these are not negative.
+cdef double LARGEST = 1e300
+POSITIVE = (
+    'pending', 'period', 'beyond', 'watched', 'wait', 'upset', 'usual', 'saturated', 'narrowed'
+)
+
+
+cdef class Structure:
+    """
+    An observer of one output, whatever its structure.
+
+    Parameters
+    ----------
+    configuration : ObserverConfiguration
+
+    Notes
+    -----
+    Two threads can not use one at the same time: the second one gets a RuntimeError.
+
+    """
+
+    def __cinit__(self, configuration):
+        self.configuration = configuration
+        self.order, self.levels = configuration.model.order, configuration.levels
+        self.inputs = len(configuration.model.inputs)
+        if self.inputs > MOST_INPUTS:
+            raise ConfigurationError(
+                f"parameter 'inputs': expected at most {MOST_INPUTS}, got {self.inputs}"
+            )
+        self.predicting, self.implicit = configuration.predicting, configuration.implicit
+        self.from_measurement = configuration.parameters['start_from_measurement']
+        self.internal = configuration.internal
+        self.d_is_internal = configuration.internal or self.levels == self.order
+        self.epsilon = configuration.epsilon
+        self.prediction = Prediction(
+            configuration.expressions, configuration.parameters['prediction_step']
+        )
+
+    def __init__(self, configuration):
+        self.reset()
+
+    # What the policy, runs and channels call
+
+    cdef int start(self, double y) noexcept nogil:
+        """Take `y` as the first sample: no time has passed. Return a status word (status.py)."""
+        cdef int word = 0
+        self.memory.offset = 0.0
+        if isfinite(HEADROOM * y):
+            self.memory.y, self.memory.pending = y, 0.0
+            if self.from_measurement:
+                self.level[0].z_hat = y
+        else:
+            word = REJECTED_MEASUREMENT
+        return word | self.measure(self.memory.y)
+
+    cdef int step(self, double y, double h, const double* u) noexcept nogil:
+        """
+        Advance to the sample `y` that lies `h` seconds after the last call; return a status word.
+
+        A rejected sample changes no level; see `Status`.
+        """
+        cdef Memory* memory = &self.memory
+        cdef int word = 0, i
+        cdef double measured = y, whole, mean, zero = 0.0
+        y -= memory.offset  # D 23
+        if not isfinite(HEADROOM * y):
+            word |= REJECTED_MEASUREMENT
+        for i in range(self.inputs):
+            if not isfinite(u[i]):
+                word |= REJECTED_INPUT
+        if not (h > 0.0 and isfinite(HEADROOM * h)):
+            word |= REJECTED_PERIOD
+        if not word:
+            whole = h + memory.pending
+            for i in range(self.levels):
+                self.trial[i] = self.level[i]
+            self.advance(y, whole, u)
+            for i in range(self.levels):  # a difference of equals is 0, or NaN if not finite
+                zero += HEADROOM * self.trial[i].z_hat - HEADROOM * self.trial[i].z_hat
+                zero += HEADROOM * self.trial[i].z_tilde - HEADROOM * self.trial[i].z_tilde
+            if zero != 0.0:
+                word = REJECTED_STEP
+                # Nothing of the sample may make the next step fail as well: not its time, and not
+                # the y at the interval's beginning, which is what fails explicitly.
+                memory.pending = 0.0
+                if not self.implicit:
+                    memory.y = y
+                self.fail(y)
+            elif memory.beyond > LOST_SAMPLES and self.jump(u):
+                memory.pending = whole
+                word = REJECTED_SPIKE | JUMPED
+            elif memory.beyond > LOST_SAMPLES:
+                self.restart(measured)
+                word = DIVERGED
+            elif memory.beyond > 0.0:
+                memory.pending = whole
+                word = REJECTED_SPIKE
+            else:
+                word = self.accept(y, whole)
+                memory.y, memory.pending = y, 0.0
+                mean = memory.period if memory.period > 0.0 else whole
+                memory.period = mean + (min(whole, 2.0 * mean) - mean) / MEAN_OF
+        if word & (REJECTED_MEASUREMENT | REJECTED_INPUT) and not word & REJECTED_PERIOD:
+            memory.pending += h
+        return word | self.measure(memory.y)
+
+    cdef int measure(self, double y) noexcept nogil:
+        """Write eps_i = m_i - z_hat_i; return the number of open levels, shifted for a word."""
+        cdef int i, count = 0
+        cdef bint running = True
+        cdef double m = y
+        for i in range(self.levels):
+            self.innovation[i] = m - self.level[i].z_hat
+            count += running
+            running = running and fabs(self.innovation[i]) <= self.epsilon  # P Eifunction
+            m = self.level[i].z_tilde  # m_{i+1} = z_tilde_{i+1}
+        return count << LEVEL_SHIFT
+
+    cdef void begin_at_estimates(self) noexcept nogil:
+        """Begin a prediction at the last sample and the internal estimates."""
+        cdef int i
+        for i in range(self.prediction.n):
+            self.prediction.z[i] = self.level[i - 1].z_tilde if i > 0 else self.memory.y
+            self.prediction.dz[i] = 0.0
+
+    cdef double unknown_input(self) noexcept nogil:
+        """Return the estimate of d."""
+        if self.d_is_internal:
+            return self.level[self.order - 1].z_tilde
+        return self.level[self.order].z_hat
+
+    cdef void reset(self) noexcept nogil:
+        """Go back to the state before any sample."""
+        memset(&self.memory, 0, sizeof(Memory))
+        memset(self.level, 0, sizeof(self.level))
+        memset(self.covariance, 0, sizeof(self.covariance))
+        memset(self.innovation, 0, sizeof(self.innovation))
+        self.memory.y = NAN
+        self.memory.scale = self.memory.spread = 1.0
+        self.is_kept = False
+
+    cdef bint keep(self) noexcept nogil:
+        """Remember the present state; return False if it is too large for that."""
+        self.kept.level, self.kept.covariance = self.level, self.covariance
+        self.kept.memory = self.memory
+        self.is_kept = True
+        return True
+
+    cdef void go_back(self) noexcept nogil:
+        """Go back to the state of the latest `keep`."""
+        if self.is_kept:
+            self.level, self.covariance = self.kept.level, self.kept.covariance
+            self.memory = self.kept.memory
+            self.measure(self.memory.y)
+
+    cdef void enter(self) except *:
+        """Raise RuntimeError while another thread runs this observer."""
+        if self.busy:
+            raise RuntimeError('this observer is in use by another thread: give each its own')
+
+    # What a structure implements
+
+    cdef void advance(self, double y, double h, const double* u) noexcept nogil:
+        """
+        Change `trial`, and write L and its gradient, by a sample `h` seconds after the last one.
+
+        `Memory.beyond` counts samples that are too unlikely to be used.
+        """
+
+    cdef int accept(self, double y, double h) noexcept nogil:
+        """Make `trial` the state; return status flags."""
+        cdef int i
+        for i in range(self.levels):
+            self.level[i] = self.trial[i]
+        return 0
+
+    cdef void fail(self, double y) noexcept nogil:
+        """Forget what may have made a step leave the finite numbers."""
+
+    cdef void restart(self, double y) noexcept nogil:
+        """Begin afresh from `y`; the time of the next sample counts from it."""
+
+    cdef double innovation_variance(self) noexcept nogil:
+        """Return the variance that the latest innovation was expected to have."""
+        return 0.0
+
+    cdef double most_change(self, int i) noexcept nogil:
+        """Return how much Phi_{i+1} may change in a jump of y that it does not contradict."""
+        return 0.0
+
+    cdef void go_on_after_jump(self, double of_state) noexcept nogil:
+        """Go on after y has jumped; z_1 is another one by `of_state`."""
+
+    cdef double variance(self, int i) noexcept nogil:
+        """Return the variance of the error of z_{i+1}, or of d for i = n; NaN if not known."""
+        return NAN
+
+    cdef void tell(self, double* model, double* tuning) noexcept nogil:
+        """Write the likeliest model of d, and what has been found; only self-tuning has them."""
+
+    cdef bint jump(self, const double* u) noexcept nogil:
+        """
+        Go on with a y that alone has jumped (D 23).
+
+        Returns
+        -------
+        bool
+            False if that is not what happened: y differs from its prediction by no constant, or
+            the model says that the plant is now elsewhere. Then only `Memory.jumps` has changed.
+
+        """
+        cdef Memory* memory = &self.memory
+        cdef double b = memory.miss, offset = memory.offset + b, total = memory.jumps + b
+        cdef double small = GATE * memory.spread * sqrt(2.0 * self.innovation_variance())
+        cdef double z[MOST_LEVELS]
+        cdef double still[MOST_LEVELS]
+        cdef double change, behind
+        cdef bint is_back = fabs(total) <= small, contradicted = False, larger = True
+        cdef int i
+        if not (memory.beyond < INFINITY and fabs(b - memory.first_miss) <= small):
+            memory.jumps = 0.0
+            return False
+        for i in range(self.levels):
+            z[i], still[i] = self.trial[i].z_hat, 0.0
+        for i in range(self.levels):
+            z[0] = self.trial[0].z_hat
+            change = self.prediction.phi.evaluate(i, z, still, u).value
+            z[0] = self.trial[0].z_hat + offset
+            change -= self.prediction.phi.evaluate(i, z, still, u).value
+            if not fabs(change) <= self.most_change(i):
+                contradicted = True
+                behind = self.trial[i + 1].z_hat if i + 1 < self.levels else 0.0
+                larger = larger and not fabs(behind + change) <= MUCH_SMALLER * fabs(behind)
+        memory.jumps = 0.0 if is_back else total
+        if contradicted and not is_back:
+            if not larger:
+                return False
+            memory.offset = offset
+        elif contradicted and memory.offset == 0.0:
+            return False
+        else:
+            memory.offset = 0.0
+            self.level[0].z_hat += offset
+            memory.y += offset
+        self.go_on_after_jump(self.level[0].z_hat - self.trial[0].z_hat)
+        memory.beyond = memory.drift = memory.one_sided = 0.0
+        memory.watched = WATCH
+        return True
+
+    # What Python calls
+
+    def begin(self, double y):
+        """Take the first sample; return the estimate."""
+        self.enter()
+        return self.report(self.start(y))
+
+    def update(self, double y, double dt, u=0.0):
+        """Advance by `dt` seconds to the sample `y`; return the estimate."""
+        return self.report(self.take(y, dt, u))
+
+    def take(self, double y, double dt, u=0.0):
+        """Do the same and return only the status word."""
+        cdef double number
+        cdef double inputs[MOST_INPUTS]
+        cdef int i
+        self.enter()
+        if isnan(self.memory.y) and isfinite(y):
+            self.start(y)
+        if self.inputs == 1 and isinstance(u, float):
+            number = u
+            self.word = self.step(y, dt, &number)
+            return self.word
+        for i, number in enumerate(self.configuration.model.known_inputs(u)):
+            inputs[i] = number
+        self.word = self.step(y, dt, inputs)
+        return self.word
+
+    def report(self, int word):
+        """Return the estimate of the present state after a step that ended with `word`."""
+        cdef Estimate estimate = Estimate.__new__(Estimate)
+        cdef int i
+        estimate.order, estimate.levels, estimate.word = self.order, self.levels, word
+        self.word = word
+        for i in range(self.levels):
+            estimate.innovations[i] = self.innovation[i]
+        for i in range(self.order):
+            estimate.values[i] = self.level[i].z_hat
+            if self.internal and i > 0:
+                estimate.values[i] = self.level[i - 1].z_tilde
+        estimate.unknown_input, estimate.gamma = self.unknown_input(), self.memory.gamma
+        return estimate
+
+    def forget(self):
+        """Go back to the state before any sample."""
+        self.enter()
+        self.reset()
+
+    @property
+    def started(self):
+        """True once a sample has arrived."""
+        return not isnan(self.memory.y)
+
+    @property
+    def d(self):
+        """The estimate of d."""
+        return self.unknown_input()
+
+    @property
+    def gamma(self):
+        """The adaptive power."""
+        return self.memory.gamma
+
+    @property
+    def spread(self):
+        """Size of the innovations over that expected from noise_size, at least 1 (D 21)."""
+        return self.memory.spread
+
+    @property
+    def offset(self):
+        """What y is taken to be too large by, since a jump that the model contradicts (D 23)."""
+        return self.memory.offset
+
+    @property
+    def variances(self):
+        """Variances of the errors of z and d, (n + 1,); NaN with fixed gains."""
+        return np.array([self.variance(i) for i in range(self.order + 1)])
+
+    @property
+    def found(self):
+        """What a self-tuning observer has found, (7,); NaN with fixed gains."""
+        cdef double model[4]
+        cdef double tuning[7]
+        cdef int i
+        for i in range(7):
+            tuning[i] = NAN
+        self.tell(model, tuning)
+        return np.array([tuning[i] for i in range(7)])
+
+    def seed(self, values):
+        """
+        Put the estimate there at once, as if the observer had converged; time and gamma go on.
+
+        Parameters
+        ----------
+        values : (n + 1,) array
+            z_1 .. z_n and d.
+
+        """
+        cdef int i
+        self.enter()
+        if len(values) != self.order + 1:
+            raise ValueError(f'seed: expected {self.order + 1} values, got {len(values)}')
+        memset(self.level, 0, sizeof(self.level))
+        for i in range(min(self.order + 1, self.levels)):  # derivatives of d, behind it, are 0
+            self.level[i].z_hat = values[i]
+        for i in range(self.order):
+            self.level[i].z_tilde = values[i + 1]
+        self.memory.settled = 1.0
+        self.is_kept = False
+        self.measure(self.memory.y)
+
+    # Snapshots and copies
+
+    def state_dict(self):
+        """
+        Return all that it remembers: name -> number, or array of one number a level.
+
+        `load_state_dict` takes it back. Names that begin with ``before_`` are of the state before
+        the latest gap.
+        """
+        cdef Kept now
+        self.enter()
+        now.level, now.covariance, now.memory = self.level, self.covariance, self.memory
+        found = self.named(now)
+        if self.is_kept:
+            found |= {f'before_{name}': value for name, value in self.named(self.kept).items()}
+        return found
+
+    cdef dict named(self, Kept state):
+        """Return the named numbers of a state."""
+        cdef int n = self.levels
+        cdef list levels = state.level
+        found = {
+            name: np.array([level[name] for level in levels[:n]])
+            for name in ('z_hat', 'z_tilde', 'p', 'q')
+        }
+        found['covariance'] = np.array(state.covariance)[:n, :n].copy()
+        memory = state.memory
+        return found | memory
+
+    def load_state_dict(self, values):
+        """
+        Go on where an observer of the same size was.
+
+        Raises
+        ------
+        ConfigurationError
+            A number that is missing, of another size, not finite or out of its range. Then nothing
+            has changed.
+
+        """
+        cdef Kept now, before
+        self.enter()
+        has_before = 'before_y' in values
+        now = self.checked(values, '')
+        if has_before:
+            before = self.checked(values, 'before_')
+            self.kept = before
+        self.is_kept = has_before
+        self.level, self.covariance, self.memory = now.level, now.covariance, now.memory
+        self.measure(self.memory.y)
+
+    cdef Kept checked(self, values, str prefix) except *:
+        """Return a state from named numbers; raise where one can not be."""
+        cdef Kept state
+        cdef int n = self.levels, i, j
+        memory = {}
+        memset(&state, 0, sizeof(Kept))
+        state_memory = state.memory
+        for name in state_memory:
+            number = self.number(values, prefix + name, ())
+            unknown = name == 'y' and np.isnan(number)  # before the first sample
+            least = 0.0 if name in POSITIVE else 1.0 if name in ('spread', 'scale') else -LARGEST
+            if not (unknown or least <= number <= LARGEST):
+                raise ConfigurationError(
+                    f"snapshot: '{prefix}{name}': expected a finite number of at least {least:g}, "
+                    f'got {number}'
+                )
+            memory[name] = float(number)
+        state.memory = memory
+        for i in range(n):
+            state.level[i].z_hat = self.finite(values, prefix + 'z_hat', (n,))[i]
+            state.level[i].z_tilde = self.finite(values, prefix + 'z_tilde', (n,))[i]
+            state.level[i].p = self.finite(values, prefix + 'p', (n,))[i]
+            state.level[i].q = self.finite(values, prefix + 'q', (n,))[i]
+        covariance = self.finite(values, prefix + 'covariance', (n, n))
+        for i in range(n):
+            for j in range(n):
+                state.covariance[i][j] = covariance[i, j]
+        return state
+
+    cdef number(self, values, str name, tuple shape):
+        """Return what a snapshot has of a name, as an array of that shape."""
+        try:
+            number = np.asarray(values[name], dtype=np.float64)
+        except KeyError:
+            raise ConfigurationError(f"snapshot: expected '{name}', got none") from None
+        except (TypeError, ValueError):
+            raise ConfigurationError(f"snapshot: '{name}': expected numbers") from None
+        if number.shape != shape:
+            raise ConfigurationError(
+                f"snapshot: '{name}': expected shape {shape}, got {number.shape}"
+            )
+        return number
+
+    cdef finite(self, values, str name, tuple shape):
+        """Return the same, after a check that all of it is finite."""
+        number = self.number(values, name, shape)
+        if not (np.abs(number) <= LARGEST).all():
+            raise ConfigurationError(f"snapshot: '{name}': expected finite numbers")
+        return number
+
+    def __reduce__(self):
+        return type(self), (self.configuration,), self.state_dict()
+
+    def __setstate__(self, values):
+        self.load_state_dict(values)
+
+
+cdef class Estimate:
+    """
+    What an observer knows after a sample.
+
+    Attributes
+    ----------
+    z : (n,) array
+        Estimated states; z[0] is z_hat_1, the others follow `estimate_from`.
+    unknown_input : float
+        Estimated d.
+    gamma : float
+        Power gamma in use.
+    innovation : (N,) array
+        eps_i = m_i - z_hat_i.
+    word : int
+        Status word; see `status` and `open_levels`.
+
+    """
+
+    def __init__(self, z, double unknown_input, double gamma, innovation, int word):
+        cdef int i
+        self.order, self.levels = len(z), len(innovation)
+        if max(self.order, self.levels) > MOST_LEVELS:
+            raise ValueError(f'estimate: expected at most {MOST_LEVELS} levels')
+        for i in range(self.order):
+            self.values[i] = z[i]
+        for i in range(self.levels):
+            self.innovations[i] = innovation[i]
+        self.unknown_input, self.gamma, self.word = unknown_input, gamma, word
+
+    @property
+    def z(self):
+        """Estimated states."""
+        return np.array([self.values[i] for i in range(self.order)])
+
+    @property
+    def innovation(self):
+        """Innovations of the levels."""
+        return np.array([self.innovations[i] for i in range(self.levels)])
+
+    @property
+    def status(self):
+        """Flags of the step."""
+        return flags(self.word)
+
+    @property
+    def open_levels(self):
+        """Number of levels that run (the paper's E_i)."""
+        return open_levels(self.word)
+
+    def __reduce__(self):
+        return Estimate, (self.z, self.unknown_input, self.gamma, self.innovation, self.word)
+
+    def __repr__(self):
+        return (
+            f'Estimate(z={self.z}, unknown_input={self.unknown_input:.6g}, '
+            f'gamma={self.gamma:.6g}, status={self.status!r})'
+        )

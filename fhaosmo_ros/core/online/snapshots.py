@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What an estimator remembers as named numbers, and these as one labelled vector for a topic.
+
+In the vector an array has one entry for each of its numbers, labelled by the array's name and its
+index from 1 on, such as ``z_hat1`` or ``covariance1_2``. Integers of 64 bits (stamps) do not fit
+into a double: each has two entries, its upper and its lower half.
+"""
+
+from collections.abc import Mapping, Sequence
+from enum import IntFlag
+from functools import lru_cache
+import math
+from numbers import Integral
+import re
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+VERSION = 2
+"""Of the names. Those of version 1, which did not tell it, are read as well."""
+HEAD = ['version', 'flags', 'sec', 'nanosec']
+HALF = 2**32
+SECOND = 1_000_000_000
+LARGEST = 1e300
+INTEGERS = -(2**63), 2**63 - 1
+COUNTS = 0, 2**62
+YES_OR_NO = 0, 1
+RANGES: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(('frozen', 'valid', 'timed', 'held', 'bridged', 'lost'), YES_OR_NO),
+    **dict.fromkeys(('stuck', 'holds'), YES_OR_NO),
+    **dict.fromkeys(('spikes', 'tick_count', 'repeats', 'held_for'), COUNTS),
+    **dict.fromkeys(('mean_interval', 'mean_jitter'), COUNTS),
+    'version': (1, VERSION), 'intervals': (0, 32), 'regular': (0, 12), 'ticks': (-5000, 2**17),
+    'elsewhere': (0.0, 1.0), 'event': (0, 5), 'event_deviation': (0.0, math.inf),
+    'past_place': (0, 511), 'past_count': (0, 512),
+}  # fmt: skip
+"""Of what is remembered. Times may be any integers, other numbers as large as `LARGEST`."""
+INDEX = re.compile(r'(.*?)(\d{1,6}(?:_\d{1,6})*)')
+OLD_NAMES = {
+    'z_hat_sensitivity': 'p', 'z_tilde_sensitivity': 'q', 'interval': 'mean_interval',
+    'jitter': 'mean_jitter',
+}  # fmt: skip
+OLD_DEFAULTS = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}
+"""What the oldest bags lack and is not 0."""
+
+
+class Flag(IntFlag):
+    """What happened at the sample of a snapshot."""
+
+    STARTED = 1
+    """The estimator was reset before this sample, or it is the first one."""
+    CHANGED = 2
+    """Parameters changed after it."""
+    RESET = 4
+    """The estimator was reset after it."""
+
+
+class Snapshot(NamedTuple):
+    """
+    What an estimator remembers after a sample.
+
+    Attributes
+    ----------
+    stamp : int
+        Stamp of the sample, in nanoseconds.
+    flags : Flag
+    values : dict
+        As `OnlineEstimator.state_dict` returns them.
+
+    """
+
+    stamp: int
+    flags: Flag
+    values: dict[str, Any]
+
+
+def pack(snapshot: Snapshot) -> tuple[list[str], NDArray[np.float64]]:
+    """Return a snapshot as labels and a vector; the first entry is the version."""
+    values = {name: value for name, value in snapshot.values.items() if name != 'version'}
+    head = [VERSION, int(snapshot.flags), *divmod(snapshot.stamp, SECOND)]
+    whole = [isinstance(value, Integral) for value in values.values()]
+    parts = [
+        np.ravel(divmod(int(value), HALF) if is_whole else value)
+        for value, is_whole in zip(values.values(), whole, strict=True)
+    ]
+    shapes = tuple(zip(values, map(np.shape, values.values()), whole, strict=True))
+    return _labels(shapes), np.concatenate([head, *parts], dtype=np.float64)
+
+
+@lru_cache(maxsize=64)
+def _labels(shapes: tuple[tuple[str, tuple[int, ...], bool], ...]) -> list[str]:
+    """Return a label for each entry of numbers with these names and shapes, integers or not."""
+    labels = list(HEAD)
+    for name, shape, whole in shapes:
+        if whole:
+            labels += [f'{name}_upper', f'{name}_lower']
+        elif shape:
+            labels += [name + '_'.join(str(k + 1) for k in index) for index in np.ndindex(shape)]
+        else:
+            labels.append(name)
+    return labels
+
+
+def unpack(vector: ArrayLike, labels: Sequence[str]) -> Snapshot:
+    """
+    Return the snapshot in a vector.
+
+    Raises
+    ------
+    ConfigurationError
+        The entries are not those of an estimator of this version, or of an older one.
+
+    """
+    v = np.asarray(vector, dtype=np.float64)
+    if v.shape != (len(labels),) or len(set(labels)) < len(labels):
+        raise ConfigurationError(
+            f'snapshot: expected entries of as many names, got {v.size} of {len(set(labels))}'
+        )
+    entries = dict(zip(labels, v.tolist(), strict=True))
+    version = entries.pop('version', 1.0)
+    head = [entries.pop(name, np.nan) for name in ('flags', 'sec', 'nanosec')]
+    if version not in (1.0, VERSION) or not np.all(np.abs(head) < HALF):
+        raise ConfigurationError(
+            f'snapshot: expected version 1 or {VERSION}, and a stamp, got version {version:g}'
+        )
+    flags, second, nanosecond = map(int, head)
+    values = _old_values(entries) if version == 1.0 else {'version': VERSION, **_values(entries)}
+    return Snapshot(second * SECOND + nanosecond, Flag(flags & 7), values)
+
+
+def _values(entries: Mapping[str, float]) -> dict[str, Any]:
+    """Return numbers and arrays by name."""
+    values: dict[str, Any] = {}
+    parts: dict[str, dict[tuple[int, ...], float]] = {}
+    for label, number in entries.items():
+        name, _, half = label.rpartition('_')
+        if half == 'lower' and f'{name}_upper' in entries:
+            upper = entries[f'{name}_upper']
+            if not (abs(upper) <= HALF and 0.0 <= number < HALF):
+                raise ConfigurationError(f"snapshot: '{name}': expected an integer")
+            values[name] = int(upper) * HALF + int(number)
+        elif half != 'upper' or f'{name}_lower' not in entries:
+            match = INDEX.fullmatch(label)
+            if match is None:
+                values[label] = number
+            else:
+                place = tuple(int(k) for k in match[2].split('_'))
+                parts.setdefault(match[1], {})[place] = number
+    for name, part in parts.items():
+        shape = tuple(max(places) for places in zip(*part, strict=False))
+        wanted = np.ndindex(shape) if math.prod(shape) == len(part) else ()
+        if sorted(part) != [tuple(k + 1 for k in index) for index in wanted]:
+            raise ConfigurationError(f"snapshot: '{name}': expected all entries of an array")
+        values[name] = np.array([part[place] for place in sorted(part)]).reshape(shape)
+    return values
+
+
+def _old_values(entries: Mapping[str, float]) -> dict[str, Any]:
+    """Return the same of version 1; `completed` adds what it did not remember."""
+    if 'm1' in entries:
+        raise ConfigurationError(
+            'snapshot: expected version 2 of a self-tuning observer; the members of version 1 '
+            'can not be followed'
+        )
+    u = np.array([entries[name] for name in entries if name == 'u' or name.startswith('u_')])
+    rest = {name: entries[name] for name in entries if name != 'u' and not name.startswith('u_')}
+    found, m = _values(rest), len(u)
+    values: dict[str, Any] = {'version': 1, 'u': u, 'past_latest': u}
+    for name, value in found.items():
+        before = 'before_' if name.startswith('before_') else ''
+        stem = name.removeprefix(before)
+        values[before + OLD_NAMES.get(stem, stem)] = value
+    past, ring = np.ravel(values.pop('past', ())), 3 + 2 * m
+    if len(past):  # place, count, m; inputs of the step; the latest inputs; a ring
+        if len(past) < ring or (len(past) - ring) % (1 + m) or not np.isfinite(past).all():
+            raise ConfigurationError("snapshot: 'past': expected the past of the known inputs")
+        values |= {'past_place': int(past[0]), 'past_count': int(past[1])}
+        values['past_latest'] = past[3 + m : ring]
+        values['past_pieces'] = past[ring:].reshape(-1, 1 + m)
+    return values
+
+
+def completed(values: Mapping[str, Any], like: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those numbers of version 1 that `like` names; what it did not remember is 0."""
+    found, names = {'version': VERSION}, dict(like)
+    if np.any(values.get('bridged', False)):  # else the state before a gap does not matter
+        names |= {f'before_{name}': value for name, value in like.items()}
+    for name, value in names.items():
+        nothing = np.zeros_like(value) if isinstance(value, np.ndarray) else type(value)(0)
+        found[name] = values.get(name, OLD_DEFAULTS.get(name, nothing))
+    return found
+
+
+def checked(values: Mapping[str, Any], like: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return the numbers that `like` names, each of the type that it has there.
+
+    Raises
+    ------
+    ConfigurationError
+        One is missing, of another type, or out of its range.
+
+    """
+    found: dict[str, Any] = {}
+    for name, value in like.items():
+        number: Any = values.get(name)
+        whole = isinstance(value, Integral)
+        least, most = RANGES.get(name, INTEGERS if whole else (-LARGEST, LARGEST))
+        kind: Any = Integral if whole else (float, int, np.floating)
+        if not isinstance(number, kind) or not least <= number <= most:
+            raise ConfigurationError(
+                f"snapshot: '{name}': expected {'an integer' if whole else 'a number'} of "
+                f'{least:g} to {most:g}, got {number!r}'
+            )
+        found[name] = int(number) if whole else float(number)
+    return found
+
+
+def array_of(values: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return an array of that shape, all of it finite, or raise ConfigurationError."""
+    nothing = np.zeros(shape) if 0 in shape else np.nan  # an empty array has no entries
+    try:
+        array = np.asarray(values.get(name, nothing), dtype=np.float64)
+    except (OverflowError, TypeError, ValueError):
+        array = np.full(1, np.nan)
+    if array.shape != shape or not (np.abs(array) <= LARGEST).all():
+        raise ConfigurationError(
+            f"snapshot: '{name}': expected finite numbers of shape {shape}, got {array.shape}"
+        )
+    return array

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Unknown inputs d(t) of a simulated plant."""
+
+cdef enum Kind:
+    NONE, SINE, STEP, SQUARE, CHIRP
+
+
+cdef class Disturbance:
+    cdef double at(self, double t) noexcept nogil
+
+
+cdef class Wave(Disturbance):
+    cdef Kind kind
+    cdef double amplitude  # of the wave, or height of the step (unit of d)
+    cdef double omega  # angular frequency; a chirp's at t = 0 (rad/s)
+    cdef double phase  # of the sine at t = 0 (rad)
+    cdef double offset  # added to it (unit of d)
+    cdef double start  # time of the step (s)
+    cdef double omega_end  # angular frequency from sweep_time on (rad/s)
+    cdef double sweep_time  # length of a chirp's sweep (s)
+
+
+cdef class Table(Disturbance):
+    cdef double spacing  # of its values (s)
+    cdef Py_ssize_t count  # of its values, at least 2
+    cdef double* values  # from t = 0 on (unit of d)

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Unknown inputs d(t) that the simulated plant can be given."""
+
+from libc.math cimport fmin, sin
+from libc.stdlib cimport free, malloc
+from libc.string cimport memcpy
+
+import numpy as np
+
+KINDS = ('none', 'sine', 'step', 'square', 'chirp')
+
+
+cdef class Disturbance:
+    """A function d(t) of the time since the plant's start."""
+
+    cdef double at(self, double t) noexcept nogil:
+        """Return d(t)."""
+        return 0.0
+
+    def along(self, t):
+        """Return d at times `t` (s), an array of their shape (K,)."""
+        cdef const double[::1] times = np.ascontiguousarray(t, dtype=np.float64)
+        cdef double[::1] d = np.empty(times.shape[0])
+        cdef Py_ssize_t k
+        for k in range(times.shape[0]):
+            d[k] = self.at(times[k])
+        return np.asarray(d)
+
+
+cdef class Wave(Disturbance):
+    """The d(t) of a plant with the parameters `p`, checked ones."""
+
+    def __init__(self, p):
+        self.kind = KINDS.index(p['disturbance'])
+        self.amplitude, self.offset = p['disturbance_amplitude'], p['disturbance_offset']
+        self.omega, self.phase = p['disturbance_omega'], p['disturbance_phase']
+        self.omega_end, self.start = p['disturbance_omega_end'], p['disturbance_start']
+        self.sweep_time = p['disturbance_sweep_time']
+
+    cdef double at(self, double t) noexcept nogil:
+        """Return d(t)."""
+        cdef double angle = self.omega * t, swept, wave
+        if self.kind == NONE:
+            return 0.0
+        if self.kind == STEP:
+            return self.offset + (self.amplitude if t >= self.start else 0.0)
+        if self.kind == CHIRP:
+            swept = fmin(t, self.sweep_time)
+            angle = (
+                self.omega * swept
+                + 0.5 * (self.omega_end - self.omega) / self.sweep_time * swept * swept
+                + self.omega_end * (t - swept)
+            )
+        wave = sin(angle + self.phase)
+        if self.kind == SQUARE:
+            wave = 1.0 if wave >= 0.0 else -1.0
+        return self.offset + self.amplitude * wave
+
+
+cdef class Table(Disturbance):
+    """
+    Any d(t), linear between values at 0, `spacing`, ... and constant behind the last one.
+
+    Parameters
+    ----------
+    values : (M,) array
+        M >= 2.
+    spacing : float
+        Seconds, > 0.
+
+    """
+
+    def __cinit__(self, values, double spacing):
+        cdef const double[::1] given = np.ascontiguousarray(values, dtype=np.float64)
+        self.count, self.spacing = given.shape[0], spacing
+        if self.count < 2 or not spacing > 0.0:
+            raise ValueError('table of d: expected at least 2 values and a spacing > 0')
+        self.values = <double*>malloc(self.count * sizeof(double))
+        if self.values == NULL:
+            raise MemoryError
+        memcpy(self.values, &given[0], self.count * sizeof(double))
+
+    def __dealloc__(self):
+        free(self.values)
+
+    def __reduce__(self):
+        return Table, ([self.values[k] for k in range(self.count)], self.spacing)
+
+    cdef double at(self, double t) noexcept nogil:
+        """Return d(t)."""
+        cdef double position = t / self.spacing
+        cdef Py_ssize_t j
+        if not position < self.count - 1:
+            return self.values[self.count - 1]
+        if not position >= 0.0:
+            return self.values[0]
+        j = <Py_ssize_t>position
+        return self.values[j] + (position - j) * (self.values[j + 1] - self.values[j])

@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Plant and observer as one system of differential equations, integrated with a fixed step.
+
+This is how the paper simulates: in continuous time, the observer sees y = z_1 at every stage of
+the solver. Its rates are those of its explicit scheme (D 2 to D 7 in docs/mathematics.md).
+"""
+
+from libc.math cimport fmax, fmin
+from libc.string cimport memcpy, memset
+
+from fhaosmo_ros.core.model.integrate cimport (
+    BOGACKI_SHAMPINE, CLASSICAL, EULER, Dynamics, Method, take_step
+)
+from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
+from fhaosmo_ros.core.observer.sliding_mode cimport SlidingMode
+from fhaosmo_ros.core.observer.structure cimport Level, MOST_INPUTS
+from fhaosmo_ros.core.simulation.system cimport System
+
+from typing import NamedTuple
+
+from fhaosmo_ros.core.model.inputs import Floats
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.configuration import ObserverConfiguration, per_level
+from fhaosmo_ros.core.observer.observer import make_structure
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
+from fhaosmo_ros.core.simulation.disturbance import Wave
+import numpy as np
+
+
+class Solver(NamedTuple):
+    """
+    How plant and observer are integrated.
+
+    Attributes
+    ----------
+    method : str
+        Euler ('ode1'), Bogacki-Shampine ('ode3') or classical Runge-Kutta ('ode4').
+    holds_sign : bool
+        True if sign(eps_i) is taken at the first stage of a step and held for its other stages,
+        as simulators with zero-crossing detection do with their sign block. All else, |eps_i|
+        included, follows every stage. For the variants with sign; a fuzzy curve is not held.
+
+    """
+
+    method: str
+    holds_sign: bool = False
+
+
+SOLVERS = {name: Solver(name) for name in ('ode1', 'ode3', 'ode4')}
+SOLVERS['ode4 held'] = Solver('ode4', holds_sign=True)
+"""What a fixed-step simulation offers, by its usual names."""
+ITS_EQUATIONS = {'scheme': 'explicit', 'noise_size': 0.0}
+"""Parameters of an observer that a solver integrates: it has no scheme of its own."""
+
+
+class JointRun(NamedTuple):
+    """
+    Truth and estimates on one time grid.
+
+    Attributes
+    ----------
+    t : (K,) array
+        Seconds.
+    z, unknown_input : (K, n) and (K,) arrays
+        The plant's states and d.
+    z_hat, z_tilde : (K, N) arrays
+        Filtered and internal states; z_tilde[:, i] belongs to z_{i+2}.
+    gamma : (K,) array
+
+    """
+
+    t: Floats
+    z: Floats
+    unknown_input: Floats
+    z_hat: Floats
+    z_tilde: Floats
+    gamma: Floats
+
+
+cdef struct State:
+    # Of plant and observer, or the rates of all that: an array of doubles with names.
+    double gamma  # adaptive power
+    double z[MOST_LEVELS]  # states of the plant
+    Level level[MOST_LEVELS]  # of the observer
+
+
+cdef class Joint(Dynamics):
+    """
+    A plant, and an observer of the explicit scheme, from their initial states; u = 0.
+
+    Signs are held for a whole step if `holds_sign`; see `Solver`.
+    """
+
+    cdef System plant
+    cdef SlidingMode observer
+    cdef SlidingMode free  # the same without injections
+    cdef bint holds_sign  # sign(eps_i) is held for a whole step
+    cdef bint shared  # one innovation drives all levels
+    cdef double sign[MOST_LEVELS]  # sign(eps_i) at the beginning of a step
+    cdef double loss  # L then
+    cdef double wait  # time for which innovations have yet to stay small before gamma leaks (s)
+    cdef double u[MOST_INPUTS]  # known inputs: 0
+    cdef State state
+
+    def __init__(self, System plant not None, configuration, bint holds_sign):
+        cdef SlidingMode observer = make_structure(configuration)
+        cdef SlidingMode free = make_structure(configuration)
+        cdef int i
+        self.plant, self.observer, self.free = plant, observer, free
+        if plant.phi.inputs > MOST_INPUTS:
+            raise ConfigurationError(f'plant: expected at most {MOST_INPUTS} known inputs')
+        self.holds_sign, self.shared = holds_sign, configuration.levant
+        plant.u = self.u
+        self.size = (sizeof(State) - sizeof(self.state.level)) // sizeof(double)
+        self.size += observer.levels * (sizeof(Level) // sizeof(double))
+        for i in range(plant.size):
+            self.state.z[i] = plant.z[i]
+        self.state.level = observer.level
+        if observer.from_measurement:
+            self.state.level[0].z_hat = self.state.z[0]
+        self.state.gamma = observer.memory.gamma
+        for i in range(free.levels):
+            free.gains[i].lambda_ = free.gains[i].alpha = 0.0
+
+    cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil:
+        """Write the rates of plant, levels and gamma."""
+        cdef const State* now = <const State*>x
+        cdef State* rate = <State*>slope
+        memset(rate, 0, self.size * sizeof(double))
+        self.plant.rates(stage, t, now.z, rate.z)
+        self.observer_rates(self.observer, now, rate)
+        if stage == 0:
+            self.loss = self.observer.loss
+        if self.holds_sign:
+            self.hold_signs(now, rate, stage == 0)
+        if self.observer.adaptive:
+            rate.gamma = self.gamma_rate(self.observer, now.gamma)
+
+    cdef void observer_rates(
+        self, SlidingMode observer, const State* now, State* rate
+    ) noexcept nogil:
+        """Write the rates of the levels: a forward Euler step of length 1 moves them by these."""
+        cdef int i
+        cdef Level* after
+        memcpy(observer.trial, now.level, observer.levels * sizeof(Level))
+        observer.memory.gamma, observer.memory.y = now.gamma, now.z[0]
+        observer.follow(now.z[0], 1.0, self.u)
+        for i in range(observer.levels):
+            after = &observer.trial[i]
+            rate.level[i].z_hat = after.z_hat - now.level[i].z_hat
+            rate.level[i].z_tilde = after.z_tilde - now.level[i].z_tilde
+            rate.level[i].p = after.p - now.level[i].p
+            rate.level[i].q = after.q - now.level[i].q
+
+    cdef void hold_signs(self, const State* now, State* rate, bint first) noexcept nogil:
+        """Remember the signs of the innovations, or replace those behind the rates by them."""
+        cdef State free
+        cdef bint known = False
+        cdef double eps, sign, factor
+        cdef Level* one
+        cdef int i
+        for i in range(self.observer.levels):
+            if i == 0 or self.shared:
+                eps = now.z[0] - now.level[0].z_hat
+            else:
+                eps = now.level[i - 1].z_tilde - now.level[i].z_hat
+            sign = (eps > 0.0) - (eps < 0.0)
+            if first:
+                self.sign[i] = sign
+            elif self.sign[i] != sign:
+                if not known:
+                    self.observer_rates(self.free, now, &free)
+                    known = True
+                factor, one = self.sign[i] * sign, &rate.level[i]
+                # What the injections add has the other sign.
+                one.z_hat = free.level[i].z_hat + factor * (one.z_hat - free.level[i].z_hat)
+                one.z_tilde = (
+                    free.level[i].z_tilde + factor * (one.z_tilde - free.level[i].z_tilde)
+                )
+
+    cdef double gamma_rate(self, SlidingMode law, double gamma) noexcept nogil:
+        """Return the rate of gamma by the law of D 7 and D 8, for the latest L."""
+        cdef bint rests = law.loss <= law.dead_zone * law.dead_zone
+        cdef double rate = 0.0
+        if not rests:
+            rate = -law.gamma_rate * law.gradient  # P adaptationlawgamma
+        if law.dead_zone == 0.0 or (rests and self.wait <= 0.0):
+            rate -= law.leakage * (gamma - law.gamma_initial)
+        return rate
+
+    cdef void end_step(self, SlidingMode law, double h) noexcept nogil:
+        """Project gamma on its range (D 8), and count the time until it leaks."""
+        if not law.adaptive:
+            return
+        self.state.gamma = fmin(fmax(self.state.gamma, law.gamma_min), law.gamma_max)
+        if self.loss <= law.dead_zone * law.dead_zone:
+            self.wait = fmax(self.wait - h, 0.0)
+        else:
+            self.wait = law.leakage_delay
+
+    def run(self, str method, double h, Py_ssize_t count, int every):
+        """Integrate and return `count` states, every `every`-th one, from the first one on."""
+        cdef Method used = {'ode1': EULER, 'ode3': BOGACKI_SHAMPINE, 'ode4': CLASSICAL}[method]
+        cdef int n = self.plant.size, levels = self.observer.levels, i, _
+        cdef Py_ssize_t row, step = 0
+        cdef double[:, ::1] z = np.empty((count, n))
+        cdef double[:, ::1] z_hat = np.empty((count, levels)), z_tilde = np.empty((count, levels))
+        cdef double[::1] gamma = np.empty(count)
+        with nogil:
+            for row in range(count):
+                for _ in range(every if row > 0 else 0):
+                    take_step(self, &used, step * h, h, <double*>&self.state)
+                    self.end_step(self.observer, h)
+                    step += 1
+                for i in range(n):
+                    z[row, i] = self.state.z[i]
+                for i in range(levels):
+                    z_hat[row, i] = self.state.level[i].z_hat
+                    z_tilde[row, i] = self.state.level[i].z_tilde
+                gamma[row] = self.state.gamma
+        return {
+            'z': np.asarray(z), 'z_hat': np.asarray(z_hat), 'z_tilde': np.asarray(z_tilde),
+            'gamma': np.asarray(gamma),
+        }
+
+
+def simulate(observer, plant, solver='ode3', step=1e-3, duration=20.0, every=1):
+    """
+    Integrate plant and observer from their initial states over `duration`.
+
+    Parameters
+    ----------
+    observer, plant : mapping
+        Parameters as for `Observer` and `Plant`; scheme, noise and integration_step play no part.
+    solver : {'ode1', 'ode3', 'ode4', 'ode4 held'}
+        See `SOLVERS`.
+    step : float
+        Fixed step in seconds.
+    duration : float
+        Simulated seconds.
+    every : int
+        Record every `every`-th step.
+
+    Returns
+    -------
+    JointRun
+
+    Raises
+    ------
+    ConfigurationError
+        A bad parameter, or one of the arguments here.
+
+    """
+    if solver not in SOLVERS:
+        raise ConfigurationError(f'solver: expected one of {", ".join(SOLVERS)}, got {solver!r}')
+    if not 0.0 < step <= duration < float('inf'):
+        raise ConfigurationError(
+            f'step: expected 0 < step <= duration (s), got {step} and {duration}'
+        )
+    if every < 1:
+        raise ConfigurationError(f'every: expected an integer >= 1, got {every}')
+    configuration = ObserverConfiguration(observer)
+    if configuration.self_tuning:
+        raise ConfigurationError(
+            "parameter 'gains': expected fixed for a solver's steps, got 'self_tuning'"
+        )
+    configuration = configuration.changed(ITS_EQUATIONS)
+    p = PLANT_PARAMETERS.complete(plant)
+    (method, holds), model, d = SOLVERS[solver], TriangularModel.of(p), Wave(p)
+    z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], model.order)
+    system = System(model.expressions, d, step, z)
+    joint = Joint(system, configuration, holds and configuration.is_sign)
+    rows = round(duration / step) // every + 1
+    found = joint.run(method, step, rows, every)
+    t = np.arange(rows, dtype=np.float64) * (every * step)
+    return JointRun(t=t, unknown_input=d.along(t), **found)

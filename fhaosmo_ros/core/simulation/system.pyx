@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated plant as differential equations (paper eq. newsimpledynamics)."""
+
+from libc.math cimport ceil, fmax
+from libc.string cimport memcpy
+
+from fhaosmo_ros.core.model.integrate cimport CLASSICAL, take_step
+from fhaosmo_ros.core.model.phi cimport Expressions
+from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
+from fhaosmo_ros.core.simulation.disturbance cimport Disturbance
+
+import numpy as np
+
+cdef double[MOST_LEVELS] STILL  # direction of a derivative that nobody needs: 0
+
+
+cdef class System(Dynamics):
+    """
+    A triangular system that d drives, integrated by the classical Runge-Kutta method.
+
+    Parameters
+    ----------
+    phi : Expressions
+        Phi_1 .. Phi_n.
+    d : Disturbance
+    h : float
+        Step (s).
+    z : (n,) array
+        States at t = 0.
+
+    """
+
+    def __init__(self, Expressions phi not None, Disturbance d not None, double h, z):
+        cdef int i
+        self.size, self.h = phi.count, h
+        if self.size > MOST_LEVELS or len(z) != self.size or not h > 0.0:
+            raise ValueError(f'expected {phi.count} <= {MOST_LEVELS} states and a step > 0')
+        self.phi, self.d = phi, d
+        for i in range(self.size):
+            self.on_grid[i] = self.z[i] = z[i]
+
+    def __reduce__(self):
+        values = {'taken': self.taken, 'on_grid': self.on_grid, 'z': self.z}
+        return System, (self.phi, self.d, self.h, self.states), values
+
+    def __setstate__(self, values):
+        self.taken, self.on_grid, self.z = values['taken'], values['on_grid'], values['z']
+
+    def change(self, Expressions phi not None, Disturbance d not None):
+        """Go on with other functions of as many states."""
+        if phi.count != self.size:
+            raise ValueError(f'expected {self.size} states, got {phi.count}')
+        self.phi, self.d = phi, d
+
+    @property
+    def states(self):
+        """States at the time of the latest `advance`, (n,)."""
+        return np.array([self.z[i] for i in range(self.size)])
+
+    cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil:
+        """Write z_i' = z_{i+1} + Phi_i(z, u), z_n' = d(t) + Phi_n(z, u)."""
+        cdef int i, last = self.size - 1
+        for i in range(self.size):
+            slope[i] = x[i + 1] if i < last else self.d.at(t)
+            slope[i] += self.phi.evaluate(i, x, STILL, self.u).value
+
+    cdef void go_to(self, double t, const double* u) noexcept nogil:
+        """
+        Bring `z` to the time `t`.
+
+        Only whole steps of the grid change `on_grid`; the rest of the way to `t` is taken on a
+        copy, so that the trajectory doesn't depend on the times at which somebody looks.
+        """
+        self.u = u
+        while (self.taken + 1) * self.h <= t:
+            take_step(self, &CLASSICAL, self.taken * self.h, self.h, self.on_grid)
+            self.taken += 1
+        memcpy(self.z, self.on_grid, sizeof(self.z))
+        if t > self.taken * self.h:
+            take_step(self, &CLASSICAL, self.taken * self.h, t - self.taken * self.h, self.z)
+
+    def advance(self, t, u):
+        """
+        Return the states at many times, (K, n).
+
+        Parameters
+        ----------
+        t : (K,) array
+            Times since t = 0 (s), finite and not decreasing.
+        u : (K, m) array
+            Known inputs of the interval that ends at each.
+
+        """
+        cdef const double[::1] times = t
+        cdef const double[:, ::1] inputs = checked(u, times.shape[0], self.phi)
+        cdef double[:, ::1] states = np.empty((times.shape[0], self.size))
+        cdef Py_ssize_t k
+        for k in range(times.shape[0]):
+            self.go_to(times[k], &inputs[k, 0])
+            memcpy(&states[k, 0], self.z, self.size * sizeof(double))
+        return np.asarray(states)
+
+    def respond(self, t, u):
+        """Do the same from t = 0 on without a grid: each interval is divided evenly."""
+        cdef const double[::1] times = t
+        cdef const double[:, ::1] inputs = checked(u, times.shape[0], self.phi)
+        cdef double[:, ::1] states = np.empty((times.shape[0], self.size))
+        cdef double begin = 0.0, step
+        cdef Py_ssize_t k
+        cdef long long j, count
+        for k in range(times.shape[0]):
+            self.u = &inputs[k, 0]
+            count = <long long>fmax(ceil((times[k] - begin) / self.h - 1e-9), 1.0)
+            step = (times[k] - begin) / count
+            for j in range(count if step > 0.0 else 0):
+                take_step(self, &CLASSICAL, begin + j * step, step, self.z)
+            begin = times[k]
+            memcpy(&states[k, 0], self.z, self.size * sizeof(double))
+        return np.asarray(states)
+
+
+cdef const double[:, ::1] checked(u, Py_ssize_t count, Expressions phi) except *:
+    """Return `u` if it has a row for each time, and the columns that Phi may use."""
+    if u.shape[0] != count or u.shape[1] < phi.inputs:
+        raise ValueError(f'expected known inputs ({count}, {phi.inputs}), got {u.shape}')
+    return u if u.shape[1] else np.zeros((count, 1))

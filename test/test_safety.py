@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Copies, threads, hostile snapshots and calls: an error or a good estimate, never a crash."""
+
+import copy
+from pathlib import Path
+import pickle
+import re
+import threading
+
+from fhaosmo_ros.core import Observer, Status
+from fhaosmo_ros.core.observer.status import FLAGS_MASK, LEVEL_SHIFT, REJECTED, UNUSED
+from fuzz import fuzz_calls, fuzz_snapshots, KINDS, running
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+kinds = pytest.mark.parametrize('kind', KINDS)
+STAMPS = 10**9 + 300 * 10**6 + np.arange(200) * 10**6
+Y = 0.1 * np.sin(STAMPS * 3e-9)
+
+
+def same(one, other):
+    for name, value in one._asdict().items():
+        np.testing.assert_array_equal(value, getattr(other, name))
+
+
+@pytest.mark.parametrize('duplicate', [
+    copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x)),  # noqa: S301
+])  # fmt: skip
+@kinds
+def test_a_copy_goes_on_by_itself(kind, duplicate):
+    estimator = running(KINDS[kind], 300, 1)
+    other = duplicate(running(KINDS[kind], 300, 1))  # what it was made from is gone
+    found = other.run(STAMPS, Y)
+    same(found, estimator.run(STAMPS, Y))
+    third = duplicate(estimator)
+    estimator.run(STAMPS + 10**9, -Y)
+    same(third.run(STAMPS + 2 * 10**8, Y), other.run(STAMPS + 2 * 10**8, Y))
+
+
+@kinds
+def test_hostile_snapshots(kind):
+    fuzz_snapshots(kind, 150, 3, lambda: None)
+
+
+@kinds
+def test_hostile_calls(kind):
+    fuzz_calls(kind, 200, 4, lambda: None)
+
+
+@pytest.mark.parametrize('kind', ['cascade', 'self-tuning'])
+def test_two_threads_on_one_estimator_get_an_error(kind):
+    estimator = running(KINDS[kind], 100, 1)
+    count = 400_000 if kind == 'cascade' else 20_000
+    stamps = 2 * 10**9 + np.arange(count) * 10**6
+    errors, finished = [], threading.Event()
+
+    def run():
+        estimator.run(stamps, np.zeros(count))
+        finished.set()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    while not finished.is_set():
+        try:
+            estimator.update(1, 0.0)
+        except RuntimeError as error:
+            errors.append(str(error))
+    thread.join()
+    assert any('another thread' in error for error in errors)
+    assert np.isfinite(estimator.observer.estimate.z).all()
+
+
+def test_flags_of_compiled_code_are_those_of_status():
+    text = (ROOT / 'fhaosmo_ros' / 'core' / 'observer' / 'status.pxd').read_text()
+    found = {name: eval(value) for name, value in re.findall(r'(\w+) = ([\d +]+)', text)}  # noqa: S307
+    named = {'REJECTED': REJECTED, 'UNUSED': UNUSED}
+    named |= {'LEVEL_SHIFT': LEVEL_SHIFT, 'FLAGS_MASK': FLAGS_MASK}
+    assert found == named | {flag.name: int(flag) for flag in Status if flag}
+
+
+@pytest.mark.parametrize('parameters', [{}, {'noise_size': 1e-3}, {'variant': 'sign'}])
+def test_snapshot_of_an_observer_has_names_and_goes_on(parameters):
+    t = np.arange(400) * 1e-3
+    observer, other = Observer(parameters), Observer(parameters)
+    observer.run(t[:200], np.sin(t[:200]))
+    state = observer.state
+    assert {'z_hat', 'z_tilde', 'gamma', 'y'} <= state.values.keys()
+    other.restore(state)
+    same(other.run(t[200:], np.sin(t[200:])), observer.run(t[200:], np.sin(t[200:])))
