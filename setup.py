@@ -47,9 +47,13 @@ def extensions():
             options += [] if debug else ['-O3']
         else:
             options.append('-ffp-contract=off')
-        extension = Extension('.'.join(path.with_suffix('').parts), [str(path)])
-        extension.extra_compile_args = options
-        extension.extra_link_args = sanitize
+        extension = Extension(
+            '.'.join(path.with_suffix('').parts),
+            [str(path)],
+            libraries=['m'],
+            extra_compile_args=options,
+            extra_link_args=sanitize,
+        )
         extension.cython_directives = {
             'language_level': 3,
             'boundscheck': debug,
@@ -161,15 +165,16 @@ setup(
     zip_safe=False,
     install_requires=[
         'matplotlib',
+        'mcap>=1.6,<1.7',  # tools/bags uses two attributes of its Writer
         'networkx',  # this, packaging and scipy: scikit-fuzzy imports them but declares nothing
         'numpy',
-        'orjson',
         'packaging',
         'pyyaml',
         'rosbags>=0.11.9,<0.12',  # tools/bags uses its internals
         'scikit-fuzzy',
         'scipy',
         'tqdm',
+        'zstandard',
     ],
     # Not tests_require: colcon then finds no tests.
     extras_require={
@@ -188,7 +193,6 @@ setup(
             'colcon-common-extensions',
             'cython-lint',
             'import-linter',
-            'mcap',
             'mcap-ros2-support',
             'mypy',
             'ruff',

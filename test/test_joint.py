@@ -4,9 +4,9 @@
 from itertools import pairwise
 
 from fhaosmo_ros.core import ConfigurationError, Observer
-from fhaosmo_ros.core.simulation.plant_and_observer import simulate
 import numpy as np
 import pytest
+from studies.paper.plant_and_observer import simulate
 
 OBSERVER = {
     'lambda': 15, 'alpha': 30, 'epsilon': 0.5, 'fuzzy_widths': [0.5], 'fuzzy_shape': 'gaussian',

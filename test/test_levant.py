@@ -15,7 +15,6 @@ from fhaosmo_ros.core.observer.fuzzy import curves
 from fhaosmo_ros.core.observer.levant import Levant
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
-from fhaosmo_ros.core.simulation.plant_and_observer import simulate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -24,6 +23,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq
+from studies.paper.plant_and_observer import simulate
 
 PHI = {
     1: (['-0.5*z1 + u'], [lambda z, u: -0.5 * z[0] + u]),

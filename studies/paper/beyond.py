@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.simulation.metrics import rms
-from fhaosmo_ros.core.simulation.plant_and_observer import JointRun
 import numpy as np
 from numpy.typing import NDArray
 from studies.paper.cases import (
@@ -20,6 +19,7 @@ from studies.paper.cases import (
     score,
     truth_of,
 )
+from studies.paper.plant_and_observer import JointRun
 
 Floats = NDArray[np.float64]
 

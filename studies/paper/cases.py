@@ -9,10 +9,10 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import chatter, high_passed, rms, settling_time
-from fhaosmo_ros.core.simulation.plant_and_observer import JointRun, simulate
 from fhaosmo_ros.tools.cli.share import shipped
 import numpy as np
 from numpy.typing import NDArray
+from studies.paper.plant_and_observer import JointRun, simulate
 
 Floats = NDArray[np.float64]
 

@@ -10,13 +10,13 @@ import time
 from typing import Any
 
 from fhaosmo_ros.core.observer.fuzzy import of_level
-from fhaosmo_ros.core.simulation.plant_and_observer import SOLVERS
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.plot.fuzzy import fuzzy_figure, Row
 from studies import document
 from studies.paper import beyond, cases, curves, figures, findings, results
+from studies.paper.plant_and_observer import SOLVERS
 
 DOCS = Path(__file__).resolve().parents[2] / 'docs'
 OBSERVERS = cases.OBSERVERS | cases.OURS

@@ -4,7 +4,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from fhaosmo_ros.core.simulation.plant_and_observer import JointRun
 from fhaosmo_ros.tools.plot.figures import COLOURS, envelope, TRUTH
 from matplotlib import rcParams
 from matplotlib.axes import Axes
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from studies.paper.beyond import LongRun, Row
 from studies.paper.findings import WidthMap
+from studies.paper.plant_and_observer import JointRun
 
 Floats = NDArray[np.float64]
 # Estimates that chatter are solid and below; the truth lies on top, dashed so that both are seen.

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
-from fhaosmo_ros.core.simulation.plant_and_observer import JointRun
 import numpy as np
 from numpy.typing import NDArray
 from studies.paper.cases import FREQUENCIES, joint, OBSERVERS, OURS, Score, score
+from studies.paper.plant_and_observer import JointRun
 
 LOW, HIGH = FREQUENCIES
 VISIBLE = 0.005

@@ -3,7 +3,6 @@
 
 from collections.abc import Iterable
 
-from fhaosmo_ros.core.simulation.plant_and_observer import SOLVERS
 from studies.paper.beyond import LongRun, Row, WORSE
 from studies.paper.cases import OBSERVERS, OURS, Score
 from studies.paper.curves import CurveRow, SYSTEMS
@@ -17,6 +16,7 @@ from studies.paper.findings import (
     verdicts,
     WidthMap,
 )
+from studies.paper.plant_and_observer import SOLVERS
 
 RMS_HEAD = '| RMS z1 | RMS z2 | RMS z3 | RMS d | settles [s] | variation | high-passed |'
 

@@ -272,7 +272,9 @@ def is_linear(tokens: Sequence[tuple[int, float]]) -> bool:
             b, a = stack.pop(), stack.pop()
             most = max(a, b)
             is_kept = (
-                code in (phi.ADD, phi.SUB) or (code == phi.MUL and 0 in (a, b)) or (code == phi.DIV and b == 0)
+                code in (phi.ADD, phi.SUB)
+                or (code == phi.MUL and 0 in (a, b))
+                or (code == phi.DIV and b == 0)
             )
             stack.append(most if is_kept or most < 2 else 3)
         else:

@@ -87,6 +87,8 @@ class ObserverConfiguration:
 
     """
 
+    self_tuning: bool
+    levels: int
     lambdas: Floats
     alphas: Floats
     widths: Floats

@@ -139,7 +139,8 @@ class Observer:
 
         Infinite before it knows the noise; NaN for an observer with fixed gains.
         """
-        return np.sqrt(self.structure.variances)
+        variances: NDArray[np.float64] = self.structure.variances
+        return np.sqrt(variances)
 
     @property
     def tuning(self) -> Tuning:

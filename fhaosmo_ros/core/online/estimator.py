@@ -97,24 +97,7 @@ class OnlineEstimator:
     def from_yaml(
         cls, path: str | Path, node: str = 'estimator', channel: str = ''
     ) -> 'OnlineEstimator':
-        """
-        Return one with the parameters of a file for ROS, such as the `gains.yaml` of `tune`.
-
-        Parameters
-        ----------
-        path : path
-            A YAML file of the form ``estimator: {ros__parameters: {...}}``.
-        node : str
-            Whose sections to take, such as '/rig/estimator'.
-        channel : str
-            Name of the channel, of a node that has several.
-
-        Raises
-        ------
-        ConfigurationError
-            As the constructor, or a file that can't be used; the message begins with its path.
-
-        """
+        """Return one with the parameters of a file for ROS; see `Observer.from_yaml`."""
         return make_from_file(cls, path, node, channel)
 
     @property

@@ -150,9 +150,7 @@ cdef class Policy:
         noisy = may_have_noise(&self.sensor) and self.tuner.is_noisy(self.sensor.sample)
         return REJECTED_STUCK * repeats_noise(&self.sensor, &self.counters, y, noisy)
 
-    cdef long long since_latest(
-        self, long long now, double y, int* word
-    ) noexcept nogil:
+    cdef long long since_latest(self, long long now, double y, int* word) noexcept nogil:
         """Return the time since the latest sample, 0 where there is none; add flags to `word`."""
         cdef long long latest, elapsed
         if not self.course.timed:

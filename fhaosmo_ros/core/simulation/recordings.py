@@ -9,7 +9,7 @@ A family of recordings for training and for judging estimators: seeded, with the
     r = training[0]        # r.t, r.y, r.u, r.z, r.d
 
 A recording is a function of the parameters, its number and the seed alone. Parameters:
-family_parameters.py; a plant's YAML serves as well.
+recording_parameters.py; a plant's YAML serves as well.
 """
 
 from collections.abc import Mapping

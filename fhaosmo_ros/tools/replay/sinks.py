@@ -2,7 +2,7 @@
 """Where replayed estimates go: a bag, a CSV or an NPZ file, block by block."""
 
 from collections.abc import Mapping
-from itertools import groupby
+import csv
 from pathlib import Path
 import shutil
 from typing import Any, NamedTuple, Protocol
@@ -26,11 +26,6 @@ from fhaosmo_ros.topics import (
 )
 import numpy as np
 from numpy.typing import NDArray
-
-try:
-    import orjson
-except ModuleNotFoundError:  # rosdep has no key for it; without it, CSV takes longer
-    orjson = None
 
 
 class Rows(NamedTuple):
@@ -88,31 +83,21 @@ class CsvSink:
     """A table with a header line; its numbers read back as the same doubles."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open('wb')
+        self._file = path.open('w', encoding='utf-8', newline='')
+        self._writer = csv.writer(self._file, lineterminator='\n')
         self._began = False
 
     def write(self, rows: Rows) -> None:
         """Append a line for each sample."""
         table = columns(rows)
         if not self._began:
-            self._file.write(','.join(table).encode() + b'\n')
+            self._writer.writerow(table)
             self._began = True
-        # Neighbouring columns of one type are formatted together: fewer pieces a line are faster.
-        groups = [list(group) for _, group in groupby(table.values(), lambda c: c.dtype)]
-        pieces = [_lines(np.column_stack(group)) for group in groups]
-        self._file.write(b'\n'.join(map(b','.join, zip(*pieces, strict=True))) + b'\n')
+        self._writer.writerows(zip(*(c.tolist() for c in table.values()), strict=True))
 
     def close(self) -> None:
         """Complete the file."""
         self._file.close()
-
-
-def _lines(array: NDArray) -> list[bytes]:
-    """Return the rows of an array: numbers in their shortest form, separated by commas."""
-    if orjson is None or not np.isfinite(array).all():  # JSON has no infinity
-        return [','.join(map(repr, row)).encode() for row in array.tolist()]
-    text = orjson.dumps(np.ascontiguousarray(array), option=orjson.OPT_SERIALIZE_NUMPY)
-    return text[2:-2].split(b'],[')  # JSON: [[1.0,2.0],[3.0,4.0]]
 
 
 class NpzSink:

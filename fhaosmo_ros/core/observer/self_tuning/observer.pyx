@@ -256,9 +256,6 @@ cdef class SelfTuning(Structure):
         w.first, w.last = HALF - shared.moving, min(HALF + shared.moving, shared.active)
         self.carry_flow(h, u)
         sample.off = y - self.prediction.z[0]
-        if not fabs(sample.off) <= LARGEST:
-            self.trial[0].z_hat = NAN  # the step is rejected, and the members begin afresh
-            return
         # A sample that is not likely changes no member: what it makes of them stands apart.
         for i in range(self.levels):
             mean[i] = self.trial[i].z_hat
@@ -394,9 +391,10 @@ cdef class SelfTuning(Structure):
             begin_growth(m)
             memory.beyond = 0.0
         memory.beyond += 1.0
-        memory.miss = sample.off
+        # Where a prediction has overflowed, two errors are not alike (D 23).
+        memory.miss = sample.off if fabs(sample.off) <= LARGEST else LARGEST
         if memory.beyond == 1.0:
-            memory.first_miss = sample.off
+            memory.first_miss = sample.off if fabs(sample.off) <= LARGEST else -LARGEST
         # A y that is off is so on one side, and evenly.
         if other_side or (shared.roughness > HUBER and shared.recent == 0.0):
             follow_noise(m)

@@ -11,7 +11,7 @@ between numbers by `a if a > b else b`, as fmin and fmax are calls.
 
 cdef extern from *:
     """
-    #if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
+    #if defined(__x86_64__) && defined(__GLIBC__) && __GNUC__ >= 12 && !defined(__clang__)
     #define VECTORISED __attribute__((target_clones("arch=x86-64-v3", "default"))) void
     /* Another module's pointer to such a function has no attributes, which is no mistake. */
     #pragma GCC diagnostic ignored "-Wattributes"

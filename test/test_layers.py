@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What import-linter cannot see: imports of compiled modules, and what an import really loads."""
+
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import pytest
+
+tomllib = pytest.importorskip('tomllib', reason='Python 3.10 has no tomllib')
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / 'fhaosmo_ros'
+IMPORT = re.compile(r'^\s*(?:from|import|cimport)\s+(fhaosmo_ros[\w.]*)', re.MULTILINE)
+CONTRACTS = tomllib.loads((ROOT / 'pyproject.toml').read_text())['tool']['importlinter'][
+    'contracts'
+]
+ROOMS = next(c['layers'] for c in CONTRACTS if 'rooms' in c['name'] and 'core' in c['name'])
+COMPILED = sorted(PACKAGE.rglob('*.p[yx][xd]'))
+
+
+@pytest.mark.parametrize('path', COMPILED, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_compiled_module_imports_only_its_room_and_those_below(path):
+    room = '.'.join(('fhaosmo_ros', *path.relative_to(PACKAGE).parts[:2]))
+    allowed = ROOMS[ROOMS.index(room) :]
+    for name in IMPORT.findall(path.read_text()):
+        assert '.'.join(name.split('.')[:3]) in allowed, name
+
+
+ESTIMATE = """
+import sys
+from fhaosmo_ros.core import Observer, OnlineEstimator
+Observer().step(0.0, 1.0)
+OnlineEstimator().advance(1, 0.0)
+OnlineEstimator({'gains': 'self_tuning'}).advance(1, 0.0)
+print(*{name.split('.')[0] for name in sys.modules})
+"""
+
+
+def test_an_estimate_of_the_default_parameters_loads_nothing_slow():
+    done = subprocess.run([sys.executable, '-c', ESTIMATE], capture_output=True, check=True)
+    loaded = set(done.stdout.decode().split())
+    assert 'numpy' in loaded
+    assert not loaded & {'scipy', 'skfuzzy', 'networkx', 'matplotlib', 'rclpy', 'rosbags'}
