@@ -6,7 +6,8 @@ Definitions are those of a rosbags typestore (``fielddefs``): by type, its const
 as pairs of a name and (kind, detail). Nodes make the same of message classes.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 from math import asin, atan2, copysign, pi
 import re
 from typing import Any, NamedTuple
@@ -27,6 +28,8 @@ KINDS = {
     'int16': 'i2', 'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4', 'int64': 'i8', 'uint64': 'u8',
     'float32': 'f4', 'float64': 'f8',
 }  # fmt: skip
+MOST_LISTED, LONGEST_LISTED = 10, 60
+"""Names that one line lists, and letters of each: a message may have thousands."""
 IDENTIFIER = r'[A-Za-z]\w*'
 SUBSCRIPT = r'\[[^\[\]]+\]'
 
@@ -117,8 +120,8 @@ class Field(NamedTuple):
         if key.name not in names:
             raise MissingElementError(
                 f'field {self.text!r}: expected a name that is in the message '
-                f'({", ".join(names) or "which has none"}), got {key.name!r}'
-                f'{suggestion(key.name, names)}'
+                f'({listed(names) or "which has none"}), got {key.name!r}'
+                f'{suggestion(key.name, islice(names, MOST_LISTED))}'
             )
         return int(names.index(key.name))
 
@@ -130,6 +133,13 @@ class Field(NamedTuple):
 
 class MissingElementError(ConfigurationError):
     """One message does not have the element of a list that is meant; others may."""
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return names separated by commas, as far as one line has room for them."""
+    texts = [n if len(n) <= LONGEST_LISTED else f'{n[:LONGEST_LISTED]}...' for n in names]
+    more = len(texts) - MOST_LISTED
+    return ', '.join(texts[:MOST_LISTED]) + (f' and {more} more' if more > 0 else '')
 
 
 def find_field(

@@ -470,6 +470,11 @@ ESTIMATOR_NODE = (
         live=False, lengths='any',
     ),
     Parameter(
+        'max_channels', 64,
+        'Most channels that from_joint_names makes of a message; further joints are left out.',
+        lower=1, upper=1000, live=False,
+    ),
+    Parameter(
         'autostart', True,
         'Configure and activate by itself at the start. false: wait for a lifecycle manager, or '
         'for `ros2 lifecycle set`.',

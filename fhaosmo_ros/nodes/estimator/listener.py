@@ -2,7 +2,6 @@
 """Which number a listener takes out of the messages of a topic, and what is wrong with it."""
 
 from collections.abc import Callable, Mapping
-import re
 from typing import Any, TYPE_CHECKING
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -12,13 +11,13 @@ from fhaosmo_ros.core.parameters.per_channel import of_channel
 from fhaosmo_ros.inputs import Input, known_inputs, measured_output
 from fhaosmo_ros.messages.fields import Field, find_field, Unwrapper
 from fhaosmo_ros.nodes.middleware.definitions import definitions
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from fhaosmo_ros.nodes.middleware.publishers import full_name
 from rclpy.node import Node
 
 if TYPE_CHECKING:
     from fhaosmo_ros.nodes.estimator.sources import Source
 
-MOST_WHYS = 20
+MOST_WHYS = 3
 """Different reasons that are told, of a publisher that always has another one."""
 Take = Callable[[int, float, int], None]
 """Gets the stamp of a sample, its value, and when it was published; times in nanoseconds."""
@@ -128,12 +127,10 @@ def check_inputs(
         used = estimator.observer.used_inputs
         for wanted in (measured_output(own, name), *known_inputs(own, used, name).values()):
             try:
-                node.resolve_topic_name(wanted.topic)
-            except rclpy_implementation.RCLError as error:
-                problem = re.sub(r'^.*?: |, at \S+$', '', str(error))
+                full_name(node, wanted.topic)
+            except ConfigurationError as error:
                 raise ConfigurationError(
-                    "parameters 'input_topic', 'known_input_topics': expected the name of a "
-                    f'topic, got {wanted.topic!r} ({problem})'
+                    f"parameters 'input_topic', 'known_input_topics': {error}"
                 ) from None
             if wanted.message_type:
                 try:

@@ -9,7 +9,6 @@ from fhaosmo_ros.core.parameters.declaration import Parameters, suggestion, Valu
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.per_channel import (
-    channel_names,
     CHANNELS,
     FROM_JOINTS,
     of_channel,
@@ -22,11 +21,12 @@ from fhaosmo_ros.inputs import measured_output, with_joints
 from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.channel_group import ChannelGroup, make_estimators
 from fhaosmo_ros.nodes.estimator.channel_inheritance import ChannelInheritance
+from fhaosmo_ros.nodes.estimator.joints import Joints
 from fhaosmo_ros.nodes.estimator.listener import check_inputs
 from fhaosmo_ros.nodes.estimator.parameter_topic import ParameterTopic
 from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes
-from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE
+from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE, WARN
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
 from fhaosmo_ros.nodes.middleware.publishers import check_overrides
@@ -68,7 +68,8 @@ class EstimatorNode(ManagedNode):
             overrides['sampling'] = 'clock'
         values = complete(with_joints(overrides), ESTIMATOR_PARAMETERS)
         self._names: list[str] = values[CHANNELS]
-        self._joints: set[str] = set()
+        self._joints = Joints(self)
+        self._from_joints = self._names == FROM_JOINTS
         self._node_parameters = NodeParameters(self, values, fixed=['autostart', CHANNELS])
         self._inheritance = ChannelInheritance(
             with_own_parameters(values[CHANNELS], values), overrides
@@ -139,7 +140,7 @@ class EstimatorNode(ManagedNode):
             self._channels = Channel(self, values, *estimators.values(), self._sources)
         else:
             self._channels = ChannelGroup(self, values, estimators, self._sources)
-        if self._joints:
+        if self._from_joints:
             self._sources.of(measured_output(values)).on_names = self._take_joints
         self._sources.open()
 
@@ -160,24 +161,12 @@ class EstimatorNode(ManagedNode):
 
     def _take_joints(self, names: list[str]) -> None:
         """Make the channels from the first names; later, report those that are new."""
-        new = [name for name in dict.fromkeys(names) if name not in self._joints]
-        self._joints |= set(new)
+        new = self._joints.new(names)
         if self._names != FROM_JOINTS:
-            for name in new:
-                self.get_logger().warning(
-                    f"joint '{name}' has come after the first message: it is not estimated; start "
-                    'the node again to take it'
-                )
+            if new:
+                self._joints.refuse(new)
             return
-        fit = []
-        for name in new:
-            try:
-                fit += channel_names({CHANNELS: [name or '?']})  # '' is no channel's name
-            except ConfigurationError as error:
-                self.get_logger().error(
-                    f"joint '{name}' can't be the name of a channel: it is left out ({error}); "
-                    f'name a channel and set input_field to position[{name}] for it'
-                )
+        fit = self._joints.choose(new, self._node_parameters.values['max_channels'])
         if not fit:
             return
         present = self._node_parameters.values
@@ -256,6 +245,8 @@ class EstimatorNode(ManagedNode):
             state.find(level, text)
         if active and self._channels is None:
             state.find(STALE, 'no message with the names of the joints yet')
+        if self._joints.problem:
+            state.find(WARN, self._joints.problem)
         if not active or self._channels is None:
             return [state]
         return [state, *self._channels.reports()]

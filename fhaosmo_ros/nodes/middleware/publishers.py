@@ -2,9 +2,11 @@
 """Publishers whose QoS a user may override by parameters qos_overrides./TOPIC.publisher.POLICY."""
 
 from collections.abc import Callable, Iterable
+import re
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -43,6 +45,25 @@ def listeners_of(publisher: Any) -> Callable[[], int]:
     return count
 
 
+def full_name(node: Node, topic: str) -> str:
+    """
+    Return the full name of a topic, after remapping.
+
+    Raises
+    ------
+    ConfigurationError
+        No topic can have this name, for instance because it is too long.
+
+    """
+    try:
+        return str(node.resolve_topic_name(topic))
+    except rclpy_implementation.RCLError as error:
+        problem = re.sub(r'^.*?: |, at \S+$', '', str(error))
+        raise ConfigurationError(
+            f'expected the name of a topic, got {topic!r} ({problem})'
+        ) from None
+
+
 def check_overrides(node: Node, topics: Iterable[str]) -> None:
     """
     Raise for QoS overrides that rclpy would ignore, or refuse with an unclear message.
@@ -56,10 +77,11 @@ def check_overrides(node: Node, topics: Iterable[str]) -> None:
     Raises
     ------
     ConfigurationError
-        A topic that is none of them, or a policy or value that can't be set.
+        A name that is none of a topic, an override of another topic, or a policy or value that
+        can't be set.
 
     """
-    names = [node.resolve_topic_name(topic) for topic in topics]
+    names = [full_name(node, topic) for topic in topics]
     policies = {policy.name.lower(): allowed for policy, allowed in POLICIES.items()}
     for name, parameter in node.get_parameters_by_prefix('qos_overrides').items():
         if name.startswith(OF_RCLPY):
