@@ -18,6 +18,7 @@ from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, Repor
 from fhaosmo_ros.nodes.middleware.messages import labelled
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.nodes.middleware.subscription import SENSOR_QOS, subscribe_with_info
+import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -51,10 +52,10 @@ class EmptyNode(Node):
         outputs = []
         for prefix in [f'~/{joint}/' for joint in JOINTS[:joints]] or ['~/']:
             messages = {
-                'state': labelled(['z1', 'z2', 'z3']),
+                'state': labelled(['z1', 'z2', 'z3'])(np.zeros(3)),
                 'unknown_input': Float64(),
                 'gamma': Float64(),
-                'innovation': labelled(['eps1', 'eps2', 'eps3', 'eps4']),
+                'innovation': labelled(['eps1', 'eps2', 'eps3', 'eps4'])(np.zeros(4)),
                 'stamp': self._stamp,
             }
             outputs += [(prefix + topic, message) for topic, message in messages.items()]

@@ -15,7 +15,6 @@ import sys
 import threading
 from time import monotonic
 
-from fhaosmo_ros.nodes.middleware.messages import double_encoder, read_double
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.nodes.plant import PlantNode
 import rclpy
@@ -54,10 +53,9 @@ class Faults:
         self._last = 0.0
         self._origin: float | None = None
         self._matched: float | None = None
-        self._encode = double_encoder()
         self._publisher = node.create_publisher(Float64, TOPIC, 10)
 
-    def pass_on(self, data: bytes) -> None:
+    def pass_on(self, message: Float64) -> None:
         """Publish what faults leave, or make, of a sample."""
         if not self._is_matched():
             self.counts['held back for discovery'] += 1
@@ -70,8 +68,8 @@ class Faults:
             event = self._events.pop()
             self._active[event.kind] = event.size
             self.counts[f'event: {event.kind}'] += 1
-        for y in self._faulty(read_double(data)):
-            self._publisher.publish(self._encode(y))
+        for y in self._faulty(message.data):
+            self._publisher.publish(Float64(data=y))
             self.counts['published'] += 1
 
     def _is_matched(self) -> bool:

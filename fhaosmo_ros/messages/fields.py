@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Which number of a message of any type is meant, by the definitions of the types.
+Which number of a message of any type is meant, and that number in message objects.
 
-Definitions are those of a rosbags typestore (``fielddefs``): by type, its constants and its fields
-as pairs of a name and (kind, detail). Nodes make the same of message classes.
+Objects are those of rclpy or of rosbags: live and replay read them alike. Definitions are those of
+a rosbags typestore (``fielddefs``): by type, its constants and its fields as pairs of a name and
+(kind, detail). Nodes make the same of message classes.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from math import asin, atan2, copysign, pi
 import re
@@ -14,7 +15,6 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-import numpy as np
 
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 """How rosbags numbers the kinds of a field."""
@@ -23,11 +23,10 @@ QUATERNION = 'geometry_msgs/msg/Quaternion'
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 ANGLES = ('roll', 'pitch', 'yaw')
 """Of a quaternion, as if they were fields of it: rotations about x, y, z (fixed axes)."""
-KINDS = {
-    'bool': 'u1', 'byte': 'u1', 'char': 'u1', 'octet': 'u1', 'int8': 'i1', 'uint8': 'u1',
-    'int16': 'i2', 'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4', 'int64': 'i8', 'uint64': 'u8',
-    'float32': 'f4', 'float64': 'f8',
-}  # fmt: skip
+NUMBERS = frozenset({
+    'bool', 'byte', 'char', 'octet', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32',
+    'int64', 'uint64', 'float32', 'float64',
+})  # fmt: skip
 MOST_LISTED, LONGEST_LISTED = 10, 60
 """Names that one line lists, and letters of each: a message may have thousands."""
 IDENTIFIER = r'[A-Za-z]\w*'
@@ -52,12 +51,8 @@ class Field(NamedTuple):
         As the user wrote it, such as 'angular_velocity.z', 'position[2]' or 'position[elbow]'.
     steps : list of str, int and Key
         Names of fields and elements of lists, from the message inwards.
-    kind : dtype
-    has_header : bool
-        True if the message begins with a std_msgs/Header.
-    types : mapping
-        Definitions by type.
-    message_type : str
+    header : str
+        Name of the std_msgs/Header that the message begins with, '' if there is none.
     angle : str
         One of `ANGLES` where the steps lead to the x of a quaternion, else ''.
 
@@ -65,16 +60,8 @@ class Field(NamedTuple):
 
     text: str
     steps: list[str | int | Key]
-    kind: np.dtype
-    has_header: bool
-    types: Mapping[str, Any]
-    message_type: str
+    header: str
     angle: str = ''
-
-    @property
-    def width(self) -> int:
-        """How many numbers one value is made of: 4 for the angle of a quaternion."""
-        return 4 if self.angle else 1
 
     @property
     def wraps(self) -> bool:
@@ -101,38 +88,53 @@ class Field(NamedTuple):
             if isinstance(step, str):
                 around, node = node, getattr(node, step)
                 continue
-            index = step if isinstance(step, int) else self._index(step, around)
+            index = step
+            if isinstance(step, Key):
+                names = getattr(around, step.names)
+                if step.name not in names:
+                    raise MissingElementError(self.text, step, names)
+                index = names.index(step.name)
             if index >= len(node):
-                problem = (
-                    'expected an index below the number of elements, '
-                    f'{len(node)} in one message, got {index}'
-                )
-                if isinstance(step, Key):  # the same text wherever the name stands
-                    problem = f'expected an element for each name, got none for {step.name!r}'
-                raise MissingElementError(f'field {self.text!r}: {problem}')
+                raise MissingElementError(self.text, step, len(node))
             node = node[index]
         if self.angle:
             return angle_of(self.angle, around.x, around.y, around.z, around.w)
-        return float(node)
-
-    def _index(self, key: Key, around: Any) -> int:
-        names = getattr(around, key.names)
-        if key.name not in names:
-            raise MissingElementError(
-                f'field {self.text!r}: expected a name that is in the message '
-                f'({listed(names) or "which has none"}), got {key.name!r}'
-                f'{suggestion(key.name, islice(names, MOST_LISTED))}'
-            )
-        return int(names.index(key.name))
+        return float(node[0] if isinstance(node, bytes) else node)  # a byte of rclpy
 
     def stamp(self, message: Any) -> int:
         """Return the stamp of the header that the message begins with, in nanoseconds."""
-        stamp = getattr(message, self.types[self.message_type][1][0][0]).stamp
+        stamp = getattr(message, self.header).stamp
         return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 class MissingElementError(ConfigurationError):
-    """One message does not have the element of a list that is meant; others may."""
+    """
+    One message does not have the element of a list that is meant; others may.
+
+    Its text is made when it is asked for: messages at 1 kHz may all lack the element. `found` are
+    the names in the message or, where the list itself is too short, the number of its elements.
+    """
+
+    def __init__(self, text: str, step: int | Key, found: Sequence[str] | int) -> None:
+        super().__init__(text, step, found)
+
+    def __str__(self) -> str:
+        """Say what is meant, and what the message has instead."""
+        text, step, found = self.args
+        if isinstance(step, int):
+            problem = (
+                'expected an index below the number of elements, '
+                f'{found} in one message, got {step}'
+            )
+        elif isinstance(found, int):
+            problem = f'expected an element for each name, got none for {step.name!r}'
+        else:
+            problem = (
+                'expected a name that is in the message '
+                f'({listed(found) or "which has none"}), got {step.name!r}'
+                f'{suggestion(step.name, islice(found, MOST_LISTED))}'
+            )
+        return f'field {text!r}: {problem}'
 
 
 def listed(names: Iterable[str]) -> str:
@@ -179,10 +181,10 @@ def find_field(
             f'field {text!r}: expected a number in {message_type}, one of '
             f'{", ".join(known) or "none: it holds no number"}, got {text!r}{hint}'
         )
-    steps, kind, angle = found
+    steps, angle = found
     fields = types[message_type][1]
     has_header = bool(fields) and tuple(fields[0][1]) == (NAME, HEADER)
-    return Field(text, steps, np.dtype(kind), has_header, types, message_type, angle)
+    return Field(text, steps, fields[0][0] if has_header else '', angle)
 
 
 def _only_number(types: Mapping[str, Any], message_type: str) -> str:
@@ -209,14 +211,14 @@ def _numbers(types: Mapping[str, Any], message_type: str, prefix: str = '') -> I
                 yield from _numbers(types, detail, f'{path}.')
             if detail == QUATERNION:
                 yield from (f'{path}.{angle}' for angle in ANGLES)
-        elif detail[0] in KINDS:
+        elif detail[0] in NUMBERS:
             yield path
 
 
 def _follow(
     types: Mapping[str, Any], message_type: str, text: str, name: str
-) -> tuple[list[str | int | Key], str, str] | None:
-    """Return the steps to a number, its kind and the angle; None if they lead to none."""
+) -> tuple[list[str | int | Key], str] | None:
+    """Return the steps to a number, and the angle; None if they lead to none."""
     part = f'{IDENTIFIER}({SUBSCRIPT})*'
     if not re.fullmatch(rf'{part}(\.{part})*', text):
         return None
@@ -227,7 +229,7 @@ def _follow(
     for k, (word, subscript) in enumerate(words):
         if word and node[0] == NAME and node[1] in types:
             if node[1] == QUATERNION and word in ANGLES and k == len(words) - 1:
-                return [*steps, 'x'], KINDS['float64'], word
+                return [*steps, 'x'], word
             beside = types[node[1]][1]
             node = dict(beside).get(word, (None, None))
             steps.append(word)
@@ -245,8 +247,7 @@ def _follow(
             return None
         steps.append(step)
         node = node[1][0]
-    kind = KINDS.get(node[1][0]) if node[0] == BASE else None
-    return None if kind is None else (steps, kind, '')
+    return (steps, '') if node[0] == BASE and node[1][0] in NUMBERS else None
 
 
 def _element(text: str, node: Any, beside: list[Any], by_name: bool = False) -> int | Key | None:

@@ -10,7 +10,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.tables import PLANT_NODE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import Plant
-from fhaosmo_ros.nodes.middleware.messages import array_encoder, double_encoder
+from fhaosmo_ros.nodes.middleware.messages import labelled
 from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
 from fhaosmo_ros.nodes.middleware.publishers import check_overrides, create_publisher
 from fhaosmo_ros.nodes.middleware.simulated_time import reject_negative_time
@@ -62,8 +62,7 @@ class PlantNode(Node):
         self._origin: int | None = None
         self._now = 0
         self._diverged = False
-        self._encode = double_encoder()
-        self._encode_state = array_encoder([f'z{i + 1}' for i in range(self.plant.order)])
+        self._state_message = labelled([f'z{i + 1}' for i in range(self.plant.order)])
         check_overrides(self, TOPICS)
         self._publish_y, self._publish_state, self._publish_d = (
             create_publisher(self, kind, topic, DEPTH).publish for topic, kind in TOPICS.items()
@@ -96,9 +95,9 @@ class PlantNode(Node):
         truth = self.plant.sample(self._plant_time(clock.now().nanoseconds), self._u)
         if not math.isfinite(truth.y):
             return
-        self._publish_y(self._encode(truth.y))
-        self._publish_state(self._encode_state(truth.z))
-        self._publish_d(self._encode(truth.unknown_input))
+        self._publish_y(Float64(data=truth.y))
+        self._publish_state(self._state_message(truth.z))
+        self._publish_d(Float64(data=truth.unknown_input))
 
     def _hold(self) -> None:
         """Log once that the plant has left the finite numbers."""

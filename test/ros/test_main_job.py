@@ -5,7 +5,7 @@ import bisect
 import math
 import signal
 
-from fhaosmo_ros.core.observer.self_tuning.members import TUNING
+from fhaosmo_ros.core.observer.estimates import TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np

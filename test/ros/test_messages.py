@@ -15,11 +15,22 @@ rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2
 pytestmark = pytest.mark.ros
 
 from builtin_interfaces.msg import Time  # noqa: E402
-from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
+from fhaosmo_ros.messages.fields import find_field  # noqa: E402
+from fhaosmo_ros.nodes.middleware.definitions import definitions  # noqa: E402
+from fhaosmo_ros.nodes.middleware.messages import type_name  # noqa: E402
 from geometry_msgs.msg import AccelStamped, PoseStamped, Quaternion, WrenchStamped  # noqa: E402
+from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 from rig import Client, EstimatorRig, node_process, parameters, Process, ROOT  # noqa: E402
 from sensor_msgs.msg import Imu, JointState  # noqa: E402
-from std_msgs.msg import Float64, Header  # noqa: E402
+from std_msgs.msg import (  # noqa: E402
+    Bool,
+    ByteMultiArray,
+    Float32,
+    Float64,
+    Header,
+    UInt8MultiArray,
+)
 
 ROBOT = (Path(__file__).parent / 'fake_robot.py').read_text(encoding='utf-8')
 WARN, ERROR = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -181,6 +192,8 @@ def test_bad_messages_are_told_counted_and_survived(client, folder):
         stamp = SECOND
         publish(joint_state(stamp, elbow=0.2))
         rig.wait_count('samples accepted', 1)
+        publish(b'\0\1\0\0' + bytes(9))  # shorter than any JointState
+        rig.wait_count('damaged messages', 1)
         publish(joint_state(stamp + 1, elbwo=0.2))
         rig.wait_count('messages without y', 1)
         assert "got 'elbow'; did you mean 'elbwo'?" in process.output
@@ -235,6 +248,22 @@ def test_what_cannot_be_meant_is_one_line_before_anything_starts(folder, options
 
 
 # Other messages.
+
+
+def test_numbers_of_any_kind_in_the_objects_of_rclpy():
+    levels = DiagnosticArray(status=[DiagnosticStatus(), DiagnosticStatus(level=b'\2')])
+    covariance = Imu(angular_velocity_covariance=np.arange(9.0))
+    for message, text, value in (
+        (levels, 'status[1].level', 2.0),
+        (covariance, 'angular_velocity_covariance[4]', 4.0),
+        (Bool(data=True), 'data', 1.0),
+        (ByteMultiArray(data=[b'\1', b'\3']), 'data[1]', 3.0),
+        (UInt8MultiArray(data=[1, 4]), 'data[1]', 4.0),
+        (Float32(data=0.1), 'data', float(np.float32(0.1))),
+    ):
+        kind = type_name(type(message))
+        heard = deserialize_message(serialize_message(message), type(message))
+        assert find_field(definitions(kind), kind, text).value(heard) == value
 
 
 def test_yaw_is_continuous_and_the_outputs_are_typed(client, folder):

@@ -472,7 +472,7 @@ ESTIMATOR_NODE = (
     Parameter(
         'max_channels', 64,
         'Most channels that from_joint_names makes of a message; further joints are left out.',
-        lower=1, upper=1000, live=False,
+        lower=1, upper=10_000, live=False,
     ),
     Parameter(
         'autostart', True,

@@ -88,13 +88,13 @@ class Channel:
         simulated = node.get_parameter('use_sim_time').value
         self._health = Health(self.estimator, values, simulated)
         wanted = measured_output(values, name)
-        self._y = sources.of(wanted).add(wanted, self._on_sample, self._logger)
+        self._y = sources.of(wanted).add(wanted, self._on_sample)
         self._u: dict[str, Listener] = {}
         known = known_inputs(values, observer.used_inputs, name)
         self._pairing = make_pairing(values, observer.inputs, known, estimator.inputs)
         for u, its in known.items():
             take = partial(self._on_input, observer.inputs.index(u), u)
-            self._u[u] = sources.of(its).add(its, take, self._logger, first=True)
+            self._u[u] = sources.of(its).add(its, take, first=True)
         self._typed = self._typed_outputs(values)
         services = [
             node.create_service(Trigger, outputs + 'reset', self.reset),

@@ -2,6 +2,7 @@
 """Which number a listener takes out of the messages of a topic, and what is wrong with it."""
 
 from collections.abc import Callable, Mapping
+import math
 from typing import Any, TYPE_CHECKING
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -9,7 +10,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import of_channel
 from fhaosmo_ros.inputs import Input, known_inputs, measured_output
-from fhaosmo_ros.messages.fields import Field, find_field, Unwrapper
+from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError, Unwrapper
 from fhaosmo_ros.nodes.middleware.definitions import definitions
 from fhaosmo_ros.nodes.middleware.publishers import full_name
 from rclpy.node import Node
@@ -17,8 +18,6 @@ from rclpy.node import Node
 if TYPE_CHECKING:
     from fhaosmo_ros.nodes.estimator.sources import Source
 
-MOST_WHYS = 3
-"""Different reasons that are told, of a publisher that always has another one."""
 Take = Callable[[int, float, int], None]
 """Gets the stamp of a sample, its value, and when it was published; times in nanoseconds."""
 
@@ -41,21 +40,18 @@ class Listener:
         Why no field can be found in the topic's type, else ''.
     lacking : int
         Messages that lacked the field.
-    why : str
+    why : MissingElementError or None
         Why the latest one of them did.
 
     """
 
-    def __init__(
-        self, wanted: Input, take: Take, source: 'Source', logger: Any, is_sample: bool
-    ) -> None:
+    def __init__(self, wanted: Input, take: Take, source: 'Source', is_sample: bool) -> None:
         self.wanted, self.take, self.source = wanted, take, source
         self.is_sample = is_sample
         self.field: Field | None = None
-        self.error = self.why = ''
+        self.error = ''
         self.lacking = 0
-        self._whys: set[str] = set()
-        self._logger = logger
+        self.why: MissingElementError | None = None
         self._kind = 'source'
         self._unwrap: Unwrapper | None = None
 
@@ -75,14 +71,27 @@ class Listener:
         self.field = field
         self._kind = wanted.stamp
         if wanted.stamp == 'auto':
-            self._kind = 'header' if field.has_header else 'source'
+            self._kind = 'header' if field.header else 'source'
         self._unwrap = Unwrapper() if field.wraps else None
 
-    def hear(self, value: float | None, header: int, info: Mapping[str, Any]) -> None:
-        """Pass the number in a message on, or count that there is none."""
-        if value is None:
-            self._miss()
-            return
+    def hear(self, message: Any, header: int, info: Mapping[str, Any]) -> bool:
+        """
+        Pass the number in a message on, NaN where there is no message.
+
+        Returns
+        -------
+        bool
+            False if the message lacks the number; then `why` says why.
+
+        """
+        value = math.nan
+        if message is not None and self.field is not None:
+            try:
+                value = self.field.value(message)
+            except MissingElementError as error:
+                self.lacking += 1
+                self.why = error.with_traceback(None)  # which holds the message
+                return False
         if self._unwrap:
             value = self._unwrap(value)
         source: int = info['source_timestamp']
@@ -92,13 +101,7 @@ class Listener:
             self.take(source, value, source)
         else:
             self.take(info['received_timestamp'], value, source)
-
-    def _miss(self) -> None:
-        self.lacking += 1
-        self.why = self.source.missing(self)
-        if self.why not in self._whys and len(self._whys) < MOST_WHYS:
-            self._whys.add(self.why)  # each is told once: two publishers may alternate
-            self._logger.warning(f'a message on {self.source.topic} is left out: {self.why}')
+        return True
 
 
 def check_inputs(
@@ -150,7 +153,7 @@ def find_wanted(types: Mapping[str, Any], wanted: Input) -> Field:
 
     """
     field = find_field(types, wanted.message_type, wanted.field, wanted.name)
-    if wanted.stamp == 'header' and not field.has_header:
+    if wanted.stamp == 'header' and not field.header:
         raise ConfigurationError(
             "parameters 'input_stamp', 'known_input_stamps': expected messages with a header on "
             f'{wanted.topic} for the stamps header, got {wanted.message_type}'

@@ -8,16 +8,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described, Event
-from fhaosmo_ros.nodes.middleware.messages import (
-    array_encoder,
-    double_encoder,
-    message_class,
-    time_encoder,
-)
+from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
 from fhaosmo_ros.nodes.middleware.publishers import create_publisher, listeners_of
 from fhaosmo_ros.topics import DIAGNOSTICS, ESTIMATES, EVENT, SELF_TUNED
 import numpy as np
 from rclpy.node import Node
+from std_msgs.msg import Float64
 
 DEPTH = 10
 
@@ -68,21 +64,23 @@ class Outputs(Publishers):
 
     def __init__(self, node: Node, prefix: str, order: int, levels: int) -> None:
         super().__init__(node, prefix, ESTIMATES)
-        encoders = (
-            array_encoder([f'z{i + 1}' for i in range(order)]), double_encoder(), double_encoder(),
-            array_encoder([f'eps{i + 1}' for i in range(levels)]), time_encoder(),
-        )  # fmt: skip
-        publish = [publisher.publish for publisher in self._publishers]
-        self._parts = list(zip(self._listeners, publish, encoders, strict=True))
+        self._state = labelled([f'z{i + 1}' for i in range(order)])
+        self._innovation = labelled([f'eps{i + 1}' for i in range(levels)])
 
     def publish(self, estimate: Estimate, stamp: int) -> None:
         """Publish an estimate and, last, the stamp of its sample in nanoseconds."""
-        values = (
-            estimate.z, estimate.unknown_input, estimate.gamma, estimate.innovation, stamp
-        )  # fmt: skip
-        for (listeners, publish, encode), value in zip(self._parts, values, strict=True):
+        messages = {
+            'state': lambda: self._state(estimate.z),
+            'unknown_input': lambda: Float64(data=estimate.unknown_input),
+            'gamma': lambda: Float64(data=estimate.gamma),
+            'innovation': lambda: self._innovation(estimate.innovation),
+            'stamp': lambda: time_message(stamp),
+        }
+        for publisher, listeners, name in zip(
+            self._publishers, self._listeners, ESTIMATES, strict=True
+        ):
             if listeners():
-                publish(encode(value))
+                publisher.publish(messages[name]())
 
 
 class TuningOutputs(Publishers):
@@ -101,17 +99,17 @@ class TuningOutputs(Publishers):
 
     def __init__(self, node: Node, prefix: str, order: int) -> None:
         super().__init__(node, prefix, SELF_TUNED)
-        self._encode_deviation = array_encoder([*(f'z{i + 1}' for i in range(order)), 'd'])
-        self._encode_tuning = array_encoder(TUNING)
+        self._deviation = labelled([*(f'z{i + 1}' for i in range(order)), 'd'])
+        self._tuning = labelled(TUNING)
 
     def publish(self, estimator: OnlineEstimator) -> None:
         """Publish the standard deviations of the latest estimate, and the tuning at its sample."""
         (deviation, tuning), (of_deviation, of_tuning) = self._publishers, self._listeners
         if of_deviation():
-            deviation.publish(self._encode_deviation(estimator.standard_deviation))
+            deviation.publish(self._deviation(estimator.standard_deviation))
         if of_tuning():
             noise, correlation, bandwidth, shares = estimator.tuning
-            tuning.publish(self._encode_tuning(np.array([noise, correlation, bandwidth, *shares])))
+            tuning.publish(self._tuning(np.array([noise, correlation, bandwidth, *shares])))
 
 
 class EventOutput:
@@ -138,10 +136,8 @@ class EventOutput:
     def publish(self, event: Event, unit: str, hardware_id: str) -> str:
         """Publish the begin or the end of an event; return it in words."""
         text, values = described(event, unit)
-        stamp = Time()
-        stamp.sec, stamp.nanosec = divmod(event.stamp, 1_000_000_000)
         level = DiagnosticStatus.WARN if event.begins else DiagnosticStatus.OK
-        self._send(stamp, DiagnosticStatus(
+        self._send(time_message(event.stamp), DiagnosticStatus(
             level=level, name=self._name, message=text, hardware_id=hardware_id,
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         ))  # fmt: skip

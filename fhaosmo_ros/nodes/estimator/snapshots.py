@@ -3,7 +3,7 @@
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
-from fhaosmo_ros.nodes.middleware.messages import array_encoder, message_class
+from fhaosmo_ros.nodes.middleware.messages import labelled, message_class
 from fhaosmo_ros.topics import ARRAY, SNAPSHOT
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -59,8 +59,8 @@ class SnapshotPublisher:
         if stamp is not None:
             labels, vector = pack(Snapshot(stamp, flags, self._estimator.state_dict()))
             if labels != self._labels:  # a state before a gap is there only after one
-                self._labels, self._encode = labels, array_encoder(labels)
-            self._publisher.publish(self._encode(vector))
+                self._labels, self._message = labels, labelled(labels)
+            self._publisher.publish(self._message(vector))
             self._due = self._first = False
 
     def destroy(self) -> None:

@@ -12,8 +12,6 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import Input
-from fhaosmo_ros.messages.layout import names_in
-from fhaosmo_ros.messages.reader import MessageReader
 from fhaosmo_ros.nodes.estimator.listener import Listener, Take
 from fhaosmo_ros.nodes.middleware.definitions import definitions
 from fhaosmo_ros.nodes.middleware.messages import message_class
@@ -23,10 +21,13 @@ from rclpy.clock import Clock, ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 
 DISCOVERY_PERIOD = 0.2
 FRESH = 0.2
 """Seconds for which what was seen of the publishers serves further channels."""
+MOST_WHYS = 3
+"""Different reasons that are told, of a publisher that always has another one."""
 NOBODY = Publishers({}, {})
 
 
@@ -66,8 +67,8 @@ class Source:
         self._listeners: list[Listener] = []
         self.after: Callable[[], None] | None = None
         """Called after each message."""
-        self._reader: MessageReader | None = None
-        self._heard: list[Listener] = []  # those with a field, in the order of the reader
+        self._heard: list[Listener] = []  # those with a field
+        self._whys: set[str] = set()
         self._subscription: Any = None
         self._watch: PublisherWatch | None = None
         self._seen, self._seen_at = NOBODY, -FRESH
@@ -77,7 +78,7 @@ class Source:
         self.on_names: Callable[[list[str]], None] | None = None
         """Called with the names in a message when they are not those of the one before."""
         self.on_type: Callable[[], None] = lambda: None
-        self._pattern: object = None
+        self._names: list[str] = []
 
     def expect_type(self, message_type: str) -> None:
         """
@@ -97,9 +98,9 @@ class Source:
         if message_type and not self.message_type:
             self.message_type, self._from_graph = message_type, False
 
-    def add(self, wanted: Input, take: Take, logger: Any, first: bool = False) -> Listener:
+    def add(self, wanted: Input, take: Take, first: bool = False) -> Listener:
         """Add a listener; a `first` one hears a message before those that are not."""
-        listener = Listener(wanted, take, self, logger, is_sample=not first)
+        listener = Listener(wanted, take, self, is_sample=not first)
         if first:
             self._listeners.insert(0, listener)
         else:
@@ -163,11 +164,6 @@ class Source:
                 self._begin_discovery()
         return self._seen
 
-    def missing(self, listener: Listener) -> str:
-        """Return why the latest message lacked the field of a listener."""
-        assert self._reader is not None
-        return self._reader.missing.get(self._heard.index(listener), '')
-
     @property
     def stamps(self) -> set[str]:
         """Which stamps its listeners' samples of y have, as far as is known."""
@@ -212,13 +208,13 @@ class Source:
             self._timer = None
 
     def _subscribe(self, message_type: str) -> None:
-        kind = message_class(message_type)
+        self._class = message_class(message_type)
         self._types = definitions(message_type)
         self.message_type = message_type
         self._find_fields()
         self.forget()
         self._subscription = subscribe_with_info(
-            self._node, kind, self.topic, self._on_message, self._qos, raw=True
+            self._node, self._class, self.topic, self._on_message, self._qos, raw=True
         )
         self._watch = PublisherWatch(self._node, self._subscription)
         self._seen_at = -FRESH
@@ -227,48 +223,47 @@ class Source:
         for listener in self._listeners:
             listener.find(self._types, self.message_type)
         self._heard = [listener for listener in self._listeners if listener.field]
-        fields = [listener.field for listener in self._heard if listener.field]
-        self._reader = MessageReader(fields) if fields else None
 
     def _unsubscribe(self) -> None:
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
         self._subscription = self._watch = None
-        self._heard, self._reader = [], None
+        self._heard = []
 
     def _on_message(self, data: bytes, info: Mapping[str, Any]) -> None:
         sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
         if sequence != self._sequence + 1:
             self._count_lost(sequence)
         self._sequence = sequence
-        if self._reader is None:
-            if self.on_names is None:
-                return
-            self._tell_names(data)
-            if self._reader is None:
-                return
+        message, header = None, 0
         try:
-            header, values = self._reader.read(data)
-            if self._reader.pattern is not self._pattern:
-                self._pattern = self._reader.pattern
-                self._tell_names(data)
-        except ValueError:  # rclpy's own conversion would end the node
+            message = deserialize_message(data, self._class)
+        except RuntimeError:  # in a subscription that is not raw it would end the node
             self.damaged += 1
-            header, values = 0, [float('nan')] * len(self._heard)
-        for listener, value in zip(self._heard, values, strict=True):
-            listener.hear(value, header, info)
+        else:
+            self._tell_names(message)
+            if self._heard and self._heard[0].field.header:
+                header = self._heard[0].field.stamp(message)
+        lacking = [li for li in self._heard if not li.hear(message, header, info)]
+        if lacking and len(self._whys) < MOST_WHYS:
+            self._tell_lacking(lacking)
         if self.after is not None:
             self.after()
 
-    def _tell_names(self, data: bytes) -> None:
-        if self.on_names is None:
-            return
-        try:
-            names = names_in(self._types, self.message_type, data)
-        except ValueError:
-            return
-        if names:
-            self.on_names(names)
+    def _tell_names(self, message: Any) -> None:
+        if self.on_names is not None:
+            names = getattr(message, 'name', None)
+            if names and isinstance(names, list) and names != self._names:
+                self._names = names
+                self.on_names(names)
+
+    def _tell_lacking(self, lacking: list[Listener]) -> None:
+        """Tell why a message lacks the field of some listeners, in one line, once a reason."""
+        why = str(lacking[0].why)
+        if why not in self._whys:  # two publishers may alternate
+            self._whys.add(why)
+            more = f' (and {len(lacking) - 1} more like it)' if lacking[1:] else ''
+            self._logger.warning(f'a message on {self.topic} is left out: {why}{more}')
 
     def _count_lost(self, sequence: int) -> None:
         """Count the messages between the publisher's last sequence number and this one."""

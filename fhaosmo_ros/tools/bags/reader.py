@@ -236,7 +236,7 @@ class BagReader:
             The messages have no header, or the bag no publish times.
 
         """
-        if stamp == 'header' and not field.has_header:
+        if stamp == 'header' and not field.header:
             raise ConfigurationError(
                 f'--stamp header: expected messages with a header on {topic}, '
                 f'got {self.message_type(topic)}'
@@ -246,7 +246,7 @@ class BagReader:
                 f'--stamp source: expected an mcap bag, got {self.path} without publish times'
             )
         if stamp == 'auto':
-            stamp = 'header' if field.has_header else 'source'
+            stamp = 'header' if field.header else 'source'
         samples = self._samples(topic, field, stamp)
         with _readable(self.path):
             while rows := list(islice(samples, BLOCK)):

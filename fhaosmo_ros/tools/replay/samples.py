@@ -48,7 +48,7 @@ class Samples:
         self._reader, self._backwards = reader, arguments.backwards == 'error'
         self._every, self._seen, self._taken = arguments.every, 0, 0
         self._field = reader.field(topic, y.field, y.name)
-        if self._stamp == 'auto' and not self._field.has_header:
+        if self._stamp == 'auto' and not self._field.header:
             # An estimator that used its clock took a sample when it came, not when it was sent.
             self._stamp = 'bag' if estimator.parameters['sampling'] == 'clock' else 'auto'
         self._other_than_bag = False
@@ -83,8 +83,8 @@ class Samples:
         """Where the stamps came from, in words."""
         if not self._other_than_bag:
             return 'bag'
-        has_header = self._field.has_header and self._stamp != 'source'
-        return 'header of the messages' if has_header else 'source (publish times of the bag)'
+        from_header = self._field.header and self._stamp != 'source'
+        return 'header of the messages' if from_header else 'source (publish times of the bag)'
 
     def __iter__(self) -> Iterator[tuple[int, list[Rows]]]:
         """Yield the number of samples taken, and their estimates."""
