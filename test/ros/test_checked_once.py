@@ -90,7 +90,7 @@ def test_live_change_of_channels_is_prepared_once_in_each(counts, start):
 
 
 def test_warm_up_leaves_no_trace(start):
-    estimator = start(OVERRIDES)._channels.estimator
+    estimator = start(OVERRIDES)._channels.channels[0].estimator
     fresh = OnlineEstimator(OVERRIDES)
     assert estimator.counters == fresh.counters
     assert estimator.estimate is None
@@ -100,13 +100,13 @@ def test_warm_up_leaves_no_trace(start):
 def test_change_acts_on_the_channel(start):
     """What ROS has, the node and its estimator have too."""
     node = start(OVERRIDES)
-    channel = node._channels
+    channel = node._channels.channels[0]
     changes = {'epsilon': 2.0, 'max_gap': 5.0, 'publish_rate': 50.0, 'sampling': 'clock'}
     parameters = [Parameter(name, value=value) for name, value in changes.items()]
     assert node.set_parameters_atomically(parameters).successful
     assert {name: node._node_parameters.values[name] for name in changes} == changes
     for name in ('epsilon', 'max_gap', 'sampling'):
         assert channel.estimator.parameters[name] == changes[name]
-    assert channel._timer.timer_period_ns == 20_000_000
+    assert node._channels._timer.timer_period_ns == 20_000_000
     channel._on_sample(10**18, 0.2, 10**18)
     assert channel.estimator.stamp != 10**18

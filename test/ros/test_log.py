@@ -36,7 +36,7 @@ def node():
 def test_a_slow_sensor_gets_one_warning_of_each_kind(node, capfd, monkeypatch):
     """Each sample comes long after max_gap; without a limit two warnings a sample are logged."""
     monkeypatch.setattr(channel_module, 'QUIET', 3600.0)
-    channel = node._channels
+    channel = node._channels.channels[0]
     said = ''
     for k in range(1, 11):
         channel._on_sample(k * 10**9, math.nan if k == 6 else 0.2, k * 10**9)

@@ -63,7 +63,7 @@ def valid(rng, parameter) -> object:
 
 def test_random_sets(node):
     rng = np.random.default_rng(5)
-    channel = node._channels
+    channel = node._channels.channels[0]
     stamp, accepted, refused = 10**18, 0, 0
     for k in range(COUNT):
         names = rng.choice([*LIVE, *FIXED[:2]], size=rng.integers(1, 4), replace=False)

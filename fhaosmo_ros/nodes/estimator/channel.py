@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """One channel of an estimator node: y (and u) in, one observer, estimates out."""
 
+from collections.abc import Callable
 from functools import partial
 from math import isfinite
 from time import perf_counter, time_ns
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fhaosmo_ros.core.observer.status import REJECTED, Status, UNUSED
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
@@ -16,7 +17,7 @@ from fhaosmo_ros.nodes.estimator.listener import Listener
 from fhaosmo_ros.nodes.estimator.outputs import EventOutput, Outputs, TuningOutputs
 from fhaosmo_ros.nodes.estimator.snapshots import SnapshotPublisher
 from fhaosmo_ros.nodes.estimator.sources import Sources
-from fhaosmo_ros.nodes.estimator.typed_outputs import Output, TypedOutputs
+from fhaosmo_ros.nodes.estimator.typed_outputs import Output
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, WARN
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
@@ -44,13 +45,15 @@ class Channel:
     Parameters
     ----------
     node : Node
-        Owns the topics, the services and the timer.
+        Owns the topics and the services.
     values : Parameters
         Those of an estimator node, as they are for this channel.
     estimator : OnlineEstimator
         Made with `values`.
     sources : Sources
         Of the node. They are not open yet.
+    estimated : callable
+        Called with the channel for each sample that was used.
     name : str
         Of the channel: in its topics and services, its reports and its log; '' without names.
 
@@ -62,9 +65,11 @@ class Channel:
         values: Parameters,
         estimator: OnlineEstimator,
         sources: Sources,
+        estimated: Callable[['Channel'], None],
         name: str = '',
     ) -> None:
         self._node = node
+        self._estimated = estimated
         self.name = name
         outputs = f'~/{name}/' if name else '~/'
         self._clock = node.get_clock()
@@ -74,7 +79,6 @@ class Channel:
         self.estimator = estimator
         self._values = values
         self._read_settings()
-        self._timer: Any = None
         self._active = False
         self._lost_before = 0
         self._forget()
@@ -95,7 +99,6 @@ class Channel:
         for u, its in known.items():
             take = partial(self._on_input, observer.inputs.index(u), u)
             self._u[u] = sources.of(its).add(its, take, first=True)
-        self._typed = self._typed_outputs(values)
         services = [
             node.create_service(Trigger, outputs + 'reset', self.reset),
             node.create_service(SetBool, outputs + 'freeze', self.freeze),
@@ -113,7 +116,6 @@ class Channel:
         self._y.source.forget()
         self._lost_before = self._y.source.lost
         self._active = True
-        self._start_timer()
         if self.estimator.events.on:
             self._events.say('no event yet', self._values['hardware_id'])
         observer = self.estimator.observer
@@ -128,7 +130,6 @@ class Channel:
     def deactivate(self) -> None:
         """Drop samples and publish nothing from now on."""
         self._active = False
-        self._stop_timer()
 
     def destroy(self) -> None:
         """Take the topics and the services away."""
@@ -140,8 +141,6 @@ class Channel:
         if self._tuning is not None:
             self._tuning.destroy()
         self._events.destroy()
-        if self._typed is not None:
-            self._typed.destroy()
         self._snapshots.destroy()
 
     def prepare(self, values: Parameters) -> ChannelChange:
@@ -161,15 +160,12 @@ class Channel:
         found = self.estimator.events.on
         self.estimator.adopt(change.estimator)
         self._snapshots.changed()
-        before, self._values = self._values, change.values
+        self._values = change.values
         if self._active and found != self.estimator.events.on:
             text = 'events are switched off' if found else 'no event yet'
             self._events.say(text, change.values['hardware_id'])
         self._health.limits = change.values
         self._read_settings()
-        if self._active and change.values['publish_rate'] != before['publish_rate']:
-            self._stop_timer()
-            self._start_timer()
 
     def reports(self) -> list[Report]:
         """Return the reports for /diagnostics, on the time since the last ones."""
@@ -213,10 +209,6 @@ class Channel:
             self._values['measurement_unit'], self.estimator.observer.order
         )
         self._clock_stamps = self._values['sampling'] == 'clock'
-        self._each = self._values['publish_on'] == 'sample'
-
-    def _typed_outputs(self, values: Parameters) -> TypedOutputs | None:
-        return TypedOutputs(self._node, values)
 
     def _forget(self) -> None:
         self._arrived = False
@@ -259,44 +251,25 @@ class Channel:
 
     def _take(self, stamp: int, y: float) -> None:
         """Step the observer to a sample."""
-        begin, estimator = perf_counter(), self.estimator
+        begin, estimator, health = perf_counter(), self.estimator, self._health
         word = estimator.advance(stamp, y)
-        self.taken(word, stamp, y, estimator.observer.unknown_input, perf_counter() - begin)
-        if estimator.events.waiting:
-            self.tell_events()
-        if self._each and not word & UNUSED:
-            self.publish()
-
-    def taken(
-        self, word: int, stamp: int, y: float, unknown_input: float, duration: float
-    ) -> None:
-        """
-        Remember, and log, what became of a sample.
-
-        Parameters
-        ----------
-        word : int
-            Status word of its step.
-        stamp, y
-            The sample.
-        unknown_input : float
-            Estimate of d after the sample.
-        duration : float
-            Time that the step took, in seconds.
-
-        """
-        self._health.durations.append(duration)
-        if not word & UNUSED:
-            health = self._health
+        now = perf_counter()
+        health.durations.append(now - begin)
+        used = not word & UNUSED
+        if used:
             self._arrived = True
             self._snapshots.accepted(stamp)
-            health.latest = perf_counter()
+            health.latest = now
             health.stamps.append(stamp)
-            health.unknown_inputs.append(unknown_input)
+            health.unknown_inputs.append(estimator.observer.unknown_input)
         if word & TOLD:
             self._tell(word, stamp, y)
+        if estimator.events.waiting:
+            self._tell_events()
+        if used:
+            self._estimated(self)
 
-    def tell_events(self) -> None:
+    def _tell_events(self) -> None:
         """Publish, and log, the events that have begun or ended."""
         for event in self.estimator.events.taken():
             text = self._events.publish(event, self._unit, self._values['hardware_id'])
@@ -345,26 +318,7 @@ class Channel:
                 throttle_duration_sec=QUIET,
             )
 
-    def _start_timer(self) -> None:
-        self._timer = self._node.create_timer(1.0 / self._values['publish_rate'], self._tick)
-
-    def _stop_timer(self) -> None:
-        if self._timer is not None:
-            self._node.destroy_timer(self._timer)
-            self._timer = None
-
-    def _tick(self) -> None:
-        self.end_waiting()
-        if not self.is_stale() and not self._each:
-            self.publish()
-
-    def publish(self) -> None:
-        """Publish the latest estimate."""
-        output = self.output()
-        if output is not None and self._typed is not None:
-            self._typed.publish([output])
-
-    def output(self) -> Output | None:
+    def publish(self) -> Output | None:
         """Publish the numbers of the latest estimate; return it for the typed messages."""
         estimator = self.estimator
         estimate = estimator.estimate

@@ -13,14 +13,12 @@ from fhaosmo_ros.core.parameters.per_channel import (
     FROM_JOINTS,
     of_channel,
     split,
-    UNNAMED,
     with_own_parameters,
 )
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import measured_output, with_joints
-from fhaosmo_ros.nodes.estimator.channel import Channel
-from fhaosmo_ros.nodes.estimator.channel_group import ChannelGroup, make_estimators
 from fhaosmo_ros.nodes.estimator.channel_inheritance import ChannelInheritance
+from fhaosmo_ros.nodes.estimator.channels import Channels, make_estimators
 from fhaosmo_ros.nodes.estimator.joints import Joints
 from fhaosmo_ros.nodes.estimator.listener import check_inputs
 from fhaosmo_ros.nodes.estimator.parameter_topic import ParameterTopic
@@ -75,7 +73,7 @@ class EstimatorNode(ManagedNode):
             with_own_parameters(values[CHANNELS], values), overrides
         )
         self._sources: Sources | None = None
-        self._channels: Channel | ChannelGroup | None = None
+        self._channels: Channels | None = None
         self._parameter_topic: ParameterTopic | None = None
         self._clock_watch = ClockWatch(self)
         self._diagnostics = DiagnosticsPublisher(
@@ -136,10 +134,7 @@ class EstimatorNode(ManagedNode):
     def _make_channels(self, estimators: dict[str, OnlineEstimator]) -> None:
         values = self._node_parameters.values
         assert self._sources is not None
-        if self._names == UNNAMED:
-            self._channels = Channel(self, values, *estimators.values(), self._sources)
-        else:
-            self._channels = ChannelGroup(self, values, estimators, self._sources)
+        self._channels = Channels(self, values, estimators, self._sources)
         if self._from_joints:
             self._sources.of(measured_output(values)).on_names = self._take_joints
         self._sources.open()
