@@ -21,7 +21,7 @@ from setuptools.command.build_ext import build_ext
 NAME = 'fhaosmo_ros'
 FOR_ROS2_RUN = bool({'install', 'develop'} & set(sys.argv))
 CHECK = ['hypothesis', 'pytest', 'pytest-rerunfailures', 'pytest-xdist']
-TUNE = ['cmaes', 'control', 'optuna>=4,<6']
+TUNE = ['cmaes', 'optuna>=4,<6']
 DOCS = ['myst-parser', 'sphinx', 'sphinx-rtd-theme']
 
 

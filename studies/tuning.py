@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-`python -m studies.tuning` measures what docs/tuning.md says of tune: bags, samplers, presets.
+`python -m studies.tuning` measures what docs/tuning.md says of tune: bags, presets.
 
 bags: gains that `tune --bag` finds without the truth, on other recordings of the same kind, beside
-a Kalman filter that is tuned with the truth of these. samplers: CMA-ES against TPE, the same
-problems, starts and numbers of trials. presets: config/noise_*.yaml on held-out recordings, beside
-Kalman filters whose model of d (a random walk; a decaying one) and bandwidth were scanned on the
-presets' own training recordings.
+a Kalman filter that is tuned with the truth of these. presets: config/noise_*.yaml on held-out
+recordings, beside Kalman filters whose model of d (a random walk; a decaying one) and bandwidth
+were scanned on the presets' own training recordings.
 """
 
 import argparse
@@ -32,16 +31,12 @@ from fhaosmo_ros.tools.cli.share import shipped
 from fhaosmo_ros.tools.tuning.identification.checks import refuse, refuse_unseen
 from fhaosmo_ros.tools.tuning.identification.gains import make_gains
 from fhaosmo_ros.tools.tuning.identification.identify import identify_input
+from fhaosmo_ros.tools.tuning.linear_gains import kalman_like, SampledModel
 from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.search.minimise import minimise, StudyOptions
-from fhaosmo_ros.tools.tuning.search.space import changes
 from fhaosmo_ros.tools.tuning.sensor import identify
 from fhaosmo_ros.tools.tuning.source import RecordedOutput, simulated
-from fhaosmo_ros.tools.tuning.start.find import SCHEME
-from fhaosmo_ros.tools.tuning.start.sampled_model import SampledModel
-from fhaosmo_ros.tools.tuning.start.theory import kalman_like
-from fhaosmo_ros.tools.tuning.tuner import Tuner
+from fhaosmo_ros.tools.tuning.start import SCHEME
 import numpy as np
 from studies import everywhere
 from studies.comparison.evaluation import METHODS, tune
@@ -65,17 +60,6 @@ steady-state Kalman filter for a slow d takes so long to start."""
 BAG, JUDGED, SEEDS = 60.0, 30.0, (2, 3)
 """Duration of a bag and of the recordings that judge (s); seeds of these."""
 FILTER_TRIALS = 80
-
-SAMPLERS = ('cmaes', 'tpe')
-TRIALS, STUDIES = 600, 3
-COMMON = {'sample_rate': 200.0, 'recordings': 6, 'held_out': 10, 'integration_step': 1e-3}
-PENDULUM = {'order': 2, 'phi': ['0', '-19.62*sin(z1) - 0.3*z2 - 0.5*tanh(z2/0.1)']}
-PROBLEMS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "paper's plant, noise 1e-4": ({'noise_std': 1e-4}, {}),
-    "paper's plant, noise 1e-3, cascade": ({'noise_std': 1e-3}, {'structure': 'cascade'}),
-    'pendulum, noise 5e-4': (PENDULUM | {'noise_std': 5e-4, 'rms_of_d': 2.8}, {}),
-}
-"""Parameters of the family, and of the estimator."""
 
 NOISES, RECORDINGS = ('1e-4', '1e-3', '1e-2'), 36
 WIDE, LINEAR = 1e4, 1e-5
@@ -171,49 +155,6 @@ def bags_table(results: dict[str, Any]) -> str:
     return '\n'.join([*lines, '', total, '', *(f'- {k}: {row}.' for k, row in crossed.items())])
 
 
-def samplers(tick: Tick) -> dict[str, Any]:
-    """Return objectives (training, held out) at the start and after each search."""
-    results: dict[str, Any] = {}
-    for problem in PROBLEMS:
-        tuner, start = problem_of(problem)
-        row: dict[str, Any] = {'start': [_kept(x.objective) for x in (
-            tuner.training(start), tuner.held_out(start)
-        )]}  # fmt: skip
-        for sampler in SAMPLERS:
-            row[sampler] = []
-            for seed in range(1, STUDIES + 1):
-                options = StudyOptions(seed, sampler)
-                result = minimise(tuner.evaluate, tuner.space, TRIALS, options, jobs=1)
-                held_out = tuner.held_out(changes(result.best)).objective
-                row[sampler].append([_kept(result.value), _kept(held_out)])
-                tick()
-        results[problem] = row
-    return results
-
-
-def problem_of(name: str) -> tuple[Tuner, dict[str, Any]]:
-    """Return a problem and where its searches start."""
-    family, estimator = PROBLEMS[name]
-    values = TUNE_PARAMETERS.complete(COMMON | family)
-    tuner = Tuner(simulated(values, 1), estimator, values, 1)
-    return tuner, changes({d.name: d.start for d in tuner.space})
-
-
-def samplers_table(results: dict[str, Any]) -> str:
-    """Return the table."""
-    lines = [
-        '| problem | start | CMA-ES | held out | TPE | held out | start, held out |',
-        '|---' * 7 + '|',
-    ]
-    for problem, row in results.items():
-        cells = [f'{row["start"][0]:.4f}']
-        for sampler in SAMPLERS:
-            for column in np.transpose(row[sampler]):
-                cells.append(f'{column.mean():.4f} ({column.max():.4f})')
-        lines.append(f'| {problem} | {" | ".join(cells)} | {row["start"][1]:.4f} |')
-    return '\n'.join(lines)
-
-
 def presets(tick: Tick) -> dict[str, Any]:
     """Return error and objective on held-out recordings, by noise."""
     return {noise: presets_at(noise, tick) for noise in NOISES}
@@ -276,7 +217,6 @@ def presets_table(results: dict[str, Any]) -> str:
 
 PARTS: dict[str, tuple[Callable[[Tick], dict[str, Any]], Callable[[dict[str, Any]], str], int]] = {
     'bags': (bags, bags_table, len(BAGS) * len(KINDS)),
-    'samplers': (samplers, samplers_table, len(PROBLEMS) * len(SAMPLERS) * STUDIES),
     'presets': (presets, presets_table, len(NOISES) * len(DECAYS)),
 }
 """What measures a part, what makes its table, and how many steps the first one has."""

@@ -4,13 +4,13 @@
 from fhaosmo_ros.core import ConfigurationError, TriangularModel
 from fhaosmo_ros.core.simulation.plant import Plant
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.tuning.start.sampled_model import pair, SampledModel
+from fhaosmo_ros.tools.tuning.linear_gains import SampledModel
 import numpy as np
 import pytest
 from scipy.linalg import expm
 from studies.comparison.evaluation import METHODS
 from studies.comparison.methods.adaptive import ADAPTIVE
-from studies.comparison.methods.linear import FILTERS
+from studies.comparison.methods.linear import FILTERS, pair, placed
 from studies.comparison.methods.method import Setting
 
 MODELS = {
@@ -57,7 +57,7 @@ def test_poles_lie_where_they_were_asked(name, period, speed):
     poles = [*pair(speed, 0.6), *pair(2.0 * speed, 1.5)][: model.order + 1]
     if len(poles) == 3:
         poles = [*pair(speed, 0.6), complex(-speed)]
-    gain = SampledModel(model, period).placed(poles)
+    gain = placed(SampledModel(model, period), poles)
     found = np.linalg.eigvals(error_transition(rates(model), period, gain))
     found = np.log(found.astype(complex)) / period
     np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(poles), rtol=2e-2)
@@ -130,7 +130,7 @@ def test_prediction_equals_the_matrix_exponential():
     setting = Setting(model, 1e-2, 1.0, 0.0)
     r = recording(model, np.arange(0.0, 0.5, 1e-2), [0.0, 4.0], 0.5, u=0.1)
     wrong = r._replace(y=r.y + 0.1)
-    gain = SampledModel(model, 1e-2, integrators_only=True).placed([-9.0] * 3)
+    gain = placed(SampledModel(model, 1e-2, integrators_only=True), [-9.0] * 3)
     found = method.prepare(setting, {'bandwidth': 9.0})(wrong)['filtered']
     a, b = rates(model), np.array([0.0, 50.0, 0.0])
     extended = expm(np.block([[a, b[:, None]], [np.zeros((1, 4))]]) * 1e-2)

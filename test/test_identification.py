@@ -1,11 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `tune` finds in a y without the truth (D 30), and when it refuses."""
 
-import numpy as np
-import pytest
-
-pytest.importorskip('control', reason='python-control is not installed (extra: tune)')
-
 from fhaosmo_ros.core import Observer, TriangularModel
 from fhaosmo_ros.core.observer.kalman import LinearModel, stationary
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
@@ -25,6 +20,8 @@ from fhaosmo_ros.tools.tuning.identification.likelihood import (
 )
 from fhaosmo_ros.tools.tuning.sensor import identify
 from fhaosmo_ros.tools.tuning.source import RecordedOutput
+import numpy as np
+import pytest
 from scipy.signal import lfilter
 
 H, K = 5e-3, 4000

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `tune`: its output, its inputs, its ends; few trials each."""
 
+from contextlib import closing
 import os
 from pathlib import Path
 import re
 import signal
+import sqlite3
 import subprocess
 import sys
 
@@ -20,7 +22,7 @@ from fhaosmo_ros.tools.tuning.objective import Evaluation, Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.sensor import identify, noise_at_stamps
 from fhaosmo_ros.tools.tuning.source import simulated, TuningData
-from fhaosmo_ros.tools.tuning.start.theory import candidates
+from fhaosmo_ros.tools.tuning.start import candidates
 import numpy as np
 import pytest
 from waiting import wait_until
@@ -29,9 +31,8 @@ pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
 pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
 
 from fhaosmo_ros.tools.tuning import report
-from fhaosmo_ros.tools.tuning.search.minimise import Dimension, StudyOptions
-from fhaosmo_ros.tools.tuning.search.study import FinishedTrial
-from fhaosmo_ros.tools.tuning.tuner import pareto_front, PARETO_WEIGHTS, TrialScores, Tuner
+from fhaosmo_ros.tools.tuning.search import Dimension
+from fhaosmo_ros.tools.tuning.tuner import Tuner
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = {'duration': 4.0, 'integration_step': 1e-3, 'sample_rate': 200.0}
@@ -44,7 +45,7 @@ QUICK = [f'-p{name}:={value}' for name, value in SHORT.items()] + [
     '--trials=12',
     '--jobs=2',
 ]
-FILES = ['estimates.png', 'gains.yaml', 'report.md', 'sensitivity.png', 'study.journal']
+FILES = ['estimates.png', 'gains.yaml', 'report.md']
 
 
 def command(*arguments, **options):
@@ -56,10 +57,6 @@ def command(*arguments, **options):
         env=os.environ | {'PYTHONPATH': str(ROOT)},
         **options,
     )
-
-
-def published(journal):
-    return journal.read_text().count('"worker"') if journal.exists() else 0
 
 
 # output
@@ -108,20 +105,6 @@ def test_given_gains_are_where_it_begins_if_they_are_better(tmp_path):
     before, _, tuned, _ = map(float, row.split('|')[2:6])
     assert 'given, training' in report
     assert tuned <= 1.006 * before  # rounded
-
-
-def test_front_of_error_and_chatter(tmp_path):
-    out = tmp_path / 'out'
-    assert main([*QUICK, '--pareto', '--trials=60', '-o', str(out)]) == 0
-    assert (out / 'pareto.png').stat().st_size > 10_000
-    assert '(pareto.png)' in (out / 'report.md').read_text()
-
-
-def test_front_drops_what_is_beaten():
-    pairs = [(2.0, 3.0), (1.0, 5.0), (4.0, 1.0), (2.0, 2.0), (3.0, 2.0)]
-    trials = [FinishedTrial({}, (0.0, 0.0, error, chatter, 9.0)) for error, chatter in pairs]
-    found = [(scores.error, scores.chatter) for scores in pareto_front(trials, 'chatter')]
-    assert found == [(1.0, 5.0), (2.0, 2.0), (4.0, 1.0)]
 
 
 def test_sections_of_a_file(tmp_path):
@@ -274,10 +257,12 @@ def test_bag_that_is_too_short(tmp_path, capsys):
 
 @pytest.mark.signals
 def test_interrupt_keeps_the_best(tmp_path):
-    out = tmp_path / 'out'
-    process = command(*QUICK, '--trials=1000000', '-o', out)
+    out, storage = tmp_path / 'out', tmp_path / 'study.db'
+    process = command(
+        *QUICK, '--jobs=1', '--trials=1000000', '--storage', f'sqlite:///{storage}', '-o', out
+    )
     try:
-        wait_until(lambda: published(tmp_path / 'out.journal') > 20, 'trial')
+        wait_until(lambda: finished(storage) > 3, 'trial', process=process)
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=60.0)
     finally:
@@ -288,63 +273,24 @@ def test_interrupt_keeps_the_best(tmp_path):
     load(out / 'gains.yaml', 'estimator')
 
 
-@pytest.mark.signals
-def test_killed_run_goes_on(tmp_path, capsys):
-    out, journal = tmp_path / 'out', tmp_path / 'out.journal'
-    process = command(*QUICK, '--trials=1000000', '-o', out)
-    try:
-        wait_until(lambda: published(journal) > 20, 'trial')
-    finally:
-        process.kill()
-        process.wait()
-    assert not out.exists()
-    kept = published(journal)
-    assert main([*QUICK, f'--trials={kept + 5}', '-o', str(out)]) == 0
-    assert 'goes on' in capsys.readouterr().out
-    count = published(out / 'study.journal')
-    assert 0 <= count - (kept + 5) <= 1  # of two threads each may begin a last trial
-    assert f'({count} trials' in (out / 'gains.yaml').read_text()
-    assert not journal.exists()
+def finished(storage):
+    """Return how many trials the data base of a study holds."""
+    if not storage.exists():
+        return 0
+    with closing(sqlite3.connect(storage)) as base:
+        try:
+            return base.execute("SELECT count(*) FROM trials WHERE state='COMPLETE'").fetchone()[0]
+        except sqlite3.OperationalError:  # its tables are made right now
+            return 0
 
 
-@pytest.mark.signals
-def test_two_processes_share_a_study(tmp_path):
-    storage = tmp_path / 'shared.log'
-    workers = [
-        command(*QUICK, '--jobs=1', '--trials=1200', '--storage', storage, '-o', tmp_path / name)
-        for name in 'ab'
-    ]
-    try:
-        results = [worker.communicate(timeout=150.0) for worker in workers]
-    finally:
-        for worker in workers:
-            worker.kill()
-            worker.wait()
-    assert [worker.returncode for worker in workers] == [0, 0], results
-    both = storage.read_text().split('"worker":"')[1:]
-    assert len({text.split('"')[0] for text in both}) == 2
-    # Each learns of the other's trials ten times a second.
-    assert 1200 <= len(both) < 1400
-    assert 'study.journal' not in [path.name for path in (tmp_path / 'a').iterdir()]
-
-
-def test_storage_that_fails_in_the_middle_leaves_the_best_so_far(tmp_path, monkeypatch, capsys):
-    out, file, calls = tmp_path / 'out', tmp_path / 'study.db', []
-    evaluate = Tuner.evaluate
-
-    def fail_later(self, values):
-        calls.append(values)
-        if len(calls) == 10:
-            file.write_bytes(b'damaged')
-        return evaluate(self, values)
-
-    monkeypatch.setattr(Tuner, 'evaluate', fail_later)
-    assert main([*QUICK, '--storage', f'sqlite:///{file}', '-o', str(out)]) == 1
-    errors = [x for x in capsys.readouterr().err.splitlines() if x.startswith('tune: error')]
-    assert len(errors) == 1
-    assert re.search(r"study\.db' failed after 1\d trials: .*best gains so far", errors[0])
-    assert sorted(path.name for path in out.iterdir()) == FILES[:-1]
-    load(out / 'gains.yaml', 'estimator')
+def test_storage_holds_what_the_next_run_goes_on_with(tmp_path):
+    storage = ['--storage', f'sqlite:///{tmp_path}/study.db', '--jobs=1']
+    for trials in (4, 6):
+        out = tmp_path / str(trials)
+        assert main([*QUICK, *storage, f'--trials={trials}', '-o', str(out)]) == 0
+        assert f'({trials} trials' in (out / 'gains.yaml').read_text()
+    assert finished(tmp_path / 'study.db') == 6
 
 
 # wrong input
@@ -547,47 +493,23 @@ def test_held_out_recordings_are_others_with_the_scale_of_the_training():
     np.testing.assert_array_equal(tuner.held_out.scale, tuner.training.scale)
 
 
-def searched(monkeypatch, cost, pareto=None):
+def searched(monkeypatch, cost):
     """Return the result of a search in lambda whose trials cost what `cost` says."""
     values = TUNING.changed({'recordings': 1, 'search': ['lambda 1 100'], 'noise_std': 1e-3})
     estimator = {'scheme': 'explicit', 'variant': 'sign', 'unknown_input': False}
     tuner = Tuner(simulated(values, 1), estimator, values, 1)
     monkeypatch.setattr(tuner, 'evaluate', cost)
-    return tuner.search(180 if pareto else 20, 1, StudyOptions(), pareto, lambda: False)
+    return tuner.search(20)
 
 
 @pytest.mark.parametrize(('loss', 'rounds'), [(1e-4, True), (1e-1, False)])
 def test_gains_are_rounded_only_where_that_costs_little(monkeypatch, loss, rounds):
     def cost(values):
         rounded = all(v == float(f'{v:.4g}') for v in values.values())
-        objective = sum(values.values()) * (1.0 + loss * rounded)
-        return TrialScores(objective, objective, 0.0, 0.0)
+        return sum(values.values()) * (1.0 + loss * rounded)
 
     best = searched(monkeypatch, cost).best
     assert all(v == float(f'{v:.4g}') for v in best.values()) is rounds
-
-
-def test_each_search_of_a_front_weighs_the_second_objective(monkeypatch):
-    """The error falls and the chatter rises along x: the best x depends on the weight."""
-
-    def cost(values):
-        x = sum(np.log10(v) for v in values.values()) / len(values)  # 0 .. 2
-        return TrialScores(1.0, 1.0 + (2.0 - x) ** 2, x, 0.0)
-
-    trials = searched(monkeypatch, cost, 'chatter').trials
-    for trial in trials:
-        weight = (trial.values[0] - trial.values[2]) / trial.values[3]
-        assert min(abs(weight / w - 1.0) for w in PARETO_WEIGHTS) < 1e-6
-    weights = {round((t.values[0] - t.values[2]) / t.values[3], 6) for t in trials}
-    assert weights == set(PARETO_WEIGHTS)
-
-
-@pytest.mark.parametrize('second', ['chatter', 'settling'])
-def test_front_is_of_error_and_the_second_objective(second):
-    rows = [(1.0, 3.0, 5.0), (2.0, 2.0, 4.0), (3.0, 4.0, 1.0)]
-    trials = [FinishedTrial({}, (0.0, 0.0, *row)) for row in rows]
-    found = [getattr(scores, second) for scores in pareto_front(trials, second)]
-    assert found == {'chatter': [3.0, 2.0], 'settling': [5.0, 4.0, 1.0]}[second]
 
 
 def column(error):

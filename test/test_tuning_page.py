@@ -7,8 +7,6 @@ import pytest
 
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
 pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
-pytest.importorskip('control', reason='python-control is not installed (extra: tune)')
-
 from studies import tuning
 
 REWRITE = 'run python -m studies.tuning'
@@ -24,13 +22,6 @@ def test_a_bag_gives_gains_of_the_documented_error(documented):
     name, kind = 'motor', 'square'
     error = tuning.error_with(tuning.gains_of_bag(name, kind), tuning.judging(name, kind))
     assert error == pytest.approx(documented['bags'][name][kind]['error'], rel=0.05), REWRITE
-
-
-def test_a_search_starts_where_the_page_says(documented):
-    name = 'pendulum, noise 5e-4'
-    tuner, start = tuning.problem_of(name)
-    found = [tuner.training(start).objective, tuner.held_out(start).objective]
-    assert found == pytest.approx(documented['samplers'][name]['start'], rel=0.01), REWRITE
 
 
 def test_a_preset_has_the_documented_error(documented):

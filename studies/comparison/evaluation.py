@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.objective import SMALLEST
-from fhaosmo_ros.tools.tuning.search.minimise import BAD, Dimension, minimise, StudyOptions
+from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
 import numpy as np
 from studies.comparison.cells import Sensor
 from studies.comparison.methods.adaptive import ADAPTIVE
@@ -109,7 +109,7 @@ def tune(
     elif len(space) == 1:
         values = _scan(judged, space[0], trials)
     elif space:
-        values = minimise(judged, space, trials, StudyOptions(seed), jobs=1).best
+        values = minimise(judged, space, trials, seed).best
     found = trial(method, setting, values, recordings)
     return Tuned(dict(values), found.readout or 'filtered', found.value)
 

@@ -14,7 +14,7 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.recording_parameters import SENSOR
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.cli.command import Interrupted, run_command, without_password
+from fhaosmo_ros.tools.cli.command import Interrupted, run_command
 from fhaosmo_ros.tools.cli.options import add_input_options, assigned, bag_inputs
 from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
@@ -27,7 +27,7 @@ from fhaosmo_ros.tools.tuning.source import (
 )
 
 TRIALS = 1000
-NEEDED = ('optuna>=4,<6', 'cmaes', 'control')
+NEEDED = ('optuna>=4,<6', 'cmaes')
 """Only this command needs them, so a robot may lack them."""
 BOTH = ParameterTable(
     TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values(), ESTIMATOR_PARAMETERS.families
@@ -41,9 +41,9 @@ def main(argv: list[str] | None = None) -> int:
     Returns
     -------
     int
-        0 if the output is complete (also where Ctrl-C ended the search early). 1 if the storage
-        failed in the middle: the output has the best gains so far. Otherwise nothing is written:
-        1 without `NEEDED`, 2 for wrong input, 130 if it was interrupted before the first trial.
+        0 if the output is complete (also where Ctrl-C ended the search early). Otherwise nothing
+        is written: 1 without `NEEDED`, 2 for wrong input or a storage that fails, 130 if it was
+        interrupted before the first trial.
 
     """
     return run_command(_parser(), argv, _tune, needs=NEEDED)
@@ -63,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         default=Path('tune_output'),
         metavar='FOLDER',
-        help='for gains.yaml, report.md and the figures (default: %(default)s)',
+        help='for gains.yaml, report.md and a figure (default: %(default)s)',
     )
     add('--force', action='store_true', help='replace an output that exists')
     add(
@@ -91,19 +91,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     add('--jobs', type=int, metavar='N', help='trials at a time (default: one a core)')
     add('--seed', type=int, default=1, help='of recordings and search (default: %(default)s)')
-    add('--sampler', choices=('cmaes', 'tpe', 'random'), default='cmaes', help='(%(default)s)')
-    add(
-        '--pareto',
-        choices=('chatter', 'settling'),
-        nargs='?',
-        const='chatter',
-        help='search the front of the error and this one',
-    )
     add(
         '--storage',
         metavar='URL',
-        help='of an Optuna study that several tune share: a data base such as '
-        'postgresql://..., or a file for a journal (default: FOLDER.journal)',
+        help='data base of an Optuna study that several tune share, and that can be continued: '
+        'sqlite:///study.db, postgresql+psycopg://... (default: in memory)',
     )
     bag = parser.add_argument_group('from a bag')
     add = bag.add_argument
@@ -119,7 +111,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _tune(arguments: argparse.Namespace, stop: Stop) -> int:
-    from fhaosmo_ros.tools.tuning.search.minimise import StudyOptions
     from fhaosmo_ros.tools.tuning.tuner import Tuner
     from fhaosmo_ros.tools.tuning.writer import write
 
@@ -143,28 +134,13 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> int:
         )
         jobs = arguments.jobs or os.cpu_count() or 1
         tuner = Tuner(data, estimator, values, arguments.seed, jobs, stop.is_set)
-        storage = arguments.storage or f'{arguments.output}.journal'
-        if arguments.storage is None and Path(storage).exists():
-            print(f'{storage}: of a run that was cut short; goes on where it asked the same')
-        options = StudyOptions(arguments.seed, arguments.sampler, storage)
-        result = tuner.search(arguments.trials, jobs, options, arguments.pareto, stop.is_set)
+        result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
         if result is None:
             raise Interrupted('before the first trial: nothing was written')
         text = write(output.path, tuner, result, arguments.command_line)
-        if arguments.storage is None and result.failure is None:
-            # The journal of a complete study belongs to the output; the next run starts a new one.
-            Path(storage).replace(output.path / 'study.journal')
-            Path(f'{storage}.lock').unlink(missing_ok=True)
         final = output.keep()
     _say_where(text, final)
-    if result.failure is None:
-        return 0
-    print(
-        f'tune: error: storage {without_password(storage)!r} failed after {len(result.trials)} '
-        f'trials: {result.failure}; {final} has the best gains so far',
-        file=sys.stderr,
-    )
-    return 1
+    return 0
 
 
 def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -194,7 +170,7 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
 
 def _say_where(text: str, folder: Path) -> None:
     print(f'\n{text}\n')
-    print(f'output: {folder}/gains.yaml, report.md, figures')
+    print(f'output: {folder}/gains.yaml, report.md, estimates.png')
     print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {folder}/gains.yaml')
 
 
@@ -209,7 +185,7 @@ def _identify(
     """Write the gains for what y itself shows; return the report's main part."""
     from fhaosmo_ros.tools.tuning.identification import checks, gains, output
     from fhaosmo_ros.tools.tuning.identification.identify import identify_input
-    from fhaosmo_ros.tools.tuning.start.find import chosen_otherwise
+    from fhaosmo_ros.tools.tuning.start import chosen_otherwise
 
     others = chosen_otherwise(estimator)
     if others:

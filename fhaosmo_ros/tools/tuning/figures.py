@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a tuning: estimates before and after, sensitivity, front of two objectives."""
+"""Figures of a tuning."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.plot.figures import DASHES, TRUTH
-from fhaosmo_ros.tools.tuning.search.minimise import Dimension
-from matplotlib.axes import Axes
+from fhaosmo_ros.tools.plot.figures import TRUTH
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +13,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 BEFORE = {'color': '#999999', 'linewidth': 0.9, 'label': 'before'}
 AFTER = {'color': '#D55E00', 'linewidth': 1.2, 'linestyle': '--', 'label': 'tuned'}
-COLUMNS = 4
-HIGHEST = 2.0
-"""Upper end of the axis of the sensitivity, in units of the best objective."""
 
 
 def save_estimates(
@@ -107,72 +102,4 @@ def save_identified(
     below.legend(loc='upper right', fontsize='small')
     for axes in (above, below):
         axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=150)
-
-
-def save_sensitivity(
-    curves: Mapping[str, tuple[Floats, Floats]],
-    space: Sequence[Dimension],
-    best: Mapping[str, float],
-    objective: float,
-    path: Path,
-) -> None:
-    """
-    Draw the objective over each parameter alone.
-
-    Parameters
-    ----------
-    curves : mapping
-        Values and objectives by the dimension's name.
-    space : sequence of Dimension
-    best : mapping
-        Values by name.
-    objective : float
-        At `best`.
-    path : path
-
-    """
-    count = len(space)
-    columns = min(COLUMNS, count)
-    rows = -(-count // columns)
-    figure = Figure(figsize=(2.3 * columns + 0.6, 1.7 * rows + 0.7), layout='constrained')
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
-    for axes in grid.flat[count:]:
-        axes.set_axis_off()
-    for axes, d in zip(grid.flat, space, strict=False):
-        x, value = curves[d.name]
-        axes.plot(x, np.minimum(value, 10.0 * objective), color='#0072B2', marker='.', lw=1.2)
-        axes.plot([best[d.name]], [objective], color='#D55E00', marker='o', ls='none')
-        if d.log:  # matplotlib's own labels overlap in a panel as small as this
-            axes.set_xscale('log')
-            ticks = np.geomspace(np.min(x), np.max(x), 3)
-            axes.set_xticks(ticks, [f'{tick:.2g}' for tick in ticks])
-            axes.minorticks_off()
-        axes.set_title(d.name, fontsize='medium')
-        axes.grid(alpha=0.3)
-        axes.set_ylim(0.95 * objective, HIGHEST * objective)
-    figure.supylabel('objective (training)')
-    figure.supxlabel('value of this parameter alone; the dot is the tuned one', fontsize='medium')
-    figure.savefig(path, dpi=150)
-
-
-def save_front(
-    all_values: Floats, front: Floats, chosen: Floats, names: tuple[str, str], path: Path
-) -> None:
-    """Draw two objectives of all trials, the front of them, and the one that was taken."""
-    figure = Figure(figsize=(6.5, 4.5), layout='constrained')
-    axes: Axes = figure.subplots()
-    axes.plot(*all_values.T, color='#999999', marker='.', ls='none', ms=3, label='trials')
-    axes.step(
-        *front.T, where='post', color='#0072B2', marker='o', ms=3, ls=DASHES[0], label='front'
-    )
-    axes.plot(*chosen, color='#D55E00', marker='*', ms=14, ls='none', label='taken')
-    for k, setter in enumerate((axes.set_xlim, axes.set_ylim)):
-        low, high = front[:, k].min(), front[:, k].max()
-        margin = 0.5 * (high - low) or 0.1 * abs(high) or 1.0
-        setter(low - 0.2 * margin, high + margin)
-    axes.set_xlabel(names[0])
-    axes.set_ylabel(names[1])
-    axes.grid(alpha=0.3)
-    axes.legend()
     figure.savefig(path, dpi=150)

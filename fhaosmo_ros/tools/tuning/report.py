@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.tools.tuning.objective import Evaluation, Objective
-from fhaosmo_ros.tools.tuning.search.minimise import Dimension
+from fhaosmo_ros.tools.tuning.search import Dimension
 from fhaosmo_ros.tools.tuning.source import TuningData
 import numpy as np
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One tuning: from recordings and parameters to the best gains, before anything is written."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import hashlib
 import json
 import math
@@ -12,13 +12,11 @@ from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools.cli.progress import progress
-from fhaosmo_ros.tools.tuning.objective import Objective
-from fhaosmo_ros.tools.tuning.search.minimise import minimise, StudyOptions, Values
-from fhaosmo_ros.tools.tuning.search.space import changes, make_space
-from fhaosmo_ros.tools.tuning.search.study import FinishedTrial
+from fhaosmo_ros.tools.tuning.objective import least_damping, Objective
+from fhaosmo_ros.tools.tuning.search import minimise, Values
 from fhaosmo_ros.tools.tuning.source import TuningData
-from fhaosmo_ros.tools.tuning.stability import least_damping
-from fhaosmo_ros.tools.tuning.start.find import find_start, StartProblem, with_scheme
+from fhaosmo_ros.tools.tuning.space import changes, make_space
+from fhaosmo_ros.tools.tuning.start import find_start, StartProblem, with_scheme
 import numpy as np
 
 DIGITS = 4
@@ -28,24 +26,12 @@ NEAR, FAR = 0.5, 3.0
 """`decades` around a start that a Kalman filter gave, and around any other one."""
 LEAST_DAMPING, DAMPING_WEIGHT = 0.1, 10.0
 """Of the errors' dynamics: gains with less suit their recordings and fail on others."""
-PARETO_WEIGHTS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
-"""Weights of the second objective; each has a search of its own."""
-
 LOST_TIME, LOST_SAMPLES = 0.1, 20
 """
 Seconds, and at least so many samples, for which the innovation exceeds the largest half-width
 before the estimator restarts. With all levels saturated the chain of integrators may oscillate
 without end.
 """
-
-
-class TrialScores(NamedTuple):
-    """What is stored with a trial; see `Evaluation`."""
-
-    objective: float
-    error: float
-    chatter: float
-    settling: float
 
 
 class TuningResult(NamedTuple):
@@ -56,20 +42,15 @@ class TuningResult(NamedTuple):
     ----------
     best : dict
         Values by dimension, rounded.
-    trials : list of FinishedTrial
+    trials : int
+        In the study.
     seconds : float
-    pareto : str or None
-        Second objective.
-    failure : str or None
-        Why the storage failed in the middle, which ended the search.
 
     """
 
     best: Values
-    trials: list[FinishedTrial]
+    trials: int
     seconds: float
-    pareto: str | None
-    failure: str | None
 
 
 class Tuner:
@@ -141,7 +122,7 @@ class Tuner:
         # The user's own gains are a start, too: the tuned ones are never worse than they are.
         best = min(
             [by_theory, given] if given else [by_theory],
-            key=lambda gains: self._evaluate(gains).objective,
+            key=self._evaluate,
         )
         self.before_is_given = bool(given)
         observer = Observer(complete)
@@ -171,24 +152,23 @@ class Tuner:
             digest.update(recording.y.tobytes())
         return f'tune-{digest.hexdigest()[:16]}'
 
-    def evaluate(self, values: Values) -> TrialScores:
-        """Return the scores of a point of the space on the training recordings."""
+    def evaluate(self, values: Values) -> float:
+        """Return the objective at a point of the space, larger where errors are badly damped."""
         gains = changes(values)
-        scores = self._evaluate(gains)
-        if math.isinf(scores.objective):
-            return scores
+        objective = self._evaluate(gains)
+        if math.isinf(objective):
+            return objective
         missing = max(self._damping - self._damped(gains), 0.0)
-        return scores._replace(objective=scores.objective * (1.0 + DAMPING_WEIGHT * missing))
+        return objective * (1.0 + DAMPING_WEIGHT * missing)
 
     def _damped(self, gains: Mapping[str, Any]) -> float:
         return least_damping(Observer(ESTIMATOR_PARAMETERS.complete(self.estimator | dict(gains))))
 
-    def _evaluate(self, gains: Mapping[str, Any]) -> TrialScores:
+    def _evaluate(self, gains: Mapping[str, Any]) -> float:
         try:
-            evaluation = self.training(gains)
+            return self.training(gains).objective
         except ConfigurationError:  # a value out of its bounds, or values that do not fit
-            return TrialScores(*(math.inf,) * 4)
-        return TrialScores(*evaluation[:4])
+            return math.inf
 
     def with_readout(self, gains: Mapping[str, Any]) -> dict[str, Any]:
         """Return gains with internal or filtered variables; held-out recordings do not decide."""
@@ -213,26 +193,18 @@ class Tuner:
     def search(
         self,
         trials: int,
-        jobs: int,
-        options: StudyOptions,
-        pareto: str | None,
-        stopped: Callable[[], bool],
+        jobs: int = 1,
+        storage: str | None = None,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> TuningResult | None:
         """
         Search until the study holds `trials`, or `stopped` returns True; None if it does at once.
 
-        A storage that fails in the middle ends the search, too.
-
-        For a Pareto front, one search after the other minimises error + weight * `pareto`. Each
-        starts from the best trial of the searches before it.
-
         Parameters
         ----------
         trials, jobs : int
-        options : StudyOptions
-            Its name is not used: the study is named by what it searches.
-        pareto : {'chatter', 'settling', None}
-            Second objective.
+        storage : str, optional
+            As for `minimise`; the study is named by what it searches.
         stopped : callable
             Asked before each trial.
 
@@ -245,73 +217,12 @@ class Tuner:
         if stopped():
             return None
         begin = time.monotonic()
-        weights = PARETO_WEIGHTS if pareto else (0.0,)
-        each = -(-trials // len(weights))
-        finished: list[FinishedTrial] = []
-        failure: str | None = None
-        with progress(total=each * len(weights), unit='trial', desc='tune', smoothing=0.05) as bar:
-            for weight in weights:
-                name, scalar = self.study_name, _scalar_objective(pareto, weight)
-                space = list(self.space)
-                if pareto:
-                    name += f'-{pareto}-{weight:g}'
-                if finished:
-                    start = min(finished, key=lambda t: scalar(stored_scores(t))).parameters
-                    space = [d._replace(start=start[d.name]) for d in space]
-
-                def objective(values: Values, scalar: Any = scalar) -> tuple[float, ...]:
-                    scores = self.evaluate(values)
-                    return (scalar(scores), *scores)
-
-                def show(count: int, best: float, done: int = len(finished)) -> None:
-                    if not bar.n:
-                        bar.initial = count - 1
-                    bar.set_postfix_str(f'best {best:.4f}', refresh=False)
-                    bar.update(done + count - bar.n)
-
-                try:
-                    found = minimise(
-                        objective,
-                        space,
-                        each,
-                        options._replace(name=name),
-                        jobs=jobs,
-                        on_trial=show,
-                        stopped=stopped,
-                    )
-                except ConfigurationError as error:
-                    if not finished:
-                        raise
-                    failure = str(error)  # between two searches of a front
-                    break
-                finished += found.trials
-                failure = found.failure
-                if failure or stopped():
-                    break
-        best = min(finished, key=lambda trial: stored_scores(trial).objective).parameters
-        rounded = {key: float(f'{v:.{DIGITS}g}') for key, v in best.items()}
-        if self.evaluate(rounded).objective <= (1.0 + LOSS) * self.evaluate(best).objective:
-            best = rounded
-        return TuningResult(best, finished, time.monotonic() - begin, pareto, failure)
-
-
-def stored_scores(trial: FinishedTrial) -> TrialScores:
-    """Return the scores that were stored with a trial."""
-    return TrialScores(*trial.values[1:])
-
-
-def pareto_front(trials: Sequence[FinishedTrial], second: str) -> list[TrialScores]:
-    """Return the scores that no others dominate in error and in `second`, sorted by error."""
-    found: list[TrialScores] = []
-    best = math.inf
-    for scores in sorted(map(stored_scores, trials), key=lambda s: (s.error, getattr(s, second))):
-        if getattr(scores, second) < best:
-            best = getattr(scores, second)
-            found.append(scores)
-    return found
-
-
-def _scalar_objective(pareto: str | None, weight: float) -> Callable[[TrialScores], float]:
-    if pareto is None:
-        return lambda scores: scores.objective
-    return lambda scores: scores.error + weight * float(getattr(scores, pareto))
+        with progress(total=trials, unit='trial', desc='tune', smoothing=0.05) as bar:
+            found = minimise(
+                self.evaluate, self.space, trials, self.seed, storage=storage,
+                name=self.study_name, jobs=jobs, on_trial=bar.update, stopped=stopped,
+            )  # fmt: skip
+        best = {key: float(f'{v:.{DIGITS}g}') for key, v in found.best.items()}
+        if self.evaluate(best) > (1.0 + LOSS) * self.evaluate(found.best):
+            best = found.best
+        return TuningResult(best, found.trials, time.monotonic() - begin)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The output of a tuning: gains.yaml, report.md and the figures."""
+"""The output of a tuning: gains.yaml, report.md and the figure."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,29 +8,12 @@ from fhaosmo_ros import __version__
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.tuning import figures, report
-from fhaosmo_ros.tools.tuning.search.minimise import Dimension, Values
-from fhaosmo_ros.tools.tuning.search.space import changes
-from fhaosmo_ros.tools.tuning.tuner import (
-    pareto_front,
-    stored_scores,
-    TrialScores,
-    Tuner,
-    TuningResult,
-)
-import numpy as np
+from fhaosmo_ros.tools.tuning.space import changes
+from fhaosmo_ros.tools.tuning.tuner import Tuner, TuningResult
 
-POINTS = 7
-"""Values of each parameter in the figure of sensitivities, apart from the best one."""
-REACH = 1.0
-"""Distance of the outermost values from the best, in decades or (linear) half ranges."""
 SHOWN = 3
 """Recordings in the figure of estimates."""
-SECOND = {
-    'chatter': 'chatter of d, powers of ten',
-    'settling': 'settling, share of the time',
-}
 
 
 def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str:
@@ -62,27 +44,7 @@ def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str
     text = _document(tuner, result, command, main)
     (folder / 'report.md').write_text(text, encoding='utf-8')
     _draw_estimates(folder / 'estimates.png', tuner, before, gains)
-    figures.save_sensitivity(
-        _sensitivities(tuner, result.best),
-        tuner.space,
-        result.best,
-        tuned[0].evaluation.objective,
-        folder / 'sensitivity.png',
-    )
-    if result.pareto is not None:
-        figures.save_front(
-            _pairs(map(stored_scores, result.trials), result.pareto),
-            _pairs(pareto_front(result.trials, result.pareto), result.pareto),
-            _pairs([tuner.evaluate(result.best)], result.pareto)[0],
-            ('error, relative to the truth', SECOND[result.pareto]),
-            folder / 'pareto.png',
-        )
     return main
-
-
-def _pairs(several: Iterable[TrialScores], second: str) -> np.ndarray:
-    """Return error and second objective, a row each."""
-    return np.array([(scores.error, getattr(scores, second)) for scores in several])
 
 
 def _comments(
@@ -93,7 +55,7 @@ def _comments(
     lines = [
         'Made by',
         f'    python -m fhaosmo_ros {command}',
-        f'({len(result.trials)} trials, fhaosmo_ros {__version__}) for: {tuner.data.origin}.',
+        f'({result.trials} trials, fhaosmo_ros {__version__}) for: {tuner.data.origin}.',
     ]
     if not tuner.data.origin.startswith('pieces'):
         lines.append(
@@ -113,7 +75,7 @@ def _document(tuner: Tuner, result: TuningResult, command: str, main: str) -> st
     parts = [
         '# Tuning',
         f'    python -m fhaosmo_ros {command}',
-        f'{len(result.trials)} trials in the study, {result.seconds:.0f} s in this run; '
+        f'{result.trials} trials in the study, {result.seconds:.0f} s in this run; '
         f'{len(tuner.data.training)} recordings to train on, {len(tuner.data.held_out)} held out: '
         f'{tuner.data.origin}.',
         '## Result',
@@ -124,13 +86,10 @@ def _document(tuner: Tuner, result: TuningResult, command: str, main: str) -> st
         '![d and its estimates](estimates.png)',
         '## Gains',
         report.gains_table(tuner.space, begin, result.best),
-        '![Sensitivity](sensitivity.png)',
     ]
     if tuner.tried:
         chosen = tuner.fixed['unknown_input_derivatives']
-        parts.insert(-1, report.start_table(tuner.tried, chosen))
-    if result.pareto is not None:
-        parts.append(f'![Error and {result.pareto}](pareto.png)')
+        parts.append(report.start_table(tuner.tried, chosen))
     if tuner.data.sensor is not None:
         parts += ['## Sensor', report.sensor_table(tuner.data)]
     rows = '\n'.join(f'    {name}: {value}' for name, value in settings.items())
@@ -157,18 +116,3 @@ def _draw_estimates(
 def _estimate(tuner: Tuner, gains: dict[str, Any], recording: Recording) -> Any:
     observer = Observer(ESTIMATOR_PARAMETERS.complete(tuner.estimator | gains))
     return observer.run(recording.t, recording.y, recording.u).unknown_input
-
-
-def _sensitivities(tuner: Tuner, best: Values) -> dict[str, tuple[Any, Any]]:
-    curves = {}
-    for d in progress(tuner.space, desc='sensitivity', unit='parameter', leave=False):
-        x = np.unique(np.append(_around(d, best[d.name]), best[d.name]))
-        value = [tuner.evaluate(best | {d.name: float(v)}).objective for v in x]
-        curves[d.name] = (x, np.array(value))
-    return curves
-
-
-def _around(d: Dimension, best: float) -> Any:
-    part = np.linspace(-REACH, REACH, POINTS)
-    x = best * 10.0**part if d.log else best + 0.5 * part * (d.high - d.low)
-    return np.clip(x, d.low, d.high)

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.tuning.search.minimise import Dimension
-from fhaosmo_ros.tools.tuning.start.sampled_model import SampledModel
+from fhaosmo_ros.tools.tuning.linear_gains import SampledModel
+from fhaosmo_ros.tools.tuning.search import Dimension
 import numpy as np
 from studies.comparison.methods.filters import several_models
 from studies.comparison.methods.linear import each_order, LONGEST, matern_space, Samples

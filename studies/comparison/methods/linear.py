@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The linear peers: constant gains from python-control, the same model and Phi as ours.
+The linear peers: constant gains, the same model and Phi as ours.
 
     z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d
     d' = d_1 - decay d, d_1' = d_2 - decay d_1, ..., d_{m-1}' = -decay d_{m-1}
@@ -13,17 +13,19 @@ The extended state observer (ESO): J. Han, IEEE Transactions on Industrial Elect
 doi:10.1109/TIE.2008.2011621.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
+import math
 from typing import NamedTuple
 
 from fhaosmo_ros.core.model.inputs import known_inputs_of_run
 from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.tuning.search.minimise import Dimension, minimise, StudyOptions
-from fhaosmo_ros.tools.tuning.start.find import DERIVATIVES
-from fhaosmo_ros.tools.tuning.start.sampled_model import pair, SampledModel
+from fhaosmo_ros.tools.tuning.linear_gains import SampledModel
+from fhaosmo_ros.tools.tuning.search import Dimension, minimise
+from fhaosmo_ros.tools.tuning.start import DERIVATIVES
 import numpy as np
 from studies.comparison.methods.filters import constant_gain
 from studies.comparison.methods.method import LINEAR, Method, Run, Search, Setting, USUAL, Values
@@ -120,8 +122,43 @@ def _kalman_ramp(model: SampledModel, values: Values) -> np.ndarray:
     return model.kalman([drift, walk])
 
 
+def placed(model: SampledModel, poles: Sequence[complex]) -> np.ndarray:
+    """
+    Return the gain that places the poles of the error dynamics here in the s plane.
+
+    By Ackermann's formula, since poles may coincide. Slow poles lie so close to 1 in the z plane
+    that a placement of z fails: (z - 1) / period is placed, with time in units of the mean pole.
+    """
+    speed, size = math.exp(float(np.mean(np.log(np.abs(poles))))), model.size
+    scale = speed ** -np.arange(float(size))
+    difference = model.a / model.scale[:, None] * model.scale[None, :] - np.eye(size)
+    rates = difference * scale[:, None] / scale[None, :] / (model.period * speed)
+    seen = rates[0] * (model.period * speed) + np.eye(size)[0]  # y after the prediction
+    places = [np.expm1(pole * model.period) / (model.period * speed) for pole in poles]
+    observed = np.array([seen @ np.linalg.matrix_power(rates, i) for i in range(size)])
+    polynomial = np.zeros((size, size))
+    for coefficient in np.real(np.poly(places)):
+        polynomial = polynomial @ rates + coefficient * np.eye(size)
+    try:
+        gain = polynomial @ np.linalg.solve(observed, np.eye(size)[-1])
+    except np.linalg.LinAlgError as error:
+        raise ConfigurationError(f'pole placement: no solution ({error})') from None
+    if not np.isfinite(gain).all():
+        raise ConfigurationError('gain: expected finite numbers, got some that are not')
+    return gain * model.period * speed / scale
+
+
+def pair(frequency: float, damping: float) -> list[complex]:
+    """Return the poles of s^2 + 2 damping frequency s + frequency^2."""
+    if damping < 1.0:
+        imaginary = frequency * math.sqrt(1.0 - damping * damping)
+        return [complex(-damping * frequency, sign * imaginary) for sign in (1.0, -1.0)]
+    root = frequency * math.sqrt(damping * damping - 1.0)
+    return [complex(-damping * frequency + sign * root) for sign in (1.0, -1.0)]
+
+
 def _eso(model: SampledModel, values: Values) -> np.ndarray:
-    return model.placed([complex(-values['bandwidth'])] * model.size)
+    return placed(model, [complex(-values['bandwidth'])] * model.size)
 
 
 def _luenberger(model: SampledModel, values: Values) -> np.ndarray:
@@ -130,7 +167,7 @@ def _luenberger(model: SampledModel, values: Values) -> np.ndarray:
         poles += pair(values[f'frequency_{i + 1}'], values[f'damping_{i + 1}'])
     if model.size % 2:
         poles.append(complex(-values['real_pole']))
-    return model.placed(poles)
+    return placed(model, poles)
 
 
 def _luenberger_space(setting: Setting) -> tuple[Dimension, ...]:
@@ -164,7 +201,7 @@ def each_order(*more: Dimension) -> Callable[[Search], Values]:
                 lambda v, fixed=fixed: search.judged(fixed | v),
                 (*matern_space(search.setting, k), *more),
                 max(1, search.trials // len(DERIVATIVES)),
-                StudyOptions(search.seed),
+                search.seed,
                 jobs=1,
             )
             if not best[1] or found.value < best[0]:

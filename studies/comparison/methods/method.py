@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.tuning.search.minimise import Dimension
+from fhaosmo_ros.tools.tuning.search import Dimension
 from studies.comparison.scores import Estimates
 
 ROUNDING = 1e-15

@@ -16,9 +16,9 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.core.simulation.scoring import FIRST_STAMP
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.search.minimise import Dimension, StudyOptions
-from fhaosmo_ros.tools.tuning.search.space import changes
+from fhaosmo_ros.tools.tuning.search import Dimension
 from fhaosmo_ros.tools.tuning.source import TuningData
+from fhaosmo_ros.tools.tuning.space import changes
 from fhaosmo_ros.tools.tuning.tuner import Tuner
 import numpy as np
 from studies.comparison.methods.method import (
@@ -65,7 +65,7 @@ def _tune(search: Search) -> Values:
     with redirect_stderr(StringIO()):  # its progress bars
         tuner = Tuner(data, {}, tuning, search.seed, 1, lambda: next(used) >= search.trials)
         left = max(1, search.trials - next(used) + 1)
-        found = tuner.search(left, 1, StudyOptions(search.seed), None, lambda: False)
+        found = tuner.search(left)
     return tuner.parameters(changes(found.best)) if found is not None else {}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from fhaosmo_ros.core.parameters.declaration import Parameter, unknown_parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
-from fhaosmo_ros.tools.tuning.search.minimise import Dimension, Values
+from fhaosmo_ros.tools.tuning.search import Dimension, Values
 import numpy as np
 
 NUMBERS = ('double', 'double_array')

@@ -1,0 +1,469 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Sets of gains that follow from the theory of the observer; a search begins with the best of them.
+
+For |eps| well below its half-width w a fuzzy level is a second-order filter, z_tilde'' +
+2 zeta omega z_tilde' + omega^2 z_tilde = omega^2 m', with omega^2 = alpha / w and a damping
+2 zeta omega = lambda |eps|^gamma / w; above it, it is a super-twisting differentiator, which
+converges if alpha exceeds the second derivative of m (A. Levant, Automatica 34(3), 1998,
+doi:10.1016/S0005-1098(97)00209-4). So one bandwidth omega for the whole chain, one factor kappa
+and one damping zeta give all gains:
+
+    s_1 = noise,  s_i = noise sqrt(h omega^(2 i - 1))        the noise that is left in m_i
+    w_i = kappa (s_i + L_i / omega^2)                        and the error by the lag
+    alpha_i = omega^2 w_i
+    lambda_i = 2 zeta omega w_i / (w_i / 3)^gamma            damped at a third of the half-width
+
+with L_i the size of m_i'' in the recordings: z_3, .., d, d', d''. A small kappa is a sliding mode,
+a large one a linear observer. The structure `levant` has one innovation and so one width,
+w = kappa (noise + D / omega^n) with D the size of d, and N poles at omega:
+
+    lambda_i = binomial(N, i) omega^i w / (w / 3)^(p_i),     p_i as in D 11
+
+Some candidates are evaluated and the best one is taken: the best omega is a trade between noise
+and lag, which depends on the family of d, and there is no formula for it.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
+import math
+from math import comb
+from typing import Any, NamedTuple, TypeVar
+
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA
+from fhaosmo_ros.core.observer.fuzzy import curves
+from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
+from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.tools.tuning.linear_gains import kalman_like, SampledModel
+from fhaosmo_ros.tools.tuning.objective import Objective
+import numpy as np
+from numpy.typing import NDArray
+
+SCHEME: Mapping[str, Any] = {
+    'structure': 'levant',
+    'scheme': 'predict_correct',
+    'variant': 'fuzzy_adaptive',
+    'gamma_rate': 0.0,
+    'gamma_min': 1e-4,
+    'fuzzy_growth': True,
+}
+"""What is tuned where the user sets no other structure or scheme."""
+MEANT_FOR = ('lambda', 'alpha', 'epsilon', 'initial_internal')
+"""A user who sets one of these has chosen structure and scheme: such values fit one of them."""
+DERIVATIVES = (0, 1, 2, 3)
+WORTH = 0.99
+"""One more derivative of d must reduce the objective to this part of it."""
+HOPELESS = 1.3
+"""Numbers of derivatives that are this factor behind the best on the grid are given up."""
+GAMMAS = (0.25, 0.5)
+"""Powers gamma to start from with the other schemes, where gamma is searched."""
+LEAST = 1e-30
+"""Gain that stands for one that is not positive."""
+FASTEST = 5.0
+"""Bandwidth times period of a deadbeat observer."""
+GAMMA = 3e-3
+"""Power at which the injections are nearly linear in the innovation; the user may set another."""
+RATES = tuple(float(x) for x in np.geomspace(0.1, 30.0, 8))
+FACTORS = (0.8, 1.0, 1.25)
+WIDTH = 16.0
+"""Nearly linear for the noise itself, and outliers count as a few standard deviations of it."""
+ZOOMS = (0.5, 0.25)
+"""Distances to the neighbours that are tried around the best design, in steps of the grid."""
+OMEGAS = tuple(float(w) for w in np.geomspace(2.0, 200.0, 9))
+KAPPAS = (1.0, 5.0, 25.0)
+ZETAS = (0.7, 1.5, 4.0)
+OPEN = 100.0
+"""epsilon in units of the largest half-width: all levels run, except far from the estimate."""
+
+Candidate = TypeVar('Candidate')
+
+
+class Start(NamedTuple):
+    """
+    Where a search begins.
+
+    Attributes
+    ----------
+    gains : dict
+        Parameters of the observer: those that are searched, and those that fit them.
+    tried : dict
+        Best objective by number of derivatives of d, where that number was open.
+
+    """
+
+    gains: dict[str, Any]
+    tried: dict[int, float]
+
+
+class StartProblem(NamedTuple):
+    """
+    What a start is searched for.
+
+    Attributes
+    ----------
+    recordings : sequence of Recording
+    estimator : mapping
+        What is set for the estimator, with the scheme; see `with_scheme`.
+    names : sequence of str
+        Parameters that are searched.
+    objective : callable
+        From what is set for the estimator to an Objective.
+    least_noise : float
+        Noise of y to assume where the recordings show less.
+
+    """
+
+    recordings: Sequence[Recording]
+    estimator: Mapping[str, Any]
+    names: Sequence[str]
+    objective: Callable[[Mapping[str, Any]], Objective]
+    least_noise: float = 0.0
+
+    @property
+    def observer(self) -> Observer:
+        """An observer with what is set."""
+        return Observer(ESTIMATOR_PARAMETERS.complete(self.estimator))
+
+    @property
+    def free_gamma(self) -> bool:
+        """True if gamma_initial is searched and not set."""
+        return 'gamma_initial' in self.names and 'gamma_initial' not in self.estimator
+
+
+class CandidateEvaluator:
+    """Evaluates candidates in several threads and shows a progress bar."""
+
+    def __init__(self, jobs: int, stopped: Callable[[], bool]) -> None:
+        self._pool, self._stopped = ThreadPoolExecutor(jobs), stopped
+        self._bar = progress(unit='set', desc='start', leave=False)
+
+    def __enter__(self) -> 'CandidateEvaluator':
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown()
+        self._bar.close()
+
+    def best(
+        self, objective: Callable[[Candidate], float], several: Sequence[Candidate]
+    ) -> tuple[float, Candidate]:
+        """Return the smallest objective and its candidate, the first of equals."""
+
+        def evaluate(candidate: Candidate) -> float:
+            try:
+                return math.inf if self._stopped() else objective(candidate)
+            except ConfigurationError:  # a value out of its bounds, or values that do not fit
+                return math.inf
+            finally:
+                self._bar.update()
+
+        self._bar.total = (self._bar.total or 0) + len(several)
+        values = list(self._pool.map(evaluate, several))
+        number = min(range(len(values)), key=values.__getitem__)
+        return values[number], several[number]
+
+
+def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
+    """Return the parameters, as set by the user, that ask for something else than `SCHEME`."""
+    found = [k for k in ('structure', 'scheme') if estimator.get(k, SCHEME[k]) != SCHEME[k]]
+    if not estimator.get('unknown_input', True):
+        found.append('unknown_input')
+    return found + [k for k in MEANT_FOR if k in estimator]
+
+
+def with_scheme(
+    estimator: Mapping[str, Any], recordings: Sequence[Recording], least_noise: float = 0.0
+) -> dict[str, Any]:
+    """
+    Return what the user set for the estimator, with `SCHEME` where that is open.
+
+    The sizes of the noise, of the states and of d are those of the recordings. Without noise on y
+    they are left out: nothing says how sure the observer is.
+    """
+    given = dict(estimator)
+    if chosen_otherwise(given):
+        return given
+    period = float(f'{np.median(np.diff(recordings[0].t)):.4g}')
+    noise = max(effective_noise(recordings), least_noise)
+    sizes = np.sqrt(
+        np.mean(np.concatenate([np.column_stack([r.z, r.d]) for r in recordings]) ** 2, axis=0)
+    )
+    known = {}
+    if noise > 0.0 and (sizes > 0.0).all():
+        z, d = [float(f'{x:.3g}') for x in sizes[:-1]], float(f'{sizes[-1]:.3g}')
+        known = {'noise_size': float(f'{noise:.3g}'), 'state_sizes': z, 'unknown_input_size': d}
+    return {**SCHEME, 'correction_period': period, **known, **given}
+
+
+def find_start(problem: StartProblem, jobs: int, stopped: Callable[[], bool]) -> Start:
+    """
+    Evaluate the gains that theory proposes, and return the best of them.
+
+    Parameters
+    ----------
+    problem : StartProblem
+    jobs : int
+        Threads.
+    stopped : callable
+        Asked before each evaluation; True ends the search with the best so far.
+
+    """
+    p = problem.observer.parameters
+    with CandidateEvaluator(jobs, stopped) as evaluator:
+        if p['scheme'] == 'predict_correct' and p['variant'].startswith('fuzzy'):
+            found = _best_kalman_filter(problem, evaluator)
+            if found is not None:
+                return found
+        return Start(_best_scaled_gains(problem, evaluator), {})
+
+
+def _best_scaled_gains(problem: StartProblem, evaluator: CandidateEvaluator) -> dict[str, Any]:
+    """Return the best of `theory.candidates`."""
+    observer, recordings = problem.observer, problem.recordings
+    p = observer.parameters
+    gammas = [FIXED_GAMMA]
+    if p['variant'].endswith('_adaptive'):
+        gammas = [
+            g for g in GAMMAS if problem.free_gamma and p['gamma_min'] <= g <= p['gamma_max']
+        ]
+        gammas = gammas or [p['gamma_initial']]
+    objective = problem.objective(problem.estimator)
+    several = candidates(
+        recordings,
+        observer.levels,
+        max(effective_noise(recordings), problem.least_noise),
+        p['structure'],
+        gammas,
+    )
+    searched = [{k: v for k, v in gains.items() if k in problem.names} for gains in several]
+    return evaluator.best(lambda gains: objective(gains).objective, searched)[1]
+
+
+def _best_kalman_filter(problem: StartProblem, evaluator: CandidateEvaluator) -> Start | None:
+    """Return the best Kalman filter with the best number of derivatives, or None without any."""
+    estimator, p = problem.estimator, problem.observer.parameters
+    gamma = p['gamma_initial']
+    if not p['variant'].endswith('_adaptive'):
+        gamma = FIXED_GAMMA
+    elif problem.free_gamma:
+        gamma = min(max(GAMMA, p['gamma_min']), p['gamma_max'])
+    fixed = {k: v for k, v in estimator.items() if k not in problem.names}
+    model = TriangularModel.of(p)
+    open_ = not {'unknown_input_derivatives', 'lambda'} & estimator.keys()
+    gains, objectives, found = {}, {}, {}
+    for k in DERIVATIVES if open_ else [p['unknown_input_derivatives']]:
+        make = KalmanGains(problem.recordings, fixed, model, k, gamma, problem.least_noise)
+        judge = problem.objective({**estimator, 'unknown_input_derivatives': k})
+
+        def objective(design: KalmanDesign, make: Any = make, judge: Any = judge) -> float:
+            return float(judge(make(design)).objective)
+
+        gains[k], objectives[k] = make, objective
+        found[k] = evaluator.best(objective, grid())
+    limit = HOPELESS * min(value for value, _ in found.values())
+    for k, objective in objectives.items():
+        if found[k][0] > limit:
+            continue
+        for zoom in ZOOMS:
+            neighbours = list(around(found[k][1], zoom))
+            found[k] = min(found[k], evaluator.best(objective, neighbours))
+    tried = {k: value for k, (value, _) in found.items()}
+    best = min(tried.values())
+    if math.isinf(best):
+        return None
+    chosen = next(k for k, value in tried.items() if WORTH * value <= best)
+    return Start(gains[chosen](found[chosen][1]), tried)
+
+
+class KalmanDesign(NamedTuple):
+    """
+    One filter of the grid.
+
+    Attributes
+    ----------
+    rate : float
+        kappa of D 17 in 1/s: how fast d changes.
+    factor : float
+        Bandwidth, relative to the one that this d and the noise ask for.
+    width : float
+        Half-width of all levels, in units of the noise (without any: of y's change in a period).
+
+    """
+
+    rate: float
+    factor: float
+    width: float = WIDTH
+
+
+def grid() -> list[KalmanDesign]:
+    """Return the designs to evaluate first."""
+    return [KalmanDesign(*pair) for pair in product(RATES, FACTORS)]
+
+
+def around(design: KalmanDesign, zoom: float) -> Iterator[KalmanDesign]:
+    """Yield the neighbours of a design, `zoom` steps of the grid away."""
+    steps = [(x[1] / x[0]) ** zoom for x in (RATES, FACTORS)]
+    for i, j in product((-1, 0, 1), repeat=2):
+        if i or j:
+            yield design._replace(
+                rate=design.rate * steps[0] ** i, factor=design.factor * steps[1] ** j
+            )
+
+
+class KalmanGains:
+    """
+    Turns designs into parameters of the observer.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        With their truth, from which the sizes of d and of the noise follow.
+    fixed : mapping
+        Parameters of the observer that are set and not searched: `unknown_input_decay` and the
+        first of `fuzzy_widths` replace those of a design; its fuzzy curves are theirs.
+    model : TriangularModel
+    derivatives : int
+        Derivatives of d that the observer estimates.
+    gamma : float
+    least_noise : float
+        Noise of y to assume where the recordings show less.
+
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        fixed: Mapping[str, Any],
+        model: TriangularModel,
+        derivatives: int,
+        gamma: float,
+        least_noise: float = 0.0,
+    ) -> None:
+        self._fixed, self._model, self._derivatives = fixed, model, derivatives
+        self._gamma = gamma
+        self._period = float(np.median(np.diff(recordings[0].t)))
+        states = np.concatenate([np.column_stack([r.z, r.d]) for r in recordings])
+        size = np.sqrt(np.mean(np.square(states), axis=0))
+        self._size = float(size[-1])
+        # Without noise the fastest observer is deadbeat: this noise is too small to slow it down.
+        least = 0.1 * self._size * self._period**model.order
+        noise = max(effective_noise(recordings), least_noise)
+        self._noise = max(noise, least)
+        # Then the start has the largest innovations: what z_2 moves y by in a period.
+        self._unit = noise if noise > least else max(float(size[1]) * self._period, least)
+
+    def bandwidth(self, rate: float) -> float:
+        """Return the bandwidth (rad/s) of the Kalman filter for a Matern d of this rate (D 17)."""
+        k, levels = self._derivatives, self._model.order + 1 + self._derivatives
+        scaled = self._size**2 * (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2
+        intensity = scaled / math.factorial(2 * k)
+        return float((intensity / (self._noise**2 * self._period)) ** (0.5 / levels))
+
+    def __call__(self, design: KalmanDesign) -> dict[str, Any]:
+        """
+        Return the parameters of a design.
+
+        Raises
+        ------
+        ConfigurationError
+            There is no such filter.
+
+        """
+        decay = self._fixed.get('unknown_input_decay', design.rate)
+        width = design.width * self._unit
+        width = self._fixed.get('fuzzy_widths', [width])[0]
+        bandwidth = min(design.factor * self.bandwidth(design.rate), FASTEST / self._period)
+        small = max(self._noise, 1e-3 * width)
+        try:
+            model = SampledModel(self._model, self._period, 1 + self._derivatives, decay=decay)
+        except np.linalg.LinAlgError as error:  # the model at rest has no finite slope
+            raise ConfigurationError(f'Kalman gain: {error}') from None
+        psi = curves(OBSERVER_PARAMETERS.defaults() | dict(self._fixed), model.size)
+        gain = kalman_like(model, bandwidth, width, psi, small, self._gamma)
+        return {
+            'unknown_input_derivatives': self._derivatives,
+            'unknown_input_decay': decay,
+            'lambda': [float(x) for x in gain.clip(LEAST, OBSERVER_PARAMETERS['lambda'].upper)],
+            'fuzzy_widths': [width] * len(gain),
+            'gamma_initial': self._gamma,
+        }
+
+
+def candidates(
+    recordings: Sequence[Recording],
+    levels: int,
+    noise: float,
+    structure: str = 'cascade',
+    gammas: Sequence[float] = (0.5,),
+) -> Iterator[dict[str, Any]]:
+    """
+    Yield lambda, alpha, fuzzy_widths, epsilon and gamma_initial by the rules above.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        With their truth.
+    levels : int
+        N.
+    noise : float
+        Standard deviation of y - z_1, the effect of jitter included.
+    structure : str
+        'cascade' or 'levant'.
+    gammas : sequence of float
+        Powers to try.
+
+    """
+    size = second_derivatives(recordings, levels)
+    period = float(np.median(np.diff(recordings[0].t)))
+    noise = max(noise, size[0] * period**2)
+    level = np.arange(1, levels + 1)
+    for omega, kappa, gamma in product(OMEGAS, KAPPAS, gammas):
+        common = {'gamma_initial': gamma}
+        if structure == 'levant':
+            d = _rms(np.concatenate([r.d for r in recordings]))
+            width = kappa * (noise + d / omega ** (levels - 1))
+            poles = np.array([comb(levels, int(i)) for i in level]) * omega**level
+            power = 2.0 * gamma * (levels - level) / levels
+            yield common | {
+                'lambda': _list(poles * width / (width / 3.0) ** power),
+                'fuzzy_widths': [width] * levels,
+            }
+            continue
+        left = noise * np.sqrt(period * omega ** (2.0 * level - 1.0))
+        left[0] = noise
+        widths = kappa * (left + size / omega**2)
+        for zeta in ZETAS:
+            yield common | {
+                'lambda': _list(2.0 * zeta * omega * widths / (widths / 3.0) ** gamma),
+                'alpha': _list(omega**2 * widths),
+                'fuzzy_widths': _list(widths),
+                'epsilon': OPEN * float(widths.max()),
+            }
+
+
+def second_derivatives(recordings: Sequence[Recording], levels: int) -> NDArray[np.float64]:
+    """Return the RMS values L_1 .. L_N of z_3, .., z_n, d, d', .. over recordings."""
+    chain = np.concatenate([np.column_stack([r.z, r.d]) for r in recordings])
+    size = np.sqrt(np.mean(np.square(chain), axis=0))
+    rates = [_rms(np.diff(r.d)) / (_rms(r.d) * np.median(np.diff(r.t))) for r in recordings]
+    rate = float(np.median(rates))
+    size = np.concatenate([size, size[-1] * rate ** np.arange(1, levels + 1)])
+    return np.maximum(size[2 : 2 + levels], np.finfo(float).tiny)
+
+
+def effective_noise(recordings: Sequence[Recording]) -> float:
+    """Return the RMS of y - z_1: noise, quantum and, where z_1 is at the stamps, jitter."""
+    return _rms(np.concatenate([r.y - r.z[:, 0] for r in recordings]))
+
+
+def _list(values: NDArray[np.float64]) -> list[float]:
+    return [float(v) for v in values]
+
+
+def _rms(x: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))
