@@ -3,10 +3,10 @@
 
 import bag_files as files
 import bag_variants as variants
+from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.tools.replay import command as replay
-from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.source import BagSource, from_bag
+from fhaosmo_ros.tools.tuning.source import BagSource, recorded
 import numpy as np
 import pytest
 
@@ -76,12 +76,11 @@ def test_sqlite_has_no_publish_times(tmp_path, capsys):
 
 def test_tune_takes_them_too(late, tmp_path):
     """Else it would see the jitter of reception."""
-    tuning = TUNE_PARAMETERS.complete({'recordings': 1, 'held_out': 1})
     sensors = []
     for name, received in (('exact', STAMPS), ('late', late)):
         messages = files.floats(received, Y)
         bag = variants.write(tmp_path / name, messages, 'jazzy', 'mcap', 'zstd', published=STAMPS)
-        sensors.append(from_bag(BagSource(bag), tuning).sensor)
+        sensors.append(recorded(BagSource(bag), TriangularModel(['0'])).sensor)
     assert sensors[0] == sensors[1]
 
 

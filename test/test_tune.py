@@ -15,13 +15,13 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.scoring import Scores
-from fhaosmo_ros.tools.bags.types import labelled_array, serialise
+from fhaosmo_ros.tools.bags.types import serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.tuning.command import main, read_parameters
 from fhaosmo_ros.tools.tuning.objective import Evaluation, Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.sensor import identify, noise_at_stamps
-from fhaosmo_ros.tools.tuning.source import simulated, TuningData
+from fhaosmo_ros.tools.tuning.sensor import identify
+from fhaosmo_ros.tools.tuning.source import simulated
 from fhaosmo_ros.tools.tuning.start import candidates
 import numpy as np
 import pytest
@@ -158,53 +158,20 @@ def test_levant_is_tuned_without_what_it_does_not_use(tmp_path):
 # bags
 
 
-def make_bag(path, truth=True, noise=1e-3, jitter=0.0):
-    family = Family(SHORT | {'duration': 9.0, 'noise_std': noise, 'dropout': 0.02})
-    r = family.recording(0)
-    stamps = r.t + jitter * np.random.default_rng(1).standard_normal(len(r.t))
-    with BagWriter(path) as bag:
+@pytest.fixture(name='bag')
+def _bag(tmp_path):
+    r = Family(SHORT | {'duration': 9.0, 'noise_std': 1e-3, 'dropout': 0.02}).recording(0)
+    with BagWriter(tmp_path / 'bag') as bag:
         bag.add('/y', 'std_msgs/msg/Float64')
-        if truth:
-            bag.add('/plant/unknown_input', 'std_msgs/msg/Float64')
-            bag.add('/plant/state', 'std_msgs/msg/Float64MultiArray')
-        for k, stamp in enumerate((10**18 + np.round(stamps * 1e9).astype(np.int64)).tolist()):
-            bag.write('/y', stamp, serialise('std_msgs/msg/Float64', data=r.y[k]))
-            if truth:
-                d = serialise('std_msgs/msg/Float64', data=r.d[k])
-                bag.write('/plant/unknown_input', stamp + 9000, d)
-                state = labelled_array(['z1', 'z2', 'z3'], r.z[k])
-                bag.write('/plant/state', stamp + 9000, state)
-    return r
+        stamps = 10**18 + np.round(r.t * 1e9).astype(np.int64)
+        for stamp, y in zip(stamps.tolist(), r.y.tolist(), strict=True):
+            bag.write('/y', stamp, serialise('std_msgs/msg/Float64', data=y))
+    return tmp_path / 'bag'
 
 
-def test_bag_with_truth_is_what_it_trains_on(tmp_path):
-    make_bag(tmp_path / 'bag')
+def test_bag_says_what_its_y_shows(bag, tmp_path, capsys):
     out = tmp_path / 'out'
-    assert main([*QUICK, '--bag', str(tmp_path / 'bag'), '-o', str(out)]) == 0
-    report = (out / 'report.md').read_text()
-    assert 'pieces of bag bag' in report
-    assert '1 recordings to train on, 1 held out' in report
-    errors = re.search(r'relative to the truth \|(.*)', report)[1].split('|')
-    assert errors[2] != errors[3]  # on other pieces
-    assert 'another run as well' in report
-    assert 'simulated' not in (out / 'gains.yaml').read_text()
-
-
-def test_jitter_counts_where_the_truth_is_for_the_very_samples(tmp_path):
-    """As the plant publishes it: y is its z1 to the last bit, and only the stamps are off."""
-    make_bag(tmp_path / 'bag', noise=0.0, jitter=1e-4)
-    out = tmp_path / 'out'
-    words = [word for word in QUICK if 'scheme' not in word]
-    assert main([*words, '--bag', str(tmp_path / 'bag'), '-o', str(out)]) == 0
-    report = (out / 'report.md').read_text()
-    error = re.search(r'relative to the truth \|(.*)', report)[1].split('|')
-    assert all(float(word) < 0.9 for word in error[:4]), error
-
-
-def test_bag_without_truth_says_what_its_y_shows(tmp_path, capsys):
-    make_bag(tmp_path / 'bag', truth=False)
-    out = tmp_path / 'out'
-    arguments = ['--bag', str(tmp_path / 'bag'), '-o', str(out), '--topic', '/y']
+    arguments = ['--bag', str(bag), '-o', str(out), '--topic', '/y']
     assert main(arguments) == 0
     files = ['estimates.png', 'gains.yaml', 'report.md']
     assert sorted(path.name for path in out.iterdir()) == files
@@ -229,27 +196,11 @@ def test_bag_without_truth_says_what_its_y_shows(tmp_path, capsys):
         ('noise_std:=1000.0', 'd = 0'),
     ],
 )
-def test_bag_without_truth_that_can_give_no_gains(tmp_path, capsys, given, message):
-    make_bag(tmp_path / 'bag', truth=False)
+def test_bag_that_can_give_no_gains(bag, tmp_path, capsys, given, message):
     out = tmp_path / 'out'
-    assert main(['--bag', str(tmp_path / 'bag'), '-o', str(out), '-p', given]) == 2
+    assert main(['--bag', str(bag), '-o', str(out), '-p', given]) == 2
     assert message in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_bag_that_is_too_short(tmp_path, capsys):
-    make_bag(tmp_path / 'bag')
-    arguments = [
-        *QUICK,
-        '-psettled:=8.0',
-        '--bag',
-        str(tmp_path / 'bag'),
-        '-o',
-        str(tmp_path / 'o'),
-    ]
-    assert main(arguments) == 2
-    assert 'expected at least 19.2 s with the truth' in capsys.readouterr().err
-    assert not (tmp_path / 'o').exists()
 
 
 # ends
@@ -308,7 +259,7 @@ def test_storage_holds_what_the_next_run_goes_on_with(tmp_path):
         (['-psettled:=4.0'], 'more than 4 s'),
         (['--trials=0'], '--trials >= 1'),
         (['--storage', 'nodb://x'], 'storage'),
-        (['--bag', 'nothing'], 'does not exist'),
+        (['--bag', 'nothing', '-pscheme:=predict_correct'], 'does not exist'),
         (['--params-file', 'nothing.yaml'], 'nothing.yaml'),
         (['-o', '/proc/no/out'], 'output'),
     ],
@@ -368,25 +319,6 @@ def test_sensor_outlives_bad_samples():
     assert identify(t, y).noise_std == pytest.approx(1e-3, rel=0.1)
     with pytest.raises(ConfigurationError, match='at least 200 samples'):
         identify(t[:100], y[:100])
-
-
-@pytest.mark.parametrize(
-    ('noise', 'jitter', 'expected'),
-    [
-        (1e-4, 0.0, 1e-4),
-        (0.0, 1e-4, 1e-4),
-        (0.0, 0.0, 0.0),
-    ],
-)
-def test_noise_at_stamps_is_noise_and_jitter(noise, jitter, expected):
-    """Uneven sampling that the stamps tell, and missing samples, are neither."""
-    random = np.random.default_rng(2)
-    t = 1e-3 * (np.arange(20_000) + random.uniform(-0.3, 0.3, 20_000))
-    t = t[random.random(len(t)) > 0.1]
-    y = np.sin(t) + t + noise * random.standard_normal(len(t))
-    slope = np.sqrt(np.mean((np.cos(t) + 1.0) ** 2))
-    t += 3**0.5 * jitter / slope * random.uniform(-1.0, 1.0, len(t))
-    assert noise_at_stamps(t, y) == pytest.approx(expected, rel=0.1, abs=1e-9)
 
 
 def test_theory_scales_with_the_unit_of_y():
@@ -517,13 +449,12 @@ def column(error):
 
 
 def test_report_warns_of_overfitting_and_of_bounds():
-    data = TuningData([], [], '', {})
     space = [Dimension('a', 1e-3, 1e3, 1.0), Dimension('b', 0.0, 1.0, 0.5, log=False)]
     middle = {'a': 1.0, 'b': 0.5}
-    assert report.warnings(space, middle, [column(0.4), column(0.49)], data) == []
-    (worse,) = report.warnings(space, middle, [column(0.4), column(0.52)], data)
+    assert report.warnings(space, middle, [column(0.4), column(0.49)]) == []
+    (worse,) = report.warnings(space, middle, [column(0.4), column(0.52)])
     assert '1.30 times' in worse
-    (bound,) = report.warnings(space, {'a': 1.1e-3, 'b': 0.5}, [column(0.4)] * 2, data)
+    (bound,) = report.warnings(space, {'a': 1.1e-3, 'b': 0.5}, [column(0.4)] * 2)
     assert 'At their bounds: a;' in bound
     assert not report.at_bound(space[0], 3.0)  # in logarithms this is the middle
 

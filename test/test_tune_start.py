@@ -19,7 +19,7 @@ from fhaosmo_ros.tools.tuning.objective import least_damping, Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.source import simulated
 from fhaosmo_ros.tools.tuning.space import changes
-from fhaosmo_ros.tools.tuning.start import grid, KalmanGains, SCHEME, with_scheme
+from fhaosmo_ros.tools.tuning.start import KalmanDesign, KalmanGains, SCHEME, with_scheme
 from fhaosmo_ros.tools.tuning.tuner import Tuner
 import numpy as np
 from studies.comparison.methods.linear import estimates
@@ -80,7 +80,7 @@ def test_bandwidth_is_that_of_the_matern_process_of_d():
         one, other = (KalmanGains(rs, {}, model, k, 1e-4) for rs in (recordings, large))
         assert one.bandwidth(2.0) == pytest.approx(other.bandwidth(2.0))
         assert one.bandwidth(4.0) > one.bandwidth(2.0)
-        widths = [start(grid()[5])['fuzzy_widths'][0] for start in (one, other)]
+        widths = [start(KalmanDesign(0.5, 1.25))['fuzzy_widths'][0] for start in (one, other)]
         assert widths[1] == pytest.approx(9.0 * widths[0])
     # k = 0: a first-order Gauss-Markov process, var = intensity / (2 rate).
     start = KalmanGains(recordings, {}, model, 0, 1e-4)

@@ -8,7 +8,7 @@ import sys
 from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
+from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
@@ -18,13 +18,7 @@ from fhaosmo_ros.tools.cli.command import Interrupted, run_command
 from fhaosmo_ros.tools.cli.options import add_input_options, assigned, bag_inputs
 from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.source import (
-    BagSource,
-    from_bag,
-    RecordedOutput,
-    simulated,
-    TuningData,
-)
+from fhaosmo_ros.tools.tuning.source import BagSource, recorded, simulated
 
 TRIALS = 1000
 NEEDED = ('optuna>=4,<6', 'cmaes')
@@ -102,17 +96,16 @@ def _parser() -> argparse.ArgumentParser:
     add(
         '--bag',
         type=Path,
-        help='with the truth in it: tune on it; without: the gains that are likeliest for its y '
-        '(--trials and the other options of the search are not used)',
+        help='find the gains that are likeliest for its y (--trials and the other options of the '
+        'search are not used)',
     )
     add_input_options(add)
-    add('--plant', default='/plant', help='whose topics are the truth (%(default)s)')
     return parser
 
 
 def _tune(arguments: argparse.Namespace, stop: Stop) -> int:
+    from fhaosmo_ros.tools.tuning.report import write
     from fhaosmo_ros.tools.tuning.tuner import Tuner
-    from fhaosmo_ros.tools.tuning.writer import write
 
     if arguments.trials < 1 or (arguments.jobs or 1) < 1 or arguments.seed < 0:
         raise ConfigurationError(
@@ -122,16 +115,13 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> int:
     estimator, tuning = read_parameters(arguments.params_file, arguments.param)
     with Output(arguments.output, arguments.force) as output:
         values = TUNE_PARAMETERS.complete(tuning)
-        with stop.raising():
-            data = _data(arguments, estimator, values)
-        if isinstance(data, RecordedOutput):
-            text = _identify(arguments, data, estimator, tuning, output.path, stop)
+        if arguments.bag is not None:
+            text = _identify(arguments, estimator, tuning, output.path, stop)
             _say_where(text, output.keep())
             return 0
-        print(
-            f'{len(data.training)} recordings to train on, {len(data.held_out)} held out: '
-            f'{data.origin}'
-        )
+        with stop.raising():
+            data = simulated(values, arguments.seed)
+        print(f'{len(data.training)} recordings to train on, {len(data.held_out)} held out')
         jobs = arguments.jobs or os.cpu_count() or 1
         tuner = Tuner(data, estimator, values, arguments.seed, jobs, stop.is_set)
         result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
@@ -176,7 +166,6 @@ def _say_where(text: str, folder: Path) -> None:
 
 def _identify(
     arguments: argparse.Namespace,
-    data: RecordedOutput,
     estimator: dict[str, Any],
     tuning: dict[str, Any],
     folder: Path,
@@ -190,7 +179,7 @@ def _identify(
     others = chosen_otherwise(estimator)
     if others:
         raise ConfigurationError(
-            f'--bag without the truth: expected gains of structure levant and scheme '
+            f'--bag: expected gains of structure levant and scheme '
             f'predict_correct, got {", ".join(others)} set. Leave that out; or tune by a '
             'simulated family: without --bag, with noise_std, rms_of_d and band_of_d as this '
             'command finds them'
@@ -207,8 +196,11 @@ def _identify(
         given['noise_size'] = tuning['noise_std']
     values = ESTIMATOR_PARAMETERS.complete(given)
     given |= {name: values[name] for name in ('order', 'phi')}
+    model = TriangularModel.of(values)
     with stop.raising():
-        found = identify_input(data, TriangularModel.of(values), values, given)
+        inputs = bag_inputs(arguments, estimator, model.used_inputs)
+        data = recorded(BagSource(arguments.bag, *inputs), model)
+        found = identify_input(data, model, values, given)
         checks.refuse(found)
         made = gains.make_gains(found, given)
         checks.refuse_unseen(found, made)
@@ -216,17 +208,6 @@ def _identify(
     name = f'bag {arguments.bag.resolve().name}'
     notes = checks.notes(found, made, run)
     return output.write(folder, found, made, run, notes, arguments.command_line, name)
-
-
-def _data(
-    arguments: argparse.Namespace, estimator: dict[str, Any], values: Parameters
-) -> TuningData | RecordedOutput:
-    if arguments.bag is None:
-        return simulated(values, arguments.seed)
-    used = TriangularModel.of(values).used_inputs
-    inputs = bag_inputs(arguments, estimator, used)
-    source = BagSource(arguments.bag, *inputs, arguments.plant.rstrip('/'))
-    return from_bag(source, values)
 
 
 if __name__ == '__main__':

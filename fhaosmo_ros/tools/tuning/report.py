@@ -1,19 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Texts of a tuning: the YAML for the estimator, and the parts of the report."""
+"""The output of a search: gains.yaml, report.md and a figure of the estimates."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from fhaosmo_ros import __version__
+from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.files import dumps
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.tools.tuning.figures import save_estimates
 from fhaosmo_ros.tools.tuning.objective import Evaluation, Objective
 from fhaosmo_ros.tools.tuning.search import Dimension
-from fhaosmo_ros.tools.tuning.source import TuningData
+from fhaosmo_ros.tools.tuning.space import changes
+from fhaosmo_ros.tools.tuning.tuner import Tuner, TuningResult
 import numpy as np
 
 OVERFITTED = 1.25
 """The report warns from this ratio of the held-out error to the training error on."""
 AT_BOUND = 0.02
 """A value counts as at its bound if it is this close to it, as a share of the range."""
+SHOWN = 3
+"""Recordings in the figure of estimates."""
 
 
 class Column(NamedTuple):
@@ -94,13 +103,10 @@ def at_bound(dimension: Dimension, value: float) -> bool:
 
 
 def warnings(
-    space: Sequence[Dimension],
-    best: Mapping[str, float],
-    tuned: Sequence[Column],
-    data: TuningData,
+    space: Sequence[Dimension], best: Mapping[str, float], tuned: Sequence[Column]
 ) -> list[str]:
     """Return what a user should know before using the gains."""
-    found = list(data.notes)
+    found = []
     training, held_out = (column.evaluation.error for column in tuned)
     if held_out > OVERFITTED * training:
         found.append(
@@ -122,10 +128,92 @@ def warnings(
     return found
 
 
-def sensor_table(data: TuningData) -> str:
-    """Return a Markdown table of what was estimated from the y of a bag."""
-    if data.sensor is None:
-        return ''
-    lines = ['| estimated from y | |', '|---|---|']
-    lines += [f'| {name} | {value:.4g} |' for name, value in data.sensor._asdict().items()]
-    return '\n'.join(lines)
+def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str:
+    """
+    Write everything into a new folder.
+
+    Returns
+    -------
+    str
+        The report's main part, to be printed.
+
+    """
+    folder.mkdir()
+    gains = tuner.with_readout(changes(result.best))
+    name = 'given' if tuner.before_is_given else 'start'
+    before = tuner.with_readout(tuner.before)
+    columns = [
+        Column(f'{title}, {data}', objective(values), objective)
+        for title, values in ((name, before), ('tuned', gains))
+        for data, objective in (('training', tuner.training), ('held out', tuner.held_out))
+    ]
+    tuned = columns[2:]
+    parameters = tuner.parameters(gains)
+    comments = _comments(tuner, result, command, tuned)
+    (folder / 'gains.yaml').write_text(parameter_file(parameters, comments), 'utf-8')
+    cautions = warnings(tuner.space, result.best, tuned)
+    main = '\n\n'.join([table(columns), *(f'Note: {text}' for text in cautions)])
+    text = _document(tuner, result, command, main)
+    (folder / 'report.md').write_text(text, encoding='utf-8')
+    _draw_estimates(folder / 'estimates.png', tuner, before, gains)
+    return main
+
+
+def _comments(tuner: Tuner, result: TuningResult, command: str, tuned: list[Column]) -> list[str]:
+    training, held_out = (column.evaluation for column in tuned)
+    p = tuner.data.parameters
+    return [
+        'Made by',
+        f'    python -m fhaosmo_ros {command}',
+        f'({result.trials} trials, fhaosmo_ros {__version__}) for a simulated family.',
+        f'Noise of y {p["noise_std"]:.3g}, {p["sample_rate"]:g} Hz, '
+        f'd: {", ".join(dict.fromkeys(p["disturbances"]))} with an RMS of {p["rms_of_d"]:.3g}.',
+        f'Error relative to the truth: {training.error:.3f} in training, '
+        f'{held_out.error:.3f} on held-out recordings.',
+    ]
+
+
+def _document(tuner: Tuner, result: TuningResult, command: str, main: str) -> str:
+    begin = {d.name: d.start for d in tuner.space}
+    settings = tuner.data.parameters | dict(tuner.tuning)
+    parts = [
+        '# Tuning',
+        f'    python -m fhaosmo_ros {command}',
+        f'{result.trials} trials in the study, {result.seconds:.0f} s in this run; '
+        f'{len(tuner.data.training)} recordings to train on, {len(tuner.data.held_out)} held out.',
+        '## Result',
+        main,
+        'The error is the weighted RMS error over that of the truth, a geometric mean over the '
+        'recordings. The objective adds chatter and settling by their weights. Held-out '
+        'recordings took no part in the search.',
+        '![d and its estimates](estimates.png)',
+        '## Gains',
+        gains_table(tuner.space, begin, result.best),
+    ]
+    if tuner.tried:
+        chosen = tuner.fixed['unknown_input_derivatives']
+        parts.append(start_table(tuner.tried, chosen))
+    rows = '\n'.join(f'    {name}: {value}' for name, value in settings.items())
+    parts += ['## Settings', rows]
+    return '\n\n'.join(parts) + '\n'
+
+
+def _draw_estimates(
+    path: Path, tuner: Tuner, before: dict[str, Any], after: dict[str, Any]
+) -> None:
+    seen: dict[str, Recording] = {}
+    for r in tuner.data.held_out:
+        seen.setdefault(r.shape, r)
+    chosen = list(seen.values())
+    if len(chosen) == 1:
+        chosen = tuner.data.held_out
+    shown = []
+    for r in chosen[:SHOWN]:
+        pair = (_estimate(tuner, gains, r) for gains in (before, after))
+        shown.append((f'held out: {r.shape}', r, *pair))
+    save_estimates(shown, tuner.tuning['settled'], path)
+
+
+def _estimate(tuner: Tuner, gains: dict[str, Any], recording: Recording) -> Any:
+    observer = Observer(ESTIMATOR_PARAMETERS.complete(tuner.estimator | gains))
+    return observer.run(recording.t, recording.y, recording.u).unknown_input

@@ -13,8 +13,7 @@ Floats = NDArray[np.float64]
 FEWEST = 200
 """An estimate needs so many samples."""
 DIFFERENCES = range(1, 9)
-DIVIDED = range(2, 6)
-"""Orders of the differences on evenly spaced samples, and of the divided differences."""
+"""Orders of the differences of y."""
 NORMAL = 0.6745
 """Median of |x| of a standard normal x."""
 ON_GRID = 0.02
@@ -90,44 +89,6 @@ def identify(t: Floats, y: Floats) -> Sensor:
     return Sensor(
         noise, quantum, rate, jitter, lost / (lost + len(t)), lost / gaps if gaps else 1.0
     )
-
-
-def noise_at_stamps(t: Floats, y: Floats) -> float:
-    """
-    Return the RMS noise of y over its stamps; jitter of the stamps acts as noise, too.
-
-    It follows from divided differences, scaled so that white noise keeps its size. None is taken
-    across missing samples.
-
-    Parameters
-    ----------
-    t, y : (K,) arrays
-        Increasing stamps (s) and samples. Fewer than `FEWEST` of them tell nothing: 0 is returned.
-
-    """
-    if len(t) < FEWEST:
-        return 0.0
-    h = np.diff(t)
-    regular = h < 1.5 * float(np.median(h))
-    found = []
-    for order in DIVIDED:
-        whole = np.lib.stride_tricks.sliding_window_view(regular, order).all(axis=1)
-        times, values = (
-            np.lib.stride_tricks.sliding_window_view(x, order + 1)[whole] for x in (t, y)
-        )
-        if len(times) < FEWEST // 2:
-            continue
-        columns = range(order + 1)
-        times = times / h.mean()
-        weights = np.column_stack(
-            [
-                1.0 / np.prod([times[:, j] - times[:, k] for k in columns if k != j], axis=0)
-                for j in columns
-            ]
-        )
-        left = np.sum(weights * values, axis=1) / np.linalg.norm(weights, axis=1)
-        found.append(float(np.sqrt(np.mean(left**2))))
-    return min(found, default=0.0)
 
 
 def _noise(y: Floats, regular: NDArray[np.bool_]) -> float:

@@ -26,10 +26,9 @@ and lag, which depends on the family of d, and there is no formula for it.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import product
+from itertools import product, starmap
 import math
-from math import comb
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA
@@ -80,8 +79,6 @@ ZETAS = (0.7, 1.5, 4.0)
 OPEN = 100.0
 """epsilon in units of the largest half-width: all levels run, except far from the estimate."""
 
-Candidate = TypeVar('Candidate')
-
 
 class Start(NamedTuple):
     """
@@ -113,8 +110,6 @@ class StartProblem(NamedTuple):
         Parameters that are searched.
     objective : callable
         From what is set for the estimator to an Objective.
-    least_noise : float
-        Noise of y to assume where the recordings show less.
 
     """
 
@@ -122,50 +117,14 @@ class StartProblem(NamedTuple):
     estimator: Mapping[str, Any]
     names: Sequence[str]
     objective: Callable[[Mapping[str, Any]], Objective]
-    least_noise: float = 0.0
 
-    @property
-    def observer(self) -> Observer:
-        """An observer with what is set."""
-        return Observer(ESTIMATOR_PARAMETERS.complete(self.estimator))
-
-    @property
-    def free_gamma(self) -> bool:
-        """True if gamma_initial is searched and not set."""
-        return 'gamma_initial' in self.names and 'gamma_initial' not in self.estimator
-
-
-class CandidateEvaluator:
-    """Evaluates candidates in several threads and shows a progress bar."""
-
-    def __init__(self, jobs: int, stopped: Callable[[], bool]) -> None:
-        self._pool, self._stopped = ThreadPoolExecutor(jobs), stopped
-        self._bar = progress(unit='set', desc='start', leave=False)
-
-    def __enter__(self) -> 'CandidateEvaluator':
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._pool.shutdown()
-        self._bar.close()
-
-    def best(
-        self, objective: Callable[[Candidate], float], several: Sequence[Candidate]
-    ) -> tuple[float, Candidate]:
-        """Return the smallest objective and its candidate, the first of equals."""
-
-        def evaluate(candidate: Candidate) -> float:
-            try:
-                return math.inf if self._stopped() else objective(candidate)
-            except ConfigurationError:  # a value out of its bounds, or values that do not fit
-                return math.inf
-            finally:
-                self._bar.update()
-
-        self._bar.total = (self._bar.total or 0) + len(several)
-        values = list(self._pool.map(evaluate, several))
-        number = min(range(len(values)), key=values.__getitem__)
-        return values[number], several[number]
+    def gamma(self, p: Mapping[str, Any], usual: float) -> float:
+        """Return gamma_initial: what is set, or the usual one where it is searched."""
+        if not p['variant'].endswith('_adaptive'):
+            return FIXED_GAMMA
+        if 'gamma_initial' in self.names and 'gamma_initial' not in self.estimator:
+            return float(min(max(usual, p['gamma_min']), p['gamma_max']))
+        return float(p['gamma_initial'])
 
 
 def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
@@ -176,9 +135,7 @@ def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
     return found + [k for k in MEANT_FOR if k in estimator]
 
 
-def with_scheme(
-    estimator: Mapping[str, Any], recordings: Sequence[Recording], least_noise: float = 0.0
-) -> dict[str, Any]:
+def with_scheme(estimator: Mapping[str, Any], recordings: Sequence[Recording]) -> dict[str, Any]:
     """
     Return what the user set for the estimator, with `SCHEME` where that is open.
 
@@ -189,10 +146,7 @@ def with_scheme(
     if chosen_otherwise(given):
         return given
     period = float(f'{np.median(np.diff(recordings[0].t)):.4g}')
-    noise = max(effective_noise(recordings), least_noise)
-    sizes = np.sqrt(
-        np.mean(np.concatenate([np.column_stack([r.z, r.d]) for r in recordings]) ** 2, axis=0)
-    )
+    noise, sizes = effective_noise(recordings), true_sizes(recordings)
     known = {}
     if noise > 0.0 and (sizes > 0.0).all():
         z, d = [float(f'{x:.3g}') for x in sizes[:-1]], float(f'{sizes[-1]:.3g}')
@@ -213,71 +167,67 @@ def find_start(problem: StartProblem, jobs: int, stopped: Callable[[], bool]) ->
         Asked before each evaluation; True ends the search with the best so far.
 
     """
-    p = problem.observer.parameters
-    with CandidateEvaluator(jobs, stopped) as evaluator:
+    observer = Observer(ESTIMATOR_PARAMETERS.complete(problem.estimator))
+    p = observer.parameters
+    with ThreadPoolExecutor(jobs) as pool, progress(unit='set', desc='start', leave=False) as bar:
+
+        def best(objective: Callable[[Any], float], several: Sequence[Any]) -> tuple[float, Any]:
+            """Return the smallest objective and its candidate, the first of equals."""
+
+            def evaluate(candidate: Any) -> float:
+                bar.update()
+                try:
+                    return math.inf if stopped() else objective(candidate)
+                except ConfigurationError:  # a value out of its bounds, or values that do not fit
+                    return math.inf
+
+            return min(
+                zip(pool.map(evaluate, several), several, strict=True), key=lambda pair: pair[0]
+            )
+
         if p['scheme'] == 'predict_correct' and p['variant'].startswith('fuzzy'):
-            found = _best_kalman_filter(problem, evaluator)
+            found = _best_kalman_filter(problem, p, best)
             if found is not None:
                 return found
-        return Start(_best_scaled_gains(problem, evaluator), {})
-
-
-def _best_scaled_gains(problem: StartProblem, evaluator: CandidateEvaluator) -> dict[str, Any]:
-    """Return the best of `theory.candidates`."""
-    observer, recordings = problem.observer, problem.recordings
-    p = observer.parameters
-    gammas = [FIXED_GAMMA]
-    if p['variant'].endswith('_adaptive'):
-        gammas = [
-            g for g in GAMMAS if problem.free_gamma and p['gamma_min'] <= g <= p['gamma_max']
+        noise = effective_noise(problem.recordings)
+        judge = problem.objective(problem.estimator)
+        several = [
+            {k: v for k, v in gains.items() if k in problem.names}
+            for gamma in sorted({problem.gamma(p, usual) for usual in GAMMAS})
+            for gains in candidates(
+                problem.recordings, observer.levels, noise, p['structure'], gamma
+            )
         ]
-        gammas = gammas or [p['gamma_initial']]
-    objective = problem.objective(problem.estimator)
-    several = candidates(
-        recordings,
-        observer.levels,
-        max(effective_noise(recordings), problem.least_noise),
-        p['structure'],
-        gammas,
-    )
-    searched = [{k: v for k, v in gains.items() if k in problem.names} for gains in several]
-    return evaluator.best(lambda gains: objective(gains).objective, searched)[1]
+        return Start(best(lambda gains: judge(gains).objective, several)[1], {})
 
 
-def _best_kalman_filter(problem: StartProblem, evaluator: CandidateEvaluator) -> Start | None:
+def _best_kalman_filter(
+    problem: StartProblem, p: Mapping[str, Any], best: Callable[..., tuple[float, Any]]
+) -> Start | None:
     """Return the best Kalman filter with the best number of derivatives, or None without any."""
-    estimator, p = problem.estimator, problem.observer.parameters
-    gamma = p['gamma_initial']
-    if not p['variant'].endswith('_adaptive'):
-        gamma = FIXED_GAMMA
-    elif problem.free_gamma:
-        gamma = min(max(GAMMA, p['gamma_min']), p['gamma_max'])
+    estimator = problem.estimator
     fixed = {k: v for k, v in estimator.items() if k not in problem.names}
-    model = TriangularModel.of(p)
     open_ = not {'unknown_input_derivatives', 'lambda'} & estimator.keys()
-    gains, objectives, found = {}, {}, {}
+    make, objectives, found = {}, {}, {}
     for k in DERIVATIVES if open_ else [p['unknown_input_derivatives']]:
-        make = KalmanGains(problem.recordings, fixed, model, k, gamma, problem.least_noise)
+        make[k] = KalmanGains(
+            problem.recordings, fixed, TriangularModel.of(p), k, problem.gamma(p, GAMMA)
+        )
         judge = problem.objective({**estimator, 'unknown_input_derivatives': k})
-
-        def objective(design: KalmanDesign, make: Any = make, judge: Any = judge) -> float:
-            return float(judge(make(design)).objective)
-
-        gains[k], objectives[k] = make, objective
-        found[k] = evaluator.best(objective, grid())
+        objectives[k] = lambda design, k=k, judge=judge: judge(make[k](design)).objective
+        found[k] = best(objectives[k], list(starmap(KalmanDesign, product(RATES, FACTORS))))
     limit = HOPELESS * min(value for value, _ in found.values())
     for k, objective in objectives.items():
-        if found[k][0] > limit:
-            continue
-        for zoom in ZOOMS:
-            neighbours = list(around(found[k][1], zoom))
-            found[k] = min(found[k], evaluator.best(objective, neighbours))
+        if found[k][0] <= limit:
+            for zoom in ZOOMS:
+                neighbours = list(around(found[k][1], zoom))
+                found[k] = min(found[k], best(objective, neighbours))
     tried = {k: value for k, (value, _) in found.items()}
-    best = min(tried.values())
-    if math.isinf(best):
+    least = min(tried.values())
+    if math.isinf(least):
         return None
-    chosen = next(k for k, value in tried.items() if WORTH * value <= best)
-    return Start(gains[chosen](found[chosen][1]), tried)
+    chosen = next(k for k, value in tried.items() if WORTH * value <= least)
+    return Start(make[chosen](found[chosen][1]), tried)
 
 
 class KalmanDesign(NamedTuple):
@@ -298,11 +248,6 @@ class KalmanDesign(NamedTuple):
     rate: float
     factor: float
     width: float = WIDTH
-
-
-def grid() -> list[KalmanDesign]:
-    """Return the designs to evaluate first."""
-    return [KalmanDesign(*pair) for pair in product(RATES, FACTORS)]
 
 
 def around(design: KalmanDesign, zoom: float) -> Iterator[KalmanDesign]:
@@ -330,8 +275,6 @@ class KalmanGains:
     derivatives : int
         Derivatives of d that the observer estimates.
     gamma : float
-    least_noise : float
-        Noise of y to assume where the recordings show less.
 
     """
 
@@ -342,17 +285,15 @@ class KalmanGains:
         model: TriangularModel,
         derivatives: int,
         gamma: float,
-        least_noise: float = 0.0,
     ) -> None:
         self._fixed, self._model, self._derivatives = fixed, model, derivatives
         self._gamma = gamma
         self._period = float(np.median(np.diff(recordings[0].t)))
-        states = np.concatenate([np.column_stack([r.z, r.d]) for r in recordings])
-        size = np.sqrt(np.mean(np.square(states), axis=0))
+        size = true_sizes(recordings)
         self._size = float(size[-1])
         # Without noise the fastest observer is deadbeat: this noise is too small to slow it down.
         least = 0.1 * self._size * self._period**model.order
-        noise = max(effective_noise(recordings), least_noise)
+        noise = effective_noise(recordings)
         self._noise = max(noise, least)
         # Then the start has the largest innovations: what z_2 moves y by in a period.
         self._unit = noise if noise > least else max(float(size[1]) * self._period, least)
@@ -399,7 +340,7 @@ def candidates(
     levels: int,
     noise: float,
     structure: str = 'cascade',
-    gammas: Sequence[float] = (0.5,),
+    gamma: float = FIXED_GAMMA,
 ) -> Iterator[dict[str, Any]]:
     """
     Yield lambda, alpha, fuzzy_widths, epsilon and gamma_initial by the rules above.
@@ -414,23 +355,23 @@ def candidates(
         Standard deviation of y - z_1, the effect of jitter included.
     structure : str
         'cascade' or 'levant'.
-    gammas : sequence of float
-        Powers to try.
+    gamma : float
+        Power of the injections.
 
     """
     size = second_derivatives(recordings, levels)
     period = float(np.median(np.diff(recordings[0].t)))
     noise = max(noise, size[0] * period**2)
     level = np.arange(1, levels + 1)
-    for omega, kappa, gamma in product(OMEGAS, KAPPAS, gammas):
+    for omega, kappa in product(OMEGAS, KAPPAS):
         common = {'gamma_initial': gamma}
         if structure == 'levant':
             d = _rms(np.concatenate([r.d for r in recordings]))
             width = kappa * (noise + d / omega ** (levels - 1))
-            poles = np.array([comb(levels, int(i)) for i in level]) * omega**level
+            poles = np.array([math.comb(levels, int(i)) for i in level]) * omega**level
             power = 2.0 * gamma * (levels - level) / levels
             yield common | {
-                'lambda': _list(poles * width / (width / 3.0) ** power),
+                'lambda': (poles * width / (width / 3.0) ** power).tolist(),
                 'fuzzy_widths': [width] * levels,
             }
             continue
@@ -439,30 +380,31 @@ def candidates(
         widths = kappa * (left + size / omega**2)
         for zeta in ZETAS:
             yield common | {
-                'lambda': _list(2.0 * zeta * omega * widths / (widths / 3.0) ** gamma),
-                'alpha': _list(omega**2 * widths),
-                'fuzzy_widths': _list(widths),
+                'lambda': (2.0 * zeta * omega * widths / (widths / 3.0) ** gamma).tolist(),
+                'alpha': (omega**2 * widths).tolist(),
+                'fuzzy_widths': (widths).tolist(),
                 'epsilon': OPEN * float(widths.max()),
             }
 
 
 def second_derivatives(recordings: Sequence[Recording], levels: int) -> NDArray[np.float64]:
     """Return the RMS values L_1 .. L_N of z_3, .., z_n, d, d', .. over recordings."""
-    chain = np.concatenate([np.column_stack([r.z, r.d]) for r in recordings])
-    size = np.sqrt(np.mean(np.square(chain), axis=0))
+    size = true_sizes(recordings)
     rates = [_rms(np.diff(r.d)) / (_rms(r.d) * np.median(np.diff(r.t))) for r in recordings]
     rate = float(np.median(rates))
     size = np.concatenate([size, size[-1] * rate ** np.arange(1, levels + 1)])
     return np.maximum(size[2 : 2 + levels], np.finfo(float).tiny)
 
 
+def true_sizes(recordings: Sequence[Recording]) -> NDArray[np.float64]:
+    """Return the RMS values of z and d over recordings."""
+    chain = np.concatenate([np.column_stack([r.z, r.d]) for r in recordings])
+    return np.asarray(np.sqrt(np.mean(np.square(chain), axis=0)))
+
+
 def effective_noise(recordings: Sequence[Recording]) -> float:
     """Return the RMS of y - z_1: noise, quantum and, where z_1 is at the stamps, jitter."""
     return _rms(np.concatenate([r.y - r.z[:, 0] for r in recordings]))
-
-
-def _list(values: NDArray[np.float64]) -> list[float]:
-    return [float(v) for v in values]
 
 
 def _rms(x: NDArray[np.float64]) -> float:

@@ -101,10 +101,10 @@ class Tuner:
         names = [rule.split()[0] for rule in tuning['search'] if rule.split()]
         # The estimator may have a model of its own, other than the plant's.
         model = {name: tuning[name] for name in ('order', 'phi')}
-        self.estimator = with_scheme(model | dict(estimator), data.training, data.least_noise)
+        self.estimator = with_scheme(model | dict(estimator), data.training)
         self._choose = 'estimate_from' not in estimator
         start = find_start(
-            StartProblem(data.training, self.estimator, names, self._objective, data.least_noise),
+            StartProblem(data.training, self.estimator, names, self._objective),
             jobs,
             stopped,
         )

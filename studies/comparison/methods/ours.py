@@ -60,7 +60,7 @@ def _prepared(
 def _tune(search: Search) -> Values:
     """Return the parameters of the estimator that `tune` writes; its start uses trials, too."""
     tuning = TUNE_PARAMETERS.complete(_model(search.setting) | GOAL)
-    data = TuningData(list(search.recordings), list(search.recordings[:1]), '', {})
+    data = TuningData(list(search.recordings), list(search.recordings[:1]), {})
     used = count(1)
     with redirect_stderr(StringIO()):  # its progress bars
         tuner = Tuner(data, {}, tuning, search.seed, 1, lambda: next(used) >= search.trials)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The output of a tuning by a bag without the truth: gains.yaml, report.md and a figure."""
+"""The output of a tuning by a bag: gains.yaml, report.md and a figure."""
 
 from collections.abc import Sequence
 import math
@@ -57,7 +57,7 @@ def write(
     ])  # fmt: skip
     s = found.sensor
     parts = [
-        '# Tuning by a bag without the truth',
+        '# Tuning by a bag',
         f'    python -m fhaosmo_ros {command}',
         f'{origin}: {len(y)} samples of y, {whole:.1f} s, {s.sample_rate:.4g} Hz (jitter '
         f'{1e3 * s.stamp_jitter:.2g} ms, {s.dropout:.2%} lost'
