@@ -28,9 +28,9 @@ from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.cli.share import shipped
-from fhaosmo_ros.tools.tuning.identification.checks import refuse, refuse_unseen
-from fhaosmo_ros.tools.tuning.identification.gains import make_gains
-from fhaosmo_ros.tools.tuning.identification.identify import identify_input
+from fhaosmo_ros.tools.tuning.bag_checks import refuse, refuse_unseen
+from fhaosmo_ros.tools.tuning.bag_gains import make_gains
+from fhaosmo_ros.tools.tuning.identify import identify_input
 from fhaosmo_ros.tools.tuning.linear_gains import kalman_like, SampledModel
 from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS

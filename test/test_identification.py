@@ -4,15 +4,15 @@
 from fhaosmo_ros.core import Observer, TriangularModel
 from fhaosmo_ros.core.observer.kalman import LinearModel, stationary
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.tools.tuning.identification.checks import notes, refuse, refuse_unseen
-from fhaosmo_ros.tools.tuning.identification.gains import make_gains, run
-from fhaosmo_ros.tools.tuning.identification.identify import (
+from fhaosmo_ros.tools.tuning.bag_checks import notes, refuse, refuse_unseen
+from fhaosmo_ros.tools.tuning.bag_gains import make_gains, run
+from fhaosmo_ros.tools.tuning.identify import (
     identify_input,
     ljung_box,
     NothingToFind,
     size_of_input,
 )
-from fhaosmo_ros.tools.tuning.identification.likelihood import (
+from fhaosmo_ros.tools.tuning.likelihood import (
     Design,
     likeliest_scale,
     Likelihood,
@@ -221,16 +221,6 @@ def test_given_values_stay():
 def test_nothing_is_made_of_nothing(y, about):
     with pytest.raises(NothingToFind, match=about):
         found_in(y())
-
-
-def test_drift_of_the_sensor_is_told_or_refused():
-    drift = np.cumsum(np.random.default_rng(5).standard_normal(K)) * 2e-3
-    try:
-        found, gains, along = found_in(plant()[:, 0] + noise() + drift)
-    except NothingToFind as error:
-        assert 'drift' in str(error)  # noqa: PT017
-    else:
-        assert any('drift' in text for text in notes(found, gains, along))
 
 
 def test_unstable_model_is_told():

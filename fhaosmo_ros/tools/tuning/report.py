@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The output of a search: gains.yaml, report.md and a figure of the estimates."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,59 +39,30 @@ def parameter_file(parameters: Mapping[str, Any], comments: Sequence[str]) -> st
     return head + dumps(parameters)
 
 
-def table(columns: Sequence[Column]) -> str:
-    """Return a Markdown table of the evaluations, a column each."""
-    rows = {'objective': [f'{c.evaluation.objective:.4f}' for c in columns]}
-    rows['error, relative to the truth'] = [f'{c.evaluation.error:.4f}' for c in columns]
-    recordings = [c.objective.trial.recordings for c in columns]
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [head, ['---'] * len(head), *rows]
+    return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
+
+
+def evaluations(columns: Sequence[Column]) -> str:
+    """Return a table of the evaluations, a column each."""
+    found = [column.evaluation for column in columns]
+    rows = [
+        ['objective', *(f'{e.objective:.4f}' for e in found)],
+        ['error, relative to the truth', *(f'{e.error:.4f}' for e in found)],
+    ]
     quantities = len(columns[0].objective.scale)
     names = [f'z{k + 1}' for k in range(quantities - 1)] + ['d']
     for k, name in enumerate(names):
-        rows[f'RMS error of {name}'] = [
-            f'{_pooled(c.evaluation.scores.error[:, c.evaluation.choice, k]):.3g}' for c in columns
-        ]
-    shapes = dict.fromkeys(r.shape for rows_ in recordings for r in rows_)
-    if len(shapes) > 1:
-        for shape in shapes:
-            rows[f'RMS error of d, {shape}'] = [_of_shape(c, shape) for c in columns]
-    rows['chatter of d, powers of ten'] = [f'{c.evaluation.chatter:.2f}' for c in columns]
-    rows['settling, share of the time'] = [f'{c.evaluation.settling:.2f}' for c in columns]
-    rows['estimates from'] = [c.evaluation.estimate_from for c in columns]
-    head = ['', *(c.title for c in columns)]
-    lines = [f'| {" | ".join(head)} |', '|' + '---|' * len(head)]
-    lines += [f'| {" | ".join([name, *cells])} |' for name, cells in rows.items()]
-    return '\n'.join(lines)
-
-
-def _pooled(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float('nan')
-
-
-def _of_shape(column: Column, shape: str) -> str:
-    chosen = [k for k, r in enumerate(column.objective.trial.recordings) if r.shape == shape]
-    errors = column.evaluation.scores.error[chosen, column.evaluation.choice, -1]
-    return f'{_pooled(errors):.3g}' if chosen else '-'
-
-
-def gains_table(space: Sequence[Dimension], start: Mapping[str, float], best: Any) -> str:
-    """Return a Markdown table of what was searched."""
-    lines = ['| parameter | from | to | start | tuned |', '|---|---|---|---|---|']
-    for d in space:
-        mark = ' (at its bound)' if at_bound(d, best[d.name]) else ''
-        lines.append(
-            f'| {d.name} | {d.low:.3g} | {d.high:.3g} | {start[d.name]:.4g} | '
-            f'{best[d.name]:.4g}{mark} |'
-        )
-    return '\n'.join(lines)
-
-
-def start_table(tried: Mapping[int, float], chosen: int) -> str:
-    """Return a Markdown table of the numbers of derivatives of d that were tried."""
-    lines = ['| unknown_input_derivatives | objective at the start |', '|---|---|']
-    lines += [
-        f'| {k}{" (taken)" if k == chosen else ""} | {value:.4f} |' for k, value in tried.items()
+        errors = [np.sqrt(np.mean(np.square(e.scores.error[:, e.choice, k]))) for e in found]
+        rows.append([f'RMS error of {name}', *(f'{error:.3g}' for error in errors)])
+    rows += [
+        ['chatter of d, powers of ten', *(f'{e.chatter:.2f}' for e in found)],
+        ['settling, share of the time', *(f'{e.settling:.2f}' for e in found)],
+        ['estimates from', *(e.estimate_from for e in found)],
     ]
-    return '\n'.join(lines)
+    return table(['', *(column.title for column in columns)], rows)
 
 
 def at_bound(dimension: Dimension, value: float) -> bool:
@@ -139,43 +110,46 @@ def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str
 
     """
     folder.mkdir()
-    gains = tuner.with_readout(changes(result.best))
+    gains, before = (tuner.with_readout(x) for x in (changes(result.best), tuner.before))
     name = 'given' if tuner.before_is_given else 'start'
-    before = tuner.with_readout(tuner.before)
     columns = [
         Column(f'{title}, {data}', objective(values), objective)
         for title, values in ((name, before), ('tuned', gains))
         for data, objective in (('training', tuner.training), ('held out', tuner.held_out))
     ]
     tuned = columns[2:]
-    parameters = tuner.parameters(gains)
-    comments = _comments(tuner, result, command, tuned)
-    (folder / 'gains.yaml').write_text(parameter_file(parameters, comments), 'utf-8')
-    cautions = warnings(tuner.space, result.best, tuned)
-    main = '\n\n'.join([table(columns), *(f'Note: {text}' for text in cautions)])
-    text = _document(tuner, result, command, main)
-    (folder / 'report.md').write_text(text, encoding='utf-8')
-    _draw_estimates(folder / 'estimates.png', tuner, before, gains)
-    return main
-
-
-def _comments(tuner: Tuner, result: TuningResult, command: str, tuned: list[Column]) -> list[str]:
-    training, held_out = (column.evaluation for column in tuned)
+    training, held_out = (column.evaluation.error for column in tuned)
     p = tuner.data.parameters
-    return [
+    comments = [
         'Made by',
         f'    python -m fhaosmo_ros {command}',
         f'({result.trials} trials, fhaosmo_ros {__version__}) for a simulated family.',
         f'Noise of y {p["noise_std"]:.3g}, {p["sample_rate"]:g} Hz, '
         f'd: {", ".join(dict.fromkeys(p["disturbances"]))} with an RMS of {p["rms_of_d"]:.3g}.',
-        f'Error relative to the truth: {training.error:.3f} in training, '
-        f'{held_out.error:.3f} on held-out recordings.',
+        f'Error relative to the truth: {training:.3f} in training, {held_out:.3f} on held-out '
+        'recordings.',
     ]
+    yaml = parameter_file(tuner.parameters(gains), comments)
+    (folder / 'gains.yaml').write_text(yaml, 'utf-8')
+    cautions = warnings(tuner.space, result.best, tuned)
+    main = '\n\n'.join([evaluations(columns), *(f'Note: {text}' for text in cautions)])
+    text = _document(tuner, result, command, main)
+    (folder / 'report.md').write_text(text, encoding='utf-8')
+    seen = {r.shape: r for r in reversed(tuner.data.held_out)}  # the first one of each kind of d
+    recordings = list(seen.values()) if len(seen) > 1 else tuner.data.held_out
+    shown = [
+        (f'held out: {r.shape}', r, _estimate(tuner, before, r), _estimate(tuner, gains, r))
+        for r in recordings[:SHOWN]
+    ]
+    save_estimates(shown, tuner.tuning['settled'], folder / 'estimates.png')
+    return main
 
 
 def _document(tuner: Tuner, result: TuningResult, command: str, main: str) -> str:
-    begin = {d.name: d.start for d in tuner.space}
-    settings = tuner.data.parameters | dict(tuner.tuning)
+    gains = [
+        [d.name, f'{d.low:.3g}', f'{d.high:.3g}', f'{d.start:.4g}', f'{result.best[d.name]:.4g}']
+        for d in tuner.space
+    ]
     parts = [
         '# Tuning',
         f'    python -m fhaosmo_ros {command}',
@@ -188,30 +162,18 @@ def _document(tuner: Tuner, result: TuningResult, command: str, main: str) -> st
         'recordings took no part in the search.',
         '![d and its estimates](estimates.png)',
         '## Gains',
-        gains_table(tuner.space, begin, result.best),
+        table(['parameter', 'from', 'to', 'start', 'tuned'], gains),
     ]
     if tuner.tried:
         chosen = tuner.fixed['unknown_input_derivatives']
-        parts.append(start_table(tuner.tried, chosen))
-    rows = '\n'.join(f'    {name}: {value}' for name, value in settings.items())
-    parts += ['## Settings', rows]
+        rows = [
+            [f'{k}{" (taken)" if k == chosen else ""}', f'{value:.4f}']
+            for k, value in tuner.tried.items()
+        ]
+        parts.append(table(['unknown_input_derivatives', 'objective at the start'], rows))
+    settings = tuner.data.parameters | dict(tuner.tuning)
+    parts += ['## Settings', '\n'.join(f'    {name}: {value}' for name, value in settings.items())]
     return '\n\n'.join(parts) + '\n'
-
-
-def _draw_estimates(
-    path: Path, tuner: Tuner, before: dict[str, Any], after: dict[str, Any]
-) -> None:
-    seen: dict[str, Recording] = {}
-    for r in tuner.data.held_out:
-        seen.setdefault(r.shape, r)
-    chosen = list(seen.values())
-    if len(chosen) == 1:
-        chosen = tuner.data.held_out
-    shown = []
-    for r in chosen[:SHOWN]:
-        pair = (_estimate(tuner, gains, r) for gains in (before, after))
-        shown.append((f'held out: {r.shape}', r, *pair))
-    save_estimates(shown, tuner.tuning['settled'], path)
 
 
 def _estimate(tuner: Tuner, gains: dict[str, Any], recording: Recording) -> Any:

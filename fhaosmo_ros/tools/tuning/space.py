@@ -47,18 +47,22 @@ def make_space(
         parameter = _numeric(name)
         if not _used(name, start):
             continue
-        low, high, log = _bounds(rule, rest, parameter)
-        if name == 'gamma_initial' and low is None:
-            low, high = start['gamma_min'], start['gamma_max']
-            log = high > 10.0 * low
-        if name == 'unknown_input_decay' and low is None and not start[name]:
-            low, high = DECAYS
+        bounds, log = _bounds(rule, rest, parameter)
+        if name == 'gamma_initial' and bounds is None:
+            bounds = start['gamma_min'], start['gamma_max']
+            log = bounds[1] > 10.0 * bounds[0]
+        if name == 'unknown_input_decay' and bounds is None and not start[name]:
+            bounds = DECAYS
         values = start[name] if isinstance(start[name], list) else [start[name]]
+        labels = [name]
         if parameter.kind == 'double_array':
             values = [values[min(k, len(values) - 1)] for k in range(levels)]
-        for k, value in enumerate(values):
-            label = f'{name}[{k}]' if parameter.kind == 'double_array' else name
-            space.append(_dimension(label, value, low, high, log, decades, parameter))
+            labels = [f'{name}[{k}]' for k in range(levels)]
+        for label, value in zip(labels, values, strict=True):
+            low, high = bounds or _around(value, log, decades, parameter)
+            if log and value < low:  # such as 0, which has no logarithm
+                value = float(np.sqrt(low * high))
+            space.append(Dimension(label, low, high, min(max(value, low), high), log))
     if not space:
         raise ConfigurationError(
             f"parameter 'search': expected one that the variant {start['variant']} uses, "
@@ -107,46 +111,32 @@ def _used(name: str, start: Mapping[str, Any]) -> bool:
 
 def _bounds(
     rule: str, rest: list[str], parameter: Parameter
-) -> tuple[float | None, float | None, bool]:
-    lower = float('-inf') if parameter.lower is None else parameter.lower
-    upper = float('inf') if parameter.upper is None else parameter.upper
+) -> tuple[tuple[float, float] | None, bool]:
+    """Return the bounds that a rule gives, and whether to search in logarithms."""
+    lower = -np.inf if parameter.lower is None else parameter.lower
+    upper = np.inf if parameter.upper is None else parameter.upper
     log = lower >= 0.0 and upper > 1.0
     if not rest:
-        return None, None, log
-    error = ConfigurationError(
-        f"parameter 'search': expected NAME, NAME LOW HIGH or NAME LOW HIGH log|linear with "
-        f'bounds for {parameter.name} ({parameter.allowed}), got {rule!r}'
-    )
+        return None, log
     try:
-        low, high = float(rest[0]), float(rest[1])
-    except (ValueError, IndexError):
-        raise error from None
-    if len(rest) > 3 or (len(rest) == 3 and rest[2] not in ('log', 'linear')):
-        raise error
+        low, high = map(float, rest[:2])
+    except ValueError:
+        low = high = np.nan
     if len(rest) == 3:
         log = rest[2] == 'log'
-    if not lower <= low < high <= upper or (log and low <= 0.0):
-        raise error
-    return low, high, log
+    known = len(rest) == 2 or rest[2:] in (['log'], ['linear'])
+    if not (known and lower <= low < high <= upper) or (log and low <= 0.0):
+        raise ConfigurationError(
+            f"parameter 'search': expected NAME, NAME LOW HIGH or NAME LOW HIGH log|linear with "
+            f'bounds for {parameter.name} ({parameter.allowed}), got {rule!r}'
+        )
+    return (low, high), log
 
 
-def _dimension(
-    label: str,
-    value: float,
-    low: float | None,
-    high: float | None,
-    log: bool,
-    decades: float,
-    parameter: Parameter,
-) -> Dimension:
+def _around(value: float, log: bool, decades: float, parameter: Parameter) -> tuple[float, float]:
+    """Return the usual bounds around a start."""
     lower, upper = parameter.lower or 0.0, parameter.upper or 1.0
-    if low is None or high is None:
-        if log:
-            value = max(value, SMALLEST)
-            low = max(value / 10.0**decades, lower, SMALLEST)
-            high = min(value * 10.0**decades, upper)
-        else:
-            low, high = lower + 0.05 * (upper - lower), upper
-    if log and value < low:  # such as 0, which has no logarithm
-        value = float(np.sqrt(low * high))
-    return Dimension(label, low, high, min(max(value, low), high), log)
+    if not log:
+        return lower + 0.05 * (upper - lower), upper
+    value = max(value, SMALLEST)
+    return max(value / 10.0**decades, lower, SMALLEST), min(value * 10.0**decades, upper)

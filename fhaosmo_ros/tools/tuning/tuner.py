@@ -79,7 +79,7 @@ class Tuner:
     training, held_out : Objective
     space : list of Dimension
     tried : dict
-        Objective of the best Kalman filter by number of derivatives of d; see start/find.py.
+        Objective of the best Kalman filter by number of derivatives of d; see start.py.
 
     Raises
     ------

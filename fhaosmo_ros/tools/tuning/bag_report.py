@@ -8,9 +8,9 @@ from pathlib import Path
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools.tuning import figures
-from fhaosmo_ros.tools.tuning.identification.gains import BEGIN, Gains, Run
-from fhaosmo_ros.tools.tuning.identification.identify import Identified, LAGS
-from fhaosmo_ros.tools.tuning.report import parameter_file
+from fhaosmo_ros.tools.tuning.bag_gains import BEGIN, Gains, Run
+from fhaosmo_ros.tools.tuning.identify import Identified, LAGS
+from fhaosmo_ros.tools.tuning.report import parameter_file, table
 import numpy as np
 
 FLAT = 2.0
@@ -69,11 +69,6 @@ def write(
         'log-likelihood. What is found is that of y in this bag: where d will be quicker or '
         'larger, record it so.',
         '![d, and the innovations](estimates.png)',
-        '## Held-out pieces',
-        _held_out(found),
-        'Every second tenth of the bag was held out while these were fitted. Larger is better; a '
-        'difference below 3 is chance. What is taken was fitted to all of the bag, where it is '
-        'the likeliest.',
         '## Gains',
         '\n'.join(f'    {name}: {value}' for name, value in parameters.items()),
     ]
@@ -105,7 +100,7 @@ def _found(found: Identified, gains: Gains) -> str:
         (f'expected error of {name}', f'{e:.3g}')
         for name, e in zip(names, gains.expected, strict=True)
     ]
-    return '\n'.join(['| found in y | |', '|---|---|', *(f'| {a} | {b} |' for a, b in rows)])
+    return table(['found in y', ''], rows)
 
 
 def _number(value: float, spread: float) -> str:
@@ -128,22 +123,4 @@ def _run(run: Run, gains: Gains) -> str:
         ('probability of that if they are white (Ljung-Box)', f'{run.probability:.2g}'),
         ('samples rejected, times begun afresh', f'{counts.rejected}, {counts.divergences}'),
     ]
-    return '\n'.join(
-        ['| the estimator along the bag | |', '|---|---|', *(f'| {a} | {b} |' for a, b in rows)]
-    )
-
-
-def _held_out(found: Identified) -> str:
-    best = max(found.tried.values(), key=lambda e: e.held_out)
-    count = len(found.likelihood.samples.y) / 2.0
-    lines = [
-        '| derivatives of d | noise | bandwidth, rad/s | log-likelihood, training | held out |',
-        '|---|---|---|---|---|',
-    ]
-    lines += [
-        f'| {k}{" (taken)" if k == found.best.design.derivatives else ""} | {e.low_noise:.4g} | '
-        f'{e.design.bandwidth:.3g} | {(e.training - best.training) * count:+.1f} | '
-        f'{(e.held_out - best.held_out) * count:+.1f} |'
-        for k, e in found.tried.items()
-    ]
-    return '\n'.join(lines)
+    return table(['the estimator along the bag', ''], rows)

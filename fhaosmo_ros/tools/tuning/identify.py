@@ -10,7 +10,7 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.cli.progress import progress
-from fhaosmo_ros.tools.tuning.identification.likelihood import (
+from fhaosmo_ros.tools.tuning.likelihood import (
     CLIP,
     Design,
     Evaluation,
@@ -56,8 +56,8 @@ SHAKES = tuple(float(x) for x in np.geomspace(1e-4, 1e2, 7))
 WHITE = 0.01
 """Probability above which innovations pass for white, so that no colour is searched."""
 LAGS = 20
-DROP = 0.5
-"""Fall of the log-likelihood over a step of the second differences, about."""
+DROP, STEP_CHANGES = 0.125, 6
+"""Fall of the log-likelihood over a step of the differences, about; how often a step changes."""
 FEWEST = 500
 """Samples."""
 
@@ -86,7 +86,7 @@ class Identified:
     shaken : dict
         Rise of the log-likelihood if white noise drove state i = 1 .. n as well.
     spread : dict
-        Standard deviations of the logarithms of noise, intensity, decay and size of d; NaN where
+        Standard deviations of the logarithms of noise, decay and size of d; NaN where
         y does not tell.
     outliers : int
         Samples that were left out.
@@ -352,68 +352,52 @@ class Search:
 
     def alternatives(self, best: Evaluation) -> tuple[float, dict[int, float]]:
         """Return `Identified.silent` and `Identified.shaken`."""
-        count, whole = (
-            int(self.likelihood.samples.used.sum()),
-            float(self.likelihood.samples.h.sum()),
-        )
-        still = self._evaluate(best.design._replace(bandwidth=STILL / whole))
-        shaken = {}
-        for level in range(1, self.likelihood.model.order + 1):
-            trials = [
-                self._evaluate(best.design._replace(shaken=level, shake=shake)).training
-                for shake in SHAKES
-            ]
-            shaken[level] = (max(trials) - best.training) * count
-        return (best.training - still.training) * count, shaken
+        count = int(self.likelihood.samples.used.sum())
+        still = STILL / float(self.likelihood.samples.h.sum())
+
+        def rise(**changes: Any) -> float:
+            return (
+                self._evaluate(best.design._replace(**changes)).training - best.training
+            ) * count
+
+        shaken = {
+            level: max(rise(shaken=level, shake=shake) for shake in SHAKES)
+            for level in range(1, self.likelihood.model.order + 1)
+        }
+        return -rise(bandwidth=still), shaken
 
     def spread(self, best: Evaluation) -> dict[str, float]:
         """Return standard deviations from the curvature of the log-likelihood at its maximum."""
         design, count = best.design, int(self.likelihood.samples.used.sum())
-        x = np.array(self._point(design))[: 1 if self._decay else 3]
-        whole = self._point(design)
+        top = np.array(self._point(design))
+        free = 1 if self._decay else len(top)
 
-        def log_likelihood(change: Floats) -> float:
-            point = np.array(whole)
-            point[: len(change)] += change
-            return self._evaluate(self._design(design, point)).training * count
+        def fall(change: Floats) -> float:
+            """Return by how much the log-likelihood falls from its maximum."""
+            x = top.copy()
+            x[:free] += change
+            return (best.training - self._evaluate(self._design(design, x)).training) * count
 
-        top, m = best.training * count, len(x)
-        axes = np.eye(m)
-        steps = np.empty(m)
-        for i in range(m):  # so long that the log-likelihood falls by about DROP
-            steps[i] = 0.05
-            for _ in range(6):
-                fall = top - 0.5 * (
-                    log_likelihood(steps[i] * axes[i]) + log_likelihood(-steps[i] * axes[i])
-                )
-                factor = math.sqrt(DROP / fall) if fall > 0.0 else 4.0
+        steps = np.diag(np.full(free, 0.05))
+        for step in steps:
+            for _ in range(STEP_CHANGES):
+                mean = 0.5 * (fall(step) + fall(-step))
+                factor = math.sqrt(DROP / mean) if mean > 0.0 else 4.0
                 if 0.5 < factor < 2.0:
                     break
-                steps[i] *= min(max(factor, 0.2), 5.0)
-        curvature = np.empty((m, m))
-        for i in range(m):
-            for j in range(i, m):
-                a, b = steps[i] * axes[i], steps[j] * axes[j]
-                if i == j:
-                    value = log_likelihood(a) + log_likelihood(-a) - 2.0 * top
-                    curvature[i, i] = value / steps[i] ** 2
-                    continue
-                mixed = (
-                    log_likelihood(a + b) + log_likelihood(-a - b)
-                    - log_likelihood(a - b) - log_likelihood(b - a)
-                )  # fmt: skip
-                curvature[i, j] = curvature[j, i] = mixed / (4.0 * steps[i] * steps[j])
-        names = ('noise', 'intensity', 'decay', 'size')
+                step *= min(max(factor, 0.2), 5.0)
+        curvature = np.array([
+            [0.25 * (fall(a + b) + fall(-a - b) - fall(a - b) - fall(b - a)) for b in steps]
+            for a in steps
+        ])  # fmt: skip
+        k, axes = design.derivatives, np.eye(max(free, 2))[:, :free]
+        intensity = 2.0 * (self.likelihood.model.order + 1 + k) * axes[0]
+        decay = axes[0] + axes[1] if free > 1 else 0.0 * axes[0]  # ln kappa = ln omega + ln ratio
+        rows = {'decay': decay, 'size': 0.5 * intensity - (k + 0.5) * decay}
         try:
-            covariance = np.linalg.inv(-curvature)
+            covariance = steps @ np.linalg.inv(curvature) @ steps
         except np.linalg.LinAlgError:
-            return dict.fromkeys(names, math.nan)
-        levels, k = self.likelihood.model.order + 1 + design.derivatives, design.derivatives
-        free = m > 1  # ln kappa = ln omega + ln ratio
-        decay = np.array([1.0, 1.0, *[0.0] * (m - 2)]) if free else np.zeros(m)
-        intensity = 2.0 * levels * axes[0]
-        rows = {'intensity': intensity, 'decay': decay}
-        rows['size'] = 0.5 * intensity - (k + 0.5) * decay
+            return dict.fromkeys(('noise', *rows), math.nan)
         with np.errstate(invalid='ignore'):
             found = {name: float(np.sqrt(row @ covariance @ row)) for name, row in rows.items()}
         return {'noise': math.sqrt(0.5 / count)} | found

@@ -10,7 +10,7 @@ from fhaosmo_ros.core.observer.kalman import Uncertainty
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
-from fhaosmo_ros.tools.tuning.identification.identify import Identified, ljung_box
+from fhaosmo_ros.tools.tuning.identify import Identified, ljung_box
 from fhaosmo_ros.tools.tuning.linear_gains import with_gain
 from fhaosmo_ros.tools.tuning.start import GAMMA, LEAST, SCHEME, WIDTH
 import numpy as np

@@ -4,13 +4,13 @@
 from itertools import pairwise
 import math
 
-from fhaosmo_ros.tools.tuning.identification.gains import BEGIN, Gains, Run
-from fhaosmo_ros.tools.tuning.identification.identify import (
+from fhaosmo_ros.tools.tuning.bag_gains import BEGIN, Gains, Run
+from fhaosmo_ros.tools.tuning.identify import (
     Identified,
     NothingToFind,
     PIECES,
 )
-from fhaosmo_ros.tools.tuning.identification.likelihood import QUICKEST
+from fhaosmo_ros.tools.tuning.likelihood import QUICKEST
 import numpy as np
 
 SURE = 10.0
