@@ -90,7 +90,8 @@ class SampledModel:
         """
         noise = self.process_noise(intensities)
         try:
-            p = solve_discrete_are(self.a.T, self._c.T, noise, np.eye(1))
+            with np.errstate(invalid='ignore'):  # the result is checked below
+                p = solve_discrete_are(self.a.T, self._c.T, noise, np.eye(1))
         except (np.linalg.LinAlgError, ValueError) as error:
             raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
         gain = p[:, 0] / (p[0, 0] + 1.0) / self.scale
