@@ -43,8 +43,8 @@ class Smoother:
     def __init__(self, configuration: ObserverConfiguration, lag: int | None = None) -> None:
         self._rows = Rows(configuration)
         self._lag, self._tunes = lag, configuration.self_tuning
-        self._held: list[NDArray[Any]] | None = None
-        self._model: Floats | None = None  # the latest one of a self-tuning observer
+        self._held: list[NDArray[Any]] = []  # rows that wait for a self-tuning observer's model
+        self._model: Floats | None = None  # the latest one
         self._wait = BLOCK
         self._expected = {JUMPS: 0, BEGINS: 1}
 
@@ -107,42 +107,40 @@ class Smoother:
             `model` and `standard_deviation` of a `Trajectory`.
 
         """
-        estimates = z_hat.copy()
+        own = np.full((len(z_hat), 1 + self._tunes, z_hat.shape[1]), np.inf)
+        own[:, 0] = z_hat
         if self._rows.configuration.internal:
-            estimates[:, 1:] = z_tilde[:, :-1]
-        columns = [estimates, *samples, times, kinds, models.copy(), deviations]
-        if self._held is not None:
-            columns = [np.concatenate(pair) for pair in zip(self._held, columns, strict=True)]
-            self._held = None
-        if self._tunes and self._model is None:
-            early = self._lag is None and len(columns[0]) <= BEGINNING
-            if early or not columns[6].any():
-                self._held = columns
-                return
-        self._go(columns)
-
-    def _go(self, columns: list[NDArray[Any]]) -> None:
-        """Go forward through rows."""
-        estimates, y, h, u, times, kinds, models, deviations = columns
+            own[:, 0, 1:] = z_tilde[:, :-1]
         if self._tunes:
-            self._complete(estimates, models)
-        self._rows.append(estimates, (y, h, u), times, kinds, models, deviations)
+            own[:, 1, : deviations.shape[1]] = deviations**2
+        rows = [own, *samples, times, kinds, models]
+        if self._held:
+            rows = [np.concatenate(pair) for pair in zip(self._held, rows, strict=True)]
+        self._held, early = rows, self._lag is None and len(rows[0]) <= BEGINNING
+        if not self._tunes or self._model is not None or (rows[-1].any() and not early):
+            self._go()
 
-    def _complete(self, estimates: Floats, models: Floats) -> None:
+    def _go(self) -> None:
+        """Go forward through the rows that are held."""
+        (own, y, h, u, times, kinds, models), self._held = self._held, []
+        if self._tunes and len(models):
+            models = self._completed(own, models)
+        self._rows.append(own, (y, h, u), times, kinds, models)
+
+    def _completed(self, own: Floats, models: Floats) -> Floats:
         """Let what a self-tuning observer knows stand for what it did not know before (D 34)."""
-        known = models[:, 1] > 0.0  # it has a q
+        numbers, known = np.arange(len(models)), models[:, 1] > 0.0  # it has a q
+        latest = np.maximum.accumulate(np.where(known, numbers, -1))
         if self._model is None:
             first = int(np.argmax(known))
-            estimates[:first, 1:] = estimates[first, 1:]
-            stands = first if self._lag is not None else min(BEGINNING, len(models) - 1)
-            models[:stands], known[:stands] = models[stands], True
-            models[:stands, 3] %= DERIVATIVES + 1  # d has not jumped at each of them
-            self._model = models[stands]
-        for k in np.flatnonzero(~known):
-            models[k] = models[k - 1] if k else self._model
-        if len(models):
-            self._model = models[-1].copy()
-        estimates[:, -DERIVATIVES:] = 0.0  # those of d are not relied on
+            own[:first, 0, 1:] = own[first, 0, 1:]
+            stands = first if self._lag is not None else max(first, min(BEGINNING, numbers[-1]))
+            latest[:stands], self._model = latest[stands], models[first]
+        own[:, 0, -DERIVATIVES:] = 0.0  # those of d are not relied on
+        models = np.vstack([models, self._model])[latest]
+        models[latest != numbers, 3] %= DERIVATIVES + 1  # d has not jumped at each of them
+        self._model = models[-1]
+        return models
 
     def due(self) -> Floats:
         """
@@ -164,12 +162,11 @@ class Smoother:
 
     def finish(self) -> Floats:
         """Return the estimates of all rows that wait, as `due` does: nothing comes after them."""
-        if self._held is not None:
-            columns, self._held = self._held, None
-            estimates = columns[0]
-            if not columns[6].any():  # the observer knows nothing but y
-                return np.stack([estimates, np.full_like(estimates, np.inf)], axis=1)
-            self._go(columns)
+        if self._held and not self._held[-1].any():  # the observer knows nothing but y
+            own, self._held = self._held[0], []
+            return own
+        if self._held:
+            self._go()
         return self._rows.smooth(self._rows.count)  # type: ignore[no-any-return]
 
     def innovations(self) -> tuple[Floats, Floats]:
@@ -184,38 +181,31 @@ def smooth(observer: Any, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0
     See `Observer.smooth`.
     """
     t, y = np.asarray(t), np.asarray(y, dtype=np.float64)
-    u = known_inputs_of_run(u, len(t), observer.inputs).copy()
-    smoother = Smoother(observer.configuration)
-    parts = [observer.run(t[:0], y[:0], u[:0])]
-    found, first = [], None
-    for start in range(0, len(t), BLOCK):
-        block = slice(start, start + BLOCK)
-        part = observer.run(t[block], y[block], u[block])
-        parts.append(part)
-        if first is None and observer.started:
-            first = start + int(np.argmax((part.status & REJECTED) == 0))
-            latest, held = t[first], u[first]
-        if first is None:
-            continue
-        rows = slice(max(first, start), start + len(part.t))
-        part = Trajectory._make(column[rows.start - start :] for column in part)
-        inputs = u[rows]
-        for k in np.flatnonzero(~np.isfinite(inputs).all(axis=1)):  # the last ones are held
-            inputs[k] = inputs[k - 1] if k else held
-        times = np.fmax.accumulate(np.append(latest, t[rows]))
-        h = np.diff(times) * (1e-9 if np.issubdtype(t.dtype, np.integer) else 1.0)
-        latest, held = times[-1], inputs[-1]
-        samples = (part.z_hat + part.innovation)[:, 0], h, inputs
-        smoother.take(
-            part.z_hat, part.z_tilde, samples, np.arange(rows.start, rows.stop),
-            smoother.kinds(part.status), part.model, part.standard_deviation,
-        )  # fmt: skip
+    u = known_inputs_of_run(u, len(t), observer.inputs)
+    whole: Trajectory = observer.run(t, y, u)
+    if not observer.started:
+        return whole
+    first = int(np.argmax((whole.status & REJECTED) == 0))
+    rows = Trajectory._make(column[first:] for column in whole)
+    inputs = u[first:].copy()
+    for k in np.flatnonzero(~np.isfinite(inputs).all(axis=1)):  # the last ones are held
+        inputs[k] = inputs[max(k - 1, 0)]
+    times = np.fmax.accumulate(rows.t)
+    h = np.diff(times, prepend=times[0]) * (1e-9 if np.issubdtype(t.dtype, np.integer) else 1.0)
+    smoother, found = Smoother(observer.configuration), []
+    columns = (
+        rows.z_hat, rows.z_tilde, rows.z_hat[:, 0] + rows.innovation[:, 0], h, inputs,
+        np.arange(len(h)), smoother.kinds(rows.status), rows.model, rows.standard_deviation,
+    )  # fmt: skip
+    for start in range(0, len(h), BLOCK):
+        z_hat, z_tilde, *samples, times, kinds, model, deviation = (
+            column[start : start + BLOCK] for column in columns
+        )
+        smoother.take(z_hat, z_tilde, tuple(samples), times, kinds, model, deviation)
         found.append(smoother.due())
     found.append(smoother.finish())
-    whole = Trajectory(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    if first is not None:
-        estimates, n = np.concatenate(found), observer.order
-        whole.z[first:], whole.unknown_input[first:] = estimates[:, 0, :n], estimates[:, 0, n]
-        if observer.self_tuning:
-            whole.standard_deviation[first:] = np.sqrt(estimates[:, 1, : n + 1])
+    estimates, n = np.concatenate(found), observer.order
+    rows.z[:], rows.unknown_input[:] = estimates[:, 0, :n], estimates[:, 0, n]
+    if observer.self_tuning:
+        rows.standard_deviation[:] = np.sqrt(estimates[:, 1, : n + 1])
     return whole

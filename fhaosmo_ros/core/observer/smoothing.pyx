@@ -2,18 +2,15 @@
 """
 A recording, row by row, and what is known of each time by all of it (D 24, D 25, D 34).
 
-The observer runs forward as ever. About its estimates the model is linearised, with D 17 as the
-model of d, and the smoothing problem of this linear model is solved: forward by the Kalman filter
-of the deviation from the observer's estimates, backward by the recursion of Rauch, Tung and
-Striebel in the form of Bierman, which inverts no matrix. For a nonlinear Phi this is one
-Gauss-Newton step towards the most likely trajectory, begun at the observer's (Bell 1994). With a
-self-tuning observer the noise and the model of d are those of its likeliest member at each sample.
+Forward goes an extended Kalman filter with D 17 as the model of d, backward the recursion of Rauch,
+Tung and Striebel in the form of Bierman, which inverts no matrix. Of the observer it needs to know
+which samples are used, where it begins afresh, and, if it tunes itself, the noise and the model of
+d of its likeliest member at each sample. Its estimates stand where numbers overflow.
 
-Rauch, Tung and Striebel 1965, doi:10.2514/3.3166; Bierman 1973, Int. J. Control 18 (1);
-Bell 1994, doi:10.1137/0804035.
+Rauch, Tung and Striebel 1965, doi:10.2514/3.3166; Bierman 1973, Int. J. Control 18 (1).
 """
 
-from libc.math cimport INFINITY, exp, fabs, fmax, isfinite, pow, sqrt
+from libc.math cimport INFINITY, exp, fabs, isfinite, pow, sqrt
 from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
@@ -22,6 +19,7 @@ from fhaosmo_ros.core.observer.kalman cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport by_binomials, ORDERS
 from fhaosmo_ros.core.observer.sliding_mode cimport follow_spread
+from fhaosmo_ros.core.observer.structure cimport Memory
 
 from fhaosmo_ros.core.observer.kalman import STATES_DOUBT, Uncertainty
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -33,10 +31,34 @@ cdef double HUBER = 2.0
 cdef double TOLERANCE = 1e-9
 # A model of d that ends has been wrong if it has so much smaller a variance than the observer.
 cdef double SURER = 4.0
-# No variance is less than this part of that of the prediction, from which it is subtracted.
+# Part of a number that rounding may change.
 cdef double ROUNDING = 1e-12
 # At the start states count as so many times larger than `state_sizes`, or than their estimates.
 cdef double DOUBT = STATES_DOUBT
+
+
+cpdef enum:
+    MEASURED  # a sample that was used
+    UNMEASURED  # a time at which none was used
+    JUMPS  # the first sample that was used after a jump of y alone (D 23)
+    BEGINS  # the first one of a fresh start
+
+
+cdef struct Point:
+    # What a row has one number of.
+    double y  # sample, less its offset (D 23)
+    double h  # time since the row before (s)
+    double variance  # of the noise on y
+    double intensity  # of the white noise that drives the last level of d
+    double decay  # kappa of D 26 (1/s), with d and its derivatives as there; 0: as in phi
+    double derivatives  # k of the model of d; k - 4: d has jumped since the row before (D 33)
+    double pull  # e / S; this and the next two are 0 without a sample
+    double certainty  # 1 / S
+    double noise  # variance that the sample is taken to have
+    long long time  # ns
+    int kind  # MEASURED .. BEGINS
+    int last  # the level that white noise drives
+
 cdef Point example
 POINT = np.asarray(<Point[:1]> &example).dtype
 
@@ -56,19 +78,42 @@ cdef class Rows:
 
     """
 
+    # What the parameters say.
+    cdef readonly object configuration
+    cdef Prediction prediction
+    cdef int n, order, inputs  # levels; states and known inputs of the model
+    cdef bint tunes  # a self-tuning observer: the model of d is another one in each row
+    cdef bint from_measurement  # z_1 begins at the first sample
+    cdef double fastest  # rate of the fastest motion of the model (1/s)
+    cdef object model  # variance, intensity, decay and derivatives of d; of fixed gains
+    cdef double[::1] first  # estimates of a fresh observer
+    cdef double[::1] state_sizes
+    cdef double[:, ::1] fresh  # P of a fresh observer with fixed gains
+    # What it remembers beside the rows.
+    cdef Memory memory  # the size of the innovations (D 21), nothing else
+    cdef readonly Py_ssize_t count  # rows
+    cdef readonly Py_ssize_t done  # those of them that have been handed out
+    cdef readonly Py_ssize_t began  # the latest one that begins; below 0 if it has been dropped
+    cdef Py_ssize_t new  # the first of those that came last
+    # The rows, with room for some more.
+    cdef dict columns  # the arrays by name
+    cdef Point[::1] point
+    cdef double[:, ::1] u  # known inputs since the row before
+    cdef double[:, :, ::1] own  # the observer's estimates; if it tunes itself, their variances
+    cdef double[:, ::1] x  # z, d and its derivatives, predicted from the rows before
+    cdef double[:, :, ::1] p  # P of its errors; the rows of a matrix are `Row`
+    cdef double[:, :, ::1] f  # F from the row before; 0 where a row begins
+
     def __cinit__(self, configuration):
         cdef int n = configuration.levels
         self.n, self.order = n, configuration.model.order
         self.inputs, self.tunes = len(configuration.model.inputs), configuration.self_tuning
-        self.look_at({
-            'point': np.empty(0, dtype=POINT),
-            'u': np.empty((0, self.inputs)),
-            'own': np.empty((0, (self.order + 1) * self.tunes)),
-            'base': np.empty((0, n)),
-            'deviation': np.empty((0, n)),
-            'covariance': np.empty((0, n, n)),
-            'transition': np.empty((0, n, n)),
-        })
+        shapes = {
+            'u': (self.inputs,), 'own': (1 + self.tunes, n), 'x': (n,),
+            'p': (n, MOST_LEVELS), 'f': (n, MOST_LEVELS),
+        }
+        columns = {name: np.empty((0, *shape)) for name, shape in shapes.items()}
+        self.look_at(columns | {'point': np.empty(0, dtype=POINT)})
         self.configure(configuration)
 
     def configure(self, configuration):
@@ -80,7 +125,6 @@ cdef class Rows:
         if self.tunes:
             slopes = model.jacobian(np.zeros(self.order))
             linear = LinearModel(np.nan_to_num(slopes, posinf=0.0, neginf=0.0), 0.0)
-            self.fresh = np.zeros((n, n))
         elif p['noise_size'] > 0.0 and p['unknown_input']:
             its = Uncertainty(model, p, configuration.state_sizes)
             linear, self.fresh = its.linear, its.fresh
@@ -99,8 +143,7 @@ cdef class Rows:
     cdef look_at(self, dict columns):
         """Hold the rows in these arrays."""
         self.columns, self.point, self.u = columns, columns['point'], columns['u']
-        self.base, self.own, self.deviation = columns['base'], columns['own'], columns['deviation']
-        self.covariance, self.transition = columns['covariance'], columns['transition']
+        self.own, self.x, self.p, self.f = (columns[name] for name in ('own', 'x', 'p', 'f'))
 
     cdef make_room(self, Py_ssize_t more):
         """Drop rows that are done, all but two to go on from, where memory is needed for more."""
@@ -115,35 +158,22 @@ cdef class Rows:
         self.look_at(larger)
         self.count, self.done, self.began = kept, self.done - drop, self.began - drop
 
-    cdef enter(self):
-        """Raise RuntimeError while another thread appends rows."""
-        if self.busy:
-            raise RuntimeError('this smoother is in use by another thread: give each its own')
-
-    def append(self, estimates, samples, times, kinds, models, deviations):
-        """Go forward (D 24) through more rows: `base` of each, and the rest as `Smoother.take`."""
-        cdef Py_ssize_t more = len(estimates), k
-        self.enter()
-        self.busy = True
-        try:
-            self.make_room(more)
-            rows = slice(self.count, self.count + more)
-            point = self.columns['point'][rows]
-            model = models.T if self.tunes else self.model
-            for name, values in zip(('variance', 'intensity', 'decay', 'derivatives'), model):
-                point[name] = values
-            point['time'], point['kind'] = times, kinds
-            point['y'], point['h'], self.columns['u'][rows] = samples
-            self.columns['base'][rows], self.columns['own'][rows] = estimates, deviations
-            self.new = self.count
-            for k in range(self.count, self.count + more):
-                if self.point[k].kind == BEGINS:
-                    self.began = k
-                self.point[k].last = self.order + (<int>self.point[k].derivatives & (ORDERS - 1))
-                self.forward(k)
-            self.count += more
-        finally:
-            self.busy = False
+    def append(self, own, samples, times, kinds, models):
+        """Go forward (D 24) through more rows: `own` of each, and the rest as `Smoother.take`."""
+        cdef Py_ssize_t more = len(own), k
+        self.make_room(more)
+        rows = slice(self.count, self.count + more)
+        point, model = self.columns['point'][rows], models.T if self.tunes else self.model
+        for name, values in zip(('variance', 'intensity', 'decay', 'derivatives'), model):
+            point[name] = values
+        point['last'] = self.order + (point['derivatives'].astype(int) & (ORDERS - 1))
+        point['time'], point['kind'] = times, kinds
+        point['y'], point['h'], self.columns['u'][rows] = samples
+        self.columns['own'][rows] = own
+        self.new = self.count
+        for k in range(self.count, self.count + more):
+            self.forward(k)
+        self.count += more
 
     # Forward
 
@@ -151,106 +181,92 @@ cdef class Rows:
         """Go forward to row k (D 24), which holds the sample and the observer's estimate."""
         cdef Point* now = &self.point[k]
         cdef Point* before
+        cdef int i
+        now.pull = now.certainty = 0.0
         if k == 0 or now.kind == BEGINS:
-            self.begin(k, now.y)
-            self.memory.spread = 1.0
+            self.began, self.memory.spread = k, 1.0
+            self.begin(k, &self.first[0])
+            if self.from_measurement:
+                self.x[k, 0] = now.y
             return
         before = &self.point[k - 1]
         if now.kind != UNMEASURED and now.h <= 0.0 and k > 1 and before.kind != BEGINS:
             # The policy has withdrawn the sample before: its stamp was ahead.
-            if before.kind == JUMPS:
-                now.kind = JUMPS
+            now.kind, now.h = max(now.kind, before.kind), now.h + before.h
             before.kind, before.h, before.time = UNMEASURED, 0.0, self.point[k - 2].time
+            before.pull = before.certainty = 0.0
             self.predict(k - 1)
-            now.h = (now.time - before.time) * 1e-9
         if not now.h > 0.0:  # no time has passed
             now.h, now.time = 0.0, before.time
             if now.kind == MEASURED:
                 now.kind = UNMEASURED
         self.predict(k)
-        if now.kind == JUMPS:
-            self.jump(k)
+        if now.kind == JUMPS:  # nothing before it matters to z_1, which is y (D 23)
+            for i in range(self.n):
+                self.f[k, 0, i] = self.p[k, 0, i] = self.p[k, i, 0] = 0.0
+            self.p[k, 0, 0], self.x[k, 0] = now.variance, now.y
         elif now.kind == MEASURED:
             self.measure(k)
 
-    cdef void begin(self, Py_ssize_t k, double y) noexcept nogil:
-        """Let nothing before row k matter: its estimate is that of a fresh observer."""
+    cdef void begin(self, Py_ssize_t k, const double* x) noexcept nogil:
+        """Begin at row k with an estimate: nothing before it matters."""
         cdef Point* now = &self.point[k]
-        cdef int i, j
-        if self.tunes:
-            self.doubt(k)
-        now.pull, now.certainty, now.noise, now.kind = 0.0, 0.0, 0.0, BEGINS
-        for i in range(self.n):
-            self.deviation[k, i] = self.first[i] - self.base[k, i]
-            for j in range(self.n):
-                self.transition[k, i, j] = 0.0
-                self.covariance[k, i, j] = self.fresh[i, j]
-        if self.from_measurement:
-            self.deviation[k, 0] = y - self.base[k, 0]
-
-    cdef void doubt(self, Py_ssize_t k) noexcept nogil:
-        """Write to `fresh` how far off the estimates of row k may be with its model (D 34)."""
-        cdef int i, j, d = self.order, count = self.point[k].last - d
+        cdef Row* p = <Row*> &self.p[k, 0, 0]
+        cdef int i, j, d = self.order, chain = now.last - d
         cdef double size
-        self.fresh[:, :] = 0.0
-        self.fresh[0, 0] = self.point[k].variance
+        now.kind = BEGINS
+        memset(p, 0, self.n * sizeof(Row))
+        memset(&self.f[k, 0, 0], 0, self.n * sizeof(Row))
+        memcpy(&self.x[k, 0], x, self.n * sizeof(double))
+        if not self.tunes:
+            for i in range(self.n):
+                memcpy(p[i], &self.fresh[i, 0], self.n * sizeof(double))
+            return
+        p[0][0] = now.variance
         for i in range(1, d):
-            size = DOUBT * fmax(self.state_sizes[i], fabs(self.base[k, i]))
-            self.fresh[i, i] = size * size
-        for i in range(count + 1):
-            for j in range(count + 1):
-                self.fresh[d + i, d + j] = usual(&self.point[k], count - i, count - j)
+            size = DOUBT * max(self.state_sizes[i], fabs(self.own[k, 0, i]))
+            p[i][i] = size * size
+        for i in range(chain + 1):
+            for j in range(chain + 1):
+                p[d + i][d + j] = usual(now, chain - i, chain - j)
 
     cdef void predict(self, Py_ssize_t k) noexcept nogil:
         """Predict row k from row k - 1 (D 24); if that can't be, begin at the observer's."""
-        cdef Row f[MOST_LEVELS]
-        cdef Row p[MOST_LEVELS]
         cdef Row slope[MOST_LEVELS]
-        cdef double x[MOST_LEVELS]
-        cdef double before[MOST_LEVELS]
-        cdef double carried[MOST_LEVELS]
+        cdef Row* p = <Row*> &self.p[k, 0, 0]
+        cdef Row* f = <Row*> &self.f[k, 0, 0]
+        cdef double* x = &self.x[k, 0]
         cdef Point* now = &self.point[k]
-        cdef int i, j, n = self.n, count = sub_steps(now.h, fmax(self.fastest, now.decay))
-        cdef double step = now.h / count, off
+        cdef Point* before = &self.point[k - 1]
+        cdef int i, j, n = self.n, count = sub_steps(now.h, max(self.fastest, now.decay))
         cdef bint finite
-        memset(f, 0, sizeof(f))
+        memcpy(p, &self.p[k - 1, 0, 0], n * sizeof(Row))
+        memset(f, 0, n * sizeof(Row))
         for i in range(n):
-            x[i], f[i][i] = self.base[k - 1, i], 1.0
-            before[i] = (
-                self.deviation[k - 1, i] + self.covariance[k - 1, i, 0] * self.point[k - 1].pull
-            )
-            memcpy(p[i], &self.covariance[k - 1, i, 0], n * sizeof(double))
-        if self.point[k - 1].certainty > 0.0:
-            correct(n, p, self.point[k - 1].noise)
-        if now.decay != self.point[k - 1].decay or now.last != self.point[k - 1].last:
-            self.change_model(k, x, f, p)
+            x[i], f[i][i] = self.x[k - 1, i] + p[i][0] * before.pull, 1.0
+        if before.certainty > 0.0:
+            correct(n, p, before.noise)
+        if now.decay != before.decay or now.last != before.last:
+            self.change_model(k)
         for _ in range(count):
-            self.step(k, step, x, slope)
+            self.step(k, now.h / count, slope)
             multiply(n, slope, f)
             carry(n, slope, p)
-            add_drive(now.last, now.intensity, step, p)
-        now.pull = now.certainty = now.noise = 0.0
+            add_drive(now.last, now.intensity, now.h / count, p)
         finite = p[0][0] + now.variance > 0.0
         for i in range(n):
-            carried[i] = 0.0
-            for j in range(n):
-                carried[i] += f[i][j] * before[j]
-                self.transition[k, i, j] = f[i][j]
-                self.covariance[k, i, j] = 0.5 * (p[i][j] + p[j][i])
-            off = self.deviation[k, i] = x[i] + carried[i] - self.base[k, i]
-            finite = finite and isfinite(off * off) and isfinite(p[i][i])
+            for j in range(i):
+                p[i][j] = p[j][i] = 0.5 * (p[i][j] + p[j][i])
+            finite = finite and isfinite(x[i] * x[i]) and isfinite(p[i][i])
         if not finite:
-            self.begin(k, self.base[k, 0])
-            memset(&self.deviation[k, 0], 0, n * sizeof(double))
-        elif now.kind == UNMEASURED:
-            memcpy(&self.base[k, 0], x, n * sizeof(double))
-            memcpy(&self.deviation[k, 0], carried, n * sizeof(double))
+            self.begin(k, &self.own[k, 0, 0])
 
-    cdef void step(self, Py_ssize_t k, double h, double* x, Row* slope) noexcept nogil:
-        """Go on from x by `h`, in place; write the exact derivative of the Runge-Kutta steps."""
+    cdef void step(self, Py_ssize_t k, double h, Row* slope) noexcept nogil:
+        """Go on by `h` with x of row k; write the exact derivative of the Runge-Kutta steps."""
+        cdef double* x = &self.x[k, 0]
         cdef double* z = self.prediction.z
         cdef double* dz = self.prediction.dz
-        cdef double kappa = self.point[k].decay, decayed = exp(-kappa * h)
+        cdef double kappa = self.point[k].decay
         cdef int i, j, n = self.n, d = self.order
         for j in range(n):
             for i in range(n):
@@ -264,160 +280,136 @@ cdef class Rows:
         memcpy(x, z, (d if kappa > 0.0 else n) * sizeof(double))
         for i in range(d, n if kappa > 0.0 else d):
             memset(slope[i], 0, sizeof(Row))
-            slope[i][i] = decayed
-            x[i] *= decayed
+            slope[i][i] = exp(-kappa * h)
+            x[i] *= slope[i][i]
             for j in range(i + 1, n):
                 slope[i][j] = slope[i][j - 1] * h / (j - i)
                 x[i] += slope[i][j] * x[j]
 
-    cdef void change_model(self, Py_ssize_t k, double* x, Row* f, Row* p) noexcept nogil:
+    cdef void change_model(self, Py_ssize_t k) noexcept nogil:
         """
-        Express the levels of d of row k - 1 as the model of row k has them (D 34), in place.
+        Go over to the model of d of row k, with its own derivatives of d (D 34).
 
-        A level that the model before did not have is as large as ever; one that the model has not
-        any more is 0. If it was far surer of z and d than the observer is now, it was wrong.
+        A derivative that the model before did not have begins as ever. If the model before was
+        surer of an estimate than the observer is now, it was wrong.
         """
+        cdef Row* p = <Row*> &self.p[k, 0, 0]
+        cdef Row* f = <Row*> &self.f[k, 0, 0]
         cdef Point* now = &self.point[k]
         cdef int i, j, d = self.order
-        cdef double more = now.decay - self.point[k - 1].decay, variance
-        by_binomials(x + d, ORDERS, more)
+        cdef double more = now.decay - self.point[k - 1].decay
+        by_binomials(&self.x[k, 0] + d, ORDERS, more)
         for i in range(d + 1, self.n):  # row by row: (D + kappa)^j = (D + kappa)^(j-1) (D + kappa)
             for j in range(d, i + 1):
                 f[i][j] = more * f[i - 1][j] + (f[i - 1][j - 1] if j > d else 0.0)
         for i in range(now.last + 1, self.n):
-            x[i] = 0.0
+            self.x[k, i] = 0.0
             memset(f[i], 0, sizeof(Row))
         carry(self.n, f, p)
         for i in range(self.point[k - 1].last + 1, now.last + 1):
-            p[i][i] = fmax(p[i][i], usual(now, now.last - i, now.last - i))
+            p[i][i] = max(p[i][i], usual(now, now.last - i, now.last - i))
         for i in range(d + 1):
-            variance = self.own[k, i] * self.own[k, i]
-            if SURER * p[i][i] < variance < INFINITY:
-                p[i][i] = variance
-
-    cdef void jump(self, Py_ssize_t k) noexcept nogil:
-        """Let nothing before row k matter to z_1, which is y: y alone has jumped (D 23)."""
-        cdef int i
-        for i in range(self.n):
-            self.transition[k, 0, i] = 0.0
-            self.covariance[k, 0, i] = self.covariance[k, i, 0] = 0.0
-        self.covariance[k, 0, 0] = self.point[k].variance
-        self.deviation[k, 0] = self.point[k].y - self.base[k, 0]
+            if SURER * p[i][i] < self.own[k, 1, i] < INFINITY:
+                p[i][i] = self.own[k, 1, i]
 
     cdef void measure(self, Py_ssize_t k) noexcept nogil:
-        """Weigh the sample of row k (D 24)."""
+        """Weigh the sample of row k (D 24); if d has jumped meanwhile it says by how much (D 34)."""
         cdef Point* now = &self.point[k]
-        cdef double s = self.covariance[k, 0, 0] + now.variance
-        cdef double e = now.y - self.base[k, 0] - self.deviation[k, 0]
-        cdef double usual = follow_spread(&self.memory, e, sqrt(s))
-        cdef double factor = fmax(fabs(e) / (HUBER * usual), 1.0)
+        cdef Row* p = <Row*> &self.p[k, 0, 0]
+        cdef int i, j, d = self.order
+        cdef double s = p[0][0] + now.variance, e = now.y - self.x[k, 0], share
+        cdef double factor = max(fabs(e) / (HUBER * follow_spread(&self.memory, e, sqrt(s))), 1.0)
         if now.derivatives < 0.0 and factor > 1.0:
-            self.allow_jump(k, e * e - s)
+            for i in range(self.n):
+                share = (e * e - s) * self.f[k, i, d] / (self.f[k, 0, d] * self.f[k, 0, d])
+                for j in range(self.n):
+                    p[i][j] += share * self.f[k, j, d]
+                if 0 < i <= d:  # when it has jumped is not known
+                    p[i][i] += share * self.f[k, i, d]
             factor = 1.0
         now.noise = now.variance * factor
-        now.certainty = 1.0 / (self.covariance[k, 0, 0] + now.noise)
+        now.certainty = 1.0 / (p[0][0] + now.noise)
         now.pull = e * now.certainty
-
-    cdef void allow_jump(self, Py_ssize_t k, double missing) noexcept nogil:
-        """Raise the variance of the predicted y by `missing`: d has jumped meanwhile (D 34)."""
-        cdef double share[MOST_LEVELS]  # of the jump of y
-        cdef int i, j, d = self.order
-        for i in range(self.n):
-            share[i] = self.transition[k, i, d] / self.transition[k, 0, d]
-        for i in range(self.n):
-            for j in range(self.n):
-                self.covariance[k, i, j] += missing * share[i] * share[j]
-            if 0 < i <= d:  # when it has jumped is not known
-                self.covariance[k, i, i] += missing * share[i] * share[i]
 
     # Back
 
-    cdef void turn_back(self, Py_ssize_t k, bint is_last, Row* a) noexcept nogil:
-        """
-        Write A of chi_k = A chi_{k+1} - c e / S, of the costates before two samples (D 25).
-
-        Of the last row it goes on from the costate behind its sample.
-        """
-        cdef int i, j
-        cdef double total
-        for i in range(self.n):
-            for j in range(self.n):
-                a[j][i] = 1.0 if i == j else 0.0
-                if not is_last:
-                    a[j][i] = self.transition[k + 1, i, j]
-        for j in range(self.n):
-            total = 0.0
-            for i in range(self.n):
-                total += self.covariance[k, i, 0] * a[i][j]
-            a[0][j] -= self.point[k].certainty * total
-
     cdef void go_back(
-        self, Py_ssize_t last, Py_ssize_t stop, Py_ssize_t top, double* out
+        self, Py_ssize_t last, Py_ssize_t end, double doubt, double[:, :, ::1] out
     ) noexcept nogil:
-        """Go back from row `last` to row `stop` (D 25); write what is known of `stop` .. `top`."""
-        cdef double costates[2][MOST_LEVELS]
-        cdef double* costate = costates[0]
-        cdef double* behind = costates[1]
+        """
+        Write what rows up to `last` say of those before `end` that wait (D 25).
+
+        The estimates behind row `last` are off by `doubt` standard deviations.
+        """
+        cdef double costate[MOST_LEVELS]
+        cdef double behind[MOST_LEVELS]
         cdef Row known[MOST_LEVELS]  # X of D 34
-        cdef Row a[MOST_LEVELS]
-        cdef double total, size
+        cdef Row a[MOST_LEVELS]  # of X <- A X A'
+        cdef Row* p
+        cdef Row* f
+        cdef Point* now
+        cdef double total
         cdef Py_ssize_t k
-        cdef int i, j
-        memset(costate, 0, sizeof(Row))
+        cdef int i, j, n = self.n
         memset(known, 0, sizeof(known))
-        for k in range(last, stop - 1, -1):
-            total = 0.0
-            for i in range(self.n):
-                total += self.covariance[k, 0, i] * costate[i]
-            costate[0] -= self.point[k].pull + self.point[k].certainty * total
+        memset(a, 0, sizeof(a))
+        for i in range(n):
+            a[i][i], total = 1.0, self.p[last, i, i]
+            costate[i] = doubt / sqrt(total) if total > 0.0 else 0.0
+        for k in range(last, self.done - 1, -1):
+            now, p, f = &self.point[k], <Row*> &self.p[k, 0, 0], <Row*> &self.f[k, 0, 0]
+            total = now.pull
+            for i in range(n):
+                total += now.certainty * p[0][i] * costate[i]
+            costate[0] -= total
             if self.tunes:
-                self.turn_back(k, k == last, a)
-                carry(self.n, a, known)
-                known[0][0] += self.point[k].certainty
-            if k <= top:
-                self.write(k, costate, known, out + (k - stop) * (1 + self.tunes) * self.n)
-            costate, behind = behind, costate
-            size = 0.0
-            for j in range(self.n):
-                total = 0.0
-                for i in range(self.n):
-                    total += self.transition[k, i, j] * behind[i]
-                costate[j] = total
-                size += total + known[j][j]
-            if not isfinite(size):  # nothing is known of what comes later
-                memset(costate, 0, sizeof(Row))
+                for j in range(n):
+                    total = 0.0
+                    for i in range(n):
+                        total += p[0][i] * a[i][j]
+                    a[0][j] -= now.certainty * total
+                carry(n, a, known)
+                known[0][0] += now.certainty
+            if k < end:
+                self.write(k, costate, known, &out[k - self.done, 0, 0])
+            memset(behind, 0, sizeof(behind))
+            for i in range(n):
+                for j in range(n):
+                    behind[j] += f[i][j] * costate[i]
+                    a[j][i] = f[i][j]
+            total = 0.0
+            for i in range(n):
+                costate[i] = behind[i]
+                total += costate[i] + known[i][i]
+            if not isfinite(total):  # nothing is known of what comes later
+                memset(costate, 0, sizeof(costate))
                 memset(known, 0, sizeof(known))
 
     cdef void write(
         self, Py_ssize_t k, const double* costate, const Row* known, double* out
     ) noexcept nogil:
-        """
-        Write the estimates of row k, and of a self-tuning observer the variances of their errors.
+        """Write the estimates of row k, and of a self-tuning observer the variances of errors."""
+        cdef Row* p = <Row*> &self.p[k, 0, 0]
+        cdef Row less[MOST_LEVELS]
+        cdef int i, j, n = self.n
+        for i in range(n):
+            out[i] = self.x[k, i]
+            for j in range(n):
+                out[i] -= p[i][j] * costate[j]
+        if self.tunes:
+            memcpy(less, known, n * sizeof(Row))
+            carry(n, p, less)
+            for i in range(n):
+                out[n + i] = max(p[i][i] - less[i][i], ROUNDING * p[i][i])
 
-        If one of them is not finite they are the observer's own.
-        """
-        cdef double total, variance
-        cdef bint finite = True
-        cdef int i, j, m
-        for i in range(self.n):
-            total, variance = self.base[k, i] + self.deviation[k, i], self.covariance[k, i, i]
-            for j in range(self.n):
-                total -= self.covariance[k, i, j] * costate[j]
-                for m in range(self.n if self.tunes else 0):
-                    variance -= self.covariance[k, i, j] * known[j][m] * self.covariance[k, m, i]
-            out[i] = total
-            if self.tunes:
-                out[self.n + i] = fmax(variance, ROUNDING * fabs(self.covariance[k, i, i]))
-            finite = finite and isfinite(total) and isfinite(variance)
-        for i in range(0 if finite else self.n):
-            out[i] = self.base[k, i]
-            if self.tunes:
-                out[self.n + i] = self.own[k, i] * self.own[k, i] if i <= self.order else INFINITY
-
-    cdef room(self, Py_ssize_t rows):
-        """Return an array for the estimates of so many rows."""
-        self.enter()
-        return np.empty((rows, 1 + self.tunes, self.n))
+    cdef handed_out(self, double[:, :, ::1] out, Py_ssize_t end):
+        """Return estimates of rows up to `end`, those of the observer where they overflow."""
+        found, own = np.asarray(out)[:end - self.done], self.columns['own'][self.done:end]
+        if not np.isfinite(found).all():
+            bad = ~np.isfinite(found).all(axis=(1, 2))
+            found[bad] = own[bad]
+        self.done = end
+        return found
 
     def smooth(self, Py_ssize_t end):
         """
@@ -429,13 +421,13 @@ cdef class Rows:
             With the variances of their errors, for a self-tuning observer.
 
         """
-        cdef double[:, :, ::1] out = self.room(max(end - self.done, 0))
-        if end != self.done + out.shape[0] or end > self.count:
+        cdef double[:, :, ::1] out
+        if not self.done <= end <= self.count:
             raise ValueError(f'smooth: expected {self.done} to {self.count}, got {end}')
+        out = np.empty((end - self.done, 1 + self.tunes, self.n))
         if end > self.done:
-            self.go_back(self.count - 1, self.done, end - 1, &out[0, 0, 0])
-        self.done = end
-        return np.asarray(out)
+            self.go_back(self.count - 1, end, 0.0, out)
+        return self.handed_out(out, end)
 
     def smooth_lagging(self, long long lag):
         """
@@ -443,47 +435,32 @@ cdef class Rows:
 
         A row that begins makes all before it due: they will not be known better.
         """
-        cdef double[:, :, ::1] out = self.room(self.count - self.done)
-        cdef Py_ssize_t first = self.done, k, due, last
-        for k in range(self.new, min(self.count, first + out.shape[0])):
-            due, last = self.done, k
-            if self.point[k].kind == BEGINS:
-                due, last = k, k - 1
-            while due <= last and self.point[k].time - self.point[due].time >= lag:
-                due += 1
-            if due > self.done:
-                self.go_back(last, self.done, due - 1, &out[self.done - first, 0, 0])
-                self.done = due
-        self.new = self.count
-        return np.asarray(out)[:self.done - first]
+        cdef Py_ssize_t first = self.done, end = first, k
+        cdef double[:, :, ::1] out = np.empty((self.count - first, 1 + self.tunes, self.n))
+        for k in range(max(self.new, first), self.count):
+            while end <= k and (
+                self.point[k].time - self.point[end].time >= lag
+                or (end < k and self.point[k].kind == BEGINS)
+            ):
+                end += 1
+            if end > self.done:
+                self.go_back(k, end, 0.0, out[self.done - first:])
+                self.done = end
+        self.done, self.new = first, self.count
+        return self.handed_out(out, end)
 
     def settled(self):
         """Return how many rows samples to come can change by `TOLERANCE` at most."""
-        cdef Row influence[MOST_LEVELS]  # of what the filter has yet to learn, on the costate
-        cdef Row a[MOST_LEVELS]
-        cdef double total, largest
-        cdef Py_ssize_t k
-        cdef int i, j, m
-        self.enter()
-        memset(influence, 0, sizeof(influence))
-        for i in range(self.n):
-            if self.count > 0 and self.covariance[self.count - 1, i, i] > 0.0:
-                influence[i][i] = 1.0 / sqrt(self.covariance[self.count - 1, i, i])
-        for k in range(self.count - 1, self.done - 1, -1):
-            self.turn_back(k, k == self.count - 1, a)
-            multiply(self.n, a, influence)
-            largest = 0.0
-            for i in range(self.n):
-                for m in range(self.n):
-                    total = 0.0
-                    for j in range(self.n):
-                        total += self.covariance[k, i, j] * influence[j][m]
-                    if total != 0.0:
-                        total = fabs(total) / sqrt(fabs(self.covariance[k, i, i]))
-                        largest = fmax(largest, total)
-            if largest < TOLERANCE:
-                return k + 1
-        return self.done
+        cdef double[:, :, ::1] out = np.empty((self.count - self.done, 1 + self.tunes, self.n))
+        cdef double[:, :, ::1] other = np.empty_like(out)
+        if self.done < self.count:
+            self.go_back(self.count - 1, self.count, 0.0, out)
+            self.go_back(self.count - 1, self.count, 1.0, other)
+        found, off = np.asarray(out)[:, 0], np.asarray(other)[:, 0]
+        variance = np.diagonal(self.columns['p'][self.done:self.count], axis1=1, axis2=2)
+        allowed = TOLERANCE * np.sqrt(np.abs(variance)) + ROUNDING * np.abs(found)
+        open_rows = np.flatnonzero((np.abs(off - found) > allowed).any(axis=1))
+        return self.done + (open_rows[0] if len(open_rows) else len(found))
 
     def innovations(self):
         """Return e and S of the samples that are remembered, for their likelihood."""
@@ -492,24 +469,22 @@ cdef class Rows:
         return points['pull'] / points['certainty'], 1.0 / points['certainty']
 
     def __reduce__(self):
-        self.enter()
         columns = {name: rows[:self.count].copy() for name, rows in self.columns.items()}
         numbers = self.done, self.began, self.new, self.memory.spread
         return Rows, (self.configuration,), (columns, *numbers)
 
     def __setstate__(self, state):
         columns, done, began, new, spread = state
-        count = len(columns['point'])
-        for name, rows in self.columns.items():
-            if columns[name].shape != (count, *rows.shape[1:]):
-                raise ValueError(f'smoothing: {name} of another size')
         last = columns['point']['last']
-        if not (0 <= done <= count and new >= 0 and self.order <= last.min(initial=self.order)
+        if any(columns[name].shape != (len(last), *rows.shape[1:])
+               for name, rows in self.columns.items()):
+            raise ValueError('smoothing: columns of other sizes')
+        if not (0 <= done <= len(last) and new >= 0 and self.order <= last.min(initial=self.order)
                 and last.max(initial=0) < self.n):
             raise ValueError('smoothing: numbers of rows or levels that can not be')
         self.look_at({name: np.array(rows) for name, rows in columns.items()})
         self.done, self.began, self.new, self.memory.spread = done, began, new, spread
-        self.count = count
+        self.count = len(last)
 
 
 cdef double usual(const Point* now, int i, int j) noexcept nogil:

@@ -99,7 +99,7 @@ class PastEstimates:
         return self._handed_out(self._smoother.finish())
 
     def _handed_out(self, smoothed: Floats) -> Trajectory:
-        """Return the oldest rows with their smoothed estimates, where these are finite."""
+        """Return the oldest rows with their smoothed estimates."""
         count, n, taken = len(smoothed), self._observer.order, []
         if not count:
             structure, self.numbers = self._observer.structure, self.numbers[:0]
@@ -115,12 +115,10 @@ class PastEstimates:
         parts = zip(*(part for part, _ in taken), strict=True)
         rows = Trajectory._make(map(np.concatenate, parts))
         self.numbers = np.concatenate([numbers for _, numbers in taken])
-        good = np.isfinite(smoothed[:, 0, : n + 1]).all(axis=1)
+        rows.z[:], rows.unknown_input[:] = smoothed[:, 0, :n], smoothed[:, 0, n]
         if self._observer.self_tuning:
-            good &= (smoothed[:, 1, : n + 1] >= 0.0).all(axis=1)
-            rows.standard_deviation[good] = np.sqrt(smoothed[good, 1, : n + 1])
+            rows.standard_deviation[:] = np.sqrt(smoothed[:, 1, : n + 1])
             self.standard_deviation, self.tuning = rows.standard_deviation[-1], rows.tuning[-1]
-        rows.z[good], rows.unknown_input[good] = smoothed[good, 0, :n], smoothed[good, 0, n]
         self.stamp, self.estimate = int(rows.t[-1]), None
         if self._smoother.goes_on:  # else nothing is due yet since the restart
             word = int(rows.status[-1]) | int(rows.open_levels[-1]) << LEVEL_SHIFT
