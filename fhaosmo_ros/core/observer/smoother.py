@@ -152,9 +152,10 @@ class Smoother:
             With the variances of their errors, for a self-tuning observer.
 
         """
-        rows, end = self._rows, self._rows.done
+        rows = self._rows
         if self._lag is not None:
-            return rows.smooth_lagging(self._lag)  # type: ignore[no-any-return]
+            return rows.smooth(rows.count, self._lag)  # type: ignore[no-any-return]
+        end = rows.done
         if self.waiting >= self._wait:
             end = rows.settled()
             self._wait = rows.count - end + BLOCK
@@ -188,12 +189,12 @@ def smooth(observer: Any, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0
     first = int(np.argmax((whole.status & REJECTED) == 0))
     rows = Trajectory._make(column[first:] for column in whole)
     inputs = u[first:].copy()
-    for k in np.flatnonzero(~np.isfinite(inputs).all(axis=1)):  # the last ones are held
+    for k in np.flatnonzero(~np.isfinite(inputs).all(axis=1)).tolist():  # the last ones are held
         inputs[k] = inputs[max(k - 1, 0)]
     times = np.fmax.accumulate(rows.t)
     h = np.diff(times, prepend=times[0]) * (1e-9 if np.issubdtype(t.dtype, np.integer) else 1.0)
     smoother, found = Smoother(observer.configuration), []
-    columns = (
+    columns: tuple[Any, ...] = (
         rows.z_hat, rows.z_tilde, rows.z_hat[:, 0] + rows.innovation[:, 0], h, inputs,
         np.arange(len(h)), smoother.kinds(rows.status), rows.model, rows.standard_deviation,
     )  # fmt: skip

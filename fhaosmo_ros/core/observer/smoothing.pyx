@@ -2,10 +2,10 @@
 """
 A recording, row by row, and what is known of each time by all of it (D 24, D 25, D 34).
 
-Forward goes an extended Kalman filter with D 17 as the model of d, backward the recursion of Rauch,
-Tung and Striebel in the form of Bierman, which inverts no matrix. Of the observer it needs to know
-which samples are used, where it begins afresh, and, if it tunes itself, the noise and the model of
-d of its likeliest member at each sample. Its estimates stand where numbers overflow.
+An extended Kalman filter goes forward, with D 17 as the model of d; the recursion of Rauch, Tung
+and Striebel goes back, in the form of Bierman, which inverts no matrix. The observer says which
+samples are used, where it begins afresh, and, if it tunes itself, the noise and the model of d of
+its likeliest member at each sample. Its estimates stand where numbers overflow.
 
 Rauch, Tung and Striebel 1965, doi:10.2514/3.3166; Bierman 1973, Int. J. Control 18 (1).
 """
@@ -313,7 +313,7 @@ cdef class Rows:
                 p[i][i] = self.own[k, 1, i]
 
     cdef void measure(self, Py_ssize_t k) noexcept nogil:
-        """Weigh the sample of row k (D 24); if d has jumped meanwhile it says by how much (D 34)."""
+        """Weigh the sample of row k (D 24); after a jump of d it says how large that was (D 34)."""
         cdef Point* now = &self.point[k]
         cdef Row* p = <Row*> &self.p[k, 0, 0]
         cdef int i, j, d = self.order
@@ -339,7 +339,8 @@ cdef class Rows:
         """
         Write what rows up to `last` say of those before `end` that wait (D 25).
 
-        The estimates behind row `last` are off by `doubt` standard deviations.
+        With a `doubt` write x as it would become if all samples were as predicted, but the
+        estimates behind row `last` were off by so many standard deviations.
         """
         cdef double costate[MOST_LEVELS]
         cdef double behind[MOST_LEVELS]
@@ -348,7 +349,7 @@ cdef class Rows:
         cdef Row* p
         cdef Row* f
         cdef Point* now
-        cdef double total
+        cdef double total, size
         cdef Py_ssize_t k
         cdef int i, j, n = self.n
         memset(known, 0, sizeof(known))
@@ -358,7 +359,7 @@ cdef class Rows:
             costate[i] = doubt / sqrt(total) if total > 0.0 else 0.0
         for k in range(last, self.done - 1, -1):
             now, p, f = &self.point[k], <Row*> &self.p[k, 0, 0], <Row*> &self.f[k, 0, 0]
-            total = now.pull
+            total = 0.0 if doubt > 0.0 else now.pull
             for i in range(n):
                 total += now.certainty * p[0][i] * costate[i]
             costate[0] -= total
@@ -372,16 +373,18 @@ cdef class Rows:
                 known[0][0] += now.certainty
             if k < end:
                 self.write(k, costate, known, &out[k - self.done, 0, 0])
-            memset(behind, 0, sizeof(behind))
-            for i in range(n):
+            for i in range(n if self.tunes else 0):
                 for j in range(n):
-                    behind[j] += f[i][j] * costate[i]
                     a[j][i] = f[i][j]
-            total = 0.0
-            for i in range(n):
-                costate[i] = behind[i]
-                total += costate[i] + known[i][i]
-            if not isfinite(total):  # nothing is known of what comes later
+            memcpy(behind, costate, n * sizeof(double))
+            size = 0.0
+            for j in range(n):
+                total = 0.0
+                for i in range(n):
+                    total += f[i][j] * behind[i]
+                costate[j] = total
+                size += total + known[j][j]
+            if not isfinite(size):  # nothing is known of what comes later
                 memset(costate, 0, sizeof(costate))
                 memset(known, 0, sizeof(known))
 
@@ -402,18 +405,13 @@ cdef class Rows:
             for i in range(n):
                 out[n + i] = max(p[i][i] - less[i][i], ROUNDING * p[i][i])
 
-    cdef handed_out(self, double[:, :, ::1] out, Py_ssize_t end):
-        """Return estimates of rows up to `end`, those of the observer where they overflow."""
-        found, own = np.asarray(out)[:end - self.done], self.columns['own'][self.done:end]
-        if not np.isfinite(found).all():
-            bad = ~np.isfinite(found).all(axis=(1, 2))
-            found[bad] = own[bad]
-        self.done = end
-        return found
-
-    def smooth(self, Py_ssize_t end):
+    def smooth(self, Py_ssize_t end, lag=None):
         """
         Return the estimates of the rows before `end` that wait, by all that is known.
+
+        With a lag (ns) only those that became so old with the last `append`, by what was known
+        then; a row that begins makes all before it due, which will not be known better. Where
+        numbers overflow they are the observer's.
 
         Returns
         -------
@@ -421,46 +419,39 @@ cdef class Rows:
             With the variances of their errors, for a self-tuning observer.
 
         """
+        cdef Py_ssize_t first = self.done, due = first, k
+        cdef bint whole = lag is None
+        cdef long long age = 0 if whole else lag
         cdef double[:, :, ::1] out
-        if not self.done <= end <= self.count:
-            raise ValueError(f'smooth: expected {self.done} to {self.count}, got {end}')
-        out = np.empty((end - self.done, 1 + self.tunes, self.n))
-        if end > self.done:
-            self.go_back(self.count - 1, end, 0.0, out)
-        return self.handed_out(out, end)
-
-    def smooth_lagging(self, long long lag):
-        """
-        Return likewise those of the rows that became `lag` (ns) old with the last `append`.
-
-        A row that begins makes all before it due: they will not be known better.
-        """
-        cdef Py_ssize_t first = self.done, end = first, k
-        cdef double[:, :, ::1] out = np.empty((self.count - first, 1 + self.tunes, self.n))
-        for k in range(max(self.new, first), self.count):
-            while end <= k and (
-                self.point[k].time - self.point[end].time >= lag
-                or (end < k and self.point[k].kind == BEGINS)
+        if not first <= end <= self.count:
+            raise ValueError(f'smooth: expected {first} to {self.count}, got {end}')
+        out = np.empty((end - first, 1 + self.tunes, self.n))
+        for k in range(self.count - 1 if whole else self.new, self.count):
+            while due < min(end, k + 1) and (
+                whole or self.point[k].time - self.point[due].time >= age
+                or (self.point[k].kind == BEGINS and due < k)
             ):
-                end += 1
-            if end > self.done:
-                self.go_back(k, end, 0.0, out[self.done - first:])
-                self.done = end
-        self.done, self.new = first, self.count
-        return self.handed_out(out, end)
+                due += 1
+            if due > self.done:
+                self.go_back(k, due, 0.0, out[self.done - first:])
+                self.done = due
+        self.new = self.count
+        found, own = np.asarray(out)[:due - first], self.columns['own'][first:due]
+        if not np.isfinite(found).all():
+            bad = ~np.isfinite(found).all(axis=(1, 2))
+            found[bad] = own[bad]
+        return found
 
     def settled(self):
         """Return how many rows samples to come can change by `TOLERANCE` at most."""
         cdef double[:, :, ::1] out = np.empty((self.count - self.done, 1 + self.tunes, self.n))
-        cdef double[:, :, ::1] other = np.empty_like(out)
+        rows = slice(self.done, self.count)
         if self.done < self.count:
-            self.go_back(self.count - 1, self.count, 0.0, out)
-            self.go_back(self.count - 1, self.count, 1.0, other)
-        found, off = np.asarray(out)[:, 0], np.asarray(other)[:, 0]
-        variance = np.diagonal(self.columns['p'][self.done:self.count], axis1=1, axis2=2)
-        allowed = TOLERANCE * np.sqrt(np.abs(variance)) + ROUNDING * np.abs(found)
-        open_rows = np.flatnonzero((np.abs(off - found) > allowed).any(axis=1))
-        return self.done + (open_rows[0] if len(open_rows) else len(found))
+            self.go_back(self.count - 1, self.count, 1.0, out)
+        x, variance = self.columns['x'][rows], self.columns['p'][rows].diagonal(0, 1, 2)
+        change, allowed = np.abs(np.asarray(out)[:, 0] - x), TOLERANCE * np.sqrt(np.abs(variance))
+        open_rows = np.flatnonzero((change > allowed + ROUNDING * np.abs(x)).any(axis=1))
+        return self.done + (open_rows[0] if len(open_rows) else len(x))
 
     def innovations(self):
         """Return e and S of the samples that are remembered, for their likelihood."""
@@ -476,11 +467,10 @@ cdef class Rows:
     def __setstate__(self, state):
         columns, done, began, new, spread = state
         last = columns['point']['last']
-        if any(columns[name].shape != (len(last), *rows.shape[1:])
-               for name, rows in self.columns.items()):
-            raise ValueError('smoothing: columns of other sizes')
-        if not (0 <= done <= len(last) and new >= 0 and self.order <= last.min(initial=self.order)
-                and last.max(initial=0) < self.n):
+        shapes = {name: (len(last), *rows.shape[1:]) for name, rows in self.columns.items()}
+        if not (shapes == {name: rows.shape for name, rows in columns.items()}
+                and 0 <= done <= len(last) and new >= 0
+                and self.order <= last.min(initial=self.order) and last.max(initial=0) < self.n):
             raise ValueError('smoothing: numbers of rows or levels that can not be')
         self.look_at({name: np.array(rows) for name, rows in columns.items()})
         self.done, self.began, self.new, self.memory.spread = done, began, new, spread
