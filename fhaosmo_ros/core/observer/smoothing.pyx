@@ -313,7 +313,7 @@ cdef class Rows:
                 p[i][i] = self.own[k, 1, i]
 
     cdef void measure(self, Py_ssize_t k) noexcept nogil:
-        """Weigh the sample of row k (D 24); after a jump of d it says how large that was (D 34)."""
+        """Weigh the sample of row k (D 24); after a jump of d it says of what size (D 34)."""
         cdef Point* now = &self.point[k]
         cdef Row* p = <Row*> &self.p[k, 0, 0]
         cdef int i, j, d = self.order
