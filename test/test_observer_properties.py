@@ -6,7 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 from observer_cases import (
-    any_law, assert_same_state, concatenated, laws, remembered, samples, SMALL,
+    any_law,
+    assert_same_state,
+    concatenated,
+    laws,
+    remembered,
+    samples,
+    SMALL,
 )  # fmt: skip
 import pytest
 

@@ -69,7 +69,7 @@ cdef double follow_spread(Memory* memory, double b, double expected) noexcept no
         return usual
     memory.beyond = 0.0
     if memory.watched > 0.0:
-        memory.watched -= 1.0
+        memory.watched = max(memory.watched - 1.0, 0.0)
         memory.drift += b / usual - memory.drift / REMEMBERED
         if fabs(memory.drift) > MOST_DRIFT:
             memory.beyond = INFINITY

@@ -31,7 +31,7 @@ cdef double WATCH = 1000.0
 # If a jump of y would make |z_{i+1}| or |d| so much smaller, y was wrong before it (D 23).
 cdef double MUCH_SMALLER = 0.5
 # No number of a snapshot is larger, and these are not negative.
-cdef double LARGEST = 1e300
+cdef double LARGEST = 1.8e300
 POSITIVE = (
     'pending', 'period', 'beyond', 'watched', 'wait', 'upset', 'usual', 'saturated', 'narrowed'
 )

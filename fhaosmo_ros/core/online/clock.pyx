@@ -3,32 +3,24 @@
 
 from fhaosmo_ros.core.online.memory cimport Clock, Counters
 
+# Stands for every difference (ns) that an integer may not hold.
 cdef long long FAR = 4_000_000_000_000_000_000
-"""Stands for every difference (ns) that an integer may not hold."""
+# A tick belongs to the line through those before it if it is off by at most so many intervals of
+# the samples, and so many times as far as they usually are.
 cdef long long FOLLOWED = 2, UNUSUAL = 4
-"""
-A tick belongs to the line through those before it if it is off by at most so many intervals of the
-samples, and so many times as far as they usually are.
-"""
+# Samples whose ticks are off by more than so many intervals on average are not steady: for so many
+# ticks there is no line.
 cdef double STEADY = 2.0
 cdef long long AGAIN = 5000
-"""
-Samples whose ticks are off by more than so many intervals on average are not steady: for so many
-ticks there is no line.
-"""
+# For so long (ns) a line that remembers so many ticks goes on without one that belongs to it: when
+# the node has not run for a moment, ticks and samples come at once, in any order.
 cdef long long PATIENCE = 200_000_000, KNOWN = 16
-"""
-For so long (ns) a line that remembers so many ticks goes on without one that belongs to it: when
-the node has not run for a moment, ticks and samples come at once, in any order.
-"""
+# Samples that the line remembers; those in which times follow it, at most, and a part of those
+# that it remembers so far.
 cdef long long MOST_SAMPLES = 51_200
 cdef double SMOOTH = 4000.0, YOUNG = 4.0
-"""
-Samples that the line remembers; those in which times follow it, at most, and a part of those that
-it remembers so far.
-"""
+# Parts of a nanosecond in which the interval of the samples between ticks is kept.
 cdef long long FINE = 1024
-"""Parts of a nanosecond in which the interval of the samples between ticks is kept."""
 
 
 cdef long long difference(long long a, long long b) noexcept nogil:

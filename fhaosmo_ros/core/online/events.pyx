@@ -52,12 +52,12 @@ cdef struct Memory:
     double event_deviation  # standard deviation that events are judged by
 
 
+# Factor on how quickly sigma grows while an event lasts.
 cdef double QUICKER = 4.0
-"""Factor on how quickly sigma grows while an event lasts."""
+# Events that are kept until somebody takes them.
 SECOND = 1_000_000_000
 LONG = 1e9
 MOST = 10_000
-"""Events that are kept until somebody takes them."""
 
 
 class Event(NamedTuple):

@@ -6,17 +6,15 @@ from libc.math cimport fabs, fmax, fmin, rint
 from fhaosmo_ros.core.online.clock cimport difference
 from fhaosmo_ros.core.online.memory cimport Counters, Course, Sensor, Settings
 
+# A step of y is a multiple of another one up to this, and up to rounding of y to 32 bits.
 cdef double MULTIPLE = 1e-4, SINGLE = 6e-7
-"""A step of y is a multiple of another one up to this, and up to rounding of y to 32 bits."""
+# After so many regular changes y's sensor holds its values; so many are remembered.
 cdef int ENOUGH_REGULAR = 4, MOST_REGULAR = 12
-"""After so many regular changes y's sensor holds its values; so many are remembered."""
+# A y with noise may repeat itself so often in a row by chance, if it is a float of 32 bits.
 cdef int CHANCE_REPEATS = 2
-"""A y with noise may repeat itself so often in a row by chance, if it is a float of 32 bits."""
+# Of late, less than this share of so many of its values were repeated, but for one: at the end of
+# a range it is always the same one.
 cdef double RARELY = 0.05, CHANGES = 50.0
-"""
-Of late, less than this share of so many of its values were repeated, but for one: at the end of a
-range it is always the same one.
-"""
 
 
 cdef bint is_stuck(

@@ -25,11 +25,11 @@ from fhaosmo_ros.core.online.outliers cimport (
 
 import numpy as np
 
+# With max_step = 0 an interval of more mean intervals than this is a gap.
 cdef double GAP_RATIO = 2.0
-"""With max_step = 0 an interval of more mean intervals than this is a gap."""
+# Bounds what one sample may cost: a few milliseconds.
 cdef int MOST_STEPS = 10_000
 MOST_SUB_STEPS = MOST_STEPS
-"""Bounds what one sample may cost: a few milliseconds."""
 cdef long long LARGEST_STAMP = 2**63 - 1
 
 
@@ -294,7 +294,7 @@ cdef class Policy:
         h = elapsed * NANOSECONDS / count
         if count > 1 or self.settings.gate > 0.0:
             self.structure.begin_at_estimates()
-            for k in range(count):
+            for _ in range(count):
                 self.structure.prediction.step(h, u)
             end = self.structure.prediction.z[0]
             modelled = fabs(end) <= self.settings.limit  # False for NaN
