@@ -6,42 +6,9 @@ import math
 
 from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.observer import arrays
-from fhaosmo_ros.core.observer.self_tuning.covariances import at
-from fhaosmo_ros.core.observer.self_tuning.intervals import (
-    CHANCE,
-    FAR_TAIL,
-    LOST,
-    MEAN,
-    passage,
-    truncate,
-)
-from fhaosmo_ros.core.observer.self_tuning.jumps import otherwise, SHAPE
-from fhaosmo_ros.core.observer.self_tuning.members import (
-    COLOUR,
-    COUNT,
-    HALF,
-    IN_BAND,
-    KAPPA,
-    Members,
-    members_in,
-    ORDER,
-    ORDERS,
-    SCORE,
-    scratch_in,
-    scratch_rows,
-    TAU,
-    USED,
-    WEIGHT,
-    WINDOW,
-)
-from fhaosmo_ros.core.observer.self_tuning.noise import LATTICE_SHARE
-from fhaosmo_ros.core.observer.self_tuning.normal import exponential, FARTHEST, mills
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from scipy.signal import lfilter
-from scipy.stats import norm, truncnorm
 from studies.everywhere import (
     Condition,
     CONDITIONS,
@@ -99,87 +66,6 @@ def case():
 def rms(values):
     """Return the root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def members_of(observer):
-    """Return copies of the members' arrays."""
-    rows = observer.state.levels[arrays.ROWS + observer.levels :]
-    count, *views = members_in(rows, observer.order, COUNT)
-    return Members(count, *(view.copy() for view in views))
-
-
-def filtered(y, periods, rates, intensity, variance, first, covariance):
-    """Return estimate and covariance of a textbook Kalman filter, the noise being a state."""
-    size = len(rates)
-    x, p = np.append(first, 0.0), np.zeros((size + 1, size + 1))
-    p[:size, :size] = covariance
-    c = np.zeros(size + 1)
-    c[0] = c[-1] = 1.0
-    whole, chain = np.zeros((2 * size, 2 * size)), np.eye(size, k=1)
-    whole[:size, :size], whole[size:, size:] = -chain, chain.T
-    whole[size - 1, 2 * size - 1] = 1.0
-    for measured, h in zip(y, periods, strict=True):
-        exponential = expm(whole * h)  # Van Loan; Q is that of integrators (D 20)
-        a = np.zeros((size + 1, size + 1))
-        a[:size, :size] = expm(rates * h)
-        q = np.zeros_like(p)
-        q[:size, :size] = intensity * exponential[size:, size:].T @ exponential[:size, size:]
-        q[-1, -1] = variance
-        x, p = a @ x, a @ p @ a.T + q
-        s = c @ p @ c
-        gain = p @ c / s
-        x, p = x + gain * (measured - c @ x), p - np.outer(gain, c @ p)
-    return x, p
-
-
-@pytest.mark.parametrize('stretch', [1.0, 1.2])
-def test_members_with_white_noise_are_kalman_filters(case, stretch):
-    """State and covariance of members of every k, while no innovation is large."""
-    t, z, _, noise = case
-    y = z[:, 0] + 1e-3 * np.where(t < 0.3, noise, 0.3 * noise)
-    observer = Observer(SELF_TUNING)
-    observer.run(t[:300], y[:300])
-    members, moving = members_of(observer), int(observer.state.memory[arrays.MOVING])
-    samples, periods = y[300:315], [stretch * PERIOD] * 15
-    for measured, h in zip(samples, periods, strict=True):
-        observer.step(measured, h)
-    after = members_of(observer)
-    for k in range(ORDERS):
-        scores = np.where((COLOUR == 0) & (k == ORDER), members.record[SCORE], -np.inf)
-        scores[: HALF - moving + 2 * IN_BAND] = -np.inf
-        g = np.argmax(scores)
-        size, first, upper = 4 + k, members.x[: 4 + k, g], np.triu_indices(3 + ORDERS)
-        covariance = np.zeros((3 + ORDERS, 3 + ORDERS))
-        covariance[upper] = members.p[:, g]
-        covariance = (covariance + np.triu(covariance, 1).T)[:size, :size]
-        rates = np.eye(size, k=1)
-        rates[2, 2] = -1.0
-        rates[range(3, size), range(3, size)] = -members.rates[KAPPA, g]
-        drive, variance = members.drive[k, g], members.noise[USED, 0]
-        found, expected = filtered(samples, periods, rates, drive, variance, first, covariance)
-        estimate = after.x[:, g]
-        deviations = np.sqrt(np.diag(expected)[:size])
-        assert (np.abs(estimate[:size] - found[:size]) < 1e-6 * deviations).all(), k
-        triangle = np.zeros_like(expected, shape=(3 + ORDERS, 3 + ORDERS))
-        triangle[upper] = after.p[:, g]
-        np.testing.assert_allclose(
-            triangle[:size, :size], np.triu(expected[:size, :size]), rtol=1e-6
-        )
-        assert not estimate[size:].any()
-        assert not triangle[:, size:].any()
-
-
-def test_a_sample_that_is_not_likely_changes_no_member(case):
-    """Neither estimates nor covariances nor gains, although all are predicted to it."""
-    t, z, _, noise = case
-    y = z[:, 0] + 1e-3 * noise
-    observer = Observer(SELF_TUNING)
-    observer.run(t[:300], y[:300])
-    before = members_of(observer)
-    assert observer.step(y[300] + 10.0, PERIOD).status & Status.REJECTED_SPIKE
-    after = members_of(observer)
-    for name in ('x', 'p', 'gain'):
-        np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
 
 
 @pytest.mark.parametrize(
@@ -305,21 +191,6 @@ def test_d_and_noise_are_not_taken_for_jumps_of_y(case):
         assert not (Observer(SELF_TUNING).run(t, y).status & Status.JUMPED).any()
 
 
-@pytest.mark.parametrize('n', [1, 2, 3])
-def test_only_a_constant_explains_a_jump(n):
-    """Powers of time, a line and larger noise explain themselves; a step is none of these."""
-    since, rng = np.arange(WINDOW) - 20, np.random.default_rng(n)
-    shapes = [np.where(since > 0, since.clip(0) ** p, 0.0) for p in range(1, n + 1)]
-    for shape in (*shapes, np.linspace(-3.0, 5.0, WINDOW), np.full(WINDOW, 3.0)):
-        r = 8.0 * shape / np.abs(shape).max()
-        assert otherwise(r, n) == pytest.approx(r @ r, rel=1e-9)
-    loud = 8.0 * np.where(since >= 0, rng.standard_normal(WINDOW), 0.0)
-    step = 4.0 * (since >= 0)
-    means = [np.sum(r[20:]) ** 2 / 12 for r in (loud, step)]
-    assert means[0] < otherwise(loud, n)
-    assert means[1] > otherwise(step, n) + SHAPE
-
-
 def test_another_rate_and_lost_samples(case):
     """Every tenth sample, and then half of the samples at random, from the middle on."""
     t, z, d, noise = case
@@ -426,85 +297,6 @@ def test_a_jump_of_d_is_followed_at_once():
     jump = int(np.argmax(d < 0.0))
     assert (off[jump : jump + 3] > 1.0).any()
     assert (off[jump + 25 : jump + 300] < 0.1).all()
-
-
-@pytest.mark.parametrize('noise', [0.0, 4.4e-7])
-def test_covariances_stay_positive(noise):
-    """Also where y is far more exact than its prediction, as after a jump of d."""
-    t, y, _ = swept(FRICTION, 70.0, PERIOD, 10.0, lambda phase: np.sign(np.sin(phase)))
-    y, observer = y + noise * np.random.default_rng(7).standard_normal(len(t)), Observer(MOTOR)
-    for part in np.array_split(np.arange(len(t)), 150):
-        observer.run(t[part], y[part])
-        expect_positive(members_of(observer))
-
-
-def expect_positive(members):
-    assert np.isfinite(members.record).all()
-    size = len(members.x)
-    for i in range(size):
-        of_state = i - (size - ORDERS) <= ORDER  # other models of d do not have it
-        assert (members.p[at.py_func(size, i, i), of_state] > 0.0).all()
-
-
-def within(low, high):
-    """What `truncate` finds of a normal number of variance 1 between two others."""
-    rows = np.zeros((scratch_rows(1), 1 + ORDERS))
-    scratch = scratch_in(rows, 1)
-    half, scratch.b[0], scratch.p[0, 0] = 0.5 * (high - low), 0.5 * (low + high), 1.0
-    truncate(scratch, half, 0.0, FAR_TAIL, 1)
-    return [scratch.lines[row, 0] for row in (CHANCE, MEAN, LOST)]
-
-
-@pytest.mark.parametrize('width', [1e-6, 0.02, 0.04, 0.5, 2.0, 9.0, 30.0])
-@pytest.mark.parametrize('middle', [-5.0, -1.3, 0.0, 0.4, 3.0, 5.0])
-def test_moments_of_a_truncated_normal_distribution(middle, width):
-    low, high = middle - 0.5 * width, middle + 0.5 * width
-    chance, mean, lost = within(low, high)
-    with np.errstate(all='ignore'):
-        expected = truncnorm.stats(low, high, moments='mv')
-    np.testing.assert_allclose([mean, 1.0 - lost], expected, rtol=1e-3, atol=1e-4)
-    share = norm.cdf(high) - norm.cdf(low) if middle < 0.0 else norm.sf(low) - norm.sf(high)
-    np.testing.assert_allclose(math.exp(chance), share, rtol=1e-3)
-
-
-def test_normal_distribution_by_additions_and_multiplications():
-    x = np.linspace(0.0, FARTHEST, 1001)
-    found = [exponential(-0.5 * value * value) for value in x]
-    np.testing.assert_allclose(found, np.exp(-0.5 * x * x), rtol=1e-12)
-    np.testing.assert_allclose([mills(value) for value in x], norm.sf(x) / norm.pdf(x), rtol=1e-11)
-    assert exponential(-1e9) == exponential(-100.0)
-
-
-@pytest.mark.parametrize('sign', [-1.0, 1.0])
-def test_an_interval_far_off_counts_as_its_nearer_end(sign):
-    low, high = sorted((sign * 20.0, sign * 21.0))
-    chance, mean, lost = within(low, high)
-    assert 20.0 <= sign * mean <= 20.1
-    assert chance == pytest.approx(-200.0)
-    assert 0.0 < lost < 1.0
-
-
-@pytest.mark.parametrize('counts', [1024, 2**20])
-def test_covariances_stay_positive_where_y_is_quantised(counts):
-    quantum, t = 2.0 * np.pi / counts, np.arange(4000) * PERIOD
-    observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
-    observer.run(t, np.round(np.sin(5.0 * t) / quantum) * quantum)
-    expect_positive(members_of(observer))
-
-
-def test_coloured_noise_is_found_where_y_is_quantised_no_more():
-    """Members with coloured noise take no part before, and go on from the others then."""
-    quantum, t = 1e-2, np.arange(8000) * PERIOD
-    observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
-    y = np.round(np.sin(2.0 * t) / quantum) * quantum
-    observer.run(t[:4000], y[:4000])
-    assert observer.tuning.correlation == 0.0
-    assert observer.state.memory[arrays.ACTIVE] < COUNT
-    noise = 0.1 * lfilter([1.0], [1.0, -0.9], np.random.default_rng(3).standard_normal(4000))
-    observer.run(t[4000:], np.sin(2.0 * t[4000:]) + noise)
-    assert observer.state.memory[arrays.ACTIVE] == COUNT
-    assert observer.tuning.correlation > 0.6
-    expect_positive(members_of(observer))
 
 
 SLOW = np.arange(30_000) * PERIOD
@@ -647,21 +439,6 @@ def test_y_that_really_stands_still_is_not_taken_for_held():
     assert np.abs(run.unknown_input[5500:]).max() < 1.0
 
 
-def test_outliers_do_not_hide_the_quanta():
-    """Steps to them are no multiples; taken for the quantum, y would be smooth for ever."""
-    t, clean, d = swept(FRICTION, 70.0, PERIOD, 20.0, np.sin)
-    clean = np.round(clean / 1.5e-3) * 1.5e-3
-    expected = rms((Observer(MOTOR).run(t, clean).unknown_input - d)[5000:])
-    y = clean.copy()
-    for k in range(10, len(t), 700):  # the first one before the members begin
-        y[k : k + 15] += 0.0224 * (-1) ** k
-    observer = Observer(MOTOR)
-    run = observer.run(t, y)
-    assert observer.state.memory[arrays.QUANTUM] == pytest.approx(1.5e-3, rel=1e-6)
-    assert observer.state.memory[arrays.LATTICE] > LATTICE_SHARE
-    assert rms((run.unknown_input - d)[5000:]) < 1.5 * expected
-
-
 def test_y_that_stands_still_says_no_more_with_every_sample():
     """Within the quantum every z1 is as likely as any other one: a deviation of 0.29 q."""
     y = np.full(20_000, 0.3)
@@ -690,19 +467,6 @@ def test_slider(case):
         run = Observer({**SELF_TUNING, 'bandwidth': bandwidth}).run(t[:8000], y)
         roughness.append(rms(np.diff(run.unknown_input[4000:])))
     assert roughness[0] < 0.5 * roughness[1] < 0.25 * roughness[2]
-
-
-def test_a_constant_changes_live():
-    """Members of a linear model keep what it makes of them in a period: of the new one then."""
-    t, y, d = swept(np.array([[0.0, 1.0], [0.0, -5.0]]), 70.0, PERIOD, 20.0, np.sin)
-    y = y + 1e-4 * np.random.default_rng(8).standard_normal(len(t))
-    observer = Observer({**SELF_TUNING, 'order': 2, 'phi': ['0', '-b*z2'], 'constants.b': 25.0})
-    observer.run(t[:8000], y[:8000])
-    observer.configure({'constants.b': 5.0})
-    observer.run(t[8000:8001], y[8000:8001])
-    assert members_of(observer).flow[1, 1] == pytest.approx(math.exp(-5.0 * PERIOD), rel=1e-9)
-    run = observer.run(t[8001:], y[8001:])
-    assert rms((run.unknown_input - d[8001:])[4000:]) < 0.02 * rms(d)
 
 
 def test_a_memory_goes_on_where_it_was(case):
@@ -740,18 +504,6 @@ def test_a_copy_is_independent(case, kind):
         np.testing.assert_array_equal(one.run(stamps[400:], y[400:]).unknown_input, expected)
 
 
-def test_weights_are_shares(case):
-    """They are not negative and add up to 1; coloured members have a correlation time."""
-    t, z, _, noise = case
-    observer = Observer(SELF_TUNING)
-    observer.run(t[:1000], z[:1000, 0] + 1e-3 * noise[:1000])
-    members = members_of(observer)
-    assert members.record[WEIGHT].min() >= 0.0
-    assert members.record[WEIGHT].sum() == pytest.approx(1.0)
-    assert ((members.rates[TAU] > 0.0) == (COLOUR > 0)).all()
-    assert observer.tuning.derivatives.shape == (ORDERS,)
-
-
 def test_it_needs_the_unknown_input():
     """Without it there is nothing to tune."""
     with pytest.raises(ConfigurationError, match='unknown_input'):
@@ -782,20 +534,3 @@ def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, kind, seed, seconds
     p = model_of(setting_of(plant, condition)) | SELF_TUNING
     found, _ = online(r, p)
     assert np.abs(found - r.d).max() < 4.0 * np.abs(r.d).max()
-
-
-@pytest.mark.parametrize('distance', [-0.5, 0.0, 1.0, 2.5])
-@pytest.mark.parametrize(
-    ('moved', 'deviation', 'noise'),
-    [(0.02, 0.0, 0.0), (-0.01, 0.02, 0.0), (0.0, 0.05, 0.0), (0.0, 0.0, 0.1), (0.02, 0.01, 0.05)],
-)
-def test_passing_an_edge_is_as_likely_as_among_many_numbers(distance, moved, deviation, noise):
-    """Normal numbers that move a little, with noise: how many pass an edge from below."""
-    random = np.random.default_rng(5)
-    number = math.sqrt(1.0 - noise**2) * random.standard_normal(4_000_000)
-    before = number + noise * random.standard_normal(number.size)
-    move = moved + deviation * random.standard_normal(number.size)
-    after = number + move + noise * random.standard_normal(number.size)
-    passed = np.mean((before < distance) & (after > distance))
-    found = passage.py_func(distance, 1.0, moved, deviation**2 + 2.0 * noise**2)
-    assert found == pytest.approx(passed, rel=0.25, abs=2e-5)
