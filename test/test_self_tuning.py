@@ -534,3 +534,29 @@ def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, kind, seed, seconds
     p = model_of(setting_of(plant, condition)) | SELF_TUNING
     found, _ = online(r, p)
     assert np.abs(found - r.d).max() < 4.0 * np.abs(r.d).max()
+
+
+def test_a_constant_changes_live():
+    """Members of a linear model keep what it makes of them in a period: of the new one then."""
+    t, y, d = swept(np.array([[0.0, 1.0], [0.0, -5.0]]), 70.0, PERIOD, 20.0, np.sin)
+    y = y + 1e-4 * np.random.default_rng(8).standard_normal(len(t))
+    observer = Observer({**SELF_TUNING, 'order': 2, 'phi': ['0', '-b*z2'], 'constants.b': 25.0})
+    observer.run(t[:8000], y[:8000])
+    observer.configure({'constants.b': 5.0})
+    observer.run(t[8000:8001], y[8000:8001])
+    flow = observer.state.values['flow']
+    assert flow[1, 1] == pytest.approx(math.exp(-5.0 * PERIOD), rel=1e-9)
+    run = observer.run(t[8001:], y[8001:])
+    assert rms((run.unknown_input - d[8001:])[4000:]) < 0.02 * rms(d)
+
+
+def test_weights_are_shares(case):
+    """They are not negative and add up to 1; coloured members have a correlation time."""
+    t, z, _, noise = case
+    observer = Observer(SELF_TUNING)
+    observer.run(t[:1000], z[:1000, 0] + 1e-3 * noise[:1000])
+    values = observer.state.values
+    assert values['weight'].min() >= 0.0
+    assert values['weight'].sum() == pytest.approx(1.0)
+    np.testing.assert_array_equal(values['tau'] > 0.0, np.arange(240) >= 120)
+    assert observer.tuning.derivatives.shape == (4,)
