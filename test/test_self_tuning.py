@@ -560,3 +560,30 @@ def test_weights_are_shares(case):
     assert values['weight'].sum() == pytest.approx(1.0)
     np.testing.assert_array_equal(values['tau'] > 0.0, np.arange(240) >= 120)
     assert observer.tuning.derivatives.shape == (4,)
+
+
+def test_a_sample_that_is_not_likely_changes_no_member(case):
+    """Neither estimates nor covariances nor gains, although all are predicted to it."""
+    t, z, _, noise = case
+    y = z[:, 0] + 1e-3 * noise
+    observer = Observer(SELF_TUNING)
+    observer.run(t[:300], y[:300])
+    before = observer.state.values
+    assert observer.step(y[300] + 10.0, PERIOD).status & Status.REJECTED_SPIKE
+    after = observer.state.values
+    for name in ('z', 'd', 'p_zz', 'p_zd', 'p_dd', 'gain_z', 'gain_d'):
+        np.testing.assert_array_equal(before[name], after[name])
+
+
+@pytest.mark.parametrize('noise', [0.0, 4.4e-7])
+def test_covariances_stay_positive(noise):
+    """Also where y is far more exact than its prediction, as after a jump of d."""
+    t, y, _ = swept(FRICTION, 70.0, PERIOD, 10.0, lambda phase: np.sign(np.sin(phase)))
+    y, observer = y + noise * np.random.default_rng(7).standard_normal(len(t)), Observer(MOTOR)
+    n, derivatives = observer.order, np.tile(np.repeat(np.arange(4), 2), 30)
+    for part in np.array_split(np.arange(len(t)), 150):
+        observer.run(t[part], y[part])
+        values = observer.state.values
+        assert (values['p_zz'][np.cumsum([0, *range(n, 1, -1)])] > 0.0).all()
+        for i in range(4):  # other models of d do not have it
+            assert (values['p_dd'][i, i, derivatives >= i] > 0.0).all()
