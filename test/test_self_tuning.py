@@ -584,6 +584,77 @@ def test_covariances_stay_positive(noise):
     for part in np.array_split(np.arange(len(t)), 150):
         observer.run(t[part], y[part])
         values = observer.state.values
-        assert (values['p_zz'][np.cumsum([0, *range(n, 1, -1)])] > 0.0).all()
+        assert (values['p_zz'][np.cumsum(range(1, n + 1)) - 1] > 0.0).all()
         for i in range(4):  # other models of d do not have it
             assert (values['p_dd'][i, i, derivatives >= i] > 0.0).all()
+
+
+def members_of(values):
+    """Return the members' states (N, 240) and covariances (N, N, 240), by a snapshot."""
+    n = len(values['z'])
+    p = np.zeros((n + 4, n + 4, 240))
+    p[:n, n:], p[n:, n:] = values['p_zd'], values['p_dd']
+    p[np.tril_indices(n)[::-1]] = values['p_zz']  # column by column
+    upper = np.triu_indices(n + 4, 1)
+    p[upper[::-1]] = p[upper]
+    return np.concatenate([values['z'], values['d']]), p
+
+
+def filtered(y, periods, rates, intensity, variance, first, covariance):
+    """Return estimate and covariance of a textbook Kalman filter, the noise being a state."""
+    size = len(rates)
+    x, p = np.append(first, 0.0), np.zeros((size + 1, size + 1))
+    p[:size, :size] = covariance
+    c = np.zeros(size + 1)
+    c[0] = c[-1] = 1.0
+    whole, chain = np.zeros((2 * size, 2 * size)), np.eye(size, k=1)
+    whole[:size, :size], whole[size:, size:] = -chain, chain.T
+    whole[size - 1, 2 * size - 1] = 1.0
+    for measured, h in zip(y, periods, strict=True):
+        exponential = expm(whole * h)  # Van Loan; Q is that of integrators (D 20)
+        a = np.zeros((size + 1, size + 1))
+        a[:size, :size] = expm(rates * h)
+        q = np.zeros_like(p)
+        q[:size, :size] = intensity * exponential[size:, size:].T @ exponential[:size, size:]
+        q[-1, -1] = variance
+        x, p = a @ x, a @ p @ a.T + q
+        s = c @ p @ c
+        gain = p @ c / s
+        x, p = x + gain * (measured - c @ x), p - np.outer(gain, c @ p)
+    return x, p
+
+
+@pytest.mark.parametrize('stretch', [1.0, 1.2])
+def test_members_with_white_noise_are_kalman_filters(case, stretch):
+    """State and covariance of members of every k, while no innovation is large."""
+    t, z, _, noise = case
+    y = z[:, 0] + 1e-3 * np.where(t < 0.3, noise, 0.3 * noise)
+    observer = Observer(SELF_TUNING)
+    observer.run(t[:300], y[:300])
+    values = observer.state.values
+    moving, kappa, (x, covariances) = int(values['moving']), values['kappa'], members_of(values)
+    samples, periods = y[300:315], [stretch * PERIOD] * 15
+    for measured, h in zip(samples, periods, strict=True):
+        observer.step(measured, h)
+    after_x, after_covariances = members_of(observer.state.values)
+    derivatives = np.tile(np.repeat(np.arange(4), 2), 30)
+    for k in range(4):
+        scores = np.where((np.arange(240) < 120) & (k == derivatives), values['score'], -np.inf)
+        scores[: 120 - moving + 2 * 8] = -np.inf
+        g = np.argmax(scores)
+        size = 4 + k
+        first, covariance = x[:size, g], covariances[:size, :size, g]
+        rates = np.eye(size, k=1)
+        rates[2, 2] = -1.0
+        rates[range(3, size), range(3, size)] = -kappa[g]
+        drive, variance = values['drive'][k, g], values['used_noise'][0]
+        found, expected = filtered(samples, periods, rates, drive, variance, first, covariance)
+        estimate = after_x[:, g]
+        deviations = np.sqrt(np.diag(expected)[:size])
+        assert (np.abs(estimate[:size] - found[:size]) < 1e-6 * deviations).all(), k
+        found_covariance = after_covariances[:, :, g]
+        np.testing.assert_allclose(
+            found_covariance[:size, :size], expected[:size, :size], rtol=1e-6
+        )
+        assert not estimate[size:].any()
+        assert not found_covariance[:, size:].any()
