@@ -6,9 +6,13 @@ import math
 
 from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.self_tuning.intervals import bell_and_mills, passing, within
+from fhaosmo_ros.core.observer.self_tuning.jumps import explained
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.signal import lfilter
+from scipy.stats import norm, truncnorm
 from studies.everywhere import (
     Condition,
     CONDITIONS,
@@ -20,6 +24,10 @@ from studies.everywhere import (
 from studies.everywhere import (
     PLANTS as PLANTS_OF_STUDY,
 )
+
+WINDOW, SHAPE, FARTHEST, LEAST_CHANCE = 32, 2.0, 12.0, -6.0
+"""Of the test for jumps of y (D 35), and of quantised samples (D 31)."""
+
 
 PERIOD = 1e-3
 SELF_TUNING = {'gains': 'self_tuning'}
@@ -580,13 +588,18 @@ def test_covariances_stay_positive(noise):
     """Also where y is far more exact than its prediction, as after a jump of d."""
     t, y, _ = swept(FRICTION, 70.0, PERIOD, 10.0, lambda phase: np.sign(np.sin(phase)))
     y, observer = y + noise * np.random.default_rng(7).standard_normal(len(t)), Observer(MOTOR)
-    n, derivatives = observer.order, np.tile(np.repeat(np.arange(4), 2), 30)
     for part in np.array_split(np.arange(len(t)), 150):
         observer.run(t[part], y[part])
-        values = observer.state.values
-        assert (values['p_zz'][np.cumsum(range(1, n + 1)) - 1] > 0.0).all()
-        for i in range(4):  # other models of d do not have it
-            assert (values['p_dd'][i, i, derivatives >= i] > 0.0).all()
+        expect_positive(observer.state.values)
+
+
+def expect_positive(values):
+    records = ('weight', 'score', 'variance', 'log_variance', 'residual', 'far', 'short_mean')
+    assert all(np.isfinite(values[name]).all() for name in records)
+    n, derivatives = len(values['z']), np.tile(np.repeat(np.arange(4), 2), 30)
+    assert (values['p_zz'][np.cumsum(range(1, n + 1)) - 1] > 0.0).all()
+    for i in range(4):  # other models of d do not have it
+        assert (values['p_dd'][i, i, derivatives >= i] > 0.0).all()
 
 
 def members_of(values):
@@ -658,3 +671,102 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
         )
         assert not estimate[size:].any()
         assert not found_covariance[:, size:].any()
+
+
+@pytest.mark.parametrize('n', [1, 2, 3])
+def test_only_a_constant_explains_a_jump(n):
+    """Powers of time, a line and larger noise explain themselves; a step is none of these."""
+    since, rng = np.arange(WINDOW) - 20, np.random.default_rng(n)
+    shapes = [np.where(since > 0, since.clip(0) ** p, 0.0) for p in range(1, n + 1)]
+    for shape in (*shapes, np.linspace(-3.0, 5.0, WINDOW), np.full(WINDOW, 3.0)):
+        r = 8.0 * shape / np.abs(shape).max()
+        assert explained(r, n) == pytest.approx(r @ r, rel=1e-9)
+    loud = 8.0 * np.where(since >= 0, rng.standard_normal(WINDOW), 0.0)
+    step = 4.0 * (since >= 0)
+    means = [np.sum(r[20:]) ** 2 / 12 for r in (loud, step)]
+    assert means[0] < explained(loud, n)
+    assert means[1] > explained(step, n) + SHAPE
+
+
+@pytest.mark.parametrize('width', [1e-6, 0.02, 0.04, 0.5, 2.0, 9.0, 30.0])
+@pytest.mark.parametrize('middle', [-5.0, -1.3, 0.0, 0.4, 3.0, 5.0])
+def test_moments_of_a_truncated_normal_distribution(middle, width):
+    low, high = middle - 0.5 * width, middle + 0.5 * width
+    chance, mean, lost = within(low, high)
+    with np.errstate(all='ignore'):
+        expected = truncnorm.stats(low, high, moments='mv')
+    np.testing.assert_allclose([mean, 1.0 - lost], expected, rtol=1e-3, atol=1e-4)
+    share = norm.cdf(high) - norm.cdf(low) if middle < 0.0 else norm.sf(low) - norm.sf(high)
+    np.testing.assert_allclose(chance, max(math.log(share), LEAST_CHANCE), atol=1e-3)
+
+
+def test_normal_distribution_by_additions_and_multiplications():
+    x = np.linspace(0.0, FARTHEST, 1001)
+    bell, ratio = np.transpose([bell_and_mills(value) for value in x])
+    np.testing.assert_allclose(bell, np.exp(-0.5 * x * x), rtol=1e-12)
+    np.testing.assert_allclose(ratio, norm.sf(x) / norm.pdf(x), rtol=1e-11)
+    assert bell_and_mills(1e5)[0] == bell_and_mills(math.sqrt(200.0))[0]
+
+
+@pytest.mark.parametrize('sign', [-1.0, 1.0])
+def test_an_interval_far_off_counts_as_its_nearer_end(sign):
+    low, high = sorted((sign * 20.0, sign * 21.0))
+    chance, mean, lost = within(low, high)
+    assert 20.0 <= sign * mean <= 20.1
+    assert chance == LEAST_CHANCE
+    assert 0.0 < lost < 1.0
+
+
+@pytest.mark.parametrize('distance', [-0.5, 0.0, 1.0, 2.5])
+@pytest.mark.parametrize(
+    ('moved', 'deviation', 'noise'),
+    [(0.02, 0.0, 0.0), (-0.01, 0.02, 0.0), (0.0, 0.05, 0.0), (0.0, 0.0, 0.1), (0.02, 0.01, 0.05)],
+)
+def test_passing_an_edge_is_as_likely_as_among_many_numbers(distance, moved, deviation, noise):
+    """Normal numbers that move a little, with noise: how many pass an edge from below."""
+    random = np.random.default_rng(5)
+    number = math.sqrt(1.0 - noise**2) * random.standard_normal(4_000_000)
+    before = number + noise * random.standard_normal(number.size)
+    move = moved + deviation * random.standard_normal(number.size)
+    after = number + move + noise * random.standard_normal(number.size)
+    passed = np.mean((before < distance) & (after > distance))
+    found = passing(distance, 1.0, moved, deviation**2 + 2.0 * noise**2)
+    assert found == pytest.approx(passed, rel=0.25, abs=2e-5)
+
+
+@pytest.mark.parametrize('counts', [1024, 2**20])
+def test_covariances_stay_positive_where_y_is_quantised(counts):
+    quantum, t = 2.0 * np.pi / counts, np.arange(4000) * PERIOD
+    observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
+    observer.run(t, np.round(np.sin(5.0 * t) / quantum) * quantum)
+    expect_positive(observer.state.values)
+
+
+def test_coloured_noise_is_found_where_y_is_quantised_no_more():
+    """Members with coloured noise take no part before, and go on from the others then."""
+    quantum, t = 1e-2, np.arange(8000) * PERIOD
+    observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
+    y = np.round(np.sin(2.0 * t) / quantum) * quantum
+    observer.run(t[:4000], y[:4000])
+    assert observer.tuning.correlation == 0.0
+    assert observer.state.values['active'] < 240
+    noise = 0.1 * lfilter([1.0], [1.0, -0.9], np.random.default_rng(3).standard_normal(4000))
+    observer.run(t[4000:], np.sin(2.0 * t[4000:]) + noise)
+    assert observer.state.values['active'] == 240
+    assert observer.tuning.correlation > 0.6
+    expect_positive(observer.state.values)
+
+
+def test_outliers_do_not_hide_the_quanta():
+    """Steps to them are no multiples; taken for the quantum, y would be smooth for ever."""
+    t, clean, d = swept(FRICTION, 70.0, PERIOD, 20.0, np.sin)
+    clean = np.round(clean / 1.5e-3) * 1.5e-3
+    expected = rms((Observer(MOTOR).run(t, clean).unknown_input - d)[5000:])
+    y = clean.copy()
+    for k in range(10, len(t), 700):  # the first one before the members begin
+        y[k : k + 15] += 0.0224 * (-1) ** k
+    observer = Observer(MOTOR)
+    run = observer.run(t, y)
+    assert observer.state.values['quantum'] == pytest.approx(1.5e-3, rel=1e-6)
+    assert observer.state.values['lattice'] > 0.9
+    assert rms((run.unknown_input - d)[5000:]) < 1.5 * expected

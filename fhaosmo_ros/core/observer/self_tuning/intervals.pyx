@@ -8,6 +8,7 @@ the truncated one has (Curry, Vander Velde and Potter 1970, IEEE Transactions on
 """
 
 from libc.math cimport INFINITY, M_2_PI, M_PI, copysign, exp, fabs, fmax, fmin, log, sqrt
+from libc.stdlib cimport calloc, free
 
 from fhaosmo_ros.core.observer.self_tuning.filters cimport GATE, HUBER, INEXACT
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
@@ -222,3 +223,36 @@ cdef bint choose_members(Members* m, double quanta) noexcept nogil:
             m.variance[g], m.log_variance[g] = m.variance[white], m.log_variance[white]
             m.residual[g], m.short_mean[g], m.far[g] = 0.0, 1.0, 0.0
     return m.shared.active != before
+
+
+# What Python can ask, a number at a time
+
+def within(double low, double high):
+    """
+    Return what `truncate` finds of a normal number of variance 1 between two others.
+
+    Returns
+    -------
+    (float, float, float)
+        Logarithm of the probability (at least `LEAST_CHANCE`), mean, what the variance loses.
+
+    """
+    cdef Members* m = <Members*>calloc(1, sizeof(Members))
+    if m == NULL:
+        raise MemoryError
+    m.n = m.shared.active = 1
+    m.work.b[0], m.work.p.zz[0][0] = 0.5 * (low + high), 1.0
+    truncate(m, 0.5 * (high - low), 0.0, False)
+    found = m.work.chance[0], m.work.mean[0], m.work.lost[0]
+    free(m)
+    return found
+
+
+def bell_and_mills(double x):
+    """Return exp(-x^2 / 2) and Mills' ratio for 0 <= x <= 12, as the loops have them."""
+    return exponential(-0.5 * x * x), mills(x)
+
+
+def passing(double to_edge, double variance, double moved, double spread):
+    """Return `passage`."""
+    return passage(to_edge, variance, moved, spread)
