@@ -246,3 +246,13 @@ def test_too_many_states_are_told_or_refused():
 
 def test_nothing_is_told_where_all_is_well(plain):
     assert notes(*plain) == []
+
+
+def test_drift_of_the_sensor_is_told_or_refused():
+    drift = np.cumsum(np.random.default_rng(5).standard_normal(K)) * 2e-3
+    try:
+        found, gains, along = found_in(plant()[:, 0] + noise() + drift)
+    except NothingToFind as error:
+        assert 'drift' in str(error)  # noqa: PT017
+    else:
+        assert any('drift' in text for text in notes(found, gains, along))

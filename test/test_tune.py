@@ -408,3 +408,61 @@ def test_estimate_that_left_the_finite_numbers_is_the_worst():
     assert objective(wild).objective > 1e3
     assert not np.isnan(objective(wild).objective)
     assert Observer().order == 3
+
+
+def test_levant_is_tuned_without_what_it_does_not_use(tmp_path):
+    out = tmp_path / 'out'
+    assert main([*QUICK, '-pstructure:=levant', '-o', str(out)]) == 0
+    values = load(out / 'gains.yaml', 'estimator')
+    assert values['structure'] == 'levant'
+    assert 'alpha' not in values
+    assert '| epsilon |' not in (out / 'report.md').read_text()
+    assert values['epsilon'] == max(values['fuzzy_widths'])
+    assert values['divergence_time'] == 0.1  # 20 samples at 200 Hz
+    assert len(values['lambda']) == 4
+
+
+def test_theory_begins_below_an_estimate_of_zero():
+    family = Family({'noise_std': 1e-4, 'integration_step': 1e-3})
+    tuning = TUNE_PARAMETERS.defaults()
+    objective = Objective(family.recordings(3), {'variant': 'fuzzy'}, tuning, choose=True)
+    errors = [objective(gains).error for gains in candidates(family.recordings(3), 4, 1e-4)]
+    assert min(errors) < 0.8
+    assert max(errors) > 1.5
+
+
+def test_objective_weighs_what_it_is_told_to():
+    recordings = Family(SHORT | {'noise_std': 1e-3}).recordings(2)
+    gains = {'lambda': 5.0, 'alpha': 3.0, 'fuzzy_widths': 0.05, 'epsilon': 1.0}
+    plain = {'chatter_weight': 0.0, 'settling_weight': 0.0}
+
+    def judge(**changes):
+        return Objective(recordings, {}, TUNING.changed(changes), choose=True)(gains)
+
+    only_d = judge(**plain)
+    assert only_d.objective == only_d.error
+    scores, choice = only_d.scores, only_d.choice
+    scale = np.sqrt(np.mean(np.concatenate([r.d[r.t >= 1.0] for r in recordings]) ** 2))
+    expected = np.exp(np.mean(np.log(scores.error[:, choice, -1] / scale)))
+    np.testing.assert_allclose(only_d.error, expected, rtol=1e-6)
+    assert judge(weights=[1.0, 0.0, 0.0, 0.0], **plain).error < 0.1 * only_d.error
+    both = judge(chatter_weight=2.0, settling_weight=3.0)
+    np.testing.assert_allclose(
+        both.objective, both.error + 2.0 * both.chatter + 3.0 * both.settling
+    )
+    assert both.settling > 0.0
+    other = Objective(
+        recordings, {'estimate_from': 'filtered'}, TUNING.changed(plain), choose=False
+    )
+    assert other(gains).estimate_from == 'filtered'
+    assert other(gains).error >= only_d.error
+
+
+def test_held_out_recordings_are_others_with_the_scale_of_the_training():
+    values = TUNING.changed({'recordings': 2, 'held_out': 2, 'noise_std': 1e-3})
+    data = simulated(values, 1)
+    assert not any(np.array_equal(a.y, b.y) for a in data.training for b in data.held_out)
+    tuner = Tuner(data, {'scheme': 'explicit', 'lambda': [1.0], 'alpha': [1.0]}, values, 1)
+    assert tuner.training.trial.recordings == data.training
+    assert tuner.held_out.trial.recordings == data.held_out
+    np.testing.assert_array_equal(tuner.held_out.scale, tuner.training.scale)

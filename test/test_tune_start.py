@@ -15,7 +15,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PA
 from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.tools.tuning.command import main
 from fhaosmo_ros.tools.tuning.linear_gains import kalman_like, SampledModel
-from fhaosmo_ros.tools.tuning.objective import least_damping
+from fhaosmo_ros.tools.tuning.objective import least_damping, Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.source import simulated
 from fhaosmo_ros.tools.tuning.space import changes
@@ -237,3 +237,52 @@ def test_gains_of_the_models_follow_their_plant(name):
     found = online.run(np.round(r.t * 1e9).astype(np.int64) + 1, r.y, r.u)
     error = np.sqrt(np.mean((found.unknown_input - r.d)[r.t >= 5.0] ** 2))
     assert error < 0.3 * amplitude
+
+
+def test_gains_that_are_written_are_as_good_as_those_that_were_judged_without_noise():
+    """Written are also rules for when y is lost, which half-widths have to leave room for."""
+    quiet = {'noise_std': 0.0, 'sample_rate': 1000.0, 'disturbances': ['sines']}
+    values = VALUES.changed(quiet)
+    tuner = Tuner(simulated(values, 1), {}, values, 1, jobs=2)
+    judged = tuner.training(tuner.before).error
+    assert judged < 0.1
+    assert tuner.training(tuner.parameters(tuner.before)).error < 1.01 * judged
+
+
+def test_bounds_are_near_a_start_by_kalman_and_far_from_others(tuner):
+    def decades(some, name):
+        return next(np.log10(d.high / d.low) for d in some.space if d.name == name)
+
+    cascade = Tuner(tuner.data, {'scheme': 'implicit'}, VALUES, 1)
+    assert not cascade.tried
+    for name in ('lambda[0]', 'fuzzy_widths[1]'):
+        assert 0.0 < decades(tuner, name) < decades(cascade, name) == pytest.approx(6.0)
+    wide = Tuner(tuner.data, {'unknown_input_derivatives': 0}, VALUES.changed({'decades': 4.0}), 1)
+    assert decades(wide, 'lambda[0]') == pytest.approx(8.0)
+
+
+@pytest.mark.parametrize('noise', ['1e-4', '1e-3', '1e-2'])
+def test_presets_fit_the_noise_in_their_name(noise):
+    path = ROOT / 'config' / f'noise_{noise}.yaml'
+    text = path.read_text()
+    assert 'python -m fhaosmo_ros tune ' in text
+    assert f'-p noise_std:={noise} -o noise_{noise}\n' in text
+    values = load(path, 'estimator')
+    assert dict(SCHEME).items() <= values.items()
+    assert load(path, 'plant')['noise_std'] == float(noise)
+    family = Family({'noise_std': float(noise), 'integration_step': 1e-3})
+    recordings = family.recordings(3, seed=77)
+    tuning = TUNE_PARAMETERS.defaults()
+    demo = load(ROOT / 'config' / 'demo.yaml', 'estimator')
+    judged = []
+    for p in (values, demo):
+        complete = ESTIMATOR_PARAMETERS.complete(p)
+        judged.append(Objective(recordings, complete, tuning, choose=False)({}))
+    assert judged[0].error < min(0.95, 0.9 * judged[1].error)
+    # The node's own path gives the same.
+    r = recordings[0]
+    online = OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values))
+    found = online.run(np.round(r.t * 1e9).astype(np.int64) + 1, r.y, r.u)
+    late = r.t >= tuning['settled']
+    error = np.sqrt(np.mean((found.unknown_input - r.d)[late] ** 2))
+    assert error == pytest.approx(judged[0].scores.error[0, 0, -1], rel=1e-3)
