@@ -12,14 +12,11 @@ from libc.math cimport copysign, exp, fabs, log, log1p, pow, sqrt
 
 from fhaosmo_ros.core.model.phi cimport Dual, evaluate
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
-from fhaosmo_ros.core.observer.sliding_mode cimport SlidingMode, psi
+from fhaosmo_ros.core.observer.sliding_mode cimport (
+    NEWTON_STEPS, NEWTON_TOLERANCE, TINY, SlidingMode, psi
+)
 from fhaosmo_ros.core.observer.structure cimport Level
 
-# Newton's method ends at such a relative change; its square, about 1e-15, is the error left.
-cdef int NEWTON_STEPS = 60
-cdef double NEWTON_TOLERANCE = 3e-8
-# Innovations below this are taken for 0: their powers would underflow.
-cdef double TINY = 1e-300
 cdef int BISECTIONS = 60
 
 

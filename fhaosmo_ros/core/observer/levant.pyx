@@ -16,17 +16,13 @@ from fhaosmo_ros.core.model.phi cimport Dual, evaluate
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.kalman cimport Row
 from fhaosmo_ros.core.observer.sliding_mode cimport (
-    SlidingMode, doubt_of_noise, follow_spread, psi
+    HUBER, LONG_AGO, NEWTON_STEPS, NEWTON_TOLERANCE, TINY, SlidingMode, doubt_of_noise,
+    follow_spread, psi
 )
 from fhaosmo_ros.core.observer.structure cimport Level, Memory
 
 from fhaosmo_ros.core.observer.configuration import deadbeat_shares
 
-# Newton's method ends at such a relative change; its square, about 1e-15, is the error left.
-cdef int NEWTON_STEPS = 60
-cdef double NEWTON_TOLERANCE = 3e-8
-# Innovations below this are taken for 0: their powers would underflow.
-cdef double TINY = 1e-300
 # An interval that differs from the tuned one by at most this part of it needs no other gains.
 cdef double NEAR = 0.25
 # Gains that differ from the tuned ones by at most this part of them are replaced by them.
@@ -35,10 +31,7 @@ cdef double CLOSE = 0.02
 cdef double NEARLY_STEADY = 1.5
 # So many samples in a row beyond all half-widths widen them.
 cdef double SATURATED_SAMPLES = 20.0
-# Seconds since the start where it does not matter when it was.
-cdef double LONG_AGO = 1e12
-# Innovations of more standard deviations count as so many, at most and at least (D 32).
-cdef double HUBER = 2.0
+# Innovations of more standard deviations count as so many, at least (D 32).
 cdef double LEAST_HUBER = 1.0
 # The share within the largest limit if the noise is normal: with it the gains are the tuned ones.
 cdef double WITHIN = 0.9465

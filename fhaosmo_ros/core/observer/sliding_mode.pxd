@@ -7,6 +7,17 @@ from fhaosmo_ros.core.observer.kalman cimport LinearModel, Row
 from fhaosmo_ros.core.observer.structure cimport Level, Memory, Structure
 
 
+# Seconds since the start where it does not matter when it was (D 20).
+cdef double LONG_AGO
+# Newton's method for eps ends at such a relative change; its square, 1e-15, is the error left.
+cdef int NEWTON_STEPS
+cdef double NEWTON_TOLERANCE
+# Innovations below this are taken for 0: their powers would underflow.
+cdef double TINY
+# Innovations of more standard deviations count as so many, at most (D 32).
+cdef double HUBER
+
+
 cdef struct Gains:
     double lambda_  # of the power |eps|^gamma
     double alpha  # of the integrated psi

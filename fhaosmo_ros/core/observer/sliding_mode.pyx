@@ -15,7 +15,7 @@ from libc.string cimport memcpy
 from fhaosmo_ros.core.model.phi cimport Dual
 from fhaosmo_ros.core.observer.kalman cimport correct
 from fhaosmo_ros.core.observer.status cimport GAMMA_AT_MAX, GAMMA_AT_MIN, SENSITIVITY_RESET
-from fhaosmo_ros.core.observer.structure cimport Memory, Structure
+from fhaosmo_ros.core.observer.structure cimport GATE, Memory, Structure, has_drifted
 
 # Sensitivities beyond it are set to 0.
 cdef double SENSITIVITY_LIMIT = 1e9
@@ -26,20 +26,17 @@ cdef double LONG = 8.0
 # Median of |x| where x is normal with variance 1, and by what part the spread follows a sample.
 cdef double MEDIAN = 0.6745
 cdef double SPREAD_RATE = 0.005
-# Innovations of so many standard deviations are too unlikely to be used (D 21).
-cdef double GATE = 6.0
-# How many prediction errors after a jump of y their sum remembers, and the sum that is too much:
-# five standard deviations of that of white noise (D 23).
-cdef double REMEMBERED = 100.0
-cdef double MOST_DRIFT = 35.0
 # A jump of y contradicts the model if it changes a Phi by more than this part of its size.
 cdef double OF_SIZE = 0.25
 # At the start the noise counts as so many times larger than `noise_size`; the logarithm of this
 # factor decays within so many time constants of the steady Kalman filter.
 cdef double NOISE_DOUBT = 3.0
 cdef double DOUBTED = 2.0
-# Seconds since the start where it does not matter when it was.
-cdef double LONG_AGO = 1e12
+LONG_AGO = 1e12
+NEWTON_STEPS = 60
+NEWTON_TOLERANCE = 3e-8
+TINY = 1e-300
+HUBER = 2.0
 
 
 cdef double doubt_of_noise(double age, double speed) noexcept nogil:
@@ -68,11 +65,8 @@ cdef double follow_spread(Memory* memory, double b, double expected) noexcept no
             memory.first_miss = b
         return usual
     memory.beyond = 0.0
-    if memory.watched > 0.0:
-        memory.watched = max(memory.watched - 1.0, 0.0)
-        memory.drift += b / usual - memory.drift / REMEMBERED
-        if fabs(memory.drift) > MOST_DRIFT:
-            memory.beyond = INFINITY
+    if has_drifted(memory, b / usual):
+        memory.beyond = INFINITY
     return usual
 
 

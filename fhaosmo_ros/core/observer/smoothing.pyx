@@ -18,15 +18,13 @@ from fhaosmo_ros.core.observer.kalman cimport (
     LinearModel, Row, add_drive, carry, correct, multiply, sub_steps
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport by_binomials, ORDERS
-from fhaosmo_ros.core.observer.sliding_mode cimport follow_spread
+from fhaosmo_ros.core.observer.sliding_mode cimport HUBER, follow_spread
 from fhaosmo_ros.core.observer.structure cimport Memory
 
 from fhaosmo_ros.core.observer.kalman import STATES_DOUBT, Uncertainty
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 
-# Innovations of so many times their usual size count as no larger ones (D 24).
-cdef double HUBER = 2.0
 # What later samples may still change, in standard deviations of the filter's errors.
 cdef double TOLERANCE = 1e-9
 # A model of d that ends has been wrong if it has so much smaller a variance than the observer.

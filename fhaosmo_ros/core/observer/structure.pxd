@@ -14,6 +14,12 @@ cdef enum:
     MOST_INPUTS = 64  # known inputs
 
 
+# More unlikely samples in a row say that y is lost, and innovations of so many standard deviations
+# are too unlikely to be used (D 21).
+cdef int LOST_SAMPLES
+cdef double GATE
+
+
 cdef struct Level:
     double z_hat  # filtered estimate of z_i (unit of z_i)
     double z_tilde  # internal state, of z_{i+1}; theta at the last level (unit of z_{i+1})
@@ -105,6 +111,9 @@ cdef class Structure:
     cdef Kept checked(self, values, str prefix) except *
     cdef number(self, values, str name, tuple shape)
     cdef finite(self, values, str name, tuple shape)
+
+
+cdef bint has_drifted(Memory* memory, double off) noexcept nogil
 
 
 cdef class Estimate:

@@ -18,16 +18,18 @@ from fhaosmo_ros.core.observer.status import flags, open_levels
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 
-# More samples in a row that are too far from the prediction say that y is lost (D 21).
-cdef int LOST_SAMPLES = 20
+LOST_SAMPLES = 20
+GATE = 6.0
 # Intervals that the running mean remembers.
 cdef double MEAN_OF = 32.0
 # Values above the largest double over this are rejected, so that differences cannot overflow.
 cdef double HEADROOM = 1e8
-# Innovations of so many standard deviations are too unlikely to be used (D 21).
-cdef double GATE = 6.0
 # Samples after a jump of y in which prediction errors may not sum up (D 23).
 cdef double WATCH = 1000.0
+# How many of these errors their sum remembers, and the sum that is too much: five standard
+# deviations of that of white noise (D 23).
+cdef double REMEMBERED = 100.0
+cdef double MOST_DRIFT = 35.0
 # If a jump of y would make |z_{i+1}| or |d| so much smaller, y was wrong before it (D 23).
 cdef double MUCH_SMALLER = 0.5
 # No number of a snapshot is larger, and these are not negative.
@@ -35,6 +37,19 @@ cdef double LARGEST = 1.8e300
 POSITIVE = (
     'pending', 'period', 'beyond', 'watched', 'wait', 'upset', 'usual', 'saturated', 'narrowed'
 )
+
+
+cdef bint has_drifted(Memory* memory, double off) noexcept nogil:
+    """
+    Return True if y has left its prediction since it jumped: the plant has jumped, too (D 23).
+
+    `off` is the prediction error of a sample that is used, over its usual size.
+    """
+    if not memory.watched > 0.0:
+        return False
+    memory.watched = max(memory.watched - 1.0, 0.0)
+    memory.drift += off - memory.drift / REMEMBERED
+    return fabs(memory.drift) > MOST_DRIFT
 
 
 cdef class Structure:

@@ -16,7 +16,6 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 
 cdef double HUBER = 3.0  # innovations of more standard deviations count as so many (Huber 1964)
-cdef double GATE = 6.0  # those of so many are too unlikely to be used (D 29)
 # By this factor S is too large, so that P stays positive where y is by many orders of magnitude
 # more exact than its prediction: what is left of P then is more than what rounding makes of it.
 cdef double INEXACT = 1.0 + 1e-10

@@ -10,12 +10,13 @@ the truncated one has (Curry, Vander Velde and Potter 1970, IEEE Transactions on
 from libc.math cimport INFINITY, M_2_PI, M_PI, copysign, exp, fabs, fmax, fmin, log, sqrt
 from libc.stdlib cimport calloc, free
 
-from fhaosmo_ros.core.observer.self_tuning.filters cimport GATE, HUBER, INEXACT
+from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER, INEXACT
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     COLOURS, COUNT, GRID, HALF, Members, ORDERS, Work, entry, state
 )
 from fhaosmo_ros.core.observer.self_tuning.normal cimport exponential, mills
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.observer.structure cimport GATE
 
 cdef double ROOT = sqrt(2.0 * M_PI)
 cdef double FARTHEST = 12.0  # standard deviations; numbers that are farther off count as so far

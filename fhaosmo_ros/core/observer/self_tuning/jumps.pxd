@@ -4,7 +4,6 @@
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
 
 cdef double GROWTHS
-cdef int LOST_SAMPLES
 
 cdef void begin_growth(Members* m) noexcept nogil
 cdef bint follow_growth(Members* m, double beyond) noexcept nogil

@@ -11,14 +11,14 @@ mean (Willsky and Jones 1976).
 from libc.math cimport INFINITY, fabs, fmax, log, sqrt
 from libc.string cimport memcpy, memset
 
-from fhaosmo_ros.core.observer.self_tuning.filters cimport GATE, HUBER
+from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     COUNT, GRID, HALF, Line, MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW,
     by_binomials, put, state
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport ROUGH
+from fhaosmo_ros.core.observer.structure cimport GATE, LOST_SAMPLES
 
-cdef int LOST_SAMPLES = 20  # more unlikely samples in a row say that y is lost (D 21)
 # If so many samples in a row are farther off than the first one, d has jumped (D 33).
 cdef double GROWTHS = 3.0
 # Farther means: so many times as far, and 3 sigma more; so much of what a jump of d makes of it;

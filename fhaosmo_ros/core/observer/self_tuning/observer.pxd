@@ -31,7 +31,6 @@ cdef class SelfTuning(Structure):
     cdef void carry_flow(self, double h, const double* u) noexcept nogil
     cdef void pass_over(self, bint doubted) noexcept nogil
     cdef void take_sample(self, bint doubted) noexcept nogil
-    cdef bint drifts(self, double off, double variance) noexcept nogil
     cdef bint has_begun(self) noexcept nogil
     # Snapshots.
     cdef dict places(self)

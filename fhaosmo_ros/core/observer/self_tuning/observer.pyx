@@ -6,11 +6,11 @@ from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.observer.self_tuning.filters cimport (
-    GATE, HUBER, allow_jump, correct, correct_states, expect, predict_states
+    HUBER, allow_jump, correct, correct_states, expect, predict_states
 )
 from fhaosmo_ros.core.observer.self_tuning.intervals cimport choose_members, take_interval
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
-    GROWTHS, LOST_SAMPLES, begin_growth, follow_growth, follow_innovations, follow_jump,
+    GROWTHS, begin_growth, follow_growth, follow_innovations, follow_jump,
     samples_since_jump, shift, watch
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
@@ -26,7 +26,9 @@ from fhaosmo_ros.core.observer.self_tuning.weights cimport (
     FLOOR, Model, QUANTISED_FLOOR, judge, mix, tell_model, weigh
 )
 from fhaosmo_ros.core.observer.status cimport JUMPED
-from fhaosmo_ros.core.observer.structure cimport Memory, Structure
+from fhaosmo_ros.core.observer.structure cimport (
+    GATE, LOST_SAMPLES, Memory, Structure, has_drifted
+)
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
@@ -50,9 +52,6 @@ cdef double NEAR = 0.25, GAP = 2.5
 cdef double LONG = 8.0  # time constants of a member after which its P is steady
 # Covariances of so many members, or of a multiple, move: whole vectors of the processor.
 cdef int EVEN = 16
-# How many prediction errors after a jump of y their sum remembers, and the sum that is too much:
-# five standard deviations of that of white noise (D 23).
-cdef double REMEMBERED = 100.0, MOST_DRIFT = 35.0
 # A jump of y contradicts the model if it changes a Phi by so many standard deviations (D 23).
 cdef double OF_DEVIATION = 3.0
 # A y has noise if its differences are all more than the first part of its first difference, RMS;
@@ -291,7 +290,9 @@ cdef class SelfTuning(Structure):
             self.trial_variances[0] = expected
             return
         memory.beyond = 0.0
-        if not jumped and sample.quanta == 0.0 and self.drifts(sample.off, expected):
+        if not jumped and sample.quanta == 0.0 and has_drifted(
+            memory, sample.off / sqrt(expected)
+        ):
             memory.beyond = INFINITY
             return
         if jumped:
@@ -422,15 +423,6 @@ cdef class SelfTuning(Structure):
             judge(m, sample.grown, kept, calm)
         correct_states(m, sample.y)
         weigh(m, QUANTISED_FLOOR if quantised else FLOOR)
-
-    cdef bint drifts(self, double off, double variance) noexcept nogil:
-        """Return True if y has left its prediction since it jumped: the plant did (D 23)."""
-        cdef Memory* memory = &self.memory
-        if not memory.watched > 0.0:
-            return False
-        memory.watched = fmax(memory.watched - 1.0, 0.0)
-        memory.drift += off / sqrt(variance) - memory.drift / REMEMBERED
-        return fabs(memory.drift) > MOST_DRIFT
 
     # Live changes, snapshots and copies
 

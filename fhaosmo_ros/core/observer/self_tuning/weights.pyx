@@ -3,12 +3,13 @@
 
 from libc.math cimport M_PI, NAN, cos, exp, floor as floor_of, fmin, isfinite, log, pow, sqrt
 
-from fhaosmo_ros.core.observer.self_tuning.filters cimport GATE, HUBER
+from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     BANDS, BAND_STEP, COLOURS, COUNT, GRID, HALF, IN_BAND, Members, ORDERS, Shared, Work, entry,
     fill, largest
 )
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.observer.structure cimport GATE
 
 # No log-likelihood falls further below the best one (D 28, D 31), but by what the member's prior
 # is below that of the likeliest: a larger d needs more reason to be believed.
