@@ -20,8 +20,6 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 MAX_PAUSE = 1_000_000_000
 """Clock jumps beyond this many nanoseconds are not simulated through."""
-DEPTH = 1000
-"""Of the topics' queues: a recorder that stalls for a second loses nothing at 1 kHz."""
 TOPICS = {'y': Float64, '~/state': Float64MultiArray, '~/unknown_input': Float64}
 
 
@@ -65,7 +63,7 @@ class PlantNode(Node):
         self._state_message = labelled([f'z{i + 1}' for i in range(self.plant.order)])
         check_overrides(self, TOPICS)
         self._publish_y, self._publish_state, self._publish_d = (
-            create_publisher(self, kind, topic, DEPTH).publish for topic, kind in TOPICS.items()
+            create_publisher(self, kind, topic).publish for topic, kind in TOPICS.items()
         )
         for index, name in enumerate(self.plant.model.inputs):
             if name in self.plant.model.used_inputs:

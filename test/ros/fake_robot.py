@@ -59,7 +59,7 @@ def main() -> None:
     context = Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node('robot', context=context)
-    publisher = node.create_publisher(JointState, arguments.topic, 100)
+    publisher = node.create_publisher(JointState, arguments.topic, 1000)
     while not ended and publisher.get_subscription_count() < arguments.subscribers:
         time.sleep(0.02)
     time.sleep(0.5)  # the other side's match

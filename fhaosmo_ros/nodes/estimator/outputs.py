@@ -15,7 +15,7 @@ import numpy as np
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
-DEPTH = 10
+EVENTS_KEPT = 10
 
 
 class Publishers:
@@ -37,7 +37,7 @@ class Publishers:
     def __init__(self, node: Node, prefix: str, kinds: Mapping[str, str]) -> None:
         self._node = node
         self._publishers = [
-            create_publisher(node, message_class(kind), prefix + name, DEPTH)
+            create_publisher(node, message_class(kind), prefix + name)
             for name, kind in kinds.items()
         ]
         self._listeners = [listeners_of(publisher) for publisher in self._publishers]
@@ -131,7 +131,7 @@ class EventOutput:
         self._name = f'{node.get_fully_qualified_name().lstrip("/")}: {channel} event'
         self._name = self._name.replace(':  ', ': ')
         kind = message_class(DIAGNOSTICS)
-        self._publisher = create_publisher(node, kind, prefix + EVENT, DEPTH, latched=True)
+        self._publisher = create_publisher(node, kind, prefix + EVENT, EVENTS_KEPT, latched=True)
 
     def publish(self, event: Event, unit: str, hardware_id: str) -> str:
         """Publish the begin or the end of an event; return it in words."""

@@ -9,14 +9,12 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.observer.estimates import Estimate
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.messages import message_class, time_message
-from fhaosmo_ros.nodes.middleware.publishers import listeners_of
+from fhaosmo_ros.nodes.middleware.publishers import DEPTH, listeners_of
 from fhaosmo_ros.topics import TYPED_ESTIMATES
 from geometry_msgs.msg import AccelStamped, Vector3, WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
-
-DEPTH = 10
 
 
 class Output(NamedTuple):

@@ -11,6 +11,11 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+DEPTH = 1000
+"""
+A second of samples at 1 kHz. Fast DDS has been seen not to deliver for 0.2 s, seconds after a node
+has joined; what the publisher still keeps then is sent again.
+"""
 POLICIES: dict[QoSPolicyKind, tuple[str, ...] | range] = {
     QoSPolicyKind.HISTORY: ('keep_last', 'keep_all'),
     QoSPolicyKind.DEPTH: range(1, 100_001),
@@ -22,7 +27,9 @@ OF_RCLPY = ('/clock.', '/parameter_events.', '/rosout.')
 """Topics whose QoS can be overridden in every node of rclpy."""
 
 
-def create_publisher(node: Node, kind: Any, topic: str, depth: int, latched: bool = False) -> Any:
+def create_publisher(
+    node: Node, kind: Any, topic: str, depth: int = DEPTH, latched: bool = False
+) -> Any:
     """Return a publisher, reliable unless the user wants another QoS; latched: transient-local."""
     durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
     return node.create_publisher(

@@ -180,19 +180,14 @@ def _record(
         for topic, kind, transient_local in topics:
             bag.add(topic, kind, qos=[LATCHED_QOS if transient_local else OFFERED_QOS])
         options = ('--ros-args', '--params-file', str(parameters))
+        # Together: Fast DDS finds a node that starts half a second after another one 3 s late.
         nodes.start_node('estimator', *options)
-        _wait(
-            'the estimator',
-            lambda: recorder.publishers('/estimator/state') and recorder.subscribers('/y') >= 2,
-            recorder,
-            nodes,
-            stop,
-        )
         nodes.start_node('plant', *options)
+        compared = ['/y', *(f'/plant/{name}' for name in TRUTH), '/estimator/state']
         _wait(
             'the first estimate',
             lambda: (
-                recorder.counts['/estimator/state']
+                all(recorder.counts[topic] for topic in compared)
                 and (not plan.changes or recorder.can_set_parameters('/plant'))
             ),
             recorder,
