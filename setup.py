@@ -196,7 +196,6 @@ setup(
             'mcap-ros2-support',
             'mypy',
             'ruff',
-            'selenium',  # with chromium and its driver, where they are installed
             'setuptools>=68,<80',  # from 80 on, colcon build --symlink-install silently copies
             'sympy',
             'types-PyYAML',

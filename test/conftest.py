@@ -2,6 +2,7 @@
 """Settings shared by all tests."""
 
 import os
+from pathlib import Path
 import signal
 
 from domains import take_domain
@@ -13,6 +14,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 os.environ['ROS_DOMAIN_ID'] = str(take_domain())
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(Path(__file__).with_name('quick_discovery.xml'))
 
 # Same examples in every run; no deadline, because other processes may take the machine.
 settings.register_profile('fixed', derandomize=True, deadline=None, database=None)

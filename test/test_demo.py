@@ -3,8 +3,6 @@
 
 import os
 from pathlib import Path
-import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -100,10 +98,10 @@ def test_figure_is_a_picture(finished):
     assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
 
 
-def test_the_shipped_demonstration_changes_the_plant_and_is_drawn_live(tmp_path):
+def test_the_shipped_demonstration_changes_the_plant(tmp_path):
     """Self-tuning: what it has found is in the bag, in words and in the figure."""
     folder = tmp_path / 'out'
-    result = run('--duration', 6, '--output', folder, '--live')
+    result = run('--duration', 6, '--output', folder)
     assert result.returncode == 0, result.stderr
     assert 'the noise on y is ten times larger' in result.stdout
     assert 'd lay within two standard deviations' in result.stdout
@@ -113,11 +111,6 @@ def test_the_shipped_demonstration_changes_the_plant_and_is_drawn_live(tmp_path)
     assert np.median(true[end]) > 5.0 * np.median(true[begin])  # the plant did change
     found = run_.tuned.noise[end]
     assert np.median(found) > 0.5 * np.median(true[end])  # jitter of a busy machine adds to it
-    page = Path(re.search(r'live figure: file://(\S+)', result.stdout)[1])
-    text = page.read_text()
-    shutil.rmtree(page.parent)
-    assert 'finished' in text
-    assert 'http-equiv' not in text
 
 
 def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(parameters):

@@ -123,7 +123,7 @@ def test_outputs_qos_can_be_overridden(client, listen):
     assert infos['stamp'].reliability == ReliabilityPolicy.RELIABLE
     assert infos['gamma'].durability == DurabilityPolicy.TRANSIENT_LOCAL
     assert infos['stamp'].durability == DurabilityPolicy.VOLATILE
-    assert rig.parameters.get(f'qos_overrides.{prefix}/innovation.publisher.depth') == 10
+    assert rig.parameters.get(f'qos_overrides.{prefix}/innovation.publisher.depth') == 1000
 
 
 def test_who_comes_later_hears_the_latched_estimates_too(client, start):

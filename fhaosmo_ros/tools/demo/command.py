@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, Sample, TopicRecorder
+from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, TopicRecorder
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.types import LATCHED_QOS, OFFERED_QOS
 from fhaosmo_ros.tools.bags.writer import BagWriter
@@ -21,7 +21,6 @@ from fhaosmo_ros.tools.cli.processes import Children
 from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.cli.share import shipped
 from fhaosmo_ros.tools.demo.figure import save_run
-from fhaosmo_ros.tools.demo.live import LivePage
 from fhaosmo_ros.tools.demo.report import read_run, table
 from fhaosmo_ros.topics import (
     ARRAY,
@@ -37,8 +36,6 @@ from fhaosmo_ros.topics import (
     TRUTH,
 )
 
-DRAW_PERIOD = 1.0
-"""Seconds between two pictures of --live."""
 START_DEADLINE = 60.0
 """Seconds for a node to appear; it takes one or two where nothing else runs."""
 CHANGES = (
@@ -96,10 +93,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar='FOLDER',
         help='new or empty folder for bag and figure (default: demo_output/TIME)',
     )
-    parser.add_argument(
-        '--live', action='store_true',
-        help='draw d while it runs, in a page for a browser; opened where there is a display',
-    )  # fmt: skip
     parser.add_argument('--force', action='store_true', help='replace an output that exists')
     parser.add_argument(
         '--params-file',
@@ -125,15 +118,11 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         f'plant and estimator with {parameters}, on this host only, '
         f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}'
     )
-    page = LivePage() if arguments.live else None
-    if page is not None:
-        print(f'live figure: {page.path.as_uri()}')
-        page.open()
     with Output(arguments.output or _default_output(), arguments.force) as output:
         folder = output.path
         folder.mkdir()
         plan = Plan(arguments.duration, changes)
-        marks = _record(folder, parameters, topics, plan, page, stop)
+        marks = _record(folder, parameters, topics, plan, stop)
         if stop.is_set():
             print('stopped early: reporting what has been recorded')
         run = read_run(folder / 'bag')
@@ -142,8 +131,6 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
         print(f'\n{text}\n')
         final = output.keep()
-    if page is not None:
-        page.finish(f'finished; bag and figure: {final}', final / 'demo.png')
     print(f'figure:  {final / "demo.png"}\nbag:     {final / "bag"}')
 
 
@@ -162,19 +149,12 @@ def _record(
     parameters: Path,
     topics: list[ExpectedTopic],
     plan: Plan,
-    page: LivePage | None,
     stop: Stop,
 ) -> list[tuple[int, str]]:
     """Record a run; return when the plant changed (ns), and how."""
-
-    def take(sample: Sample) -> None:
-        bag.write(*sample)
-        if page is not None:
-            page.take(sample)
-
     with (
         BagWriter(folder / 'bag') as bag,
-        TopicRecorder(take, topics) as recorder,
+        TopicRecorder(lambda sample: bag.write(*sample), topics) as recorder,
         Children(folder) as nodes,
     ):
         for topic, kind, transient_local in topics:
@@ -194,7 +174,7 @@ def _record(
             nodes,
             stop,
         )
-        return _watch(recorder, nodes, plan, page, stop)
+        return _watch(recorder, nodes, plan, stop)
 
 
 def _check_alone(recorder: TopicRecorder) -> None:
@@ -227,12 +207,11 @@ def _wait(
 
 
 def _watch(
-    recorder: TopicRecorder, nodes: Children, plan: Plan, page: LivePage | None, stop: Stop
+    recorder: TopicRecorder, nodes: Children, plan: Plan, stop: Stop
 ) -> list[tuple[int, str]]:
     """Show a progress bar, and change the plant, until the time is over or the user stops it."""
     duration, changes = plan
     begin, coming, marks = time.monotonic(), deque(changes), []
-    drawn = begin
     with progress(
         total=duration, unit='s', bar_format='{l_bar}{bar}| {n:.0f}/{total:.0f} s{postfix}'
     ) as bar:
@@ -247,9 +226,6 @@ def _watch(
                 bar.write(f'{elapsed:4.1f} s: {words}')
                 marks.append((time.time_ns(), words))
                 recorder.set_parameters('/plant', values)
-            if page is not None and time.monotonic() > drawn + DRAW_PERIOD:
-                page.update(f'{elapsed:.0f} of {duration:g} s')
-                drawn = time.monotonic()
             if elapsed >= duration:
                 break
     return marks

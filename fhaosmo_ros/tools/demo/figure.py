@@ -2,7 +2,6 @@
 """The figure of a demonstration."""
 
 from collections.abc import Sequence
-import io
 from pathlib import Path
 
 from fhaosmo_ros.tools.demo.report import Run
@@ -74,23 +73,3 @@ def save_run(run: Run, path: Path, marks: Sequence[tuple[int, str]] = ()) -> Non
     axes[-1].set_xlim(run.t[0], run.t[-1])
     figure.suptitle('States and unknown input, estimated live from y = z1')
     figure.savefig(path, dpi=150)
-
-
-def picture_of_d(
-    t: NDArray[np.float64],
-    truth: NDArray[np.float64],
-    estimate: NDArray[np.float64],
-    deviation: NDArray[np.float64] | None,
-) -> bytes:
-    """Return a PNG of d, its estimate and, where it is known, its band over time."""
-    figure = Figure(figsize=(9.0, 4.5), layout='constrained')
-    axes = figure.subplots()
-    draw_comparison(axes, t, truth, estimate)
-    if deviation is not None:
-        draw_band(axes, t, estimate, deviation)
-    axes.set_ylabel('unknown input d')
-    axes.set_xlabel('time since the first estimate [s]')
-    axes.legend(loc='upper left', ncols=3)
-    picture = io.BytesIO()
-    figure.savefig(picture, dpi=100)
-    return picture.getvalue()

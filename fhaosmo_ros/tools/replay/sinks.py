@@ -4,9 +4,7 @@
 from collections.abc import Mapping
 import csv
 from pathlib import Path
-import shutil
 from typing import Any, NamedTuple, Protocol
-import zipfile
 
 from fhaosmo_ros.core.observer.estimates import Trajectory, TUNING
 from fhaosmo_ros.core.online.events import described, Event
@@ -101,39 +99,21 @@ class CsvSink:
 
 
 class NpzSink:
-    """Arrays by name; until it is closed, each grows in a file of its own, not in memory."""
+    """Arrays by name."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._parts = path.with_name('columns')
-        self._parts.mkdir()
-        self._kinds: dict[str, np.dtype] = {}
-        self._count = 0
+        self._blocks: list[dict[str, NDArray]] = []
 
     def write(self, rows: Rows) -> None:
         """Append to every array."""
-        for name, column in columns(rows).items():
-            self._kinds[name] = column.dtype
-            with (self._parts / name).open('ab') as file:
-                file.write(np.ascontiguousarray(column).tobytes())
-        self._count += len(rows.y)
+        self._blocks.append(columns(rows))
 
     def close(self) -> None:
-        """Collect the arrays in one file."""
-        with zipfile.ZipFile(self._path, 'w', allowZip64=True) as archive:
-            for name, kind in self._kinds.items():
-                header = {
-                    'descr': np.lib.format.dtype_to_descr(kind),
-                    'fortran_order': False,
-                    'shape': (self._count,),
-                }
-                with (
-                    archive.open(f'{name}.npy', 'w', force_zip64=True) as out,
-                    (self._parts / name).open('rb') as part,
-                ):
-                    np.lib.format.write_array_header_1_0(out, header)
-                    shutil.copyfileobj(part, out, 1 << 20)
-        shutil.rmtree(self._parts)
+        """Write the file."""
+        names = self._blocks[0] if self._blocks else ()
+        arrays = {name: np.concatenate([b[name] for b in self._blocks]) for name in names}
+        np.savez(self._path, **arrays)
 
 
 class BagSink:
