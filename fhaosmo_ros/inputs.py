@@ -16,6 +16,9 @@ from fhaosmo_ros.messages.fields import JOINT_STATE
 from fhaosmo_ros.pairing import StampPairing
 from fhaosmo_ros.topics import FLOAT
 
+BACK = 0.5
+"""Seconds by which stamps of a known input go back if its clock does, where max_gap is 0."""
+
 
 class Input(NamedTuple):
     """
@@ -144,7 +147,7 @@ def make_pairing(
     if not any(by_stamp):
         return None
     get = _values(values)
-    wait, max_gap = (round(get(name) * 1e9) for name in ('known_input_wait', 'max_gap'))
+    wait, max_gap = round(get('known_input_wait') * 1e9), round((get('max_gap') or BACK) * 1e9)
     return StampPairing(by_stamp, wait, max_gap, held)
 
 

@@ -151,7 +151,7 @@ def disturbed():
 
 @pytest.mark.parametrize('parameters', CASES.values(), ids=CASES.keys())
 def test_one_by_one_many_and_resumed_are_the_same(parameters):
-    parameters = parameters | {'spike_gate': 1.0}
+    parameters = parameters | {'spike_gate': 1.0, 'max_gap': 0.5}
     stamps, y, u = disturbed()
     one, many, resumed = (OnlineEstimator(parameters) for _ in range(3))
     found = many.run(stamps, y, u)

@@ -2,6 +2,7 @@
 """From checked parameters to what a structure is made from; here they are checked as a set."""
 
 from collections.abc import Mapping
+import math
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import constants_of, TriangularModel
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 FIXED_GAMMA = 0.5
 """Power of the variants that do not adapt (paper eq. triangularObserver, fuzzysuper)."""
+STEP = 0.1
+"""Of a prediction, in parts of the time constant of the fastest motion of the model at rest."""
 DERIVATIVES = 3
 """Derivatives of d that a self-tuning observer has behind it (D 26)."""
 
@@ -72,6 +75,8 @@ class ObserverConfiguration:
         internal states.
     epsilon, gamma_initial : float
     state_sizes : (n,) array
+    prediction_step : float
+        Longest Runge-Kutta step between samples (s).
     initial_estimate, initial_internal : (N,) arrays
     lambdas, alphas, widths, decays : (N,) arrays
         Gains, half-widths of psi, and decay of the internal states; with fixed gains only.
@@ -132,8 +137,9 @@ class ObserverConfiguration:
             )
         self.self_tuning = p['gains'] == 'self_tuning'
         self.schedule: Schedule | None = None
-        sizes = OBSERVER_PARAMETERS['state_sizes']
-        self.state_sizes = per_level(sizes, p['state_sizes'], self.model.order)
+        order, sizes = self.model.order, OBSERVER_PARAMETERS['state_sizes']
+        self.state_sizes = per_level(sizes, p['state_sizes'], order)
+        self.prediction_step = p['prediction_step'] or usual_step(self.model)
         if self.self_tuning:
             self._complete_self_tuning()
         else:
@@ -186,6 +192,9 @@ class ObserverConfiguration:
             p['unknown_input_decay'], p['unknown_input_derivatives']
         )
         known_period = p['correction_period'] > 0.0 or not self.predicting
+        rate = p['unknown_input_decay'] or p['unknown_input_rate']
+        usual = p['unknown_input_size'] / rate ** np.arange(n, 0.0, -1.0)  # d integrated
+        self.state_sizes = np.where(self.state_sizes > 0.0, self.state_sizes, usual)
         if p['noise_size'] > 0.0 and p['unknown_input'] and known_period:
             self.schedule = self._make_schedule()
 
@@ -272,6 +281,13 @@ def deadbeat_shares(count: int) -> Floats:
         result[:, i] = np.cumsum(power)
         power = np.convolve(power, logarithm)[:count]
     return result
+
+
+def usual_step(model: TriangularModel) -> float:
+    """Return the Runge-Kutta step (s) that follows the fastest motion of a model at rest."""
+    slopes = np.nan_to_num(model.jacobian(np.zeros(model.order)), posinf=0.0, neginf=0.0)
+    fastest = np.abs(np.linalg.eigvals(slopes + np.eye(model.order, k=1))).max()
+    return float(STEP / fastest) if fastest > 0.0 else math.inf
 
 
 def per_level(parameter: Parameter, values: list[float], count: int) -> Floats:

@@ -133,7 +133,7 @@ class Smoother:
         latest = np.maximum.accumulate(np.where(known, numbers, -1))
         if self._model is None:
             first = int(np.argmax(known))
-            own[:first, 0, 1:] = own[first, 0, 1:]
+            own[:first, :, 1:] = own[first, :, 1:]
             stands = first if self._lag is not None else max(first, min(BEGINNING, numbers[-1]))
             latest[:stands], self._model = latest[stands], models[first]
         own[:, 0, -DERIVATIVES:] = 0.0  # those of d are not relied on

@@ -134,7 +134,7 @@ cdef class Rows:
                 f'{str(p["unknown_input"]).lower()}'
             )
         self.configuration, self.fastest = configuration, linear.fastest
-        self.prediction = Prediction(configuration.expressions, p['prediction_step'])
+        self.prediction = Prediction(configuration.expressions, configuration.prediction_step)
         self.from_measurement = self.tunes or p['start_from_measurement']
         self.first, self.state_sizes = configuration.initial_estimate, configuration.state_sizes
 
@@ -224,6 +224,8 @@ cdef class Rows:
         for i in range(1, d):
             size = DOUBT * max(self.state_sizes[i], fabs(self.own[k, 0, i]))
             p[i][i] = size * size
+            if size * size < self.own[k, 1, i] < INFINITY:
+                p[i][i] = self.own[k, 1, i]
         for i in range(chain + 1):
             for j in range(chain + 1):
                 p[d + i][d + j] = usual(now, chain - i, chain - j)

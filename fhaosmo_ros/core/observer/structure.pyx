@@ -79,9 +79,7 @@ cdef class Structure:
         self.internal = configuration.internal
         self.d_is_internal = configuration.internal or self.levels == self.order
         self.epsilon = configuration.epsilon
-        self.prediction = Prediction(
-            configuration.expressions, configuration.parameters['prediction_step']
-        )
+        self.prediction = Prediction(configuration.expressions, configuration.prediction_step)
 
     def __init__(self, configuration):
         self.reset()

@@ -3,6 +3,8 @@
 
 from fhaosmo_ros.core.online.memory cimport Clock, Counters
 
+cdef long long FAR
+
 cdef enum:
     WINDOW = 32  # intervals, or ticks, that a running mean remembers
 

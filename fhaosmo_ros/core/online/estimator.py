@@ -25,6 +25,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 NANOSECONDS = 1e-9
+SILENCE, SILENT_SAMPLES = 0.5, 5
+"""Seconds, and usual intervals, after which y is said to be silent; the larger of both."""
 LARGEST_STAMP = 2**63 - 1
 Ints = NDArray[np.int64]
 
@@ -88,7 +90,7 @@ class OnlineEstimator:
         settings = self._settings(p)
         past = PastInputs(len(self._u), settings['lag'] > 0)
         self.policy = Policy(self.observer.structure, settings, past)
-        self.events = EventDetector(p, p['max_gap'])
+        self.events = EventDetector(p, p['max_gap'] or math.inf)
 
     def __copy__(self) -> 'OnlineEstimator':
         return deepcopy(self)
@@ -176,7 +178,7 @@ class OnlineEstimator:
         self._parameters = change.parameters
         if self._smoothing is not None:
             self._smoothing.configure()
-        self.events.configure(change.parameters, change.parameters['max_gap'])
+        self.events.configure(change.parameters, change.parameters['max_gap'] or math.inf)
         if change.parameters['sampling'] != before:
             self.forget_stamp()
 
@@ -207,6 +209,13 @@ class OnlineEstimator:
             'limit': p['divergence_limit'],
             'epsilon': math.inf if self.observer.self_tuning else p['epsilon'],
         }  # fmt: skip
+
+    @property
+    def silence(self) -> float:
+        """Time without a sample, in seconds, after which nothing is known of the present."""
+        p = self._parameters
+        usual = self.policy.course['usual_interval'] * NANOSECONDS or p['nominal_period']
+        return p['max_gap'] or float(max(SILENCE, SILENT_SAMPLES * usual))
 
     def reset(self) -> None:
         """Start afresh: the next sample is the first. Counters go on, and so does `freeze`."""

@@ -19,6 +19,7 @@ Rejected samples do not count. After a restart nothing is known, so an event end
 
 from libc.math cimport INFINITY, expm1, fabs, fmax, fmin, isfinite, pow
 
+from fhaosmo_ros.core.observer.self_tuning.observer cimport MEMORY
 from fhaosmo_ros.core.observer.status cimport DIVERGED, RESTARTED, UNUSED
 
 from collections import deque
@@ -39,7 +40,8 @@ cdef enum Doing:
 
 cdef struct Settings:
     double threshold, deviations, release  # event_threshold, ..
-    double duration, change_time, growth  # event_duration, event_change_time, tuning_memory (ns)
+    double duration, change_time  # event_duration, event_change_time (ns)
+    double growth  # tuning_memory (ns); 0: MEMORY samples
     long long max_gap  # after a longer time durations begin anew (ns)
 
 
@@ -138,7 +140,7 @@ cdef class EventDetector:
         cdef bint on
         if self.on and change_time != settings.change_time:
             self.reset()
-        settings.change_time, settings.max_gap = change_time, round(max_gap * SECOND)
+        settings.change_time, settings.max_gap = change_time, round(min(max_gap, LONG) * SECOND)
         settings.threshold = parameters['event_threshold']
         settings.deviations = parameters['event_deviations']
         settings.release = parameters['event_release']
@@ -204,7 +206,7 @@ cdef class EventDetector:
         cdef Memory* memory = &self.memory
         cdef Settings* settings = &self.settings
         cdef long long elapsed = now - memory.event_time, past
-        cdef double sigma = memory.event_deviation
+        cdef double sigma = memory.event_deviation, lag, share
         self.begins = False
         memory.event_time = now
         if restarted:
@@ -219,8 +221,9 @@ cdef class EventDetector:
         if memory.event == FRESH or sigma <= 0.0:
             sigma = deviation
         elif deviation > sigma:
-            lag = settings.growth / (QUICKER if memory.event > QUIET else 1.0)
-            sigma *= pow(deviation / sigma, -expm1(-elapsed / lag))
+            lag = (settings.growth or MEMORY) / (QUICKER if memory.event > QUIET else 1.0)
+            share = elapsed if settings.growth > 0.0 else 1.0
+            sigma *= pow(deviation / sigma, -expm1(-share / lag))
         sigma = memory.event_deviation = fmin(sigma, deviation)
         if memory.event == FRESH:
             memory.event_since, memory.event_mean = now, d

@@ -8,7 +8,7 @@ cdef struct Settings:
     bint to_now  # estimates are carried over the delay
     bint filtered  # estimates are z_hat
     long long period  # nominal one
-    long long max_gap
+    long long max_gap  # 0: so many intervals as policy.pyx says
     long long max_step  # 0: twice the mean interval
     long long stuck_time  # 0: off
     long long divergence_time  # 0: off
@@ -47,6 +47,7 @@ cdef struct Course:
     double held_y
     double mean_interval  # running mean of dt (ns)
     double mean_jitter  # running mean of its deviation (ns)
+    double usual_interval  # longest mean_interval of late; a restart does not forget it (ns)
 
 
 cdef struct Clock:

@@ -19,12 +19,12 @@ cdef double RARELY = 0.05, CHANGES = 50.0
 
 cdef bint is_stuck(
     Sensor* sensor, const Settings* settings, Counters* counters, double last, double y,
-    long long now
+    long long now, long long max_gap
 ) noexcept nogil:
     """Return True, and count it, if y has been seen unchanged for longer than stuck_time."""
     cdef long long silence = abs(difference(now, sensor.seen))
     sensor.seen = now
-    if y != last or silence > settings.max_gap:
+    if y != last or silence > max_gap:
         sensor.changed, sensor.stuck = now, False
         return False
     if difference(now, sensor.changed) <= settings.stuck_time:
@@ -37,7 +37,7 @@ cdef bint is_stuck(
 
 
 cdef bint is_held(
-    Sensor* sensor, const Settings* settings, const Course* course, double y, long long now
+    Sensor* sensor, long long max_gap, const Course* course, double y, long long now
 ) noexcept nogil:
     """
     Return True if y repeats a value because its sensor holds it, being slower than the topic.
@@ -54,7 +54,7 @@ cdef bint is_held(
     sensor.sample = y
     if change == 0.0:
         sensor.repeats += 1
-        if sensor.repeats > 2 * usual + 1 or 2 * abs(elapsed) >= settings.max_gap:
+        if sensor.repeats > 2 * usual + 1 or 2 * abs(elapsed) >= max_gap:
             return False
         return sensor.holds
     low, high = fmin(fabs(change), fabs(sensor.change)), fmax(fabs(change), fabs(sensor.change))

@@ -16,7 +16,7 @@ from fhaosmo_ros.core.observer.status cimport (
     REJECTED_SPIKE, REJECTED_STEP, REJECTED_STUCK, REPEATED, RESTARTED, UNUSED
 )
 from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, Structure
-from fhaosmo_ros.core.online.clock cimport WINDOW, clock_time, difference
+from fhaosmo_ros.core.online.clock cimport FAR, WINDOW, clock_time, difference
 from fhaosmo_ros.core.online.delay cimport NANOSECONDS, PastInputs
 from fhaosmo_ros.core.online.memory cimport Counters, Course, Settings
 from fhaosmo_ros.core.online.outliers cimport (
@@ -31,6 +31,10 @@ cdef double GAP_RATIO = 2.0
 cdef int MOST_STEPS = 10_000
 MOST_SUB_STEPS = MOST_STEPS
 cdef long long LARGEST_STAMP = 2**63 - 1
+# With max_gap = 0 an interval of more usual ones is a gap; one of more nanoseconds while there
+# is none to compare it with.
+cdef double MOST_INTERVALS = 500.0, FIRST_GAP = 3.6e12
+GAP_SAMPLES = MOST_INTERVALS
 
 
 cdef class Policy:
@@ -87,7 +91,7 @@ cdef class Policy:
             course.now += self.settings.period
             now = course.now
         elif self.settings.by_clock:
-            now = clock_time(&self.clock, stamp, self.settings.max_gap, counters)
+            now = clock_time(&self.clock, stamp, self.max_gap(), counters)
         word = self.judge(stamp, now, y)
         if not word and not isnan(memory.y):
             elapsed = self.since_latest(now, y, &word)
@@ -137,12 +141,13 @@ cdef class Policy:
             self.counters.zero_stamps += 1
             return REJECTED_PERIOD
         if self.settings.stuck_time and is_stuck(
-            &self.sensor, &self.settings, &self.counters, memory.y, y - memory.offset, now
+            &self.sensor, &self.settings, &self.counters, memory.y, y - memory.offset, now,
+            self.max_gap(),
         ):
             return REJECTED_STUCK
         if self.tuner is None:
             return 0
-        held = is_held(&self.sensor, &self.settings, &self.course, y, now)
+        held = is_held(&self.sensor, self.max_gap(), &self.course, y, now)
         if self.sensor.holds and not held_before:
             self.tuner.begin_afresh()  # with the sensor's own period
         if held:
@@ -157,8 +162,12 @@ cdef class Policy:
             self.forget_clock(now)
         latest = self.course.latest
         elapsed = difference(now, latest)
-        if 0 < elapsed <= self.settings.max_gap:
+        if 0 < elapsed <= self.max_gap():
             self.course.held = False
+            if self.settings.max_gap == 0 and self.course.intervals == 1 and (
+                MOST_INTERVALS * elapsed < self.course.mean_interval
+            ):
+                word[0] = self.begin_again()
             return elapsed
         elapsed = self.settle(now, elapsed, y, word)
         if word[0] & RESTARTED:
@@ -181,7 +190,7 @@ cdef class Policy:
 
         """
         cdef Course* course = &self.course
-        cdef long long max_gap = self.settings.max_gap, follow
+        cdef long long max_gap = self.max_gap(), follow
         if self.settings.nominal:
             if 0 < elapsed <= self.settings.period:
                 return elapsed  # nothing was lost: the period itself is longer than max_gap
@@ -193,7 +202,7 @@ cdef class Policy:
             self.counters.duplicate_stamps += 1
             word[0] = REJECTED_PERIOD
             return 0
-        if -max_gap <= elapsed < 0:
+        if -self.max_late() <= elapsed < 0:
             if not (course.bridged and now > course.before):
                 self.counters.backward_stamps += 1
                 word[0] = REJECTED_PERIOD
@@ -215,11 +224,41 @@ cdef class Policy:
         self.refresh()
         word[0] = RESTARTED
         follow = difference(now, course.held_stamp)
-        if not 0 < follow <= max_gap:
+        if not 0 < follow <= max_gap:  # the rate is not known any more
+            course.usual_interval = 0.0
             return 0
+        if 0 < elapsed <= FIRST_GAP:  # the next one like this is none
+            course.usual_interval = max(
+                course.usual_interval, 2.0 * elapsed / MOST_INTERVALS
+            )
         self.structure.start(course.held_y)
         course.latest = self.sensor.changed = course.held_stamp
         return follow
+
+    cdef long long max_gap(self) noexcept nogil:
+        """Return the longest interval that is stepped over (ns)."""
+        if self.settings.max_gap > 0:
+            return self.settings.max_gap
+        if self.settings.nominal:
+            return <long long>(MOST_INTERVALS * self.settings.period)
+        if self.course.usual_interval > 0.0:
+            return <long long>fmin(MOST_INTERVALS * self.course.usual_interval, FAR)
+        return <long long>FIRST_GAP
+
+    cdef long long max_late(self) noexcept nogil:
+        """Return how far back a stamp may lie whose clock has not been set back (ns)."""
+        if self.settings.max_gap > 0 or self.settings.nominal:
+            return self.max_gap()
+        return <long long>fmin(MOST_INTERVALS * self.course.mean_interval, FAR)
+
+    cdef int begin_again(self) noexcept nogil:
+        """Begin at the sample before, as the interval that led to it was a gap; return flags."""
+        cdef double y = self.structure.memory.y + self.structure.memory.offset
+        self.refresh()
+        self.structure.start(y)
+        self.past.ring.past_count = 0
+        self.counters.restarts_forward += 1
+        return RESTARTED
 
     cdef void forget_clock(self, long long now) noexcept nogil:
         """Let the sample at `now`, of another clock, follow the one before as usual."""
@@ -357,6 +396,9 @@ cdef class Policy:
         if course.intervals == WINDOW:
             change = fmin(change, WINDOW * course.mean_interval)
         course.mean_interval += change / course.intervals
+        course.usual_interval = max(
+            course.mean_interval, course.usual_interval * (1.0 - 1.0 / MOST_INTERVALS)
+        )
         if course.intervals > 1:
             course.mean_jitter += (fabs(change) - course.mean_jitter) / course.intervals
 

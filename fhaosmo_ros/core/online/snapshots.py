@@ -32,7 +32,7 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(('frozen', 'valid', 'timed', 'held', 'bridged', 'lost'), YES_OR_NO),
     **dict.fromkeys(('stuck', 'holds'), YES_OR_NO),
     **dict.fromkeys(('spikes', 'tick_count', 'repeats', 'held_for'), COUNTS),
-    **dict.fromkeys(('mean_interval', 'mean_jitter'), COUNTS),
+    **dict.fromkeys(('mean_interval', 'mean_jitter', 'usual_interval'), COUNTS),
     'version': (1, VERSION), 'intervals': (0, 32), 'regular': (0, 12), 'ticks': (-5000, 2**17),
     'elsewhere': (0.0, 1.0), 'event': (0, 5), 'event_deviation': (0.0, math.inf),
     'past_place': (0, 511), 'past_count': (0, 512),

@@ -91,9 +91,10 @@ OBSERVER = (
         lower=0.1, upper=10.0,
     ),
     Parameter(
-        'tuning_memory', 8.0,
-        'self_tuning: how long a sample counts in the choice of the observers.',
-        unit='s', lower=0.01, upper=1e6,
+        'tuning_memory', 0.0,
+        'self_tuning: how long a sample counts in the choice of the observers. 0: for the time '
+        'of 8000 samples.',
+        unit='s', lower=0.0, upper=1e12,
     ),
     Parameter(
         'structure', 'cascade',
@@ -116,10 +117,10 @@ OBSERVER = (
         choices=('explicit', 'implicit', 'predict_correct'),
     ),
     Parameter(
-        'prediction_step', 0.0025,
-        'Longest Runge-Kutta step of predict_correct; a longer interval takes several. Well below '
-        "1 / rate of the model's fastest motion.",
-        unit='s', lower=1e-6, upper=10.0,
+        'prediction_step', 0.0,
+        'Longest Runge-Kutta step of predict_correct and of self_tuning; a longer interval takes '
+        "several. Well below 1 / rate of the model's fastest motion; 0: a tenth of that at z = 0.",
+        unit='s', lower=0.0, upper=1e12,
     ),
     Parameter(
         'correction_period', 0.0,
@@ -138,10 +139,11 @@ OBSERVER = (
         lower=0.0, upper=1e12,
     ),
     Parameter(
-        'state_sizes', [1.0],
+        'state_sizes', [0.0],
         'RMS values of z_1 .. z_n in usual operation: how far off a fresh observer may be. Used '
-        'with noise_size.',
-        lower=1e-12, upper=1e12, lengths='1 (used for every state) or n',
+        'with noise_size, and by self_tuning. 0: not known; self_tuning takes them from the '
+        'first samples, fixed gains from size and rate of d.',
+        lower=0.0, upper=1e100, lengths='1 (used for every state) or n',
     ),
     Parameter(
         'unknown_input_size', 1.0, 'RMS value of d in usual operation. Used with noise_size.',
@@ -271,10 +273,11 @@ SAMPLING = (
         unit='s', lower=1e-6, upper=10.0,
     ),
     Parameter(
-        'max_gap', 0.5,
+        'max_gap', 0.0,
         'A longer time between two usable samples, or a stamp that lies further back, restarts '
-        'the observer from the new samples, once a second one confirms the jump.',
-        unit='s', lower=1e-6, upper=3600.0,
+        'the observer from the new samples, once a second one confirms the jump. 0: the time of '
+        '500 samples; the node says that y is silent after 0.5 s, or 5 samples.',
+        unit='s', lower=0.0, upper=1e6,
     ),
     Parameter(
         'max_step', 0.0,
@@ -307,7 +310,7 @@ SAMPLING = (
         unit='s', lower=0.0, upper=3600.0,
     ),
     Parameter(
-        'divergence_limit', 1e12,
+        'divergence_limit', 1e100,
         'A sample of larger magnitude is rejected, and an observer with a larger state starts '
         'afresh from y.',
         lower=1.0, upper=1e100,

@@ -342,13 +342,13 @@ class Channel:
             self._arrived = self._stale = False
             self._silent_since = None
         elif not self._stale:
-            now, max_gap = self._clock.now().nanoseconds, self._values['max_gap']
+            now, longest = self._clock.now().nanoseconds, self.estimator.silence
             if self._silent_since is None:  # the clock is not read while samples come
                 self._silent_since = now
-            elif not 0 <= now - self._silent_since <= max_gap * 1e9:  # or it jumped back
+            elif not 0 <= now - self._silent_since <= longest * 1e9:  # or it jumped back
                 self._stale = True
                 self._logger.warning(
-                    f'no usable sample on {self._y.source.topic} for {max_gap:g} s: not '
+                    f'no usable sample on {self._y.source.topic} for {longest:.3g} s: not '
                     'publishing until one comes',
                     throttle_duration_sec=QUIET,
                 )

@@ -7,6 +7,8 @@ import math
 from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.configuration import usual_step
+from fhaosmo_ros.core.online.policy import GAP_SAMPLES
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.cli.progress import progress
@@ -188,7 +190,7 @@ def _prepared(
     h = np.diff(t, prepend=t[0])
     period = float(np.median(h[1:]))
     periods = np.maximum(np.round(h / period), 1.0).astype(np.int64)
-    periods[(h > max(values['max_gap'], 3.0 * period))] = periods[0] = 0
+    periods[(h > max(values['max_gap'] or GAP_SAMPLES * period, 3.0 * period))] = periods[0] = 0
     samples = Samples(h, periods, y, np.ascontiguousarray(u), np.ones(count, dtype=bool))
     training = (np.arange(count) * PIECES // count) % 2 == 0
     block = max(count // 300, 1)
@@ -207,7 +209,7 @@ def _prepared(
         np.array(sizes),
         given.get('noise_size') or noise,
         bool(given.get('noise_size')),
-        values['prediction_step'],
+        values['prediction_step'] or usual_step(model),
         rounding,
     )
 

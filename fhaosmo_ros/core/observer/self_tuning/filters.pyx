@@ -6,12 +6,12 @@ Only the covariances of members `Work.first` .. `Work.last` - 1 move; the others
 steady values.
 """
 
-from libc.math cimport log, pow, sqrt
+from libc.math cimport log, sqrt
 from libc.string cimport memset
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     COLOURS, COUNT, GRID, Line, Members, MOST_STATES, ORDERS, Work, entry, factorial, fill, pair,
-    state
+    power, state
 )
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 
@@ -249,7 +249,7 @@ cdef VECTORISED allow_jump(Members* m, double y, double tau) noexcept nogil:
             elif j <= n:  # at its begin, or at any time of it
                 part = factorial(n) / factorial(n - i) * factorial(n) / factorial(n - j)
                 part *= 0.5 + 0.5 * (2.0 * n + 1.0) / (2.0 * n + 1.0 - i - j)
-                part /= pow(tau, i + j)
+                part /= power(tau, i + j)
                 for g in range(active):
                     row[g] += part * w.two[g]
     for i in range(n + ORDERS):

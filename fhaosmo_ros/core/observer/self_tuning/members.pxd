@@ -175,6 +175,7 @@ cdef inline double* state(Estimates* x, int n, int i) noexcept nogil:
 cdef VECTORISED fill(double* values, const double* of_colours) noexcept nogil
 cdef double largest(const double* values, Py_ssize_t count) noexcept nogil
 cdef double factorial(int i) noexcept nogil
+cdef double power(double x, int count) noexcept nogil
 cdef void by_binomials(double* chain, int count, double more) noexcept nogil
 cdef void put(Members* m, int g, const double* estimate) noexcept nogil
 cdef void find_tuning(Members* m, double* found) noexcept nogil

@@ -85,6 +85,14 @@ cdef double factorial(int i) noexcept nogil:
     return product
 
 
+cdef double power(double x, int count) noexcept nogil:
+    """Return x^count by products, which scale exactly with x where it is doubled."""
+    cdef double product = 1.0
+    for _ in range(count):
+        product *= x
+    return product
+
+
 cdef void by_binomials(double* chain, int count, double more) noexcept nogil:
     """Turn (D + c)^j d, j = 0, 1, .., into (D + c + more)^j d, in place."""
     cdef int first, j

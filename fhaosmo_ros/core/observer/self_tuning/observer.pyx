@@ -33,6 +33,8 @@ from fhaosmo_ros.core.observer.structure cimport (
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 
+# A log-likelihood is remembered for so many samples, unless `tuning_memory` says otherwise.
+cdef double MEMORY = 8000.0
 cdef double NOISE_SAMPLES = 1000.0  # the noise is averaged over so many
 # What is beyond 3 sigma in so many samples after a jump of d is due to it, too.
 cdef double JUMP_SAMPLES = 10.0
@@ -92,7 +94,7 @@ cdef class SelfTuning(Structure):
         self.forgetting, self.slider = p['tuning_memory'], p['bandwidth']
         self.least_noise = p['noise_size']
         for i in range(self.order):
-            self.sizes[i] = configuration.state_sizes[i] ** 2
+            self.told_sizes[i] = configuration.state_sizes[i] ** 2
         self.members = <Members*>calloc(1, sizeof(Members))
         if self.members == NULL:
             raise MemoryError
@@ -110,6 +112,7 @@ cdef class SelfTuning(Structure):
         self.y_jumped = False
         for i in range(self.levels):
             self.variances[i] = INFINITY
+        memcpy(self.sizes, self.told_sizes, sizeof(self.sizes))
 
     cdef bint keep(self) noexcept nogil:
         """Return False: the members are too many to be kept."""
@@ -154,14 +157,18 @@ cdef class SelfTuning(Structure):
             for i in range(n):
                 self.trial[i].z_hat, self.trial_variances[i] = 0.0, INFINITY
             self.trial[0].z_hat = y
-            gather(self.members, self.sizes, self.least_noise)
+            gather(self.members, self.told_sizes, self.least_noise)
         for i in range(n):  # the internal states stand for the estimates
             self.trial[i].z_tilde = self.trial[i + 1].z_hat if i + 1 < n else 0.0
 
     cdef int accept(self, double y, double h) noexcept nogil:
         """Make `trial` the state; return status flags."""
-        cdef int word = JUMPED if self.y_jumped else 0
+        cdef int word = JUMPED if self.y_jumped else 0, i
+        cdef double square, size, count = fmin(self.members.shared.samples, NOISE_SAMPLES)
         Structure.accept(self, y, h)
+        for i in range(self.order if self.has_begun() else 0):
+            square, size = self.level[i].z_hat * self.level[i].z_hat, self.sizes[i]
+            self.sizes[i] = fmax(size + (square - size) / count, self.told_sizes[i])
         memcpy(self.variances, self.trial_variances, sizeof(self.variances))
         self.model, self.y_jumped = self.trial_model, False
         return word
@@ -267,7 +274,7 @@ cdef class SelfTuning(Structure):
             EXACT * EXACT * m.rough[0][1],
         )
         sample.average = fmin(shared.samples, NOISE_SAMPLES)
-        sample.kept = exp(-h / self.forgetting)
+        sample.kept = exp(-h / self.forgetting if self.forgetting > 0.0 else -1.0 / MEMORY)
         shared.samples = <int>sample.average + 1
         growing = follow_growth(m, memory.beyond)
         off, sign = fabs(sample.off), copysign(1.0, sample.off)
@@ -432,6 +439,7 @@ cdef class SelfTuning(Structure):
         before.enter()
         self.level, self.memory, self.innovation = before.level, before.memory, before.innovation
         memcpy(self.variances, other.variances, sizeof(self.variances))
+        memcpy(self.sizes, other.sizes, sizeof(self.sizes))
         self.y_jumped = other.y_jumped
         self.members.shared = other.members.shared
         of = other.places()
@@ -491,7 +499,8 @@ cdef class SelfTuning(Structure):
             found = {name: found[name] for name in EARLY}
         found |= shared | {'model': list(model.values())}
         found = {name: np.clip(np.nan_to_num(x), -LARGEST, LARGEST) for name, x in found.items()}
-        found['variances'] = np.array([self.variances[i] for i in range(self.levels)])
+        for name, numbers in (('variances', self.variances), ('sizes', self.sizes)):
+            found[name] = np.array([numbers[i] for i in range(self.levels)])
         return whole | found
 
     def load_state_dict(self, values):
@@ -508,9 +517,13 @@ cdef class SelfTuning(Structure):
                 f"snapshot: 'active': expected {HALF} or {COUNT} members, got {shared.active}"
             )
         found = {name: self.within(values, name, shape) for name, (_, shape) in names.items()}
-        variances = self.number(values, 'variances', (self.levels,))
-        if not (variances >= 0.0).all():
-            raise ConfigurationError("snapshot: 'variances': expected numbers of at least 0")
+        variances, sizes = (
+            self.number(values, name, (self.levels,)) for name in ('variances', 'sizes')
+        )
+        if not (variances >= 0.0).all() or not (sizes >= 0.0).all():
+            raise ConfigurationError(
+                "snapshot: 'variances', 'sizes': expected numbers of at least 0"
+            )
         numbers = self.finite(values, 'model', (4,))
         Structure.load_state_dict(self, values)
         self.members.shared, self.members.work.q_interval = shared, 0.0
@@ -520,7 +533,7 @@ cdef class SelfTuning(Structure):
             data = number.tobytes()
             memcpy(<void*><size_t>names[name][0], <char*>data, len(data))
         for i in range(self.levels):
-            self.variances[i] = variances[i]
+            self.variances[i], self.sizes[i] = variances[i], sizes[i]
 
     cdef within(self, values, str name, tuple shape):
         """Return what a snapshot has of a name, after a check that it is within its range."""

@@ -1,22 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """The first samples, and members that begin with what these tell (D 26, D 28)."""
 
-from libc.math cimport INFINITY, fabs, fmax, fmin, log, pow, sqrt
+from libc.math cimport INFINITY, fabs, fmax, fmin, log, sqrt
 from libc.string cimport memset
 
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     COLOURS, COUNT, DIFFERENCES, Estimates, FIRST_SAMPLES, GRID, HALF, Line,
-    MOST_ORDER, Members, ORDERS, Shared, factorial, pair
+    MOST_ORDER, Members, ORDERS, Shared, factorial, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     CALM_SAMPLES, LATTICE_SHARE, follow_differences, is_multiple
 )
 from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, weigh
 
+cdef double LEAST = 1e-150  # noise: its square is not 0
 cdef double MEDIAN = 0.6745  # of |x| where x is normal with variance 1
 # Share of the first samples' differences that say how large z may be; others may be outliers.
 cdef double MOST = 0.8
+# States may be so many times as large: a start that is too sure of them costs more than one that
+# is not sure enough.
+cdef double DOUBT = 10.0
 # y may be constant until its sensor is ready. So many samples from its first change on tell
 # whether it is quantised; if not, the first samples are those from there on.
 cdef int CHANGING = 8
@@ -62,7 +66,7 @@ cdef void gather(Members* m, const double* sizes, double least_noise) noexcept n
             drop_first(m, changed - 1, count)
             shared.samples = since + 1
         return
-    begin(m, sizes, find_noise(m, fmax(least_noise, fmax(1e-9 * largest, 1e-150)), largest))
+    begin(m, sizes, find_noise(m, fmax(least_noise, fmax(1e-9 * largest, LEAST)), largest))
     shared.samples = FIRST_SAMPLES + 1
 
 
@@ -173,7 +177,7 @@ cdef void find_sizes(Members* m, double* sizes) noexcept nogil:
         for j in range(length):
             first[j] = (first[j + stride] - first[j]) / (stride * m.shared.steady_period)
             values[j] = first[j] * first[j]
-        sizes[i] = fmax(sizes[i], ranked(values, length, MOST))
+        sizes[i] = fmax(sizes[i], DOUBT * DOUBT * ranked(values, length, MOST))
 
 
 cdef void begin(Members* m, const double* least_sizes, double noise) noexcept nogil:
@@ -206,7 +210,7 @@ cdef void begin(Members* m, const double* least_sizes, double noise) noexcept no
     memset(m.drive, 0, sizeof(m.drive))
     for g in range(COUNT):
         omega, kappa, k = GRID.bandwidth[g] / period, m.kappa[g], GRID.order[g]
-        intensity = noise * noise * period * pow(omega, 2 * (n + 1 + k))
+        intensity = noise * noise * period * power(omega, 2 * (n + 1 + k))
         m.drive[k][g] = intensity
         m.x.z[0][g], m.p.zz[0][g] = y, noise * noise
         for i in range(1, n):
@@ -215,9 +219,9 @@ cdef void begin(Members* m, const double* least_sizes, double noise) noexcept no
             for j in range(i, k + 1):
                 below = 2 * k - i - j
                 m.p.dd[i][j][g] = intensity * factorial(below) / (
-                    factorial(k - i) * factorial(k - j) * pow(2.0 * kappa, below + 1)
+                    factorial(k - i) * factorial(k - j) * power(2.0 * kappa, below + 1)
                 )
-        size = log(m.p.dd[0][0][g])
+        size = log(m.p.dd[0][0][g] / m.p.dd[0][0][0])
         m.prior[g] = -0.5 * size
         least = fmin(least, size)
     for g in range(COUNT):

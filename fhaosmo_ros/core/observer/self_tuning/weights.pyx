@@ -6,7 +6,7 @@ from libc.math cimport M_PI, NAN, cos, exp, floor as floor_of, fmin, isfinite, l
 from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     BANDS, BAND_STEP, COLOURS, COUNT, GRID, HALF, IN_BAND, Members, ORDERS, Shared, Work, entry,
-    fill, largest
+    fill, largest, power
 )
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 from fhaosmo_ros.core.observer.structure cimport GATE
@@ -37,7 +37,7 @@ cdef VECTORISED judge(Members* m, double grown, double kept, bint calm) noexcept
         m.far[g] = m.far[g] + 1.0 if w.ratio[g] > GATE * GATE else 0.0
     if kept >= 0.0:
         for g in range(COLOURS):
-            logs[g] = log(m.noise[g])
+            logs[g] = log(m.noise[g] / m.shared.first_noise)
         fill(w.one, logs)
         for g in range(active):
             late = slack * (m.far[g] - 1.0 if m.far[g] > 1.0 else 0.0)
@@ -89,7 +89,7 @@ cdef void tell_model(Members* m, double slider, bint jumped, Model* model) noexc
     k, noise, a = GRID.order[g], m.noise[GRID.colour[g]], m.correlation[g]
     twice = 2.0 * (m.n + 1 + k)
     model.drive, model.loss = m.drive[k][g] * pow(slider, twice), m.kappa[g] * slider
-    edge = fmin(pow(model.drive / (noise * h), 1.0 / twice) * h, M_PI)
+    edge = fmin(pow(model.drive / noise * power(h, 2 * (m.n + 1 + k) - 1), 1.0 / twice), M_PI)
     model.noise = noise / (1.0 + a * (a - 2.0 * cos(edge)))
     model.derivatives = k - ORDERS if jumped else k
 

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+y in another unit, time in another unit: the same estimate in those units.
+
+z_i' = z_{i+1} + Phi_i keeps its form if y is scaled by a, time by b, and z_i by a b^-(i-1). A
+self-tuning observer is told nothing but Phi, so it has to give the same estimate: to the bit where
+a and b are powers of two, else to rounding. The same holds for what the policy does with gaps,
+stamps that are late or far away, bad values and a sensor that is stuck.
+"""
+
+from fhaosmo_ros.core import Observer, OnlineEstimator
+import numpy as np
+import pytest
+
+PERIOD = 2.0**-9
+COUNT = 3000
+
+
+def model(a, b, order):
+    """Return parameters of z_n' = -2 z_n - z_1 / 2 + d in other units; as simple as can be."""
+    phi = ['0'] * (order - 1) + [f'{-2.0 / b!r}*z{order} - {0.5 * b**-order!r}*z1']
+    return {'order': order, 'phi': phi, 'gains': 'self_tuning'}
+
+
+def samples(order, noise=1e-4):
+    rng, h, t = np.random.default_rng(order), PERIOD / 10, np.arange(COUNT) * PERIOD
+    d = np.sin(2.0 * t) + (t % 2.0 > 1.2)
+    z, y = np.zeros(order), np.empty(COUNT)
+    for k in range(COUNT):
+        y[k] = z[0]
+        for _ in range(10):
+            z = z + h * np.append(z[1:], d[k] - 2.0 * z[-1] - 0.5 * z[0])
+    return t, y + noise * np.std(y) * rng.standard_normal(COUNT)
+
+
+def estimates(found, a, b, order):
+    """Return z, d and what is known of them in the units of a = b = 1."""
+    sizes = a * b ** -np.arange(order + 1.0)
+    z = np.column_stack([found.z, found.unknown_input])
+    return np.hstack([z / sizes, found.standard_deviation / sizes])
+
+
+@pytest.mark.parametrize('order', [1, 2, 4])
+@pytest.mark.parametrize(('a', 'b'), [
+    (2.0**20, 1.0), (2.0**-20, 1.0), (1.0, 2.0**20), (1.0, 2.0**-20), (2.0**-15, 2.0**9),
+])  # fmt: skip
+def test_powers_of_two_change_no_bit(order, a, b):
+    t, y = samples(order)
+    wanted = estimates(Observer(model(1.0, 1.0, order)).run(t, y), 1.0, 1.0, order)
+    found = estimates(Observer(model(a, b, order)).run(b * t, a * y), a, b, order)
+    np.testing.assert_array_equal(found, wanted)
+
+
+@pytest.mark.parametrize('a', [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize('b', [1e-6, 1.0, 1e6])
+def test_other_units_change_no_more_than_rounding_does(a, b):
+    t, y = samples(2)
+    wanted = estimates(Observer(model(1.0, 1.0, 2)).run(t, y), 1.0, 1.0, 2)
+    found = estimates(Observer(model(a, b, 2)).run(b * t, a * y), a, b, 2)
+    known = np.isfinite(wanted).all(axis=1)
+    np.testing.assert_array_equal(np.isfinite(found).all(axis=1), known)
+    size = np.sqrt(np.mean(wanted[known] ** 2, axis=0))
+    assert (np.abs(found[known] - wanted[known]) / size).max() < 1e-6
+
+
+@pytest.mark.parametrize('order', [2, 4])
+@pytest.mark.parametrize(('a', 'b'), [(2.0**16, 1), (1.0, 2**10), (2.0**-16, 2**3)])
+def test_policy_takes_the_same_samples_in_any_unit(order, a, b):
+    """At the periods of 2 ms, 16 ms and 2 s; stamps are whole nanoseconds, so none is shorter."""
+    t, y = samples(order)
+    rng = np.random.default_rng(7)
+    stamps = np.round(t * 1e9).astype(np.int64) + rng.integers(0, 200_000, COUNT)
+    stamps[500:] += 40_000_000  # a gap
+    stamps[900:] += 3_000_000_000  # a silence
+    stamps[1200] += 300_000_000  # a stamp ahead
+    stamps[1500:] -= 5_000_000_000  # a clock that is set back
+    y[700], y[800:810], y[2000:2100] = np.nan, y[800] + 5.0, y[2000]
+    one = OnlineEstimator(model(1.0, 1.0, order))
+    other = OnlineEstimator(model(a, float(b), order))
+    origin = 2**40
+    wanted = estimates(one.run(stamps + origin, y), 1.0, 1.0, order)
+    found = estimates(other.run((stamps + origin) * b, a * y), a, float(b), order)
+    assert other.counters == one.counters
+    assert one.counters.restarts == 2
+    np.testing.assert_array_equal(found, wanted)
