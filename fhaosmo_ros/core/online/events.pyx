@@ -14,12 +14,13 @@ not expected makes a self-tuning observer less sure of d at once, and this must 
 
     (log sigma)' = (log deviation - log sigma) / (tuning_memory, a quarter of it while |s| > L)
 
+With tuning_memory = 0 the lag is 800 samples.
+
 Rejected samples do not count. After a restart nothing is known, so an event ends there.
 """
 
 from libc.math cimport INFINITY, expm1, fabs, fmax, fmin, isfinite, pow
 
-from fhaosmo_ros.core.observer.self_tuning.observer cimport MEMORY
 from fhaosmo_ros.core.observer.status cimport DIVERGED, RESTARTED, UNUSED
 
 from collections import deque
@@ -41,7 +42,7 @@ cdef enum Doing:
 cdef struct Settings:
     double threshold, deviations, release  # event_threshold, ..
     double duration, change_time  # event_duration, event_change_time (ns)
-    double growth  # tuning_memory (ns); 0: MEMORY samples
+    double growth  # tuning_memory (ns); 0: GROWTH samples
     long long max_gap  # after a longer time durations begin anew (ns)
 
 
@@ -54,8 +55,9 @@ cdef struct Memory:
     double event_deviation  # standard deviation that events are judged by
 
 
-# Factor on how quickly sigma grows while an event lasts.
-cdef double QUICKER = 4.0
+# The lag of sigma in samples, where `tuning_memory` is 0, and how much quicker it grows while an
+# event lasts.
+cdef double GROWTH = 800.0, QUICKER = 4.0
 # Events that are kept until somebody takes them.
 SECOND = 1_000_000_000
 LONG = 1e9
@@ -221,7 +223,7 @@ cdef class EventDetector:
         if memory.event == FRESH or sigma <= 0.0:
             sigma = deviation
         elif deviation > sigma:
-            lag = (settings.growth or MEMORY) / (QUICKER if memory.event > QUIET else 1.0)
+            lag = (settings.growth or GROWTH) / (QUICKER if memory.event > QUIET else 1.0)
             share = elapsed if settings.growth > 0.0 else 1.0
             sigma *= pow(deviation / sigma, -expm1(-share / lag))
         sigma = memory.event_deviation = fmin(sigma, deviation)

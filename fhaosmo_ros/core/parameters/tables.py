@@ -310,7 +310,7 @@ SAMPLING = (
         unit='s', lower=0.0, upper=3600.0,
     ),
     Parameter(
-        'divergence_limit', 1e100,
+        'divergence_limit', 1e60,
         'A sample of larger magnitude is rejected, and an observer with a larger state starts '
         'afresh from y.',
         lower=1.0, upper=1e100,

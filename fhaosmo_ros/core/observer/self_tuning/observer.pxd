@@ -6,8 +6,6 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport Members
 from fhaosmo_ros.core.observer.self_tuning.weights cimport Model
 from fhaosmo_ros.core.observer.structure cimport Structure
 
-cdef double MEMORY
-
 
 cdef class SelfTuning(Structure):
     # What the parameters say.
