@@ -20,7 +20,7 @@ from setuptools.command.build_ext import build_ext
 
 NAME = 'fhaosmo_ros'
 FOR_ROS2_RUN = bool({'install', 'develop'} & set(sys.argv))
-CHECK = ['hypothesis', 'pytest', 'pytest-rerunfailures', 'pytest-xdist']
+CHECK = ['hypothesis', 'pytest', 'pytest-xdist']
 TUNE = ['cmaes', 'optuna>=4,<6']
 DOCS = ['myst-parser', 'sphinx', 'sphinx-rtd-theme']
 
@@ -178,7 +178,6 @@ setup(
     ],
     # Not tests_require: colcon then finds no tests.
     extras_require={
-        'differentiate': ['cvxpy', 'pynumdiff>=0.3'],
         'docs': DOCS,
         'recipes': ['rotorpy>=3,<4'],  # a simulator of drones, for studies/recipes
         # Community builds, for machines without ROS. Never beside an installed ROS.

@@ -2,8 +2,7 @@
 """
 Measure speed as ratios within one run, and say which bars are met (`make bench`).
 
-With `--page`, docs/speed.md and the tables of upsets in docs/operation.md are written anew, each
-part as soon as it is measured.
+With `--page`, docs/speed.md is written anew, each part as soon as it is measured.
 
 Exit code 0 if all bars are met, 1 if one is missed, 130 after Ctrl-C.
 """
@@ -17,23 +16,17 @@ import core_step
 import page
 import rates
 import replay
-import simulation
 import startup
 from table import CannotMeasureError, render, Row, Table
-import tune
-import upsets
 
 PARTS = {
     'core': core_step.measure,
-    'simulation': simulation.measure,
     'rates': rates.measure,
     'joints': rates.joints,
     'self_tuning': rates.self_tuning,
     'channels': channels.measure,
     'startup': startup.measure,
     'replay': replay.measure,
-    'tune': tune.measure,
-    'upsets': upsets.measure,
 }
 
 
@@ -77,9 +70,7 @@ def _measure(part: str, quick: bool, to_page: bool) -> list[Row | Table]:
     except CannotMeasureError as error:
         print(f'{part}: {error}', file=sys.stderr)
         return [Row(part, None, bar=0.0, note=str(error))]
-    if to_page and part == 'upsets':
-        upsets.page(results)
-    elif to_page:
+    if to_page:
         page.write({part: page.part(results, where)})
     return results
 

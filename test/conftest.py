@@ -21,9 +21,6 @@ settings.register_profile('fixed', derandomize=True, deadline=None, database=Non
 settings.load_profile('fixed')
 
 
-pytest_plugins = ['stalls']
-
-
 @pytest.fixture(autouse=True)
 def _signals():
     """The commands set handlers for the process that they take for their own."""

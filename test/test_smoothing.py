@@ -2,7 +2,6 @@
 """Estimates from the samples before and after: theorems of smoothing, faults of data, lags."""
 
 import copy
-import json
 import pickle
 
 from fhaosmo_ros.core import Observer, OnlineEstimator, Plant
@@ -14,7 +13,6 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from studies import differentiation
 
 CONFIG = 'config/noise_1e-3.yaml'
 MS = 1_000_000
@@ -388,26 +386,3 @@ def test_a_copy_goes_on_alike(way, gains):
     for name in ('t', 'unknown_input', 'standard_deviation'):
         np.testing.assert_array_equal(getattr(found[0], name), getattr(found[1], name))
     assert len(found[0].t) == len(t) - 900
-
-
-# docs/smoothing.json
-
-
-def test_the_results_are_what_the_study_measures():
-    results = json.loads(differentiation.RESULTS.read_text())
-    name = 'models/pendulum'
-    assert differentiation.with_file(name) == pytest.approx(results['files'][name], rel=0.02)
-    found = differentiation.with_file(name, self_tuning=True)
-    assert found == pytest.approx(results['self-tuning'][name], rel=0.05)
-
-
-def test_the_study_finds_parameters_by_their_likelihood():
-    t = np.arange(400) * differentiation.DT
-    y = np.sin(2.0 * t) + 0.1 * np.random.default_rng(3).standard_normal(len(t))
-
-    def unfitness(noise, size):
-        return differentiation.unfitness(y, differentiation.parameters(1, noise, size, 3.0), None)
-
-    best = unfitness(0.1, 1.4)
-    for other in ((0.2, 1.4), (0.05, 1.4), (0.1, 100.0), (0.1, 0.01)):
-        assert unfitness(*other) > best + 10.0

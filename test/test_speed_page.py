@@ -26,7 +26,7 @@ def test_the_page_says_what_was_measured(page):
 def test_every_part_is_on_a_page(page):
     pytest.importorskip('rclpy')
     run = importlib.import_module('run')
-    assert set(page.kept()) | {'upsets'} == set(run.PARTS)
+    assert set(page.kept()) == set(run.PARTS)
 
 
 def test_a_part_replaces_only_itself(page, tmp_path, monkeypatch):

@@ -17,9 +17,6 @@ from fhaosmo_ros.core.observer.kalman cimport Row, carry, correct
 import numpy as np
 
 cdef double LEAST = 1e-4  # smallest variance of the noise, over the tuned one
-# A y that is more than GATE standard deviations off, over MOST times in a row, is another one.
-cdef double GATE = 12.0
-cdef int MOST = 20
 
 
 cdef struct Filter:
@@ -224,66 +221,4 @@ def several_models(Prediction prediction, samples, bank):
     finally:
         free(filters)
         free(mixed)
-    return np.asarray(out)
-
-
-def with_faults(Prediction prediction, samples, model):
-    """
-    Run one Kalman filter that may bound innovations or tell that y is lost.
-
-    Parameters
-    ----------
-    prediction, samples
-        As for `constant_gain`; `samples` also has `which` (K,), the index of each interval, and
-        `outliers` (K,): 1 where a sample is left out.
-    model
-        With `a`, `q` (I, N, N): transition and what P gains, by interval; `fresh` (N, N): P at
-        the first sample; `variance` of the noise; `huber`: standard deviations; `lost`: whether
-        it begins afresh where y is another one.
-
-    Returns
-    -------
-    (K, N) array
-
-    """
-    check(prediction, samples, model.fresh, *model.a, *model.q)
-    if not 0 <= min(samples.which) <= max(samples.which) < min(len(model.a), len(model.q)):
-        raise ValueError('expected an interval for each sample')
-    cdef const double[::1] y = samples.y, h = samples.h, outliers = samples.outliers
-    cdef const double[:, ::1] u = samples.u
-    cdef const long long[::1] which = samples.which
-    cdef const double[:, :, ::1] transitions = model.a, added = model.q
-    cdef double huber = model.huber, e
-    cdef bint lost = model.lost, skip
-    cdef int n = prediction.n, beyond = 0, i
-    cdef double[:, ::1] out = np.empty((y.shape[0], n))
-    cdef double[::1] scale = np.ones(n)
-    cdef Row a[MOST_LEVELS]
-    cdef Filter fresh
-    cdef Filter f
-    cdef Py_ssize_t k
-    memset(&fresh, 0, sizeof(Filter))
-    fill(model.fresh, fresh.p)
-    fresh.r = model.variance
-    for k in range(y.shape[0]):
-        if k == 0:
-            f = fresh
-            f.x[0] = y[0]
-        else:
-            for i in range(n):
-                memcpy(a[i], &transitions[which[k], i, 0], n * sizeof(double))
-                memcpy(f.q[i], &added[which[k], i, 0], n * sizeof(double))
-            predict(prediction, &f, h[k], &u[k, 0])
-            grow(n, a, &f)
-            e = y[k] - f.x[0]
-            skip = outliers[k] > 0.0
-            if lost:
-                beyond = beyond + 1 if fabs(e) > GATE * sqrt(f.p[0][0] + f.r) else 0
-                skip = beyond > 0
-                if beyond > MOST:
-                    f, beyond = fresh, 0
-                    f.x[0] = y[k]
-            if not skip:
-                take(n, &f, e, huber, &scale[0])
-        memcpy(&out[k, 0], f.x, n * sizeof(double))
     return np.asarray(out)
