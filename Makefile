@@ -13,7 +13,7 @@ help:
 	@echo 'make demo    run plant and estimator for 20 s, draw what was estimated'
 	@echo 'make paper   reproduce the paper, rewrite docs/paper.md and its figures'
 	@echo 'make tune    find gains that fit a sensor: ARGS="--params-file my.yaml", or --bag run'
-	@echo 'make compare tune other observers by the same rules, rewrite docs/comparison.md'
+	@echo 'make compare tune other observers by the same rules, rewrite docs/evidence'
 	@echo 'make test    check style and types, run the tests'
 	@echo 'make lint    check style and types only'
 	@echo 'make docs    build the pages in docs/ as a site, build/docs/index.html'

@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-`python -m studies.everywhere` writes docs/everywhere.md: tuned once, used everywhere.
+`python -m studies.everywhere` measures: tuned once, used everywhere.
 
 Estimators of d that are tuned for one condition, or told only the model, in many conditions;
 beside a Kalman filter that is tuned anew with the truth for each.
 """
 
 import argparse
-from collections.abc import Callable
-import json
 import math
 import os
 from pathlib import Path
 import sys
-import time
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import OnlineEstimator, Recording, TriangularModel
@@ -30,16 +27,17 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
-from studies import document
+from studies import evidence
 from studies.comparison.evaluation import METHODS, tune
 from studies.comparison.methods.adaptive import HUBER, IMM, NOISE
 from studies.comparison.methods.linear import LINEAR_LIMIT
 from studies.comparison.methods.method import Setting, Values
 from studies.comparison.scores import Estimates, JUDGED_FROM, mean, objective
+from studies.evidence import markdown, Row
 from studies.waves import wave
 
 Floats = NDArray[np.float64]
-NAME, RESULTS, DOCS = 'everywhere', 'results.json', Path(__file__).resolve().parents[1] / 'docs'
+NAME = 'everywhere'
 STEP, RATE, SEED = 5e-4, 1000.0, 1
 
 
@@ -117,6 +115,8 @@ PEERS: dict[str, list[dict[str, float]]] = {
     IMM: [{'spread': f, 'stay': seconds} for f in (1.5, 2.0, 3.0) for seconds in (1.0, 10.0)],
 }
 """What the tuning chooses from, around the filter that it has found."""
+ANEW = 'tuned anew'
+"""Error of d of the Kalman filter tuned for the condition; all others are over this."""
 KNOWN = 'every z known'
 """What a wrong Phi makes of d, whoever estimates it."""
 CEILING = 20.0
@@ -244,7 +244,7 @@ def best_peers(setting: Setting, values: Values, recordings: list[Recording]) ->
     }  # fmt: skip
 
 
-def cell(name: str, condition: str, size: Size, once: Once | None) -> dict[str, Any]:
+def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row, Once]:
     """Return the errors of all methods in a condition; without `once` tune them here."""
     plant, c = PLANTS[name], CONDITIONS[condition]
     recordings = [recording(plant, c, kind, size.duration) for kind in size.kinds]
@@ -253,25 +253,17 @@ def cell(name: str, condition: str, size: Size, once: Once | None) -> dict[str, 
     anew = found.at(setting.model.order, c.rate)
     once = once or Once(found, best_peers(setting, anew, recordings))
     values = once.member.at(setting.model.order, c.rate)
-    model = model_of(setting)
-    preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | model
-    own, inside = self_tuned(model, recordings)
+    preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | model_of(setting)
     errors = {
-        SELF: own,
         ONCE: errors_of(LINEAR_LIMIT, setting, values, recordings),
         PRESET: [error(r, online(r, preset)[0]) for r in recordings],
     }
     for peer, number in once.peers.items():
         errors[peer] = errors_of(peer, setting, {**values, **PEERS[peer][number]}, recordings)
     yard = mean(errors_of(LINEAR_LIMIT, setting, anew, recordings))
-    if c.phi != 1.0:
-        errors[KNOWN] = [implied(plant, c, recordings)]
-    return {
-        'plant': name, 'condition': condition, 'tuned anew': round(yard, 5),
-        'member': list(found), 'peers': once.peers,
-        'ratios': {k: float(f'{mean(e) / yard:.4g}') for k, e in errors.items()},
-        'inside': inside,
-    }  # fmt: skip
+    row: Row = {'plant': name, 'condition': condition, ANEW: yard, SELF: 0.0}
+    row |= {peer: mean(e) / yard for peer, e in errors.items()}
+    return again(row, size), once
 
 
 def model_of(setting: Setting) -> dict[str, Any]:
@@ -292,54 +284,41 @@ def self_tuned(
     return errors, [round(float(x), 3) for x in np.mean(inside, axis=0)]
 
 
-def again(before: dict[str, Any], size: Size) -> dict[str, Any]:
+def again(row: Row, size: Size) -> Row:
     """Return a cell with self-tuning measured anew, and all else as it was."""
-    plant, c = PLANTS[before['plant']], CONDITIONS[before['condition']]
+    plant, c = PLANTS[row['plant']], CONDITIONS[row['condition']]
     recordings = [recording(plant, c, kind, size.duration) for kind in size.kinds]
-    errors, inside = self_tuned(model_of(setting_of(plant, c)), recordings)
-    anew = {SELF: mean(errors)}
-    if c.phi != 1.0:
-        anew[KNOWN] = implied(plant, c, recordings)
-    ratios = {k: float(f'{e / before["tuned anew"]:.4g}') for k, e in anew.items()}
-    return before | {'ratios': before['ratios'] | ratios, 'inside': inside}
+    errors, (one, two) = self_tuned(model_of(setting_of(plant, c)), recordings)
+    known = implied(plant, c, recordings) / row[ANEW] if c.phi != 1.0 else None
+    return row | {
+        SELF: mean(errors) / row[ANEW], KNOWN: known, 'inside 1 σ': one, 'inside 1.96 σ': two,
+    }  # fmt: skip
 
 
-def compute_again(folder: Path, size: Size, jobs: int, stop: Stop) -> list[dict[str, Any]]:
-    """Return the cells of the results in a folder with self-tuning measured anew."""
-    before = json.loads((folder / RESULTS).read_text())['cells']
-    calls: dict[Any, tuple[Any, ...]] = {i: (again, c, size) for i, c in enumerate(before)}
-    found: dict[int, dict[str, Any]] = {}
-    with Workers(jobs, stop) as workers, progress(total=len(calls), unit='cell', desc=NAME) as bar:
-        for key, result in workers.results(calls):
-            found[key] = result
-            bar.update()
-    return [found[i] for i in range(len(before))]
+def compute(size: Size, jobs: int, stop: Stop, before: list[Row]) -> list[Row]:
+    """Return all cells: those of the tuning first; with `before` only self-tuning is measured."""
+    keys = [(p, c) for p in size.plants for c in size.conditions]
+    found: dict[Any, Any] = {}
+    with (
+        Workers(jobs, stop) as workers,
+        progress(total=len(before) or len(keys), unit='cell', desc=NAME) as bar,
+    ):
 
-
-def once_of(found: dict[str, Any]) -> Once:
-    """Return what the cell of the tuning has found."""
-    return Once(Member(*found['member']), found['peers'])
-
-
-def compute(size: Size, jobs: int, stop: Stop) -> list[dict[str, Any]]:
-    """Return all cells: first those of the tuning, then the others."""
-    found: dict[Any, dict[str, Any]] = {}
-    others = [c for c in size.conditions if c != TUNED]
-    total = len(size.plants) * (1 + len(others))
-    with Workers(jobs, stop) as workers, progress(total=total, unit='cell', desc=NAME) as bar:
-        for conditions in ([TUNED], others):
-            calls: dict[Any, tuple[Any, ...]] = {
-                (p, c): (cell, p, c, size, once_of(found[p, TUNED]) if found else None)
-                for p in size.plants
-                for c in conditions
-            }
+        def run(calls: dict[Any, tuple[Any, ...]]) -> None:
             for key, result in workers.results(calls):
                 found[key] = result
                 bar.update()
-    return [found[p, c] for p in size.plants for c in size.conditions]
+
+        if before:
+            run({k: (again, row, size) for k, row in enumerate(before)})
+            return [found[k] for k in range(len(before))]
+        run({(p, c): (cell, p, c, size, None) for p, c in keys if c == TUNED})
+        tuned = {p: found[p, TUNED][1] for p in size.plants}
+        run({(p, c): (cell, p, c, size, tuned[p]) for p, c in keys if c != TUNED})
+    return [found[key][0] for key in keys]
 
 
-def draw(cells: list[dict[str, Any]]) -> Figure:
+def draw(cells: list[Row]) -> Figure:
     """Draw the ratios: a panel a plant, a row a condition, a marker a method."""
     plants = list(dict.fromkeys(c['plant'] for c in cells))
     figure = Figure(figsize=(11.0, 6.6), layout='constrained')
@@ -347,7 +326,7 @@ def draw(cells: list[dict[str, Any]]) -> Figure:
     for plant, axes in zip(plants, panels, strict=True):
         rows = [c for c in cells if c['plant'] == plant]
         for name, (colour, marker, area) in STYLES.items():
-            x = [min(row['ratios'][name], CEILING) for row in rows]
+            x = [min(row[name], CEILING) for row in rows]
             front = 4 if name == SELF else 3
             axes.scatter(
                 x, range(len(rows)), area, colour, marker=marker, label=name, zorder=front
@@ -363,65 +342,29 @@ def draw(cells: list[dict[str, Any]]) -> Figure:
     return figure
 
 
-def table(cells: list[dict[str, Any]], entry: Callable[[dict[str, Any]], str]) -> str:
-    """Return a table: a row a condition, a column a plant."""
-    plants = list(dict.fromkeys(c['plant'] for c in cells))
-    lines = ['| condition | ' + ' | '.join(plants) + ' |', '|---' * (1 + len(plants)) + '|']
-    for condition in dict.fromkeys(c['condition'] for c in cells):
-        row = [entry(c) for c in cells if c['condition'] == condition]
-        lines.append(f'| {condition} | ' + ' | '.join(row) + ' |')
-    return '\n'.join(lines)
-
-
 def number(ratio: float) -> str:
     """Return a ratio as text."""
-    return f'{ratio:.2f}' if ratio < 10.0 else f'{ratio:.0f}' if ratio < 1e4 else 'diverges'
+    return f'{ratio:.2f}' if ratio < 10.0 else f'{ratio:,.0f}' if ratio < 1e4 else 'diverges'
 
 
-def texts(found: dict[str, Any]) -> dict[str, str]:
-    """Return the generated parts of the page."""
-    cells = found['cells']
-    lines = ['| method | geometric mean | worst | cells above 1.25 |', '|---|---|---|---|']
+def texts(cells: list[Row]) -> dict[str, str]:
+    """Return the part of the page."""
+    lines = []
     for name in STYLES:
-        ratios = [c['ratios'][name] for c in cells]
-        worst = max(cells, key=lambda c, name=name: c['ratios'][name])
-        bad = sum(ratio > 1.25 for ratio in ratios)
-        lines.append(
-            f'| {name} | {number(mean(ratios))} | {number(max(ratios))} '
-            f'({worst["plant"]}, {worst["condition"]}) | {bad} of {len(cells)} |'
-        )
-
-    def both(c: dict[str, Any]) -> str:
-        return ' / '.join(number(c['ratios'][name]) for name in (SELF, ONCE, PRESET))
-
-    def inside(c: dict[str, Any]) -> str:
-        return ' / '.join(f'{100.0 * share:.0f}' for share in c['inside'])
-
-    wrong = [c for c in cells if KNOWN in c['ratios']]
-    return {
-        'methods': '\n'.join(lines),
-        'wrong': table(
-            wrong, lambda c: f'{number(c["ratios"][SELF])} / {number(c["ratios"][KNOWN])}'
-        ),
-        'ratios': table(cells, both),
-        'bands': table(cells, inside),
-    }
+        ratios = [c[name] for c in cells]
+        worst = max(cells, key=lambda c, name=name: c[name])
+        where = f'{number(max(ratios))} ({worst["plant"]}, {worst["condition"]})'
+        bad = f'{sum(ratio > 1.25 for ratio in ratios)} of {len(cells)}'
+        lines.append([name, number(mean(ratios)), where, bad])
+    return {'methods': markdown(['method', 'geometric mean', 'worst', 'cells above 1.25'], lines)}
 
 
 def _study(arguments: argparse.Namespace, stop: Stop) -> None:
     size = SHORT if arguments.short else Size()
-    output = arguments.output or (Path('everywhere_output') if arguments.short else DOCS)
-    begin = time.monotonic()
-    with document.rewriting(output, NAME, 'Tuned once, used everywhere') as pages:
-        if arguments.only_self_tuning:
-            cells = compute_again(output / NAME, size, arguments.jobs, stop)
-        else:
-            cells = compute(size, arguments.jobs, stop)
-        found = {'duration': size.duration, 'cells': cells}
-        (pages.folder / RESULTS).write_text(json.dumps(found, indent=1) + '\n')
-        draw(found['cells']).savefig(pages.folder / 'ratios.png', dpi=110)
-        pages.write(texts(found))
-    print(f'{output / NAME}.md ({time.monotonic() - begin:.0f} s)')
+    docs = arguments.output or (Path('everywhere_output') if arguments.short else evidence.DOCS)
+    before = evidence.read(NAME, docs) if arguments.only_self_tuning else []
+    cells = evidence.rounded(compute(size, arguments.jobs, stop, before))
+    evidence.publish(docs, {NAME: cells}, texts(cells), {NAME: draw(cells)})
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -433,7 +376,7 @@ def main(argv: list[str] | None = None) -> int:
         help='measure self-tuning anew, and take the rest from the results that are there',
     )  # fmt: skip
     parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1, help='processes')
-    parser.add_argument('--output', type=Path, help='folder for page and results (default: docs)')
+    parser.add_argument('--output', type=Path, help='folder for results (default: docs)')
     return run_command(parser, argv, _study)
 
 

@@ -1,24 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The study of use without tuning anew: page, filters and command."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
-from studies import document, everywhere
+from studies import everywhere, evidence
 from studies.comparison.methods.adaptive import HUBER, IMM
 from studies.comparison.methods.linear import LINEAR_LIMIT
 
-DOCS = Path(__file__).resolve().parents[1] / 'docs'
 MOTOR, TUNED = everywhere.PLANTS['motor'], everywhere.CONDITIONS['as tuned']
-
-
-def test_the_page_says_what_was_computed():
-    found = json.loads((DOCS / everywhere.NAME / everywhere.RESULTS).read_text())
-    assert document.parts((DOCS / 'everywhere.md').read_text()) == everywhere.texts(found)
-    names = {(c['plant'], c['condition']) for c in found['cells']}
-    assert names == {(p, c) for p in everywhere.PLANTS for c in everywhere.CONDITIONS}
 
 
 @pytest.mark.parametrize('derivatives', [0, 2])
@@ -48,10 +37,14 @@ def test_what_differs_between_conditions():
             assert noise == pytest.approx(c.noise * MOTOR.noise, rel=0.15), name
 
 
-def test_the_command_in_short(tmp_path, capsys):
+def test_the_command_in_short(tmp_path):
     assert everywhere.main(['--short', '--jobs', '1', '--output', str(tmp_path)]) == 0
-    assert 'everywhere.md' in capsys.readouterr().out
-    found = json.loads((tmp_path / 'everywhere' / 'results.json').read_text())
-    assert len(found['cells']) == 2
-    assert all(0.0 < c['ratios'][everywhere.SELF] < 1.25 for c in found['cells'])
-    assert found['cells'][0]['ratios'][everywhere.ONCE] == 1.0
+    found = evidence.read(everywhere.NAME, tmp_path)
+    assert [c['condition'] for c in found] == list(everywhere.SHORT.conditions)
+    assert all(0.0 < c[everywhere.SELF] < 1.25 for c in found)
+    assert found[0][everywhere.ONCE] == 1.0
+    command = ['--short', '--only-self-tuning', '--jobs', '1', '--output', str(tmp_path)]
+    assert everywhere.main(command) == 0
+    again = evidence.read(everywhere.NAME, tmp_path)
+    for new, old in zip(again, found, strict=True):
+        assert new == old | {everywhere.SELF: pytest.approx(old[everywhere.SELF], rel=1e-4)}

@@ -4,87 +4,44 @@
 import argparse
 import os
 from pathlib import Path
-import time
 from typing import Any
 
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.cli.processes import Workers
 from fhaosmo_ros.tools.cli.progress import progress
-from studies import document
-from studies.comparison import figures, results, tables
+from studies import evidence
+from studies.comparison import figures
 from studies.comparison.cells import Sensor, sensors
-from studies.comparison.evaluation import evaluate, METHODS, methods_for, seconds_a_sample
-from studies.comparison.methods import steps_bound
-from studies.comparison.results import Entry, Results
-from studies.comparison.verdicts import verdicts
+from studies.comparison.evaluation import evaluate, METHODS, methods_for
+from studies.comparison.results import best_of_kinds, Cell, texts
+from studies.evidence import Row
 
-DOCS = Path(__file__).resolve().parents[2] / 'docs'
-FOLDER, RESULTS = 'comparison', 'results.json'
+NAME = 'comparison'
 TRIALS, QUICK_TRIALS = 200, 15
 TRAINING, QUICK_TRAINING = 4, 1
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0, 2 for a bad argument or output, 130 if it was interrupted."""
-    return run_command(_parser(), argv, _compare)
-
-
-def _compare(arguments: argparse.Namespace, stop: Stop) -> None:
-    quick = arguments.quick
-    output = arguments.output or _default_output(quick)
-    trials = arguments.trials or (QUICK_TRIALS if quick else TRIALS)
-    training = QUICK_TRAINING if quick else TRAINING
-    begin = time.monotonic()
-    before = results.load(output / FOLDER / RESULTS) if arguments.only else None
-    with document.rewriting(output, FOLDER, 'Comparison') as pages:
-        with Workers(arguments.jobs, stop) as workers:
-            entries, bounds = tune_all(sensors(quick), trials, training, workers, arguments.only)
-        with stop.raising():
-            found = Results(entries, sample_times(entries), trials, training, bounds)
-            found = before.with_new(found) if before else found
-            write(found, pages)
-    print(f'\n{tables.verdict_table(verdicts(found.table(list(METHODS))))}\n')
-    print(
-        f'document: {output / "comparison.md"}, figures: {output / FOLDER} '
-        f'({time.monotonic() - begin:.0f} s)'
-    )
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='compare', description=__doc__)
     parser.add_argument(
-        '--quick',
-        action='store_true',
-        help='a few cells and trials, for a first look and for tests',
+        '--quick', action='store_true', help='a few cells and trials, for a first look'
     )
+    parser.add_argument('--trials', type=_positive, metavar='N', help='trials of each tuning')
     parser.add_argument(
-        '--trials',
-        type=_positive,
-        metavar='N',
-        help=f'trials of each tuning (default: {TRIALS}, {QUICK_TRIALS} with --quick)',
-    )
-    parser.add_argument(
-        '--only',
-        choices=list(METHODS),
-        metavar='METHOD',
+        '--only', choices=list(METHODS), metavar='METHOD',
         help='measure this method anew, and take the others from the results that are there',
-    )
+    )  # fmt: skip
     parser.add_argument(
-        '--jobs',
-        type=_positive,
-        metavar='N',
-        default=os.cpu_count() or 1,
+        '--jobs', type=_positive, metavar='N', default=os.cpu_count() or 1,
         help='processes (default: one a core)',
-    )
+    )  # fmt: skip
     parser.add_argument(
-        '--output',
-        type=Path,
-        metavar='FOLDER',
-        help='folder for comparison.md and comparison/ (default: docs of this checkout; '
-        'comparison_output with --quick or without a checkout)',
-    )
-    return parser
+        '--output', type=Path, metavar='FOLDER',
+        help='folder for results and figures (default: docs; comparison_output with --quick)',
+    )  # fmt: skip
+    return run_command(parser, argv, _compare)
 
 
 def _positive(text: str) -> int:
@@ -94,55 +51,43 @@ def _positive(text: str) -> int:
     return value
 
 
-def _default_output(quick: bool) -> Path:
-    return DOCS if not quick and (DOCS / 'comparison.md').is_file() else Path('comparison_output')
+def _compare(arguments: argparse.Namespace, stop: Stop) -> None:
+    quick = arguments.quick
+    docs = arguments.output or (Path('comparison_output') if quick else evidence.DOCS)
+    trials = arguments.trials or (QUICK_TRIALS if quick else TRIALS)
+    training = QUICK_TRAINING if quick else TRAINING
+    kept: list[Row] = []
+    if arguments.only:
+        kept = [row for row in evidence.read(NAME, docs) if row['method'] != arguments.only]
+    with Workers(arguments.jobs, stop) as workers:
+        found = measure(sensors(quick), trials, training, workers, arguments.only)
+    rows = evidence.rounded([*kept, *found])
+    chosen = best_of_kinds(rows)
+    drawn = {
+        f'{NAME}_{name}': figures.against_linear(chosen, jumps)
+        for name, jumps in (('smooth', False), ('jumps', True))
+    }
+    evidence.publish(docs, {NAME: rows}, texts(rows), drawn)
 
 
-def tune_all(
-    chosen: list[Sensor],
-    trials: int,
-    training: int,
-    workers: Workers,
-    only: str | None = None,
-) -> tuple[list[Entry], dict[Sensor, float]]:
-    """
-    Tune and evaluate all methods for these sensors, and bound the error for step signals.
-
-    With `only`, do it for this method, without the bound.
-    """
-    tasks = [
-        (sensor, name) for sensor in chosen for name in methods_for(sensor) if only in (None, name)
-    ]
-    known = [sensor for sensor in chosen if only is None and steps_bound.applies(sensor)]
+def measure(
+    chosen: list[Sensor], trials: int, training: int, workers: Workers, only: str | None = None
+) -> list[Row]:
+    """Tune and judge all methods, or only one, for these sensors; return a line a cell."""
     calls: dict[Any, tuple[Any, ...]] = {
-        task: (_tune_and_evaluate, *task, trials, training) for task in tasks
+        (sensor, name): (evaluate, sensor, name, training, trials)
+        for sensor in chosen
+        for name in methods_for(sensor)
+        if only in (None, name)
     }
-    calls |= {sensor: (steps_bound.bound, sensor) for sensor in known}
-    found = {}
+    rows: dict[Any, list[Row]] = {}
     with progress(total=len(calls), unit='tuning', desc='compare') as bar:
-        for key, result in workers.results(calls):
-            found[key] = result
+        for (sensor, name), (tuned, errors) in workers.results(calls):
+            s = sensor
+            rows[sensor, name] = [
+                Cell(s.plant, d, s.noise, s.rate, s.timing)._asdict()
+                | {'method': name, 'training': tuned.training, 'error': error}
+                for d, error in zip(s.disturbances, errors, strict=True)
+            ]
             bar.update()
-    return [found[task] for task in tasks], {sensor: found[sensor] for sensor in known}
-
-
-def sample_times(entries: list[Entry]) -> dict[str, float]:
-    """Return the time (s) that each method takes for a sample of a sensor for all of them."""
-    first = next(e.sensor for e in entries if methods_for(e.sensor) == list(METHODS))
-    return {
-        e.method: seconds_a_sample(e.method, e.tuned, first) for e in entries if e.sensor == first
-    }
-
-
-def _tune_and_evaluate(sensor: Sensor, name: str, trials: int, training: int) -> Entry:
-    tuned, scores = evaluate(sensor, name, training, trials)
-    return Entry(sensor, name, tuned, scores)
-
-
-def write(found: Results, pages: document.Pages) -> None:
-    """Write document, figures and results."""
-    path = pages.folder / RESULTS
-    results.save(found, path)
-    rounded = results.load(path)  # so that the document is a function of the file
-    figures.save_all(rounded, pages.folder)
-    pages.write(tables.texts(rounded))
+    return [row for key in calls for row in rows[key]]

@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Sequence
 import math
-import time
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -17,9 +16,8 @@ from studies.comparison.methods.linear import FILTERS
 from studies.comparison.methods.method import Method, Search, Setting, Values
 from studies.comparison.methods.ours import OUR_METHODS
 from studies.comparison.methods.sliding import OBSERVERS
-from studies.comparison.scores import Estimates, objective, Scores, scores
+from studies.comparison.scores import mean, objective
 
-REPEATS = 5
 HOPELESS = 1.5
 """A trial this many times worse than the best one so far is not run on more recordings."""
 METHODS: dict[str, Method] = {
@@ -124,27 +122,20 @@ def _scan(judged: Callable[[Values], float], d: Dimension, trials: int) -> dict[
     return {d.name: float(min([best, *closer], key=lambda x: judged({d.name: x})))}
 
 
-def judge(
+def errors(
     method: Method, setting: Setting, tuned: Tuned, recordings: Sequence[Recording]
-) -> Scores:
-    """Return the scores on held-out recordings."""
-    return scores(recordings, estimates(method, setting, tuned, recordings))
-
-
-def estimates(
-    method: Method, setting: Setting, tuned: Tuned, recordings: Sequence[Recording]
-) -> list[Estimates]:
-    """Return the estimates of a tuned method."""
+) -> list[float]:
+    """Return the error of d of a tuned method on each recording."""
     run = method.prepare(setting, tuned.values)
-    return [run(recording)[tuned.readout] for recording in recordings]
+    return [objective(recording, run(recording)[tuned.readout]) for recording in recordings]
 
 
-def evaluate(sensor: Sensor, name: str, training: int, trials: int) -> tuple[Tuned, list[Scores]]:
-    """Tune a method for a sensor and return its scores for each of the sensor's disturbances."""
+def evaluate(sensor: Sensor, name: str, training: int, trials: int) -> tuple[Tuned, list[float]]:
+    """Tune a method for a sensor and return its error for each of the sensor's disturbances."""
     method, setting = METHODS[name], sensor.setting()
     tuned = tune(method, setting, sensor.training(training), trials, seed=1)
     return tuned, [
-        judge(method, setting, tuned, sensor.held_out(disturbance))
+        mean(errors(method, setting, tuned, sensor.held_out(disturbance)))
         for disturbance in sensor.disturbances
     ]
 
@@ -153,15 +144,3 @@ def methods_for(sensor: Sensor) -> list[str]:
     """Return the methods that are compared for a sensor."""
     quiet = sensor.setting().noise == 0.0
     return [name for name, method in METHODS.items() if not (quiet and method.needs_noise)]
-
-
-def seconds_a_sample(name: str, tuned: Tuned, sensor: Sensor) -> float:
-    """Return the processor time that a tuned method takes for a sample; the least of some runs."""
-    recording = sensor.training(1)[0]
-    run = METHODS[name].prepare(sensor.setting(), tuned.values)
-    best = float('inf')
-    for _ in range(REPEATS):
-        begin = time.process_time()
-        run(recording)
-        best = min(best, time.process_time() - begin)
-    return best / len(recording.t)

@@ -67,17 +67,14 @@ def _papers_gains(variant: str) -> Parameters:
     return parameters
 
 
-def _levant(scheme: str) -> Parameters:
-    def parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
-        """Non-recursive form: kappa_i = lambda_i kappa_{i+1}^(i / (i+1)) L^((N-i) / N)."""
-        levels = setting.model.order + 1
-        gains, kappa = [], 1.0
-        for i in reversed(range(levels)):
-            kappa = RECURSIVE[i] * kappa ** (i / (i + 1))
-            gains.append(kappa * values['lipschitz'] ** ((levels - i) / levels))
-        return {'structure': 'levant', 'variant': 'sign', 'scheme': scheme, 'lambda': gains}
-
-    return parameters
+def _levant(setting: Setting, values: Values) -> Mapping[str, Any]:
+    """Non-recursive form: kappa_i = lambda_i kappa_{i+1}^(i / (i+1)) L^((N-i) / N)."""
+    levels = setting.model.order + 1
+    gains, kappa = [], 1.0
+    for i in reversed(range(levels)):
+        kappa = RECURSIVE[i] * kappa ** (i / (i + 1))
+        gains.append(kappa * values['lipschitz'] ** ((levels - i) / levels))
+    return {'structure': 'levant', 'variant': 'sign', 'scheme': 'implicit', 'lambda': gains}
 
 
 def _levant_space(setting: Setting) -> list[Dimension]:
@@ -91,18 +88,11 @@ def _none(setting: Setting) -> list[Dimension]:
 
 OBSERVERS = (
     Method(
-        'Levant, explicit',
-        "Levant's robust exact differentiator with Phi, explicit Euler",
-        SLIDING,
-        _levant_space,
-        prepared(_levant('explicit')),
-    ),
-    Method(
         'Levant, implicit',
-        'the same, implicit Euler',
+        "Levant's robust exact differentiator with Phi, implicit Euler",
         SLIDING,
         _levant_space,
-        prepared(_levant('implicit')),
+        prepared(_levant),
     ),
     Method(
         'paper: sign',

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/evidence.md and the tables and figures in the folder beside it."""
+
+from collections.abc import Iterable, Mapping, Sequence
+import csv
+from pathlib import Path
+import re
+from typing import Any
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.tools.cli.output import Output
+from matplotlib.figure import Figure
+
+DOCS = Path(__file__).resolve().parents[1] / 'docs'
+PAGE, FOLDER = 'evidence.md', 'evidence'
+PART = '<!-- begin {0} -->\n{1}\n<!-- end {0} -->'
+PATTERN = re.compile(r'<!-- begin (?P<name>\S+) -->\n(?P<text>.*?)\n?<!-- end (?P=name) -->', re.S)
+Row = dict[str, Any]
+"""A line of a table, by column; numbers are floats."""
+
+
+def read(name: str, docs: Path = DOCS) -> list[Row]:
+    """Return the lines of a table in the folder beside the page."""
+    with (docs / FOLDER / f'{name}.csv').open(newline='', encoding='utf-8') as file:
+        return [{k: _value(text) for k, text in row.items()} for row in csv.DictReader(file)]
+
+
+def _value(text: str) -> float | str | None:
+    try:
+        return float(text) if text else None
+    except ValueError:
+        return text
+
+
+def rounded(rows: Iterable[Mapping[str, Any]]) -> list[Row]:
+    """Return lines as they will be read: numbers with six digits."""
+    return [
+        {k: float(f'{v:.6g}') if isinstance(v, float | int) else v for k, v in row.items()}
+        for row in rows
+    ]
+
+
+def parts(document: str) -> dict[str, str]:
+    """Return the generated parts of a document by name."""
+    return {match['name']: match['text'] for match in PATTERN.finditer(document)}
+
+
+def filled(document: str, texts: Mapping[str, str]) -> str:
+    """
+    Return the document with these parts replaced; others stay.
+
+    Raises
+    ------
+    ConfigurationError
+        The document has no markers of one of the names.
+
+    """
+    present = set(parts(document))
+    if not set(texts) <= present:
+        raise ConfigurationError(
+            f'markers of the document: expected {", ".join(sorted(texts))}, '
+            f'got {", ".join(sorted(present)) or "none"}'
+        )
+    return PATTERN.sub(
+        lambda match: PART.format(match['name'], texts.get(match['name'], match['text'])), document
+    )
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table of the page."""
+    return '\n'.join(f'| {" | ".join(line)} |' for line in (head, ['---'] * len(head), *rows))
+
+
+def publish(
+    docs: Path,
+    tables: Mapping[str, Sequence[Mapping[str, Any]]],
+    texts: Mapping[str, str],
+    figures: Mapping[str, Figure],
+) -> None:
+    """
+    Write tables and figures into the folder beside the page, and fill the page if it is there.
+
+    Parameters
+    ----------
+    docs : path
+        Folder of the page; made where there is none.
+    tables : mapping
+        Lines by name of the CSV.
+    texts : mapping
+        Generated parts of the page by name.
+    figures : mapping
+        By name of the PNG.
+
+    """
+    page, folder = docs / PAGE, docs / FOLDER
+    text = filled(page.read_text(encoding='utf-8'), texts) if page.exists() else ''
+    for name, rows in tables.items():
+        with Output(folder / f'{name}.csv', force=True) as output:
+            with output.path.open('w', newline='', encoding='utf-8') as file:
+                table = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
+                table.writeheader()
+                for row in rows:
+                    table.writerow({k: _text(v) for k, v in row.items()})
+            print(output.keep())
+    for name, figure in figures.items():
+        with Output(folder / f'{name}.png', force=True) as output:
+            figure.savefig(output.path, dpi=110)
+            print(output.keep())
+    if text:
+        with Output(page, force=True) as output:
+            output.path.write_text(text, encoding='utf-8')
+            print(output.keep())
+    for body in texts.values():
+        print(f'\n{body}')
+
+
+def _text(value: Any) -> str:
+    return f'{value:.6g}' if isinstance(value, float | int) else value or ''
