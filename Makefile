@@ -11,7 +11,7 @@ with = python=$$(PYTHON='$(PYTHON)' sh scripts/environment.sh $(1))
 
 help:
 	@echo 'make demo    run plant and estimator for 20 s, draw what was estimated'
-	@echo 'make paper   reproduce the paper, rewrite docs/paper.md and its figures'
+	@echo 'make paper   reproduce the paper, rewrite docs/evidence and its figures'
 	@echo 'make tune    find gains that fit a sensor: ARGS="--params-file my.yaml", or --bag run'
 	@echo 'make compare tune other observers by the same rules, rewrite docs/evidence'
 	@echo 'make test    check style and types, run the tests'

@@ -7,8 +7,14 @@ from studies import everywhere, evidence
 from studies.comparison import results as comparison
 from studies.comparison.cells import sensors
 from studies.comparison.evaluation import methods_for
+from studies.paper import cases, findings
+from studies.paper.plant_and_observer import SOLVERS
 
-PARTS = {'comparison': comparison.texts, 'everywhere': everywhere.texts}
+PARTS = {
+    'comparison': comparison.texts,
+    'everywhere': everywhere.texts,
+    'paper': findings.texts,
+}
 """What makes the parts of the page, by the name of the table they are made from."""
 
 
@@ -29,6 +35,10 @@ def test_tables_are_about_all_cells():
     }
     cells = {(row['plant'], row['condition']) for row in evidence.read('everywhere')}
     assert cells == {(p, c) for p in everywhere.PLANTS for c in everywhere.CONDITIONS}
+    simulations = {tuple(row.values())[:3] for row in evidence.read('paper')}
+    assert simulations == {
+        (s, name, w) for s in SOLVERS for name in cases.OBSERVERS for w in cases.FREQUENCIES
+    }
 
 
 def test_a_table_is_read_as_it_was_written_and_the_page_is_filled(tmp_path):

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's three findings as inequalities between numbers, and where they hold."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-from studies.paper.cases import FREQUENCIES, joint, OBSERVERS, OURS, Score, score
-from studies.paper.plant_and_observer import JointRun
+from studies.evidence import markdown, Row
+from studies.paper.cases import FREQUENCIES, joint, OBSERVERS, Score, score
+from studies.paper.plant_and_observer import JointRun, SOLVERS
 
 LOW, HIGH = FREQUENCIES
 VISIBLE = 0.005
@@ -25,8 +24,7 @@ WIDTHS = (
 )  # fmt: skip
 """Half-widths of the map, on both axes."""
 
-FINE, COARSE, FUZZY, ADAPTIVE = OBSERVERS
-DEFAULT_LAW = next(iter(OURS))
+FINE, COARSE, FUZZY, ADAPTIVE = list(OBSERVERS)[:4]
 Scores = dict[tuple[str, float], Score]
 """By observer and angular frequency."""
 
@@ -56,7 +54,7 @@ class Verdict(NamedTuple):
     def words(self) -> str:
         """Whether it holds, and what that is worth."""
         text = 'yes' if self.holds else 'no'
-        return text if self.estimates else f'{text}, but no estimate'
+        return f'**{text}**' if self.estimates else f'{text}, but no estimate'
 
 
 def _estimates(*scores: Score) -> bool:
@@ -66,111 +64,86 @@ def _estimates(*scores: Score) -> bool:
 @cache
 def run(name: str, omega: float, solver: str) -> JointRun:
     """Simulate one of the observers, once: the figures show what the tables judge."""
-    variant, step, changes = (OBSERVERS | OURS)[name]
+    variant, step, changes = OBSERVERS[name]
     return joint(variant, omega, step, solver, **changes)
+
+
+def scores_by_solver(rows: Iterable[Row]) -> dict[str, Scores]:
+    """Return the lines of the table of simulations, by solver."""
+    found: dict[str, Scores] = {}
+    for row in rows:
+        found.setdefault(row['solver'], {})[row['observer'], row['omega']] = row
+    return found
+
+
+def choose_solver(scores: dict[str, Scores]) -> str:
+    """
+    Return the solver that reproduces the paper best.
+
+    Its figures show sign at 1e-5 s chattering around the truth: the one whose estimate of d is
+    closest to it, over both frequencies. Solvers that hold the sign are closer, but they are not
+    methods for the equations of the paper: they stand beside them.
+    """
+    return min(
+        (solver for solver in scores if not SOLVERS[solver].holds_sign),
+        key=lambda solver: sum(scores[solver][FINE, omega]['rms_d'] for omega in FREQUENCIES),
+    )
 
 
 def verdicts(s: Scores) -> list[Verdict]:
     """Judge the findings F1, F2, F3 from the scores of one solver."""
     result = []
     for label, w in (('low', LOW), ('high', HIGH)):
-        fine, coarse, fuzzy = s[FINE, w], s[COARSE, w], s[FUZZY, w]
-        adaptive = s[ADAPTIVE, w]
-        fine_hp, fuzzy_hp = fine['high_pass'], fuzzy['high_pass']
+        fine, coarse, fuzzy, adaptive = (s[name, w] for name in (FINE, COARSE, FUZZY, ADAPTIVE))
+        chatter, smooth = fine['high_pass'], fuzzy['high_pass']
         result += [
             Verdict(
-                f'F1a {label}',
-                'sign at 1e-5 s chatters visibly',
-                fine_hp >= VISIBLE,
-                f'high-passed RMS {fine_hp:.1e} (visible from {VISIBLE:g}); '
-                f'RMS of d {fine["rms_d"]:.3f}',
-                _estimates(fine),
+                f'F1a {label}', 'sign at 1e-5 s chatters visibly', chatter >= VISIBLE,
+                f'high-passed {chatter:.1e}; error {fine["rms_d"]:.3f}', _estimates(fine),
             ),
             Verdict(
-                f'F1b {label}',
-                'sign at 1e-3 s is bad',
+                f'F1b {label}', 'sign at 1e-3 s is bad',
                 coarse['rms_d'] >= BADLY * fine['rms_d'],
-                f'RMS of d {coarse["rms_d"]:.3f}, at 1e-5 s {fine["rms_d"]:.3f}',
+                f'error {coarse["rms_d"]:.3f}, at 1e-5 s {fine["rms_d"]:.3f}',
                 _estimates(coarse, fine),
             ),
             Verdict(
-                f'F1c {label}',
-                'fuzzy at 1e-3 s does not chatter',
-                fuzzy_hp <= SMOOTH * fine_hp,
-                f'high-passed RMS {fuzzy_hp:.1e}, sign at 1e-5 s {fine_hp:.1e}',
+                f'F1c {label}', 'fuzzy at 1e-3 s does not chatter', smooth <= SMOOTH * chatter,
+                f'high-passed {smooth:.1e}, sign at 1e-5 s {chatter:.1e}',
                 _estimates(fuzzy, fine),
             ),
             Verdict(
-                f'F3 {label}',
-                'adaptation improves fuzzy, and γ moves',
+                f'F3 {label}', 'adaptation improves fuzzy, and γ moves',
                 adaptive['rms_d'] < fuzzy['rms_d'] and abs(adaptive['gamma'] - 0.5) >= MOVED,
-                f'RMS of d {adaptive["rms_d"]:.4f}, without {fuzzy["rms_d"]:.4f}; '
-                f'γ ends at {adaptive["gamma"]:.3f}',
+                f'error {adaptive["rms_d"]:.4f}, without {fuzzy["rms_d"]:.4f}; γ ends at '
+                f'{adaptive["gamma"]:.3f}',
                 _estimates(adaptive, fuzzy),
             ),
-        ]
+        ]  # fmt: skip
     fuzzy, fine = s[FUZZY, HIGH], s[FINE, HIGH]
     result.append(
         Verdict(
-            'F2',
-            'at the high frequency fuzzy is worse than sign',
-            fuzzy['rms_d'] > fine['rms_d'],
-            f'RMS of d {fuzzy["rms_d"]:.3f}, sign at 1e-5 s {fine["rms_d"]:.3f}',
+            'F2', 'at the high frequency fuzzy is worse than sign', fuzzy['rms_d'] > fine['rms_d'],
+            f'error {fuzzy["rms_d"]:.3f}, sign at 1e-5 s {fine["rms_d"]:.3f}',
             _estimates(fuzzy, fine),
         )
-    )
+    )  # fmt: skip
     return sorted(result)
 
 
-class WidthMap(NamedTuple):
-    """
-    Where the findings that depend on the half-widths hold.
-
-    Attributes
-    ----------
-    widths : (K,) array
-        Half-widths of level 1 (rows) and of the later levels (columns).
-    holds : (3, K, K) array of bool
-        F1c, F2, F3 (F1c and F3 at both frequencies).
-
-    """
-
-    widths: NDArray[np.float64]
-    holds: NDArray[np.bool_]
-
-    @property
-    def region(self) -> NDArray[np.bool_]:
-        """Where all hold."""
-        return self.holds.all(axis=0)
-
-    def deepest(self) -> tuple[float, float]:
-        """
-        Return the half-widths furthest inside the region, in cells to its border or the map's.
-
-        Of several equally far inside, in order of level 1 and then of the later levels, the
-        middle one. NaN if there is no region.
-        """
-        inside = np.pad(self.region, 1)
-        depth = np.zeros(inside.shape, dtype=int)
-        while inside.any():
-            depth += inside
-            shrunk = np.zeros_like(inside)
-            shrunk[1:-1, 1:-1] = np.min(
-                [np.roll(inside, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0
-            )[1:-1, 1:-1]
-            inside = shrunk
-        if not depth.any():
-            return float('nan'), float('nan')
-        ties = np.argwhere(depth == depth.max())
-        i, j = ties[len(ties) // 2]
-        return float(self.widths[i - 1]), float(self.widths[j - 1])
+def texts(rows: Iterable[Row]) -> dict[str, str]:
+    """Return the part of the page, from the table of simulations."""
+    scores = scores_by_solver(rows)
+    found = verdicts(scores[choose_solver(scores)])
+    head = ['finding', 'claim', 'holds', 'numbers (RMS error of d; high-passed estimate)']
+    return {'findings': markdown(head, [(v.name, v.claim, v.words, v.numbers) for v in found])}
 
 
 def width_map(
     signs: dict[float, Score], solver: str, every: int, tick: Callable[[], object]
-) -> WidthMap:
+) -> list[Row]:
     """
-    Judge F1c, F2 and F3 at every pair of half-widths.
+    Judge F1c, F2 and F3 at every pair of half-widths: of level 1, and of the later levels.
 
     Parameters
     ----------
@@ -179,22 +152,23 @@ def width_map(
     every : int
         Take every `every`-th of `WIDTHS`.
     tick : callable
-        Called after each row.
+        Called after each half-width of level 1.
 
     """
-    widths = np.array(WIDTHS[::every])
-    holds = np.zeros((3, len(widths), len(widths)), dtype=bool)
-    for i, first in enumerate(widths):
-        for j, later in enumerate(widths):
-            changes = {'fuzzy_widths': [first, later]}
+    rows = []
+    for first in WIDTHS[::every]:
+        for later in WIDTHS[::every]:
             s: Scores = {(COARSE, w): signs[w] for w in FREQUENCIES}  # no part of the map
             s |= {(FINE, w): signs[w] for w in FREQUENCIES}
             for w in FREQUENCIES:
                 for name in (FUZZY, ADAPTIVE):
                     variant, step, _ = OBSERVERS[name]
-                    s[name, w] = score(joint(variant, w, step, solver, **changes))
-            all_verdicts = verdicts(s)
-            for k, part in enumerate(('F1c', 'F2', 'F3')):
-                holds[k, i, j] = all(v.holds for v in all_verdicts if v.name.startswith(part))
+                    found = joint(variant, w, step, solver, fuzzy_widths=[first, later])
+                    s[name, w] = score(found)
+            judged = verdicts(s)
+            row = {'level 1': first, 'later levels': later}
+            for part in ('F1c', 'F2', 'F3'):
+                row[part] = float(all(v.holds for v in judged if v.name.startswith(part)))
+            rows.append(row)
         tick()
-    return WidthMap(widths, holds)
+    return rows
