@@ -7,61 +7,56 @@ from pathlib import Path
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
+from studies import evidence
 from studies.recipes import (
     encoder,
+    figures,
     hidden_force,
     joint_torque,
     motor_load,
-    page,
     sensor_bias,
     wind,
 )
-from studies.recipes.judging import judge
+from studies.recipes.judging import judge, table
 
 RECIPES = {
-    'encoder': encoder,
-    'motor_load': motor_load,
-    'wind': wind,
-    'joint_torque': joint_torque,
-    'sensor_bias': sensor_bias,
-    'hidden_force': hidden_force,
-}
+    'encoder': encoder, 'motor_load': motor_load, 'wind': wind, 'joint_torque': joint_torque,
+    'sensor_bias': sensor_bias, 'hidden_force': hidden_force,
+}  # fmt: skip
+NAME = 'recipes'
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0, 2 for a bad argument or output, 130 if it was interrupted."""
-    return run_command(_parser(), argv, _measure)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog='recipes', description=__doc__)
-    parser.add_argument('recipe', choices=RECIPES, help='which page of docs/ to make anew')
+    parser = argparse.ArgumentParser(prog=NAME, description=__doc__)
+    parser.add_argument('recipe', choices=RECIPES, help='which one to measure anew')
     needs = '; '.join(f'{name}: {r.DATA}' for name, r in RECIPES.items() if r.DATA)
     parser.add_argument('--data', type=Path, metavar='PATH', help=f'recordings ({needs})')
     parser.add_argument(
-        '--short',
-        action='store_true',
+        '--short', action='store_true',
         help='two short simulations by this package, without recordings; writes nothing',
-    )
-    return parser
+    )  # fmt: skip
+    return run_command(parser, argv, _measure)
 
 
 def _measure(arguments: argparse.Namespace, stop: Stop) -> None:
-    recipe = RECIPES[arguments.recipe]
+    name, recipe = arguments.recipe, RECIPES[arguments.recipe]
     if recipe.DATA and not (arguments.short or arguments.data):
         raise ConfigurationError(
-            f'{arguments.recipe}: expected --data PATH ({recipe.DATA}), or --short, got neither'
+            f'{name}: expected --data PATH ({recipe.DATA}), or --short, got neither'
         )
     if arguments.data and not arguments.data.exists():
         raise ConfigurationError(f'--data: expected a path that exists, got {arguments.data}')
     with stop.raising():
-        if arguments.short:
-            folds, remarks = recipe.short(), {}
-        else:
-            folds, remarks = recipe.conditions(arguments.data)
-        results = {name: judge(recipe.METHODS, these) for name, these in folds.items()}
-        print(page.table(results))
-        print(', '.join(f'{name} {value:.4g}' for name, value in remarks.items()))
+        folds, remarks = (
+            (recipe.short(), {}) if arguments.short else recipe.conditions(arguments.data)
+        )
+        results = {condition: judge(recipe.METHODS, these) for condition, these in folds.items()}
+        rows = table(name, results)
+        for row in rows:
+            print(f'{row["condition"]}: {row["method"]}: {row["error"]:.3g} {row["chosen"]}')
+        print(', '.join(f'{quantity} {value:.4g}' for quantity, value in remarks.items()))
         if not arguments.short:
-            for path in page.write(arguments.recipe, recipe, folds, results, remarks):
-                print(path)
+            others = [row for row in evidence.read(NAME) if row['recipe'] != name]
+            drawn = {f'recipe_{name}': figures.draw(recipe, folds, results)}
+            evidence.publish(evidence.DOCS, {NAME: [*others, *rows]}, {}, drawn)

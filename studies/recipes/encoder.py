@@ -24,7 +24,6 @@ from studies.recipes.judging import (
 )
 
 Floats = NDArray[np.float64]
-TITLE = 'velocity and acceleration from an encoder'
 DATA = None
 QUANTITY, SCALE = 'acceleration [rad/s²]', 1.0
 SHOWN, SHOWN_FOLD, BAND = (2.0, 4.0), 0, False
@@ -70,7 +69,6 @@ METHODS = {
     OURS: Method(this_observer),
     FIXED: Method(this_observer, BANDWIDTHS),
 }
-
 DRAWN = ('Savitzky-Golay, causal, degree 3', OURS)
 
 

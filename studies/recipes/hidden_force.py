@@ -24,7 +24,6 @@ from studies.recipes.judging import (
 )
 
 Floats = NDArray[np.float64]
-TITLE = 'hidden force on an oscillator'
 DATA = 'SNLS80mV.csv of Silverbox'
 QUANTITY, SCALE = 'V1 [V]', 1.0 / 186_024.0
 SHOWN, SHOWN_FOLD, BAND = (5.0, 5.12), 0, False
@@ -93,7 +92,6 @@ METHODS = {
     OURS: Method(self_tuning),
     LAGGING: Method(lagging),
 }
-
 DRAWN = ('disturbance observer', LAGGING)
 
 
@@ -125,11 +123,8 @@ def recorded(name: str, y: Floats, d: Floats) -> Recorded:
 
 
 def short() -> dict[str, list[Fold]]:
-    """Return a fold of two short simulated recordings of the file's own oscillator."""
+    """Return a fold of two short simulations of the file's own oscillator."""
     p = model('hidden_force')
-    family = p | {
-        'duration': 1.5, 'sample_rate': 1 / PERIOD, 'initial_state': 0.0, 'noise_std': 1e-5,
-        'rms_of_d': 4000.0, 'band_of_d': [60.0, 600.0], 'disturbances': ['sines'],
-    }  # fmt: skip
-    both = [recorded(r.name, r.y, r.d) for r in simulated(family, SETTLED, 2)]
-    return {'simulated': [Fold(p, both[:1], both[1:])]}
+    both = simulated(p, 2, 1 / PERIOD, 1e-5, (4000.0, 200.0), seconds=1.5)
+    first, second = (recorded(r.name, r.y, r.d) for r in both)
+    return {'simulated': [Fold(p, [first], [second])]}

@@ -8,7 +8,6 @@ from typing import Any
 from fhaosmo_ros.tools.bags.reader import BagReader
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
 from scipy.signal import butter, filtfilt, savgol_filter
 from studies.recipes import peers
 from studies.recipes.judging import (
@@ -20,10 +19,10 @@ from studies.recipes.judging import (
     OURS,
     Recorded,
     self_tuning,
+    simulated,
 )
 
 Floats = NDArray[np.float64]
-TITLE = 'torque at a joint'
 DATA = 'bag of the pendubot'
 QUANTITY, SCALE = 'torque at the shoulder [N m]', 1.0
 SHOWN, SHOWN_FOLD, BAND = (0.5, 4.7), 0, False
@@ -146,7 +145,6 @@ METHODS = {
     FIXED: Method(this_observer_fixed, BANDWIDTHS),
     OURS: Method(this_observer),
 }
-
 DRAWN = ('momentum observer', FIXED, OURS)
 
 
@@ -168,36 +166,11 @@ def cut(r: Recorded, part: slice) -> Recorded:
 
 
 def short() -> dict[str, list[Fold]]:
-    """Return a fold of two simulations of the file's own robot, 3 s each."""
+    """Return a fold of two short simulations of the shoulder, below an elbow that is moved."""
     p = model('joint_torque')
-    both = [simulated(p, seed) for seed in (1, 2)]
+    inputs = (-1.57, 0.1), (0.0, 0.1), (0.0, 0.5)
+    both = [
+        r._replace(d=r.d * inertia(p, r))
+        for r in simulated(p, 2, RATE, 0.02, (20.0, 6.0), inputs, SETTLED, 4.0)
+    ]
     return {'simulated': [Fold(p, both[:1], both[1:])]}
-
-
-def simulated(p: Mapping[str, Any], seed: int) -> Recorded:
-    """Return a recording of both links under a torque that holds the arm and shakes it."""
-    c = {name.partition('.')[2]: x for name, x in p.items() if name.startswith('constants.')}
-    shoulder, rng = peers.model_of(p), np.random.default_rng(seed)
-    size, rate, phase = rng.uniform([[0.05], [3.0], [0.0]], [[0.15], [12.0], [6.3]], (3, 4))
-
-    def torque(t: Floats, angle: Floats, speed: Floats) -> Floats:
-        shaken = (size * np.sin(np.multiply.outer(t, rate) + phase)).sum(axis=-1)
-        result: Floats = shaken - 2.0 * (angle + 1.57) - 0.1 * speed
-        return result
-
-    def rates(t: float, x: Floats) -> list[float]:
-        angle, speed, elbow, elbow_speed = x
-        held = c['p'] - c['r'] * np.cos(elbow) ** 2
-        known = shoulder.evaluate(np.array([speed]), np.array([angle, elbow, elbow_speed]))[0]
-        acceleration = known + float(torque(t, angle, speed)) / held
-        absolute = -c['r'] / c['h'] * (
-            np.cos(elbow) * acceleration + np.sin(elbow) * speed**2
-        ) - c['k'] * np.cos(angle + elbow)
-        return [speed, acceleration, elbow_speed, absolute - acceleration]
-
-    t = np.arange(0.0, 3.0, 1.0 / RATE)
-    found = solve_ivp(rates, (0.0, 3.0), [-1.3, 0.0, 0.3, 0.0], t_eval=t, rtol=1e-6).y
-    angle, speed, elbow, elbow_speed = found
-    u = np.column_stack([angle, elbow, elbow_speed])
-    y = speed + 0.02 * rng.standard_normal(len(t))
-    return Recorded(f'simulated {seed}', t, y, u, torque(t, angle, speed), t > SETTLED)

@@ -5,11 +5,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core import Family, OnlineEstimator, Trajectory
+from fhaosmo_ros.core import OnlineEstimator, Trajectory, TriangularModel
 from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.simulation.plant import respond
 import numpy as np
 from numpy.typing import NDArray
+from studies.evidence import Row
 from studies.model import model_alone, SELF_TUNING
+from studies.waves import wave
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'recipes'
 OURS, FIXED = 'this observer, self-tuning', 'this observer, fixed gains'
@@ -124,9 +128,21 @@ def error(pairs: Sequence[tuple[Recorded, Floats]]) -> float:
     return float(np.sqrt(wrong / size))
 
 
-def judge(methods: Mapping[str, Method], folds: Sequence[Fold]) -> dict[str, dict[str, Any]]:
+class Judged(NamedTuple):
+    """The error of a method, and the numbers that were chosen for it, one a fold."""
+
+    error: float
+    chosen: list[float]
+    unit: str
+
+
+Results = Mapping[str, Mapping[str, Judged]]
+"""By condition and method."""
+
+
+def judge(methods: Mapping[str, Method], folds: Sequence[Fold]) -> dict[str, Judged]:
     """
-    Return the error of each method by name, in total and of each recording, and what was chosen.
+    Return the error of each method over all recordings, and what was chosen.
 
     A method's number is the one with the least error on the training recordings of a fold.
     """
@@ -141,21 +157,45 @@ def judge(methods: Mapping[str, Method], folds: Sequence[Fold]) -> dict[str, dic
                     for number in method.numbers
                 }
                 best = min(scores, key=scores.__getitem__)
-            chosen.append(float(f'{best:.4g}'))
+                chosen.append(float(f'{best:.4g}'))
             pairs += [(r, method.estimate(p, r, best)) for r in judged]
-        found[name] = {
-            'error': float(f'{error(pairs):.4g}'),
-            'recordings': {r.name: float(f'{error([(r, d)]):.4g}') for r, d in pairs},
-            'chosen': chosen if len(method.numbers) > 1 else [],
-            'unit': method.unit,
-        }
+        found[name] = Judged(float(f'{error(pairs):.4g}'), chosen, method.unit)
     return found
 
 
-def simulated(family: Mapping[str, Any], settled: float, count: int = 4) -> list[Recorded]:
-    """Return recordings of the package's own simulation, for a run without foreign data."""
-    found = []
-    for k, r in enumerate(Family(family).recordings(count)):
-        u = np.asarray(r.u, dtype=np.float64).reshape(len(r.t), -1)
-        found.append(Recorded(f'simulated {k + 1}', r.t, r.y, u, r.d, r.t > settled))
+def table(recipe: str, results: Results) -> list[Row]:
+    """Return a line for each condition and method."""
+    return [
+        {
+            'recipe': recipe, 'condition': condition, 'method': method, 'error': row.error,
+            'chosen': ' '.join(f'{x:g}' for x in row.chosen),
+            'unit': row.unit if row.chosen else '',
+        }
+        for condition, found in results.items()
+        for method, row in found.items()
+    ]  # fmt: skip
+
+
+def simulated(
+    parameters: Mapping[str, Any], count: int, rate: float, noise: float, d: tuple[float, float],
+    inputs: Sequence[tuple[float, float]] = (), settled: float = 1.0, seconds: float = 8.0,
+) -> list[Recorded]:  # fmt: skip
+    """
+    Simulate the model that the parameters describe, for a run without foreign data.
+
+    `d` has the RMS of the unknown input and its speed (rad/s), `inputs` mean and RMS of each
+    known one; what is judged begins `settled` seconds after the start.
+    """
+    model, found = TriangularModel.of(ESTIMATOR_PARAMETERS.complete(parameters)), []
+    t = np.arange(0.0, seconds, 1.0 / rate)
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        force = d[0] * wave('sine', t, d[1], rng)
+        u = np.zeros((len(t), max(1, len(inputs))))
+        for column, (mean, size) in zip(u.T, inputs, strict=False):
+            column[:] = mean + size * wave('sine', t, 2.0, rng)
+        z, truth = respond(model, 0.0, t, force, 1.0 / rate, u, step=0.5 / rate)
+        y = z[:, 0] + noise * rng.standard_normal(len(t))
+        known = u if inputs else u[:, :0]
+        found.append(Recorded(f'simulated {seed + 1}', t, y, known, truth, t > settled))
     return found

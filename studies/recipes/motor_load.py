@@ -22,7 +22,6 @@ from studies.recipes.judging import (
 )
 
 Floats = NDArray[np.float64]
-TITLE = 'load of a servo'
 DATA = 'folder with the JSON files of one XL330 of BAM'
 QUANTITY, SCALE = 'load torque [N m]', 0.00732
 """Inertia (kg m²): mass * g * lever over the identified weight."""
@@ -39,8 +38,6 @@ METHODS = {
     FIXED: Method(fixed, BANDWIDTHS),
     OURS: Method(self_tuning),
 }
-
-
 DRAWN = ('disturbance observer', OURS)
 
 
@@ -106,16 +103,8 @@ def conditions(data: Path) -> tuple[dict[str, list[Fold]], dict[str, float]]:
 
 
 def short() -> dict[str, list[Fold]]:
-    """Return a fold of two short simulated recordings of the file's own motor."""
+    """Return a fold of two short simulations of the file's own motor."""
     p = model('motor_load')
-    family = {
-        'order': 2, 'phi': ['0', '10.4*u - 4.6*z2 - 3.9*tanh(z2/0.3)'], 'duration': 4.0,
-        'sample_rate': 190.0, 'initial_state': 0.0, 'quantisation': 2 * np.pi / 4096,
-        'noise_std': 0.0, 'rms_of_d': 25.0, 'band_of_d': [2.0, 12.0], 'disturbances': ['sines'],
-        'rms_of_u': 2.0,
-    }  # fmt: skip
-    both = [
-        r._replace(u=np.column_stack([r.u[:, 0], np.ones(len(r.t))]))
-        for r in simulated(family, SETTLED, 2)
-    ]
+    inputs = (0.0, 2.0), (1.0, 0.0)
+    both = simulated(p, 2, 190.0, 4e-4, (25.0, 6.0), inputs, SETTLED, 4.0)
     return {'simulated': [Fold(p, both[:1], both[1:])]}

@@ -11,7 +11,6 @@ from studies.recipes.flight import fly, gusts
 from studies.recipes.judging import Fold, Method, model, OURS, Recorded, self_tuning, simulated
 
 Floats = NDArray[np.float64]
-TITLE = 'bias of a gyroscope'
 DATA = None
 QUANTITY, SCALE = 'bias [rad/s]', -1.0
 SHOWN, SHOWN_FOLD, BAND = (0.0, 60.0), 0, True
@@ -27,7 +26,6 @@ METHODS = {
     'Kalman filter, bias a random walk': Method(peers.kalman_filter, BANDWIDTHS),
     OURS: Method(self_tuning),
 }
-
 DRAWN = ('complementary filter', OURS)
 
 
@@ -59,13 +57,7 @@ def conditions(_: Path | None) -> tuple[dict[str, list[Fold]], dict[str, float]]
 
 def short() -> dict[str, list[Fold]]:
     """Return a fold of two short simulations of the model alone."""
-    family = {
-        'order': 1, 'phi': ['u'], 'duration': 8.0, 'sample_rate': 100.0, 'initial_state': 0.0,
-        'noise_std': 3.5e-3, 'rms_of_d': 0.05, 'band_of_d': [0.1, 0.3], 'disturbances': ['sines'],
-        'rms_of_u': 0.5,
-    }  # fmt: skip
-    both = [
-        r._replace(u=np.column_stack([0.0 * r.u, r.u, np.zeros((len(r.t), 2))]))
-        for r in simulated(family, 2.0, 2)
-    ]
-    return {'simulated': [Fold(model('sensor_bias'), both[:1], both[1:])]}
+    p = model('sensor_bias')
+    inputs = (0.0, 0.3), (0.0, 0.5), (0.0, 0.2), (0.0, 0.2)
+    both = simulated(p, 2, 100.0, 3.5e-3, (0.05, 0.2), inputs, 2.0)
+    return {'simulated': [Fold(p, both[:1], both[1:])]}

@@ -20,7 +20,6 @@ from studies.recipes.judging import (
 )
 
 Floats = NDArray[np.float64]
-TITLE = 'wind on a multirotor'
 DATA = None
 QUANTITY, SCALE = 'wind along the axis [m/s]', 2.237
 SHOWN, SHOWN_FOLD, BAND = (3.0, 23.0), 0, True
@@ -36,7 +35,6 @@ METHODS = {
     FIXED: Method(fixed, BANDWIDTHS),
     OURS: Method(self_tuning),
 }
-
 DRAWN = ('low-passed second difference less thrust', OURS)
 
 
@@ -70,10 +68,5 @@ def conditions(_: Path | None) -> tuple[dict[str, list[Fold]], dict[str, float]]
 def short() -> dict[str, list[Fold]]:
     """Return a fold of two short simulations of the model alone."""
     p = model('wind')
-    family = {
-        'order': 2, 'phi': ['0', f'u - {p["constants.k"]}*z2'], 'duration': 8.0,
-        'sample_rate': 100.0, 'initial_state': 0.0, 'noise_std': 3.5e-3, 'rms_of_d': 1.5,
-        'band_of_d': [0.3, 3.0], 'disturbances': ['sines'],
-    }  # fmt: skip
-    both = simulated(family, SETTLED, 2)
+    both = simulated(p, 2, 100.0, 3.5e-3, (1.5, 1.0), [(0.0, 1.0)], SETTLED)
     return {'simulated': [Fold(p, both[:1], both[1:])]}
