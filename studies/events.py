@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-`python -m studies.events` makes the numbers and the figure of docs/events.md: delay, false alarms.
+`python -m studies.events` measures how late events are, and how many are false alarms.
 
 A joint, z1' = z2, z2' = -z2 + d, whose angle is measured at 100 Hz. d is a small load that is
 always there, and faults are added to it: steps of 1 for 2 s. False alarms are counted over ten
@@ -12,9 +12,8 @@ recordings.
 
 import argparse
 from collections.abc import Callable, Sequence
-from pathlib import Path
 import sys
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fhaosmo_ros.core import EventDetector, Observer
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
@@ -26,10 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter, ss2tf
-from studies.document import refill
+from studies import evidence
+from studies.evidence import Row
 from studies.model import SELF_TUNING
 
-PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'events.md'
+NAME = 'events'
 H, NOISE, LOAD, FAULT, LASTS, EVERY, SETTLED = 0.01, 1e-3, 0.05, 1.0, 2.0, 20.0, 60.0
 HOURS = 10.0
 MODEL = {'order': 2, 'phi': ['0', '-z2']}
@@ -38,8 +38,6 @@ THRESHOLDS = np.geomspace(0.08, 0.9, 14)
 DEVIATIONS, DURATION = 5.0, 0.03
 FACTORS, NEVER = (1.0, 3.0), 0.05
 INTENSITIES = np.geomspace(1e-3, 1e1, 9)
-PRINTED = (5, 8, 11, 13)
-"""Of the thresholds: those in the table."""
 FILTER, OURS = 'Kalman filter', 'self-tuning'
 Array = NDArray[np.float64]
 Estimates = tuple[Array, Array]
@@ -157,87 +155,42 @@ def tuned_intensity(hours: float) -> float:
     ))  # fmt: skip
 
 
-def measure(hours: float) -> dict[str, Any]:
-    """
-    Return what the page shows.
-
-    Returns
-    -------
-    dict
-        `hours`; `intensity` of d, as told to the filter; `points` by the factor on the noise and
-        by the name of the estimator: of each threshold the fields of `Point`, None for a delay
-        that is infinite.
-
-    """
+def measure(hours: float) -> list[Row]:
+    """Return a line for each factor on the noise, estimator and threshold."""
     intensity = tuned_intensity(0.1 * hours)
     ways: dict[str, tuple[Callable[[Array], Estimates], float]] = {
         FILTER: (lambda y: kalman(y, intensity), 0.0),
         OURS: (self_tuning, DEVIATIONS),
     }
-    points: dict[str, dict[str, Any]] = {}
+    rows = []
     for factor in FACTORS:
-        noise, found = factor * NOISE, points.setdefault(f'{factor:g}', {})
+        noise = factor * NOISE
         quiet, faulty = record(hours, 1, noise), record(0.1 * hours, 2, noise, faults=True)
         for name, (way, deviations) in ways.items():
-            of_way = curve(way(quiet.y), way(faulty.y), faulty.faults, deviations)
-            found[name] = [
-                [float(f'{x:.6g}') if np.isfinite(x) else None for x in point] for point in of_way
+            told = intensity if name == FILTER else None
+            rows += [
+                {'noise': noise, 'estimator': name, 'intensity': told} | point._asdict()
+                for point in curve(way(quiet.y), way(faulty.y), faulty.faults, deviations)
             ]
-    return {'hours': hours, 'intensity': float(f'{intensity:.4g}'), 'points': points}
+    return rows
 
 
-def points_of(results: dict[str, Any], factor: float, name: str) -> list[Point]:
+def points_of(rows: Sequence[Row], factor: float, name: str) -> list[Point]:
     """Return the points of an estimator at the noise times a factor."""
-    rows = results['points'][f'{factor:g}'][name]
-    return [Point(*(np.inf if x is None else x for x in row)) for row in rows]
+    return [
+        Point(*(row[field] for field in Point._fields))
+        for row in rows
+        if row['estimator'] == name and round(row['noise'] / NOISE, 3) == factor
+    ]
 
 
-def texts(results: dict[str, Any]) -> dict[str, str]:
-    """Return the generated parts of the page."""
-    cells = [(factor, name) for factor in FACTORS for name in (FILTER, OURS)]
-    heads = [name if f == 1.0 else f'noise × {f:g}: {name}' for f, name in cells]
-    lines = ['| threshold | ' + ' | '.join(heads) + ' |', '|---' * (1 + len(cells)) + '|']
-    curves = {cell: points_of(results, *cell) for cell in cells}
-    for k in PRINTED:
-        row = ' | '.join(_words(curves[cell][k]) for cell in cells)
-        lines.append(f'| {THRESHOLDS[k]:.2g} | {row} |')
-    told, changed = FACTORS
-    chosen = {name: best(curves[told, name]) for name in (FILTER, OURS)}
-    lines += ['', 'The least median delay with at most one false alarm an hour:', '']
-    for name, point in chosen.items():
-        kept = next(p for p in curves[changed, name] if p.threshold == point.threshold)
-        anew = best(curves[changed, name])
-        lines.append(
-            f'- {name}, threshold {point.threshold:.2g}: {_sentence(point)}. With {changed:g} '
-            f'times the noise and nothing changed: {_sentence(kept)}. With the threshold that is '
-            f'best then, {anew.threshold:.2g}: {_sentence(anew)}.'
-        )
-    return {'results': '\n'.join(lines)}
-
-
-def _false(point: Point) -> str:
-    return f'{point.false:.1f}' if 0.0 < point.false < 10.0 else f'{point.false:,.0f}'
-
-
-def _words(point: Point) -> str:
-    late = f'{point.delay:.2f} s' if np.isfinite(point.delay) else 'not found'
-    return f'{_false(point)}, {late}'
-
-
-def _sentence(point: Point) -> str:
-    return (
-        f'{_false(point)} false alarms an hour, {point.delay:.2f} s, '
-        f'{100.0 * point.found:.0f} % found'
-    )
-
-
-def draw(results: dict[str, Any]) -> Figure:
+def draw(rows: Sequence[Row]) -> Figure:
     """Draw the delay over the false alarms, a panel for each noise."""
     figure = Figure(figsize=(9.5, 4.2), layout='constrained')
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     for factor, axes in zip(FACTORS, panels, strict=True):
         for k, name in enumerate((FILTER, OURS)):
-            shown = [p for p in points_of(results, factor, name) if p.found > 0.9]
+            shown = [p for p in points_of(rows, factor, name) if p.found > 0.9]
             axes.plot(
                 [max(p.false, NEVER) for p in shown], [p.delay for p in shown], 'o-',
                 color=COLOURS[k], markersize=4, label=name,
@@ -245,7 +198,7 @@ def draw(results: dict[str, Any]) -> Figure:
         title = f'noise of {factor * NOISE:g} rad'
         axes.set_title(title + (', nothing told' if factor > 1.0 else ''))
         axes.set_xscale('log')
-        axes.set_xlabel(f'false alarms an hour (leftmost: none in {results["hours"]:g} hours)')
+        axes.set_xlabel(f'false alarms an hour (leftmost: none in {HOURS:g} hours)')
         axes.grid(alpha=0.3)
     panels[0].set_ylabel('median delay [s]')
     panels[0].set_ylim(0.0, None)
@@ -258,9 +211,8 @@ def main(argv: list[str] | None = None) -> int:
 
     def body(_: argparse.Namespace, stop: Stop) -> None:
         with stop.raising():
-            results = measure(HOURS)
-            for path in refill(PAGE, texts(results), draw(results), results):
-                print(path)
+            rows = evidence.rounded(measure(HOURS))
+            evidence.publish(evidence.DOCS, {NAME: rows}, {}, {NAME: draw(rows)})
 
     return run_command(argparse.ArgumentParser(prog='events', description=__doc__), argv, body)
 
