@@ -8,7 +8,7 @@ from time import monotonic, perf_counter, sleep
 from typing import Any
 
 from fhaosmo_ros.tools.cli import processes
-from table import CannotMeasureError
+from results import CannotMeasureError
 
 ROOT = Path(__file__).parents[1]
 POLL = 0.002

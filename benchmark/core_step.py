@@ -14,8 +14,8 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 import numpy as np
 from reference import assert_agreement, CASE, compile_reference, in_c, in_core, output, PERIOD
+from results import CannotMeasureError, Row
 from studies.model import model_alone, SELF_TUNING
-from table import CannotMeasureError, Row
 from tqdm import tqdm
 
 BAR = 1.1
@@ -26,39 +26,30 @@ SCHEMES = ('explicit', 'implicit')
 MODELS = Path(__file__).parents[1] / 'config' / 'models'
 SELF_TUNING_BARS = {'paper_plant': 12.0, 'dc_motor': 12.0, 'pendulum': 100.0}
 """Microseconds a step, of files in `MODELS`."""
-LENGTH, WINDOW = 300, 30
-"""Seconds of a run at 1 kHz, and of its beginning and its end."""
+LENGTH = 30
+"""Seconds of a run at 1 kHz."""
 NOISE = 1e-4
 """Of y, where the file has no quantum."""
 
 
 def measure(quick: bool) -> list[Row]:
-    """Return the ratio to C, and nanoseconds a step of every variant and scheme."""
+    """Return the ratio to C, and the time of a step of every variant and scheme."""
     samples, rounds, calls = (40_000, 5, 2_000) if quick else (400_000, 15, 20_000)
     y = output(samples + 1)
-    total = rounds + len(VARIANTS) * len(SCHEMES) + len(SCHEMES) + 1 + len(SELF_TUNING_BARS)
-    with tqdm(total=total, desc='core', unit='round', leave=False) as progress:
-        rows = [_against_c(y, rounds, progress)]
-        for variant, scheme in product(VARIANTS, SCHEMES):
-            step = in_core(CASE | {'variant': variant, 'scheme': scheme}, y)
-            step()
-            best = min(_seconds(step) for _ in range(3)) / samples
-            rows.append(Row(f'core step, {variant}, {scheme}', best * 1e9, 'ns'))
-            progress.update()
-        rows.append(_recorded(y))
-        progress.update()
-        for scheme in SCHEMES:
-            rows.append(
-                _live(CASE | {'scheme': scheme}, y[:calls], None if quick else CALLS[scheme])
-            )
-            progress.update()
-        for model, bar in SELF_TUNING_BARS.items():
-            rows += _self_tuning(model, None if quick else bar, 5 if quick else LENGTH)
-            progress.update()
+    rows = [_against_c(y, rounds)]
+    for variant, scheme in tqdm([*product(VARIANTS, SCHEMES)], desc='core', leave=False):
+        step = in_core(CASE | {'variant': variant, 'scheme': scheme}, y)
+        step()
+        best = min(_seconds(step) for _ in range(3)) / samples
+        rows.append(Row(f'core step, {variant}, {scheme}', best * 1e9, 'ns'))
+    for scheme, bar in CALLS.items():
+        rows.append(_live(CASE | {'scheme': scheme}, y[:calls], None if quick else bar))
+    for model, bar in SELF_TUNING_BARS.items():
+        rows.append(_self_tuning(model, None if quick else bar, 5 if quick else LENGTH))
     return rows
 
 
-def _against_c(y: np.ndarray, rounds: int, progress: tqdm) -> Row:
+def _against_c(y: np.ndarray, rounds: int) -> Row:
     name, samples = 'core step / same step in C (-O3)', len(y) - 1
     try:
         with TemporaryDirectory() as folder:
@@ -66,7 +57,6 @@ def _against_c(y: np.ndarray, rounds: int, progress: tqdm) -> Row:
         assert_agreement(library, y)
     except CannotMeasureError as error:
         tqdm.write(f'core: {error}')
-        progress.update(rounds)
         return Row(name, None, bar=BAR, note=str(error))
     except AssertionError as error:
         reason = ' '.join(str(error).split())
@@ -75,7 +65,6 @@ def _against_c(y: np.ndarray, rounds: int, progress: tqdm) -> Row:
     times = np.empty((rounds, 2))
     for k in range(rounds):
         times[k] = _seconds(ours), _seconds(c)
-        progress.update()
     times *= 1e9 / samples
     median, best = np.median(times, axis=0), times.min(axis=0)
     note = (
@@ -83,13 +72,6 @@ def _against_c(y: np.ndarray, rounds: int, progress: tqdm) -> Row:
         f'{best[0]:.1f} / {best[1]:.1f} ns min ({best[0] / best[1]:.2f})'
     )
     return Row(name, float(np.median(times[:, 0] / times[:, 1])), bar=BAR, note=note)
-
-
-def _recorded(y: np.ndarray) -> Row:
-    t = np.arange(len(y)) * PERIOD
-    seconds = min(_seconds(lambda: Observer(CASE).run(t, y)) for _ in range(3))
-    note = 'fuzzy_adaptive, explicit; every sample recorded, arrays made included'
-    return Row('Observer.run, per sample', seconds / len(y) * 1e9, 'ns', note=note)
 
 
 def _live(parameters: dict[str, Any], y: np.ndarray, bar: float | None) -> Row:
@@ -106,32 +88,21 @@ def _live(parameters: dict[str, Any], y: np.ndarray, bar: float | None) -> Row:
     return Row(name, seconds / len(samples) * 1e6, 'us', bar, 'fuzzy_adaptive')
 
 
-def _self_tuning(model: str, bar: float | None, length: int) -> list[Row]:
-    """Return microseconds a step at the beginning of a recording and at its end."""
+def _self_tuning(model: str, bar: float | None, length: int) -> Row:
+    """Return microseconds a step of a recording."""
     path = MODELS / f'{model}.yaml'
     plant = {k: v for k, v in load(path, 'plant').items() if k in PLANT_PARAMETERS}
     noise = {} if plant.get('quantisation') else {'noise_std': NOISE}
     t = np.arange(round(length / PERIOD)) * PERIOD
     y = Plant(plant | noise).simulate(t).y
     stamps = 10**9 + np.round(t * 1e9).astype(np.int64)
-    found = load(path, 'estimator')
-    told = model_alone(found) | SELF_TUNING
+    told = model_alone(load(path, 'estimator')) | SELF_TUNING
     estimator = OnlineEstimator(told)
-    parts = np.array_split(np.arange(len(t)), max(2, length // WINDOW))
-    spent = []
-    for part in parts:
-        begin = process_time()
-        estimator.run(stamps[part], y[part])
-        spent.append(1e6 * (process_time() - begin) / len(part))
-    seconds = length / len(parts)
-    states = f'{told["order"]} states; 1 kHz, stamps exact'
-    return [
-        Row(f'step, self-tuning, {model}, {when}', value, 'us', bar, note)
-        for when, value, note in (
-            ('at first', spent[0], f'first {seconds:g} s; {states}'),
-            ('later', spent[-1], f'last {seconds:g} s of {length} s'),
-        )
-    ]
+    begin = process_time()
+    estimator.run(stamps, y)
+    spent = 1e6 * (process_time() - begin) / len(y)
+    note = f'{length} s at 1 kHz; {told["order"]} states'
+    return Row(f'step, self-tuning, {model}', spent, 'us', bar, note)
 
 
 def _seconds(run: Callable[[], object]) -> float:

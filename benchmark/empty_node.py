@@ -8,7 +8,6 @@ middleware's.
 """
 
 import argparse
-import contextlib
 import gc
 import signal
 import threading
@@ -20,7 +19,6 @@ from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.nodes.middleware.subscription import SENSOR_QOS, subscribe_with_info
 import numpy as np
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
@@ -38,14 +36,13 @@ class EmptyNode(Node):
     ----------
     rate : float
         Rate of the timer, in Hz; 0: publish on each sample.
-    name : str
     joints : int
         0: a Float64 on ``y``. Else so many joints of a JointState, with the messages of each.
 
     """
 
-    def __init__(self, rate: float, name: str, joints: int = 0) -> None:
-        super().__init__(name)
+    def __init__(self, rate: float, joints: int = 0) -> None:
+        super().__init__('empty_node')
         self._count = 0
         self._latest = 0
         self._stamp, self._joint_states = Time(), joint_state(max(joints, 1))
@@ -101,17 +98,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description='A node that computes nothing.')
     parser.add_argument('--rate', type=float, default=100.0, help='of the timer; 0: on samples')
     parser.add_argument('--joints', type=int, default=0, help='of a JointState instead of y')
-    parser.add_argument('--plain', action='store_true', help='spin with rclpy.spin')
     arguments = parser.parse_args()
     ended = threading.Event()
-    if arguments.plain:
-        rclpy.init()
-        with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-            rclpy.spin(EmptyNode(arguments.rate, 'plain'))
-        return
     signal.signal(signal.SIGINT, lambda *_: ended.set())
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = EmptyNode(arguments.rate, 'empty_node', arguments.joints)
+    node = EmptyNode(arguments.rate, arguments.joints)
     gc.collect()
     gc.freeze()  # as run_node does
     with Spinner(node, on_end=ended.set):

@@ -18,7 +18,7 @@ from fhaosmo_ros.core.observer.status import LEVEL_SHIFT
 from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np
 from numpy.typing import NDArray
-from table import CannotMeasureError
+from results import CannotMeasureError
 
 SOURCE = Path(__file__).with_name('reference.c')
 OPTIONS = ('-O3', '-shared', '-fPIC', f'-DLEVEL_SHIFT={LEVEL_SHIFT}')

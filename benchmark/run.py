@@ -2,7 +2,7 @@
 """
 Measure speed as ratios within one run, and say which bars are met (`make bench`).
 
-With `--page`, docs/speed.md is written anew, each part as soon as it is measured.
+With `--page`, docs/evidence/speed.csv is written anew, each part as soon as it is measured.
 
 Exit code 0 if all bars are met, 1 if one is missed, 130 after Ctrl-C.
 """
@@ -11,21 +11,15 @@ import argparse
 import signal
 import sys
 
-import channels
 import core_step
-import page
-import rates
+import node
 import replay
-import startup
-from table import CannotMeasureError, render, Row, Table
+from results import CannotMeasureError, machine, publish, render, Row
 
 PARTS = {
     'core': core_step.measure,
-    'rates': rates.measure,
-    'joints': rates.joints,
-    'self_tuning': rates.self_tuning,
-    'channels': channels.measure,
-    'startup': startup.measure,
+    'node': node.measure,
+    'startup': node.startup,
     'replay': replay.measure,
 }
 
@@ -37,42 +31,34 @@ def main(argv: list[str] | None = None) -> int:
         '--quick', action='store_true', help='small sizes, and missed bars do not fail'
     )
     parser.add_argument('--only', choices=PARTS, help='one part only')
-    parser.add_argument('--page', action='store_true', help='write the tables in docs/ anew')
+    parser.add_argument('--page', action='store_true', help='write the table in docs/ anew')
     arguments = parser.parse_args(argv)
     if arguments.page and arguments.quick:
         parser.error('--page shows full measurements: expected no --quick, got --quick')
     # A job in the background starts with SIGINT ignored; SIGTERM must end the children as well.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    results: list[Row | Table] = []
-    where = page.machine()
+    rows: list[Row] = []
+    where = machine()
     try:
         for part in [arguments.only] if arguments.only else PARTS:
-            results += _measure(part, arguments.quick, arguments.page)
+            try:
+                found = PARTS[part](arguments.quick)
+            except CannotMeasureError as error:
+                print(f'{part}: {error}', file=sys.stderr)
+                found = [Row(part, None, bar=0.0, note=str(error))]
+            else:
+                if arguments.page:
+                    publish(part, found, where)
+            rows += found
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)
         return 130
-    rows = [result for result in results if isinstance(result, Row)]
     print(f'{where}\n\n{render(rows)}')
-    for table in results:
-        if isinstance(table, Table):
-            print(f'\n{table.render()}')
     missed = [row.name for row in rows if row.missed]
     if missed:
         print(f'\n{len(missed)} of the bars missed: {"; ".join(missed)}')
     return 1 if missed and not arguments.quick else 0
-
-
-def _measure(part: str, quick: bool, to_page: bool) -> list[Row | Table]:
-    where = page.machine()
-    try:
-        results = PARTS[part](quick)
-    except CannotMeasureError as error:
-        print(f'{part}: {error}', file=sys.stderr)
-        return [Row(part, None, bar=0.0, note=str(error))]
-    if to_page:
-        page.write({part: page.part(results, where)})
-    return results
 
 
 if __name__ == '__main__':

@@ -1,38 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A client that changes the estimator's parameters, well and badly, and resets it."""
+"""A client of a soak that changes the estimator's parameters, well and badly, and resets it."""
 
 from collections import Counter
 from time import monotonic, sleep
 from typing import Any
 
 from fhaosmo_ros.nodes.recording.private_node import PrivateNode
+from rcl_interfaces.msg import Parameter as ParameterMessage
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
+from results import CannotMeasureError
 from std_srvs.srv import Trigger
-from table import CannotMeasureError
 
 GOOD = (
-    {'variant': 'sign'},
-    {'variant': 'fuzzy'},
-    {'variant': 'fuzzy_adaptive'},
-    {'scheme': 'explicit', 'variant': 'fuzzy'},
-    {'scheme': 'implicit'},
-    {'lambda': [15.0], 'alpha': [30.0]},
-    {'epsilon': 0.5},
-    {'publish_rate': 250.0},
-    {'estimate_from': 'filtered'},
-    {'gamma_rate': 4.0, 'gamma_min': 0.4, 'gamma_max': 0.6},
-)
+    {'variant': 'sign'}, {'variant': 'fuzzy'}, {'variant': 'fuzzy_adaptive'},
+    {'scheme': 'explicit', 'variant': 'fuzzy'}, {'scheme': 'implicit'},
+    {'lambda': [15.0], 'alpha': [30.0]}, {'epsilon': 0.5}, {'publish_rate': 250.0},
+    {'estimate_from': 'filtered'}, {'gamma_rate': 4.0, 'gamma_min': 0.4, 'gamma_max': 0.6},
+)  # fmt: skip
 BAD = (
-    {'variant': 'fuzy'},
-    {'lambda': [-1.0]},
-    {'alpha': [1.0, 2.0]},
-    {'epsilon': float('nan')},
-    {'gamma_min': 0.9, 'gamma_max': 0.2},
-    {'order': 7},
-    {'publish_rate': 0.0},
+    {'variant': 'fuzy'}, {'lambda': [-1.0]}, {'alpha': [1.0, 2.0]}, {'epsilon': float('nan')},
+    {'gamma_min': 0.9, 'gamma_max': 0.2}, {'order': 7}, {'publish_rate': 0.0},
     {'no_such_parameter': 1.0},
-)
+)  # fmt: skip
 ANSWERED = 10.0
 """Seconds that an answer may take."""
 
@@ -50,7 +40,6 @@ class SoakClient(PrivateNode):
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._turn: Counter[str] = Counter()
         super().__init__('soak_client')
         self._parameters = AsyncParameterClient(self.node, '/estimator')
         self._reset = self.node.create_client(Trigger, '/estimator/reset')
@@ -63,12 +52,12 @@ class SoakClient(PrivateNode):
             raise CannotMeasureError("the estimator's parameter services did not appear")
         answer = self._wait(self._parameters.get_parameters(names))
         for name, value in zip(names, answer.values, strict=True):
-            self._base[name] = Parameter.from_parameter_msg(_message(name, value)).value
+            message = ParameterMessage(name=name, value=value)
+            self._base[name] = Parameter.from_parameter_msg(message).value
 
     def call(self, kind: str) -> None:
-        """Make the next call of a kind of `soak_schedule.CALLS`."""
-        turn = self._turn[kind]
-        self._turn[kind] += 1
+        """Make the next call of a kind of `soak_plant.CALLS`."""
+        turn = self.counts[kind]
         if kind == 'reset':
             right = self._wait(self._reset.call_async(Trigger.Request())).success
         elif kind == 'good parameters':
@@ -94,9 +83,3 @@ class SoakClient(PrivateNode):
                 raise CannotMeasureError(f'the estimator did not answer within {ANSWERED:g} s')
             sleep(0.002)
         return future.result()
-
-
-def _message(name: str, value: Any) -> Any:
-    from rcl_interfaces.msg import Parameter as ParameterMessage
-
-    return ParameterMessage(name=name, value=value)

@@ -3,7 +3,7 @@
 
 import struct
 import threading
-from types import TracebackType
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, Sample, TopicRecorder
@@ -112,10 +112,5 @@ class SoakWatch:
         self._recorder.__enter__()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._recorder.__exit__(kind, error, trace)
+    def __exit__(self, *reason: Any) -> None:
+        self._recorder.__exit__(*reason)

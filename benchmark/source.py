@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Publishes y at an exact rate, on one topic or on many, from a process of its own.
+Publishes y at an exact rate, from a process of its own.
 
 Sample k is published k periods after the first one: a late one does not delay those behind it.
-Begins once every topic has its subscribers; says at its end how many samples it has published.
+Begins once it has its subscribers; says at its end how many samples it has published.
 """
 
 import argparse
@@ -35,9 +35,8 @@ def main() -> None:
     """Publish until SIGINT."""
     parser = argparse.ArgumentParser(description='Publishes y at an exact rate.')
     parser.add_argument('--rate', type=float, default=1000.0, help='in Hz')
-    parser.add_argument('--topics', nargs='+', default=['y'])
     parser.add_argument('--joints', type=int, default=0, help='of a JointState instead of y')
-    parser.add_argument('--subscribers', type=int, default=1, help='of each topic')
+    parser.add_argument('--subscribers', type=int, default=1)
     arguments = parser.parse_args()
     ended = False
 
@@ -50,11 +49,9 @@ def main() -> None:
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = Node('source', context=context, start_parameter_services=False)
     joints = joint_state(arguments.joints) if arguments.joints else None
-    topics, kind = (['joint_states'], JointState) if joints else (arguments.topics, Float64)
-    publishers = [node.create_publisher(kind, topic, 10) for topic in topics]
-    while not ended and any(
-        publisher.get_subscription_count() < arguments.subscribers for publisher in publishers
-    ):
+    kind, topic = (JointState, 'joint_states') if joints else (Float64, 'y')
+    publisher = node.create_publisher(kind, topic, 10)
+    while not ended and publisher.get_subscription_count() < arguments.subscribers:
         time.sleep(0.02)
     time.sleep(SETTLE)
     print(READY, flush=True)
@@ -69,8 +66,7 @@ def main() -> None:
             message.header.stamp.sec, message.header.stamp.nanosec = stamp
         else:
             message.data = y
-        for publisher in publishers:
-            publisher.publish(message)
+        publisher.publish(message)
         count += 1
     time.sleep(SETTLE)  # the last samples leave before their writer does
     print(PUBLISHED, count, flush=True)

@@ -2,8 +2,7 @@
 """What nodes say: samples taken, when they published, which sample that contained."""
 
 import struct
-from types import TracebackType
-from typing import NamedTuple
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, Sample, TopicRecorder
@@ -13,15 +12,6 @@ from rclpy.serialization import deserialize_message
 
 DIAGNOSTICS = '/diagnostics'
 CDR_TIME = struct.Struct('<4xiI')
-NANOSECONDS = 1e-9
-
-
-class Quantiles(NamedTuple):
-    """Of absolute values, in seconds; NaN without any."""
-
-    median: float
-    p99: float
-    largest: float
 
 
 class Watch:
@@ -49,12 +39,10 @@ class Watch:
             values = {item.key: item.value for item in status.values}
             if 'samples accepted' in values:
                 taken = int(values['samples accepted']) + int(values.get('samples rejected', 0))
-                node, _, what = status.name.partition(': ')  # what: [channel] input
-                for name in (node, f'{node}/{what.split()[0]}'):
-                    self._reports[name] = published, taken
+                self._reports[status.name.partition(': ')[0]] = published, taken
 
     def report(self, name: str) -> tuple[int, int]:
-        """Return when a node or NODE/CHANNEL reported last (ns), and the samples taken so far."""
+        """Return when a node reported last (ns), and the samples taken so far."""
         return self._reports.get(name, (0, 0))
 
     def forget(self) -> None:
@@ -66,34 +54,18 @@ class Watch:
         """Return how many estimates a node has published since `forget`."""
         return len(self._pairs[f'/{name}/stamp'])
 
-    def jitter(self, name: str, rate: float) -> Quantiles:
-        """Return the deviation of the time between two publications from 1 / rate."""
-        return _quantiles(np.diff(self._columns(name)[0]) * NANOSECONDS - 1.0 / rate)
-
-    def latency(self, name: str) -> Quantiles:
-        """Return the time from a sample's publication to that of the first estimate with it."""
-        published, sample = self._columns(name)
-        _, first = np.unique(sample, return_index=True)
-        return _quantiles((published - sample)[first] * NANOSECONDS)
-
-    def _columns(self, name: str) -> np.ndarray:
+    def latency(self, name: str) -> tuple[float, float]:
+        """Return the time (s) from a sample's publication to its first estimate: median, 99 %."""
         pairs = sorted(self._pairs[f'/{name}/stamp'])
-        return np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        published, sample = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        _, first = np.unique(sample, return_index=True)
+        late = 1e-9 * np.abs(published - sample)[first]
+        median, most = np.quantile(late, [0.5, 0.99]) if len(late) else (np.nan, np.nan)
+        return float(median), float(most)
 
     def __enter__(self) -> 'Watch':
         self._recorder.__enter__()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._recorder.__exit__(kind, error, trace)
-
-
-def _quantiles(values: np.ndarray) -> Quantiles:
-    if not len(values):
-        return Quantiles(*[float('nan')] * 3)
-    return Quantiles(*np.quantile(np.abs(values), [0.5, 0.99, 1.0]).tolist())
+    def __exit__(self, *reason: Any) -> None:
+        self._recorder.__exit__(*reason)

@@ -3,6 +3,7 @@
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import pytest
+import results
 from studies import everywhere, evidence
 from studies.comparison import results as comparison
 from studies.comparison.cells import sensors
@@ -11,6 +12,7 @@ from studies.paper import cases, findings
 from studies.paper.plant_and_observer import SOLVERS
 
 PARTS = {
+    'speed': results.texts,
     'comparison': comparison.texts,
     'everywhere': everywhere.texts,
     'paper': findings.texts,

@@ -20,7 +20,7 @@ def test_site_builds_and_its_links_lead_somewhere(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     pages = {path: path.read_text() for path in (tmp_path / 'site').glob('*.html')}
-    assert len(pages) > 12
+    assert len(pages) > 10
     places = {path.name: set(re.findall(r'id="([^"]+)"', text)) for path, text in pages.items()}
     lost = []
     for path, text in pages.items():

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The plant, with the faults of a schedule on its topic ``faulty_y``; counts what it does.
+The plant of a soak, with the faults of a schedule on its topic ``faulty_y``; counts what it does.
+
+A soak is a row of cycles: faults, then rest, in whose last part the estimate is judged. The first
+cycle is without faults: caches fill, and the others are compared with it.
 
 Not a node between plant and estimator: that would stamp y anew, and on a busy machine the jitter
 of one more hop makes an error in d that hides the drift which a soak is to find.
@@ -14,20 +17,57 @@ import signal
 import sys
 import threading
 from time import monotonic
+from typing import NamedTuple
 
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.nodes.plant import PlantNode
+import numpy as np
 import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-from soak_schedule import schedule, STREAM
 from std_msgs.msg import Float64
+
+CYCLE = 20.0
+FAULTS, RESTORE, JUDGED = (0.5, 11.0), 12.0, (15.0, 19.5)
+"""In a cycle: when faults begin, when parameters are put back, when the estimate must be right."""
+PAUSE = (0.2, 1.2)
+"""Shortest and longest time between two faults, in seconds."""
+STREAM = {
+    'nan': (1, 20), 'infinity': (1, 20), 'spike': (1, 3), 'duplicate': (1, 50), 'stuck': (5, 100),
+    'burst': (2, 40), 'short gap': (2, 100), 'long gap': (300, 600), 'publisher restart': (1, 1),
+}  # fmt: skip
+"""Faults of y, with the smallest and largest number of samples that each concerns."""
+CALLS = ('good parameters', 'bad parameters', 'reset')
+"""What a client does meanwhile."""
 
 READY = 'injecting'
 TOPIC = 'faulty_y'
 SPIKE = 1e3
 SETTLE = 0.5
 """Seconds from the match of a new publisher, as seen from here, to its first sample."""
+
+
+class Event(NamedTuple):
+    """A fault: seconds since the start, what it is, how many samples it concerns."""
+
+    time: float
+    kind: str
+    size: int
+
+
+def schedule(seed: int, seconds: float) -> list[Event]:
+    """Return all events of a soak, in order; every kind comes up before one comes up again."""
+    generator = np.random.default_rng(seed)
+    events, kinds = [], list[str]()
+    for start in np.arange(CYCLE, seconds - CYCLE + 1.0, CYCLE).tolist():
+        time = start + FAULTS[0]
+        while time < start + FAULTS[1]:
+            kinds = kinds or generator.permutation([*STREAM, *CALLS]).tolist()
+            kind = kinds.pop()
+            low, high = STREAM.get(kind, (1, 1))
+            events.append(Event(time, kind, int(generator.integers(low, high + 1))))
+            time += float(generator.uniform(*PAUSE))
+    return events
 
 
 class Faults:

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What was measured, beside what is allowed; and where docs/evidence.md has it from."""
+
+from collections.abc import Iterable, Mapping
+import os
+from pathlib import Path
+import platform
+from typing import Any, NamedTuple
+
+from studies import evidence
+
+NAME = 'speed'
+SHOWN = (
+    'core step / same step in C (-O3)',
+    'core step, sign, explicit',
+    'core step, fuzzy_adaptive, explicit',
+    'core step, fuzzy_adaptive, implicit',
+    'step, self-tuning, paper_plant',
+    'CPU, estimator / empty node, y 1000 Hz, estimates 1000 Hz',
+    'CPU, estimator / empty node, 7 joints 1000 Hz, estimates 100 Hz',
+    'samples lost, y 1000 Hz, estimates 1000 Hz',
+    'latency, 99 %, y 1000 Hz, estimates on samples',
+    'replay to a bag / rosbags reads',
+)
+"""Rows of the page."""
+
+
+class CannotMeasureError(Exception):
+    """Something that a measurement needs is missing; the message is one line."""
+
+
+class Row(NamedTuple):
+    """
+    One line of the result.
+
+    Attributes
+    ----------
+    name : str
+        What was measured.
+    value : float or None
+        None if it could not be measured; then a bar counts as missed.
+    unit : str
+    bar : float or None
+        Highest allowed value, None where there is no bar.
+    note : str
+        The numbers behind the value.
+
+    """
+
+    name: str
+    value: float | None
+    unit: str = ''
+    bar: float | None = None
+    note: str = ''
+
+    @property
+    def missed(self) -> bool:
+        """True if there is a bar and the value is not within it."""
+        return self.bar is not None and (self.value is None or not self.value <= self.bar)
+
+    @property
+    def measured(self) -> str:
+        """The value as a reader sees it."""
+        if self.value is None:
+            return '-'
+        digits = '.0f' if abs(self.value) >= 100.0 else '.3g'
+        return f'{self.value:{digits}} {self.unit}'.strip()
+
+    @property
+    def allowed(self) -> str:
+        """The bar as a reader sees it."""
+        return '' if self.bar is None else f'<= {self.bar:g}'
+
+
+def render(rows: Iterable[Row]) -> str:
+    """Return the rows as an aligned table."""
+    cells = [('', 'measured', 'allowed', '', '')]
+    for row in rows:
+        verdict = '' if row.bar is None else 'MISSED' if row.missed else 'pass'
+        cells.append((row.name, row.measured, row.allowed, verdict, row.note))
+    name, value, bar, verdict, _ = (max(len(line[k]) for line in cells) for k in range(5))
+    return '\n'.join(
+        f'{a:<{name}}  {b:>{value}}  {c:<{bar}}  {d:<{verdict}}  {e}'.rstrip()
+        for a, b, c, d, e in cells
+    )
+
+
+def machine() -> str:
+    """Return what this is measured on, and how busy it is now."""
+    with Path('/proc/cpuinfo').open(encoding='utf-8') as lines:
+        found = [line.split(':')[1].strip() for line in lines if 'model name' in line][:1]
+    load = f'load {os.getloadavg()[0]:.1f} at the start'
+    python = f'Python {platform.python_version()}'
+    return ', '.join([*(found or [platform.machine()]), f'{os.cpu_count()} cores', python, load])
+
+
+def texts(rows: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """Return the part of the page, from the table."""
+    found = {row['name']: Row(*(row[k] for k in Row._fields)) for row in rows}
+    found = {name: row._replace(unit=row.unit or '') for name, row in found.items()}
+    lines = [(name, found[name].measured, found[name].allowed) for name in SHOWN]
+    return {NAME: evidence.markdown(['', 'measured', 'allowed'], lines)}
+
+
+def publish(part: str, rows: Iterable[Row], where: str) -> None:
+    """Replace the lines of a part in the table, and the rows of the page."""
+    kept = [row for row in evidence.read(NAME) if row['part'] != part]
+    new = evidence.rounded({'part': part, **row._asdict(), 'machine': where} for row in rows)
+    evidence.publish(evidence.DOCS, {NAME: [*kept, *new]}, texts([*kept, *new]), {})
