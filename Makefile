@@ -52,7 +52,7 @@ docs:
 	@$(call with,docs) && exec "$$python" -m sphinx -W --keep-going -q $(ARGS) docs build/docs
 
 bench:
-	@$(call with,tune) && exec "$$python" benchmark/run.py $(ARGS)
+	@$(call with) && exec "$$python" benchmark/run.py $(ARGS)
 
 soak:
 	@$(call with) && exec "$$python" benchmark/soak.py --minutes $(MINUTES) $(ARGS)

@@ -15,7 +15,7 @@ from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 import numpy as np
 from reference import assert_agreement, CASE, compile_reference, in_c, in_core, output, PERIOD
 from results import CannotMeasureError, Row
-from studies.model import model_alone, SELF_TUNING
+from studies.harness import model_alone, SELF_TUNING
 from tqdm import tqdm
 
 BAR = 1.1

@@ -129,15 +129,17 @@ def isolate() -> None:
 
 def observe(case: Case, seconds: float) -> dict[str, Figures]:
     """Start a source of y, an estimator and an empty node, both on the same samples."""
-    from watch import Watch  # needs ROS
+    from fhaosmo_ros.topics import TIME  # needs ROS
+    from watch import Watch
 
     joints = str(case.joints)
     estimator = ['-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-p', f'gains:={case.gains}']
     estimator += ['-p', f'publish_rate:={case.out}' if case.out else 'publish_on:=sample']
     estimator += ['-p', 'channels:=[from_joint_names]'] if case.joints else []
     empty = ['benchmark/empty_node.py', '--rate', str(case.out), '--joints', joints]
-    watched = {n: f'{n}/joint1' if case.joints else n for n in (ESTIMATOR, EMPTY)}
-    with Children() as children, Watch(sorted(watched.values())) as watch:
+    joint = '/joint1' if case.joints else ''
+    watched = {name: f'/{name}{joint}/stamp' for name in (ESTIMATOR, EMPTY)}
+    with Children() as children, Watch(dict.fromkeys(watched.values(), TIME)) as watch:
         nodes = {
             ESTIMATOR: children.start(ESTIMATOR, *estimator),
             EMPTY: children.start(EMPTY, *empty),
@@ -159,16 +161,21 @@ def observe(case: Case, seconds: float) -> dict[str, Figures]:
         used = {name: node.cpu_seconds() - before[name] for name, node in nodes.items()}
         asked = (case.out or case.rate) * elapsed
         held = {name: watch.count(topic) / asked for name, topic in watched.items()}
-        latency = {name: watch.latency(topic) for name, topic in watched.items()}
+        latency = {name: _latency(*watch.series(topic)) for name, topic in watched.items()}
         sent, ended = _end(source), time_ns()
         for name in nodes:
-            wait_until(lambda name=name: watch.report(name)[0] > ended, f'no report of {name}')
+            wait_until(lambda name=name: watch.reported_after(name, ended), f'no report of {name}')
         return {
-            name: Figures(
-                used[name] / elapsed, held[name], sent, watch.report(name)[1], latency[name]
-            )
+            name: Figures(used[name] / elapsed, held[name], sent, watch.taken(name), latency[name])
             for name in nodes
         }
+
+
+def _latency(published: np.ndarray, stamps: np.ndarray) -> tuple[float, float]:
+    """Return the time (s) from a sample's publication to its first estimate: median, 99 %."""
+    _, first = np.unique(stamps, return_index=True)
+    median, most = np.quantile(1e-9 * np.abs(published - stamps)[first], [0.5, 0.99])
+    return float(median), float(most)
 
 
 def _end(source: Child) -> int:

@@ -18,7 +18,6 @@ from time import monotonic, sleep, time_ns
 from typing import NamedTuple
 
 from children import Child, Children, ROOT
-from fhaosmo_ros.core.online.counters import Counters
 from heartbeat import Heartbeat
 from node import isolate, wait_until
 import numpy as np
@@ -32,6 +31,11 @@ ESTIMATOR = ('-r', 'y:=faulty_y', '-p', 'spike_gate:=1.0', '-p', 'gamma_leakage:
              '-p', 'gamma_dead_zone:=0.0')  # fmt: skip
 """What docs/node.md advises for a node that nobody looks after."""
 RATE = 500.0
+TRUTH, ESTIMATE = '/plant/unknown_input', '/estimator/unknown_input'
+GAMMA, STAMP = '/estimator/gamma', '/estimator/stamp'
+ARRAYS = ('/estimator/state', '/estimator/innovation')
+PAIRED = 5_000_000
+"""Nanoseconds within which the topics of one estimate are published."""
 STALLED = 3
 """Exit code."""
 MEMORY = 2.0
@@ -41,7 +45,7 @@ ERROR, ERROR_GROWTH, MANY = 0.05, 0.01, 15
 Largest median error of d in any judged window (half of d's amplitude), what it may grow by between
 the first and the last third, and from how many windows on that is judged.
 """
-GAMMA = 0.02
+DRIFT = 0.02
 """What gamma may move between the first and the last third."""
 LATE, LOSS, REPORTED = 0.005, 0.02, 3
 """
@@ -151,11 +155,15 @@ def _soak(seed: int, minutes: float, output: Path) -> int:
 
 def run(seed: int, seconds: float) -> Course:
     """Run a soak and return its course."""
+    from fhaosmo_ros.topics import ARRAY, FLOAT, TIME  # needs ROS
     from soak_client import SoakClient
-    from soak_watch import SoakWatch
+    from watch import Watch
+
+    topics = dict.fromkeys((TRUTH, ESTIMATE, GAMMA), FLOAT) | {STAMP: TIME}
+    topics |= dict.fromkeys(ARRAYS, ARRAY)
 
     with (
-        Heartbeat() as heartbeat, Children() as children, SoakWatch() as watch,
+        Heartbeat() as heartbeat, Children() as children, Watch(topics) as watch,
         SoakClient() as client,
     ):  # fmt: skip
         estimator = children.start(
@@ -176,10 +184,10 @@ def run(seed: int, seconds: float) -> Course:
         plant.wait_for('}')
         faults = Counter(json.loads(plant.output().splitlines()[-1]))
         ended = time_ns() + 500_000_000
-        wait_until(lambda: int(watch.report.get('received', 0)) > ended, 'no report at the end')
+        wait_until(lambda: watch.reported_after('estimator', ended), 'no report at the end')
         return Course(
-            memory, windows, watch.outputs, watch.not_finite, _taken(watch.report),
-            int(watch.report['samples lost']), losses, beats, faults, client.counts,
+            memory, windows, watch.outputs, watch.not_finite, watch.taken('estimator'),
+            int(watch.reports['estimator']['samples lost']), losses, beats, faults, client.counts,
         )  # fmt: skip
 
 
@@ -205,13 +213,13 @@ def _follow(seed, seconds, nodes: dict[str, Child], watch, client):
             if judging != (JUDGED[0] <= phase < JUDGED[1]):
                 judging = not judging
                 if judging:
-                    watch.keep()
+                    watch.forget()
                 else:
-                    windows.append((now, *watch.judge()))
+                    windows.append((now, *_judged(watch)))
             if now >= progress.n + 1:
                 progress.update(int(now) - progress.n)
-                if int(watch.report.get('samples lost', 0)) > lost:
-                    lost = int(watch.report['samples lost'])
+                before, lost = lost, int(watch.reports.get('estimator', {}).get('samples lost', 0))
+                if lost > before:
                     losses.append(now)
                 if now > CYCLE:
                     for name, node in nodes.items():
@@ -219,12 +227,24 @@ def _follow(seed, seconds, nodes: dict[str, Child], watch, client):
     return {name: np.array(used) for name, used in memory.items()}, np.array(windows), losses
 
 
-def _taken(report: dict[str, str]) -> int:
-    """Return the samples of y that the estimator has used or rejected."""
-    names = {name: name.replace('_', ' ') for name in Counters._fields}
-    names['accepted'] = 'samples accepted'
-    counters = Counters(**{name: int(report[key]) for name, key in names.items()})
-    return counters.accepted + counters.rejected
+def _judged(watch) -> tuple[float, float]:
+    """
+    Return what came since `Watch.forget`.
+
+    Returns
+    -------
+    (float, float)
+        Medians of the absolute error of d (a busy machine delays single samples) and of gamma;
+        NaN without estimates.
+
+    """
+    if not all(watch.count(topic) for topic in (TRUTH, ESTIMATE, GAMMA, STAMP)):
+        return float('nan'), float('nan')
+    (published, d), (times, stamps), (at, truth) = map(watch.series, (ESTIMATE, STAMP, TRUTH))
+    after = np.minimum(np.searchsorted(times, published), len(times) - 1)
+    paired = np.abs(times[after] - published) < PAIRED
+    true = np.interp((stamps[after] - at[0])[paired], at - at[0], truth)
+    return float(np.median(np.abs(d[paired] - true))), float(np.median(watch.series(GAMMA)[1]))
 
 
 def verdict(course: Course) -> list[Row]:
@@ -248,7 +268,7 @@ def verdict(course: Course) -> list[Row]:
         Row(GROWTH, errors[1] - errors[0], '', ERROR_GROWTH if len(error) >= MANY else ERROR,
             f'{errors[0]:.2g} to {errors[1]:.2g}, medians of the first and the last third'),
         Row(WORST, error.max(), '', ERROR, f'{len(error)} windows, median {np.median(error):.2g}'),
-        Row('gamma, drift', abs(gammas[1] - gammas[0]), '', GAMMA,
+        Row('gamma, drift', abs(gammas[1] - gammas[0]), '', DRIFT,
             f'{gammas[0]:.4f} to {gammas[1]:.4f}'),
         Row('wrong answers to calls', wrong, '', 0.0, calls),
     ]  # fmt: skip

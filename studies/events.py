@@ -27,7 +27,7 @@ from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter, ss2tf
 from studies import evidence
 from studies.evidence import Row
-from studies.model import SELF_TUNING
+from studies.harness import SELF_TUNING
 
 NAME = 'events'
 H, NOISE, LOAD, FAULT, LASTS, EVERY, SETTLED = 0.01, 1e-3, 0.05, 1.0, 2.0, 20.0, 60.0

@@ -8,32 +8,29 @@ beside a Kalman filter that is tuned anew with the truth for each.
 
 import argparse
 import math
-import os
-from pathlib import Path
 import sys
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core import OnlineEstimator, Recording, TriangularModel
+from fhaosmo_ros.core import Recording, TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import quantised, respond
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
-from fhaosmo_ros.tools.cli.processes import Workers
-from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.cli.share import shipped
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
-from studies import evidence
+from studies import evidence, ratios
 from studies.comparison.evaluation import METHODS, tune
 from studies.comparison.methods.adaptive import HUBER, IMM, NOISE
 from studies.comparison.methods.linear import LINEAR_LIMIT
 from studies.comparison.methods.method import Setting, Values
 from studies.comparison.scores import Estimates, JUDGED_FROM, mean, objective
 from studies.evidence import markdown, Row
+from studies.harness import called, observed, output, SELF_TUNING, study, with_jobs
 from studies.waves import wave
 
 Floats = NDArray[np.float64]
@@ -106,8 +103,8 @@ CONDITIONS = {
 TUNED = 'as tuned'
 SELF, ONCE, PRESET = 'self-tuning', 'Kalman, tuned once', 'shipped file'
 STYLES = {
-    SELF: ('#D55E00', '*', 90), ONCE: ('#0072B2', 'o', 26), PRESET: ('#009E73', 's', 22),
-    HUBER: ('#56B4E9', '^', 26), NOISE: ('#CC79A7', 'D', 20), IMM: ('#000000', 'x', 26),
+    SELF: ratios.SELF, ONCE: ratios.USUAL, PRESET: ratios.TUNED, HUBER: ratios.ROBUST,
+    NOISE: ratios.OTHER, IMM: ratios.GREY,
 }  # fmt: skip
 PEERS: dict[str, list[dict[str, float]]] = {
     HUBER: [{'huber': limit} for limit in (1.5, 2.5, 4.0)],
@@ -119,8 +116,6 @@ ANEW = 'tuned anew'
 """Error of d of the Kalman filter tuned for the condition; all others are over this."""
 KNOWN = 'every z known'
 """What a wrong Phi makes of d, whoever estimates it."""
-CEILING = 20.0
-"""Largest ratio that is drawn."""
 
 
 class Size(NamedTuple):
@@ -133,7 +128,7 @@ class Size(NamedTuple):
     trials: int = 160
 
 
-SHORT = Size(7.0, ('sine', 'ou'), ('motor',), (TUNED, 'noise x 10'), 24)
+QUICK = Size(7.0, ('sine', 'ou'), ('motor',), (TUNED, 'noise x 10'), 24)
 
 
 class Member(NamedTuple):
@@ -225,13 +220,6 @@ def best_member(setting: Setting, recordings: list[Recording], trials: int) -> M
     return member._replace(bandwidth=member.bandwidth / quicker)
 
 
-def online(r: Recording, parameters: dict[str, Any]) -> tuple[Floats, Floats]:
-    """Return d, and the standard deviations of z and d if there are any, as the node does."""
-    stamps = 10**9 + np.round(r.t * 1e9).astype(np.int64)
-    found = OnlineEstimator(parameters).run(stamps, r.y)
-    return found.unknown_input, found.standard_deviation
-
-
 def best_peers(setting: Setting, values: Values, recordings: list[Recording]) -> dict[str, int]:
     """Tune the peers with the truth."""
 
@@ -256,7 +244,7 @@ def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row,
     preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | model_of(setting)
     errors = {
         ONCE: errors_of(LINEAR_LIMIT, setting, values, recordings),
-        PRESET: [error(r, online(r, preset)[0]) for r in recordings],
+        PRESET: [error(r, observed(preset, r.t, r.y).unknown_input) for r in recordings],
     }
     for peer, number in once.peers.items():
         errors[peer] = errors_of(peer, setting, {**values, **PEERS[peer][number]}, recordings)
@@ -275,12 +263,12 @@ def self_tuned(
     model: dict[str, Any], recordings: list[Recording]
 ) -> tuple[list[float], list[float]]:
     """Return the errors of self-tuning, and the shares of d within 1 and 1.96 deviations."""
-    tuning = [online(r, model | {'gains': 'self_tuning'}) for r in recordings]
-    inside = [
-        [np.mean((np.abs(d - r.d) < k * s[:, -1])[r.t >= JUDGED_FROM]) for k in (1.0, 1.96)]
-        for r, (d, s) in zip(recordings, tuning, strict=True)
-    ]
-    errors = [error(r, d) for r, (d, _) in zip(recordings, tuning, strict=True)]
+    errors, inside = [], []
+    for r in recordings:
+        found = observed(model | SELF_TUNING, r.t, r.y)
+        errors.append(error(r, found.unknown_input))
+        away = np.abs(found.unknown_input - r.d) / found.standard_deviation[:, -1]
+        inside.append([np.mean((away < k)[r.t >= JUDGED_FROM]) for k in (1.0, 1.96)])
     return errors, [round(float(x), 3) for x in np.mean(inside, axis=0)]
 
 
@@ -297,49 +285,24 @@ def again(row: Row, size: Size) -> Row:
 
 def compute(size: Size, jobs: int, stop: Stop, before: list[Row]) -> list[Row]:
     """Return all cells: those of the tuning first; with `before` only self-tuning is measured."""
+    if before:
+        rows = called({k: (again, row, size) for k, row in enumerate(before)}, NAME, jobs, stop)
+        return [rows[k] for k in range(len(before))]
     keys = [(p, c) for p in size.plants for c in size.conditions]
-    found: dict[Any, Any] = {}
-    with (
-        Workers(jobs, stop) as workers,
-        progress(total=len(before) or len(keys), unit='cell', desc=NAME) as bar,
-    ):
-
-        def run(calls: dict[Any, tuple[Any, ...]]) -> None:
-            for key, result in workers.results(calls):
-                found[key] = result
-                bar.update()
-
-        if before:
-            run({k: (again, row, size) for k, row in enumerate(before)})
-            return [found[k] for k in range(len(before))]
-        run({(p, c): (cell, p, c, size, None) for p, c in keys if c == TUNED})
-        tuned = {p: found[p, TUNED][1] for p in size.plants}
-        run({(p, c): (cell, p, c, size, tuned[p]) for p, c in keys if c != TUNED})
+    first = {(p, c): (cell, p, c, size, None) for p, c in keys if c == TUNED}
+    found = called(first, NAME, jobs, stop)
+    others = {(p, c): (cell, p, c, size, found[p, TUNED][1]) for p, c in keys if c != TUNED}
+    found |= called(others, NAME, jobs, stop)
     return [found[key][0] for key in keys]
 
 
 def draw(cells: list[Row]) -> Figure:
     """Draw the ratios: a panel a plant, a row a condition, a marker a method."""
-    plants = list(dict.fromkeys(c['plant'] for c in cells))
-    figure = Figure(figsize=(11.0, 6.6), layout='constrained')
-    panels = figure.subplots(1, len(plants), sharey=True, squeeze=False)[0]
-    for plant, axes in zip(plants, panels, strict=True):
-        rows = [c for c in cells if c['plant'] == plant]
-        for name, (colour, marker, area) in STYLES.items():
-            x = [min(row[name], CEILING) for row in rows]
-            front = 4 if name == SELF else 3
-            axes.scatter(
-                x, range(len(rows)), area, colour, marker=marker, label=name, zorder=front
-            )
-        axes.axvline(1.0, color='#000000', lw=0.8)
-        axes.set(xscale='log', xlim=(0.05, 1.2 * CEILING), title=plant)
-        axes.set_yticks(range(len(rows)), [row['condition'] for row in rows])
-        axes.grid(alpha=0.3)
-    panels[0].invert_yaxis()
+    panels: dict[str, dict[str, Row]] = {}
+    for cell in cells:
+        panels.setdefault(cell['plant'], {})[cell['condition']] = cell
     text = 'error of d over that of a Kalman filter tuned anew with the truth'
-    figure.supxlabel(f'{text} (at {CEILING:g}: that or more)', fontsize='medium')
-    figure.legend(*panels[0].get_legend_handles_labels(), loc='outside upper center', ncols=6)
-    return figure
+    return ratios.draw(panels, STYLES, text)
 
 
 def number(ratio: float) -> str:
@@ -351,17 +314,16 @@ def texts(cells: list[Row]) -> dict[str, str]:
     """Return the part of the page."""
     lines = []
     for name in STYLES:
-        ratios = [c[name] for c in cells]
+        found = [c[name] for c in cells]
         worst = max(cells, key=lambda c, name=name: c[name])
-        where = f'{number(max(ratios))} ({worst["plant"]}, {worst["condition"]})'
-        bad = f'{sum(ratio > 1.25 for ratio in ratios)} of {len(cells)}'
-        lines.append([name, number(mean(ratios)), where, bad])
+        where = f'{number(max(found))} ({worst["plant"]}, {worst["condition"]})'
+        bad = f'{sum(ratio > 1.25 for ratio in found)} of {len(cells)}'
+        lines.append([name, number(mean(found)), where, bad])
     return {'methods': markdown(['method', 'geometric mean', 'worst', 'cells above 1.25'], lines)}
 
 
 def _study(arguments: argparse.Namespace, stop: Stop) -> None:
-    size = SHORT if arguments.short else Size()
-    docs = arguments.output or (Path('everywhere_output') if arguments.short else evidence.DOCS)
+    docs, size = output(arguments, NAME), QUICK if arguments.quick else Size()
     before = evidence.read(NAME, docs) if arguments.only_self_tuning else []
     cells = evidence.rounded(compute(size, arguments.jobs, stop, before))
     evidence.publish(docs, {NAME: cells}, texts(cells), {NAME: draw(cells)})
@@ -369,14 +331,11 @@ def _study(arguments: argparse.Namespace, stop: Stop) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0, 2 for a bad argument or output, 130 if it was interrupted."""
-    parser = argparse.ArgumentParser(prog=NAME, description=__doc__)
-    parser.add_argument('--short', action='store_true', help='two cells, for tests')
+    parser = with_jobs(study(NAME, __doc__))
     parser.add_argument(
         '--only-self-tuning', action='store_true',
         help='measure self-tuning anew, and take the rest from the results that are there',
     )  # fmt: skip
-    parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1, help='processes')
-    parser.add_argument('--output', type=Path, help='folder for results (default: docs)')
     return run_command(parser, argv, _study)
 
 

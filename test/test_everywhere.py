@@ -38,12 +38,12 @@ def test_what_differs_between_conditions():
 
 
 def test_the_command_in_short(tmp_path):
-    assert everywhere.main(['--short', '--jobs', '1', '--output', str(tmp_path)]) == 0
+    assert everywhere.main(['--quick', '--jobs', '1', '--output', str(tmp_path)]) == 0
     found = evidence.read(everywhere.NAME, tmp_path)
-    assert [c['condition'] for c in found] == list(everywhere.SHORT.conditions)
+    assert [c['condition'] for c in found] == list(everywhere.QUICK.conditions)
     assert all(0.0 < c[everywhere.SELF] < 1.25 for c in found)
     assert found[0][everywhere.ONCE] == 1.0
-    command = ['--short', '--only-self-tuning', '--jobs', '1', '--output', str(tmp_path)]
+    command = ['--quick', '--only-self-tuning', '--jobs', '1', '--output', str(tmp_path)]
     assert everywhere.main(command) == 0
     again = evidence.read(everywhere.NAME, tmp_path)
     for new, old in zip(again, found, strict=True):

@@ -17,13 +17,13 @@ from studies.everywhere import (
     Condition,
     CONDITIONS,
     model_of,
-    online,
     recording,
     setting_of,
 )
 from studies.everywhere import (
     PLANTS as PLANTS_OF_STUDY,
 )
+from studies.harness import observed
 
 WINDOW, SHAPE, FARTHEST, LEAST_CHANCE = 32, 2.0, 12.0, -6.0
 """Of the test for jumps of y (D 35), and of quantised samples (D 31)."""
@@ -341,7 +341,8 @@ def test_how_sure_it_is_of_a_quantised_y(plant):
     inside, model = [], model_of(setting_of(PLANTS_OF_STUDY[plant], steps))
     for kind in ('sine', 'chirp', 'ou', 'square', 'pulses'):
         r = recording(PLANTS_OF_STUDY[plant], steps, kind, 20.0, 3)
-        d, deviation = online(r, model | SELF_TUNING)
+        found = observed(model | SELF_TUNING, r.t, r.y)
+        d, deviation = found.unknown_input, found.standard_deviation
         late = r.t > 3.0
         wrong = np.abs(d - r.d)[late]
         assert np.sqrt(np.mean(wrong**2)) < 1.2 * np.sqrt(np.mean(r.d[late] ** 2))
@@ -540,7 +541,7 @@ def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, kind, seed, seconds
     plant, condition = PLANTS_OF_STUDY[name], Condition(later=100.0)
     r = recording(plant, condition, kind, seconds, seed)
     p = model_of(setting_of(plant, condition)) | SELF_TUNING
-    found, _ = online(r, p)
+    found = observed(p, r.t, r.y).unknown_input
     assert np.abs(found - r.d).max() < 4.0 * np.abs(r.d).max()
 
 

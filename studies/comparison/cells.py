@@ -51,11 +51,6 @@ class Disturbance(NamedTuple):
         """True for a d that jumps."""
         return self.judged in JUMPS
 
-    @property
-    def seen(self) -> bool:
-        """True if the tuning sees this shape."""
-        return self.judged == self.trained
-
 
 class PlantCase(NamedTuple):
     """A plant of config/models, and how its d and its noise are scaled."""

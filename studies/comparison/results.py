@@ -4,12 +4,27 @@
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+from matplotlib.figure import Figure
+from studies import ratios as figure
 from studies.comparison.cells import PLANTS
 from studies.comparison.evaluation import METHODS
-from studies.comparison.methods.method import KINDS, LINEAR
+from studies.comparison.methods.method import (
+    KINDS,
+    LINEAR,
+    OURS,
+    PAPER,
+    ROBUST,
+    SELF_TUNING,
+    SLIDING,
+    USUAL,
+)
 from studies.comparison.scores import mean
 from studies.evidence import markdown, Row
 
+STYLES = {
+    USUAL: figure.USUAL, ROBUST: figure.ROBUST, SLIDING: figure.OTHER, PAPER: figure.GREY,
+    OURS: figure.TUNED, SELF_TUNING: figure.SELF,
+}  # fmt: skip
 CLOSE = 0.05
 """Errors within this part of another one count as equal."""
 
@@ -85,3 +100,29 @@ def number(x: float) -> str:
     if x >= 100.0:
         return f'{x:.3g}' if x < 1e4 else f'{x:.0e}'
     return f'{x:.2g}' if x < 0.1 else f'{x:.2f}'
+
+
+def draw(chosen: Chosen, jumps: bool) -> Figure:
+    """Draw each kind's error over that of the best linear filter, for d with or without jumps."""
+    about = [c for c in sorted(chosen, key=_order) if c.jumps == jumps]
+    panels: dict[str, dict[str, dict[str, float]]] = {}
+    for plant in PLANTS:
+        for at in dict.fromkeys(_order(c) for c in about if c.plant == plant):
+            cells = {c for c in about if c.plant == plant and _order(c) == at}
+            found = {kind: ratios(chosen, kind, cells.__contains__) for kind in STYLES}
+            panels.setdefault(PLANTS[plant].text, {})[_text(next(iter(cells)))] = {
+                kind: mean(values) for kind, values in found.items() if values
+            }
+    with_jumps = 'with' if jumps else 'without'
+    text = f'd {with_jumps} jumps: error of d over that of the best linear filter'
+    return figure.draw(panels, STYLES, text)
+
+
+def _order(cell: Cell) -> tuple[bool, str, float, float]:
+    return cell.timing != 'even', cell.timing, -cell.rate, cell.noise
+
+
+def _text(cell: Cell) -> str:
+    rate = '1 kHz' if cell.rate == 1000.0 else f'{cell.rate:g} Hz'
+    timing = '' if cell.timing == 'even' else f', {cell.timing}'
+    return f'{rate}{timing}, {f"noise {cell.noise:g}" if cell.noise else "no noise"}'

@@ -3,7 +3,7 @@
 
 import sys
 
-from studies.start import start
+from studies.paper.command import main
 
 if __name__ == '__main__':
-    sys.exit(start('studies.paper.command'))
+    sys.exit(main())

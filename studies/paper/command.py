@@ -16,9 +16,11 @@ from fhaosmo_ros.tools.plot.fuzzy import Row as FuzzyRow
 from matplotlib.figure import Figure
 from studies import evidence
 from studies.evidence import Row
+from studies.harness import output, study
 from studies.paper import beyond, cases, figures, findings
 from studies.paper.plant_and_observer import SOLVERS
 
+NAME = 'paper'
 QUICK_WIDTHS, QUICK_LONG = 6, 200.0
 ZOOM = 0.1
 """Seconds that figure sim1 enlarges."""
@@ -29,18 +31,9 @@ def main(argv: list[str] | None = None) -> int:
 
     def body(arguments: argparse.Namespace, stop: Stop) -> None:
         with stop.raising():
-            _paper(arguments.output, arguments.quick)
+            _paper(output(arguments, NAME), arguments.quick)
 
-    parser = argparse.ArgumentParser(prog='paper', description=__doc__)
-    parser.add_argument(
-        '--quick', action='store_true',
-        help='a coarse search and short long runs: for a first look and for tests',
-    )  # fmt: skip
-    parser.add_argument(
-        '--output', type=Path, metavar='FOLDER',
-        help='folder for results and figures (default: docs; paper_output with --quick)',
-    )  # fmt: skip
-    return run_command(parser, argv, body)
+    return run_command(study(NAME, __doc__), argv, body)
 
 
 def measure(solvers: Sequence[str], tick: Callable[[], object]) -> list[Row]:
@@ -59,8 +52,7 @@ def measure(solvers: Sequence[str], tick: Callable[[], object]) -> list[Row]:
     return rows
 
 
-def _paper(output: Path | None, quick: bool) -> None:
-    docs = output or (Path('paper_output') if quick else evidence.DOCS)
+def _paper(docs: Path, quick: bool) -> None:
     every = QUICK_WIDTHS if quick else 1
     duration = QUICK_LONG if quick else beyond.LONG_DURATION
     joint = len(SOLVERS) * len(cases.OBSERVERS) * len(cases.FREQUENCIES)

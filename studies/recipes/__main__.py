@@ -3,7 +3,7 @@
 
 import sys
 
-from studies.start import start
+from studies.recipes.command import main
 
 if __name__ == '__main__':
-    sys.exit(start('studies.recipes.command'))
+    sys.exit(main())

@@ -10,7 +10,7 @@ from fhaosmo_ros.core import Family
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter, savgol_coeffs
-from studies.model import SELF_TUNING
+from studies.harness import SELF_TUNING
 from studies.recipes import peers
 from studies.recipes.judging import (
     FIXED,

@@ -8,7 +8,7 @@ from fhaosmo_ros.tools.plot.figures import COLOURS, TRUTH
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-from studies.model import SELF_TUNING
+from studies.harness import SELF_TUNING
 from studies.recipes.judging import Fold, OURS, Results, run
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from studies.model import SELF_TUNING
+from studies.harness import SELF_TUNING
 from studies.recipes import peers
 from studies.recipes.judging import (
     FIXED,

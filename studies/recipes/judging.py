@@ -5,14 +5,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core import OnlineEstimator, Trajectory, TriangularModel
+from fhaosmo_ros.core import Trajectory, TriangularModel
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import respond
 import numpy as np
 from numpy.typing import NDArray
 from studies.evidence import Row
-from studies.model import model_alone, SELF_TUNING
+from studies.harness import model_alone, observed, SELF_TUNING
 from studies.waves import wave
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'recipes'
@@ -95,8 +95,7 @@ def model(name: str, constants: Mapping[str, float] | None = None) -> dict[str, 
 
 def run(parameters: Mapping[str, Any], r: Recorded) -> Trajectory:
     """Return what the node would have estimated."""
-    stamps = 10**9 + np.round((r.t - r.t[0]) * 1e9).astype(np.int64)
-    return OnlineEstimator(parameters).run(stamps, r.y, r.u if r.u.size else None)
+    return observed(parameters, r.t, r.y, r.u if r.u.size else None)
 
 
 def self_tuning(parameters: Mapping[str, Any], r: Recorded, _: float = 0.0) -> Floats:
