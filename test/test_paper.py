@@ -97,7 +97,7 @@ def test_new_search_of_half_widths_agrees_with_the_table(documented, solver):
 @pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
 @pytest.mark.parametrize('omega', cases.FREQUENCIES)
 def test_default_law_is_never_worse_than_none(scheme, omega):
-    run = beyond.long_rows('paper', scheme, omega, 0.0, 250.0)[1]
+    run = beyond.long_rows(scheme, omega, 0.0, 250.0)[1]
     assert run['rms_d_last'] <= 1.05 * run['rms_d_fixed']
     assert run['rms_d_last'] <= run['rms_d_first']
     if omega == cases.FREQUENCIES[0]:

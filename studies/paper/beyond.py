@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from studies.evidence import Row
 from studies.paper.cases import (
     CONVERGED,
-    DEMO,
     FREQUENCIES,
     observe,
     SAFE,
@@ -40,18 +39,13 @@ LONG_DURATION, WINDOW = 2000.0, 100.0
 """Seconds of a long run, and of the windows at its begin and its end that are judged."""
 LAWS: dict[str, dict[str, Any]] = {"the paper's": {}, 'default': SAFE}
 """Laws of gamma by name: what differs from config/paper.yaml."""
-GAINS: dict[str, dict[str, Any]] = {'paper': {}, 'demo': DEMO}
-"""Gains by the name of the configuration that they are from."""
-LONG = (
-    *(
-        ('paper', scheme, omega, noise)
-        for noise in (0.0, 1e-4)
-        for scheme in ('explicit', 'implicit')
-        for omega in FREQUENCIES
-    ),
-    *(('demo', 'implicit', omega, 0.0) for omega in FREQUENCIES),
+LONG = tuple(
+    (scheme, omega, noise)
+    for noise in (0.0, 1e-4)
+    for scheme in ('explicit', 'implicit')
+    for omega in FREQUENCIES
 )
-"""Long runs: gains, scheme, angular frequency, noise on y."""
+"""Long runs: scheme, angular frequency, noise on y."""
 THINNED = 10
 """Long runs record every 10th sample."""
 
@@ -66,7 +60,7 @@ def sampled_rows(scheme: str, step: float, omega: float, noise: float) -> list[R
 
 
 def long_rows(
-    gains: str, scheme: str, omega: float, noise: float, duration: float = LONG_DURATION
+    scheme: str, omega: float, noise: float, duration: float = LONG_DURATION
 ) -> list[Row]:
     """
     Adapt gamma by each of `LAWS` for a long time, from `CONVERGED` on.
@@ -83,10 +77,8 @@ def long_rows(
     first, size = round(CONVERGED / row), round(WINDOW / row)
 
     def windows(variant: str, changes: dict[str, Any]) -> tuple[Floats, Floats]:
-        run = observe(truth, variant, scheme, THINNED, **(GAINS[gains] | changes))
-        internal = GAINS[gains].get('estimate_from') == 'internal'
-        estimate = run.z_tilde[:, -2] if internal else run.z_hat[:, -1]
-        error = estimate - run.unknown_input
+        run = observe(truth, variant, scheme, THINNED, **changes)
+        error = run.z_hat[:, -1] - run.unknown_input
         starts = range(first, len(error) - size + 1, size)
         return (
             np.array([rms(error[k : k + size]) for k in starts]),
@@ -98,7 +90,7 @@ def long_rows(
     for law, changes in LAWS.items():
         rms_d, gamma = windows('fuzzy_adaptive', changes)
         rows.append({
-            'gains': gains, 'law': law, 'scheme': scheme, 'omega': omega, 'noise': noise,
+            'law': law, 'scheme': scheme, 'omega': omega, 'noise': noise,
             'gamma_first': float(gamma[0]), 'gamma_last': float(gamma[-1]),
             'rms_d_first': float(rms_d[0]), 'rms_d_last': float(rms_d[-1]), 'rms_d_fixed': fixed,
         })  # fmt: skip

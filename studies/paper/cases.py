@@ -52,12 +52,6 @@ SAFE = {
     if p.name.startswith('gamma_') and p.name != 'gamma_initial'
 }
 """The law of gamma with its default settings, where config/paper.yaml has the paper's."""
-DEMO = {
-    name: value
-    for name, value in load(shipped('config/demo.yaml'), 'estimator').items()
-    if name in ('lambda', 'alpha', 'fuzzy_widths', 'epsilon', 'estimate_from')
-} | {'initial_estimate': [0.0], 'initial_internal': [0.0], 'start_from_measurement': True}
-"""The observer of config/demo.yaml: gains that were found for a noisy y over a middleware."""
 OBSERVERS |= {'fuzzy adaptive, default law, 1e-3 s': Case('fuzzy_adaptive', 1e-3, SAFE)}
 
 

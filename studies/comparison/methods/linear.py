@@ -211,48 +211,37 @@ def each_order(*more: Dimension) -> Callable[[Search], Values]:
     return tune
 
 
+def _one_bandwidth(setting: Setting) -> tuple[Dimension, ...]:
+    return (_bandwidth('bandwidth', setting),)
+
+
+def _two_bandwidths(setting: Setting) -> tuple[Dimension, ...]:
+    return (*_one_bandwidth(setting), _bandwidth('drift_bandwidth', setting))
+
+
 FILTERS = (
     Method(
-        'Kalman',
-        'steady-state Kalman filter, d a random walk',
-        USUAL,
-        lambda s: (_bandwidth('bandwidth', s),),
-        _prepare(1, _kalman),
+        'Kalman', 'steady-state Kalman filter, d a random walk', USUAL,
+        _one_bandwidth, _prepare(1, _kalman),
     ),
     Method(
-        'Kalman, ramp',
-        'steady-state Kalman filter, d and its derivative random walks',
-        LINEAR,
-        lambda s: (_bandwidth('bandwidth', s), _bandwidth('drift_bandwidth', s)),
-        _prepare(2, _kalman_ramp),
+        'Kalman, ramp', 'steady-state Kalman filter, d and its derivative random walks', LINEAR,
+        _two_bandwidths, _prepare(2, _kalman_ramp),
     ),
     Method(
-        'Kalman, decaying',
-        'steady-state Kalman filter, d a random walk that decays',
-        LINEAR,
-        matern_space,
-        _prepare(1, _kalman),
+        'Kalman, decaying', 'steady-state Kalman filter, d a random walk that decays', LINEAR,
+        matern_space, _prepare(1, _kalman),
     ),
     Method(
-        LINEAR_LIMIT,
-        'steady-state Kalman filter, d a Matern process as in ours',
-        LINEAR,
-        matern_space,
-        _prepare(1, _kalman),
-        each_order(),
+        LINEAR_LIMIT, 'steady-state Kalman filter, d a Matern process as in ours', LINEAR,
+        matern_space, _prepare(1, _kalman), each_order(),
     ),
     Method(
-        'ESO',
-        'high-gain (extended state) observer, all poles at one place',
-        LINEAR,
-        lambda s: (_bandwidth('bandwidth', s),),
-        _prepare(1, _eso, integrators_only=True),
+        'ESO', 'high-gain (extended state) observer, all poles at one place', LINEAR,
+        _one_bandwidth, _prepare(1, _eso, integrators_only=True),
     ),
     Method(
-        'Luenberger',
-        'Luenberger observer with disturbance state, all poles free',
-        LINEAR,
-        _luenberger_space,
-        _prepare(1, _luenberger),
+        'Luenberger', 'Luenberger observer with disturbance state, all poles free', LINEAR,
+        _luenberger_space, _prepare(1, _luenberger),
     ),
-)
+)  # fmt: skip

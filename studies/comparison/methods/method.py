@@ -115,3 +115,9 @@ class Method(NamedTuple):
     prepare: Callable[[Setting, Values], Run]
     tune: Callable[[Search], Values] | None = None
     needs_noise: bool = False
+
+
+def untuned(setting: Setting) -> tuple[Dimension, ...]:
+    """Return the space of a method that has no parameters."""
+    del setting
+    return ()

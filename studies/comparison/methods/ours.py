@@ -16,7 +16,6 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.core.simulation.scoring import FIRST_STAMP
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.search import Dimension
 from fhaosmo_ros.tools.tuning.source import TuningData
 from fhaosmo_ros.tools.tuning.space import changes
 from fhaosmo_ros.tools.tuning.tuner import Tuner
@@ -28,6 +27,7 @@ from studies.comparison.methods.method import (
     Search,
     SELF_TUNING,
     Setting,
+    untuned,
     Values,
 )
 from studies.comparison.scores import Estimates, JUDGED_FROM
@@ -69,25 +69,13 @@ def _tune(search: Search) -> Values:
     return tuner.parameters(changes(found.best)) if found is not None else {}
 
 
-def _none(setting: Setting) -> tuple[Dimension, ...]:
-    del setting
-    return ()
-
-
 OUR_METHODS = (
     Method(
-        OURS,
-        'levant, fuzzy, predict_correct, all gains and the model of d by `tune`',
-        OURS,
-        _none,
-        _prepared(lambda _, values: values),
-        _tune,
+        OURS, 'levant, fuzzy, predict_correct, all gains and the model of d by `tune`', OURS,
+        untuned, _prepared(lambda _, values: values), _tune,
     ),
     Method(
-        SELF_TUNING,
-        'told the model only, no tuning',
-        SELF_TUNING,
-        _none,
+        SELF_TUNING, 'told the model only, no tuning', SELF_TUNING, untuned,
         _prepared(lambda *_: {'gains': 'self_tuning'}),
     ),
-)
+)  # fmt: skip

@@ -17,7 +17,15 @@ from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.cli.share import shipped
 from fhaosmo_ros.tools.tuning.search import Dimension
 import numpy as np
-from studies.comparison.methods.method import Method, PAPER, Run, Setting, SLIDING, Values
+from studies.comparison.methods.method import (
+    Method,
+    PAPER,
+    Run,
+    Setting,
+    SLIDING,
+    untuned,
+    Values,
+)
 from studies.comparison.scores import Estimates
 
 Parameters = Callable[[Setting, Values], Mapping[str, Any]]
@@ -81,38 +89,20 @@ def _levant_space(setting: Setting) -> list[Dimension]:
     return [Dimension('lipschitz', 1e-4 * setting.size, 1e8 * setting.size, 10.0 * setting.size)]
 
 
-def _none(setting: Setting) -> list[Dimension]:
-    del setting
-    return []
-
-
 OBSERVERS = (
     Method(
-        'Levant, implicit',
-        "Levant's robust exact differentiator with Phi, implicit Euler",
-        SLIDING,
-        _levant_space,
-        prepared(_levant),
+        'Levant, implicit', "Levant's robust exact differentiator with Phi, implicit Euler",
+        SLIDING, _levant_space, prepared(_levant),
     ),
-    Method(
-        'paper: sign',
-        "sign observer with the paper's gains",
-        PAPER,
-        _none,
-        prepared(_papers_gains('sign')),
+    *(
+        Method(name, text, PAPER, untuned, prepared(_papers_gains(variant)))
+        for name, text, variant in (
+            ('paper: sign', "sign observer with the paper's gains", 'sign'),
+            ('paper: fuzzy', "fuzzy observer with the paper's gains", 'fuzzy'),
+            (
+                'paper: adaptive', "fuzzy observer with adapted gamma and the paper's gains",
+                'fuzzy_adaptive',
+            ),
+        )
     ),
-    Method(
-        'paper: fuzzy',
-        "fuzzy observer with the paper's gains",
-        PAPER,
-        _none,
-        prepared(_papers_gains('fuzzy')),
-    ),
-    Method(
-        'paper: adaptive',
-        "fuzzy observer with adapted gamma and the paper's gains",
-        PAPER,
-        _none,
-        prepared(_papers_gains('fuzzy_adaptive')),
-    ),
-)
+)  # fmt: skip
