@@ -13,26 +13,28 @@ recordings.
 import argparse
 from collections.abc import Callable, Sequence
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from fhaosmo_ros.core import EventDetector, Observer
+from fhaosmo_ros.core import EventDetector, Observer, TriangularModel
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.simulation import recordings
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.plot.figures import COLOURS
+from fhaosmo_ros.tools.tuning.linear_gains import SampledModel
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_are
-from scipy.signal import lfilter, ss2tf
+from scipy.signal import lfilter
 from studies import evidence
+from studies.comparison.methods.linear import estimates
 from studies.evidence import Row
 from studies.harness import SELF_TUNING
 
 NAME = 'events'
 H, NOISE, LOAD, FAULT, LASTS, EVERY, SETTLED = 0.01, 1e-3, 0.05, 1.0, 2.0, 20.0, 60.0
 HOURS = 10.0
-MODEL = {'order': 2, 'phi': ['0', '-z2']}
+MODEL: dict[str, Any] = {'order': 2, 'phi': ['0', '-z2']}
 SELF_TUNED = MODEL | SELF_TUNING
 THRESHOLDS = np.geomspace(0.08, 0.9, 14)
 DEVIATIONS, DURATION = 5.0, 0.03
@@ -71,18 +73,12 @@ def record(hours: float, seed: int, noise: float = NOISE, faults: bool = False) 
 
 
 def kalman(y: Array, intensity: float) -> tuple[Array, Array]:
-    """Return d and its standard deviation by the filter whose d is a random walk."""
-    e = np.exp(-H)
-    f = np.array([[1.0, 1.0 - e, H - 1.0 + e], [0.0, e, 1.0 - e], [0.0, 0.0, 1.0]])
-    c, q = np.array([[1.0, 0.0, 0.0]]), np.diag([0.0, 0.0, intensity * H])
-    before = solve_discrete_are(f.T, c.T, q, np.array([[NOISE**2]]))
-    k = before @ c.T / (before[0, 0] + NOISE**2)
-    after = before - k @ c @ before
-    stay = np.eye(3) - k @ c
-    # x_k = (I - K C) F x_{k-1} + K y_k, as a filter from y to d
-    numerator, denominator = ss2tf(stay @ f, stay @ f @ k, np.array([[0.0, 0.0, 1.0]]), k[2:3])
-    d = lfilter(numerator[0], denominator, y - y[0])
-    return d, np.full(len(y), np.sqrt(after[2, 2]))
+    """Return d by the filter whose d is a random walk, and no standard deviation."""
+    model = TriangularModel(MODEL['phi'])
+    gain = SampledModel(model, H).kalman([intensity / NOISE**2])
+    t, none = H * np.arange(len(y)), np.zeros(len(y))
+    samples = recordings.Recording(t, y, none, none[:, None], none, FILTER)
+    return estimates(model, gain, 0.0, samples, 1.5 * H)[:, model.order], none
 
 
 def self_tuning(y: Array) -> tuple[Array, Array]:

@@ -33,13 +33,10 @@ def test_the_file_of_the_page_finds_faults_and_nothing_else(estimator, factor):
     assert not len(quiet[quiet > 10.0])
 
 
-def test_the_filter_beside_it_is_a_kalman_filter():
+def test_the_filter_beside_it_follows_a_fault_and_smooths_a_load():
     r = events.record(0.05, 6)
-    d, deviation = events.kalman(r.y, 1e-2)
-    late = slice(2000, None)
-    # White noise of its innovations' size in, and as sure as it is: d is nearly at rest here.
-    assert np.std((d - r.d)[late]) < 1.3 * deviation[0]
-    assert np.std((d - r.d)[late]) < np.std(events.kalman(r.y, 1.0)[0][late] - r.d[late])
+    slow, quick = (events.kalman(r.y, intensity)[0][2000:] - r.d[2000:] for intensity in (1e-2, 1))
+    assert np.std(slow) < np.std(quick) < events.FAULT
 
 
 @pytest.fixture(scope='module')
