@@ -6,7 +6,7 @@ MINUTES ?= 2
 # $(call with,EXTRA): set $python to the environment's Python, making the environment first.
 with = python=$$(PYTHON='$(PYTHON)' sh scripts/environment.sh $(1))
 
-.PHONY: help demo paper tune compare test lint docs bench soak clean
+.PHONY: help demo paper tune compare evidence test lint docs bench soak clean
 .NOTPARALLEL:
 
 help:
@@ -14,6 +14,7 @@ help:
 	@echo 'make paper   reproduce the paper, rewrite docs/evidence and its figures'
 	@echo 'make tune    find gains that fit a sensor: ARGS="--params-file my.yaml", or --bag run'
 	@echo 'make compare tune other observers by the same rules, rewrite docs/evidence'
+	@echo 'make evidence  all tables and figures in docs/evidence but recipes and speed: for a night'
 	@echo 'make test    check style and types, run the tests'
 	@echo 'make lint    check style and types only'
 	@echo 'make docs    build the pages in docs/ as a site, build/docs/index.html'
@@ -36,6 +37,9 @@ tune:
 
 compare:
 	@$(call with,compare) && exec "$$python" -m studies.comparison $(ARGS)
+
+evidence: paper compare
+	@$(call with,compare) && "$$python" -m studies.everywhere && exec "$$python" -m studies.events
 
 lint:
 	@$(call with,test) && set -x && \

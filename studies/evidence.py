@@ -20,8 +20,11 @@ Row = dict[str, Any]
 
 
 def read(name: str, docs: Path = DOCS) -> list[Row]:
-    """Return the lines of a table in the folder beside the page."""
-    with (docs / FOLDER / f'{name}.csv').open(newline='', encoding='utf-8') as file:
+    """Return the lines of a table in the folder beside the page; none where there is no such."""
+    path = docs / FOLDER / f'{name}.csv'
+    if not path.exists():
+        return []
+    with path.open(newline='', encoding='utf-8') as file:
         return [{k: _value(text) for k, text in row.items()} for row in csv.DictReader(file)]
 
 

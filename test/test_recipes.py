@@ -34,7 +34,7 @@ def errors(condition, ours):
 
 @recipes
 def test_short_run_of_all_methods(name, capsys):
-    assert main([name, '--short']) == 0
+    assert main([name, '--quick']) == 0
     said = re.findall(r'simulated: (.*): ([0-9.e+-]+)', capsys.readouterr().out)
     found = {method: float(error) for method, error in said}
     assert list(found) == list(RECIPES[name].METHODS)

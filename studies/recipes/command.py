@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure a recipe: the usual peers, tuned with the truth, beside the self-tuning observer."""
+"""
+Measure a recipe: the usual peers, tuned with the truth, beside the self-tuning observer.
+
+With --quick on two short simulations by this package, without recordings; writes nothing.
+"""
 
 import argparse
 from pathlib import Path
@@ -8,6 +12,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
 from studies import evidence
+from studies.harness import output, study
 from studies.recipes import (
     encoder,
     figures,
@@ -28,35 +33,32 @@ NAME = 'recipes'
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0, 2 for a bad argument or output, 130 if it was interrupted."""
-    parser = argparse.ArgumentParser(prog=NAME, description=__doc__)
+    parser = study(NAME, __doc__)
     parser.add_argument('recipe', choices=RECIPES, help='which one to measure anew')
     needs = '; '.join(f'{name}: {r.DATA}' for name, r in RECIPES.items() if r.DATA)
     parser.add_argument('--data', type=Path, metavar='PATH', help=f'recordings ({needs})')
-    parser.add_argument(
-        '--short', action='store_true',
-        help='two short simulations by this package, without recordings; writes nothing',
-    )  # fmt: skip
     return run_command(parser, argv, _measure)
 
 
 def _measure(arguments: argparse.Namespace, stop: Stop) -> None:
     name, recipe = arguments.recipe, RECIPES[arguments.recipe]
-    if recipe.DATA and not (arguments.short or arguments.data):
+    if recipe.DATA and not (arguments.quick or arguments.data):
         raise ConfigurationError(
-            f'{name}: expected --data PATH ({recipe.DATA}), or --short, got neither'
+            f'{name}: expected --data PATH ({recipe.DATA}), or --quick, got neither'
         )
     if arguments.data and not arguments.data.exists():
         raise ConfigurationError(f'--data: expected a path that exists, got {arguments.data}')
     with stop.raising():
         folds, remarks = (
-            (recipe.short(), {}) if arguments.short else recipe.conditions(arguments.data)
+            (recipe.short(), {}) if arguments.quick else recipe.conditions(arguments.data)
         )
         results = {condition: judge(recipe.METHODS, these) for condition, these in folds.items()}
         rows = table(name, results)
         for row in rows:
             print(f'{row["condition"]}: {row["method"]}: {row["error"]:.3g} {row["chosen"]}')
         print(', '.join(f'{quantity} {value:.4g}' for quantity, value in remarks.items()))
-        if not arguments.short:
-            others = [row for row in evidence.read(NAME) if row['recipe'] != name]
+        if not arguments.quick:
+            docs = output(arguments, NAME)
+            others = [row for row in evidence.read(NAME, docs) if row['recipe'] != name]
             drawn = {f'recipe_{name}': figures.draw(recipe, folds, results)}
-            evidence.publish(evidence.DOCS, {NAME: [*others, *rows]}, {}, drawn)
+            evidence.publish(docs, {NAME: [*others, *rows]}, {}, drawn)
