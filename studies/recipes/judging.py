@@ -93,6 +93,11 @@ def model(name: str, constants: Mapping[str, float] | None = None) -> dict[str, 
     return model_alone(p) | {f'constants.{k}': float(v) for k, v in (constants or {}).items()}
 
 
+def plant_of(parameters: Mapping[str, Any]) -> TriangularModel:
+    """Return the model that the estimator's parameters describe."""
+    return TriangularModel.of(ESTIMATOR_PARAMETERS.complete(parameters))
+
+
 def run(parameters: Mapping[str, Any], r: Recorded) -> Trajectory:
     """Return what the node would have estimated."""
     return observed(parameters, r.t, r.y, r.u if r.u.size else None)
@@ -185,7 +190,7 @@ def simulated(
     `d` has the RMS of the unknown input and its speed (rad/s), `inputs` mean and RMS of each
     known one; what is judged begins `settled` seconds after the start.
     """
-    model, found = TriangularModel.of(ESTIMATOR_PARAMETERS.complete(parameters)), []
+    model, found = plant_of(parameters), []
     t = np.arange(0.0, seconds, 1.0 / rate)
     for seed in range(count):
         rng = np.random.default_rng(seed)

@@ -4,19 +4,12 @@
 from collections.abc import Mapping
 from typing import Any
 
-from fhaosmo_ros.core import TriangularModel
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import bilinear, lfilter
-from studies.recipes.judging import Recorded
+from studies.recipes.judging import plant_of, Recorded
 
 Floats = NDArray[np.float64]
-
-
-def model_of(parameters: Mapping[str, Any]) -> TriangularModel:
-    """Return the model that the estimator's parameters describe."""
-    return TriangularModel.of(ESTIMATOR_PARAMETERS.complete(parameters))
 
 
 def low_passed(x: Floats, bandwidth: float, period: float, order: int, derivative: int) -> Floats:
@@ -36,7 +29,7 @@ def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) ->
     The low-passed second derivative less what the model explains (Chen et al. 2016,
     doi:10.1109/TIE.2015.2478397).
     """
-    model, h = model_of(p), r.period
+    model, h = plant_of(p), r.period
     velocity = low_passed(r.y, bandwidth, h, 2, 1)
     inputs = r.u if r.u.size else np.zeros((len(r.y), 1))
     explained = np.array(
@@ -56,7 +49,7 @@ def kalman_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats
     Only the ratio of the two noises matters; it is given as the bandwidth of the steady filter of
     the chain of integrators: q = bandwidth^(2N) noise² h, N = n + 1.
     """
-    model = model_of(p)
+    model = plant_of(p)
     n, h = model.order, r.period
     q = bandwidth ** (2 * n + 2) * h
     x = np.zeros(n + 1)
@@ -95,7 +88,7 @@ def complementary_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) ->
     In one dimension this is the filter of Mahony et al. (2008, doi:10.1109/TAC.2008.923738)
     with its estimate of the bias.
     """
-    model, angle, bias, found = model_of(p), float(r.y[0]), 0.0, np.zeros(len(r.y))
+    model, angle, bias, found = plant_of(p), float(r.y[0]), 0.0, np.zeros(len(r.y))
     for k in range(1, len(r.y)):
         dt, rate = r.t[k] - r.t[k - 1], model.evaluate(r.y[k : k + 1], r.u[k])[0]
         wrong = r.y[k] - angle - dt * (rate + bias)
