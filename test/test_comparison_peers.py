@@ -4,7 +4,6 @@
 from fhaosmo_ros.core import ConfigurationError, TriangularModel
 from fhaosmo_ros.core.simulation.plant import Plant
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.tuning.linear_gains import SampledModel
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -12,6 +11,7 @@ from studies.comparison.evaluation import METHODS
 from studies.comparison.methods.adaptive import ADAPTIVE
 from studies.comparison.methods.linear import FILTERS, pair, placed
 from studies.comparison.methods.method import Setting
+from studies.comparison.methods.sampled import SampledModel
 
 MODELS = {
     'paper': TriangularModel(['0', '0', '-z3']),

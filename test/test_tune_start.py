@@ -14,15 +14,16 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.tools.tuning.command import main
-from fhaosmo_ros.tools.tuning.linear_gains import kalman_like, SampledModel
-from fhaosmo_ros.tools.tuning.objective import least_damping, Objective
+from fhaosmo_ros.tools.tuning.linear_gains import least_damping, with_gain
+from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.source import simulated
 from fhaosmo_ros.tools.tuning.space import changes
-from fhaosmo_ros.tools.tuning.start import KalmanDesign, KalmanGains, SCHEME, with_scheme
+from fhaosmo_ros.tools.tuning.start import KalmanStart, SCHEME, with_scheme
 from fhaosmo_ros.tools.tuning.tuner import Tuner
 import numpy as np
 from studies.comparison.methods.linear import estimates
+from studies.comparison.methods.sampled import SampledModel
 
 ROOT = Path(__file__).resolve().parents[1]
 PHI = ['0', '0', '-z3']
@@ -56,7 +57,7 @@ def test_kalman_like_gains_make_a_kalman_filter(derivatives, decay):
             | {
                 'unknown_input_derivatives': derivatives,
                 'unknown_input_decay': decay,
-                'lambda': kalman_like(model, bandwidth, width, psi, noise, gamma).tolist(),
+                'lambda': with_gain(gain, period, width, psi, noise, gamma).tolist(),
                 'fuzzy_widths': [width],
                 'gamma_initial': gamma,
                 'gamma_min': 1e-5,
@@ -75,15 +76,15 @@ def test_bandwidth_is_that_of_the_matern_process_of_d():
     """Were d and the noise c times as large, the filter would be the same one."""
     recordings = Family(SHORT).recordings(2)
     large = [r._replace(y=9.0 * r.y, z=9.0 * r.z, d=9.0 * r.d) for r in recordings]
-    model = TriangularModel(PHI, 3)
+    p = OBSERVER_PARAMETERS.complete({'order': 3, 'phi': PHI})
     for k in (0, 2):
-        one, other = (KalmanGains(rs, {}, model, k, 1e-4) for rs in (recordings, large))
+        one, other = (KalmanStart(rs, {}, p, k, 1e-4) for rs in (recordings, large))
         assert one.bandwidth(2.0) == pytest.approx(other.bandwidth(2.0))
         assert one.bandwidth(4.0) > one.bandwidth(2.0)
-        widths = [start(KalmanDesign(0.5, 1.25))['fuzzy_widths'][0] for start in (one, other)]
+        widths = [start(0.5, 1.25)['fuzzy_widths'][0] for start in (one, other)]
         assert widths[1] == pytest.approx(9.0 * widths[0])
     # k = 0: a first-order Gauss-Markov process, var = intensity / (2 rate).
-    start = KalmanGains(recordings, {}, model, 0, 1e-4)
+    start = KalmanStart(recordings, {}, p, 0, 1e-4)
     d = np.concatenate([r.d for r in recordings])
     noise = np.concatenate([r.y - r.z[:, 0] for r in recordings])
     expected = (np.mean(d**2) * 2.0 * 3.0 / (np.mean(noise**2) / 200.0)) ** (1 / 8)
@@ -199,7 +200,8 @@ def test_damping_of_a_chain_of_integrators_is_butterworths(levels):
     period, width, noise = 1e-3, 1e3, 1e-3
     model = SampledModel(TriangularModel(['0'], 1), period, levels - 1)
     psi = curves(OBSERVER_PARAMETERS.defaults(), levels)
-    gains = kalman_like(model, 15.0, width, psi, noise, 1e-4)
+    k = model.kalman([period * 15.0 ** (2 * levels)])
+    gains = with_gain(k, period, width, psi, noise, 1e-4)
     values = dict(SCHEME) | {
         'order': 1, 'phi': ['0'], 'unknown_input_derivatives': levels - 2,
         'correction_period': period, 'noise_size': noise, 'lambda': gains.tolist(),

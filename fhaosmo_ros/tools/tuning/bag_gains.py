@@ -5,14 +5,12 @@ from collections.abc import Mapping
 import math
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.observer.fuzzy import curves
-from fhaosmo_ros.core.observer.kalman import Uncertainty
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
 from fhaosmo_ros.tools.tuning.identify import Identified, ljung_box
-from fhaosmo_ros.tools.tuning.linear_gains import with_gain
-from fhaosmo_ros.tools.tuning.start import GAMMA, LEAST, SCHEME, WIDTH
+from fhaosmo_ros.tools.tuning.linear_gains import kalman_gains
+from fhaosmo_ros.tools.tuning.start import GAMMA, SCHEME, WIDTH
 import numpy as np
 from numpy.typing import NDArray
 
@@ -104,19 +102,10 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
         **given,
     }
     checked = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(values))
-    uncertainty = Uncertainty(model, checked, np.array(values['state_sizes']))
-    p = uncertainty.steady(period)
-    total = p[0, 0] + uncertainty.variance
-    k = p[0] / total
-    errors = np.sqrt(np.maximum(np.diag(p - np.outer(p[0], p[0]) / total), 0.0))
-    psi = curves(checked, len(k))
-    small = max(noise, 1e-3 * width)
-    found_lambda = with_gain(
-        k, period, values['fuzzy_widths'][0], psi, small, checked['gamma_initial']
-    )
-    largest = OBSERVER_PARAMETERS['lambda'].upper
-    values['lambda'] = [_rounded(x) for x in found_lambda.clip(LEAST, largest)]
-    return Gains(values, errors[: model.order + 1], math.sqrt(total), 1.0 - float(k[0]))
+    lambdas, k, p, variance = kalman_gains(model, checked, period)
+    values['lambda'] = [_rounded(x) for x in lambdas]
+    errors = np.sqrt(np.maximum(np.diag(p) - k**2 * variance, 0.0))
+    return Gains(values, errors[: model.order + 1], math.sqrt(variance), 1.0 - float(k[0]))
 
 
 def run(found: Identified, gains: Gains) -> Run:

@@ -23,6 +23,7 @@ from fhaosmo_ros.tools.tuning.likelihood import (
     Samples,
     SLOWEST,
 )
+from fhaosmo_ros.tools.tuning.linear_gains import matern
 from fhaosmo_ros.tools.tuning.sensor import Sensor
 from fhaosmo_ros.tools.tuning.source import RecordedOutput
 import numpy as np
@@ -120,9 +121,7 @@ class Identified:
 
 def size_of_input(design: Design, intensity: float) -> float:
     """Return D of D 17 for a model of d whose last derivative has this intensity."""
-    k = design.derivatives
-    scaled = intensity * math.factorial(2 * k) / math.factorial(k) ** 2
-    return math.sqrt(scaled / (2.0 * design.decay) ** (2 * k + 1))
+    return math.sqrt(intensity / matern(design.decay, design.derivatives))
 
 
 def identify_input(

@@ -1,141 +1,108 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Gains of the steady-state Kalman filter, and lambda with which the observer has them (D 19).
+"""lambda of a Kalman filter, and the linear observer that given lambda come to (D 18, D 19)."""
 
-All gains are for a filter that predicts to t_k and then corrects with y_k itself. States are
-scaled by powers of the period, because the Riccati equation is badly conditioned otherwise. The
-covariance of the process noise over a period is Van Loan's integral by matrix exponentials: C. F.
-Van Loan, IEEE Transactions on Automatic Control 23(3), 1978, doi:10.1109/TAC.1978.1101743.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Mapping
+import math
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import deadbeat_shares
+from fhaosmo_ros.core.observer.fuzzy import curves
+from fhaosmo_ros.core.observer.kalman import Uncertainty
+from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import expm, solve_discrete_are
+from numpy.typing import NDArray
+from scipy.linalg import expm, solve_triangular
 
-Matrix = NDArray[np.float64]
+Floats = NDArray[np.float64]
 SMALLEST = 1e-12
 """Stands for 1 - K_1 of a deadbeat observer."""
-LONGEST_STEP = 1.0
-"""Upper limit of `resolution` in seconds, for a model without dynamics of its own."""
+LEAST = 1e-30
+"""Gain that stands for one that is not positive."""
+SIZES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 12.0, 16.0)
+"""
+Of innovations, in the standard deviations of what is expected. With a d that is faster than
+expected their spread grows, and so do the limits of D 21 and D 32.
+"""
+STILL = 1e-3
+"""Stands for an innovation of 0."""
+DEADBEAT = 1e-12
+"""Poles (z) that are smaller, or rates, count as 0."""
 
 
-class SampledModel:
+class KalmanGains(NamedTuple):
     """
-    The model, linearised at rest and extended by a chain of `chain` integrators that makes d.
+    The steady-state Kalman filter of a model, and the observer that equals it.
+
+    Attributes
+    ----------
+    lambdas : (N,) array
+        Of the observer.
+    gain : (N,) array
+        K of a filter that predicts and then corrects.
+    predicted : (N, N) array
+        Covariance of the errors of its predictions.
+    variance : float
+        Of its innovations.
+
+    """
+
+    lambdas: Floats
+    gain: Floats
+    predicted: Floats
+    variance: float
+
+
+def kalman_gains(model: TriangularModel, p: Mapping[str, Any], period: float) -> KalmanGains:
+    """
+    Return lambda with which predict_correct is the Kalman filter that parameters ask for (D 19).
 
     Parameters
     ----------
     model : TriangularModel
+    p : mapping
+        Of the observer, complete: noise_size, the model of d, the first of fuzzy_widths for all
+        levels, and gamma_initial.
     period : float
-        Sampling period in seconds.
-    chain : int
-        Integrators that model d: with 1 the white noise drives d itself, with 2 its derivative.
-    integrators_only : bool
-        Take Phi = 0, as for the gains of an extended state observer.
-    decay : float
-        Rate (1/s) at which all states of the chain decay, so that d is a Matern process.
+        Sampling period (s).
 
-    Attributes
-    ----------
-    scale : (N,) array
-        Powers of the period, 0 to N - 1.
-    a : (N, N) array
-        Transition over a period, in scaled states x_i * period^(i - 1).
-    resolution : float
-        Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
-        0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as
-        dry friction, needs shorter ones.
+    Raises
+    ------
+    ConfigurationError
+        There is no such filter in floating-point numbers, or psi is 0 at the size of the noise.
 
     """
-
-    def __init__(
-        self,
-        model: TriangularModel,
-        period: float,
-        chain: int = 1,
-        integrators_only: bool = False,
-        decay: float = 0.0,
-    ) -> None:
-        self.size = model.order + chain
-        self.period = period
-        self.scale = period ** np.arange(self.size)
-        self._rates = np.eye(self.size, k=1)
-        self._rates[range(model.order, self.size), range(model.order, self.size)] = -decay
-        jacobian = model.jacobian(np.zeros(model.order))
-        fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(model.order, k=1))))
-        self.resolution = min(0.03 / max(float(fastest), 1e-9), LONGEST_STEP)
-        if not integrators_only:
-            self._rates[: model.order, : model.order] += jacobian
-        self.a = self._scaled(expm(self._rates * period))
-        self._c = np.eye(self.size)[:1]
-
-    def _scaled(self, matrix: Matrix) -> Matrix:
-        return matrix * self.scale[:, None] / self.scale[None, :]
-
-    def kalman(self, intensities: Sequence[float]) -> Matrix:
-        """
-        Return the steady-state Kalman gain for noise of variance 1 on y.
-
-        Parameters
-        ----------
-        intensities : sequence of float
-            Of the continuous white noises that drive the last states of the chain; the first one
-            is that of the last state.
-
-        """
-        noise = self.process_noise(intensities)
-        try:
-            with np.errstate(invalid='ignore'):  # the result is checked below
-                p = solve_discrete_are(self.a.T, self._c.T, noise, np.eye(1))
-        except (np.linalg.LinAlgError, ValueError) as error:
-            raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
-        gain = p[:, 0] / (p[0, 0] + 1.0) / self.scale
-        if not np.isfinite(gain).all():
-            raise ConfigurationError(f'Kalman gain: expected finite numbers, got {gain}')
-        return gain
-
-    def process_noise(self, intensities: Sequence[float]) -> Matrix:
-        """Return what noise as in `kalman` adds to the scaled covariance (Van Loan 1978)."""
-        spectrum = np.zeros(self.size)
-        for i, value in enumerate(intensities):
-            spectrum[self.size - 1 - i] = value
-        n, rates = self.size, self._scaled(self._rates) * self.period
-        spectrum = spectrum * self.scale**2 * self.period
-        largest = float(spectrum.max()) or 1.0
-        block = np.zeros((2 * n, 2 * n))
-        block[:n, :n], block[:n, n:], block[n:, n:] = -rates, np.diag(spectrum / largest), rates.T
-        exponential = expm(block)
-        covariance = largest * exponential[n:, n:].T @ exponential[:n, n:]
-        return 0.5 * (covariance + covariance.T)
+    uncertainty = Uncertainty(model, p, np.zeros(model.order))
+    predicted = uncertainty.steady(period)
+    variance = predicted[0, 0] + uncertainty.variance
+    gain = predicted[0] / variance
+    width = p['fuzzy_widths'][0]
+    small = max(p['noise_size'], 1e-3 * width)
+    lambdas = with_gain(gain, period, width, curves(p, len(gain)), small, p['gamma_initial'])
+    lambdas = lambdas.clip(LEAST, OBSERVER_PARAMETERS['lambda'].upper)
+    return KalmanGains(lambdas, gain, predicted, variance)
 
 
-def kalman_like(
-    model: SampledModel,
-    bandwidth: float,
-    widths: ArrayLike,
-    curves: Matrix,
-    small: float,
-    gamma: float,
-) -> Matrix:
+def matern(rate: float, derivatives: int) -> float:
+    """Return the intensity of the white noise behind a Matern d of the RMS 1 (D 17)."""
+    k = derivatives
+    return (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2 / math.factorial(2 * k)
+
+
+def with_gain(
+    k: Floats, h: float, widths: Any, curves: Floats, small: float, gamma: float
+) -> Floats:
     """
-    Return lambda_1 .. lambda_N with which predict_correct is a Kalman filter (D 19).
-
-    For innovations of the size `small` the corrections are those of the steady-state Kalman filter
-    of the model, linearised at rest, whose last level is driven by white noise. For a chain of N
-    integrators and (intensity / density of the noise on y) = bandwidth^(2 N) its poles are
-    Butterworth's, at the distance `bandwidth`.
+    Return lambda_1 .. lambda_N with which predict_correct has the gains K_1 .. K_N (D 19).
 
     Parameters
     ----------
-    model : SampledModel
-        With the observer's model of d.
-    bandwidth : float
-        rad/s.
+    k : (N,) array
+        Gains of a linear observer that predicts and then corrects.
+    h : float
+        Sampling period (s).
     widths : float or (N,) array
         Half-widths, unit of y.
     curves : (N, K) array
@@ -147,57 +114,57 @@ def kalman_like(
     Raises
     ------
     ConfigurationError
-        The Riccati equation has no solution in floating-point numbers, or psi is 0 there.
-
-    """
-    n, h = model.size, model.period
-    k = model.kalman([h * bandwidth ** (2 * n)])
-    return with_gain(k, h, widths, curves, small, gamma)
-
-
-def with_gain(
-    k: Matrix,
-    h: float,
-    widths: ArrayLike,
-    curves: Matrix,
-    small: float,
-    gamma: float,
-) -> Matrix:
-    """
-    Return lambda_1 .. lambda_N with which predict_correct has the gains K_1 .. K_N (D 19).
-
-    Parameters
-    ----------
-    k : (N,) array
-        Gains of a linear observer that predicts and then corrects.
-    h : float
-        Sampling period (s).
-    widths, curves, small, gamma
-        As for `kalman_like`.
-
-    Raises
-    ------
-    ConfigurationError
         psi is 0 there.
 
     """
-    n = len(k)
     # Every injection is a function of eps = (1 - k_1) b, the innovation after the correction.
-    wanted = k / max(1.0 - k[0], SMALLEST)
-    injections = np.zeros(n)
-    share = deadbeat_shares(n)
-    for i in reversed(range(n)):  # wanted_i = sum_j beta_ji h^(j-i+1) v_j  (D 19)
-        behind = sum(share[j, i] * h ** (j - i + 1) * injections[j] for j in range(i + 1, n))
-        injections[i] = (wanted[i] - behind) / h
-    level = np.arange(1, n + 1)
-    power = 2.0 * gamma * (n - level) / n  # D 11
-    grid = np.linspace(0.0, 1.0, curves.shape[1])
-    psi = np.array(
-        [
-            np.interp(small / width, grid, curve)
-            for width, curve in zip(np.broadcast_to(widths, n), curves, strict=True)
-        ]
-    )
+    injections = solve_triangular(_corrections(len(k), h), k / max(1.0 - k[0], SMALLEST))
+    psi = _membership(curves, np.broadcast_to(small / np.asarray(widths), len(k)))
     if not psi.all():
         raise ConfigurationError(f'Kalman gain: expected psi > 0 at {small:g}, got {psi}')
-    return np.asarray(injections * small ** (1.0 - power) / psi)
+    return np.asarray(injections * small ** (1.0 - _power(len(k), gamma)) / psi)
+
+
+def least_damping(observer: Observer) -> float:
+    """
+    Return the smallest damping ratio of the errors' dynamics, linearised at rest (D 18).
+
+    For each of `SIZES` the corrections count as linear: K_i is what they are over the innovation.
+    Below 0 the errors grow by themselves. 1 without `noise_size` or with another scheme, where
+    other rules hold.
+    """
+    c = observer.configuration
+    if not c.predicting or c.schedule is None:
+        return 1.0
+    n, h = c.levels, c.parameters['correction_period']
+    transition = expm(Uncertainty(c.model, c.parameters, c.state_sizes).rates * h)
+    expected = np.sqrt(c.schedule.steady[0, 0] + c.schedule.variance)
+    worst = 1.0
+    for size in SIZES:
+        a = max(size, STILL) * expected
+        psi = _membership(c.curves, np.minimum(a / c.widths, 1.0))
+        wanted = _corrections(n, h) @ (c.lambdas * a ** (_power(n, c.gamma_initial) - 1.0) * psi)
+        errors = transition - np.outer(wanted / (1.0 + wanted[0]), transition[0])
+        if not np.isfinite(errors).all():
+            return -1.0
+        poles = np.linalg.eigvals(errors).astype(complex)
+        rates = np.log(poles[np.abs(poles) > DEADBEAT])
+        worst = min(worst, *(-rates.real / np.maximum(np.abs(rates), DEADBEAT)).tolist())
+    return worst
+
+
+def _corrections(n: int, h: float) -> Floats:
+    """Return the matrix from injections to corrections, beta_ji h^(j - i + 1) (D 18)."""
+    level = np.arange(n)
+    return np.triu(deadbeat_shares(n).T * h ** (level[None, :] - level[:, None] + 1.0))
+
+
+def _power(n: int, gamma: float) -> Floats:
+    """Return the powers of the innovation in the injections (D 11)."""
+    return 2.0 * gamma * np.arange(n - 1.0, -1.0, -1.0) / n
+
+
+def _membership(curves: Floats, inputs: Floats) -> Floats:
+    """Return psi of each level at its input."""
+    grid = np.linspace(0.0, 1.0, curves.shape[1])
+    return np.array([np.interp(x, grid, curve) for x, curve in zip(inputs, curves, strict=True)])

@@ -26,19 +26,18 @@ and lag, which depends on the family of d, and there is no formula for it.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import product, starmap
+from itertools import product
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA
-from fhaosmo_ros.core.observer.fuzzy import curves
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.cli.progress import progress
-from fhaosmo_ros.tools.tuning.linear_gains import kalman_like, SampledModel
+from fhaosmo_ros.tools.tuning.linear_gains import kalman_gains, matern
 from fhaosmo_ros.tools.tuning.objective import Objective
 import numpy as np
 from numpy.typing import NDArray
@@ -61,70 +60,22 @@ HOPELESS = 1.3
 """Numbers of derivatives that are this factor behind the best on the grid are given up."""
 GAMMAS = (0.25, 0.5)
 """Powers gamma to start from with the other schemes, where gamma is searched."""
-LEAST = 1e-30
-"""Gain that stands for one that is not positive."""
 FASTEST = 5.0
 """Bandwidth times period of a deadbeat observer."""
 GAMMA = 3e-3
 """Power at which the injections are nearly linear in the innovation; the user may set another."""
-RATES = tuple(float(x) for x in np.geomspace(0.1, 30.0, 8))
-FACTORS = (0.8, 1.0, 1.25)
+RATES, FACTORS = np.geomspace(0.1, 30.0, 8), np.array([0.8, 1.0, 1.25])
+"""kappa of D 17 (1/s), and the bandwidth relative to the one that this d and the noise ask for."""
 WIDTH = 16.0
 """Nearly linear for the noise itself, and outliers count as a few standard deviations of it."""
 ZOOMS = (0.5, 0.25)
-"""Distances to the neighbours that are tried around the best design, in steps of the grid."""
+"""Distances to the neighbours that are tried around the best filter, in steps of the grid."""
 OMEGAS = tuple(float(w) for w in np.geomspace(2.0, 200.0, 9))
 KAPPAS = (1.0, 5.0, 25.0)
 ZETAS = (0.7, 1.5, 4.0)
 OPEN = 100.0
 """epsilon in units of the largest half-width: all levels run, except far from the estimate."""
-
-
-class Start(NamedTuple):
-    """
-    Where a search begins.
-
-    Attributes
-    ----------
-    gains : dict
-        Parameters of the observer: those that are searched, and those that fit them.
-    tried : dict
-        Best objective by number of derivatives of d, where that number was open.
-
-    """
-
-    gains: dict[str, Any]
-    tried: dict[int, float]
-
-
-class StartProblem(NamedTuple):
-    """
-    What a start is searched for.
-
-    Attributes
-    ----------
-    recordings : sequence of Recording
-    estimator : mapping
-        What is set for the estimator, with the scheme; see `with_scheme`.
-    names : sequence of str
-        Parameters that are searched.
-    objective : callable
-        From what is set for the estimator to an Objective.
-
-    """
-
-    recordings: Sequence[Recording]
-    estimator: Mapping[str, Any]
-    names: Sequence[str]
-    objective: Callable[[Mapping[str, Any]], Objective]
-
-    def gamma(self, p: Mapping[str, Any], usual: float) -> float:
-        """Return gamma_initial: what is set, or the usual one where it is searched."""
-        if not p['variant'].endswith('_adaptive'):
-            return FIXED_GAMMA
-        if 'gamma_initial' in self.names and 'gamma_initial' not in self.estimator:
-            return float(min(max(usual, p['gamma_min']), p['gamma_max']))
-        return float(p['gamma_initial'])
+Gains = dict[str, Any]
 
 
 def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
@@ -135,7 +86,7 @@ def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
     return found + [k for k in MEANT_FOR if k in estimator]
 
 
-def with_scheme(estimator: Mapping[str, Any], recordings: Sequence[Recording]) -> dict[str, Any]:
+def with_scheme(estimator: Mapping[str, Any], recordings: Sequence[Recording]) -> Gains:
     """
     Return what the user set for the estimator, with `SCHEME` where that is open.
 
@@ -154,124 +105,102 @@ def with_scheme(estimator: Mapping[str, Any], recordings: Sequence[Recording]) -
     return {**SCHEME, 'correction_period': period, **known, **given}
 
 
-def find_start(problem: StartProblem, jobs: int, stopped: Callable[[], bool]) -> Start:
+def find_start(
+    recordings: Sequence[Recording],
+    estimator: Mapping[str, Any],
+    names: Sequence[str],
+    objective: Callable[[Mapping[str, Any]], Objective],
+    jobs: int,
+    stopped: Callable[[], bool],
+) -> tuple[Gains, dict[int, float]]:
     """
     Evaluate the gains that theory proposes, and return the best of them.
 
     Parameters
     ----------
-    problem : StartProblem
+    recordings : sequence of Recording
+    estimator : mapping
+        What is set for the estimator, with the scheme; see `with_scheme`.
+    names : sequence of str
+        Parameters that are searched.
+    objective : callable
+        From what is set for the estimator to an Objective.
     jobs : int
         Threads.
     stopped : callable
         Asked before each evaluation; True ends the search with the best so far.
 
+    Returns
+    -------
+    gains : dict
+        Parameters of the observer: those that are searched, and those that fit them.
+    tried : dict
+        Best objective by number of derivatives of d, for Kalman filters.
+
     """
-    observer = Observer(ESTIMATOR_PARAMETERS.complete(problem.estimator))
+    observer = Observer(ESTIMATOR_PARAMETERS.complete(estimator))
     p = observer.parameters
+
+    def gamma(usual: float) -> float:
+        """Return gamma_initial: what is set, or the usual one where it is searched."""
+        if not p['variant'].endswith('_adaptive'):
+            return FIXED_GAMMA
+        if 'gamma_initial' in names and 'gamma_initial' not in estimator:
+            return float(min(max(usual, p['gamma_min']), p['gamma_max']))
+        return float(p['gamma_initial'])
+
     with ThreadPoolExecutor(jobs) as pool, progress(unit='set', desc='start', leave=False) as bar:
 
-        def best(objective: Callable[[Any], float], several: Sequence[Any]) -> tuple[float, Any]:
-            """Return the smallest objective and its candidate, the first of equals."""
+        def best(judge: Objective, several: Sequence[Callable[[], Gains]]) -> tuple[float, int]:
+            """Return the smallest objective and its place, that of the first of equals."""
 
-            def evaluate(candidate: Any) -> float:
+            def evaluate(gains: Callable[[], Gains]) -> float:
                 bar.update()
                 try:
-                    return math.inf if stopped() else objective(candidate)
+                    return math.inf if stopped() else judge(gains()).objective
                 except ConfigurationError:  # a value out of its bounds, or values that do not fit
                     return math.inf
 
-            return min(
-                zip(pool.map(evaluate, several), several, strict=True), key=lambda pair: pair[0]
-            )
+            values = list(pool.map(evaluate, several))
+            return min(values), values.index(min(values))
 
         if p['scheme'] == 'predict_correct' and p['variant'].startswith('fuzzy'):
-            found = _best_kalman_filter(problem, p, best)
-            if found is not None:
-                return found
-        noise = effective_noise(problem.recordings)
-        judge = problem.objective(problem.estimator)
+            fixed = {k: v for k, v in estimator.items() if k not in names}
+            open_ = not {'unknown_input_derivatives', 'lambda'} & estimator.keys()
+            filters = {
+                k: KalmanStart(recordings, fixed, p, k, gamma(GAMMA))
+                for k in (DERIVATIVES if open_ else [p['unknown_input_derivatives']])
+            }
+            judges = {k: objective({**estimator, 'unknown_input_derivatives': k}) for k in filters}
+            found = _best_filters(filters, judges, best)
+            tried = {k: value for k, (value, _) in found.items()}
+            least = min(tried.values())
+            if least < math.inf:
+                chosen = next(k for k, value in tried.items() if WORTH * value <= least)
+                return filters[chosen](*found[chosen][1]), tried
+        noise, judge = effective_noise(recordings), objective(estimator)
         several = [
-            {k: v for k, v in gains.items() if k in problem.names}
-            for gamma in sorted({problem.gamma(p, usual) for usual in GAMMAS})
-            for gains in candidates(
-                problem.recordings, observer.levels, noise, p['structure'], gamma
-            )
+            {k: v for k, v in gains.items() if k in names}
+            for power in sorted({gamma(usual) for usual in GAMMAS})
+            for gains in candidates(recordings, observer.levels, noise, p['structure'], power)
         ]
-        return Start(best(lambda gains: judge(gains).objective, several)[1], {})
+        place = best(judge, [lambda gains=gains: gains for gains in several])[1]
+        return several[place], {}
 
 
-def _best_kalman_filter(
-    problem: StartProblem, p: Mapping[str, Any], best: Callable[..., tuple[float, Any]]
-) -> Start | None:
-    """Return the best Kalman filter with the best number of derivatives, or None without any."""
-    estimator = problem.estimator
-    fixed = {k: v for k, v in estimator.items() if k not in problem.names}
-    open_ = not {'unknown_input_derivatives', 'lambda'} & estimator.keys()
-    make, objectives, found = {}, {}, {}
-    for k in DERIVATIVES if open_ else [p['unknown_input_derivatives']]:
-        make[k] = KalmanGains(
-            problem.recordings, fixed, TriangularModel.of(p), k, problem.gamma(p, GAMMA)
-        )
-        judge = problem.objective({**estimator, 'unknown_input_derivatives': k})
-        objectives[k] = lambda design, k=k, judge=judge: judge(make[k](design)).objective
-        found[k] = best(objectives[k], list(starmap(KalmanDesign, product(RATES, FACTORS))))
-    limit = HOPELESS * min(value for value, _ in found.values())
-    for k, objective in objectives.items():
-        if found[k][0] <= limit:
-            for zoom in ZOOMS:
-                neighbours = list(around(found[k][1], zoom))
-                found[k] = min(found[k], best(objective, neighbours))
-    tried = {k: value for k, (value, _) in found.items()}
-    least = min(tried.values())
-    if math.isinf(least):
-        return None
-    chosen = next(k for k, value in tried.items() if WORTH * value <= least)
-    return Start(make[chosen](found[chosen][1]), tried)
-
-
-class KalmanDesign(NamedTuple):
+class KalmanStart:
     """
-    One filter of the grid.
-
-    Attributes
-    ----------
-    rate : float
-        kappa of D 17 in 1/s: how fast d changes.
-    factor : float
-        Bandwidth, relative to the one that this d and the noise ask for.
-    width : float
-        Half-width of all levels, in units of the noise (without any: of y's change in a period).
-
-    """
-
-    rate: float
-    factor: float
-    width: float = WIDTH
-
-
-def around(design: KalmanDesign, zoom: float) -> Iterator[KalmanDesign]:
-    """Yield the neighbours of a design, `zoom` steps of the grid away."""
-    steps = [(x[1] / x[0]) ** zoom for x in (RATES, FACTORS)]
-    for i, j in product((-1, 0, 1), repeat=2):
-        if i or j:
-            yield design._replace(
-                rate=design.rate * steps[0] ** i, factor=design.factor * steps[1] ** j
-            )
-
-
-class KalmanGains:
-    """
-    Turns designs into parameters of the observer.
+    Makes parameters of the observer that is a Kalman filter.
 
     Parameters
     ----------
     recordings : sequence of Recording
         With their truth, from which the sizes of d and of the noise follow.
     fixed : mapping
-        Parameters of the observer that are set and not searched: `unknown_input_decay` and the
-        first of `fuzzy_widths` replace those of a design; its fuzzy curves are theirs.
-    model : TriangularModel
+        Parameters that are set and not searched: `unknown_input_decay` and the first of
+        `fuzzy_widths` replace those of a filter.
+    p : mapping
+        Of the observer, complete.
     derivatives : int
         Derivatives of d that the observer estimates.
     gamma : float
@@ -282,32 +211,32 @@ class KalmanGains:
         self,
         recordings: Sequence[Recording],
         fixed: Mapping[str, Any],
-        model: TriangularModel,
+        p: Mapping[str, Any],
         derivatives: int,
         gamma: float,
     ) -> None:
-        self._fixed, self._model, self._derivatives = fixed, model, derivatives
-        self._gamma = gamma
+        self._fixed, self._derivatives, self._gamma = fixed, derivatives, gamma
+        self._p, self._model = p, TriangularModel.of(p)
+        self._levels = self._model.order + 1 + derivatives
         self._period = float(np.median(np.diff(recordings[0].t)))
         size = true_sizes(recordings)
         self._size = float(size[-1])
         # Without noise the fastest observer is deadbeat: this noise is too small to slow it down.
-        least = 0.1 * self._size * self._period**model.order
+        least = 0.1 * self._size * self._period**self._model.order
         noise = effective_noise(recordings)
         self._noise = max(noise, least)
         # Then the start has the largest innovations: what z_2 moves y by in a period.
-        self._unit = noise if noise > least else max(float(size[1]) * self._period, least)
+        unit = noise if noise > least else max(float(size[1]) * self._period, least)
+        self._width = fixed.get('fuzzy_widths', [WIDTH * unit])[0]
 
     def bandwidth(self, rate: float) -> float:
         """Return the bandwidth (rad/s) of the Kalman filter for a Matern d of this rate (D 17)."""
-        k, levels = self._derivatives, self._model.order + 1 + self._derivatives
-        scaled = self._size**2 * (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2
-        intensity = scaled / math.factorial(2 * k)
-        return float((intensity / (self._noise**2 * self._period)) ** (0.5 / levels))
+        intensity = self._size**2 * matern(rate, self._derivatives)
+        return float((intensity / (self._noise**2 * self._period)) ** (0.5 / self._levels))
 
-    def __call__(self, design: KalmanDesign) -> dict[str, Any]:
+    def __call__(self, rate: float, factor: float) -> Gains:
         """
-        Return the parameters of a design.
+        Return the parameters of a filter; see `RATES` and `FACTORS`.
 
         Raises
         ------
@@ -315,24 +244,42 @@ class KalmanGains:
             There is no such filter.
 
         """
-        decay = self._fixed.get('unknown_input_decay', design.rate)
-        width = design.width * self._unit
-        width = self._fixed.get('fuzzy_widths', [width])[0]
-        bandwidth = min(design.factor * self.bandwidth(design.rate), FASTEST / self._period)
-        small = max(self._noise, 1e-3 * width)
-        try:
-            model = SampledModel(self._model, self._period, 1 + self._derivatives, decay=decay)
-        except np.linalg.LinAlgError as error:  # the model at rest has no finite slope
-            raise ConfigurationError(f'Kalman gain: {error}') from None
-        psi = curves(OBSERVER_PARAMETERS.defaults() | dict(self._fixed), model.size)
-        gain = kalman_like(model, bandwidth, width, psi, small, self._gamma)
-        return {
+        decay = self._fixed.get('unknown_input_decay', float(rate))
+        bandwidth = min(factor * self.bandwidth(rate), FASTEST / self._period)
+        intensity = self._noise**2 * self._period * bandwidth ** (2 * self._levels)
+        unit = matern(decay or self._p['unknown_input_rate'], self._derivatives)
+        asked = {
+            'noise_size': self._noise,
+            'unknown_input_size': math.sqrt(intensity / unit),
             'unknown_input_derivatives': self._derivatives,
             'unknown_input_decay': decay,
-            'lambda': [float(x) for x in gain.clip(LEAST, OBSERVER_PARAMETERS['lambda'].upper)],
-            'fuzzy_widths': [width] * len(gain),
+            'fuzzy_widths': [self._width] * self._levels,
             'gamma_initial': self._gamma,
         }
+        found = kalman_gains(self._model, dict(self._p) | asked, self._period)
+        shown = {k: v for k, v in asked.items() if not k.endswith('_size')}
+        return shown | {'lambda': found.lambdas.tolist()}
+
+
+def _best_filters(
+    filters: Mapping[int, KalmanStart], judges: Mapping[int, Objective], best: Callable[..., Any]
+) -> dict[int, tuple[float, tuple[float, float]]]:
+    """Return the best objective and its rate and factor, by number of derivatives."""
+
+    def search(k: int, points: list[tuple[float, float]]) -> tuple[float, tuple[float, float]]:
+        value, place = best(judges[k], [lambda x=x: filters[k](*x) for x in points])
+        return value, points[place]
+
+    found = {k: search(k, list(product(RATES, FACTORS))) for k in filters}
+    limit = HOPELESS * min(value for value, _ in found.values())
+    for k in found:
+        if found[k][0] <= limit:
+            for zoom in ZOOMS:
+                rate, factor = found[k][1]
+                a, b = ((x[1] / x[0]) ** zoom for x in (RATES, FACTORS))
+                near = product((rate / a, rate, rate * a), (factor / b, factor, factor * b))
+                found[k] = min(found[k], search(k, list(near)))
+    return found
 
 
 def candidates(

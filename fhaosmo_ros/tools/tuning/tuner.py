@@ -12,11 +12,12 @@ from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools.cli.progress import progress
-from fhaosmo_ros.tools.tuning.objective import least_damping, Objective
+from fhaosmo_ros.tools.tuning.linear_gains import least_damping
+from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.search import minimise, Values
 from fhaosmo_ros.tools.tuning.source import TuningData
 from fhaosmo_ros.tools.tuning.space import changes, make_space
-from fhaosmo_ros.tools.tuning.start import find_start, StartProblem, with_scheme
+from fhaosmo_ros.tools.tuning.start import find_start, with_scheme
 import numpy as np
 
 DIGITS = 4
@@ -103,13 +104,10 @@ class Tuner:
         model = {name: tuning[name] for name in ('order', 'phi')}
         self.estimator = with_scheme(model | dict(estimator), data.training)
         self._choose = 'estimate_from' not in estimator
-        start = find_start(
-            StartProblem(data.training, self.estimator, names, self._objective),
-            jobs,
-            stopped,
+        gains, self.tried = find_start(
+            data.training, self.estimator, names, self._objective, jobs, stopped
         )
-        self.tried = start.tried
-        not_searched = {k: v for k, v in start.gains.items() if k not in names}
+        not_searched = {k: v for k, v in gains.items() if k not in names}
         self.estimator = not_searched | self.estimator
         self.training = self._objective(self.estimator)
         complete = ESTIMATOR_PARAMETERS.complete(self.estimator)
@@ -118,7 +116,7 @@ class Tuner:
         )
         given = {name: value for name, value in estimator.items() if name in names}
         given = given if 'lambda' in given else {}  # other parameters alone are no set of gains
-        by_theory = {k: v for k, v in start.gains.items() if k in names}
+        by_theory = {k: v for k, v in gains.items() if k in names}
         # The user's own gains are a start, too: the tuned ones are never worse than they are.
         best = min(
             [by_theory, given] if given else [by_theory],

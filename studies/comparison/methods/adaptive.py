@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.tuning.linear_gains import SampledModel
 from fhaosmo_ros.tools.tuning.search import Dimension
 import numpy as np
 from studies.comparison.methods.filters import several_models
 from studies.comparison.methods.linear import each_order, LONGEST, matern_space, Samples
 from studies.comparison.methods.method import Method, ROBUST, Run, Setting, Values
+from studies.comparison.methods.sampled import SampledModel
 from studies.comparison.scores import Estimates
 
 HUBER, NOISE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'

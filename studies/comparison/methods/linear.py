@@ -23,12 +23,12 @@ from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.tuning.linear_gains import SampledModel
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise
 from fhaosmo_ros.tools.tuning.start import DERIVATIVES
 import numpy as np
 from studies.comparison.methods.filters import constant_gain
 from studies.comparison.methods.method import LINEAR, Method, Run, Search, Setting, USUAL, Values
+from studies.comparison.methods.sampled import SampledModel
 from studies.comparison.scores import Estimates
 
 LINEAR_LIMIT = 'Kalman, Matern'
