@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
-from fhaosmo_ros.tools.tuning.identify import Identified, ljung_box
+from fhaosmo_ros.tools.tuning.identify import Identified, ljung_box, NothingToFind
 from fhaosmo_ros.tools.tuning.linear_gains import kalman_gains
 from fhaosmo_ros.tools.tuning.start import GAMMA, SCHEME, WIDTH
 import numpy as np
@@ -20,6 +20,8 @@ FIRST_STAMP = 1_000_000_000
 """Stamp (ns) of the first sample; 0 would stand for a stamp that is not set."""
 SIZE_OF_USUAL = 0.9616
 """RMS of a standard normal number among the 99 % that are nearest to 0."""
+UNSEEN = 0.97
+"""Expected error of d over its size from which on an estimate tells nothing."""
 BEGIN = 0.1
 """Part of the bag in which the estimates may still be settling."""
 
@@ -80,7 +82,7 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
     Raises
     ------
     ConfigurationError
-        There is no such filter in floating-point numbers.
+        There is no such filter in floating-point numbers, or its estimate of d tells nothing.
 
     """
     likelihood, design = found.likelihood, found.best.design
@@ -105,6 +107,14 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
     lambdas, k, p, variance = kalman_gains(model, checked, period)
     values['lambda'] = [_rounded(x) for x in lambdas]
     errors = np.sqrt(np.maximum(np.diag(p) - k**2 * variance, 0.0))
+    share = errors[model.order] / found.size_of_input
+    if share > UNSEEN:
+        raise NothingToFind(
+            f'd: it changes too fast to be seen through this noise: the expected error is '
+            f'{min(share, 1.0):.2f} of its size, and an estimate of 0 has 1.00. Does y drift or '
+            f'jump by itself, or is the order ({model.order}) too high by one? '
+            'Else a sensor with less noise, or a higher rate, is needed'
+        )
     return Gains(values, errors[: model.order + 1], math.sqrt(variance), 1.0 - float(k[0]))
 
 

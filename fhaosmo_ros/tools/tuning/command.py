@@ -172,7 +172,7 @@ def _identify(
     stop: Stop,
 ) -> str:
     """Write the gains for what y itself shows; return the report's main part."""
-    from fhaosmo_ros.tools.tuning import bag_checks, bag_gains, bag_report
+    from fhaosmo_ros.tools.tuning import bag_gains, bag_report
     from fhaosmo_ros.tools.tuning.identify import identify_input
     from fhaosmo_ros.tools.tuning.start import chosen_otherwise
 
@@ -201,12 +201,10 @@ def _identify(
         inputs = bag_inputs(arguments, estimator, model.used_inputs)
         data = recorded(BagSource(arguments.bag, *inputs), model)
         found = identify_input(data, model, values, given)
-        bag_checks.refuse(found)
         made = bag_gains.make_gains(found, given)
-        bag_checks.refuse_unseen(found, made)
         run = bag_gains.run(found, made)
     name = f'bag {arguments.bag.resolve().name}'
-    notes = bag_checks.notes(found, made, run)
+    notes = bag_report.notes(found, made, run)
     return bag_report.write(folder, found, made, run, notes, arguments.command_line, name)
 
 

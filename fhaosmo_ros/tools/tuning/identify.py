@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The likeliest model of d and of the noise for a recorded y, and how sure it is (D 30)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -32,8 +32,6 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 Floats = NDArray[np.float64]
-PIECES = 10
-"""The bag is cut into so many pieces; every other one is held out."""
 DERIVATIVES = (0, 1, 2)
 BANDWIDTHS = tuple(float(w) for w in np.geomspace(2e-4, 2.0, 15))
 """First bandwidths, in rad a sample; at the first number of derivatives and ratio below."""
@@ -59,8 +57,14 @@ SHAKES = tuple(float(x) for x in np.geomspace(1e-4, 1e2, 7))
 WHITE = 0.01
 """Probability above which innovations pass for white, so that no colour is searched."""
 LAGS = 20
-DROP, STEP_CHANGES = 0.125, 6
-"""Fall of the log-likelihood over a step of the differences, about; how often a step changes."""
+SURE = 10.0
+"""A difference of log-likelihoods that is no accident."""
+NO_NOISE = 1e-7
+"""Noise over the size of y below which y is a simulated one without noise."""
+WANDERING = 0.99
+"""A correlation from which on the noise is a random walk."""
+STEP = 0.1
+"""Of the differences of the log-likelihood in ln bandwidth, ln ratio and logit colour."""
 FEWEST = 500
 """Samples."""
 
@@ -77,11 +81,10 @@ class Identified:
     Attributes
     ----------
     likelihood : Likelihood
-        Of the whole recording.
     best : Evaluation
-        Of the likeliest design, over the whole recording.
+        Of the likeliest design.
     tried : dict
-        Evaluations by number of derivatives, fitted to the training pieces alone.
+        The likeliest one by number of derivatives.
     white : Evaluation or None
         The likeliest one with white noise, where the noise was found to be coloured.
     silent : float
@@ -147,25 +150,24 @@ def identify_input(
 
     """
     likelihood = _prepared(data, model, values, given)
-    search = Search(likelihood, given)
-    with search.bar:
+    with progress(unit='filter', desc='likelihood', leave=False) as bar:
+        search = Search(likelihood, given, bar.update)
         start = search.start()
         outliers = _leave_out_outliers(likelihood, start)
         tried, white = search.each_order(start)
-        if not any(math.isfinite(e.held_out) for e in tried.values()):
+        best = _simplest(tried)
+        if not math.isfinite(best.log_likelihood):
             raise NothingToFind(
                 f'y: expected samples that the model can predict, got none that phi = '
                 f'{list(model.phi)} follows: its estimates leave the finite numbers'
             )
-        likelihood.training[:] = True
-        whole = {k: search.local(e.design) for k, e in tried.items()}
-        count = int(likelihood.samples.used.sum())
-        best = whole[_simplest({k: e.training * count for k, e in whole.items()})]
-        spread = search.spread(best)
         silent, shaken = search.alternatives(best)
-    return Identified(
+        spread = search.spread(best)
+    found = Identified(
         likelihood, best, tried, white, silent, shaken, spread, outliers, data.sensor
     )
+    _refuse(found)
+    return found
 
 
 def _prepared(
@@ -191,7 +193,6 @@ def _prepared(
     periods = np.maximum(np.round(h / period), 1.0).astype(np.int64)
     periods[(h > max(values['max_gap'] or GAP_SAMPLES * period, 3.0 * period))] = periods[0] = 0
     samples = Samples(h, periods, y, np.ascontiguousarray(u), np.ones(count, dtype=bool))
-    training = (np.arange(count) * PIECES // count) % 2 == 0
     block = max(count // 300, 1)
     slow = y[: count // block * block].reshape(-1, block).mean(axis=1)
     sizes = [float(np.sqrt(np.mean(slow**2)))]
@@ -204,13 +205,46 @@ def _prepared(
         model,
         period,
         samples,
-        training,
         np.array(sizes),
         given.get('noise_size') or noise,
         bool(given.get('noise_size')),
         values['prediction_step'] or usual_step(model),
         rounding,
     )
+
+
+def _refuse(found: Identified) -> None:
+    """Raise NothingToFind, which says why, where there can be no gains."""
+    likelihood, design, y = found.likelihood, found.best.design, found.likelihood.samples.y
+    period, sensor = likelihood.period, found.sensor
+    top = 0.9 * QUICKEST / period
+    white = found.white or found.best
+    silent = sensor.noise_std < NO_NOISE * float(np.std(y)) and not sensor.quantisation
+    if silent and not likelihood.fixed:
+        raise NothingToFind(
+            f'y: expected noise, got none that shows ({sensor.noise_std:.1e} in a y of '
+            f'{np.std(y):.3g}), as in a simulation without noise: the less noise, the larger the '
+            'gains, without limit. Say what the sensor will have: -p noise_size:=...'
+        )
+    if not likelihood.fixed and max(white.design.bandwidth, design.bandwidth) > top:
+        raise NothingToFind(
+            f'y: the likeliest filter follows every sample ({design.bandwidth:.3g} rad/s at '
+            f'{1.0 / period:.4g} Hz). Either y has no noise that shows, or it moves in a way that '
+            'the model cannot: it jumps, or order or phi are wrong. Say what noise the sensor '
+            'has (-p noise_size:=...), sample faster, or correct the model'
+        )
+    if design.colour > WANDERING:
+        step = found.best.noise / math.sqrt(period)
+        raise NothingToFind(
+            f'y: its error wanders like a random walk, by {step:.3g} in a second (in the unit of '
+            'y), which cannot be told from what d does. Either the sensor drifts, or y has no '
+            'noise that shows, or order or phi do not fit this plant'
+        )
+    if found.silent < SURE:
+        raise NothingToFind(
+            f'd: expected a y that d moves, got one that the model explains with d = 0 (noise '
+            f'{found.best.noise:.3g}). Record while the unknown input acts, and longer'
+        )
 
 
 def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:
@@ -228,45 +262,42 @@ def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:
     return int(far.sum())
 
 
-def _simplest(log_likelihoods: Mapping[int, float]) -> int:
-    """Return the number of derivatives from which on a larger one gains too little."""
-    orders = sorted(log_likelihoods)
-    chosen = orders[0]
-    for k in orders[1:]:
-        gain = log_likelihoods[k] - log_likelihoods[chosen]
-        if gain > WORTH or not math.isfinite(log_likelihoods[chosen]):
-            chosen = k
+def _simplest(tried: Mapping[int, Evaluation]) -> Evaluation:
+    """Return the one with the fewest derivatives; a richer one must be likelier by `WORTH`."""
+    chosen = tried[min(tried)]
+    for k in sorted(tried):
+        if tried[k].log_likelihood > chosen.log_likelihood + WORTH:
+            chosen = tried[k]
     return chosen
 
 
 class Search:
     """The search for one recording."""
 
-    def __init__(self, likelihood: Likelihood, given: Mapping[str, Any]) -> None:
-        self.likelihood = likelihood
+    def __init__(
+        self, likelihood: Likelihood, given: Mapping[str, Any], tick: Callable[[], object]
+    ) -> None:
+        self.likelihood, self._tick = likelihood, tick
         self._decay = given.get('unknown_input_decay') or None
         self._orders = DERIVATIVES
         if 'unknown_input_derivatives' in given:
             self._orders = (given['unknown_input_derivatives'],)
-        self.held_out = int((~likelihood.training).sum())
-        self.bar = progress(unit='filter', desc='likelihood', leave=False)
 
     def _evaluate(self, design: Design) -> Evaluation:
-        self.bar.update()
+        self._tick()
         return self.likelihood(design)
 
     def start(self) -> Evaluation:
         """Scan bandwidths and colours, and bring the scale of clipping and the sizes about."""
         likelihood, period = self.likelihood, self.likelihood.period
-        first = [
-            self._evaluate(Design(FIRST_DERIVATIVES, w / period, FIRST_RATIO, colour))
+        best = self._likeliest(
+            Design(FIRST_DERIVATIVES, w / period, FIRST_RATIO, colour)
             for w in BANDWIDTHS
             for colour in (COLOURS[:1] if likelihood.fixed else COLOURS)
-        ]
-        best = max(first, key=lambda e: e.training)
+        )
         likelihood.clip = CLIP
         for _ in range(2):
-            if math.isfinite(best.training):
+            if math.isfinite(best.log_likelihood):
                 likelihood.noise = best.noise
                 sizes = np.sqrt(
                     np.nanmean(best.estimates[:, : len(likelihood.sizes)] ** 2, axis=0)
@@ -275,13 +306,16 @@ class Search:
             best = self._evaluate(best.design)
         return best
 
+    def _likeliest(self, designs: Iterable[Design]) -> Evaluation:
+        return max(map(self._evaluate, designs), key=lambda e: e.log_likelihood)
+
     def each_order(self, start: Evaluation) -> tuple[dict[int, Evaluation], Evaluation | None]:
         """Fit each number of derivatives; return them, and the best with white noise, if worse."""
         white = {
             k: self._from_neighbours(start.design._replace(derivatives=k, colour=0.0))
             for k in self._orders
         }
-        chosen = self._best(white)
+        chosen = _simplest(white)
         r = chosen.innovations[self.likelihood.samples.used & np.isfinite(chosen.innovations)]
         if self.likelihood.fixed or (len(r) and ljung_box(np.clip(r, -CLIP, CLIP))[1] > WHITE):
             return white, None
@@ -293,26 +327,19 @@ class Search:
             like = white[k].design
             slower = like._replace(colour=COLOURED, bandwidth=SLOWER * like.bandwidth)
             several = [self.local(like._replace(colour=0.5)), self._from_neighbours(slower)]
-            coloured[k] = max(several, key=lambda e: e.training)
-        better = self._best(coloured)
-        if not (better.held_out - chosen.held_out) * self.held_out > WORTH:
-            return white, None
-        return coloured, chosen
-
-    def _best(self, tried: Mapping[int, Evaluation]) -> Evaluation:
-        """Return the simplest of those that predict the held-out pieces well."""
-        return tried[_simplest({k: e.held_out * self.held_out for k, e in tried.items()})]
+            coloured[k] = max(several, key=lambda e: e.log_likelihood)
+        if _simplest(coloured).log_likelihood > chosen.log_likelihood + WORTH:
+            return coloured, chosen
+        return white, None
 
     def _from_neighbours(self, design: Design) -> Evaluation:
-        several = [
-            self._evaluate(
-                design._replace(
-                    bandwidth=design.bandwidth * math.exp(a), ratio=FIRST_RATIO * math.exp(b)
-                )
+        best = self._likeliest(
+            design._replace(
+                bandwidth=design.bandwidth * math.exp(a), ratio=FIRST_RATIO * math.exp(b)
             )
             for a, b in NEIGHBOURS
-        ]
-        return self.local(max(several, key=lambda e: e.training).design)
+        )
+        return self.local(best.design)
 
     def _design(self, like: Design, x: Floats) -> Design:
         period = self.likelihood.period
@@ -337,29 +364,23 @@ class Search:
         x = np.array(self._point(design))
 
         def loss(x: Floats) -> float:
-            value = self._evaluate(self._design(design, x)).training
+            value = self._evaluate(self._design(design, x)).log_likelihood
             return -value if math.isfinite(value) else 1e300
 
-        simplex = np.vstack([x, x + np.diag(STEPS[: len(x)])])
-        count = self.likelihood.training.sum()
-        found = minimize(
-            loss, x, method='Nelder-Mead',
-            options={
-                'initial_simplex': simplex, 'xatol': 0.02, 'fatol': 0.1 / count,
-                'maxfev': EVALUATIONS,
-            },
-        )  # fmt: skip
+        options = {
+            'initial_simplex': np.vstack([x, x + np.diag(STEPS[: len(x)])]),
+            'xatol': 0.02, 'fatol': 0.1, 'maxfev': EVALUATIONS,
+        }  # fmt: skip
+        found = minimize(loss, x, method='Nelder-Mead', options=options)
         return self._evaluate(self._design(design, found.x))
 
     def alternatives(self, best: Evaluation) -> tuple[float, dict[int, float]]:
         """Return `Identified.silent` and `Identified.shaken`."""
-        count = int(self.likelihood.samples.used.sum())
         still = STILL / float(self.likelihood.samples.h.sum())
 
         def rise(**changes: Any) -> float:
-            return (
-                self._evaluate(best.design._replace(**changes)).training - best.training
-            ) * count
+            design = best.design._replace(**changes)
+            return self._evaluate(design).log_likelihood - best.log_likelihood
 
         shaken = {
             level: max(rise(shaken=level, shake=shake) for shake in SHAKES)
@@ -373,30 +394,21 @@ class Search:
         top = np.array(self._point(design))
         free = 1 if self._decay else len(top)
 
-        def fall(change: Floats) -> float:
-            """Return by how much the log-likelihood falls from its maximum."""
+        def at(change: Floats) -> float:
             x = top.copy()
             x[:free] += change
-            return (best.training - self._evaluate(self._design(design, x)).training) * count
+            return self._evaluate(self._design(design, x)).log_likelihood
 
-        steps = np.diag(np.full(free, 0.05))
-        for step in steps:
-            for _ in range(STEP_CHANGES):
-                mean = 0.5 * (fall(step) + fall(-step))
-                factor = math.sqrt(DROP / mean) if mean > 0.0 else 4.0
-                if 0.5 < factor < 2.0:
-                    break
-                step *= min(max(factor, 0.2), 5.0)
+        steps = STEP * np.eye(free)
         curvature = np.array([
-            [0.25 * (fall(a + b) + fall(-a - b) - fall(a - b) - fall(b - a)) for b in steps]
-            for a in steps
+            [at(a - b) + at(b - a) - at(a + b) - at(-a - b) for b in steps] for a in steps
         ])  # fmt: skip
         k, axes = design.derivatives, np.eye(max(free, 2))[:, :free]
         intensity = 2.0 * (self.likelihood.model.order + 1 + k) * axes[0]
         decay = axes[0] + axes[1] if free > 1 else 0.0 * axes[0]  # ln kappa = ln omega + ln ratio
         rows = {'decay': decay, 'size': 0.5 * intensity - (k + 0.5) * decay}
         try:
-            covariance = steps @ np.linalg.inv(curvature) @ steps
+            covariance = 4.0 * STEP**2 * np.linalg.inv(curvature)
         except np.linalg.LinAlgError:
             return dict.fromkeys(('noise', *rows), math.nan)
         with np.errstate(invalid='ignore'):

@@ -121,8 +121,8 @@ class Evaluation:
     design : Design
     noise : float
         Standard deviation of the white noise w: the likeliest one for this design.
-    training, held_out : float
-        Mean log-likelihood of a sample.
+    log_likelihood : float
+        Of all samples that are used; -inf for a filter that diverges.
     innovations : (K,) array
         Divided by their expected standard deviations; NaN where there is none.
     estimates : (K, N) array
@@ -131,8 +131,7 @@ class Evaluation:
 
     design: Design
     noise: float
-    training: float
-    held_out: float
+    log_likelihood: float
     innovations: Floats
     estimates: Floats
 
@@ -153,8 +152,6 @@ class Likelihood:
     period : float
         Sampling period (s).
     samples : Samples
-    training : (K,) array of bool
-        Samples that count; the others are held out.
     sizes : (n,) array
         How far off z_1 .. z_n may be where the filter begins.
     noise : float
@@ -173,7 +170,6 @@ class Likelihood:
     model: TriangularModel
     period: float
     samples: Samples
-    training: NDArray[np.bool_]
     sizes: Floats
     noise: float
     fixed: bool = False
@@ -223,21 +219,16 @@ class Likelihood:
 
     def _evaluation(self, design: Design, b: Floats, s: Floats, x: Floats) -> Evaluation:
         r = b / np.sqrt(s)
-        counted, used = np.isfinite(r) & self.samples.used, self.samples.used
+        used, counted = self.samples.used, np.isfinite(r) & self.samples.used
         if not counted.sum() > LEAST_USED * used.sum():
-            return Evaluation(design, math.nan, -math.inf, -math.inf, r, x)
+            return Evaluation(design, math.nan, -math.inf, r, x)
         noise = self.noise
         if not self.fixed:
-            noise = max(likeliest_scale(r[counted & self.training]), self.least_noise)
-        means = []
-        for chosen in (counted & self.training, counted & ~self.training):
-            if not chosen.any():
-                means.append(math.nan)
-                continue
-            size = np.abs(r[chosen]) / noise
-            loss = np.where(size <= CLIP, size**2, 2.0 * CLIP * size - CLIP**2)
-            means.append(-0.5 * float(np.mean(loss + np.log(s[chosen]))) - math.log(noise))
-        return Evaluation(design, noise, *means, r / noise, x)
+            noise = max(likeliest_scale(r[counted]), self.least_noise)
+        size = np.abs(r[counted]) / noise
+        loss = np.where(size <= CLIP, size**2, 2.0 * CLIP * size - CLIP**2)
+        mean = -0.5 * float(np.mean(loss + np.log(s[counted]))) - math.log(noise)
+        return Evaluation(design, noise, mean * int(used.sum()), r / noise, x)
 
 
 def likeliest_scale(r: Floats) -> float:
