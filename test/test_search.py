@@ -111,21 +111,6 @@ def test_two_processes_share_a_study(tmp_path):
     assert 1 + sum(own) == max(counts)
 
 
-@pytest.mark.parametrize(
-    ('space', 'message'),
-    [
-        ([], 'at least one dimension'),
-        ([Dimension('a', 2.0, 1.0, 1.5)], "'a'.*lower one first"),
-        ([Dimension('a', 1.0, 2.0, 3.0)], "'a'.*start from 1.0 to 2.0, got 3.0"),
-        ([Dimension('a', 0.0, 2.0, 1.0)], "'a'.*bounds > 0"),
-        ([Dimension('a', 0.0, float('inf'), 1.0)], "'a'.*finite"),
-    ],
-)
-def test_bad_space_is_one_line(space, message):
-    with pytest.raises(ConfigurationError, match=message):
-        minimise(bowl, space, 1)
-
-
 @pytest.mark.parametrize('storage', ['study.log', 'nodb://x', 'sqlite:////no/x.db'])
 def test_bad_storage_is_one_line(storage):
     with pytest.raises(ConfigurationError, match=r'storage.*expected') as error:

@@ -82,11 +82,7 @@ def write(
         '\n'.join(f'    {name}: {value}' for name, value in parameters.items()),
     ]
     (folder / 'report.md').write_text('\n\n'.join(parts) + '\n', encoding='utf-8')
-    begin = int(BEGIN * len(run.t))
-    figures.save_identified(
-        run.t, run.unknown_input, gains.expected[-1], run.t[begin], run.correlations,
-        2.0 / math.sqrt(len(run.t) - begin), folder / 'estimates.png',
-    )  # fmt: skip
+    figures.save_identified(run, gains.expected[-1], folder / 'estimates.png')
     return main
 
 

@@ -100,15 +100,7 @@ def warnings(
 
 
 def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str:
-    """
-    Write everything into a new folder.
-
-    Returns
-    -------
-    str
-        The report's main part, to be printed.
-
-    """
+    """Write everything into a new folder; return the report's main part, to be printed."""
     folder.mkdir()
     gains, before = (tuner.with_readout(x) for x in (changes(result.best), tuner.before))
     name = 'given' if tuner.before_is_given else 'start'
@@ -117,8 +109,7 @@ def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str
         for title, values in ((name, before), ('tuned', gains))
         for data, objective in (('training', tuner.training), ('held out', tuner.held_out))
     ]
-    tuned = columns[2:]
-    training, held_out = (column.evaluation.error for column in tuned)
+    training, held_out = (column.evaluation.error for column in columns[2:])
     p = tuner.data.parameters
     comments = [
         'Made by',
@@ -131,22 +122,9 @@ def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str
     ]
     yaml = parameter_file(tuner.parameters(gains), comments)
     (folder / 'gains.yaml').write_text(yaml, 'utf-8')
-    cautions = warnings(tuner.space, result.best, tuned)
+    cautions = warnings(tuner.space, result.best, columns[2:])
     main = '\n\n'.join([evaluations(columns), *(f'Note: {text}' for text in cautions)])
-    text = _document(tuner, result, command, main)
-    (folder / 'report.md').write_text(text, encoding='utf-8')
-    seen = {r.shape: r for r in reversed(tuner.data.held_out)}  # the first one of each kind of d
-    recordings = list(seen.values()) if len(seen) > 1 else tuner.data.held_out
-    shown = [
-        (f'held out: {r.shape}', r, _estimate(tuner, before, r), _estimate(tuner, gains, r))
-        for r in recordings[:SHOWN]
-    ]
-    save_estimates(shown, tuner.tuning['settled'], folder / 'estimates.png')
-    return main
-
-
-def _document(tuner: Tuner, result: TuningResult, command: str, main: str) -> str:
-    gains = [
+    rows = [
         [d.name, f'{d.low:.3g}', f'{d.high:.3g}', f'{d.start:.4g}', f'{result.best[d.name]:.4g}']
         for d in tuner.space
     ]
@@ -162,7 +140,7 @@ def _document(tuner: Tuner, result: TuningResult, command: str, main: str) -> st
         'recordings took no part in the search.',
         '![d and its estimates](estimates.png)',
         '## Gains',
-        table(['parameter', 'from', 'to', 'start', 'tuned'], gains),
+        table(['parameter', 'from', 'to', 'start', 'tuned'], rows),
     ]
     if tuner.tried:
         chosen = tuner.fixed['unknown_input_derivatives']
@@ -171,11 +149,19 @@ def _document(tuner: Tuner, result: TuningResult, command: str, main: str) -> st
             for k, value in tuner.tried.items()
         ]
         parts.append(table(['unknown_input_derivatives', 'objective at the start'], rows))
-    settings = tuner.data.parameters | dict(tuner.tuning)
+    settings = p | dict(tuner.tuning)
     parts += ['## Settings', '\n'.join(f'    {name}: {value}' for name, value in settings.items())]
-    return '\n\n'.join(parts) + '\n'
+    (folder / 'report.md').write_text('\n\n'.join(parts) + '\n', encoding='utf-8')
 
+    def estimate(values: Mapping[str, Any], r: Recording) -> Any:
+        observer = Observer(ESTIMATOR_PARAMETERS.complete(tuner.estimator | values))
+        return observer.run(r.t, r.y, r.u).unknown_input
 
-def _estimate(tuner: Tuner, gains: dict[str, Any], recording: Recording) -> Any:
-    observer = Observer(ESTIMATOR_PARAMETERS.complete(tuner.estimator | gains))
-    return observer.run(recording.t, recording.y, recording.u).unknown_input
+    seen = {r.shape: r for r in reversed(tuner.data.held_out)}  # the first one of each kind of d
+    recordings = list(seen.values()) if len(seen) > 1 else tuner.data.held_out
+    shown = [
+        (f'held out: {r.shape}', r, estimate(before, r), estimate(gains, r))
+        for r in recordings[:SHOWN]
+    ]
+    save_estimates(shown, tuner.tuning['settled'], folder / 'estimates.png')
+    return main

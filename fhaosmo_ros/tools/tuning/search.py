@@ -109,10 +109,9 @@ def minimise(
     Raises
     ------
     ConfigurationError
-        A space or storage that can't be used.
+        A storage that can't be used.
 
     """
-    check_space(space)
     optuna.logging.set_verbosity(optuna.logging.ERROR)
 
     def evaluate(trial: optuna.Trial) -> float:
@@ -125,29 +124,18 @@ def minimise(
         if stopped():
             study.stop()
 
-    study = _open_study(storage, name, _sampler(space, seed))
-    try:
-        done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        if not done:
-            study.enqueue_trial({d.name: d.start for d in space}, skip_if_exists=True)
-        left = trials - len(done)
-        if left > 0:
-            callbacks = [after, MaxTrialsCallback(trials, states=(TrialState.COMPLETE,))]
-            study.optimize(evaluate, n_trials=left, n_jobs=jobs, callbacks=callbacks)
-        count = len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
-        return Result(dict(study.best_params), study.best_value, count)
-    except Exception as error:
-        # Where a storage fails, Optuna's loop may fail in turn: its own error is further down.
-        if any(isinstance(e, optuna.exceptions.StorageInternalError) for e in _chain(error)):
-            raise ConfigurationError(f'storage {storage!r}: {_one_line(error)}') from None
-        raise
+    def finished() -> int:
+        return len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
 
-
-def _open_study(
-    storage: str | None, name: str, sampler: optuna.samplers.BaseSampler
-) -> optuna.Study:
+    with warnings.catch_warnings():
+        # Optuna 6, which setup.py excludes, removes x0 and sigma0.
+        warnings.simplefilter('ignore', FutureWarning)
+        start = {d.name: d.start for d in space}
+        sampler = optuna.samplers.CmaEsSampler(
+            x0=start, sigma0=SIGMA, seed=seed, warn_independent_sampling=False
+        )
     try:
-        return optuna.create_study(
+        study = optuna.create_study(
             storage=storage, sampler=sampler, study_name=name, load_if_exists=True
         )
     except Exception as error:  # SQLAlchemy and each driver have exceptions of their own
@@ -155,49 +143,22 @@ def _open_study(
             f'storage {storage!r}: expected what Optuna takes, such as sqlite:///study.db or '
             f'postgresql+psycopg://user@host/name, got: {_one_line(error)}'
         ) from None
+    try:
+        done = finished()
+        if not done:
+            study.enqueue_trial(start, skip_if_exists=True)
+        if done < trials:
+            callbacks = [after, MaxTrialsCallback(trials, states=(TrialState.COMPLETE,))]
+            study.optimize(evaluate, n_trials=trials - done, n_jobs=jobs, callbacks=callbacks)
+        return Result(dict(study.best_params), study.best_value, finished())
+    except (optuna.exceptions.StorageInternalError, UnboundLocalError) as error:
+        if storage is None:  # else the second one: Optuna's loop raises it where a storage fails
+            raise
+        raise ConfigurationError(f'storage {storage!r}: {_one_line(error)}') from None
 
 
 def _one_line(error: BaseException) -> str:
-    """Return what went wrong, without the SQL statement and the advice that come with it."""
-    first = _chain(error)[-1]  # the driver's error says more than those that follow from it
-    return ' '.join(str(first).split())[:LONGEST] or type(first).__name__
-
-
-def _chain(error: BaseException) -> list[BaseException]:
-    """Return an error and those that it came from, the first one last."""
-    chain = [error]
-    while (before := chain[-1].__cause__ or chain[-1].__context__) is not None:
-        chain.append(before)
-    return chain
-
-
-def _sampler(space: Sequence[Dimension], seed: int) -> optuna.samplers.BaseSampler:
-    with warnings.catch_warnings():
-        # Optuna 6, which setup.py excludes, removes x0 and sigma0.
-        warnings.simplefilter('ignore', FutureWarning)
-        return optuna.samplers.CmaEsSampler(
-            x0={d.name: d.start for d in space},
-            sigma0=SIGMA,
-            seed=seed,
-            warn_independent_sampling=False,
-        )
-
-
-def check_space(space: Sequence[Dimension]) -> None:
-    """Raise ConfigurationError for a space without dimensions, or with impossible bounds."""
-    if not space:
-        raise ConfigurationError('search: expected at least one dimension, got none')
-    for d in space:
-        if not (math.isfinite(d.low) and math.isfinite(d.high) and d.low < d.high):
-            raise ConfigurationError(
-                f"dimension '{d.name}': expected finite bounds, the lower one first, "
-                f'got {d.low} and {d.high}'
-            )
-        if not d.low <= d.start <= d.high:
-            raise ConfigurationError(
-                f"dimension '{d.name}': expected a start from {d.low} to {d.high}, got {d.start}"
-            )
-        if d.log and d.low <= 0.0:
-            raise ConfigurationError(
-                f"dimension '{d.name}': expected bounds > 0 for a logarithm, got {d.low}"
-            )
+    """Return what a driver says, without the SQL statement and the advice that come with it."""
+    while (before := error.__cause__ or error.__context__) is not None:
+        error = before
+    return ' '.join(str(error).split())[:LONGEST] or type(error).__name__

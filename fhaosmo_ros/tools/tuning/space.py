@@ -2,7 +2,6 @@
 """The search space made from names of estimator parameters, and parameters from its points."""
 
 from collections.abc import Mapping, Sequence
-import re
 from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, unknown_parameter
@@ -42,9 +41,12 @@ def make_space(
 
     """
     space: list[Dimension] = []
+    numbers = [p.name for p in OBSERVER_PARAMETERS.values() if p.kind in NUMBERS]
     for rule in search:
-        name, *rest = rule.split()
-        parameter = _numeric(name)
+        name, *rest = rule.split() or ['']
+        if name not in numbers:
+            raise unknown_parameter(name, numbers)
+        parameter = OBSERVER_PARAMETERS[name]
         if not _used(name, start):
             continue
         bounds, log = _bounds(rule, rest, parameter)
@@ -53,10 +55,10 @@ def make_space(
             log = bounds[1] > 10.0 * bounds[0]
         if name == 'unknown_input_decay' and bounds is None and not start[name]:
             bounds = DECAYS
-        values = start[name] if isinstance(start[name], list) else [start[name]]
-        labels = [name]
+        values, labels = [start[name]], [name]
         if parameter.kind == 'double_array':
-            values = [values[min(k, len(values) - 1)] for k in range(levels)]
+            given = start[name]
+            values = [given[min(k, len(given) - 1)] for k in range(levels)]
             labels = [f'{name}[{k}]' for k in range(levels)]
         for label, value in zip(labels, values, strict=True):
             low, high = bounds or _around(value, log, decades, parameter)
@@ -72,30 +74,15 @@ def make_space(
 
 
 def changes(values: Values) -> dict[str, Any]:
-    """
-    Return the parameters of the observer at a point of the space.
-
-    Parameters
-    ----------
-    values : dict
-        By the names of the dimensions.
-
-    """
+    """Return the parameters of the observer at a point of the space, whose dimensions name it."""
     found: dict[str, Any] = {}
     for label, value in values.items():
-        name = re.sub(r'\[\d+\]$', '', label)
-        if name == label:
-            found[name] = value
-        else:
+        name, level, _ = label.partition('[')
+        if level:
             found.setdefault(name, []).append(value)
+        else:
+            found[name] = value
     return found
-
-
-def _numeric(name: str) -> Parameter:
-    numbers = [p.name for p in OBSERVER_PARAMETERS.values() if p.kind in NUMBERS]
-    if name not in numbers:
-        raise unknown_parameter(name, numbers)
-    return OBSERVER_PARAMETERS[name]
 
 
 def _used(name: str, start: Mapping[str, Any]) -> bool:

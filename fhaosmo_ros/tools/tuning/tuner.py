@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Mapping
 import hashlib
-import json
 import math
 import time
 from typing import Any, NamedTuple
@@ -142,13 +141,9 @@ class Tuner:
     @property
     def study_name(self) -> str:
         """Name of the study: a digest of all that its trials depend on."""
-        problem = json.dumps(
-            [dict(self.tuning), self.data.parameters, self.estimator, self.space], sort_keys=True
-        )
-        digest = hashlib.sha256(problem.encode())
-        for recording in self.data.training:
-            digest.update(recording.y.tobytes())
-        return f'tune-{digest.hexdigest()[:16]}'
+        samples = [recording.y.tobytes() for recording in self.data.training]
+        problem = repr((sorted(self.tuning.items()), sorted(self.estimator.items()), self.space))
+        return f'tune-{hashlib.sha256(b"".join([problem.encode(), *samples])).hexdigest()[:16]}'
 
     def evaluate(self, values: Values) -> float:
         """Return the objective at a point of the space, larger where errors are badly damped."""
