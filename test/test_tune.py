@@ -22,7 +22,6 @@ from fhaosmo_ros.tools.tuning.objective import Evaluation, Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.sensor import identify
 from fhaosmo_ros.tools.tuning.source import simulated
-from fhaosmo_ros.tools.tuning.start import candidates
 import numpy as np
 import pytest
 from waiting import wait_until
@@ -309,18 +308,6 @@ def test_sensor_outlives_bad_samples():
         identify(t[:100], y[:100])
 
 
-def test_theory_scales_with_the_unit_of_y():
-    """Were y, d and the noise c times as large, alpha, widths and epsilon would be, too."""
-    c = 100.0
-    small = Family(SHORT | {'noise_std': 1e-3}).recordings(2)
-    large = [r._replace(y=c * r.y, z=c * r.z, d=c * r.d) for r in small]
-    pairs = zip(candidates(small, 4, 1e-3), candidates(large, 4, c * 1e-3), strict=True)
-    for one, other in pairs:
-        np.testing.assert_allclose(other['lambda'], np.sqrt(c) * np.array(one['lambda']))
-        for name in ('alpha', 'fuzzy_widths', 'epsilon'):
-            np.testing.assert_allclose(other[name], c * np.array(one[name]))
-
-
 def made_objective(monkeypatch, scores, **changes):
     """Return an objective of two recordings whose trial always has these scores."""
     recordings = Family(SHORT).recordings(2)
@@ -420,15 +407,6 @@ def test_levant_is_tuned_without_what_it_does_not_use(tmp_path):
     assert values['epsilon'] == max(values['fuzzy_widths'])
     assert values['divergence_time'] == 0.1  # 20 samples at 200 Hz
     assert len(values['lambda']) == 4
-
-
-def test_theory_begins_below_an_estimate_of_zero():
-    family = Family({'noise_std': 1e-4, 'integration_step': 1e-3})
-    tuning = TUNE_PARAMETERS.defaults()
-    objective = Objective(family.recordings(3), {'variant': 'fuzzy'}, tuning, choose=True)
-    errors = [objective(gains).error for gains in candidates(family.recordings(3), 4, 1e-4)]
-    assert min(errors) < 0.8
-    assert max(errors) > 1.5
 
 
 def test_objective_weighs_what_it_is_told_to():

@@ -1,30 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Sets of gains that follow from the theory of the observer; a search begins with the best of them.
+Where a search begins: the observer that is the best Kalman filter for the recordings (D 19).
 
-For |eps| well below its half-width w a fuzzy level is a second-order filter, z_tilde'' +
-2 zeta omega z_tilde' + omega^2 z_tilde = omega^2 m', with omega^2 = alpha / w and a damping
-2 zeta omega = lambda |eps|^gamma / w; above it, it is a super-twisting differentiator, which
-converges if alpha exceeds the second derivative of m (A. Levant, Automatica 34(3), 1998,
-doi:10.1016/S0005-1098(97)00209-4). So one bandwidth omega for the whole chain, one factor kappa
-and one damping zeta give all gains:
-
-    s_1 = noise,  s_i = noise sqrt(h omega^(2 i - 1))        the noise that is left in m_i
-    w_i = kappa (s_i + L_i / omega^2)                        and the error by the lag
-    alpha_i = omega^2 w_i
-    lambda_i = 2 zeta omega w_i / (w_i / 3)^gamma            damped at a third of the half-width
-
-with L_i the size of m_i'' in the recordings: z_3, .., d, d', d''. A small kappa is a sliding mode,
-a large one a linear observer. The structure `levant` has one innovation and so one width,
-w = kappa (noise + D / omega^n) with D the size of d, and N poles at omega:
-
-    lambda_i = binomial(N, i) omega^i w / (w / 3)^(p_i),     p_i as in D 11
-
-Some candidates are evaluated and the best one is taken: the best omega is a trade between noise
-and lag, which depends on the family of d, and there is no formula for it.
+How fast d changes, how many of its derivatives to follow, and a factor on the bandwidth are tried;
+the sizes of d and of the noise are those of the recordings. Other schemes than `SCHEME` begin with
+the user's gains, or the default ones.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 import math
@@ -58,8 +41,6 @@ WORTH = 0.99
 """One more derivative of d must reduce the objective to this part of it."""
 HOPELESS = 1.3
 """Numbers of derivatives that are this factor behind the best on the grid are given up."""
-GAMMAS = (0.25, 0.5)
-"""Powers gamma to start from with the other schemes, where gamma is searched."""
 FASTEST = 5.0
 """Bandwidth times period of a deadbeat observer."""
 GAMMA = 3e-3
@@ -70,12 +51,7 @@ WIDTH = 16.0
 """Nearly linear for the noise itself, and outliers count as a few standard deviations of it."""
 ZOOMS = (0.5, 0.25)
 """Distances to the neighbours that are tried around the best filter, in steps of the grid."""
-OMEGAS = tuple(float(w) for w in np.geomspace(2.0, 200.0, 9))
-KAPPAS = (1.0, 5.0, 25.0)
-ZETAS = (0.7, 1.5, 4.0)
-OPEN = 100.0
-"""epsilon in units of the largest half-width: all levels run, except far from the estimate."""
-Gains = dict[str, Any]
+Gains, Point = dict[str, Any], tuple[float, float]
 
 
 def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
@@ -114,7 +90,7 @@ def find_start(
     stopped: Callable[[], bool],
 ) -> tuple[Gains, dict[int, float]]:
     """
-    Evaluate the gains that theory proposes, and return the best of them.
+    Evaluate Kalman filters, and return the best one.
 
     Parameters
     ----------
@@ -135,57 +111,51 @@ def find_start(
     gains : dict
         Parameters of the observer: those that are searched, and those that fit them.
     tried : dict
-        Best objective by number of derivatives of d, for Kalman filters.
+        Best objective by number of derivatives of d. Both are empty where no filter fits.
 
     """
-    observer = Observer(ESTIMATOR_PARAMETERS.complete(estimator))
-    p = observer.parameters
-
-    def gamma(usual: float) -> float:
-        """Return gamma_initial: what is set, or the usual one where it is searched."""
-        if not p['variant'].endswith('_adaptive'):
-            return FIXED_GAMMA
+    p = Observer(ESTIMATOR_PARAMETERS.complete(estimator)).parameters
+    if p['scheme'] != 'predict_correct' or not p['variant'].startswith('fuzzy'):
+        return {}, {}
+    gamma = FIXED_GAMMA
+    if p['variant'].endswith('_adaptive'):
+        gamma = p['gamma_initial']
         if 'gamma_initial' in names and 'gamma_initial' not in estimator:
-            return float(min(max(usual, p['gamma_min']), p['gamma_max']))
-        return float(p['gamma_initial'])
-
+            gamma = min(max(GAMMA, p['gamma_min']), p['gamma_max'])
+    fixed = {k: v for k, v in estimator.items() if k not in names}
+    open_ = not {'unknown_input_derivatives', 'lambda'} & estimator.keys()
+    orders = DERIVATIVES if open_ else [p['unknown_input_derivatives']]
+    filters = {k: KalmanStart(recordings, fixed, p, k, gamma) for k in orders}
+    judges = {k: objective({**estimator, 'unknown_input_derivatives': k}) for k in orders}
     with ThreadPoolExecutor(jobs) as pool, progress(unit='set', desc='start', leave=False) as bar:
 
-        def best(judge: Objective, several: Sequence[Callable[[], Gains]]) -> tuple[float, int]:
-            """Return the smallest objective and its place, that of the first of equals."""
+        def best(k: int, points: Iterable[Point]) -> tuple[float, Point]:
+            """Return the smallest objective, and its rate and factor."""
 
-            def evaluate(gains: Callable[[], Gains]) -> float:
+            def evaluate(point: Point) -> tuple[float, Point]:
                 bar.update()
                 try:
-                    return math.inf if stopped() else judge(gains()).objective
+                    value = math.inf if stopped() else judges[k](filters[k](*point)).objective
                 except ConfigurationError:  # a value out of its bounds, or values that do not fit
-                    return math.inf
+                    value = math.inf
+                return value, point
 
-            values = list(pool.map(evaluate, several))
-            return min(values), values.index(min(values))
+            return min(pool.map(evaluate, points))
 
-        if p['scheme'] == 'predict_correct' and p['variant'].startswith('fuzzy'):
-            fixed = {k: v for k, v in estimator.items() if k not in names}
-            open_ = not {'unknown_input_derivatives', 'lambda'} & estimator.keys()
-            filters = {
-                k: KalmanStart(recordings, fixed, p, k, gamma(GAMMA))
-                for k in (DERIVATIVES if open_ else [p['unknown_input_derivatives']])
-            }
-            judges = {k: objective({**estimator, 'unknown_input_derivatives': k}) for k in filters}
-            found = _best_filters(filters, judges, best)
-            tried = {k: value for k, (value, _) in found.items()}
-            least = min(tried.values())
-            if least < math.inf:
-                chosen = next(k for k, value in tried.items() if WORTH * value <= least)
-                return filters[chosen](*found[chosen][1]), tried
-        noise, judge = effective_noise(recordings), objective(estimator)
-        several = [
-            {k: v for k, v in gains.items() if k in names}
-            for power in sorted({gamma(usual) for usual in GAMMAS})
-            for gains in candidates(recordings, observer.levels, noise, p['structure'], power)
-        ]
-        place = best(judge, [lambda gains=gains: gains for gains in several])[1]
-        return several[place], {}
+        found = {k: best(k, product(RATES, FACTORS)) for k in orders}
+        limit = HOPELESS * min(value for value, _ in found.values())
+        for k, zoom in product(orders, ZOOMS):
+            if found[k][0] <= limit:
+                rate, factor = found[k][1]
+                a, b = ((x[1] / x[0]) ** zoom for x in (RATES, FACTORS))
+                near = product((rate / a, rate, rate * a), (factor / b, factor, factor * b))
+                found[k] = min(found[k], best(k, near))
+    tried = {k: value for k, (value, _) in found.items()}
+    least = min(tried.values())
+    if math.isinf(least):
+        return {}, {}
+    chosen = next(k for k, value in tried.items() if WORTH * value <= least)
+    return filters[chosen](*found[chosen][1]), tried
 
 
 class KalmanStart:
@@ -259,88 +229,6 @@ class KalmanStart:
         found = kalman_gains(self._model, dict(self._p) | asked, self._period)
         shown = {k: v for k, v in asked.items() if not k.endswith('_size')}
         return shown | {'lambda': found.lambdas.tolist()}
-
-
-def _best_filters(
-    filters: Mapping[int, KalmanStart], judges: Mapping[int, Objective], best: Callable[..., Any]
-) -> dict[int, tuple[float, tuple[float, float]]]:
-    """Return the best objective and its rate and factor, by number of derivatives."""
-
-    def search(k: int, points: list[tuple[float, float]]) -> tuple[float, tuple[float, float]]:
-        value, place = best(judges[k], [lambda x=x: filters[k](*x) for x in points])
-        return value, points[place]
-
-    found = {k: search(k, list(product(RATES, FACTORS))) for k in filters}
-    limit = HOPELESS * min(value for value, _ in found.values())
-    for k in found:
-        if found[k][0] <= limit:
-            for zoom in ZOOMS:
-                rate, factor = found[k][1]
-                a, b = ((x[1] / x[0]) ** zoom for x in (RATES, FACTORS))
-                near = product((rate / a, rate, rate * a), (factor / b, factor, factor * b))
-                found[k] = min(found[k], search(k, list(near)))
-    return found
-
-
-def candidates(
-    recordings: Sequence[Recording],
-    levels: int,
-    noise: float,
-    structure: str = 'cascade',
-    gamma: float = FIXED_GAMMA,
-) -> Iterator[dict[str, Any]]:
-    """
-    Yield lambda, alpha, fuzzy_widths, epsilon and gamma_initial by the rules above.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        With their truth.
-    levels : int
-        N.
-    noise : float
-        Standard deviation of y - z_1, the effect of jitter included.
-    structure : str
-        'cascade' or 'levant'.
-    gamma : float
-        Power of the injections.
-
-    """
-    size = second_derivatives(recordings, levels)
-    period = float(np.median(np.diff(recordings[0].t)))
-    noise = max(noise, size[0] * period**2)
-    level = np.arange(1, levels + 1)
-    for omega, kappa in product(OMEGAS, KAPPAS):
-        common = {'gamma_initial': gamma}
-        if structure == 'levant':
-            d = _rms(np.concatenate([r.d for r in recordings]))
-            width = kappa * (noise + d / omega ** (levels - 1))
-            poles = np.array([math.comb(levels, int(i)) for i in level]) * omega**level
-            power = 2.0 * gamma * (levels - level) / levels
-            yield common | {
-                'lambda': (poles * width / (width / 3.0) ** power).tolist(),
-                'fuzzy_widths': [width] * levels,
-            }
-            continue
-        left = noise * np.sqrt(period * omega ** (2.0 * level - 1.0))
-        left[0] = noise
-        widths = kappa * (left + size / omega**2)
-        for zeta in ZETAS:
-            yield common | {
-                'lambda': (2.0 * zeta * omega * widths / (widths / 3.0) ** gamma).tolist(),
-                'alpha': (omega**2 * widths).tolist(),
-                'fuzzy_widths': (widths).tolist(),
-                'epsilon': OPEN * float(widths.max()),
-            }
-
-
-def second_derivatives(recordings: Sequence[Recording], levels: int) -> NDArray[np.float64]:
-    """Return the RMS values L_1 .. L_N of z_3, .., z_n, d, d', .. over recordings."""
-    size = true_sizes(recordings)
-    rates = [_rms(np.diff(r.d)) / (_rms(r.d) * np.median(np.diff(r.t))) for r in recordings]
-    rate = float(np.median(rates))
-    size = np.concatenate([size, size[-1] * rate ** np.arange(1, levels + 1)])
-    return np.maximum(size[2 : 2 + levels], np.finfo(float).tiny)
 
 
 def true_sizes(recordings: Sequence[Recording]) -> NDArray[np.float64]:
