@@ -5,8 +5,10 @@ import bag_files as files
 import bag_variants as variants
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.inputs import measured_output
+from fhaosmo_ros.tools.cli.options import BagInputs
 from fhaosmo_ros.tools.replay import command as replay
-from fhaosmo_ros.tools.tuning.source import BagSource, recorded
+from fhaosmo_ros.tools.tuning.source import recorded
 import numpy as np
 import pytest
 
@@ -80,7 +82,8 @@ def test_tune_takes_them_too(late, tmp_path):
     for name, received in (('exact', STAMPS), ('late', late)):
         messages = files.floats(received, Y)
         bag = variants.write(tmp_path / name, messages, 'jazzy', 'mcap', 'zstd', published=STAMPS)
-        sensors.append(recorded(BagSource(bag), TriangularModel(['0'])).sensor)
+        inputs = BagInputs(measured_output({}), {}, 'auto', {})
+        sensors.append(recorded(bag, inputs, TriangularModel(['0'])).sensor)
     assert sensors[0] == sensors[1]
 
 

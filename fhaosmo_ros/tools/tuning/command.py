@@ -18,7 +18,7 @@ from fhaosmo_ros.tools.cli.command import Interrupted, run_command
 from fhaosmo_ros.tools.cli.options import add_input_options, assigned, bag_inputs
 from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.source import BagSource, recorded, simulated
+from fhaosmo_ros.tools.tuning.source import recorded, simulated
 
 TRIALS = 1000
 NEEDED = ('optuna>=4,<6', 'cmaes')
@@ -52,54 +52,36 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add(
-        '-o',
-        '--output',
-        type=Path,
-        default=Path('tune_output'),
-        metavar='FOLDER',
+        '-o', '--output', type=Path, default=Path('tune_output'), metavar='FOLDER',
         help='for gains.yaml, report.md and a figure (default: %(default)s)',
-    )
+    )  # fmt: skip
     add('--force', action='store_true', help='replace an output that exists')
     add(
-        '--params-file',
-        type=Path,
-        action='append',
-        default=[],
-        metavar='FILE',
+        '--params-file', type=Path, action='append', default=[], metavar='FILE',
         help="parameters: sections of the estimator, the plant and 'tune', or /**",
-    )
+    )  # fmt: skip
     add(
-        '-p',
-        '--param',
-        action='append',
-        default=[],
-        metavar='NAME:=VALUE',
+        '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
         help='set one parameter; wins over the file',
-    )
+    )  # fmt: skip
     add(
-        '--trials',
-        type=int,
-        default=TRIALS,
-        metavar='N',
+        '--trials', type=int, default=TRIALS, metavar='N',
         help='that the study shall hold at the end (default: %(default)s)',
-    )
+    )  # fmt: skip
     add('--jobs', type=int, metavar='N', help='trials at a time (default: one a core)')
     add('--seed', type=int, default=1, help='of recordings and search (default: %(default)s)')
     add(
-        '--storage',
-        metavar='URL',
+        '--storage', metavar='URL',
         help='data base of an Optuna study that several tune share, and that can be continued: '
         'sqlite:///study.db, postgresql+psycopg://... (default: in memory)',
-    )
+    )  # fmt: skip
     bag = parser.add_argument_group('from a bag')
-    add = bag.add_argument
-    add(
-        '--bag',
-        type=Path,
+    bag.add_argument(
+        '--bag', type=Path,
         help='find the gains that are likeliest for its y (--trials and the other options of the '
         'search are not used)',
-    )
-    add_input_options(add)
+    )  # fmt: skip
+    add_input_options(bag.add_argument)
     return parser
 
 
@@ -199,7 +181,7 @@ def _identify(
     model = TriangularModel.of(values)
     with stop.raising():
         inputs = bag_inputs(arguments, estimator, model.used_inputs)
-        data = recorded(BagSource(arguments.bag, *inputs), model)
+        data = recorded(arguments.bag, inputs, model)
         found = identify_input(data, model, values, given)
         made = bag_gains.make_gains(found, given)
         run = bag_gains.run(found, made)

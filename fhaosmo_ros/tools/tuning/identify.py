@@ -24,7 +24,7 @@ from fhaosmo_ros.tools.tuning.likelihood import (
     SLOWEST,
 )
 from fhaosmo_ros.tools.tuning.linear_gains import matern
-from fhaosmo_ros.tools.tuning.sensor import Sensor
+from fhaosmo_ros.tools.tuning.sensor import Sensor, usable
 from fhaosmo_ros.tools.tuning.source import RecordedOutput
 import numpy as np
 from numpy.typing import NDArray
@@ -174,10 +174,8 @@ def _prepared(
     data: RecordedOutput, model: TriangularModel, values: Parameters, given: Mapping[str, Any]
 ) -> Likelihood:
     t, y, u, sensor = data
-    keep = np.isfinite(y) & np.isfinite(t) & np.isfinite(u).all(axis=1)
+    keep = usable(t, y, u)
     t, y, u = t[keep], y[keep], u[keep]
-    later = np.concatenate([[True], np.diff(np.maximum.accumulate(t)) > 0.0])
-    t, y, u = t[later], y[later], u[later]
     count = len(y)
     if count < FEWEST:
         raise NothingToFind(f'y: expected at least {FEWEST} samples, got {count}')

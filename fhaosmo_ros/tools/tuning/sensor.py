@@ -7,6 +7,7 @@ from typing import NamedTuple
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import median_abs_deviation
 
 Floats = NDArray[np.float64]
 
@@ -14,8 +15,6 @@ FEWEST = 200
 """An estimate needs so many samples."""
 DIFFERENCES = range(1, 9)
 """Orders of the differences of y."""
-NORMAL = 0.6745
-"""Median of |x| of a standard normal x."""
 ON_GRID = 0.02
 """Values count as quantised if they are this close to multiples of the quantum, relatively."""
 
@@ -67,10 +66,8 @@ def identify(t: Floats, y: Floats) -> Sensor:
         Too few samples.
 
     """
-    good = np.isfinite(y) & np.isfinite(t)
-    t, y = t[good], y[good]
-    later = np.concatenate([[True], t[1:] > np.maximum.accumulate(t)[:-1]]) if len(t) else good[:0]
-    t, y = t[later], y[later]
+    keep = usable(t, y)
+    t, y = t[keep], y[keep]
     if len(t) < FEWEST:
         raise ConfigurationError(
             f'bag: expected at least {FEWEST} samples of y with increasing stamps to estimate the '
@@ -91,6 +88,13 @@ def identify(t: Floats, y: Floats) -> Sensor:
     )
 
 
+def usable(t: Floats, *values: Floats) -> NDArray[np.bool_]:
+    """Return which samples are finite and later than all before them."""
+    finite = np.isfinite(np.column_stack([t, *values])).all(axis=1)
+    latest = np.maximum.accumulate(np.where(finite, t, -np.inf))
+    return finite & (t > np.concatenate([[-np.inf], latest[:-1]])[: len(t)])
+
+
 def _noise(y: Floats, regular: NDArray[np.bool_]) -> float:
     """Return the smallest estimate over the orders: low orders contain the signal as well."""
     found = []
@@ -98,11 +102,9 @@ def _noise(y: Floats, regular: NDArray[np.bool_]) -> float:
         whole = np.lib.stride_tricks.sliding_window_view(regular, order).all(axis=1)
         differences = np.diff(y, order)[whole]
         if len(differences) >= FEWEST // 2:
-            size = _spread(differences) or float(
-                np.std(differences)
-            )  # the median is 0 if quantised
+            size = _spread(differences) or float(np.std(differences))  # 0 if quantised
             found.append(size / comb(2 * order, order) ** 0.5)
-    return min(found) if found else 0.0
+    return min(found, default=0.0)
 
 
 def _quantum(y: Floats) -> float:
@@ -111,16 +113,13 @@ def _quantum(y: Floats) -> float:
     steps = steps[steps > 0.0]
     if len(steps) < FEWEST // 10:
         return 0.0
-    smallest = float(np.quantile(steps, 0.01))
-    multiples = steps / smallest
-    few = len(np.unique(np.round(multiples))) < len(steps) / 10
-    near = np.abs(multiples - np.round(multiples)) <= ON_GRID * np.maximum(multiples, 1.0)
-    if not few or near.mean() < 0.99:
-        return 0.0
+    multiples = steps / np.quantile(steps, 0.01)
     whole = np.round(multiples)
-    return float(np.sum(steps) / np.sum(whole))
+    few = len(np.unique(whole)) < len(steps) / 10
+    near = np.abs(multiples - whole) <= ON_GRID * np.maximum(multiples, 1.0)
+    return float(np.sum(steps) / np.sum(whole)) if few and near.mean() >= 0.99 else 0.0
 
 
 def _spread(x: Floats) -> float:
     """Return the standard deviation without outliers, by the median of |x - median|."""
-    return float(np.median(np.abs(x - np.median(x))) / NORMAL)
+    return float(median_abs_deviation(x, scale='normal'))

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What gains are made for: recordings of a simulated family, or the y of a bag."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
@@ -11,10 +9,10 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Family, Recording
-from fhaosmo_ros.inputs import Input, measured_output
 from fhaosmo_ros.messages.fields import Unwrapper
 from fhaosmo_ros.tools.bags.held_input import HeldInputs
 from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.cli.options import BagInputs
 from fhaosmo_ros.tools.tuning.sensor import identify, Sensor
 import numpy as np
 from numpy.typing import NDArray
@@ -29,16 +27,6 @@ class TuningData(NamedTuple):
     training: list[Recording]
     held_out: list[Recording]
     parameters: dict[str, Any]
-
-
-class BagSource(NamedTuple):
-    """A bag, and its fields that are y and u."""
-
-    path: Path
-    y: Input = measured_output({})
-    u: Mapping[str, Input] = MappingProxyType({})
-    stamp: str = 'auto'
-    values: Mapping[str, Any] = MappingProxyType({})
 
 
 class RecordedOutput(NamedTuple):
@@ -71,20 +59,21 @@ def simulated(values: Parameters, seed: int) -> TuningData:
     )
 
 
-def recorded(source: BagSource, model: TriangularModel) -> RecordedOutput:
+def recorded(bag: Path, inputs: BagInputs, model: TriangularModel) -> RecordedOutput:
     """Return the y of a bag, and the known inputs of a model."""
-    with BagReader(source.path) as reader:
-        topic = source.y.absolute('')
-        found = reader.field(topic, source.y.field, source.y.name)
-        blocks = list(reader.blocks(topic, found, source.stamp))
+    y_at, u_at, stamp, values = inputs
+    with BagReader(bag) as reader:
+        topic = y_at.absolute('')
+        found = reader.field(topic, y_at.field, y_at.name)
+        blocks = list(reader.blocks(topic, found, stamp))
         stamps, y = (np.concatenate([block[k] for block in blocks]) for k in (1, 2))
         if found.wraps:
             y = np.array(list(map(Unwrapper(), y.tolist())))
         u = np.zeros((len(y), len(model.inputs)))
         if model.uses_input:
-            held = HeldInputs(reader, model, source.u, source.values)
+            held = HeldInputs(reader, model, u_at, values)
             u = np.concatenate([u for _, u in held.along(blocks)])
     if not len(y):
-        raise ConfigurationError(f'bag {source.path}: expected samples of y, got none')
+        raise ConfigurationError(f'bag {bag}: expected samples of y, got none')
     t = (stamps - stamps[0]) * 1e-9
     return RecordedOutput(t, y, u, identify(t, y))

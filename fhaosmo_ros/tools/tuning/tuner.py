@@ -35,18 +35,7 @@ without end.
 
 
 class TuningResult(NamedTuple):
-    """
-    The outcome of a tuning.
-
-    Attributes
-    ----------
-    best : dict
-        Values by dimension, rounded.
-    trials : int
-        In the study.
-    seconds : float
-
-    """
+    """The best values by dimension, rounded; trials of the study, and seconds of this run."""
 
     best: Values
     trials: int
@@ -98,7 +87,7 @@ class Tuner:
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         self.data, self.tuning, self.seed = data, tuning, seed
-        names = [rule.split()[0] for rule in tuning['search'] if rule.split()]
+        names = [rule.partition(' ')[0] for rule in tuning['search']]
         # The estimator may have a model of its own, other than the plant's.
         model = {name: tuning[name] for name in ('order', 'phi')}
         self.estimator = with_scheme(model | dict(estimator), data.training)
@@ -114,14 +103,11 @@ class Tuner:
             data.held_out, complete, tuning, self._choose, self.training.scale
         )
         given = {name: value for name, value in estimator.items() if name in names}
-        given = given if 'lambda' in given else {}  # other parameters alone are no set of gains
-        by_theory = {k: v for k, v in gains.items() if k in names}
+        self.before_is_given = 'lambda' in given  # other parameters alone are no set of gains
+        best = {k: v for k, v in gains.items() if k in names}
         # The user's own gains are a start, too: the tuned ones are never worse than they are.
-        best = min(
-            [by_theory, given] if given else [by_theory],
-            key=self._evaluate,
-        )
-        self.before_is_given = bool(given)
+        if self.before_is_given and self._evaluate(given) < self._evaluate(best):
+            best = given
         observer = Observer(complete)
         self.space = make_space(
             tuning['search'],
@@ -130,7 +116,7 @@ class Tuner:
             tuning['decades'] or (NEAR if self.tried else FAR),
         )
         searched = changes({d.name: d.start for d in self.space})
-        self.before = given or searched
+        self.before = given if self.before_is_given else searched
         self.fixed = {k: v for k, v in self.estimator.items() if k not in searched}
         self._damping = min(LEAST_DAMPING, self._damped(searched))
 
