@@ -29,6 +29,7 @@ from fhaosmo_ros.tools.tuning.source import RecordedOutput
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.special import expit, logit
 from scipy.stats import chi2
 
 Floats = NDArray[np.float64]
@@ -41,15 +42,17 @@ COLOURED, SLOWER = 0.75, 0.35
 FIRST_DERIVATIVES, FIRST_RATIO = 1, 0.5
 NEIGHBOURS = ((-0.5, -1.6), (-0.5, 0.3), (0.2, -1.6), (0.2, 0.3))
 """ln bandwidth and ln ratio beside the best of the first, where a search may begin."""
-STEPS = (0.3, 0.5, 0.4)
-"""Sides of the first simplex in ln bandwidth, ln ratio and logit colour."""
+STEPS = np.array([0.3, 0.5, 0.4])
+"""Sides of the first simplex in ln bandwidth (rad a sample), ln ratio and logit colour."""
+LOW = np.array([*np.log([SLOWEST, LEAST_RATIO]), -9.0])
+HIGH = np.array([*np.log([QUICKEST, MOST_RATIO]), 6.2])
+"""Bounds of these."""
 EVALUATIONS = 90
 WORTH = 3.0
 """By so much a richer model must raise the log-likelihood."""
 OUTLIER, LONGEST_RUN = 6.0, 3
 """An outlier has an innovation of so many standard deviations; so many of them may follow."""
 MOST_OUTLIERS = 0.05
-MOST_COLOUR = 0.998
 STILL = 0.03
 """Bandwidth of a filter that takes d for 0, over the bag's length."""
 SHAKES = tuple(float(x) for x in np.geomspace(1e-4, 1e2, 7))
@@ -297,9 +300,8 @@ class Search:
         for _ in range(2):
             if math.isfinite(best.log_likelihood):
                 likelihood.noise = best.noise
-                sizes = np.sqrt(
-                    np.nanmean(best.estimates[:, : len(likelihood.sizes)] ** 2, axis=0)
-                )
+                states = best.estimates[:, : len(likelihood.sizes)]
+                sizes = np.sqrt(np.nanmean(states**2, axis=0))
                 likelihood.sizes = np.where(np.isfinite(sizes), sizes, likelihood.sizes)
             best = self._evaluate(best.design)
         return best
@@ -339,38 +341,38 @@ class Search:
         )
         return self.local(best.design)
 
-    def _design(self, like: Design, x: Floats) -> Design:
-        period = self.likelihood.period
-        bandwidth = float(np.exp(np.clip(x[0], *np.log([SLOWEST / period, QUICKEST / period]))))
-        ratio = float(np.exp(np.clip(x[1], *np.log([LEAST_RATIO, MOST_RATIO]))))
+    def _open(self, design: Design) -> list[bool]:
+        """Return which of the three numbers of `_moved` are searched."""
+        return [True, not self._decay, design.colour > 0.0]
+
+    def _moved(self, design: Design, change: Floats) -> Design:
+        """Change ln bandwidth, ln ratio and logit colour of a design."""
+        bandwidth = design.bandwidth * math.exp(change[0])
+        ratio = design.ratio * math.exp(change[1])
         if self._decay:
             ratio = self._decay / bandwidth
-        colour = 0.0
-        if len(x) > 2:
-            colour = min(1.0 / (1.0 + math.exp(-max(x[2], -9.0))), MOST_COLOUR)
-        return like._replace(bandwidth=bandwidth, ratio=ratio, colour=colour)
-
-    @staticmethod
-    def _point(design: Design) -> list[float]:
-        point = [math.log(design.bandwidth), math.log(design.ratio)]
-        if design.colour > 0.0:
-            point.append(math.log(design.colour / (1.0 - design.colour)))
-        return point
+        colour = float(expit(logit(design.colour) + change[2]))
+        return design._replace(bandwidth=bandwidth, ratio=ratio, colour=colour)
 
     def local(self, design: Design) -> Evaluation:
         """Return the likeliest design around this one (Nelder and Mead 1965)."""
-        x = np.array(self._point(design))
+        free, rate = self._open(design), design.bandwidth * self.likelihood.period
+        axes = np.eye(3)[:, free]
+        point = np.array([math.log(rate), math.log(design.ratio), logit(design.colour)])
 
-        def loss(x: Floats) -> float:
-            value = self._evaluate(self._design(design, x)).log_likelihood
+        def loss(change: Floats) -> float:
+            value = self._evaluate(self._moved(design, axes @ change)).log_likelihood
             return -value if math.isfinite(value) else 1e300
 
+        start = np.zeros(axes.shape[1])
+        low, high = np.minimum(LOW - point, 0.0)[free], np.maximum(HIGH - point, 0.0)[free]
         options = {
-            'initial_simplex': np.vstack([x, x + np.diag(STEPS[: len(x)])]),
+            'initial_simplex': np.vstack([start, np.diag(STEPS[free])]),
             'xatol': 0.02, 'fatol': 0.1, 'maxfev': EVALUATIONS,
         }  # fmt: skip
-        found = minimize(loss, x, method='Nelder-Mead', options=options)
-        return self._evaluate(self._design(design, found.x))
+        bounds = list(zip(low, high, strict=True))
+        found = minimize(loss, start, method='Nelder-Mead', bounds=bounds, options=options)
+        return self._evaluate(self._moved(design, axes @ found.x))
 
     def alternatives(self, best: Evaluation) -> tuple[float, dict[int, float]]:
         """Return `Identified.silent` and `Identified.shaken`."""
@@ -388,23 +390,21 @@ class Search:
 
     def spread(self, best: Evaluation) -> dict[str, float]:
         """Return standard deviations from the curvature of the log-likelihood at its maximum."""
-        design, count = best.design, int(self.likelihood.samples.used.sum())
-        top = np.array(self._point(design))
-        free = 1 if self._decay else len(top)
+        count = int(self.likelihood.samples.used.sum())
+        axes = np.eye(3)[:, self._open(best.design)]
 
         def at(change: Floats) -> float:
-            x = top.copy()
-            x[:free] += change
-            return self._evaluate(self._design(design, x)).log_likelihood
+            return self._evaluate(self._moved(best.design, change)).log_likelihood
 
-        steps = STEP * np.eye(free)
+        steps = STEP * axes.T
         curvature = np.array([
             [at(a - b) + at(b - a) - at(a + b) - at(-a - b) for b in steps] for a in steps
         ])  # fmt: skip
-        k, axes = design.derivatives, np.eye(max(free, 2))[:, :free]
-        intensity = 2.0 * (self.likelihood.model.order + 1 + k) * axes[0]
-        decay = axes[0] + axes[1] if free > 1 else 0.0 * axes[0]  # ln kappa = ln omega + ln ratio
-        rows = {'decay': decay, 'size': 0.5 * intensity - (k + 0.5) * decay}
+        k = best.design.derivatives
+        intensity = np.array([2.0 * (self.likelihood.model.order + 1 + k), 0.0, 0.0])
+        # ln kappa = ln omega + ln ratio
+        decay = np.zeros(3) if self._decay else np.array([1.0, 1.0, 0.0])
+        rows = {'decay': decay @ axes, 'size': (0.5 * intensity - (k + 0.5) * decay) @ axes}
         try:
             covariance = 4.0 * STEP**2 * np.linalg.inv(curvature)
         except np.linalg.LinAlgError:
