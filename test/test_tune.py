@@ -294,8 +294,6 @@ def test_sensor_is_identified(truth):
         truth.get('stamp_jitter', 0.0), rel=0.1, abs=1e-9
     )
     assert sensor['dropout'] == pytest.approx(truth.get('dropout', 0.0), rel=0.2, abs=1e-3)
-    if 'dropout' in truth:
-        assert sensor['dropout_length'] == pytest.approx(4.0, rel=0.2)
 
 
 def test_sensor_outlives_bad_samples():

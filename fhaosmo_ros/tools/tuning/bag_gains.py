@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
-from fhaosmo_ros.tools.tuning.identify import Identified, ljung_box, NothingToFind
+from fhaosmo_ros.tools.tuning.identify import Identified, ljung_box, NothingToFind, SURE
+from fhaosmo_ros.tools.tuning.likelihood import QUICKEST
 from fhaosmo_ros.tools.tuning.linear_gains import kalman_gains
 from fhaosmo_ros.tools.tuning.start import GAMMA, SCHEME, WIDTH
 import numpy as np
@@ -22,6 +23,10 @@ SIZE_OF_USUAL = 0.9616
 """RMS of a standard normal number among the 99 % that are nearest to 0."""
 UNSEEN = 0.97
 """Expected error of d over its size from which on an estimate tells nothing."""
+NO_NOISE = 1e-7
+"""Noise over the size of y below which y is a simulated one without noise."""
+WANDERING = 0.99
+"""A correlation from which on the noise is a random walk."""
 BEGIN = 0.1
 """Part of the bag in which the estimates may still be settling."""
 
@@ -81,10 +86,13 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
 
     Raises
     ------
+    NothingToFind
+        There can be no gains, or the estimate of d would tell nothing.
     ConfigurationError
-        There is no such filter in floating-point numbers, or its estimate of d tells nothing.
+        There is no such filter in floating-point numbers.
 
     """
+    _refuse(found)
     likelihood, design = found.likelihood, found.best.design
     model, period = likelihood.model, _rounded(likelihood.period)
     noise, begin = _rounded(found.best.low_noise), int(BEGIN * len(likelihood.samples.y))
@@ -116,6 +124,40 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
             'Else a sensor with less noise, or a higher rate, is needed'
         )
     return Gains(values, errors[: model.order + 1], math.sqrt(variance), 1.0 - float(k[0]))
+
+
+def _refuse(found: Identified) -> None:
+    """Raise NothingToFind, which says why, where there can be no gains."""
+    likelihood, design, y = found.likelihood, found.best.design, found.likelihood.samples.y
+    period, sensor = likelihood.period, found.sensor
+    top = 0.9 * QUICKEST / period
+    white = found.white or found.best
+    silent = sensor.noise_std < NO_NOISE * float(np.std(y)) and not sensor.quantisation
+    if silent and not likelihood.fixed:
+        raise NothingToFind(
+            f'y: expected noise, got none that shows ({sensor.noise_std:.1e} in a y of '
+            f'{np.std(y):.3g}), as in a simulation without noise: the less noise, the larger the '
+            'gains, without limit. Say what the sensor will have: -p noise_size:=...'
+        )
+    if not likelihood.fixed and max(white.design.bandwidth, design.bandwidth) > top:
+        raise NothingToFind(
+            f'y: the likeliest filter follows every sample ({design.bandwidth:.3g} rad/s at '
+            f'{1.0 / period:.4g} Hz). Either y has no noise that shows, or it moves in a way that '
+            'the model cannot: it jumps, or order or phi are wrong. Say what noise the sensor '
+            'has (-p noise_size:=...), sample faster, or correct the model'
+        )
+    if design.colour > WANDERING:
+        step = found.best.noise / math.sqrt(period)
+        raise NothingToFind(
+            f'y: its error wanders like a random walk, by {step:.3g} in a second (in the unit of '
+            'y), which cannot be told from what d does. Either the sensor drifts, or y has no '
+            'noise that shows, or order or phi do not fit this plant'
+        )
+    if found.silent < SURE:
+        raise NothingToFind(
+            f'd: expected a y that d moves, got one that the model explains with d = 0 (noise '
+            f'{found.best.noise:.3g}). Record while the unknown input acts, and longer'
+        )
 
 
 def run(found: Identified, gains: Gains) -> Run:

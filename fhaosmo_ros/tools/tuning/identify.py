@@ -62,10 +62,6 @@ WHITE = 0.01
 LAGS = 20
 SURE = 10.0
 """A difference of log-likelihoods that is no accident."""
-NO_NOISE = 1e-7
-"""Noise over the size of y below which y is a simulated one without noise."""
-WANDERING = 0.99
-"""A correlation from which on the noise is a random walk."""
 STEP = 0.1
 """Of the differences of the log-likelihood in ln bandwidth, ln ratio and logit colour."""
 FEWEST = 500
@@ -166,11 +162,9 @@ def identify_input(
             )
         silent, shaken = search.alternatives(best)
         spread = search.spread(best)
-    found = Identified(
+    return Identified(
         likelihood, best, tried, white, silent, shaken, spread, outliers, data.sensor
     )
-    _refuse(found)
-    return found
 
 
 def _prepared(
@@ -212,40 +206,6 @@ def _prepared(
         values['prediction_step'] or usual_step(model),
         rounding,
     )
-
-
-def _refuse(found: Identified) -> None:
-    """Raise NothingToFind, which says why, where there can be no gains."""
-    likelihood, design, y = found.likelihood, found.best.design, found.likelihood.samples.y
-    period, sensor = likelihood.period, found.sensor
-    top = 0.9 * QUICKEST / period
-    white = found.white or found.best
-    silent = sensor.noise_std < NO_NOISE * float(np.std(y)) and not sensor.quantisation
-    if silent and not likelihood.fixed:
-        raise NothingToFind(
-            f'y: expected noise, got none that shows ({sensor.noise_std:.1e} in a y of '
-            f'{np.std(y):.3g}), as in a simulation without noise: the less noise, the larger the '
-            'gains, without limit. Say what the sensor will have: -p noise_size:=...'
-        )
-    if not likelihood.fixed and max(white.design.bandwidth, design.bandwidth) > top:
-        raise NothingToFind(
-            f'y: the likeliest filter follows every sample ({design.bandwidth:.3g} rad/s at '
-            f'{1.0 / period:.4g} Hz). Either y has no noise that shows, or it moves in a way that '
-            'the model cannot: it jumps, or order or phi are wrong. Say what noise the sensor '
-            'has (-p noise_size:=...), sample faster, or correct the model'
-        )
-    if design.colour > WANDERING:
-        step = found.best.noise / math.sqrt(period)
-        raise NothingToFind(
-            f'y: its error wanders like a random walk, by {step:.3g} in a second (in the unit of '
-            'y), which cannot be told from what d does. Either the sensor drifts, or y has no '
-            'noise that shows, or order or phi do not fit this plant'
-        )
-    if found.silent < SURE:
-        raise NothingToFind(
-            f'd: expected a y that d moves, got one that the model explains with d = 0 (noise '
-            f'{found.best.noise:.3g}). Record while the unknown input acts, and longer'
-        )
 
 
 def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:

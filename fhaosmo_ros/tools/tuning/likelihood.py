@@ -54,19 +54,7 @@ class Linear(NamedTuple):
     """
     The linear model of a sampling period, of N + 1 states: z, d, its derivatives, and v.
 
-    Attributes
-    ----------
-    a, q : (N + 1, N + 1) arrays
-        Transition, and the covariance that a period adds.
-    fresh : (N + 1, N + 1) array
-        Covariance of the errors where the filter begins.
-    variance : float
-        Of the white noise on y.
-    clip : float
-        Innovations of more standard deviations correct as so many (Huber 1964).
-    settled : int
-        Samples without a gap after which the covariance counts as steady.
-
+    What each member is stands with `kalman.innovations`, which takes them.
     """
 
     a: Floats

@@ -33,8 +33,6 @@ class Sensor(NamedTuple):
         s.
     dropout : float
         Share of the samples that are lost.
-    dropout_length : float
-        Mean number of them lost one after the other.
 
     """
 
@@ -43,7 +41,6 @@ class Sensor(NamedTuple):
     sample_rate: float
     stamp_jitter: float
     dropout: float
-    dropout_length: float
 
 
 def identify(t: Floats, y: Floats) -> Sensor:
@@ -78,14 +75,12 @@ def identify(t: Floats, y: Floats) -> Sensor:
     missing = np.maximum(np.round(h / period).astype(np.int64) - 1, 0)
     regular = missing == 0
     jitter = _spread(h[regular]) / float(np.sqrt(2.0))
-    lost, gaps = int(missing.sum()), int((missing > 0).sum())
+    lost = int(missing.sum())
     quantum = _quantum(y)
     noise = _noise(y, regular)
     noise = float(np.sqrt(max(noise**2 - quantum**2 / 12.0, 0.0)))
     rate = (lost + len(h)) / float(t[-1] - t[0])
-    return Sensor(
-        noise, quantum, rate, jitter, lost / (lost + len(t)), lost / gaps if gaps else 1.0
-    )
+    return Sensor(noise, quantum, rate, jitter, lost / (lost + len(t)))
 
 
 def usable(t: Floats, *values: Floats) -> NDArray[np.bool_]:
