@@ -129,13 +129,13 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
 def _refuse(found: Identified) -> None:
     """Raise NothingToFind, which says why, where there can be no gains."""
     likelihood, design, y = found.likelihood, found.best.design, found.likelihood.samples.y
-    period, sensor = likelihood.period, found.sensor
+    period, noise = likelihood.period, found.best.noise
     top = 0.9 * QUICKEST / period
     white = found.white or found.best
-    silent = sensor.noise_std < NO_NOISE * float(np.std(y)) and not sensor.quantisation
+    silent = noise < NO_NOISE * float(np.std(y)) and not found.sensor.quantisation
     if silent and not likelihood.fixed:
         raise NothingToFind(
-            f'y: expected noise, got none that shows ({sensor.noise_std:.1e} in a y of '
+            f'y: expected noise, got none that shows ({noise:.1e} in a y of '
             f'{np.std(y):.3g}), as in a simulation without noise: the less noise, the larger the '
             'gains, without limit. Say what the sensor will have: -p noise_size:=...'
         )

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit, logit
-from scipy.stats import chi2
+from scipy.stats import chi2, median_abs_deviation
 
 Floats = NDArray[np.float64]
 DERIVATIVES = (0, 1, 2)
@@ -195,7 +195,9 @@ def _prepared(
         slow = np.diff(slow) / (block * period)
         sizes.append(3.0 * float(np.sqrt(np.mean(slow**2))))
     rounding = sensor.quantisation / math.sqrt(12.0)
-    noise = max(math.hypot(sensor.noise_std, rounding), 1e-9 * float(np.std(y)))
+    # A smooth signal vanishes in differences of high order: a first guess.
+    rough = median_abs_deviation(np.diff(y, 4), scale='normal') / math.sqrt(70.0)
+    noise = max(float(rough), rounding, 1e-9 * float(np.std(y)))
     return Likelihood(
         model,
         period,

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimates of a sensor from its recorded y: noise, resolution, rate, jitter, losses."""
+"""Estimates of a sensor from its recorded y: resolution, rate, jitter, losses."""
 
-from math import comb
 from typing import NamedTuple
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -13,8 +12,6 @@ Floats = NDArray[np.float64]
 
 FEWEST = 200
 """An estimate needs so many samples."""
-DIFFERENCES = range(1, 9)
-"""Orders of the differences of y."""
 ON_GRID = 0.02
 """Values count as quantised if they are this close to multiples of the quantum, relatively."""
 
@@ -25,8 +22,8 @@ class Sensor(NamedTuple):
 
     Attributes
     ----------
-    noise_std, quantisation : float
-        In the unit of y; quantisation 0 for none that shows.
+    quantisation : float
+        In the unit of y; 0 for none that shows.
     sample_rate : float
         Hz.
     stamp_jitter : float
@@ -36,7 +33,6 @@ class Sensor(NamedTuple):
 
     """
 
-    noise_std: float
     quantisation: float
     sample_rate: float
     stamp_jitter: float
@@ -47,10 +43,8 @@ def identify(t: Floats, y: Floats) -> Sensor:
     """
     Estimate a sensor from what it measured.
 
-    The noise follows from differences of high order, in which a smooth signal vanishes. Medians
-    make steps and outliers unimportant. Only white noise is found: noise that a filter in the
-    sensor has smoothed looks like signal. Jitter of the periods and jitter of the stamps cannot be
-    distinguished; it is taken as that of the stamps, which is the worse one.
+    Jitter of the periods and jitter of the stamps cannot be distinguished; it is taken as that of
+    the stamps, which is the worse one.
 
     Parameters
     ----------
@@ -68,19 +62,15 @@ def identify(t: Floats, y: Floats) -> Sensor:
     if len(t) < FEWEST:
         raise ConfigurationError(
             f'bag: expected at least {FEWEST} samples of y with increasing stamps to estimate the '
-            f'noise from, got {len(t)}'
+            f'sensor from, got {len(t)}'
         )
     h = np.diff(t)
     period = float(np.median(h))
     missing = np.maximum(np.round(h / period).astype(np.int64) - 1, 0)
-    regular = missing == 0
-    jitter = _spread(h[regular]) / float(np.sqrt(2.0))
+    jitter = float(median_abs_deviation(h[missing == 0], scale='normal') / np.sqrt(2.0))
     lost = int(missing.sum())
-    quantum = _quantum(y)
-    noise = _noise(y, regular)
-    noise = float(np.sqrt(max(noise**2 - quantum**2 / 12.0, 0.0)))
     rate = (lost + len(h)) / float(t[-1] - t[0])
-    return Sensor(noise, quantum, rate, jitter, lost / (lost + len(t)))
+    return Sensor(_quantum(y), rate, jitter, lost / (lost + len(t)))
 
 
 def usable(t: Floats, *values: Floats) -> NDArray[np.bool_]:
@@ -88,18 +78,6 @@ def usable(t: Floats, *values: Floats) -> NDArray[np.bool_]:
     finite = np.isfinite(np.column_stack([t, *values])).all(axis=1)
     latest = np.maximum.accumulate(np.where(finite, t, -np.inf))
     return finite & (t > np.concatenate([[-np.inf], latest[:-1]])[: len(t)])
-
-
-def _noise(y: Floats, regular: NDArray[np.bool_]) -> float:
-    """Return the smallest estimate over the orders: low orders contain the signal as well."""
-    found = []
-    for order in DIFFERENCES:
-        whole = np.lib.stride_tricks.sliding_window_view(regular, order).all(axis=1)
-        differences = np.diff(y, order)[whole]
-        if len(differences) >= FEWEST // 2:
-            size = _spread(differences) or float(np.std(differences))  # 0 if quantised
-            found.append(size / comb(2 * order, order) ** 0.5)
-    return min(found, default=0.0)
 
 
 def _quantum(y: Floats) -> float:
@@ -113,8 +91,3 @@ def _quantum(y: Floats) -> float:
     few = len(np.unique(whole)) < len(steps) / 10
     near = np.abs(multiples - whole) <= ON_GRID * np.maximum(multiples, 1.0)
     return float(np.sum(steps) / np.sum(whole)) if few and near.mean() >= 0.99 else 0.0
-
-
-def _spread(x: Floats) -> float:
-    """Return the standard deviation without outliers, by the median of |x - median|."""
-    return float(median_abs_deviation(x, scale='normal'))
