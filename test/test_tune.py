@@ -18,7 +18,7 @@ from fhaosmo_ros.core.simulation.scoring import Scores
 from fhaosmo_ros.tools.bags.types import serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.tuning.command import main, read_parameters
-from fhaosmo_ros.tools.tuning.objective import Evaluation, Objective
+from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.sensor import identify
 from fhaosmo_ros.tools.tuning.source import simulated
@@ -370,17 +370,13 @@ def test_gains_are_rounded_only_where_that_costs_little(monkeypatch, loss, round
     assert all(v == float(f'{v:.4g}') for v in best.values()) is rounds
 
 
-def column(error):
-    return report.Column('', Evaluation(error, error, 0.0, 0.0, 'internal', None, 0), None)
-
-
 def test_report_warns_of_overfitting_and_of_bounds():
     space = [Dimension('a', 1e-3, 1e3, 1.0), Dimension('b', 0.0, 1.0, 0.5, log=False)]
     middle = {'a': 1.0, 'b': 0.5}
-    assert report.warnings(space, middle, [column(0.4), column(0.49)]) == []
-    (worse,) = report.warnings(space, middle, [column(0.4), column(0.52)])
+    assert report.warnings(space, middle, 0.4, 0.49) == []
+    (worse,) = report.warnings(space, middle, 0.4, 0.52)
     assert '1.30 times' in worse
-    (bound,) = report.warnings(space, {'a': 1.1e-3, 'b': 0.5}, [column(0.4)] * 2)
+    (bound,) = report.warnings(space, {'a': 1.1e-3, 'b': 0.5}, 0.4, 0.4)
     assert 'At their bounds: a;' in bound
     assert not report.at_bound(space[0], 3.0)  # in logarithms this is the middle
 

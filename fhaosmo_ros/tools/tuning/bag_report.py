@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a tuning by a bag says: gains.yaml, report.md with notes, and a figure."""
 
-from collections.abc import Sequence
 from itertools import pairwise
 import math
 from pathlib import Path
@@ -11,7 +10,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools.tuning import figures
 from fhaosmo_ros.tools.tuning.bag_gains import BEGIN, Gains, Run
 from fhaosmo_ros.tools.tuning.identify import Identified, LAGS, SURE
-from fhaosmo_ros.tools.tuning.report import parameter_file, table
+from fhaosmo_ros.tools.tuning.report import save, table
 import numpy as np
 
 TENTHS = 10
@@ -27,42 +26,27 @@ FLAT = 2.0
 
 
 def write(
-    folder: Path,
-    found: Identified,
-    gains: Gains,
-    run: Run,
-    notes: Sequence[str],
-    command: str,
-    origin: str,
+    folder: Path, found: Identified, gains: Gains, run: Run, command: str, origin: str
 ) -> str:
-    """
-    Write everything into a new folder.
-
-    Returns
-    -------
-    str
-        The report's main part, to be printed.
-
-    """
-    folder.mkdir()
+    """Write everything into a new folder; return the report's main part, to be printed."""
     likelihood, y = found.likelihood, found.likelihood.samples.y
     whole = float(likelihood.samples.h.sum())
     share = gains.expected[-1] / found.size_of_input
+    told = [f'Note: {text}' for text in notes(found, gains, run)]
     comments = [
         'Made by',
         f'    python -m fhaosmo_ros {command}',
         f'(fhaosmo_ros {__version__}) from {origin}: {len(y)} samples, {whole:.1f} s.',
         f'Found: noise {found.best.low_noise:.3g}; d with an RMS of {found.size_of_input:.3g}; '
         f'its expected error is {gains.expected[-1]:.3g}.',
-        *(f'Note: {text}' for text in notes),
+        *told,
     ]
     parameters = ESTIMATOR_PARAMETERS.part_of(gains.parameters)
-    (folder / 'gains.yaml').write_text(parameter_file(parameters, comments), 'utf-8')
     main = '\n\n'.join([
         _found(found, gains),
         f'The error of d is expected to be {share:.2f} of its size.',
         _run(run, gains),
-        *(f'Note: {text}' for text in notes),
+        *told,
     ])  # fmt: skip
     s = found.sensor
     parts = [
@@ -81,7 +65,7 @@ def write(
         '## Gains',
         '\n'.join(f'    {name}: {value}' for name, value in parameters.items()),
     ]
-    (folder / 'report.md').write_text('\n\n'.join(parts) + '\n', encoding='utf-8')
+    save(folder, parameters, comments, parts)
     figures.save_identified(run, gains.expected[-1], folder / 'estimates.png')
     return main
 

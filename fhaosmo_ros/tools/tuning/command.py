@@ -186,8 +186,7 @@ def _identify(
         made = bag_gains.make_gains(found, given)
         run = bag_gains.run(found, made)
     name = f'bag {arguments.bag.resolve().name}'
-    notes = bag_report.notes(found, made, run)
-    return bag_report.write(folder, found, made, run, notes, arguments.command_line, name)
+    return bag_report.write(folder, found, made, run, arguments.command_line, name)
 
 
 if __name__ == '__main__':

@@ -3,7 +3,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.observer.observer import Observer
@@ -11,7 +11,7 @@ from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.figures import save_estimates
-from fhaosmo_ros.tools.tuning.objective import Evaluation, Objective
+from fhaosmo_ros.tools.tuning.objective import Evaluation
 from fhaosmo_ros.tools.tuning.search import Dimension
 from fhaosmo_ros.tools.tuning.space import changes
 from fhaosmo_ros.tools.tuning.tuner import Tuner, TuningResult
@@ -25,18 +25,14 @@ SHOWN = 3
 """Recordings in the figure of estimates."""
 
 
-class Column(NamedTuple):
-    """One set of gains, evaluated on one set of recordings."""
-
-    title: str
-    evaluation: Evaluation
-    objective: Objective
-
-
-def parameter_file(parameters: Mapping[str, Any], comments: Sequence[str]) -> str:
-    """Return a YAML that `estimator` loads as it is."""
+def save(
+    folder: Path, parameters: Mapping[str, Any], comments: Sequence[str], parts: Sequence[str]
+) -> None:
+    """Write a YAML that `estimator` loads as it is, and the parts of a report."""
+    folder.mkdir()
     head = ''.join(f'# {line}'.rstrip() + '\n' for line in comments)
-    return head + dumps(parameters)
+    (folder / 'gains.yaml').write_text(head + dumps(parameters), 'utf-8')
+    (folder / 'report.md').write_text('\n\n'.join(parts) + '\n', 'utf-8')
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -45,24 +41,23 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
 
 
-def evaluations(columns: Sequence[Column]) -> str:
+def evaluations(columns: Mapping[str, Evaluation]) -> str:
     """Return a table of the evaluations, a column each."""
-    found = [column.evaluation for column in columns]
+    found = columns.values()
     rows = [
         ['objective', *(f'{e.objective:.4f}' for e in found)],
         ['error, relative to the truth', *(f'{e.error:.4f}' for e in found)],
     ]
-    quantities = len(columns[0].objective.scale)
-    names = [f'z{k + 1}' for k in range(quantities - 1)] + ['d']
-    for k, name in enumerate(names):
-        errors = [np.sqrt(np.mean(np.square(e.scores.error[:, e.choice, k]))) for e in found]
+    mean_squares = np.array([np.mean(e.scores.error[:, e.choice] ** 2, axis=0) for e in found])
+    for k, errors in enumerate(np.sqrt(mean_squares).T, 1):
+        name = f'z{k}' if k < mean_squares.shape[1] else 'd'
         rows.append([f'RMS error of {name}', *(f'{error:.3g}' for error in errors)])
     rows += [
         ['chatter of d, powers of ten', *(f'{e.chatter:.2f}' for e in found)],
         ['settling, share of the time', *(f'{e.settling:.2f}' for e in found)],
         ['estimates from', *(e.estimate_from for e in found)],
     ]
-    return table(['', *(column.title for column in columns)], rows)
+    return table(['', *columns], rows)
 
 
 def at_bound(dimension: Dimension, value: float) -> bool:
@@ -74,11 +69,10 @@ def at_bound(dimension: Dimension, value: float) -> bool:
 
 
 def warnings(
-    space: Sequence[Dimension], best: Mapping[str, float], tuned: Sequence[Column]
+    space: Sequence[Dimension], best: Mapping[str, float], training: float, held_out: float
 ) -> list[str]:
-    """Return what a user should know before using the gains."""
+    """Return what a user should know before using gains of these errors."""
     found = []
-    training, held_out = (column.evaluation.error for column in tuned)
     if held_out > OVERFITTED * training:
         found.append(
             f'The error on held-out recordings is {held_out / training:.2f} times that of the '
@@ -101,15 +95,14 @@ def warnings(
 
 def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str:
     """Write everything into a new folder; return the report's main part, to be printed."""
-    folder.mkdir()
     gains, before = (tuner.with_readout(x) for x in (changes(result.best), tuner.before))
     name = 'given' if tuner.before_is_given else 'start'
-    columns = [
-        Column(f'{title}, {data}', objective(values), objective)
+    columns = {
+        f'{title}, {data}': objective(values)
         for title, values in ((name, before), ('tuned', gains))
         for data, objective in (('training', tuner.training), ('held out', tuner.held_out))
-    ]
-    training, held_out = (column.evaluation.error for column in columns[2:])
+    }
+    training, held_out = (columns[f'tuned, {data}'].error for data in ('training', 'held out'))
     p = tuner.data.parameters
     comments = [
         'Made by',
@@ -120,9 +113,7 @@ def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str
         f'Error relative to the truth: {training:.3f} in training, {held_out:.3f} on held-out '
         'recordings.',
     ]
-    yaml = parameter_file(tuner.parameters(gains), comments)
-    (folder / 'gains.yaml').write_text(yaml, 'utf-8')
-    cautions = warnings(tuner.space, result.best, columns[2:])
+    cautions = warnings(tuner.space, result.best, training, held_out)
     main = '\n\n'.join([evaluations(columns), *(f'Note: {text}' for text in cautions)])
     rows = [
         [d.name, f'{d.low:.3g}', f'{d.high:.3g}', f'{d.start:.4g}', f'{result.best[d.name]:.4g}']
@@ -151,7 +142,7 @@ def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str
         parts.append(table(['unknown_input_derivatives', 'objective at the start'], rows))
     settings = p | dict(tuner.tuning)
     parts += ['## Settings', '\n'.join(f'    {name}: {value}' for name, value in settings.items())]
-    (folder / 'report.md').write_text('\n\n'.join(parts) + '\n', encoding='utf-8')
+    save(folder, tuner.parameters(gains), comments, parts)
 
     def estimate(values: Mapping[str, Any], r: Recording) -> Any:
         observer = Observer(ESTIMATOR_PARAMETERS.complete(tuner.estimator | values))

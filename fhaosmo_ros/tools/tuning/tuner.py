@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Mapping
 import hashlib
+import json
 import math
 import time
 from typing import Any, NamedTuple
@@ -128,7 +129,7 @@ class Tuner:
     def study_name(self) -> str:
         """Name of the study: a digest of all that its trials depend on."""
         samples = [recording.y.tobytes() for recording in self.data.training]
-        problem = repr((sorted(self.tuning.items()), sorted(self.estimator.items()), self.space))
+        problem = json.dumps([dict(self.tuning), self.estimator, self.space], sort_keys=True)
         return f'tune-{hashlib.sha256(b"".join([problem.encode(), *samples])).hexdigest()[:16]}'
 
     def evaluate(self, values: Values) -> float:
