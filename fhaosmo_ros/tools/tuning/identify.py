@@ -283,13 +283,11 @@ class Search:
             return white, None
         coloured = {}
         for k in self._orders:
-            if start.design.colour > 0.0:
-                coloured[k] = self._from_neighbours(start.design._replace(derivatives=k))
-                continue
-            like = white[k].design
-            slower = like._replace(colour=COLOURED, bandwidth=SLOWER * like.bandwidth)
-            several = [self.local(like._replace(colour=0.5)), self._from_neighbours(slower)]
-            coloured[k] = max(several, key=lambda e: e.log_likelihood)
+            origin = start.design
+            if origin.colour == 0.0:
+                slower = SLOWER * white[k].design.bandwidth
+                origin = white[k].design._replace(colour=COLOURED, bandwidth=slower)
+            coloured[k] = self._from_neighbours(origin._replace(derivatives=k))
         if _simplest(coloured).log_likelihood > chosen.log_likelihood + WORTH:
             return coloured, chosen
         return white, None
