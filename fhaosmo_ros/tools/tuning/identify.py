@@ -40,14 +40,12 @@ COLOURS = (0.0, 0.9)
 COLOURED, SLOWER = 0.75, 0.35
 """A colour, and a factor on the bandwidth found with white noise, to search a colour from."""
 FIRST_DERIVATIVES, FIRST_RATIO = 1, 0.5
-NEIGHBOURS = ((-0.5, -1.6), (-0.5, 0.3), (0.2, -1.6), (0.2, 0.3))
-"""ln bandwidth and ln ratio beside the best of the first, where a search may begin."""
 STEPS = np.array([0.3, 0.5, 0.4])
 """Sides of the first simplex in ln bandwidth (rad a sample), ln ratio and logit colour."""
 LOW = np.array([*np.log([SLOWEST, LEAST_RATIO]), -9.0])
 HIGH = np.array([*np.log([QUICKEST, MOST_RATIO]), 6.2])
 """Bounds of these."""
-EVALUATIONS = 90
+EVALUATIONS = 120
 WORTH = 3.0
 """By so much a richer model must raise the log-likelihood."""
 OUTLIER, LONGEST_RUN = 6.0, 3
@@ -274,8 +272,7 @@ class Search:
     def each_order(self, start: Evaluation) -> tuple[dict[int, Evaluation], Evaluation | None]:
         """Fit each number of derivatives; return them, and the best with white noise, if worse."""
         white = {
-            k: self._from_neighbours(start.design._replace(derivatives=k, colour=0.0))
-            for k in self._orders
+            k: self.local(start.design._replace(derivatives=k, colour=0.0)) for k in self._orders
         }
         chosen = _simplest(white)
         r = chosen.innovations[self.likelihood.samples.used & np.isfinite(chosen.innovations)]
@@ -287,19 +284,10 @@ class Search:
             if origin.colour == 0.0:
                 slower = SLOWER * white[k].design.bandwidth
                 origin = white[k].design._replace(colour=COLOURED, bandwidth=slower)
-            coloured[k] = self._from_neighbours(origin._replace(derivatives=k))
+            coloured[k] = self.local(origin._replace(derivatives=k))
         if _simplest(coloured).log_likelihood > chosen.log_likelihood + WORTH:
             return coloured, chosen
         return white, None
-
-    def _from_neighbours(self, design: Design) -> Evaluation:
-        best = self._likeliest(
-            design._replace(
-                bandwidth=design.bandwidth * math.exp(a), ratio=FIRST_RATIO * math.exp(b)
-            )
-            for a, b in NEIGHBOURS
-        )
-        return self.local(best.design)
 
     def _open(self, design: Design) -> list[bool]:
         """Return which of the three numbers of `_moved` are searched."""
