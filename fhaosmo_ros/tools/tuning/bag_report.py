@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a tuning by a bag says: gains.yaml, report.md with notes, and a figure."""
 
-from itertools import pairwise
 import math
 from pathlib import Path
 
@@ -137,13 +136,11 @@ def _of_noise(found: Identified) -> list[str]:
             f'`gains: self_tuning` follows the colour itself. (White noise is less likely by '
             f'{gain:.0f} in the logarithm.)'
         )
-    r = found.best.innovations
-    edges = np.linspace(0, len(r), TENTHS + 1).astype(int)
-    levels = []
-    for a, b in pairwise(edges):
-        piece = np.abs(r[a:b][np.isfinite(r[a:b]) & found.likelihood.samples.used[a:b]])
-        if len(piece) >= 30:
-            levels.append(float(np.median(piece)) / 0.6745 * found.best.noise)
+    r = np.where(found.likelihood.samples.used, found.best.innovations, np.nan)
+    finite = [np.abs(piece[np.isfinite(piece)]) for piece in np.array_split(r, TENTHS)]
+    levels = [
+        float(np.median(piece)) / 0.6745 * found.best.noise for piece in finite if len(piece) >= 30
+    ]
     if levels and max(levels) > CHANGED * min(levels):
         texts.append(
             f'Noise, or d, changes along the bag: in tenths of it the innovations have a size of '

@@ -28,6 +28,7 @@ from fhaosmo_ros.tools.tuning.sensor import Sensor, usable
 from fhaosmo_ros.tools.tuning.source import RecordedOutput
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_opening
 from scipy.optimize import minimize
 from scipy.special import expit, logit
 from scipy.stats import chi2, median_abs_deviation
@@ -196,16 +197,11 @@ def _prepared(
     # A smooth signal vanishes in differences of high order: a first guess.
     rough = median_abs_deviation(np.diff(y, 4), scale='normal') / math.sqrt(70.0)
     noise = max(float(rough), rounding, 1e-9 * float(np.std(y)))
+    known = given.get('noise_size')
     return Likelihood(
-        model,
-        period,
-        samples,
-        np.array(sizes),
-        given.get('noise_size') or noise,
-        bool(given.get('noise_size')),
-        values['prediction_step'] or usual_step(model),
-        rounding,
-    )
+        model, period, samples, np.array(sizes), known or noise, fixed=bool(known),
+        longest=values['prediction_step'] or usual_step(model), least_noise=rounding,
+    )  # fmt: skip
 
 
 def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:
@@ -213,10 +209,7 @@ def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:
     size = np.abs(np.nan_to_num(start.innovations))
     # Innovations of a first, coarse fit are not normal: their own median says what is usual.
     far = size > OUTLIER * max(float(np.median(size)) / 0.6745, 1.0)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(np.int8), [0]])))
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        if end - begin > LONGEST_RUN:
-            far[begin:end] = False
+    far &= ~binary_opening(far, np.ones(LONGEST_RUN + 1))  # which keeps longer runs
     if far.mean() > MOST_OUTLIERS:
         return 0
     likelihood.samples.used[far] = False
