@@ -38,11 +38,14 @@ def late(y):
     return np.concatenate([np.full(LATE, np.nan), y[:-LATE]])
 
 
-@pytest.mark.parametrize('scheme', ['predict_correct', 'implicit', 'explicit'])
-def test_late_samples_give_the_estimates_of_punctual_ones(scheme):
+@pytest.mark.parametrize('law', [
+    {'scheme': 'predict_correct'}, {'scheme': 'implicit'},
+    {'scheme': 'explicit', 'structure': 'cascade'},
+])  # fmt: skip
+def test_late_samples_give_the_estimates_of_punctual_ones(law):
     y, u = truth().z[:, 0], voltage()
-    punctual = OnlineEstimator(MOTOR | {'scheme': scheme}).run(STAMPS, y, u)
-    delayed = OnlineEstimator(DELAYED | {'scheme': scheme}).run(STAMPS, late(y), u)
+    punctual = OnlineEstimator(MOTOR | law).run(STAMPS, y, u)
+    delayed = OnlineEstimator(DELAYED | law).run(STAMPS, late(y), u)
     np.testing.assert_array_equal(delayed.t[LATE:], punctual.t[:-LATE])
     np.testing.assert_array_equal(delayed.z[LATE:], punctual.z[:-LATE])
     np.testing.assert_array_equal(delayed.unknown_input[LATE:], punctual.unknown_input[:-LATE])

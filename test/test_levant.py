@@ -3,8 +3,7 @@
 The second structure, against its equations written down a second time, and its theorems.
 
 The reference is plain Python made from docs/mathematics.md, not from the kernels: scipy's brentq
-solves the implicit equations, its solve_ivp follows the model. The sensitivities are tested in
-test_sensitivity.py.
+solves the implicit equations, its solve_ivp follows the model.
 """
 
 import math
@@ -23,7 +22,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq
-from studies.paper.plant_and_observer import simulate
 
 PHI = {
     1: (['-0.5*z1 + u'], [lambda z, u: -0.5 * z[0] + u]),
@@ -39,7 +37,7 @@ PHI = {
 # Levant's gains for a last derivative bounded by L: lambda_i = C_i L^(i / N).
 COEFFICIENTS = {2: (1.5, 1.1), 4: (3.0, 4.16, 3.06, 1.1)}
 COEFFICIENTS[6] = (7.0, 23.72, 32.24, 20.26, 6.75, 1.1)
-SCHEMES = ['explicit', 'implicit', 'predict_correct']
+SCHEMES = ['implicit', 'predict_correct']
 WIDTHS = [0.3, 0.05]
 
 
@@ -93,10 +91,6 @@ class Reference:
 
     def model(self, point, u):
         return np.array([*(f(point, u) for f in self.phi), *(-self.decay * point[self.n :])])
-
-    def explicit(self, y, h, u):
-        rate = np.append(self.z[1:], 0.0) + self.known(y, u) + self.injections(y - self.z[0])
-        self.z = self.z + h * rate
 
     def implicit(self, y, h, u):
         """Solve (1 - h shift) z = old + h (Phi + injections(y - z_1)) for z."""
@@ -152,9 +146,7 @@ def test_run_follows_the_equations(scheme, variant, n, decay, derivatives):
     reference = Reference(p, 0.7 if variant.endswith('adaptive') else 0.5)
     z = [reference.z]
     for k in range(1, len(t)):
-        # Explicit: the sample at the interval's beginning.
-        sample = y[k - 1] if scheme == 'explicit' else y[k]
-        getattr(reference, scheme)(sample, t[k] - t[k - 1], u[k])
+        getattr(reference, scheme)(y[k], t[k] - t[k - 1], u[k])
         z.append(reference.z)
     np.testing.assert_allclose(result.z_hat, z, rtol=1e-7, atol=1e-7)
     assert np.ptp(result.z_hat, axis=0).min() > 0.1  # every level moved
@@ -165,11 +157,10 @@ def test_run_follows_the_equations(scheme, variant, n, decay, derivatives):
     np.testing.assert_array_equal(result.innovation[1:, 1:], 0.0)
 
 
-@pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
-def test_two_levels_are_the_super_twisting_pair(scheme):
+def test_two_levels_are_the_super_twisting_pair():
     """With psi = sign: the first level of the paper's cascade, with alpha_1 = lambda_2."""
     t, y, u = signals()
-    p = {'order': 1, 'phi': ['0'], 'variant': 'sign', 'scheme': scheme}
+    p = {'order': 1, 'phi': ['0'], 'variant': 'sign', 'scheme': 'implicit'}
     pair = Observer(p | {'structure': 'levant', 'lambda': [4.0, 6.0]}).run(t, y, u)
     level = Observer(p | {'unknown_input': False, 'lambda': 4.0, 'alpha': 6.0}).run(t, y, u)
     np.testing.assert_allclose(pair.z, level.z, atol=1e-9)
@@ -239,7 +230,7 @@ def test_prediction_step_divides_a_long_interval(variant):
 @pytest.mark.parametrize('scheme', SCHEMES)
 @pytest.mark.parametrize('level', [0, 1, 2, 3])
 def test_errors_shrink_with_the_step_as_levants_theorem_says(scheme, level):
-    """|error of z_i| <= mu_i L^(..) h^(N - i + 1), explicitly; implicitly at least order 1."""
+    """|error of z_i| <= mu_i L^(..) h^(N - i + 1); here at least order 1."""
     p = {'structure': 'levant', 'order': 3, 'phi': ['0'] * 3, 'variant': 'sign'}
     steps, errors = [8e-3, 4e-3, 2e-3], []
     for h in steps:
@@ -347,12 +338,16 @@ def test_without_its_last_level_it_is_refused():
         Observer({'structure': 'levant', 'unknown_input': False})
 
 
-@pytest.mark.parametrize('variant', VARIANTS)
-def test_euler_of_the_joint_system_is_the_explicit_scheme(variant):
-    p = {'structure': 'levant', 'variant': variant, 'lambda': gains(4, 3.0), 'scheme': 'explicit'}
-    p |= {'fuzzy_widths': WIDTHS, 'gamma_initial': 0.6, 'gamma_rate': 0.1}
-    run = simulate(p, {}, 'ode1', 1e-3, duration=0.3)
-    sampled = Observer(p).run(run.t, run.z[:, 0])
-    np.testing.assert_allclose(run.z_hat, sampled.z_hat, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(run.z_tilde, sampled.z_tilde, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(run.gamma, sampled.gamma, rtol=1e-9)
+def test_explicit_is_no_scheme_of_levant():
+    with pytest.raises(ConfigurationError, match="expected scheme = 'implicit' or 'predict"):
+        Observer({'structure': 'levant', 'scheme': 'explicit'})
+
+
+@pytest.mark.parametrize('scheme', SCHEMES)
+def test_gamma_is_held(scheme):
+    t, y, u = signals()
+    p = parameters(3, scheme=scheme, variant='fuzzy_adaptive')
+    held = Observer(p).run(t, y, u)
+    learning = Observer(p | {'gamma_rate': 10.0, 'gamma_leakage': 1.0}).run(t, y, u)
+    np.testing.assert_array_equal(held.z_hat, learning.z_hat)
+    np.testing.assert_array_equal(learning.gamma, 0.7)

@@ -47,7 +47,6 @@ CHANGES = {
     'alpha': Change([10.0, 20.0, 30.0, 40.0]),
     'epsilon': Change(1e-4),
     'fuzzy_widths': Change(0.02),
-    'fuzzy_growth': Change(True, PREDICTING | {'fuzzy_widths': [1e-3], 'gamma_initial': 0.1}),
     'fuzzy_systems': Change(['curve 0 0.8 1']),
     'fuzzy_shape': Change('gaussian'),
     'fuzzy_normalise': Change(False),

@@ -6,6 +6,7 @@ from array import array
 from fhaosmo_ros.core import ConfigurationError, Observer
 from fhaosmo_ros.core.parameters import files
 from fhaosmo_ros.core.parameters.declaration import KINDS, Parameter, ParameterTable
+from fhaosmo_ros.core.parameters.removed import REMOVED
 from fhaosmo_ros.core.parameters.tables import (
     ESTIMATOR_PARAMETERS,
     NODE_TABLES,
@@ -233,3 +234,13 @@ def test_gains_of_a_model_alone_tune_themselves():
         {'channels': ['a', 'b'], **model, 'b.lambda': [3.0]}, ESTIMATOR_PARAMETERS
     )
     assert (values['a.gains'], values['b.gains']) == ('self_tuning', 'fixed')
+
+
+@pytest.mark.parametrize('name', REMOVED)
+@pytest.mark.parametrize('prefix', ['', 'hip.'])
+def test_parameter_of_an_older_version_names_its_successor(name, prefix):
+    values = {'channels': ['hip']} if prefix else {}
+    with pytest.raises(ConfigurationError) as error:
+        files.complete(values | {prefix + name: 1.0}, ESTIMATOR_PARAMETERS)
+    assert str(error.value) == f"parameter '{prefix}{name}' is gone: {REMOVED[name]}"
+    assert not any(name in table for table in files.NODE_TABLES.values())

@@ -161,7 +161,7 @@ def as_of_version_1(estimator, left_out=()):
     return list(kept), list(kept.values())
 
 
-@pytest.mark.parametrize('scheme', ['implicit', 'explicit'])
+@pytest.mark.parametrize('scheme', ['implicit', 'predict_correct'])
 @pytest.mark.parametrize('left_out', [
     ('none',), ('covariance', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread'),
     ('lost_since', 'event', 'repeats', 'sample'),

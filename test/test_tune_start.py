@@ -130,7 +130,7 @@ def test_start_is_as_good_as_the_best_kalman_filter(tuner):
         ({'variant': 'fuzzy', 'max_gap': 2.0}, 'predict_correct'),
         ({'structure': 'cascade'}, None),
         ({'scheme': 'implicit'}, 'implicit'),
-        ({'structure': 'levant', 'scheme': 'explicit'}, 'explicit'),
+        ({'structure': 'levant', 'scheme': 'implicit'}, 'implicit'),
         ({'unknown_input': False}, None),
         ({'lambda': [1.0], 'alpha': [2.0]}, None),
     ],

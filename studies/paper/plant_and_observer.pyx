@@ -97,7 +97,6 @@ cdef class Joint(Dynamics):
     cdef SlidingMode observer
     cdef SlidingMode free  # the same without injections
     cdef bint holds_sign  # sign(eps_i) is held for a whole step
-    cdef bint shared  # one innovation drives all levels
     cdef double sign[MOST_LEVELS]  # sign(eps_i) at the beginning of a step
     cdef double loss  # L then
     cdef double wait  # time for which innovations have yet to stay small before gamma leaks (s)
@@ -111,7 +110,7 @@ cdef class Joint(Dynamics):
         self.plant, self.observer, self.free = plant, observer, free
         if plant.phi.inputs > MOST_INPUTS:
             raise ConfigurationError(f'plant: expected at most {MOST_INPUTS} known inputs')
-        self.holds_sign, self.shared = holds_sign, configuration.levant
+        self.holds_sign = holds_sign
         plant.u = self.u
         self.size = (sizeof(State) - sizeof(self.state.level)) // sizeof(double)
         self.size += observer.levels * (sizeof(Level) // sizeof(double))
@@ -162,7 +161,7 @@ cdef class Joint(Dynamics):
         cdef Level* one
         cdef int i
         for i in range(self.observer.levels):
-            if i == 0 or self.shared:
+            if i == 0:
                 eps = now.z[0] - now.level[0].z_hat
             else:
                 eps = now.level[i - 1].z_tilde - now.level[i].z_hat

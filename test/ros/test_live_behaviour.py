@@ -102,7 +102,7 @@ ELSEWHERE = {
     'predict_to_now',  # needs a delay, which is fixed: test_delay.py
     # These act where y is far off or its rate changes: test_online_parameters.py.
     'correction_period', 'noise_size', 'state_sizes', 'unknown_input_size', 'unknown_input_rate',
-    'fuzzy_growth', 'bandwidth', 'tuning_memory',
+    'bandwidth', 'tuning_memory',
     # These decide what is an event: test_event_topic.py, test_online_parameters.py.
     'event_threshold', 'event_deviations', 'event_duration', 'event_release',
     'event_change_time',

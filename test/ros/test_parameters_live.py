@@ -50,7 +50,6 @@ OTHER = {
     'epsilon': 0.05,
     'fuzzy_widths': [0.03, 0.01],
     'fuzzy_systems': ['terms 5; output singleton 5', 'curve 0 0.8 1'],
-    'fuzzy_growth': True,
     'fuzzy_shape': 'gaussian',
     'fuzzy_normalise': False,
     'gamma_initial': 0.6,

@@ -165,9 +165,10 @@ class ObserverConfiguration:
         self.predicting = p['scheme'] == 'predict_correct'
         self.implicit = p['scheme'] != 'explicit'
         self.internal = p['estimate_from'] == 'internal'
-        self.adaptive = p['variant'].endswith('_adaptive')
+        adaptive = p['variant'].endswith('_adaptive')
+        self.adaptive = adaptive and not self.levant
         self.is_sign = p['variant'].startswith('sign')
-        self.gamma_initial = p['gamma_initial'] if self.adaptive else FIXED_GAMMA
+        self.gamma_initial = p['gamma_initial'] if adaptive else FIXED_GAMMA
         self.epsilon = np.inf if self.levant else p['epsilon']  # one innovation has no gates
         self.levels = levels = n + (1 + p['unknown_input_derivatives']) * p['unknown_input']
         self.initial_estimate = self._per_level('initial_estimate')
@@ -216,6 +217,11 @@ class ObserverConfiguration:
                 "parameters 'scheme', 'structure': predict_correct is a scheme of levant alone, "
                 "expected structure = 'levant' or another scheme (explicit, implicit), got "
                 f'{p["structure"]!r} and {p["scheme"]!r}'
+            )
+        if p['scheme'] == 'explicit' and p['structure'] == 'levant':
+            raise ConfigurationError(
+                "parameters 'scheme', 'structure': levant has no explicit scheme any more, "
+                "expected scheme = 'implicit' or 'predict_correct', got 'explicit'"
             )
 
     def _per_level(self, name: str) -> Floats:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Levant's arbitrary-order differentiator with the paper's curves and power."""
 
-from fhaosmo_ros.core.model.phi cimport Dual
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.sliding_mode cimport SlidingMode
 
@@ -15,14 +14,11 @@ cdef struct Root:
 cdef class Levant(SlidingMode):
     cdef double widest  # half-width (unit of y); growth begins beyond it (D 22)
     cdef double relaxation  # at which the scale returns to 1 (1/s)
-    cdef double share[MOST_LEVELS][MOST_LEVELS]  # beta of D 18; 1 for the other schemes
+    cdef double share[MOST_LEVELS][MOST_LEVELS]  # beta of D 18; 1 for implicit
     cdef double ratio[MOST_LEVELS]  # factors of the corrections of the levels, P / steady P
-    cdef void explicit(self, double y, double h, const double* u) noexcept nogil
     cdef void backward(self, double y, double h, const double* u) noexcept nogil
     cdef void predict_correct(self, double y, double h, const double* u) noexcept nogil
-    cdef void mirror(self) noexcept nogil
     cdef void correct_levels(self, double y, double h) noexcept nogil
-    cdef Dual injection(self, int i, double a, double power, double p) noexcept nogil
     cdef Root root(self, const double* weight, double b, double gamma) noexcept nogil
-    cdef double influence(self, double b, double usual) noexcept nogil
     cdef void grow(self, double a, double h) noexcept nogil
+    cdef double influence(self, double b, double usual) noexcept nogil

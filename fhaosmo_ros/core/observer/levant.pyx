@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Levant's arbitrary-order differentiator with the paper's curves and power, all three schemes.
+Levant's arbitrary-order differentiator with the paper's curves and power.
 
-One innovation drives every level: eps = y - z_hat_1. Equations are cited by their numbers in
-docs/mathematics.md (D). The internal states mirror the estimates, z_tilde_{i+1} = z_hat_{i+1}, so
-that whatever reads a cascade's state reads this one; theta is 0.
+One innovation drives every level: eps = y - z_hat_1; gamma is held. Equations are cited by their
+numbers in docs/mathematics.md (D). The internal states mirror the estimates, z_tilde_{i+1} =
+z_hat_{i+1}, so that whatever reads a cascade's state reads this one; theta is 0.
 
 Levant 2003, doi:10.1080/0020717031000099029.
 """
@@ -19,7 +19,7 @@ from fhaosmo_ros.core.observer.sliding_mode cimport (
     HUBER, LONG_AGO, NEWTON_STEPS, NEWTON_TOLERANCE, TINY, SlidingMode, doubt_of_noise,
     follow_spread, psi
 )
-from fhaosmo_ros.core.observer.structure cimport Level, Memory
+from fhaosmo_ros.core.observer.structure cimport Memory
 
 from fhaosmo_ros.core.observer.configuration import deadbeat_shares
 
@@ -52,9 +52,9 @@ cdef class Levant(SlidingMode):
 
     def __cinit__(self, configuration):
         cdef int i, j, n = self.levels
-        p = configuration.parameters
         self.widest = INFINITY
-        if p['fuzzy_growth'] and not self.is_sign:
+        # With larger powers saturated levels find y again by themselves.
+        if self.predicting and not self.is_sign and self.gamma_initial < 0.5:
             self.widest = max(configuration.widths)
             speed = (configuration.lambdas[n - 1] / configuration.widths[n - 1]) ** (1.0 / n)
             self.relaxation = speed / 3.0
@@ -68,60 +68,8 @@ cdef class Levant(SlidingMode):
         """Advance `trial` by the scheme."""
         if self.predicting:
             self.predict_correct(y, h, u)
-        elif self.implicit:
-            self.backward(y, h, u)
         else:
-            self.explicit(self.memory.y, h, u)
-
-    cdef void mirror(self) noexcept nogil:
-        """Write the internal states that stand for the estimates."""
-        cdef int i, n = self.levels
-        for i in range(n - 1):
-            self.trial[i].z_tilde, self.trial[i].q = self.trial[i + 1].z_hat, self.trial[i + 1].p
-        self.trial[n - 1].z_tilde = self.trial[n - 1].q = 0.0
-
-    cdef Dual injection(self, int i, double a, double power, double p) noexcept nogil:
-        """Return psi(a) |eps|^p and its slope along a = |eps|, given |eps|^p."""
-        cdef Dual curve
-        if a > 0.0:
-            curve = psi(self, i, a)
-            return Dual(power * curve.value, power * (p * curve.value / a + curve.slope))
-        if self.is_sign or p > 0.0:
-            return Dual(0.0, 0.0)
-        return Dual(0.0, psi(self, i, 0.0).slope)
-
-    cdef void explicit(self, double y, double h, const double* u) noexcept nogil:
-        """Forward Euler of D 11; `y` is the sample at the interval's beginning."""
-        cdef Level* level
-        cdef double m[MOST_LEVELS]
-        cdef double dm[MOST_LEVELS]
-        cdef double gamma = self.memory.gamma, power = 1.0, follower = 0.0, dfollower = 0.0
-        cdef double eps = y - self.trial[0].z_hat, s = -self.trial[0].p, a = fabs(eps)
-        cdef double log_a = log(a) if a > 0.0 else 0.0, dp, hat, dhat
-        cdef int i, n = self.levels
-        cdef double root_power = pow(a, 2.0 * gamma / n)
-        cdef Dual phi, v
-        m[0], dm[0] = y, 0.0
-        for i in range(1, n):
-            m[i], dm[i] = self.trial[i].z_hat, self.trial[i].p
-        for i in range(n - 1, -1, -1):
-            level = &self.trial[i]
-            phi = evaluate(self.prediction.phi, i, m, dm, u)
-            dp = 2.0 * (n - 1 - i) / n
-            v = self.injection(i, a, power, gamma * dp)
-            hat, dhat = level.z_hat, level.p
-            level.z_hat += h * (
-                follower + phi.value + self.gains[i].lambda_ * copysign(v.value, eps)
-            )
-            if self.sensitive:  # D 13
-                level.p += h * (
-                    dfollower + phi.slope
-                    + self.gains[i].lambda_ * (copysign(v.value, eps) * log_a * dp + v.slope * s)
-                )
-            follower, dfollower = hat, dhat
-            power *= root_power
-        self.mirror()
-        self.loss, self.gradient = eps * eps, 2.0 * eps * s
+            self.backward(y, h, u)
 
     cdef void backward(self, double y, double h, const double* u) noexcept nogil:
         """
@@ -130,18 +78,15 @@ cdef class Levant(SlidingMode):
         Phi is taken at the new sample `y`, at the interval's end, and the old estimates.
         """
         cdef double m[MOST_LEVELS]
-        cdef double dm[MOST_LEVELS]
-        cdef double above = 0.0, dabove = 0.0
-        cdef Dual phi
+        cdef double still[MOST_LEVELS]
+        cdef double above = 0.0, phi
         cdef int i, n = self.levels
-        m[0], dm[0] = y, 0.0
-        for i in range(1, n):
-            m[i], dm[i] = self.trial[i].z_hat, self.trial[i].p
+        for i in range(n):
+            m[i], still[i] = y if i == 0 else self.trial[i].z_hat, 0.0
         for i in range(n - 1, -1, -1):
-            phi = evaluate(self.prediction.phi, i, m, dm, u)
-            above = self.trial[i].z_hat + h * (above + phi.value)
-            dabove = self.trial[i].p + h * (dabove + phi.slope)
-            self.trial[i].z_hat, self.trial[i].p = above, dabove
+            phi = evaluate(self.prediction.phi, i, m, still, u).value
+            above = self.trial[i].z_hat + h * (above + phi)
+            self.trial[i].z_hat = above
         self.correct_levels(y, h)
 
     cdef void predict_correct(self, double y, double h, const double* u) noexcept nogil:
@@ -163,12 +108,9 @@ cdef class Levant(SlidingMode):
             doubt = doubt_of_noise(-memory.settled, self.bandwidth(period))
             self.linear.predict(p, h)
             variance = p[0][0] + doubt * doubt * self.noise_variance
+        self.predict_trial(h, u)
         for i in range(n):
-            self.prediction.z[i], self.prediction.dz[i] = self.trial[i].z_hat, self.trial[i].p
-        self.prediction.over(h, u)
-        for i in range(n):
-            self.trial[i].z_hat, self.trial[i].p = self.prediction.z[i], self.prediction.dz[i]
-            self.ratio[i] = 1.0
+            self.trial[i].z_hat, self.ratio[i] = self.prediction.z[i], 1.0
         if not self.scheduled:
             if period > 0.0:  # not below the mean interval: another rate is no gap
                 h = min(h, max(period, memory.period))
@@ -199,56 +141,29 @@ cdef class Levant(SlidingMode):
         """Turn predicted levels into corrected ones by the solution of D 12 or D 18."""
         cdef double weight[MOST_LEVELS]  # h^i lambda_i
         cdef double power_of_h[MOST_LEVELS]  # h^i
-        cdef double gamma = self.memory.gamma, scale = self.memory.scale
-        cdef double b = (y - self.trial[0].z_hat) / scale, db = -self.trial[0].p / scale  # D 22
-        cdef double log_a = 0.0, deps = 0.0, power = 1.0, numerator, denominator, dp, to_gamma
-        cdef double share, a
+        cdef double scale = self.memory.scale, power = 1.0, v, share
+        cdef double b = (y - self.trial[0].z_hat) / scale  # D 22
         cdef int i, j, n = self.levels
         cdef Root root
-        cdef Dual v
-        cdef bint sliding
         for i in range(n):
             power_of_h[i] = h if i == 0 else power_of_h[i - 1] * h
             weight[i] = self.ratio[0] * power_of_h[i] * self.gains[i].lambda_
-        root = self.root(weight, fabs(b), gamma)
-        a = root.eps
-        sliding = self.is_sign and a == 0.0
-        if self.sensitive and not sliding:  # D 14: implicit function theorem
-            log_a = log(a) if a > 0.0 else 0.0
-            numerator, denominator = db, 1.0
-            for i in range(n - 1, -1, -1):
-                dp = 2.0 * (n - 1 - i) / n
-                v = self.injection(i, a, power, gamma * dp)
-                numerator -= weight[i] * copysign(v.value, b) * log_a * dp
-                denominator += weight[i] * v.slope
-                power *= root.w
-            deps = numerator / denominator
-        power = 1.0
-        for i in range(n - 1, -1, -1):  # v_i and its derivative along gamma
-            dp = 2.0 * (n - 1 - i) / n
-            v = self.injection(i, a, power, gamma * dp)
-            to_gamma = copysign(v.value, b) * log_a * dp
+        root = self.root(weight, fabs(b), self.memory.gamma)
+        for i in range(n - 1, -1, -1):
+            v = power * psi(self, i, root.eps).value if root.eps > 0.0 else 0.0
             if i == n - 1:
-                v.value = root.s
-                if sliding:
-                    to_gamma = db / weight[i]
-            self.trial[i].z_tilde = self.gains[i].lambda_ * copysign(v.value, b)
-            if self.sensitive:
-                self.trial[i].q = self.gains[i].lambda_ * (to_gamma + v.slope * deps)
+                v = root.s
+            self.trial[i].z_tilde = self.gains[i].lambda_ * copysign(v, b)
             power *= root.w
         for i in range(n):
             for j in range(i, n):
                 share = scale * self.ratio[i] * power_of_h[j - i] * self.share[j][i]
                 self.trial[i].z_hat += share * self.trial[j].z_tilde
-                if self.sensitive:
-                    self.trial[i].p += share * self.trial[j].q
-        self.grow(a, h)
-        a, deps = scale * a, scale * deps
-        self.trial[0].z_hat = y - copysign(a, b)  # what the sum above is but for rounding
-        if self.sensitive:
-            self.trial[0].p = -deps
-        self.mirror()
-        self.loss, self.gradient = a * a, 2.0 * copysign(a, b) * deps
+        self.grow(root.eps, h)
+        # What the sum above is but for rounding.
+        self.trial[0].z_hat = y - copysign(scale * root.eps, b)
+        for i in range(n):
+            self.trial[i].z_tilde = self.trial[i + 1].z_hat if i + 1 < n else 0.0
 
     cdef Root root(self, const double* weight, double b, double gamma) noexcept nogil:
         """

@@ -51,6 +51,7 @@ cdef class SlidingMode(Structure):
     cdef void follow(self, double y, double h, const double* u) noexcept nogil
     cdef double predicted_y(self, double h, const double* u) noexcept nogil
     cdef void hand_over(self, const double* u) noexcept nogil
+    cdef void predict_trial(self, double h, const double* u) noexcept nogil
     cdef int adapt(self, double h) noexcept nogil
     cdef void begin_estimates(self, double y, double h, const double* u) noexcept nogil
     cdef void fit(self) noexcept

@@ -267,6 +267,13 @@ cdef class SlidingMode(Structure):
         memory.gamma = gamma
         return word
 
+    cdef void predict_trial(self, double h, const double* u) noexcept nogil:
+        """Let the prediction go on from the estimates of `trial` by `h`."""
+        cdef int i
+        for i in range(self.levels):
+            self.prediction.z[i], self.prediction.dz[i] = self.trial[i].z_hat, 0.0
+        self.prediction.over(h, u)
+
     # Scheduled gains
 
     cdef double bandwidth(self, double h) noexcept nogil:
@@ -289,9 +296,7 @@ cdef class SlidingMode(Structure):
         cdef double noise = doubt * doubt * self.noise_variance, s, b
         self.linear.predict(self.trial_covariance, h)
         s = self.trial_covariance[0][0] + noise
-        for i in range(n):
-            self.prediction.z[i], self.prediction.dz[i] = self.trial[i].z_hat, 0.0
-        self.prediction.over(h, u)
+        self.predict_trial(h, u)
         b = y - self.prediction.z[0]
         follow_spread(memory, b, sqrt(s))
         if memory.beyond > 0.0:

@@ -106,14 +106,15 @@ OBSERVER = (
     Parameter(
         'variant', 'fuzzy_adaptive',
         'sign: discontinuous injection, gamma = 1/2. fuzzy: fuzzy curve instead of sign. '
-        'sign_adaptive, fuzzy_adaptive: the same with adapted gamma.',
+        'sign_adaptive, fuzzy_adaptive: the same with adapted gamma; with levant gamma stays '
+        'gamma_initial.',
         choices=('sign', 'fuzzy', 'fuzzy_adaptive', 'sign_adaptive'),
     ),
     Parameter(
         'scheme', 'implicit',
-        'explicit: forward Euler (the paper). implicit: backward Euler, without the chatter that '
-        'a digital step makes. predict_correct (levant only): the model is followed to the new '
-        'sample by Runge-Kutta steps, then corrected as implicit does.',
+        'explicit (cascade only): forward Euler (the paper). implicit: backward Euler, without '
+        'the chatter that a digital step makes. predict_correct (levant only): the model is '
+        'followed to the new sample by Runge-Kutta steps, then corrected as implicit does.',
         choices=('explicit', 'implicit', 'predict_correct'),
     ),
     Parameter(
@@ -178,12 +179,6 @@ OBSERVER = (
         'levels that follow. Beyond its half-width psi is +-1. In the unit of the innovation '
         'eps_i; levant: of y at every level.',
         lower=1e-12, upper=1e12, lengths='1 to N; the last one serves the levels that follow',
-    ),
-    Parameter(
-        'fuzzy_growth', False,
-        'levant, implicit and predict_correct: half-widths and injections grow while innovations '
-        'stay beyond all half-widths, and shrink to what they were afterwards. For gamma well '
-        'below 1/2, where an observer whose levels are all saturated would never find y again.',
     ),
     Parameter(
         'fuzzy_systems', ['terms 5', 'terms 7'],

@@ -31,7 +31,6 @@ SCHEME: Mapping[str, Any] = {
     'variant': 'fuzzy_adaptive',
     'gamma_rate': 0.0,
     'gamma_min': 1e-4,
-    'fuzzy_growth': True,
 }
 """What is tuned where the user sets no other structure or scheme."""
 MEANT_FOR = ('lambda', 'alpha', 'epsilon', 'initial_internal')
