@@ -93,11 +93,8 @@ OTHER = {
     'disturbance': 'square',
     'disturbance_amplitude': 0.2,
     'disturbance_omega': 2.0,
-    'disturbance_phase': 0.5,
     'disturbance_offset': -0.1,
     'disturbance_start': 2.0,
-    'disturbance_omega_end': 5.0,
-    'disturbance_sweep_time': 10.0,
     'noise_std': 0.001,
     'quantisation': 0.002,
     'noise_seed': 7,
@@ -121,7 +118,7 @@ SLIDERS = {
 SIGNED = {
     'unknown_input_scale',
     'initial_estimate', 'initial_internal', 'initial_state', 'disturbance_amplitude',
-    'disturbance_phase', 'disturbance_offset',
+    'disturbance_offset',
 }  # fmt: skip
 LIVE = {node: [name for name, p in table.items() if p.live] for node, table in TABLES.items()}
 

@@ -3,5 +3,8 @@
 
 REMOVED = {
     'fuzzy_growth': "leave it out: 'predict_correct' has it wherever 'gamma_initial' is below 0.5",
+    'disturbance_phase': 'leave it out: waves of d begin at their offset',
+    'disturbance_omega_end': "leave it out: a chirp ends at ten times 'disturbance_omega'",
+    'disturbance_sweep_time': 'leave it out: a chirp sweeps for 20 s',
 }
 """What a message says of a name that was a parameter once."""

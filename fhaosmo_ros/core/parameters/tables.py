@@ -564,9 +564,9 @@ PLANT_MODEL = (
     ),
     Parameter(
         'disturbance', 'sine',
-        'The unknown input d(t): none (0), sine (amplitude sin(omega t + phase) + offset), step '
-        '(offset, from start on offset + amplitude), square (sign of the sine), chirp (sine whose '
-        'angular frequency goes from omega to omega_end within sweep_time and stays there).',
+        'The unknown input d(t): none (0), sine (amplitude sin(omega t) + offset), step (offset, '
+        'from start on offset + amplitude), square (sign of the sine), chirp (sine whose angular '
+        'frequency goes from omega to 10 omega within 20 s and stays there).',
         choices=('none', 'sine', 'step', 'square', 'chirp'),
     ),
     Parameter(
@@ -576,21 +576,10 @@ PLANT_MODEL = (
         'disturbance_omega', 1.0, 'Angular frequency of d.', unit='rad/s', lower=0.0, upper=1e5,
     ),
     Parameter(
-        'disturbance_phase', 0.0, 'Phase of d.', unit='rad', lower=-1e3, upper=1e3,
-    ),
-    Parameter(
         'disturbance_offset', 0.0, 'Constant part of d.', lower=-1e9, upper=1e9,
     ),
     Parameter(
         'disturbance_start', 1.0, 'Time of the step.', unit='s', lower=0.0, upper=1e9,
-    ),
-    Parameter(
-        'disturbance_omega_end', 10.0, 'Angular frequency at the end of the chirp.',
-        unit='rad/s', lower=0.0, upper=1e5,
-    ),
-    Parameter(
-        'disturbance_sweep_time', 20.0, 'Duration of the sweep of the chirp.',
-        unit='s', lower=1e-3, upper=1e9,
     ),
     Parameter(
         'noise_std', 0.0, 'Standard deviation of the white Gaussian noise on y (unit of y).',

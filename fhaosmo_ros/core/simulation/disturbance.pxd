@@ -13,11 +13,8 @@ cdef class Wave(Disturbance):
     cdef Kind kind
     cdef double amplitude  # of the wave, or height of the step (unit of d)
     cdef double omega  # angular frequency; a chirp's at t = 0 (rad/s)
-    cdef double phase  # of the sine at t = 0 (rad)
     cdef double offset  # added to it (unit of d)
     cdef double start  # time of the step (s)
-    cdef double omega_end  # angular frequency from sweep_time on (rad/s)
-    cdef double sweep_time  # length of a chirp's sweep (s)
 
 
 cdef class Table(Disturbance):

@@ -7,6 +7,9 @@ from libc.string cimport memcpy
 
 import numpy as np
 
+# A chirp sweeps over so many times its first angular frequency, within this time (s).
+cdef double SWEEP = 10.0
+cdef double SWEEP_TIME = 20.0
 KINDS = ('none', 'sine', 'step', 'square', 'chirp')
 
 
@@ -33,25 +36,23 @@ cdef class Wave(Disturbance):
     def __init__(self, p):
         self.kind = KINDS.index(p['disturbance'])
         self.amplitude, self.offset = p['disturbance_amplitude'], p['disturbance_offset']
-        self.omega, self.phase = p['disturbance_omega'], p['disturbance_phase']
-        self.omega_end, self.start = p['disturbance_omega_end'], p['disturbance_start']
-        self.sweep_time = p['disturbance_sweep_time']
+        self.omega, self.start = p['disturbance_omega'], p['disturbance_start']
 
     cdef double at(self, double t) noexcept nogil:
         """Return d(t)."""
-        cdef double angle = self.omega * t, swept, wave
+        cdef double angle = self.omega * t, last = SWEEP * self.omega, swept, wave
         if self.kind == NONE:
             return 0.0
         if self.kind == STEP:
             return self.offset + (self.amplitude if t >= self.start else 0.0)
         if self.kind == CHIRP:
-            swept = fmin(t, self.sweep_time)
+            swept = fmin(t, SWEEP_TIME)
             angle = (
                 self.omega * swept
-                + 0.5 * (self.omega_end - self.omega) / self.sweep_time * swept * swept
-                + self.omega_end * (t - swept)
+                + 0.5 * (last - self.omega) / SWEEP_TIME * swept * swept
+                + last * (t - swept)
             )
-        wave = sin(angle + self.phase)
+        wave = sin(angle)
         if self.kind == SQUARE:
             wave = 1.0 if wave >= 0.0 else -1.0
         return self.offset + self.amplitude * wave
