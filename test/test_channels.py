@@ -14,7 +14,7 @@ PARAMETERS = [
     {'order': 1, 'phi': ['-z1'], 'unknown_input': False, 'variant': 'sign'},
     {'order': 2, 'phi': ['0', 'u - sin(z1)'], 'variant': 'fuzzy', 'scheme': 'explicit'},
     {'order': 5, 'phi': ['0', '0', '0', '0', '-z5'], 'estimate_from': 'filtered'},
-    {'sampling': 'nominal', 'spike_gate': 0.05, 'spike_gate_samples': 2},
+    {'sampling': 'nominal', 'spike_gate': 0.05},
 ]
 PERIODS = [MS, MS, MS, 2 * MS, 0, -MS, 40 * MS, 501 * MS, -700 * MS]
 VALUES = [0.0, 0.1, 0.2, -0.3, float('nan'), float('inf'), 1e300]

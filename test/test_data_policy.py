@@ -89,20 +89,20 @@ def test_spike_is_rejected_and_changes_nothing():
 
 
 def test_real_step_of_y_is_believed_after_so_many_samples():
-    feed = Feed(spike_gate=0.05, spike_gate_samples=4)
+    feed = Feed(spike_gate=0.05)
     feed.sine(100)
     words = feed(*[5.0] * 50)
-    assert [bool(w & Status.REJECTED_SPIKE) for w in words] == [True] * 4 + [False] * 46
-    assert feed.events == {'rejected_spikes': 4, 'spikes_believed': 1}
+    assert [bool(w & Status.REJECTED_SPIKE) for w in words] == [True] * 5 + [False] * 45
+    assert feed.events == {'rejected_spikes': 5, 'spikes_believed': 1}
 
 
 def test_spikes_are_counted_in_a_row():
-    feed = Feed(spike_gate=0.05, spike_gate_samples=2)
+    feed = Feed(spike_gate=0.05)
     feed.sine(100)
     for _ in range(10):
-        words = feed(5.0, -5.0, 0.21)
-        assert [w.rejected for w in words] == [True, True, False]
-    assert feed.events == {'rejected_spikes': 20}
+        words = feed(*[5.0, -5.0] * 2, 5.0, 0.21)
+        assert [w.rejected for w in words] == [True] * 5 + [False]
+    assert feed.events == {'rejected_spikes': 50}
 
 
 def test_gate_is_around_the_prediction_not_around_the_last_sample():

@@ -81,7 +81,7 @@ def test_prediction_ends_at_the_present_state(share, estimate_from):
 
 TWO = {
     'order': 1, 'phi': ['0*a*b'], 'inputs': ['a', 'b'], 'gains': 'fixed', 'variant': 'sign',
-    'max_step': 10.0, 'spike_gate': 1.0, 'spike_gate_samples': 1000,
+    'max_step': 10.0, 'spike_gate': 1.0,
 }  # fmt: skip
 FIRST = 10**18
 

@@ -66,7 +66,6 @@ CHANGES = {
     'max_gap': Change(0.1),
     'max_step': Change(0.05),
     'spike_gate': Change(0.05),
-    'spike_gate_samples': Change(1, {'spike_gate': 0.05}),
     'stuck_time': Change(0.005),
     'divergence_time': Change(0.005, {'epsilon': 1e-4}),
     'divergence_limit': Change(1.0),

@@ -91,7 +91,6 @@ CASES = {
     'nominal_period': Case(0.05),
     'max_step': Case(2e-4),
     'spike_gate': Case(1e-6),
-    'spike_gate_samples': Case(1, {'spike_gate': 1e-6}),
     'stuck_time': Case(1e-6, y=lambda _: 0.2),
     'divergence_time': Case(1e-6, {'epsilon': 1e-9}),
     'divergence_limit': Case(1.0, y=lambda k: 1.5 + 0.01 * k),

@@ -68,7 +68,6 @@ OTHER = {
     'max_gap': 50.0,
     'max_step': 0.01,
     'spike_gate': 10.0,
-    'spike_gate_samples': 3,
     'stuck_time': 100.0,
     'divergence_time': 5.0,
     'divergence_limit': 1e9,

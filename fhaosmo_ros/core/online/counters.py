@@ -45,7 +45,7 @@ class Counters(NamedTuple):
     bursts: int = 0
     """Samples that came within a tenth of the mean interval after the one before."""
     spikes_believed: int = 0
-    """Times that spike_gate_samples in a row lay beyond the gate: a real step of y."""
+    """Times that five samples in a row lay beyond the gate: a real step of y."""
     stuck: int = 0
     """Times that y began to be stuck."""
     restarts_forward: int = 0

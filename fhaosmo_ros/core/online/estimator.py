@@ -29,6 +29,8 @@ SILENCE, SILENT_SAMPLES = 0.5, 5
 """Seconds, and usual intervals, after which y is said to be silent; the larger of both."""
 LARGEST_STAMP = 2**63 - 1
 Ints = NDArray[np.int64]
+SPIKES = 5
+"""So many samples in a row may be rejected by spike_gate."""
 
 
 class Change(NamedTuple):
@@ -205,7 +207,7 @@ class OnlineEstimator:
         return {name: round(seconds / NANOSECONDS) for name, seconds in times.items()} | {
             'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
             'to_now': p['predict_to_now'], 'filtered': p['estimate_from'] == 'filtered',
-            'gate': p['spike_gate'], 'gate_samples': p['spike_gate_samples'],
+            'gate': p['spike_gate'], 'gate_samples': SPIKES,
             'limit': p['divergence_limit'],
             'epsilon': math.inf if self.observer.self_tuning else p['epsilon'],
         }  # fmt: skip

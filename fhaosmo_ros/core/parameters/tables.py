@@ -284,14 +284,9 @@ SAMPLING = (
     Parameter(
         'spike_gate', 0.0,
         'A sample that lies further than this from what the model predicts from the one before '
-        'is rejected (unit of y); 0 for no gate.',
+        'is rejected (unit of y), five in a row at most: the next one is believed, a step of y is '
+        'not a spike. 0 for no gate.',
         lower=0.0, upper=1e12,
-    ),
-    Parameter(
-        'spike_gate_samples', 5,
-        'So many samples in a row may be rejected by spike_gate; the next one is believed: a '
-        'step of y is not a spike.',
-        lower=1, upper=1_000_000,
     ),
     Parameter(
         'stuck_time', 0.0,
