@@ -21,13 +21,13 @@ from fhaosmo_ros.core.simulation import recordings
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.plot.figures import COLOURS
-from fhaosmo_ros.tools.tuning.linear_gains import SampledModel
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 from studies import evidence
 from studies.comparison.methods.linear import estimates
+from studies.comparison.methods.sampled import SampledModel
 from studies.evidence import Row
 from studies.harness import SELF_TUNING
 

@@ -392,7 +392,7 @@ def test_estimate_that_left_the_finite_numbers_is_the_worst():
 
 def test_levant_is_tuned_without_what_it_does_not_use(tmp_path):
     out = tmp_path / 'out'
-    assert main([*QUICK, '-pstructure:=levant', '-o', str(out)]) == 0
+    assert main([*QUICK, '-pstructure:=levant', '-pscheme:=implicit', '-o', str(out)]) == 0
     values = load(out / 'gains.yaml', 'estimator')
     assert values['structure'] == 'levant'
     assert 'alpha' not in values
