@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings shared by all tests."""
 
+import contextlib
+from importlib.metadata import PackageNotFoundError, version
 import os
 from pathlib import Path
 import signal
@@ -14,7 +16,10 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 os.environ['ROS_DOMAIN_ID'] = str(take_domain())
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(Path(__file__).with_name('quick_discovery.xml'))
+with contextlib.suppress(PackageNotFoundError):  # no ROS 2 in this Python
+    middleware = 'FASTRTPS' if version('rclpy').startswith('7.') else 'FASTDDS'  # Jazzy, or later
+    profiles = Path(__file__).with_name('quick_discovery.xml')
+    os.environ[f'{middleware}_DEFAULT_PROFILES_FILE'] = str(profiles)
 
 # Same examples in every run; no deadline, because other processes may take the machine.
 settings.register_profile('fixed', derandomize=True, deadline=None, database=None)
