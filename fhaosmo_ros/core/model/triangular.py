@@ -111,6 +111,12 @@ class TriangularModel:
         columns = [self.expressions.along(z, e, inputs)[1] for e in np.eye(self.order)]
         return np.stack(columns, axis=1)
 
+    @property
+    def slopes_at_rest(self) -> np.ndarray:
+        """The Jacobian at z = 0, with 0 where a slope is not finite."""
+        slopes = self.jacobian(np.zeros(self.order))
+        return np.asarray(np.nan_to_num(slopes, posinf=0.0, neginf=0.0))
+
 
 def constants_of(parameters: Mapping[str, Any]) -> dict[str, float]:
     """Return the named constants among some parameters."""

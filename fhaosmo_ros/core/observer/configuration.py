@@ -137,8 +137,8 @@ class ObserverConfiguration:
             )
         self.self_tuning = p['gains'] == 'self_tuning'
         self.schedule: Schedule | None = None
-        order, sizes = self.model.order, OBSERVER_PARAMETERS['state_sizes']
-        self.state_sizes = per_level(sizes, p['state_sizes'], order)
+        sizes = OBSERVER_PARAMETERS['state_sizes']
+        self.state_sizes = per_level(sizes, p['state_sizes'], self.model.order)
         self.prediction_step = p['prediction_step'] or usual_step(self.model)
         if self.self_tuning:
             self._complete_self_tuning()
@@ -291,8 +291,7 @@ def deadbeat_shares(count: int) -> Floats:
 
 def usual_step(model: TriangularModel) -> float:
     """Return the Runge-Kutta step (s) that follows the fastest motion of a model at rest."""
-    slopes = np.nan_to_num(model.jacobian(np.zeros(model.order)), posinf=0.0, neginf=0.0)
-    fastest = np.abs(np.linalg.eigvals(slopes + np.eye(model.order, k=1))).max()
+    fastest = LinearModel(model.slopes_at_rest + np.eye(model.order, k=1), 0.0).fastest
     return float(STEP / fastest) if fastest > 0.0 else math.inf
 
 

@@ -121,8 +121,7 @@ cdef class Rows:
         if (n, model.order, len(model.inputs)) != (self.n, self.order, self.inputs):
             raise ValueError('smoothing: the parameters are those of another model')
         if self.tunes:
-            slopes = model.jacobian(np.zeros(self.order))
-            linear = LinearModel(np.nan_to_num(slopes, posinf=0.0, neginf=0.0), 0.0)
+            linear = LinearModel(model.slopes_at_rest, 0.0)
         elif p['noise_size'] > 0.0 and p['unknown_input']:
             its = Uncertainty(model, p, configuration.state_sizes)
             linear, self.fresh = its.linear, its.fresh

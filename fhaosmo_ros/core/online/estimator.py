@@ -29,8 +29,6 @@ SILENCE, SILENT_SAMPLES = 0.5, 5
 """Seconds, and usual intervals, after which y is said to be silent; the larger of both."""
 LARGEST_STAMP = 2**63 - 1
 Ints = NDArray[np.int64]
-SPIKES = 5
-"""So many samples in a row may be rejected by spike_gate."""
 
 
 class Change(NamedTuple):
@@ -92,7 +90,7 @@ class OnlineEstimator:
         settings = self._settings(p)
         past = PastInputs(len(self._u), settings['lag'] > 0)
         self.policy = Policy(self.observer.structure, settings, past)
-        self.events = EventDetector(p, p['max_gap'] or math.inf)
+        self.events = EventDetector(p, p['max_gap'])
 
     def __copy__(self) -> 'OnlineEstimator':
         return deepcopy(self)
@@ -180,7 +178,7 @@ class OnlineEstimator:
         self._parameters = change.parameters
         if self._smoothing is not None:
             self._smoothing.configure()
-        self.events.configure(change.parameters, change.parameters['max_gap'] or math.inf)
+        self.events.configure(change.parameters, change.parameters['max_gap'])
         if change.parameters['sampling'] != before:
             self.forget_stamp()
 
@@ -207,17 +205,14 @@ class OnlineEstimator:
         return {name: round(seconds / NANOSECONDS) for name, seconds in times.items()} | {
             'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
             'to_now': p['predict_to_now'], 'filtered': p['estimate_from'] == 'filtered',
-            'gate': p['spike_gate'], 'gate_samples': SPIKES,
-            'limit': p['divergence_limit'],
+            'gate': p['spike_gate'], 'limit': p['divergence_limit'],
             'epsilon': math.inf if self.observer.self_tuning else p['epsilon'],
         }  # fmt: skip
 
     @property
     def silence(self) -> float:
         """Time without a sample, in seconds, after which nothing is known of the present."""
-        p = self._parameters
-        usual = self.policy.course['usual_interval'] * NANOSECONDS or p['nominal_period']
-        return p['max_gap'] or float(max(SILENCE, SILENT_SAMPLES * usual))
+        return float(self._parameters['max_gap'] or max(SILENCE, SILENT_SAMPLES * self.period))
 
     def reset(self) -> None:
         """Start afresh: the next sample is the first. Counters go on, and so does `freeze`."""

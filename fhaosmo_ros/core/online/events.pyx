@@ -104,7 +104,7 @@ cdef class EventDetector:
     parameters : mapping
         Those whose names begin with ``event_``, and tuning_memory; others are left alone.
     max_gap : float
-        After a longer time durations begin anew, in seconds.
+        After a longer time durations begin anew, in seconds; 0: never.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ cdef class EventDetector:
     cdef bint begins  # the event that was found: it begins, else it ends
     cdef double signal, limit  # d or its change, and what it has to exceed
 
-    def __init__(self, parameters, double max_gap=LONG):
+    def __init__(self, parameters, double max_gap=0.0):
         self.waiting = deque(maxlen=MOST)
         self.configure(parameters, max_gap)
 
@@ -135,14 +135,14 @@ cdef class EventDetector:
         """True while an event lasts."""
         return self.memory.event >= ACTIVE
 
-    def configure(self, parameters, double max_gap=LONG):
+    def configure(self, parameters, double max_gap=0.0):
         """Go on with other parameters; an event that lasts ends if none are asked for."""
         cdef Settings* settings = &self.settings
         cdef double change_time = round(parameters['event_change_time'] * SECOND)
         cdef bint on
         if self.on and change_time != settings.change_time:
             self.reset()
-        settings.change_time, settings.max_gap = change_time, round(min(max_gap, LONG) * SECOND)
+        settings.change_time, settings.max_gap = change_time, round((max_gap or LONG) * SECOND)
         settings.threshold = parameters['event_threshold']
         settings.deviations = parameters['event_deviations']
         settings.release = parameters['event_release']

@@ -14,7 +14,6 @@ cdef struct Settings:
     long long divergence_time  # 0: off
     long long delay  # of y
     long long lag  # how much later than the inputs y is known: measurement_delay - input_delay
-    long long gate_samples  # so many spikes in a row may be rejected
     double gate  # a spike is further from its prediction (unit of y); 0: off
     double limit  # larger samples are rejected, larger states are lost
     double epsilon  # y is lost while |eps_1| is larger (unit of y)

@@ -15,6 +15,8 @@ cdef int CHANCE_REPEATS = 2
 # Of late, less than this share of so many of its values were repeated, but for one: at the end of
 # a range it is always the same one.
 cdef double RARELY = 0.05, CHANGES = 50.0
+# So many samples in a row may be rejected by spike_gate.
+cdef int MOST_SPIKES = 5
 
 
 cdef bint is_stuck(
@@ -112,7 +114,7 @@ cdef bint is_spike(
         course.spikes = 0
         return False
     course.spikes += 1
-    if course.spikes > settings.gate_samples:
+    if course.spikes > MOST_SPIKES:
         course.spikes = 0
         counters.spikes_believed += 1
         return False

@@ -337,7 +337,7 @@ class Channel:
         return self.name or (field.key if field else '') or 'y'
 
     def is_stale(self) -> bool:
-        """Return True while no sample has come for max_gap, and log it once."""
+        """Return True while y is silent, and log it once."""
         if self._arrived:
             self._arrived = self._stale = False
             self._silent_since = None
