@@ -145,8 +145,9 @@ cdef class Levant(SlidingMode):
         cdef double b = (y - self.trial[0].z_hat) / scale  # D 22
         cdef int i, j, n = self.levels
         cdef Root root
-        for i in range(n):
-            power_of_h[i] = h if i == 0 else power_of_h[i - 1] * h
+        power_of_h[0], weight[0] = h, self.ratio[0] * h * self.gains[0].lambda_
+        for i in range(1, n):
+            power_of_h[i] = power_of_h[i - 1] * h
             weight[i] = self.ratio[0] * power_of_h[i] * self.gains[i].lambda_
         root = self.root(weight, fabs(b), self.memory.gamma)
         for i in range(n - 1, -1, -1):
