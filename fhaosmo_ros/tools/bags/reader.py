@@ -1,24 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading bags as a stream: all storages, compressions and message types that rosbags knows."""
 
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager, ExitStack
+from contextlib import contextmanager, ExitStack, suppress
 from functools import cache
-from itertools import islice
+from itertools import islice, pairwise, zip_longest
 from operator import itemgetter
 from pathlib import Path
 import shutil
 import sqlite3
+import struct
 import sys
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
+from zlib import crc32
 
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError
-from fhaosmo_ros.tools.bags.mcap_file import check_summary, copy_whole_part, is_cut, Reading, Row
 from fhaosmo_ros.tools.bags.types import LATCHED_QOS, OFFERED_QOS, TYPES
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.reader import NonSeekingReader
+from mcap.records import Chunk
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.writer import CompressionType, MCAP0_MAGIC, Writer
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
@@ -34,6 +42,14 @@ STAMPS = ('auto', 'header', 'source', 'bag')
 ZSTD = b'\x28\xb5\x2f\xfd'
 """Begin of what zstd has compressed; a message in CDR begins with a zero."""
 HEADER = 'std_msgs/msg/Header'
+RECORD = struct.Struct('<BQ')
+"""Of mcap: opcode and length, before the content of each record."""
+MESSAGE = struct.Struct('<HIQQ')
+"""Of mcap: channel, sequence, log time and publish time, before a message in CDR."""
+FOOTER = struct.Struct('<BQQQI8x')
+"""Of mcap: opcode, length, begin of the summary and of its offsets, CRC; then the magic number."""
+Row = tuple[int, int, int, bytes]
+"""Log time and publish time (ns), number of the connection, and message in CDR."""
 
 
 class Block(NamedTuple):
@@ -94,21 +110,21 @@ class BagReader:
         path = self.path
         if path.suffix in ('.mcap', '.db3') and path.is_file():
             path = _whole_part(path, Path(stack.enter_context(TemporaryDirectory())))
-        for file in [path] if path.is_file() else path.glob('*.mcap'):
+        for file in path.glob('*.mcap') if path.is_dir() else [path]:
             if file.suffix == '.mcap':
-                check_summary(file)
+                _check_summary(file)
         self._reader = stack.enter_context(AnyReader([path], default_typestore=TYPES))
-        self._types = self._reader.typestore
-        first: Any = self._reader.readers[0]
+        self.types = self._reader.typestore
+        """The bag's own type definitions: a rosbags typestore."""
+        self._storages: list[Any] = self._reader.readers
         if self._reader.is2:
-            self._storages = list(getattr(first.storage, 'storages', [])) or [first.storage]
-        else:
-            # Headers of ROS 2 have no sequence number.
-            self._types = get_typestore(Stores.EMPTY)
-            types = self._reader.typestore.fielddefs | {HEADER: TYPES.fielddefs[HEADER]}
-            self._types.register(types)
-            self._storages = [first]
-        stored = [c for s in self._storages for c in s.connections]
+            storage = self._storages[0].storage
+            self._storages = storage.storages if path.is_dir() else [storage]
+        else:  # headers of ROS 2 have no sequence number
+            types = self.types.fielddefs | {HEADER: TYPES.fielddefs[HEADER]}
+            self.types = get_typestore(Stores.EMPTY)
+            self.types.register(types)
+        stored = [c for storage in self._storages for c in storage.connections]
         for topic in {c.topic for c in self.connections}:
             there = sum(c.msgcount for c in stored if c.topic == topic)
             _expect(topic, self.count(topic), there)
@@ -126,11 +142,6 @@ class BagReader:
         if self._reader.is2:
             return connection.ext.offered_qos_profiles, connection.digest
         return [LATCHED_QOS if connection.ext.latching else OFFERED_QOS], ''
-
-    @property
-    def types(self) -> Any:
-        """The bag's own type definitions: a rosbags typestore."""
-        return self._types
 
     def count(self, topic: str) -> int:
         """Return how many messages a topic has."""
@@ -185,21 +196,57 @@ class BagReader:
                     _expect(c.topic, c.msgcount, counts[c.id])
 
     def _rows(self, storage: Any, chosen: list[Connection]) -> Iterator[Row]:
-        if isinstance(storage, McapReader):
-            reading = Reading(storage, {c.id for c in chosen})
-            yield from reading
-            self.unchecked |= reading.unchecked
+        if isinstance(storage, McapReader) and storage.chunks:
+            yield from self._chunks(storage, {c.id for c in chosen})
             return
         self.unchecked = True
+        if isinstance(storage, McapReader):
+            yield from _unindexed(storage, {c.id for c in chosen})
+            return
         for c, stamp, data in storage.messages(chosen):
             if not self._reader.is2:
-                data = bytes(self._types.ros1_to_cdr(data, c.msgtype))
+                data = bytes(self.types.ros1_to_cdr(data, c.msgtype))
             yield stamp, 0, c.id, data
+
+    def _chunks(self, storage: McapReader, channels: Collection[int]) -> Iterator[Row]:
+        """Yield messages by log time, with the publish time that rosbags does not give."""
+        # Without message indexes it is not known which channels a chunk holds.
+        chunks = sorted(
+            (c.message_start_time, c.chunk_start_offset)
+            for c in storage.chunks
+            if not c.channel_count or any(map(c.channel_count.get, channels))
+        )
+        rows: list[Row] = []
+        for (_, offset), following in zip_longest(chunks, chunks[1:]):
+            rows += self._chunk(storage, offset, channels)
+            rows.sort(key=itemgetter(0))
+            # Chunks may overlap: what lies behind the next one's begin has to wait.
+            ready = bisect_left(rows, following[0], key=itemgetter(0)) if following else len(rows)
+            yield from rows[:ready]
+            del rows[:ready]
+
+    def _chunk(self, storage: McapReader, at: int, channels: Collection[int]) -> Iterator[Row]:
+        assert storage.bio
+        storage.bio.seek(at + RECORD.size)
+        chunk = Chunk.read(ReadDataStream(storage.bio))
+        self.unchecked |= not chunk.uncompressed_crc
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+        data, at = stream.read(size), 0
+        while at < size:
+            opcode, length = RECORD.unpack_from(data, at)
+            at += RECORD.size
+            if at + length > size:
+                raise ValueError('a record goes beyond the end of its chunk')
+            if opcode == Opcode.MESSAGE:
+                channel, _, logged, published = MESSAGE.unpack_from(data, at)
+                if channel in channels:
+                    yield logged, published, channel, data[at + MESSAGE.size : at + length]
+            at += length
 
     def objects(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any, int]]:
         """Yield topic, stamp (ns), message and publish time of the messages of some topics."""
         types = {c.topic: str(c.msgtype) for c in self.connections}
-        read = self._types.deserialize_cdr
+        read = self.types.deserialize_cdr
         with _readable(self.path):
             for topic, time, data, published in self.messages(topics):
                 yield topic, time, read(data, types[topic]), published
@@ -248,12 +295,9 @@ class BagReader:
         if stamp == 'auto':
             stamp = 'header' if field.header else 'source'
         samples = self._samples(topic, field, stamp)
-        with _readable(self.path):
-            while rows := list(islice(samples, BLOCK)):
-                times, stamps, values = zip(*rows, strict=True)
-                yield Block(
-                    np.array(times, np.int64), np.array(stamps, np.int64), np.array(values)
-                )
+        while rows := list(islice(samples, BLOCK)):
+            times, stamps, values = zip(*rows, strict=True)
+            yield Block(np.array(times, np.int64), np.array(stamps, np.int64), np.array(values))
 
     def _samples(self, topic: str, field: Field, stamp: str) -> Iterator[tuple[int, int, float]]:
         for _, time, message, published in self.objects([topic]):
@@ -275,24 +319,47 @@ def _expect(topic: str, listed: int, there: int) -> None:
 
 
 def _expect_bag(path: Path) -> None:
-    allowed = 'expected a bag (a folder with metadata.yaml, its .mcap or .db3, or a ROS 1 .bag)'
     if not path.exists():
-        raise ConfigurationError(f'bag {path}: {allowed}, got a path that does not exist')
-    if path.is_dir() and not (path / 'metadata.yaml').exists():
+        found = 'a path that does not exist'
+    elif path.is_dir() and not (path / 'metadata.yaml').exists():
         files = sorted(p.name for p in path.iterdir() if p.suffix in ('.mcap', '.db3'))
-        hint = f' but {files[0]}: name that file, or run ros2 bag reindex' if files else ''
-        raise ConfigurationError(f'bag {path}: {allowed}, got a folder without it{hint}')
-    if path.is_file() and path.suffix not in ('.mcap', '.db3', '.bag'):
-        raise ConfigurationError(f'bag {path}: {allowed}, got a file that is none')
+        found = 'a folder without it'
+        found += f' but {files[0]}: name that file, or run ros2 bag reindex' if files else ''
+    elif path.is_file() and path.suffix not in ('.mcap', '.db3', '.bag'):
+        found = 'a file that is none'
+    else:
+        return
+    raise ConfigurationError(
+        f'bag {path}: expected a bag (a folder with metadata.yaml, its .mcap or .db3, or a ROS 1 '
+        f'.bag), got {found}'
+    )
+
+
+def _check_summary(path: Path) -> None:
+    """Compare the summary of an mcap file, which holds its topics and its index, with its CRC."""
+    with path.open('rb') as file:
+        place = file.seek(-FOOTER.size, 2)
+        _, _, start, _, crc = FOOTER.unpack(file.read())
+        if crc and start < place:
+            file.seek(start or place)
+            if crc32(file.read()[:-12]) != crc:
+                raise ValueError('the summary does not agree with its CRC')
+
+
+def _unindexed(storage: McapReader, channels: Collection[int]) -> Iterator[Row]:
+    """Yield the messages of an mcap file without chunks, which all are kept in memory."""
+    with storage.path.open('rb') as file:
+        for _, channel, message in NonSeekingReader(file, validate_crcs=True).iter_messages():
+            if channel.id in channels:
+                yield message.log_time, message.publish_time, channel.id, message.data
 
 
 def _whole_part(path: Path, folder: Path) -> Path:
     """Return a storage file; if its writer was killed or it was cut, a copy of what is whole."""
     copy = folder / path.name
     journals = [p for end in ('-journal', '-wal') if (p := Path(f'{path}{end}')).exists()]
-    if path.suffix == '.mcap' and is_cut(path):
-        if not copy_whole_part(path, copy):
-            raise ValueError('a file that was cut before its first chunk ended')
+    if path.suffix == '.mcap' and _is_cut(path):
+        _copy_whole_part(path, copy)
     elif journals:
         for part in (path, *journals):
             shutil.copy(part, folder)
@@ -303,6 +370,34 @@ def _whole_part(path: Path, folder: Path) -> Path:
         return path
     _say_once(f'bag {path}: cut, or its writer was killed; read up to its last whole part')
     return copy
+
+
+def _is_cut(path: Path) -> bool:
+    with path.open('rb') as file:
+        begin = file.read(len(MCAP0_MAGIC))
+        file.seek(max(0, file.seek(0, 2) - len(MCAP0_MAGIC)))
+        return begin == MCAP0_MAGIC and file.read() != MCAP0_MAGIC
+
+
+def _copy_whole_part(path: Path, copy: Path) -> None:
+    """Copy the messages of an mcap file that was cut, but for the last one: it may be cut, too."""
+    with path.open('rb') as source, copy.open('wb') as target:
+        writer = Writer(target, compression=CompressionType.NONE)
+        writer.start('ros2', 'fhaosmo_ros')
+        channels: dict[int, int] = {}
+        found = NonSeekingReader(source, validate_crcs=True).iter_messages(log_time_order=False)
+        with suppress(Exception):  # struct.error, those of compressors, ...
+            for (schema, channel, message), _ in pairwise(found):
+                if channel.id not in channels:
+                    kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[channel.id] = writer.register_channel(
+                        channel.topic, channel.message_encoding, kind, channel.metadata
+                    )
+                number, sent = channels[channel.id], message.publish_time
+                writer.add_message(number, message.log_time, message.data, sent)
+        writer.finish()
+    if not channels:
+        raise ValueError('a file that was cut before its first chunk ended')
 
 
 @cache

@@ -4,22 +4,28 @@ Bags written as Jazzy's rosbag2 writes them.
 
 rosbags writes metadata.yaml and sqlite3. Three things of it are changed: the storage file is named
 `NAME_0` as by rosbag2, so that `ros2 bag reindex` finds it; the distribution is ROS's, not
-rosbags; and messages can be flushed, so that a kill does not take them back. mcap files are
-written by mcap_file.py.
+rosbags; and messages can be flushed, so that a kill does not take them back.
+
+The mcap package writes mcap: rosbags' own files are refused by rosbag2's C++ reader ('cannot read
+MCAP in time order with no message indexes'), as it closes chunks that hold no message.
 """
 
 from collections.abc import Iterator, Sequence
 import os
 from pathlib import Path
 import sqlite3
-from typing import Any, ClassVar
+import struct
+from typing import Any, ClassVar, NamedTuple
 
-from fhaosmo_ros.tools.bags.mcap_file import McapFile
-from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.bags.reader import BagReader, MESSAGE, RECORD
 from fhaosmo_ros.tools.bags.types import learn, OFFERED_QOS, TYPES
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import Connection, Qos
+from rosbags.interfaces import Connection, MessageDefinitionFormat, Qos
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
@@ -29,10 +35,9 @@ VERSION = 9
 """Version of the metadata that Jazzy writes."""
 BATCH = 8192
 """Messages that are copied at a time."""
-
-
-def _with_distribution(metadata: str) -> str:
-    return metadata.replace('ros_distro: rosbags', f'ros_distro: {DISTRIBUTION}')
+CHUNK_SIZE = 1 << 20
+"""Bytes of messages after which a chunk of mcap is closed."""
+Columns = Sequence[tuple[Connection, NDArray[np.uint8]]]
 
 
 class _SqliteFile(Sqlite3Writer):
@@ -43,15 +48,13 @@ class _SqliteFile(Sqlite3Writer):
         self.conn.executescript(self.SQLITE_SCHEMA.replace("'rosbags'", f"'{DISTRIBUTION}'"))
         self.cursor = self.conn.cursor()
 
-    def write(self, connection: Connection, stamp: int, data: bytes, _: int) -> None:
+    def write(self, connection: Connection, stamp: int, data: bytes, _: int = 0) -> None:
         super().write(connection, stamp, data)
 
-    def write_columns(
-        self, times: NDArray[np.int64], columns: Sequence[tuple[Connection, NDArray[np.uint8]]]
-    ) -> None:
+    def write_columns(self, times: NDArray[np.int64], columns: Columns) -> None:
         for k, time in enumerate(times.tolist()):
             for connection, messages in columns:
-                super().write(connection, time, messages[k].tobytes())
+                self.write(connection, time, messages[k].tobytes())
 
     def flush(self) -> None:
         self.conn.commit()
@@ -65,10 +68,122 @@ class _SqliteFile(Sqlite3Writer):
         return {row[0]: row[1] for row in rows}, first, last
 
 
+class _Index(NamedTuple):
+    """Log times and places of a channel's messages in a chunk, written faster than by mcap."""
+
+    channel: int
+    entries: NDArray[np.int64]
+
+    def write(self, builder: RecordBuilder) -> None:
+        builder.start_record(Opcode.MESSAGE_INDEX)
+        builder.write2(self.channel)
+        builder.write4(self.entries.nbytes)
+        builder.write(self.entries.astype('<i8').tobytes())
+        builder.finish_record()
+
+
+class _McapFile:
+    """
+    An mcap file, with the methods that rosbags' `Writer` calls.
+
+    The mcap package's `add_message` takes 4 microseconds, and a replay writes five messages for
+    each sample. So the messages of a chunk are joined here, and then given to it all at once.
+    """
+
+    def __init__(self, path: Path, _: Any) -> None:
+        self.path = path / f'{path.name}_0.mcap'
+        self._file = self.path.open('xb')
+        self._writer = McapWriter(self._file, compression=CompressionType.NONE)
+        self._writer.start('ros2', 'fhaosmo_ros')
+        self._schemas: dict[str, int] = {}
+        self._data = bytearray()  # message records of the chunk that is open
+        self._rows: list[tuple[int, int, int]] = []  # their channels, log times and places
+
+    def add_msgtype(self, connection: Connection) -> None:
+        definition = connection.msgdef
+        encoding = 'ros2msg' if definition.format == MessageDefinitionFormat.MSG else 'ros2idl'
+        self._schemas[connection.msgtype] = self._writer.register_schema(
+            connection.msgtype, encoding, definition.data.encode()
+        )
+
+    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
+        metadata = {
+            'offered_qos_profiles': offered_qos_profiles,
+            'topic_type_hash': connection.digest,
+        }
+        schema = self._schemas[connection.msgtype]
+        self._writer.register_channel(connection.topic, 'cdr', schema, metadata)
+
+    def write(self, connection: Connection, stamp: int, data: bytes, published: int) -> None:
+        self._rows.append((connection.id, stamp, len(self._data)))
+        self._data += RECORD.pack(Opcode.MESSAGE, MESSAGE.size + len(data))
+        self._data += MESSAGE.pack(connection.id, 0, stamp, published)
+        self._data += data
+        if len(self._data) > CHUNK_SIZE:
+            self._close_chunk()
+
+    def write_columns(self, times: NDArray[np.int64], columns: Columns) -> None:
+        self._close_chunk()
+        stamps = times.astype('<i8').view(np.uint8).reshape(len(times), -1)
+        parts, places, width = [], [], 0
+        for connection, messages in columns:
+            size = MESSAGE.size + messages.shape[1]
+            head = RECORD.pack(Opcode.MESSAGE, size) + struct.pack('<HI', connection.id, 0)
+            heads = np.tile(np.frombuffer(head, np.uint8), (len(times), 1))
+            parts += [heads, stamps, stamps, messages]
+            places.append(width)
+            width += RECORD.size + size
+        channels = [connection.id for connection, _ in columns]
+        starts = width * np.arange(len(times))[:, np.newaxis] + places
+        rows = [np.tile(channels, len(times)), np.repeat(times, len(columns)), starts.ravel()]
+        self._add(np.hstack(parts).tobytes(), np.column_stack(rows))
+
+    def _close_chunk(self) -> None:
+        if self._rows:
+            self._add(bytes(self._data), np.array(self._rows, dtype=np.int64))
+            self._data, self._rows = bytearray(), []
+
+    def _add(self, data: bytes, rows: NDArray[np.int64]) -> None:
+        """Write message records as a chunk: what `Writer.add_message` does for each of them."""
+        chunk = self._writer._Writer__chunk_builder
+        statistics = self._writer._Writer__statistics
+        first, last = int(rows[:, 1].min()), int(rows[:, 1].max())
+        rows[:, 2] += chunk.count  # behind new schemas and channels
+        for channel in np.unique(rows[:, 0]).tolist():
+            entries = rows[rows[:, 0] == channel, 1:]
+            chunk.message_indices[channel] = _Index(channel, entries)
+            statistics.channel_message_counts[channel] += len(entries)
+        chunk.record_writer.write(data)
+        chunk.num_messages = len(rows)
+        chunk.message_start_time, chunk.message_end_time = first, last
+        earlier = statistics.message_start_time if statistics.message_count else first
+        statistics.message_start_time = min(first, earlier)
+        statistics.message_end_time = max(last, statistics.message_end_time)
+        statistics.message_count += len(rows)
+        self._writer.flush()
+
+    def flush(self) -> None:
+        self._close_chunk()
+        self._writer.flush()
+
+    def totals(self) -> tuple[dict[int, int], int, int]:
+        self._close_chunk()
+        s = self._writer._Writer__statistics
+        return dict(s.channel_message_counts), s.message_start_time, s.message_end_time
+
+    def close(self, _: int, metadata: str) -> None:
+        self._writer.add_metadata('rosbag2', {'serialized_metadata': metadata})
+        self._writer.finish()
+        self._file.close()
+
+    def abort(self) -> None:
+        self._file.close()
+
+
 class _Writer(Writer):
     STORAGE_PLUGINS: ClassVar = {
         StoragePlugin.SQLITE3: _SqliteFile,
-        StoragePlugin.MCAP: McapFile,
+        StoragePlugin.MCAP: _McapFile,
     }
 
     def close(self) -> None:
@@ -79,6 +194,10 @@ class _Writer(Writer):
         part = self.metapath.with_suffix('.part')
         part.write_text(text, encoding='utf-8')
         part.replace(self.metapath)
+
+
+def _with_distribution(metadata: str) -> str:
+    return metadata.replace('ros_distro: rosbags', f'ros_distro: {DISTRIBUTION}')
 
 
 class BagWriter:
