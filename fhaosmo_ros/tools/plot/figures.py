@@ -1,22 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of runs and of estimates in bags."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.plot.curves import Curves
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 
 Thinning = Callable[[NDArray[Any], NDArray[Any]], tuple[NDArray[Any], NDArray[Any]]]
-WINDOWLESS = ('agg', 'cairo', 'pdf', 'pgf', 'ps', 'svg', 'template')
-"""Backends of matplotlib that open no window, in small letters."""
 TRUTH = {'color': '#0072B2', 'linewidth': 2.2, 'label': 'true'}
 """Blue of the Okabe-Ito palette."""
 COLOURS = ('#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
@@ -69,11 +66,10 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
 
     """
     thinned = (lambda t, x: (t, x)) if window else envelope
-    names = max((c.names for c in curves), key=len)
-    rows = len(names) + (2 if epsilon is None else 3)
-    figure = _make_figure(rows, window)
-    axes = figure.subplots(rows, 1, sharex=True)
-    row_of = dict(zip([*names[:-1], 'd', 'gamma', 'innovation', 'levels'], axes, strict=False))
+    first, names = curves[0], max((c.names for c in curves), key=len)
+    rows = [*names, 'gamma', 'innovation', *([] if epsilon is None else ['levels'])]
+    figure = _make_figure(len(rows), window)
+    axes = dict(zip(rows, figure.subplots(len(rows), 1, sharex=True), strict=True))
     origin = min(c.stamps[0] for c in curves)
     for number, c in enumerate(curves):
         style = {
@@ -84,35 +80,32 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
         }
         t = (c.stamps - origin) * 1e-9
         for k, name in enumerate(c.names):
-            row = row_of['d'] if name == 'd' else axes[k]
+            row = axes[name if name == 'd' else names[k]]
             if c.truth is not None and number == 0:
                 row.plot(*thinned(t, c.truth[:, k]), **TRUTH)
             row.plot(*thinned(t, c.estimate[:, k]), **style)
             if c.deviation is not None:
                 draw_band(row, t, c.estimate[:, k], c.deviation[:, k], thinned, style['color'])
-        shade_events(row_of['d'], c.events, origin, style['color'])
-        row_of['gamma'].plot(*thinned(t, c.gamma), **style)
+        for begin, end in (np.array(c.events).reshape(-1, 2) - origin) * 1e-9:
+            axes['d'].axvspan(begin, end, color=style['color'], alpha=0.12, linewidth=0.0)
+        axes['gamma'].plot(*thinned(t, c.gamma), **style)
         if epsilon is not None:
-            levels = thinned(t, _open_levels(c, epsilon))
-            row_of['levels'].step(*levels, where='post', **style)
-    for name, row in zip(names, axes, strict=False):
-        _fit_after_transient(
-            row, [c.estimate[:, c.names.index(name)] for c in curves if name in c.names]
-        )
-        row.set_ylabel(next(c.title(name) for c in curves if name in c.names))
-    row_of['gamma'].set_ylabel('power γ')
-    first = curves[0]
+            axes['levels'].step(*thinned(t, _open_levels(c, epsilon)), where='post', **style)
+    for name in names:
+        those = [c for c in curves if name in c.names]
+        _fit_after_transient(axes[name], [c.estimate[:, c.names.index(name)] for c in those])
+        axes[name].set_ylabel(those[0].title(name))
+    axes['gamma'].set_ylabel('power γ')
     t = (first.stamps - origin) * 1e-9
-    _draw_innovations(row_of['innovation'], t, first.innovation, epsilon, thinned)
-    label = '|innovation|' if len(curves) == 1 else '|innovation|\n(first)'
-    row_of['innovation'].set_ylabel(label)
+    _draw_innovations(axes['innovation'], t, first.innovation, epsilon, thinned)
+    axes['innovation'].set_ylabel('|innovation|' + ('\n(first)' if len(curves) > 1 else ''))
     if epsilon is not None:
-        row_of['levels'].set_ylabel('open levels')
-        row_of['levels'].set_yticks(range(1, first.innovation.shape[1] + 1))
-    for row in axes:
+        axes['levels'].set_ylabel('open levels')
+        axes['levels'].set_yticks(range(1, first.innovation.shape[1] + 1))
+    for row in axes.values():
         row.grid(alpha=0.3)
-    axes[-1].set_xlabel('time since the first estimate [s]')
-    handles, labels = axes[0].get_legend_handles_labels()
+    axes[rows[-1]].set_xlabel('time since the first estimate [s]')
+    handles, labels = axes[rows[0]].get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside upper center', ncols=2, fontsize='small')
     figure.savefig(path, dpi=150)
 
@@ -135,14 +128,6 @@ def draw_band(
     axes.fill_between(
         grid, *edges, color=colour, alpha=0.22, linewidth=0.0, label='± 2 standard deviations'
     )
-
-
-def shade_events(axes: Axes, events: Sequence[tuple[int, int]], origin: int, colour: str) -> None:
-    """Shade the times of events (ns)."""
-    for begin, end in events:
-        span = (begin - origin) * 1e-9, (end - origin) * 1e-9
-        axes.axvspan(*span, color=colour, alpha=0.15, hatch='//', fill=False, linewidth=0.0)
-        axes.axvspan(*span, color=colour, alpha=0.08, linewidth=0.0)
 
 
 def _draw_innovations(
@@ -174,8 +159,17 @@ def _make_figure(rows: int, window: bool) -> Figure:
         return Figure(figsize=size, layout='constrained')
     import matplotlib.pyplot as plt
 
-    _expect_windows()
-    return plt.figure(figsize=size, layout='constrained')
+    try:
+        figure = plt.figure(figsize=size, layout='constrained')
+        found = '' if figure.canvas.required_interactive_framework else plt.get_backend()
+    except ImportError as error:
+        found = str(error)
+    if found:
+        raise ConfigurationError(
+            '--show: expected a display (DISPLAY or WAYLAND_DISPLAY), PyQt or tkinter, and no '
+            f'MPLBACKEND without windows, got {found}'
+        )
+    return figure
 
 
 def _open_levels(c: Curves, epsilon: float) -> NDArray[np.int64]:
@@ -198,27 +192,3 @@ def show() -> None:
     import matplotlib.pyplot as plt
 
     plt.show()
-
-
-def _expect_windows() -> None:
-    """
-    Let matplotlib choose its backend, or take that of MPLBACKEND.
-
-    Raises
-    ------
-    ConfigurationError
-        It can't open windows here.
-
-    """
-    import matplotlib.pyplot as plt
-
-    try:
-        plt.switch_backend(matplotlib.get_backend())
-        found = plt.get_backend()
-    except ImportError as error:
-        found = str(error)
-    if found.lower() in WINDOWLESS or ' ' in found:
-        raise ConfigurationError(
-            '--show: expected a display (DISPLAY or WAYLAND_DISPLAY), PyQt or tkinter, and no '
-            f'MPLBACKEND without windows, got {found}'
-        )
