@@ -4,16 +4,16 @@
  * Phi = (0, 0, -z3), N = 4 levels, fuzzy_adaptive, explicit. It is written as one would write it
  * for speed (the model is inlined by hand), and serves the benchmark only.
  *
- * State: z_hat[4], z_tilde[4], p[4], q[4], gamma, y, pending, wait: PARTS in reference.py.
+ * State: z_hat[4], z_tilde[4], p[4], q[4], gamma, y, pending: PARTS in reference.py.
  */
 #include <math.h>
 
-enum { N = 4, SIZE = 4 * N + 4, KNOTS = 193 };
+enum { N = 4, SIZE = 4 * N + 3, KNOTS = 193 };
 
 struct law {
     double lambda[N], alpha[N], inverse_width[N];
     double curves[2][KNOTS];
-    double epsilon, gamma_initial, rate, min, max, dead_zone, leakage, delay;
+    double epsilon, gamma_initial, rate, min, max, dead_zone, leakage;
 };
 
 static int step(const struct law *law, double *state, double y, double h, double *eps)
@@ -32,10 +32,9 @@ static int step(const struct law *law, double *state, double y, double h, double
     }
     h += x[4 * N + 2];
     double loss = 0.0, gradient = 0.0;
-    int running = 1, upset = 0;
+    int running = 1;
     for (int i = 0; i < N; i++) {
         const double e = m[i] - x[i], s = dm[i] - x[2 * N + i], a = fabs(e);
-        upset = upset || a * law->inverse_width[i] > 1.0;
         loss += e * e;
         gradient += 2.0 * e * s;
         if (!running)
@@ -74,17 +73,11 @@ static int step(const struct law *law, double *state, double y, double h, double
     if (word)
         for (int k = 2 * N; k < 4 * N; k++)
             x[k] = 0.0;
-    int leaks = law->dead_zone == 0.0;
-    if (loss <= law->dead_zone * law->dead_zone) {
-        leaks = leaks || x[4 * N + 3] <= 0.0;
-        x[4 * N + 3] = fmax(x[4 * N + 3] - h, 0.0);
-    } else {
-        x[4 * N + 3] = law->delay;
-        if (!word && !(upset && law->dead_zone > 0.0))
-            g -= h * law->rate * gradient;
-    }
-    if (leaks)
+    const int rests = loss <= law->dead_zone * law->dead_zone;
+    if (law->dead_zone == 0.0 || rests)
         g -= fmin(h * law->leakage, 1.0) * (g - law->gamma_initial);
+    if (!word && !rests)
+        g -= h * law->rate * gradient;
     if (g <= law->min) {
         g = law->min;
         word |= 16;

@@ -26,9 +26,9 @@ PERIOD = 1e-3
 CASE = {'variant': 'fuzzy_adaptive', 'scheme': 'explicit', 'fuzzy_widths': [0.1]}
 """Wide fuzzy sets: no chatter, so that rounding does not grow and both end at the same state."""
 
-PARTS = ('z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending', 'wait')
+PARTS = ('z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending')
 """What a cascade remembers, in the order of the state of reference.c."""
-LAW = ('min', 'max', 'dead_zone', 'leakage', 'leakage_delay')
+LAW = ('min', 'max', 'dead_zone', 'leakage')
 """Parameters of gamma at the end of its law."""
 
 State = NDArray[np.float64]

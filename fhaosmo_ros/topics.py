@@ -14,23 +14,20 @@ TEXT = 'std_msgs/msg/String'
 TIME = 'builtin_interfaces/msg/Time'
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 
-ESTIMATES = {
-    'state': ARRAY,
-    'unknown_input': FLOAT,
-    'gamma': FLOAT,
-    'innovation': ARRAY,
-    'stamp': TIME,
+STANDARD_DEVIATION = 'standard_deviation'
+OF_GAINS = {
+    'fixed': {'gamma': FLOAT},
+    'self_tuning': {STANDARD_DEVIATION: ARRAY, 'tuning': ARRAY},
 }
-"""Topics of an estimate below the estimator's name (and channel's), in order of publication."""
+"""Topics that an estimator has by its parameter `gains`."""
+ESTIMATES = {'state': ARRAY, 'unknown_input': FLOAT, 'innovation': ARRAY, 'stamp': TIME}
+"""Topics that every estimator has below its name (and channel's); stamp is published last."""
 TYPED_ESTIMATES = {
     'joint_states': 'sensor_msgs/msg/JointState',
     'wrench': 'geometry_msgs/msg/WrenchStamped',
     'accel': 'geometry_msgs/msg/AccelStamped',
 }
 """Topics below the estimator's name for those who want stamped messages, if asked for."""
-STANDARD_DEVIATION = 'standard_deviation'
-SELF_TUNED = {STANDARD_DEVIATION: ARRAY, 'tuning': ARRAY}
-"""Further topics of a self-tuning estimator, with each estimate."""
 EVENT = 'event'
 """Begin and end of each event (DIAGNOSTICS, transient-local), below its name and channel's."""
 SNAPSHOT = 'snapshot'
@@ -48,6 +45,5 @@ OF_ALL_NODES = {
 
 
 def estimates_of(parameters: Mapping[str, Any]) -> dict[str, str]:
-    """Return topics of a channel whose QoS may be chosen, and their types, by its parameters."""
-    tuned = SELF_TUNED if parameters['gains'] == 'self_tuning' else {}
-    return ESTIMATES | tuned | {EVENT: DIAGNOSTICS}
+    """Return the topics of the estimates, and their types, in order of publication."""
+    return OF_GAINS[parameters['gains']] | ESTIMATES

@@ -22,7 +22,7 @@ def main() -> None:
     """Infer the curves and write them, each number with all its digits."""
     columns = []
     for text in TEXTS:
-        system = read_system(text, SHAPES[0])
+        system = read_system(text)
         assert isinstance(system, FuzzySystem)
         columns.append(inferred(text, system).tolist())
     with DEFAULT_CURVES.open('w', newline='') as file:

@@ -70,7 +70,8 @@ def smooth_errors(scheme, variant, steps):
     """Return the errors at t = 1 against a step a hundred times finer, extrapolated."""
     p = {'order': 2, 'phi': ['0', '-z2*z1'], 'scheme': scheme, 'variant': variant}
     p |= {'lambda': 3.0, 'alpha': 2.0, 'epsilon': 1e6, 'fuzzy_widths': [3.0, 5.0, 5.0]}
-    p |= {'fuzzy_shape': 'gaussian', 'gamma_rate': 0.05, 'gamma_initial': 0.6}
+    p |= {'fuzzy_systems': ['terms gaussian 5', 'terms gaussian 7']}
+    p |= {'gamma_rate': 0.05, 'gamma_initial': 0.6}
     p |= {'initial_estimate': [0.5, -0.3, 0.2], 'start_from_measurement': False}
 
     def end(step):

@@ -2,10 +2,10 @@
 """The numbers of the demonstration's table, from a bag whose errors are known."""
 
 import bag_files as files
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core import ConfigurationError, Observer
 from fhaosmo_ros.tools.bags.types import labelled_array
-from fhaosmo_ros.tools.demo.report import read_run, table
-from fhaosmo_ros.topics import ARRAY, ESTIMATES, FLOAT, TIME
+from fhaosmo_ros.tools.demo.report import OTHERS, others, read_run, START, table
+from fhaosmo_ros.topics import ARRAY, estimates_of, FLOAT, TIME
 import numpy as np
 import pytest
 
@@ -14,22 +14,21 @@ COUNT, PERIOD = 401, 0.01
 T = PERIOD * np.arange(COUNT)
 NAMES = ['z1', 'z2', 'z3', 'd']
 SIZES = np.array([1.0, 3.0, 0.2, 0.05])
-"""Amplitude of each state and of d; their range is twice that, so the band is 0.2 of it."""
+"""Amplitude of each state and of d."""
 TRUTH = SIZES * np.sin(0.5 * np.pi * T)[:, None]
 ERROR = np.select([T < 0.995, T < 1.495, T < 2.0, T < 2.995], [1.0, 0.3, 0.1, 0.01], 0.03)
-"""Relative to the amplitude; the sign alternates. In a band twice as wide it settles at 1 s."""
+"""Relative to the amplitude; the sign alternates."""
 ESTIMATE = TRUTH + SIZES * (ERROR * (-1.0) ** np.arange(COUNT))[:, None]
-RMS = 0.0224
-"""Of the second half, 100 samples of 0.01 and 101 of 0.03; of the last quarter it is 0.03."""
+KINDS = estimates_of({'gains': 'fixed'})
 
 
 def tick(k, stamp):
     """Return the CDR of an estimate's messages by their topics."""
     z, d = ESTIMATE[k, :3], ESTIMATE[k, 3]
     return {
+        'gamma': files.float64(0.5 + 1e-3 * k),
         'state': labelled_array(NAMES[:3], z),
         'unknown_input': files.float64(d),
-        'gamma': files.float64(0.5 + 1e-3 * k),
         'innovation': labelled_array(['eps1', 'eps2', 'eps3', 'eps4'], np.zeros(4)),
         'stamp': files.cdr(TIME, sec=stamp // 10**9, nanosec=stamp % 10**9),
     }
@@ -58,7 +57,7 @@ def record(path, missing=(), count=5):
             ('/plant/unknown_input', FLOAT, 40_000, files.float64(TRUTH[k, 3])),
         ]
         for number, (name, data) in enumerate(tick(k, stamp).items()):
-            rows.append((f'/estimator/{name}', ESTIMATES[name], 10**6 + 10**4 * number, data))
+            rows.append((f'/estimator/{name}', KINDS[name], 10**6 + 10**4 * number, data))
         if k in (100, 200, 300):
             counters = {'samples_lost': 3, 'samples_accepted': k, 'samples_rejected': 2}
             rows.append(('/diagnostics', DIAGNOSTICS, 2 * 10**6, report(stamp, **counters)))
@@ -70,15 +69,20 @@ def record(path, missing=(), count=5):
     return files.write(path, messages)
 
 
-def rows_of(text):
-    """Return RMS of error and truth, settling time and chatter by quantity."""
-    rows = {}
-    for line in text.splitlines():
-        words = line.split()
-        if words and words[0] in NAMES:
-            rms, size, settled, _, chatter = words[1:]
-            rows[words[0]] = [float(word) for word in (rms, size, settled, chatter)]
-    return rows
+def errors_of(text):
+    """Return error and chatter of d, and the errors of the states."""
+    (line,) = [line for line in text.splitlines() if line.startswith('this estimator, live')]
+    (states,) = [line for line in text.splitlines() if line.startswith('RMS errors of the states')]
+    of_states = [float(part.split()[1]) for part in states.split(': ')[1].split(', ')]
+    return [*map(float, line.split()[-2:]), *of_states]
+
+
+def expected(late):
+    """Return the same by the truth and the estimates of this file."""
+    error, d, truth = (ESTIMATE - TRUTH)[late], ESTIMATE[late, 3], TRUTH[late, 3]
+    chatter = np.abs(np.diff(d)).sum() / np.abs(np.diff(truth)).sum()
+    rms = np.sqrt(np.mean(error**2, axis=0))
+    return [rms[3], chatter, *rms[:3]]
 
 
 def test_table_says_the_errors_that_are_in_the_bag(tmp_path):
@@ -87,21 +91,29 @@ def test_table_says_the_errors_that_are_in_the_bag(tmp_path):
     np.testing.assert_allclose(run.truth, TRUTH, rtol=0.0, atol=1e-15)
     np.testing.assert_allclose(run.estimate, ESTIMATE, rtol=0.0, atol=1e-15)
     np.testing.assert_allclose(run.t, T, rtol=0.0, atol=1e-12)
-    text = table(run)
-    rows = rows_of(text)
-    for column, name in enumerate(NAMES):
-        late = slice(COUNT // 2, None)
-        chatter = np.abs(np.diff(ESTIMATE[late, column])).sum() / (2.0 * SIZES[column])
-        expected = [RMS * SIZES[column], np.sqrt(0.5) * SIZES[column], 1.5, chatter]
-        assert rows[name] == pytest.approx(expected, rel=5e-3), name
-    assert 'sample rate held: 100.0 Hz' in text
-    assert 'samples: 300 used, 3 dropped, 2 rejected' in text
+    text = table(run, {}, [])
+    assert errors_of(text) == pytest.approx(expected(run.t >= START), rel=0.05)
+    assert 'samples: 300 used, 3 dropped, 2 rejected; 100.0 a second' in text
+
+
+def test_other_observers_go_through_the_same_samples(tmp_path):
+    """What changes begins a column of the table."""
+    run = read_run(record(tmp_path / 'bag'))
+    parameters = {'gains': 'fixed'}
+    compared = others(run, parameters)
+    name, changes = [*OTHERS.items()][1]
+    alone = Observer(changes).run(run.y.stamps, run.y.values.ravel())
+    np.testing.assert_array_equal(compared[name], alone.unknown_input[run.rows])
+    text = table(run, compared, [(files.ORIGIN + 3 * 10**9, 'noise')])
+    assert 'from 2 s' in text
+    assert 'from 3 s' in text
+    assert others(run, {'gains': 'self_tuning'}) == {}
 
 
 @pytest.mark.parametrize(
     'missing',
     [
-        *([f'/estimator/{name}'] for name in ESTIMATES),
+        *([f'/estimator/{name}'] for name in KINDS),
         ['/plant/state'],
         ['/plant/unknown_input'],
         ['/y'],
@@ -115,13 +127,10 @@ def test_early_messages_that_are_missing_change_no_number(missing, tmp_path):
     begin = 0 if missing == ['/y'] else 5
     np.testing.assert_array_equal(run.estimate, ESTIMATE[begin:])
     np.testing.assert_array_equal(run.truth, TRUTH[begin:])
-    rows = rows_of(table(run))
-    for column, name in enumerate(NAMES):
-        assert rows[name][0] == pytest.approx(RMS * SIZES[column], rel=0.02), name
-        assert rows[name][2] == pytest.approx(1.5 - begin * PERIOD, abs=6e-3), name
+    assert errors_of(table(run, {}, [])) == pytest.approx(expected(T >= START), rel=0.1)
 
 
 def test_bag_without_estimates_is_refused(tmp_path):
-    bag = record(tmp_path / 'bag', [f'/estimator/{name}' for name in ESTIMATES], COUNT)
+    bag = record(tmp_path / 'bag', [f'/estimator/{name}' for name in KINDS], COUNT)
     with pytest.raises(ConfigurationError, match='ended before an estimate arrived'):
         read_run(bag)

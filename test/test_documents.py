@@ -20,8 +20,8 @@ from fhaosmo_ros.topics import (
     DIAGNOSTICS,
     ESTIMATES,
     EVENT,
+    OF_GAINS,
     PARAMETERS,
-    SELF_TUNED,
     SNAPSHOT,
     TEXT,
     TRUTH,
@@ -95,7 +95,9 @@ def test_topics_in_the_table_are_those_of_the_code():
         if row[0] in ('estimator', 'plant') and 'srvs' not in kind
     }
     latched = {EVENT: DIAGNOSTICS, PARAMETERS: TEXT, SNAPSHOT: ESTIMATES['state']}
-    declared = ESTIMATES | SELF_TUNED | TYPED_ESTIMATES | latched
+    declared = ESTIMATES | TYPED_ESTIMATES | latched
+    for topics in OF_GAINS.values():
+        declared |= topics
     expected = {('estimator', name): kind for name, kind in declared.items()}
     expected |= {('estimator', 'diagnostics'): DIAGNOSTICS, ('plant', 'y'): 'std_msgs/msg/Float64'}
     expected |= {('plant', name): kind for name, kind in TRUTH.items()}

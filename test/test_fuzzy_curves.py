@@ -27,7 +27,6 @@ pytestmark = pytest.mark.filterwarnings('ignore:Passing more than 2 positional')
 
 EVEN = [(terms, shape) for terms in (5, 7) for shape in SHAPES]
 even = pytest.mark.parametrize(('terms', 'shape'), EVEN)
-normalised = pytest.mark.parametrize('normalise', [True, False])
 
 
 def law(level_widths=(0.02,), **options):
@@ -95,8 +94,9 @@ INPUTS = [0.0, 1 / 512, 0.1, 0.125, 0.2503, 1 / 3, 0.4, 0.5, 0.5001, 2 / 3, 0.77
 @even
 def test_curve_agrees_with_a_control_system_of_scikit_fuzzy(terms, shape):
     level = 0 if terms == 5 else 1
-    curves = law((1.0,), fuzzy_shape=shape, fuzzy_normalise=False)
+    curves = law((1.0,), fuzzy_systems=[f'terms {shape} 5', f'terms {shape} 7'])
     simulation = even_oracle(terms, shape)
+    end = computed(simulation, 1.0)
     # Knots are h = 1/192 apart, and every corner of a triangle's curve is one. A smooth curve
     # leaves the straight line between two of them by h^2 / 8 times its curvature, some 10, hence
     # 4e-5; triangles are steeper beside their peaks, trapezoids have corners between knots.
@@ -104,7 +104,7 @@ def test_curve_agrees_with_a_control_system_of_scikit_fuzzy(terms, shape):
     for x in INPUTS:
         for sign in (1.0, -1.0):
             expected = computed(simulation, sign * x)
-            np.testing.assert_allclose(psi(curves, level, sign * x), expected, atol=atol)
+            np.testing.assert_allclose(end * psi(curves, level, sign * x), expected, atol=atol)
 
 
 @even
@@ -112,7 +112,7 @@ def test_inference_agrees_with_a_control_system_of_scikit_fuzzy(terms, shape):
     simulation = even_oracle(terms, shape)
     expected = [computed(simulation, x) for x in INPUTS]
     # Nothing is interpolated between knots here; only the output grids differ.
-    found = infer(np.array(INPUTS), read_system(f'terms {terms}', shape))
+    found = infer(np.array(INPUTS), read_system(f'terms {shape} {terms}'))
     np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
@@ -136,29 +136,29 @@ def test_own_system_agrees_with_a_control_system_of_scikit_fuzzy(text, inputs, o
     p5, p7 = (np.array([float(v) for v in p.split()]) for p in (P5, P7))
     simulation = oracle((inputs, p5), (outputs, p7), rules, method)
     expected = [computed(simulation, x) for x in INPUTS]
-    found = infer(np.array(INPUTS), read_system(text, 'triangle'))
+    found = infer(np.array(INPUTS), read_system(text))
     np.testing.assert_allclose(found, expected, atol=1e-5)  # of the finite output grids
-    own = law((1.0,), fuzzy_systems=[text], fuzzy_normalise=False)
+    own = law((1.0,), fuzzy_systems=[text])
     for x, value in zip(INPUTS, expected, strict=True):  # corners between knots are cut
-        np.testing.assert_allclose(psi(own, 3, x), value, atol=4e-3)
+        np.testing.assert_allclose(psi(own, 3, x), value / expected[-1], atol=5e-3)
 
 
 def test_singletons_at_the_peaks_make_a_straight_line_between_them():
     """The weighted mean of singletons by memberships that are linear and add up to 1."""
     text = 'input -1 -0.25 0 0.25 1; output singleton -1 -0.6 0 0.6 1'
-    found = curve(text, 'triangle', False)
+    found = curve(text)
     grid = np.linspace(0.0, 1.0, KNOTS)
     np.testing.assert_allclose(found, np.interp(grid, [0, 0.25, 1], [0, 0.6, 1]), atol=1e-15)
-    line = curve('terms 7; output singleton 7', 'triangle', False)
+    line = curve('terms 7; output singleton 7')
     np.testing.assert_allclose(line, grid, atol=1e-15)
 
 
 def test_sampled_curve_is_interpolated_and_mirrored():
     grid = np.linspace(0.0, 1.0, KNOTS)
-    whole = curve('curve -0.9 -0.7 0 0.7 0.9', 'triangle', False)
-    np.testing.assert_array_equal(whole, np.interp(grid, [0, 0.5, 1], [0, 0.7, 0.9]))
-    np.testing.assert_array_equal(whole, curve('curve 0 0.7 0.9', 'triangle', False))
-    np.testing.assert_allclose(curve('curve 0,0.7,0.9', 'triangle', True), whole / 0.9)
+    whole = curve('curve -0.9 -0.7 0 0.7 0.9')
+    np.testing.assert_allclose(whole, np.interp(grid, [0, 0.5, 1], [0, 0.7 / 0.9, 1]))
+    np.testing.assert_array_equal(whole, curve('curve 0 0.7 0.9'))
+    np.testing.assert_array_equal(whole, curve('curve 0,0.7,0.9'))
 
 
 REFUSED = {
@@ -229,65 +229,56 @@ def any_system(draw):
 
 
 @settings(max_examples=10)
-@given(any_system(), st.booleans())
-def test_any_system_is_refused_or_keeps_the_promise(text, normalise):
+@given(any_system())
+def test_any_system_is_refused_or_keeps_the_promise(text):
     try:
-        values = curve(text, 'triangle', normalise)
+        values = curve(text)
     except ConfigurationError:
         return
     assert values.shape == (KNOTS,)
     assert values[0] == 0.0
     assert np.all(np.diff(values) >= 0.0)
-    assert 0.0 < values[-1] <= 1.0
-    assert not normalise or values[-1] == 1.0
+    assert values[-1] == 1.0
 
 
 @even
 def test_inference_is_odd(terms, shape):
-    x, system = np.array(INPUTS), read_system(f'terms {terms}', shape)
+    x, system = np.array(INPUTS), read_system(f'terms {shape} {terms}')
     # The curve keeps the half for x >= 0 only; this is what makes that right.
     np.testing.assert_allclose(infer(-x, system), -infer(x, system), atol=1e-14)
 
 
 @even
-@normalised
-def test_curve_rises_from_0_to_its_end(terms, shape, normalise):
-    values = curve(f'terms {terms}', shape, normalise)
+def test_curve_rises_from_0_to_its_end(terms, shape):
+    values = curve(f'terms {shape} {terms}')
     assert values.shape == (KNOTS,)
     assert values[0] == 0.0
     # Trapezoids have a plateau around each peak.
     assert np.diff(values).min() >= 0.0 if shape == 'trapezoid' else np.diff(values).min() > 0.0
-    assert values[-1] <= 1.0
+    assert values[-1] == 1.0
     assert not values.flags.writeable
-    if normalise:
-        assert values[-1] == 1.0
 
 
 @pytest.mark.parametrize(('terms', 'end'), [(5, 5.0 / 6.0), (7, 8.0 / 9.0)])
 def test_centroid_alone_falls_short_of_1(terms, end):
     # The centroid of the outermost half triangle, a third of its base away from 1.
-    np.testing.assert_allclose(curve(f'terms {terms}', 'triangle', False)[-1], end, atol=1e-6)
-
-
-@even
-def test_normalised_curve_is_the_raw_one_scaled(terms, shape):
-    raw, scaled = (curve(f'terms {terms}', shape, normalise) for normalise in (False, True))
-    np.testing.assert_allclose(scaled, raw / raw[-1], rtol=1e-15)
+    system = read_system(f'terms {terms}')
+    np.testing.assert_allclose(infer(np.ones(1), system), end, atol=1e-6)
 
 
 @even
 def test_shipped_curve_is_the_inferred_one(terms, shape):
     """Else `python -m studies.fuzzy_curves` writes the file anew."""
-    text = f'terms {terms}'
-    system = read_system(text, shape)
+    text = f'terms {shape} {terms}'
+    system = read_system(text)
     np.testing.assert_allclose(default_curves()[system], inferred(text, system), atol=1e-14)
 
 
 def test_level_1_has_5_terms_and_the_others_7():
     curves = law().configuration.curves
-    np.testing.assert_array_equal(curves[0], curve('terms 5', 'triangle', True))
+    np.testing.assert_array_equal(curves[0], curve('terms 5'))
     for row in curves[1:]:
-        np.testing.assert_array_equal(row, curve('terms 7', 'triangle', True))
+        np.testing.assert_array_equal(row, curve('terms 7'))
 
 
 def test_more_systems_than_levels_are_refused():
@@ -302,9 +293,8 @@ def test_last_width_serves_the_levels_that_follow():
 
 
 LAWS = {
-    (shape, normalise): law((0.02, 0.5), fuzzy_shape=shape, fuzzy_normalise=normalise)
+    shape: law((0.02, 0.5), fuzzy_systems=[f'terms {shape} 5', f'terms {shape} 7'])
     for shape in SHAPES
-    for normalise in (True, False)
 }
 any_law = st.sampled_from(list(LAWS.values()))
 levels = st.integers(0, 3)
@@ -338,10 +328,9 @@ def test_slope_is_that_of_psi(law, level, share):
 
 
 @given(st.sampled_from(list(LAWS)), levels, st.floats(0.0, 2.0), st.floats(1e-9, 1e9))
-def test_width_scales_the_input(options, level, share, width):
-    shape, normalise = options
-    scaled = law((width,), fuzzy_shape=shape, fuzzy_normalise=normalise)
-    unit = law((1.0,), fuzzy_shape=shape, fuzzy_normalise=normalise)
+def test_width_scales_the_input(shape, level, share, width):
+    scaled = law((width,), fuzzy_systems=[f'terms {shape} 5'])
+    unit = law((1.0,), fuzzy_systems=[f'terms {shape} 5'])
     expected = psi(unit, level, share)
     np.testing.assert_allclose(psi(scaled, level, share * width), expected, atol=1e-13)
 

@@ -11,7 +11,8 @@ import pytest
 
 def law(variant, lambda_, alpha, width, shape='triangle'):
     p = {'variant': variant, 'lambda': lambda_, 'alpha': alpha, 'fuzzy_widths': width}
-    return Cascade(ObserverConfiguration(p | {'fuzzy_shape': shape}))
+    p |= {'fuzzy_systems': [f'terms {shape} 5', f'terms {shape} 7']}
+    return Cascade(ObserverConfiguration(p))
 
 
 def powers(low, high):

@@ -9,7 +9,8 @@ import pytest
 from studies.paper.plant_and_observer import simulate
 
 OBSERVER = {
-    'lambda': 15, 'alpha': 30, 'epsilon': 0.5, 'fuzzy_widths': [0.5], 'fuzzy_shape': 'gaussian',
+    'lambda': 15, 'alpha': 30, 'epsilon': 0.5, 'fuzzy_widths': [0.5],
+    'fuzzy_systems': ['terms gaussian 5', 'terms gaussian 7'],
     'gamma_initial': 0.5, 'gamma_rate': 0.01, 'initial_estimate': [0.1, 0.2, 0.2, 0.05],
     'initial_internal': [0.2, 0.2, 0.05, 0.0], 'start_from_measurement': False,
 }  # fmt: skip

@@ -6,12 +6,12 @@ from pathlib import Path
 import re
 from xml.etree import ElementTree
 
-from fhaosmo_ros.topics import ARRAY, ESTIMATES, FLOAT, TRUTH, TYPED_ESTIMATES
+from fhaosmo_ros.topics import ARRAY, estimates_of, FLOAT, TRUTH, TYPED_ESTIMATES
 import pytest
 
 LAYOUTS = Path(__file__).resolve().parents[1] / 'config' / 'layouts'
 TYPES = {'/y': FLOAT}
-TYPES |= {f'/estimator/{name}': kind for name, kind in ESTIMATES.items()}
+TYPES |= {f'/estimator/{name}': kind for name, kind in estimates_of({'gains': 'fixed'}).items()}
 TYPES |= {f'/plant/{name}': kind for name, kind in TRUTH.items()}
 TYPES |= {f'/joint_estimator/{name}': kind for name, kind in TYPED_ESTIMATES.items()}
 FIELDS = {FLOAT: r'data', ARRAY: r'data\[\d\]'}

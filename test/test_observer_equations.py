@@ -111,8 +111,6 @@ class Reference:
             self.hat[0] = Dual(y)
         self.gamma = p['gamma_initial'] if p['variant'].endswith('_adaptive') else 0.5
         self.y = y
-        self.upset = 0.0  # how long gamma rests yet
-        self.calm = np.inf  # how long the innovations have been within the dead zone
         self.curves = curves(p, self.N)
 
     def psi(self, i, x):
@@ -201,25 +199,12 @@ class Reference:
             return
         loss = sum((e * e for e in eps), Dual(0.0))
         gamma = self.gamma
-        upset = self.is_upset(eps, h) and p['gamma_dead_zone'] > 0.0
-        if loss.value > p['gamma_dead_zone'] ** 2:
-            if not upset:
-                gamma -= h * p['gamma_rate'] * loss.slope
-            self.calm = 0.0
         rests = loss.value <= p['gamma_dead_zone'] ** 2
-        waited = self.calm > p['gamma_leakage_delay'] - 1e-12
-        leaks = p['gamma_dead_zone'] == 0.0 or (rests and waited)
-        self.calm += h if rests else 0.0
-        if leaks:
+        if rests or p['gamma_dead_zone'] == 0.0:
             gamma -= h * p['gamma_leakage'] * (gamma - p['gamma_initial'])
+        if not rests:
+            gamma -= h * p['gamma_rate'] * loss.slope
         self.gamma = min(max(gamma, p['gamma_min']), p['gamma_max'])
-
-    def is_upset(self, eps, h):
-        fuzzy = not self.p['variant'].startswith('sign')
-        self.upset = max(self.upset - h, 0.0)
-        if fuzzy and abs(eps[0].value) > self.p['fuzzy_widths'][0]:
-            self.upset = self.p['gamma_leakage_delay']
-        return self.upset > 0.0
 
     def open(self):
         m = [self.y, *(v.value for v in self.tilde[: self.N - 1])]
@@ -240,15 +225,12 @@ def parameters(n, extra, **others):
         'epsilon': 0.2,
         'fuzzy_widths': [0.05, 0.3][:levels],
         'fuzzy_systems': ['terms 5', 'terms 7'],
-        'fuzzy_shape': 'triangle',
-        'fuzzy_normalise': True,
         'gamma_initial': 0.5,
         'gamma_rate': 0.5,  # fast, so that gamma matters within the horizon
         'gamma_min': 0.2,
         'gamma_max': 0.9,
         'gamma_dead_zone': 0.0,
         'gamma_leakage': 0.0,
-        'gamma_leakage_delay': 0.1,
         'initial_estimate': list(rng.uniform(-0.2, 0.2, levels)),
         'initial_internal': list(rng.uniform(-0.2, 0.2, levels)),
         'start_from_measurement': False,
@@ -304,10 +286,9 @@ def test_run_follows_the_equations(scheme, variant, n, extra):
         {'gamma_leakage': 2.0},
         {'gamma_dead_zone': 0.1},
         {'gamma_dead_zone': 0.1, 'gamma_leakage': 3.0},
-        {'gamma_dead_zone': 0.1, 'gamma_leakage': 3.0, 'gamma_leakage_delay': 0.0},
         {'gamma_min': 0.499, 'gamma_max': 0.501},
         {'gamma_rate': 0.0, 'gamma_leakage': 5.0, 'gamma_initial': 0.31, 'gamma_min': 0.3},
-        {'fuzzy_shape': 'gaussian', 'fuzzy_normalise': False},
+        {'fuzzy_systems': ['terms gaussian 5', 'terms trapezoid 7']},
         {'start_from_measurement': True, 'fuzzy_widths': [0.02]},
         {'epsilon': 1e3},
         {'unknown_input_decay': 5.0},

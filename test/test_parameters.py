@@ -2,6 +2,7 @@
 """Every declared parameter, by the rules that all of them share."""
 
 from array import array
+import warnings
 
 from fhaosmo_ros.core import ConfigurationError, Observer
 from fhaosmo_ros.core.parameters import files
@@ -222,18 +223,16 @@ def test_list_of_the_wrong_length_is_refused(name, value, allowed):
             assert part in message
 
 
-def test_gains_of_a_model_alone_tune_themselves():
-    """Unless something is given that only fixed gains use; in a node each channel for itself."""
-    model = {'order': 2, 'phi': ['0', '-k*z2'], 'constants.k': 2.0, 'noise_size': 0.1}
-    complete = ESTIMATOR_PARAMETERS.complete
-    assert complete(model)['gains'] == 'self_tuning'
-    for other in ({'lambda': [3.0]}, {'gains': 'fixed'}, {'unknown_input': False}):
-        assert complete(model | other)['gains'] == 'fixed'
-    assert complete({'noise_size': 0.1})['gains'] == 'fixed'
-    values = files.complete(
-        {'channels': ['a', 'b'], **model, 'b.lambda': [3.0]}, ESTIMATOR_PARAMETERS
-    )
-    assert (values['a.gains'], values['b.gains']) == ('self_tuning', 'fixed')
+def test_default_gains_with_the_plant_of_a_user_are_warned_of():
+    """Whether a value is given or is the default makes no difference."""
+    model = {'order': 2, 'phi': ['0', '-z2']}
+    with pytest.warns(UserWarning, match='gains to self_tuning'):
+        Observer(model)
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        for fine in ({}, {'phi': ['0', '0', '-z3']}, model | {'lambda': 3.0},
+                     model | {'gains': 'self_tuning'}):  # fmt: skip
+            Observer(fine)
 
 
 @pytest.mark.parametrize('name', REMOVED)

@@ -214,7 +214,7 @@ def test_figure_of_fuzzy_systems_shows_memberships_and_curve():
         ('terms 5', 2.0, '1'),
         ('terms 7', 0.5, '2 to 4'),
     ]
-    figure = fuzzy_figure(rows, 'triangle', True)
+    figure = fuzzy_figure(rows)
     for row, axes, terms in zip(rows, np.reshape(figure.axes, (2, 3)), (5, 7), strict=True):
         for side, scale in ((axes[0], row.width), (axes[1], 1.0)):
             assert len(side.lines) == terms

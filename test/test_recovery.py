@@ -22,10 +22,9 @@ from observer_cases import remembered
 import pytest
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
-PAPER = CONFIG / 'paper.yaml'
 FILES = [
     path for path in sorted(CONFIG.glob('**/*.yaml'))
-    if path != PAPER and 'noise_size' in load(path, 'estimator', ONLINE_PARAMETERS)
+    if {'noise_size', 'correction_period'} <= load(path, 'estimator', ONLINE_PARAMETERS).keys()
 ]  # fmt: skip
 RATE = 1000
 LOST_SAMPLES = 20
@@ -233,7 +232,7 @@ def test_another_rate_without_the_sizes():
 @pytest.mark.parametrize('offset', [1.0, -10.0])
 def test_papers_gains_find_y_again(offset):
     """They have no sizes, and no noise: the paper's observer, as it is."""
-    parameters = load(PAPER, 'estimator', ONLINE_PARAMETERS)
+    parameters = load(CONFIG / 'paper.yaml', 'estimator', ONLINE_PARAMETERS)
     t = np.arange(16 * RATE) / RATE
     truth = Plant({'noise_std': 0.0}).simulate(t)
     y = truth.y.copy()

@@ -519,15 +519,6 @@ def test_it_needs_the_unknown_input():
         Observer({**SELF_TUNING, 'unknown_input': False})
 
 
-def test_noise_is_at_least_what_is_said(case):
-    """So that y without any noise, which no member is quick enough for, can be used."""
-    t, z, d, _ = case
-    observer = Observer(PLANTS['paper'] | {'gains': 'self_tuning', 'noise_size': 1e-4})
-    run = observer.run(t, z[:, 0])
-    assert observer.tuning.noise >= 1e-4
-    assert rms((run.unknown_input - d)[5000:]) < 0.9 * rms(d)
-
-
 @pytest.mark.parametrize(
     ('name', 'kind', 'seed', 'seconds'),
     [

@@ -262,11 +262,11 @@ def test_known_inputs_and_a_nonlinear_model():
     assert errors[1] < 0.35 * errors[0]
 
 
-@pytest.mark.parametrize('structure', ['demo', 'levant'])
-def test_any_observer_can_run_forward(structure):
+@pytest.mark.parametrize('file', ['demo', 'noise_1e-4'])
+def test_any_observer_can_run_forward(file):
     t, y, truth = recording(6.0, noise=1e-5)
     judged = slice(2000, 5000)
-    observer = Observer.from_yaml(f'config/{structure}.yaml')
+    observer = Observer.from_yaml(f'config/{file}.yaml')
     run, smoothed = observer.run(t, y), observer.smooth(t, y)
     before, after = (
         rms((found.unknown_input - truth.unknown_input)[judged]) for found in (run, smoothed)

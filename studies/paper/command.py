@@ -96,7 +96,7 @@ def drawn(solver: str) -> dict[str, Figure]:
     first = cases.first_observer(1e-5, solver, cases.DURATION, every=5)
     return {
         'paper_sim1': figures.sim1(first, ZOOM),
-        'paper_fuzzysystems': fuzzy_figure(rows, preset['fuzzy_shape'], preset['fuzzy_normalise']),
+        'paper_fuzzysystems': fuzzy_figure(rows),
         'paper_simz': figures.simz(list(runs.items()), cases.FREQUENCIES),
         'paper_simu': figures.simu(adaptive, cases.FREQUENCIES),
     }

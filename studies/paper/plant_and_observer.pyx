@@ -98,8 +98,6 @@ cdef class Joint(Dynamics):
     cdef SlidingMode free  # the same without injections
     cdef bint holds_sign  # sign(eps_i) is held for a whole step
     cdef double sign[MOST_LEVELS]  # sign(eps_i) at the beginning of a step
-    cdef double loss  # L then
-    cdef double wait  # time for which innovations have yet to stay small before gamma leaks (s)
     cdef double u[MOST_INPUTS]  # known inputs: 0
     cdef State state
 
@@ -130,8 +128,6 @@ cdef class Joint(Dynamics):
         memset(rate, 0, self.size * sizeof(double))
         self.plant.rates(stage, t, now.z, rate.z)
         self.observer_rates(self.observer, now, rate)
-        if stage == 0:
-            self.loss = self.observer.loss
         if self.holds_sign:
             self.hold_signs(now, rate, stage == 0)
         if self.observer.adaptive:
@@ -183,21 +179,16 @@ cdef class Joint(Dynamics):
         """Return the rate of gamma by the law of D 7 and D 8, for the latest L."""
         cdef bint rests = law.loss <= law.dead_zone * law.dead_zone
         cdef double rate = 0.0
-        if not rests:
-            rate = -law.gamma_rate * law.gradient  # P adaptationlawgamma
-        if law.dead_zone == 0.0 or (rests and self.wait <= 0.0):
+        if law.dead_zone == 0.0 or rests:
             rate -= law.leakage * (gamma - law.gamma_initial)
+        if not rests:
+            rate -= law.gamma_rate * law.gradient  # P adaptationlawgamma
         return rate
 
-    cdef void end_step(self, SlidingMode law, double h) noexcept nogil:
-        """Project gamma on its range (D 8), and count the time until it leaks."""
-        if not law.adaptive:
-            return
-        self.state.gamma = fmin(fmax(self.state.gamma, law.gamma_min), law.gamma_max)
-        if self.loss <= law.dead_zone * law.dead_zone:
-            self.wait = fmax(self.wait - h, 0.0)
-        else:
-            self.wait = law.leakage_delay
+    cdef void project(self, SlidingMode law) noexcept nogil:
+        """Project gamma on its range (D 8)."""
+        if law.adaptive:
+            self.state.gamma = fmin(fmax(self.state.gamma, law.gamma_min), law.gamma_max)
 
     def run(self, str method, double h, Py_ssize_t count, int every):
         """Integrate and return `count` states, every `every`-th one, from the first one on."""
@@ -211,7 +202,7 @@ cdef class Joint(Dynamics):
             for row in range(count):
                 for _ in range(every if row > 0 else 0):
                     take_step(self, &used, step * h, h, <double*>&self.state)
-                    self.end_step(self.observer, h)
+                    self.project(self.observer)
                     step += 1
                 for i in range(n):
                     z[row, i] = self.state.z[i]

@@ -138,7 +138,7 @@ class Estimate(NamedTuple):
     stamp: int
     z: list[float]
     unknown_input: float
-    gamma: float
+    gamma: float | None
     innovation: list[float]
 
 
@@ -316,12 +316,18 @@ class EstimatorRig:
     """
 
     def __init__(
-        self, client: Client, namespace: str = '', feed: bool = True, greet: bool = True
+        self,
+        client: Client,
+        namespace: str = '',
+        feed: bool = True,
+        greet: bool = True,
+        gains: str = 'fixed',
     ) -> None:
         self.client = client
         name = f'{namespace}/estimator'
         self.parameters = Parameters(client, name)
-        self.topics = {t: client.record(f'{name}/{t}', kind) for t, kind in ESTIMATES.items()}
+        kinds = {t: kind for t, kind in ESTIMATES.items() if t != 'gamma' or gains == 'fixed'}
+        self.topics = {t: client.record(f'{name}/{t}', kind) for t, kind in kinds.items()}
         self._all_diagnostics = client.record('/diagnostics', DiagnosticArray)
         self.y = client.record(f'{namespace}/y', Float64)
         self._name = name.lstrip('/')
@@ -329,7 +335,7 @@ class EstimatorRig:
         self._next = dict.fromkeys(self.topics, 0)
         self._ticks = 0
         self._before = 0
-        topics = [f'{name}/{t}' for t in ESTIMATES]
+        topics = [f'{name}/{t}' for t in kinds]
         client.wait(
             lambda: all(client.node.count_publishers(t) for t in topics), 'estimator publisher'
         )
@@ -374,7 +380,8 @@ class EstimatorRig:
                     Estimate(
                         stamp.sec * 10**9 + stamp.nanosec,
                         list(parts['state'].data), parts['unknown_input'].data,
-                        parts['gamma'].data, list(parts['innovation'].data),
+                        parts['gamma'].data if 'gamma' in parts else None,
+                        list(parts['innovation'].data),
                     )
                 )  # fmt: skip
                 for topic in parts:

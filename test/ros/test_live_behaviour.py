@@ -63,8 +63,6 @@ CASES = {
     'epsilon': Case(1e-9),
     'fuzzy_widths': Case([0.01, 0.02]),
     'fuzzy_systems': Case(['curve 0 0.8 1']),
-    'fuzzy_shape': Case('gaussian'),
-    'fuzzy_normalise': Case(False),
     'gamma_initial': Case(0.5, reset=True),
     'gamma_rate': Case(500.0, QUICK_GAMMA),
     'gamma_min': Case(0.6, {'gamma_initial': 0.5}, prepare={'gamma_initial': 0.6}),
@@ -72,16 +70,6 @@ CASES = {
     'gamma_dead_zone': Case(1e6, QUICK_GAMMA),
     'gamma_leakage': Case(
         1e3, {'gamma_initial': 0.7, 'gamma_dead_zone': 0.0}, prepare={'gamma_initial': 0.5}
-    ),
-    'gamma_leakage_delay': Case(  # innovations leave the dead zone, and come back to it
-        0.0,
-        {
-            'gamma_initial': 0.7,
-            'gamma_leakage': 1e3,
-            'gamma_dead_zone': 0.4,
-        },
-        prepare={'gamma_initial': 0.5},
-        y=lambda _: 2.0,
     ),
     'initial_estimate': Case([0.5], reset=True),
     'initial_internal': Case([0.5], reset=True),

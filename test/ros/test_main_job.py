@@ -140,7 +140,8 @@ def test_tuning_is_that_of_a_replay(client, folder):
     arguments = parameters(namespace='/tuned', publish_on='sample', **settings)
     with node_process(folder(), 'estimator', *arguments):
         found = client.record('/tuned/estimator/tuning', Float64MultiArray)
-        rig, replay = EstimatorRig(client, '/tuned'), OnlineEstimator(settings)
+        rig = EstimatorRig(client, '/tuned', gains='self_tuning')
+        replay = OnlineEstimator(settings)
         client.wait(lambda: client.node.count_publishers('/tuned/estimator/tuning'), 'tuning')
         rig.feed(0.2)  # no sample from before the reset is on its way any more
         rig.reset()

@@ -44,7 +44,7 @@ def listen(client, folder, request, stack):
     def start(**values) -> EstimatorRig:
         arguments = parameters(namespace=namespace, **values)
         process = stack.enter_context(node_process(folder(), 'estimator', *arguments))
-        rig = EstimatorRig(client, namespace, feed=False)
+        rig = EstimatorRig(client, namespace, feed=False, gains=values.get('gains', 'fixed'))
         rig.topic, rig.process = f'{namespace}/y', process
         return rig
 

@@ -64,7 +64,7 @@ def test_signal_while_parameters_are_set(client, folder):
     try:
         values = Parameters(client, '/set/estimator')
         assert values.set(epsilon=4.0)[0].successful
-        request = values.request(fuzzy_shape='gaussian', variant='fuzzy')
+        request = values.request(fuzzy_systems=['terms gaussian 5'], variant='fuzzy')
         for _ in range(20):
             client.call_later('/set/estimator/set_parameters', *request)
         process.send(signal.SIGINT)

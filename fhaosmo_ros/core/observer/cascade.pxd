@@ -10,6 +10,8 @@ cdef struct Root:
 
 
 cdef class Cascade(SlidingMode):
+    cdef void start_as_kalman(self, double y, double h, const double* u) noexcept nogil
+    cdef void hand_over(self, const double* u) noexcept nogil
     cdef void explicit(self, double gamma, double y, double h, const double* u) noexcept nogil
     cdef void backward(self, double gamma, double y, double h, const double* u) noexcept nogil
     cdef Root root(self, int i, double b, double h, double gamma) noexcept nogil

@@ -13,10 +13,14 @@ from libc.math cimport copysign, exp, fabs, log, log1p, pow, sqrt
 from fhaosmo_ros.core.model.phi cimport Dual, evaluate
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.sliding_mode cimport (
-    NEWTON_STEPS, NEWTON_TOLERANCE, TINY, SlidingMode, psi
+    NEWTON_STEPS, NEWTON_TOLERANCE, TINY, SlidingMode, doubt_of_noise, psi
 )
-from fhaosmo_ros.core.observer.structure cimport Level
+from fhaosmo_ros.core.observer.structure cimport Level, Memory
 
+# Time constants of the steady Kalman filter after which its errors are steady.
+cdef double LONG = 8.0
+# Innovations of more standard deviations count as so many at the start.
+cdef double MOST_SIGMAS = 3.0
 cdef int BISECTIONS = 60
 
 
@@ -24,11 +28,73 @@ cdef class Cascade(SlidingMode):
     """The paper's observer: level i follows z_i by the super-twisting algorithm."""
 
     cdef void follow(self, double y, double h, const double* u) noexcept nogil:
-        """Advance `trial` by the scheme."""
-        if self.implicit:
+        """Advance `trial` by the scheme, or start as a Kalman filter."""
+        if self.scheduled and self.memory.settled <= 0.0:
+            self.start_as_kalman(y, h, u)
+        elif self.implicit:
             self.backward(self.memory.gamma, y, h, u)
         else:
             self.explicit(self.memory.gamma, self.memory.y, h, u)
+
+    cdef void start_as_kalman(self, double y, double h, const double* u) noexcept nogil:
+        """Estimate by the Kalman filter itself until P is steady (D 20); sensitivities rest."""
+        cdef Memory* memory = &self.memory
+        cdef int i, n = self.levels
+        cdef double speed = self.bandwidth(h), doubt = doubt_of_noise(-memory.settled, speed)
+        cdef double s, b
+        self.linear.predict(self.trial_covariance, h)
+        s = self.trial_covariance[0][0] + doubt * doubt * self.noise_variance
+        self.predict_trial(h, u)
+        b = y - self.prediction.z[0]
+        b = min(max(b, -MOST_SIGMAS * sqrt(s)), MOST_SIGMAS * sqrt(s))
+        for i in range(n):
+            self.trial[i].z_hat = (
+                self.prediction.z[i] + self.trial_covariance[0][i] / s * b  # K = P C' / S
+            )
+            self.trial[i].p = self.trial[i].q = 0.0
+        for i in range(n):
+            self.trial[i].z_tilde = self.trial[i + 1].z_hat if i + 1 < n else 0.0
+        self.correct_trial(doubt)
+        memory.settled -= h
+        if -memory.settled * speed > LONG:
+            self.hand_over(u)
+            memory.settled = 1.0
+
+    cdef void hand_over(self, const double* u) noexcept nogil:
+        """
+        Put the levels where they would be if they had followed the estimates of `trial`.
+
+        Level i then has alpha_i psi_i(eps_i) = z_{i+1}', and its internal state lags by its
+        injection.
+        """
+        cdef double z[MOST_LEVELS]
+        cdef double still[MOST_LEVELS]
+        cdef double rate, wanted, low, high, middle, eps, injection
+        cdef int i, _, n = self.levels
+        for i in range(n):
+            z[i], still[i] = self.trial[i].z_hat, 0.0
+        for i in range(n):
+            rate = 0.0
+            if i + 1 < n:
+                rate = evaluate(self.prediction.phi, i + 1, z, still, u).value
+                if i + 2 < n:
+                    rate += z[i + 2]
+            wanted = min(fabs(rate) / self.gains[i].alpha, 1.0)
+            low, high = 0.0, 0.0 if self.is_sign else 1.0 / self.gains[i].inverse_width
+            for _ in range(BISECTIONS):
+                middle = 0.5 * (low + high)
+                if psi(self, i, middle).value < wanted:
+                    low = middle
+                else:
+                    high = middle
+            eps = copysign(high, rate)
+            injection = 0.0
+            if high > 0.0:
+                injection = self.gains[i].lambda_ * pow(high, self.memory.gamma) * wanted
+            self.trial[i].z_hat = (
+                self.trial[0].z_hat if i == 0 else self.trial[i - 1].z_tilde
+            ) - eps
+            self.trial[i].z_tilde = (z[i + 1] if i + 1 < n else 0.0) - copysign(injection, rate)
 
     cdef void explicit(self, double gamma, double y, double h, const double* u) noexcept nogil:
         """
@@ -202,53 +268,6 @@ cdef class Cascade(SlidingMode):
             raise ValueError(f'solve: expected a level below {self.levels}, got {level}')
         cdef Root found = self.root(level, b, h, gamma)
         return found.eps, found.s
-
-    cdef double predicted_y(self, double h, const double* u) noexcept nogil:
-        """Return y after one Euler step of the internal states (D 21)."""
-        cdef double still = 0.0, y = self.memory.y
-        cdef double eps = y - self.trial[0].z_hat, injection
-        cdef double rate = self.trial[0].z_tilde
-        rate += evaluate(self.prediction.phi, 0, &y, &still, u).value
-        if eps != 0.0:  # the internal state lags by the injection of the first level
-            injection = self.gains[0].lambda_ * pow(fabs(eps), self.memory.gamma)
-            rate += copysign(injection * psi(self, 0, fabs(eps)).value, eps)
-        return y + h * rate
-
-    cdef void hand_over(self, const double* u) noexcept nogil:
-        """
-        Put the levels where they would be if they had followed the estimates of `trial`.
-
-        Level i then has alpha_i psi_i(eps_i) = z_{i+1}', and its internal state lags by its
-        injection.
-        """
-        cdef double z[MOST_LEVELS]
-        cdef double still[MOST_LEVELS]
-        cdef double rate, wanted, low, high, middle, eps, injection
-        cdef int i, _, n = self.levels
-        for i in range(n):
-            z[i], still[i] = self.trial[i].z_hat, 0.0
-        for i in range(n):
-            rate = 0.0
-            if i + 1 < n:
-                rate = evaluate(self.prediction.phi, i + 1, z, still, u).value
-                if i + 2 < n:
-                    rate += z[i + 2]
-            wanted = min(fabs(rate) / self.gains[i].alpha, 1.0)
-            low, high = 0.0, 0.0 if self.is_sign else 1.0 / self.gains[i].inverse_width
-            for _ in range(BISECTIONS):
-                middle = 0.5 * (low + high)
-                if psi(self, i, middle).value < wanted:
-                    low = middle
-                else:
-                    high = middle
-            eps = copysign(high, rate)
-            injection = 0.0
-            if high > 0.0:
-                injection = self.gains[i].lambda_ * pow(high, self.memory.gamma) * wanted
-            self.trial[i].z_hat = (
-                self.trial[0].z_hat if i == 0 else self.trial[i - 1].z_tilde
-            ) - eps
-            self.trial[i].z_tilde = (z[i + 1] if i + 1 < n else 0.0) - copysign(injection, rate)
 
 
 cdef inline double decayed(double decay, double h) noexcept nogil:

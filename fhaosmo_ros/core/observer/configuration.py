@@ -34,8 +34,7 @@ class Schedule(NamedTuple):
     variance : float
         Of the noise on y.
     fresh, steady : (N, N) arrays
-        P of a fresh observer, and of the predictions once P is steady (0 where no scheme needs
-        it).
+        P of a fresh observer, and of the predictions once P is steady (levant; else 0).
     tuned_over_kalman : (N,) array
         The tuned corrections of a small innovation over those of the Kalman filter.
     next_sizes : (N,) array
@@ -182,7 +181,7 @@ class ObserverConfiguration:
         self.widths = np.array([of_level(p['fuzzy_widths'], i) for i in range(levels)])
         if self.is_sign:  # no curve is read
             for text in p['fuzzy_systems']:
-                read_system(text, p['fuzzy_shape'])
+                read_system(text)
             self.curves = np.ones((levels, 2))
         else:
             self.curves = curves(p, levels)
@@ -192,11 +191,11 @@ class ObserverConfiguration:
         self.expressions = self.model.with_unknown_input(
             p['unknown_input_decay'], p['unknown_input_derivatives']
         )
-        known_period = p['correction_period'] > 0.0 or not self.predicting
         rate = p['unknown_input_decay'] or p['unknown_input_rate']
         usual = p['unknown_input_size'] / rate ** np.arange(n, 0.0, -1.0)  # d integrated
         self.state_sizes = np.where(self.state_sizes > 0.0, self.state_sizes, usual)
-        if p['noise_size'] > 0.0 and p['unknown_input'] and known_period:
+        starts = not self.levant or (self.predicting and p['correction_period'] > 0.0)
+        if p['noise_size'] > 0.0 and p['unknown_input'] and starts:
             self.schedule = self._make_schedule()
 
     def _check_structure(self) -> None:
@@ -228,11 +227,11 @@ class ObserverConfiguration:
         return per_level(OBSERVER_PARAMETERS[name], self.parameters[name], self.levels)
 
     def _make_schedule(self) -> Schedule:
-        p, n, order = self.parameters, self.levels, self.model.order
+        p, n = self.parameters, self.levels
         uncertainty = Uncertainty(self.model, p, self.state_sizes)
         sizes, steady, ratio = np.zeros(n), np.zeros((n, n)), np.ones(n)
-        sizes[:order] = [*self.state_sizes[1:], p['unknown_input_size']]
-        if self.predicting:
+        sizes[: self.model.order] = [*self.state_sizes[1:], p['unknown_input_size']]
+        if self.levant:
             period = p['correction_period']
             steady = uncertainty.steady(period)
             tuned = self.tuned_corrections(p['noise_size'], period)

@@ -90,7 +90,7 @@ class FuzzySystem(NamedTuple):
     defuzzifier: str
 
 
-def read_system(text: str, shape: str) -> FuzzySystem | Curve:
+def read_system(text: str) -> FuzzySystem | Curve:
     """
     Read the text of a system: clauses with ``;`` between them, each a word and its values.
 
@@ -103,7 +103,7 @@ def read_system(text: str, shape: str) -> FuzzySystem | Curve:
     ``curve v0 v1 ..``   instead of all these: samples of psi
     ==================== ==========================================================================
 
-    S is a shape, `shape` where it is left out. P is the number of terms that divide [-1, 1]
+    S is a shape, triangle where it is left out. P is the number of terms that divide [-1, 1]
     evenly, or their peaks. Samples are evenly spaced, over [0, 1] if the first one is 0, else
     over [-1, 1].
 
@@ -134,8 +134,8 @@ def read_system(text: str, shape: str) -> FuzzySystem | Curve:
     sides = [clauses.get(side, common) for side in ('input', 'output')]
     if sides[0] is None:
         raise _refused(text, 'terms, input or curve', ', '.join(clauses))
-    inputs = _terms(text, sides[0], shape, SHAPES)
-    outputs = _terms(text, sides[1] or sides[0], shape, (*SHAPES, SINGLETON))
+    inputs = _terms(text, sides[0], SHAPES)
+    outputs = _terms(text, sides[1] or sides[0], (*SHAPES, SINGLETON))
     if 'rules' in clauses:
         numbers = _numbers(text, clauses['rules'])
         rules = tuple(int(k) - 1 for k in numbers if k == int(k) and 1 <= k <= len(outputs.peaks))
@@ -178,7 +178,8 @@ def _numbers(text: str, words: Sequence[str]) -> list[float]:
     return numbers
 
 
-def _terms(text: str, words: Sequence[str], shape: str, shapes: Sequence[str]) -> Terms:
+def _terms(text: str, words: Sequence[str], shapes: Sequence[str]) -> Terms:
+    shape = shapes[0]
     if words and words[0][:1].isalpha():
         shape, *words = words
     if shape not in shapes:
@@ -282,21 +283,20 @@ def infer(x: Curve, system: FuzzySystem) -> Curve:
 
 
 @lru_cache(maxsize=32)
-def curve(text: str, shape: str, normalise: bool) -> Curve:
+def curve(text: str) -> Curve:
     """
     Return psi at `KNOTS` evenly spaced points of [0, 1] (it is odd), read-only.
 
     Parameters
     ----------
-    text, shape : str
+    text : str
         See `read_system`.
-    normalise : bool
-        Scale the curve to end at 1. A centroid alone ends at about 0.83 (5 terms).
 
     Returns
     -------
     (KNOTS,) array
-        0 at 0, non-decreasing, at most 1.
+        0 at 0, non-decreasing, 1 at 1: a centroid alone ends at about 0.83 (5 terms), which would
+        cut every gain.
 
     Raises
     ------
@@ -304,15 +304,14 @@ def curve(text: str, shape: str, normalise: bool) -> Curve:
         The text is no system, or its curve is not odd, falls, stays 0, or leaves [-1, 1].
 
     """
-    system = read_system(text, shape)
+    system = read_system(text)
     if isinstance(system, FuzzySystem):
         shipped = default_curves().get(system)
         psi = inferred(text, system) if shipped is None else shipped.copy()
     else:
         psi = np.interp(np.linspace(0.0, 1.0, KNOTS), np.linspace(0.0, 1.0, len(system)), system)
     _expect_rising(text, psi)
-    if normalise:
-        psi /= psi[-1]
+    psi /= psi[-1]
     psi.flags.writeable = False
     return psi
 
@@ -324,7 +323,7 @@ def curves(parameters: Mapping[str, Any], levels: int) -> Curve:
     Parameters
     ----------
     parameters : mapping
-        With `fuzzy_systems`, `fuzzy_shape` and `fuzzy_normalise`.
+        With `fuzzy_systems`.
     levels : int
         N.
 
@@ -333,9 +332,8 @@ def curves(parameters: Mapping[str, Any], levels: int) -> Curve:
     (N, KNOTS) array
 
     """
-    options = parameters['fuzzy_shape'], parameters['fuzzy_normalise']
     texts = parameters['fuzzy_systems']
-    return np.array([curve(of_level(texts, i), *options) for i in range(levels)])
+    return np.array([curve(of_level(texts, i)) for i in range(levels)])
 
 
 def of_level(values: Sequence[Any], level: int) -> Any:
@@ -349,7 +347,7 @@ def default_curves() -> dict[FuzzySystem, Curve]:
     with DEFAULT_CURVES.open(newline='') as file:
         header, *rows = csv.reader(file)
     columns = np.array(rows, dtype=float).T
-    systems = (read_system(text, SHAPES[0]) for text in header)
+    systems = (read_system(text) for text in header)
     return {s: c for s, c in zip(systems, columns, strict=True) if isinstance(s, FuzzySystem)}
 
 

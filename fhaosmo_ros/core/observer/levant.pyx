@@ -6,6 +6,11 @@ One innovation drives every level: eps = y - z_hat_1; gamma is held. Equations a
 numbers in docs/mathematics.md (D). The internal states mirror the estimates, z_tilde_{i+1} =
 z_hat_{i+1}, so that whatever reads a cascade's state reads this one; theta is 0.
 
+With `noise_size` the gains of predict_correct are scheduled: the covariance P of the errors
+follows the Kalman filter of the model, linearised at rest, with a Matern model of d (D 17, D 20).
+It begins with the sizes of the states, of d and of the noise that parameters tell, and makes gains
+larger until it is steady. It also says which samples are unlikely (D 21).
+
 Levant 2003, doi:10.1080/0020717031000099029.
 """
 
@@ -16,10 +21,9 @@ from fhaosmo_ros.core.model.phi cimport Dual, evaluate
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.kalman cimport Row
 from fhaosmo_ros.core.observer.sliding_mode cimport (
-    HUBER, LONG_AGO, NEWTON_STEPS, NEWTON_TOLERANCE, TINY, SlidingMode, doubt_of_noise,
-    follow_spread, psi
+    LONG_AGO, NEWTON_STEPS, NEWTON_TOLERANCE, TINY, SlidingMode, doubt_of_noise, psi
 )
-from fhaosmo_ros.core.observer.structure cimport Memory
+from fhaosmo_ros.core.observer.structure cimport GATE, Memory, Structure, has_drifted
 
 from fhaosmo_ros.core.observer.configuration import deadbeat_shares
 
@@ -31,6 +35,7 @@ cdef double CLOSE = 0.02
 cdef double NEARLY_STEADY = 1.5
 # So many samples in a row beyond all half-widths widen them.
 cdef double SATURATED_SAMPLES = 20.0
+HUBER = 2.0
 # Innovations of more standard deviations count as so many, at least (D 32).
 cdef double LEAST_HUBER = 1.0
 # The share within the largest limit if the noise is normal: with it the gains are the tuned ones.
@@ -39,6 +44,37 @@ cdef double WITHIN = 0.9465
 cdef double NARROWING = 0.01
 # More samples in a row beyond the limit on the same side are no outliers (D 32).
 cdef double ISOLATED = 20.0
+# Median of |x| where x is normal with variance 1, and by what part the spread follows a sample.
+cdef double MEDIAN = 0.6745
+cdef double SPREAD_RATE = 0.005
+# A jump of y contradicts the model if it changes a Phi by more than this part of its size.
+cdef double OF_SIZE = 0.25
+
+
+cdef double follow_spread(Memory* memory, double b, double expected) noexcept nogil:
+    """
+    Return the size that innovations have: the expected one times the spread, which follows (D 21).
+
+    The spread goes up by a small part of it where |b| is above its median if it were normal, and
+    down by as much where |b| is below. So its size does not matter, and outliers hardly do. A
+    sample that is too far off is counted in `Memory.beyond`.
+    """
+    cdef double usual
+    if fabs(b) > MEDIAN * memory.spread * expected:
+        memory.spread *= 1.0 + SPREAD_RATE
+    else:
+        memory.spread = max(memory.spread / (1.0 + SPREAD_RATE), 1.0)
+    usual = memory.spread * expected
+    if fabs(b) > GATE * usual:
+        memory.beyond += 1.0
+        memory.miss = b
+        if memory.beyond == 1.0:
+            memory.first_miss = b
+        return usual
+    memory.beyond = 0.0
+    if has_drifted(memory, b / usual):
+        memory.beyond = INFINITY
+    return usual
 
 
 cdef inline double beyond(double c) noexcept nogil:
@@ -63,6 +99,38 @@ cdef class Levant(SlidingMode):
             self.ratio[i] = 1.0
             for j in range(n):
                 self.share[j][i] = shares[j, i] if self.predicting else 1.0
+        self.correction_period = configuration.parameters['correction_period']
+        schedule = configuration.schedule
+        if self.scheduled:
+            self.steady_variance = schedule.steady[0, 0] + schedule.variance
+            for i in range(n):
+                self.tuned_over_kalman[i] = schedule.tuned_over_kalman[i]
+                self.next_size[i] = schedule.next_sizes[i]
+                for j in range(n):
+                    self.steady[i][j] = schedule.steady[i, j]
+
+    cdef void restart(self, double y) noexcept nogil:
+        """Begin afresh from `y`; the time of the next sample counts from it."""
+        cdef Memory* memory = &self.memory
+        SlidingMode.restart(self, y)
+        memory.saturated = memory.beyond = memory.offset = memory.watched = 0.0
+        memory.drift = memory.one_sided = 0.0
+        memory.scale = 1.0
+
+    def take_over(self, Structure before):
+        """Go on with the state of an observer that has other live parameters."""
+        cdef Levant other
+        cdef int i, j
+        cdef bint same = isinstance(before, Levant)
+        SlidingMode.take_over(self, before)
+        if same:
+            other = before
+            same = self.scheduled == other.scheduled
+            for i in range(self.levels):
+                for j in range(self.levels):
+                    same = same and self.steady[i][j] == other.steady[i][j]
+        if not same:  # P is of other sizes
+            self.memory.settled = 1.0
 
     cdef void follow(self, double y, double h, const double* u) noexcept nogil:
         """Advance `trial` by the scheme."""
@@ -98,8 +166,6 @@ cdef class Levant(SlidingMode):
         cdef double b, usual, largest = 1.0
         cdef bint far, holds = memory.settled > 0.0 and fabs(h - period) <= NEAR * period
         cdef bint scheduling = self.scheduled and not holds
-        if self.scheduled:
-            memcpy(p, self.covariance, n * sizeof(Row))
         if scheduling:
             if memory.settled > 0.0:
                 memcpy(p, self.steady, n * sizeof(Row))
@@ -249,6 +315,30 @@ cdef class Levant(SlidingMode):
             return b
         return min(max(b, -c * usual), c * usual) * WITHIN / (1.0 - share)
 
+    cdef double innovation_variance(self) noexcept nogil:
+        """Return the variance that the latest innovation was expected to have."""
+        return self.trial_covariance[0][0] + self.noise_variance
+
+    cdef double most_change(self, int i) noexcept nogil:
+        """Return how much Phi_{i+1} may change in a jump of y that it does not contradict."""
+        return OF_SIZE * self.next_size[i]
+
+    cdef void go_on_after_jump(self, double of_state) noexcept nogil:
+        """Let P say that z_1 is not known any more (D 23)."""
+        cdef Memory* memory = &self.memory
+        cdef Row* p = self.trial_covariance
+        cdef int i, n = self.levels
+        if memory.settled > 0.0:
+            memcpy(p, self.steady, n * sizeof(Row))
+            self.correct_trial(1.0)
+            memory.settled = -LONG_AGO
+        else:
+            memcpy(p, self.covariance, n * sizeof(Row))
+        for i in range(n):
+            p[0][i] = p[i][0] = 0.0
+        p[0][0] = memory.miss * memory.miss
+        memcpy(self.covariance, p, n * sizeof(Row))
+
     def solve(self, weights, double b, double gamma):
         """Return |eps|, its power 2 gamma / N and s_N of D 12, for weights h^i lambda_i."""
         cdef double numbers[MOST_LEVELS]
@@ -268,9 +358,3 @@ cdef class Levant(SlidingMode):
     def narrowed(self):
         """By what the limit of the influence of innovations is below the largest one (D 32)."""
         return self.memory.narrowed
-
-    cdef double predicted_y(self, double h, const double* u) noexcept nogil:
-        """Return y after one Euler step of the estimates (D 21)."""
-        cdef double still = 0.0, y = self.memory.y
-        cdef double phi = evaluate(self.prediction.phi, 0, &y, &still, u).value
-        return self.trial[0].z_hat + h * (self.trial[0].z_tilde + phi)

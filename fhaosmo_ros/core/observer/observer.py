@@ -4,6 +4,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+import warnings
 
 from fhaosmo_ros.core.model.inputs import known_inputs_of_run
 from fhaosmo_ros.core.model.triangular import TriangularModel
@@ -15,12 +16,15 @@ from fhaosmo_ros.core.observer.record import run
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import make_from_file
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 HEADROOM = 1e8
 """Samples above the largest double over this are rejected."""
+OF_PAPER = 'lambda', 'alpha', 'fuzzy_widths'
+DEFINING = 'phi', 'gains', *OF_PAPER
+DEFAULTS = OBSERVER_PARAMETERS.defaults()
 
 
 def make_structure(configuration: ObserverConfiguration) -> Any:
@@ -48,6 +52,11 @@ class Observer:
     ConfigurationError
         An unknown name, a bad value, or values that do not fit together.
 
+    Warns
+    -----
+    UserWarning
+        The gains are the default ones, for the paper's plant, and phi is of another plant.
+
     Examples
     --------
     >>> observer = Observer({'order': 2, 'phi': ['0', '-z2'], 'lambda': 15, 'alpha': 30})
@@ -62,6 +71,13 @@ class Observer:
         if not isinstance(parameters, Parameters):
             parameters = ESTIMATOR_PARAMETERS.complete(parameters)
         self.structure = make_structure(ObserverConfiguration(parameters))
+        defaults = {name for name in DEFINING if self.parameters[name] == DEFAULTS[name]}
+        if 'phi' not in defaults and {'gains', *OF_PAPER} <= defaults:
+            warnings.warn(
+                "the default gains are for the paper's plant, and phi is of another one: set "
+                f'gains to self_tuning, or find {", ".join(OF_PAPER)} with the command tune',
+                stacklevel=2,
+            )
         self._t: float | int | None = None
         self._word = 0
 
@@ -111,6 +127,19 @@ class Observer:
     def self_tuning(self) -> bool:
         """True if it finds its gains by itself."""
         return self.configuration.self_tuning
+
+    @property
+    def description(self) -> str:
+        """What runs, in words."""
+        c = self.configuration
+        if c.self_tuning:
+            return 'self-tuning: a bank of Kalman filters'
+        structure = 'Levant' if c.levant else 'super-twisting cascade'
+        power = 'adaptive power' if c.adaptive and c.parameters['gamma_rate'] > 0.0 else 'power'
+        return (
+            f'{structure}, {"sign" if c.is_sign else "fuzzy"}, '
+            f'{power} {c.gamma_initial:g}, {c.parameters["scheme"]}'
+        )
 
     @property
     def model(self) -> TriangularModel:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the two structures with fixed gains share: psi, the law of gamma, scheduled gains."""
+"""What the two structures with fixed gains share: psi, the law of gamma, and the start."""
 
 from fhaosmo_ros.core.model.phi cimport Dual
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.kalman cimport LinearModel, Row
-from fhaosmo_ros.core.observer.structure cimport Level, Memory, Structure
+from fhaosmo_ros.core.observer.structure cimport Level, Structure
 
 
 # Seconds since the start where it does not matter when it was (D 20).
@@ -14,8 +14,6 @@ cdef int NEWTON_STEPS
 cdef double NEWTON_TOLERANCE
 # Innovations below this are taken for 0: their powers would underflow.
 cdef double TINY
-# Innovations of more standard deviations count as so many, at most (D 32).
-cdef double HUBER
 
 
 cdef struct Gains:
@@ -30,38 +28,28 @@ cdef class SlidingMode(Structure):
     cdef readonly bint is_sign  # psi is sign
     cdef readonly bint adaptive  # gamma adapts
     cdef readonly bint sensitive  # sensitivities are carried along
-    cdef readonly bint scheduled  # gains follow P at first and after gaps (D 20)
+    cdef readonly bint scheduled  # gains follow P at first; with levant also after gaps (D 20)
     cdef Gains gains[MOST_LEVELS]
     cdef double* curves  # psi of each level at `knots` points of [0, half-width]
     cdef int knots
     cdef Level first[MOST_LEVELS]  # levels of a fresh observer
     cdef double gamma_initial, gamma_rate, gamma_min, gamma_max  # law of gamma (D 7)
     cdef double dead_zone  # no adaptation while sqrt(L) is smaller (D 8, unit of y)
-    cdef double leakage  # of gamma (1/s), after a wait of leakage_delay (s)
-    cdef double leakage_delay
-    cdef double correction_period  # interval that the gains are tuned for (s); 0: any
+    cdef double leakage  # of gamma, towards gamma_initial (1/s)
     # For scheduled gains (D 20).
     cdef LinearModel linear
     cdef double noise_variance  # of the noise on y
-    cdef double steady_variance  # of the innovations once P is steady
-    cdef Row steady[MOST_LEVELS]  # P of the predictions then
     cdef Row fresh[MOST_LEVELS]  # P of a fresh observer
-    cdef double tuned_over_kalman[MOST_LEVELS]  # corrections of a small innovation
-    cdef double next_size[MOST_LEVELS]  # sizes of z_2 .. z_n, d
     cdef void follow(self, double y, double h, const double* u) noexcept nogil
-    cdef double predicted_y(self, double h, const double* u) noexcept nogil
-    cdef void hand_over(self, const double* u) noexcept nogil
-    cdef void predict_trial(self, double h, const double* u) noexcept nogil
     cdef int adapt(self, double h) noexcept nogil
-    cdef void begin_estimates(self, double y, double h, const double* u) noexcept nogil
     cdef void fit(self) noexcept
     cdef void forget_sensitivities(self) noexcept
+    cdef void predict_trial(self, double h, const double* u) noexcept nogil
     cdef double bandwidth(self, double h) noexcept nogil
     cdef void correct_trial(self, double doubt) noexcept nogil
 
 
 cdef double doubt_of_noise(double age, double speed) noexcept nogil
-cdef double follow_spread(Memory* memory, double b, double expected) noexcept nogil
 
 
 cdef inline Dual psi(SlidingMode law, int i, double a) noexcept nogil:

@@ -42,9 +42,6 @@ cdef struct Memory:
     double drift  # sum of the recent prediction errors over their usual size, while watched
     # What those with fixed gains remember.
     double gamma  # adaptive power
-    double wait  # time for which innovations have yet to stay small before gamma leaks (s)
-    double upset  # time for which gamma has yet to rest after |eps_1| > w_1 (D 8, s)
-    double usual  # running median of sqrt(L) (D 8, unit of y)
     double scale  # factor s of the half-widths and of the injections (D 22)
     double saturated  # samples in a row with |eps_1| beyond all half-widths (D 22)
     double settled  # 1: the gains are the tuned ones; else minus the time since the start (D 20)

@@ -34,9 +34,7 @@ cdef double MOST_DRIFT = 35.0
 cdef double MUCH_SMALLER = 0.5
 # No number of a snapshot is larger, and these are not negative.
 cdef double LARGEST = 1.8e300
-POSITIVE = (
-    'pending', 'period', 'beyond', 'watched', 'wait', 'upset', 'usual', 'saturated', 'narrowed'
-)
+POSITIVE = 'pending', 'period', 'beyond', 'watched', 'saturated', 'narrowed'
 
 
 cdef bint has_drifted(Memory* memory, double off) noexcept nogil:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a parameter is: declared once, checked everywhere by the same rules."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 import difflib
 import math
@@ -54,8 +54,6 @@ class Parameter:
         False where it can't change in a running node (read-only in ROS).
     lengths : str
         Allowed numbers of values of a list, in words, for the documentation.
-    choose : callable or None
-        Takes the values that are given and returns the default, where that depends on them.
 
     """
 
@@ -69,7 +67,6 @@ class Parameter:
     choices: tuple[str, ...] = ()
     live: bool = True
     lengths: str = ''
-    choose: Callable[[Mapping[str, Any]], Value] | None = None
 
     @property
     def kind(self) -> str:
@@ -224,14 +221,12 @@ class ParameterTable(Mapping[str, Parameter]):
     def __len__(self) -> int:
         return len(self._by_name)
 
-    def defaults(self, given: 'Mapping[str, Any] | None' = None) -> dict[str, Any]:
-        """Return a fresh dictionary of the defaults, where these values are `given`."""
-        found: dict[str, Any] = {
+    def defaults(self) -> dict[str, Any]:
+        """Return a fresh dictionary of the defaults."""
+        return {
             p.name: list(p.default) if isinstance(p.default, list) else p.default
             for p in self.values()
         }
-        chosen = {p.name: p.choose(given or {}) for p in self.values() if p.choose}
-        return found | chosen
 
     def complete(self, values: 'Mapping[str, Any] | None' = None) -> 'Parameters':
         """
@@ -284,7 +279,7 @@ class Parameters(Mapping[str, Any]):
 
     def __init__(self, table: ParameterTable, checked: Mapping[str, Any]) -> None:
         self.table = table
-        self._values = table.defaults(checked) | dict(checked)
+        self._values = table.defaults() | dict(checked)
 
     def __getitem__(self, name: str) -> Any:
         return self._values[name]

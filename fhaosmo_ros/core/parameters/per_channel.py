@@ -96,20 +96,13 @@ def with_channels(
     common += [declared[name] for name in values if name.startswith(CONSTANTS)]
     common += declared.families
     own = [
-        replace(p, name=f'{name}.{p.name}', default=_own_default(p, name, values), choose=None)
+        replace(p, name=f'{name}.{p.name}', default=values.get(p.name, p.default))
         for name in names
         if name
         for p in common
     ]
     families = table.families if isinstance(table, ParameterTable) else ()
     return ParameterTable(table.values(), families, own)
-
-
-def _own_default(p: Parameter, name: str, values: Mapping[str, Any]) -> Any:
-    """Return what a channel's own parameter defaults to: the common value."""
-    if p.choose and p.name not in values:
-        return p.choose(of_channel(values, name))
-    return values.get(p.name, p.default)
 
 
 @overload

@@ -3,6 +3,9 @@
 
 REMOVED = {
     'fuzzy_growth': "leave it out: 'predict_correct' has it wherever 'gamma_initial' is below 0.5",
+    'fuzzy_shape': "name the shape in 'fuzzy_systems', such as 'terms gaussian 5'",
+    'fuzzy_normalise': "leave it out: psi always ends at +-1; scale 'lambda' and 'alpha' instead",
+    'gamma_leakage_delay': "leave it out: 'gamma_leakage' acts within the dead zone",
     'disturbance_phase': 'leave it out: waves of d begin at their offset',
     'disturbance_omega_end': "leave it out: a chirp ends at ten times 'disturbance_omega'",
     'disturbance_sweep_time': 'leave it out: a chirp sweeps for 20 s',

@@ -5,29 +5,12 @@ Every parameter of the package, declared once.
 YAML checks, ROS descriptors, docs/parameters.md and error messages derive from these tables.
 """
 
-from collections.abc import Mapping
-from typing import Any
-
 from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
 
 MAX_ORDER = 12
 CONSTANTS = 'constants.'
 """Begin of the names of constants in expressions."""
 PER_LEVEL = '1 (used for every level) or one a level'
-
-SELF_TUNING_USES = {
-    'order', 'phi', 'inputs', 'unknown_input', 'gains', 'bandwidth', 'tuning_memory',
-    'prediction_step', 'noise_size', 'state_sizes', 'start_from_measurement',
-}  # fmt: skip
-"""Of the observer's parameters; the others, but for constants, belong to fixed gains."""
-
-
-def choose_gains(given: Mapping[str, Any]) -> str:
-    """Return the default of gains: self_tuning where only a model of the user's is given."""
-    of_fixed_gains = OBSERVER_PARAMETERS.keys() - SELF_TUNING_USES
-    only_model = 'phi' in given and of_fixed_gains.isdisjoint(given)
-    return 'self_tuning' if only_model and given.get('unknown_input', True) else 'fixed'
-
 
 MODEL = (
     Parameter(
@@ -80,10 +63,9 @@ OBSERVER = (
         'gains', 'fixed',
         'fixed: those below. self_tuning: none; many observers run side by side and are weighted '
         'by how well they predict y, so that noise, size and speed of d are found and followed. '
-        'Of the parameters from structure to gamma_leakage_delay it uses prediction_step, '
-        'noise_size and state_sizes alone. The default is self_tuning where phi is given and no '
-        'parameter that belongs to fixed gains alone.',
-        choices=('fixed', 'self_tuning'), live=False, choose=choose_gains,
+        'Of the parameters from structure to gamma_leakage it uses prediction_step alone. The '
+        "default gains are for the default phi, that of the paper's plant.",
+        choices=('fixed', 'self_tuning'), live=False,
     ),
     Parameter(
         'bandwidth', 1.0,
@@ -132,18 +114,16 @@ OBSERVER = (
     ),
     Parameter(
         'noise_size', 0.0,
-        'Standard deviation of the noise on y. With it, and with a correction_period, '
-        'predict_correct knows how sure it is: at the start, and where samples come at another '
-        'rate, the gains are those of a Kalman filter; unlikely samples are rejected, and y that '
-        'stays unlikely counts as lost. self_tuning: the least that the noise is taken for. '
-        '0: not known.',
+        'Standard deviation of the noise on y. With it cascade starts as a Kalman filter does. '
+        'predict_correct, if correction_period is given, too, knows how sure it is: at the start, '
+        'and where samples come at another rate, the gains are those of a Kalman filter; unlikely '
+        'samples are rejected, and y that stays unlikely counts as lost. 0: not known.',
         lower=0.0, upper=1e12,
     ),
     Parameter(
         'state_sizes', [0.0],
         'RMS values of z_1 .. z_n in usual operation: how far off a fresh observer may be. Used '
-        'with noise_size, and by self_tuning. 0: not known; self_tuning takes them from the '
-        'first samples, fixed gains from size and rate of d.',
+        'with noise_size. 0: what size and rate of d make of them.',
         lower=0.0, upper=1e100, lengths='1 (used for every state) or n',
     ),
     Parameter(
@@ -188,16 +168,6 @@ OBSERVER = (
         lengths='1 to N; the last one serves the levels that follow',
     ),
     Parameter(
-        'fuzzy_shape', 'triangle',
-        'Shape of the membership functions where fuzzy_systems names none.',
-        choices=('triangle', 'trapezoid', 'gaussian'),
-    ),
-    Parameter(
-        'fuzzy_normalise', True,
-        'Scale psi to saturate at +-1 as sign does. A centroid alone saturates at about 0.83 '
-        '(5 terms), which silently cuts every gain.',
-    ),
-    Parameter(
         'gamma_initial', 0.67, 'Power gamma at the start of an adaptive variant.',
         lower=0.0, lower_open=True, upper=1.0,
     ),
@@ -215,22 +185,14 @@ OBSERVER = (
     Parameter(
         'gamma_dead_zone', 0.006,
         'Adaptation rests while the norm of the innovations is at most this (their unit; set it '
-        'below the norm at which the estimate has become good enough); with noise_size, '
-        'also while it is at most three times its running median. 0: it never rests.',
+        'below the norm at which the estimate has become good enough). 0: it never rests.',
         lower=0.0, upper=1e12,
     ),
     Parameter(
-        'gamma_leakage', 0.05,
-        'Rate that draws gamma back to gamma_initial once the innovations have stayed within the '
-        'dead zone for gamma_leakage_delay; without a dead zone always. 0 for none.',
+        'gamma_leakage', 0.01,
+        'Rate at which gamma goes back to gamma_initial within the dead zone (without one: '
+        'always). 0 for none.',
         unit='1/s', lower=0.0, upper=1e3,
-    ),
-    Parameter(
-        'gamma_leakage_delay', 5.0,
-        'Leakage waits for this time after innovations beyond the dead zone, and adaptation for '
-        'this time after an innovation of y beyond its half-width. Not used where the dead zone '
-        'is 0.',
-        unit='s', lower=0.0, upper=1e6,
     ),
     Parameter(
         'initial_estimate', [0.0], 'Filtered estimates z_hat_1 .. z_hat_N at the start.',

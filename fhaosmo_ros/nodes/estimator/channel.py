@@ -14,7 +14,7 @@ from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.inputs import known_inputs, make_pairing, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
 from fhaosmo_ros.nodes.estimator.listener import Listener
-from fhaosmo_ros.nodes.estimator.outputs import EventOutput, Outputs, TuningOutputs
+from fhaosmo_ros.nodes.estimator.outputs import EventOutput, Outputs
 from fhaosmo_ros.nodes.estimator.snapshots import SnapshotPublisher
 from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import Output
@@ -83,10 +83,7 @@ class Channel:
         self._lost_before = 0
         self._forget()
         observer = self.estimator.observer
-        self._outputs = Outputs(node, outputs, observer.order, observer.levels)
-        self._tuning: TuningOutputs | None = None
-        if observer.self_tuning:
-            self._tuning = TuningOutputs(node, outputs, observer.order)
+        self._outputs = Outputs(node, outputs, observer)
         self._events = EventOutput(node, outputs, name)
         self._snapshots = SnapshotPublisher(node, self.estimator, outputs)
         simulated = node.get_parameter('use_sim_time').value
@@ -119,12 +116,9 @@ class Channel:
         if self.estimator.events.on:
             self._events.say('no event yet', self._values['hardware_id'])
         observer = self.estimator.observer
-        parameters, kind = observer.parameters, 'self-tuning'
-        if not observer.self_tuning:
-            kind = f'{parameters["variant"]}, {parameters["scheme"]}'
         self._logger.info(
             f'estimating {observer.order} states and the unknown input from '
-            f'{self._y.source.topic} ({kind})'
+            f'{self._y.source.topic} ({observer.description})'
         )
 
     def deactivate(self) -> None:
@@ -138,8 +132,6 @@ class Channel:
             destroy(entity)
         self._owned = []
         self._outputs.destroy()
-        if self._tuning is not None:
-            self._tuning.destroy()
         self._events.destroy()
         self._snapshots.destroy()
 
@@ -325,9 +317,7 @@ class Channel:
         if estimate is None:
             return None
         stamp = estimator.stamp
-        self._outputs.publish(estimate, stamp)
-        if self._tuning is not None:
-            self._tuning.publish(estimator)
+        self._outputs.publish(estimator, estimate, stamp)
         return Output(self.label, stamp, estimate, self._values)
 
     @property

@@ -31,7 +31,7 @@ from fhaosmo_ros.nodes.middleware.publishers import check_overrides
 from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
 from fhaosmo_ros.nodes.middleware.spin import run_node
 from fhaosmo_ros.nodes.middleware.subscription import input_qos
-from fhaosmo_ros.topics import estimates_of
+from fhaosmo_ros.topics import estimates_of, EVENT
 from rclpy.parameter import Parameter as RosParameter
 
 
@@ -104,7 +104,7 @@ class EstimatorNode(ManagedNode):
             [
                 f'~/{name}/{topic}' if name else f'~/{topic}'
                 for name in names
-                for topic in estimates_of(of_channel(values, name))
+                for topic in [*estimates_of(of_channel(values, name)), EVENT]
             ],
         )
         estimators = make_estimators(values, names)

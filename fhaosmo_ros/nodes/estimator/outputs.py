@@ -1,26 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """The topics on which a channel publishes its estimates."""
 
-from collections.abc import Mapping
-
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
+from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
 from fhaosmo_ros.nodes.middleware.publishers import create_publisher, listeners_of
-from fhaosmo_ros.topics import DIAGNOSTICS, ESTIMATES, EVENT, SELF_TUNED
-import numpy as np
+from fhaosmo_ros.topics import DIAGNOSTICS, estimates_of, EVENT, STANDARD_DEVIATION
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
 EVENTS_KEPT = 10
 
 
-class Publishers:
+class Outputs:
     """
-    Publishers of some topics, each with ROS' parameters qos_overrides./TOPIC.publisher.POLICY.
+    Publishers of the estimates, each with ROS' parameters qos_overrides./TOPIC.publisher.POLICY.
 
     What nobody listens to is not made: a message costs as much as a step with fixed gains.
 
@@ -29,87 +27,43 @@ class Publishers:
     node : Node
     prefix : str
         Prefix of the topics' names.
-    kinds : mapping of str to str
-        Their message types.
+    observer : Observer
 
     """
 
-    def __init__(self, node: Node, prefix: str, kinds: Mapping[str, str]) -> None:
+    def __init__(self, node: Node, prefix: str, observer: Observer) -> None:
         self._node = node
+        kinds = estimates_of(observer.parameters)
         self._publishers = [
             create_publisher(node, message_class(kind), prefix + name)
             for name, kind in kinds.items()
         ]
-        self._listeners = [listeners_of(publisher) for publisher in self._publishers]
+        listeners = [listeners_of(publisher) for publisher in self._publishers]
+        self._topics = list(zip(kinds, self._publishers, listeners, strict=True))
+        states = [f'z{i + 1}' for i in range(observer.order)]
+        self._state, self._tuning = labelled(states), labelled(TUNING)
+        self._deviation = labelled([*states, 'd'])
+        self._innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
+
+    def publish(self, estimator: OnlineEstimator, estimate: Estimate, stamp: int) -> None:
+        """Publish an estimate and, last, the stamp of its sample in nanoseconds."""
+        messages = {
+            'gamma': lambda: Float64(data=estimate.gamma),
+            STANDARD_DEVIATION: lambda: self._deviation(estimator.standard_deviation),
+            'tuning': lambda: self._tuning(estimator.observer.structure.found),
+            'state': lambda: self._state(estimate.z),
+            'unknown_input': lambda: Float64(data=estimate.unknown_input),
+            'innovation': lambda: self._innovation(estimate.innovation),
+            'stamp': lambda: time_message(stamp),
+        }
+        for name, publisher, listeners in self._topics:
+            if listeners():
+                publisher.publish(messages[name]())
 
     def destroy(self) -> None:
         """Take the publishers away."""
         while self._publishers:
             self._node.destroy_publisher(self._publishers.pop())
-
-
-class Outputs(Publishers):
-    """
-    Publishers of the estimates.
-
-    Parameters
-    ----------
-    node : Node
-    prefix : str
-        Prefix of the topics' names.
-    order, levels : int
-        Numbers of states and of innovations.
-
-    """
-
-    def __init__(self, node: Node, prefix: str, order: int, levels: int) -> None:
-        super().__init__(node, prefix, ESTIMATES)
-        self._state = labelled([f'z{i + 1}' for i in range(order)])
-        self._innovation = labelled([f'eps{i + 1}' for i in range(levels)])
-
-    def publish(self, estimate: Estimate, stamp: int) -> None:
-        """Publish an estimate and, last, the stamp of its sample in nanoseconds."""
-        messages = {
-            'state': lambda: self._state(estimate.z),
-            'unknown_input': lambda: Float64(data=estimate.unknown_input),
-            'gamma': lambda: Float64(data=estimate.gamma),
-            'innovation': lambda: self._innovation(estimate.innovation),
-            'stamp': lambda: time_message(stamp),
-        }
-        for publisher, listeners, name in zip(
-            self._publishers, self._listeners, ESTIMATES, strict=True
-        ):
-            if listeners():
-                publisher.publish(messages[name]())
-
-
-class TuningOutputs(Publishers):
-    """
-    Publishers of what a self-tuning observer knows beside its estimates.
-
-    Parameters
-    ----------
-    node : Node
-    prefix : str
-        Prefix of the topics' names.
-    order : int
-        Number of states.
-
-    """
-
-    def __init__(self, node: Node, prefix: str, order: int) -> None:
-        super().__init__(node, prefix, SELF_TUNED)
-        self._deviation = labelled([*(f'z{i + 1}' for i in range(order)), 'd'])
-        self._tuning = labelled(TUNING)
-
-    def publish(self, estimator: OnlineEstimator) -> None:
-        """Publish the standard deviations of the latest estimate, and the tuning at its sample."""
-        (deviation, tuning), (of_deviation, of_tuning) = self._publishers, self._listeners
-        if of_deviation():
-            deviation.publish(self._deviation(estimator.standard_deviation))
-        if of_tuning():
-            noise, correlation, bandwidth, shares = estimator.tuning
-            tuning.publish(self._tuning(np.array([noise, correlation, bandwidth, *shares])))
 
 
 class EventOutput:

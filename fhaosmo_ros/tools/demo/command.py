@@ -9,6 +9,7 @@ from pathlib import Path
 import time
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, TopicRecorder
@@ -20,17 +21,16 @@ from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.cli.processes import Children
 from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.cli.share import shipped
-from fhaosmo_ros.tools.demo.figure import save_run
-from fhaosmo_ros.tools.demo.report import read_run, table
+from fhaosmo_ros.tools.demo.figure import save_figure
+from fhaosmo_ros.tools.demo.report import others, read_run, table
 from fhaosmo_ros.topics import (
     ARRAY,
     DIAGNOSTICS,
-    ESTIMATES,
+    estimates_of,
     EVENT,
     FLOAT,
     OF_ALL_NODES,
     PARAMETERS,
-    SELF_TUNED,
     SNAPSHOT,
     TEXT,
     TRUTH,
@@ -38,15 +38,12 @@ from fhaosmo_ros.topics import (
 
 START_DEADLINE = 60.0
 """Seconds for a node to appear; it takes one or two where nothing else runs."""
-CHANGES = (
-    (1.0 / 3.0, 'the noise on y is ten times larger', {'noise_std': 1e-2}),
-    (2.0 / 3.0, 'd is three times faster', {'disturbance_omega': 3.0}),
-)
-"""What happens to the plant of the shipped file: part of the duration, words, parameters."""
+NOISE = 2.0 / 3.0, 'now with noise of 1e-4 on y', {'noise_std': 1e-4}
+"""What happens to the plant of the shipped files: part of the duration, words, parameters."""
 
 
 class Plan(NamedTuple):
-    """Duration of a run in seconds, and what changes in it, as `CHANGES`."""
+    """Duration of a run in seconds, and what changes in it, as `NOISE`."""
 
     duration: float
     changes: Sequence[tuple[float, str, Mapping[str, Any]]]
@@ -54,11 +51,11 @@ class Plan(NamedTuple):
 
 def topics_of(estimator: Mapping[str, Any]) -> list[ExpectedTopic]:
     """Return what is recorded, by the parameters of the estimator."""
-    tuned = SELF_TUNED if estimator.get('gains') == 'self_tuning' else {}
+    estimates = estimates_of({'gains': 'fixed', **estimator})
     return [
         ExpectedTopic('/y', FLOAT),
         *(ExpectedTopic(f'/plant/{name}', kind) for name, kind in TRUTH.items()),
-        *(ExpectedTopic(f'/estimator/{name}', kind) for name, kind in (ESTIMATES | tuned).items()),
+        *(ExpectedTopic(f'/estimator/{name}', kind) for name, kind in estimates.items()),
         ExpectedTopic(f'/estimator/{EVENT}', DIAGNOSTICS, transient_local=True),
         ExpectedTopic(f'/estimator/{SNAPSHOT}', ARRAY, transient_local=True),
         ExpectedTopic(f'/estimator/{PARAMETERS}', TEXT, transient_local=True),
@@ -94,12 +91,18 @@ def _parser() -> argparse.ArgumentParser:
         help='new or empty folder for bag and figure (default: demo_output/TIME)',
     )
     parser.add_argument('--force', action='store_true', help='replace an output that exists')
-    parser.add_argument(
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
         '--params-file',
         type=Path,
         metavar='FILE',
-        help='parameters of both nodes (default: the shipped config/self_tuning.yaml, with a '
-        'plant that changes)',
+        help='parameters of both nodes (default: the shipped config/demo.yaml, with noise on y in '
+        'the last third)',
+    )
+    which.add_argument(
+        '--self-tuning',
+        action='store_true',
+        help="the second engine instead of the paper's observer (config/self_tuning.yaml)",
     )
     return parser
 
@@ -109,10 +112,12 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         raise ConfigurationError(
             f'--duration: expected 1 to 3600 seconds, got {arguments.duration:g}'
         )
-    parameters = arguments.params_file or shipped('config/self_tuning.yaml')
+    name = 'self_tuning' if arguments.self_tuning else 'demo'
+    parameters = arguments.params_file or shipped(f'config/{name}.yaml')
     load(parameters, 'plant')
-    topics = topics_of(load(parameters, 'estimator'))
-    changes = () if arguments.params_file else CHANGES
+    estimator = load(parameters, 'estimator')
+    Observer(estimator)
+    changes = () if arguments.params_file else (NOISE,)
     _keep_to_this_host()
     print(
         f'plant and estimator with {parameters}, on this host only, '
@@ -122,12 +127,13 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         folder = output.path
         folder.mkdir()
         plan = Plan(arguments.duration, changes)
-        marks = _record(folder, parameters, topics, plan, stop)
+        marks = _record(folder, parameters, topics_of(estimator), plan, stop)
         if stop.is_set():
             print('stopped early: reporting what has been recorded')
         run = read_run(folder / 'bag')
-        save_run(run, folder / 'demo.png', marks)
-        text = table(run)
+        compared = others(run, estimator)
+        save_figure(run, compared, marks, folder / 'demo.png')
+        text = table(run, compared, marks)
         (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
         print(f'\n{text}\n')
         final = output.keep()

@@ -1,75 +1,85 @@
 # SPDX-License-Identifier: Apache-2.0
 """The figure of a demonstration."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from fhaosmo_ros.tools.demo.report import Run
-from fhaosmo_ros.tools.plot.figures import draw_band, TRUTH
+from fhaosmo_ros.tools.demo.report import Floats, Run, SELF_TUNING, START, true_noise
+from fhaosmo_ros.tools.plot.figures import COLOURS, draw_band, TRUTH
+from fhaosmo_ros.topics import STANDARD_DEVIATION
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
 
-ESTIMATE = {'color': '#D55E00', 'linewidth': 1.1, 'linestyle': '--', 'label': 'estimated'}
-"""Vermilion of the Okabe-Ito palette, dashed so that grey print tells it from the truth."""
+LIVE = {'color': COLOURS[0], 'linewidth': 1.1, 'linestyle': '--'}
+"""Of the live estimate; dashed, so that grey print tells it from the truth."""
 
 
-def draw_comparison(
-    axes: Axes, t: NDArray[np.float64], truth: NDArray[np.float64], estimate: NDArray[np.float64]
+def save_figure(
+    run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, str]], path: Path
 ) -> None:
-    """Draw an estimate over the truth; the limits fit the truth and what follows the transient."""
-    axes.plot(t, truth, **TRUTH)
-    axes.plot(t, estimate, **ESTIMATE)
-    late = t >= 0.1 * t[-1]
-    low = min(np.nanmin(truth), estimate[late].min())
-    high = max(np.nanmax(truth), estimate[late].max())
-    margin = 0.15 * (high - low) or 1.0
-    axes.set_ylim(low - margin, high + margin)
-    axes.grid(alpha=0.3)
-
-
-def save_run(run: Run, path: Path, marks: Sequence[tuple[int, str]] = ()) -> None:
     """
-    Write a figure of a run: states, d, and the noise found or gamma over time.
+    Write a figure: states, d, what the other observers make of d, and the power or the noise.
 
     Parameters
     ----------
-    run : Run
+    run, compared, marks
+        As for `table`.
     path : path
-    marks : sequence of (int, str)
-        What happened to the plant: stamps (ns), and words.
 
     """
-    rows = len(run.names) + 1
-    figure = Figure(figsize=(8.0, 1.6 * rows + 0.6), layout='constrained')
-    axes = figure.subplots(rows, 1, sharex=True)
-    for column, name in enumerate(run.names):
-        truth, estimate = run.truth[:, column], run.estimate[:, column]
-        draw_comparison(axes[column], run.t, truth, estimate)
-        if run.tuned is not None:
-            draw_band(axes[column], run.t, estimate, run.tuned.deviation[:, column])
-        axes[column].set_ylabel('unknown\ninput d' if name == 'd' else name)
-    if run.tuned is None:
-        axes[-1].plot(run.t, run.gamma, color='black', linewidth=1.2)
-        axes[-1].set_ylabel('power γ')
+    rows = [*run.names, *(['compared'] if compared else []), 'last']
+    figure = Figure(figsize=(8.0, 1.5 * len(rows) + 0.8), layout='constrained')
+    axes = dict(zip(rows, figure.subplots(len(rows), 1, sharex=True), strict=True))
+    for k, name in enumerate(run.names):
+        axes[name].plot(run.t, run.truth[:, k], **TRUTH)
+        axes[name].plot(run.t, run.estimate[:, k], label='estimated live', **LIVE)
+        if STANDARD_DEVIATION in run.of_gains:
+            deviation = run.of_gains[STANDARD_DEVIATION][:, k]
+            draw_band(axes[name], run.t, run.estimate[:, k], deviation)
+        _fit(axes[name], [run.truth[:, k], run.estimate[run.t >= START, k]])
+        axes[name].set_ylabel('unknown\ninput d' if name == 'd' else name)
+    handles, labels = axes['d'].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside upper center', ncols=3)
+    if compared:
+        row = axes['compared']
+        d = run.truth[:, -1]
+        shown = {name: e for name, e in compared.items() if name != SELF_TUNING}
+        for colour, (name, estimate) in zip(('#999999', '#009E73'), shown.items(), strict=True):
+            row.plot(run.t, estimate - d, color=colour, linewidth=0.8, label=name)
+        row.plot(run.t, run.estimate[:, -1] - d, label='live: the power adapts', **LIVE)
+        size = 1.5 * float(np.abs(d).max())
+        row.set_ylim(-size, size)
+        row.set_ylabel('error of d')
+        row.legend(loc='upper right', ncols=3, fontsize='x-small')
+    last = axes['last']
+    if 'gamma' in run.of_gains:
+        gamma = run.of_gains['gamma']
+        last.plot(run.t, gamma, color='black', linewidth=1.2)
+        last.axhline(gamma[0], color='black', linewidth=0.8, linestyle=':')
+        last.set_ylabel('power γ')
     else:
-        axes[-1].plot(run.t, run.tuned.true_noise, **TRUTH)
-        axes[-1].plot(run.t, run.tuned.noise, **ESTIMATE)
-        axes[-1].set_yscale('log')
-        axes[-1].set_ylabel('noise on y\n(standard dev.)')
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside lower center', ncols=3)
+        last.plot(run.t, true_noise(run), **TRUTH)
+        last.plot(run.t, run.of_gains['tuning'][:, 0], **LIVE)
+        last.set_yscale('log')
+        last.set_ylabel('noise on y')
     for stamp, words in marks:
-        t = (stamp - run.origin) * 1e-9
-        for row in axes:
+        t = (stamp - run.y.stamps[run.rows[0]]) * 1e-9
+        for row in axes.values():
             row.axvline(t, color='black', linewidth=0.8, linestyle=':')
-        axes[-2].annotate(
+        axes['d'].annotate(
             words, (t, 1.0), (3, -3), xycoords=('data', 'axes fraction'), va='top',
             textcoords='offset points', fontsize='small',
         )  # fmt: skip
-    axes[-1].grid(alpha=0.3)
-    axes[-1].set_xlabel('time since the first estimate [s]')
-    axes[-1].set_xlim(run.t[0], run.t[-1])
-    figure.suptitle('States and unknown input, estimated live from y = z1')
+    for row in axes.values():
+        row.grid(alpha=0.3)
+    last.set_xlabel('time since the first estimate [s]')
+    last.set_xlim(run.t[0], run.t[-1])
     figure.savefig(path, dpi=150)
+
+
+def _fit(axes: Axes, curves: Sequence[Floats]) -> None:
+    """Fit the picture to curves, and let what is beyond them leave it."""
+    low, high = np.nanmin(np.concatenate(curves)), np.nanmax(np.concatenate(curves))
+    margin = 0.15 * (high - low) or 1.0
+    axes.set_ylim(low - margin, high + margin)

@@ -1,44 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The truth and the estimates in a recorded run of plant and estimator, and a table of errors."""
+"""A recorded run of plant and estimator beside the truth, and a table of errors."""
 
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.simulation.metrics import chatter, rms, settling_time
+from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import messages, read_ticks, series, truth_at
-from fhaosmo_ros.topics import ESTIMATES, SELF_TUNED, STANDARD_DEVIATION
+from fhaosmo_ros.tools.bags.topics import messages, read_ticks, Series, series, truth_at
+from fhaosmo_ros.topics import ESTIMATES, OF_GAINS, STANDARD_DEVIATION
 import numpy as np
 from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
+START = 2.0
+"""Seconds of the start that the table leaves out."""
 RECENT = 50
 """Estimates over which the true noise is averaged."""
-SETTLED = 1.0
-"""Seconds of the start that do not count for the share of the band."""
-BAND = 0.1
-"""Half-width of the settling band, as a fraction of the range of the truth."""
-
-
-class Tuned(NamedTuple):
-    """
-    What a self-tuning estimator knows beside its estimates, and the noise that there was.
-
-    Attributes
-    ----------
-    deviation : (K, n + 1) array
-        Standard deviations of the estimates; infinite while they are not known.
-    noise, true_noise : (K,) arrays
-        Standard deviation of the noise on y that it has found, and that of the latest samples.
-    bandwidth : (K,) array
-        How fast d is followed, in rad/s.
-
-    """
-
-    deviation: NDArray[np.float64]
-    noise: NDArray[np.float64]
-    true_noise: NDArray[np.float64]
-    bandwidth: NDArray[np.float64]
+SELF_TUNING, HELD = 'self-tuning', 'fuzzy, the power held'
+OTHERS: dict[str, dict[str, Any]] = {
+    'sign, gains of the paper': {
+        'variant': 'sign',
+        'scheme': 'explicit',
+        'lambda': [15.0],
+        'alpha': [30.0],
+        'epsilon': 0.025,
+        'noise_size': 0.0,
+    },
+    HELD: {'gamma_rate': 0.0, 'gamma_leakage': 0.0},
+    SELF_TUNING: {'gains': 'self_tuning'},
+}
+"""Observers that go through the same y: how their parameters differ from those of the file."""
+WORDS = """
+Error: RMS of the estimate of d minus d. Chatter: how much further the estimate moves than d does
+(1: no chatter). The first observer ran live; the others went through the same y afterwards, by
+the same code. Self-tuning is not the paper's observer: it is a bank of Kalman filters that is told
+the model alone.
+"""
 
 
 class Run(NamedTuple):
@@ -53,27 +54,25 @@ class Run(NamedTuple):
         z1 .. zn and d.
     truth, estimate : (K, n + 1) arrays
         States, and the unknown input as the last column.
-    gamma : (K,) array
-    sample_rate : float
-        Samples of y a second, as published.
+    of_gains : dict of str to array
+        What the estimator publishes by its gains: gamma, or standard_deviation and tuning.
+    y : Series
+        All samples.
+    rows : (K,) array of int
+        The sample behind each estimate.
     counters : dict of str to str
         What the estimator reported last in its diagnostics.
-    origin : int
-        Stamp of the first estimate, in nanoseconds.
-    tuned : Tuned or None
-        Of a self-tuning estimator.
 
     """
 
-    t: NDArray[np.float64]
+    t: Floats
     names: list[str]
-    truth: NDArray[np.float64]
-    estimate: NDArray[np.float64]
-    gamma: NDArray[np.float64]
-    sample_rate: float
+    truth: Floats
+    estimate: Floats
+    of_gains: dict[str, Floats]
+    y: Series
+    rows: NDArray[np.int64]
     counters: dict[str, str]
-    origin: int
-    tuned: Tuned | None
 
 
 def read_run(bag: Path, plant: str = '/plant', estimator: str = '/estimator') -> Run:
@@ -91,81 +90,118 @@ def read_run(bag: Path, plant: str = '/plant', estimator: str = '/estimator') ->
     """
     y = series(bag, '/y')
     with BagReader(bag) as reader:
-        tuned = all(reader.count(f'{estimator}/{part}') for part in SELF_TUNED)
-    ticks = read_ticks(bag, estimator, [*(SELF_TUNED if tuned else {}), *ESTIMATES])
+        found = [
+            topic for topics in OF_GAINS.values() for topic in topics
+            if reader.count(f'{estimator}/{topic}')
+        ]  # fmt: skip
+    ticks = read_ticks(bag, estimator, [*found, *ESTIMATES])
     when = ticks['stamp'].astype(np.int64)
     truth = truth_at(bag, plant, when) if len(when) else None
     if truth is None or not truth.known.any():
         raise ConfigurationError('the run ended before an estimate arrived beside its truth')
     known = truth.known
-    estimate = np.column_stack([ticks['state'], ticks['unknown_input']])[known]
-    t = (when[known] - when[known][0]) * 1e-9
-    span = (y.stamps[-1] - y.stamps[0]) * 1e-9
-    rate = (len(y.stamps) - 1) / span if span > 0.0 else float('nan')
-    names = [*truth.labels, 'd']
-    gamma = ticks['gamma'][known]
-    of_tuning = None
-    if tuned:
-        place = np.searchsorted(y.stamps, when[known]).clip(max=len(y.stamps) - 1)
-        wrong = y.values[place] - truth.values[known][:, 0]
-        mean = np.convolve(wrong**2, np.full(RECENT, 1.0 / RECENT))[: len(wrong)]
-        share = np.minimum(1.0, np.arange(1, len(wrong) + 1) / RECENT)
-        noise, _, bandwidth, *_ = ticks['tuning'][known].T
-        of_tuning = Tuned(
-            ticks[STANDARD_DEVIATION][known], noise, np.sqrt(mean / share), bandwidth
-        )
-    origin = int(when[known][0])
-    counters = _counters(bag)
-    return Run(t, names, truth.values[known], estimate, gamma, rate, counters, origin, of_tuning)
-
-
-def _found(run: Run, tuned: Tuned) -> list[str]:
-    """Return what a self-tuning estimator has found, in words."""
-    known = np.isfinite(tuned.deviation[:, -1]) & (run.t > SETTLED)
-    if not known.any():
-        return ['the run was too short for the estimator to find the noise']
-    error = np.abs(run.estimate[:, -1] - run.truth[:, -1])[known]
-    share = float(np.mean(error <= 2.0 * tuned.deviation[known, -1]))
-    return [
-        f'd lay within two standard deviations of its estimate for {share:.0%} of the time',
-        f'noise on y at the end: found {tuned.noise[-1]:.2g}, true {tuned.true_noise[-1]:.2g}; '
-        f'd is followed within {1.0 / tuned.bandwidth[-1]:.2g} s',
-    ]
-
-
-def _counters(bag: Path) -> dict[str, str]:
-    last: dict[str, str] = {}
+    counters: dict[str, str] = {}
     for _, message in messages(bag, '/diagnostics'):
         for status in message.status:
             if 'estimator' in status.name:
-                last |= {pair.key: pair.value for pair in status.values}
-    return last
+                counters |= {pair.key: pair.value for pair in status.values}
+    return Run(
+        (when[known] - when[known][0]) * 1e-9,
+        [*truth.labels, 'd'],
+        truth.values[known],
+        np.column_stack([ticks['state'], ticks['unknown_input']])[known],
+        {topic: ticks[topic][known] for topic in found},
+        y,
+        np.searchsorted(y.stamps, when[known]).clip(max=len(y.stamps) - 1),
+        counters,
+    )
 
 
-def table(run: Run) -> str:
-    """Return the report of a run as text: a row for each state and d, then the samples."""
-    half = run.t >= 0.5 * run.t[-1]
+def others(run: Run, parameters: Mapping[str, Any]) -> dict[str, Floats]:
+    """Return d as `OTHERS` estimate it from the same samples; nothing if gains tune themselves."""
+    if parameters.get('gains') == 'self_tuning':
+        return {}
+    return {
+        name: Observer({**parameters, **changes})
+        .run(run.y.stamps, run.y.values.ravel())
+        .unknown_input[run.rows]
+        for name, changes in OTHERS.items()
+    }
+
+
+def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, str]]) -> str:
+    """
+    Return the report of a run as text: how each observer estimates d, then states and samples.
+
+    Parameters
+    ----------
+    run : Run
+    compared : mapping
+        As `others` returns it.
+    marks : sequence of (int, str)
+        When something changed (stamps in ns), and what.
+
+    """
+    origin = run.y.stamps[run.rows[0]]
+    edges = [START, *((stamp - origin) * 1e-9 for stamp, _ in marks), np.inf]
+    parts = [
+        (begin, part) for begin, end in pairwise(edges)
+        if (part := (run.t >= begin) & (run.t < end)).any()
+    ] or [(0.0, run.t >= 0.0)]  # fmt: skip
+    d = run.truth[:, -1]
+    estimates = {'this estimator, live': run.estimate[:, -1], **compared}
+    width = max(map(len, estimates))
+    head = ''.join(f'{f"from {begin:.0f} s":>20}' for begin, _ in parts)
     lines = [
-        f'{"":4}{"RMS error":>12}{"RMS truth":>12}{"settling":>12}{"chatter":>10}',
-        f'{"":4}{"(2nd half)":>12}{"(2nd half)":>12}{f"({BAND:.0%} band)":>12}{"":>10}',
-    ]
-    for column, name in enumerate(run.names):
-        truth, estimate = run.truth[:, column], run.estimate[:, column]
-        error = estimate - truth
-        settled = settling_time(run.t, error, BAND * max(float(np.ptp(truth)), 1e-300))
-        settled_text = f'{settled:.2f} s' if np.isfinite(settled) else 'not yet'
-        lines.append(
-            f'{name:4}{rms(error[half]):12.3g}{rms(truth[half]):12.3g}'
-            f'{settled_text:>12}{chatter(estimate[half], truth[half]):10.3g}'
+        f'{"d":{width}}{head}', f'{"":{width}}' + f'{"error":>12}{"chatter":>8}' * len(parts)
+    ]  # fmt: skip
+    for name, estimate in estimates.items():
+        cells = (
+            f'{rms((estimate - d)[part]):12.2g}{chatter(estimate[part], d[part]):8.3g}'
+            for _, part in parts
         )
-    if run.tuned is not None:
-        lines += ['', *_found(run, run.tuned)]
-    counters = run.counters
-    lost, accepted = counters.get('samples lost', '?'), counters.get('samples accepted', '?')
-    rejected = counters.get('samples rejected', '?')
-    lines += [
-        '',
-        f'sample rate held: {run.sample_rate:.1f} Hz',
-        f'samples: {accepted} used, {lost} dropped, {rejected} rejected',
+        lines.append(f'{name:{width}}' + ''.join(cells))
+    sizes = (f'{rms(d[part]):12.2g}{"":8}' for _, part in parts)
+    lines.append((f'{"RMS of d itself":{width}}' + ''.join(sizes)).rstrip())
+    late = run.t >= parts[0][0]
+    if compared:
+        live, held = (rms((e - d)[late]) for e in (run.estimate[:, -1], compared[HELD]))
+        lines.append(WORDS.rstrip())
+        lines.append(f'The power that adapts changed the error by {live / held - 1.0:+.1%}.')
+    errors = [
+        f'{name} {rms((run.estimate - run.truth)[late, k]):.2g}'
+        for k, name in enumerate(run.names[:-1])
     ]
+    lines += ['', f'RMS errors of the states from {parts[0][0]:.0f} s on: {", ".join(errors)}']
+    if STANDARD_DEVIATION in run.of_gains:
+        lines.append(_found(run))
+    span = (run.y.stamps[-1] - run.y.stamps[0]) * 1e-9
+    counts = [run.counters.get(f'samples {n}', '?') for n in ('accepted', 'lost', 'rejected')]
+    lines.append(
+        f'samples: {counts[0]} used, {counts[1]} dropped, {counts[2]} rejected; '
+        f'{(len(run.y.stamps) - 1) / span if span > 0.0 else float("nan"):.1f} a second'
+    )
     return '\n'.join(lines)
+
+
+def _found(run: Run) -> str:
+    """Return what a self-tuning estimator has found, in words."""
+    deviation = run.of_gains[STANDARD_DEVIATION][:, -1]
+    known = np.isfinite(deviation) & (run.t > START)
+    if not known.any():
+        return 'the run was too short for the estimator to find the noise'
+    error = np.abs(run.estimate[:, -1] - run.truth[:, -1])[known]
+    noise, _, bandwidth, *_ = run.of_gains['tuning'][-1]
+    return (
+        'd lay within two standard deviations of its estimate for '
+        f'{np.mean(error <= 2.0 * deviation[known]):.0%} of the time\n'
+        f'noise on y at the end: found {noise:.2g}, true {true_noise(run)[-1]:.2g}; '
+        f'd is followed within {1.0 / bandwidth:.2g} s'
+    )
+
+
+def true_noise(run: Run) -> Floats:
+    """Return the standard deviation of the latest y minus z1 behind each estimate."""
+    wrong = run.y.values.ravel()[run.rows] - run.truth[:, 0]
+    mean = np.convolve(wrong**2, np.full(RECENT, 1.0 / RECENT))[: len(wrong)]
+    return np.asarray(np.sqrt(mean / np.minimum(1.0, np.arange(1, len(wrong) + 1) / RECENT)))

@@ -100,8 +100,7 @@ def _plot_fuzzy(arguments: argparse.Namespace, path: Path) -> None:
         select(online_parameters(arguments, recorded), OBSERVER_PARAMETERS)
     )
     levels = Observer(parameters).levels
-    options = parameters['fuzzy_shape'], parameters['fuzzy_normalise']
     with Output(path, arguments.force) as output:
-        fuzzy_figure(rows_of(parameters, levels), *options).savefig(output.path, dpi=150)
+        fuzzy_figure(rows_of(parameters, levels)).savefig(output.path, dpi=150)
         final = output.keep()
     print(f'figure: {final}', flush=True)

@@ -31,7 +31,8 @@ class Curves(NamedTuple):
     names : list of str
         z1 .. zn and d.
     estimate : (K, n + 1) array
-    gamma : (K,) array
+    gamma : (K,) array or None
+        None of a self-tuning estimator, which has no power.
     innovation : (K, N) array
     truth : (K, n + 1) array or None
         NaN where the bag lacks it.
@@ -50,7 +51,7 @@ class Curves(NamedTuple):
     stamps: NDArray[np.int64]
     names: list[str]
     estimate: NDArray[np.float64]
-    gamma: NDArray[np.float64]
+    gamma: NDArray[np.float64] | None
     innovation: NDArray[np.float64]
     truth: NDArray[np.float64] | None
     epsilon: float | None
@@ -82,7 +83,8 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
 def _read_curves(
     reader: BagReader, path: Path, topics: set[str], names: list[str] | None, plant: str
 ) -> list[Curves]:
-    found = sorted(t.removesuffix('/gamma') for t in topics if t.endswith('/gamma'))
+    last = f'/{[*ESTIMATES][-1]}'
+    found = sorted(t.removesuffix(last) for t in topics if t.endswith(last))
     found = [name for name in found if all(f'{name}/{part}' in topics for part in ESTIMATES)]
     for name in names or []:
         if name not in found:
@@ -114,8 +116,8 @@ def _settings(reader: BagReader, name: str) -> tuple[float | None, str]:
 def _curves(
     path: Path, name: str, plant: str, topics: set[str], epsilon: float | None, unit: str
 ) -> Curves:
-    tuned = [STANDARD_DEVIATION] if f'{name}/{STANDARD_DEVIATION}' in topics else []
-    ticks = read_ticks(path, name, [*tuned, *ESTIMATES])
+    of_gains = [p for p in ('gamma', STANDARD_DEVIATION) if f'{name}/{p}' in topics]
+    ticks = read_ticks(path, name, [*of_gains, *ESTIMATES])
     when = ticks['stamp']
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
     truth = truth_at(path, plant, when)
@@ -129,12 +131,12 @@ def _curves(
         when,
         [*labels, 'd'],
         estimate,
-        ticks['gamma'],
+        ticks.get('gamma'),
         ticks['innovation'],
         truth.values if truth else None,
         epsilon,
         unit,
-        ticks[STANDARD_DEVIATION] if tuned else None,
+        ticks.get(STANDARD_DEVIATION),
         read_events(path, name, int(when[-1])) if f'{name}/{EVENT}' in topics else [],
     )
 

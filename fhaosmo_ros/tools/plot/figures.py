@@ -50,8 +50,9 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
     """
     Write a figure of several estimates laid one over another.
 
-    From top to bottom: a row for each state, for d, for gamma, for the innovations of the first
-    estimate, and for the open levels if the threshold of the gates is known.
+    From top to bottom: a row for each state, for d, for gamma if an estimate has it, for the
+    innovations of the first estimate, and for the open levels if the threshold of the gates is
+    known.
 
     Parameters
     ----------
@@ -67,7 +68,9 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
     """
     thinned = (lambda t, x: (t, x)) if window else envelope
     first, names = curves[0], max((c.names for c in curves), key=len)
-    rows = [*names, 'gamma', 'innovation', *([] if epsilon is None else ['levels'])]
+    rows = [*names, 'innovation', *([] if epsilon is None else ['levels'])]
+    if any(c.gamma is not None for c in curves):
+        rows.insert(len(names), 'gamma')
     figure = _make_figure(len(rows), window)
     axes = dict(zip(rows, figure.subplots(len(rows), 1, sharex=True), strict=True))
     origin = min(c.stamps[0] for c in curves)
@@ -88,14 +91,15 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
                 draw_band(row, t, c.estimate[:, k], c.deviation[:, k], thinned, style['color'])
         for begin, end in (np.array(c.events).reshape(-1, 2) - origin) * 1e-9:
             axes['d'].axvspan(begin, end, color=style['color'], alpha=0.12, linewidth=0.0)
-        axes['gamma'].plot(*thinned(t, c.gamma), **style)
+        if c.gamma is not None:
+            axes['gamma'].plot(*thinned(t, c.gamma), **style)
+            axes['gamma'].set_ylabel('power γ')
         if epsilon is not None:
             axes['levels'].step(*thinned(t, _open_levels(c, epsilon)), where='post', **style)
     for name in names:
         those = [c for c in curves if name in c.names]
         _fit_after_transient(axes[name], [c.estimate[:, c.names.index(name)] for c in those])
         axes[name].set_ylabel(those[0].title(name))
-    axes['gamma'].set_ylabel('power γ')
     t = (first.stamps - origin) * 1e-9
     _draw_innovations(axes['innovation'], t, first.innovation, epsilon, thinned)
     axes['innovation'].set_ylabel('|innovation|' + ('\n(first)' if len(curves) > 1 else ''))

@@ -59,15 +59,13 @@ def rows_of(parameters: Mapping[str, Any], levels: int) -> list[Row]:
     return rows
 
 
-def fuzzy_figure(rows: Sequence[Row], shape: str, normalise: bool) -> Figure:
+def fuzzy_figure(rows: Sequence[Row]) -> Figure:
     """
     Draw a row a system: membership functions of input and output, and the curve.
 
     Parameters
     ----------
     rows : sequence of Row
-    shape, normalise : str, bool
-        `fuzzy_shape` and `fuzzy_normalise`.
 
     Raises
     ------
@@ -78,12 +76,12 @@ def fuzzy_figure(rows: Sequence[Row], shape: str, normalise: bool) -> Figure:
     figure = Figure(figsize=(9.0, 0.6 + 2.0 * len(rows)), layout='constrained')
     panels = figure.subplots(len(rows), 3, squeeze=False)
     for row, (left, middle, right) in zip(rows, panels, strict=True):
-        system = read_system(row.text, shape)
+        system = read_system(row.text)
         left.set_xlabel(f'ε of level {row.levels} [its unit]')
-        middle.set_xlabel('ψ [1]' + (', before scaling to ±1' if normalise else ''))
+        middle.set_xlabel('ψ [1], before scaling to ±1')
         right.set_xlabel(f'ε of level {row.levels} [its unit]')
         right.set_ylabel('ψ(ε) [1]')
-        half = curve(row.text, shape, normalise)
+        half = curve(row.text)
         grid = np.linspace(0.0, row.width, len(half))
         right.plot([-row.width, 0, 0, row.width], [-1, -1, 1, 1], **GREY)
         right.plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')

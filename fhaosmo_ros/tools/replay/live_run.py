@@ -21,7 +21,7 @@ TRIES = 30
 """Snapshots that may have no sample in the bag, before replay stops looking for the first one."""
 AGREEMENT = 1e-12
 """Relative or absolute difference up to which two memories count as the same."""
-COMPARED = 'z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending', 'wait'
+COMPARED = 'z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending'
 """What snapshots of every version hold of a state."""
 VALUE_FIELDS = {
     1: 'bool_value', 2: 'integer_value', 3: 'double_value', 4: 'string_value',

@@ -13,12 +13,13 @@ from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.tools.bags.types import diagnostics, labelled_array, LATCHED_QOS, serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.topics import (
+    ARRAY,
     DIAGNOSTICS,
-    ESTIMATES,
+    estimates_of,
     EVENT,
     FLOAT,
     PARAMETERS,
-    SELF_TUNED,
+    STANDARD_DEVIATION,
     TEXT,
     TIME,
 )
@@ -143,16 +144,20 @@ class BagSink:
         self._has_parameters = False
         self._unit = derivative_unit(parameters.get('measurement_unit', ''), order)
         state = [f'z{i + 1}' for i in range(order)]
-        labels = [state, [f'eps{i + 1}' for i in range(levels)], [*state, 'd'], TUNING]
-        lists = [labelled_array(names, np.zeros(len(names))) for names in labels]
-        number, stamp = serialise(FLOAT, data=0.0), serialise(TIME, sec=0, nanosec=0)
-        self._messages = [lists[0], number, number, lists[1], stamp, *lists[2:]]
+        labels = {
+            'state': state, 'innovation': [f'eps{i + 1}' for i in range(levels)],
+            STANDARD_DEVIATION: [*state, 'd'], 'tuning': TUNING,
+        }  # fmt: skip
+        empty = {
+            FLOAT: lambda _: serialise(FLOAT, data=0.0),
+            TIME: lambda _: serialise(TIME, sec=0, nanosec=0),
+            ARRAY: lambda topic: labelled_array(labels[topic], np.zeros(len(labels[topic]))),
+        }
         bag.add(f'{name}/{PARAMETERS}', TEXT, qos=[LATCHED_QOS])
-        tuned = parameters['gains'] == 'self_tuning'
-        topics = ESTIMATES | (SELF_TUNED if tuned else {})
+        topics = estimates_of(parameters)
         for topic, kind in topics.items():
             bag.add(f'{name}/{topic}', kind)
-        self._topics = [f'{name}/{topic}' for topic in topics]
+        self._messages = {topic: empty[kind](topic) for topic, kind in topics.items()}
 
     def write(self, rows: Rows) -> None:
         """Append the messages of each sample, and those of events."""
@@ -162,14 +167,17 @@ class BagSink:
             self._has_parameters = True
         e = rows.estimates
         stamp = np.column_stack(np.divmod(e.t, 1_000_000_000)).astype('<i4')
-        numbers = [e.z, e.unknown_input, e.gamma, e.innovation, stamp]
-        numbers += [e.standard_deviation, e.tuning]
+        numbers = {
+            'gamma': e.gamma, STANDARD_DEVIATION: e.standard_deviation, 'tuning': e.tuning,
+            'state': e.z, 'unknown_input': e.unknown_input, 'innovation': e.innovation,
+            'stamp': stamp,
+        }  # fmt: skip
         columns = []
-        for topic, message, values in zip(self._topics, self._messages, numbers, strict=False):
-            ends = _bytes(values, len(rows.times))
+        for topic, message in self._messages.items():
+            ends = _bytes(numbers[topic], len(rows.times))
             begin = np.frombuffer(message[: len(message) - ends.shape[1]], np.uint8)
             begins = np.tile(begin, (len(rows.times), 1))
-            columns.append((topic, np.hstack([begins, ends])))
+            columns.append((f'{self._name}/{topic}', np.hstack([begins, ends])))
         self._bag.write_columns(rows.times, columns)
         for time, event in rows.events:
             topic = f'{self._name}/{EVENT}'

@@ -12,12 +12,10 @@ cdef class SelfTuning(Structure):
     cdef bint is_linear  # the model
     cdef double forgetting  # time constant of the log-likelihoods (s); 0: `MEMORY` samples
     cdef double slider  # estimates are those of members so much quicker
-    cdef double least_noise  # least standard deviation of the noise on y; 0: any
-    cdef double told_sizes[MOST_LEVELS]  # squares of the sizes of z; 0: not told
     # What it remembers.
     cdef Members* members
     cdef Model model  # the likeliest model of d, which a smoother goes by (D 34)
-    cdef double sizes[MOST_LEVELS]  # mean squares of z, or more, if that was told
+    cdef double sizes[MOST_LEVELS]  # mean squares of z
     cdef double variances[MOST_LEVELS]  # of the errors of z, d, ..; infinite before it begins
     cdef bint y_jumped  # a sample tells that y has jumped (D 35)
     # A step's own.

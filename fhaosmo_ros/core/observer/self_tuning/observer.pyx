@@ -84,7 +84,6 @@ cdef class SelfTuning(Structure):
     """
 
     def __cinit__(self, configuration):
-        cdef int i
         if self.order > MOST_ORDER:
             raise ConfigurationError(
                 f"parameter 'order': expected at most {MOST_ORDER}, got {self.order}"
@@ -92,9 +91,6 @@ cdef class SelfTuning(Structure):
         p = configuration.parameters
         self.is_linear = configuration.model.is_linear
         self.forgetting, self.slider = p['tuning_memory'], p['bandwidth']
-        self.least_noise = p['noise_size']
-        for i in range(self.order):
-            self.told_sizes[i] = configuration.state_sizes[i] ** 2
         self.members = <Members*>calloc(1, sizeof(Members))
         if self.members == NULL:
             raise MemoryError
@@ -112,7 +108,7 @@ cdef class SelfTuning(Structure):
         self.y_jumped = False
         for i in range(self.levels):
             self.variances[i] = INFINITY
-        memcpy(self.sizes, self.told_sizes, sizeof(self.sizes))
+        memset(self.sizes, 0, sizeof(self.sizes))
 
     cdef bint keep(self) noexcept nogil:
         """Return False: the members are too many to be kept."""
@@ -157,7 +153,7 @@ cdef class SelfTuning(Structure):
             for i in range(n):
                 self.trial[i].z_hat, self.trial_variances[i] = 0.0, INFINITY
             self.trial[0].z_hat = y
-            gather(self.members, self.told_sizes, self.least_noise)
+            gather(self.members)
         for i in range(n):  # the internal states stand for the estimates
             self.trial[i].z_tilde = self.trial[i + 1].z_hat if i + 1 < n else 0.0
 
@@ -168,7 +164,7 @@ cdef class SelfTuning(Structure):
         Structure.accept(self, y, h)
         for i in range(self.order if self.has_begun() else 0):
             square, size = self.level[i].z_hat * self.level[i].z_hat, self.sizes[i]
-            self.sizes[i] = fmax(size + (square - size) / count, self.told_sizes[i])
+            self.sizes[i] = size + (square - size) / count
         memcpy(self.variances, self.trial_variances, sizeof(self.variances))
         self.model, self.y_jumped = self.trial_model, False
         return word
@@ -269,10 +265,7 @@ cdef class SelfTuning(Structure):
         expect(m, h, y)
         find_knowing(m, memory.beyond > 0.0)
         expected = w.believed[shared.likeliest] * w.noise[shared.likeliest]
-        sample.floor = fmax(
-            fmax(sample.quanta, self.least_noise * self.least_noise),
-            EXACT * EXACT * m.rough[0][1],
-        )
+        sample.floor = fmax(sample.quanta, EXACT * EXACT * m.rough[0][1])
         sample.average = fmin(shared.samples, NOISE_SAMPLES)
         sample.kept = exp(-h / self.forgetting if self.forgetting > 0.0 else -1.0 / MEMORY)
         shared.samples = <int>sample.average + 1

@@ -3,4 +3,4 @@
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
 
-cdef void gather(Members* m, const double* sizes, double least_noise) noexcept nogil
+cdef void gather(Members* m) noexcept nogil

@@ -34,12 +34,8 @@ cdef double REPEATED = 0.3
 cdef double WITHIN_SAMPLES = 1.0, MORE_REASON = 50.0
 
 
-cdef void gather(Members* m, const double* sizes, double least_noise) noexcept nogil:
-    """
-    Collect the first samples; once there are enough, let the members begin (D 28).
-
-    `sizes` are the squares of those of z. With a `least_noise` fewer samples are enough.
-    """
+cdef void gather(Members* m) noexcept nogil:
+    """Collect the first samples; once there are enough, let the members begin (D 28)."""
     cdef Shared* shared = &m.shared
     cdef double largest = 0.0
     cdef int count = shared.samples, changed = 1, since, i
@@ -51,7 +47,7 @@ cdef void gather(Members* m, const double* sizes, double least_noise) noexcept n
         count -= 1
     m.first_y[count], m.first_h[count] = m.work.sample.y, m.work.sample.h
     shared.samples = count = count + 1
-    if count < FIRST_SAMPLES and not (least_noise > 0.0 and count > 2 * m.n + 4):
+    if count < FIRST_SAMPLES:
         return
     for i in range(count):
         largest = fmax(largest, fabs(m.first_y[i]))
@@ -59,14 +55,14 @@ cdef void gather(Members* m, const double* sizes, double least_noise) noexcept n
     while changed < count and fabs(m.first_y[changed] - m.first_y[0]) <= 1e-12 * largest:
         changed += 1
     since = count - changed
-    if changed > 1 and least_noise == 0.0 and not (
+    if changed > 1 and not (
         since >= CHANGING and on_lattice(m.first_y + count - CHANGING - 1)
     ):
         if since >= CHANGING:
             drop_first(m, changed - 1, count)
             shared.samples = since + 1
         return
-    begin(m, sizes, find_noise(m, fmax(least_noise, fmax(1e-9 * largest, LEAST)), largest))
+    begin(m, find_noise(m, fmax(1e-9 * largest, LEAST), largest))
     shared.samples = FIRST_SAMPLES + 1
 
 
@@ -166,7 +162,7 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
 
 
 cdef void find_sizes(Members* m, double* sizes) noexcept nogil:
-    """Raise the squares of the sizes of z to what differences of the first samples say."""
+    """Find the squares of the sizes of z by differences of the first samples."""
     cdef double first[FIRST_SAMPLES]
     cdef double values[FIRST_SAMPLES]
     cdef int count = m.shared.samples, stride = max((count - 1) // m.n, 1), length, i, j
@@ -177,18 +173,17 @@ cdef void find_sizes(Members* m, double* sizes) noexcept nogil:
         for j in range(length):
             first[j] = (first[j + stride] - first[j]) / (stride * m.shared.steady_period)
             values[j] = first[j] * first[j]
-        sizes[i] = fmax(sizes[i], DOUBT * DOUBT * ranked(values, length, MOST))
+        sizes[i] = DOUBT * DOUBT * ranked(values, length, MOST)
 
 
-cdef void begin(Members* m, const double* least_sizes, double noise) noexcept nogil:
+cdef void begin(Members* m, double noise) noexcept nogil:
     """Let the members begin at the last sample (D 28)."""
     cdef Shared* shared = &m.shared
     cdef double sizes[MOST_ORDER]
     cdef double y = m.first_y[shared.samples - 1], period = shared.steady_period
     cdef double omega, kappa, intensity, size, least = INFINITY
     cdef int n = m.n, g, i, j, k, below, c
-    for i in range(n):
-        sizes[i] = least_sizes[i]
+    sizes[0] = 0.0
     find_sizes(m, sizes)
     shared.moving, shared.active = HALF, COUNT
     shared.unsettled = shared.flow_period = 0.0
