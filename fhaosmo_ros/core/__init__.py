@@ -5,7 +5,6 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.estimates import Estimate, ObserverState, Trajectory
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.status import Status
-from fhaosmo_ros.core.online.batch import EstimatorBatch
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import Event, EventDetector
@@ -18,7 +17,6 @@ __all__ = [
     'ConfigurationError',
     'Counters',
     'Estimate',
-    'EstimatorBatch',
     'Event',
     'EventDetector',
     'Family',

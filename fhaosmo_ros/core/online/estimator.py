@@ -401,10 +401,7 @@ class OnlineEstimator:
 
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
-        return self.advance_with(stamp, y, self._u)
-
-    def advance_with(self, stamp: int, y: float, u: NDArray[np.float64]) -> int:
-        """Do the same with other known inputs, (m,) and all finite, than those that are held."""
+        u = self._u
         if self._smoothing is None and not self.events.on:
             return self.policy.advance(stamp, y, u)  # type: ignore[no-any-return]
         stamps = np.array([min(max(int(stamp), -LARGEST_STAMP), LARGEST_STAMP)])
