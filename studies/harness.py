@@ -3,14 +3,15 @@
 
 import argparse
 from collections.abc import Hashable, Mapping
+import multiprocessing
 import os
 from pathlib import Path
+import signal
 from typing import Any
 
 from fhaosmo_ros.core import OnlineEstimator, Trajectory
 from fhaosmo_ros.core.parameters.tables import CONSTANTS
-from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.cli.processes import Workers
+from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.cli.progress import progress
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from studies.evidence import DOCS
 
 SELF_TUNING = {'gains': 'self_tuning'}
 MODEL = ('order', 'phi', 'inputs')
+POLL = 0.1
+"""Seconds between two looks at what has come."""
 Floats = NDArray[np.float64]
 
 
@@ -73,10 +76,28 @@ def output(arguments: argparse.Namespace, name: str) -> Path:
 def called(
     calls: Mapping[Hashable, tuple[Any, ...]], name: str, jobs: int, stop: Stop
 ) -> dict[Hashable, Any]:
-    """Return the results of calls (function, arguments) in several processes, by key."""
+    """
+    Return the results of calls (function, arguments) in several processes, by key.
+
+    Raises
+    ------
+    Stopped
+        A signal came; it ends the processes.
+
+    """
+    for variable in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
+        os.environ.setdefault(variable, '1')  # the processes already use all cores
     found = {}
-    with Workers(jobs, stop) as workers, progress(total=len(calls), unit='part', desc=name) as bar:
-        for key, result in workers.results(calls):
-            found[key] = result
-            bar.update()
+    # Inherited: only this process takes signals, and ends the others.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
+    with multiprocessing.get_context('spawn').Pool(jobs) as pool:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        waiting = {key: pool.apply_async(call[0], call[1:]) for key, call in calls.items()}
+        with progress(total=len(calls), unit='part', desc=name) as bar:
+            while waiting:
+                if stop.wait(POLL):
+                    raise Stopped
+                for key in [key for key, result in waiting.items() if result.ready()]:
+                    found[key] = waiting.pop(key).get()
+                    bar.update()
     return found

@@ -23,7 +23,7 @@ import argparse, os, sys, time
 from pathlib import Path
 from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.cli.output import Output
-from fhaosmo_ros.tools.cli.processes import Workers
+from studies.harness import called
 
 def work(folder, k):
     (folder / f'{k}.pid').write_text(str(os.getpid()))
@@ -31,9 +31,9 @@ def work(folder, k):
 
 def body(arguments, stop):
     folder = Path(sys.argv[1])
-    with Output(folder / 'out') as output, Workers(2, stop) as workers:
+    with Output(folder / 'out') as output:
         output.path.mkdir()
-        list(workers.results({k: (work, folder, k) for k in range(2)}))
+        called({k: (work, folder, k) for k in range(2)}, 'busy', 2, stop)
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(prog='busy')

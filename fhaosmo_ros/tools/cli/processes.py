@@ -1,28 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Child processes that never outlive their parent's block: programs, and workers of a pool."""
+"""Child processes that never outlive their parent's block."""
 
-from collections.abc import Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-import contextlib
-import multiprocessing
-import multiprocessing.connection
+from collections.abc import Mapping
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
-import threading
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.stop_signals import ending_signals, SIGNALS, Stop, Stopped
+from fhaosmo_ros.stop_signals import ending_signals
 
 GRACE = 5.0
 """Seconds that a child has to end by itself."""
-POLL = 0.1
-"""Seconds between two looks at the event that a signal sets."""
-
-Key = TypeVar('Key')
 
 
 class Child:
@@ -138,88 +129,3 @@ class Children:
         finally:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
-
-
-class Workers:
-    """
-    Processes that compute; they end with its block, and also if their parent is killed.
-
-    They never see SIGINT, SIGTERM and SIGHUP, which may reach a whole group of processes: only the
-    parent takes these, and it ends the workers. Linear algebra has one thread in each worker: for
-    small matrices more threads only wait for each other, and the workers already use all cores.
-
-    Parameters
-    ----------
-    jobs : int
-        Number of processes.
-    stop : Stop
-        What signals set; `results` then raises Stopped.
-
-    """
-
-    def __init__(self, jobs: int, stop: Stop) -> None:
-        self._stop = stop
-        for variable in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
-            os.environ.setdefault(variable, '1')
-        # spawn: a fork after rclpy has started threads can hang.
-        context = multiprocessing.get_context('spawn')
-        # This starts multiprocessing's resource tracker, which inherits the mask: it handles
-        # SIGINT and SIGTERM only, so that a SIGHUP to the group would kill it.
-        with _signals_blocked():
-            self._pool = ProcessPoolExecutor(
-                jobs, mp_context=context, initializer=_end_with_parent
-            )
-
-    def results(self, calls: Mapping[Key, tuple[Any, ...]]) -> Iterator[tuple[Key, Any]]:
-        """
-        Call functions, and yield each call's key and result as they come.
-
-        Parameters
-        ----------
-        calls : mapping
-            By key: a function of a module, and its arguments.
-
-        Raises
-        ------
-        Stopped
-            A signal came.
-
-        """
-        # A worker inherits the mask, so it takes no signal from its very beginning.
-        with _signals_blocked():
-            keys = {self._pool.submit(*call): key for key, call in calls.items()}
-        left = set(keys)
-        while left:
-            done, left = wait(left, POLL, return_when=FIRST_COMPLETED)
-            if self._stop.is_set():
-                raise Stopped
-            for future in done:
-                yield keys[future], future.result()
-
-    def __enter__(self) -> 'Workers':
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for process in (self._pool._processes or {}).values():
-            process.kill()  # what it computes is not worth waiting for
-        self._pool.shutdown(cancel_futures=True)
-
-
-@contextlib.contextmanager
-def _signals_blocked() -> Iterator[None]:
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-def _end_with_parent() -> None:
-    """End this worker when its parent has been killed, instead of waiting for work for ever."""
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        multiprocessing.connection.wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
