@@ -32,12 +32,11 @@ SYSTEMS = (
 
 
 def samples(count=200, seed=1):
-    """Return t, y, u with NaNs, duplicate and backward stamps, and a first sample that is bad."""
+    """Return t, y, u with NaNs and infinities, and a first sample that is bad."""
     rng = np.random.default_rng(seed)
     t = np.cumsum(rng.uniform(0.5e-3, 2e-3, count))
     y = np.sin(3.0 * t) + 1e-3 * rng.standard_normal(count)
     u = rng.uniform(-1.0, 1.0, count)
-    t[60], t[61], t[90] = t[59], t[58], t[70]
     y[[0, 1, 30, 31, 100]] = np.nan
     y[120], u[140] = np.inf, np.nan
     return t, y, u

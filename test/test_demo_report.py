@@ -2,7 +2,7 @@
 """The numbers of the demonstration's table, from a bag whose errors are known."""
 
 import bag_files as files
-from fhaosmo_ros.core import ConfigurationError, Observer
+from fhaosmo_ros.core import ConfigurationError, OnlineEstimator
 from fhaosmo_ros.tools.bags.types import labelled_array
 from fhaosmo_ros.tools.demo.report import OTHERS, others, read_run, START, table
 from fhaosmo_ros.topics import ARRAY, estimates_of, FLOAT, TIME
@@ -102,7 +102,7 @@ def test_other_observers_go_through_the_same_samples(tmp_path):
     parameters = {'gains': 'fixed'}
     compared = others(run, parameters)
     name, changes = [*OTHERS.items()][1]
-    alone = Observer(changes).run(run.y.stamps, run.y.values.ravel())
+    alone = OnlineEstimator(changes).run(run.y.stamps, run.y.values.ravel())
     np.testing.assert_array_equal(compared[name], alone.unknown_input[run.rows])
     text = table(run, compared, [(files.ORIGIN + 3 * 10**9, 'noise')])
     assert 'from 2 s' in text

@@ -28,17 +28,17 @@ def test_saturated_gamma_is_flagged(scheme, bound):
     p |= {'gamma_rate': 0.0, 'gamma_leakage': 100.0}
     observer = Observer(p)
     observer.start(0.0)
-    assert not observer.step(0.1, 1e-3).status
+    assert not observer.step(0.1, 1e-3, 0.0).status
     target = {'min': {'gamma_initial': 0.4, 'gamma_min': 0.4}}.get(
         bound, {'gamma_initial': 0.7, 'gamma_max': 0.7}
     )
     observer.configure(target)
     for _ in range(1000):
-        estimate = observer.step(0.1, 1e-3)
+        estimate = observer.step(0.1, 1e-3, 0.0)
     flag = {'min': Status.GAMMA_AT_MIN, 'max': Status.GAMMA_AT_MAX}[bound]
     np.testing.assert_allclose(estimate.gamma, target['gamma_initial'])
     observer.configure({'gamma_rate': 1e6})  # the gradient drives it to a bound, and beyond
-    statuses = [observer.step(np.sin(0.1 * k), 1e-3).status for k in range(300)]
+    statuses = [observer.step(np.sin(0.1 * k), 1e-3, 0.0).status for k in range(300)]
     assert any(status & flag for status in statuses)
     assert not any(status.rejected for status in statuses)
 
@@ -50,7 +50,7 @@ def test_gamma_stays_within_its_bounds(rate, leakage, seed, dt):
         observer = Observer(p | {'scheme': scheme})
         observer.start(0.0)
         for y in np.random.default_rng(seed).uniform(-1.0, 1.0, 50):
-            assert 0.3 <= observer.step(y, dt).gamma <= 0.8
+            assert 0.3 <= observer.step(y, dt, 0.0).gamma <= 0.8
 
 
 @given(st.floats(0.0, 1e3), st.floats(1e-5, 10.0))
@@ -59,6 +59,6 @@ def test_leakage_never_overshoots(leakage, dt):
     observer = Observer(p | {'gamma_initial': 0.7})
     observer.start(0.0)
     observer.configure({'gamma_initial': 0.4})
-    gamma = [0.7] + [observer.step(0.0, dt).gamma for _ in range(20)]
+    gamma = [0.7] + [observer.step(0.0, dt, 0.0).gamma for _ in range(20)]
     assert np.all(np.diff(gamma) <= 1e-15)
     assert gamma[-1] >= 0.4 - 1e-12

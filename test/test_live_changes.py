@@ -68,7 +68,7 @@ def assert_state_stays(law, name, value):
     fresh = Observer(observer.parameters)
     fresh.restore(after)
     for k in range(20):
-        one, other = (o.step(0.01 * k, 1e-3) for o in (observer, fresh))
+        one, other = (o.step(0.01 * k, 1e-3, 0.0) for o in (observer, fresh))
         assert not one.status.rejected
         np.testing.assert_array_equal(one.z, other.z)
         assert one.gamma == other.gamma

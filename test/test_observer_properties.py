@@ -69,9 +69,9 @@ def test_snapshot_is_a_copy():
     snapshot = observer.state
     snapshot.values['z_hat'][:] = 7.0
     assert not np.any(remembered(observer, 'z_hat') == 7.0)
-    estimate = observer.step(0.1, 1e-3)
+    estimate = observer.step(0.1, 1e-3, 0.0)
     z, innovation = estimate.z.copy(), estimate.innovation.copy()
-    observer.step(5.0, 1e-3)
+    observer.step(5.0, 1e-3, 0.0)
     np.testing.assert_array_equal(estimate.z, z)
     np.testing.assert_array_equal(estimate.innovation, innovation)
 

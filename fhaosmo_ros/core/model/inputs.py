@@ -72,6 +72,12 @@ def known_inputs_of_run(u: ArrayLike, count: int, names: Sequence[str]) -> Float
     return np.ascontiguousarray(np.broadcast_to(values, shape))
 
 
+def column(values: ArrayLike) -> NDArray[np.generic]:
+    """Return one column of a table, (K, 1), as (K,); anything else as an array of its shape."""
+    values = np.asarray(values)
+    return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+
+
 def _is_for_all(values: Floats, names: Sequence[str]) -> bool:
     return values.shape == () and (len(names) == 1 or values == 0.0)
 

@@ -5,6 +5,7 @@ cpdef enum:
     CONST, STATE, INPUT
     ADD, SUB, MUL, DIV, POW, ATAN2, MIN, MAX
     NEG, SIN, COS, TAN, EXP, LOG, SQRT, ABS, TANH, SIGN
+    CALL
 
 cdef enum:
     MOST_OPERANDS = 128  # on the stack of an expression
@@ -29,6 +30,9 @@ cdef class Expressions:
     cdef Dual evaluate(
         self, int i, const double* z, const double* dz, const double* u
     ) noexcept nogil
+    cdef Dual call(
+        self, int i, const double* z, const double* dz, const double* u
+    ) noexcept with gil
     cdef check(self, expression)
 
 

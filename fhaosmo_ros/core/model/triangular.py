@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fhaosmo_ros.core.model.expressions import is_linear, Names, ONLY_U, parse
+from fhaosmo_ros.core.model.function import Function
 from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.model.phi import Expressions, INPUT
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -20,7 +21,7 @@ class TriangularModel:
     Parameters
     ----------
     phi : sequence of str
-        One expression a state.
+        One expression, or `Function`, a state.
     order : int, optional
         Number of states n, to be checked against ``len(phi)``.
     names : Names, optional
@@ -34,6 +35,8 @@ class TriangularModel:
         Phi_1 .. Phi_n.
     inputs : tuple of str
         Names of the known inputs u_1 .. u_m, in the order of their values.
+    functions : tuple of Function
+        Those of Phi that are Python functions.
 
     Raises
     ------
@@ -54,7 +57,11 @@ class TriangularModel:
         self.order = len(self.phi)
         names.check()
         self.inputs = tuple(names.inputs)
-        self._parsed = [parse(text, i + 1, names) for i, text in enumerate(self.phi)]
+        self.functions = tuple(phi for phi in self.phi if isinstance(phi, Function))
+        self._parsed: list[Any] = [
+            text if isinstance(text, Function) else parse(text, i + 1, names)
+            for i, text in enumerate(self.phi)
+        ]
         self.expressions = Expressions(self._parsed, self.order, len(self.inputs))
 
     @classmethod
@@ -65,8 +72,9 @@ class TriangularModel:
 
     @property
     def used_inputs(self) -> tuple[str, ...]:
-        """Names of the known inputs that a Phi uses."""
-        used = {index for tokens in self._parsed for code, index in tokens if code == INPUT}
+        """Names of the known inputs that an expression of Phi uses."""
+        expressions = [tokens for tokens in self._parsed if not isinstance(tokens, Function)]
+        used = {index for tokens in expressions for code, index in tokens if code == INPUT}
         return tuple(name for k, name in enumerate(self.inputs) if k in used)
 
     @property
@@ -77,7 +85,7 @@ class TriangularModel:
     @property
     def is_linear(self) -> bool:
         """True if every Phi is a linear function of the states, whatever the known inputs."""
-        return all(is_linear(tokens) for tokens in self._parsed)
+        return not self.functions and all(is_linear(tokens) for tokens in self._parsed)
 
     def with_unknown_input(self, decay: float, derivatives: int) -> Expressions:
         """

@@ -85,6 +85,15 @@ class Trajectory(NamedTuple):
     model: NDArray[np.float64]
     tuning: NDArray[np.float64]
 
+    def __repr__(self) -> str:
+        if not len(self.t):
+            return 'Trajectory(no samples)'
+        z = ', '.join(f'z{i + 1}={value:.4g}' for i, value in enumerate(self.z[-1]))
+        return (
+            f'Trajectory({len(self.t)} samples, t={self.t[0]} .. {self.t[-1]}, the last one: '
+            f'{z}, unknown_input={self.unknown_input[-1]:.4g})'
+        )
+
     @classmethod
     def of(cls, structure: Any, t: NDArray[Any], record: Any) -> 'Trajectory':
         """

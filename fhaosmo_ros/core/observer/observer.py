@@ -2,11 +2,12 @@
 """The observer: one sample at a time, or arrays of samples, by the same compiled recursion."""
 
 from collections.abc import Mapping
+import math
 from pathlib import Path
 from typing import Any
 import warnings
 
-from fhaosmo_ros.core.model.inputs import known_inputs_of_run
+from fhaosmo_ros.core.model.inputs import column, known_inputs_of_run
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.cascade import Cascade
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
@@ -46,6 +47,8 @@ class Observer:
         Values for the parameters in docs/parameters.md; defaults for the rest. Those of the
         estimator that are not the observer's are checked and left out, so that it takes what
         `tune` has written. `Parameters` have been checked and are taken as they are.
+    **named
+        Parameters as keyword arguments, which win; lambda_ for lambda.
 
     Raises
     ------
@@ -59,7 +62,7 @@ class Observer:
 
     Examples
     --------
-    >>> observer = Observer({'order': 2, 'phi': ['0', '-z2'], 'lambda': 15, 'alpha': 30})
+    >>> observer = Observer(order=2, phi=['0', '-k*z2'], constants={'k': 3}, gains='self_tuning')
     >>> observer.start(0.1).z
     array([0.1, 0. ])
     >>> observer.step(0.1, dt=0.001).status
@@ -67,10 +70,10 @@ class Observer:
 
     """
 
-    def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
-        if not isinstance(parameters, Parameters):
-            parameters = ESTIMATOR_PARAMETERS.complete(parameters)
-        self.structure = make_structure(ObserverConfiguration(parameters))
+    def __init__(self, parameters: Mapping[str, Any] | None = None, /, **named: Any) -> None:
+        if not isinstance(parameters, Parameters) or named:
+            parameters = ESTIMATOR_PARAMETERS.complete(parameters, named)
+        self._use(make_structure(ObserverConfiguration(parameters)))
         defaults = {name for name in DEFINING if self.parameters[name] == DEFAULTS[name]}
         if 'phi' not in defaults and {'gains', *OF_PAPER} <= defaults:
             warnings.warn(
@@ -79,7 +82,9 @@ class Observer:
                 stacklevel=2,
             )
         self._t: float | int | None = None
-        self._word = 0
+
+    def __repr__(self) -> str:
+        return f'Observer(order={self.order}, phi={list(self.model.phi)}: {self.description})'
 
     @classmethod
     def from_yaml(cls, path: str | Path, node: str = 'estimator', channel: str = '') -> 'Observer':
@@ -222,7 +227,7 @@ class Observer:
         structure = make_structure(configuration)
         structure.take_over(self.structure)
         structure.word = self.structure.word
-        self.structure = structure
+        self._use(structure)
 
     def reset(self) -> None:
         """Go back to the initial state; the next sample is the first."""
@@ -233,7 +238,7 @@ class Observer:
         """Take the first sample: time has not passed yet, so nothing is integrated."""
         return self.structure.begin(y)
 
-    def step(self, y: float, dt: float, u: ArrayLike = 0.0) -> Estimate:
+    def step(self, y: float, dt: float, u: ArrayLike | None = None) -> Estimate:
         """
         Advance by `dt` to the sample `y`.
 
@@ -246,21 +251,29 @@ class Observer:
             Measured output at the end of the interval.
         dt : float
             Time since the previous call, in seconds, > 0.
-        u : number or (m,) array
-            Known input, or known inputs, during the interval.
+        u : number or (m,) array, optional
+            Known input, or known inputs, during the interval; needed where phi uses one.
 
         Returns
         -------
         Estimate
-            Bad data does not raise: `Estimate.status` says what was rejected, the state stays as
-            it was, and the time of a rejected sample is added to the next step (see `Status`).
+            A bad sample does not raise: `Estimate.status` says what was rejected, the state stays
+            as it was, and the time of a rejected sample is added to the next step (see `Status`).
+
+        Raises
+        ------
+        ConfigurationError
+            A `dt` that is not > 0 and finite, or u is missing or of another shape.
 
         """
-        return self.structure.update(y, dt, u)
-
-    def advance(self, y: float, dt: float, u: ArrayLike = 0.0) -> int:
-        """Do what `step` does and return only the status word; see `estimate`."""
-        return self.structure.take(y, dt, u)  # type: ignore[no-any-return]
+        if not 0.0 < dt < math.inf:
+            raise ConfigurationError(f'step: expected dt > 0 and finite, in seconds, got {dt}')
+        if u is None:
+            u = self._no_input()
+        estimate = self.structure.update(y, dt, u)
+        if self._functions:
+            self._check_functions()
+        return estimate
 
     @property
     def estimate(self) -> Estimate:
@@ -273,7 +286,7 @@ class Observer:
         return self.structure.d  # type: ignore[no-any-return]
 
     def run(
-        self, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0, every: int = 1
+        self, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None, every: int = 1
     ) -> Trajectory:
         """
         Step through arrays; the state goes on from where it is, so a run can be split.
@@ -281,12 +294,13 @@ class Observer:
         Parameters
         ----------
         t : (K,) array
-            Sample times, in seconds, or in nanoseconds if integers. A sample that does not lie
-            after all samples before it is rejected.
+            Sample times, in seconds, or in nanoseconds if integers; they increase. Columns of a
+            table, (K, 1), are taken as well, of this and the others.
         y : (K,) array
-            Samples.
-        u : number, (K,) or (K, m) array
-            Known input, or known inputs, during the interval that ends at each sample.
+            Samples; NaN stands for a missing one.
+        u : number, (K,) or (K, m) array, optional
+            Known input, or known inputs, during the interval that ends at each sample; needed
+            where phi uses one.
         every : int
             Record every `every`-th sample only.
 
@@ -299,27 +313,31 @@ class Observer:
         Raises
         ------
         ConfigurationError
-            Arrays whose shapes do not fit, or `every` < 1.
+            Arrays whose shapes do not fit, times that do not increase, u that is missing, or
+            `every` < 1.
 
         """
-        t, y = np.asarray(t), np.ascontiguousarray(y, dtype=np.float64)
+        if every < 1:
+            raise ConfigurationError(f'run: expected every >= 1, got {every}')
+        t, y = times(t), np.ascontiguousarray(column(y), dtype=np.float64)
         if t.ndim != 1 or y.shape != t.shape:
             raise ConfigurationError(
                 f'run: expected t and y with one dimension and equal length, '
                 f'got shapes {t.shape} and {y.shape}'
             )
-        if every < 1:
-            raise ConfigurationError(f'run: expected every >= 1, got {every}')
-        u = known_inputs_of_run(u, len(y), self.inputs)
-        first = 0
+        u = known_inputs_of_run(self._no_input() if u is None else u, len(y), self.inputs)
+        first, start = 0, self._t
         if not self.started:
-            self._t = None
             good = np.flatnonzero(np.isfinite(HEADROOM * y))
-            first = good[0] + 1 if len(good) else len(y)
-        record = run(self.structure, y, self._periods(t, first), u, first, every)
+            first, start = good[0] + 1 if len(good) else len(y), None
+        h = intervals(t, start)
+        if len(t):
+            self._t = t[-1].item()
+        record = run(self.structure, y, h, u, first, every)
+        self._check_functions()
         return Trajectory.of(self.structure, t[every - 1 :: every], record)
 
-    def smooth(self, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0) -> Trajectory:
+    def smooth(self, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
         """
         Estimate each time from the samples before and after it (D 24, D 25).
 
@@ -349,18 +367,58 @@ class Observer:
 
         return smooth(Observer(self.configuration.parameters), t, y, u)
 
-    def _periods(self, t: NDArray[Any], first: int) -> NDArray[np.float64]:
-        """Return the time of each sample since the latest sample before it, in seconds."""
-        integers = np.issubdtype(t.dtype, np.integer)
-        t = t.astype(np.int64 if integers else np.float64)
-        known = t if integers else np.where(np.isfinite(t), t, np.nan)
-        # Times before the first sample do not count.
-        known = known[max(first - 1, 0) :]
-        if not len(known):
-            return np.zeros(len(t))
-        start = self._t if self._t is not None else known[0]
-        latest = np.fmax.accumulate(np.concatenate([[start], known]).astype(t.dtype))
-        self._t = latest[-1].item()
-        h = np.zeros(len(t))
-        h[len(t) - len(known) :] = t[len(t) - len(known) :] - latest[:-1]
-        return h * 1e-9 if integers else h
+    def _use(self, structure: Any) -> None:
+        self.structure = structure
+        self._needs_input = self.uses_input
+        self._functions = self.model.functions
+
+    def _check_functions(self) -> None:
+        """Raise what a Python function of phi has raised."""
+        for function in self._functions:
+            if function.failed is not None:
+                error, function.failed = function.failed, None
+                raise error
+
+    def _no_input(self) -> float:
+        """Return what stands for known inputs that were not given, or raise where phi has one."""
+        if self._needs_input:
+            raise ConfigurationError(
+                f'u: expected values of {", ".join(self.used_inputs)}, which phi uses, got none'
+            )
+        return 0.0
+
+
+def times(t: ArrayLike) -> NDArray[Any]:
+    """Return times as a column of 64-bit numbers; integers stay integers."""
+    t = column(t)
+    return t.astype(np.int64 if np.issubdtype(t.dtype, np.integer) else np.float64)
+
+
+def intervals(t: NDArray[Any], start: float | int | None) -> NDArray[np.float64]:
+    """
+    Return the time of each sample since the one before it, in seconds.
+
+    Parameters
+    ----------
+    t : (K,) array
+        In seconds, or in nanoseconds if integers.
+    start : number or None
+        Time before the first one; None if there was none: then its interval is 0.
+
+    Raises
+    ------
+    ConfigurationError
+        Times that are not finite, or do not increase.
+
+    """
+    before = np.concatenate([t[:1] if start is None else np.array([start], t.dtype), t[:-1]])
+    h = t - before
+    good = (h > 0) & np.isfinite(h)
+    if start is None:
+        good[:1] = np.isfinite(h[:1])
+    if not good.all():
+        k = int(np.argmin(good))
+        raise ConfigurationError(
+            f'run: expected finite times that increase, got t[{k}] = {t[k]} after {before[k]}'
+        )
+    return np.asarray(h * 1e-9 if np.issubdtype(t.dtype, np.integer) else h)

@@ -175,24 +175,23 @@ class Smoother:
         return self._rows.innovations()  # type: ignore[no-any-return]
 
 
-def smooth(observer: Any, t: ArrayLike, y: ArrayLike, u: ArrayLike | float = 0.0) -> Trajectory:
+def smooth(observer: Any, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
     """
     Let a fresh observer go forward through samples; estimate each from all of them.
 
     See `Observer.smooth`.
     """
-    t, y = np.asarray(t), np.asarray(y, dtype=np.float64)
-    u = known_inputs_of_run(u, len(t), observer.inputs)
     whole: Trajectory = observer.run(t, y, u)
     if not observer.started:
         return whole
     first = int(np.argmax((whole.status & REJECTED) == 0))
     rows = Trajectory._make(column[first:] for column in whole)
+    u = known_inputs_of_run(0.0 if u is None else u, len(whole.t), observer.inputs)
     inputs = u[first:].copy()
     for k in np.flatnonzero(~np.isfinite(inputs).all(axis=1)).tolist():  # the last ones are held
         inputs[k] = inputs[max(k - 1, 0)]
-    times = np.fmax.accumulate(rows.t)
-    h = np.diff(times, prepend=times[0]) * (1e-9 if np.issubdtype(t.dtype, np.integer) else 1.0)
+    scale = 1e-9 if np.issubdtype(rows.t.dtype, np.integer) else 1.0
+    h = np.diff(rows.t, prepend=rows.t[0]) * scale
     smoother, found = Smoother(observer.configuration), []
     columns: tuple[Any, ...] = (
         rows.z_hat, rows.z_tilde, rows.z_hat[:, 0] + rows.innovation[:, 0], h, inputs,

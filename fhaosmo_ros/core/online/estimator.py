@@ -4,10 +4,11 @@
 from collections.abc import Mapping
 from copy import deepcopy
 import math
+import operator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.model.inputs import known_inputs_of_run
+from fhaosmo_ros.core.model.inputs import column, known_inputs_of_run
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, Tuning
 from fhaosmo_ros.core.observer.observer import Observer
@@ -52,6 +53,8 @@ class OnlineEstimator:
     parameters : mapping, optional
         Values for the observer's and the sampling parameters in docs/parameters.md; defaults for
         the rest. `Parameters` have been checked and are taken as they are.
+    **named
+        Parameters as keyword arguments, which win; lambda_ for lambda.
 
     Attributes
     ----------
@@ -70,9 +73,9 @@ class OnlineEstimator:
 
     """
 
-    def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
-        if not isinstance(parameters, Parameters):
-            parameters = ESTIMATOR_PARAMETERS.complete(parameters)
+    def __init__(self, parameters: Mapping[str, Any] | None = None, /, **named: Any) -> None:
+        if not isinstance(parameters, Parameters) or named:
+            parameters = ESTIMATOR_PARAMETERS.complete(parameters, named)
         self._parameters = ONLINE_PARAMETERS.complete(parameters)
         self.observer = Observer(self._parameters)
         p = self._parameters
@@ -94,6 +97,9 @@ class OnlineEstimator:
 
     def __copy__(self) -> 'OnlineEstimator':
         return deepcopy(self)
+
+    def __repr__(self) -> str:
+        return f'OnlineEstimator({self.observer!r}, {self.counters!r})'
 
     @classmethod
     def from_yaml(
@@ -395,8 +401,13 @@ class OnlineEstimator:
             Of this sample, or the previous state's with the reason of the rejection. With
             `smoothing_lag` that of the time so long ago; None while there is none.
 
+        Raises
+        ------
+        TypeError
+            A stamp that is no integer: seconds are not nanoseconds.
+
         """
-        self.advance(int(stamp), y)
+        self.advance(operator.index(stamp), y)
         return self.policy.report() if self._smoothing is None else self.estimate
 
     def advance(self, stamp: int, y: float) -> int:
@@ -440,11 +451,15 @@ class OnlineEstimator:
         Raises
         ------
         ConfigurationError
-            Arrays whose shapes do not fit.
+            Arrays whose shapes do not fit, or stamps that are no integers.
 
         """
+        stamps, y = column(stamps), np.ascontiguousarray(column(y), dtype=np.float64)
+        if len(stamps) and not np.issubdtype(stamps.dtype, np.integer):
+            raise ConfigurationError(
+                f'run: expected stamps in nanoseconds, which are integers, got {stamps.dtype}'
+            )
         stamps = np.ascontiguousarray(stamps, dtype=np.int64)
-        y = np.ascontiguousarray(y, dtype=np.float64)
         if y.ndim != 1 or stamps.shape != y.shape:
             raise ConfigurationError(
                 'run: expected stamps and y with one dimension and equal length, got shapes '

@@ -228,12 +228,15 @@ class ParameterTable(Mapping[str, Parameter]):
             for p in self.values()
         }
 
-    def complete(self, values: 'Mapping[str, Any] | None' = None) -> 'Parameters':
+    def complete(
+        self, values: 'Mapping[str, Any] | None' = None, named: 'Mapping[str, Any] | None' = None
+    ) -> 'Parameters':
         """
         Return the values of all parameters: those given, checked, and defaults for the rest.
 
-        `Parameters` of any table have been checked already and are not checked again: of a larger
-        table the part that this one declares is taken.
+        `named` are keyword arguments, which win; lambda_ stands for lambda. `Parameters` of any
+        table have been checked already and are not checked again: of a larger table the part that
+        this one declares is taken.
 
         Raises
         ------
@@ -241,6 +244,9 @@ class ParameterTable(Mapping[str, Parameter]):
             An unknown name (with the closest known one), or a bad value.
 
         """
+        if named:
+            named = {name.removesuffix('_'): value for name, value in named.items()}
+            values = self.coerce(values or {}) | self.coerce(named)
         if isinstance(values, Parameters):
             if values.table is self:
                 return values
@@ -251,16 +257,24 @@ class ParameterTable(Mapping[str, Parameter]):
         """
         Check names, types and bounds of `values`; what is absent stays absent.
 
+        ``{'constants': {'k': 3}}`` is the same as ``{'constants.k': 3}``.
+
         Raises
         ------
         ConfigurationError
             An unknown name (with the closest known one), or a bad value.
 
         """
-        for name in values:
+        flat: dict[str, Any] = {}
+        for name, value in values.items():
+            if name in self._families and isinstance(value, Mapping):
+                flat |= {f'{name}.{key}': number for key, number in value.items()}
+            else:
+                flat[name] = value
+        for name in flat:
             if name not in self:
                 raise unknown_parameter(name, [*self, *(p.name for p in self.families)])
-        return {name: self[name].coerce(value) for name, value in values.items()}
+        return {name: self[name].coerce(value) for name, value in flat.items()}
 
 
 class Parameters(Mapping[str, Any]):

@@ -45,6 +45,8 @@ class Plant:
     ----------
     parameters : mapping, optional
         Values for the plant's parameters in docs/parameters.md; defaults for the rest.
+    **named
+        Parameters as keyword arguments, which win.
 
     Raises
     ------
@@ -53,13 +55,21 @@ class Plant:
 
     """
 
-    def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
-        p = self._parameters = PLANT_PARAMETERS.complete(parameters)
+    def __init__(self, parameters: Mapping[str, Any] | None = None, /, **named: Any) -> None:
+        p = self._parameters = PLANT_PARAMETERS.complete(parameters, named)
         self._model = TriangularModel.of(p)
         z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], self._model.order)
         self._d = Wave(p)
         self._system = System(self._model.expressions, self._d, p['integration_step'], z)
         self._random = np.random.default_rng(p['noise_seed'])
+
+    def __repr__(self) -> str:
+        p = self._parameters
+        return (
+            f'Plant(order={self.order}, phi={list(self._model.phi)}, '
+            f'd: {p["disturbance"]} of {p["disturbance_amplitude"]:g}, '
+            f'noise_std={p["noise_std"]:g})'
+        )
 
     @property
     def parameters(self) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.tools.bags.reader import BagReader
@@ -122,7 +122,7 @@ def others(run: Run, parameters: Mapping[str, Any]) -> dict[str, Floats]:
     if parameters.get('gains') == 'self_tuning':
         return {}
     return {
-        name: Observer({**parameters, **changes})
+        name: OnlineEstimator({**parameters, **changes})
         .run(run.y.stamps, run.y.values.ravel())
         .unknown_input[run.rows]
         for name, changes in OTHERS.items()
