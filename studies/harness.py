@@ -4,6 +4,7 @@
 import argparse
 from collections.abc import Hashable, Mapping
 import multiprocessing
+from multiprocessing import resource_tracker
 import os
 from pathlib import Path
 import signal
@@ -89,7 +90,10 @@ def called(
         os.environ.setdefault(variable, '1')  # the processes already use all cores
     found = {}
     # Inherited: only this process takes signals, and ends the others.
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
+    signals = {signal.SIGINT, signal.SIGHUP}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    resource_tracker.ensure_running()  # which unblocks SIGINT (Python 3.11), so once more
+    signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     with multiprocessing.get_context('spawn').Pool(jobs) as pool:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         waiting = {key: pool.apply_async(call[0], call[1:]) for key, call in calls.items()}

@@ -19,13 +19,15 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PARSER = argparse.ArgumentParser(prog='try')
 BUSY = """
-import argparse, os, sys, time
+import argparse, os, signal, sys, time
 from pathlib import Path
 from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.cli.output import Output
 from studies.harness import called
 
 def work(folder, k):
+    # Only the parent takes Ctrl-C, however busy the machine is.
+    assert {signal.SIGINT, signal.SIGHUP} <= signal.pthread_sigmask(signal.SIG_BLOCK, ())
     (folder / f'{k}.pid').write_text(str(os.getpid()))
     time.sleep(600)
 
