@@ -8,6 +8,7 @@ from multiprocessing import resource_tracker
 import os
 from pathlib import Path
 import signal
+import threading
 from typing import Any
 
 from fhaosmo_ros.core import OnlineEstimator, Trajectory
@@ -94,7 +95,7 @@ def called(
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     resource_tracker.ensure_running()  # which unblocks SIGINT (Python 3.11), so once more
     signal.pthread_sigmask(signal.SIG_BLOCK, signals)
-    with multiprocessing.get_context('spawn').Pool(jobs) as pool:
+    with multiprocessing.get_context('spawn').Pool(jobs, _end_with_parent) as pool:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         waiting = {key: pool.apply_async(call[0], call[1:]) for key, call in calls.items()}
         with progress(total=len(calls), unit='part', desc=name) as bar:
@@ -105,3 +106,13 @@ def called(
                     found[key] = waiting.pop(key).get()
                     bar.update()
     return found
+
+
+def _end_with_parent() -> None:
+    """End this process once its parent has: a killed one does not end it."""
+
+    def watch() -> None:
+        multiprocessing.parent_process().join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
