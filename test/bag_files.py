@@ -1,16 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags for tests, written by rosbags."""
+"""Bags for tests, written by rosbags, and those of mcap's presets by the mcap package."""
 
 import struct
 
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 import numpy as np
-from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
+import yaml
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 FLOAT = 'std_msgs/msg/Float64'
 ORIGIN = 1_700_000_000_123_456_789
+PRESETS = {
+    'plain': {'compression': CompressionType.NONE},
+    'zstd': {'compression': CompressionType.ZSTD},
+    'lz4': {'compression': CompressionType.LZ4},
+    'fastwrite': {'use_chunking': False},
+    'zstd_fast': {'compression': CompressionType.ZSTD, 'enable_crcs': False},
+}
+"""Of Jazzy's mcap storage."""
 
 
 def signal(count, rng=None):
@@ -28,6 +38,11 @@ def float64(value):
     return b'\0\1\0\0' + struct.pack('<d', value)
 
 
+def floats(stamps, values, topic='/y'):
+    rows = zip(stamps.tolist(), values.tolist(), strict=True)
+    return [(topic, FLOAT, stamp, float64(value)) for stamp, value in rows]
+
+
 def header(stamp, frame='base'):
     types = TYPES.types
     time = types['builtin_interfaces/msg/Time'](
@@ -36,49 +51,67 @@ def header(stamp, frame='base'):
     return types['std_msgs/msg/Header'](stamp=time, frame_id=frame)
 
 
-def write(path, messages, storage='mcap', compression=None, version=9):
-    """Write (topic, type, stamp, CDR) tuples."""
-    with Writer(path, version=version, storage_plugin=StoragePlugin[storage.upper()]) as bag:
-        _fill(bag, messages)
-    return path
-
-
-def write_ros1(path, messages):
-    """Write (topic, type, stamp, CDR) tuples as a bag of ROS 1, with its own message types."""
-    types = get_typestore(Stores.ROS1_NOETIC)
-    connections = {}
-    with Ros1Writer(path) as bag:
+def write(path, messages, storage='mcap', compression='none', version=9):
+    """Write (topic, type, stamp, CDR) tuples; compression: none, file or message."""
+    bag = Writer(path, version=version, storage_plugin=StoragePlugin[storage.upper()])
+    bag.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+    with bag:
+        connections = {}
         for topic, message_type, stamp, data in messages:
             if topic not in connections:
-                connections[topic] = bag.add_connection(topic, message_type, typestore=types)
-            message = TYPES.deserialize_cdr(data, message_type)
-            if hasattr(message, 'header'):  # theirs has a sequence number in front
-                header = types.types['std_msgs/msg/Header'](
-                    seq=7, stamp=message.header.stamp, frame_id=message.header.frame_id
-                )
-                fields = {f: getattr(message, f) for f, _ in TYPES.fielddefs[message_type][1]}
-                message = types.types[message_type](**(fields | {'header': header}))
-            raw = types.serialize_ros1(message, message_type)
-            bag.write(connections[topic], int(stamp), raw)
+                connections[topic] = bag.add_connection(topic, message_type, typestore=TYPES)
+            bag.write(connections[topic], int(stamp), data)
     return path
 
 
-def write_compressed(path, messages, storage, mode):
-    bag = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
-    bag.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
-    with bag:
-        _fill(bag, messages)
+def write_preset(path, messages, preset, published=None, parts=1):
+    """
+    Write (topic, type, stamp, CDR) tuples as one of `PRESETS`, to so many files.
+
+    `published` are the publish times, by default the stamps.
+    """
+    path.mkdir()
+    published = [m[2] for m in messages] if published is None else published
+    share = -(-len(messages) // parts)
+    names = [f'{path.name}_{k}.mcap' for k in range(parts)]
+    for k, name in enumerate(names):
+        part = slice(k * share, (k + 1) * share)
+        _write_file(path / name, messages[part], published[part], PRESETS[preset])
+    topics = sorted({m[:2] for m in messages})
+    information = {
+        'version': 9, 'storage_identifier': 'mcap', 'message_count': len(messages),
+        'starting_time': {'nanoseconds_since_epoch': int(messages[0][2])},
+        'duration': {'nanoseconds': int(messages[-1][2] - messages[0][2])},
+        'topics_with_message_count': [
+            {
+                'topic_metadata': {
+                    'name': topic, 'type': kind, 'serialization_format': 'cdr',
+                    'offered_qos_profiles': [],
+                    'type_description_hash': TYPES.hash_rihs01(kind),
+                },
+                'message_count': sum(m[0] == topic for m in messages),
+            }
+            for topic, kind in topics
+        ],
+        'compression_format': '', 'compression_mode': '', 'relative_file_paths': names,
+        'files': [], 'custom_data': None, 'ros_distro': 'jazzy',
+    }  # fmt: skip
+    (path / 'metadata.yaml').write_text(
+        yaml.safe_dump({'rosbag2_bagfile_information': information})
+    )
     return path
 
 
-def _fill(bag, messages):
-    connections = {}
-    for topic, message_type, stamp, data in messages:
-        if topic not in connections:
-            connections[topic] = bag.add_connection(topic, message_type, typestore=TYPES)
-        bag.write(connections[topic], int(stamp), data)
-
-
-def floats(stamps, values, topic='/y'):
-    rows = zip(stamps.tolist(), values.tolist(), strict=True)
-    return [(topic, FLOAT, stamp, float64(value)) for stamp, value in rows]
+def _write_file(path, messages, published, options):
+    with path.open('wb') as stream:
+        writer = McapWriter(stream, chunk_size=20_000, **options)
+        writer.start(profile='ros2', library='libmcap 1.3.1')
+        channels = {}
+        for (topic, kind, stamp, data), sent in zip(messages, published, strict=True):
+            if topic not in channels:
+                text, _ = TYPES.generate_msgdef(kind, ros_version=2)
+                schema = writer.register_schema(kind, 'ros2msg', text.encode())
+                extra = {'offered_qos_profiles': '[]'}
+                channels[topic] = writer.register_channel(topic, 'cdr', schema, extra)
+            writer.add_message(channels[topic], int(stamp), data, int(sent))
+        writer.finish()

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags have what Jazzy's rosbag2 writes and reads, as seen by readers that are not rosbags."""
 
-import sqlite3
 import struct
 
 import bag_files as files
+from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.types import LATCHED_QOS, make_qos
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.replay import command as replay
@@ -30,98 +30,60 @@ LATCHED = RELIABLE | {'history': 'unknown', 'depth': 0, 'durability': 'transient
 """As the middleware tells of a publisher: it does not know history and depth."""
 
 
-def make(path, storage):
+def test_metadata(tmp_path):
+    """Every field that rosbag2's parser asks for in version 9, of its type; twice."""
     latched = make_qos(
         'UNKNOWN', 0, 'RELIABLE', 'TRANSIENT_LOCAL', 2**63 - 1, 2**63 - 1, 'AUTOMATIC', 2**63 - 1
     )
-    with BagWriter(path, storage) as bag:
+    with BagWriter(tmp_path / 'bag') as bag:
         bag.add('/y', KIND)
         bag.add('/late', KIND, qos=[latched])
         bag.write('/y', 5, files.float64(1.5))
         bag.write('/late', 7, files.float64(-2.5))
         bag.write('/y', 9, files.float64(2.5))
-    return path
-
-
-def check(information, storage, file):
-    """Every field that rosbag2's parser asks for in version 9, of its type."""
-    topics = {t['topic_metadata']['name']: t for t in information['topics_with_message_count']}
-    times = {'starting_time': {'nanoseconds_since_epoch': 5}, 'duration': {'nanoseconds': 4}}
-    assert information == {
-        'version': 9, 'storage_identifier': storage, 'message_count': 3, **times,
-        'topics_with_message_count': list(topics.values()),
-        'compression_format': '', 'compression_mode': '', 'relative_file_paths': [file],
-        'files': [{'path': file, 'message_count': 3} | times],
+    assert sorted(p.name for p in (tmp_path / 'bag').iterdir()) == ['bag_0.mcap', 'metadata.yaml']
+    span = {
+        'starting_time': {'nanoseconds_since_epoch': 5}, 'duration': {'nanoseconds': 4},
+        'message_count': 3,
+    }  # fmt: skip
+    expected = {
+        'version': 9, 'storage_identifier': 'mcap', **span,
+        'topics_with_message_count': [
+            {
+                'message_count': count,
+                'topic_metadata': {
+                    'name': name, 'type': KIND, 'serialization_format': 'cdr',
+                    'offered_qos_profiles': [qos], 'type_description_hash': FLOAT_HASH,
+                },
+            }
+            for name, count, qos in (('/y', 2, RELIABLE), ('/late', 1, LATCHED))
+        ],
+        'compression_format': '', 'compression_mode': '', 'relative_file_paths': ['bag_0.mcap'],
+        'files': [{'path': 'bag_0.mcap', **span}],
         'custom_data': None,  # how yaml-cpp writes an empty map
         'ros_distro': 'jazzy',
     }  # fmt: skip
-    expected = {'/y': (2, RELIABLE), '/late': (1, LATCHED)}
-    assert set(topics) == set(expected)
-    for name, (count, qos) in expected.items():
-        assert topics[name] == {
-            'message_count': count,
-            'topic_metadata': {
-                'name': name, 'type': KIND, 'serialization_format': 'cdr',
-                'offered_qos_profiles': [qos], 'type_description_hash': FLOAT_HASH,
-            },
-        }  # fmt: skip
-
-
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_metadata_file(storage, tmp_path):
-    bag = make(tmp_path / 'bag', storage)
-    content = yaml.safe_load((bag / 'metadata.yaml').read_text())
-    assert list(content) == ['rosbag2_bagfile_information']
-    file = 'bag_0.mcap' if storage == 'mcap' else 'bag_0.db3'
-    check(content['rosbag2_bagfile_information'], storage, file)
-    assert sorted(p.name for p in bag.iterdir()) == [file, 'metadata.yaml']
-
-
-def test_mcap_file(tmp_path):
-    bag = make(tmp_path / 'bag', 'mcap')
-    with (bag / 'bag_0.mcap').open('rb') as file:
+    text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
+    assert yaml.safe_load(text) == {'rosbag2_bagfile_information': expected}
+    with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
         for channel in summary.channels.values():
-            qos = LATCHED if channel.topic == '/late' else RELIABLE
             assert channel.message_encoding == 'cdr'
             assert set(channel.metadata) == {'offered_qos_profiles', 'topic_type_hash'}
             assert channel.metadata['topic_type_hash'] == FLOAT_HASH
+            qos = LATCHED if channel.topic == '/late' else RELIABLE
             assert yaml.safe_load(channel.metadata['offered_qos_profiles']) == [qos]
             schema = summary.schemas[channel.schema_id]
             assert (schema.name, schema.encoding) == (KIND, 'ros2msg')
         (metadata,) = reader.iter_metadata()
         assert metadata.name == 'rosbag2'
-        check(yaml.safe_load(metadata.metadata['serialized_metadata']), 'mcap', 'bag_0.mcap')
+        assert yaml.safe_load(metadata.metadata['serialized_metadata']) == expected
         got = [
             (channel.topic, message.log_time, message.publish_time, decoded.data)
             for _, channel, message, decoded in reader.iter_decoded_messages()
         ]
     assert got == [('/y', 5, 5, 1.5), ('/late', 7, 7, -2.5), ('/y', 9, 9, 2.5)]
-
-
-def test_sqlite_file(tmp_path):
-    bag = make(tmp_path / 'bag', 'sqlite3')
-    with sqlite3.connect(bag / 'bag_0.db3') as database:
-
-        def rows(text):
-            return database.execute(text).fetchall()
-
-        assert rows('SELECT * FROM schema') == [(4, 'jazzy')]
-        ((version, text),) = rows('SELECT metadata_version, metadata FROM metadata')
-        check(yaml.safe_load(text), 'sqlite3', 'bag_0.db3')
-        assert version == 9
-        topics = rows('SELECT name, offered_qos_profiles, type_description_hash FROM topics')
-        assert [t[0] for t in topics] == ['/y', '/late']
-        assert yaml.safe_load(topics[1][1]) == [LATCHED]
-        assert {t[2] for t in topics} == {FLOAT_HASH}
-        definitions = rows('SELECT topic_type, encoding, type_description_hash'
-                           ' FROM message_definitions')  # fmt: skip
-        assert definitions == [(KIND, 'ros2msg', FLOAT_HASH)]
-        got = rows('SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp')
-    database.close()
-    values = [(1, 5, 1.5), (2, 7, -2.5), (1, 9, 2.5)]
-    assert got == [(topic, stamp, files.float64(value)) for topic, stamp, value in values]
 
 
 def recorded(path):
@@ -222,6 +184,8 @@ def test_replayed_bag_is_read_by_another_reader(tmp_path):
     assert len(found.pop('/estimator/parameters')) == 1
     assert len(found) == 5
     assert {len(rows) for rows in found.values()} == {3000}
+    with BagReader(tmp_path / 'out') as copied:  # the QoS goes along
+        assert [c.ext.offered_qos_profiles for c in copied.connections if c.topic == '/y'] == [[]]
     states = [message for _, message in found['/estimator/state']]
     assert {m.layout.dim[0].label for m in states} == {'z1,z2,z3'}
     assert np.isfinite([m.data for m in states]).all()

@@ -80,11 +80,11 @@ class Live:
         self._tell(Flag.CHANGED, 100_100)
 
 
-def write(path, stamps, y, *lives, begin=0, storage='mcap'):
+def write(path, stamps, y, *lives, begin=0):
     """Write what a recorder gets that comes at sample `begin`."""
     messages = files.floats(stamps, y) + [m for live in lives for m in live.messages]
     messages = [m for m in messages if m[2] >= stamps[begin]]
-    return files.write(path, sorted(messages, key=lambda m: m[2]), storage)
+    return files.write(path, sorted(messages, key=lambda m: m[2]))
 
 
 def run(capsys, *arguments):
@@ -100,9 +100,8 @@ def rows(path):
         return dict(zip(arrays['stamp_ns'].tolist(), values.tolist(), strict=True))
 
 
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('begin', [0, 700, 2600])
-def test_every_live_estimate_comes_again(begin, storage, tmp_path, capsys):
+def test_every_live_estimate_comes_again(begin, tmp_path, capsys):
     stamps, y = files.signal(COUNT)
     live = Live()
     live.run(stamps, y, 123, 1000)  # it discovered y later than the recorder
@@ -117,7 +116,7 @@ def test_every_live_estimate_comes_again(begin, storage, tmp_path, capsys):
     live.run(stamps, y, 2700, 3400)
     live.freeze(False)
     live.run(stamps, y, 3400, COUNT)
-    bag = write(tmp_path / 'bag', stamps, y, live, begin=begin, storage=storage)
+    bag = write(tmp_path / 'bag', stamps, y, live, begin=begin)
     parameters = ['-p', 'epsilon:=3.0'] if begin == 0 else []
     (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
     if begin == 2600:  # whoever records later has to know the parameters

@@ -17,6 +17,7 @@ pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 import bag_files as files
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.tools.bags.reader import BagReader
+from waiting import wait_until
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,7 +48,7 @@ def test_estimator_restarts_where_the_loop_begins_again(tmp_path):
 
     reader = threading.Thread(target=read)
     reader.start()
-    player = start('play', bag, '--loop', '--rate', '2', '--delay', '0', '--wait', '/y', '/clock')
+    player = start('play', bag, '--loop', '--rate', '2', '--delay', '0')
     try:
         assert jumped.wait(60), ''.join(lines)
         assert player.poll() is None
@@ -79,7 +80,6 @@ def test_bag_takes_its_own_time_over_the_rate(tmp_path):
         (['BAG', '--rate', '0'], ['--rate', '0.001 to 1000', '0']),
         (['BAG', '--delay', '-1'], ['--delay', '0 to 3600', '-1']),
         (['BAG', '--topics', '/x'], ["'/x'", '/y']),
-        (['BAG', '--exclude', '/y'], ['expected a message to play']),
     ],
 )
 def test_wrong_input_is_said_in_one_line(arguments, words, tmp_path):
@@ -143,14 +143,15 @@ def test_names_and_remappings_of_a_launch_file_act(tmp_path):
         '-p', 'use_sim_time:=true', '--params-file', tmp_path / 'none.yaml',
     )  # fmt: skip
     recorder = start('record', '-o', tmp_path / 'out', *remapped, '-r', '__node:=scribe')
+    player = start('play', bag, '--delay', '0', '--loop', *remapped)
+    file = tmp_path / 'out' / 'out_0.mcap'
     try:
-        assert 'recording to' in recorder.stdout.readline()
-        player = start('play', bag, '--delay', '0', '--wait', '/y', *remapped)
-        played, _ = player.communicate(timeout=60)  # it waits for the recorder, then ends
-        assert player.returncode == 0, played
+        wait_until(lambda: file.exists() and file.stat().st_size > 20_000, 'messages', 90.0)
     finally:
-        recorder.send_signal(signal.SIGINT)
-        said, _ = recorder.communicate(timeout=60)
-    assert recorder.returncode == 0, said
+        said = []
+        for process in (player, recorder):
+            process.send_signal(signal.SIGINT)
+            said.append(process.communicate(timeout=60)[0])
+    assert (player.returncode, recorder.returncode) == (0, 0), said
     with BagReader(tmp_path / 'out') as recorded:
         assert recorded.count('/rig/y') > 0

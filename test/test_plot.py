@@ -178,12 +178,9 @@ sys.exit(command.main(sys.argv[1:]))
 
 
 @pytest.mark.signals
-def test_ctrl_c_leaves_nothing(tmp_path):
-    stamps, y = files.signal(60_000)
-    bag = files.write(tmp_path / 'bag', files.floats(stamps, y), 'sqlite3')
-    assert replay.main([str(bag), '-o', str(tmp_path / 'out'), '--storage', 'sqlite3']) == 0
+def test_ctrl_c_leaves_nothing(bag, tmp_path):
     process = subprocess.Popen(
-        [sys.executable, '-c', SLOW, tmp_path / 'out', '-o', tmp_path / 'f.pdf'],
+        [sys.executable, '-c', SLOW, bag, '-o', tmp_path / 'f.pdf'],
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
@@ -196,7 +193,7 @@ def test_ctrl_c_leaves_nothing(tmp_path):
     assert process.returncode == 130, error
     assert error.strip().splitlines()[-1] == 'plot: interrupted'
     assert 'Traceback' not in error
-    assert sorted(p.name for p in tmp_path.iterdir()) == ['bag', 'out']
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['bag', 'one', 'two']
 
 
 def test_fuzzy_systems_are_drawn_without_a_bag(tmp_path, capsys):

@@ -4,14 +4,12 @@
 import csv
 import os
 from pathlib import Path
-import shutil
 import signal as signals
 import sqlite3
 import subprocess
 import sys
 
 import bag_files as files
-import bag_variants as variants
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.tools.bags.reader import BagReader
@@ -21,7 +19,6 @@ from fhaosmo_ros.tools.replay import command as replay
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import storage_mcap
 from waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,13 +47,12 @@ def run(*arguments):
     return replay.main([str(a) for a in arguments])
 
 
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_output_bag_holds_the_estimators_topics(storage, tmp_path):
+def test_output_bag_holds_the_estimators_topics(tmp_path):
     stamps, y = files.signal(300)
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
     out = tmp_path / 'out'
     model = ['-p', 'order:=2', '-p', 'phi:=["0","0"]', '-p', 'gains:=fixed']
-    assert run(bag, '-o', out, '--storage', storage, *model) == 0
+    assert run(bag, '-o', out, *model) == 0
     rows = expected(stamps, y, {'order': 2, 'phi': ['0', '0'], 'gains': 'fixed'})
     state = series(out, '/estimator/state')
     np.testing.assert_array_equal(state.values, rows[:, :2])
@@ -73,8 +69,8 @@ def test_output_bag_holds_the_estimators_topics(storage, tmp_path):
         assert set(counts.values()) == {300}
     # A bag that has estimates gets the replayed ones beside them.
     again = tmp_path / 'again'
-    assert run(out, '-o', again, '--every', 7) == 0
-    assert len(series(again, '/replay/estimator/state').stamps) == 300 // 7
+    assert run(out, '-o', again) == 0
+    assert len(series(again, '/replay/estimator/state').stamps) == 300
     assert len(series(again, '/estimator/state').stamps) == 300
 
 
@@ -89,7 +85,7 @@ def test_csv_reads_back_as_the_same_numbers(tmp_path):
     np.testing.assert_array_equal(got, expected(stamps, y))
 
 
-def test_parameters_of_file_and_command_line(tmp_path):
+def test_parameters_of_file_and_command_line(tmp_path, capsys):
     stamps, y = files.signal(300)
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
     (tmp_path / 'p.yaml').write_text(
@@ -97,6 +93,9 @@ def test_parameters_of_file_and_command_line(tmp_path):
     )
     arguments = ['--params-file', tmp_path / 'p.yaml', '-p', 'lambda:=[20, 15.5, 15, 1e1]']
     assert run(bag, '-o', tmp_path / 'o.npz', *arguments) == 0
+    assert 'warning' not in capsys.readouterr().err
+    assert run(bag, '-o', tmp_path / 'default.npz') == 0
+    assert 'replay: warning: the bag has no ~/parameters' in capsys.readouterr().err
     values = {'variant': 'sign', 'alpha': 30, 'lambda': [20, 15.5, 15, 10]}
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y, values))
 
@@ -163,15 +162,14 @@ def imu(stamp, value):
             angular=files.TYPES.types['geometry_msgs/msg/Vector3'](1.0, v, 3.0)), np.float64),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_any_number_of_any_type(kind, field, make, rounding, storage, tmp_path):
+def test_any_number_of_any_type(kind, field, make, rounding, tmp_path):
     stamps, y = files.signal(400)
     late = stamps + 3_000_000  # the bag's own stamps, not those of the headers
     messages = [
         ('/sensor', kind, at, make(stamp, value))
         for at, stamp, value in zip(late.tolist(), stamps.tolist(), y.tolist(), strict=True)
     ]
-    bag = files.write(tmp_path / 'bag', messages, storage)
+    bag = files.write(tmp_path / 'bag', messages)
     choice = ['--field', field] if field else []
     assert run(bag, '--topic', '/sensor', *choice, '-o', tmp_path / 'o.npz') == 0
     used = stamps if b'header' in repr(files.TYPES.fielddefs[kind]).encode() else late
@@ -181,42 +179,6 @@ def test_any_number_of_any_type(kind, field, make, rounding, storage, tmp_path):
         bag, '--topic', '/sensor', *choice, '--stamp', 'bag', '-o', tmp_path / 'b.npz'
     ) == 0  # fmt: skip
     np.testing.assert_array_equal(table(tmp_path / 'b.npz'), expected(late, y))
-
-
-def test_bag_of_ros1_is_read_as_one_of_ros2(tmp_path, capsys):
-    stamps, y = files.signal(500)
-    messages = []
-    for stamp, value in zip(stamps.tolist(), y.tolist(), strict=True):
-        joints = files.cdr(
-            'sensor_msgs/msg/JointState', header=files.header(stamp), name=['hip', 'knee'],
-            position=np.array([0.0, value]), velocity=np.zeros(0), effort=np.zeros(0),
-        )  # fmt: skip
-        messages.append(('/joints', 'sensor_msgs/msg/JointState', stamp + 250_000, joints))
-    messages += files.floats(stamps[::2] + 1, np.sin(stamps[::2] * 1e-9), '/u')
-    messages.sort(key=lambda m: m[2])
-    bags = (
-        files.write_ros1(tmp_path / 'old.bag', messages),
-        files.write(tmp_path / 'new', messages),
-    )
-    options = ['--topic', '/joints', '--field', 'position[1]', '-p', "phi:=['0','0','u-z3']"]
-    options += ['-p', 'gains:=fixed']
-    tables = []
-    for bag in bags:
-        out = tmp_path / f'{bag.stem}.npz'
-        assert run(bag, *options, '-o', out, '-o', tmp_path / f'{bag.stem}_out') == 0
-        assert 'stamps: header of the messages' in capsys.readouterr().out
-        with np.load(out) as found:
-            np.testing.assert_array_equal(found['stamp_ns'], stamps)
-            np.testing.assert_array_equal(found['bag_time_ns'], stamps + 250_000)
-        tables.append(table(out))
-    np.testing.assert_array_equal(*tables)
-    with BagReader(tmp_path / 'old_out') as copied:  # as a bag of ROS 2
-        assert [row[:3] for row in copied.messages(['/joints', '/u'])] == [
-            (topic, stamp, data) for topic, _, stamp, data in messages
-        ]
-    (tmp_path / 'bad.bag').write_bytes(bags[0].read_bytes()[:5000])
-    assert run(tmp_path / 'bad.bag', *options, '-o', tmp_path / 'o.npz') != 0
-    assert 'bad.bag: expected a whole bag' in capsys.readouterr().err
 
 
 def test_several_known_inputs_are_held_each_by_itself(tmp_path, capsys):
@@ -245,42 +207,6 @@ def test_several_known_inputs_are_held_each_by_itself(tmp_path, capsys):
     assert "'/a'" in capsys.readouterr().err
 
 
-def test_chunks_that_overlap_are_put_in_order(tmp_path, monkeypatch):
-    stamps, y = files.signal(3000)
-    order = np.argsort(np.arange(3000) + np.random.default_rng(3).uniform(0, 700, 3000))
-    messages = files.floats(stamps, y)
-    close = storage_mcap.McapWriter.close_chunk
-
-    def write(self, *arguments):
-        original(self, *arguments)
-        if self.chunk.bio.tell() > 20_000:
-            close(self)
-
-    original = storage_mcap.McapWriter.write
-    monkeypatch.setattr(storage_mcap.McapWriter, 'write', write)
-    bag = files.write(tmp_path / 'bag', [messages[k] for k in order])
-    monkeypatch.undo()
-    assert run(bag, '-o', tmp_path / 'o.npz') == 0
-    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y))
-
-
-def test_bag_whose_qos_differs_from_its_storage_is_read(tmp_path):
-    """rosbags finds no message then."""
-    stamps, y = files.signal(50)
-    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
-    text = (bag / 'metadata.yaml').read_text()
-    qos = '[{history: keep_last, depth: 3, reliability: reliable, durability: volatile, '
-    zero = '{sec: 0, nsec: 0}'
-    qos += f'deadline: {zero}, lifespan: {zero}, liveliness: automatic, '
-    qos += f'liveliness_lease_duration: {zero}, avoid_ros_namespace_conventions: false}}]'
-    assert 'offered_qos_profiles: []' in text
-    (bag / 'metadata.yaml').write_text(
-        text.replace('offered_qos_profiles: []', f'offered_qos_profiles: {qos}')
-    )
-    assert run(bag, '-o', tmp_path / 'o.npz') == 0
-    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y))
-
-
 def test_stamps_that_go_back_are_rejected_as_live_if_asked(tmp_path, capsys):
     stamps, y = files.signal(200)
     shown = stamps.copy()
@@ -305,9 +231,11 @@ def test_topic_of_an_unknown_type_is_copied(tmp_path):
     """A sqlite3 bag of Humble has no definitions."""
     stamps, y = files.signal(500)
     messages = files.floats(stamps, y) + files.floats(stamps[:1], y[:1], '/odd')
-    bag = variants.write(tmp_path / 'bag', messages, 'humble', 'sqlite3', 'plain')
-    with sqlite3.connect(bag / 'bag_0.db3') as database:
+    bag = files.write(tmp_path / 'bag', messages, 'sqlite3', version=8)
+    with sqlite3.connect(bag / 'bag.db3') as database:
         database.execute("UPDATE topics SET type = 'rig_msgs/msg/Odd' WHERE name = '/odd'")
+        database.execute('DROP TABLE message_definitions')
+        database.execute('UPDATE schema SET schema_version = 3')
     database.close()
     text = (bag / 'metadata.yaml').read_text()
     at = text.index('name: /odd')
@@ -353,6 +281,10 @@ def spoil(bag):
     path.write_bytes(data)
 
 
+def old(bag):
+    bag.with_name('old.bag').write_bytes(b'#ROSBAG V2.0')
+
+
 def lose_metadata(bag):
     (bag / 'metadata.yaml').unlink()
 
@@ -369,7 +301,7 @@ def lose_metadata(bag):
         (None, ['BAG', '-p', 'lamda:=3'], ["'lamda'", "did you mean 'lambda'?"]),
         (None, ['BAG', '-p', 'epsilon:=-3'], ["'epsilon'", '> 0', '-3']),
         (None, ['BAG', '-p', "phi:=['0','0','u']"], ["'/u'", '(/y)']),
-        (None, ['BAG', '--every', '0'], ['--every', '>= 1', '0']),
+        (old, ['old.bag'], ['ROS 1', 'rosbags-convert --src old.bag']),
         (None, ['BAG', '--params-file', '/no.yaml'], ['/no.yaml', 'No such file']),
         (cut, ['BAG'], ['whole bag', 'mcap recover']),
         (spoil, ['BAG'], ['whole bag']),
@@ -377,8 +309,9 @@ def lose_metadata(bag):
     ],
 )
 def test_wrong_input_is_said_in_one_line_and_leaves_nothing(
-    harm, arguments, words, bag, tmp_path, capsys
+    harm, arguments, words, bag, tmp_path, capsys, monkeypatch
 ):
+    monkeypatch.chdir(tmp_path)
     if harm:
         harm(bag)
     before = sorted(tmp_path.iterdir())
@@ -446,10 +379,9 @@ def test_output_without_a_name_is_refused(name, bag, capsys):
     assert error == f'replay: error: output {name}: expected a name, got a folder that is in use'
 
 
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_full_disk_is_said_in_one_line(storage, bag, tmp_path):
+def test_full_disk_is_said_in_one_line(bag, tmp_path):
     """The system refuses to make a file larger than 300 kB."""
-    command = f'-m fhaosmo_ros replay {bag} -o {tmp_path / "out"} --storage {storage}'
+    command = f'-m fhaosmo_ros replay {bag} -o {tmp_path / "out"}'
     result = subprocess.run(
         ['sh', '-c', f'ulimit -f 600; exec {sys.executable} {command}'],
         capture_output=True,
@@ -464,35 +396,43 @@ def test_full_disk_is_said_in_one_line(storage, bag, tmp_path):
     assert not (tmp_path / 'out').exists()
 
 
+# The command, which writes until the signal comes, so that none can come too late.
+SLOW = """
+import sys
+from fhaosmo_ros.tools.replay import command
+write = command._write
+def forever(*arguments):
+    write(*arguments)
+    arguments[-1].wait()
+    command._check_stop(arguments[-1])
+command._write = forever
+sys.exit(command.main(sys.argv[1:]))
+"""
+
+
 @pytest.mark.signals
-def test_ctrl_c_leaves_nothing(tmp_path):
-    stamps, y = files.signal(200_000)
-    bag = files.write(tmp_path / 'bag', files.floats(stamps, y), 'sqlite3')
+def test_ctrl_c_leaves_nothing(bag, tmp_path):
     process = subprocess.Popen(
-        [sys.executable, '-m', 'fhaosmo_ros', 'replay', bag, '-o', tmp_path / 'out',
-         '--storage', 'sqlite3'],
+        [sys.executable, '-c', SLOW, bag, '-o', tmp_path / 'out'],
         stderr=subprocess.PIPE, text=True, cwd=ROOT,
         env={**os.environ, 'PYTHONPATH': str(ROOT)}, start_new_session=True,
     )  # fmt: skip
-    part = tmp_path / '.out.part' / 'out' / 'out_0.db3'
-    wait_until(part.exists, 'output', process=process)
+    wait_until((tmp_path / '.out.part' / 'out').exists, 'output', process=process)
     os.killpg(process.pid, signals.SIGINT)
     os.killpg(process.pid, signals.SIGINT)
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130, error
     assert 'Traceback' not in error
     assert sorted(p.name for p in tmp_path.iterdir()) == ['bag']
-    shutil.rmtree(bag)
 
 
-@pytest.mark.parametrize('every', [1, 3])
 @pytest.mark.parametrize('way', ['--smooth', '--lag'])
-def test_smoothed_estimates_are_the_librarys(way, every, tmp_path, capsys):
+def test_smoothed_estimates_are_the_librarys(way, tmp_path, capsys):
     stamps, y = files.signal(3000)
     y[500:503] = np.nan
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
     lag = [] if way == '--smooth' else ['0.2']
-    options = ['--params-file', ROOT / 'config' / 'demo.yaml', '--every', every]
+    options = ['--params-file', ROOT / 'config' / 'demo.yaml']
     assert run(bag, '-o', tmp_path / 'o.npz', way, *lag, *options) == 0
     estimator = OnlineEstimator.from_yaml(ROOT / 'config' / 'demo.yaml')
     if lag:
@@ -503,7 +443,7 @@ def test_smoothed_estimates_are_the_librarys(way, every, tmp_path, capsys):
     with np.load(tmp_path / 'o.npz') as found:
         columns = {name: found[name] for name in found.files}
     for name, key in (('stamp_ns', 't'), ('unknown_input', 'unknown_input')):
-        ours = np.concatenate([getattr(part, key) for part in parts])[every - 1 :: every]
+        ours = np.concatenate([getattr(part, key) for part in parts])
         np.testing.assert_allclose(columns[name], ours, rtol=0.0, atol=1e-7)
     np.testing.assert_array_equal(columns['bag_time_ns'], columns['stamp_ns'])
     of_stamp = dict(zip(stamps.tolist(), y.tolist(), strict=True))

@@ -2,15 +2,13 @@
 """Record y and the estimator's topics to a bag."""
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from queue import SimpleQueue
 import re
 import shutil
-import sqlite3
 import sys
 import time
-from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -22,7 +20,6 @@ from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.types import make_qos, TYPES
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import run_command
-from fhaosmo_ros.tools.cli.output import named
 from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.topics import OF_ALL_NODES
 from tqdm import tqdm
@@ -34,17 +31,7 @@ EXTRA = ('/y', '/u', *OF_ALL_NODES)
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0 if there is a valid bag, 2 also if nothing was recorded."""
-    return run_command(_parser(), argv, _run)
-
-
-def _run(arguments: argparse.Namespace, stop: Stop) -> None:
-    if arguments.repair:
-        raise ConfigurationError(
-            '--repair: expected another tool, since record repairs no more: a file that was cut '
-            'is read as it is; `mcap recover` or .recover of sqlite3 saves what is whole of a '
-            'damaged one, and `ros2 bag reindex` makes its metadata.yaml'
-        )
-    _record(arguments, stop)
+    return run_command(_parser(), argv, _record)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -54,27 +41,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add('-o', '--output', type=Path, metavar='BAG', help='new folder (default: bag_TIME)')
-    add('--force', action='store_true', help='replace an output that exists')
-    add('--storage', choices=('mcap', 'sqlite3'), default='mcap', help='default: %(default)s')
     choice = parser.add_mutually_exclusive_group()
     choice.add_argument('--topics', nargs='+', metavar='TOPIC', help='these topics only')
     choice.add_argument('--all', action='store_true', help='every topic that has a publisher')
-    choice.add_argument('--repair', help=argparse.SUPPRESS)
     add(
-        '--names',
-        nargs='+',
-        default=['/estimator', '/plant'],
-        metavar='NAME',
+        '--names', nargs='+', default=['/estimator', '/plant'], metavar='NAME',
         help='nodes whose topics, in and out, to record (default: /estimator /plant)',
-    )
+    )  # fmt: skip
     add(
-        '--params-file',
-        type=Path,
-        action='append',
-        default=[],
-        metavar='FILE',
+        '--params-file', type=Path, action='append', default=[], metavar='FILE',
         help='of an estimator: its inputs are recorded before it runs, too',
-    )
+    )  # fmt: skip
     add('--duration', type=float, metavar='SECONDS', help='stop by itself')
     return parser
 
@@ -82,48 +59,39 @@ def _parser() -> argparse.ArgumentParser:
 def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.duration is not None and not arguments.duration > 0.0:
         raise ConfigurationError(f'--duration: expected > 0 s, got {arguments.duration:g}')
-    path = named(arguments.output or Path(time.strftime('bag_%Y-%m-%d_%H-%M-%S')))
-    if path.exists() and not arguments.force:
-        raise ConfigurationError(
-            f'output {path}: expected a new name (or --force to replace it), got an existing '
-            f'{"folder" if path.is_dir() else "file"}'
-        )
-    if arguments.topics:
-        for topic in arguments.topics:
-            if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', topic):
-                raise ConfigurationError(f'--topics: expected a name such as /y, got {topic!r}')
+    path = arguments.output or Path(time.strftime('bag_%Y-%m-%d_%H-%M-%S'))
+    if path.exists():
+        kind = 'folder' if path.is_dir() else 'file'
+        raise ConfigurationError(f'output {path}: expected a new name, got an existing {kind}')
+    for topic in arguments.topics or []:
+        if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', topic):
+            raise ConfigurationError(f'--topics: expected a name such as /y, got {topic!r}')
     # Here, so that --help needs no ROS.
     from fhaosmo_ros.nodes.recording.topic_recorder import TopicRecorder
 
-    names = [f'/{name.strip("/")}' for name in arguments.names]
-    listeners = [] if arguments.topics else names
     queue: SimpleQueue = SimpleQueue()
     recorder = TopicRecorder(
         queue.put,
         wanted=lambda topic: wanted(topic),
-        listeners=listeners,
+        listeners=[] if arguments.topics else [_full(name) for name in arguments.names],
         ros_arguments=arguments.ros_arguments,
     )
     wanted = _wanted(arguments, recorder.resolved)  # by its node's remappings
-    old = _put_aside(path)
     try:
-        with BagWriter(path, storage=arguments.storage) as bag, recorder:
+        with BagWriter(path) as bag, recorder:
             # Says when it listens, so that a user knows when to start what is to be recorded.
             print(f'recording to {path}; Ctrl-C ends it', flush=True)
             count = _drain(queue, recorder.problems, bag, arguments.duration, stop)
             lost = dict(recorder.lost)
-    except (OSError, sqlite3.Error) as error:
+    except OSError as error:
         hint = '; its storage file can be read as far as it goes' if path.exists() else ''
         raise ConfigurationError(
             f'output {path}: expected a place that can be written, got: '
-            f'{getattr(error, "strerror", None) or error}{hint}'
+            f'{error.strerror or error}{hint}'
         ) from None
     if not count:
         shutil.rmtree(path)
-        if old.exists():
-            old.rename(path)
         raise ConfigurationError('nothing was published on these topics: no bag kept')
-    _remove(old)
     for topic, number in sorted(lost.items()):
         print(
             f'record: {topic}: {number} messages were lost on their way here (a busy machine or '
@@ -133,50 +101,36 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     print(f'{count} messages: {path}')
 
 
-def _put_aside(path: Path) -> Path:
-    """Rename what is there, until there is something to replace it; return its other name."""
-    old = path.with_name(f'.{path.name}.old')
-    if path.exists():
-        _remove(old)  # of a run that was killed
-        path.rename(old)
-    return old
+def _full(name: str) -> str:
+    return f'/{name.strip("/")}'
 
 
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def _wanted(arguments: argparse.Namespace, resolved: Callable[[str], str]):
+def _wanted(
+    arguments: argparse.Namespace, resolved: Callable[[str], str]
+) -> Callable[[str], bool]:
     """Return a function that says of a topic whether to record it."""
     if arguments.all:
         return lambda topic: True
     if arguments.topics:
-        names = {resolved('/' + topic.lstrip('/')) for topic in arguments.topics}
+        names = {resolved(_full(topic)) for topic in arguments.topics}
         return lambda topic: topic in names
-    below = tuple(f'{resolved("/" + name.strip("/"))}/' for name in arguments.names)
+    below = tuple(f'{resolved(_full(name))}/' for name in arguments.names)
     extra = [resolved(topic) for topic in (*EXTRA, *_inputs(arguments))]
     return lambda topic: topic.startswith(below) or topic in extra
-
-
-def _used_inputs(values: Mapping[str, Any]) -> tuple[str, ...]:
-    return TriangularModel.of(ESTIMATOR_PARAMETERS.complete(values)).used_inputs
 
 
 def _inputs(arguments: argparse.Namespace) -> set[str]:
     """Return the topics that the estimators of the parameter files read."""
     found = set()
     for path in arguments.params_file:
-        for name in arguments.names:
+        for name in map(_full, arguments.names):
             values = with_joints(load(path, name.strip('/'), ESTIMATOR_PARAMETERS))
-            namespace = f'/{name.strip("/")}'.rpartition('/')[0]
             for channel in channel_names(values) if values else []:
                 own = of_channel(values, channel)
-                known = known_inputs(own, _used_inputs(own), channel).values()
+                model = TriangularModel.of(ESTIMATOR_PARAMETERS.complete(own))
+                known = known_inputs(own, model.used_inputs, channel).values()
                 wanted = [measured_output(own, channel), *known]
-                found |= {one.absolute(namespace) for one in wanted}
+                found |= {one.absolute(name.rpartition('/')[0]) for one in wanted}
     return found
 
 
@@ -189,10 +143,9 @@ def _drain(
 ) -> int:
     """Write what arrives until the end; return how many messages there were."""
     begin = flushed = time.monotonic()
-    count = 0
+    count, ended = 0, False
     bar_format = '{desc}: {n_fmt} messages, {elapsed}'
     with progress(desc='record', unit='message', bar_format=bar_format) as bar:
-        ended = False
         while not ended:
             ended = stop.wait(0.05) or (
                 duration is not None and time.monotonic() - begin >= duration

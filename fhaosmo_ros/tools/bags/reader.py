@@ -3,7 +3,7 @@
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, ExitStack, suppress
 from functools import cache
 from itertools import islice, pairwise, zip_longest
@@ -20,7 +20,7 @@ from zlib import crc32
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError
-from fhaosmo_ros.tools.bags.types import LATCHED_QOS, OFFERED_QOS, TYPES
+from fhaosmo_ros.tools.bags.types import TYPES
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader
@@ -30,9 +30,8 @@ from mcap.writer import CompressionType, MCAP0_MAGIC, Writer
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection, Qos
+from rosbags.interfaces import Connection
 from rosbags.rosbag2.storage_mcap import McapReader
-from rosbags.typesys import get_typestore, Stores
 import zstandard
 
 BLOCK = 16_384
@@ -41,7 +40,6 @@ STAMPS = ('auto', 'header', 'source', 'bag')
 """Stamps to choose from; see `BagReader.blocks`."""
 ZSTD = b'\x28\xb5\x2f\xfd'
 """Begin of what zstd has compressed; a message in CDR begins with a zero."""
-HEADER = 'std_msgs/msg/Header'
 RECORD = struct.Struct('<BQ')
 """Of mcap: opcode and length, before the content of each record."""
 MESSAGE = struct.Struct('<HIQQ')
@@ -73,7 +71,7 @@ class Block(NamedTuple):
 
 class BagReader:
     """
-    An open bag: a folder with metadata.yaml, one storage file of it, or a bag of ROS 1.
+    An open bag: a folder with metadata.yaml, or one storage file of it.
 
     Where the file has CRCs, what is read agrees with them; and a topic that is read to its end has
     as many messages as the bag lists. A storage file that was cut, or whose writer was killed, is
@@ -81,6 +79,10 @@ class BagReader:
 
     Attributes
     ----------
+    connections : list of Connection
+        Of rosbags: topics with their types and message counts; a topic may appear twice.
+    types : Typestore
+        Of rosbags, with the bag's own definitions of types.
     unchecked : bool
         True if something was read that has no CRC, so that damage may go unnoticed.
     lacking : Counter of str
@@ -108,22 +110,16 @@ class BagReader:
 
     def _open(self, stack: ExitStack) -> None:
         path = self.path
-        if path.suffix in ('.mcap', '.db3') and path.is_file():
+        if path.is_file():
             path = _whole_part(path, Path(stack.enter_context(TemporaryDirectory())))
         for file in path.glob('*.mcap') if path.is_dir() else [path]:
             if file.suffix == '.mcap':
                 _check_summary(file)
-        self._reader = stack.enter_context(AnyReader([path], default_typestore=TYPES))
-        self.types = self._reader.typestore
-        """The bag's own type definitions: a rosbags typestore."""
-        self._storages: list[Any] = self._reader.readers
-        if self._reader.is2:
-            storage = self._storages[0].storage
-            self._storages = storage.storages if path.is_dir() else [storage]
-        else:  # headers of ROS 2 have no sequence number
-            types = self.types.fielddefs | {HEADER: TYPES.fielddefs[HEADER]}
-            self.types = get_typestore(Stores.EMPTY)
-            self.types.register(types)
+        reader = stack.enter_context(AnyReader([path], default_typestore=TYPES))
+        self.connections: list[Connection] = list(reader.connections)
+        self.types = reader.typestore
+        storage: Any = reader.readers[0].storage
+        self._storages = storage.storages if path.is_dir() else [storage]
         stored = [c for storage in self._storages for c in storage.connections]
         for topic in {c.topic for c in self.connections}:
             there = sum(c.msgcount for c in stored if c.topic == topic)
@@ -131,17 +127,6 @@ class BagReader:
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
-
-    @property
-    def connections(self) -> list[Connection]:
-        """Topics with their types and message counts; a topic may appear twice."""
-        return list(self._reader.connections)
-
-    def offered(self, connection: Connection) -> tuple[Sequence[Qos], str]:
-        """Return the QoS of a topic of the bag, and the hash of its type, '' if not known."""
-        if self._reader.is2:
-            return connection.ext.offered_qos_profiles, connection.digest
-        return [LATCHED_QOS if connection.ext.latching else OFFERED_QOS], ''
 
     def count(self, topic: str) -> int:
         """Return how many messages a topic has."""
@@ -157,18 +142,17 @@ class BagReader:
             The topic is absent (lists those present), or has no message.
 
         """
-        for connection in self.connections:
-            if connection.topic == topic:
-                if not self.count(topic):
-                    raise ConfigurationError(
-                        f'bag {self.path}: expected messages on topic {topic!r}, got none'
-                    )
-                return str(connection.msgtype)
-        known = sorted({c.topic for c in self.connections})
-        raise ConfigurationError(
-            f'bag {self.path}: expected a topic that it holds ({", ".join(known) or "none"}), '
-            f'got {topic!r}{suggestion(topic, known)}'
-        )
+        types = {c.topic: str(c.msgtype) for c in self.connections}
+        if topic not in types:
+            raise ConfigurationError(
+                f'bag {self.path}: expected a topic that it holds '
+                f'({", ".join(sorted(types)) or "none"}), got {topic!r}{suggestion(topic, types)}'
+            )
+        if not self.count(topic):
+            raise ConfigurationError(
+                f'bag {self.path}: expected messages on topic {topic!r}, got none'
+            )
+        return types[topic]
 
     def messages(
         self, topics: Collection[str] | None = None
@@ -196,17 +180,19 @@ class BagReader:
                     _expect(c.topic, c.msgcount, counts[c.id])
 
     def _rows(self, storage: Any, chosen: list[Connection]) -> Iterator[Row]:
-        if isinstance(storage, McapReader) and storage.chunks:
+        if not isinstance(storage, McapReader):
+            self.unchecked = True
+            for c, stamp, data in storage.messages(chosen):
+                yield stamp, 0, c.id, data
+        elif storage.chunks:
             yield from self._chunks(storage, {c.id for c in chosen})
-            return
-        self.unchecked = True
-        if isinstance(storage, McapReader):
-            yield from _unindexed(storage, {c.id for c in chosen})
-            return
-        for c, stamp, data in storage.messages(chosen):
-            if not self._reader.is2:
-                data = bytes(self.types.ros1_to_cdr(data, c.msgtype))
-            yield stamp, 0, c.id, data
+        else:  # all are kept in memory, to put them in order
+            self.unchecked = True
+            with storage.path.open('rb') as file:
+                topics = [c.topic for c in chosen]
+                found = NonSeekingReader(file, validate_crcs=True).iter_messages(topics)
+                for _, channel, message in found:
+                    yield message.log_time, message.publish_time, channel.id, message.data
 
     def _chunks(self, storage: McapReader, channels: Collection[int]) -> Iterator[Row]:
         """Yield messages by log time, with the publish time that rosbags does not give."""
@@ -319,19 +305,23 @@ def _expect(topic: str, listed: int, there: int) -> None:
 
 
 def _expect_bag(path: Path) -> None:
-    if not path.exists():
+    if path.is_file():
+        if path.suffix in ('.mcap', '.db3'):
+            return
+        found = 'a file that is none'
+        if path.suffix == '.bag':
+            found = f'one of ROS 1: rosbags-convert --src {path} --dst NEW makes one of ROS 2'
+    elif not path.exists():
         found = 'a path that does not exist'
-    elif path.is_dir() and not (path / 'metadata.yaml').exists():
+    elif (path / 'metadata.yaml').exists():
+        return
+    else:
         files = sorted(p.name for p in path.iterdir() if p.suffix in ('.mcap', '.db3'))
         found = 'a folder without it'
         found += f' but {files[0]}: name that file, or run ros2 bag reindex' if files else ''
-    elif path.is_file() and path.suffix not in ('.mcap', '.db3', '.bag'):
-        found = 'a file that is none'
-    else:
-        return
     raise ConfigurationError(
-        f'bag {path}: expected a bag (a folder with metadata.yaml, its .mcap or .db3, or a ROS 1 '
-        f'.bag), got {found}'
+        f'bag {path}: expected a bag (a folder with metadata.yaml, or its .mcap or .db3), '
+        f'got {found}'
     )
 
 
@@ -344,14 +334,6 @@ def _check_summary(path: Path) -> None:
             file.seek(start or place)
             if crc32(file.read()[:-12]) != crc:
                 raise ValueError('the summary does not agree with its CRC')
-
-
-def _unindexed(storage: McapReader, channels: Collection[int]) -> Iterator[Row]:
-    """Yield the messages of an mcap file without chunks, which all are kept in memory."""
-    with storage.path.open('rb') as file:
-        for _, channel, message in NonSeekingReader(file, validate_crcs=True).iter_messages():
-            if channel.id in channels:
-                yield message.log_time, message.publish_time, channel.id, message.data
 
 
 def _whole_part(path: Path, folder: Path) -> Path:
@@ -370,6 +352,11 @@ def _whole_part(path: Path, folder: Path) -> Path:
         return path
     _say_once(f'bag {path}: cut, or its writer was killed; read up to its last whole part')
     return copy
+
+
+@cache
+def _say_once(text: str) -> None:
+    print(text, file=sys.stderr)
 
 
 def _is_cut(path: Path) -> bool:
@@ -398,11 +385,6 @@ def _copy_whole_part(path: Path, copy: Path) -> None:
         writer.finish()
     if not channels:
         raise ValueError('a file that was cut before its first chunk ended')
-
-
-@cache
-def _say_once(text: str) -> None:
-    print(text, file=sys.stderr)
 
 
 @contextmanager

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 import re
 import shlex
-import sqlite3
 import sys
 
 from fhaosmo_ros import __version__
@@ -77,8 +76,6 @@ def run_command(
     except OSError as error:
         place = f': {error.filename}' if error.filename else ''
         return _say(parser, f'error: {error.strerror or error}{place}', 2)
-    except sqlite3.Error as error:  # of a bag: a full disk, for instance
-        return _say(parser, f'error: output: {error}', 2)
     except (Interrupted, Stopped, KeyboardInterrupt) as error:  # the last by a window's toolkit
         return _say(parser, f'interrupted{f", {error}" if str(error) else ""}', 130)
 

@@ -33,7 +33,7 @@ from fhaosmo_ros.tools.replay.live_run import (
     UnknownSnapshot,
 )
 from fhaosmo_ros.tools.replay.samples import Samples
-from fhaosmo_ros.tools.replay.sinks import BagSink, CsvSink, NpzSink, Sink
+from fhaosmo_ros.tools.replay.sinks import BagSink, Sink, TABLES
 from fhaosmo_ros.topics import ESTIMATES
 
 
@@ -48,14 +48,13 @@ def _parser() -> argparse.ArgumentParser:
         description='Estimate offline from a recorded bag, with the result of the live node.',
     )
     add = parser.add_argument
-    add('bag', type=Path, help='folder of a bag, its .mcap or .db3 file, or a ROS 1 .bag')
+    add('bag', type=Path, help='folder of a bag, or its .mcap or .db3 file')
     add(
         '-o', '--output', type=Path, action='append', metavar='PATH',
         help='.csv, .npz, or else a new bag; may be given several times '
         '(default: a bag BAG_replayed in the current folder)',
     )  # fmt: skip
     add('--force', action='store_true', help='replace an output that exists')
-    add('--storage', choices=('mcap', 'sqlite3'), default='mcap', help='of a bag (%(default)s)')
     add_input_options(add)
     add(
         '--backwards', choices=('error', 'reject'), default='error',
@@ -79,7 +78,6 @@ def _parser() -> argparse.ArgumentParser:
         '--lag', type=float, metavar='SECONDS',
         help='from those before it and for so long after it, as the node with smoothing_lag does',
     )  # fmt: skip
-    add('--every', type=int, default=1, metavar='N', help='keep every N-th estimate only')
     add(
         '--name', metavar='NAME',
         help='put before the topics of the estimates (default: /estimator, or /replay/estimator '
@@ -90,15 +88,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
-    if arguments.every < 1:
-        raise ConfigurationError(f'--every: expected an integer >= 1, got {arguments.every}')
-    name = arguments.bag.resolve().name.removesuffix('.mcap').removesuffix('.bag')
-    default = Path(f'{name}_replayed')
-    finals = arguments.output or [default]
+    name = arguments.bag.resolve().name.removesuffix('.mcap')
     begin = perf_counter()
     with ExitStack() as stack:
         reader = stack.enter_context(BagReader(arguments.bag))
-        followed = recorded = None
+        followed = recorded = live = None
         if not arguments.afresh:
             followed = find_estimator(reader, arguments.follow, arguments.channel)
         if not arguments.params_file:
@@ -108,28 +102,24 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         own = channel_parameters(arguments, recorded)
         if arguments.lag is not None or arguments.smooth:
             lag = 0.0 if arguments.smooth else arguments.lag
-            own = own | {'smoothing_lag': ONLINE_PARAMETERS['smoothing_lag'].coerce(lag)}
-        values = ONLINE_PARAMETERS.part_of(own)
-        estimator = OnlineEstimator(values)
+            own['smoothing_lag'] = ONLINE_PARAMETERS['smoothing_lag'].coerce(lag)
+        estimator = OnlineEstimator(ONLINE_PARAMETERS.part_of(own))
         if arguments.smooth:
             estimator.smooth()
-        live = None
         if followed is not None:
             try:
                 events = read_events(reader, followed, named(arguments))
                 live = LiveRun(followed, events, estimator)
             except UnknownSnapshot as error:
-                text = f'{error}; {followed} is not followed, this begins at the first sample'
-                print(f'replay: warning: {text}', file=sys.stderr)
+                _warn(f'{error}; {followed} is not followed, this begins at the first sample')
         namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
-        used = estimator.observer.used_inputs
         present = {c.topic for c in reader.connections}
-        inputs = bag_inputs(arguments, own, used, present, namespace)
-        samples = Samples(reader, estimator, live, inputs, arguments)
+        inputs = bag_inputs(arguments, own, estimator.observer.used_inputs, present, namespace)
+        samples = Samples(reader, estimator, live, inputs, arguments.backwards, arguments.smooth)
+        finals = arguments.output or [Path(f'{name}_replayed')]
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
-        name = _name(reader, arguments.name)
-        complete = ONLINE_PARAMETERS.defaults() | own
-        _write(reader, samples, outputs, name, complete, arguments, stop)
+        name = _name(present, arguments.name)
+        _write(reader, samples, outputs, name, ONLINE_PARAMETERS.defaults() | own, stop)
         finals = [output.keep() for output in outputs]
     seconds = perf_counter() - begin
     c = estimator.counters
@@ -146,18 +136,21 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     print(f'stamps: {samples.stamps}')
     print(f'parameters: {_origin(arguments, recorded)}')
     if not arguments.params_file and not recorded:
-        print(
-            'replay: warning: the bag has no ~/parameters to take, so the defaults are used; '
-            "--params-file gives the node's own",
-            file=sys.stderr,
+        _warn(
+            'the bag has no ~/parameters to take, so the defaults are used; '
+            "--params-file gives the node's own"
         )
     if live:
         print(live.report())
     if reader.unchecked:
         print('the bag has no checksums: damage to its numbers would not be noticed')
     for final in finals:
-        where = '' if final.suffix in ('.csv', '.npz') else f' (estimates: {name}/...)'
+        where = '' if final.suffix in TABLES else f' (estimates: {name}/...)'
         print(f'output: {final}{where}')
+
+
+def _warn(text: str) -> None:
+    print(f'replay: warning: {text}', file=sys.stderr)
 
 
 def _origin(arguments: argparse.Namespace, recorded: Recorded | None) -> str:
@@ -171,14 +164,13 @@ def _origin(arguments: argparse.Namespace, recorded: Recorded | None) -> str:
     return base + (f', with {", ".join(own)} of the command line' if own else '')
 
 
-def _name(reader: BagReader, name: str | None) -> str:
+def _name(present: set[str], name: str | None) -> str:
     """Return the name below which the estimates' topics go."""
-    present = {c.topic for c in reader.connections}
-    for candidate in [name.rstrip('/')] if name else ['/estimator', '/replay/estimator']:
-        taken = [topic for part in ESTIMATES if (topic := f'{candidate}/{part}') in present]
+    for candidate in [f'/{name.strip("/")}'] if name else ['/estimator', '/replay/estimator']:
+        taken = present & {f'{candidate}/{part}' for part in ESTIMATES}
         if not taken:
-            return candidate if candidate.startswith('/') else f'/{candidate}'
-    raise ConfigurationError(f'--name: expected topics that the bag lacks, got {taken[0]!r}')
+            return candidate
+    raise ConfigurationError(f'--name: expected topics that the bag lacks, got {min(taken)!r}')
 
 
 def _write(
@@ -187,31 +179,26 @@ def _write(
     outputs: list[Output],
     name: str,
     parameters: Mapping[str, Any],
-    arguments: argparse.Namespace,
     stop: Stop,
 ) -> None:
     observer = samples.estimator.observer
     with ExitStack() as stack:
         sinks: list[Sink] = []
         for output in outputs:
-            if output.path.suffix == '.csv':
-                sinks.append(CsvSink(output.path))
-            elif output.path.suffix == '.npz':
-                sinks.append(NpzSink(output.path))
-            else:
-                bag = stack.enter_context(BagWriter(output.path, storage=arguments.storage))
-                sinks.append(BagSink(bag, name, observer.order, observer.levels, parameters))
-                for _ in bag.copy(reader):
-                    _check_stop(stop)
+            if output.path.suffix in TABLES:
+                sinks.append(stack.enter_context(TABLES[output.path.suffix](output.path)))
+                continue
+            bag = stack.enter_context(BagWriter(output.path))
+            sinks.append(BagSink(bag, name, observer.order, observer.levels, parameters).write)
+            for _ in bag.copy(reader):
+                _check_stop(stop)
         with progress(total=samples.total, unit='sample', unit_scale=True, desc='replay') as bar:
             for count, rows in samples:
                 _check_stop(stop)
                 for part in rows:
                     for sink in sinks:
-                        sink.write(part)
+                        sink(part)
                 bar.update(count)
-        for sink in sinks:
-            sink.close()
 
 
 def _check_stop(stop: Stop) -> None:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The samples of y in a bag, and their estimates."""
 
-import argparse
 from collections.abc import Iterator
 
 from fhaosmo_ros.core.observer.estimates import Trajectory
@@ -29,8 +28,10 @@ class Samples:
     live : LiveRun or None
         The live estimator to follow.
     inputs : BagInputs
-    arguments : Namespace
-        Options backwards, every and smooth of replay.
+    backwards : str
+        'error' or 'reject': what stamps that go back are.
+    whole : bool
+        Smooth over the whole recording.
 
     """
 
@@ -40,38 +41,33 @@ class Samples:
         estimator: OnlineEstimator,
         live: LiveRun | None,
         inputs: BagInputs,
-        arguments: argparse.Namespace,
+        backwards: str,
+        whole: bool,
     ) -> None:
         y, self._stamp = inputs.y, inputs.stamp
-        topic = y.topic
-        self.estimator, self.topic, self._live = estimator, topic, live
-        self._reader, self._backwards = reader, arguments.backwards == 'error'
-        self._every, self._seen, self._taken = arguments.every, 0, 0
-        self._field = reader.field(topic, y.field, y.name)
+        self.estimator, self._topic, self._live = estimator, y.topic, live
+        self._reader, self._whole = reader, whole
+        self._backwards = backwards == 'error' and estimator.uses_stamps
+        self._field = reader.field(y.topic, y.field, y.name)
         if self._stamp == 'auto' and not self._field.header:
             # An estimator that used its clock took a sample when it came, not when it was sent.
             self._stamp = 'bag' if estimator.parameters['sampling'] == 'clock' else 'auto'
         self._other_than_bag = False
         self._input = None
         if estimator.observer.uses_input:
-            self._input = HeldInputs(
-                reader,
-                estimator.observer.model,
-                inputs.u,
-                inputs.values,
-                estimator.reject_inputs,
-            )
-        self._whole = arguments.smooth
-        self._tells, self._active = estimator.events.on, 0
+            model, reject = estimator.observer.model, estimator.reject_inputs
+            self._input = HeldInputs(reader, model, inputs.u, inputs.values, reject)
+        self._tells, self._active = estimator.events.on, 0  # 1 while an event lasts
         self._found: list[tuple[int, Event]] = []
-        self._waiting, self._dropped = np.zeros((2, 0), dtype=np.int64), 0
+        self._waiting, self._dropped = np.zeros((2, 0), dtype=np.int64), 0  # to be smoothed
+        self._taken = 0
         self._first: int | None = None
-        self._latest: int | None = None
+        self._latest = 0
 
     @property
     def total(self) -> int:
         """Number of samples in the bag."""
-        return self._reader.count(self.topic)
+        return self._reader.count(self._topic)
 
     @property
     def span(self) -> float:
@@ -88,7 +84,7 @@ class Samples:
 
     def __iter__(self) -> Iterator[tuple[int, list[Rows]]]:
         """Yield the number of samples taken, and their estimates."""
-        blocks = self._checked()
+        blocks = map(self._checked, self._reader.blocks(self._topic, self._field, self._stamp))
         if self._live:
             blocks = self._live.begin(blocks)
         blocks = (block for block in blocks if len(block.times))
@@ -102,10 +98,10 @@ class Samples:
         if self._whole:
             yield 0, list(self._due(self.estimator.finish()))
         if not self._taken and self._reader.lacking:
-            raise ConfigurationError(f'topic {self.topic!r}: {next(iter(self._reader.lacking))}')
+            raise ConfigurationError(f'topic {self._topic!r}: {next(iter(self._reader.lacking))}')
         if not self._taken:
             raise ConfigurationError(
-                f'topic {self.topic!r}: expected messages, read none although the bag lists them'
+                f'topic {self._topic!r}: expected messages, read none although the bag lists them'
             )
 
     def _continuous(self, blocks: Iterator[Block]) -> Iterator[Block]:
@@ -117,28 +113,23 @@ class Samples:
             values = np.array([unwrap(value) for value in block.values.tolist()])
             yield block._replace(values=values)
 
-    def _checked(self) -> Iterator[Block]:
-        for block in self._reader.blocks(self.topic, self._field, self._stamp):
-            if len(block.times):
-                self._check(block)
-                yield block
-
-    def _check(self, block: Block) -> None:
+    def _checked(self, block: Block) -> Block:
         stamps = block.stamps
         self._other_than_bag |= bool((stamps != block.times).any())
         if self._first is None:
             self._first = self._latest = int(stamps[0])
         previous = np.concatenate([[self._latest], stamps[:-1]])
         back = np.flatnonzero(stamps < previous)
-        if len(back) and self._backwards and self.estimator.uses_stamps:
+        if len(back) and self._backwards:
             k = int(back[0])
             raise ConfigurationError(
-                f'topic {self.topic!r}: expected stamps that never go back, got {stamps[k]} '
+                f'topic {self._topic!r}: expected stamps that never go back, got {stamps[k]} '
                 f'after {previous[k]} (sample {self._taken + k + 1}); --backwards reject treats '
                 'them as the live node does'
             )
         self._latest = int(stamps[-1])
         self._taken += len(stamps)
+        return block
 
     def _rows(self, block: Block, u: np.ndarray | None) -> Iterator[Rows]:
         whole = [slice(0, len(block.times))]
@@ -158,12 +149,9 @@ class Samples:
             yield from self._due(estimates)
             return
         keep = np.flatnonzero((estimates.status & UNUSED) == 0)
-        count = len(keep)
-        keep = keep[(self._every - 1 - self._seen) % self._every :: self._every]
-        self._seen += count
         if len(keep):
             if len(keep) < len(block.times):
-                estimates = type(estimates)(*(a[keep] for a in estimates))
+                estimates = Trajectory._make(column[keep] for column in estimates)
             active = active[keep] if self._tells else active[:0]
             yield Rows(block.times[keep], block.values[keep], estimates, active, self._events())
 
@@ -175,13 +163,9 @@ class Samples:
     def _due(self, estimates: Trajectory) -> Iterator[Rows]:
         """Yield the rows whose smoothed estimates are final, with the samples that waited."""
         numbers = self.estimator.due
-        keep = slice((self._every - 1 - self._seen) % self._every, None, self._every)
-        self._seen += len(numbers)
-        if len(numbers[keep]):
-            times, y = self._waiting[:, numbers[keep] - self._dropped]
-            estimates = Trajectory._make(column[keep] for column in estimates)
+        if len(numbers):
+            times, y = self._waiting[:, numbers - self._dropped]
             none = np.zeros(0, dtype=np.int64)
             yield Rows(times, y.view(np.float64), estimates, none, self._events())
-        if len(numbers):
             self._waiting = self._waiting[:, numbers[-1] + 1 - self._dropped :]
             self._dropped = int(numbers[-1]) + 1

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where replayed estimates go: a bag, a CSV or an NPZ file, block by block."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 import csv
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.observer.estimates import Trajectory, TUNING
 from fhaosmo_ros.core.online.events import described, Event
@@ -52,14 +53,8 @@ class Rows(NamedTuple):
     events: list[tuple[int, Event]]
 
 
-class Sink(Protocol):
-    """A kind of output that takes estimates block by block."""
-
-    def write(self, rows: Rows) -> None:
-        """Append."""
-
-    def close(self) -> None:
-        """Complete the output."""
+Sink = Callable[[Rows], None]
+"""Takes estimates block by block."""
 
 
 def columns(rows: Rows) -> dict[str, NDArray]:
@@ -78,43 +73,32 @@ def columns(rows: Rows) -> dict[str, NDArray]:
     return result | {'status': e.status, 'open_levels': e.open_levels}
 
 
-class CsvSink:
-    """A table with a header line; its numbers read back as the same doubles."""
+@contextmanager
+def csv_sink(path: Path) -> Iterator[Sink]:
+    """Write a table with a header line; its numbers read back as the same doubles."""
+    with path.open('w', encoding='utf-8', newline='') as file:
+        writer = csv.writer(file, lineterminator='\n')
 
-    def __init__(self, path: Path) -> None:
-        self._file = path.open('w', encoding='utf-8', newline='')
-        self._writer = csv.writer(self._file, lineterminator='\n')
-        self._began = False
+        def write(rows: Rows) -> None:
+            table = columns(rows)
+            if not file.tell():
+                writer.writerow(table)
+            writer.writerows(zip(*(c.tolist() for c in table.values()), strict=True))
 
-    def write(self, rows: Rows) -> None:
-        """Append a line for each sample."""
-        table = columns(rows)
-        if not self._began:
-            self._writer.writerow(table)
-            self._began = True
-        self._writer.writerows(zip(*(c.tolist() for c in table.values()), strict=True))
-
-    def close(self) -> None:
-        """Complete the file."""
-        self._file.close()
+        yield write
 
 
-class NpzSink:
-    """Arrays by name."""
+@contextmanager
+def npz_sink(path: Path) -> Iterator[Sink]:
+    """Write arrays by name."""
+    blocks: list[dict[str, NDArray]] = []
+    yield lambda rows: blocks.append(columns(rows))
+    names = blocks[0] if blocks else ()
+    np.savez(path, **{name: np.concatenate([b[name] for b in blocks]) for name in names})
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._blocks: list[dict[str, NDArray]] = []
 
-    def write(self, rows: Rows) -> None:
-        """Append to every array."""
-        self._blocks.append(columns(rows))
-
-    def close(self) -> None:
-        """Write the file."""
-        names = self._blocks[0] if self._blocks else ()
-        arrays = {name: np.concatenate([b[name] for b in self._blocks]) for name in names}
-        np.savez(self._path, **arrays)
+TABLES = {'.csv': csv_sink, '.npz': npz_sink}
+"""Sinks that open a file, by its suffix."""
 
 
 class BagSink:
@@ -186,9 +170,6 @@ class BagSink:
             name = f'{self._name.lstrip("/")}: event'
             message = diagnostics(event.stamp, event.begins, name, text, values)
             self._bag.write(topic, time, message)
-
-    def close(self) -> None:
-        """Do nothing: who opened the bag closes it."""
 
 
 def _bytes(values: NDArray, count: int) -> NDArray[np.uint8]:

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags of every storage are read alike; a damaged one gives the right samples or an error."""
+
+import sqlite3
+import subprocess
+import sys
+
+import bag_files as files
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.inputs import measured_output
+from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.bags.topics import series
+from fhaosmo_ros.tools.bags.writer import BagWriter
+from fhaosmo_ros.tools.cli.options import BagInputs
+from fhaosmo_ros.tools.replay import command as replay
+from fhaosmo_ros.tools.tuning.source import recorded
+import numpy as np
+import pytest
+
+COUNT = 1500
+STAMPS, Y = files.signal(COUNT)
+BY_ROSBAGS = [
+    ('mcap', 'none'), ('mcap', 'file'), ('mcap', 'message'),
+    ('sqlite3', 'none'), ('sqlite3', 'file'), ('sqlite3', 'message'),
+]  # fmt: skip
+
+
+def by_us(path):
+    """As the recorder does, which flushes now and then."""
+    with BagWriter(path) as bag:
+        bag.add('/y', files.FLOAT)
+        for k, (stamp, value) in enumerate(zip(STAMPS.tolist(), Y.tolist(), strict=True)):
+            bag.write('/y', stamp, files.float64(value))
+            if k % 250 == 0:
+                bag.flush()
+    return path
+
+
+def make(path, how):
+    return by_us(path) if how == 'ours' else files.write_preset(path, files.floats(STAMPS, Y), how)
+
+
+def storage_file(bag):
+    (file,) = [p for p in bag.iterdir() if p.suffix in ('.mcap', '.db3')]
+    return file
+
+
+def read(path):
+    """Return how many samples are read, all of them right; None for an error in one line."""
+    try:
+        with BagReader(path) as reader:
+            found = list(reader.blocks('/y', reader.field('/y', None), 'auto'))
+    except ConfigurationError as error:
+        return None if '\n' not in str(error) else 'several lines'
+    times, stamps, values = (np.concatenate(part) for part in zip(*found, strict=True))
+    for column, expected in ((times, STAMPS), (stamps, STAMPS), (values, Y)):
+        np.testing.assert_array_equal(column, expected[: len(column)])
+    return len(values)
+
+
+# Whole bags
+
+
+def messages():
+    both = files.floats(STAMPS, Y) + files.floats(STAMPS + 1, -Y, '/other')
+    return sorted(both, key=lambda m: m[2])
+
+
+@pytest.mark.parametrize('parts', [1, 3])
+@pytest.mark.parametrize('preset', files.PRESETS)
+def test_presets_of_mcap(preset, parts, tmp_path):
+    bag = files.write_preset(tmp_path / 'bag', messages(), preset, parts=parts)
+    assert read(bag) == COUNT
+    other = series(bag, '/other')
+    np.testing.assert_array_equal(other.stamps, STAMPS + 1)
+    np.testing.assert_array_equal(other.values, -Y)
+
+
+@pytest.mark.parametrize('version', [8, 9])
+@pytest.mark.parametrize('how', BY_ROSBAGS, ids='-'.join)
+def test_bags_of_rosbags(how, version, tmp_path):
+    assert read(files.write(tmp_path / 'bag', messages(), *how, version=version)) == COUNT
+
+
+@pytest.mark.parametrize('how', [('mcap', 'message'), ('sqlite3', 'message'), ('sqlite3', 'none')])
+def test_storage_file_without_metadata(how, tmp_path):
+    """Only metadata.yaml says whether messages are compressed."""
+    bag = files.write(tmp_path / 'bag', messages(), *how)
+    assert read(storage_file(bag)) == COUNT
+
+
+@pytest.mark.parametrize('preset', ['plain', 'fastwrite'])
+def test_messages_and_chunks_out_of_order_are_put_in_order(preset, tmp_path):
+    order = np.argsort(np.arange(COUNT) + np.random.default_rng(3).uniform(0, 700, COUNT))
+    shuffled = [files.floats(STAMPS, Y)[k] for k in order]
+    assert read(files.write_preset(tmp_path / 'bag', shuffled, preset)) == COUNT
+
+
+def test_bag_whose_qos_differs_from_its_storage_is_read(tmp_path):
+    """rosbags finds no message then."""
+    bag = files.write(tmp_path / 'bag', files.floats(STAMPS, Y))
+    text = (bag / 'metadata.yaml').read_text()
+    qos = '[{history: keep_last, depth: 3, reliability: reliable, durability: volatile, '
+    zero = '{sec: 0, nsec: 0}'
+    qos += f'deadline: {zero}, lifespan: {zero}, liveliness: automatic, '
+    qos += f'liveliness_lease_duration: {zero}, avoid_ros_namespace_conventions: false}}]'
+    assert 'offered_qos_profiles: []' in text
+    (bag / 'metadata.yaml').write_text(
+        text.replace('offered_qos_profiles: []', f'offered_qos_profiles: {qos}')
+    )
+    assert read(bag) == COUNT
+
+
+# Damage
+
+
+@pytest.mark.parametrize('how', ['ours', 'zstd', 'lz4'])
+def test_damage_in_a_file_with_checksums_is_an_error(how, tmp_path):
+    """Single bits and zeros, half of them in the summary: topics, types and where chunks are."""
+    bag = make(tmp_path / 'bag', how)
+    file = storage_file(bag)
+    whole = file.read_bytes()
+    rng = np.random.default_rng(17)
+    results = []
+    for k in range(40):
+        data = bytearray(whole)
+        end = len(whole) - 8  # a file without its last bytes is one that was cut
+        at = int(rng.integers(0, end) if k % 2 else end - rng.integers(1, 1200))
+        if k % 4 < 2:
+            data[at] ^= 1 << int(rng.integers(8))
+        else:
+            data[at:end] = (bytes(512) + data[at + 512 : end])[: end - at]
+        file.write_bytes(data)
+        results += [read(bag), read(file)]
+    assert set(results) <= {COUNT, None}
+    assert results.count(None) > 40
+
+
+@pytest.mark.parametrize('how', ['ours', 'zstd', 'lz4', 'fastwrite', 'zstd_fast'])
+def test_file_that_was_cut_is_read_up_to_there(how, tmp_path, capsys):
+    """As after a kill of the recorder, or on a full disk; metadata.yaml is missing then."""
+    bag = make(tmp_path / 'bag', how)
+    file = storage_file(bag)
+    whole = file.read_bytes()
+    for share in (0.99, 0.7, 0.31):
+        cut = file.with_name(f'cut_{share}.mcap')
+        cut.write_bytes(whole[: int(share * len(whole))])
+        assert read(cut) > (share - 0.25) * COUNT
+        assert capsys.readouterr().err.count('read up to its last whole part') == 1
+    file.write_bytes(whole[:150])
+    assert read(file) is None
+    file.write_bytes(whole[:-2000])
+    assert read(bag) is None  # metadata.yaml lists more
+
+
+def test_database_whose_writer_was_killed_is_read_up_to_its_last_commit(tmp_path):
+    file = storage_file(files.write(tmp_path / 'bag', files.floats(STAMPS, Y), 'sqlite3'))
+    # More than its cache holds, so that pages that were not committed are in the file.
+    code = (
+        'import os, sqlite3, sys\n'
+        'database = sqlite3.connect(sys.argv[1])\n'
+        'row = database.execute("SELECT * FROM messages").fetchone()[1:]\n'
+        'database.execute("UPDATE messages SET data = zeroblob(12)")\n'
+        'for _ in range(40_000):\n'
+        '    database.execute("INSERT INTO messages(topic_id, timestamp, data)'
+        ' VALUES (?, ?, ?)", row)\n'
+        'os._exit(9)\n'
+    )
+    assert subprocess.run([sys.executable, '-c', code, file], check=False).returncode == 9
+    before = file.read_bytes()
+    assert file.with_name(f'{file.name}-journal').exists()
+    assert read(file) == COUNT
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize('share', [0.3, 0.72, 0.999])
+def test_database_that_was_cut_is_an_error(share, tmp_path):
+    bag = files.write(tmp_path / 'bag', files.floats(STAMPS, Y), 'sqlite3')
+    whole = storage_file(bag).read_bytes()
+    storage_file(bag).write_bytes(whole[: int(share * len(whole))])
+    assert read(bag) is None
+    assert read(storage_file(bag)) is None
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_messages_that_are_listed_and_not_there_are_an_error(storage, tmp_path, capsys):
+    bag = files.write(tmp_path / 'bag', files.floats(STAMPS, Y), storage)
+    if storage == 'mcap':
+        text = (bag / 'metadata.yaml').read_text()
+        (bag / 'metadata.yaml').write_text(text.replace('count: 1500', 'count: 1510'))
+    else:
+        with sqlite3.connect(bag / 'bag.db3') as database:
+            database.execute('DELETE FROM messages WHERE id > 1490')
+        database.close()
+    assert replay.main([str(bag), '-o', str(tmp_path / 'out.npz')]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert 'messages on /y' in line
+    assert '`mcap recover`' in line
+
+
+@pytest.mark.parametrize(('how', 'told'), [('zstd', 0), ('zstd_fast', 1), ('fastwrite', 1)])
+def test_bag_without_checksums_is_told_once(how, told, tmp_path, capsys):
+    assert replay.main([str(make(tmp_path / 'bag', how)), '-o', str(tmp_path / 'out.npz')]) == 0
+    assert capsys.readouterr().out.count('no checksums') == told
+
+
+# `ros2 bag record` writes the time of reception as log time, the source's as publish time.
+
+
+@pytest.fixture(name='late')
+def _late():
+    """Reception: up to 66 ms late, in the order of publication, no two at the same time."""
+    late = STAMPS + np.random.default_rng(5).integers(0, 66_000_000, COUNT)
+    return np.maximum.accumulate(late) + np.arange(COUNT)
+
+
+def replayed(bag, folder, *arguments):
+    out = folder / 'out.npz'
+    assert replay.main([str(bag), '-o', str(out), '--force', *arguments]) == 0
+    with np.load(out) as arrays:
+        return arrays['unknown_input'], arrays['stamp_ns']
+
+
+@pytest.mark.parametrize('preset', ['zstd', 'fastwrite'])
+def test_replay_takes_the_source_stamps(preset, late, tmp_path, capsys):
+    bag = files.write_preset(tmp_path / 'bag', files.floats(late, Y), preset, STAMPS)
+    d, stamps = replayed(bag, tmp_path)
+    assert 'stamps: source' in capsys.readouterr().out
+    np.testing.assert_array_equal(stamps, STAMPS)
+    live = OnlineEstimator()
+    pairs = zip(STAMPS.tolist(), Y.tolist(), strict=True)
+    np.testing.assert_array_equal(d, [live.update(t, y).unknown_input for t, y in pairs])
+    np.testing.assert_array_equal(replayed(bag, tmp_path, '--stamp', 'source')[0], d)
+    received, stamps = replayed(bag, tmp_path, '--stamp', 'bag')
+    assert 'stamps: bag' in capsys.readouterr().out
+    np.testing.assert_array_equal(stamps, late)
+    assert not np.array_equal(received, d)
+    # An estimator that used its clock got them at the times of reception.
+    np.testing.assert_array_equal(replayed(bag, tmp_path, '-p', 'sampling:=clock')[1], late)
+
+
+def test_publish_time_that_its_writer_did_not_know(tmp_path, capsys):
+    bag = files.write_preset(tmp_path / 'bag', files.floats(STAMPS, Y), 'plain', 0 * STAMPS)
+    np.testing.assert_array_equal(replayed(bag, tmp_path)[1], STAMPS)
+    assert 'stamps: bag' in capsys.readouterr().out
+
+
+def test_sqlite_has_no_publish_times(tmp_path, capsys):
+    bag = files.write(tmp_path / 'bag', files.floats(STAMPS, Y), 'sqlite3')
+    assert replay.main([str(bag), '-o', str(tmp_path / 'o.npz'), '--stamp', 'source']) == 2
+    assert '--stamp source: expected an mcap bag' in capsys.readouterr().err
+
+
+def test_tune_takes_them_too(late, tmp_path):
+    """Else it would see the jitter of reception."""
+    sensors = []
+    for name, received in (('exact', STAMPS), ('late', late)):
+        bag = files.write_preset(tmp_path / name, files.floats(received, Y), 'zstd', STAMPS)
+        inputs = BagInputs(measured_output({}), {}, 'auto', {})
+        sensors.append(recorded(bag, inputs, TriangularModel(['0'])).sensor)
+    assert sensors[0] == sensors[1]
