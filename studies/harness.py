@@ -79,12 +79,15 @@ def called(
     calls: Mapping[Hashable, tuple[Any, ...]], name: str, jobs: int, stop: Stop
 ) -> dict[Hashable, Any]:
     """
-    Return the results of calls (function, arguments) in several processes, by key.
+    Return the results of calls (function, arguments) in several processes, by key, in order.
+
+    The main process only waits, and a signal sets `stop`: nothing is raised in the middle of
+    anything, where a lock would stay locked or a library would make another error of it.
 
     Raises
     ------
     Stopped
-        A signal came; it ends the processes.
+        `stop` is set; the processes have ended.
 
     """
     for variable in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
@@ -105,7 +108,7 @@ def called(
                 for key in [key for key, result in waiting.items() if result.ready()]:
                     found[key] = waiting.pop(key).get()
                     bar.update()
-    return found
+    return {key: found[key] for key in calls}
 
 
 def _end_with_parent() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper: tables beside docs/evidence.md against a new run, and what must come out of it."""
+"""The paper: tables beside docs/evidence.md, parts of them anew, and what they must show."""
 
 import signal
 
@@ -23,13 +23,6 @@ def solver(documented):
     return findings.choose_solver(documented)
 
 
-@pytest.fixture(scope='module')
-def fresh(solver):
-    """Return the scores of a new run with the documented solver, and with the sign held."""
-    rows = command.measure((solver, 'ode4 held'), lambda: None)
-    return findings.scores_by_solver(rows)
-
-
 def check(new, old, sign):
     """Compare two scores; trajectories with sign depend on the last bit, so on the machine."""
     factor = 1.5 if sign else 1.05
@@ -38,10 +31,12 @@ def check(new, old, sign):
             assert 1 / factor < new[key] / old[key] < factor, f'{key}: {REWRITE}'
 
 
-def test_new_run_agrees_with_the_table(documented, fresh):
-    for solver_, scores in fresh.items():
-        for case, score in scores.items():
-            check(score, documented[solver_][case], case[0].startswith('sign'))
+@pytest.mark.parametrize('name', [name for name, c in cases.OBSERVERS.items() if c.step == 1e-3])
+@pytest.mark.parametrize('omega', cases.FREQUENCIES)
+def test_new_simulation_agrees_with_the_table(documented, solver, name, omega):
+    for s in (solver, 'ode4 held'):
+        old = documented[s][name, omega]
+        check(findings.simulation(s, name, omega), old, name.startswith('sign'))
 
 
 @pytest.mark.parametrize('case', beyond.SAMPLED[1::4], ids=str)
@@ -61,18 +56,25 @@ def test_new_long_run_agrees_with_the_table():
             assert a[name] == pytest.approx(b[name], rel=0.03), REWRITE
 
 
-def test_all_findings_come_out_with_the_shipped_half_widths(documented, fresh):
-    for solver_, scores in fresh.items():
-        now = {v.name: v.words for v in findings.verdicts(scores)}
-        before = findings.verdicts(documented[solver_])
-        assert now == {v.name: v.words for v in before}, REWRITE
-        failed = [name for name, words in now.items() if words.strip('*').startswith('no')]
-        assert failed == (['F1b high'] if solver_ == 'ode4 held' else [])
+def test_new_half_widths_agree_with_the_table(documented, solver):
+    """Verdicts may change where one number is just at its limit."""
+    signs = {w: documented[solver][findings.FINE, w] for w in cases.FREQUENCIES}
+    old = {tuple(row.values())[:2]: row for row in evidence.read('paper_half_widths')}
+    new = findings.width_rows(findings.WIDTHS[6], findings.WIDTHS[::6], signs, solver)
+    differ = [row[k] != old[tuple(row.values())[:2]][k] for row in new for k in list(row)[2:]]
+    assert sum(differ) <= 1, REWRITE
 
 
-def test_sign_is_an_estimate_only_where_it_is_held(solver, fresh):
+def test_all_findings_come_out_with_the_shipped_half_widths(documented, solver):
+    for name in (solver, 'ode4 held'):
+        found = findings.verdicts(documented[name])
+        failed = [v.name for v in found if not v.holds]
+        assert failed == (['F1b high'] if name == 'ode4 held' else [])
+
+
+def test_sign_is_an_estimate_only_where_it_is_held(documented, solver):
     for omega in cases.FREQUENCIES:
-        plain, held = (fresh[s][findings.FINE, omega] for s in (solver, 'ode4 held'))
+        plain, held = (documented[s][findings.FINE, omega] for s in (solver, 'ode4 held'))
         assert held['rms_d'] < held['true_d'] < plain['rms_d']
         assert held['high_pass'] > findings.VISIBLE  # it chatters all the same
 
@@ -83,15 +85,6 @@ def test_shipped_half_widths_lie_inside_the_region():
     first, later = cases.preset().observer['fuzzy_widths'][:2]
     around = [findings.WIDTHS[i - 1 : i + 2] for i in map(findings.WIDTHS.index, (first, later))]
     assert {(a, b) for a in around[0] for b in around[1]} <= holds
-
-
-def test_new_search_of_half_widths_agrees_with_the_table(documented, solver):
-    """Every sixth width; verdicts may change where one number is just at its limit."""
-    signs = {w: documented[solver][findings.FINE, w] for w in cases.FREQUENCIES}
-    old = {tuple(row.values())[:2]: row for row in evidence.read('paper_half_widths')}
-    new = findings.width_map(signs, solver, 6, lambda: None)
-    differ = [row[k] != old[tuple(row.values())[:2]][k] for row in new for k in list(row)[2:]]
-    assert np.mean(differ) < 0.05, REWRITE
 
 
 @pytest.mark.parametrize('scheme', ['explicit', 'implicit'])

@@ -74,22 +74,16 @@ def preset() -> Preset:
     )
 
 
-def joint(
-    variant: str,
-    omega: float,
-    step: float,
-    solver: str,
-    duration: float = DURATION,
-    **changes: Any,
-) -> JointRun:
-    """Simulate as the paper does: plant and observer together."""
+def simulated(name: str, omega: float, solver: str, **changes: Any) -> JointRun:
+    """Simulate one of `OBSERVERS` as the paper does: plant and observer together."""
+    variant, step, own = OBSERVERS[name]
     numbers = preset()
     return simulate(
-        numbers.observer.changed({'variant': variant} | changes),
+        numbers.observer.changed({'variant': variant} | own | changes),
         numbers.plant.changed({'disturbance_omega': omega}),
         solver,
         step,
-        duration,
+        DURATION,
         max(1, round(GRID / step)),
     )
 

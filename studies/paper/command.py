@@ -2,101 +2,79 @@
 """Reproduce all simulations of the paper, check its findings, and go beyond its limits."""
 
 import argparse
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-import os
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from fhaosmo_ros.core.observer.fuzzy import of_level
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
-from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.plot.fuzzy import fuzzy_figure
 from fhaosmo_ros.tools.plot.fuzzy import Row as FuzzyRow
 from matplotlib.figure import Figure
 from studies import evidence
-from studies.evidence import Row
-from studies.harness import output, study
+from studies.harness import called, output, study, with_jobs
 from studies.paper import beyond, cases, figures, findings
-from studies.paper.plant_and_observer import SOLVERS
+from studies.paper.plant_and_observer import JointRun, SOLVERS
 
 NAME = 'paper'
 QUICK_WIDTHS, QUICK_LONG = 6, 200.0
 ZOOM = 0.1
 """Seconds that figure sim1 enlarges."""
+DRAWN = (findings.FINE, findings.COARSE, findings.FUZZY, findings.ADAPTIVE)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0, 2 for a bad argument or output, 130 if it was interrupted."""
-
-    def body(arguments: argparse.Namespace, stop: Stop) -> None:
-        with stop.raising():
-            _paper(output(arguments, NAME), arguments.quick)
-
-    return run_command(study(NAME, __doc__), argv, body)
+    return run_command(with_jobs(study(NAME, __doc__)), argv, _paper)
 
 
-def measure(solvers: Sequence[str], tick: Callable[[], object]) -> list[Row]:
-    """Return the scores of the paper's observers and of ours by solver."""
-    tasks = [(s, name, w) for s in solvers for name in cases.OBSERVERS for w in cases.FREQUENCIES]
-    rows = []
-    pool = ThreadPoolExecutor(os.cpu_count())  # the integration releases the GIL
-    try:
-        runs = pool.map(lambda task: findings.run(task[1], task[2], task[0]), tasks)
-        for (solver, name, omega), run in zip(tasks, runs, strict=True):
-            case = {'solver': solver, 'observer': name, 'omega': omega}
-            rows.append(case | cases.score(run))
-            tick()
-    finally:
-        pool.shutdown(cancel_futures=True)  # after a signal nobody needs the runs that wait
-    return rows
+def _paper(arguments: argparse.Namespace, stop: Stop) -> None:
+    docs = output(arguments, NAME)
+
+    def results(calls: Mapping[Any, tuple[Any, ...]]) -> dict[Any, Any]:
+        return called(calls, NAME, arguments.jobs, stop)
+
+    every = QUICK_WIDTHS if arguments.quick else 1
+    duration = QUICK_LONG if arguments.quick else beyond.LONG_DURATION
+    cells = [(s, name, w) for s in SOLVERS for name in cases.OBSERVERS for w in cases.FREQUENCIES]
+    found = results(
+        {cell: (findings.simulation, *cell) for cell in cells}
+        | {('long', *case): (beyond.long_rows, *case, duration) for case in beyond.LONG}
+        | {('sampled', *case): (beyond.sampled_rows, *case) for case in beyond.SAMPLED}
+    )
+    simulations = evidence.rounded(found[cell] for cell in cells)
+    scores = findings.scores_by_solver(simulations)
+    solver = findings.choose_solver(scores)
+    signs = {w: scores[solver][findings.FINE, w] for w in cases.FREQUENCIES}
+    runs = {
+        (name, w): (cases.simulated, name, w, solver) for name in DRAWN for w in cases.FREQUENCIES
+    }
+    first = {'sim1': (cases.first_observer, 1e-5, solver, cases.DURATION, 5)}
+    widths = findings.WIDTHS[::every]
+    maps = {width: (findings.width_rows, width, widths, signs, solver) for width in widths}
+    found |= results(first | runs | maps)
+    tables = {
+        'paper': simulations,
+        'paper_half_widths': [row for width in widths for row in found[width]],
+        'paper_sampled': [row for case in beyond.SAMPLED for row in found[('sampled', *case)]],
+        'paper_long': [row for case in beyond.LONG for row in found[('long', *case)]],
+    }
+    drawn = draw(found['sim1'], [[found[name, w] for w in cases.FREQUENCIES] for name in DRAWN])
+    evidence.publish(docs, tables, findings.texts(simulations), drawn)
 
 
-def _paper(docs: Path, quick: bool) -> None:
-    every = QUICK_WIDTHS if quick else 1
-    duration = QUICK_LONG if quick else beyond.LONG_DURATION
-    joint = len(SOLVERS) * len(cases.OBSERVERS) * len(cases.FREQUENCIES)
-    total = joint + len(findings.WIDTHS[::every]) + len(beyond.SAMPLED) + len(beyond.LONG)
-    with progress(total=total, unit='part', desc='paper') as bar:
-
-        def each(rows: list[Row]) -> list[Row]:
-            bar.update()
-            return rows
-
-        simulations = evidence.rounded(measure(list(SOLVERS), bar.update))
-        scores = findings.scores_by_solver(simulations)
-        solver = findings.choose_solver(scores)
-        signs = {w: scores[solver][findings.FINE, w] for w in cases.FREQUENCIES}
-        tables = {
-            'paper': simulations,
-            'paper_half_widths': findings.width_map(signs, solver, every, bar.update),
-            'paper_sampled': [
-                row for case in beyond.SAMPLED for row in each(beyond.sampled_rows(*case))
-            ],
-            'paper_long': [
-                row for case in beyond.LONG for row in each(beyond.long_rows(*case, duration))
-            ],
-        }
-    evidence.publish(docs, tables, findings.texts(simulations), drawn(solver))
-
-
-def drawn(solver: str) -> dict[str, Figure]:
-    """Return the paper's own four figures, by name."""
+def draw(first: JointRun, runs: Sequence[Sequence[JointRun]]) -> dict[str, Figure]:
+    """Draw the paper's own four figures from the run of sim1 and those of `DRAWN`."""
     preset = cases.preset().observer
     systems, widths = preset['fuzzy_systems'], preset['fuzzy_widths']
     rows = [  # psi_1, psi_2, psi_3, as in the paper
         FuzzyRow(of_level(systems, i), of_level(widths, i), ('1', '2', '3, 4')[i])
         for i in range(3)
     ]
-    runs = {
-        name: [findings.run(name, w, solver) for w in cases.FREQUENCIES]
-        for name in (findings.FINE, findings.COARSE, findings.FUZZY, findings.ADAPTIVE)
-    }
-    adaptive = runs.pop(findings.ADAPTIVE)
-    first = cases.first_observer(1e-5, solver, cases.DURATION, every=5)
+    *fixed, adaptive = runs
     return {
         'paper_sim1': figures.sim1(first, ZOOM),
         'paper_fuzzysystems': fuzzy_figure(rows),
-        'paper_simz': figures.simz(list(runs.items()), cases.FREQUENCIES),
+        'paper_simz': figures.simz(list(zip(DRAWN, fixed, strict=False)), cases.FREQUENCIES),
         'paper_simu': figures.simu(adaptive, cases.FREQUENCIES),
     }

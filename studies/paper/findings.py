@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's three findings as inequalities between numbers, and where they hold."""
 
-from collections.abc import Callable, Iterable
-from functools import cache
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from studies.evidence import markdown, Row
-from studies.paper.cases import FREQUENCIES, joint, OBSERVERS, Score, score
-from studies.paper.plant_and_observer import JointRun, SOLVERS
+from studies.paper.cases import FREQUENCIES, OBSERVERS, Score, score, simulated
+from studies.paper.plant_and_observer import SOLVERS
 
 LOW, HIGH = FREQUENCIES
 VISIBLE = 0.005
@@ -61,11 +60,10 @@ def _estimates(*scores: Score) -> bool:
     return any(s['rms_d'] < s['true_d'] for s in scores)
 
 
-@cache
-def run(name: str, omega: float, solver: str) -> JointRun:
-    """Simulate one of the observers, once: the figures show what the tables judge."""
-    variant, step, changes = OBSERVERS[name]
-    return joint(variant, omega, step, solver, **changes)
+def simulation(solver: str, name: str, omega: float) -> Row:
+    """Return the line of one of the observers in the table of simulations."""
+    case = {'solver': solver, 'observer': name, 'omega': omega}
+    return case | score(simulated(name, omega, solver))
 
 
 def scores_by_solver(rows: Iterable[Row]) -> dict[str, Scores]:
@@ -139,36 +137,24 @@ def texts(rows: Iterable[Row]) -> dict[str, str]:
     return {'findings': markdown(head, [(v.name, v.claim, v.words, v.numbers) for v in found])}
 
 
-def width_map(
-    signs: dict[float, Score], solver: str, every: int, tick: Callable[[], object]
+def width_rows(
+    first: float, widths: Sequence[float], signs: Mapping[float, Score], solver: str
 ) -> list[Row]:
     """
-    Judge F1c, F2 and F3 at every pair of half-widths: of level 1, and of the later levels.
+    Judge F1c, F2 and F3 at one half-width of level 1 and several of the later levels.
 
-    Parameters
-    ----------
-    signs : dict
-        Scores of sign at 1e-5 s by angular frequency; it knows no half-widths.
-    every : int
-        Take every `every`-th of `WIDTHS`.
-    tick : callable
-        Called after each half-width of level 1.
-
+    `signs` has the scores of sign at 1e-5 s by angular frequency; it knows no half-widths.
     """
     rows = []
-    for first in WIDTHS[::every]:
-        for later in WIDTHS[::every]:
-            s: Scores = {(COARSE, w): signs[w] for w in FREQUENCIES}  # no part of the map
-            s |= {(FINE, w): signs[w] for w in FREQUENCIES}
-            for w in FREQUENCIES:
-                for name in (FUZZY, ADAPTIVE):
-                    variant, step, _ = OBSERVERS[name]
-                    found = joint(variant, w, step, solver, fuzzy_widths=[first, later])
-                    s[name, w] = score(found)
-            judged = verdicts(s)
-            row = {'level 1': first, 'later levels': later}
-            for part in ('F1c', 'F2', 'F3'):
-                row[part] = float(all(v.holds for v in judged if v.name.startswith(part)))
-            rows.append(row)
-        tick()
+    for later in widths:
+        s = {(name, w): signs[w] for name in (FINE, COARSE) for w in FREQUENCIES}
+        for w in FREQUENCIES:
+            for name in (FUZZY, ADAPTIVE):
+                s[name, w] = score(simulated(name, w, solver, fuzzy_widths=[first, later]))
+        judged = verdicts(s)
+        holds = {
+            part: float(all(v.holds for v in judged if v.name.startswith(part)))
+            for part in ('F1c', 'F2', 'F3')
+        }
+        rows.append({'level 1': first, 'later levels': later} | holds)
     return rows
