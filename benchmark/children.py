@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Children whose start, CPU time and memory can be measured."""
 
+from collections.abc import Callable
 import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,9 +12,21 @@ from fhaosmo_ros.tools.cli import processes
 from results import CannotMeasureError
 
 ROOT = Path(__file__).parents[1]
-POLL = 0.002
-READY = 60.0
-"""Seconds that a child has to say that it is ready."""
+PATIENCE = 60.0
+"""Seconds that anything may take that is waited for."""
+
+# What is started here is kept away from other ROS systems; the tests use the domains from 20 on.
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 19)
+
+
+def wait_until(condition: Callable[[], Any], complaint: str, poll: float = 0.02) -> None:
+    """Wait for a condition; raise with a complaint if it does not come."""
+    deadline = monotonic() + PATIENCE
+    while not condition():
+        if monotonic() > deadline:
+            raise CannotMeasureError(f'{complaint} within {PATIENCE:g} s')
+        sleep(poll)
 
 
 class Child(processes.Child):
@@ -21,25 +34,21 @@ class Child(processes.Child):
 
     failure = CannotMeasureError
 
-    def __init__(
-        self, log: Path, *arguments: str, environment: dict[str, str] | None = None
-    ) -> None:
+    def __init__(self, log: Path, *arguments: str) -> None:
         self.started = perf_counter()
-        environment = {'PYTHONUNBUFFERED': '1', **(environment or {})}
+        environment = {'PYTHONUNBUFFERED': '1'}
         super().__init__(
             log, *arguments, environment=environment, start_new_session=True, cwd=ROOT
         )
 
     def wait_for(self, text: str) -> float:
         """Wait until `text` is in the output; return the seconds since the start."""
-        deadline = monotonic() + READY
-        while text not in self.output():
+
+        def said() -> bool:
             self.check()
-            if monotonic() > deadline:
-                raise CannotMeasureError(
-                    f"{self._log.stem} did not say '{text}' within {READY:g} s"
-                )
-            sleep(POLL)
+            return text in self.output()
+
+        wait_until(said, f"{self._log.stem} did not say '{text}'", 0.002)
         return perf_counter() - self.started
 
     def cpu_seconds(self) -> float:

@@ -2,27 +2,35 @@
 """One step of the core, beside the same step in C; and of the self-tuning observer."""
 
 from collections.abc import Callable
+import ctypes
 from itertools import product
+import os
 from pathlib import Path
+import shlex
+import subprocess
 from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
 from typing import Any
 
 from fhaosmo_ros.core import OnlineEstimator, Plant
+from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.fuzzy import KNOTS
 from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.observer.record import run as run_structure
+from fhaosmo_ros.core.observer.status import LEVEL_SHIFT
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 import numpy as np
-from reference import assert_agreement, CASE, compile_reference, in_c, in_core, output, PERIOD
 from results import CannotMeasureError, Row
 from studies.harness import model_alone, SELF_TUNING
-from tqdm import tqdm
 
+PERIOD = 1e-3
+CASE = {'variant': 'fuzzy_adaptive', 'scheme': 'explicit', 'fuzzy_widths': [0.1]}
+"""Wide fuzzy sets: no chatter, so that rounding does not grow and both end at the same state."""
 BAR = 1.1
 CALLS = {'explicit': 0.6, 'implicit': None}
 """Microseconds of a call of `Observer.step`; the implicit scheme solves an equation a level."""
-VARIANTS = ('sign', 'fuzzy', 'fuzzy_adaptive')
-SCHEMES = ('explicit', 'implicit')
+VARIANTS, SCHEMES = ('sign', 'fuzzy', 'fuzzy_adaptive'), ('explicit', 'implicit')
 MODELS = Path(__file__).parents[1] / 'config' / 'models'
 SELF_TUNING_BARS = {'paper_plant': 12.0, 'dc_motor': 12.0, 'pendulum': 100.0}
 """Microseconds a step, of files in `MODELS`."""
@@ -30,6 +38,12 @@ LENGTH = 30
 """Seconds of a run at 1 kHz."""
 NOISE = 1e-4
 """Of y, where the file has no quantum."""
+PARTS = ('z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending')
+"""What a cascade remembers, in the order of the state of reference.c."""
+LAW = ('rate', 'min', 'max', 'dead_zone', 'leakage')
+"""Parameters of gamma at the end of its law there."""
+Run = Callable[[], tuple[np.ndarray, int]]
+"""Returns the last numbers of `PARTS`, the first four for each level, and the last status."""
 
 
 def measure(quick: bool) -> list[Row]:
@@ -37,35 +51,98 @@ def measure(quick: bool) -> list[Row]:
     samples, rounds, calls = (40_000, 5, 2_000) if quick else (400_000, 15, 20_000)
     y = output(samples + 1)
     rows = [_against_c(y, rounds)]
-    for variant, scheme in tqdm([*product(VARIANTS, SCHEMES)], desc='core', leave=False):
+    for variant, scheme in product(VARIANTS, SCHEMES):
         step = in_core(CASE | {'variant': variant, 'scheme': scheme}, y)
         step()
         best = min(_seconds(step) for _ in range(3)) / samples
         rows.append(Row(f'core step, {variant}, {scheme}', best * 1e9, 'ns'))
-    for scheme, bar in CALLS.items():
-        rows.append(_live(CASE | {'scheme': scheme}, y[:calls], None if quick else bar))
+    rows += [_call(scheme, y[:calls], None if quick else bar) for scheme, bar in CALLS.items()]
     for model, bar in SELF_TUNING_BARS.items():
         rows.append(_self_tuning(model, None if quick else bar, 5 if quick else LENGTH))
     return rows
 
 
-def _against_c(y: np.ndarray, rounds: int) -> Row:
-    name, samples = 'core step / same step in C (-O3)', len(y) - 1
+def output(count: int) -> np.ndarray:
+    """Return `count` samples of the paper's plant, without noise."""
+    return np.asarray(Plant({'integration_step': PERIOD}).simulate(np.arange(count) * PERIOD).y)
+
+
+def in_core(parameters: dict[str, Any], y: np.ndarray) -> Run:
+    """Return a callable that steps through y[1:] by the loop behind `Observer.run`."""
+    observer, rest = _started(parameters, y[0]), np.ascontiguousarray(y[1:])
+    start, count = observer.state, len(rest)
+    h, u = np.full(count, PERIOD), np.zeros((count, 1))
+
+    def run() -> tuple[np.ndarray, int]:
+        observer.restore(start)
+        record = run_structure(observer.structure, rest, h, u, 0, count)
+        return _numbers(observer), int(record.columns['words'][0])
+
+    return run
+
+
+def in_c(folder: Path, y: np.ndarray) -> Run:
+    """Return a callable that steps through y[1:] in C, for `CASE`."""
+    c = ObserverConfiguration(CASE)
+    if c.curves.shape != (4, KNOTS) or KNOTS != 193:
+        raise CannotMeasureError(f'reference.c expects (4, 193), the core has {c.curves.shape}')
+    gains = np.concatenate([c.lambdas, c.alphas, 1.0 / c.widths, c.curves[:2].ravel()])
+    gamma = [c.gamma_initial, *(c.parameters[f'gamma_{name}'] for name in LAW)]
+    packed = np.array([*gains, c.epsilon, *gamma])
+    start, rest = _numbers(_started(CASE, y[0])), np.ascontiguousarray(y[1:])
+    function, eps = _compiled(folder), np.empty(4)
+
+    def run() -> tuple[np.ndarray, int]:
+        state = start.copy()
+        arrays = (x.ctypes.data_as(ctypes.c_void_p) for x in (packed, state, rest, eps))
+        law, levels, samples, innovations = arrays
+        period, count = ctypes.c_double(PERIOD), ctypes.c_long(len(rest))
+        return state, function(law, levels, samples, period, count, innovations)
+
+    return run
+
+
+def _compiled(folder: Path) -> Any:
+    """Compile reference.c into a folder by $CC, else cc; return its function."""
+    command = shlex.split(os.environ.get('CC', 'cc'))
+    options = ['-O3', '-shared', '-fPIC', f'-DLEVEL_SHIFT={LEVEL_SHIFT}', '-o']
+    files = [folder / 'reference.so', Path(__file__).with_name('reference.c'), '-lm']
     try:
-        with TemporaryDirectory() as folder:
-            library = compile_reference(Path(folder))
-        assert_agreement(library, y)
-    except CannotMeasureError as error:
-        tqdm.write(f'core: {error}')
-        return Row(name, None, bar=BAR, note=str(error))
-    except AssertionError as error:
-        reason = ' '.join(str(error).split())
-        raise CannotMeasureError(f'reference.c is not the same recursion: {reason}') from None
-    ours, c = in_core(CASE, y), in_c(library, y)
-    times = np.empty((rounds, 2))
-    for k in range(rounds):
-        times[k] = _seconds(ours), _seconds(c)
-    times *= 1e9 / samples
+        done = subprocess.run(
+            [*command, *options, *files], capture_output=True, text=True, check=False
+        )
+    except FileNotFoundError:
+        raise CannotMeasureError(f'no C compiler {command[0]!r} to compare with') from None
+    if done.returncode:
+        lines = done.stderr.strip().splitlines() or ['without a word']
+        raise CannotMeasureError(f'{command[0]} failed on reference.c: {lines[0]}')
+    return ctypes.CDLL(str(files[0])).run
+
+
+def _started(parameters: dict[str, Any], y: float) -> Observer:
+    """Return an observer after its first sample."""
+    observer = Observer(parameters)
+    observer.start(y)
+    return observer
+
+
+def _numbers(observer: Observer) -> np.ndarray:
+    """Return the numbers of `PARTS`."""
+    found = observer.structure.state_dict()
+    return np.concatenate([np.atleast_1d(found[name]) for name in PARTS])
+
+
+def _against_c(y: np.ndarray, rounds: int) -> Row:
+    name, times = 'core step / same step in C (-O3)', np.empty((rounds, 2))
+    with TemporaryDirectory() as folder:
+        try:
+            c = in_c(Path(folder), y)
+        except CannotMeasureError as error:
+            return Row(name, None, bar=BAR, note=str(error))
+        ours = in_core(CASE, y)
+        for k in range(rounds):
+            times[k] = _seconds(ours), _seconds(c)
+    times *= 1e9 / (len(y) - 1)
     median, best = np.median(times, axis=0), times.min(axis=0)
     note = (
         f'N = 4, fuzzy_adaptive, explicit: {median[0]:.1f} / {median[1]:.1f} ns median, '
@@ -74,18 +151,17 @@ def _against_c(y: np.ndarray, rounds: int) -> Row:
     return Row(name, float(np.median(times[:, 0] / times[:, 1])), bar=BAR, note=note)
 
 
-def _live(parameters: dict[str, Any], y: np.ndarray, bar: float | None) -> Row:
-    samples = y.tolist()
-    observer = Observer(parameters)
+def _call(scheme: str, y: np.ndarray, bar: float | None) -> Row:
+    samples, observer = y.tolist(), Observer(CASE | {'scheme': scheme})
     observer.step(samples[0], PERIOD)
 
     def run() -> None:
         for sample in samples:
             observer.step(sample, PERIOD)
 
-    seconds = min(_seconds(run) for _ in range(3))
-    name = f'Observer.step, one call, {parameters["scheme"]}'
-    return Row(name, seconds / len(samples) * 1e6, 'us', bar, 'fuzzy_adaptive')
+    microseconds = min(_seconds(run) for _ in range(3)) / len(samples) * 1e6
+    name = f'Observer.step, one call, {scheme}'
+    return Row(name, microseconds, 'us', bar, 'fuzzy_adaptive')
 
 
 def _self_tuning(model: str, bar: float | None, length: int) -> Row:

@@ -8,7 +8,6 @@ middleware's.
 """
 
 import argparse
-import gc
 import signal
 import threading
 
@@ -24,8 +23,6 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from source import joint_state, JOINTS
 from std_msgs.msg import Float64
-
-READY = 'computing nothing'
 
 
 class EmptyNode(Node):
@@ -43,20 +40,17 @@ class EmptyNode(Node):
 
     def __init__(self, rate: float, joints: int = 0) -> None:
         super().__init__('empty_node')
-        self._count = 0
-        self._latest = 0
+        self._count = self._latest = 0
         self._stamp, self._joint_states = Time(), joint_state(max(joints, 1))
-        outputs = []
+        outputs = [('~/joint_states', self._joint_states)]
         for prefix in [f'~/{joint}/' for joint in JOINTS[:joints]] or ['~/']:
-            messages = {
-                'state': labelled(['z1', 'z2', 'z3'])(np.zeros(3)),
-                'unknown_input': Float64(),
-                'gamma': Float64(),
-                'innovation': labelled(['eps1', 'eps2', 'eps3', 'eps4'])(np.zeros(4)),
-                'stamp': self._stamp,
-            }
-            outputs += [(prefix + topic, message) for topic, message in messages.items()]
-        outputs.append(('~/joint_states', self._joint_states))
+            outputs += [
+                (f'{prefix}state', labelled(['z1', 'z2', 'z3'])(np.zeros(3))),
+                (f'{prefix}unknown_input', Float64()),
+                (f'{prefix}gamma', Float64()),
+                (f'{prefix}innovation', labelled(['eps1', 'eps2', 'eps3', 'eps4'])(np.zeros(4))),
+                (f'{prefix}stamp', self._stamp),
+            ]
         self._outputs = [
             (self.create_publisher(type(message), topic, 10).publish, message)
             for topic, message in outputs
@@ -67,7 +61,7 @@ class EmptyNode(Node):
             self._timer = self.create_timer(1.0 / rate, self._publish)
         kind, topic = (JointState, 'joint_states') if joints else (Float64, 'y')
         self._y = subscribe_with_info(self, kind, topic, self._on_sample, SENSOR_QOS)
-        self.get_logger().info(READY)
+        self.get_logger().info('computing nothing')
 
     def _on_sample(self, message: Float64 | JointState, info: dict[str, int]) -> None:
         self._count += 1
@@ -79,12 +73,11 @@ class EmptyNode(Node):
             self._publish()
 
     def _publish(self) -> None:
-        if not self._latest:
-            return
-        self._stamp.sec, self._stamp.nanosec = divmod(self._latest, 1_000_000_000)
-        self._joint_states.header.stamp = self._stamp
-        for publish, message in self._outputs:
-            publish(message)
+        if self._latest:
+            self._stamp.sec, self._stamp.nanosec = divmod(self._latest, 1_000_000_000)
+            self._joint_states.header.stamp = self._stamp
+            for publish, message in self._outputs:
+                publish(message)
 
     def _reports(self) -> list[Report]:
         """Return as many values as the estimator's reports have."""
@@ -103,8 +96,6 @@ def main() -> None:
     signal.signal(signal.SIGINT, lambda *_: ended.set())
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = EmptyNode(arguments.rate, arguments.joints)
-    gc.collect()
-    gc.freeze()  # as run_node does
     with Spinner(node, on_end=ended.set):
         ended.wait()
     node.destroy_node()

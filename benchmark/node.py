@@ -1,24 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """CPU, lost samples and latency of an estimator beside a node that computes nothing; its start."""
 
-from collections.abc import Callable
-import importlib.util
-import os
 from time import monotonic, sleep, time_ns
 from typing import NamedTuple
 
-from children import Child, Children
+from children import Children, wait_until
+from fhaosmo_ros.topics import TIME
 import numpy as np
-from results import CannotMeasureError, Row
+from results import Row
 from tqdm import tqdm
+from watch import Watch
 
 BAR, JOINT_BAR, START_BAR = 1.2, 1.5, 2.0
 WARM_UP = 1.5
 HELD = 0.97
 """A run counts for the ratio if each node published at this part of the rate at least."""
-MATCHED = 30.0
-"""Seconds that discovery may take."""
 EMPTY, ESTIMATOR = 'empty_node', 'estimator'
+START = ('-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-p')
 
 
 class Case(NamedTuple):
@@ -50,68 +48,59 @@ CASES = (
 
 
 class Figures(NamedTuple):
-    """
-    What one node did in one run.
-
-    Attributes
-    ----------
-    cpu : float
-        CPU time over wall time.
-    held : float
-        Publications over those that the timer was to make: a starved node does, and costs, less.
-    sent, taken : int
-        Samples that were published, and that the node has taken.
-    latency : (float, float)
-        Median and 99 %, in seconds.
-
-    """
+    """What one node did in one run."""
 
     cpu: float
+    """CPU time over wall time."""
     held: float
+    """Publications over those that the timer was to make: a starved node does, and costs, less."""
     sent: int
+    """Samples that were published."""
     taken: int
+    """Samples that the node has taken."""
     latency: tuple[float, float]
+    """Seconds from a sample's publication to its first estimate: median and 99 %."""
 
 
 def measure(quick: bool) -> list[Row]:
     """Return the ratios of CPU, the samples lost, and the latencies."""
-    isolate()
     seconds, repetitions = (2.0, 1) if quick else (8.0, 3)
     rows: list[Row] = []
     for case in tqdm(CASES[:1] if quick else CASES, desc='node', unit='case', leave=False):
         runs = [observe(case, seconds) for _ in range(repetitions)]
+        ours = [run[ESTIMATOR] for run in runs]
         ratios = [
             run[ESTIMATOR].cpu / run[EMPTY].cpu
             for run in runs
             if min(f.held for f in run.values()) >= HELD
         ]
-        ours = [run[ESTIMATOR] for run in runs]
         note = ', '.join(f'{r:.2f}' for r in ratios) or 'a node was starved in every run'
-        share = f'{np.median([f.cpu for f in ours]):.1%} of a core; '
-        ratio = float(np.median(ratios)) if ratios else None
+        share = f'{np.median([f.cpu for f in ours]):.1%} of a core; ratios {note}'
         lost, sent = sum(f.sent - f.taken for f in ours), sum(f.sent for f in ours)
-        of = f'of {sent:,}, over {repetitions} runs'
-        rows.append(Row(f'CPU, estimator / empty node, {case.title}', ratio, '', case.bar,
-                        f'{share}ratios {note}'))  # fmt: skip
-        rows.append(Row(f'samples lost, {case.title}', float(lost), '', 0.0, of))
-        for name, k in (('median', 0), ('99 %', 1)):
-            latency = 1e3 * float(np.median([f.latency[k] for f in ours]))
-            rows.append(Row(f'latency, {name}, {case.title}', latency, 'ms'))
+        latency = 1e3 * np.median([f.latency for f in ours], axis=0)
+        rows += [
+            Row(
+                f'CPU, estimator / empty node, {case.title}',
+                float(np.median(ratios)) if ratios else None, '', case.bar, share,
+            ),
+            Row(
+                f'samples lost, {case.title}', float(lost), '', 0.0,
+                f'of {sent:,}, over {repetitions} runs',
+            ),
+            Row(f'latency, median, {case.title}', float(latency[0]), 'ms'),
+            Row(f'latency, 99 %, {case.title}', float(latency[1]), 'ms'),
+        ]  # fmt: skip
     return rows
 
 
 def startup(quick: bool) -> list[Row]:
     """Return the seconds from the start of an estimator to its first word."""
-    isolate()
     rows = []
     for gains in ('fixed', 'self_tuning'):
         found = []
         for _ in range(1 if quick else 5):
             with Children() as children:
-                node = children.start(
-                    ESTIMATOR, '-m', 'fhaosmo_ros', 'estimator', '--ros-args',
-                    '-p', f'gains:={gains}',
-                )  # fmt: skip
+                node = children.start(ESTIMATOR, *START, f'gains:={gains}')
                 found.append((node.wait_for('estimating'), node.cpu_seconds()))
         wall, processor = np.median(found, axis=0).tolist()
         note = f'{processor:.2g} s of CPU; {", ".join(f"{w:.2f}" for w, _ in found)}'
@@ -119,76 +108,52 @@ def startup(quick: bool) -> list[Row]:
     return rows
 
 
-def isolate() -> None:
-    """Keep what we start away from other ROS systems; raise if there is no ROS."""
-    if importlib.util.find_spec('rclpy') is None:
-        raise CannotMeasureError('no rclpy in this Python: start it with make bench')
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 19)  # the tests use those from 20 on
-
-
 def observe(case: Case, seconds: float) -> dict[str, Figures]:
     """Start a source of y, an estimator and an empty node, both on the same samples."""
-    from fhaosmo_ros.topics import TIME  # needs ROS
-    from watch import Watch
-
-    joints = str(case.joints)
-    estimator = ['-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-p', f'gains:={case.gains}']
+    estimator = [*START, f'gains:={case.gains}']
     estimator += ['-p', f'publish_rate:={case.out}' if case.out else 'publish_on:=sample']
     estimator += ['-p', 'channels:=[from_joint_names]'] if case.joints else []
-    empty = ['benchmark/empty_node.py', '--rate', str(case.out), '--joints', joints]
-    joint = '/joint1' if case.joints else ''
+    joints, joint = ('--joints', str(case.joints)), '/joint1' if case.joints else ''
     watched = {name: f'/{name}{joint}/stamp' for name in (ESTIMATOR, EMPTY)}
-    with Children() as children, Watch(dict.fromkeys(watched.values(), TIME)) as watch:
+    with Children() as children, Watch((topic, TIME) for topic in watched.values()) as watch:
         nodes = {
             ESTIMATOR: children.start(ESTIMATOR, *estimator),
-            EMPTY: children.start(EMPTY, *empty),
+            EMPTY: children.start(
+                EMPTY, 'benchmark/empty_node.py', '--rate', str(case.out), *joints
+            ),
         }
         nodes[ESTIMATOR].wait_for('waiting' if case.joints else 'estimating')
         nodes[EMPTY].wait_for('computing nothing')
         source = children.start(
-            'source', 'benchmark/source.py', '--rate', str(case.rate), '--joints', joints,
-            '--subscribers', '2',
+            'source', 'benchmark/source.py', '--rate', str(case.rate), '--subscribers', '2',
+            *joints,
         )  # fmt: skip
         source.wait_for('publishing')
-        for topic in watched.values():
-            wait_until(lambda topic=topic: watch.count(topic), f'no stamp of {topic}')
+        wait_until(lambda: all(map(watch.count, watched.values())), 'not all nodes published')
         sleep(WARM_UP)
         watch.forget()
         before, start = {name: node.cpu_seconds() for name, node in nodes.items()}, monotonic()
         sleep(seconds)
         elapsed = monotonic() - start
-        used = {name: node.cpu_seconds() - before[name] for name, node in nodes.items()}
+        cpu = {name: (n.cpu_seconds() - before[name]) / elapsed for name, n in nodes.items()}
         asked = (case.out or case.rate) * elapsed
         held = {name: watch.count(topic) / asked for name, topic in watched.items()}
         latency = {name: _latency(*watch.series(topic)) for name, topic in watched.items()}
-        sent, ended = _end(source), time_ns()
-        for name in nodes:
-            wait_until(lambda name=name: watch.reported_after(name, ended), f'no report of {name}')
+        source.interrupt()
+        source.end()
+        sent, ended = int(source.output().split()[-1]), time_ns()
+        wait_until(
+            lambda: all(watch.reported(name, 'received') > ended for name in nodes),
+            'not all nodes reported at the end',
+        )
         return {
-            name: Figures(used[name] / elapsed, held[name], sent, watch.taken(name), latency[name])
+            name: Figures(cpu[name], held[name], sent, watch.taken(name), latency[name])
             for name in nodes
         }
 
 
 def _latency(published: np.ndarray, stamps: np.ndarray) -> tuple[float, float]:
-    """Return the time (s) from a sample's publication to its first estimate: median, 99 %."""
+    """Return median and 99 % of the time from a sample to the first estimate with its stamp."""
     _, first = np.unique(stamps, return_index=True)
     median, most = np.quantile(1e-9 * np.abs(published - stamps)[first], [0.5, 0.99])
     return float(median), float(most)
-
-
-def _end(source: Child) -> int:
-    """End the source and return how many samples it has published."""
-    source.interrupt()
-    source.end()
-    return int(source.output().split()[-1])
-
-
-def wait_until(condition: Callable[[], bool], complaint: str) -> None:
-    """Wait for a condition; raise with a complaint if it does not come."""
-    deadline = monotonic() + MATCHED
-    while not condition():
-        if monotonic() > deadline:
-            raise CannotMeasureError(f'{complaint} within {MATCHED:g} s')
-        sleep(0.02)

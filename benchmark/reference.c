@@ -4,7 +4,7 @@
  * Phi = (0, 0, -z3), N = 4 levels, fuzzy_adaptive, explicit. It is written as one would write it
  * for speed (the model is inlined by hand), and serves the benchmark only.
  *
- * State: z_hat[4], z_tilde[4], p[4], q[4], gamma, y, pending: PARTS in reference.py.
+ * State: z_hat[4], z_tilde[4], p[4], q[4], gamma, y, pending: PARTS in core_step.py.
  */
 #include <math.h>
 

@@ -13,20 +13,17 @@ from fhaosmo_ros.topics import FLOAT
 import numpy as np
 from results import CannotMeasureError, Row
 from rosbags.highlevel import AnyReader
-from tqdm import tqdm
 
-SAMPLES = 1_000_000
-BAR = 2.5
+SAMPLES, BAR = 1_000_000, 2.5
 
 
 def measure(quick: bool) -> list[Row]:
     """Return the ratio of times of a replay to a bag."""
     samples, rounds = (50_000, 1) if quick else (SAMPLES, 3)
-    times = np.empty((rounds, 2))
-    with TemporaryDirectory() as name:
-        bag = make_bag(Path(name) / 'bag', samples)
-        for k in tqdm(range(rounds), desc='replay', unit='run', leave=False):
-            times[k] = replay(bag, Path(name) / 'out'), read_by_rosbags(bag)
+    with TemporaryDirectory() as folder:
+        bag = make_bag(Path(folder) / 'bag', samples)
+        out = Path(folder) / 'out'
+        times = [(replay(bag, out), read_by_rosbags(bag)) for _ in range(rounds)]
     ours, theirs = np.median(times, axis=0).tolist()
     note = f'{samples:,} Float64, a process with its start: {ours:.2f} / {theirs:.2f} s'
     bar = None if quick else BAR
@@ -35,12 +32,10 @@ def measure(quick: bool) -> list[Row]:
 
 def make_bag(path: Path, samples: int) -> Path:
     """Write y at 1 kHz."""
-    times = 10**18 + np.arange(samples) * 1_000_000
-    values = 0.2 + 0.1 * np.sin(1e-3 * np.arange(samples))
     with BagWriter(path) as bag:
         bag.add('/y', FLOAT)
-        for time, value in zip(times.tolist(), values.tolist(), strict=True):
-            bag.write('/y', time, serialise(FLOAT, data=value))
+        for k, value in enumerate((0.2 + 0.1 * np.sin(1e-3 * np.arange(samples))).tolist()):
+            bag.write('/y', 10**18 + k * 1_000_000, serialise(FLOAT, data=value))
     return path
 
 

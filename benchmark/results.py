@@ -30,28 +30,16 @@ class CannotMeasureError(Exception):
 
 
 class Row(NamedTuple):
-    """
-    One line of the result.
-
-    Attributes
-    ----------
-    name : str
-        What was measured.
-    value : float or None
-        None if it could not be measured; then a bar counts as missed.
-    unit : str
-    bar : float or None
-        Highest allowed value, None where there is no bar.
-    note : str
-        The numbers behind the value.
-
-    """
+    """One line of the result."""
 
     name: str
     value: float | None
+    """None if it could not be measured; then a bar counts as missed."""
     unit: str = ''
     bar: float | None = None
+    """Highest allowed value."""
     note: str = ''
+    """The numbers behind the value."""
 
     @property
     def missed(self) -> bool:
@@ -59,36 +47,32 @@ class Row(NamedTuple):
         return self.bar is not None and (self.value is None or not self.value <= self.bar)
 
     @property
-    def measured(self) -> str:
-        """The value as a reader sees it."""
-        if self.value is None:
-            return '-'
-        digits = '.0f' if abs(self.value) >= 100.0 else '.3g'
-        return f'{self.value:{digits}} {self.unit}'.strip()
-
-    @property
-    def allowed(self) -> str:
-        """The bar as a reader sees it."""
-        return '' if self.bar is None else f'<= {self.bar:g}'
+    def cells(self) -> tuple[str, str]:
+        """Value and bar as a reader sees them."""
+        value = '-'
+        if self.value is not None:
+            digits = '.0f' if abs(self.value) >= 100.0 else '.3g'
+            value = f'{self.value:{digits}} {self.unit or ""}'.strip()
+        return value, '' if self.bar is None else f'<= {self.bar:g}'
 
 
 def render(rows: Iterable[Row]) -> str:
     """Return the rows as an aligned table."""
-    cells = [('', 'measured', 'allowed', '', '')]
+    lines = [('', 'measured', 'allowed', '', '')]
     for row in rows:
         verdict = '' if row.bar is None else 'MISSED' if row.missed else 'pass'
-        cells.append((row.name, row.measured, row.allowed, verdict, row.note))
-    name, value, bar, verdict, _ = (max(len(line[k]) for line in cells) for k in range(5))
+        lines.append((row.name, *row.cells, verdict, row.note))
+    name, value, bar, verdict, _ = (max(map(len, column)) for column in zip(*lines, strict=True))
     return '\n'.join(
         f'{a:<{name}}  {b:>{value}}  {c:<{bar}}  {d:<{verdict}}  {e}'.rstrip()
-        for a, b, c, d, e in cells
+        for a, b, c, d, e in lines
     )
 
 
 def machine() -> str:
     """Return what this is measured on, and how busy it is now."""
-    with Path('/proc/cpuinfo').open(encoding='utf-8') as lines:
-        found = [line.split(':')[1].strip() for line in lines if 'model name' in line][:1]
+    lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
+    found = [line.split(':')[1].strip() for line in lines if 'model name' in line][:1]
     load = f'load {os.getloadavg()[0]:.1f} at the start'
     python = f'Python {platform.python_version()}'
     return ', '.join([*(found or [platform.machine()]), f'{os.cpu_count()} cores', python, load])
@@ -97,8 +81,7 @@ def machine() -> str:
 def texts(rows: Iterable[Mapping[str, Any]]) -> dict[str, str]:
     """Return the part of the page, from the table."""
     found = {row['name']: Row(*(row[k] for k in Row._fields)) for row in rows}
-    found = {name: row._replace(unit=row.unit or '') for name, row in found.items()}
-    lines = [(name, found[name].measured, found[name].allowed) for name in SHOWN]
+    lines = [(name, *found[name].cells) for name in SHOWN]
     return {NAME: evidence.markdown(['', 'measured', 'allowed'], lines)}
 
 

@@ -17,14 +17,12 @@ import replay
 from results import CannotMeasureError, machine, publish, render, Row
 
 PARTS = {
-    'core': core_step.measure,
-    'node': node.measure,
-    'startup': node.startup,
+    'core': core_step.measure, 'node': node.measure, 'startup': node.startup,
     'replay': replay.measure,
-}
+}  # fmt: skip
 
 
-def main(argv: list[str] | None = None) -> int:
+def main() -> int:
     """Measure and print; see the top of this file for the exit code."""
     parser = argparse.ArgumentParser(prog='make bench', description='Measure speed.')
     parser.add_argument(
@@ -32,7 +30,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument('--only', choices=PARTS, help='one part only')
     parser.add_argument('--page', action='store_true', help='write the table in docs/ anew')
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_args()
     if arguments.page and arguments.quick:
         parser.error('--page shows full measurements: expected no --quick, got --quick')
     # A job in the background starts with SIGINT ignored; SIGTERM must end the children as well.

@@ -11,7 +11,6 @@ of one more hop makes an error in d that hides the drift which a soak is to find
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator
 import json
 import signal
 import sys
@@ -39,9 +38,6 @@ STREAM = {
 """Faults of y, with the smallest and largest number of samples that each concerns."""
 CALLS = ('good parameters', 'bad parameters', 'reset')
 """What a client does meanwhile."""
-
-READY = 'injecting'
-TOPIC = 'faulty_y'
 SPIKE = 1e3
 SETTLE = 0.5
 """Seconds from the match of a new publisher, as seen from here, to its first sample."""
@@ -71,67 +67,44 @@ def schedule(seed: int, seconds: float) -> list[Event]:
 
 
 class Faults:
-    """
-    What stands between a plant and its topic.
+    """What stands between a node's y and its topic; its time begins with the first sample."""
 
-    Parameters
-    ----------
-    node : Node
-        Owns the publisher.
-    seed : int
-    seconds : float
-        Arguments of `schedule`; its time begins with the first sample.
-
-    """
-
-    def __init__(self, node: Node, seed: int, seconds: float) -> None:
+    def __init__(self, node: Node, events: list[Event]) -> None:
         self.counts: Counter[str] = Counter()
-        self._node = node
-        self._events = [e for e in schedule(seed, seconds) if e.kind in STREAM][::-1]
-        self._active: dict[str, int] = {}
-        self._held: list[float] = []
+        self._node, self._events = node, [e for e in events if e.kind in STREAM][::-1]
+        self._active: Counter[str] = Counter()  # samples left by fault
+        self._held: list[float] = []  # of a burst
         self._last = 0.0
-        self._origin: float | None = None
-        self._matched: float | None = None
-        self._publisher = node.create_publisher(Float64, TOPIC, 10)
+        self._origin = 0.0
+        self._publisher = node.create_publisher(Float64, 'faulty_y', 10)
+        self._matched = 0.0  # when the publisher got its subscriber
 
     def pass_on(self, message: Float64) -> None:
         """Publish what faults leave, or make, of a sample."""
-        if not self._is_matched():
-            self.counts['held back for discovery'] += 1
+        if not self._matched and self._publisher.get_subscription_count():
+            self._matched = monotonic()
+        if not self._matched or monotonic() - self._matched < SETTLE:
             return
-        if self._origin is None:
+        if not self._origin:
             self._origin = monotonic()
-            print(READY, flush=True)
-        now = monotonic() - self._origin
-        while self._events and self._events[-1].time <= now:
+            print('injecting', flush=True)
+        while self._events and self._events[-1].time <= monotonic() - self._origin:
             event = self._events.pop()
             self._active[event.kind] = event.size
-            self.counts[f'event: {event.kind}'] += 1
         for y in self._faulty(message.data):
             self._publisher.publish(Float64(data=y))
             self.counts['published'] += 1
 
-    def _is_matched(self) -> bool:
-        """Return True once a new publisher has had its subscriber for a while."""
-        if self._matched is None and self._publisher.get_subscription_count():
-            self._matched = monotonic()
-        return self._matched is not None and monotonic() - self._matched > SETTLE
-
-    def _faulty(self, y: float) -> Iterator[float]:
+    def _faulty(self, y: float) -> list[float]:
         """Return what is published in place of `y`."""
         if self._take('publisher restart'):
             self._node.destroy_publisher(self._publisher)
-            self._publisher = self._node.create_publisher(Float64, TOPIC, 10)
-            self._matched = None
-            self.counts['held back for discovery'] += 1
-            return
+            self._publisher = self._node.create_publisher(Float64, 'faulty_y', 10)
+            self._matched = 0.0
+            return []
         if self._take('short gap') or self._take('long gap'):
-            self.counts['dropped'] += 1
-            return
-        if self._take('stuck'):
-            y = self._last
-        self._last = y
+            return []
+        self._last = y = self._last if self._take('stuck') else y
         if self._take('nan'):
             y = float('nan')
         elif self._take('infinity'):
@@ -140,28 +113,25 @@ class Faults:
             y += SPIKE
         if self._take('burst'):
             self._held.append(y)
-            return
-        yield from self._held
+            return []
+        found = [*self._held, y]
         self._held.clear()
-        yield y
-        if self._take('duplicate'):
-            yield y
+        return [*found, y] if self._take('duplicate') else found
 
     def _take(self, kind: str) -> bool:
         """Return True, and count one, while a fault lasts."""
-        if not self._active.get(kind):
-            return False
-        self._active[kind] -= 1
-        self.counts[kind] += 1
-        return True
+        lasts = self._active[kind] > 0
+        self._active[kind] -= lasts
+        self.counts[kind] += lasts
+        return lasts
 
 
 class FaultyPlant(PlantNode):
-    """A plant whose y goes through faults; arguments of `Faults`."""
+    """A plant whose y goes through faults."""
 
-    def __init__(self, seed: int, seconds: float) -> None:
+    def __init__(self, events: list[Event]) -> None:
         super().__init__()
-        self.faults = Faults(self, seed, seconds)
+        self.faults = Faults(self, events)
         self._publish_y = self.faults.pass_on
 
 
@@ -174,7 +144,7 @@ def main() -> None:
     ended = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: ended.set())
     rclpy.init(args=[sys.argv[0], *rest], signal_handler_options=SignalHandlerOptions.NO)
-    node = FaultyPlant(arguments.seed, arguments.seconds)
+    node = FaultyPlant(schedule(arguments.seed, arguments.seconds))
     with Spinner(node, on_end=ended.set) as spinner:
         ended.wait()
     if spinner.error:

@@ -9,18 +9,16 @@ Begins once it has its subscribers; says at its end how many samples it has publ
 import argparse
 import math
 import signal
+import threading
 import time
 
 import rclpy
-from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
-READY = 'publishing'
 JOINTS = [f'joint{k}' for k in range(1, 33)]
-PUBLISHED = 'published'
 SETTLE = 0.5
 """Seconds between the match as seen from here and the first sample: the other side's match."""
 
@@ -38,26 +36,19 @@ def main() -> None:
     parser.add_argument('--joints', type=int, default=0, help='of a JointState instead of y')
     parser.add_argument('--subscribers', type=int, default=1)
     arguments = parser.parse_args()
-    ended = False
-
-    def end(*_: object) -> None:
-        nonlocal ended
-        ended = True
-
-    signal.signal(signal.SIGINT, end)
-    context = Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    node = Node('source', context=context, start_parameter_services=False)
+    ended = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: ended.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = Node('source', start_parameter_services=False)
     joints = joint_state(arguments.joints) if arguments.joints else None
     kind, topic = (JointState, 'joint_states') if joints else (Float64, 'y')
     publisher = node.create_publisher(kind, topic, 10)
-    while not ended and publisher.get_subscription_count() < arguments.subscribers:
+    while not ended.is_set() and publisher.get_subscription_count() < arguments.subscribers:
         time.sleep(0.02)
     time.sleep(SETTLE)
-    print(READY, flush=True)
-    message, count = joints or Float64(), 0
-    start = time.monotonic()
-    while not ended:
+    print('publishing', flush=True)
+    message, count, start = joints or Float64(), 0, time.monotonic()
+    while not ended.is_set():
         time.sleep(max(0.0, start + count / arguments.rate - time.monotonic()))
         y = 0.2 + 0.1 * math.sin(count / arguments.rate)
         if joints:
@@ -69,9 +60,9 @@ def main() -> None:
         publisher.publish(message)
         count += 1
     time.sleep(SETTLE)  # the last samples leave before their writer does
-    print(PUBLISHED, count, flush=True)
+    print('published', count, flush=True)
     node.destroy_node()
-    rclpy.try_shutdown(context=context)
+    rclpy.try_shutdown()
 
 
 if __name__ == '__main__':

@@ -42,12 +42,12 @@ def test_a_copy_goes_on_by_itself(kind, duplicate):
 
 @kinds
 def test_hostile_snapshots(kind):
-    fuzz_snapshots(kind, 150, 3, lambda: None)
+    fuzz_snapshots(kind, 150, 3)
 
 
 @kinds
 def test_hostile_calls(kind):
-    fuzz_calls(kind, 200, 4, lambda: None)
+    fuzz_calls(kind, 200, 4)
 
 
 @pytest.mark.parametrize('kind', ['cascade', 'self-tuning'])
