@@ -2,12 +2,11 @@
 """The demonstration: plant and estimator as two processes over DDS, recorded and compared."""
 
 import argparse
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import os
 from pathlib import Path
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -38,15 +37,10 @@ from fhaosmo_ros.topics import (
 
 START_DEADLINE = 60.0
 """Seconds for a node to appear; it takes one or two where nothing else runs."""
-NOISE = 2.0 / 3.0, 'now with noise of 1e-4 on y', {'noise_std': 1e-4}
-"""What happens to the plant of the shipped files: part of the duration, words, parameters."""
-
-
-class Plan(NamedTuple):
-    """Duration of a run in seconds, and what changes in it, as `NOISE`."""
-
-    duration: float
-    changes: Sequence[tuple[float, str, Mapping[str, Any]]]
+NOISE = 'now with noise of 1e-4 on y', {'noise_std': 1e-4}
+"""What happens to the plant of the shipped files: words, parameters."""
+NOISY_FROM = 2.0 / 3.0
+"""Part of the duration after which it does."""
 
 
 def topics_of(estimator: Mapping[str, Any]) -> list[ExpectedTopic]:
@@ -64,16 +58,7 @@ def topics_of(estimator: Mapping[str, Any]) -> list[ExpectedTopic]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """
-    Run the demonstration.
-
-    Returns
-    -------
-    int
-        0 if there is a report (also of a run that Ctrl-C ended early), 130 if it was interrupted
-        before, 2 for a bad configuration.
-
-    """
+    """Run the command; a run that Ctrl-C ends after the first estimate is reported, too."""
     return run_command(_parser(), argv, _demo)
 
 
@@ -81,29 +66,23 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='demo', description='Run plant and estimator, record, report, draw a figure.'
     )
-    parser.add_argument(
-        '--duration', type=float, default=20.0, metavar='SECONDS', help='default: %(default)g'
-    )
-    parser.add_argument(
-        '--output',
-        type=Path,
-        metavar='FOLDER',
+    add = parser.add_argument
+    add('--duration', type=float, default=20.0, metavar='SECONDS', help='default: %(default)g')
+    add(
+        '--output', type=Path, metavar='FOLDER',
         help='new or empty folder for bag and figure (default: demo_output/TIME)',
-    )
-    parser.add_argument('--force', action='store_true', help='replace an output that exists')
+    )  # fmt: skip
+    add('--force', action='store_true', help='replace an output that exists')
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
-        '--params-file',
-        type=Path,
-        metavar='FILE',
+        '--params-file', type=Path, metavar='FILE',
         help='parameters of both nodes (default: the shipped config/demo.yaml, with noise on y in '
         'the last third)',
-    )
+    )  # fmt: skip
     which.add_argument(
-        '--self-tuning',
-        action='store_true',
+        '--self-tuning', action='store_true',
         help="the second engine instead of the paper's observer (config/self_tuning.yaml)",
-    )
+    )  # fmt: skip
     return parser
 
 
@@ -117,17 +96,19 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
     load(parameters, 'plant')
     estimator = load(parameters, 'estimator')
     Observer(estimator)
-    changes = () if arguments.params_file else (NOISE,)
-    _keep_to_this_host()
+    # Apart from other people's robots, and from a second demonstration.
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     print(
         f'plant and estimator with {parameters}, on this host only, '
         f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}'
     )
-    with Output(arguments.output or _default_output(), arguments.force) as output:
+    default = Path('demo_output') / time.strftime('%Y-%m-%d_%H-%M-%S')
+    with Output(arguments.output or default, arguments.force) as output:
         folder = output.path
         folder.mkdir()
-        plan = Plan(arguments.duration, changes)
-        marks = _record(folder, parameters, topics_of(estimator), plan, stop)
+        noisy = arguments.params_file is None
+        marks = _record(folder, parameters, estimator, arguments.duration, noisy, stop)
         if stop.is_set():
             print('stopped early: reporting what has been recorded')
         run = read_run(folder / 'bag')
@@ -140,24 +121,16 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
     print(f'figure:  {final / "demo.png"}\nbag:     {final / "bag"}')
 
 
-def _keep_to_this_host() -> None:
-    """Keep the topics apart from other people's robots, and from a second demonstration."""
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
-
-
-def _default_output() -> Path:
-    return Path('demo_output') / time.strftime('%Y-%m-%d_%H-%M-%S')
-
-
 def _record(
     folder: Path,
     parameters: Path,
-    topics: list[ExpectedTopic],
-    plan: Plan,
+    estimator: Mapping[str, Any],
+    duration: float,
+    noisy: bool,
     stop: Stop,
 ) -> list[tuple[int, str]]:
     """Record a run; return when the plant changed (ns), and how."""
+    topics = topics_of(estimator)
     with (
         BagWriter(folder / 'bag') as bag,
         TopicRecorder(lambda sample: bag.write(*sample), topics) as recorder,
@@ -170,68 +143,61 @@ def _record(
         nodes.start_node('estimator', *options)
         nodes.start_node('plant', *options)
         compared = ['/y', *(f'/plant/{name}' for name in TRUTH), '/estimator/state']
-        _wait(
-            'the first estimate',
-            lambda: (
-                all(recorder.counts[topic] for topic in compared)
-                and (not plan.changes or recorder.can_set_parameters('/plant'))
-            ),
-            recorder,
-            nodes,
-            stop,
-        )
-        return _watch(recorder, nodes, plan, stop)
+
+        def ready() -> bool:
+            heard = all(recorder.counts[topic] for topic in compared)
+            return heard and (not noisy or recorder.can_set_parameters('/plant'))
+
+        def check() -> None:
+            nodes.check()
+            _check_alone(recorder)
+
+        _wait(ready, check, stop)
+        return _watch(recorder, check, duration, noisy, stop)
 
 
 def _check_alone(recorder: TopicRecorder) -> None:
     """Raise if another node publishes what is recorded: the bag would hold a mixture."""
     for topic in ('/y', '/estimator/state'):
         if recorder.publishers(topic) > 1:
-            domain = os.environ['ROS_DOMAIN_ID']
             raise ConfigurationError(
                 f'expected one publisher of {topic}, got another one on this host with '
-                f'ROS_DOMAIN_ID={domain}; set another ROS_DOMAIN_ID'
+                f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}; set another ROS_DOMAIN_ID'
             )
 
 
-def _wait(
-    what: str,
-    ready: Callable[[], object],
-    recorder: TopicRecorder,
-    nodes: Children,
-    stop: Stop,
-) -> None:
+def _wait(ready: Callable[[], bool], check: Callable[[], None], stop: Stop) -> None:
+    """Wait for the first estimate."""
     deadline = time.monotonic() + START_DEADLINE
-    print(f'waiting for {what} ...', flush=True)
+    print('waiting for the first estimate ...', flush=True)
     while not ready():
-        nodes.check()
-        _check_alone(recorder)
+        check()
         if stop.wait(0.02):
             raise Interrupted('before the first estimate, nothing written')
         if time.monotonic() > deadline:
-            raise ConfigurationError(f'waited {START_DEADLINE:g} s for {what}, in vain')
+            raise ConfigurationError(f'waited {START_DEADLINE:g} s for the first estimate in vain')
 
 
 def _watch(
-    recorder: TopicRecorder, nodes: Children, plan: Plan, stop: Stop
+    recorder: TopicRecorder,
+    check: Callable[[], None],
+    duration: float,
+    noisy: bool,
+    stop: Stop,
 ) -> list[tuple[int, str]]:
     """Show a progress bar, and change the plant, until the time is over or the user stops it."""
-    duration, changes = plan
-    begin, coming, marks = time.monotonic(), deque(changes), []
-    with progress(
-        total=duration, unit='s', bar_format='{l_bar}{bar}| {n:.0f}/{total:.0f} s{postfix}'
-    ) as bar:
-        while not stop.wait(0.1):
-            nodes.check()
-            _check_alone(recorder)
+    words, values = NOISE
+    begin, elapsed = time.monotonic(), 0.0
+    marks: list[tuple[int, str]] = []
+    form = '{l_bar}{bar}| {n:.0f}/{total:.0f} s{postfix}'
+    with progress(total=duration, unit='s', bar_format=form) as bar:
+        while elapsed < duration and not stop.wait(0.1):
+            check()
             elapsed = min(time.monotonic() - begin, duration)
             bar.set_postfix_str(f'{recorder.counts["/y"]} samples', refresh=False)
             bar.update(elapsed - bar.n)
-            if coming and elapsed >= coming[0][0] * duration:
-                _, words, values = coming.popleft()
+            if noisy and not marks and elapsed >= NOISY_FROM * duration:
                 bar.write(f'{elapsed:4.1f} s: {words}')
                 marks.append((time.time_ns(), words))
                 recorder.set_parameters('/plant', values)
-            if elapsed >= duration:
-                break
     return marks

@@ -18,16 +18,7 @@ LIVE = {'color': COLOURS[0], 'linewidth': 1.1, 'linestyle': '--'}
 def save_figure(
     run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, str]], path: Path
 ) -> None:
-    """
-    Write a figure: states, d, what the other observers make of d, and the power or the noise.
-
-    Parameters
-    ----------
-    run, compared, marks
-        As for `table`.
-    path : path
-
-    """
+    """Draw states, d, what the other observers make of d, and the power or the noise."""
     rows = [*run.names, *(['compared'] if compared else []), 'last']
     figure = Figure(figsize=(8.0, 1.5 * len(rows) + 0.8), layout='constrained')
     axes = dict(zip(rows, figure.subplots(len(rows), 1, sharex=True), strict=True))
@@ -67,10 +58,8 @@ def save_figure(
         t = (stamp - run.y.stamps[run.rows[0]]) * 1e-9
         for row in axes.values():
             row.axvline(t, color='black', linewidth=0.8, linestyle=':')
-        axes['d'].annotate(
-            words, (t, 1.0), (3, -3), xycoords=('data', 'axes fraction'), va='top',
-            textcoords='offset points', fontsize='small',
-        )  # fmt: skip
+        corner = {'xycoords': ('data', 'axes fraction'), 'textcoords': 'offset points'}
+        axes['d'].annotate(words, (t, 1.0), (3, -3), va='top', fontsize='small', **corner)
     for row in axes.values():
         row.grid(alpha=0.3)
     last.set_xlabel('time since the first estimate [s]')

@@ -23,16 +23,12 @@ RECENT = 50
 SELF_TUNING, HELD = 'self-tuning', 'fuzzy, the power held'
 OTHERS: dict[str, dict[str, Any]] = {
     'sign, gains of the paper': {
-        'variant': 'sign',
-        'scheme': 'explicit',
-        'lambda': [15.0],
-        'alpha': [30.0],
-        'epsilon': 0.025,
-        'noise_size': 0.0,
+        'variant': 'sign', 'scheme': 'explicit', 'lambda': [15.0], 'alpha': [30.0],
+        'epsilon': 0.025, 'noise_size': 0.0,
     },
     HELD: {'gamma_rate': 0.0, 'gamma_leakage': 0.0},
     SELF_TUNING: {'gains': 'self_tuning'},
-}
+}  # fmt: skip
 """Observers that go through the same y: how their parameters differ from those of the file."""
 WORDS = """
 Error: RMS of the estimate of d minus d. Chatter: how much further the estimate moves than d does
@@ -43,41 +39,21 @@ the model alone.
 
 
 class Run(NamedTuple):
+    """Estimates beside the truth at the time of the sample that each was computed from, K rows."""
+
+    t: Floats  # (K,) seconds since the first estimate
+    names: list[str]  # z1 .. zn and d
+    truth: Floats  # (K, n + 1) states, and d as the last column
+    estimate: Floats  # (K, n + 1) likewise
+    of_gains: dict[str, Floats]  # gamma; or standard_deviation and tuning
+    y: Series  # all samples
+    rows: NDArray[np.int64]  # (K,) the sample behind each estimate
+    counters: dict[str, str]  # of the estimator's last diagnostics
+
+
+def read_run(bag: Path) -> Run:
     """
-    Estimates beside the truth at the time of the sample that each was computed from.
-
-    Attributes
-    ----------
-    t : (K,) array
-        Seconds since the first estimate.
-    names : list of str
-        z1 .. zn and d.
-    truth, estimate : (K, n + 1) arrays
-        States, and the unknown input as the last column.
-    of_gains : dict of str to array
-        What the estimator publishes by its gains: gamma, or standard_deviation and tuning.
-    y : Series
-        All samples.
-    rows : (K,) array of int
-        The sample behind each estimate.
-    counters : dict of str to str
-        What the estimator reported last in its diagnostics.
-
-    """
-
-    t: Floats
-    names: list[str]
-    truth: Floats
-    estimate: Floats
-    of_gains: dict[str, Floats]
-    y: Series
-    rows: NDArray[np.int64]
-    counters: dict[str, str]
-
-
-def read_run(bag: Path, plant: str = '/plant', estimator: str = '/estimator') -> Run:
-    """
-    Read a bag that holds a plant's and an estimator's topics.
+    Read the bag of a demonstration.
 
     Each estimate is compared with the truth of the sample behind it (``~/stamp``), not with that
     of the moment at which it was published.
@@ -92,11 +68,11 @@ def read_run(bag: Path, plant: str = '/plant', estimator: str = '/estimator') ->
     with BagReader(bag) as reader:
         found = [
             topic for topics in OF_GAINS.values() for topic in topics
-            if reader.count(f'{estimator}/{topic}')
+            if reader.count(f'/estimator/{topic}')
         ]  # fmt: skip
-    ticks = read_ticks(bag, estimator, [*found, *ESTIMATES])
+    ticks = read_ticks(bag, '/estimator', [*found, *ESTIMATES])
     when = ticks['stamp'].astype(np.int64)
-    truth = truth_at(bag, plant, when) if len(when) else None
+    truth = truth_at(bag, '/plant', when) if len(when) else None
     if truth is None or not truth.known.any():
         raise ConfigurationError('the run ended before an estimate arrived beside its truth')
     known = truth.known
@@ -131,16 +107,9 @@ def others(run: Run, parameters: Mapping[str, Any]) -> dict[str, Floats]:
 
 def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, str]]) -> str:
     """
-    Return the report of a run as text: how each observer estimates d, then states and samples.
+    Return a report: how each observer estimates d, then states and samples.
 
-    Parameters
-    ----------
-    run : Run
-    compared : mapping
-        As `others` returns it.
-    marks : sequence of (int, str)
-        When something changed (stamps in ns), and what.
-
+    `marks` says when something changed (stamps in ns), and what.
     """
     origin = run.y.stamps[run.rows[0]]
     edges = [START, *((stamp - origin) * 1e-9 for stamp, _ in marks), np.inf]
@@ -161,8 +130,8 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
             for _, part in parts
         )
         lines.append(f'{name:{width}}' + ''.join(cells))
-    sizes = (f'{rms(d[part]):12.2g}{"":8}' for _, part in parts)
-    lines.append((f'{"RMS of d itself":{width}}' + ''.join(sizes)).rstrip())
+    sizes = ''.join(f'{rms(d[part]):12.2g}{"":8}' for _, part in parts)
+    lines.append(f'{"RMS of d itself":{width}}{sizes}'.rstrip())
     late = run.t >= parts[0][0]
     if compared:
         live, held = (rms((e - d)[late]) for e in (run.estimate[:, -1], compared[HELD]))
