@@ -15,7 +15,7 @@ from fhaosmo_ros.tools.bags.topics import series
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.options import BagInputs
 from fhaosmo_ros.tools.replay import command as replay
-from fhaosmo_ros.tools.tuning.source import recorded
+from fhaosmo_ros.tools.tuning.sensor import recorded
 import numpy as np
 import pytest
 

@@ -53,36 +53,20 @@ def parameters(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope='module')
-def finished(parameters):
+def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(parameters):
     folder = parameters.parent / 'out'
-    return run('--duration', 6, '--output', folder, '--params-file', parameters), folder
-
-
-def test_it_succeeds_and_leaves_no_process(finished, parameters):
-    result, _ = finished
+    result = run('--duration', 6, '--output', folder, '--params-file', parameters)
     assert result.returncode == 0, result.stderr
     assert nodes_of(parameters) == []
-
-
-def test_report_compares_the_observers_and_counts_the_samples(finished):
-    result, folder = finished
     for word in (*OTHERS, 'RMS of d', 'z1', 'z2', 'z3', 'dropped'):
         assert word in result.stdout
     assert (folder / 'report.txt').read_text().strip() in result.stdout
-
-
-def test_bag_holds_every_topic_and_can_be_read(finished):
-    _, folder = finished
+    assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
     with AnyReader([folder / 'bag']) as reader:
         topics = {c.topic: c for c in reader.connections}
-        assert set(topics) == {t.topic for t in topics_of({})}
-        assert all(c.digest.startswith('RIHS01_') for c in topics.values())
-        assert topics['/y'].msgcount > 1000
-
-
-def test_estimate_is_near_the_truth(finished):
-    _, folder = finished
+    assert set(topics) == {t.topic for t in topics_of({})}
+    assert all(c.digest.startswith('RIHS01_') for c in topics.values())
+    assert topics['/y'].msgcount > 1000
     run_ = read_run(folder / 'bag')
     late = run_.t > 3.0
     assert late.any()
@@ -90,11 +74,6 @@ def test_estimate_is_near_the_truth(finished):
     # The median: other tests load the machine meanwhile, and in bursts its stamps jitter then.
     assert np.median(abs(error[:, -1])) < 0.05
     assert np.median(abs(error[:, 0])) < 0.01
-
-
-def test_figure_is_a_picture(finished):
-    _, folder = finished
-    assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
 
 
 def test_shipped_demonstration_changes_the_plant(tmp_path):
@@ -148,38 +127,33 @@ def test_another_plant_in_the_same_domain_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.fixture(scope='module', name='bad')
+def _bad(tmp_path_factory):
+    path = tmp_path_factory.mktemp('bad') / 'bad.yaml'
+    text = (ROOT / 'config' / 'demo.yaml').read_text()
+    path.write_text(text.replace("phi: ['0', ", 'phi: ['))
+    assert path.read_text() != text
+    return path
+
+
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [
         (['--duration', '0'], ('--duration', '1 to 3600', '0')),
         (['--params-file', '/nowhere.yaml'], ('/nowhere.yaml', 'No such file')),
+        (['--params-file', 'BAD'], ("'phi': expected 3 expressions",)),
+        (['--output', 'BUSY'], ('BUSY', '--force')),
     ],
 )
-def test_bad_arguments_are_said_in_one_line(arguments, words, tmp_path):
-    result = run('--output', tmp_path / 'out', *arguments)
+def test_bad_arguments_are_said_in_one_line(arguments, words, tmp_path, bad):
+    """And nothing is started, or written."""
+    busy = tmp_path / 'BUSY'
+    busy.mkdir()
+    (busy / 'precious.txt').write_text('mine')
+    names = {'BAD': bad, 'BUSY': busy}
+    result = run('--output', tmp_path / 'out', *(names.get(x, x) for x in arguments))
     assert result.returncode == 2
     assert len(result.stderr.strip().splitlines()) == 1
     assert all(word in result.stderr for word in words)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_busy_output_folder_is_refused(tmp_path):
-    (tmp_path / 'precious.txt').write_text('mine')
-    result = run('--output', tmp_path)
-    assert result.returncode == 2
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert str(tmp_path) in result.stderr
-    assert '--force' in result.stderr
-    assert [p.name for p in tmp_path.iterdir()] == ['precious.txt']
-
-
-def test_an_unusable_parameter_is_said_before_anything_starts(tmp_path):
-    text = (ROOT / 'config' / 'demo.yaml').read_text()
-    bad = tmp_path / 'bad.yaml'
-    bad.write_text(text.replace("phi: ['0', ", 'phi: ['))
-    assert bad.read_text() != text
-    result = run('--output', tmp_path / 'out', '--params-file', bad)
-    assert result.returncode == 2
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert "'phi': expected 3 expressions" in result.stderr
-    assert not (tmp_path / 'out').exists()
+    assert list(tmp_path.iterdir()) == [busy]
+    assert [p.name for p in busy.iterdir()] == ['precious.txt']

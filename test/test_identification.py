@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `tune` finds in a y without the truth (D 30), and when it refuses."""
 
-from fhaosmo_ros.core import Observer, TriangularModel
+from importlib.util import find_spec
+
+from fhaosmo_ros.core import ConfigurationError, Family, Observer, OnlineEstimator, TriangularModel
 from fhaosmo_ros.core.observer.kalman import LinearModel, stationary
+from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.tools.bags.types import serialise
+from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.tuning.bag_gains import make_gains, run
 from fhaosmo_ros.tools.tuning.bag_report import notes
+from fhaosmo_ros.tools.tuning.command import main
 from fhaosmo_ros.tools.tuning.identify import (
     identify_input,
     ljung_box,
@@ -18,12 +24,14 @@ from fhaosmo_ros.tools.tuning.likelihood import (
     Likelihood,
     Samples,
 )
-from fhaosmo_ros.tools.tuning.sensor import identify
-from fhaosmo_ros.tools.tuning.source import RecordedOutput
+from fhaosmo_ros.tools.tuning.sensor import identify, RecordedOutput
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+needs_optuna = pytest.mark.skipif(
+    find_spec('optuna') is None, reason='optuna is not installed (extra: tune)'
+)
 H, K = 5e-3, 4000
 PHI = ['0', '-2*z2']
 NOISE, SIZE, RATE = 1e-3, 1.0, 2.0
@@ -174,7 +182,7 @@ def test_coloured_noise_is_found_and_told():
     found, gains, along = found_in(y)
     assert found.best.design.colour == pytest.approx(0.9, abs=0.05)
     assert found.best.low_noise == pytest.approx(3.0 * NOISE, rel=0.4)
-    assert any('coloured' in text for text in notes(found, gains, along))
+    assert any('coloured' in text for text in notes(found, along))
     # As good as gains for white noise that had this power at low frequencies.
     error = along.unknown_input[K // 10 :] - plant()[K // 10 :, 2]
     assert np.sqrt(np.mean(error**2)) < 1.3 * gains.expected[-1]
@@ -219,36 +227,116 @@ def test_nothing_is_made_of_nothing(y, about):
         found_in(y())
 
 
-def test_unstable_model_is_told():
-    found, gains, along = found_in(plant()[:, 0] + noise(), phi=['0', '4*z1 - 2*z2'])
-    assert any('unstable' in text for text in notes(found, gains, along))
-
-
-def test_too_many_states_are_told_or_refused():
-    """A d that moves like a random walk acts on z2'; the model has it act on z3'."""
-    random = np.random.default_rng(6)
-    d = lfilter(
-        [1.0], [1.0, -np.exp(-3.0 * H)], 20.0 * np.sqrt(6.0 * H) * random.standard_normal(K)
-    )
-    z2 = lfilter([H], [1.0, -np.exp(-2.0 * H)], d)
-    y = np.cumsum(z2) * H + noise()
-    try:
-        found, gains, along = found_in(y, phi=['0', '-2*z2', '0'])
-    except NothingToFind as error:
-        assert 'order' in str(error)  # noqa: PT017
-    else:
-        assert any('order' in text for text in notes(found, gains, along))
-
-
 def test_nothing_is_told_where_all_is_well(plain):
-    assert notes(*plain) == []
+    assert notes(plain[0], plain[2]) == []
 
 
-def test_drift_of_the_sensor_is_told_or_refused():
+def too_few_states():
+    """Return the y of a d that moves like a random walk and acts on z2'."""
+    shocks = 20.0 * np.sqrt(6.0 * H) * np.random.default_rng(6).standard_normal(K)
+    d = lfilter([1.0], [1.0, -np.exp(-3.0 * H)], shocks)
+    return np.cumsum(lfilter([H], [1.0, -np.exp(-2.0 * H)], d)) * H + noise()
+
+
+def drifting():
     drift = np.cumsum(np.random.default_rng(5).standard_normal(K)) * 2e-3
+    return plant()[:, 0] + noise() + drift
+
+
+@pytest.mark.parametrize(
+    ('y', 'phi', 'about'),
+    [
+        (lambda: plant()[:, 0] + noise(), ['0', '4*z1 - 2*z2'], 'unstable'),
+        (too_few_states, ['0', '-2*z2', '0'], 'order'),
+        (drifting, PHI, 'drift'),
+    ],
+)
+def test_model_that_does_not_fit_is_told_or_refused(y, phi, about):
     try:
-        found, gains, along = found_in(plant()[:, 0] + noise() + drift)
+        found, _, along = found_in(y(), phi=phi)
+        told = ' '.join(notes(found, along))
     except NothingToFind as error:
-        assert 'drift' in str(error)  # noqa: PT017
-    else:
-        assert any('drift' in text for text in notes(found, gains, along))
+        told = str(error)
+    assert about in told
+
+
+# the sensor
+
+
+@pytest.mark.parametrize(
+    'truth',
+    [
+        {'noise_std': 1e-4},
+        {'noise_std': 1e-2, 'sample_rate': 100.0},
+        {'noise_std': 1e-3, 'stamp_jitter': 1e-4},
+        {'noise_std': 1e-3, 'dropout': 0.1, 'dropout_length': 4.0},
+        {'noise_std': 1e-3, 'quantisation': 1e-3},
+        {'noise_std': 1e-3, 'disturbances': ['steps'], 'rms_of_d': 5.0},
+    ],
+)
+def test_sensor_is_identified(truth):
+    r = Family({'duration': 30.0, 'integration_step': 1e-3} | truth).recording(0)
+    sensor = identify(1e5 + r.t, r.y)
+    assert sensor.sample_rate == pytest.approx(truth.get('sample_rate', 1000.0), rel=0.01)
+    assert sensor.quantisation == pytest.approx(truth.get('quantisation', 0.0), rel=1e-3)
+    jitter, dropout = (truth.get(name, 0.0) for name in ('stamp_jitter', 'dropout'))
+    assert sensor.stamp_jitter == pytest.approx(jitter, rel=0.1, abs=1e-9)
+    assert sensor.dropout == pytest.approx(dropout, rel=0.2, abs=1e-3)
+
+
+def test_sensor_outlives_bad_samples():
+    r = Family({'noise_std': 1e-3, 'integration_step': 1e-3}).recording(0)
+    y, t = r.y.copy(), r.t.copy()
+    y[::500], y[7::700] = np.nan, 1e6
+    t[1000] = t[990]
+    assert identify(t, y).sample_rate == pytest.approx(1000.0, rel=1e-3)
+    with pytest.raises(ConfigurationError, match='at least 200 samples'):
+        identify(t[:100], y[:100])
+
+
+# the command
+
+
+@pytest.fixture(name='bag')
+def _bag(tmp_path):
+    family = {'duration': 9.0, 'integration_step': 1e-3, 'sample_rate': 200.0}
+    r = Family(family | {'noise_std': 1e-3, 'dropout': 0.02}).recording(0)
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.add('/y', 'std_msgs/msg/Float64')
+        stamps = 10**18 + np.round(r.t * 1e9).astype(np.int64)
+        for stamp, y in zip(stamps.tolist(), r.y.tolist(), strict=True):
+            bag.write('/y', stamp, serialise('std_msgs/msg/Float64', data=y))
+    return tmp_path / 'bag'
+
+
+@needs_optuna
+def test_command_says_what_a_bag_shows(bag, tmp_path, capsys):
+    out = tmp_path / 'out'
+    assert main(['--bag', str(bag), '-o', str(out), '--topic', '/y']) == 0
+    assert sorted(path.name for path in out.iterdir()) == [
+        'estimates.png', 'gains.yaml', 'report.md',
+    ]  # fmt: skip
+    values = load(out / 'gains.yaml', 'estimator')
+    OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values))
+    assert values['noise_size'] == pytest.approx(1e-3, rel=0.1)
+    assert values['correction_period'] == pytest.approx(1.0 / 200.0, rel=1e-3)
+    assert values['input_topic'] == '/y'
+    report, printed = (out / 'report.md').read_text(), capsys.readouterr().out
+    for row in ('| noise of y', '| size of d', '| expected error of d', '| innovations,'):
+        assert row in report
+        assert row in printed
+    # What this y has shown stands there, and no default of a simulated family.
+    assert f'noise_size: {values["noise_size"]}' in report
+    assert 'noise_std' not in report
+
+
+@needs_optuna
+@pytest.mark.parametrize(
+    ('given', 'message'),
+    [('structure:=cascade', 'got structure set'), ('noise_std:=1000.0', 'd = 0')],
+)
+def test_bag_that_can_give_no_gains(bag, tmp_path, capsys, given, message):
+    out = tmp_path / 'out'
+    assert main(['--bag', str(bag), '-o', str(out), '-p', given]) == 2
+    assert message in capsys.readouterr().err
+    assert not out.exists()

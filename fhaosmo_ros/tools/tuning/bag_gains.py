@@ -8,17 +8,21 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
-from fhaosmo_ros.tools.tuning.identify import Identified, ljung_box, NothingToFind, SURE
-from fhaosmo_ros.tools.tuning.likelihood import QUICKEST
-from fhaosmo_ros.tools.tuning.linear_gains import kalman_gains
-from fhaosmo_ros.tools.tuning.start import GAMMA, SCHEME, WIDTH
+from fhaosmo_ros.tools.tuning.identify import (
+    Identified,
+    ljung_box,
+    NothingToFind,
+    QUICKEST,
+    SURE,
+)
+from fhaosmo_ros.tools.tuning.likelihood import CLIP
+from fhaosmo_ros.tools.tuning.linear_gains import GAMMA, kalman_gains, SCHEME, WIDTH
+from fhaosmo_ros.tools.tuning.objective import FIRST_STAMP
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 DIGITS = 4
-FIRST_STAMP = 1_000_000_000
-"""Stamp (ns) of the first sample; 0 would stand for a stamp that is not set."""
 SIZE_OF_USUAL = 0.9616
 """RMS of a standard normal number among the 99 % that are nearest to 0."""
 UNSEEN = 0.97
@@ -32,51 +36,22 @@ BEGIN = 0.1
 
 
 class Gains(NamedTuple):
-    """
-    Parameters of the estimator, and what is to be expected of them.
-
-    Attributes
-    ----------
-    parameters : dict
-    expected : (n + 1,) array
-        Standard deviations of the errors of z and d, if the model holds.
-    innovation : float
-        Standard deviation of the innovations, likewise.
-    share : float
-        Part of an innovation that is left after the correction, 1 - K_1.
-
-    """
+    """Parameters of the estimator, and what is to be expected if the model holds."""
 
     parameters: dict[str, Any]
-    expected: Floats
-    innovation: float
-    share: float
+    expected: Floats  # (n + 1,) standard deviations of the errors of z and d
+    innovation: float  # standard deviation of the innovations
+    share: float  # part of an innovation that is left after the correction, 1 - K_1
 
 
 class Run(NamedTuple):
-    """
-    The estimator with these gains along the bag.
+    """The estimator with these gains along the bag."""
 
-    Attributes
-    ----------
-    t : (K,) array
-        Times (s).
-    unknown_input : (K,) array
-    size : float
-        RMS innovation over the expected one, without the largest hundredth.
-    correlations : (LAGS,) array
-        Autocorrelations of the innovations.
-    probability : float
-        Of correlations as large as these, were the innovations white (Ljung and Box 1978).
-    counters : Counters
-
-    """
-
-    t: Floats
-    unknown_input: Floats
-    size: float
-    correlations: Floats
-    probability: float
+    t: Floats  # (K,) s
+    unknown_input: Floats  # (K,)
+    size: float  # RMS innovation over the expected one, without the largest hundredth
+    correlations: Floats  # (LAGS,) autocorrelations of the innovations
+    probability: float  # of so large ones, were innovations white (Ljung and Box 1978)
     counters: Counters
 
 
@@ -98,7 +73,6 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
     noise, begin = _rounded(found.best.low_noise), int(BEGIN * len(likelihood.samples.y))
     states = found.best.estimates[begin:, : model.order]
     sizes = np.maximum(np.sqrt(np.nanmean(np.square(states), axis=0)), noise)
-    width = _rounded(WIDTH * noise)
     values = {
         **SCHEME,
         'correction_period': period,
@@ -107,7 +81,7 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
         'unknown_input_size': _rounded(found.size_of_input),
         'unknown_input_derivatives': design.derivatives,
         'unknown_input_decay': _rounded(design.decay),
-        'fuzzy_widths': [width],
+        'fuzzy_widths': [_rounded(WIDTH * noise)],
         'gamma_initial': GAMMA,
         **given,
     }
@@ -163,24 +137,16 @@ def _refuse(found: Identified) -> None:
 def run(found: Identified, gains: Gains) -> Run:
     """Let the estimator run over the bag, as the node would, and judge its innovations."""
     samples = found.likelihood.samples
-    t = np.cumsum(samples.h)
+    t, begin = np.cumsum(samples.h), int(BEGIN * len(samples.y))
     estimator = OnlineEstimator(ESTIMATOR_PARAMETERS.complete(gains.parameters))
     u = samples.u if estimator.observer.uses_input else None
-    stamps = FIRST_STAMP + np.round(t * 1e9).astype(np.int64)
-    trajectory = estimator.run(stamps, samples.y, u)
+    trajectory = estimator.run(FIRST_STAMP + np.round(t * 1e9), samples.y, u)
     r = trajectory.innovation[:, 0] / (gains.share * gains.innovation)
-    r = r[int(BEGIN * len(r)) :][samples.used[int(BEGIN * len(r)) :]]
-    r = r[np.isfinite(r)]
+    r = r[np.isfinite(r) & samples.used & (np.arange(len(r)) >= begin)]
     usual = r[np.abs(r) <= np.quantile(np.abs(r), 0.99)]
-    correlations, probability = ljung_box(np.clip(r, -3.0, 3.0))
-    return Run(
-        t,
-        trajectory.unknown_input,
-        float(np.sqrt(np.mean(usual**2))) / SIZE_OF_USUAL,
-        correlations,
-        probability,
-        estimator.counters,
-    )
+    size = float(np.sqrt(np.mean(usual**2))) / SIZE_OF_USUAL
+    whiteness = ljung_box(np.clip(r, -CLIP, CLIP))
+    return Run(t, trajectory.unknown_input, size, *whiteness, estimator.counters)
 
 
 def _rounded(value: float) -> float:

@@ -12,6 +12,8 @@ from fhaosmo_ros.tools.tuning.identify import Identified, LAGS, SURE
 from fhaosmo_ros.tools.tuning.report import save, table
 import numpy as np
 
+COLOURED = 0.1
+"""Correlation of neighbouring samples from which on the noise is told to be coloured."""
 TENTHS = 10
 SMALL_CORRELATION = 0.05
 UNLIKELY = 0.01
@@ -31,7 +33,7 @@ def write(
     likelihood, y = found.likelihood, found.likelihood.samples.y
     whole = float(likelihood.samples.h.sum())
     share = gains.expected[-1] / found.size_of_input
-    told = [f'Note: {text}' for text in notes(found, gains, run)]
+    told = [f'Note: {text}' for text in notes(found, run)]
     comments = [
         'Made by',
         f'    python -m fhaosmo_ros {command}',
@@ -44,7 +46,7 @@ def write(
     main = '\n\n'.join([
         _found(found, gains),
         f'The error of d is expected to be {share:.2f} of its size.',
-        _run(run, gains),
+        _run(run, gains.innovation),
         *told,
     ])  # fmt: skip
     s = found.sensor
@@ -81,7 +83,7 @@ def _found(found: Identified, gains: Gains) -> str:
     ]
     if found.likelihood.fixed:
         rows[0] = (rows[0][0], f'{found.best.noise:.4g} (given)')
-    if design.colour > 0.1:
+    if design.colour > COLOURED:
         rows.insert(1, ('of that, correlation from sample to sample', f'{design.colour:.2f}'))
     names = [f'z{i + 1}' for i in range(n)] + ['d']
     rows += [
@@ -98,11 +100,11 @@ def _number(value: float, spread: float) -> str:
     return f'{value:.4g} ({low:.3g} to {high:.3g})'
 
 
-def _run(run: Run, gains: Gains) -> str:
+def _run(run: Run, innovation: float) -> str:
     largest = int(np.abs(run.correlations).argmax())
     counts = run.counters
     rows = [
-        ('innovations, measured / expected', f'{run.size:.2f} (expected {gains.innovation:.3g})'),
+        ('innovations, measured / expected', f'{run.size:.2f} (expected {innovation:.3g})'),
         (
             f'their largest correlation within {LAGS} samples',
             f'{run.correlations[largest]:+.3f} over {largest + 1}; chance explains '
@@ -114,18 +116,14 @@ def _run(run: Run, gains: Gains) -> str:
     return table(['the estimator along the bag', ''], rows)
 
 
-def notes(found: Identified, gains: Gains, run: Run) -> list[str]:
+def notes(found: Identified, run: Run) -> list[str]:
     """Return what a user should know before trusting the gains."""
-    return [
-        *_of_noise(found),
-        *_of_model(found),
-        *_of_run(found, run),
-    ]
+    return [*_of_noise(found), *_of_model(found), *_of_run(run, found.best.design.colour)]
 
 
 def _of_noise(found: Identified) -> list[str]:
     design, texts = found.best.design, []
-    if found.white is not None and design.colour > 0.1:
+    if found.white is not None and design.colour > COLOURED:
         gain = found.best.log_likelihood - found.white.log_likelihood
         texts.append(
             f'The noise of y is coloured: neighbouring samples correlate by {design.colour:.2f}, '
@@ -182,15 +180,6 @@ def _of_model(found: Identified) -> list[str]:
             'there makes a model of fewer states the right one), phi may be, or y may slip or '
             'drift. Standard deviations are too small then.'
         )
-    smoother = found.tried.get(2), found.tried.get(1)
-    if found.best.design.derivatives == 2 and all(smoother):
-        gain = smoother[0].log_likelihood - smoother[1].log_likelihood
-        if gain > SURE:
-            texts.append(
-                'd is so smooth that two of its derivatives are followed. If the order '
-                f'({n}) is right, there is nothing to do. A model with too few states shows the '
-                'same: d is then a state of the plant, and what acts on it lies behind.'
-            )
     begin = int(BEGIN * len(samples.y))
     t, d = np.cumsum(samples.h)[begin:], found.best.estimates[begin:, n]
     slope, middle = np.polyfit(t - t.mean(), d, 1)
@@ -202,18 +191,12 @@ def _of_model(found: Identified) -> list[str]:
             'varies otherwise. That is the unknown input, or a drift of the sensor, or of the '
             'plant: y alone does not tell which.'
         )
-    if found.best.design.decay * whole < 3.0:
-        texts.append(
-            f'd does not come back to 0 within this bag of {whole:.0f} s, so its size is hardly '
-            'known. A longer bag would tell.'
-        )
     return texts
 
 
-def _of_run(found: Identified, run: Run) -> list[str]:
-    texts, coloured = [], found.best.design.colour > 0.1
-    lost = run.counters.divergences
-    if lost:
+def _of_run(run: Run, colour: float) -> list[str]:
+    texts, coloured = [], colour > COLOURED
+    if lost := run.counters.divergences:
         texts.append(
             f'With these gains the estimator lost y {lost} times in this bag and began afresh: '
             'do not use them before the notes above are settled.'

@@ -14,11 +14,10 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.recording_parameters import SENSOR
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.cli.command import Interrupted, run_command
+from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.cli.options import add_input_options, assigned, bag_inputs
 from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.source import recorded, simulated
 
 TRIALS = 1000
 NEEDED = ('optuna>=4,<6', 'cmaes')
@@ -29,17 +28,7 @@ BOTH = ParameterTable(
 
 
 def main(argv: list[str] | None = None) -> int:
-    """
-    Run the command.
-
-    Returns
-    -------
-    int
-        0 if the output is complete (also where Ctrl-C ended the search early). Otherwise nothing
-        is written: 1 without `NEEDED`, 2 for wrong input or a storage that fails, 130 if it was
-        interrupted before the first trial.
-
-    """
+    """Run the command; a search that Ctrl-C ends after the first trial is written, too."""
     return run_command(_parser(), argv, _tune, needs=NEEDED)
 
 
@@ -53,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add(
         '-o', '--output', type=Path, default=Path('tune_output'), metavar='FOLDER',
-        help='for gains.yaml, report.md and a figure (default: %(default)s)',
+        help='for gains.yaml and report.md (default: %(default)s)',
     )  # fmt: skip
     add('--force', action='store_true', help='replace an output that exists')
     add(
@@ -85,10 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _tune(arguments: argparse.Namespace, stop: Stop) -> int:
-    from fhaosmo_ros.tools.tuning.report import write
-    from fhaosmo_ros.tools.tuning.tuner import Tuner
-
+def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
     if arguments.trials < 1 or (arguments.jobs or 1) < 1 or arguments.seed < 0:
         raise ConfigurationError(
             'expected --trials >= 1, --jobs >= 1 and --seed >= 0, got '
@@ -96,23 +82,32 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> int:
         )
     estimator, tuning = read_parameters(arguments.params_file, arguments.param)
     with Output(arguments.output, arguments.force) as output:
-        values = TUNE_PARAMETERS.complete(tuning)
-        if arguments.bag is not None:
-            text = _identify(arguments, estimator, tuning, output.path, stop)
-            _say_where(text, output.keep())
-            return 0
-        with stop.raising():
-            data = simulated(values, arguments.seed)
+        make = _search if arguments.bag is None else _identify
+        text, folder = make(arguments, estimator, tuning, output.path, stop), output.keep()
+    print(f'\n{text}\n')
+    print(f'output: {folder}/gains.yaml, report.md')
+    print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {folder}/gains.yaml')
+
+
+def _search(
+    arguments: argparse.Namespace,
+    estimator: dict[str, Any],
+    tuning: dict[str, Any],
+    folder: Path,
+    stop: Stop,
+) -> str:
+    """Write the gains for a simulated family; return the report's main part."""
+    from fhaosmo_ros.tools.tuning.report import write
+    from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
+
+    values = TUNE_PARAMETERS.complete(tuning)
+    with stop.raising():
+        data = simulated(values, arguments.seed)
         print(f'{len(data.training)} recordings to train on, {len(data.held_out)} held out')
-        jobs = arguments.jobs or os.cpu_count() or 1
-        tuner = Tuner(data, estimator, values, arguments.seed, jobs, stop.is_set)
-        result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
-        if result is None:
-            raise Interrupted('before the first trial: nothing was written')
-        text = write(output.path, tuner, result, arguments.command_line)
-        final = output.keep()
-    _say_where(text, final)
-    return 0
+        tuner = Tuner(data, estimator, values, arguments.seed)
+    jobs = arguments.jobs or os.cpu_count() or 1
+    result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
+    return write(folder, tuner, result, arguments.command_line)
 
 
 def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -140,12 +135,6 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
     return estimator, tuning
 
 
-def _say_where(text: str, folder: Path) -> None:
-    print(f'\n{text}\n')
-    print(f'output: {folder}/gains.yaml, report.md, estimates.png')
-    print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {folder}/gains.yaml')
-
-
 def _identify(
     arguments: argparse.Namespace,
     estimator: dict[str, Any],
@@ -156,7 +145,8 @@ def _identify(
     """Write the gains for what y itself shows; return the report's main part."""
     from fhaosmo_ros.tools.tuning import bag_gains, bag_report
     from fhaosmo_ros.tools.tuning.identify import identify_input
-    from fhaosmo_ros.tools.tuning.start import chosen_otherwise
+    from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
+    from fhaosmo_ros.tools.tuning.sensor import recorded
 
     others = chosen_otherwise(estimator)
     if others:

@@ -2,9 +2,8 @@
 """The likeliest model of d and of the noise for a recorded y, and how sure it is (D 30)."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import usual_step
@@ -12,20 +11,9 @@ from fhaosmo_ros.core.online.policy import GAP_SAMPLES
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.cli.progress import progress
-from fhaosmo_ros.tools.tuning.likelihood import (
-    CLIP,
-    Design,
-    Evaluation,
-    LEAST_RATIO,
-    Likelihood,
-    MOST_RATIO,
-    QUICKEST,
-    Samples,
-    SLOWEST,
-)
+from fhaosmo_ros.tools.tuning.likelihood import CLIP, Design, Evaluation, Likelihood, Samples
 from fhaosmo_ros.tools.tuning.linear_gains import matern
-from fhaosmo_ros.tools.tuning.sensor import Sensor, usable
-from fhaosmo_ros.tools.tuning.source import RecordedOutput
+from fhaosmo_ros.tools.tuning.sensor import RecordedOutput, Sensor, usable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
@@ -37,14 +25,15 @@ Floats = NDArray[np.float64]
 DERIVATIVES = (0, 1, 2)
 BANDWIDTHS = tuple(float(w) for w in np.geomspace(2e-4, 2.0, 15))
 """First bandwidths, in rad a sample; at the first number of derivatives and ratio below."""
-COLOURS = (0.0, 0.9)
+FIRST_DERIVATIVES, FIRST_RATIO, COLOURS = 1, 0.5, (0.0, 0.9)
 COLOURED, SLOWER = 0.75, 0.35
 """A colour, and a factor on the bandwidth found with white noise, to search a colour from."""
-FIRST_DERIVATIVES, FIRST_RATIO = 1, 0.5
+SLOWEST, QUICKEST = 1e-5, 3.0
+"""Bandwidths of the filters, in rad a sample."""
 STEPS = np.array([0.3, 0.5, 0.4])
 """Sides of the first simplex in ln bandwidth (rad a sample), ln ratio and logit colour."""
-LOW = np.array([*np.log([SLOWEST, LEAST_RATIO]), -9.0])
-HIGH = np.array([*np.log([QUICKEST, MOST_RATIO]), 6.2])
+LOW = np.array([*np.log([SLOWEST, 1e-3]), -9.0])
+HIGH = np.array([*np.log([QUICKEST, 30.0]), 6.2])
 """Bounds of these."""
 EVALUATIONS = 120
 WORTH = 3.0
@@ -71,53 +60,24 @@ class NothingToFind(ConfigurationError):
     """There are no gains for this y; the text says why."""
 
 
-@dataclass
-class Identified:
-    """
-    What a recorded y shows.
-
-    Attributes
-    ----------
-    likelihood : Likelihood
-    best : Evaluation
-        Of the likeliest design.
-    tried : dict
-        The likeliest one by number of derivatives.
-    white : Evaluation or None
-        The likeliest one with white noise, where the noise was found to be coloured.
-    silent : float
-        Fall of the log-likelihood if d were 0.
-    shaken : dict
-        Rise of the log-likelihood if white noise drove state i = 1 .. n as well.
-    spread : dict
-        Standard deviations of the logarithms of noise, decay and size of d; NaN where
-        y does not tell.
-    outliers : int
-        Samples that were left out.
-    sensor : Sensor
-        Rate, jitter, losses, resolution.
-
-    """
+class Identified(NamedTuple):
+    """What a recorded y shows."""
 
     likelihood: Likelihood
-    best: Evaluation
-    tried: dict[int, Evaluation]
-    white: Evaluation | None
-    silent: float
-    shaken: dict[int, float]
+    best: Evaluation  # of the likeliest design
+    white: Evaluation | None  # the likeliest one with white noise, where the noise is coloured
+    silent: float  # fall of the log-likelihood if d were 0
+    shaken: dict[int, float]  # its rise if white noise drove state i = 1 .. n as well
     spread: dict[str, float]
-    outliers: int
+    """Standard deviations of the logarithms of noise, decay, size of d; NaN: y does not tell."""
+    outliers: int  # samples that were left out
     sensor: Sensor
-
-    @property
-    def intensity(self) -> float:
-        """Intensity q of the white noise that drives the last derivative of d."""
-        return self.likelihood.intensity(self.best.design, self.best.noise)
 
     @property
     def size_of_input(self) -> float:
         """The RMS value D of the Matern process of d (D 17)."""
-        return size_of_input(self.best.design, self.intensity)
+        design = self.best.design
+        return size_of_input(design, self.likelihood.intensity(design, self.best.noise))
 
 
 def size_of_input(design: Design, intensity: float) -> float:
@@ -149,11 +109,10 @@ def identify_input(
     """
     likelihood = _prepared(data, model, values, given)
     with progress(unit='filter', desc='likelihood', leave=False) as bar:
-        search = Search(likelihood, given, bar.update)
+        search = _Search(likelihood, given, bar.update)
         start = search.start()
         outliers = _leave_out_outliers(likelihood, start)
-        tried, white = search.each_order(start)
-        best = _simplest(tried)
+        best, white = search.likeliest_order(start)
         if not math.isfinite(best.log_likelihood):
             raise NothingToFind(
                 f'y: expected samples that the model can predict, got none that phi = '
@@ -161,21 +120,19 @@ def identify_input(
             )
         silent, shaken = search.alternatives(best)
         spread = search.spread(best)
-    return Identified(
-        likelihood, best, tried, white, silent, shaken, spread, outliers, data.sensor
-    )
+    return Identified(likelihood, best, white, silent, shaken, spread, outliers, data.sensor)
 
 
 def _prepared(
     data: RecordedOutput, model: TriangularModel, values: Parameters, given: Mapping[str, Any]
 ) -> Likelihood:
+    """Return the likelihood of the usable samples, with a first guess of noise and states."""
     t, y, u, sensor = data
     keep = usable(t, y, u)
     t, y, u = t[keep], y[keep], u[keep]
-    count = len(y)
+    count, different = len(y), len(np.unique(y))
     if count < FEWEST:
         raise NothingToFind(f'y: expected at least {FEWEST} samples, got {count}')
-    different = len(np.unique(y))
     if different < 5 or np.ptp(y) <= 1e-12 * np.abs(y).max():
         raise NothingToFind(
             f'y: expected a signal that moves, got {count} samples with {different} different '
@@ -194,7 +151,7 @@ def _prepared(
         slow = np.diff(slow) / (block * period)
         sizes.append(3.0 * float(np.sqrt(np.mean(slow**2))))
     rounding = sensor.quantisation / math.sqrt(12.0)
-    # A smooth signal vanishes in differences of high order: a first guess.
+    # A smooth signal vanishes in differences of high order.
     rough = median_abs_deviation(np.diff(y, 4), scale='normal') / math.sqrt(70.0)
     noise = max(float(rough), rounding, 1e-9 * float(np.std(y)))
     known = given.get('noise_size')
@@ -216,22 +173,22 @@ def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:
     return int(far.sum())
 
 
-def _simplest(tried: Mapping[int, Evaluation]) -> Evaluation:
-    """Return the one with the fewest derivatives; a richer one must be likelier by `WORTH`."""
-    chosen = tried[min(tried)]
-    for k in sorted(tried):
-        if tried[k].log_likelihood > chosen.log_likelihood + WORTH:
-            chosen = tried[k]
+def _simplest(tried: Iterable[Evaluation]) -> Evaluation:
+    """Return the first one; one that follows must be likelier by `WORTH`."""
+    chosen, *others = tried
+    for richer in others:
+        if richer.log_likelihood > chosen.log_likelihood + WORTH:
+            chosen = richer
     return chosen
 
 
-class Search:
+class _Search:
     """The search for one recording."""
 
     def __init__(
         self, likelihood: Likelihood, given: Mapping[str, Any], tick: Callable[[], object]
     ) -> None:
-        self.likelihood, self._tick = likelihood, tick
+        self._likelihood, self._tick = likelihood, tick
         self._decay = given.get('unknown_input_decay') or None
         self._orders = DERIVATIVES
         if 'unknown_input_derivatives' in given:
@@ -239,16 +196,17 @@ class Search:
 
     def _evaluate(self, design: Design) -> Evaluation:
         self._tick()
-        return self.likelihood(design)
+        return self._likelihood(design)
 
     def start(self) -> Evaluation:
         """Scan bandwidths and colours, and bring the scale of clipping and the sizes about."""
-        likelihood, period = self.likelihood, self.likelihood.period
-        best = self._likeliest(
-            Design(FIRST_DERIVATIVES, w / period, FIRST_RATIO, colour)
+        likelihood = self._likelihood
+        designs = (
+            Design(FIRST_DERIVATIVES, w / likelihood.period, FIRST_RATIO, colour)
             for w in BANDWIDTHS
             for colour in (COLOURS[:1] if likelihood.fixed else COLOURS)
         )
+        best = max(map(self._evaluate, designs), key=lambda e: e.log_likelihood)
         likelihood.clip = CLIP
         for _ in range(2):
             if math.isfinite(best.log_likelihood):
@@ -259,32 +217,28 @@ class Search:
             best = self._evaluate(best.design)
         return best
 
-    def _likeliest(self, designs: Iterable[Design]) -> Evaluation:
-        return max(map(self._evaluate, designs), key=lambda e: e.log_likelihood)
+    def likeliest_order(self, start: Evaluation) -> tuple[Evaluation, Evaluation | None]:
+        """Fit each number of derivatives; return the best, and that of white noise, if worse."""
+        design = start.design
+        white = [self._fit(design._replace(derivatives=k, colour=0.0)) for k in self._orders]
+        best = _simplest(white)
+        r = best.innovations[self._likelihood.samples.used & np.isfinite(best.innovations)]
+        if self._likelihood.fixed or (len(r) and ljung_box(np.clip(r, -CLIP, CLIP))[1] > WHITE):
+            return best, None
+        origins = [design._replace(derivatives=k) for k in self._orders]
+        if design.colour == 0.0:
+            origins = [
+                e.design._replace(colour=COLOURED, bandwidth=SLOWER * e.design.bandwidth)
+                for e in white
+            ]
+        coloured = _simplest(map(self._fit, origins))
+        if coloured.log_likelihood > best.log_likelihood + WORTH:
+            return coloured, best
+        return best, None
 
-    def each_order(self, start: Evaluation) -> tuple[dict[int, Evaluation], Evaluation | None]:
-        """Fit each number of derivatives; return them, and the best with white noise, if worse."""
-        white = {
-            k: self.local(start.design._replace(derivatives=k, colour=0.0)) for k in self._orders
-        }
-        chosen = _simplest(white)
-        r = chosen.innovations[self.likelihood.samples.used & np.isfinite(chosen.innovations)]
-        if self.likelihood.fixed or (len(r) and ljung_box(np.clip(r, -CLIP, CLIP))[1] > WHITE):
-            return white, None
-        coloured = {}
-        for k in self._orders:
-            origin = start.design
-            if origin.colour == 0.0:
-                slower = SLOWER * white[k].design.bandwidth
-                origin = white[k].design._replace(colour=COLOURED, bandwidth=slower)
-            coloured[k] = self.local(origin._replace(derivatives=k))
-        if _simplest(coloured).log_likelihood > chosen.log_likelihood + WORTH:
-            return coloured, chosen
-        return white, None
-
-    def _open(self, design: Design) -> list[bool]:
-        """Return which of the three numbers of `_moved` are searched."""
-        return [True, not self._decay, design.colour > 0.0]
+    def _axes(self, design: Design) -> Floats:
+        """Return which of the three numbers of `_moved` are searched, as columns."""
+        return np.eye(3)[:, [True, not self._decay, design.colour > 0.0]]
 
     def _moved(self, design: Design, change: Floats) -> Design:
         """Change ln bandwidth, ln ratio and logit colour of a design."""
@@ -295,29 +249,28 @@ class Search:
         colour = float(expit(logit(design.colour) + change[2]))
         return design._replace(bandwidth=bandwidth, ratio=ratio, colour=colour)
 
-    def local(self, design: Design) -> Evaluation:
+    def _fit(self, design: Design) -> Evaluation:
         """Return the likeliest design around this one (Nelder and Mead 1965)."""
-        free, rate = self._open(design), design.bandwidth * self.likelihood.period
-        axes = np.eye(3)[:, free]
+        axes, rate = self._axes(design), design.bandwidth * self._likelihood.period
         point = np.array([math.log(rate), math.log(design.ratio), logit(design.colour)])
 
         def loss(change: Floats) -> float:
             value = self._evaluate(self._moved(design, axes @ change)).log_likelihood
             return -value if math.isfinite(value) else 1e300
 
-        start = np.zeros(axes.shape[1])
-        low, high = np.minimum(LOW - point, 0.0)[free], np.maximum(HIGH - point, 0.0)[free]
-        options = {
-            'initial_simplex': np.vstack([start, np.diag(STEPS[free])]),
-            'xatol': 0.02, 'fatol': 0.1, 'maxfev': EVALUATIONS,
-        }  # fmt: skip
-        bounds = list(zip(low, high, strict=True))
-        found = minimize(loss, start, method='Nelder-Mead', bounds=bounds, options=options)
+        start, used = np.zeros(axes.shape[1]), axes.any(axis=1)
+        low, high = np.minimum(LOW - point, 0.0)[used], np.maximum(HIGH - point, 0.0)[used]
+        found = minimize(
+            loss, start, method='Nelder-Mead', bounds=list(zip(low, high, strict=True)),
+            options={
+                'initial_simplex': np.vstack([start, np.diag(STEPS[used])]),
+                'xatol': 0.02, 'fatol': 0.1, 'maxfev': EVALUATIONS,
+            },
+        )  # fmt: skip
         return self._evaluate(self._moved(design, axes @ found.x))
 
     def alternatives(self, best: Evaluation) -> tuple[float, dict[int, float]]:
         """Return `Identified.silent` and `Identified.shaken`."""
-        still = STILL / float(self.likelihood.samples.h.sum())
 
         def rise(**changes: Any) -> float:
             design = best.design._replace(**changes)
@@ -325,14 +278,13 @@ class Search:
 
         shaken = {
             level: max(rise(shaken=level, shake=shake) for shake in SHAKES)
-            for level in range(1, self.likelihood.model.order + 1)
+            for level in range(1, self._likelihood.model.order + 1)
         }
-        return -rise(bandwidth=still), shaken
+        return -rise(bandwidth=STILL / float(self._likelihood.samples.h.sum())), shaken
 
     def spread(self, best: Evaluation) -> dict[str, float]:
-        """Return standard deviations from the curvature of the log-likelihood at its maximum."""
-        count = int(self.likelihood.samples.used.sum())
-        axes = np.eye(3)[:, self._open(best.design)]
+        """Return `Identified.spread`, by the curvature of the log-likelihood at its maximum."""
+        axes = self._axes(best.design)
 
         def at(change: Floats) -> float:
             return self._evaluate(self._moved(best.design, change)).log_likelihood
@@ -342,7 +294,7 @@ class Search:
             [at(a - b) + at(b - a) - at(a + b) - at(-a - b) for b in steps] for a in steps
         ])  # fmt: skip
         k = best.design.derivatives
-        intensity = np.array([2.0 * (self.likelihood.model.order + 1 + k), 0.0, 0.0])
+        intensity = np.array([2.0 * (self._likelihood.model.order + 1 + k), 0.0, 0.0])
         # ln kappa = ln omega + ln ratio
         decay = np.zeros(3) if self._decay else np.array([1.0, 1.0, 0.0])
         rows = {'decay': decay @ axes, 'size': (0.5 * intensity - (k + 0.5) * decay) @ axes}
@@ -352,7 +304,7 @@ class Search:
             return dict.fromkeys(('noise', *rows), math.nan)
         with np.errstate(invalid='ignore'):
             found = {name: float(np.sqrt(row @ covariance @ row)) for name, row in rows.items()}
-        return {'noise': math.sqrt(0.5 / count)} | found
+        return {'noise': math.sqrt(0.5 / int(self._likelihood.samples.used.sum()))} | found
 
 
 def ljung_box(r: Floats, lags: int = LAGS) -> tuple[Floats, float]:

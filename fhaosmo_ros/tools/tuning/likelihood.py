@@ -3,6 +3,7 @@
 
 from dataclasses import dataclass
 import math
+from types import SimpleNamespace
 from typing import NamedTuple
 
 from fhaosmo_ros.core.model.prediction import Prediction
@@ -16,82 +17,30 @@ CLIP = 3.0
 """Standard deviations from which on an innovation counts linearly (Huber 1964)."""
 SETTLED = 8.0
 """Time constants of the filter after which its covariance is steady."""
-SLOWEST, QUICKEST = 1e-5, 3.0
-"""Bandwidths of the filters, in rad a sample."""
-LEAST_RATIO, MOST_RATIO = 1e-3, 30.0
-"""Of kappa to the bandwidth."""
 LEAST_USED = 0.9
 """Part of the samples that needs a finite innovation."""
 SCALE_STEPS = 50
 
 
 class Samples(NamedTuple):
-    """
-    A recorded y.
+    """A recorded y, of K samples."""
 
-    Attributes
-    ----------
-    h : (K,) array
-        Time since the sample before (s); 0 for the first one.
-    periods : (K,) array
-        The same in sampling periods, rounded; 0 where the filter begins afresh.
-    y : (K,) array
-    u : (K, m) array
-        Known inputs of the interval that ends at each sample.
-    used : (K,) array of bool
-        False for samples that do not correct: outliers.
-
-    """
-
-    h: Floats
-    periods: NDArray[np.int64]
-    y: Floats
-    u: Floats
-    used: NDArray[np.bool_]
-
-
-class Linear(NamedTuple):
-    """
-    The linear model of a sampling period, of N + 1 states: z, d, its derivatives, and v.
-
-    What each member is stands with `kalman.innovations`, which takes them.
-    """
-
-    a: Floats
-    q: Floats
-    fresh: Floats
-    variance: float
-    clip: float
-    settled: int
+    h: Floats  # (K,) time since the sample before (s); 0 for the first one
+    periods: NDArray[np.int64]  # (K,) the same in sampling periods; 0: the filter begins afresh
+    y: Floats  # (K,)
+    u: Floats  # (K, m) known inputs of the interval that ends at each sample
+    used: NDArray[np.bool_]  # (K,) False for samples that do not correct: outliers
 
 
 class Design(NamedTuple):
-    """
-    A model of d and of the noise, but for the size of both.
+    """A model of d and of the noise, but for the size of both."""
 
-    Attributes
-    ----------
-    derivatives : int
-        k of D 17.
-    bandwidth : float
-        omega of the filter in rad/s: q = noise^2 h omega^(2 N), with the noise at low frequencies.
-    ratio : float
-        kappa / omega.
-    colour : float
-        a of the noise v_j = a v_{j-1} + w_j; 0 for white noise.
-    shaken : int
-        State that white noise drives as well, counted from 1; 0 for none.
-    shake : float
-        Its intensity, over noise^2 h omega^(2 `shaken`).
-
-    """
-
-    derivatives: int
-    bandwidth: float
-    ratio: float
-    colour: float = 0.0
-    shaken: int = 0
-    shake: float = 0.0
+    derivatives: int  # k of D 17
+    bandwidth: float  # omega of the filter in rad/s, which says q (D 30)
+    ratio: float  # kappa / omega
+    colour: float = 0.0  # a of the noise v_j = a v_{j-1} + w_j; 0 for white noise
+    shaken: int = 0  # state that white noise drives as well, counted from 1; 0 for none
+    shake: float = 0.0  # its intensity, over noise^2 h omega^(2 shaken)
 
     @property
     def decay(self) -> float:
@@ -99,29 +48,14 @@ class Design(NamedTuple):
         return self.ratio * self.bandwidth
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """
-    How well a design predicts y.
-
-    Attributes
-    ----------
-    design : Design
-    noise : float
-        Standard deviation of the white noise w: the likeliest one for this design.
-    log_likelihood : float
-        Of all samples that are used; -inf for a filter that diverges.
-    innovations : (K,) array
-        Divided by their expected standard deviations; NaN where there is none.
-    estimates : (K, N) array
-
-    """
+class Evaluation(NamedTuple):
+    """How well a design predicts y."""
 
     design: Design
-    noise: float
-    log_likelihood: float
-    innovations: Floats
-    estimates: Floats
+    noise: float  # standard deviation of the white noise w: the likeliest one for this design
+    log_likelihood: float  # of all samples that are used; -inf for a filter that diverges
+    innovations: Floats  # (K,) over their expected standard deviations; NaN where there is none
+    estimates: Floats  # (K, N)
 
     @property
     def low_noise(self) -> float:
@@ -131,47 +65,28 @@ class Evaluation:
 
 @dataclass
 class Likelihood:
-    """
-    The likelihood of designs for one recording.
-
-    Attributes
-    ----------
-    model : TriangularModel
-    period : float
-        Sampling period (s).
-    samples : Samples
-    sizes : (n,) array
-        How far off z_1 .. z_n may be where the filter begins.
-    noise : float
-        Standard deviation that innovations are clipped by; see `Linear`.
-    fixed : bool
-        The noise is given: it is not estimated.
-    longest : float
-        Longest Runge-Kutta step (s).
-    least_noise : float
-        The estimated noise is not smaller: that of an encoder's steps.
-    clip : float
-        In standard deviations.
-
-    """
+    """The likelihood of designs for one recording."""
 
     model: TriangularModel
-    period: float
+    period: float  # of sampling (s)
     samples: Samples
-    sizes: Floats
-    noise: float
-    fixed: bool = False
-    longest: float = 0.0025
-    least_noise: float = 0.0
-    clip: float = math.inf
+    sizes: Floats  # (n,) how far off z_1 .. z_n may be where the filter begins
+    noise: float  # standard deviation that innovations are clipped by
+    fixed: bool = False  # the noise is given: it is not estimated
+    longest: float = 0.0025  # Runge-Kutta step (s)
+    least_noise: float = 0.0  # the estimated noise is not smaller: that of an encoder's steps
+    clip: float = math.inf  # in standard deviations
 
     def __post_init__(self) -> None:
         self._jacobian = self.model.jacobian(np.zeros(self.model.order))
 
     def intensity(self, design: Design, noise: float) -> float:
         """Return q of the white noise that drives the last derivative of d."""
-        density = (noise / (1.0 - design.colour)) ** 2 * self.period
-        return density * design.bandwidth ** (2 * (self.model.order + 1 + design.derivatives))
+        levels = self.model.order + 1 + design.derivatives
+        return self._density(design, noise) * design.bandwidth ** (2 * levels)
+
+    def _density(self, design: Design, noise: float) -> float:
+        return (noise / (1.0 - design.colour)) ** 2 * self.period
 
     def __call__(self, design: Design) -> Evaluation:
         """Evaluate a design."""
@@ -179,9 +94,21 @@ class Likelihood:
         prediction = Prediction(model, self.longest)
         b, s, x = innovations(prediction, self.samples, self._linear(design))
         with np.errstate(invalid='ignore', over='ignore'):  # of a filter that diverges
-            return self._evaluation(design, b, s / self.noise**2, x)
+            s /= self.noise**2
+            r = b / np.sqrt(s)
+            used, counted = self.samples.used, np.isfinite(r) & self.samples.used
+            if not counted.sum() > LEAST_USED * used.sum():
+                return Evaluation(design, math.nan, -math.inf, r, x)
+            noise = self.noise
+            if not self.fixed:
+                noise = max(likeliest_scale(r[counted]), self.least_noise)
+            size = np.abs(r[counted]) / noise
+            loss = np.where(size <= CLIP, size**2, 2.0 * CLIP * size - CLIP**2)
+            mean = -0.5 * float(np.mean(loss + np.log(s[counted]))) - math.log(noise)
+            return Evaluation(design, noise, mean * int(used.sum()), r / noise, x)
 
-    def _linear(self, design: Design) -> Linear:
+    def _linear(self, design: Design) -> SimpleNamespace:
+        """Return the linear model of a period, of N + 1 states: z, d, its derivatives, and v."""
         n, noise = self.model.order, self.noise**2
         size, q = n + 1 + design.derivatives, self.intensity(design, self.noise)
         rates = np.eye(size, k=1)
@@ -189,10 +116,8 @@ class Likelihood:
         rates[range(n, size), range(n, size)] = -design.decay
         a, added, fresh = (np.zeros((size + 1, size + 1)) for _ in range(3))
         a[:size, :size], added[:size, :size] = LinearModel(rates, q).transition(self.period)
-        if design.shaken:
-            i = design.shaken
-            density = noise / (1.0 - design.colour) ** 2 * self.period
-            w = design.shake * density * design.bandwidth ** (2 * i)
+        if i := design.shaken:
+            w = design.shake * self._density(design, self.noise) * design.bandwidth ** (2 * i)
             added[:i, :i] += LinearModel(rates[:i, :i], w).transition(self.period)[1]
         fresh[range(1, n), range(1, n)] = np.square(self.sizes[1:])
         fresh[n:size, n:size] = stationary(rates[n:, n:], q)
@@ -203,20 +128,9 @@ class Likelihood:
             fresh[0, size] = fresh[size, 0] = -fresh[0, 0]
             noise = 0.0
         settled = int(min(SETTLED / (design.bandwidth * self.period), 2.0**40))
-        return Linear(a, added, fresh, noise, self.clip, settled)
-
-    def _evaluation(self, design: Design, b: Floats, s: Floats, x: Floats) -> Evaluation:
-        r = b / np.sqrt(s)
-        used, counted = self.samples.used, np.isfinite(r) & self.samples.used
-        if not counted.sum() > LEAST_USED * used.sum():
-            return Evaluation(design, math.nan, -math.inf, r, x)
-        noise = self.noise
-        if not self.fixed:
-            noise = max(likeliest_scale(r[counted]), self.least_noise)
-        size = np.abs(r[counted]) / noise
-        loss = np.where(size <= CLIP, size**2, 2.0 * CLIP * size - CLIP**2)
-        mean = -0.5 * float(np.mean(loss + np.log(s[counted]))) - math.log(noise)
-        return Evaluation(design, noise, mean * int(used.sum()), r / noise, x)
+        return SimpleNamespace(
+            a=a, q=added, fresh=fresh, variance=noise, clip=self.clip, settled=settled
+        )
 
 
 def likeliest_scale(r: Floats) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""lambda of a Kalman filter, and the linear observer that given lambda come to (D 18, D 19)."""
+"""lambda with which the observer is a Kalman filter (D 17 to D 19)."""
 
 from collections.abc import Mapping
 import math
@@ -9,50 +9,52 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import deadbeat_shares
 from fhaosmo_ros.core.observer.fuzzy import curves
 from fhaosmo_ros.core.observer.kalman import Uncertainty
-from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm, solve_triangular
+from scipy.linalg import solve_triangular
 
 Floats = NDArray[np.float64]
+SCHEME: Mapping[str, Any] = {
+    'structure': 'levant',
+    'scheme': 'predict_correct',
+    'variant': 'fuzzy_adaptive',
+    'gamma_rate': 0.0,
+    'gamma_min': 1e-4,
+}
+"""The observer that these gains are for."""
+WIDTH = 16.0
+"""
+Half-width over the noise: nearly linear for the noise itself, and outliers count as a few standard
+deviations of it.
+"""
+GAMMA = 3e-3
+"""Power at which the injections are nearly linear in the innovation."""
 SMALLEST = 1e-12
 """Stands for 1 - K_1 of a deadbeat observer."""
 LEAST = 1e-30
 """Gain that stands for one that is not positive."""
-SIZES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 12.0, 16.0)
-"""
-Of innovations, in the standard deviations of what is expected. With a d that is faster than
-expected their spread grows, and so do the limits of D 21 and D 32.
-"""
-STILL = 1e-3
-"""Stands for an innovation of 0."""
-DEADBEAT = 1e-12
-"""Poles (z) that are smaller, or rates, count as 0."""
 
 
 class KalmanGains(NamedTuple):
-    """
-    The steady-state Kalman filter of a model, and the observer that equals it.
+    """The steady-state Kalman filter of a model, and the observer of N levels that equals it."""
 
-    Attributes
-    ----------
-    lambdas : (N,) array
-        Of the observer.
-    gain : (N,) array
-        K of a filter that predicts and then corrects.
-    predicted : (N, N) array
-        Covariance of the errors of its predictions.
-    variance : float
-        Of its innovations.
+    lambdas: Floats  # (N,) of the observer
+    gain: Floats  # (N,) K of a filter that predicts and then corrects
+    predicted: Floats  # (N, N) covariance of the errors of its predictions
+    variance: float  # of its innovations
 
-    """
 
-    lambdas: Floats
-    gain: Floats
-    predicted: Floats
-    variance: float
+def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
+    """Return the parameters, as set by the user, that ask for something else than `SCHEME`."""
+    found = [k for k in ('structure', 'scheme') if estimator.get(k, SCHEME[k]) != SCHEME[k]]
+    if not estimator.get('unknown_input', True):
+        found.append('unknown_input')
+    # Such values fit one structure and scheme.
+    return found + [
+        k for k in ('lambda', 'alpha', 'epsilon', 'initial_internal') if k in estimator
+    ]
 
 
 def kalman_gains(model: TriangularModel, p: Mapping[str, Any], period: float) -> KalmanGains:
@@ -92,7 +94,7 @@ def matern(rate: float, derivatives: int) -> float:
 
 
 def with_gain(
-    k: Floats, h: float, widths: Any, curves: Floats, small: float, gamma: float
+    k: Floats, h: float, width: float, curves: Floats, small: float, gamma: float
 ) -> Floats:
     """
     Return lambda_1 .. lambda_N with which predict_correct has the gains K_1 .. K_N (D 19).
@@ -103,8 +105,8 @@ def with_gain(
         Gains of a linear observer that predicts and then corrects.
     h : float
         Sampling period (s).
-    widths : float or (N,) array
-        Half-widths, unit of y.
+    width : float
+        Half-width of all levels, unit of y.
     curves : (N, K) array
         psi of each level; see `fuzzy.curves`.
     small : float
@@ -117,54 +119,14 @@ def with_gain(
         psi is 0 there.
 
     """
+    n, level = len(k), np.arange(len(k))
     # Every injection is a function of eps = (1 - k_1) b, the innovation after the correction.
-    injections = solve_triangular(_corrections(len(k), h), k / max(1.0 - k[0], SMALLEST))
-    psi = _membership(curves, np.broadcast_to(small / np.asarray(widths), len(k)))
+    # Corrections are beta_ji h^(j - i + 1) times the injections (D 18).
+    corrections = np.triu(deadbeat_shares(n).T * h ** (level[None, :] - level[:, None] + 1.0))
+    injections = solve_triangular(corrections, k / max(1.0 - k[0], SMALLEST))
+    power = 2.0 * gamma * level[::-1] / n  # of the innovation (D 11)
+    grid = np.linspace(0.0, 1.0, curves.shape[1])
+    psi = np.array([np.interp(small / width, grid, curve) for curve in curves])
     if not psi.all():
         raise ConfigurationError(f'Kalman gain: expected psi > 0 at {small:g}, got {psi}')
-    return np.asarray(injections * small ** (1.0 - _power(len(k), gamma)) / psi)
-
-
-def least_damping(observer: Observer) -> float:
-    """
-    Return the smallest damping ratio of the errors' dynamics, linearised at rest (D 18).
-
-    For each of `SIZES` the corrections count as linear: K_i is what they are over the innovation.
-    Below 0 the errors grow by themselves. 1 without `noise_size` or with another scheme, where
-    other rules hold.
-    """
-    c = observer.configuration
-    if not c.predicting or c.schedule is None:
-        return 1.0
-    n, h = c.levels, c.parameters['correction_period']
-    transition = expm(Uncertainty(c.model, c.parameters, c.state_sizes).rates * h)
-    expected = np.sqrt(c.schedule.steady[0, 0] + c.schedule.variance)
-    worst = 1.0
-    for size in SIZES:
-        a = max(size, STILL) * expected
-        psi = _membership(c.curves, np.minimum(a / c.widths, 1.0))
-        wanted = _corrections(n, h) @ (c.lambdas * a ** (_power(n, c.gamma_initial) - 1.0) * psi)
-        errors = transition - np.outer(wanted / (1.0 + wanted[0]), transition[0])
-        if not np.isfinite(errors).all():
-            return -1.0
-        poles = np.linalg.eigvals(errors).astype(complex)
-        rates = np.log(poles[np.abs(poles) > DEADBEAT])
-        worst = min(worst, *(-rates.real / np.maximum(np.abs(rates), DEADBEAT)).tolist())
-    return worst
-
-
-def _corrections(n: int, h: float) -> Floats:
-    """Return the matrix from injections to corrections, beta_ji h^(j - i + 1) (D 18)."""
-    level = np.arange(n)
-    return np.triu(deadbeat_shares(n).T * h ** (level[None, :] - level[:, None] + 1.0))
-
-
-def _power(n: int, gamma: float) -> Floats:
-    """Return the powers of the innovation in the injections (D 11)."""
-    return 2.0 * gamma * np.arange(n - 1.0, -1.0, -1.0) / n
-
-
-def _membership(curves: Floats, inputs: Floats) -> Floats:
-    """Return psi of each level at its input."""
-    grid = np.linspace(0.0, 1.0, curves.shape[1])
-    return np.array([np.interp(x, grid, curve) for x, curve in zip(inputs, curves, strict=True)])
+    return np.asarray(injections * small ** (1.0 - power) / psi)

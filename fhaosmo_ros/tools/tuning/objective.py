@@ -1,67 +1,60 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a set of gains is worth: error, chatter and settling as one number."""
+"""What a set of gains is worth: error and chatter as one number."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.core.simulation.metrics import total_variation
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.core.simulation.scoring import CHOICES, Scores, Trial
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 import numpy as np
+from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
+FIRST_STAMP = 1_000_000_000
+"""Stamp (ns) of a recording's first sample; 0 would stand for a stamp that is not set."""
 SMALLEST = 1e-12
 """Relative errors below this one count as this one, so that their logarithm is finite."""
 
 
 class Evaluation(NamedTuple):
-    """
-    How good one set of parameters is.
-
-    Attributes
-    ----------
-    objective : float
-        error + chatter_weight * chatter + settling_weight * settling.
-    error : float
-        Weighted RMS error relative to the RMS of the truth; geometric mean over the recordings,
-        so that an error smaller by a tenth counts the same on an easy recording and on a hard one.
-    chatter : float
-        Powers of ten between the total variation of the estimate of d and that of d; at least 0.
-    settling : float
-        Mean share of the time `settled` that the estimate of d needs to settle.
-    estimate_from : str
-        Which variables are the estimates: 'internal' or 'filtered'.
-    scores : Scores
-    choice : int
-        Index of `estimate_from` in the scores.
-
-    """
+    """How good one set of parameters is."""
 
     objective: float
+    """error + chatter_weight * chatter."""
     error: float
+    """
+    Weighted RMS error relative to the RMS of the truth; geometric mean over the recordings, so
+    that an error smaller by a tenth counts the same on an easy recording and on a hard one.
+    """
     chatter: float
-    settling: float
-    estimate_from: str
-    scores: Scores
-    choice: int
+    """Powers of ten between the total variation of the estimate of d and that of d; at least 0."""
+    errors: Floats
+    """(R, n + 1) RMS errors of z_1 .. z_n and d of each recording."""
 
 
 class Objective:
     """
-    Evaluates parameters of the estimator on recordings.
+    Evaluates parameters of the estimator on recordings, by the node's code.
 
     Parameters
     ----------
     recordings : sequence of Recording
+        Each longer than `settled`.
     fixed : mapping
         Parameters of the estimator that do not change.
     tuning : mapping
         Of `TUNING`, complete.
-    choose : bool
-        Take the better of the internal and the filtered variables, instead of what `fixed` says.
     scale : array, optional
         RMS values that errors are divided by; by default those of the truth of these recordings.
+
+    Raises
+    ------
+    ConfigurationError
+        A recording that is too short, parameters of another model, or weights that do not fit.
 
     """
 
@@ -70,59 +63,76 @@ class Objective:
         recordings: Sequence[Recording],
         fixed: Mapping[str, Any],
         tuning: Mapping[str, Any],
-        choose: bool,
-        scale: Any = None,
+        scale: Floats | None = None,
     ) -> None:
-        online = ONLINE_PARAMETERS.complete(fixed)
-        d = np.concatenate([r.d for r in recordings])
-        band = tuning['settling_band'] * float(np.sqrt(np.mean(d**2)))
-        self.trial = Trial(recordings, online, tuning['settled'], band)
-        self.scale = self.trial.scale if scale is None else scale
-        self._tuning = tuning
-        quantities = len(self.scale)
-        weights = tuning['weights']
+        self.recordings = list(recordings)
+        self.fixed, self._tuning = ONLINE_PARAMETERS.complete(fixed), tuning
+        order, settled = OnlineEstimator(self.fixed).observer.order, tuning['settled']
+        for r in recordings:
+            if r.t[-1] - r.t[0] <= settled or r.z.shape[1] != order:
+                raise ConfigurationError(
+                    f'recording: expected more than {settled:g} s (settled) of {order} states '
+                    f'(order of the estimator), got {r.t[-1] - r.t[0]:g} s of {r.z.shape[1]}'
+                )
+        late = [np.column_stack([r.z, r.d])[r.t - r.t[0] >= settled] for r in recordings]
+        self.scale = _rms(np.concatenate(late)) if scale is None else scale
+        # A d that is constant has no variation: its size takes the place of it.
+        varies = [total_variation(truth[:, -1]) for truth in late]
+        self._truth_varies = np.maximum(varies, self.scale[-1] or 1.0)
+        weights = np.array(tuning['weights'])
         if len(weights) == 1:
-            weights = [0.0] * (quantities - 1) + weights
-        if len(weights) != quantities or not sum(weights) > 0.0:
+            weights = np.append(np.zeros(order), weights)
+        if len(weights) != order + 1 or not weights.sum() > 0.0:
             raise TUNE_PARAMETERS['weights'].error(
-                tuning['weights'], f'1 or {quantities} numbers, not all of them 0'
+                tuning['weights'], f'1 or {order + 1} numbers, not all of them 0'
             )
-        weighted = np.array(weights) > 0.0
-        if not (self.scale[weighted] > 0.0).all():
+        self._weights = weights / weights.sum()
+        if not (self.scale[weights > 0.0] > 0.0).all():
             raise ConfigurationError(
                 'recordings: expected a truth that is not 0 throughout where its weight is not 0, '
                 f'got RMS values {self.scale.tolist()}'
             )
-        self._weighted = np.flatnonzero(weighted)
-        self._weights = np.array(weights)[weighted] / np.sum(weights)
-        # A d that is constant has no variation: its size takes the place of it.
-        self._truth_varies = np.maximum(self.trial.variation, self.scale[-1] or 1.0)
-        self._choices = (0, 1) if choose else (CHOICES.index(online['estimate_from']),)
 
-    def __call__(self, parameters: Mapping[str, Any]) -> Evaluation:
-        """Evaluate the fixed parameters with these; `estimate_from` among them decides."""
-        scores = self.trial(parameters)
-        choices = self._choices
-        if 'estimate_from' in parameters:
-            choices = (CHOICES.index(parameters['estimate_from']),)
-        return min(
-            (self._evaluate(scores, choice) for choice in choices),
-            key=lambda evaluation: evaluation.objective,
-        )
+    def __call__(self, changes: Mapping[str, Any]) -> Evaluation:
+        """
+        Evaluate the fixed parameters with some changed.
 
-    def _evaluate(self, scores: Scores, choice: int) -> Evaluation:
-        # An estimate that is not finite is infinitely wrong, not undefined.
-        wrong = np.nan_to_num(scores.error[:, choice, self._weighted], nan=np.inf)
+        Raises
+        ------
+        ConfigurationError
+            As `OnlineEstimator`.
+
+        """
+        estimator = OnlineEstimator(self.fixed.changed(changes))
+        found = [self._judge(estimator, r) for r in self.recordings]
+        errors = np.array([wrong for wrong, _ in found])
+        used = self._weights > 0.0
         with np.errstate(over='ignore'):
-            each = np.sqrt(np.square(wrong / self.scale[self._weighted]) @ self._weights)
+            relative = np.square(errors[:, used] / self.scale[used])
+        each = np.sqrt(relative @ self._weights[used])
         error = float(np.exp(np.mean(np.log(np.maximum(each, SMALLEST)))))
-        tenfold = np.log10(np.maximum(scores.variation[:, choice] / self._truth_varies, 1.0))
-        chatter = float(np.mean(np.nan_to_num(tenfold, nan=np.inf)))
-        settled = self._tuning['settled']
-        settling = float(np.mean(scores.transient[:, choice]) / settled) if settled > 0.0 else 0.0
-        objective = (
-            error
-            + self._tuning['chatter_weight'] * chatter
-            + self._tuning['settling_weight'] * settling
-        )
-        return Evaluation(objective, error, chatter, settling, CHOICES[choice], scores, choice)
+        varies = np.array([variation for _, variation in found])
+        tenfold = np.log10(np.maximum(varies / self._truth_varies, 1.0))
+        chatter = float(np.mean(tenfold))
+        weighted = self._tuning['chatter_weight'] * chatter
+        return Evaluation(error + weighted, error, chatter, errors)
+
+    def _judge(self, estimator: OnlineEstimator, r: Recording) -> tuple[Floats, float]:
+        """Return the errors of z and d, and the variation of the estimate of d."""
+        estimator.reset()
+        u = r.u if estimator.observer.uses_input else None
+        found = estimator.run(FIRST_STAMP + np.round((r.t - r.t[0]) * 1e9), r.y, u)
+        t = r.t[0] + (found.t - FIRST_STAMP) * 1e-9  # before the sample's, if that is delayed
+        late = t - r.t[0] >= self._tuning['settled']
+        t, d = t[late], found.unknown_input[late]
+        truth = np.column_stack([np.interp(t, r.t, x) for x in (*r.z.T, r.d)])
+        with np.errstate(over='ignore', invalid='ignore'):
+            errors = _rms(np.column_stack([found.z[late], d]) - truth)
+            variation = total_variation(d)
+        # An estimate that is not finite is infinitely wrong, not undefined.
+        return np.nan_to_num(errors, nan=np.inf), np.nan_to_num(variation, nan=np.inf)
+
+
+def _rms(x: Floats) -> Floats:
+    """Return the RMS value of each column."""
+    return np.asarray(np.sqrt(np.mean(np.square(x), axis=0)))

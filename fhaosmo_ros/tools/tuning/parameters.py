@@ -30,32 +30,11 @@ TUNING = (
         lower=0.0, upper=1e6, live=False,
     ),
     Parameter(
-        'settling_weight', 0.05,
-        'Added to the objective for an estimate of d that needs all of `settled` to come within '
-        'settling_band; in proportion for one that needs less.',
-        lower=0.0, upper=1e6, live=False,
-    ),
-    Parameter(
-        'settling_band', 1.0, 'In RMS of d; see settling_weight.', lower=0.0, lower_open=True,
-        upper=1e6, live=False,
-    ),
-    Parameter(
-        'search',
-        [
-            'lambda', 'alpha', 'fuzzy_widths', 'epsilon', 'gamma_initial',
-            'unknown_input_decay',
-        ],
-        'Parameters of the estimator to search, each "NAME" or "NAME LOW HIGH", in logarithms '
-        'where their scale is open and linearly where they lie between 0 and 1 ("NAME LOW HIGH '
-        'log" or "... linear" says otherwise). A list is searched level by level. A parameter '
-        'that variant or structure do not use is passed over.',
+        'search', ['auto'],
+        'Parameters of the estimator to search, up to three powers of ten around their start; a '
+        'list level by level. auto: the model of d that makes the gains of a Kalman filter (D '
+        '19); for other schemes, or where lambda is set, the gains themselves.',
         live=False, lengths='1 or more',
-    ),
-    Parameter(
-        'decades', 0.0,
-        'Bounds of a search in logarithms, where none are given: powers of ten around its start. '
-        "0: 0.5 around a Kalman filter's gains (docs/offline.md), 3 around others.",
-        lower=0.0, upper=12.0, live=False,
     ),
 )  # fmt: skip
 

@@ -1,28 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The output of a search: gains.yaml, report.md and a figure of the estimates."""
+"""The output of a search: gains.yaml and report.md."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from fhaosmo_ros import __version__
-from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.files import dumps
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.tuning.figures import save_estimates
 from fhaosmo_ros.tools.tuning.objective import Evaluation
-from fhaosmo_ros.tools.tuning.search import Dimension
-from fhaosmo_ros.tools.tuning.space import changes
 from fhaosmo_ros.tools.tuning.tuner import Tuner, TuningResult
 import numpy as np
 
 OVERFITTED = 1.25
 """The report warns from this ratio of the held-out error to the training error on."""
-AT_BOUND = 0.02
-"""A value counts as at its bound if it is this close to it, as a share of the range."""
-SHOWN = 3
-"""Recordings in the figure of estimates."""
 
 
 def save(
@@ -41,68 +31,15 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
 
 
-def evaluations(columns: Mapping[str, Evaluation]) -> str:
-    """Return a table of the evaluations, a column each."""
-    found = columns.values()
-    rows = [
-        ['objective', *(f'{e.objective:.4f}' for e in found)],
-        ['error, relative to the truth', *(f'{e.error:.4f}' for e in found)],
-    ]
-    mean_squares = np.array([np.mean(e.scores.error[:, e.choice] ** 2, axis=0) for e in found])
-    for k, errors in enumerate(np.sqrt(mean_squares).T, 1):
-        name = f'z{k}' if k < mean_squares.shape[1] else 'd'
-        rows.append([f'RMS error of {name}', *(f'{error:.3g}' for error in errors)])
-    rows += [
-        ['chatter of d, powers of ten', *(f'{e.chatter:.2f}' for e in found)],
-        ['settling, share of the time', *(f'{e.settling:.2f}' for e in found)],
-        ['estimates from', *(e.estimate_from for e in found)],
-    ]
-    return table(['', *columns], rows)
-
-
-def at_bound(dimension: Dimension, value: float) -> bool:
-    """Return True if the value is so close to a bound that a wider range may be better."""
-    low, high = dimension.low, dimension.high
-    if dimension.log:
-        low, high, value = float(np.log(low)), float(np.log(high)), float(np.log(value))
-    return not AT_BOUND < (value - low) / (high - low) < 1.0 - AT_BOUND
-
-
-def warnings(
-    space: Sequence[Dimension], best: Mapping[str, float], training: float, held_out: float
-) -> list[str]:
-    """Return what a user should know before using gains of these errors."""
-    found = []
-    if held_out > OVERFITTED * training:
-        found.append(
-            f'The error on held-out recordings is {held_out / training:.2f} times that of the '
-            'training: more recordings, or fewer parameters to search, would help.'
-        )
-    if held_out > 0.9:
-        why = (
-            'there is hardly anything to be known about this d through this sensor'
-            if training < 1.1
-            else 'the search has not found gains that work: more trials, or other bounds'
-        )
-        found.append(
-            f'An estimate that is always 0 has the error 1; this one {held_out:.2f}: {why}.'
-        )
-    stuck = [d.name for d in space if at_bound(d, best[d.name])]
-    if stuck:
-        found.append(f'At their bounds: {", ".join(stuck)}; wider ones may give better gains.')
-    return found
-
-
 def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str:
     """Write everything into a new folder; return the report's main part, to be printed."""
-    gains, before = (tuner.with_readout(x) for x in (changes(result.best), tuner.before))
-    name = 'given' if tuner.before_is_given else 'start'
-    columns = {
-        f'{title}, {data}': objective(values)
-        for title, values in ((name, before), ('tuned', gains))
+    begin, best = {d.name: d.start for d in tuner.space}, result.best
+    found = {
+        f'{title}, {data}': objective(tuner.gains(values))
+        for title, values in (('given' if tuner.given else 'start', begin), ('tuned', best))
         for data, objective in (('training', tuner.training), ('held out', tuner.held_out))
     }
-    training, held_out = (columns[f'tuned, {data}'].error for data in ('training', 'held out'))
+    training, held_out = (found[f'tuned, {data}'].error for data in ('training', 'held out'))
     p = tuner.data.parameters
     comments = [
         'Made by',
@@ -113,12 +50,7 @@ def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str
         f'Error relative to the truth: {training:.3f} in training, {held_out:.3f} on held-out '
         'recordings.',
     ]
-    cautions = warnings(tuner.space, result.best, training, held_out)
-    main = '\n\n'.join([evaluations(columns), *(f'Note: {text}' for text in cautions)])
-    rows = [
-        [d.name, f'{d.low:.3g}', f'{d.high:.3g}', f'{d.start:.4g}', f'{result.best[d.name]:.4g}']
-        for d in tuner.space
-    ]
+    main = '\n\n'.join([_evaluations(found), *warnings(training, held_out)])
     parts = [
         '# Tuning',
         f'    python -m fhaosmo_ros {command}',
@@ -127,32 +59,55 @@ def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str
         '## Result',
         main,
         'The error is the weighted RMS error over that of the truth, a geometric mean over the '
-        'recordings. The objective adds chatter and settling by their weights. Held-out '
-        'recordings took no part in the search.',
-        '![d and its estimates](estimates.png)',
-        '## Gains',
-        table(['parameter', 'from', 'to', 'start', 'tuned'], rows),
+        'recordings. The objective adds chatter by its weight. Held-out recordings took no part '
+        'in the search.',
+        '## Searched',
+        table(
+            ['parameter', 'from', 'to', 'start', 'tuned'],
+            [
+                [d.name, *(f'{x:.4g}' for x in (d.low, d.high, d.start, best[d.name]))]
+                for d in tuner.space
+            ],
+        ),
+        '## Settings',
+        '\n'.join(f'    {name}: {value}' for name, value in (p | dict(tuner.tuning)).items()),
     ]
-    if tuner.tried:
-        chosen = tuner.fixed['unknown_input_derivatives']
-        rows = [
-            [f'{k}{" (taken)" if k == chosen else ""}', f'{value:.4f}']
-            for k, value in tuner.tried.items()
-        ]
-        parts.append(table(['unknown_input_derivatives', 'objective at the start'], rows))
-    settings = p | dict(tuner.tuning)
-    parts += ['## Settings', '\n'.join(f'    {name}: {value}' for name, value in settings.items())]
-    save(folder, tuner.parameters(gains), comments, parts)
-
-    def estimate(values: Mapping[str, Any], r: Recording) -> Any:
-        observer = Observer(ESTIMATOR_PARAMETERS.complete(tuner.estimator | values))
-        return observer.run(r.t, r.y, r.u).unknown_input
-
-    seen = {r.shape: r for r in reversed(tuner.data.held_out)}  # the first one of each kind of d
-    recordings = list(seen.values()) if len(seen) > 1 else tuner.data.held_out
-    shown = [
-        (f'held out: {r.shape}', r, estimate(before, r), estimate(gains, r))
-        for r in recordings[:SHOWN]
-    ]
-    save_estimates(shown, tuner.tuning['settled'], folder / 'estimates.png')
+    save(folder, tuner.parameters(best), comments, parts)
     return main
+
+
+def _evaluations(columns: Mapping[str, Evaluation]) -> str:
+    """Return a table of evaluations, a column each."""
+    found = columns.values()
+    errors = np.sqrt([np.mean(np.square(e.errors), axis=0) for e in found]).T
+    names = [*(f'z{k}' for k in range(1, len(errors))), 'd']
+    rows = [
+        ['objective', *(f'{e.objective:.4f}' for e in found)],
+        ['error, relative to the truth', *(f'{e.error:.4f}' for e in found)],
+        *(
+            [f'RMS error of {name}', *(f'{error:.3g}' for error in of_name)]
+            for name, of_name in zip(names, errors, strict=True)
+        ),
+        ['chatter of d, powers of ten', *(f'{e.chatter:.2f}' for e in found)],
+    ]
+    return table(['', *columns], rows)
+
+
+def warnings(training: float, held_out: float) -> list[str]:
+    """Return what a user should know before using gains of these errors."""
+    found = []
+    if held_out > OVERFITTED * training:
+        found.append(
+            f'Note: The error on held-out recordings is {held_out / training:.2f} times that of '
+            'the training: more recordings, or fewer parameters to search, would help.'
+        )
+    if held_out > 0.9:
+        why = (
+            'there is hardly anything to be known about this d through this sensor'
+            if training < 1.1
+            else 'the search has not found gains that work: more trials, or another start'
+        )
+        found.append(
+            f'Note: An estimate that is always 0 has the error 1; this one {held_out:.2f}: {why}.'
+        )
+    return found

@@ -14,7 +14,7 @@ import warnings
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import optuna
 from optuna.study import MaxTrialsCallback
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import TrialState
 
 Values = dict[str, float]
 
@@ -27,46 +27,21 @@ LONGEST = 200
 
 
 class Dimension(NamedTuple):
-    """
-    One parameter of a search.
-
-    Attributes
-    ----------
-    name : str
-    low, high : float
-        Bounds.
-    start : float
-        Where the search begins.
-    log : bool
-        Search in its logarithm.
-
-    """
+    """One parameter of a search."""
 
     name: str
     low: float
     high: float
-    start: float
-    log: bool = True
+    start: float  # where the search begins
+    log: bool = True  # search in its logarithm
 
 
 class Result(NamedTuple):
-    """
-    The outcome of a search.
+    """The outcome of a search."""
 
-    Attributes
-    ----------
-    best : dict
-        Values by name with the smallest objective.
-    value : float
-        The objective there.
-    trials : int
-        Finished trials of the study, also those of other processes.
-
-    """
-
-    best: Values
-    value: float
-    trials: int
+    best: Values  # by name
+    value: float  # the objective there
+    trials: int  # finished ones of the study, also those of other processes
 
 
 def minimise(
@@ -79,7 +54,6 @@ def minimise(
     name: str = 'study',
     jobs: int = 1,
     on_trial: Callable[[], object] = lambda: None,
-    stopped: Callable[[], bool] = lambda: False,
 ) -> Result:
     """
     Minimise an objective.
@@ -94,17 +68,13 @@ def minimise(
         first one is at the start of each dimension.
     seed : int
         With one job and no storage, the result is a function of it.
-    storage : str, optional
+    storage, name : str, optional
         As for `optuna.create_study`; in memory by default. All processes and machines that name
         the same storage and study search in one study.
-    name : str
-        Of the study in the storage.
     jobs : int
         Threads: an objective should spend its time in compiled code without the GIL.
     on_trial : callable
-        Called after each trial of this process.
-    stopped : callable
-        Asked after each trial; True ends the search with the best trial so far.
+        Called after each trial of this process; True ends the search with the best one so far.
 
     Raises
     ------
@@ -113,24 +83,20 @@ def minimise(
 
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
+    start = {d.name: d.start for d in space}
 
     def evaluate(trial: optuna.Trial) -> float:
         values = {d.name: trial.suggest_float(d.name, d.low, d.high, log=d.log) for d in space}
         value = float(objective(values))
         return value if math.isfinite(value) else BAD
 
-    def after(study: optuna.Study, trial: FrozenTrial) -> None:
-        on_trial()
-        if stopped():
+    def after(study: optuna.Study, _: object) -> None:
+        if on_trial():
             study.stop()
-
-    def finished() -> int:
-        return len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
 
     with warnings.catch_warnings():
         # Optuna 6, which setup.py excludes, removes x0 and sigma0.
         warnings.simplefilter('ignore', FutureWarning)
-        start = {d.name: d.start for d in space}
         sampler = optuna.samplers.CmaEsSampler(
             x0=start, sigma0=SIGMA, seed=seed, warn_independent_sampling=False
         )
@@ -139,26 +105,28 @@ def minimise(
             storage=storage, sampler=sampler, study_name=name, load_if_exists=True
         )
     except Exception as error:  # SQLAlchemy and each driver have exceptions of their own
-        raise ConfigurationError(
-            f'storage {storage!r}: expected what Optuna takes, such as sqlite:///study.db or '
-            f'postgresql+psycopg://user@host/name, got: {_one_line(error)}'
-        ) from None
+        raise _unusable(storage, error) from None
+    states = (TrialState.COMPLETE,)
     try:
-        done = finished()
+        done = len(study.get_trials(deepcopy=False, states=states))
         if not done:
             study.enqueue_trial(start, skip_if_exists=True)
         if done < trials:
-            callbacks = [after, MaxTrialsCallback(trials, states=(TrialState.COMPLETE,))]
+            callbacks = [after, MaxTrialsCallback(trials, states=states)]
             study.optimize(evaluate, n_trials=trials - done, n_jobs=jobs, callbacks=callbacks)
-        return Result(dict(study.best_params), study.best_value, finished())
+        count = len(study.get_trials(deepcopy=False, states=states))
+        return Result(dict(study.best_params), study.best_value, count)
     except (optuna.exceptions.StorageInternalError, UnboundLocalError) as error:
         if storage is None:  # else the second one: Optuna's loop raises it where a storage fails
             raise
-        raise ConfigurationError(f'storage {storage!r}: {_one_line(error)}') from None
+        raise _unusable(storage, error) from None
 
 
-def _one_line(error: BaseException) -> str:
-    """Return what a driver says, without the SQL statement and the advice that come with it."""
+def _unusable(storage: str | None, error: BaseException) -> ConfigurationError:
+    """Return what a driver says in one line, without the advice that stands around its cause."""
     while (before := error.__cause__ or error.__context__) is not None:
         error = before
-    return ' '.join(str(error).split())[:LONGEST] or type(error).__name__
+    return ConfigurationError(
+        f'storage {storage!r}: expected what Optuna takes, such as sqlite:///study.db or '
+        f'postgresql+psycopg://user@host/name, got: {" ".join(str(error).split())[:LONGEST]}'
+    )

@@ -1,9 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Estimates of a sensor from its recorded y: resolution, rate, jitter, losses."""
+"""The y of a bag, and what it says of its sensor: resolution, rate, jitter, losses."""
 
+from pathlib import Path
 from typing import NamedTuple
 
+from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.messages.fields import Unwrapper
+from fhaosmo_ros.tools.bags.held_input import HeldInputs
+from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.cli.options import BagInputs
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import median_abs_deviation
@@ -17,26 +23,41 @@ ON_GRID = 0.02
 
 
 class Sensor(NamedTuple):
-    """
-    Names as in `FAMILY_PARAMETERS`.
+    """What stamps and samples say of a sensor; names as in `FAMILY_PARAMETERS`."""
 
-    Attributes
-    ----------
-    quantisation : float
-        In the unit of y; 0 for none that shows.
-    sample_rate : float
-        Hz.
-    stamp_jitter : float
-        s.
-    dropout : float
-        Share of the samples that are lost.
+    quantisation: float  # unit of y; 0 for none that shows
+    sample_rate: float  # Hz
+    stamp_jitter: float  # s
+    dropout: float  # share of the samples that are lost
 
-    """
 
-    quantisation: float
-    sample_rate: float
-    stamp_jitter: float
-    dropout: float
+class RecordedOutput(NamedTuple):
+    """The y of a bag, of K samples."""
+
+    t: Floats  # (K,) stamps from the first one on (s)
+    y: Floats  # (K,) samples
+    u: Floats  # (K, m) known inputs
+    sensor: Sensor  # estimated from t and y
+
+
+def recorded(bag: Path, inputs: BagInputs, model: TriangularModel) -> RecordedOutput:
+    """Return the y of a bag, and the known inputs of a model."""
+    y_at, u_at, stamp, values = inputs
+    with BagReader(bag) as reader:
+        topic = y_at.absolute('')
+        found = reader.field(topic, y_at.field, y_at.name)
+        blocks = list(reader.blocks(topic, found, stamp))
+        stamps, y = (np.concatenate([block[k] for block in blocks]) for k in (1, 2))
+        if found.wraps:
+            y = np.array(list(map(Unwrapper(), y.tolist())))
+        u = np.zeros((len(y), len(model.inputs)))
+        if model.uses_input:
+            held = HeldInputs(reader, model, u_at, values)
+            u = np.concatenate([u for _, u in held.along(blocks)])
+    if not len(y):
+        raise ConfigurationError(f'bag {bag}: expected samples of y, got none')
+    t = (stamps - stamps[0]) * 1e-9
+    return RecordedOutput(t, y, u, identify(t, y))
 
 
 def identify(t: Floats, y: Floats) -> Sensor:

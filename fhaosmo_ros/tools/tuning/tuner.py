@@ -1,32 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One tuning: from recordings and parameters to the best gains, before anything is written."""
+"""
+The search for gains on simulated recordings: from recordings and parameters to the best gains.
 
-from collections.abc import Callable, Mapping
+Where the user sets no other structure or scheme, and no lambda, the start is a Kalman filter for
+a model of d (D 19): how many derivatives of d to follow, and how fast d changes, are tried on a
+small grid. Then Optuna searches size and rate of d, and lambda follows. Else it searches the gains
+themselves, from the user's, or the default ones.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 import hashlib
+from itertools import product
 import json
 import math
 import time
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA
 from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.parameters.declaration import Parameters, unknown_parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
+from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
+from fhaosmo_ros.core.simulation.recordings import Family, Recording
 from fhaosmo_ros.tools.cli.progress import progress
-from fhaosmo_ros.tools.tuning.linear_gains import least_damping
+from fhaosmo_ros.tools.tuning.linear_gains import (
+    chosen_otherwise,
+    GAMMA,
+    kalman_gains,
+    SCHEME,
+    WIDTH,
+)
 from fhaosmo_ros.tools.tuning.objective import Objective
-from fhaosmo_ros.tools.tuning.search import minimise, Values
-from fhaosmo_ros.tools.tuning.source import TuningData
-from fhaosmo_ros.tools.tuning.space import changes, make_space
-from fhaosmo_ros.tools.tuning.start import find_start, with_scheme
+from fhaosmo_ros.tools.tuning.search import Dimension, minimise, Values
 import numpy as np
 
+HELD_OUT_SEED = 1_000_003
+"""Added to the seed: held-out recordings share no random number with the others."""
+SEARCHABLE = [
+    p.name for p in OBSERVER_PARAMETERS.values()
+    if 'double' in p.kind and p.lower is not None and p.lower >= 0.0
+]  # fmt: skip
+GAINS = ('lambda', 'alpha', 'fuzzy_widths', 'epsilon', 'gamma_initial', 'unknown_input_decay')
+"""What is searched with gains of the user's, or another scheme."""
+DERIVATIVES, RATES = (0, 1, 2, 3), np.geomspace(0.1, 30.0, 8)
+"""The grid: unknown_input_derivatives, and unknown_input_decay (1/s)."""
+DECADES = 3.0
+"""Powers of ten around its start to which a search in logarithms goes."""
 DIGITS = 4
-"""Of the gains that are written, unless rounding raises their objective by more than `LOSS`."""
-LOSS = 5e-3
-NEAR, FAR = 0.5, 3.0
-"""`decades` around a start that a Kalman filter gave, and around any other one."""
-LEAST_DAMPING, DAMPING_WEIGHT = 0.1, 10.0
-"""Of the errors' dynamics: gains with less suit their recordings and fail on others."""
+"""Of the numbers that are tried and written."""
 LOST_TIME, LOST_SAMPLES = 0.1, 20
 """
 Seconds, and at least so many samples, for which the innovation exceeds the largest half-width
@@ -35,12 +58,30 @@ without end.
 """
 
 
+class TuningData(NamedTuple):
+    """Recordings to train on, others to judge by, and the complete parameters of their family."""
+
+    training: list[Recording]
+    held_out: list[Recording]
+    parameters: dict[str, Any]
+
+
 class TuningResult(NamedTuple):
-    """The best values by dimension, rounded; trials of the study, and seconds of this run."""
+    """The best values by dimension; trials of the study, and seconds of this run."""
 
     best: Values
     trials: int
     seconds: float
+
+
+def simulated(values: Parameters, seed: int) -> TuningData:
+    """Return recordings of the family that `values` (of `TUNE_PARAMETERS`) describe."""
+    family = Family(FAMILY_PARAMETERS.complete(values))
+    return TuningData(
+        family.recordings(values['recordings'], seed),
+        family.recordings(values['held_out'], seed + HELD_OUT_SEED),
+        family.parameters,
+    )
 
 
 class Tuner:
@@ -55,21 +96,15 @@ class Tuner:
     tuning : mapping
         Of `TUNE_PARAMETERS`, complete.
     seed : int
-    jobs : int
-        Threads that look for a start.
-    stopped : callable
-        Asked before each evaluation of the start; True ends it with the best so far.
 
     Attributes
     ----------
-    before : dict
-        Gains to compare with: the user's, or where the search begins.
-    fixed : dict
-        Parameters of the estimator that are not searched.
-    training, held_out : Objective
+    estimator : dict
+        Parameters of the estimator that do not follow from a point of the space.
     space : list of Dimension
-    tried : dict
-        Objective of the best Kalman filter by number of derivatives of d; see start.py.
+    training, held_out : Objective
+    given : bool
+        The search begins with gains that the user set.
 
     Raises
     ------
@@ -84,46 +119,59 @@ class Tuner:
         estimator: Mapping[str, Any],
         tuning: Mapping[str, Any],
         seed: int,
-        jobs: int = 1,
-        stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        self.data, self.tuning, self.seed = data, tuning, seed
-        names = [rule.partition(' ')[0] for rule in tuning['search']]
+        self.data, self.tuning, self._seed = data, tuning, seed
+        self._period = float(f'{np.median(np.diff(data.training[0].t)):.4g}')
+        self.given = 'lambda' in estimator
         # The estimator may have a model of its own, other than the plant's.
-        model = {name: tuning[name] for name in ('order', 'phi')}
-        self.estimator = with_scheme(model | dict(estimator), data.training)
-        self._choose = 'estimate_from' not in estimator
-        gains, self.tried = find_start(
-            data.training, self.estimator, names, self._objective, jobs, stopped
-        )
-        not_searched = {k: v for k, v in gains.items() if k not in names}
-        self.estimator = not_searched | self.estimator
-        self.training = self._objective(self.estimator)
+        own = {name: tuning[name] for name in ('order', 'phi')} | dict(estimator)
+        self._noise, self.estimator, names = 0.0, own, tuning['search']
+        fuzzy = own.get('variant', SCHEME['variant']).startswith('fuzzy')
+        kalman = fuzzy and not chosen_otherwise(own)
+        if kalman:
+            self._noise, known = self._kalman_start(own)
+            self.estimator = known | own
         complete = ESTIMATOR_PARAMETERS.complete(self.estimator)
-        self.held_out = Objective(
-            data.held_out, complete, tuning, self._choose, self.training.scale
-        )
-        given = {name: value for name, value in estimator.items() if name in names}
-        self.before_is_given = 'lambda' in given  # other parameters alone are no set of gains
-        best = {k: v for k, v in gains.items() if k in names}
-        # The user's own gains are a start, too: the tuned ones are never worse than they are.
-        if self.before_is_given and self._evaluate(given) < self._evaluate(best):
-            best = given
-        observer = Observer(complete)
-        self.space = make_space(
-            tuning['search'],
-            observer.parameters | best,
-            observer.levels,
-            tuning['decades'] or (NEAR if self.tried else FAR),
-        )
+        self.training = Objective(data.training, complete, tuning)
+        self.held_out = Objective(data.held_out, complete, tuning, self.training.scale)
+        if kalman:
+            grid = {'unknown_input_derivatives': DERIVATIVES, 'unknown_input_decay': RATES}
+            free = {k: v if k not in own else [own[k]] for k, v in grid.items()}
+            points = [dict(zip(grid, point, strict=True)) for point in product(*free.values())]
+            best = changes(min(points, key=self.evaluate))
+            self.estimator |= best
+            for objective in (self.training, self.held_out):
+                objective.fixed = objective.fixed.changed(best)
+        if names == ['auto']:
+            model = [k for k in ('unknown_input_size', 'unknown_input_decay') if k not in own]
+            names = model if kalman else GAINS
+        start = self.estimator | self.gains({})
+        self.space = make_space(names, Observer(ESTIMATOR_PARAMETERS.complete(start)))
         searched = changes({d.name: d.start for d in self.space})
-        self.before = given if self.before_is_given else searched
-        self.fixed = {k: v for k, v in self.estimator.items() if k not in searched}
-        self._damping = min(LEAST_DAMPING, self._damped(searched))
+        self.estimator = {k: v for k, v in self.estimator.items() if k not in searched}
 
-    def _objective(self, estimator: Mapping[str, Any]) -> Objective:
-        complete = ESTIMATOR_PARAMETERS.complete(estimator)
-        return Objective(self.data.training, complete, self.tuning, self._choose)
+    def _kalman_start(self, own: Mapping[str, Any]) -> tuple[float, dict[str, Any]]:
+        """Return the size of the noise, and what the recordings say of the estimator."""
+        # With quantum and jitter.
+        noise = _rms(np.concatenate([r.y - r.z[:, 0] for r in self.data.training]))
+        truth = np.concatenate([np.column_stack([r.z, r.d]) for r in self.data.training])
+        sizes = [_rounded(_rms(column)) for column in truth.T]
+        found = {
+            **SCHEME,
+            'correction_period': self._period,
+            'unknown_input_size': sizes[-1],
+            'gamma_initial': min(max(GAMMA, own.get('gamma_min', 0.0)), own.get('gamma_max', 1.0)),
+        }
+        # Without noise the fastest observer is deadbeat: this noise is too small to slow it down.
+        least = 0.1 * sizes[-1] * self._period ** (len(sizes) - 1)
+        if noise <= least:
+            # The largest innovations are those of the start: what z_2 moves y by in a period.
+            width = WIDTH * max(sizes[1] * self._period, least)
+            return least, found | {'fuzzy_widths': [width]}
+        noise = _rounded(noise)
+        if min(sizes) > 0.0:  # else nothing says how sure the observer is
+            found |= {'noise_size': noise, 'state_sizes': sizes[:-1]}
+        return noise, found | {'fuzzy_widths': [WIDTH * noise]}
 
     @property
     def study_name(self) -> str:
@@ -132,43 +180,45 @@ class Tuner:
         problem = json.dumps([dict(self.tuning), self.estimator, self.space], sort_keys=True)
         return f'tune-{hashlib.sha256(b"".join([problem.encode(), *samples])).hexdigest()[:16]}'
 
+    def gains(self, values: Values) -> dict[str, Any]:
+        """
+        Return the parameters of the estimator that follow from a point of the space.
+
+        Raises
+        ------
+        ConfigurationError
+            There is no Kalman filter for the model of d.
+
+        """
+        found = changes(values)
+        if self._noise and 'lambda' not in found:
+            p = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(self.estimator | found))
+            power = p['gamma_initial'] if p['variant'].endswith('_adaptive') else FIXED_GAMMA
+            noise = p['noise_size'] or self._noise
+            p = p.changed({'noise_size': noise, 'gamma_initial': power})
+            lambdas = kalman_gains(TriangularModel.of(p), p, self._period).lambdas
+            found['lambda'] = [_rounded(x) for x in lambdas]
+        return found
+
     def evaluate(self, values: Values) -> float:
-        """Return the objective at a point of the space, larger where errors are badly damped."""
-        gains = changes(values)
-        objective = self._evaluate(gains)
-        if math.isinf(objective):
-            return objective
-        missing = max(self._damping - self._damped(gains), 0.0)
-        return objective * (1.0 + DAMPING_WEIGHT * missing)
-
-    def _damped(self, gains: Mapping[str, Any]) -> float:
-        return least_damping(Observer(ESTIMATOR_PARAMETERS.complete(self.estimator | dict(gains))))
-
-    def _evaluate(self, gains: Mapping[str, Any]) -> float:
+        """Return the objective at a point of the space."""
         try:
-            return self.training(gains).objective
+            return self.training(self.gains(values)).objective
         except ConfigurationError:  # a value out of its bounds, or values that do not fit
             return math.inf
 
-    def with_readout(self, gains: Mapping[str, Any]) -> dict[str, Any]:
-        """Return gains with internal or filtered variables; held-out recordings do not decide."""
-        return {'estimate_from': self.training(gains).estimate_from, **gains}
-
-    def parameters(self, gains: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what the estimator needs: what is fixed, and these gains."""
-        values = self.fixed | self.with_readout(gains)
-        shown = ESTIMATOR_PARAMETERS.complete(values)
+    def parameters(self, values: Values) -> dict[str, Any]:
+        """Return all parameters of the estimator at a point of the space."""
+        found = self.estimator | self.gains(values)
+        shown = ESTIMATOR_PARAMETERS.complete(found)
         fuzzy = shown['structure'] == 'levant' and shown['variant'].startswith('fuzzy')
         if fuzzy and not shown['noise_size']:
-            period = float(np.median(np.diff(self.data.training[0].t)))
-            values = {
-                'epsilon': max(shown['fuzzy_widths']),
-                'divergence_time': float(f'{max(LOST_TIME, LOST_SAMPLES * period):.4g}'),
-            } | values
+            lost = _rounded(max(LOST_TIME, LOST_SAMPLES * self._period))
+            found = {'epsilon': max(shown['fuzzy_widths']), 'divergence_time': lost} | found
         # The gains fit these only, so the file has them even where they are the defaults.
         for name in ('variant', 'scheme', 'unknown_input'):
-            values[name] = shown[name]
-        return ESTIMATOR_PARAMETERS.part_of(values)
+            found[name] = shown[name]
+        return ESTIMATOR_PARAMETERS.part_of(found)
 
     def search(
         self,
@@ -176,17 +226,15 @@ class Tuner:
         jobs: int = 1,
         storage: str | None = None,
         stopped: Callable[[], bool] = lambda: False,
-    ) -> TuningResult | None:
+    ) -> TuningResult:
         """
-        Search until the study holds `trials`, or `stopped` returns True; None if it does at once.
+        Search until the study holds `trials`, or `stopped` returns True after one.
 
         Parameters
         ----------
-        trials, jobs : int
-        storage : str, optional
+        trials, jobs, storage
             As for `minimise`; the study is named by what it searches.
         stopped : callable
-            Asked before each trial.
 
         Raises
         ------
@@ -194,15 +242,97 @@ class Tuner:
             A storage that can't be used.
 
         """
-        if stopped():
-            return None
         begin = time.monotonic()
         with progress(total=trials, unit='trial', desc='tune', smoothing=0.05) as bar:
+
+            def on_trial() -> bool:
+                bar.update()
+                return stopped()
+
             found = minimise(
-                self.evaluate, self.space, trials, self.seed, storage=storage,
-                name=self.study_name, jobs=jobs, on_trial=bar.update, stopped=stopped,
+                self.evaluate, self.space, trials, self._seed, storage=storage,
+                name=self.study_name, jobs=jobs, on_trial=on_trial,
             )  # fmt: skip
-        best = {key: float(f'{v:.{DIGITS}g}') for key, v in found.best.items()}
-        if self.evaluate(best) > (1.0 + LOSS) * self.evaluate(found.best):
-            best = found.best
-        return TuningResult(best, found.trials, time.monotonic() - begin)
+        return TuningResult(found.best, found.trials, time.monotonic() - begin)
+
+
+def make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
+    """
+    Return the dimensions of a search.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Parameters of the observer; those that its variant does not use are passed over.
+    observer : Observer
+        Its parameters are where the search begins.
+
+    Raises
+    ------
+    ConfigurationError
+        A name that is no numeric parameter of the observer, or none that is used.
+
+    """
+    space: list[Dimension] = []
+    start = observer.parameters
+    for name in names:
+        if name not in SEARCHABLE:
+            raise unknown_parameter(name, SEARCHABLE)
+        if not _used(name, start):
+            continue
+        values, labels = [start[name]], [name]
+        if isinstance(start[name], list):
+            values = [start[name][min(k, len(start[name]) - 1)] for k in range(observer.levels)]
+            labels = [f'{name}[{k}]' for k in range(observer.levels)]
+        for label, value in zip(labels, values, strict=True):
+            low, high = _bounds(name, value, start)
+            log = 0.0 < 10.0 * low < high
+            begin = 1.0 if log and value == 0.0 else value
+            space.append(Dimension(label, low, high, min(max(begin, low), high), log))
+    if not space:
+        raise ConfigurationError(
+            f"parameter 'search': expected one that the variant {start['variant']} uses, "
+            f'got {list(names)!r}'
+        )
+    return space
+
+
+def changes(values: Values) -> dict[str, Any]:
+    """Return the parameters of the observer at a point of the space, whose dimensions name it."""
+    found: dict[str, Any] = {}
+    for label, value in values.items():
+        name, level, _ = label.partition('[')
+        if level:
+            found.setdefault(name, []).append(_rounded(value))
+        else:
+            found[name] = value if isinstance(value, int) else _rounded(value)
+    return found
+
+
+def _used(name: str, start: Mapping[str, Any]) -> bool:
+    """Return True if the structure and the variant use a parameter."""
+    variant = str(start['variant'])
+    if start['structure'] == 'levant' and name in ('alpha', 'epsilon'):
+        return False
+    if name.startswith('fuzzy_'):
+        return variant.startswith('fuzzy')
+    return not name.startswith('gamma_') or variant.endswith('_adaptive')
+
+
+def _bounds(name: str, value: float, start: Mapping[str, Any]) -> tuple[float, float]:
+    """Return the bounds of a search: in powers of ten, where the scale of a parameter is open."""
+    if name == 'gamma_initial':
+        return start['gamma_min'], start['gamma_max']
+    lower, upper = OBSERVER_PARAMETERS[name].lower or 0.0, OBSERVER_PARAMETERS[name].upper or 1.0
+    if upper <= 1.0:
+        return lower, upper
+    middle = value or 1.0  # such as unknown_input_decay, which may be 0
+    return max(middle / 10.0**DECADES, lower), min(middle * 10.0**DECADES, upper)
+
+
+def _rounded(value: float) -> float:
+    return float(f'{value:.{DIGITS}g}')
+
+
+def _rms(x: Any) -> float:
+    return float(np.sqrt(np.mean(np.square(x))))

@@ -24,7 +24,6 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise
-from fhaosmo_ros.tools.tuning.start import DERIVATIVES
 import numpy as np
 from studies.comparison.methods.filters import constant_gain
 from studies.comparison.methods.method import LINEAR, Method, Run, Search, Setting, USUAL, Values
@@ -37,6 +36,8 @@ REACH = 10.0
 """How far a search for the bandwidth goes, as a factor to both sides."""
 LONGEST = 1.5
 """Nominal periods that one step of a prediction may take."""
+DERIVATIVES = (0, 1, 2, 3)
+"""Of d, that are tried."""
 Gain = Callable[[SampledModel, Values], np.ndarray]
 
 

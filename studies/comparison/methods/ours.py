@@ -3,22 +3,19 @@
 Our observer as users get it: with the gains that `tune` finds, and self-tuning.
 
 Both run in the online estimator, by the node's code. The search is that of `tune`, without its
-weights on chatter and settling, because those of the other methods have none.
+weight on chatter, because those of the other methods have none.
 """
 
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr
 from io import StringIO
-from itertools import count
 from typing import Any
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.core.simulation.scoring import FIRST_STAMP
+from fhaosmo_ros.tools.tuning.objective import FIRST_STAMP
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.source import TuningData
-from fhaosmo_ros.tools.tuning.space import changes
-from fhaosmo_ros.tools.tuning.tuner import Tuner
+from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, Tuner, TuningData
 import numpy as np
 from studies.comparison.methods.method import (
     Method,
@@ -32,7 +29,8 @@ from studies.comparison.methods.method import (
 )
 from studies.comparison.scores import Estimates, JUDGED_FROM
 
-GOAL = {'settled': JUDGED_FROM, 'chatter_weight': 0.0, 'settling_weight': 0.0}
+GOAL = {'settled': JUDGED_FROM, 'chatter_weight': 0.0}
+GRID = len(DERIVATIVES) * len(RATES)
 
 
 def _model(setting: Setting) -> dict[str, Any]:
@@ -58,15 +56,12 @@ def _prepared(
 
 
 def _tune(search: Search) -> Values:
-    """Return the parameters of the estimator that `tune` writes; its start uses trials, too."""
+    """Return the parameters of the estimator that `tune` writes; its grid uses trials, too."""
     tuning = TUNE_PARAMETERS.complete(_model(search.setting) | GOAL)
     data = TuningData(list(search.recordings), list(search.recordings[:1]), {})
-    used = count(1)
     with redirect_stderr(StringIO()):  # its progress bars
-        tuner = Tuner(data, {}, tuning, search.seed, 1, lambda: next(used) >= search.trials)
-        left = max(1, search.trials - next(used) + 1)
-        found = tuner.search(left)
-    return tuner.parameters(changes(found.best)) if found is not None else {}
+        tuner = Tuner(data, {}, tuning, search.seed)
+        return tuner.parameters(tuner.search(max(1, search.trials - GRID)).best)
 
 
 OUR_METHODS = (
