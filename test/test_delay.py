@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A known delay of y: the inputs that acted then, the estimate's time, and the present."""
 
-from fhaosmo_ros.core import ConfigurationError, Family, OnlineEstimator, Trial
+from fhaosmo_ros.core import ConfigurationError, Family, OnlineEstimator
 from fhaosmo_ros.core.online.delay import PIECES
 from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot, unpack
 from fhaosmo_ros.core.simulation.plant import respond
+from fhaosmo_ros.tools.tuning.objective import Objective
+from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -204,7 +206,7 @@ def test_input_later_than_y_is_refused():
         OnlineEstimator(DELAYED | {'input_delay': 0.05})
 
 
-def test_trial_knows_of_the_delay():
+def test_tuning_knows_of_the_delay():
     model = {'order': 2, 'phi': ['0', '8*u - 3*z2'], 'measurement_delay': 0.05}
     family = Family(model | {'duration': 6.0, 'sample_rate': 200.0, 'rms_of_d': 2.0,
                              'disturbances': ['sines'], 'band_of_d': [0.5, 3.0],
@@ -214,7 +216,8 @@ def test_trial_knows_of_the_delay():
     gains['fuzzy_widths'] = [0.5]
 
     def error(changes):
-        return Trial(recordings, gains | changes, 2.0, 1.0)({}).error[:, 0].max(axis=0)
+        tuning = TUNE_PARAMETERS.complete({'settled': 2.0})
+        return Objective(recordings, gains | changes, tuning)({}).errors.max(axis=0)
 
     then, now = error({}), error({'predict_to_now': True})
     unknown = error({'measurement_delay': 0.0})

@@ -12,7 +12,6 @@ from fhaosmo_ros.core.online.events import Event, EventDetector
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.plant import Plant
 from fhaosmo_ros.core.simulation.recordings import Family, Recording
-from fhaosmo_ros.core.simulation.scoring import Trial
 
 __all__ = [
     'ConfigurationError',
@@ -29,6 +28,5 @@ __all__ = [
     'Recording',
     'Status',
     'Trajectory',
-    'Trial',
     'TriangularModel',
 ]

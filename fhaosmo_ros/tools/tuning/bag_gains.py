@@ -106,7 +106,7 @@ def _refuse(found: Identified) -> None:
     period, noise = likelihood.period, found.best.noise
     top = 0.9 * QUICKEST / period
     white = found.white or found.best
-    silent = noise < NO_NOISE * float(np.std(y)) and not found.sensor.quantisation
+    silent = noise < NO_NOISE * float(np.std(y)) and not found.quantum
     if silent and not likelihood.fixed:
         raise NothingToFind(
             f'y: expected noise, got none that shows ({noise:.1e} in a y of '

@@ -146,7 +146,7 @@ def _identify(
     from fhaosmo_ros.tools.tuning import bag_gains, bag_report
     from fhaosmo_ros.tools.tuning.identify import identify_input
     from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
-    from fhaosmo_ros.tools.tuning.sensor import recorded
+    from fhaosmo_ros.tools.tuning.recorded import recorded
 
     others = chosen_otherwise(estimator)
     if others:

@@ -13,7 +13,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.tuning.likelihood import CLIP, Design, Evaluation, Likelihood, Samples
 from fhaosmo_ros.tools.tuning.linear_gains import matern
-from fhaosmo_ros.tools.tuning.sensor import RecordedOutput, Sensor, usable
+from fhaosmo_ros.tools.tuning.recorded import quantum, RecordedOutput, usable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
@@ -71,7 +71,7 @@ class Identified(NamedTuple):
     spread: dict[str, float]
     """Standard deviations of the logarithms of noise, decay, size of d; NaN: y does not tell."""
     outliers: int  # samples that were left out
-    sensor: Sensor
+    quantum: float  # of y; 0 for none that shows
 
     @property
     def size_of_input(self) -> float:
@@ -120,16 +120,15 @@ def identify_input(
             )
         silent, shaken = search.alternatives(best)
         spread = search.spread(best)
-    return Identified(likelihood, best, white, silent, shaken, spread, outliers, data.sensor)
+    step = quantum(likelihood.samples.y)
+    return Identified(likelihood, best, white, silent, shaken, spread, outliers, step)
 
 
 def _prepared(
     data: RecordedOutput, model: TriangularModel, values: Parameters, given: Mapping[str, Any]
 ) -> Likelihood:
     """Return the likelihood of the usable samples, with a first guess of noise and states."""
-    t, y, u, sensor = data
-    keep = usable(t, y, u)
-    t, y, u = t[keep], y[keep], u[keep]
+    t, y, u = usable(data)
     count, different = len(y), len(np.unique(y))
     if count < FEWEST:
         raise NothingToFind(f'y: expected at least {FEWEST} samples, got {count}')
@@ -150,7 +149,7 @@ def _prepared(
     for _ in range(1, model.order):
         slow = np.diff(slow) / (block * period)
         sizes.append(3.0 * float(np.sqrt(np.mean(slow**2))))
-    rounding = sensor.quantisation / math.sqrt(12.0)
+    rounding = quantum(y) / math.sqrt(12.0)
     # A smooth signal vanishes in differences of high order.
     rough = median_abs_deviation(np.diff(y, 4), scale='normal') / math.sqrt(70.0)
     noise = max(float(rough), rounding, 1e-9 * float(np.std(y)))

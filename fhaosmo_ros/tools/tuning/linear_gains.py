@@ -80,9 +80,21 @@ def kalman_gains(model: TriangularModel, p: Mapping[str, Any], period: float) ->
     predicted = uncertainty.steady(period)
     variance = predicted[0, 0] + uncertainty.variance
     gain = predicted[0] / variance
+    n, level = len(gain), np.arange(len(gain))
+    # Every injection is a function of eps = (1 - K_1) b, the innovation after the correction.
+    # Corrections are beta_ji h^(j - i + 1) times the injections (D 18).
+    exponents = level[None, :] - level[:, None] + 1.0
+    corrections = np.triu(deadbeat_shares(n).T * period**exponents)
+    injections = solve_triangular(corrections, gain / max(1.0 - gain[0], SMALLEST))
     width = p['fuzzy_widths'][0]
-    small = max(p['noise_size'], 1e-3 * width)
-    lambdas = with_gain(gain, period, width, curves(p, len(gain)), small, p['gamma_initial'])
+    small = max(p['noise_size'], 1e-3 * width)  # an innovation that noise alone causes
+    power = 2.0 * p['gamma_initial'] * level[::-1] / n  # of the innovation (D 11)
+    curve = curves(p, n)
+    grid = np.linspace(0.0, 1.0, curve.shape[1])
+    psi = np.array([np.interp(small / width, grid, row) for row in curve])
+    if not psi.all():
+        raise ConfigurationError(f'Kalman gain: expected psi > 0 at {small:g}, got {psi}')
+    lambdas = injections * small ** (1.0 - power) / psi
     lambdas = lambdas.clip(LEAST, OBSERVER_PARAMETERS['lambda'].upper)
     return KalmanGains(lambdas, gain, predicted, variance)
 
@@ -91,42 +103,3 @@ def matern(rate: float, derivatives: int) -> float:
     """Return the intensity of the white noise behind a Matern d of the RMS 1 (D 17)."""
     k = derivatives
     return (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2 / math.factorial(2 * k)
-
-
-def with_gain(
-    k: Floats, h: float, width: float, curves: Floats, small: float, gamma: float
-) -> Floats:
-    """
-    Return lambda_1 .. lambda_N with which predict_correct has the gains K_1 .. K_N (D 19).
-
-    Parameters
-    ----------
-    k : (N,) array
-        Gains of a linear observer that predicts and then corrects.
-    h : float
-        Sampling period (s).
-    width : float
-        Half-width of all levels, unit of y.
-    curves : (N, K) array
-        psi of each level; see `fuzzy.curves`.
-    small : float
-        Size of the innovations that noise alone causes, unit of y.
-    gamma : float
-
-    Raises
-    ------
-    ConfigurationError
-        psi is 0 there.
-
-    """
-    n, level = len(k), np.arange(len(k))
-    # Every injection is a function of eps = (1 - k_1) b, the innovation after the correction.
-    # Corrections are beta_ji h^(j - i + 1) times the injections (D 18).
-    corrections = np.triu(deadbeat_shares(n).T * h ** (level[None, :] - level[:, None] + 1.0))
-    injections = solve_triangular(corrections, k / max(1.0 - k[0], SMALLEST))
-    power = 2.0 * gamma * level[::-1] / n  # of the innovation (D 11)
-    grid = np.linspace(0.0, 1.0, curves.shape[1])
-    psi = np.array([np.interp(small / width, grid, curve) for curve in curves])
-    if not psi.all():
-        raise ConfigurationError(f'Kalman gain: expected psi > 0 at {small:g}, got {psi}')
-    return np.asarray(injections * small ** (1.0 - power) / psi)

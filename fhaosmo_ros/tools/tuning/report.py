@@ -8,7 +8,8 @@ from typing import Any
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.tools.tuning.objective import Evaluation
-from fhaosmo_ros.tools.tuning.tuner import Tuner, TuningResult
+from fhaosmo_ros.tools.tuning.search import Result
+from fhaosmo_ros.tools.tuning.tuner import Tuner
 import numpy as np
 
 OVERFITTED = 1.25
@@ -31,7 +32,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
 
 
-def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str:
+def write(folder: Path, tuner: Tuner, result: Result, command: str) -> str:
     """Write everything into a new folder; return the report's main part, to be printed."""
     begin, best = {d.name: d.start for d in tuner.space}, result.best
     found = {
@@ -54,7 +55,7 @@ def write(folder: Path, tuner: Tuner, result: TuningResult, command: str) -> str
     parts = [
         '# Tuning',
         f'    python -m fhaosmo_ros {command}',
-        f'{result.trials} trials in the study, {result.seconds:.0f} s in this run; '
+        f'{result.trials} trials in the study; '
         f'{len(tuner.data.training)} recordings to train on, {len(tuner.data.held_out)} held out.',
         '## Result',
         main,

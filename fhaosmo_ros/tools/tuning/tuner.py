@@ -13,7 +13,6 @@ import hashlib
 from itertools import product
 import json
 import math
-import time
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
@@ -33,7 +32,7 @@ from fhaosmo_ros.tools.tuning.linear_gains import (
     WIDTH,
 )
 from fhaosmo_ros.tools.tuning.objective import Objective
-from fhaosmo_ros.tools.tuning.search import Dimension, minimise, Values
+from fhaosmo_ros.tools.tuning.search import Dimension, minimise, Result, Values
 import numpy as np
 
 HELD_OUT_SEED = 1_000_003
@@ -66,14 +65,6 @@ class TuningData(NamedTuple):
     parameters: dict[str, Any]
 
 
-class TuningResult(NamedTuple):
-    """The best values by dimension; trials of the study, and seconds of this run."""
-
-    best: Values
-    trials: int
-    seconds: float
-
-
 def simulated(values: Parameters, seed: int) -> TuningData:
     """Return recordings of the family that `values` (of `TUNE_PARAMETERS`) describe."""
     family = Family(FAMILY_PARAMETERS.complete(values))
@@ -86,7 +77,7 @@ def simulated(values: Parameters, seed: int) -> TuningData:
 
 class Tuner:
     """
-    Holds what a search needs.
+    A search: where it begins, what is tried, and what comes of it.
 
     Parameters
     ----------
@@ -97,21 +88,18 @@ class Tuner:
         Of `TUNE_PARAMETERS`, complete.
     seed : int
 
-    Attributes
-    ----------
-    estimator : dict
-        Parameters of the estimator that do not follow from a point of the space.
-    space : list of Dimension
-    training, held_out : Objective
-    given : bool
-        The search begins with gains that the user set.
-
     Raises
     ------
     ConfigurationError
         Parameters that do not fit together, or recordings that do not fit them.
 
     """
+
+    space: list[Dimension]
+    estimator: dict[str, Any]  # what does not follow from a point of the space
+    training: Objective
+    held_out: Objective
+    given: bool  # the search begins with gains that the user set
 
     def __init__(
         self,
@@ -138,7 +126,7 @@ class Tuner:
             grid = {'unknown_input_derivatives': DERIVATIVES, 'unknown_input_decay': RATES}
             free = {k: v if k not in own else [own[k]] for k, v in grid.items()}
             points = [dict(zip(grid, point, strict=True)) for point in product(*free.values())]
-            best = changes(min(points, key=self.evaluate))
+            best = _changes(min(points, key=self.evaluate))
             self.estimator |= best
             for objective in (self.training, self.held_out):
                 objective.fixed = objective.fixed.changed(best)
@@ -146,8 +134,8 @@ class Tuner:
             model = [k for k in ('unknown_input_size', 'unknown_input_decay') if k not in own]
             names = model if kalman else GAINS
         start = self.estimator | self.gains({})
-        self.space = make_space(names, Observer(ESTIMATOR_PARAMETERS.complete(start)))
-        searched = changes({d.name: d.start for d in self.space})
+        self.space = _make_space(names, Observer(ESTIMATOR_PARAMETERS.complete(start)))
+        searched = _changes({d.name: d.start for d in self.space})
         self.estimator = {k: v for k, v in self.estimator.items() if k not in searched}
 
     def _kalman_start(self, own: Mapping[str, Any]) -> tuple[float, dict[str, Any]]:
@@ -174,23 +162,15 @@ class Tuner:
         return noise, found | {'fuzzy_widths': [WIDTH * noise]}
 
     @property
-    def study_name(self) -> str:
+    def _study_name(self) -> str:
         """Name of the study: a digest of all that its trials depend on."""
         samples = [recording.y.tobytes() for recording in self.data.training]
         problem = json.dumps([dict(self.tuning), self.estimator, self.space], sort_keys=True)
         return f'tune-{hashlib.sha256(b"".join([problem.encode(), *samples])).hexdigest()[:16]}'
 
     def gains(self, values: Values) -> dict[str, Any]:
-        """
-        Return the parameters of the estimator that follow from a point of the space.
-
-        Raises
-        ------
-        ConfigurationError
-            There is no Kalman filter for the model of d.
-
-        """
-        found = changes(values)
+        """Return the parameters of the estimator that follow from a point of the space."""
+        found = _changes(values)
         if self._noise and 'lambda' not in found:
             p = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(self.estimator | found))
             power = p['gamma_initial'] if p['variant'].endswith('_adaptive') else FIXED_GAMMA
@@ -226,53 +206,22 @@ class Tuner:
         jobs: int = 1,
         storage: str | None = None,
         stopped: Callable[[], bool] = lambda: False,
-    ) -> TuningResult:
-        """
-        Search until the study holds `trials`, or `stopped` returns True after one.
-
-        Parameters
-        ----------
-        trials, jobs, storage
-            As for `minimise`; the study is named by what it searches.
-        stopped : callable
-
-        Raises
-        ------
-        ConfigurationError
-            A storage that can't be used.
-
-        """
-        begin = time.monotonic()
+    ) -> Result:
+        """Search as `minimise` does, or until `stopped` returns True after a trial."""
         with progress(total=trials, unit='trial', desc='tune', smoothing=0.05) as bar:
 
             def on_trial() -> bool:
                 bar.update()
                 return stopped()
 
-            found = minimise(
+            return minimise(
                 self.evaluate, self.space, trials, self._seed, storage=storage,
-                name=self.study_name, jobs=jobs, on_trial=on_trial,
+                name=self._study_name, jobs=jobs, on_trial=on_trial,
             )  # fmt: skip
-        return TuningResult(found.best, found.trials, time.monotonic() - begin)
 
 
-def make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
-    """
-    Return the dimensions of a search.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Parameters of the observer; those that its variant does not use are passed over.
-    observer : Observer
-        Its parameters are where the search begins.
-
-    Raises
-    ------
-    ConfigurationError
-        A name that is no numeric parameter of the observer, or none that is used.
-
-    """
+def _make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
+    """Return the dimensions of a search; names that the variant does not use are passed over."""
     space: list[Dimension] = []
     start = observer.parameters
     for name in names:
@@ -297,7 +246,7 @@ def make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
     return space
 
 
-def changes(values: Values) -> dict[str, Any]:
+def _changes(values: Values) -> dict[str, Any]:
     """Return the parameters of the observer at a point of the space, whose dimensions name it."""
     found: dict[str, Any] = {}
     for label, value in values.items():
