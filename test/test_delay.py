@@ -45,7 +45,7 @@ def late(y):
     {'scheme': 'explicit', 'structure': 'cascade'},
 ])  # fmt: skip
 def test_late_samples_give_the_estimates_of_punctual_ones(law):
-    y, u = truth().z[:, 0], voltage()
+    y, u = truth()[0][:, 0], voltage()
     punctual = OnlineEstimator(MOTOR | law).run(STAMPS, y, u)
     delayed = OnlineEstimator(DELAYED | law).run(STAMPS, late(y), u)
     np.testing.assert_array_equal(delayed.t[LATE:], punctual.t[:-LATE])
@@ -54,7 +54,7 @@ def test_late_samples_give_the_estimates_of_punctual_ones(law):
 
 
 def test_inputs_that_come_as_late_as_y_belong_to_it():
-    y, u = truth().z[:, 0], voltage()
+    y, u = truth()[0][:, 0], voltage()
     same = OnlineEstimator(DELAYED | {'input_delay': DELAYED['measurement_delay']})
     found, wanted = same.run(STAMPS, y, u), OnlineEstimator(MOTOR).run(STAMPS, y, u)
     np.testing.assert_array_equal(found.z, wanted.z)
@@ -149,7 +149,7 @@ def disturbed():
     stamps[400:] += 30_000_000
     stamps[600] += 50_000_000
     stamps[1000:] += 10**9
-    y = truth().z[:, 0] + 1e-4 * rng.standard_normal(COUNT)
+    y = truth()[0][:, 0] + 1e-4 * rng.standard_normal(COUNT)
     y[200], y[300] = 9.0, np.nan
     return stamps, y, voltage() + 0.1 * rng.standard_normal(COUNT)
 
@@ -184,7 +184,7 @@ def test_one_by_one_many_and_resumed_are_the_same(parameters):
 
 def test_a_withdrawn_gap_leaves_no_trace_in_the_past_of_the_inputs():
     stamps, u = STAMPS[:300].copy(), voltage()[:300]
-    y = truth().z[:300, 0]
+    y = truth()[0][:300, 0]
     stamps[200] += 100_000_000
     with_it, without = OnlineEstimator(DELAYED), OnlineEstimator(DELAYED)
     with_it.run(stamps[:202], y[:202], u[:202])

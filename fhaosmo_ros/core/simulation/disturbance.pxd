@@ -19,5 +19,4 @@ cdef class Wave(Disturbance):
 
 cdef class Table(Disturbance):
     cdef double spacing  # of its values (s)
-    cdef Py_ssize_t count  # of its values, at least 2
-    cdef double* values  # from t = 0 on (unit of d)
+    cdef double[::1] values  # from t = 0 on, at least 2 (unit of d)

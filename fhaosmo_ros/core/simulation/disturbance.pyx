@@ -2,8 +2,6 @@
 """Unknown inputs d(t) that the simulated plant can be given."""
 
 from libc.math cimport fmin, sin
-from libc.stdlib cimport free, malloc
-from libc.string cimport memcpy
 
 import numpy as np
 
@@ -71,28 +69,20 @@ cdef class Table(Disturbance):
 
     """
 
-    def __cinit__(self, values, double spacing):
-        cdef const double[::1] given = np.ascontiguousarray(values, dtype=np.float64)
-        self.count, self.spacing = given.shape[0], spacing
-        if self.count < 2 or not spacing > 0.0:
+    def __init__(self, values, double spacing):
+        self.values, self.spacing = np.array(values, dtype=np.float64), spacing
+        if len(self.values) < 2 or not spacing > 0.0:
             raise ValueError('table of d: expected at least 2 values and a spacing > 0')
-        self.values = <double*>malloc(self.count * sizeof(double))
-        if self.values == NULL:
-            raise MemoryError
-        memcpy(self.values, &given[0], self.count * sizeof(double))
-
-    def __dealloc__(self):
-        free(self.values)
 
     def __reduce__(self):
-        return Table, ([self.values[k] for k in range(self.count)], self.spacing)
+        return Table, (np.asarray(self.values), self.spacing)
 
     cdef double at(self, double t) noexcept nogil:
         """Return d(t)."""
         cdef double position = t / self.spacing
-        cdef Py_ssize_t j
-        if not position < self.count - 1:
-            return self.values[self.count - 1]
+        cdef Py_ssize_t j, last = self.values.shape[0] - 1
+        if not position < last:
+            return self.values[last]
         if not position >= 0.0:
             return self.values[0]
         j = <Py_ssize_t>position

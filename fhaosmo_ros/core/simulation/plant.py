@@ -193,13 +193,6 @@ def quantised(y: Floats, step: float) -> Floats:
     return np.where(np.isfinite(rounded), rounded, y)
 
 
-class Response(NamedTuple):
-    """States (K, n) and unknown input (K,) at some times."""
-
-    z: Floats
-    d: Floats
-
-
 def respond(
     model: TriangularModel,
     initial_state: ArrayLike,
@@ -208,9 +201,9 @@ def respond(
     spacing: float,
     u: ArrayLike | float = 0.0,
     step: float = 1e-4,
-) -> Response:
+) -> tuple[Floats, Floats]:
     """
-    Return the response of a model to any d(t), integrated from t = 0: for training data.
+    Return states (K, n) and d (K,) of a model driven by any d(t), from t = 0: for training data.
 
     Parameters
     ----------
@@ -232,4 +225,5 @@ def respond(
     t, d = np.ascontiguousarray(t, dtype=np.float64), Table(table, spacing)
     z = np.broadcast_to(initial_state, model.order)
     system = System(model.expressions, d, step, z)
-    return Response(system.respond(t, known_inputs_of_run(u, len(t), model.inputs)), d.along(t))
+    inputs = known_inputs_of_run(u, len(t), model.inputs)
+    return system.advance(t, inputs, on_grid=False), d.along(t)

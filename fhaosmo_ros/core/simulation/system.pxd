@@ -16,3 +16,4 @@ cdef class System(Dynamics):
     cdef double on_grid[MOST_LEVELS]  # z_1 .. z_n then, at taken * h
     cdef double z[MOST_LEVELS]  # and at the time of the latest `advance`
     cdef void go_to(self, double t, const double* u) noexcept nogil
+    cdef void go_evenly(self, double begin, double t, const double* u) noexcept nogil

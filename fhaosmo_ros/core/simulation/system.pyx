@@ -79,7 +79,15 @@ cdef class System(Dynamics):
         if t > self.taken * self.h:
             take_step(self, &CLASSICAL, self.taken * self.h, t - self.taken * self.h, self.z)
 
-    def advance(self, t, u):
+    cdef void go_evenly(self, double begin, double t, const double* u) noexcept nogil:
+        """Bring `z` from the time `begin` to `t` in equal steps, off the grid."""
+        cdef long long j, count = <long long>fmax(ceil((t - begin) / self.h - 1e-9), 1.0)
+        cdef double step = (t - begin) / count
+        self.u = u
+        for j in range(count if step > 0.0 else 0):
+            take_step(self, &CLASSICAL, begin + j * step, step, self.z)
+
+    def advance(self, t, u, bint on_grid=True):
         """
         Return the states at many times, (K, n).
 
@@ -89,38 +97,21 @@ cdef class System(Dynamics):
             Times since t = 0 (s), finite and not decreasing.
         u : (K, m) array
             Known inputs of the interval that ends at each.
+        on_grid : bool
+            Steps lie on the grid of time. Else, for a run from t = 0 on, each interval is divided
+            evenly, so that a step has one value of each known input.
 
         """
         cdef const double[::1] times = t
-        cdef const double[:, ::1] inputs = checked(u, times.shape[0], self.phi)
+        cdef const double[:, ::1] inputs = u if u.shape[1] else np.zeros((len(t), 1))
         cdef double[:, ::1] states = np.empty((times.shape[0], self.size))
         cdef Py_ssize_t k
+        if u.shape[0] != times.shape[0] or u.shape[1] < self.phi.inputs:
+            raise ValueError(f'expected known inputs of shape ({len(t)}, m), got {u.shape}')
         for k in range(times.shape[0]):
-            self.go_to(times[k], &inputs[k, 0])
+            if on_grid:
+                self.go_to(times[k], &inputs[k, 0])
+            else:
+                self.go_evenly(times[k - 1] if k > 0 else 0.0, times[k], &inputs[k, 0])
             memcpy(&states[k, 0], self.z, self.size * sizeof(double))
         return np.asarray(states)
-
-    def respond(self, t, u):
-        """Do the same from t = 0 on without a grid: each interval is divided evenly."""
-        cdef const double[::1] times = t
-        cdef const double[:, ::1] inputs = checked(u, times.shape[0], self.phi)
-        cdef double[:, ::1] states = np.empty((times.shape[0], self.size))
-        cdef double begin = 0.0, step
-        cdef Py_ssize_t k
-        cdef long long j, count
-        for k in range(times.shape[0]):
-            self.u = &inputs[k, 0]
-            count = <long long>fmax(ceil((times[k] - begin) / self.h - 1e-9), 1.0)
-            step = (times[k] - begin) / count
-            for j in range(count if step > 0.0 else 0):
-                take_step(self, &CLASSICAL, begin + j * step, step, self.z)
-            begin = times[k]
-            memcpy(&states[k, 0], self.z, self.size * sizeof(double))
-        return np.asarray(states)
-
-
-cdef const double[:, ::1] checked(u, Py_ssize_t count, Expressions phi) except *:
-    """Return `u` if it has a row for each time, and the columns that Phi may use."""
-    if u.shape[0] != count or u.shape[1] < phi.inputs:
-        raise ValueError(f'expected known inputs ({count}, {phi.inputs}), got {u.shape}')
-    return u if u.shape[1] else np.zeros((count, 1))
