@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A snapshot holds all that an estimator needs to go on bit for bit."""
 
-import re
-
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot, unpack
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -144,44 +142,6 @@ def test_state_of_another_size_is_refused_and_changes_nothing():
         estimator.load_state_dict(small.state_dict())
     for name, value in estimator.state_dict().items():
         np.testing.assert_array_equal(value, before[name])
-
-
-def as_of_version_1(estimator, left_out=()):
-    """Return labels and vector as bags of version 1 have them, which may lack some entries."""
-    labels, vector = pack(Snapshot(estimator.latest, Flag.CHANGED, estimator.state_dict()))
-    entries = dict(zip(labels, vector.tolist(), strict=True))
-    del entries['version'], entries['past_latest1']
-    entries['u'] = entries.pop('u1')
-    old = {'p': 'z_hat_sensitivity', 'q': 'z_tilde_sensitivity', 'mean_interval': 'interval'}
-    renamed = {}
-    for label, value in entries.items():
-        before, name, place = re.fullmatch('(before_)?(.*?)([0-9_]*)', label).groups('')
-        renamed[before + old.get(name, name) + place] = value
-    kept = {k: v for k, v in renamed.items() if not k.removeprefix('before_').startswith(left_out)}
-    return list(kept), list(kept.values())
-
-
-@pytest.mark.parametrize('scheme', ['implicit', 'predict_correct'])
-@pytest.mark.parametrize('left_out', [
-    ('none',), ('covariance', 'scale', 'saturated', 'beyond', 'settled', 'period', 'spread'),
-    ('lost_since', 'event', 'repeats', 'sample'),
-])  # fmt: skip
-def test_snapshot_of_an_older_version_is_followed(scheme, left_out):
-    """The oldest ones remembered less."""
-    parameters = {'scheme': scheme, 'structure': 'levant', 'lambda': [8.0, 20.0, 30.0, 16.0]}
-    first, second = OnlineEstimator(parameters), OnlineEstimator(parameters)
-    feed(first, 0, 1500)
-    labels, vector = as_of_version_1(first, left_out)
-    second.load_state_dict(unpack(vector, labels).values)
-    np.testing.assert_array_equal(feed(second, 1500, 3000), feed(first, 1500, 3000))
-
-
-def test_members_of_an_older_version_are_said_not_to_be_followed():
-    estimator = OnlineEstimator()
-    feed(estimator, 0, 2)
-    labels, vector = as_of_version_1(estimator)
-    with pytest.raises(ConfigurationError, match='members of version 1 can not be followed'):
-        unpack([*vector, 0.0], [*labels, 'm1'])
 
 
 @pytest.mark.parametrize('parameters', [

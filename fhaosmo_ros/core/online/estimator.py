@@ -17,7 +17,7 @@ from fhaosmo_ros.core.online.delay import PastInputs
 from fhaosmo_ros.core.online.events import check_events, EventDetector
 from fhaosmo_ros.core.online.past_estimates import check_lag, PastEstimates
 from fhaosmo_ros.core.online.policy import Policy
-from fhaosmo_ros.core.online.snapshots import array_of, checked, completed, VERSION
+from fhaosmo_ros.core.online.snapshots import array_of, checked, VERSION
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import make_from_file
@@ -287,11 +287,7 @@ class OnlineEstimator:
             Something is missing, of another size, or out of its range. Then nothing has changed.
 
         """
-        version = checked(values, {'version': VERSION})['version']
-        if version < VERSION and self.observer.self_tuning:
-            raise ConfigurationError(f'snapshot: expected version {VERSION}, for self-tuning')
-        if version < VERSION:
-            values = completed(values, self.state_dict())
+        checked(values, {'version': VERSION})
         memory = checked(values, self.policy.memory)
         events = checked(values, self.events.memory)
         if np.size(values.get('past_pieces', ())) != self.policy.past.pieces.size:

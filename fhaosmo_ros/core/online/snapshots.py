@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 VERSION = 2
-"""Of the names. Those of version 1, which did not tell it, are read as well."""
+"""Of the names."""
 HEAD = ['version', 'flags', 'sec', 'nanosec']
 HALF = 2**32
 SECOND = 1_000_000_000
@@ -33,18 +33,13 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(('stuck', 'holds'), YES_OR_NO),
     **dict.fromkeys(('spikes', 'tick_count', 'repeats', 'held_for'), COUNTS),
     **dict.fromkeys(('mean_interval', 'mean_jitter', 'usual_interval'), COUNTS),
-    'version': (1, VERSION), 'intervals': (0, 32), 'regular': (0, 12), 'ticks': (-5000, 2**17),
+    'version': (VERSION, VERSION), 'intervals': (0, 32), 'regular': (0, 12),
+    'ticks': (-5000, 2**17),
     'elsewhere': (0.0, 1.0), 'event': (0, 5), 'event_deviation': (0.0, math.inf),
     'past_place': (0, 511), 'past_count': (0, 512),
 }  # fmt: skip
 """Of what is remembered. Times may be any integers, other numbers as large as `LARGEST`."""
 INDEX = re.compile(r'(.*?)(\d{1,6}(?:_\d{1,6})*)')
-OLD_NAMES = {
-    'z_hat_sensitivity': 'p', 'z_tilde_sensitivity': 'q', 'interval': 'mean_interval',
-    'jitter': 'mean_jitter',
-}  # fmt: skip
-OLD_DEFAULTS = {'scale': 1.0, 'spread': 1.0, 'before_scale': 1.0, 'before_spread': 1.0}
-"""What the oldest bags lack and is not 0."""
 
 
 class Flag(IntFlag):
@@ -111,7 +106,7 @@ def unpack(vector: ArrayLike, labels: Sequence[str]) -> Snapshot:
     Raises
     ------
     ConfigurationError
-        The entries are not those of an estimator of this version, or of an older one.
+        The entries are not those of an estimator of this version.
 
     """
     v = np.asarray(vector, dtype=np.float64)
@@ -120,14 +115,13 @@ def unpack(vector: ArrayLike, labels: Sequence[str]) -> Snapshot:
             f'snapshot: expected entries of as many names, got {v.size} of {len(set(labels))}'
         )
     entries = dict(zip(labels, v.tolist(), strict=True))
-    version = entries.pop('version', 1.0)
-    head = [entries.pop(name, np.nan) for name in ('flags', 'sec', 'nanosec')]
-    if version not in (1.0, VERSION) or not np.all(np.abs(head) < HALF):
+    version, *head = (entries.pop(name, np.nan) for name in HEAD)
+    if version != VERSION or not np.all(np.abs(head) < HALF):
         raise ConfigurationError(
-            f'snapshot: expected version 1 or {VERSION}, and a stamp, got version {version:g}'
+            f'snapshot: expected version {VERSION}, and a stamp, got version {version:g}'
         )
     flags, second, nanosecond = map(int, head)
-    values = _old_values(entries) if version == 1.0 else {'version': VERSION, **_values(entries)}
+    values = {'version': VERSION, **_values(entries)}
     return Snapshot(second * SECOND + nanosecond, Flag(flags & 7), values)
 
 
@@ -137,61 +131,23 @@ def _values(entries: Mapping[str, float]) -> dict[str, Any]:
     parts: dict[str, dict[tuple[int, ...], float]] = {}
     for label, number in entries.items():
         name, _, half = label.rpartition('_')
-        if half == 'lower' and f'{name}_upper' in entries:
-            upper = entries[f'{name}_upper']
-            if not (abs(upper) <= HALF and 0.0 <= number < HALF):
+        match = INDEX.fullmatch(label)
+        if half in ('upper', 'lower') and {f'{name}_upper', f'{name}_lower'} <= entries.keys():
+            upper, lower = entries[f'{name}_upper'], entries[f'{name}_lower']
+            if not (abs(upper) <= HALF and 0.0 <= lower < HALF):
                 raise ConfigurationError(f"snapshot: '{name}': expected an integer")
-            values[name] = int(upper) * HALF + int(number)
-        elif half != 'upper' or f'{name}_lower' not in entries:
-            match = INDEX.fullmatch(label)
-            if match is None:
-                values[label] = number
-            else:
-                place = tuple(int(k) for k in match[2].split('_'))
-                parts.setdefault(match[1], {})[place] = number
+            values[name] = int(upper) * HALF + int(lower)
+        elif match is None:
+            values[label] = number
+        else:
+            place = tuple(int(k) - 1 for k in match[2].split('_'))
+            parts.setdefault(match[1], {})[place] = number
     for name, part in parts.items():
-        shape = tuple(max(places) for places in zip(*part, strict=False))
-        wanted = np.ndindex(shape) if math.prod(shape) == len(part) else ()
-        if sorted(part) != [tuple(k + 1 for k in index) for index in wanted]:
+        shape = tuple(1 + max(places) for places in zip(*part, strict=False))
+        if math.prod(shape) != len(part) or sorted(part) != list(np.ndindex(shape)):
             raise ConfigurationError(f"snapshot: '{name}': expected all entries of an array")
         values[name] = np.array([part[place] for place in sorted(part)]).reshape(shape)
     return values
-
-
-def _old_values(entries: Mapping[str, float]) -> dict[str, Any]:
-    """Return the same of version 1; `completed` adds what it did not remember."""
-    if 'm1' in entries:
-        raise ConfigurationError(
-            'snapshot: expected version 2 of a self-tuning observer; the members of version 1 '
-            'can not be followed'
-        )
-    u = np.array([entries[name] for name in entries if name == 'u' or name.startswith('u_')])
-    rest = {name: entries[name] for name in entries if name != 'u' and not name.startswith('u_')}
-    found, m = _values(rest), len(u)
-    values: dict[str, Any] = {'version': 1, 'u': u, 'past_latest': u}
-    for name, value in found.items():
-        before = 'before_' if name.startswith('before_') else ''
-        stem = name.removeprefix(before)
-        values[before + OLD_NAMES.get(stem, stem)] = value
-    past, ring = np.ravel(values.pop('past', ())), 3 + 2 * m
-    if len(past):  # place, count, m; inputs of the step; the latest inputs; a ring
-        if len(past) < ring or (len(past) - ring) % (1 + m) or not np.isfinite(past).all():
-            raise ConfigurationError("snapshot: 'past': expected the past of the known inputs")
-        values |= {'past_place': int(past[0]), 'past_count': int(past[1])}
-        values['past_latest'] = past[3 + m : ring]
-        values['past_pieces'] = past[ring:].reshape(-1, 1 + m)
-    return values
-
-
-def completed(values: Mapping[str, Any], like: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those numbers of version 1 that `like` names; what it did not remember is 0."""
-    found, names = {'version': VERSION}, dict(like)
-    if np.any(values.get('bridged', False)):  # else the state before a gap does not matter
-        names |= {f'before_{name}': value for name, value in like.items()}
-    for name, value in names.items():
-        nothing = np.zeros_like(value) if isinstance(value, np.ndarray) else type(value)(0)
-        found[name] = values.get(name, OLD_DEFAULTS.get(name, nothing))
-    return found
 
 
 def checked(values: Mapping[str, Any], like: Mapping[str, Any]) -> dict[str, Any]:

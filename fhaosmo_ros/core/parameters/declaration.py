@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a parameter is: declared once, checked everywhere by the same rules."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 import difflib
 import math
@@ -24,6 +24,36 @@ KINDS = {
     'string_array': 'a list of strings',
 }
 
+
+def _whole(value: Any) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return None
+
+
+def _text(value: Any) -> str | None:
+    return value if isinstance(value, str) else None
+
+
+def _expression(value: Any) -> str | None:
+    """Return a text: a bare 0 in `phi: [0, 0, -z3]` is a number to YAML, not to its writer."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return repr(value) if number else _text(value)
+
+
+ITEMS: dict[str, Callable[[Any], Any]] = {
+    'bool': lambda value: value if isinstance(value, bool) else None,
+    'int': _whole, 'double': _number, 'string': _text,
+    'double_array': _number, 'string_array': _expression,
+}  # fmt: skip
+"""What makes a value, or an item of a list, of what arrives; None where it is of another type."""
 ANY_NAME = '.NAME'
 """End of the name of a declaration that stands for any number of parameters."""
 
@@ -71,15 +101,10 @@ class Parameter:
     @property
     def kind(self) -> str:
         """One of the keys of `KINDS`."""
-        if isinstance(self.default, bool):
-            return 'bool'
-        if isinstance(self.default, int):
-            return 'int'
-        if isinstance(self.default, float):
-            return 'double'
-        if isinstance(self.default, str):
-            return 'string'
-        return 'string_array' if isinstance(self.default[0], str) else 'double_array'
+        is_list = isinstance(self.default, list)
+        item = self.default[0] if isinstance(self.default, list) else self.default
+        names = {bool: 'bool', int: 'int', float: 'double', str: 'string'}
+        return names[type(item)] + '_array' * is_list
 
     @property
     def slider(self) -> bool:
@@ -117,7 +142,7 @@ class Parameter:
         Return `value` in the parameter's own type, or raise.
 
         An integer is accepted where a number is meant, and so is a list that a command line
-        delivered as text because it mixes both (``"[15, 15.5]"``).
+        delivered as text because it mixes both (``"[15, 15.5]"``), and one number for a list.
 
         Raises
         ------
@@ -125,58 +150,35 @@ class Parameter:
             Wrong type, out of bounds, not finite or not one of the choices.
 
         """
-        original = value
-        if isinstance(value, str) and self.kind in ('double_array', 'string_array'):
+        given, kind = value, self.kind
+        is_list = kind.endswith('_array')
+        if is_list and isinstance(value, str):
             try:
                 value = parse(value)
             except ConfigurationError:
-                raise self.error(original) from None
+                raise self.error(given) from None
         if isinstance(value, np.ndarray | np.generic):
             value = value.tolist()
-        checked = self._typed(value)
-        if checked is None:
-            raise self.error(original)
-        items = checked if isinstance(checked, list) else [checked]
-        if not items or not all(self._within(item) for item in items):
-            raise self.error(original)
-        return checked
-
-    def _typed(self, value: Any) -> Value | None:
-        kind = self.kind
-        if kind == 'bool':
-            return value if isinstance(value, bool) else None
-        if kind == 'int':
-            return value if isinstance(value, int) and not isinstance(value, bool) else None
-        if kind == 'double':
-            return _number(value)
-        if kind == 'string':
-            return value if isinstance(value, str) else None
-        if kind == 'double_array' and _number(value) is not None:
-            value = [value]  # one number for every level
-        if kind == 'string_array' and isinstance(value, str):
+        if not is_list or isinstance(value, str if kind == 'string_array' else int | float):
             value = [value]
-        # Not only list and tuple: rclpy delivers array.array.
-        if isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
-            return None
-        if kind == 'string_array':
-            # A bare 0 in `phi: [0, 0, -z3]` is a number to YAML and an expression to its writer.
-            texts = [v if isinstance(v, str) else _expression_text(v) for v in value]
-            return None if any(v is None for v in texts) else [v for v in texts if v is not None]
-        numbers = [_number(v) for v in value]
-        return None if any(v is None for v in numbers) else [v for v in numbers if v is not None]
+        elif isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
+            raise self.error(given)  # rclpy delivers array.array, so any other iterable will do
+        items = [ITEMS[kind](item) for item in value]
+        if not items or not all(self._within(item) for item in items):
+            raise self.error(given)
+        return items if is_list else items[0]
 
     def _within(self, item: Any) -> bool:
-        if isinstance(item, str):
-            return not self.choices or item in self.choices
-        if isinstance(item, bool):
+        """Return True for a value of the right type, within the bounds."""
+        if item is None or (self.choices and item not in self.choices):
+            return False
+        if isinstance(item, bool | str):
             return True
         if isinstance(item, float) and not math.isfinite(item):
             return False
-        if self.lower is not None and (
-            item < self.lower or (self.lower_open and item == self.lower)
-        ):
-            return False
-        return self.upper is None or item <= self.upper
+        lower = -math.inf if self.lower is None else self.lower
+        upper = math.inf if self.upper is None else self.upper
+        return lower < item <= upper or (item == lower and not self.lower_open)
 
     def error(self, value: Any, allowed: str | None = None) -> ConfigurationError:
         """Build the error for `value`: what was wrong, what is allowed, what arrived."""
@@ -236,13 +238,7 @@ class ParameterTable(Mapping[str, Parameter]):
 
         `named` are keyword arguments, which win; lambda_ stands for lambda. `Parameters` of any
         table have been checked already and are not checked again: of a larger table the part that
-        this one declares is taken.
-
-        Raises
-        ------
-        ConfigurationError
-            An unknown name (with the closest known one), or a bad value.
-
+        this one declares is taken. Raises as `coerce`.
         """
         if named:
             named = {name.removesuffix('_'): value for name, value in named.items()}
@@ -308,15 +304,7 @@ class Parameters(Mapping[str, Any]):
         return f'Parameters({self._values!r})'
 
     def changed(self, changes: Mapping[str, Any]) -> 'Parameters':
-        """
-        Return these values with some changed; only the changes are checked.
-
-        Raises
-        ------
-        ConfigurationError
-            An unknown name or a bad value.
-
-        """
+        """Return these values with some changed, which are checked as by `coerce`."""
         if isinstance(changes, Parameters):
             return self.table.complete(changes)
         return Parameters(self.table, self._values | self.table.coerce(changes))
@@ -325,18 +313,8 @@ class Parameters(Mapping[str, Any]):
         """
         Return these values with some changed while something that was made of them runs.
 
-        Parameters
-        ----------
-        changes : mapping
-            Values to change, or complete `Parameters`.
-        running : str
-            What runs, for the message: 'observer'.
-
-        Raises
-        ------
-        ConfigurationError
-            As `changed`, or another value of a parameter that can't change live.
-
+        Raises as `changed`, or for another value of a parameter that can't change live; the
+        message says what is `running`, such as 'observer'.
         """
         parameters = self.changed(changes)
         for name in parameters:
@@ -365,19 +343,6 @@ def suggestion(word: str, known: Iterable[str]) -> str:
     """Return ``; did you mean 'x'?`` for the closest of `known`, or nothing."""
     close = difflib.get_close_matches(word, list(known), n=1)
     return f"; did you mean '{close[0]}'?" if close else ''
-
-
-def _number(value: Any) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        return float(value)
-    except OverflowError:
-        return None
-
-
-def _expression_text(value: Any) -> str | None:
-    return None if isinstance(value, bool) or not isinstance(value, int | float) else repr(value)
 
 
 def shown(value: Any) -> str:

@@ -83,21 +83,11 @@ def load(
 
 def loads(text: str, node: str, table: ParameterTable) -> dict[str, Any]:
     """Return what the text of a parameter file sets for a node; see `load`."""
-    return select(_of_node(_sections(text), node, strict=True), table)
+    return select(_of_node(text, node, strict=True), table)
 
 
 def dumps(values: Mapping[str, Any], node: str = '/**') -> str:
-    """
-    Return the text of a parameter file that sets these values.
-
-    Parameters
-    ----------
-    values : mapping
-        Of Python's own types.
-    node : str
-        The section's name: a node's full name, or a pattern.
-
-    """
+    """Return the text of a file that sets values of Python's own types for nodes of that name."""
     # Copies of the lists: PyYAML writes an alias where one list comes twice, and ROS reads none.
     copied = {name: list(v) if isinstance(v, list) else v for name, v in values.items()}
     content = {node: {'ros__parameters': copied}}
@@ -110,7 +100,7 @@ def read(path: str | Path, node: str, strict: bool = False) -> dict[str, Any]:
     try:
         with Path(path).open(encoding='utf-8') as file:
             text = file.read(MAX_LENGTH + 1)
-        return _of_node(_sections(text), node, strict)
+        return _of_node(text, node, strict)
     except OSError as error:
         problem = f'expected a readable file, got: {error.strerror}'
     except UnicodeDecodeError as error:
@@ -120,18 +110,28 @@ def read(path: str | Path, node: str, strict: bool = False) -> dict[str, Any]:
     raise ConfigurationError(f'{path}: {problem}')
 
 
-def _of_node(sections: Mapping[str, Mapping[str, Any]], node: str, strict: bool) -> dict[str, Any]:
+def _of_node(text: str, node: str, strict: bool) -> dict[str, Any]:
+    """Return the parameters in the sections of a text that are a node's."""
+    content = parse(text)
+    sections: dict[str, dict[str, Any]] = {}
+    if isinstance(content, Mapping):
+        _collect(content, '', sections)
+    if not sections:
+        raise ConfigurationError(
+            "expected 'NODE: {ros__parameters: {...}}' (NODE is a node's name or /**), "
+            f'got {shown(content)}'
+        )
     ours = [section for section in sections if _matches(section, node)]
     names = [section.lstrip('/') for section in sections]
-    misspelt = [name for name in names if _misspells(name, node)]
-    if misspelt and not ours and not strict:
-        raise ConfigurationError(
-            f"no section is that of node '{node}', got '{misspelt[0]}'; did you mean '{node}'?"
-        )
     if strict and not ours:
         raise ConfigurationError(
             f"expected a section '{node}' or '/**', got {', '.join(names)}"
             f'{suggestion(node, names)}'
+        )
+    misspelt = [name for name in names if _misspells(name, node)]
+    if misspelt and not ours:
+        raise ConfigurationError(
+            f"no section is that of node '{node}', got '{misspelt[0]}'; did you mean '{node}'?"
         )
     return {name: value for section in ours for name, value in sections[section].items()}
 
@@ -165,22 +165,9 @@ def select(values: Mapping[str, Any], table: ParameterTable) -> dict[str, Any]:
 
 def complete(values: Mapping[str, Any], table: ParameterTable) -> Parameters:
     """
-    Check what files and the command line set for a node, each value once.
+    Check what files and the command line set for a node, each value once; see `select`.
 
     The channels' own parameters are among the result; they default to the common values.
-
-    Parameters
-    ----------
-    values : mapping
-        Those of other nodes and rclpy's own are left out; see `select`.
-    table : ParameterTable
-        What the node declares, without the channels' own parameters.
-
-    Raises
-    ------
-    ConfigurationError
-        A name that no node of the package declares, or a bad value.
-
     """
     checked = select(values, table)
     own = with_own_parameters(checked.get(CHANNELS, UNNAMED), checked)
@@ -193,15 +180,7 @@ def make_from_file(
     """
     Return what `make` makes of the parameters that a file sets for a channel of an estimator.
 
-    Parameters
-    ----------
-    make : callable
-        Takes those of `ESTIMATOR_PARAMETERS`, complete.
-    path : path
-    node : str
-        Full or last part of the node's name.
-    channel : str
-        Name of the channel; '' for a node with a single one.
+    The channel of a node that has a single one is called ''.
 
     Raises
     ------
@@ -244,41 +223,23 @@ def with_origin(
     return ConfigurationError(f'{origin}: {error}') if origin else error
 
 
-def _sections(text: str) -> dict[str, dict[str, Any]]:
-    content = parse(text)
-    sections: dict[str, dict[str, Any]] = {}
-    if isinstance(content, Mapping):
-        _collect(content, '', sections)
-    if not sections:
-        raise ConfigurationError(
-            "expected 'NODE: {ros__parameters: {...}}' (NODE is a node's name or /**), "
-            f'got {shown(content)}'
-        )
-    return sections
-
-
 def _collect(content: Mapping[Any, Any], name: str, out: dict[str, dict[str, Any]]) -> None:
-    shown_name = name.replace('//', '/')
+    """Add the sections below `name`, and their parameters by their dotted names."""
+    section = name.replace('//', '/')
     for key, value in content.items():
-        if key == 'ros__parameters':
-            if not isinstance(value, Mapping):
-                raise ConfigurationError(
-                    f"section '{shown_name}': expected parameters below ros__parameters, "
-                    f'got {shown(value)}'
-                )
-            section: dict[str, Any] = {}
-            for parameter, setting in _flat(value):
-                if parameter in section:
-                    raise ConfigurationError(f"section '{shown_name}': '{parameter}' is set twice")
-                section[parameter] = setting
-            out.setdefault(name, {}).update(section)
-        elif isinstance(value, Mapping):
+        if not isinstance(value, Mapping):
+            place = f"parameters below ros__parameters of section '{section}'"
+            if key != 'ros__parameters':
+                place = f"ros__parameters below '{section or key}'"
+            raise ConfigurationError(f'expected {place}, got {shown(key)}: {shown(value)}')
+        if key != 'ros__parameters':
             _collect(value, f'{name}/{key}', out)
-        else:
-            raise ConfigurationError(
-                f"expected ros__parameters below '{shown_name or key}', "
-                f'got {shown(key)}: {shown(value)}'
-            )
+            continue
+        parameters = out.setdefault(name, {})
+        for parameter, setting in _flat(value):
+            if parameter in parameters:
+                raise ConfigurationError(f"section '{section}': '{parameter}' is set twice")
+            parameters[parameter] = setting
 
 
 def _flat(values: Mapping[Any, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
@@ -302,12 +263,7 @@ def check_one_type(name: str, value: Any) -> None:
 
 
 def _misspells(section: str, node: str) -> bool:
-    """
-    Return True if the last part of a section's name is nearly, but not quite, the node's.
-
-    Names that differ in numbers only are two nodes' (arm1, arm2), and so are those that differ in
-    the namespace.
-    """
+    """Return True if a section's last part is nearly the node's; numbers make other nodes."""
     theirs, ours = section.rsplit('/', 1)[-1], node.rsplit('/', 1)[-1]
     if re.sub(r'\d+', '', theirs) == re.sub(r'\d+', '', ours):
         return False

@@ -37,11 +37,8 @@ def channel_names(values: Mapping[str, Any]) -> list[str]:
     """
     Return the names of the channels that `values` declare, `UNNAMED` if they declare none.
 
-    Raises
-    ------
-    ConfigurationError
-        A name that is not valid in a topic, that comes twice, or that is a parameter's name.
-
+    A name that is not valid in a topic, that comes twice, or that is a parameter's name raises
+    ConfigurationError.
     """
     declared = ESTIMATOR_PARAMETERS[CHANNELS]
     names: Any = declared.coerce(values.get(CHANNELS, UNNAMED))
@@ -59,10 +56,10 @@ def channel_names(values: Mapping[str, Any]) -> list[str]:
 
 def with_own_parameters(names: list[str], values: Iterable[str]) -> list[str]:
     """
-    Return the channels whose own parameters may be among `values`.
+    Return the channels whose own parameters may be among `values`: `names`.
 
-    These are `names`, as `channel_names` returns them; where they are `FROM_JOINTS`, every name
-    that has a parameter of its own: whether there is such a joint turns out later.
+    Where these are `FROM_JOINTS`, it is every name that has a parameter of its own: whether there
+    is such a joint turns out later.
     """
     if names != FROM_JOINTS:
         return names
@@ -78,17 +75,9 @@ def with_channels(
     table: Mapping[str, Parameter], names: Iterable[str], values: Mapping[str, Any] | None = None
 ) -> ParameterTable:
     """
-    Return `table` and, for each named channel, its own parameters.
+    Return `table` and, for each named channel, a copy of the `CHANNEL_PARAMETERS` in it.
 
-    Parameters
-    ----------
-    table : mapping
-        The common parameters; `CHANNEL_PARAMETERS` among them get a copy for each channel.
-    names : iterable of str
-        As `channel_names` returns them.
-    values : mapping, optional
-        Checked common values: what a channel's own parameters default to.
-
+    The copies default to the checked common `values`.
     """
     values = values or {}
     declared = ParameterTable(table.values(), CHANNEL_PARAMETERS.families)
@@ -138,16 +127,9 @@ def differing(values: Parameters) -> dict[str, Any]:
 
 def followers(name: str, names: Iterable[str], own: Collection[str]) -> list[str]:
     """
-    Return the parameters of channels that change along with the common one called `name`.
+    Return the parameters of the channels `names` that follow the common one called `name`.
 
-    Parameters
-    ----------
-    name : str
-    names : iterable of str
-        The channels.
-    own : collection of str
-        Parameters of channels that have been set themselves, and so do not follow.
-
+    Those in `own` have been set themselves, and so do not follow.
     """
     if name not in CHANNEL_PARAMETERS:
         return []

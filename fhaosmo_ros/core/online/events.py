@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Events: d, or its change, is larger than it should be for longer than it may.
+
+An event begins where |s| has exceeded the limit L = max(event_threshold, event_deviations sigma)
+for event_duration, and ends where |s| <= event_release L. s is d, or what d lies from its running
+mean m by (event_change_time T > 0), which begins with the mean of the first T seconds, in which
+nothing is judged:
+
+    m' = (d - m) / T,   s = d - m
+
+sigma is the standard deviation of d. Where that grows, sigma follows with a lag, because what is
+not expected makes a self-tuning observer less sure of d at once, and this must not hide it:
+
+    (log sigma)' = (log deviation - log sigma) / (tuning_memory, a quarter of it while |s| > L)
+
+With tuning_memory = 0 the lag is 800 samples.
+
+Rejected samples do not count. After a restart nothing is known, so an event ends there.
+"""
+
+from collections import deque
+from collections.abc import Mapping
+import math
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core.observer.status import DIVERGED, RESTARTED, UNUSED
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+import numpy as np
+from numpy.typing import ArrayLike
+
+SECOND = 1_000_000_000
+LONG = 1e9
+MOST = 10_000
+"""Events that are kept until somebody takes them."""
+GROWTH, QUICKER = 800.0, 4.0
+"""The lag of sigma in samples, with tuning_memory = 0; how much quicker while an event lasts."""
+EARLIEST = -(2**63)
+
+
+# What a detector does: it waits for a standard deviation; learns the mean; nothing is beyond the
+# limit; it is, not for long enough yet; an event lasts; the estimates of one were lost.
+FRESH, LEARNING, QUIET, BEYOND, ACTIVE, LOST = range(6)
+
+
+class Event(NamedTuple):
+    """
+    Begin or end of an event.
+
+    Attributes
+    ----------
+    stamp : int
+        Of the estimate at which it was found, in nanoseconds.
+    begins : bool
+    since : int
+        Stamp of the first estimate beyond the limit, in nanoseconds.
+    value : float
+        d, or its change.
+    limit : float
+        What it has to exceed; infinite where the estimates were lost.
+    deviation : float
+        Standard deviation of d; NaN where it is not known.
+    sample : int
+        Number of the sample among those that were given at once.
+
+    """
+
+    stamp: int
+    begins: bool
+    since: int
+    value: float
+    limit: float
+    deviation: float
+    sample: int = 0
+
+
+class EventDetector:
+    """
+    Finds events in estimates of d; an `OnlineEstimator` has one.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Those whose names begin with ``event_``, and tuning_memory; others are left alone.
+    max_gap : float
+        After a longer time durations begin anew, in seconds; 0: never.
+
+    Attributes
+    ----------
+    on : bool
+        True if events are asked for.
+    waiting : deque of Event
+        Those that nobody has taken yet, at most the latest 10,000.
+    latest : Event or None
+    count : int
+        Events that have begun.
+
+    """
+
+    def __init__(self, parameters: Mapping[str, Any], max_gap: float = 0.0) -> None:
+        self.waiting: deque[Event] = deque(maxlen=MOST)
+        self.latest: Event | None = None
+        self.on, self.count, self._change_time = False, 0, 0.0
+        self._doing = FRESH
+        self._since = self._stamp = self._time = 0
+        self._mean = self._deviation = 0.0
+        self.configure(parameters, max_gap)
+
+    @property
+    def memory(self) -> dict[str, Any]:
+        """
+        What it remembers, for snapshots.
+
+        What is being done; since when, by the times and by the stamps of samples, and the time of
+        the latest one (ns); the running mean of d, and the deviation that events are judged by.
+        """
+        return {
+            'event': self._doing, 'event_since': self._since, 'event_stamp': self._stamp,
+            'event_time': self._time, 'event_mean': self._mean, 'event_deviation': self._deviation,
+        }  # fmt: skip
+
+    @memory.setter
+    def memory(self, values: Mapping[str, Any]) -> None:
+        self._doing, self._since, self._stamp, self._time, self._mean, self._deviation = (
+            values[name] for name in self.memory
+        )
+
+    @property
+    def active(self) -> bool:
+        """True while an event lasts."""
+        return self._doing >= ACTIVE
+
+    def configure(self, parameters: Mapping[str, Any], max_gap: float = 0.0) -> None:
+        """Go on with other parameters; an event that lasts ends if none are asked for."""
+        change_time = float(round(parameters['event_change_time'] * SECOND))
+        if self.on and change_time != self._change_time:
+            self.reset()
+        self._change_time, self._max_gap = change_time, round((max_gap or LONG) * SECOND)
+        self._threshold, self._deviations, self._release = (
+            parameters[f'event_{name}'] for name in ('threshold', 'deviations', 'release')
+        )
+        self._duration = round(parameters['event_duration'] * SECOND)
+        self._growth = float(round(parameters['tuning_memory'] * SECOND))
+        on = self._threshold > 0.0 or self._deviations > 0.0
+        if self.on and not on:
+            self._doing, self.latest = FRESH, None
+        self.on = on
+
+    def reset(self) -> None:
+        """Expect estimates of a fresh observer: what was known of the mean does not count."""
+        self._doing = LOST if self.active else FRESH
+
+    def take(
+        self,
+        stamps: ArrayLike,
+        d: ArrayLike,
+        deviations: ArrayLike | None = None,
+        times: ArrayLike | None = None,
+        words: ArrayLike | None = None,
+    ) -> None:
+        """
+        Take estimates in order; events go to `waiting`.
+
+        Parameters
+        ----------
+        stamps : (K,) array of int
+            Times of the estimates in nanoseconds, that events are to have.
+        d, deviations : (K,) arrays
+            Estimates of d; their standard deviations, infinite where not known yet. Without them
+            event_deviations has no effect.
+        times : (K,) array of int, optional
+            By which durations are measured, in nanoseconds; the stamps, else.
+        words : (K,) array of int, optional
+            Status words of the samples.
+
+        """
+        count = np.size(d)
+        columns: list[ArrayLike] = [
+            stamps, stamps if times is None else times, np.zeros(count, dtype=np.int64), d,
+            np.zeros(count) if deviations is None else deviations,
+        ]  # fmt: skip
+        if words is not None:
+            columns[2] = words
+        rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
+        for k, (stamp, time, word, value, deviation) in enumerate(rows):
+            if word & UNUSED:
+                continue
+            found = self._judge(stamp, time, word & (RESTARTED | DIVERGED) != 0, value, deviation)
+            if found is not None:
+                begins, signal, limit = found
+                known = math.nan if deviations is None else deviation
+                self.latest = Event(stamp, begins, self._stamp, signal, limit, known, k)
+                self.waiting.append(self.latest)
+                self.count += begins
+
+    def _judge(
+        self, stamp: int, now: int, restarted: bool, d: float, deviation: float
+    ) -> tuple[bool, float, float] | None:
+        """Take an estimate; where an event begins or ends, return if it begins, s and L."""
+        elapsed = now - self._time
+        self._time = now
+        if restarted:
+            self.reset()
+        elif not 0 <= elapsed <= self._max_gap:  # stamps of another clock: see forget_stamp
+            self._since = max(self._since + elapsed, EARLIEST)
+            elapsed = 0
+        if self._doing == LOST:
+            self._doing = FRESH
+            return False, d, math.inf
+        self._deviation = self._sigma(elapsed, deviation)
+        if self._doing == FRESH:
+            self._since, self._mean = now, d
+            if math.isfinite(deviation):
+                self._doing = LEARNING
+        if self._doing == LEARNING:
+            past = now - self._since
+            if past > 0:
+                self._mean += min(elapsed, past) / past * (d - self._mean)
+            if past >= self._change_time:
+                self._doing = QUIET
+        signal = d
+        if self._change_time > 0.0:
+            signal = d - self._mean
+            if self._doing > LEARNING:
+                self._mean -= math.expm1(-elapsed / self._change_time) * signal
+        limit = max(self._threshold, self._deviations * self._deviation)
+        if self._doing == ACTIVE:
+            if abs(signal) > self._release * limit:
+                return None
+            self._doing, self._deviation = QUIET, deviation
+            return False, signal, limit
+        if self._doing < QUIET:
+            return None
+        if not abs(signal) > limit:
+            self._doing = QUIET
+            return None
+        if self._doing == QUIET:
+            self._doing, self._since, self._stamp = BEYOND, now, stamp
+        if now - self._since < self._duration:
+            return None
+        self._doing = ACTIVE
+        return True, signal, limit
+
+    def _sigma(self, elapsed: int, deviation: float) -> float:
+        """Return the standard deviation that events are judged by from now on."""
+        sigma = self._deviation
+        if self._doing == FRESH or sigma <= 0.0:
+            return deviation
+        if deviation > sigma:
+            lag = (self._growth or GROWTH) / (QUICKER if self._doing > QUIET else 1.0)
+            share = elapsed if self._growth > 0.0 else 1.0
+            sigma *= math.pow(deviation / sigma, -math.expm1(-share / lag))
+        return min(sigma, deviation)
+
+    def taken(self) -> list[Event]:
+        """Return the events that have waited; they wait no more."""
+        events = list(self.waiting)
+        self.waiting.clear()
+        return events
+
+
+def described(event: Event, unit: str = '') -> tuple[str, dict[str, str]]:
+    """Return an event in words, and its numbers by name, for messages."""
+    seconds = (event.stamp - event.since) * 1e-9
+    d = ' '.join(filter(None, (f'{event.value:.4g}', unit)))
+    if event.begins:
+        text = f'unknown input {d}, beyond {event.limit:.4g} for {seconds:.3g} s'
+    else:
+        text = f'ended after {seconds:.3g} s'
+    second, nanosecond = divmod(event.since, SECOND)
+    return text, {
+        'value': f'{event.value:.9g}',
+        'limit': f'{event.limit:.9g}',
+        'standard deviation': f'{event.deviation:.9g}',
+        'since': f'{second}.{nanosecond:09d}',
+    }
+
+
+def check_events(parameters: Mapping[str, Any]) -> None:
+    """Raise ConfigurationError where standard deviations are asked for that nobody knows."""
+    k, gains = parameters['event_deviations'], parameters['gains']
+    if k and gains != 'self_tuning':
+        raise ConfigurationError(
+            "parameters 'event_deviations', 'gains': expected gains = 'self_tuning', which knows "
+            f'the standard deviation of d, or event_deviations = 0 (event_threshold needs no '
+            f'standard deviation), got {k:g} and {gains!r}'
+        )
