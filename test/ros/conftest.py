@@ -1,22 +1,118 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes for the tests of a module."""
+"""Nodes for the tests: some live for one module, some for the whole session."""
 
 import contextlib
 
 import pytest
 
-pytest.register_assert_rewrite('rig')
+pytest.register_assert_rewrite('rig', 'running')
+
+FED = {
+    'publish_on': 'sample', 'max_gap': 60.0, 'input_reliability': 'reliable',
+    'diagnostics_period': 0.2,
+}  # fmt: skip
+"""For an estimator that a test feeds: each sample is answered at once, and no gap restarts it."""
+
+LAX = {'warn_jitter_above': 1e6, 'warn_delay_above': 1e6, 'diagnostics_period': 0.2}
+"""A loaded machine is no reason for a warning here."""
+
+
+@contextlib.contextmanager
+def _launcher(folders):
+    from running import arguments, Process
+
+    processes = []
+
+    def launch(name, *words, **values):
+        """Start `fhaosmo NAME` with these parameters, and perhaps further words."""
+        path = folders.mktemp('node') / 'output'
+        command = ['-m', 'fhaosmo_ros', name, *arguments(**values), *words]
+        processes.append(Process(path, *command))
+        return processes[-1]
+
+    try:
+        yield launch
+        for process in processes:
+            process.interrupt()
+        for process in processes:
+            process.check_end()
+    finally:
+        for process in processes:
+            process.kill()
+
+
+@pytest.fixture(scope='session')
+def user():
+    """Return a node that hears, publishes and asks."""
+    from running import User
+
+    user = User()
+    yield user
+    user.close()
+
+
+@pytest.fixture(scope='module')
+def launch(tmp_path_factory):
+    """Return a function that starts a node, which lives until the end of the module."""
+    with _launcher(tmp_path_factory) as launch:
+        yield launch
+
+
+@pytest.fixture(scope='module')
+def estimator(launch, user):
+    """Return a function that starts an estimator and knows its topics."""
+    from running import Estimator
+
+    def start(namespace, *words, **values):
+        process = launch('estimator', *words, namespace=namespace, **values)
+        return Estimator(user, process, namespace, values.get('gains') != 'self_tuning')
+
+    return start
+
+
+@pytest.fixture(scope='session')
+def pair(tmp_path_factory, user):
+    """Return an estimator that hears a plant; the plant's parameters are its attribute."""
+    from running import Estimator, Parameters
+
+    with _launcher(tmp_path_factory) as launch:
+        launch('plant', namespace='/pair', sample_rate=500.0)
+        estimator = Estimator(user, launch('estimator', namespace='/pair', **LAX), '/pair')
+        estimator.plant = Parameters(user, '/pair/plant')
+        yield estimator
+
+
+@pytest.fixture(scope='session')
+def _fed(tmp_path_factory, user):
+    from running import Estimator
+
+    with _launcher(tmp_path_factory) as launch:
+        process = launch('estimator', namespace='/fed', **FED)
+        yield Estimator(user, process, '/fed').greet()
+
+
+@pytest.fixture
+def fed(_fed):
+    """Return an estimator that a test feeds, as it was at its start."""
+    from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+
+    live = [name for name, parameter in ESTIMATOR_PARAMETERS.items() if parameter.live]
+    start = {name: ESTIMATOR_PARAMETERS[name].default for name in live} | FED
+    _fed.parameters.set(**{name: start[name] for name in live})
+    _fed.reset()
+    return _fed
+
+
+# Fixtures of the tests that still use rig.
 
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """Return a function that makes a fresh folder."""
     return lambda: tmp_path_factory.mktemp('node')
 
 
 @pytest.fixture(scope='module')
 def stack():
-    """Return an exit stack that lives as long as the module's tests."""
     with contextlib.ExitStack() as exit_stack:
         yield exit_stack
 
@@ -30,7 +126,6 @@ def client(stack):
 
 @pytest.fixture(scope='module')
 def start(stack, folder):
-    """Return a function that starts a node's process."""
     from rig import node_process
 
     return lambda *arguments: stack.enter_context(node_process(folder(), *arguments))

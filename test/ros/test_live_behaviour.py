@@ -96,7 +96,7 @@ ELSEWHERE = {
     'publish_on', 'measurement_unit', 'unknown_input_unit', 'unknown_input_scale',
     'prediction_step',  # between samples this close it moves the last digits only: test_levant.py
 }  # fmt: skip
-"""Tested below, in test_parameters_live.py, test_diagnostics.py and test_messages.py."""
+"""Tested below, in test_parameters.py, test_diagnostics.py and test_messages.py."""
 
 
 def test_no_live_parameter_is_left_out():

@@ -1,0 +1,447 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes as a user starts them, and a user that hears, feeds and asks them."""
+
+from bisect import bisect_right
+from collections import defaultdict
+import inspect
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import threading
+import time
+from typing import NamedTuple
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+import fhaosmo_ros
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from std_msgs.msg import Float64, Float64MultiArray
+from std_srvs.srv import Trigger
+
+try:
+    from rclpy.experimental import EventsExecutor as Executor
+except ImportError:  # an older rclpy
+    Executor = SingleThreadedExecutor
+
+ROOT = Path(fhaosmo_ros.__file__).parents[1]
+DEADLINE = 60.0
+"""Seconds for what takes one on a quiet machine."""
+TRIES = 4
+"""Of a call, which share the deadline: the middleware may lose the first one of a new client."""
+SECOND = 1_000_000_000
+OK, WARN, ERROR, STALE = b'\0', b'\1', b'\2', b'\3'
+QOS = QoSProfile(depth=10_000)
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+ESTIMATES = {
+    'state': Float64MultiArray, 'unknown_input': Float64, 'gamma': Float64,
+    'innovation': Float64MultiArray, 'stamp': Time,
+}  # fmt: skip
+
+
+def nanoseconds(stamp: Time) -> int:
+    return stamp.sec * SECOND + stamp.nanosec
+
+
+def as_time(stamp: int) -> Time:
+    return Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
+
+
+def arguments(namespace: str = '', **values: object) -> list[str]:
+    """Return the words that set a node's namespace and parameters; `lambda_` sets lambda."""
+    words = ['--ros-args', *(['-r', f'__ns:={namespace}'] if namespace else [])]
+    for name, value in values.items():
+        words += ['-p', f'{name.rstrip("_")}:={value}']
+    return words
+
+
+class Process:
+    """A process whose output is kept in a file."""
+
+    def __init__(self, path: Path, *words: object, **environment: object) -> None:
+        self._path = path
+        self._may_end = False
+        with path.open('wb') as out:
+            self._process = subprocess.Popen(
+                [sys.executable, *map(str, words)],
+                cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=out,
+                env=os.environ | {name: str(value) for name, value in environment.items()},
+                # A test under nohup ignores SIGHUP, and so would the node.
+                preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
+            )  # fmt: skip
+
+    @property
+    def output(self) -> str:
+        return self._path.read_text(errors='replace')
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def send(self, number: int) -> None:
+        self._process.send_signal(number)
+
+    def wait(self, timeout: float = DEADLINE) -> int:
+        """Return the exit code of a process that is to end."""
+        self._may_end = True
+        return self._process.wait(timeout)
+
+    def kill(self) -> None:
+        if self.running:
+            self._process.kill()
+            self._process.wait()
+
+    def interrupt(self) -> None:
+        """Send SIGINT to a process that has to be running, if nobody has ended it."""
+        if not self._may_end:
+            assert self.running, f'it has ended by itself:\n{self.output}'
+            self.send(signal.SIGINT)
+
+    def check_end(self) -> None:
+        """Wait for the end after `interrupt`: a good one, with nothing terrible said."""
+        awaited = self._may_end
+        assert self.wait() == 0 or awaited, self.output
+        assert 'Traceback' not in self.output, self.output
+
+
+class Published(NamedTuple):
+    """A message with its source time stamp in nanoseconds."""
+
+    stamp: int
+    message: object
+
+
+class Report(NamedTuple):
+    """A message on /diagnostics: its own time in nanoseconds, and statuses by their tasks."""
+
+    stamp: int
+    time: int
+    statuses: dict
+
+
+class Estimate(NamedTuple):
+    """What was published for one sample."""
+
+    stamp: int
+    z: list[float]
+    unknown_input: float
+    gamma: float | None
+    innovation: list[float]
+
+
+class User:
+    """A node of the tests' own, with a thread that receives."""
+
+    def __init__(self) -> None:
+        context = Context()
+        rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node('user', context=context, use_global_arguments=False)
+        self._changed = threading.Condition()
+        self._clients: dict[str, object] = {}
+        self.reports: dict[str, list[Report]] = defaultdict(list)
+        self._listen('/diagnostics', DiagnosticArray, self._on_report)
+        self._executor = Executor(context=context)
+        self._executor.add_node(self.node)
+        self._end = Future()
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._end.set_result(None)
+        self._executor.wake()
+        self._thread.join()
+        self.node.destroy_node()
+        self.node.context.try_shutdown()
+
+    def _spin(self) -> None:
+        while not self._end.done():
+            # Without a timeout, the events executor of rclpy 7.1 runs no callback.
+            self._executor.spin_until_future_complete(self._end, timeout_sec=3600.0)
+
+    def _on_report(self, stamp: int, message: DiagnosticArray) -> None:
+        node = message.status[0].name.partition(': ')[0]
+        statuses = {status.name.partition(': ')[2]: status for status in message.status}
+        time = nanoseconds(message.header.stamp)
+        self.reports[node].append(Report(stamp, time, statuses))
+
+    def _listen(self, topic: str, kind: type, callback, qos: QoSProfile = QOS) -> None:
+        # By its signature rclpy knows that it takes both, but the events executor of rclpy 7.1
+        # hands them over as a tuple.
+        def receive(message: object, info: dict | None = None) -> None:
+            message, info = message if info is None else (message, info)
+            with self._changed:
+                callback(info['source_timestamp'], message)
+                self._changed.notify_all()
+
+        receive.__signature__ = inspect.signature(lambda message, info: None)
+        self.node.create_subscription(kind, topic, receive, qos)
+
+    def record(self, topic: str, kind: type, qos: QoSProfile = QOS) -> list[Published]:
+        """Return a list that grows with the messages of a topic."""
+        messages: list[Published] = []
+        self._listen(topic, kind, lambda *m: messages.append(Published(*m)), qos)
+        return messages
+
+    def publisher(self, topic: str, kind: type = Float64, heard: int = 1, qos: QoSProfile = QOS):
+        """Return a publisher once so many subscriptions hear it."""
+        publisher = self.node.create_publisher(kind, topic, qos)
+        self.wait(lambda: publisher.get_subscription_count() >= heard, f'subscription of {topic}')
+        return publisher
+
+    def wait(self, condition, what: str, timeout: float = DEADLINE) -> None:
+        """Wait until `condition` holds; it is looked at on every message, and now and then."""
+        end = time.monotonic() + timeout
+        # Without the lock: a condition that calls a service needs the thread that receives.
+        while not condition():
+            if time.monotonic() > end:
+                raise TimeoutError(f'no {what} within {timeout} s')
+            with self._changed:
+                self._changed.wait(0.05)
+
+    def client(self, service: str, kind: type):
+        """Return the client of a service that is there."""
+        if service not in self._clients:
+            self._clients[service] = self.node.create_client(kind, service)
+        self.wait(self._clients[service].service_is_ready, f'service {service}')
+        return self._clients[service]
+
+    def call(self, service: str, kind: type, request: object):
+        """Return a service's answer."""
+        return self.answer(self.client(service, kind).call_async, request)
+
+    def answer(self, ask, *request: object):
+        """Return the answer to a request, asked again where it gets lost."""
+        done = threading.Event()
+        futures = []
+        for _ in range(TRIES):
+            futures.append(ask(*request))
+            futures[-1].add_done_callback(lambda _: done.set())
+            if done.wait(DEADLINE / TRIES):
+                return next(future.result() for future in futures if future.done())
+        raise TimeoutError(f'no answer within {DEADLINE} s')
+
+
+class Parameters:
+    """The parameter services of a node, as the `ros2 param` commands use them."""
+
+    def __init__(self, user: User, node: str) -> None:
+        self._answer = user.answer
+        self.service = AsyncParameterClient(user.node, node)
+        user.wait(self.service.services_are_ready, f'parameter services of {node}')
+
+    def names(self) -> set[str]:
+        return set(self._answer(self.service.list_parameters).result.names)
+
+    def describe(self, *names: str) -> dict:
+        answer = self._answer(self.service.describe_parameters, names)
+        return {d.name: d for d in answer.descriptors}
+
+    def messages(self, *names: str) -> list:
+        return list(self._answer(self.service.get_parameters, names).values)
+
+    def all(self, names) -> dict[str, object]:
+        """Return values by name."""
+        values = map(parameter_value_to_python, self.messages(*names))
+        return {
+            name: value if isinstance(value, bool | int | float | str) else list(value)
+            for name, value in zip(names, values, strict=True)
+        }
+
+    def get(self, name: str) -> object:
+        return self.all([name])[name]
+
+    def try_to_set(self, name: str, value: object, text: bool = False):
+        """Return the result; a `text` is read as `ros2 param set` reads it."""
+        message = Parameter(name, value=value).to_parameter_msg()
+        if text:
+            message.value = get_parameter_value(value)
+        return self._answer(self.service.set_parameters, [message]).results[0]
+
+    def try_to_set_together(self, **values: object):
+        # 'lambda' is a keyword in Python, so the tests write lambda_
+        changes = [Parameter(name.rstrip('_'), value=value) for name, value in values.items()]
+        return self._answer(self.service.set_parameters_atomically, changes).result
+
+    def set(self, **values: object) -> None:
+        result = self.try_to_set_together(**values)
+        assert result.successful, result.reason
+
+
+GOALS = {
+    'configure': 'inactive', 'activate': 'active', 'deactivate': 'inactive',
+    'cleanup': 'unconfigured', 'shutdown': 'finalized',
+}  # fmt: skip
+"""State that a transition leads to, where it succeeds."""
+
+
+class Manager:
+    """Drives a managed node; what it answers is what a user of `ros2 lifecycle` sees."""
+
+    def __init__(self, user: User, node: str) -> None:
+        self._user, self._node = user, node
+
+    def _call(self, service: str, kind: type, **request: object):
+        return self._user.call(f'{self._node}/{service}', kind, kind.Request(**request))
+
+    def state(self) -> str:
+        return self._call('get_state', GetState).current_state.label
+
+    def transitions(self) -> set[str]:
+        answer = self._call('get_available_transitions', GetAvailableTransitions)
+        return {t.transition.label for t in answer.available_transitions}
+
+    def change(self, transition: int | str) -> bool:
+        by_label = isinstance(transition, str)
+        wanted = Transition(label=transition) if by_label else Transition(id=transition)
+        goal, before = GOALS.get(transition), self.state()
+        answer = self._call('change_state', ChangeState, transition=wanted)
+        # Asked again after a lost answer, the node refuses a transition that it has made.
+        return answer.success or (before != goal and self.state() == goal)
+
+
+class Estimator:
+    """A running estimator: what it publishes, what it says and what it can be asked."""
+
+    def __init__(self, user: User, process: Process, namespace: str, gamma: bool = True) -> None:
+        self.user, self.process = user, process
+        self.name = f'{namespace}/estimator'
+        self.topics = {
+            topic: user.record(f'{self.name}/{topic}', kind)
+            for topic, kind in ESTIMATES.items() if gamma or topic != 'gamma'
+        }  # fmt: skip
+        self.reports = user.reports[self.name.lstrip('/')]
+        self.y = user.record(f'{namespace}/y', Float64)
+        self._topic = f'{namespace}/y'
+        self._estimates: list[Estimate] = []
+        self._ticks = 0
+        user.wait(
+            lambda: all(user.node.count_publishers(f'{self.name}/{t}') for t in self.topics),
+            f'publishers of {self.name}',
+        )
+        self.parameters = Parameters(user, self.name)
+
+    # What it is sent.
+
+    def greet(self) -> 'Estimator':
+        """Publish samples until each is answered, then have it start afresh."""
+        self._publisher = self.user.publisher(self._topic, heard=2)  # it and our own record
+
+        def answered() -> bool:
+            stamp = self.send(0.0)
+            try:
+                self.wait_estimate(lambda e: e.stamp == stamp, 'first estimate', 1.0)
+            except TimeoutError:
+                return False
+            return True
+
+        self.user.wait(answered, f'answer of {self.name} to samples')
+        assert self.reset().success
+        return self
+
+    def reset(self):
+        return self.user.call(f'{self.name}/reset', Trigger, Trigger.Request())
+
+    def send(self, y: float) -> int:
+        """Publish one sample and return its source stamp."""
+        before = len(self.y)
+        self._publisher.publish(Float64(data=y))
+        self.user.wait(lambda: len(self.y) > before, 'own sample')
+        return self.y[-1].stamp
+
+    def feed(self, y: float) -> Estimate:
+        """Publish one sample, wait for the estimate that belongs to it and return it."""
+        stamp = self.send(y)
+        return self.wait_estimate(lambda e: e.stamp == stamp, f'estimate for y = {y}')
+
+    # What it publishes.
+
+    @property
+    def estimates(self) -> list[Estimate]:
+        """What has been published, by tick: a tick publishes `stamp` last."""
+        ticks = self.topics['stamp']
+        while self._ticks < len(ticks):
+            until = ticks[self._ticks].stamp
+            since = ticks[self._ticks - 1].stamp if self._ticks else 0
+            found = {}
+            for topic, messages in self.topics.items():
+                k = bisect_right(messages, until, key=lambda m: m.stamp) - 1
+                if not messages or (k >= 0 and messages[k].stamp <= since):
+                    return self._estimates  # this one is still on its way
+                found[topic] = messages[k].message if k >= 0 else None
+            self._ticks += 1
+            if None not in found.values():  # else one was sent before this user listened
+                self._estimates.append(
+                    Estimate(
+                        nanoseconds(found['stamp']),
+                        list(found['state'].data), found['unknown_input'].data,
+                        found['gamma'].data if 'gamma' in found else None,
+                        list(found['innovation'].data),
+                    )
+                )  # fmt: skip
+        return self._estimates
+
+    def wait_estimate(self, condition, what: str, timeout: float = DEADLINE) -> Estimate:
+        found: list[Estimate] = []
+
+        def look() -> bool:
+            found[:] = [e for e in self.estimates[-50:] if condition(e)]
+            return bool(found)
+
+        self.user.wait(look, what, timeout)
+        return found[-1]
+
+    # What it says.
+
+    def said(self, *words: str) -> list[str]:
+        """Return the lines of its log that have these words."""
+        lines = self.process.output.splitlines()
+        return [line for line in lines if all(word in line for word in words)]
+
+    def wait_said(self, *words: str) -> None:
+        self.user.wait(lambda: self.said(*words), f'{words} in the log')
+
+    def value(self, key: str) -> str | None:
+        """Return a value of the latest report that has it."""
+        for report in reversed(self.reports):
+            for status in report.statuses.values():
+                for pair in status.values:
+                    if pair.key == key:
+                        return pair.value
+        return None
+
+    def count(self, key: str) -> int:
+        return int(self.value(key) or 0)
+
+    def wait_count(self, key: str, value: int) -> None:
+        self.user.wait(lambda: self.count(key) >= value, f'{key!r} of {value} in diagnostics')
+
+    def wait_status(self, task: str, level: bytes, *words: str, since: int | None = None):
+        """
+        Return a status of a task with this level and these words in its message.
+
+        Of those that come from now on, or from the `since`-th report on.
+        """
+        since = len(self.reports) if since is None else since
+        found = []
+
+        def look() -> bool:
+            found[:] = [
+                status for report in self.reports[since:] for name, status in
+                report.statuses.items() if name == task and status.level == level
+                and all(word in status.message for word in words)
+            ]  # fmt: skip
+            return bool(found)
+
+        self.user.wait(look, f'{task} with level {level} and {words}')
+        return found[-1]
