@@ -445,12 +445,13 @@ def test_tick_that_comes_early_makes_no_sample_late():
     assert estimator.counters.accepted > 150
 
 
-def test_samples_of_a_clock_that_jumps_back_restart_within_one_tick():
+@pytest.mark.parametrize('together', [25, 1])
+def test_samples_of_a_clock_that_jumps_back_restart_within_one_tick(together):
     estimator = OnlineEstimator({'sampling': 'clock'})
     for k in range(500):
-        estimator.update(START + k // 25 * 25 * MS, sample(k))
+        estimator.update(START + k // together * together * MS, sample(k))
     for k in range(50):
-        estimator.update(10 * MS + k // 25 * 25 * MS, sample(k))
+        estimator.update(10 * MS + k // together * together * MS, sample(k))
     counters = estimator.counters
     assert counters.restarts_backward == counters.restarts == 1
     assert 0 < estimator.stamp < 100 * MS

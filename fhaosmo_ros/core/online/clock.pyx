@@ -69,7 +69,7 @@ cdef long long clock_time(
         clock.tick_length = length
         take_tick(clock, count, expected)
     else:
-        clock.ticks, clock.placed = 0, stamp
+        clock.ticks, clock.placed, clock.fitted = 0, stamp, stamp
     return clock.placed
 
 
