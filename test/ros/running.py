@@ -36,7 +36,7 @@ except ImportError:  # an older rclpy
     Executor = SingleThreadedExecutor
 
 ROOT = Path(fhaosmo_ros.__file__).parents[1]
-DEADLINE = 60.0
+DEADLINE = 12.0
 """Seconds for what takes one on a quiet machine."""
 TRIES = 4
 """Of a call, which share the deadline: the middleware may lose the first one of a new client."""
@@ -334,8 +334,8 @@ class Estimator:
     # What it is sent.
 
     def greet(self) -> 'Estimator':
-        """Publish samples until each is answered, then have it start afresh."""
-        self._publisher = self.user.publisher(self._topic, heard=2)  # it and our own record
+        """Publish samples until one is answered, then have it start afresh."""
+        self.listen()
 
         def answered() -> bool:
             stamp = self.send(0.0)
@@ -348,6 +348,10 @@ class Estimator:
         self.user.wait(answered, f'answer of {self.name} to samples')
         assert self.reset().success
         return self
+
+    def listen(self) -> None:
+        """Wait until it hears y."""
+        self._publisher = self.user.publisher(self._topic, heard=2)  # it and our own record
 
     def reset(self):
         return self.user.call(f'{self.name}/reset', Trigger, Trigger.Request())

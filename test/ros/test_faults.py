@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bad samples, gaps, jumps of time, and clocks that do not run: survived, counted and said."""
+
+import itertools
+import math
+import re
+import time
+
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+import pytest
+
+rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
+pytestmark = pytest.mark.ros
+
+from conftest import FED, LAX  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from running import as_time, ERROR, Parameters, SECOND, STALE, WARN  # noqa: E402
+from std_msgs.msg import Float64  # noqa: E402
+from std_srvs.srv import SetBool  # noqa: E402
+
+MS = 1_000_000
+
+
+def finite(e) -> bool:
+    return all(map(math.isfinite, [*e.z, e.unknown_input, e.gamma, *e.innovation]))
+
+
+def test_bad_samples_are_rejected_and_counted(fed):
+    rejected = fed.count('rejected measurements')
+    before = fed.feed(0.2)
+    stamps = [fed.send(y) for y in (math.nan, math.inf, -math.inf)]
+    after = fed.feed(0.21)
+    fed.wait_count('rejected measurements', rejected + 3)
+    assert not {e.stamp for e in fed.estimates} & set(stamps)
+    assert finite(before)
+    assert finite(after)
+    assert abs(after.z[0] - 0.2) < 0.1
+    assert fed.said('rejected a sample: expected a finite y of at most divergence_limit, got nan')
+    assert any(
+        'rejected measurements' in report.statuses['input'].message
+        and report.statuses['input'].level in (WARN, ERROR) for report in fed.reports
+    )  # fmt: skip
+
+
+def test_share_of_bad_samples_makes_an_error(fed):
+    fed.feed(0.2)
+    for level, share in ((ERROR, 0.1), (WARN, 1.0)):
+        fed.parameters.set(error_bad_share_above=share)
+        since = len(fed.reports)
+
+        def said(level=level, since=since) -> bool:
+            fed.send(math.nan)  # until a report has no good sample of before
+            statuses = [report.statuses['input'] for report in fed.reports[since:]]
+            return any(s.level == level and 'rejected measurements' in s.message for s in statuses)
+
+        fed.user.wait(said, f'level {level}')
+
+
+def test_freeze_holds_gamma_and_lets_it_go(fed):
+    fed.parameters.set(gamma_rate=100.0, gamma_initial=0.6, gamma_dead_zone=0.0)
+    fed.reset()
+
+    def freeze(data: bool) -> str:
+        answer = fed.user.call(f'{fed.name}/freeze', SetBool, SetBool.Request(data=data))
+        assert answer.success
+        return answer.message
+
+    for k in range(12):
+        before = fed.feed(0.2 + 0.1 * math.sin(k))
+    assert freeze(True) == 'gamma is held'
+    held = [fed.feed(0.2 + 0.1 * math.sin(k)).gamma for k in range(20)]
+    assert held == [before.gamma] * 20
+    assert freeze(False) == 'gamma adapts again'
+    assert fed.feed(0.5).gamma != before.gamma
+
+
+def test_reset_starts_afresh_with_the_next_sample(fed):
+    for k in range(20):
+        estimate = fed.feed(0.2 + 0.01 * k)
+    assert estimate.z[1] != 0.0
+    answer = fed.reset()
+    assert answer.success
+    assert answer.message
+    estimate = fed.feed(3.0)
+    assert estimate.z == [3.0, 0.0, 0.0]
+    assert estimate.unknown_input == 0.0
+
+
+def test_gap_stops_the_output_and_restarts_the_observer(fed):
+    fed.parameters.set(max_gap=1.0, publish_on='timer')
+    before = fed.count('restarts')
+    fed.feed(0.2)
+    fed.wait_said('for 1 s: not publishing until one comes')
+    fed.wait_status('input', STALE, 'no usable sample for')
+    # The timer is silent now: over the next reports nothing comes.
+    ticks = len(fed.topics['stamp'])
+    for _ in range(3):
+        fed.wait_status('input', STALE)
+    assert len(fed.topics['stamp']) <= ticks + 1  # one may have been on its way
+    fed.send(4.0)  # held: one stamp far away may be wrong
+    assert fed.feed(4.0).z == [4.0, 0.0, 0.0]
+    fed.wait_count('restarts', before + 1)
+    assert fed.said('restarted from the new one')
+
+
+def test_slow_sensor_does_not_flood_the_log(estimator):
+    """Each sample is a jump of the stamps: said at most every 5 s of each kind, with a count."""
+    rig = estimator('/flood', **LAX | {'max_gap': 0.001})
+    rig.greet()
+    begin = time.monotonic()
+    for k in itertools.count():
+        rig.send(math.nan if k % 10 == 5 else 1.0)
+        if rig.count('restarts') >= 20 and rig.count('rejected measurements') >= 2:
+            break
+        assert time.monotonic() < begin + 60.0
+        time.sleep(0.003)
+    kinds = [re.sub(r'[-\d.e+]+', '0', line) for line in rig.said('[WARN]')]
+    most = 2 + (time.monotonic() - begin) // 5.0
+    for kind in set(kinds):
+        assert kinds.count(kind) <= most, kind
+    for words in (
+        'restarted from the new one',
+        'no usable sample on /flood/y',
+        'got nan',
+        'restarts so far)',
+    ):
+        rig.wait_said(words)
+
+
+def test_bad_inputs_are_rejected_and_the_last_one_is_held(user, estimator):
+    model = {'order': 2, 'phi': ['0', 'u - z2'], 'max_gap': 60.0}
+    rig = estimator('/bad_u', **FED | model).greet()
+    u = user.publisher('/bad_u/u')
+    for value in (1.0, math.nan, math.inf):
+        u.publish(Float64(data=value))
+    rig.wait_count('rejected inputs', 2)
+    replay = OnlineEstimator(model)
+    replay.set_input(1.0)
+    for y in (0.2, 0.21, 0.23):
+        estimate = rig.feed(y)
+        assert estimate.z == list(replay.update(estimate.stamp, y).z)
+    assert rig.said('rejected u = nan: expected a finite number; the last one is held')
+
+
+# Clocks.
+
+
+@pytest.fixture
+def clock(user):
+    """Return a function that publishes a time on /clock until a condition holds."""
+    publisher = user.node.create_publisher(Clock, '/clock', 10)
+
+    def publish(now: int, condition, step: int = 0) -> None:
+        ticks = itertools.count(now, step)
+
+        def holds() -> bool:
+            publisher.publish(Clock(clock=as_time(next(ticks))))
+            return condition()
+
+        user.wait(holds, f'effect of {now} ns on /clock')
+
+    publish.end = lambda: user.node.destroy_publisher(publisher)
+    yield publish
+    publish.end()
+
+
+def test_node_clock_sampling_follows_simulated_time(clock, estimator):
+    options = {'use_sim_time': True, 'sampling': 'clock', 'diagnostics_period': 0.1}
+    rig = estimator('/sim', **FED | options)
+    rig.listen()
+    replay = OnlineEstimator({'max_gap': 60.0})
+
+    def at(now: int, y: float) -> None:
+        """Send a sample once a report has this time, which has then arrived."""
+        clock(now, lambda: rig.reports and rig.reports[-1].time == now)
+        rig.send(y)
+
+    for k in range(10):
+        now, y = 100 * SECOND + 10 * MS * k, 0.2 + 0.1 * math.sin(0.1 * k)
+        at(now, y)
+        estimate = rig.wait_estimate(lambda e, now=now: e.stamp == now, 'estimate')
+        assert estimate.z == list(replay.update(now, y).z)
+    # Time jumps far back, as a bag that is played again makes it.
+    at(5 * SECOND, 2.0)  # held: one stamp far away may be wrong
+    rig.wait_count('far stamps', 1)
+    at(5 * SECOND + 10 * MS, 2.0)
+    estimate = rig.wait_estimate(lambda e: e.stamp < 50 * SECOND, 'estimate in the new time')
+    assert estimate.z == [2.0, 0.0, 0.0]
+    assert rig.said('restarted from the new one')
+
+
+@pytest.mark.parametrize('node', ['estimator', 'plant'])
+def test_negative_time_on_clock_is_rejected(clock, launch, node):
+    process = launch(node, namespace='/negative', use_sim_time=True)
+    clock(-5 * SECOND, lambda: 'expected seconds >= 0, got -5' in process.output)
+    assert process.running
+
+
+def test_a_clock_that_does_not_run_is_said(clock, estimator):
+    rig = estimator('/still', use_sim_time=True, **LAX)
+    assert rig.parameters.get('sampling') == 'clock'
+    rig.wait_status('state', ERROR, 'nothing on /clock')
+    clock(SECOND, lambda: rig.reports[-1].statuses['state'].message == 'active', SECOND)
+    rig.wait_status('state', WARN, 'the time on /clock stands still for', 'paused')
+    clock.end()
+    rig.wait_status('state', ERROR, 'stands still', 'nobody publishes it any more')
+    assert len(rig.said('stands still')) == 1  # once, not five times a second
+
+
+def test_sampling_is_the_given_one_in_simulation_too(user, launch):
+    launch('estimator', namespace='/given', use_sim_time=True, sampling='nominal')
+    assert Parameters(user, '/given/estimator').get('sampling') == 'nominal'
