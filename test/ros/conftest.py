@@ -24,10 +24,10 @@ def _launcher(folders):
     processes = []
 
     def launch(name, *words, **values):
-        """Start `fhaosmo NAME` with these parameters, and perhaps further words."""
+        """Start an estimator or a plant, which code may do, with parameters and other words."""
         path = folders.mktemp('node') / 'output'
-        command = ['-m', 'fhaosmo_ros', name, *arguments(**values), *words]
-        processes.append(Process(path, *command))
+        program = ['-c', name, 'estimator'] if '\n' in name else ['-m', 'fhaosmo_ros', name]
+        processes.append(Process(path, *program, *arguments(**values), *words))
         return processes[-1]
 
     try:

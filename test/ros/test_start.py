@@ -1,0 +1,313 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a node starts: with what files and arguments say, or not at all, with one line why."""
+
+import gc
+from pathlib import Path
+import signal
+import subprocess
+import sys
+from threading import Timer
+
+from fhaosmo_ros.__main__ import main
+from fhaosmo_ros.core.parameters.files import read
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+import pytest
+from yaml_texts import HOSTILE
+
+rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
+pytestmark = pytest.mark.ros
+
+from running import DEADLINE, Estimator, Manager, Parameters, ROOT  # noqa: E402
+
+CONFIGURATIONS = sorted((ROOT / 'config').glob('**/*.yaml'))
+
+
+def section(text: str) -> str:
+    return f'/**: {{ros__parameters: {{{text}}}}}\n'
+
+
+def set_in_file(text: str) -> list[str]:
+    return ['--ros-args', '--params-file', section(text)]
+
+
+def rules(*words: str) -> list[str]:
+    return ['--ros-args', *(part for word in words for part in ('-p', word))]
+
+
+WRONG_LAMBDA = section('lambda: [-3.0]')
+# name: (node, arguments, words of the message); an argument with an end of line is put in a file
+REFUSED = {
+    # Files.
+    'unknown key': ('estimator', set_in_file('lamda: [15.0]'),
+                    [".yaml: unknown parameter 'lamda'", "mean 'lambda'?"]),
+    'length': ('estimator', set_in_file('lambda: [15.0, 15.0]'),
+               [".yaml: parameter 'lambda'", '1 or 4', '[15.0, 15.0]']),
+    'negative gain': ('plant', ['--ros-args', '--params-file', section('order: -3')],
+                      [".yaml: parameter 'order'", '>= 1', '-3']),
+    'command line over a file': (
+        'estimator', ['--ros-args', '--params-file', WRONG_LAMBDA, '-p', 'lambda:=[-4.0]'],
+        ["error: parameter 'lambda'", '> 0', '[-4.0]']),
+    'file over a file': (
+        'estimator',
+        [*set_in_file('lamda: [1]'), *set_in_file('lamda: [2]')],
+        ["5.yaml: unknown parameter 'lamda'"]),
+    'expression': ('estimator', set_in_file("phi: ['0', '0', '__import__(1)']"),
+                   ["'phi'", 'allowed', '__import__']),
+    'expression of the plant': ('plant', set_in_file("phi: ['0', '0', '__import__(1)']"),
+                                ["'phi'", 'allowed', '__import__']),
+    'not triangular': ('estimator', set_in_file("phi: ['0', 'z3', '-z3']"),
+                       ["'phi'", 'Phi_2', 'z3', 'z1..z2']),
+    'too few expressions': ('plant', set_in_file("phi: ['0', '-z2']"),
+                            ["'phi'", '3 expressions', 'got 2']),
+    'malformed': ('estimator', ['--ros-args', '--params-file', 'estimator: [b\n  c: d: e'],
+                  ['.yaml', 'expected YAML']),
+    'no section': ('estimator', ['--ros-args', '--params-file', 'lambda: [15.0]\n'],
+                   ['.yaml', 'ros__parameters']),
+    'empty': ('estimator', ['--ros-args', '--params-file', '\n'], ['.yaml', 'ros__parameters']),
+    'misspelt section': (
+        'plant', ['--ros-args', '-r', '__node:=plans', '--params-file',
+                  'plant: {ros__parameters: {order: 2}}\n'],
+        ["got 'plant'; did you mean '/plans'"]),
+    'mixed list': ('estimator', set_in_file('lambda: [15, 15.5, 16, 17]'),
+                   ["'lambda'", 'one type', '[15, 15.5, 16, 17]']),
+    'mixed expressions': ('estimator', set_in_file('phi: [0, 0, -z3]'),
+                          ["'phi'", 'one type', "[0, 0, '-z3']"]),
+    'empty list': ('estimator', set_in_file('lambda: []'), ["'lambda'", 'numbers > 0', '[]']),
+    'no value': ('estimator', set_in_file('max_gap: '), ["'max_gap'", 'a number', 'None']),
+    'constant without value': ('estimator', set_in_file('constants: {m: }'),
+                               ["'constants.m'", 'a number', 'None']),
+    'nan': ('estimator', set_in_file('epsilon: .nan'), ["'epsilon'", 'a number > 0', 'nan']),
+    'crossed bounds': ('estimator', set_in_file('gamma_min: 0.9, gamma_max: 0.8'),
+                       ['gamma_min', 'gamma_max', '0.9', '0.8']),
+    'number for an integer': ('estimator', set_in_file('order: 3.0'),
+                              ["'order'", 'an integer', '3.0']),
+    'missing': ('plant', ['--ros-args', '--params-file', '/nowhere/demo.yaml'],
+                ['/nowhere/demo.yaml', 'expected a readable file', 'No such file']),
+    'folder': ('plant', ['--ros-args', '--params-file', '/tmp'], ['/tmp', 'readable']),
+    # Arguments.
+    'unknown name': ('estimator', rules('lamda:=4'), ["'lamda'", "mean 'lambda'?"]),
+    "the other node's": ('estimator', rules('noise_std:=0.1'), ["'noise_std'"]),
+    'for this node': ('estimator', rules('estimator:noise:=0.1'), ["'noise'"]),
+    'value': ('estimator', rules('max_gap:=soon'), ["'max_gap'", 'a number', "'soon'"]),
+    'choice': ('estimator', rules('variant:=fuzy'), ['fuzzy_adaptive', "'fuzy'", 'mean']),
+    'empty list as argument': ('estimator', rules('lambda:=[]'), ["'lambda'", '[]']),
+    'mixed list as argument': ('estimator', rules('lambda:=[15, 15.5]'), ["'lambda'", '15.5']),
+    'half a rule': ('estimator', rules('epsilon'), ["'-p epsilon'"]),
+    'no rule': ('estimator', ['--ros-args', '-p'], ['-p']),
+    'unexpected argument': ('plant', ['fast'], ["'fast'", 'usage: plant']),
+    'unexpected option': ('plant', ['--fast'], ["'--fast'", 'usage: plant']),
+    'forgotten --ros-args': ('plant', ['-p', 'order:=3'], ["'-p'", '--ros-args']),
+    'unknown ROS option': ('plant', ['--ros-args', '--fast'], ['--fast']),
+    'unknown input': ('plant', rules("phi:=['v','0','0']"), ["'phi'", 'v', 'u']),
+    # Topics and messages.
+    'topic': ('estimator', rules('input_topic:=/a b'), ["'input_topic'", "'/a b'"]),
+    'type': ('estimator', rules('input_topic:=/a', 'input_type:=sensor_msgs/JoinState'),
+             ["'input_type'", "mean 'sensor_msgs/msg/JointState'?"]),
+    'type of nobody': ('estimator', rules('input_type:=nobody/msg/No'),
+                       ["'input_type'", 'is installed here', 'nobody/msg/No']),
+    'field': ('estimator', rules('input_type:=sensor_msgs/msg/Imu',
+                                 'input_field:=angular_velocty.z'),
+              ["field 'angular_velocty.z'", 'sensor_msgs/msg/Imu', "mean 'angular_velocity.z'"]),
+    'no field': ('estimator', rules('input_type:=sensor_msgs/msg/JointState'),
+                 ['a field', 'position[i]']),
+    'header': ('estimator', rules('input_type:=std_msgs/msg/Float64', 'input_stamp:=header'),
+               ["'input_stamp'", 'messages with a header', 'std_msgs/msg/Float64']),
+    'axis': ('estimator', rules('channels:=[a, b]', 'typed_outputs:=[wrench]'),
+             ["'output_axis'", 'linear.x']),
+    # Channels.
+    'channel': ('estimator', rules('channels:=[hip]', 'hpi.epsilon:=3.0'),
+                ["unknown parameter 'hpi.epsilon'; did you mean 'hip.epsilon'?"]),
+    'channel twice': ('estimator', rules('channels:=[hip, hip]'),
+                      ["parameter 'channels': expected every name once"]),
+    'value of a channel': ('estimator', rules('channels:=[hip]', 'hip.epsilon:=-1.0'),
+                           ["'hip.epsilon': expected a number > 0"]),
+    'model of a channel': ('estimator', rules('channels:=[hip]', 'hip.order:=2'),
+                           ["channel 'hip': parameter 'phi': expected 2 expressions"]),
+    'no channels': ('estimator', rules('hip.epsilon:=3.0'), ["parameter 'hip.epsilon'"]),
+    # QoS.
+    'policy': ('estimator',
+               rules('qos_overrides./estimator/state.publisher.reliability:=sometimes'),
+               ['/estimator/state', 'sometimes']),
+    'depth': ('estimator', rules('qos_overrides./estimator/state.publisher.depth:=-1'),
+              ['/estimator/state', '-1']),
+    'topic of a policy': ('estimator', rules('qos_overrides./estimator/stat.publisher.depth:=5'),
+                          ["'qos_overrides./estimator/stat", 'one of']),
+    'kind of policy': ('estimator', rules('qos_overrides./estimator/state.publisher.deadline:=5'),
+                       ['state.publisher.deadline', 'one of']),
+    'policy of the plant': ('plant', rules('qos_overrides./yy.publisher.depth:=5'),
+                            ["'qos_overrides./yy.publisher.depth': expected TOPIC"]),
+}  # fmt: skip
+
+
+def in_files(words: list[str], folder: Path) -> list[str]:
+    """Put arguments of several lines in files, and return them with the files' names."""
+    result = []
+    for k, word in enumerate(words):
+        if '\n' in word:
+            path = folder / f'{k}.yaml'
+            path.write_text(word)
+            word = str(path)
+        result.append(word)
+    return result
+
+
+def start(node: str, words: list[str]) -> int:
+    """Start a node in this process and return its exit code; it is not to run."""
+    watch = Timer(DEADLINE, signal.raise_signal, [signal.SIGTERM])
+    watch.start()
+    try:
+        return main([node, *words])
+    finally:
+        watch.cancel()
+        gc.collect()  # the node itself: two of one name in a process make rcl warn
+
+
+def check_refusal(node: str, code: int, out: str, err: str) -> str:
+    assert code == 2
+    assert out == ''
+    # rcl's own, where two nodes of a name are in one process
+    (line,) = [x for x in err.splitlines() if 'Publisher already registered' not in x]
+    assert line.startswith(f'{node}: error: ')
+    assert line.isprintable()
+    for noise in ('Traceback', '.c:', 'Error(', '/project/'):
+        assert noise not in line
+    return line
+
+
+@pytest.mark.parametrize('case', REFUSED)
+def test_one_line_says_what_is_wrong(case, tmp_path, capfd):
+    node, words, expected = REFUSED[case]
+    code = start(node, in_files(words, tmp_path))
+    line = check_refusal(node, code, *capfd.readouterr())
+    for word in expected:
+        assert word in line
+
+
+@pytest.mark.parametrize('node', ['estimator', 'plant'])
+def test_process_ends_with_one_line(node):
+    done = subprocess.run(
+        [sys.executable, '-m', 'fhaosmo_ros', node, *rules('phi:=[]')],
+        cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE,
+    )  # fmt: skip
+    assert "'phi'" in check_refusal(node, done.returncode, done.stdout, done.stderr)
+
+
+@pytest.mark.parametrize('text', HOSTILE.values(), ids=HOSTILE.keys())
+def test_hostile_text_gives_no_more_than_a_line(text, tmp_path, capfd):
+    path = tmp_path / 'file.yaml'
+    for words, content in (
+        (rules(f'lambda:={text}'), ''),
+        (['--ros-args', '--params-file', str(path)], text),
+        (['--ros-args', '--params-file', str(path)], section(f'lambda: {text}')),
+    ):
+        path.write_text(content)
+        code = start('estimator', words)
+        assert len(check_refusal('estimator', code, *capfd.readouterr())) < 600
+
+
+def test_files_and_rules_reach_the_node_for_which_they_are(user, launch, tmp_path):
+    """One that is renamed, in a namespace, with a file of another node, and lists over values."""
+    texts = (
+        '/**:\n'
+        '  ros__parameters:\n'
+        '    order: 2\n'
+        "    phi: ['0', '-z2']\n"
+        '    lambda: 12\n'
+        '    max_gap: 2e0\n'
+        '    noise_std: 0.1\n'
+        'estimator: {ros__parameters: {epsilon: 0.9}}\n'
+        '/rig/lead: {ros__parameters: {alpha: [7], spike_gate: 0.5}}\n',
+        'plant: {ros__parameters: {order: 2}}\n',
+    )
+    files = in_files(['--params-file', texts[0], '--params-file', texts[1]], tmp_path)
+    own = ['lambda:=[12.0, 13.0, 14.0]', 'gamma_max:=0.75', 'plant:noise:=0.1']
+    process = launch('estimator', '-r', '__node:=lead', '-r', '__ns:=/rig', *files, *rules(*own))
+    parameters = Parameters(user, '/rig/lead')
+    expected = {
+        'order': 2, 'phi': ['0', '-z2'], 'lambda': [12.0, 13.0, 14.0], 'max_gap': 2.0,
+        'alpha': [7.0], 'spike_gate': 0.5, 'gamma_max': 0.75,
+        'epsilon': ESTIMATOR_PARAMETERS['epsilon'].default,
+    }  # fmt: skip
+    assert parameters.all(expected) == expected
+    assert 'noise_std' not in parameters.names()
+    (line,) = [x for x in process.output.splitlines() if '[WARN]' in x]
+    assert line.endswith(f'{files[3]}: sets nothing for node /rig/lead')
+
+
+def attacks(mark: Path) -> list[str]:
+    """Return texts that would make the file `mark` if anything ran them."""
+    touch = f'touch {mark}'
+    return [
+        f"__import__('os').system('{touch}')",
+        f"().__class__.__base__.__subclasses__()[0].__init__.__globals__['os'].system('{touch}')",
+        f"z1 if __import__('os').system('{touch}') else z1",
+        f"[__import__('os').system('{touch}') for _ in (1,)][0]",
+        f"(lambda: __import__('os').system('{touch}'))()",
+        f'f\'{{open({str(mark)!r}, "w")}}\'',
+        f"open('{mark}', 'w')",
+        f"eval('{touch}')",
+        f'$({touch})',
+        f'`{touch}`',
+        f'0; {touch}',
+        f'| {touch}',
+        f'!!python/object/apply:os.system ["{touch}"]',
+    ]
+
+
+def test_parameters_through_services_execute_nothing(user, launch, tmp_path):
+    mark = tmp_path / 'mark'
+    process = launch('estimator', namespace='/attack', autostart=False)
+    values, manager = Parameters(user, '/attack/estimator'), Manager(user, '/attack/estimator')
+    for text in attacks(mark):
+        for name in ('variant', 'lambda', 'epsilon', 'order'):
+            assert not values.try_to_set(name, text).successful
+        # A text like any other; and a model, looked at as a whole when the node is configured.
+        values.set(hardware_id=text, phi=['0', '0', text])
+        assert not manager.change('configure'), text
+    assert process.output.count("'phi': Phi_3") == len(attacks(mark))
+    assert not mark.exists()
+
+
+def test_arguments_and_files_execute_nothing(tmp_path, capfd):
+    mark = tmp_path / 'mark'
+    for text in attacks(mark):
+        for words in (rules(f'epsilon:={text}'), set_in_file(f'epsilon: {text}'), [text],
+                      ['--ros-args', '--params-file', text]):  # fmt: skip
+            code = start('estimator', in_files(words, tmp_path))
+            check_refusal('estimator', code, *capfd.readouterr())
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize('path', CONFIGURATIONS, ids=lambda p: p.stem)
+def test_rcl_reads_shipped_files_as_we_do(path):
+    """A bare y, for instance, is true for rcl."""
+    context = rclpy.Context()
+    rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
+    try:
+        node = rclpy.create_node(
+            'estimator', context=context, automatically_declare_parameters_from_overrides=True
+        )
+        for name, value in read(path, 'estimator').items():
+            found = node.get_parameter(name).value
+            assert (list(found) if isinstance(value, list) else found) == value, name
+        node.destroy_node()
+    finally:
+        rclpy.shutdown(context=context)
+
+
+WITHOUT_EVENTS = """
+import sys
+sys.modules['rclpy.experimental'] = None  # an older rclpy
+from fhaosmo_ros.__main__ import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_without_the_events_executor_it_works_too(user, launch):
+    process = launch(
+        WITHOUT_EVENTS, namespace='/older', max_gap=60.0, input_reliability='reliable'
+    )
+    rig = Estimator(user, process, '/older').greet()
+    for y in (0.2, 0.21, 0.22):
+        estimate = rig.feed(y)
+    assert abs(estimate.z[0] - 0.22) < 0.1
