@@ -1,80 +1,89 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports on /diagnostics: their values, and what makes them WARN, ERROR and STALE."""
+"""Reports on /diagnostics: their values, and what makes them WARN, ERROR and STALE; QoS."""
 
-import itertools
 import math
-from pathlib import Path
-from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
-from builtin_interfaces.msg import Time  # noqa: E402
-from fhaosmo_ros.core.online.estimator import OnlineEstimator  # noqa: E402
-from fhaosmo_ros.core.parameters.files import load  # noqa: E402
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, ONLINE_PARAMETERS  # noqa: E402
-from fhaosmo_ros.nodes.estimator.health import Health  # noqa: E402
-from fhaosmo_ros.nodes.middleware.publisher_watch import Publishers  # noqa: E402
-import numpy as np  # noqa: E402
-from rig import EstimatorRig, node_process, Parameters, parameters  # noqa: E402
+from conftest import FED, LAX  # noqa: E402
+from rclpy.context import Context  # noqa: E402
+from rclpy.node import Node  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
+from rclpy.signals import SignalHandlerOptions  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
+from running import (  # noqa: E402
+    as_time,
+    ERROR,
+    LATCHED,
+    OK,
+    Parameters,
+    ROOT,
+    SECOND,
+    STALE,
+    WARN,
+)  # fmt: skip
+from sensor_msgs.msg import JointState  # noqa: E402
+from std_msgs.msg import Float64, Header, Int64  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
-OK, WARN, ERROR, STALE = b'\0', b'\1', b'\2', b'\3'
-RATE = 200.0
-LAX = {'warn_jitter_above': 1e6, 'warn_delay_above': 1e6, 'diagnostics_period': 0.2}
-"""A loaded machine is no reason for a warning here."""
-
-
-@pytest.fixture(scope='module')
-def rig(client, start):
-    """An estimator that hears a plant."""
-    start('plant', *parameters(namespace='/d', sample_rate=RATE))
-    start('estimator', *parameters(namespace='/d', **LAX))
-    rig = EstimatorRig(client, '/d', feed=False)
-    rig.wait_status('input', OK, 'OK')
-    return rig
+RATE = 500.0
+"""Of the pair's plant."""
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def numbers(status) -> dict[str, str]:
     return {pair.key: pair.value for pair in status.values}
 
 
-def test_names_are_those_that_ros_tools_expect(rig):
-    rig.client.wait(lambda: rig.diagnostics, 'diagnostics')
-    statuses = [
-        s for m in rig.diagnostics for s in m.message.status if s.name.startswith('d/estimator')
-    ]
-    assert {s.name for s in statuses} == {
-        'd/estimator: state', 'd/estimator: input', 'd/estimator: observer',
-    }  # fmt: skip
-    assert {s.hardware_id for s in statuses} == {'none'}
-    assert all(s.message for s in statuses)
-    assert all(len({pair.key for pair in s.values}) == len(s.values) for s in statuses)
+def wait_values(rig, task: str, condition, what: str) -> dict[str, str]:
+    """Return the values of the first report from now on for which a condition holds."""
+    since, found = len(rig.reports), []
+
+    def look() -> bool:
+        found[:] = [numbers(report.statuses[task]) for report in rig.reports[since:]]
+        found[:] = [values for values in found if condition(values)]
+        return bool(found)
+
+    rig.user.wait(look, what)
+    return found[0]
 
 
-def test_values_of_the_input(rig):
-    def as_sampled() -> bool:  # over 0.2 s, in which a loaded machine may stall
-        values.update(numbers(rig.wait_status('input', OK)))
-        return float(values['sample rate [Hz]']) == pytest.approx(RATE, rel=0.2)
+def test_names_are_those_that_ros_tools_expect(pair):
+    pair.wait_status('input', OK, 'OK')
+    for report in pair.reports:
+        assert set(report.statuses) == {'state', 'input', 'observer'}
+        for status in report.statuses.values():
+            assert status.hardware_id == 'none'
+            assert status.message
+            assert len({pair.key for pair in status.values}) == len(status.values)
 
-    values = {}
-    rig.client.wait(as_sampled, 'rate of the plant')
-    assert values['topic'] == '/d/y'
-    assert values['publishers'] == '/d/plant'
+
+def test_values_of_the_input(pair):
+    def as_sampled(values) -> bool:  # a loaded machine may stall, or not know a new node's name
+        return (
+            float(values['sample rate [Hz]']) == pytest.approx(RATE, rel=0.2)
+            and values['publishers'] == '/pair/plant'
+        )
+
+    values = wait_values(pair, 'input', as_sampled, 'rate and name of the plant')
+    assert values['topic'] == '/pair/y'
     assert float(values['jitter (std / mean of the period)']) >= 0.0
     mean = 1.0 / float(values['sample rate [Hz]'])
     assert float(values['longest period [s]']) >= 0.999 * mean
-    assert 0.0 < float(values['longest delay [s]']) < 10.0
-    assert 0.0 <= float(values['age of the last sample [s]']) < 10.0
-    assert int(values['samples accepted']) > 0
+    assert 0.0 < float(values['longest delay [s]']) < 60.0
+    assert 0.0 <= float(values['age of the last sample [s]']) < 60.0
+    accepted = int(values['samples accepted'])
+    assert accepted > 0
     assert int(values['samples lost']) >= 0
+    wait_values(pair, 'input', lambda v: int(v['samples accepted']) > accepted, 'more samples')
 
 
-def test_values_of_the_observer(rig):
-    values = numbers(rig.wait_status('observer', OK))
+def test_values_of_the_observer(pair):
+    values = numbers(pair.wait_status('observer', OK, 'OK'))
     assert values['open levels'] == '4 of 4'
     assert 0.1 <= float(values['gamma']) <= 1.0
     assert values['gamma at'] == 'neither bound'
@@ -83,11 +92,6 @@ def test_values_of_the_observer(rig):
     assert 0.0 <= float(values['chatter index (0 smooth, 1 nothing but chatter)']) <= 1.0
     assert 0.0 < float(values['step time, mean [us]']) <= float(values['step time, longest [us]'])
     assert int(values['overruns']) >= 0
-
-
-def test_counters_grow_from_one_report_to_the_next(rig):
-    before = int(numbers(rig.wait_status('input', OK))['samples accepted'])
-    assert int(numbers(rig.wait_status('input', OK))['samples accepted']) > before
 
 
 @pytest.mark.parametrize(
@@ -101,165 +105,225 @@ def test_counters_grow_from_one_report_to_the_next(rig):
     ],
     ids=str,
 )
-def test_thresholds(rig, task, changes, words):
-    was = {name: rig.parameters.get(name) for name in changes}
-    assert rig.parameters.set_atomically(**changes).successful
-    rig.wait_status(task, WARN, *words)
-    assert rig.parameters.set_atomically(**was).successful
-    rig.wait_status(task, OK, 'OK')
+def test_thresholds(pair, task, changes, words):
+    was = pair.parameters.all(changes)
+    pair.parameters.set(**changes)
+    pair.wait_status(task, WARN, *words)
+    pair.parameters.set(**was)
+    pair.wait_status(task, OK, 'OK')
 
 
-def test_hardware_id_and_period_are_live(rig):
-    assert rig.parameters.set(hardware_id='encoder 7')[0].successful
-    rig.client.wait(
-        lambda: rig.wait_status('state', OK).hardware_id == 'encoder 7', 'new hardware_id'
-    )
-    assert rig.parameters.set(diagnostics_period=2.0)[0].successful
-    first = len(rig.diagnostics)
+def test_hardware_id_and_period_are_live(pair):
+    pair.parameters.set(hardware_id='encoder 7', diagnostics_period=1.0)
+    since = len(pair.reports)
 
     def slow() -> bool:  # a report that comes late makes the time to the next one shorter
-        stamps = [
-            m.stamp
-            for m in rig.diagnostics[first:]
-            if m.message.status[0].name == 'd/estimator: state'
-        ]
-        return len(stamps) > 2 and stamps[-1] - stamps[-2] > 1.5e9
+        stamps = [report.stamp for report in pair.reports[since:]]
+        return len(stamps) > 2 and stamps[-1] - stamps[-2] > 0.8e9
 
-    rig.client.wait(slow, 'reports 2 s apart')
-    assert rig.parameters.set_atomically(hardware_id='none', diagnostics_period=0.2).successful
+    pair.user.wait(slow, 'reports 1 s apart')
+    assert pair.reports[-1].statuses['state'].hardware_id == 'encoder 7'
+    pair.parameters.set(hardware_id='none', diagnostics_period=LAX['diagnostics_period'])
 
 
-def test_gamma_at_a_bound_is_said(rig):
-    bounds = {'gamma_min': 0.3, 'gamma_initial': 0.3, 'gamma_max': 0.3}
-    was = {name: rig.parameters.get(name) for name in bounds}
-    assert rig.parameters.set_atomically(**bounds).successful
-    rig.client.wait(
-        lambda: numbers(rig.wait_status('observer', OK))['gamma at'].startswith('gamma_m'), 'bound'
+def test_what_holds_gamma_is_said(fed):
+    def wait_word(word: str) -> None:
+        fed.feed(0.2)
+        wait_values(fed, 'observer', lambda v: v['gamma at'].startswith(word), f'gamma at {word}')
+
+    def freeze(data: bool) -> None:
+        fed.user.call(f'{fed.name}/freeze', SetBool, SetBool.Request(data=data))
+
+    freeze(True)
+    wait_word('the value that ~/freeze holds')
+    freeze(False)
+    wait_word('neither bound')
+    fed.parameters.set(gamma_min=0.3, gamma_initial=0.3, gamma_max=0.3)
+    wait_word('gamma_m')
+    fed.parameters.set(variant='sign')
+    wait_word('a fixed value')
+
+
+def test_a_clock_that_is_slower_than_the_samples_is_said(user, estimator):
+    """What `ros2 bag play --clock` gives, at 40 Hz."""
+    rig = estimator('/slow', **FED | LAX, use_sim_time=True, sampling='clock')
+    clock = user.publisher('/clock', Clock)
+    rig.listen()
+    since, tick = len(rig.reports), 100
+
+    def said() -> bool:
+        nonlocal tick
+        tick += 1
+        clock.publish(Clock(clock=as_time(tick * SECOND // 40)))
+        for _ in range(25):
+            rig.send(0.2)
+        statuses = [report.statuses['input'] for report in rig.reports[since:]]
+        return any(s.level == WARN and 'ticks once for' in s.message for s in statuses)
+
+    user.wait(said, 'slow clock')
+    user.node.destroy_publisher(clock)
+
+
+def test_what_no_longer_fits_is_said(user, estimator):
+    file = ['--params-file', ROOT / 'config' / 'noise_1e-3.yaml']
+    options = LAX | {'warn_chatter_above': 1e9, 'publish_on': 'sample', 'max_gap': 60.0}
+    options |= {'input_topic': 'q', 'input_field': 'position[a]', 'input_reliability': 'reliable'}
+    rig = estimator('/fits', *file, **options)
+    q = user.publisher('/fits/q', JointState)
+    rng, stamp, sent = np.random.default_rng(1), SECOND, 0
+
+    def send(period: int = 1, noise: float = 1e-3, offset: float = 0.0) -> None:
+        """Send 200 samples, whose stamps are so many ms apart, and wait until they are used."""
+        nonlocal stamp, sent
+        sent += 200
+        for y in noise * rng.standard_normal(200) + offset:
+            stamp += period * 1_000_000
+            header = Header(stamp=as_time(stamp))
+            q.publish(JointState(header=header, name=['a'], position=[float(y)]))
+        taken = ('samples accepted', 'samples rejected')
+        user.wait(lambda: sum(map(rig.count, taken)) >= sent, 'use of all samples')
+
+    def wait_said(words: str, fresh: bool = True, **samples) -> None:
+        if fresh:
+            assert rig.reset().success
+        since = len(rig.reports)
+
+        def said() -> bool:
+            send(**samples)
+            statuses = [report.statuses['observer'] for report in rig.reports[since:]]
+            return any(s.level == WARN and words in s.message for s in statuses)
+
+        user.wait(said, words)
+
+    for _ in range(10):
+        send()
+    said = ' '.join(report.statuses['observer'].message for report in rig.reports)
+    for words in ('jumped', 'as large as', 'gains are for'):
+        assert words not in said
+    wait_said('y jumped 1 times', fresh=False, offset=1.0)
+    wait_said('times as large as noise_size says', noise=1e-2)
+    wait_said('gains are for 1000 Hz, y comes at 500 Hz', period=2)
+
+
+def test_missing_known_input_is_said(estimator):
+    rig = estimator('/missing', phi=['0', '0', 'u'], **LAX)
+    rig.wait_status('input', STALE, 'no publisher of u')
+
+
+# Publishers that can't be heard, or are too many.
+
+
+@pytest.fixture(scope='module')
+def stranger():
+    """A node beside the user, as another process would have."""
+    context = Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = Node('stranger', context=context, use_global_arguments=False)
+    yield node
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+def test_publishers_are_named(user, estimator, stranger):
+    rig = estimator('/heard', **FED)
+    rig.wait_status('input', STALE, 'no usable sample yet', 'no publisher of /heard/y')
+    assert numbers(rig.reports[-1].statuses['input'])['publishers'] == 'none'
+
+    unheard = stranger.create_publisher(Float64, '/heard/y', BEST_EFFORT)
+    words = ('/stranger', 'best effort publisher and reliable subscription', 'input_reliability')
+    rig.wait_status('input', ERROR, *words)
+    rig.wait_status('input', ERROR, *words)
+    assert len(rig.said('/stranger publishes /heard/y unheard')) == 1  # once, not with each report
+    stranger.destroy_publisher(unheard)
+    rig.wait_status('input', STALE, 'no publisher')
+
+    unheard = stranger.create_publisher(Int64, '/heard/y', 10)
+    rig.wait_status('input', ERROR, '/stranger', 'std_msgs/msg/Int64', 'std_msgs/msg/Float64')
+    stranger.destroy_publisher(unheard)
+
+    first = stranger.create_publisher(Float64, '/heard/y', 10)
+    wait_values(rig, 'input', lambda v: v['publishers'] == '/stranger', 'name of the publisher')
+    rig.listen()
+    rig.wait_status('input', STALE, '2 publishers')
+    rig.wait_said('2 publishers of')
+    user.wait(lambda: first.get_subscription_count() >= 2, 'subscription of the first')
+    for _ in range(20):
+        first.publish(Float64(data=0.2))
+    rig.wait_count('samples accepted', 20)
+    for _ in range(5):  # numbered from 1 on, below those of the first: nothing is lost
+        rig.send(0.2)
+        first.publish(Float64(data=0.2))
+    rig.wait_count('samples accepted', 30)
+    assert rig.count('samples lost') == 0
+    stranger.destroy_publisher(first)
+    wait_values(rig, 'input', lambda v: v['publishers'] == '/user', 'name of the other one')
+    assert rig.said('the publisher of /heard/y changed: now /user')
+
+
+def test_what_was_published_before_is_heard_if_asked_for(estimator, stranger):
+    before = stranger.create_publisher(Float64, '/latched/y', LATCHED)
+    before.publish(Float64(data=2.5))
+    rig = estimator(
+        '/latched', **FED | {'publish_on': 'timer'}, input_durability='transient_local'
     )
-    assert rig.parameters.set_atomically(**was).successful
-    assert rig.parameters.set(variant='sign')[0].successful
-    rig.client.wait(
-        lambda: numbers(rig.wait_status('observer', OK))['gamma at'] == 'a fixed value', 'it'
-    )
-    assert rig.parameters.set(variant='fuzzy_adaptive')[0].successful
+    assert rig.wait_estimate(lambda e: True, 'estimate of the latched sample').z[0] == 2.5
+    stranger.create_publisher(Float64, '/latched/y', 10)
+    rig.wait_status('input', WARN, '/stranger', 'volatile', 'input_durability')
 
 
-def test_a_forgotten_freeze_is_said(rig):
-    for data, word in ((True, 'the value that ~/freeze holds'), (False, 'neither bound')):
-        rig.client.call('/d/estimator/freeze', SetBool, SetBool.Request(data=data))
-        rig.client.wait(
-            lambda word=word: numbers(rig.wait_status('observer', OK))['gamma at'] == word, word
+# Policies of what is published.
+
+
+def test_policies_of_estimates(user, estimator):
+    prefix = 'qos_overrides./out/estimator'
+    rig = estimator('/out', gains='self_tuning', **FED, **{
+        f'{prefix}/state.publisher.reliability': 'best_effort',
+        f'{prefix}/unknown_input.publisher.durability': 'transient_local',
+        f'{prefix}/standard_deviation.publisher.depth': 7,
+    })  # fmt: skip
+    infos = {
+        topic: user.node.get_publishers_info_by_topic(f'/out/estimator/{topic}')[0].qos_profile
+        for topic in ('state', 'unknown_input', 'stamp')
+    }
+    assert infos['state'].reliability == ReliabilityPolicy.BEST_EFFORT
+    assert infos['stamp'].reliability == ReliabilityPolicy.RELIABLE
+    assert infos['unknown_input'].durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert infos['stamp'].durability == DurabilityPolicy.VOLATILE
+    assert rig.parameters.get(f'{prefix}/standard_deviation.publisher.depth') == 7
+    assert rig.parameters.get(f'{prefix}/innovation.publisher.depth') == 1000
+
+
+def test_who_comes_later_hears_the_latched_estimates_too(user, launch):
+    """An estimate that nobody listens to is not made, unless its publisher keeps the last ones."""
+    name = '/later/estimator'
+    latched = {f'qos_overrides.{name}/gamma.publisher.durability': 'transient_local'}
+    launch('estimator', namespace='/later', **FED, **latched)
+    y = user.publisher('/later/y')
+    accepted = user.reports['later/estimator']
+
+    def heard() -> bool:
+        y.publish(Float64(data=0.5))
+        return (
+            bool(accepted) and int(numbers(accepted[-1].statuses['input'])['samples accepted']) > 0
         )
 
-
-def test_silence_is_stale(client, folder):
-    arguments = parameters(namespace='/e', **LAX)
-    with node_process(folder(), 'estimator', *arguments):
-        with node_process(folder(), 'plant', *parameters(namespace='/e')):
-            rig = EstimatorRig(client, '/e', feed=False)
-            rig.wait_status('observer', OK)
-        status = rig.wait_status('input', STALE, 'no usable sample for', 'no publisher of /e/y')
-        assert numbers(status)['publishers'] == 'none'
-        rig.wait_status('observer', STALE, 'no usable samples')
+    user.wait(heard, 'accepted samples')
+    reports = len(accepted)
+    user.wait(lambda: len(accepted) > reports, 'report')
+    before = accepted[-1].stamp
+    gamma = user.record(f'{name}/gamma', Float64, LATCHED)
+    state = user.record(f'{name}/unknown_input', Float64)
+    user.wait(lambda: y.publish(Float64(data=0.5)) or (gamma and len(state) > 10), 'estimates')
+    assert gamma[0].stamp < before < state[0].stamp
 
 
-def test_share_of_bad_samples_makes_an_error(client, start):
-    limits = {'max_gap': 60.0, 'error_bad_share_above': 0.1}
-    start('estimator', *parameters(namespace='/f', **limits, **LAX))
-    rig = EstimatorRig(client, '/f')
-    rig.feed(0.2)
-    for level, share in ((ERROR, 0.1), (WARN, 1.0)):
-        assert rig.parameters.set(error_bad_share_above=share)[0].successful
-        start_at = len(rig.diagnostics)
-
-        def said(level=level, start_at=start_at) -> bool:
-            rig.send(math.nan)  # until a report has no good sample of before
-            return any(
-                s.name == 'f/estimator: input' and s.level == level
-                and 'rejected measurements' in s.message
-                for published in rig.diagnostics[start_at:] for s in published.message.status
-            )  # fmt: skip
-
-        client.wait(said, f'level {level}')
-
-
-def test_a_clock_that_does_not_run_is_said(client, start):
-    process = start(
-        'estimator', *parameters(namespace='/g', use_sim_time='true', sampling='clock', **LAX)
-    )
-    rig = EstimatorRig(client, '/g', feed=False)
-    rig.wait_status('state', ERROR, 'nothing on /clock')
-    publish = client.publisher('/clock', Clock)
-    ticks = itertools.count(1)
-
-    def runs() -> bool:
-        publish(Clock(clock=Time(sec=next(ticks))))
-        return any(s.message == 'active' for s in rig.statuses())
-
-    client.wait(runs, 'clock that runs')
-    rig.wait_status('state', WARN, 'the time on /clock stands still for', 'paused')
-    publish.destroy()
-    rig.wait_status('state', ERROR, 'stands still', 'nobody publishes it any more')
-    assert process.output.count('stands still') == 1  # once, not five times a second
-
-
-def test_missing_known_input_is_said(client, start):
-    start('estimator', *parameters(namespace='/h', phi="['0', '0', 'u']", **LAX))
-    rig = EstimatorRig(client, '/h', feed=False)
-    rig.wait_status('input', STALE, 'no publisher of u')
-    assert Parameters(client, '/h/estimator').get('phi') == ['0', '0', 'u']
-
-
-def test_simulation_time_samples_by_the_clock_unless_it_is_told_otherwise(client, start):
-    for given, expected in (({}, 'clock'), ({'sampling': 'nominal'}, 'nominal')):
-        namespace = f'/sim_{expected}'
-        start('estimator', *parameters(namespace=namespace, use_sim_time='true', **given))
-        values = Parameters(client, f'{namespace}/estimator')
-        assert values.get('sampling') == expected
-
-
-@pytest.mark.parametrize(('samples', 'told'), [(25, 'ticks once for 25 samples'), (1, '')])
-def test_a_clock_that_is_slower_than_the_samples_is_said(samples, told):
-    """What `ros2 bag play --clock` gives, at 40 Hz, and a clock that ticks with every sample."""
-    estimator = OnlineEstimator({'sampling': 'clock'})
-    health = Health(estimator, ESTIMATOR_PARAMETERS.complete(LAX))
-    source = SimpleNamespace(topic='/y', message_type='std_msgs/msg/Float64')
-    y = SimpleNamespace(source=source, field=None, stamps='source', error='', lacking=0, why='')
-    for begin in (1000, 2000):  # the first report is on the first tick too
-        for k in range(begin, begin + 1000):
-            estimator.update(k // samples * samples * 1_000_000, 0.2)
-        report, _ = health.reports(y, Publishers({(1,): '/plant'}, {}), stale=False, name='')
-    status = report.message('estimator', 'none')
-    assert told in status.message
-    assert status.level == (WARN if told else OK)
-
-
-def noise_1e_3() -> dict:
-    path = Path(__file__).resolve().parents[2] / 'config' / 'noise_1e-3.yaml'
-    return load(path, 'estimator', ONLINE_PARAMETERS)
-
-
-@pytest.mark.parametrize(
-    ('period', 'noise', 'jump', 'told'),
-    [
-        (1, 1e-3, 0.0, ''),
-        (2, 1e-3, 0.0, 'gains are for 1000 Hz, y comes at 500 Hz'),
-        (1, 1e-2, 0.0, 'times as large as noise_size says'),
-        (1, 1e-3, 1.0, 'y jumped 1 times'),
-    ],
-    ids=['nothing', 'rate', 'noise', 'jump'],
-)  # fmt: skip
-def test_what_no_longer_fits_is_said(period, noise, jump, told):
-    estimator = OnlineEstimator(noise_1e_3())
-    health = Health(estimator, ESTIMATOR_PARAMETERS.complete(LAX | {'warn_chatter_above': 1e9}))
-    source = SimpleNamespace(topic='/y', message_type='std_msgs/msg/Float64')
-    y = SimpleNamespace(source=source, field=None, stamps='source', error='', lacking=0, why='')
-    rng = np.random.default_rng(1)
-    for k in range(1, 3000):
-        stamp = k * period * 1_000_000
-        estimator.update(stamp, noise * rng.standard_normal() + jump * (k > 2000))
-        health.stamps.append(stamp)
-    _, report = health.reports(y, Publishers({(1,): '/plant'}, {}), stale=False, name='')
-    status = report.message('estimator', 'none')
-    assert told in status.message
-    assert status.level == (WARN if told else OK)
+def test_policies_of_the_plant(user, launch):
+    policies = {
+        'qos_overrides./policies/y.publisher.reliability': 'best_effort',
+        'qos_overrides./policies/plant/state.publisher.depth': 7,
+    }
+    launch('plant', namespace='/policies', **policies)
+    parameters = Parameters(user, '/policies/plant')
+    assert parameters.get('qos_overrides./policies/plant/state.publisher.depth') == 7
+    (y,) = user.node.get_publishers_info_by_topic('/policies/y')
+    assert y.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
