@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One estimator process with many channels: each is what an estimator for it alone would be."""
+
+import itertools
+import math
+
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
+pytestmark = pytest.mark.ros
+
+from builtin_interfaces.msg import Time  # noqa: E402
+from conftest import FED  # noqa: E402
+from running import as_time, nanoseconds, Parameters, SECOND  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
+from std_msgs.msg import Float64, Float64MultiArray, Header  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+FILE = """
+/**:
+  ros__parameters:
+    channels: [hip, knee]
+    epsilon: 5.0
+    hip:
+      variant: sign
+      lambda: [15.0]
+    knee:
+      order: 2
+      phi: ['0', '-z2']
+"""
+OWN = {
+    'hip': {'variant': 'sign', 'lambda': [15.0]},
+    'knee': {'order': 2, 'phi': ['0', '-z2']},
+}
+NODE = '/many/estimator'
+
+
+@pytest.fixture(scope='module')
+def parameters(user, launch, tmp_path_factory):
+    path = tmp_path_factory.mktemp('channels') / 'many.yaml'
+    path.write_text(FILE)
+    launch('estimator', '--params-file', path, namespace='/many', **FED)
+    return Parameters(user, NODE)
+
+
+class Joint:
+    """One channel, fed and heard."""
+
+    def __init__(self, user, name):
+        self.user = user
+        self.sent = user.record(f'/many/{name}/y', Float64)
+        self.state = user.record(f'{NODE}/{name}/state', Float64MultiArray)
+        self.stamps = user.record(f'{NODE}/{name}/stamp', Time)
+        self.y = user.publisher(f'/many/{name}/y', heard=2)
+        user.wait(self.answers, 'first estimate')
+
+    def answers(self) -> bool:
+        self.y.publish(Float64(data=0.0))
+        return bool(self.state and self.stamps)
+
+    def wait(self, count: int) -> None:
+        """Wait for so many samples, and the estimate of the last one, which has come whole."""
+        self.user.wait(lambda: len(self.sent) >= count, 'own samples')
+        last = self.sent[-1].stamp
+        self.user.wait(lambda: nanoseconds(self.stamps[-1].message) == last, 'last estimate')
+        published = self.stamps[-2].stamp
+        self.user.wait(lambda: self.state[-1].stamp > published, 'its state')
+
+
+@pytest.fixture(scope='module')
+def joints(user, parameters):
+    return {name: Joint(user, name) for name in OWN}
+
+
+def test_each_channel_is_bit_for_bit_an_estimator_of_its_own(user, joints, parameters):
+    """Also after a common parameter has changed, which serves knee only: hip has its own."""
+    for joint in joints.values():
+        joint.wait(len(joint.sent))
+    assert user.call(f'{NODE}/reset', Trigger, Trigger.Request()).success
+    common = {'max_gap': 60.0, 'epsilon': 5.0}
+    estimators = {name: OnlineEstimator(common | own) for name, own in OWN.items()}
+    for part in range(2):
+        begin = {name: len(joint.sent) for name, joint in joints.items()}
+        for k in range(30):
+            for name, joint in joints.items():
+                y = math.nan if (k, name) == (10, 'hip') else math.sin(0.1 * k) + part + len(name)
+                joint.y.publish(Float64(data=y))
+        for name, joint in joints.items():
+            joint.wait(begin[name] + 30)
+            for stamp, message in joint.sent[begin[name] :]:
+                estimate = estimators[name].update(stamp, message.data)
+            np.testing.assert_array_equal(list(joint.state[-1].message.data), estimate.z)
+        parameters.set(lambda_=[20.0])
+        estimators['knee'].configure({'lambda': [20.0]})
+
+
+def test_topics_reports_and_services_are_each_channels_own(user, joints):
+    labels = {n: joint.state[-1].message.layout.dim[0].label for n, joint in joints.items()}
+    assert labels == {'hip': 'z1,z2,z3', 'knee': 'z1,z2'}
+    reports = user.reports[NODE[1:]]
+    tasks = {f'{name} {task}' for name in OWN for task in ('input', 'observer')}
+    user.wait(lambda: reports and tasks <= set(reports[-1].statuses), 'reports of each')
+    for name in OWN:
+        assert user.call(f'{NODE}/{name}/reset', Trigger, Trigger.Request()).success
+
+
+def test_common_parameter_serves_channels_without_their_own(parameters):
+    def epsilons() -> list[float]:
+        return [parameters.get(f'{name}.epsilon') for name in OWN]
+
+    assert parameters.get('hip.epsilon') == 5.0
+    parameters.set(epsilon=6.0, lambda_=[20.0])
+    assert epsilons() == [6.0, 6.0]
+    assert parameters.get('hip.lambda') == [15.0]
+    assert parameters.get('knee.lambda') == [20.0]
+    parameters.set(**{'knee.epsilon': 7.0})
+    parameters.set(epsilon=8.0)
+    assert epsilons() == [8.0, 7.0]
+
+
+def test_bad_set_names_the_channel_and_changes_nothing(parameters):
+    """Also a common value that one of its followers can't take is refused for all."""
+    for changes, channel, words in (
+        ({'knee.gamma_min': 0.9, 'knee.gamma_max': 0.2}, 'knee', 'expected each at most the next'),
+        ({'hip.gamma_max': 0.8, 'gamma_initial': 0.9}, 'hip', '0.9'),
+    ):
+        names = [*changes, 'knee.gamma_initial']
+        before = parameters.all(names)
+        answer = parameters.try_to_set_together(**changes)
+        assert not answer.successful
+        assert f"channel '{channel}'" in answer.reason
+        assert words in answer.reason
+        assert parameters.all(names) == before
+
+
+# Channels from the names of joints.
+
+COUNT = itertools.count()
+
+
+class Arm:
+    """An estimator of whatever joints come, fed and heard."""
+
+    def __init__(self, user, process, namespace):
+        self.user, self.process, self.name = user, process, f'{namespace}/estimator'
+        self.publisher = user.publisher(f'{namespace}/joint_states', JointState)
+        self.out = user.record(f'{self.name}/joint_states', JointState)
+        self.stamp, self.sent = SECOND, []
+
+    def send(self, **positions) -> int:
+        self.stamp += 2_000_000
+        header = Header(stamp=as_time(self.stamp))
+        message = JointState(header=header, name=list(positions), position=positions.values())
+        self.publisher.publish(message)
+        self.sent.append((self.stamp, positions))
+        return self.stamp
+
+    def answer(self, **positions):
+        """Return the estimates of a message; it is sent again until they are heard."""
+
+        def answered() -> bool:
+            stamp = self.send(**positions)
+            try:
+                self.wait(stamp, 1.0)
+            except TimeoutError:
+                return False
+            return True
+
+        self.user.wait(answered, f'estimates of {len(positions)} joints')
+        return self.out[-1].message
+
+    def wait(self, stamp: int, *timeout: float):
+        self.user.wait(
+            lambda: self.out and nanoseconds(self.out[-1].message.header.stamp) == stamp,
+            'estimates', *timeout,
+        )  # fmt: skip
+        return self.out[-1].message
+
+    def wait_report(self, words: str) -> None:
+        reports = self.user.reports[self.name[1:]]
+        self.user.wait(
+            lambda: any(words in r.statuses['state'].message for r in reports[-20:]),
+            f'report of {words}',
+        )
+
+    def said(self, words: str) -> list[str]:
+        return [line for line in self.process.output.splitlines() if words in line]
+
+
+@pytest.fixture
+def arm(user, launch):
+    namespace = f'/arm{next(COUNT)}'
+    own = ['-p', 'elbow.epsilon:=7.0', '-p', 'elbo.epsilon:=7.0']
+    channels = FED | {'channels': ['from_joint_names']}
+    return Arm(user, launch('estimator', *own, namespace=namespace, **channels), namespace)
+
+
+def test_each_joint_is_a_channel_whatever_the_order_of_the_names(user, arm):
+    user.wait(lambda: arm.said('waiting for the first message'), 'start')
+    orders = [('shoulder', 'elbow', 'wrist'), ('wrist', 'shoulder', 'elbow'), ('elbow', 'wrist')]
+    arm.answer(shoulder=0.1, elbow=0.2, wrist=0.3)
+    for k in range(24):
+        stamp = arm.send(**{name: 0.1 * len(name) + 0.01 * k for name in orders[k % 3]})
+        arm.wait(stamp)
+    values = {name: {'max_gap': 60.0} for name in orders[0]}
+    values['elbow'] |= {'epsilon': 7.0}
+    estimators = {name: OnlineEstimator(own) for name, own in values.items()}
+    expected = {
+        stamp: {name: estimators[name].update(stamp, y) for name, y in positions.items()}
+        for stamp, positions in arm.sent
+    }
+    for _, message in arm.out:
+        estimates = expected[nanoseconds(message.header.stamp)]
+        assert set(message.name) == set(estimates)
+        for name, *numbers in zip(
+            message.name, message.position, message.velocity, message.effort, strict=True
+        ):
+            e = estimates[name]
+            assert numbers == [*e.z[:2], e.unknown_input]
+    assert arm.said("expected a name that is in the message (elbow, wrist), got 'shoulder'")
+    assert arm.said("parameters of 'elbo' are not used")
+    assert arm.said("did you mean 'elbow'")
+
+
+def test_names_that_no_topic_can_have_are_left_out(arm):
+    long = 'a' * 300
+    bad = {long: 1.0, 'constants': 2.0, '': 3.0, 'left/wrist': 4.0}
+    arm.send(hip=0.1, **bad)
+    assert arm.answer(hip=0.1).name == ['hip']
+    (line,) = arm.said('left out')
+    assert "4 joints 'aaaa" in line
+    assert "'constants', '', 'left/wrist' can't be the name of a channel" in line
+    assert len(line) < 600
+    arm.wait_report("left out: 4 joints 'aaaa")
+
+
+def test_names_that_come_later_are_one_line(arm):
+    arm.answer(hip=0.1)
+    for k in range(300):
+        arm.send(hip=0.1, **{f'late{k}_{i}': 0.1 for i in range(10)})
+    arm.answer(hip=0.1)
+    assert len(arm.said('late0_0')) == 1
+    assert len(arm.process.output.splitlines()) < 20
+    arm.wait_report("joints 'late0_0', 'late0_1'")
+
+
+def test_names_beyond_max_channels_are_left_out(arm):
+    many = {f'j{k}': 0.1 for k in range(500)}
+    assert arm.answer(**many).name == list(many)[:64]
+    (line,) = arm.said('max_channels')
+    assert "left out: 436 joints 'j64', 'j65'" in line
+    arm.wait_report("left out: 436 joints 'j64'")
