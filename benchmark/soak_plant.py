@@ -16,8 +16,9 @@ import signal
 import sys
 import threading
 from time import monotonic
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from fhaosmo_ros.nodes.middleware.arguments import read_arguments
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.nodes.plant import PlantNode
 import numpy as np
@@ -129,8 +130,8 @@ class Faults:
 class FaultyPlant(PlantNode):
     """A plant whose y goes through faults."""
 
-    def __init__(self, events: list[Event]) -> None:
-        super().__init__()
+    def __init__(self, given: dict[str, Any], events: list[Event]) -> None:
+        super().__init__(given)
         self.faults = Faults(self, events)
         self._publish_y = self.faults.pass_on
 
@@ -143,8 +144,9 @@ def main() -> None:
     arguments, rest = parser.parse_known_args()
     ended = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: ended.set())
+    given, _, rest = read_arguments('plant', rest)
     rclpy.init(args=[sys.argv[0], *rest], signal_handler_options=SignalHandlerOptions.NO)
-    node = FaultyPlant(schedule(arguments.seed, arguments.seconds))
+    node = FaultyPlant(given, schedule(arguments.seed, arguments.seconds))
     with Spinner(node, on_end=ended.set) as spinner:
         ended.wait()
     if spinner.error:

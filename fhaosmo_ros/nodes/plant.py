@@ -4,18 +4,18 @@
 from collections.abc import Mapping
 from functools import partial
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.tables import PLANT_NODE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import Plant
 from fhaosmo_ros.nodes.middleware.messages import labelled
-from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
+from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
 from fhaosmo_ros.nodes.middleware.publishers import check_overrides, create_publisher
-from fhaosmo_ros.nodes.middleware.simulated_time import reject_negative_time
+from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
-from rclpy.node import Node
+from fhaosmo_ros.nodes.middleware.timers import set_period
 from std_msgs.msg import Float64, Float64MultiArray
 
 MAX_PAUSE = 1_000_000_000
@@ -23,19 +23,17 @@ MAX_PAUSE = 1_000_000_000
 TOPICS = {'y': Float64, '~/state': Float64MultiArray, '~/unknown_input': Float64}
 
 
-class Change(NamedTuple):
-    """A live change: what somebody sets, and the parameters of the simulation with it."""
-
-    changes: Mapping[str, Value]
-    simulation: Parameters
-
-
-class PlantNode(Node):
+class PlantNode(TimedNode):
     """
     Publishes ``y``, ``~/state`` and ``~/unknown_input`` at `sample_rate`.
 
     A plant that becomes unstable stays where it is: from the first value on that is not finite,
     nothing is published, and an error is logged once.
+
+    Parameters
+    ----------
+    given : mapping, optional
+        Values of parameters, of the node and of rclpy's own such as use_sim_time.
 
     Raises
     ------
@@ -44,24 +42,19 @@ class PlantNode(Node):
 
     """
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(
-            'plant',
-            automatically_declare_parameters_from_overrides=True,
-            enable_logger_service=True,
-            **options,
-        )
-        reject_negative_time(self)
-        values = complete(overrides_of(self), PLANT_NODE_PARAMETERS)
+    def __init__(self, given: Mapping[str, Any] | None = None, **options: Any) -> None:
+        given = given or {}
+        values = complete(given, PLANT_NODE_PARAMETERS)
         self.plant = Plant(values)
-        fixed = [name for name, p in PLANT_NODE_PARAMETERS.items() if not p.live]
-        self._node_parameters = NodeParameters(self, values, fixed)
+        super().__init__(
+            'plant', parameter_overrides=built_in(given), enable_logger_service=True, **options
+        )
         self._u = [0.0] * len(self.plant.model.inputs)
         self._origin: int | None = None
         self._now = 0
         self._diverged = False
         self._state_message = labelled([f'z{i + 1}' for i in range(self.plant.order)])
-        check_overrides(self, TOPICS)
+        check_overrides(self, given, TOPICS)
         self._publish_y, self._publish_state, self._publish_d = (
             create_publisher(self, kind, topic).publish for topic, kind in TOPICS.items()
         )
@@ -69,9 +62,10 @@ class PlantNode(Node):
             if name in self.plant.model.used_inputs:
                 take = partial(self._on_input, index, name)
                 self.create_subscription(Float64, name, take, 10)
-        self._node_parameters.on_change(self._prepare, self._adopt)
+        fixed = [name for name, p in PLANT_NODE_PARAMETERS.items() if not p.live]
+        NodeParameters(self, values, fixed).on_change(self._prepare, self._adopt)
         self.plant.sample(0.0)
-        self._timer = self._start_timer(values['sample_rate'])
+        self._timer = self.create_timer(1.0 / values['sample_rate'], self._tick)
         self.get_logger().info(
             f'simulating {self.plant.order} states, d: {values["disturbance"]}, '
             f'y at {values["sample_rate"]:g} Hz'
@@ -88,7 +82,13 @@ class PlantNode(Node):
         clock = self.get_clock()
         self.plant.advance(self._plant_time(clock.now().nanoseconds), self._u)
         if not self.plant.finite:
-            self._hold()
+            if not self._diverged:
+                self._diverged = True
+                self.get_logger().error(
+                    'the simulated plant has left the finite numbers: nothing is published any '
+                    'more; its phi, the disturbance or a known input make it unstable. Correct '
+                    'them and start the node again'
+                )
             return
         truth = self.plant.sample(self._plant_time(clock.now().nanoseconds), self._u)
         if not math.isfinite(truth.y):
@@ -96,16 +96,6 @@ class PlantNode(Node):
         self._publish_y(Float64(data=truth.y))
         self._publish_state(self._state_message(truth.z))
         self._publish_d(Float64(data=truth.unknown_input))
-
-    def _hold(self) -> None:
-        """Log once that the plant has left the finite numbers."""
-        if not self._diverged:
-            self._diverged = True
-            self.get_logger().error(
-                'the simulated plant has left the finite numbers: nothing is published any more; '
-                'its phi, the disturbance or a known input make it unstable. Correct them and '
-                'start the node again'
-            )
 
     def _plant_time(self, now: int) -> float:
         """Return the plant's time in seconds; it stands still while the clock jumps."""
@@ -131,20 +121,16 @@ class PlantNode(Node):
                 throttle_duration_sec=5.0,
             )
 
-    def _start_timer(self, rate: float) -> Any:
-        return self.create_timer(1.0 / rate, self._tick)
+    def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> Any:
+        return changes, values, self.plant.prepare(values)
 
-    def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> Change:
-        return Change(changes, self.plant.prepare(values))
-
-    def _adopt(self, change: Change) -> None:
-        if 'noise_seed' in change.changes:  # the noise begins again, also with the same seed
-            self.plant.configure(change.simulation)
+    def _adopt(self, change: Any) -> None:
+        changes, values, simulation = change
+        if 'noise_seed' in changes:  # the noise begins again, also with the same seed
+            self.plant.configure(simulation)
         else:
-            self.plant.adopt(change.simulation)
-        if 'sample_rate' in change.changes:
-            self.destroy_timer(self._timer)
-            self._timer = self._start_timer(change.changes['sample_rate'])
+            self.plant.adopt(simulation)
+        set_period(self._timer, 1.0 / values['sample_rate'])
 
 
 def main(argv: list[str] | None = None) -> int:

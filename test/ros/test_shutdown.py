@@ -128,7 +128,7 @@ from fhaosmo_ros.nodes.middleware.spin import run_node
 from rclpy.node import Node
 
 class Sleeper(Node):
-    def __init__(self):
+    def __init__(self, given):
         super().__init__('sleeper')
         self.create_timer(0.01, self.sleep)
 

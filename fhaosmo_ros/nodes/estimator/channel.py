@@ -5,7 +5,6 @@ from collections.abc import Callable
 from functools import partial
 from math import isfinite
 from time import perf_counter, time_ns
-from typing import NamedTuple
 
 from fhaosmo_ros.core.observer.status import REJECTED, Status, UNUSED
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
@@ -13,10 +12,8 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.inputs import known_inputs, make_pairing, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
-from fhaosmo_ros.nodes.estimator.listener import Listener
-from fhaosmo_ros.nodes.estimator.outputs import EventOutput, Outputs
-from fhaosmo_ros.nodes.estimator.snapshots import SnapshotPublisher
-from fhaosmo_ros.nodes.estimator.sources import Sources
+from fhaosmo_ros.nodes.estimator.outputs import EventOutput, Outputs, SnapshotOutput
+from fhaosmo_ros.nodes.estimator.sources import Listener, Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import Output
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, WARN
 from rclpy.node import Node
@@ -26,13 +23,6 @@ TOLD = REJECTED | int(Status.RESTARTED | Status.DIVERGED | Status.JUMPED)
 """Flags of a step that are logged."""
 QUIET = 5.0
 """Seconds between two warnings of one kind."""
-
-
-class ChannelChange(NamedTuple):
-    """A live change of parameters that a channel can take; see `Channel.prepare`."""
-
-    values: Parameters
-    estimator: Change
 
 
 class Channel:
@@ -68,39 +58,33 @@ class Channel:
         estimated: Callable[['Channel'], None],
         name: str = '',
     ) -> None:
-        self._node = node
         self._estimated = estimated
         self.name = name
-        outputs = f'~/{name}/' if name else '~/'
         self._clock = node.get_clock()
-        self._logger = node.get_logger()
-        if name:
-            self._logger = self._logger.get_child(name)
+        self._logger = node.get_logger().get_child(name) if name else node.get_logger()
         self.estimator = estimator
         self._values = values
-        self._read_settings()
         self._active = False
         self._lost_before = 0
         self._forget()
-        observer = self.estimator.observer
-        self._outputs = Outputs(node, outputs, observer)
-        self._events = EventOutput(node, outputs, name)
-        self._snapshots = SnapshotPublisher(node, self.estimator, outputs)
+        observer = estimator.observer
+        prefix = f'~/{name}/' if name else '~/'
+        self._outputs = Outputs(node, prefix, estimator)
+        self._events = EventOutput(node, prefix, name)
+        self._snapshots = SnapshotOutput(node, prefix, estimator)
         simulated = node.get_parameter('use_sim_time').value
-        self._health = Health(self.estimator, values, simulated)
+        self._health = Health(estimator, values, simulated)
         wanted = measured_output(values, name)
         self._y = sources.of(wanted).add(wanted, self._on_sample)
-        self._u: dict[str, Listener] = {}
         known = known_inputs(values, observer.used_inputs, name)
         self._pairing = make_pairing(values, observer.inputs, known, estimator.inputs)
+        self._u: dict[str, Listener] = {}
         for u, its in known.items():
             take = partial(self._on_input, observer.inputs.index(u), u)
             self._u[u] = sources.of(its).add(its, take, first=True)
-        services = [
-            node.create_service(Trigger, outputs + 'reset', self.reset),
-            node.create_service(SetBool, outputs + 'freeze', self.freeze),
-        ]
-        self._owned = [(node.destroy_service, s) for s in services]
+        if name:  # those without a name are the node's
+            node.create_service(Trigger, prefix + 'reset', self.reset)
+            node.create_service(SetBool, prefix + 'freeze', self.freeze)
 
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
@@ -110,7 +94,6 @@ class Channel:
         if self._pairing is not None:
             self._pairing.forget_samples()
             self._unpaired = self._pairing.late, self._pairing.ahead
-        self._y.source.forget()
         self._lost_before = self._y.source.lost
         self._active = True
         if self.estimator.events.on:
@@ -125,51 +108,25 @@ class Channel:
         """Drop samples and publish nothing from now on."""
         self._active = False
 
-    def destroy(self) -> None:
-        """Take the topics and the services away."""
-        self.deactivate()
-        for destroy, entity in self._owned:
-            destroy(entity)
-        self._owned = []
-        self._outputs.destroy()
-        self._events.destroy()
-        self._snapshots.destroy()
-
-    def prepare(self, values: Parameters) -> ChannelChange:
-        """
-        Return what `adopt` takes to go on with other live parameters; change nothing.
-
-        Raises
-        ------
-        ConfigurationError
-            They do not fit together.
-
-        """
-        return ChannelChange(values, self.estimator.prepare(values))
-
-    def adopt(self, change: ChannelChange) -> None:
-        """Go on with what `prepare` has returned, from the next sample on."""
+    def adopt(self, values: Parameters, change: Change) -> None:
+        """Go on with other live parameters, which the estimator has prepared."""
         found = self.estimator.events.on
-        self.estimator.adopt(change.estimator)
+        self.estimator.adopt(change)
         self._snapshots.changed()
-        self._values = change.values
+        self._values = self._health.limits = values
         if self._active and found != self.estimator.events.on:
             text = 'events are switched off' if found else 'no event yet'
-            self._events.say(text, change.values['hardware_id'])
-        self._health.limits = change.values
-        self._read_settings()
+            self._events.say(text, values['hardware_id'])
 
     def reports(self) -> list[Report]:
         """Return the reports for /diagnostics, on the time since the last ones."""
-        y = self._y
-        publishers = y.source.look()
-        self._health.lost = y.source.lost - self._lost_before
-        self._health.damaged = y.source.damaged
-        self._health.lacking = y.lacking
+        y, health = self._y, self._health
+        health.lost = y.source.lost - self._lost_before
+        health.damaged, health.lacking = y.source.damaged, y.lacking
         title = f'{self.name} ' if self.name else ''
-        reports = self._health.reports(y, publishers, self._stale, title)
+        reports = health.reports(y, y.source.publishers, self._stale, title)
         for name, u in self._u.items():
-            found = u.source.look() if u.source is not y.source else publishers
+            found = u.source.publishers
             for text in [u.error] if u.error else found.unheard.values():
                 reports[0].find(ERROR if u.error else WARN, text)
             if not found.heard and not found.unheard:
@@ -196,12 +153,6 @@ class Channel:
                 'one clock?',
             )
 
-    def _read_settings(self) -> None:
-        self._unit = derivative_unit(
-            self._values['measurement_unit'], self.estimator.observer.order
-        )
-        self._clock_stamps = self._values['sampling'] == 'clock'
-
     def _forget(self) -> None:
         self._arrived = False
         self._stale = True
@@ -218,7 +169,7 @@ class Channel:
         health.delays.append(time_ns() - source)
         health.offset = source - stamp if stamp else 0
         measured = stamp
-        if self._clock_stamps:
+        if self._values['sampling'] == 'clock':
             stamp = self._clock.now().nanoseconds
         if self._pairing is None:
             self._take(stamp, y)
@@ -263,8 +214,9 @@ class Channel:
 
     def _tell_events(self) -> None:
         """Publish, and log, the events that have begun or ended."""
+        unit = derivative_unit(self._values['measurement_unit'], self.estimator.observer.order)
         for event in self.estimator.events.taken():
-            text = self._events.publish(event, self._unit, self._values['hardware_id'])
+            text = self._events.publish(event, unit, self._values['hardware_id'])
             if event.begins:
                 self._logger.warning(f'event: {text}', throttle_duration_sec=QUIET)
 
@@ -312,12 +264,10 @@ class Channel:
 
     def publish(self) -> Output | None:
         """Publish the numbers of the latest estimate; return it for the typed messages."""
-        estimator = self.estimator
-        estimate = estimator.estimate
+        estimate, stamp = self.estimator.estimate, self.estimator.stamp
         if estimate is None:
             return None
-        stamp = estimator.stamp
-        self._outputs.publish(estimator, estimate, stamp)
+        self._outputs.publish(estimate, stamp)
         return Output(self.label, stamp, estimate, self._values)
 
     @property
@@ -365,13 +315,13 @@ class Channel:
     def _reason(self, word: int, stamp: int, y: float) -> tuple[int, str]:
         """Return the flag that says why a sample was rejected, and the reason in words."""
         late = 'expected a stamp later than the one before'
-        if not stamp and not self._clock_stamps:
+        if not stamp and self._values['sampling'] != 'clock':
             hint = '; input_stamp: source does without it' if self._y.stamps == 'header' else ''
             late = f'its {self._y.stamps} stamp is 0: nobody fills it{hint}'
         for flag, text in (
             (
                 Status.HELD,
-                'its stamp lies more than max_gap from the one before; the next one decides',
+                'its stamp lies more than max_gap from the one before; the next tells',
             ),
             (Status.REJECTED_PERIOD, late),
             (Status.REJECTED_SPIKE, f'y = {y} lies beyond spike_gate'),

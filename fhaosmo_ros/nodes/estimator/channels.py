@@ -3,18 +3,20 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
 
-from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.per_channel import of_channel, UNNAMED
-from fhaosmo_ros.nodes.estimator.channel import Channel, ChannelChange
+from fhaosmo_ros.core.parameters.per_channel import of_channel
+from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.sources import Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import Output, TypedOutputs
 from fhaosmo_ros.nodes.middleware.diagnostics import Report
+from fhaosmo_ros.nodes.middleware.timers import set_period
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
+
+ChannelChange = tuple[Parameters, Change]
 
 
 class Channels:
@@ -44,51 +46,32 @@ class Channels:
         estimators: Mapping[str, OnlineEstimator],
         sources: Sources,
     ) -> None:
-        self._node = node
-        self._rate = values['publish_rate']
-        self._each = values['publish_on'] == 'sample'
-        sources.after_message(self._publish_typed)
+        self._sources = sources
         self._outputs: dict[str, Output] = {}
         """Estimates that have been published, but not yet in the typed messages."""
-        self._typed: TypedOutputs | None = None
-        self._timer: Any = None
-        self._services: list[Any] = []
-        self.channels: list[Channel] = []
-        try:
-            for name, estimator in estimators.items():
-                own = of_channel(values, name)
-                self.channels.append(Channel(node, own, estimator, sources, self._estimated, name))
-            self._typed = TypedOutputs(node, values)
-            if list(estimators) != UNNAMED:  # else the channel's own services have these names
-                self._services = [
-                    node.create_service(Trigger, '~/reset', self._reset),
-                    node.create_service(SetBool, '~/freeze', self._freeze),
-                ]
-        except BaseException:
-            self.destroy()
-            raise
+        self._typed = TypedOutputs(node, values)
+        self._each = values['publish_on'] == 'sample'
+        self.channels = [
+            Channel(node, of_channel(values, name), estimator, sources, self._estimated, name)
+            for name, estimator in estimators.items()
+        ]
+        sources.after_message = self._publish_typed
+        node.create_service(Trigger, '~/reset', self._reset)
+        node.create_service(SetBool, '~/freeze', self._freeze)
+        self._timer = node.create_timer(1.0 / values['publish_rate'], self._tick)
+        self._timer.cancel()
 
     def activate(self) -> None:
         """Take samples and publish from now on."""
         for channel in self.channels:
             channel.activate()
-        self._start_timer()
+        self._timer.reset()
 
     def deactivate(self) -> None:
         """Drop samples and publish nothing from now on."""
+        self._timer.cancel()
         for channel in self.channels:
             channel.deactivate()
-        self._stop_timer()
-
-    def destroy(self) -> None:
-        """Take all topics and services away."""
-        self.deactivate()
-        while self.channels:
-            self.channels.pop().destroy()
-        if self._typed is not None:
-            self._typed.destroy()
-        while self._services:
-            self._node.destroy_service(self._services.pop())
 
     def prepare(self, values: Parameters) -> list[ChannelChange]:
         """
@@ -102,24 +85,21 @@ class Channels:
         """
         changes = []
         for channel in self.channels:
+            own = of_channel(values, channel.name)
             with naming_channel(channel.name):
-                changes.append(channel.prepare(of_channel(values, channel.name)))
+                changes.append((own, channel.estimator.prepare(own)))
         return changes
 
     def adopt(self, changes: list[ChannelChange]) -> None:
         """Go on with what `prepare` has returned, from the next sample on."""
-        for channel, change in zip(self.channels, changes, strict=True):
-            channel.adopt(change)
-        rate = changes[0].values['publish_rate']
-        self._each = changes[0].values['publish_on'] == 'sample'
-        if rate != self._rate:
-            self._rate = rate
-            if self._timer is not None:
-                self._stop_timer()
-                self._start_timer()
+        for channel, (values, change) in zip(self.channels, changes, strict=True):
+            channel.adopt(values, change)
+        self._each = values['publish_on'] == 'sample'
+        set_period(self._timer, 1.0 / values['publish_rate'])
 
     def reports(self) -> list[Report]:
         """Return the reports of all channels."""
+        self._sources.look()
         return [report for channel in self.channels for report in channel.reports()]
 
     def _tick(self) -> None:
@@ -142,17 +122,9 @@ class Channels:
             self._outputs[channel.name] = output
 
     def _publish_typed(self) -> None:
-        if self._outputs and self._typed is not None:
+        if self._outputs:
             self._typed.publish(list(self._outputs.values()))
             self._outputs.clear()
-
-    def _start_timer(self) -> None:
-        self._timer = self._node.create_timer(1.0 / self._rate, self._tick)
-
-    def _stop_timer(self) -> None:
-        if self._timer is not None:
-            self._node.destroy_timer(self._timer)
-            self._timer = None
 
     def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         for channel in self.channels:

@@ -2,6 +2,7 @@
 """What a channel reports on /diagnostics: on its input, and on its observer."""
 
 from collections import deque
+from math import nan
 from time import perf_counter
 from typing import NamedTuple
 
@@ -12,11 +13,10 @@ from fhaosmo_ros.core.online.events import described
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
-from fhaosmo_ros.nodes.estimator.listener import Listener
+from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
 from fhaosmo_ros.nodes.middleware.publisher_watch import Publishers
 import numpy as np
-from numpy.typing import NDArray
 
 LIMIT = 20_000
 """Number of latest samples that are remembered for one report."""
@@ -45,27 +45,19 @@ class Interval(NamedTuple):
 
     Attributes
     ----------
-    periods : (K,) array
-        Intervals between the samples' stamps, in seconds.
-    delays : (K,) array
-        Times from the source stamp to the callback, in nanoseconds.
-    durations : (K,) array
-        Times that the callback took, in seconds.
-    unknown_inputs : (K,) array
-        Estimates of d.
-    counts : dict of str to int
-        Counters now.
-    news : dict of str to int
-        By how much each counter has grown.
+    mean, jitter, longest : float
+        Of the intervals between the samples' stamps: mean, standard deviation over the mean, and
+        longest one; s, NaN without samples.
+    counts, news : dict of str to int
+        Counters now, and by how much each has grown.
     stale : bool
         No estimates are published, because no samples come.
 
     """
 
-    periods: NDArray[np.float64]
-    delays: NDArray[np.float64]
-    durations: NDArray[np.float64]
-    unknown_inputs: NDArray[np.float64]
+    mean: float
+    jitter: float
+    longest: float
     counts: dict[str, int]
     news: dict[str, int]
     stale: bool
@@ -90,12 +82,12 @@ class Health:
     stamps, delays, durations, unknown_inputs : deque
         To be appended to on each sample: stamp (ns); time from the source stamp to the callback
         (ns); time that the callback took (s); estimate of d.
-    lost : int
-        Samples missing between the publisher's sequence numbers.
-    damaged, lacking : int
-        Messages that are shorter than their type, and those that lack the field.
+    lost, damaged, lacking : int
+        Messages that did not arrive, are shorter than their type, lack the field.
     offset : int
         From the latest sample's stamp to the publication of its message (ns).
+    latest : float
+        Time of the last sample on `perf_counter`, NaN before the first.
 
     """
 
@@ -103,17 +95,15 @@ class Health:
         self, estimator: OnlineEstimator, limits: Parameters, simulated: bool = False
     ) -> None:
         self._estimator = estimator
-        self.simulated = simulated
+        self._simulated = simulated
         self.limits = limits
         self.stamps: deque[int] = deque(maxlen=LIMIT)
         self.delays: deque[int] = deque(maxlen=LIMIT)
         self.durations: deque[float] = deque(maxlen=LIMIT)
         self.unknown_inputs: deque[float] = deque(maxlen=LIMIT)
-        self.lost = self.damaged = self.lacking = 0
-        self.offset = 0
-        self.latest = float('nan')
-        """Time of the last sample on `perf_counter`."""
-        self._before: dict[str, int] = self._counts()
+        self.lost = self.damaged = self.lacking = self.offset = 0
+        self.latest = nan
+        self._before = self._counts()
         self._events_before = 0
 
     def reports(self, y: Listener, publishers: Publishers, stale: bool, name: str) -> list[Report]:
@@ -131,47 +121,42 @@ class Health:
             Of the channel, as a prefix of 'input' and 'observer'.
 
         """
-        interval = self._interval(stale)
-        return [
+        counts = self._counts()
+        news = {key: count - self._before[key] for key, count in counts.items()}
+        self._before = counts
+        mean = jitter = longest = nan
+        periods = np.diff(np.array(self.stamps, dtype=np.int64)) * NANOSECONDS
+        if len(periods):
+            mean, longest = float(np.mean(periods)), float(np.max(periods))
+            jitter = float(np.std(periods)) / mean if mean > 0.0 else nan
+        interval = Interval(mean, jitter, longest, counts, news, stale)
+        reports = [
             self._input(Report(f'{name}input'), interval, y, publishers),
             self._observer(Report(f'{name}observer'), interval),
         ]
-
-    def _interval(self, stale: bool) -> Interval:
-        """Return what happened since the last call."""
-        counts = self._counts()
-        news = {key: counts[key] - self._before[key] for key in counts}
-        self._before = counts
-        periods = np.diff(np.array(self.stamps, dtype=np.int64)) * NANOSECONDS
-        delays, durations, d = (
-            np.array(column) for column in (self.delays, self.durations, self.unknown_inputs)
-        )
         for column in (self.stamps, self.delays, self.durations, self.unknown_inputs):
             column.clear()
-        return Interval(periods, delays, durations, d, counts, news, stale)
+        return reports
 
     def _input(
         self, report: Report, interval: Interval, y: Listener, publishers: Publishers
     ) -> Report:
-        topic = y.source.topic
-        limits, news = self.limits, interval.news
-        periods, delays = interval.periods, interval.delays
-        mean = float(np.mean(periods)) if len(periods) else float('nan')
-        jitter = float(np.std(periods)) / mean if mean > 0.0 else float('nan')
-        delay = float(np.max(delays)) * NANOSECONDS if len(delays) else float('nan')
+        limits, news, mean = self.limits, interval.news, interval.mean
+        delay = max(self.delays) * NANOSECONDS if self.delays else nan
+        offset = self.offset * NANOSECONDS
         age = perf_counter() - self.latest
         names = ', '.join(sorted(publishers.heard.values()))
         report.values = {
-            'topic': topic,
+            'topic': y.source.topic,
             'type': y.source.message_type or 'not known yet',
             'field': y.field.text if y.field else 'not known yet',
             'stamps': 'clock' if limits['sampling'] == 'clock' else y.stamps or 'not known yet',
             'publishers': names or 'none',
-            'sample rate [Hz]': 1.0 / mean if mean > 0.0 else float('nan'),
-            'jitter (std / mean of the period)': jitter,
-            'longest period [s]': float(np.max(periods)) if len(periods) else float('nan'),
+            'sample rate [Hz]': 1.0 / mean if mean > 0.0 else nan,
+            'jitter (std / mean of the period)': interval.jitter,
+            'longest period [s]': interval.longest,
             'longest delay [s]': delay,
-            'from stamp to publication [s]': self.offset * NANOSECONDS,
+            'from stamp to publication [s]': offset,
             'age of the last sample [s]': age,
             **interval.counts,
         }
@@ -184,17 +169,17 @@ class Health:
             since = f'for {age:.3g} s' if age == age else 'yet'
             report.find(silence, f'no usable sample {since}')
         if not names and not y.error:
-            report.find(silence, f'no publisher of {topic} that can be heard')
+            report.find(silence, f'no publisher of {y.source.topic} that can be heard')
         elif len(publishers.heard) > 1 and not news['messages without y']:
             report.find(WARN, f'{len(publishers.heard)} publishers, their samples mix')
-        if news['messages without y'] and not news['samples accepted']:
+        used, spread = news['samples accepted'], news['spread stamps']
+        if news['messages without y'] and not used:
             report.find(WARN, f'{news["messages without y"]} messages without y: {y.why}')
         bad = {key: news[key] for key in UNUSED if news[key]}
         if bad:
-            share = sum(bad.values()) / (sum(bad.values()) + news['samples accepted'])
+            share = sum(bad.values()) / (sum(bad.values()) + used)
             level = ERROR if share > limits['error_bad_share_above'] else WARN
             report.find(level, ', '.join(f'{key} {n}' for key, n in bad.items()))
-        used, spread = news['samples accepted'], news['spread stamps']
         if used < 2 * spread:
             report.find(
                 WARN,
@@ -206,64 +191,53 @@ class Health:
                 report.find(WARN, f'{key} {news[key]}')
         if mean * limits['warn_rate_below'] > 1.0:
             report.find(WARN, f'sample rate {1.0 / mean:.4g} Hz')
-        if jitter > limits['warn_jitter_above']:
-            report.find(WARN, f'jitter {jitter:.3g}')
+        if interval.jitter > limits['warn_jitter_above']:
+            report.find(WARN, f'jitter {interval.jitter:.3g}')
         if delay > limits['warn_delay_above']:
             report.find(WARN, f'samples arrive {delay:.3g} s after their stamps')
-        self._find_other_clock(report, y)
-        return report
-
-    def _find_other_clock(self, report: Report, y: Listener) -> None:
-        """Tell of header stamps that are far from the time of publication."""
-        if y.stamps != 'header' or self.simulated:
-            return
-        offset, limit = self.offset * NANOSECONDS, self.limits['warn_delay_above']
-        if abs(offset) > limit:
+        by_header = y.stamps == 'header' and not self._simulated
+        if by_header and abs(offset) > limits['warn_delay_above']:
             side = 'before' if offset > 0.0 else 'after'
             report.find(
                 WARN,
                 f'header stamps lie {abs(offset):.3g} s {side} publication: another clock '
                 "than the host's, or an old measurement; dt is not affected",
             )
+        return report
 
     def _observer(self, report: Report, interval: Interval) -> Report:
-        observer, estimate = self._estimator.observer, self._estimator.estimate
-        limits = self.limits
+        estimator, limits, mean = self._estimator, self.limits, interval.mean
+        observer, estimate, offset = estimator.observer, estimator.estimate, estimator.offset
         unit = derivative_unit(limits['measurement_unit'], observer.order)
-        d_now = estimate.unknown_input if estimate else float('nan')
-        periods, durations, d = interval.periods, interval.durations, interval.unknown_inputs
-        diverged, jumps = interval.news['divergences'], interval.news['jumps']
-        offset = self._estimator.offset
+        d_now = estimate.unknown_input if estimate else nan
+        d, durations = np.array(self.unknown_inputs), np.array(self.durations)
         chatter = high_passed(d, WINDOW)
-        spread = float(np.std(d)) if len(d) else float('nan')
-        overruns = int(np.sum(durations > np.mean(periods))) if len(periods) else 0
-        away, tuned = _gamma_away(self._estimator), observer.parameters['correction_period']
-        mean = float(np.mean(periods)) if len(periods) else 0.0
+        deviation = float(np.std(d)) if len(d) else nan
+        overruns = int(np.sum(durations > mean))
+        away = self._gamma_away()
         report.values = {
             'open levels': f'{estimate.open_levels if estimate else 0} of {observer.levels}',
-            'gamma': estimate.gamma if estimate else float('nan'),
+            'gamma': estimate.gamma if estimate else nan,
             'gamma away from gamma_initial': away,
-            'gamma at': _bound(self._estimator, estimate.status if estimate else Status.OK),
-            'innovations over those expected': self._estimator.spread,
+            'gamma at': self._bound(estimate.status if estimate else Status.OK),
+            'innovations over those expected': estimator.spread,
             'y over z1, since it jumped': offset,
             titled('unknown input', unit): d_now,
             'chatter of the unknown input': chatter,
             'chatter index (0 smooth, 1 nothing but chatter)': (
-                min(1.0, chatter / spread) if spread > 0.0 else 0.0
+                min(1.0, chatter / deviation) if deviation > 0.0 else 0.0
             ),
             'step time, mean [us]': 1e6 * float(np.mean(durations)) if len(durations) else 0.0,
-            'step time, longest [us]': 1e6 * float(np.max(durations)) if len(durations) else 0.0,
+            'step time, longest [us]': 1e6 * max(self.durations, default=0.0),
             'overruns': overruns,
         }
         if observer.self_tuning:
-            tuning = observer.tuning
+            tuning, d_error = observer.tuning, float(estimator.standard_deviation[-1])
             report.values |= {
                 'noise of y': tuning.noise,
                 'correlation of the noise': tuning.correlation,
                 'd is followed within [s]': 1.0 / tuning.bandwidth,
-                titled('standard deviation of d', unit): float(
-                    self._estimator.standard_deviation[-1]
-                ),
+                titled('standard deviation of d', unit): d_error,
             }
         self._find_events(report, unit)
         if limits['unknown_input_unit']:
@@ -274,6 +248,7 @@ class Health:
         elif estimate is not None and estimate.open_levels < observer.levels:
             first = estimate.open_levels + 1
             report.find(WARN, f'levels from {first} on hold: an innovation is above epsilon')
+        diverged, jumps = interval.news['divergences'], interval.news['jumps']
         if diverged:
             report.find(ERROR, f'diverged and started again from y, {diverged} times')
         if jumps:
@@ -282,19 +257,19 @@ class Health:
             report.find(WARN, f'y is taken as {offset:.3g} too large since it jumped')
         if abs(away) > GAMMA_AWAY:
             report.find(WARN, f'gamma is {away:+.2g} away from gamma_initial')
-        tuned = tuned if observer.parameters['scheme'] == 'predict_correct' else 0.0
-        if tuned and mean and not tuned / RATE_RATIO < mean < tuned * RATE_RATIO:
+        tuned = observer.parameters['correction_period']
+        by_period = observer.parameters['scheme'] == 'predict_correct' and tuned and mean > 0.0
+        if by_period and not tuned / RATE_RATIO < mean < tuned * RATE_RATIO:
             report.find(
                 WARN, f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / mean:.4g} Hz'
             )
-        if self._estimator.spread > SPREAD:
+        if estimator.spread > SPREAD:
             report.find(
-                WARN,
-                f'innovations are {self._estimator.spread:.3g} times as large as noise_size says',
+                WARN, f'innovations are {estimator.spread:.3g} times as large as noise_size says'
             )
         if overruns:
             report.find(WARN, f'{overruns} steps took longer than the sampling period')
-        if 0.0 < self.limits['warn_chatter_above'] < chatter:
+        if 0.0 < limits['warn_chatter_above'] < chatter:
             report.find(WARN, f'the estimate of d chatters by {chatter:.3g}')
         return report
 
@@ -327,20 +302,18 @@ class Health:
             'restarts': counters.restarts,
         }
 
+    def _gamma_away(self) -> float:
+        observer, estimate = self._estimator.observer, self._estimator.estimate
+        adaptive = observer.parameters['variant'].endswith('_adaptive')
+        if estimate is None or observer.self_tuning or not adaptive:
+            return 0.0
+        return float(estimate.gamma - observer.parameters['gamma_initial'])
 
-def _gamma_away(estimator: OnlineEstimator) -> float:
-    estimate, parameters = estimator.estimate, estimator.observer.parameters
-    adaptive = parameters['variant'].endswith('_adaptive') and not estimator.observer.self_tuning
-    if estimate is None or not adaptive:
-        return 0.0
-    return float(estimate.gamma - parameters['gamma_initial'])
-
-
-def _bound(estimator: OnlineEstimator, status: Status) -> str:
-    if not estimator.observer.parameters['variant'].endswith('_adaptive'):
-        return 'a fixed value'
-    if estimator.frozen:
-        return 'the value that ~/freeze holds'
-    if status & Status.GAMMA_AT_MIN:
-        return 'gamma_min'
-    return 'gamma_max' if status & Status.GAMMA_AT_MAX else 'neither bound'
+    def _bound(self, status: Status) -> str:
+        if not self._estimator.observer.parameters['variant'].endswith('_adaptive'):
+            return 'a fixed value'
+        if self._estimator.frozen:
+            return 'the value that ~/freeze holds'
+        if status & Status.GAMMA_AT_MIN:
+            return 'gamma_min'
+        return 'gamma_max' if status & Status.GAMMA_AT_MAX else 'neither bound'

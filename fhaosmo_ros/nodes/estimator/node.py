@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimator node: a managed node (ROS 2 lifecycle) of one channel or many."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -10,27 +10,27 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.per_channel import (
     CHANNELS,
+    followers,
     FROM_JOINTS,
     of_channel,
     split,
     with_own_parameters,
 )
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.inputs import measured_output, with_joints
-from fhaosmo_ros.nodes.estimator.channel_inheritance import ChannelInheritance
+from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
 from fhaosmo_ros.nodes.estimator.channels import Channels, make_estimators
 from fhaosmo_ros.nodes.estimator.joints import Joints
-from fhaosmo_ros.nodes.estimator.listener import check_inputs
 from fhaosmo_ros.nodes.estimator.parameter_topic import ParameterTopic
-from fhaosmo_ros.nodes.estimator.sources import Sources
+from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE, WARN
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
-from fhaosmo_ros.nodes.middleware.parameters import NodeParameters, overrides_of
+from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
 from fhaosmo_ros.nodes.middleware.publishers import check_overrides
 from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
 from fhaosmo_ros.nodes.middleware.spin import run_node
 from fhaosmo_ros.nodes.middleware.subscription import input_qos
+from fhaosmo_ros.nodes.middleware.timers import set_period
 from fhaosmo_ros.topics import estimates_of, EVENT
 from rclpy.parameter import Parameter as RosParameter
 
@@ -39,9 +39,14 @@ class EstimatorNode(ManagedNode):
     """
     A managed node around one channel, or many.
 
-    configure makes the channel from the parameters; activate lets it take samples and publish;
-    deactivate stops that; cleanup destroys the channel, and then every parameter can be set,
-    except the names of the channels.
+    configure makes the channels from the parameters; activate lets them take samples and publish;
+    deactivate stops that; cleanup destroys them, and then every parameter can be set, except the
+    names of the channels.
+
+    Parameters
+    ----------
+    given : mapping, optional
+        Values of parameters, of the node and of rclpy's own such as use_sim_time.
 
     Raises
     ------
@@ -50,40 +55,39 @@ class EstimatorNode(ManagedNode):
 
     """
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, given: Mapping[str, Any] | None = None, **options: Any) -> None:
+        given = dict(given or {})
+        # In simulated time the middleware's stamps are of no use, but those of headers are.
+        self._chooses_sampling = given.get('use_sim_time') is True and 'sampling' not in given
+        if self._chooses_sampling:
+            given['sampling'] = 'clock'
+        values = complete(with_joints(given), ESTIMATOR_PARAMETERS)
         super().__init__(
             'estimator',
-            automatically_declare_parameters_from_overrides=True,
+            parameter_overrides=built_in(given),
             enable_logger_service=True,
             **options,
         )
-        overrides = overrides_of(self)
-        # In simulated time the middleware's stamps are of no use, but those of headers are.
-        self._chooses_sampling = (
-            overrides.get('use_sim_time') is True and 'sampling' not in overrides
-        )
-        if self._chooses_sampling:
-            overrides['sampling'] = 'clock'
-        values = complete(with_joints(overrides), ESTIMATOR_PARAMETERS)
+        self._given = given
         self._names: list[str] = values[CHANNELS]
         self._joints = Joints(self)
         self._from_joints = self._names == FROM_JOINTS
-        self._node_parameters = NodeParameters(self, values, fixed=['autostart', CHANNELS])
-        self._inheritance = ChannelInheritance(
-            with_own_parameters(values[CHANNELS], values), overrides
-        )
-        self._sources: Sources | None = None
+        self._own = {name for name in given if split(name)[0]}
+        """Parameters of channels that do not change along with the common ones."""
+        self._asked: set[str] = set()
         self._channels: Channels | None = None
-        self._parameter_topic: ParameterTopic | None = None
+        self._parameters_topic: ParameterTopic | None = None
         self._clock_watch = ClockWatch(self)
+        self._node_parameters = NodeParameters(self, values, fixed=['autostart', CHANNELS])
+        self._node_parameters.on_change(self._prepare, self._adopt, self._followers)
         self._diagnostics = DiagnosticsPublisher(
             self, self._reports, values['diagnostics_period'], values['hardware_id']
         )
-        self._node_parameters.on_change(self._prepare, self._adopt, self._inheritance.followers)
-        # For the first configure; made now, so that bad parameters end the node in any case.
-        self._made: tuple[Parameters, dict[str, OnlineEstimator]] | None = None
         try:
-            self._made = self._node_parameters.values, self._make_estimators()
+            # For the first configure; made now, so that bad parameters end the node in any case.
+            self._made: tuple[Parameters, dict[str, OnlineEstimator]] | None = (
+                values, self._make_estimators(),
+            )  # fmt: skip
             if values['autostart']:
                 self.start()
             else:
@@ -98,50 +102,47 @@ class EstimatorNode(ManagedNode):
         """Return new estimators; raise for parameters that do not fit together."""
         values, names = self._node_parameters.values, self._names
         if names == FROM_JOINTS:  # which joints there are is not known yet, but some may be named
-            names = [*names, *with_own_parameters(values[CHANNELS], values)]
-        check_overrides(
-            self,
-            [
-                f'~/{name}/{topic}' if name else f'~/{topic}'
-                for name in names
-                for topic in [*estimates_of(of_channel(values, name)), EVENT]
-            ],
-        )
+            names = [*names, *with_own_parameters(names, values)]
+        own = {name: of_channel(values, name) for name in names}
+        check_overrides(self, self._given, [
+            f'~/{name}/{topic}' if name else f'~/{topic}'
+            for name in names
+            for topic in [*estimates_of(own[name]), EVENT]
+        ])  # fmt: skip
         estimators = make_estimators(values, names)
-        check_inputs(self, values, estimators)
-        check_axes(values, {name: of_channel(values, name) for name in self._names})
+        for name, estimator in estimators.items():
+            known = known_inputs(own[name], estimator.observer.used_inputs, name)
+            check_inputs(self, [measured_output(own[name], name), *known.values()])
+        check_axes(values['typed_outputs'], {name: own[name] for name in self._names})
         return estimators
 
     def configure(self) -> None:
         """Make the channel, or channels, from the present parameters."""
         values = self._node_parameters.values
         made, self._made = self._made, None
-        fresh = made is not None and made[0] is values
-        estimators = made[1] if made and fresh else self._make_estimators()
+        estimators = made[1] if made and made[0] is values else self._make_estimators()
         self._sources = Sources(self, input_qos(values), self._found_type)
-        self._parameter_topic = ParameterTopic(self)
+        self._parameters_topic = ParameterTopic(self)
+        if self._from_joints:
+            self._sources.of(measured_output(values)).on_names = self._take_joints
         if self._names == FROM_JOINTS:
-            source = self._sources.of(measured_output(values))
-            source.on_names = self._take_joints
             self._sources.open()
             self.get_logger().info(
-                f'channels from_joint_names: waiting for the first message on {source.topic}'
+                'channels from_joint_names: waiting for the first message on '
+                f'{self.resolve_topic_name(measured_output(values).topic)}'
             )
         else:
             self._make_channels(estimators)
-        self._parameter_topic.publish(self._node_parameters.values)
+        self._parameters_topic.publish(self._node_parameters.values)
 
     def _make_channels(self, estimators: dict[str, OnlineEstimator]) -> None:
         values = self._node_parameters.values
-        assert self._sources is not None
         self._channels = Channels(self, values, estimators, self._sources)
-        if self._from_joints:
-            self._sources.of(measured_output(values)).on_names = self._take_joints
         self._sources.open()
 
     def _found_type(self) -> None:
         """Choose the sampling of simulated time, once it is known which stamps there are."""
-        if not self.get_parameter('use_sim_time').value or self._sources is None:
+        if not self.get_parameter('use_sim_time').value:
             return
         stamps = self._sources.stamps
         if self._chooses_sampling and stamps and stamps <= {'header'}:
@@ -175,15 +176,14 @@ class EstimatorNode(ManagedNode):
             CHANNELS: fit,
         }, ESTIMATOR_PARAMETERS)  # fmt: skip
         self._names = fit
-        self._inheritance.extend(fit)
         self._node_parameters.extend(values)
         try:
             self._make_channels(self._make_estimators())
         except ConfigurationError as error:
             self.get_logger().error(str(error))
             return
-        assert self._parameter_topic is not None
-        self._parameter_topic.publish(values)
+        assert self._parameters_topic is not None
+        self._parameters_topic.publish(values)
         self.get_logger().info(f'channels: {", ".join(fit)}')
         if self.state == 'active':
             self.activate()
@@ -200,15 +200,15 @@ class EstimatorNode(ManagedNode):
 
     def cleanup(self) -> None:
         """Destroy the channels."""
-        if self._channels is not None:
-            self._channels.destroy()
-            self._channels = None
-        if self._sources is not None:
-            self._sources.close()
-            self._sources = None
-        if self._parameter_topic is not None:
-            self._parameter_topic.destroy()
-            self._parameter_topic = None
+        super().cleanup()
+        self._channels = self._parameters_topic = None
+
+    def _followers(self, names: Collection[str]) -> dict[str, str]:
+        """Return the parameters of channels that change along with `names`, and with which."""
+        self._asked = {name for name in names if split(name)[0]}
+        own = self._own | self._asked
+        channels = with_own_parameters(self._names, self._node_parameters.values)
+        return {f: name for name in names for f in followers(name, channels, own)}
 
     def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> Any:
         if self._channels is None:  # whether the values fit together is checked by configure
@@ -224,12 +224,12 @@ class EstimatorNode(ManagedNode):
 
     def _adopt(self, change: Any) -> None:
         values = self._node_parameters.values
-        self._inheritance.adopt()
+        self._own |= self._asked  # these no longer follow
         if self._channels is not None:
             self._channels.adopt(change)
-        if self._parameter_topic is not None:
-            self._parameter_topic.publish(values)
-        self._diagnostics.set_period(values['diagnostics_period'])
+        if self._parameters_topic is not None:
+            self._parameters_topic.publish(values)
+        set_period(self._diagnostics.timer, values['diagnostics_period'])
         self._diagnostics.hardware_id = values['hardware_id']
 
     def _reports(self) -> list[Report]:

@@ -1,19 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics on which a channel publishes its estimates."""
+"""The topics on which a channel publishes: its estimates, its events, all that it remembers."""
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
-from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described, Event
+from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
-from fhaosmo_ros.nodes.middleware.publishers import create_publisher, listeners_of
-from fhaosmo_ros.topics import DIAGNOSTICS, estimates_of, EVENT, STANDARD_DEVIATION
+from fhaosmo_ros.nodes.middleware.publishers import create_publisher, has_listeners, LATCHED
+from fhaosmo_ros.topics import (
+    ARRAY,
+    DIAGNOSTICS,
+    estimates_of,
+    EVENT,
+    SNAPSHOT,
+    STANDARD_DEVIATION,
+)
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
-EVENTS_KEPT = 10
+PERIOD, PERIOD_OF_SELF_TUNING = 1_000_000_000, 30_000_000_000
+"""Nanoseconds between two snapshots; a self-tuning estimator remembers thousands of numbers."""
 
 
 class Outputs:
@@ -21,32 +29,23 @@ class Outputs:
     Publishers of the estimates, each with ROS' parameters qos_overrides./TOPIC.publisher.POLICY.
 
     What nobody listens to is not made: a message costs as much as a step with fixed gains.
-
-    Parameters
-    ----------
-    node : Node
-    prefix : str
-        Prefix of the topics' names.
-    observer : Observer
-
     """
 
-    def __init__(self, node: Node, prefix: str, observer: Observer) -> None:
-        self._node = node
-        kinds = estimates_of(observer.parameters)
-        self._publishers = [
-            create_publisher(node, message_class(kind), prefix + name)
-            for name, kind in kinds.items()
-        ]
-        listeners = [listeners_of(publisher) for publisher in self._publishers]
-        self._topics = list(zip(kinds, self._publishers, listeners, strict=True))
+    def __init__(self, node: Node, prefix: str, estimator: OnlineEstimator) -> None:
+        observer = estimator.observer
+        self._estimator = estimator
+        self._publishers = {
+            name: create_publisher(node, message_class(kind), prefix + name)
+            for name, kind in estimates_of(observer.parameters).items()
+        }
         states = [f'z{i + 1}' for i in range(observer.order)]
         self._state, self._tuning = labelled(states), labelled(TUNING)
         self._deviation = labelled([*states, 'd'])
         self._innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
 
-    def publish(self, estimator: OnlineEstimator, estimate: Estimate, stamp: int) -> None:
+    def publish(self, estimate: Estimate, stamp: int) -> None:
         """Publish an estimate and, last, the stamp of its sample in nanoseconds."""
+        estimator = self._estimator
         messages = {
             'gamma': lambda: Float64(data=estimate.gamma),
             STANDARD_DEVIATION: lambda: self._deviation(estimator.standard_deviation),
@@ -56,36 +55,20 @@ class Outputs:
             'innovation': lambda: self._innovation(estimate.innovation),
             'stamp': lambda: time_message(stamp),
         }
-        for name, publisher, listeners in self._topics:
-            if listeners():
+        for name, publisher in self._publishers.items():
+            if has_listeners(publisher):
                 publisher.publish(messages[name]())
-
-    def destroy(self) -> None:
-        """Take the publishers away."""
-        while self._publishers:
-            self._node.destroy_publisher(self._publishers.pop())
 
 
 class EventOutput:
-    """
-    Publisher of events: WARN where one begins, OK where it ends.
-
-    Parameters
-    ----------
-    node : Node
-    prefix : str
-        Prefix of the topic's name.
-    channel : str
-        Name of the channel, '' without names.
-
-    """
+    """Publisher of a channel's events: WARN where one begins, OK where it ends."""
 
     def __init__(self, node: Node, prefix: str, channel: str) -> None:
         self._node = node
-        self._name = f'{node.get_fully_qualified_name().lstrip("/")}: {channel} event'
-        self._name = self._name.replace(':  ', ': ')
+        task = f'{channel} event' if channel else 'event'
+        self._name = f'{node.get_fully_qualified_name().lstrip("/")}: {task}'
         kind = message_class(DIAGNOSTICS)
-        self._publisher = create_publisher(node, kind, prefix + EVENT, EVENTS_KEPT, latched=True)
+        self._publisher = create_publisher(node, kind, prefix + EVENT, latched=True)
 
     def publish(self, event: Event, unit: str, hardware_id: str) -> str:
         """Publish the begin or the end of an event; return it in words."""
@@ -107,6 +90,42 @@ class EventOutput:
         message.header.stamp = stamp
         self._publisher.publish(message)
 
-    def destroy(self) -> None:
-        """Take the publisher away."""
-        self._node.destroy_publisher(self._publisher)
+
+class SnapshotOutput:
+    """
+    Publisher of an estimator's memory, so that a replay can follow a live run exactly.
+
+    Once a second, after the first sample, and after each live change and reset.
+    """
+
+    def __init__(self, node: Node, prefix: str, estimator: OnlineEstimator) -> None:
+        self._estimator = estimator
+        self._period = PERIOD_OF_SELF_TUNING if estimator.observer.self_tuning else PERIOD
+        self._first, self._latest = True, 0
+        self._labels: list[str] = []
+        self._publisher = node.create_publisher(message_class(ARRAY), prefix + SNAPSHOT, LATCHED)
+
+    def accepted(self, stamp: int) -> None:
+        """Publish if it is time to; to be called for each sample that was accepted."""
+        if self._first or abs(stamp - self._latest) >= self._period:
+            # Where samples wait in a queue, the observer may be ahead of this one.
+            begins = self._first and stamp == self._estimator.latest
+            self._publish(Flag.STARTED if begins else Flag(0))
+
+    def changed(self) -> None:
+        """Publish that parameters or `freeze` have changed after the latest sample."""
+        self._publish(Flag.CHANGED)
+
+    def reset(self) -> None:
+        """Publish that the estimator was reset after the latest sample."""
+        self._publish(Flag.RESET)
+        self._first = True
+
+    def _publish(self, flags: Flag) -> None:
+        stamp = self._estimator.latest
+        if stamp is not None:
+            labels, vector = pack(Snapshot(stamp, flags, self._estimator.state_dict()))
+            if labels != self._labels:  # a state before a gap is there only after one
+                self._labels, self._message = labels, labelled(labels)
+            self._publisher.publish(self._message(vector))
+            self._first, self._latest = False, stamp

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A node's parameters on a topic, so that a bag says with which ones its estimates were made."""
 
+from typing import Any
+
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import dumps
@@ -16,14 +18,7 @@ LATEST = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class ParameterTopic:
-    """
-    Publishes all parameters of a node as the text of a parameter file that makes such a node.
-
-    Parameters
-    ----------
-    node : Node
-
-    """
+    """Publishes all parameters of a node as the text of a file that makes such a node."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -35,9 +30,9 @@ class ParameterTopic:
         text = dumps(named, self._node.get_fully_qualified_name())
         self._publisher.publish(String(data=text))
 
-    def _remapped(self, values: Parameters) -> dict[str, str | list[str]]:
+    def _remapped(self, values: Parameters) -> dict[str, Any]:
         """Return the topics of y and u that a remapping has changed: a bag knows of none."""
-        found: dict[str, str | list[str]] = {}
+        found: dict[str, Any] = {}
         for channel in values[CHANNELS]:
             prefix = f'{channel}.' if channel else ''
             own = of_channel(values, channel)
@@ -55,7 +50,3 @@ class ParameterTopic:
     def _is_remapped(self, wanted: Input) -> bool:
         plain = wanted.absolute(self._node.get_namespace())
         return self._node.resolve_topic_name(wanted.topic) != plain
-
-    def destroy(self) -> None:
-        """Take the topic away."""
-        self._node.destroy_publisher(self._publisher)

@@ -72,22 +72,10 @@ class DiagnosticsPublisher:
         hardware_id: str = 'none',
     ) -> None:
         self.hardware_id = hardware_id
-        self._node = node
-        self._reports = reports
+        self._node, self._reports = node, reports
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer: Any = None
-        self._period = 0.0
-        self.set_period(period)
-
-    def set_period(self, period: float) -> None:
-        """Change the time between two reports."""
-        if period == self._period:
-            return
-        if self._timer is not None:
-            self._node.destroy_timer(self._timer)
-        self._period = period
-        self._timer = self._node.create_timer(period, self.publish, clock=self._clock)
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.timer = node.create_timer(period, self.publish, clock=clock)
 
     def publish(self) -> None:
         """Publish all present reports."""

@@ -2,33 +2,40 @@
 """A managed node whose transitions may fail but never end the process."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import traceback
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.nodes.middleware.simulated_time import reject_negative_time
+from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
 from lifecycle_msgs.srv import ChangeState
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
-class ManagedNode(LifecycleNode):
+class ManagedNode(LifecycleNode, TimedNode):
     """
     A managed node (ROS 2 lifecycle) that says why a transition failed.
 
-    A transition fails if `configure`, `activate` or `deactivate` of a subclass raises. After a
-    failed configure or activate, what it has made is destroyed again.
+    A transition fails if `configure`, `activate` or `deactivate` of a subclass raises. All
+    publishers, subscriptions, services and timers that were made since `configure` began are
+    destroyed by the transition cleanup, and if `configure` fails.
+
+    Attributes
+    ----------
+    state : str
+        unconfigured, inactive, active or finalized.
+
     """
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
-        reject_negative_time(self)
+        self.state = 'unconfigured'
         self._error: Exception | None = None
+        self._lasting: set[Any] = set()
         # In rclpy 7.1 a transition that the state does not allow raises, and ends the spinning.
-        service = self._service_change_state
+        service = next(s for s in self.services if s.service_name.endswith('/change_state'))
         service.callback = self._guarded(service.callback)
 
     @abstractmethod
@@ -43,14 +50,12 @@ class ManagedNode(LifecycleNode):
     def deactivate(self) -> None:
         """Stop working; also called when the node is not active."""
 
-    @abstractmethod
     def cleanup(self) -> None:
-        """Destroy what `configure` has made, all or part of it."""
-
-    @property
-    def state(self) -> str:
-        """Label of the state: unconfigured, inactive, active, finalized."""
-        return str(self._state_machine.current_state[1])
+        """Stop working and destroy what was made since `configure` began, all or part of it."""
+        self.deactivate()
+        for entity, destroy in list(self._entities()):
+            if entity not in self._lasting:
+                destroy(entity)
 
     def start(self) -> None:
         """
@@ -69,39 +74,56 @@ class ManagedNode(LifecycleNode):
 
     def stop(self) -> None:
         """Finalize from whatever state."""
-        if self.state in ('unconfigured', 'inactive', 'active'):
+        if self.state != 'finalized':
             self.trigger_shutdown()
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Unconfigured to inactive."""
-        return self._attempt(self.configure, undo=self.cleanup)
+        self._lasting = {entity for entity, _ in self._entities()}
+        return self._attempt(self.configure, 'inactive', undo=self.cleanup)
 
     def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Inactive to active."""
-        return self._attempt(self.activate, undo=self.deactivate)
+        return self._attempt(self.activate, 'active', undo=self.deactivate)
 
     def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Active to inactive."""
-        return self._attempt(self.deactivate)
+        return self._attempt(self.deactivate, 'inactive')
 
     def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Inactive to unconfigured."""
-        return self._attempt(self.cleanup)
+        return self._attempt(self.cleanup, 'unconfigured')
 
     def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Any state to finalized."""
-        return self._attempt(self.cleanup)
+        return self._attempt(
+            self.deactivate if self.state == 'unconfigured' else self.cleanup, 'finalized'
+        )
 
     def _attempt(
-        self, action: Callable[[], None], undo: Callable[[], None] = lambda: None
+        self, action: Callable[[], None], goal: str, undo: Callable[[], None] | None = None
     ) -> TransitionCallbackReturn:
         try:
             action()
         except Exception as error:
             self._error = error
-            undo()
+            if undo is not None:
+                undo()
             return FAILURE
+        self.state = goal
         return SUCCESS
+
+    def _entities(self) -> Iterator[tuple[Any, Callable[[Any], object]]]:
+        """Yield what the node has in ROS, each with what destroys it."""
+        clock = self.resolve_topic_name('/clock')  # rclpy's own, also made later
+        others = [s for s in self.subscriptions if s.topic_name != clock]
+        for entities, destroy in (
+            (self.publishers, self.destroy_publisher),
+            (others, self.destroy_subscription),
+            (self.services, self.destroy_service),
+            (self.timers, self.destroy_timer),
+        ):
+            yield from ((entity, destroy) for entity in entities)
 
     def _guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         def change_state(
@@ -111,7 +133,7 @@ class ManagedNode(LifecycleNode):
             before, wanted = self.state, request.transition.label or request.transition.id
             try:
                 response = callback(request, response)
-            except rclpy_implementation.RCLError:
+            except RuntimeError:  # rcl's
                 response.success = False
             if response.success:
                 self.get_logger().info(f'{before} -> {self.state}')

@@ -2,11 +2,13 @@
 """From the declarations of the core to ROS parameters: descriptors, overrides, live changes."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
 from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import (
     Parameter,
     Parameters,
+    shown,
     suggestion,
     Value,
 )
@@ -76,19 +78,20 @@ def descriptor(
     return result
 
 
-def overrides_of(node: Node) -> dict[str, Any]:
+def built_in(given: Mapping[str, Any]) -> list[RosParameter]:
     """
-    Return what files and the command line set, before anything is declared.
+    Return those given parameters that are rclpy's own, such as use_sim_time.
 
-    The node was made with ``automatically_declare_parameters_from_overrides=True``: only so are
-    names known that the node does not declare.
+    Raises
+    ------
+    ConfigurationError
+        One that is no single value.
+
     """
-    return {name: p.value for name, p in node.get_parameters_by_prefix('').items()}
-
-
-def no_followers(_: Collection[str]) -> Mapping[str, str]:
-    """Return no parameter that changes along with others."""
-    return {}
+    for name, value in given.items():
+        if is_built_in(name) and not isinstance(value, bool | int | float | str):
+            raise ConfigurationError(f"parameter '{name}': expected one value, got {shown(value)}")
+    return [RosParameter(name, value=v) for name, v in given.items() if is_built_in(name)]
 
 
 class NodeParameters:
@@ -102,9 +105,8 @@ class NodeParameters:
     Parameters
     ----------
     node : Node
-        Made with ``automatically_declare_parameters_from_overrides=True``.
     values : Parameters
-        What `overrides_of` the node complete to.
+        Checked and complete.
     fixed : iterable of str
         Parameters that can't change in any state of the node.
 
@@ -118,35 +120,26 @@ class NodeParameters:
     def __init__(self, node: Node, values: Parameters, fixed: Iterable[str]) -> None:
         self.values = values
         self._node = node
-        self._coerced: dict[str, Value | ConfigurationError] = {}
+        self._read_only = set(fixed)
+        self._coerced: dict[str, Value] = {}
+        self._refused: ConfigurationError | None = None
         self._next: Parameters = values
         self._prepared: Any = None
-        for name in overrides_of(node):
-            if not is_built_in(name):  # declared as it came, without a descriptor
-                node.undeclare_parameter(name)
-        self._read_only = set(fixed)
-        self._declare(values)
+        self.extend(values)
 
     def extend(self, values: Parameters) -> None:
-        """Go on with values of a larger table, whose further parameters are declared now."""
-        self._declare(values)
-        self.values = values
-
-    def _declare(self, values: Parameters) -> None:
+        """Go on with values, perhaps of a larger table: what is new is declared."""
         for name, value in values.items():
             if not self._node.has_parameter(name):
-                self._node.declare_parameter(
-                    name,
-                    value,
-                    descriptor(values.table[name], name in self._read_only, values),
-                    ignore_override=True,
-                )
+                declared = descriptor(values.table[name], name in self._read_only, values)
+                self._node.declare_parameter(name, value, declared, ignore_override=True)
+        self.values = values
 
     def on_change(
         self,
         prepare: Callable[[Parameters, Mapping[str, Value]], Any],
         adopt: Callable[[Any], None],
-        followers: Callable[[Collection[str]], Mapping[str, str]] = no_followers,
+        followers: Callable[[Collection[str]], Mapping[str, str]] = lambda _: {},
     ) -> None:
         """
         Take live changes from now on.
@@ -171,67 +164,53 @@ class NodeParameters:
     def _coerce(self, parameters: list[RosParameter]) -> list[RosParameter]:
         """Return the parameters, and those that follow, in their declared types if they fit."""
         table = self.values.table
-        self._coerced = {}
+        self._coerced, self._refused = {}, None
         converted = {}
         for p in parameters:
-            if not self._node.has_parameter(p.name):  # rclpy 7.1 refuses it too, without the name
-                raise ParameterNotDeclaredException(f"'{p.name}'{suggestion(p.name, table)}")
-            converted[p.name] = self._converted(p, table[p.name]) if p.name in table else p
-        for name, leader in self._followers(list(converted)).items():
-            self._coerced[name] = self._coerced[leader]
-            converted[name] = RosParameter(name, converted[leader].type_, converted[leader].value)
+            name = p.name
+            if not self._node.has_parameter(name):  # rclpy 7.1 refuses it too, without the name
+                raise ParameterNotDeclaredException(f"'{name}'{suggestion(name, table)}")
+            converted[name] = p
+            if name in table:
+                try:
+                    value = self._coerced[name] = table[name].coerce(_read(p.value, table[name]))
+                    converted[name] = RosParameter(name, TYPES[table[name].kind], value)
+                except ConfigurationError:
+                    self._refused = self._refused or table[name].error(p.value)
+        if self._refused is None:
+            for name, leader in self._followers(list(converted)).items():
+                p = converted[leader]
+                self._coerced[name] = self._coerced[leader]
+                converted[name] = RosParameter(name, p.type_, p.value)
         return list(converted.values())
 
-    def _converted(self, parameter: RosParameter, declared: Parameter) -> RosParameter:
-        """Return the parameter in its declared type, or as it is if `_check` is to refuse it."""
-        try:
-            value = declared.coerce(_read(parameter.value, declared))
-        except ConfigurationError:
-            self._coerced[parameter.name] = declared.error(parameter.value)
-            return parameter
-        self._coerced[parameter.name] = value
-        return RosParameter(parameter.name, TYPES[declared.kind], value)
-
-    def _changes(self, parameters: list[RosParameter]) -> dict[str, Value]:
-        """Return those of our parameters among some that are set, as `_coerce` left them."""
-        table, changes = self.values.table, {}
-        for name in (p.name for p in parameters if p.name in table):
-            value = self._coerced[name]
-            if isinstance(value, ConfigurationError):
-                raise value
-            changes[name] = value
-        return changes
-
     def _check(self, parameters: list[RosParameter]) -> SetParametersResult:
-        table = self.values.table
+        ours = [p.name for p in parameters if p.name in self.values.table]
         try:
-            changes = self._changes(parameters)
-            if changes:
-                self._next = Parameters(table, {**self.values, **changes})
-                self._prepared = self._prepare(self._next, changes)
+            if ours and self._refused is not None:
+                raise self._refused
+            if ours:
+                self._next = Parameters(self.values.table, {**self.values, **self._coerced})
+                self._prepared = self._prepare(self._next, self._coerced)
         except ConfigurationError as error:
             self._node.get_logger().warning(f'rejected: {error}')
-            for p in parameters:
-                if p.name in table:  # rclpy has already put the rejected type there
-                    kind = table[p.name].kind
-                    self._node.describe_parameter(p.name).type = TYPES[kind].value
+            for name in ours:  # rclpy has already put the rejected type there
+                kind = self.values.table[name].kind
+                self._node.describe_parameter(name).type = TYPES[kind].value
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _adopt(self, parameters: list[RosParameter]) -> None:
-        changes = self._changes(parameters)
-        if changes:
+        if any(p.name in self.values.table for p in parameters):
             self.values = self._next
             self._adopt_change(self._prepared)
-            text = ', '.join(f'{name} = {value}' for name, value in changes.items())
+            text = ', '.join(f'{name} = {value}' for name, value in self._coerced.items())
             self._node.get_logger().info(f'set {text}')
 
 
 def _read(value: Any, declared: Parameter) -> Any:
     """Return the number in a text: `ros2 param set` sends 1e-3 as one."""
     if isinstance(value, str) and declared.kind == 'double':
-        try:
+        with suppress(ConfigurationError):
             return parse(value)
-        except ConfigurationError:
-            pass
     return value

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time from /clock: a node survives whatever is published there, and says what is wrong."""
 
+from collections.abc import Callable
+from functools import partial
 from time import monotonic
+from typing import Any
 
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, WARN
 from rclpy.node import Node
@@ -11,43 +14,37 @@ PATIENCE = 2.0
 """Seconds of the host for which simulated time may stand still."""
 
 
-def reject_negative_time(node: Node) -> None:
+class TimedNode(Node):
     """
-    Let a node ignore messages on /clock with negative seconds, and log how many there were.
+    A node that ignores messages on /clock with negative seconds, and logs how many there were.
 
-    rclpy 7.1 raises ValueError for them in its subscription of /clock, which ends the node.
+    In rclpy 7.1 they raise ValueError in its subscription of /clock, which ends the node.
     """
-    source = node._time_source
-    take = source.clock_callback
-    rejected = 0
 
-    def clock_callback(message: Clock) -> None:
-        nonlocal rejected
+    _rejected = 0
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Any, *arguments: Any, **options: Any
+    ) -> Any:
+        """Return a subscription; that of /clock, which rclpy makes, passes over such times."""
+        if msg_type is Clock:
+            callback = partial(self._take_time, callback)
+        return super().create_subscription(msg_type, topic, callback, *arguments, **options)
+
+    def _take_time(self, take: Callable[[Clock], None], message: Clock) -> None:
         if message.clock.sec >= 0:
             take(message)
             return
-        rejected += 1
-        node.get_logger().warning(
+        self._rejected += 1
+        self.get_logger().warning(
             f'rejected a time on /clock: expected seconds >= 0, got {message.clock.sec} '
-            f'({rejected} rejected so far)',
+            f'({self._rejected} rejected so far)',
             throttle_duration_sec=5.0,
         )
 
-    source.clock_callback = clock_callback  # for a later use_sim_time
-    if source._clock_sub is not None:
-        source._clock_sub.callback = clock_callback
-
 
 class ClockWatch:
-    """
-    Finds that simulated time has not begun, or does not go on.
-
-    Parameters
-    ----------
-    node : Node
-        Whose clock it is, and whose log.
-
-    """
+    """Finds that a node's simulated time has not begun, or does not go on."""
 
     def __init__(self, node: Node) -> None:
         self._node = node

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line of a node: its parameters, read once and by us, and its help."""
+
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+import os
+import re
+import textwrap
+from typing import Any, NamedTuple
+
+from fhaosmo_ros import __version__
+from fhaosmo_ros.core.parameters.declaration import Parameter, shown, suggestion
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import check_one_type, is_built_in, read
+from fhaosmo_ros.core.parameters.tables import FIRST, NODE_TABLES
+from fhaosmo_ros.core.parameters.yaml_text import parse
+from rclpy.logging import get_logger
+from rclpy.utilities import remove_ros_args
+
+USAGE = '[--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r FROM:=TO] ...]'
+
+
+class Arguments(NamedTuple):
+    """
+    What a command line says.
+
+    Attributes
+    ----------
+    given : dict
+        Values of parameters by name; neither names nor values are checked yet.
+    origins : dict
+        Where each of them comes from: the file, or None for the command line.
+    rest : list of str
+        What is left for ROS: remappings, levels of the log.
+
+    """
+
+    given: dict[str, Any]
+    origins: dict[str, str | None]
+    rest: list[str]
+
+
+def read_arguments(name: str, argv: list[str]) -> Arguments:
+    """
+    Read the parameters of a node; those of the command line win over those of files.
+
+    Raises
+    ------
+    ConfigurationError
+        A file that can't be read, no section for the node but a similar one, a value that is no
+        YAML, or an argument that no node has.
+
+    """
+    files, rules, rest = _split(argv)
+    full_name = _full_name(name, rest)
+    given: dict[str, Any] = {}
+    origins: dict[str, str | None] = {}
+    for path in files:
+        values = read(path, full_name)
+        if not values:
+            get_logger(name).warning(f'{path}: sets nothing for node {full_name}')
+        given |= values
+        origins |= dict.fromkeys(values, path)
+    for rule in rules:
+        target, separator, text = rule.partition(':=')
+        node, _, parameter = target.rpartition(':')
+        if not (separator and parameter):
+            raise ConfigurationError(f"expected -p NAME:=VALUE, got '-p {rule}'")
+        if node and node != full_name.rsplit('/', 1)[-1]:
+            continue  # one command line may serve several nodes
+        # A file may hold the parameters of another node of the package, too; a rule may not.
+        table = NODE_TABLES[name]
+        if not (is_built_in(parameter) or '.' in parameter or parameter in table):
+            raise ConfigurationError(
+                f"unknown parameter '{parameter}'{suggestion(parameter, table)}"
+            )
+        try:
+            value = parse(text)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"parameter '{parameter}': {error}") from None
+        check_one_type(parameter, value)
+        given[parameter], origins[parameter] = value, None
+    others = remove_ros_args([name, *rest])[1:]
+    if others:
+        raise ConfigurationError(
+            f'unexpected argument {others[0]!r}; usage: {name} {USAGE}; parameters: {name} --help'
+        )
+    return Arguments(given, origins, rest)
+
+
+def _split(argv: list[str]) -> tuple[list[str], list[str], list[str]]:
+    """Return the parameter files, the rules of -p, and the other arguments."""
+    files: list[str] = []
+    rules: list[str] = []
+    rest: list[str] = []
+    words, of_ros = iter(argv), False
+    for word in words:
+        if word in ('--ros-args', '--'):
+            of_ros = word == '--ros-args'
+        if of_ros and word in ('-p', '--param', '--params-file'):
+            value = next(words, None)
+            if value is None:
+                raise ConfigurationError(f'{word}: expected a value, got nothing')
+            if word == '--params-file':
+                files.append(os.path.expanduser(value))
+            else:
+                rules.append(value)
+        else:
+            rest.append(word)
+    return files, rules, rest
+
+
+def _full_name(name: str, arguments: list[str]) -> str:
+    """Return the node's name after the renaming that the command line asks for."""
+    parts = {'node': name, 'ns': ''}
+    for flag, word in pairwise(arguments):
+        rule = re.fullmatch(r'(?:[^:]+:)?__(node|name|ns):=(.+)', word)
+        if flag in ('-r', '--remap') and rule:
+            parts['ns' if rule[1] == 'ns' else 'node'] = rule[2]
+    return f'{parts["ns"].rstrip("/")}/{parts["node"]}'
+
+
+def help_of(name: str, argv: list[str]) -> str:
+    """Return the help that a command line asks for, '' if it asks for none."""
+    table = NODE_TABLES[name]
+    if '-h' in argv or '--help' in argv:
+        first = [p for p in table.values() if p.name in FIRST]
+        return '\n'.join([
+            f'usage: {name} {USAGE}', '',
+            'The parameters that matter first, and their defaults:', '', *_lines(first), '',
+            f'All of them: {name} --help-parameters; docs/parameters.md says more.',
+        ])  # fmt: skip
+    if '--help-parameters' in argv:
+        return '\n'.join(_lines([*table.values(), *table.families]))
+    return f'fhaosmo_ros {__version__}' if '--version' in argv else ''
+
+
+def _lines(parameters: Iterable[Parameter]) -> Iterator[str]:
+    for p in parameters:
+        yield f'{p.name}: {shown(p.default)}'
+        indent = ' ' * 4
+        text = f'{p.text} ({p.allowed})'
+        yield from textwrap.wrap(text, 99, initial_indent=indent, subsequent_indent=indent)
