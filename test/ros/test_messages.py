@@ -33,7 +33,7 @@ from std_msgs.msg import (  # noqa: E402
 )
 
 ROBOT = (Path(__file__).parent / 'fake_robot.py').read_text(encoding='utf-8')
-WARN, ERROR = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+WARN, STALE = DiagnosticStatus.WARN, DiagnosticStatus.STALE
 SECOND = 1_000_000_000
 
 
@@ -216,7 +216,7 @@ def test_type_without_the_field_is_told_until_one_comes_that_has_it(client, star
     rig = EstimatorRig(client, '/kind', feed=False)
     with Client() as other:  # one participant has one type of a topic
         other.publisher('/kind/data', Float64)
-        rig.wait_status('input', ERROR, "field 'position[elbow]': expected a number in")
+        rig.wait_status('input', STALE, "field 'position[elbow]': expected a number in")
         assert process.output.count('expected a number in') == 1
     publish = client.publisher('/kind/data', JointState)
     client.wait(lambda: publish.matched() == 1, 'subscription')
