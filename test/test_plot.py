@@ -126,12 +126,12 @@ def test_figure_of_many_estimates_is_thinned(tmp_path, monkeypatch):
     count = 20_000
     stamps, y = files.signal(count)
     estimate, innovation = np.column_stack([y, y]), np.column_stack([y, y])
-    curves = Curves('run', stamps, ['z1', 'd'], estimate, y, innovation, estimate, 1.0)
+    curves = Curves('run', stamps, ['z1', 'd'], estimate, innovation, y, truth=estimate)
     drawn = []
     monkeypatch.setattr(Figure, 'savefig', lambda figure, *_, **__: drawn.extend(figure.axes))
     save_curves([curves], 1.0, tmp_path / 'f.png', window=False)
     lengths = [len(line.get_xdata()) for axes in drawn for line in axes.lines]
-    assert len(lengths) == 8
+    assert len(lengths) == 7
     assert max(lengths) <= 2 * COLUMNS + 2 < count
 
 
@@ -269,6 +269,6 @@ def test_truth_is_unknown_where_the_bag_lacks_it(tmp_path):
 def test_units_follow_from_that_of_y():
     empty = np.zeros((0, 3))
     names = ['z1', 'z2', 'd']
-    curves = Curves('run', np.zeros(0, np.int64), names, empty, empty, empty, None, None, 'rad')
+    curves = Curves('run', np.zeros(0, np.int64), names, empty, empty, unit='rad')
     assert [curves.title(name).split('[')[1] for name in names] == ['rad]', 'rad/s]', 'rad/s^2]']
     assert curves._replace(unit='').title('z1') == 'z1'

@@ -35,12 +35,9 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add('bags', type=Path, nargs='*', metavar='BAG')
     add(
-        '-o',
-        '--output',
-        type=Path,
-        metavar='FILE',
+        '-o', '--output', type=Path, metavar='FILE',
         help='.png, .svg or .pdf (default: BAG.png, or fuzzy.png, in the current folder)',
-    )
+    )  # fmt: skip
     add('--fuzzy', action='store_true', help='draw membership functions and curves instead')
     add('--force', action='store_true', help='replace an output that exists')
     add('--show', action='store_true', help='open a window too')

@@ -11,7 +11,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.recorded_parameters import recorded_parameters
+from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
 from fhaosmo_ros.tools.bags.topics import messages, read_ticks, series, truth_at
 from fhaosmo_ros.topics import ESTIMATES, EVENT, STANDARD_DEVIATION
 import numpy as np
@@ -31,17 +31,17 @@ class Curves(NamedTuple):
     names : list of str
         z1 .. zn and d.
     estimate : (K, n + 1) array
+    innovation : (K, N) array
     gamma : (K,) array or None
         None of a self-tuning estimator, which has no power.
-    innovation : (K, N) array
+    deviation : (K, n + 1) array or None
+        Standard deviations of the estimates, of a self-tuning estimator.
     truth : (K, n + 1) array or None
         NaN where the bag lacks it.
     epsilon : float or None
         Threshold of its gates, if it has gates and the bag has its parameters.
     unit : str
         Of y, '' if the bag does not say it.
-    deviation : (K, n + 1) array or None
-        Standard deviations of the estimates, of a self-tuning estimator.
     events : list of (int, int)
         Begin and end of each event, in nanoseconds.
 
@@ -51,12 +51,12 @@ class Curves(NamedTuple):
     stamps: NDArray[np.int64]
     names: list[str]
     estimate: NDArray[np.float64]
-    gamma: NDArray[np.float64] | None
     innovation: NDArray[np.float64]
-    truth: NDArray[np.float64] | None
-    epsilon: float | None
-    unit: str = ''
+    gamma: NDArray[np.float64] | None = None
     deviation: NDArray[np.float64] | None = None
+    truth: NDArray[np.float64] | None = None
+    epsilon: float | None = None
+    unit: str = ''
     events: Sequence[tuple[int, int]] = ()
 
     def title(self, name: str) -> str:
@@ -77,45 +77,33 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
     """
     with BagReader(path) as reader:
         topics = {c.topic for c in reader.connections if c.msgcount}
-        return _read_curves(reader, path, topics, names, plant)
-
-
-def _read_curves(
-    reader: BagReader, path: Path, topics: set[str], names: list[str] | None, plant: str
-) -> list[Curves]:
-    last = f'/{[*ESTIMATES][-1]}'
-    found = sorted(t.removesuffix(last) for t in topics if t.endswith(last))
-    found = [name for name in found if all(f'{name}/{part}' in topics for part in ESTIMATES)]
-    for name in names or []:
-        if name not in found:
+        candidates = sorted({topic.rpartition('/')[0] for topic in topics})
+        found = [n for n in candidates if topics.issuperset(f'{n}/{part}' for part in ESTIMATES)]
+        wrong = [name for name in names or [] if name not in found]
+        if wrong:
             raise ConfigurationError(
                 f'bag {path}: expected estimates of one of {", ".join(found) or "none"}, '
-                f'got {name!r}'
+                f'got {wrong[0]!r}'
             )
-    if not found:
-        raise ConfigurationError(
-            f'bag {path}: expected the topics of an estimator ({", ".join(ESTIMATES)} below its '
-            f'name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
-        )
-    return [
-        _curves(path, name, plant, topics, *_settings(reader, name)) for name in names or found
-    ]
-
-
-def _settings(reader: BagReader, name: str) -> tuple[float | None, str]:
-    """Return the threshold of an estimator's gates, and the unit of y, if the bag says them."""
-    recorded = recorded_parameters(reader, name)
-    if recorded is None:
-        return None, ''
-    values = ESTIMATOR_PARAMETERS.defaults() | of_channel(recorded.values, recorded.channel)
-    gates = values['structure'] == 'cascade' and values['gains'] == 'fixed'
-    epsilon = values['epsilon'] if gates else None
-    return epsilon, values['measurement_unit']
+        if not found:
+            raise ConfigurationError(
+                f'bag {path}: expected the topics of an estimator ({", ".join(ESTIMATES)} below '
+                f'its name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
+            )
+        recorded = {name: recorded_parameters(reader, name) for name in names or found}
+    return [_curves(path, name, plant, topics, of_bag) for name, of_bag in recorded.items()]
 
 
 def _curves(
-    path: Path, name: str, plant: str, topics: set[str], epsilon: float | None, unit: str
+    path: Path, name: str, plant: str, topics: set[str], recorded: Recorded | None
 ) -> Curves:
+    epsilon, unit = None, ''
+    if recorded:
+        own = of_channel(recorded.values, recorded.channel)
+        values = ESTIMATOR_PARAMETERS.defaults() | own
+        unit = values['measurement_unit']
+        if values['structure'] == 'cascade' and values['gains'] == 'fixed':
+            epsilon = values['epsilon']
     of_gains = [p for p in ('gamma', STANDARD_DEVIATION) if f'{name}/{p}' in topics]
     ticks = read_ticks(path, name, [*of_gains, *ESTIMATES])
     when = ticks['stamp']
@@ -123,42 +111,34 @@ def _curves(
     truth = truth_at(path, plant, when)
     if truth is not None and truth.values.shape != estimate.shape:
         truth = None  # of another model
-    labels = series(path, f'{name}/state').labels or [
-        f'z{i + 1}' for i in range(estimate.shape[1] - 1)
-    ]
+    labels = series(path, f'{name}/state').labels
     return Curves(
         f'{path.resolve().name} {name}',
         when,
-        [*labels, 'd'],
+        [*(labels or [f'z{i + 1}' for i in range(estimate.shape[1] - 1)]), 'd'],
         estimate,
-        ticks.get('gamma'),
         ticks['innovation'],
+        ticks.get('gamma'),
+        ticks.get(STANDARD_DEVIATION),
         truth.values if truth else None,
         epsilon,
         unit,
-        ticks.get(STANDARD_DEVIATION),
-        read_events(path, name, int(when[-1])) if f'{name}/{EVENT}' in topics else [],
+        _events(path, f'{name}/{EVENT}', int(when[-1])) if f'{name}/{EVENT}' in topics else (),
     )
 
 
-def read_events(path: Path, name: str, end: int) -> list[tuple[int, int]]:
+def _events(path: Path, topic: str, end: int) -> list[tuple[int, int]]:
     """Return begin and end of each event of an estimator; one that lasts is given the last end."""
-    spans: list[tuple[int, int]] = []
-    for _, message in messages(path, f'{name}/{EVENT}'):
+    spans: dict[int, int] = {}
+    for _, message in messages(path, topic):
         (status,) = message.status
         since = {pair.key: pair.value for pair in status.values}.get('since')
-        if since is None:  # there has been none
-            continue
-        second, _, nanosecond = since.partition('.')
-        begin = int(second) * 1_000_000_000 + int(nanosecond)
-        ends = message.header.stamp
-        if status.level:
-            spans.append((begin, end))
-        elif spans:
-            spans[-1] = spans[-1][0], ends.sec * 1_000_000_000 + ends.nanosec
-        else:
-            spans.append((begin, ends.sec * 1_000_000_000 + ends.nanosec))
-    return spans
+        if since is not None:  # else there has been none
+            second, _, nanosecond = since.partition('.')
+            stamp = message.header.stamp
+            ended = stamp.sec * 1_000_000_000 + stamp.nanosec
+            spans[int(second) * 1_000_000_000 + int(nanosecond)] = end if status.level else ended
+    return list(spans.items())
 
 
 def metrics(curves: list[Curves]) -> str:

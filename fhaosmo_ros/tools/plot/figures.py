@@ -50,15 +50,14 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
     """
     Write a figure of several estimates laid one over another.
 
-    From top to bottom: a row for each state, for d, for gamma if an estimate has it, for the
-    innovations of the first estimate, and for the open levels if the threshold of the gates is
-    known.
+    From top to bottom: a row for each state, for d, for gamma if an estimate has it, and for the
+    innovations of the first estimate.
 
     Parameters
     ----------
     curves : list of Curves
     epsilon : float or None
-        Threshold of the gates; drawn, and the gates with it, if known.
+        Threshold of the gates, drawn if known.
     path : path
         Its suffix names the format.
     window : bool
@@ -68,9 +67,8 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
     """
     thinned = (lambda t, x: (t, x)) if window else envelope
     first, names = curves[0], max((c.names for c in curves), key=len)
-    rows = [*names, 'innovation', *([] if epsilon is None else ['levels'])]
-    if any(c.gamma is not None for c in curves):
-        rows.insert(len(names), 'gamma')
+    gamma = ['gamma'] if any(c.gamma is not None for c in curves) else []
+    rows = [*names, *gamma, 'innovation']
     figure = _make_figure(len(rows), window)
     axes = dict(zip(rows, figure.subplots(len(rows), 1, sharex=True), strict=True))
     origin = min(c.stamps[0] for c in curves)
@@ -94,8 +92,6 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
         if c.gamma is not None:
             axes['gamma'].plot(*thinned(t, c.gamma), **style)
             axes['gamma'].set_ylabel('power γ')
-        if epsilon is not None:
-            axes['levels'].step(*thinned(t, _open_levels(c, epsilon)), where='post', **style)
     for name in names:
         those = [c for c in curves if name in c.names]
         _fit_after_transient(axes[name], [c.estimate[:, c.names.index(name)] for c in those])
@@ -103,9 +99,6 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
     t = (first.stamps - origin) * 1e-9
     _draw_innovations(axes['innovation'], t, first.innovation, epsilon, thinned)
     axes['innovation'].set_ylabel('|innovation|' + ('\n(first)' if len(curves) > 1 else ''))
-    if epsilon is not None:
-        axes['levels'].set_ylabel('open levels')
-        axes['levels'].set_yticks(range(1, first.innovation.shape[1] + 1))
     for row in axes.values():
         row.grid(alpha=0.3)
     axes[rows[-1]].set_xlabel('time since the first estimate [s]')
@@ -174,12 +167,6 @@ def _make_figure(rows: int, window: bool) -> Figure:
             f'MPLBACKEND without windows, got {found}'
         )
     return figure
-
-
-def _open_levels(c: Curves, epsilon: float) -> NDArray[np.int64]:
-    """Return how many levels ran: those whose gate, and all gates before it, are open."""
-    gates = np.abs(c.innovation[:, :-1]) <= epsilon
-    return 1 + np.logical_and.accumulate(gates, axis=1).sum(axis=1)
 
 
 def _fit_after_transient(axes: Axes, rows: list[NDArray[np.float64]]) -> None:
