@@ -49,18 +49,17 @@ class HeldInputs:
         values: Mapping[str, Any],
         reject: Callable[[int], None] = lambda _: None,
     ) -> None:
-        self._reader, self._reject = reader, reject
         self._names, self._wanted, self._values = model.inputs, wanted, values
-        self._inputs = [self._recorded(name, wanted[name]) for name in model.used_inputs]
-
-    def _recorded(self, name: str, wanted: Input) -> Iterator[tuple[int, int, int, float]]:
-        """Return time in the bag, number of the input, stamp and value of each of its messages."""
-        field = self._reader.field(wanted.topic, wanted.field, wanted.name)
-        stamp = 'header' if wanted.stamp == 'header' else 'bag'
-        blocks = self._reader.blocks(wanted.topic, field, stamp)
-        return self._finite(self._names.index(name), blocks)
+        self._reject = reject
+        self._inputs = []
+        for name in model.used_inputs:
+            topic, _, text, stamp, channel = wanted[name]
+            field = reader.field(topic, text, channel)
+            blocks = reader.blocks(topic, field, 'header' if stamp == 'header' else 'bag')
+            self._inputs.append(self._finite(self._names.index(name), blocks))
 
     def _finite(self, j: int, blocks: Iterator[Block]) -> Iterator[tuple[int, int, int, float]]:
+        """Yield time in the bag, number of the input, stamp and value of each of its messages."""
         for block in blocks:
             good = np.isfinite(block.values)
             self._reject(int((~good).sum()))
@@ -107,11 +106,12 @@ class HeldInputs:
                 pairing.take_sample(stamp, None)
                 rows += [u for _, u in pairing.released()]
             yield from _complete(waiting, rows)
-        while event is not None and waiting:
-            pairing.take_input(*event[1:])
+        for later in chain([event] if event else [], inputs):
+            pairing.take_input(*later[1:])
             rows += [u for _, u in pairing.released()]
-            event = next(inputs, None)
             yield from _complete(waiting, rows)
+            if not waiting:
+                return
         rows += [u for _, u in pairing.released(at_once=True)]
         yield from _complete(waiting, rows)
 

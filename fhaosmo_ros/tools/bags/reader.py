@@ -9,8 +9,6 @@ from functools import cache
 from itertools import islice, pairwise, zip_longest
 from operator import itemgetter
 from pathlib import Path
-import shutil
-import sqlite3
 import struct
 import sys
 from tempfile import TemporaryDirectory
@@ -74,7 +72,7 @@ class BagReader:
     An open bag: a folder with metadata.yaml, or one storage file of it.
 
     Where the file has CRCs, what is read agrees with them; and a topic that is read to its end has
-    as many messages as the bag lists. A storage file that was cut, or whose writer was killed, is
+    as many messages as the bag lists. An mcap file that was cut, or whose writer was killed, is
     read up to there, which is said on stderr.
 
     Attributes
@@ -337,19 +335,15 @@ def _check_summary(path: Path) -> None:
 
 
 def _whole_part(path: Path, folder: Path) -> Path:
-    """Return a storage file; if its writer was killed or it was cut, a copy of what is whole."""
-    copy = folder / path.name
-    journals = [p for end in ('-journal', '-wal') if (p := Path(f'{path}{end}')).exists()]
-    if path.suffix == '.mcap' and _is_cut(path):
-        _copy_whole_part(path, copy)
-    elif journals:
-        for part in (path, *journals):
-            shutil.copy(part, folder)
-        database = sqlite3.connect(copy)  # takes back what was not committed
-        database.execute('SELECT count(*) FROM messages')
-        database.close()
-    else:
+    """Return a storage file; of an mcap file that was cut, a copy of what is whole."""
+    if any(Path(f'{path}{end}').exists() for end in ('-journal', '-wal')):
+        raise ValueError(
+            f'a file whose writer was killed: `sqlite3 {path} .tables` takes back what is half'
+        )
+    if path.suffix != '.mcap' or not _is_cut(path):
         return path
+    copy = folder / path.name
+    _copy_whole_part(path, copy)
     _say_once(f'bag {path}: cut, or its writer was killed; read up to its last whole part')
     return copy
 

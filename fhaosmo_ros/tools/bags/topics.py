@@ -41,28 +41,6 @@ class Series(NamedTuple):
     labels: list[str]
 
 
-class Truth(NamedTuple):
-    """
-    States and unknown input of a simulated plant at some times.
-
-    Attributes
-    ----------
-    values : (K, n + 1) array
-        z_1 .. z_n and d; a row of NaN where the bag lacks them.
-    labels : list of str
-        Names of the states, where the messages have a label.
-
-    """
-
-    values: NDArray[np.float64]
-    labels: list[str]
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """Return which rows the bag holds."""
-        return np.asarray(np.isfinite(self.values).all(axis=1))
-
-
 def messages(path: Path, topic: str) -> list[tuple[int, Any]]:
     """Return the stamps (ns) and messages of a topic that has few of them."""
     with BagReader(path) as reader:
@@ -128,24 +106,11 @@ def read_ticks(path: Path, name: str, parts: Sequence[str]) -> dict[str, NDArray
         row = _rows_of_ticks(column.stamps, ticks)
         whole &= row >= 0
         found[part] = column.values[row] if len(column.values) else column.values
-        del column, row
-    if whole.all():
-        return found
     return {part: values[whole] if whole.any() else values[:0] for part, values in found.items()}
 
 
 def _rows_of_ticks(times: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """
-    Return which message of a topic belongs to each tick, -1 where it is missing.
-
-    Parameters
-    ----------
-    times : (K,) array
-        Stamps of the topic.
-    ticks : (T,) array
-        Stamps of the topic that is published last.
-
-    """
+    """Return which message of a topic belongs to each tick, -1 where it is missing."""
     if not len(times) or not len(ticks):
         return np.full(len(ticks), -1)
     # The estimator publishes it before the last topic; but a recorder that stamps messages as
@@ -161,7 +126,7 @@ def _rows_of_ticks(times: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArra
     return np.where(early, before, -1) if lead <= lag else np.where(late, after, -1)
 
 
-def truth_at(bag: Path, plant: str, when: NDArray[np.int64]) -> Truth | None:
+def truth_at(bag: Path, plant: str, when: NDArray[np.int64]) -> Series | None:
     """
     Return the truth that belongs to samples of y.
 
@@ -178,8 +143,9 @@ def truth_at(bag: Path, plant: str, when: NDArray[np.int64]) -> Truth | None:
 
     Returns
     -------
-    Truth or None
-        None if the bag has no message of one of the topics.
+    Series or None
+        z_1 .. z_n and d at `when`; a row of NaN where the bag lacks them. None if it has no message
+        of one of the topics.
 
     """
     columns = []
@@ -196,4 +162,4 @@ def truth_at(bag: Path, plant: str, when: NDArray[np.int64]) -> Truth | None:
         values = found.values[row].astype(np.float64).reshape(len(row), -1)
         columns.append(np.where(its_own[:, None], values, np.nan))
         labels = labels or found.labels
-    return Truth(np.column_stack(columns), labels)
+    return Series(when, np.column_stack(columns), labels)

@@ -226,12 +226,10 @@ def assigned(rules: Sequence[str], table: ParameterTable) -> dict[str, Any]:
 
 
 def _on_command_line(arguments: argparse.Namespace) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for target, value in _rules(arguments.param):
-        node, _, name = target.rpartition(':')
-        if not node or node.strip('/') == arguments.node.strip('/'):
-            values[name] = value  # not another node's, as on a command line of ROS
-    return values
+    """Return what -p sets of this node; as on a command line of ROS it may be for another."""
+    own = ('', arguments.node.strip('/'))
+    split = [(target.rpartition(':'), value) for target, value in _rules(arguments.param)]
+    return {name: value for (node, _, name), value in split if node.strip('/') in own}
 
 
 def _rules(rules: Sequence[str]) -> Iterator[tuple[str, Any]]:

@@ -7,21 +7,6 @@ import shutil
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 
 
-def named(path: Path) -> Path:
-    """
-    Return a path to write to.
-
-    Raises
-    ------
-    ConfigurationError
-        It has no name of its own that something could be renamed to: ``.``, ``..`` or ``/``.
-
-    """
-    if path.name in ('', '..'):
-        raise ConfigurationError(f'output {path}: expected a name, got a folder that is in use')
-    return path
-
-
 class Output:
     """
     A file or folder that is made in a hidden folder beside its place, and moved once complete.
@@ -47,7 +32,11 @@ class Output:
     """
 
     def __init__(self, final: Path, force: bool = False) -> None:
-        self._final, self._force = named(final), force
+        if final.name in ('', '..'):  # nothing could be renamed to it
+            raise ConfigurationError(
+                f'output {final}: expected a name, got a folder that is in use'
+            )
+        self._final, self._force = final, force
         self._folder = final.with_name(f'.{final.name}.part')
         self.path = self._folder / final.name
 
@@ -55,7 +44,12 @@ class Output:
         final = self._final
         try:
             if not self._force and final.exists():
-                _expect_empty_folder(final)
+                folder = final.is_dir()
+                if not folder or any(final.iterdir()):
+                    raise ConfigurationError(
+                        f'output {final}: expected a new name (or --force to replace it), got an '
+                        f'existing {"folder with something in it" if folder else "file"}'
+                    )
             shutil.rmtree(self._folder, ignore_errors=True)  # of a run that was killed
             self._folder.mkdir(parents=True)
         except OSError as error:
@@ -72,12 +66,3 @@ class Output:
 
     def __exit__(self, *_: object) -> None:
         shutil.rmtree(self._folder, ignore_errors=True)
-
-
-def _expect_empty_folder(path: Path) -> None:
-    if not path.is_dir() or any(path.iterdir()):
-        kind = 'folder with something in it' if path.is_dir() else 'file'
-        raise ConfigurationError(
-            f'output {path}: expected a new name (or --force to replace it), got an existing '
-            f'{kind}'
-        )

@@ -63,16 +63,15 @@ class Child:
     def check(self) -> None:
         """Raise, with the end of its output, if the child has ended."""
         if self._process.poll() is not None:
-            lines = self.output().splitlines()
+            last = ' / '.join(self.output().splitlines()[-2:])
             raise self.failure(
                 f'{self._log.stem} ended with exit code {self._process.returncode}: '
-                f'{" / ".join(lines[-2:]) or "without a word"}'
+                f'{last or "without a word"}'
             )
 
     def interrupt(self) -> None:
         """Ask the child to end."""
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGINT)
+        self._process.send_signal(signal.SIGINT)
 
     def end(self) -> None:
         """Wait for the child's end, and kill it if it takes more than `GRACE` seconds."""

@@ -73,9 +73,9 @@ def read_run(bag: Path) -> Run:
     ticks = read_ticks(bag, '/estimator', [*found, *ESTIMATES])
     when = ticks['stamp'].astype(np.int64)
     truth = truth_at(bag, '/plant', when) if len(when) else None
-    if truth is None or not truth.known.any():
+    known = None if truth is None else np.isfinite(truth.values).all(axis=1)
+    if known is None or not known.any():
         raise ConfigurationError('the run ended before an estimate arrived beside its truth')
-    known = truth.known
     counters: dict[str, str] = {}
     for _, message in messages(bag, '/diagnostics'):
         for status in message.status:

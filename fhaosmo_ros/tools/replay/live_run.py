@@ -2,7 +2,7 @@
 """Following a live estimator through a bag: the same first sample, resets and live changes."""
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -60,23 +60,22 @@ def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> st
         for c in reader.connections
         if c.topic.endswith(f'/{SNAPSHOT}') and c.msgcount
     )
-    of_channel = [other for other in found if channel and other.endswith(f'/{channel}')]
-    if name is None and len(of_channel) == 1:
-        return of_channel[0]
-    if name is None and len(found) > 1:
-        raise ConfigurationError(
-            f'--follow: expected one of the live estimators in the bag ({", ".join(found)}), '
-            '--channel for one of a node, or --afresh'
-        )
     if name is not None and name not in found:
         raise ConfigurationError(
             f'--follow: expected an estimator whose snapshots are in the bag '
             f'({", ".join(found) or "none"}), got {name!r}'
         )
-    return name or next(iter(found), None)
+    of_channel = [other for other in found if channel and other.endswith(f'/{channel}')]
+    wanted = [name] if name else of_channel if len(of_channel) == 1 else found
+    if len(wanted) > 1:
+        raise ConfigurationError(
+            f'--follow: expected one of the live estimators in the bag ({", ".join(found)}), '
+            '--channel for one of a node, or --afresh'
+        )
+    return wanted[0] if wanted else None
 
 
-def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Event]:
+def read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[Event]:
     """
     Return the events of a live estimator in order.
 
@@ -85,7 +84,7 @@ def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Even
     reader : BagReader
     name : str
         Name of the estimator: the node's full name, followed by the channel's if it has channels.
-    fixed : iterable of str
+    fixed : collection of str
         Parameters whose live changes are not repeated.
 
     Raises
@@ -99,13 +98,16 @@ def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Even
     topics = {f'{name}/{SNAPSHOT}', EVENTS} & {c.topic for c in reader.connections}
     for topic, time, message in reader.read_all(topics):
         if topic == EVENTS:
-            if name == message.node or name.startswith(f'{message.node}/'):
-                channel = name.removeprefix(message.node).strip('/')
-                changes |= _changes(message.changed_parameters, channel, set(fixed))
+            node, channel = message.node, name.removeprefix(message.node).strip('/')
+            if name == node or name.startswith(f'{node}/'):
+                for parameter in message.changed_parameters:
+                    of_channel, key = split(parameter.name)
+                    if of_channel == channel and key in ONLINE_PARAMETERS and key not in fixed:
+                        value = getattr(parameter.value, VALUE_FIELDS[parameter.value.type])
+                        changes[key] = ONLINE_PARAMETERS[key].coerce(value)
             continue
         try:
-            names = message.layout.dim[0].label.split(',')
-            snapshot = unpack(message.data, names)
+            snapshot = unpack(message.data, message.layout.dim[0].label.split(','))
         except (IndexError, ConfigurationError) as error:
             raise UnknownSnapshot(f'topic {topic!r}: {error}') from None
         # The node publishes the change first, then the snapshot.
@@ -114,16 +116,6 @@ def read_events(reader: BagReader, name: str, fixed: Iterable[str]) -> list[Even
         if took_them:
             changes = {}
     return events
-
-
-def _changes(parameters: Sequence[Any], channel: str, fixed: set[str]) -> dict[str, Any]:
-    values = {}
-    for parameter in parameters:
-        of_channel, name = split(parameter.name)
-        if of_channel == channel and name in ONLINE_PARAMETERS and name not in fixed:
-            value = getattr(parameter.value, VALUE_FIELDS[parameter.value.type])
-            values[name] = ONLINE_PARAMETERS[name].coerce(value)
-    return values
 
 
 class LiveRun:
@@ -161,8 +153,7 @@ class LiveRun:
                 block = next(blocks, None)
                 if block is None:
                     break
-                if len(block.times):
-                    held.append(block)
+                held.append(block)
             for k, block in enumerate(held):
                 found = np.flatnonzero(block.stamps == event.snapshot.stamp)
                 if len(found):
@@ -198,7 +189,11 @@ class LiveRun:
         return True
 
     def parts(self, stamps: NDArray[np.int64]) -> Iterator[slice]:
-        """Yield parts of a block; in between, do what was done to the live estimator there."""
+        """
+        Yield parts of a block; in between, do what was done to the live estimator there.
+
+        A part may be empty.
+        """
         position = 0
         while self._events:
             event = self._events[0]
@@ -210,20 +205,17 @@ class LiveRun:
             # If the bag lacks that sample, the event takes place before the next one.
             at = position + int(found[0]) if len(found) else _next(stamps, position, stamp)
             if flags & Flag.STARTED:
-                if at > position:
-                    yield slice(position, at)
+                yield slice(position, at)
                 position = at
                 self._configure(event)
                 self._estimator.reset()
             end = at + 1 if len(found) else at
-            if end > position:
-                yield slice(position, end)
-                position = end
+            yield slice(position, end)
+            position = end
             self._repeat(event)
             if len(found) or self._estimator.latest == stamp:
                 self._compare(event.snapshot)
-        if position < len(stamps):
-            yield slice(position, len(stamps))
+        yield slice(position, len(stamps))
 
     def _repeat(self, event: Event) -> None:
         """Do what was done to the live estimator after the event's sample."""
@@ -264,13 +256,12 @@ class LiveRun:
                 'began afresh at the first'
             )
         begin = 'from the state it had' if self._resumed else 'afresh'
-        count = self._same + self._other
-        text = f'followed {self._name} {begin} after {self.left_out} samples of the bag'
-        text += self._unfit
-        text += f'; {self._same} of {count} snapshots are the same to {AGREEMENT:g}'
-        if self._other:
-            text += ' (parameters differ, or one of the two missed samples)'
-        return text
+        differs = ' (parameters differ, or one of the two missed samples)' if self._other else ''
+        return (
+            f'followed {self._name} {begin} after {self.left_out} samples of the bag'
+            f'{self._unfit}; {self._same} of {self._same + self._other} snapshots are the same '
+            f'to {AGREEMENT:g}{differs}'
+        )
 
 
 def _next(stamps: NDArray[np.int64], position: int, stamp: int) -> int:

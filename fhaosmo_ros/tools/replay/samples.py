@@ -135,7 +135,8 @@ class Samples:
         whole = [slice(0, len(block.times))]
         for part in self._live.parts(block.stamps) if self._live else whole:
             inputs = None if u is None else u[part]
-            yield from self._estimate(Block(*(column[part] for column in block)), inputs)
+            if part.start < part.stop:
+                yield from self._estimate(Block(*(column[part] for column in block)), inputs)
 
     def _estimate(self, block: Block, u: np.ndarray | None) -> Iterator[Rows]:
         estimates = self.estimator.run(block.stamps, block.values, u)
