@@ -92,14 +92,14 @@ def recorded(path):
         bag.flush()
         bag.add('/y', KIND)
         bag.flush()
-        for k in range(500):
+        for k in range(60_000):
             bag.write('/y', 1000 + k, files.float64(k))
         bag.add('/late', 'sensor_msgs/msg/JointState')
         bag.flush()
         bag.flush()
         bag.add('/description', 'std_msgs/msg/String', qos=[LATCHED_QOS])
         bag.write('/description', 900, files.cdr('std_msgs/msg/String', data='<robot/>'))
-        bag.write('/y', 1700, files.float64(5.0))
+        bag.write('/y', 70_000, files.float64(5.0))
 
 
 def without_messages(path):
@@ -108,20 +108,13 @@ def without_messages(path):
         bag.flush()
 
 
-def many_messages(path):
-    with BagWriter(path) as bag:
-        bag.add('/y', KIND)
-        for k in range(60_000):
-            bag.write('/y', k, files.float64(k))
-
-
 def replayed(path):
     stamps, y = files.signal(3000)
     bag = files.write(path.with_name('source'), files.floats(stamps, y))
     assert replay.main([str(bag), '-o', str(path)]) == 0
 
 
-@pytest.mark.parametrize('write', [recorded, without_messages, many_messages, replayed])
+@pytest.mark.parametrize('write', [recorded, without_messages, replayed])
 def test_file_is_one_that_the_cpp_reader_takes(write, tmp_path):
     """It refuses files with a chunk that has no complete message index (mcap 1.3.0)."""
     write(tmp_path / 'bag')

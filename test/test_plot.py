@@ -53,6 +53,9 @@ def test_formats_by_file_name(kind, bag, tmp_path, capsys):
         (['BAG', '--names', '/no'], ['/estimator, /replay/estimator', "'/no'"]),
         (['/no/bag'], ['/no/bag', 'does not exist']),
         (['PLAIN'], ['topics of an estimator', '/y']),
+        ([], ['a BAG or --fuzzy']),
+        (['--fuzzy', '--show'], ['no --show']),
+        (['--fuzzy', '-p', "fuzzy_systems:=['terms 4']"], ['odd number of terms']),
     ],
 )
 def test_wrong_input_is_said_in_one_line(arguments, words, bag, tmp_path, capsys, monkeypatch):
@@ -66,7 +69,7 @@ def test_wrong_input_is_said_in_one_line(arguments, words, bag, tmp_path, capsys
     assert not list(tmp_path.glob('*.png'))
 
 
-@pytest.mark.parametrize('backend', ['', 'Agg', 'svg', 'TkAgg', 'QtAgg'])
+@pytest.mark.parametrize('backend', ['', 'Agg', 'QtAgg'])
 def test_window_that_can_not_be_opened_is_said(backend, bag, tmp_path):
     """In a process of its own: matplotlib keeps the backend that it has chosen."""
     environment = {k: v for k, v in os.environ.items() if not k.endswith('DISPLAY')}
@@ -125,14 +128,15 @@ def test_figure_of_many_estimates_is_thinned(tmp_path, monkeypatch):
     """All samples of a million estimates took 460 MB more."""
     count = 20_000
     stamps, y = files.signal(count)
-    estimate, innovation = np.column_stack([y, y]), np.column_stack([y, y])
-    curves = Curves('run', stamps, ['z1', 'd'], estimate, innovation, y, truth=estimate)
+    both = np.column_stack([y, y])
+    curves = Curves('run', stamps, ['z1', 'd'], both, both, y, truth=both, unit='rad')
     drawn = []
     monkeypatch.setattr(Figure, 'savefig', lambda figure, *_, **__: drawn.extend(figure.axes))
     save_curves([curves], 1.0, tmp_path / 'f.png', window=False)
     lengths = [len(line.get_xdata()) for axes in drawn for line in axes.lines]
     assert len(lengths) == 7
     assert max(lengths) <= 2 * COLUMNS + 2 < count
+    assert [axes.get_ylabel() for axes in drawn[:2]] == ['z1 [rad]', 'unknown\ninput d [rad/s]']
 
 
 def test_thinning_leaves_short_curves_and_times_that_go_back():
@@ -140,7 +144,6 @@ def test_thinning_leaves_short_curves_and_times_that_go_back():
     kept, _ = envelope(t, np.sin(t))
     assert np.flatnonzero(np.diff(kept) < 0.0).size == 1
     for count in (0, 1, 100):
-        assert envelope(t[:count], t[:count])[0] is not None
         assert envelope(t[:count], t[:count])[1].tolist() == t[:count].tolist()
     assert len(envelope(np.ones(9999), np.arange(9999.0))[0]) == 9999
 
@@ -152,19 +155,12 @@ def test_signal_in_a_destructor_is_not_lost(bag, tmp_path, monkeypatch, capsys):
         def __del__(self):
             signal.raise_signal(signal.SIGINT)
 
+    read = plot.read_curves
     monkeypatch.setattr(plot, 'save_curves', lambda c, e, path, show: path.write_bytes(b'x'))
-    monkeypatch.setattr(plot, 'read_curves', _then(plot.read_curves, Collected))
+    monkeypatch.setattr(plot, 'read_curves', lambda *a: (Collected(), read(*a))[1])
     assert plot.main([str(bag), '-o', str(tmp_path / 'f.png')]) == 130
     assert capsys.readouterr().err.endswith('plot: interrupted\n')
     assert not list(tmp_path.glob('*f.png*'))
-
-
-def _then(function, another):
-    def both(*arguments):
-        another()
-        return function(*arguments)
-
-    return both
 
 
 # The command, which draws so long that no signal can come too late.
@@ -196,12 +192,20 @@ def test_ctrl_c_leaves_nothing(bag, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ['bag', 'one', 'two']
 
 
-def test_fuzzy_systems_are_drawn_without_a_bag(tmp_path, capsys):
+def test_fuzzy_systems_are_drawn_without_a_bag_or_as_it_was_made(tmp_path, capsys, monkeypatch):
     out = tmp_path / 'fuzzy.svg'
     systems = "['input -1 -0.2 0 0.2 1; output singleton 5', 'terms 11', 'curve 0 0.8 1']"
     assert plot.main(['--fuzzy', '-p', f'fuzzy_systems:={systems}', '-o', str(out)]) == 0
     assert out.read_bytes().startswith(MAGIC['svg'])
     assert capsys.readouterr().out == f'figure: {out}\n'
+    bag = files.write(tmp_path / 'bag', files.floats(*files.signal(100)))
+    own = ['curve 0 0.8 1']
+    made = tmp_path / 'made'
+    assert replay.main([str(bag), '-o', str(made), '-p', f'fuzzy_systems:={own}']) == 0
+    drawn = []
+    monkeypatch.setattr(plot, 'rows_of', lambda p, n: drawn.append(p) or rows_of(p, n))
+    assert plot.main(['--fuzzy', str(made), '-o', str(tmp_path / 'f.png')]) == 0
+    assert drawn[0]['fuzzy_systems'] == own
 
 
 def test_figure_of_fuzzy_systems_shows_memberships_and_curve():
@@ -221,32 +225,6 @@ def test_figure_of_fuzzy_systems_shows_memberships_and_curve():
         assert (x[0], x[-1], psi[0], psi[-1]) == (-row.width, row.width, -1.0, 1.0)
 
 
-def test_fuzzy_systems_of_a_bag_are_those_it_was_made_with(tmp_path, monkeypatch):
-    stamps, y = files.signal(100)
-    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
-    own = ['curve 0 0.8 1']
-    arguments = ['-o', str(tmp_path / 'one'), '-p', f'fuzzy_systems:={own}']
-    assert replay.main([str(bag), *arguments]) == 0
-    drawn = []
-    monkeypatch.setattr(plot, 'rows_of', lambda p, n: drawn.append(p) or rows_of(p, n))
-    assert plot.main(['--fuzzy', str(tmp_path / 'one'), '-o', str(tmp_path / 'f.png')]) == 0
-    assert drawn[0]['fuzzy_systems'] == own
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        ([], 'a BAG or --fuzzy'),
-        (['--fuzzy', '--show'], 'no --show'),
-        (['--fuzzy', '-p', "fuzzy_systems:=['terms 4']"], 'odd number of terms'),
-    ],
-)
-def test_wrong_fuzzy_arguments_are_said_in_one_line(arguments, words, capsys):
-    assert plot.main(arguments) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert words in line
-
-
 def test_truth_is_unknown_where_the_bag_lacks_it(tmp_path):
     """A recorder may hear the plant later than the estimator."""
     stamps, y = files.signal(500)
@@ -264,11 +242,3 @@ def test_truth_is_unknown_where_the_bag_lacks_it(tmp_path):
     known = np.isfinite(curves.truth)
     assert known.all(axis=1).tolist() == [100 <= k < 400 for k in range(500)]
     assert 'nan' not in metrics([curves])
-
-
-def test_units_follow_from_that_of_y():
-    empty = np.zeros((0, 3))
-    names = ['z1', 'z2', 'd']
-    curves = Curves('run', np.zeros(0, np.int64), names, empty, empty, unit='rad')
-    assert [curves.title(name).split('[')[1] for name in names] == ['rad]', 'rad/s]', 'rad/s^2]']
-    assert curves._replace(unit='').title('z1') == 'z1'

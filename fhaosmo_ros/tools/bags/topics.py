@@ -144,8 +144,8 @@ def truth_at(bag: Path, plant: str, when: NDArray[np.int64]) -> Series | None:
     Returns
     -------
     Series or None
-        z_1 .. z_n and d at `when`; a row of NaN where the bag lacks them. None if it has no message
-        of one of the topics.
+        z_1 .. z_n and d at `when`; a row of NaN where the bag lacks them. None if it has no
+        message of one of the topics.
 
     """
     columns = []
