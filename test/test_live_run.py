@@ -87,10 +87,18 @@ def write(path, stamps, y, *lives, begin=0):
     return files.write(path, sorted(messages, key=lambda m: m[2]))
 
 
-def run(capsys, *arguments):
-    code = replay.main([str(a) for a in arguments])
-    out, error = capsys.readouterr()
-    return code, out, error.strip().splitlines()[-1] if error.strip() else ''
+def run(capsys, *arguments, code=0):
+    """Return what a replay says, and the rows of its output."""
+    out = arguments[0].with_suffix('.npz')
+    assert replay.main([*map(str, arguments), '-o', str(out), '--force']) == code
+    said = capsys.readouterr()
+    return (said.out, rows(out)) if code == 0 else said.err
+
+
+def expect(found, live, first=0):
+    """Compare with what the live estimator found, from its sample number `first` on."""
+    assert list(found) == list(live.rows)[first:]
+    np.testing.assert_array_equal(list(found.values()), [live.rows[stamp] for stamp in found])
 
 
 def rows(path):
@@ -123,15 +131,9 @@ def test_every_live_estimate_comes_again(begin, tmp_path, capsys):
         parameters = ['-p', 'epsilon:=2.0', '-p', 'gamma_rate:=0.02']
     elif begin == 700 or parameters:
         parameters = ['--params-file', tmp_path / 'p.yaml']
-    out = tmp_path / 'o.npz'
-    code, text, _ = run(capsys, bag, '-o', out, *OPTIONS, *parameters)
-    assert code == 0
-    got = rows(out)
+    text, found = run(capsys, bag, *OPTIONS, *parameters)
     # The first snapshot after the begin is that of sample 123, 999 or 2699.
-    first = {0: 123, 700: 1000, 2600: 2700}[begin]
-    assert list(got) == stamps[first:].tolist()
-    for stamp, row in got.items():
-        np.testing.assert_array_equal(row, live.rows[stamp])
+    expect(found, live, {0: 0, 700: 1000 - 123, 2600: 2700 - 123}[begin])
     assert 'followed /estimator' in text
     count = sum(m[0].endswith('snapshot') and m[2] >= stamps[begin] for m in live.messages)
     count -= begin > 0  # where it begins there is nothing to compare
@@ -149,15 +151,10 @@ def test_parameters_come_from_the_bag(begin, tmp_path, capsys):
     live.tell_parameters(stamps[1200 if begin else 999] + 200_000, variant='fuzzy', epsilon=1e-6)
     live.run(stamps, y, 1000, 2000)
     bag = write(tmp_path / 'bag', stamps, y, live, begin=begin)
-    out = tmp_path / 'o.npz'
-    code, text, _ = run(capsys, bag, '-o', out)
-    assert code == 0
+    text, found = run(capsys, bag)
     assert 'parameters: /rig/estimator/parameters in the bag\n' in text
     assert 'parameters differ' not in text
-    got = rows(out)
-    assert len(got) == 2000 - {0: 0, 1200: 1500}[begin]
-    for stamp, row in got.items():
-        np.testing.assert_array_equal(row, live.rows[stamp])
+    expect(found, live, 1500 if begin else 0)
 
 
 def test_parameters_of_the_bag_make_way(tmp_path, capsys):
@@ -165,15 +162,14 @@ def test_parameters_of_the_bag_make_way(tmp_path, capsys):
     live = Live().run(stamps, y, 0, 600)
     live.tell_parameters(stamps[0], variant='sign', epsilon=1.0)
     bag = write(tmp_path / 'bag', stamps, y, live)
-    out = tmp_path / 'o.npz'
-    _, text, _ = run(capsys, bag, '-o', out, *OPTIONS, '-p', 'epsilon:=3.0')
+    text, found = run(capsys, bag, *OPTIONS, '-p', 'epsilon:=3.0')
     assert 'in the bag, with variant, epsilon of the command line' in text
-    assert list(rows(out).values()) == list(live.rows.values())
+    expect(found, live)
     path = tmp_path / 'p.yaml'
     path.write_text('/**: {ros__parameters: {variant: fuzzy_adaptive, epsilon: 3.0}}')
-    _, text, _ = run(capsys, bag, '-o', out, '--force', '--params-file', path)
+    text, found = run(capsys, bag, '--params-file', path)
     assert f'parameters: {path}\n' in text
-    assert list(rows(out).values()) == list(live.rows.values())
+    expect(found, live)
 
 
 def test_parameters_of_another_version_are_said(tmp_path, capsys):
@@ -181,8 +177,7 @@ def test_parameters_of_another_version_are_said(tmp_path, capsys):
     live = Live().run(stamps, y, 0, 300)
     live.tell_parameters(stamps[0], epsilom=1.0)
     bag = write(tmp_path / 'bag', stamps, y, live)
-    code, _, error = run(capsys, bag, '-o', tmp_path / 'o.npz')
-    assert code == 2
+    error = run(capsys, bag, code=2)
     for word in ("'/estimator/parameters'", 'epsilom', '--params-file'):
         assert word in error
 
@@ -198,23 +193,16 @@ def test_input_that_came_before_the_recording_holds(begin, tmp_path, capsys):
     live.messages += files.floats(stamps[3000:3001] - 1, np.array([-0.4]), '/u')
     live.run(stamps, y, 3000, COUNT)
     bag = write(tmp_path / 'bag', stamps, y, live, begin=begin)
-    out = tmp_path / 'o.npz'
-    code, _, error = run(
-        capsys, bag, '-o', out, '-p', "phi:=['0', '0', 'u - z3']", '-p', 'gains:=fixed'
-    )
-    assert code == 0, error
-    found = rows(out)
-    assert len(found) >= COUNT - 1000
-    assert found == {stamp: live.rows[stamp] for stamp in found}
+    _, found = run(capsys, bag, '-p', "phi:=['0', '0', 'u - z3']", '-p', 'gains:=fixed')
+    expect(found, live, 1000 if begin else 0)
 
 
 def test_afresh_begins_at_the_first_sample(tmp_path, capsys):
     stamps, y = files.signal(1000)
     live = Live().run(stamps, y, 300, 1000)
     bag = write(tmp_path / 'bag', stamps, y, live)
-    code, text, _ = run(capsys, bag, '-o', tmp_path / 'o.npz', *OPTIONS, '--afresh')
-    assert code == 0
-    assert list(rows(tmp_path / 'o.npz')) == stamps.tolist()
+    text, found = run(capsys, bag, *OPTIONS, '--afresh')
+    assert list(found) == stamps.tolist()
     assert 'followed' not in text
 
 
@@ -224,13 +212,9 @@ def test_fixed_parameter_stays(tmp_path, capsys):
     live.change(stamps[699], 'epsilon', 1e-6)
     live.run(stamps, y, 700, 1500)
     bag = write(tmp_path / 'bag', stamps, y, live)
-    out = tmp_path / 'o.npz'
-    code, text, _ = run(capsys, bag, '-o', out, *OPTIONS, '-p', 'epsilon:=3.0')
-    assert code == 0
+    text, found = run(capsys, bag, *OPTIONS, '-p', 'epsilon:=3.0')
     assert 'parameters differ' in text
-    expected = Live().run(stamps, y, 0, 1500).rows
-    got = rows(out)
-    np.testing.assert_array_equal([got[s] for s in got], [expected[s] for s in got])
+    expect(found, Live().run(stamps, y, 0, 1500))
 
 
 def test_observer_of_another_size_begins_afresh(tmp_path, capsys):
@@ -238,9 +222,9 @@ def test_observer_of_another_size_begins_afresh(tmp_path, capsys):
     live = Live().run(stamps, y, 0, 1500)
     bag = write(tmp_path / 'bag', stamps, y, live, begin=600)
     out = tmp_path / 'o.csv'
-    code, text, _ = run(capsys, bag, '-o', out, '-p', 'order:=2', '-p', "phi:=['0','0']")
-    assert code == 0
-    assert 'afresh after 399 samples' in text
+    options = ['-p', 'order:=2', '-p', "phi:=['0','0']"]
+    assert replay.main([str(bag), '-o', str(out), *options]) == 0
+    assert 'afresh after 399 samples' in capsys.readouterr().out
 
 
 def test_samples_of_another_clock_are_not_followed(tmp_path, capsys):
@@ -248,10 +232,9 @@ def test_samples_of_another_clock_are_not_followed(tmp_path, capsys):
     stamps, y = files.signal(1500)
     live = Live().run(stamps + 17, y, 0, 1500)
     bag = write(tmp_path / 'bag', stamps, y, live)
-    code, text, _ = run(capsys, bag, '-o', tmp_path / 'o.npz', *OPTIONS)
-    assert code == 0
+    text, found = run(capsys, bag, *OPTIONS)
     assert '/estimator not followed' in text
-    assert list(rows(tmp_path / 'o.npz')) == stamps.tolist()
+    assert list(found) == stamps.tolist()
 
 
 def test_sample_that_the_bag_lacks_does_not_stop_the_following(tmp_path, capsys):
@@ -261,10 +244,7 @@ def test_sample_that_the_bag_lacks_does_not_stop_the_following(tmp_path, capsys)
     live.run(stamps, y, 1000, 2000)
     keep = np.arange(2000) != 1000  # the one from which it started again
     bag = write(tmp_path / 'bag', stamps[keep], y[keep], live)
-    out = tmp_path / 'o.npz'
-    code, _, _ = run(capsys, bag, '-o', out, *OPTIONS, '-p', 'epsilon:=3.0')
-    assert code == 0
-    got = rows(out)
+    _, got = run(capsys, bag, *OPTIONS, '-p', 'epsilon:=3.0')
     np.testing.assert_array_equal(got[int(stamps[999])], live.rows[int(stamps[999])])
     assert got[int(stamps[1001])][4] == live.rows[int(stamps[1000])][4]  # gamma began afresh too
 
@@ -273,16 +253,11 @@ def test_which_estimator_to_follow(tmp_path, capsys):
     stamps, y = files.signal(1200)
     lives = [Live('/left').run(stamps, y, 0, 1200), Live('/right').run(stamps, y, 500, 1200)]
     bag = write(tmp_path / 'bag', stamps, y, *lives)
-    out = tmp_path / 'o.npz'
-    code, _, error = run(capsys, bag, '-o', out)
-    assert code == 2
+    error = run(capsys, bag, code=2)
     assert '/left, /right' in error
     assert '--afresh' in error
-    code, _, error = run(capsys, bag, '-o', out, '--follow', '/middle')
-    assert code == 2
-    assert "'/middle'" in error
-    code, text, _ = run(capsys, bag, '-o', out, '--follow', '/right', *OPTIONS)
-    assert code == 0
+    assert "'/middle'" in run(capsys, bag, '--follow', '/middle', code=2)
+    text, _ = run(capsys, bag, '--follow', '/right', *OPTIONS)
     assert 'followed /right afresh after 500 samples' in text
 
 
@@ -300,12 +275,9 @@ def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
     (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
     file = ['--params-file', tmp_path / 'p.yaml', *OPTIONS]
     for live, (source, options) in product(lives, [(bag, file), (told, [])]):
-        out = tmp_path / f'{live.name.rpartition("/")[2]}_{source.name}.npz'
-        code, text, _ = run(capsys, source, '-o', out, '--follow', live.name, *options)
-        assert code == 0
+        text, found = run(capsys, source, '--follow', live.name, *options)
         assert 'parameters differ' not in text
-        got = rows(out)
-        np.testing.assert_array_equal(list(got.values()), [live.rows[stamp] for stamp in got])
+        expect(found, live)
 
 
 @pytest.mark.parametrize('labels', [['a', 'b'], ['version', 'z_hat1'], ['flags', 'm1']])
@@ -331,11 +303,8 @@ def test_channel_says_whom_to_follow(tmp_path, capsys):
     own = {'variant': 'fuzzy_adaptive', 'epsilon': 3.0, 'channels': ['hip', 'knee']}
     lives[0].tell_parameters(stamps[0], **own)
     bag = write(tmp_path / 'bag', stamps, y, *lives)
-    out = tmp_path / 'o.npz'
-    code, text, _ = run(capsys, bag, '-o', out, '--channel', 'knee')
-    assert code == 0
+    text, found = run(capsys, bag, '--channel', 'knee')
     assert 'followed /estimator/knee' in text
-    assert list(rows(out).values()) == list(lives[1].rows.values())
-    code, _, error = run(capsys, bag, '-o', out, '--afresh', '--channel', 'hop')
-    assert code == 2
+    expect(found, lives[1])
+    error = run(capsys, bag, '--afresh', '--channel', 'hop', code=2)
     assert '--channel: expected hip or knee, got hop' in error
