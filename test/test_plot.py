@@ -54,7 +54,7 @@ def test_formats_by_file_name(kind, bag, tmp_path, capsys):
         (['/no/bag'], ['/no/bag', 'does not exist']),
         (['PLAIN'], ['topics of an estimator', '/y']),
         ([], ['a BAG or --fuzzy']),
-        (['--fuzzy', '--show'], ['no --show']),
+        (['BAG', 'BAG', '--fuzzy'], ['at most one BAG']),
         (['--fuzzy', '-p', "fuzzy_systems:=['terms 4']"], ['odd number of terms']),
     ],
 )
@@ -67,40 +67,6 @@ def test_wrong_input_is_said_in_one_line(arguments, words, bag, tmp_path, capsys
     assert len(error) == 1
     assert all(word in error[0] for word in words)
     assert not list(tmp_path.glob('*.png'))
-
-
-@pytest.mark.parametrize('backend', ['', 'Agg', 'QtAgg'])
-def test_window_that_can_not_be_opened_is_said(backend, bag, tmp_path):
-    """In a process of its own: matplotlib keeps the backend that it has chosen."""
-    environment = {k: v for k, v in os.environ.items() if not k.endswith('DISPLAY')}
-    environment |= {'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])}
-    environment |= {'MPLBACKEND': backend} if backend else {}
-    done = subprocess.run(
-        [sys.executable, '-m', 'fhaosmo_ros', 'plot', bag, '-o', tmp_path / 'f.png', '--show'],
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 2, done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert 'DISPLAY' in done.stderr
-    assert not (tmp_path / 'f.png').exists()
-
-
-def test_figure_is_kept_before_the_window_opens(bag, tmp_path, monkeypatch):
-    """Whoever closes the window by Ctrl-C has it all the same."""
-    out = tmp_path / 'f.png'
-
-    def shown(*arguments):
-        assert out.exists()
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(plot, 'save_curves', lambda c, e, path, show: path.write_bytes(b'x'))
-    monkeypatch.setattr(plot, 'show', shown)
-    assert plot.main([str(bag), '-o', str(out), '--show']) == 130
-    assert out.exists()
 
 
 def test_thinned_curve_draws_the_same_pixels():
@@ -132,7 +98,7 @@ def test_figure_of_many_estimates_is_thinned(tmp_path, monkeypatch):
     curves = Curves('run', stamps, ['z1', 'd'], both, both, y, truth=both, unit='rad')
     drawn = []
     monkeypatch.setattr(Figure, 'savefig', lambda figure, *_, **__: drawn.extend(figure.axes))
-    save_curves([curves], 1.0, tmp_path / 'f.png', window=False)
+    save_curves([curves], 1.0, tmp_path / 'f.png')
     lengths = [len(line.get_xdata()) for axes in drawn for line in axes.lines]
     assert len(lengths) == 7
     assert max(lengths) <= 2 * COLUMNS + 2 < count
@@ -156,7 +122,7 @@ def test_signal_in_a_destructor_is_not_lost(bag, tmp_path, monkeypatch, capsys):
             signal.raise_signal(signal.SIGINT)
 
     read = plot.read_curves
-    monkeypatch.setattr(plot, 'save_curves', lambda c, e, path, show: path.write_bytes(b'x'))
+    monkeypatch.setattr(plot, 'save_curves', lambda c, e, path: path.write_bytes(b'x'))
     monkeypatch.setattr(plot, 'read_curves', lambda *a: (Collected(), read(*a))[1])
     assert plot.main([str(bag), '-o', str(tmp_path / 'f.png')]) == 130
     assert capsys.readouterr().err.endswith('plot: interrupted\n')

@@ -294,31 +294,6 @@ def test_input_that_was_remapped_and_channels_are_recorded(tmp_path):
     assert 'followed /estimator/hip' in result.stdout
 
 
-def test_inputs_of_a_parameter_file_are_recorded_before_the_estimator_runs(tmp_path):
-    file, bag = tmp_path / 'rig.yaml', tmp_path / 'bag'
-    file.write_text(
-        '/rig/estimator: {ros__parameters: {input_topic: force, phi: ["0", "0", "u"], '
-        'known_input_topics: [/motor/current]}}'
-    )
-    recorder = start(
-        'record', '-o', bag, '--names', '/rig/estimator', '--params-file', file, domain=APART
-    )
-    plants = [
-        start('plant', '--ros-args', '-r', f'__node:={name}', '-r', f'y:={topic}', domain=APART)
-        for name, topic in (('a', '/rig/force'), ('b', '/motor/current'), ('c', '/rig/current'))
-    ]
-    try:
-        wait_until(lambda: size(bag) > 300_000, 'messages', 90.0, recorder)
-    finally:
-        for process in (*plants, recorder):
-            process.send_signal(signal.SIGINT)
-            process.communicate(timeout=60)
-    with BagReader(bag) as reader:
-        topics = {c.topic for c in reader.connections}
-    assert {'/rig/force', '/motor/current'} <= topics
-    assert '/rig/current' not in topics
-
-
 def test_full_disk_leaves_what_was_recorded(live, tmp_path):
     """The system refuses to make a file larger than 150 kB."""
     command = ['record', '-o', str(tmp_path / 'bag'), '--topics', '/y']

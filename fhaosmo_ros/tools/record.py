@@ -10,12 +10,7 @@ import shutil
 import sys
 import time
 
-from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.core.parameters.per_channel import channel_names, of_channel
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.types import make_qos, TYPES
 from fhaosmo_ros.tools.bags.writer import BagWriter
@@ -47,10 +42,6 @@ def _parser() -> argparse.ArgumentParser:
     add(
         '--names', nargs='+', default=['/estimator', '/plant'], metavar='NAME',
         help='nodes whose topics, in and out, to record (default: /estimator /plant)',
-    )  # fmt: skip
-    add(
-        '--params-file', type=Path, action='append', default=[], metavar='FILE',
-        help='of an estimator: its inputs are recorded before it runs, too',
     )  # fmt: skip
     add('--duration', type=float, metavar='SECONDS', help='stop by itself')
     return parser
@@ -115,23 +106,8 @@ def _wanted(
         names = {resolved(_full(topic)) for topic in arguments.topics}
         return lambda topic: topic in names
     below = tuple(f'{resolved(_full(name))}/' for name in arguments.names)
-    extra = [resolved(topic) for topic in (*EXTRA, *_inputs(arguments))]
+    extra = [resolved(topic) for topic in EXTRA]
     return lambda topic: topic.startswith(below) or topic in extra
-
-
-def _inputs(arguments: argparse.Namespace) -> set[str]:
-    """Return the topics that the estimators of the parameter files read."""
-    found = set()
-    for path in arguments.params_file:
-        for name in map(_full, arguments.names):
-            values = with_joints(load(path, name.strip('/'), ESTIMATOR_PARAMETERS))
-            for channel in channel_names(values) if values else []:
-                own = of_channel(values, channel)
-                model = TriangularModel.of(ESTIMATOR_PARAMETERS.complete(own))
-                known = known_inputs(own, model.used_inputs, channel).values()
-                wanted = [measured_output(own, channel), *known]
-                found |= {one.absolute(name.rpartition('/')[0]) for one in wanted}
-    return found
 
 
 def _drain(

@@ -15,7 +15,7 @@ from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.cli.options import add_parameter_options, online_parameters
 from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.plot.curves import metrics, read_curves
-from fhaosmo_ros.tools.plot.figures import save_curves, show
+from fhaosmo_ros.tools.plot.figures import save_curves
 from fhaosmo_ros.tools.plot.fuzzy import fuzzy_figure, rows_of
 
 SUFFIXES = ('.png', '.svg', '.pdf')
@@ -40,7 +40,6 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add('--fuzzy', action='store_true', help='draw membership functions and curves instead')
     add('--force', action='store_true', help='replace an output that exists')
-    add('--show', action='store_true', help='open a window too')
     add('--names', nargs='+', metavar='NAME', help='estimators (default: all in the bags)')
     add('--plant', default='/plant', help='whose topics are the truth (default: %(default)s)')
     add_parameter_options(parser)
@@ -69,19 +68,17 @@ def _plot(arguments: argparse.Namespace, stop: Stop) -> None:
         c for bag in arguments.bags for c in read_curves(bag, arguments.names, arguments.plant)
     ]
     with Output(path, arguments.force) as output:
-        save_curves(curves, values.get('epsilon', curves[0].epsilon), output.path, arguments.show)
+        save_curves(curves, values.get('epsilon', curves[0].epsilon), output.path)
         if stop.is_set():  # Python drops what a signal raises in a destructor or weakref callback
             raise Stopped
         final = output.keep()
     print(f'{metrics(curves)}\nfigure: {final}', flush=True)
-    if arguments.show:
-        show()
 
 
 def _plot_fuzzy(arguments: argparse.Namespace, path: Path) -> None:
     """Draw the fuzzy systems of the observer that a bag, files and -p describe."""
-    if len(arguments.bags) > 1 or arguments.show or len(arguments.names or []) > 1:
-        raise ConfigurationError('--fuzzy: expected at most one BAG and one name, and no --show')
+    if len(arguments.bags) > 1 or len(arguments.names or []) > 1:
+        raise ConfigurationError('--fuzzy: expected at most one BAG and one name')
     recorded = None
     for bag in arguments.bags:
         with BagReader(bag) as reader:

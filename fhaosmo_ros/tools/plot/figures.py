@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of runs and of estimates in bags."""
 
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.plot.curves import Curves
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 
-Thinning = Callable[[NDArray[Any], NDArray[Any]], tuple[NDArray[Any], NDArray[Any]]]
 TRUTH = {'color': '#0072B2', 'linewidth': 2.2, 'label': 'true'}
 """Blue of the Okabe-Ito palette."""
 COLOURS = ('#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
@@ -46,7 +43,7 @@ def envelope(t: NDArray[Any], x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[An
     return t[rows], x[rows]
 
 
-def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window: bool) -> None:
+def save_curves(curves: list[Curves], epsilon: float | None, path: Path) -> None:
     """
     Write a figure of several estimates laid one over another.
 
@@ -60,16 +57,12 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
         Threshold of the gates, drawn if known.
     path : path
         Its suffix names the format.
-    window : bool
-        Make a window too, for `show`. It gets all samples, as one may zoom in; without a window
-        the curves are thinned.
 
     """
-    thinned = (lambda t, x: (t, x)) if window else envelope
     first, names = curves[0], max((c.names for c in curves), key=len)
     gamma = ['gamma'] if any(c.gamma is not None for c in curves) else []
     rows = [*names, *gamma, 'innovation']
-    figure = _make_figure(len(rows), window)
+    figure = Figure(figsize=(8.5, 1.45 * len(rows) + 0.9), layout='constrained')
     axes = dict(zip(rows, figure.subplots(len(rows), 1, sharex=True), strict=True))
     origin = min(c.stamps[0] for c in curves)
     for number, c in enumerate(curves):
@@ -83,21 +76,21 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path, window:
         for k, name in enumerate(c.names):
             row = axes[name if name == 'd' else names[k]]
             if c.truth is not None and number == 0:
-                row.plot(*thinned(t, c.truth[:, k]), **TRUTH)
-            row.plot(*thinned(t, c.estimate[:, k]), **style)
+                row.plot(*envelope(t, c.truth[:, k]), **TRUTH)
+            row.plot(*envelope(t, c.estimate[:, k]), **style)
             if c.deviation is not None:
-                draw_band(row, t, c.estimate[:, k], c.deviation[:, k], thinned, style['color'])
+                draw_band(row, t, c.estimate[:, k], c.deviation[:, k], style['color'])
         for begin, end in (np.array(c.events).reshape(-1, 2) - origin) * 1e-9:
             axes['d'].axvspan(begin, end, color=style['color'], alpha=0.12, linewidth=0.0)
         if c.gamma is not None:
-            axes['gamma'].plot(*thinned(t, c.gamma), **style)
+            axes['gamma'].plot(*envelope(t, c.gamma), **style)
             axes['gamma'].set_ylabel('power γ')
     for name in names:
         those = [c for c in curves if name in c.names]
         _fit_after_transient(axes[name], [c.estimate[:, c.names.index(name)] for c in those])
         axes[name].set_ylabel(those[0].title(name))
     t = (first.stamps - origin) * 1e-9
-    _draw_innovations(axes['innovation'], t, first.innovation, epsilon, thinned)
+    _draw_innovations(axes['innovation'], t, first.innovation, epsilon)
     axes['innovation'].set_ylabel('|innovation|' + ('\n(first)' if len(curves) > 1 else ''))
     for row in axes.values():
         row.grid(alpha=0.3)
@@ -112,14 +105,12 @@ def draw_band(
     t: NDArray[np.float64],
     estimate: NDArray[np.float64],
     deviation: NDArray[np.float64],
-    thinned: Thinning | None = None,
-    colour: str = '#D55E00',
+    colour: str = COLOURS[0],
 ) -> None:
     """Draw the band of two standard deviations, in which the truth is for 95 % of the time."""
-    thinned = thinned or envelope
     known = np.where(np.isfinite(deviation), deviation, np.nan)
-    low_t, low = thinned(t, estimate - 2.0 * known)
-    high_t, high = thinned(t, estimate + 2.0 * known)
+    low_t, low = envelope(t, estimate - 2.0 * known)
+    high_t, high = envelope(t, estimate + 2.0 * known)
     grid = np.union1d(low_t, high_t)
     edges = np.interp(grid, low_t, low), np.interp(grid, high_t, high)
     axes.fill_between(
@@ -128,16 +119,12 @@ def draw_band(
 
 
 def _draw_innovations(
-    axes: Axes,
-    t: NDArray[np.float64],
-    eps: NDArray[np.float64],
-    epsilon: float | None,
-    thinned: Thinning,
+    axes: Axes, t: NDArray[np.float64], eps: NDArray[np.float64], epsilon: float | None
 ) -> None:
     """Draw |eps_1| .. |eps_N| on a logarithmic scale, and the band within which gates open."""
     size = np.abs(eps)
     for k in range(eps.shape[1]):
-        axes.plot(*thinned(t, size[:, k] + TINY), linewidth=0.8, label=f'ε{k + 1}')
+        axes.plot(*envelope(t, size[:, k] + TINY), linewidth=0.8, label=f'ε{k + 1}')
     axes.set_yscale('log')
     size = size[size > 0.0]
     if len(size):
@@ -150,25 +137,6 @@ def _draw_innovations(
     axes.legend(loc='upper right', ncols=5, fontsize='small')
 
 
-def _make_figure(rows: int, window: bool) -> Figure:
-    size = (8.5, 1.45 * rows + 0.9)
-    if not window:
-        return Figure(figsize=size, layout='constrained')
-    import matplotlib.pyplot as plt
-
-    try:
-        figure = plt.figure(figsize=size, layout='constrained')
-        found = '' if figure.canvas.required_interactive_framework else plt.get_backend()
-    except ImportError as error:
-        found = str(error)
-    if found:
-        raise ConfigurationError(
-            '--show: expected a display (DISPLAY or WAYLAND_DISPLAY), PyQt or tkinter, and no '
-            f'MPLBACKEND without windows, got {found}'
-        )
-    return figure
-
-
 def _fit_after_transient(axes: Axes, rows: list[NDArray[np.float64]]) -> None:
     """Fit the picture to what comes after the first tenth."""
     late = np.concatenate([row[len(row) // 10 :] for row in rows])
@@ -176,10 +144,3 @@ def _fit_after_transient(axes: Axes, rows: list[NDArray[np.float64]]) -> None:
     if len(late):
         margin = 0.1 * float(np.ptp(late)) or 0.1 * abs(float(late[0])) or 1.0
         axes.set_ylim(late.min() - margin, late.max() + margin)
-
-
-def show() -> None:
-    """Wait until the user has closed the window."""
-    import matplotlib.pyplot as plt
-
-    plt.show()
