@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded beside a live estimator: complete bags, the live estimates replayed, kills survived."""
 
+import contextlib
 import os
 from pathlib import Path
 import re
@@ -8,7 +9,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
@@ -16,7 +16,6 @@ import pytest
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 from domains import take_domain
-from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import read_ticks, series
 from fhaosmo_ros.tools.demo.command import topics_of
@@ -24,6 +23,7 @@ from fhaosmo_ros.topics import ESTIMATES
 import numpy as np
 import rclpy
 from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rosbags.highlevel import AnyReader
@@ -152,70 +152,56 @@ def test_replay_follows_a_run_that_began_before_the_recording(live, tmp_path):
 def record_changes(bag):
     process = start('record', '-o', bag)
     wait_until(lambda: size(bag) > 800_000, 'messages', 90.0, process)
-    with Hand(int(DOMAIN)) as hand:
-        hand.set(epsilon=0.05, gamma_rate=0.008, unknown_input_decay=0.5)
+    with hand() as (change, reset):
+        change(epsilon=0.05, gamma_rate=0.008, unknown_input_decay=0.5)
         wait_for_more(bag, 100_000, process)  # half a second of messages to compare
-        hand.reset()
+        reset()
         wait_for_more(bag, 100_000, process)
-        hand.set(epsilon=0.3)
+        change(epsilon=0.3)
         wait_for_more(bag, 200_000, process)
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=60)
-        hand.set(epsilon=40.0, gamma_rate=0.004, unknown_input_decay=0.0)
+        change(epsilon=40.0, gamma_rate=0.004, unknown_input_decay=0.0)
     assert process.returncode == 0, error
     return error
 
 
-class Hand:
-    """Calls the estimator's services."""
+@contextlib.contextmanager
+def hand():
+    """Yield functions that set parameters of the estimator, and that reset it."""
+    context = Context()
+    rclpy.init(context=context, domain_id=int(DOMAIN))
+    node = rclpy.create_node('hand', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    client = AsyncParameterClient(node, '/estimator')
+    trigger = node.create_client(Trigger, '/estimator/reset')
+    assert client.wait_for_services(90)
+    assert trigger.wait_for_service(90)
 
-    def __init__(self, domain):
-        self._context = Context()
-        rclpy.init(context=self._context, domain_id=domain)
-        self._node = rclpy.create_node('hand', context=self._context)
-        self._parameters = AsyncParameterClient(self._node, '/estimator')
-        self._reset = self._node.create_client(Trigger, '/estimator/reset')
-        self._spinner = Spinner(self._node)
-
-    def set(self, **values):
-        if not self._parameters.wait_for_services(30):
-            raise TimeoutError('no parameter services')
-        parameters = [Parameter(name, value=value) for name, value in values.items()]
-        results = self._done(self._parameters.set_parameters(parameters)).results
-        assert all(result.successful for result in results)
-
-    def reset(self):
-        if not self._reset.wait_for_service(30):
-            raise TimeoutError('no reset service')
-        assert self._done(self._reset.call_async(Trigger.Request())).success
-
-    def _done(self, future):
-        ended = threading.Event()
-        future.add_done_callback(lambda _: ended.set())
-        if not ended.wait(60):
-            raise TimeoutError('no answer')
+    def result(future):
+        executor.spin_until_future_complete(future, 90)
         return future.result()
 
-    def __enter__(self):
-        self._spinner.__enter__()
-        return self
+    def change(**values):
+        parameters = [Parameter(name, value=value) for name, value in values.items()]
+        assert all(r.successful for r in result(client.set_parameters(parameters)).results)
 
-    def __exit__(self, *_):
-        self._spinner.__exit__()
-        self._node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+    def reset():
+        assert result(trigger.call_async(Trigger.Request())).success
 
-
-def expect_nothing_lost(bag):
-    """Fail if the live estimator says that it has missed samples: they are replayed."""
-    with BagReader(bag) as reader:
-        for _, _, message in reader.read_all(['/diagnostics']):
-            for pair in (pair for status in message.status for pair in status.values):
-                assert pair.key != 'samples lost' or int(pair.value) == 0
+    yield change, reset
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
 
 
 def compare(out, fewest=150):
-    expect_nothing_lost(out)
+    with BagReader(out) as reader:
+        for _, _, message in reader.read_all(['/diagnostics']):
+            for pair in (pair for status in message.status for pair in status.values):
+                # The live estimator has not missed samples: they are replayed.
+                assert pair.key != 'samples lost' or int(pair.value) == 0
     live = read_ticks(out, '/estimator', list(ESTIMATES))
     replayed = read_ticks(out, '/replay/estimator', list(ESTIMATES))
     there = live['stamp'] >= replayed['stamp'][0]
