@@ -320,7 +320,7 @@ def test_command_says_what_a_bag_shows(bag, tmp_path, capsys):
 @needs_optuna
 @pytest.mark.parametrize(
     ('given', 'message'),
-    [('structure:=cascade', 'got structure set'), ('noise_std:=1000.0', 'd = 0')],
+    [('structure:=cascade', 'got structure set'), ('noise_size:=1000.0', 'd = 0')],
 )
 def test_bag_that_can_give_no_gains(bag, tmp_path, capsys, given, message):
     out = tmp_path / 'out'

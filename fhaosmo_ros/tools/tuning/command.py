@@ -53,6 +53,8 @@ def _parser() -> argparse.ArgumentParser:
         '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
         help='set one parameter; wins over the file',
     )  # fmt: skip
+    search = parser.add_argument_group('from simulated recordings')
+    add = search.add_argument
     add(
         '--trials', type=int, default=TRIALS, metavar='N',
         help='that the study shall hold at the end (default: %(default)s)',
@@ -65,11 +67,7 @@ def _parser() -> argparse.ArgumentParser:
         'sqlite:///study.db, postgresql+psycopg://... (default: in memory)',
     )  # fmt: skip
     bag = parser.add_argument_group('from a bag')
-    bag.add_argument(
-        '--bag', type=Path,
-        help='find the gains that are likeliest for its y (--trials and the other options of the '
-        'search are not used)',
-    )  # fmt: skip
+    bag.add_argument('--bag', type=Path, help='find the gains that are likeliest for its y')
     add_input_options(bag.add_argument)
     return parser
 
@@ -81,9 +79,10 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
             f'{arguments.trials}, {arguments.jobs} and {arguments.seed}'
         )
     estimator, tuning = read_parameters(arguments.params_file, arguments.param)
+    make = _search if arguments.bag is None else _identify
     with Output(arguments.output, arguments.force) as output:
-        make = _search if arguments.bag is None else _identify
-        text, folder = make(arguments, estimator, tuning, output.path, stop), output.keep()
+        text = make(arguments, estimator, tuning, output.path, stop)
+        folder = output.keep()
     print(f'\n{text}\n')
     print(f'output: {folder}/gains.yaml, report.md')
     print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {folder}/gains.yaml')
@@ -97,7 +96,7 @@ def _search(
     stop: Stop,
 ) -> str:
     """Write the gains for a simulated family; return the report's main part."""
-    from fhaosmo_ros.tools.tuning.report import write
+    from fhaosmo_ros.tools.tuning import report
     from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 
     values = TUNE_PARAMETERS.complete(tuning)
@@ -107,19 +106,11 @@ def _search(
         tuner = Tuner(data, estimator, values, arguments.seed)
     jobs = arguments.jobs or os.cpu_count() or 1
     result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
-    return write(folder, tuner, result, arguments.command_line)
+    return report.write(folder, tuner, result, arguments.command_line)
 
 
 def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """
-    Return what is set for the estimator, and for the tuning.
-
-    Raises
-    ------
-    ConfigurationError
-        A file, a name or a value that can't be used.
-
-    """
+    """Return what files and rules set for the estimator, and for the tuning."""
     estimator: dict[str, Any] = {}
     tuning: dict[str, Any] = {}
     for path in files:
@@ -148,24 +139,22 @@ def _identify(
     from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
     from fhaosmo_ros.tools.tuning.recorded import recorded
 
-    others = chosen_otherwise(estimator)
-    if others:
+    if others := chosen_otherwise(estimator):
         raise ConfigurationError(
             f'--bag: expected gains of structure levant and scheme '
             f'predict_correct, got {", ".join(others)} set. Leave that out; or tune by a '
             'simulated family: without --bag, with noise_std, rms_of_d and band_of_d as this '
             'command finds them'
         )
-    where = {
-        'input_topic': arguments.topic,
-        'input_field': arguments.field,
-        'known_input_topics': arguments.input_topic,
-        'known_input_fields': arguments.input_field,
-    }
     given = ParameterTable(MODEL).part_of(tuning) | estimator
-    given |= {name: value for name, value in where.items() if value}
-    if 'noise_size' not in given and tuning.get('noise_std'):
-        given['noise_size'] = tuning['noise_std']
+    for name, value in (
+        ('input_topic', arguments.topic),
+        ('input_field', arguments.field),
+        ('known_input_topics', arguments.input_topic),
+        ('known_input_fields', arguments.input_field),
+    ):
+        if value:
+            given[name] = value
     values = ESTIMATOR_PARAMETERS.complete(given)
     given |= {name: values[name] for name in ('order', 'phi')}
     model = TriangularModel.of(values)
