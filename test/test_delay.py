@@ -217,7 +217,7 @@ def test_tuning_knows_of_the_delay():
 
     def error(changes):
         tuning = TUNE_PARAMETERS.complete({'settled': 2.0})
-        return Objective(recordings, gains | changes, tuning)({}).errors.max(axis=0)
+        return Objective(recordings, tuning)(gains | changes).errors.max(axis=0)
 
     then, now = error({}), error({'predict_to_now': True})
     unknown = error({'measurement_delay': 0.0})

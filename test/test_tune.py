@@ -65,8 +65,8 @@ def test_errors_are_those_of_the_nodes_estimator(scheme, unknown_input):
     recordings, n = family.recordings(3), 3 + unknown_input
     fixed = {'scheme': scheme, 'unknown_input': unknown_input}
     gains = {k: v if k == 'epsilon' else v[:n] for k, v in GAINS.items()}
-    objective = Objective(recordings, fixed, VALUES)
-    found = objective(gains)
+    objective = Objective(recordings, VALUES)
+    found = objective(fixed | gains)
     for r, errors in zip(recordings, found.errors, strict=True):
         e, late = online(fixed | gains, r), r.t - r.t[0] >= 1.0
         expected = [rms((e.z - r.z)[late, i]) for i in range(3)]
@@ -79,9 +79,7 @@ def test_errors_are_those_of_the_nodes_estimator(scheme, unknown_input):
 
 def made_objective(monkeypatch, judged, **changes):
     """Return the evaluation of two recordings that are judged like this."""
-    objective = Objective(
-        Family(SHORT).recordings(2), {}, VALUES.changed(changes), scale=np.ones(4)
-    )
+    objective = Objective(Family(SHORT).recordings(2), VALUES.changed(changes), np.ones(4))
     results = iter(judged)
     monkeypatch.setattr(objective, '_judge', lambda *_: next(results))
     objective._truth_varies = np.ones(2)
@@ -102,10 +100,10 @@ def test_objective_is_a_geometric_mean_of_weighted_errors_with_chatter(monkeypat
 
 def test_infinite_estimate_is_the_worst_and_another_model_is_refused():
     wild = {'lambda': 1e6, 'alpha': 1e9, 'fuzzy_widths': 1e-12, 'epsilon': 1e12}
-    objective = Objective(Family(SHORT).recordings(1), {'scheme': 'explicit'}, VALUES)
-    assert objective(wild).objective > 1e3
-    with pytest.raises(ConfigurationError, match=r'of 2 states.*got 4 s of 3'):
-        Objective(objective.recordings, {'order': 2, 'phi': ['0', '0']}, VALUES)
+    objective = Objective(Family(SHORT).recordings(1), VALUES)
+    assert objective(wild | {'scheme': 'explicit'}).objective > 1e3
+    with pytest.raises(ConfigurationError, match=r"'order': expected 3, .*got 2"):
+        objective({'order': 2, 'phi': ['0', '0']})
 
 
 # the Kalman filter inside (D 19)
@@ -119,12 +117,12 @@ def test_gains_of_a_kalman_filter_make_one(derivatives, decay):
     apart = []
     for width, gamma in ((10.0, 1e-2), (1e3, 1e-4)):
         values = dict(SCHEME) | {
-            'noise_size': 1e-3, 'unknown_input_size': 0.07,
+            'order': 3, 'phi': PHI, 'noise_size': 1e-3, 'unknown_input_size': 0.07,
             'unknown_input_derivatives': derivatives,
             'unknown_input_decay': decay, 'fuzzy_widths': [width], 'gamma_initial': gamma,
             'gamma_min': 1e-5, 'correction_period': period,
         }  # fmt: skip
-        made = kalman_gains(model, OBSERVER_PARAMETERS.complete(values), period)
+        made = kalman_gains(OBSERVER_PARAMETERS.complete(values), period)
         expected = estimates(model, made.gain, decay, r, 0.1)
         values |= {'lambda': made.lambdas.tolist(), 'noise_size': 0.0}  # steady from the start
         found = Observer(values).run(r.t, r.y, r.u).z_hat
@@ -155,7 +153,7 @@ def test_start_is_nearly_as_good_as_the_best_kalman_filter(tuner):
             errors.append(rms(wrong[r.t >= 2.0]) / tuner.training.scale[-1])
         best = min(best, float(np.exp(np.mean(np.log(errors)))))
     start = {d.name: d.start for d in tuner.space}
-    assert tuner.training(tuner.gains(start)).error < 1.03 * best
+    assert tuner.training(tuner.parameters(start)).error < 1.03 * best
     assert [*start] == ['unknown_input_size', 'unknown_input_decay']
     # Held-out recordings are others, and errors relative to the same scale.
     assert tuner.training.recordings == tuner.data.training
@@ -202,17 +200,14 @@ def test_another_scheme_begins_with_its_own_gains(given):
     assert 'noise_size' not in found
 
 
-def test_gains_that_are_written_are_as_good_as_those_that_were_judged_without_noise():
-    """Written are also rules for when y is lost, which half-widths have to leave room for."""
+def test_start_without_noise_is_nearly_exact():
+    """And nothing is written that would say how sure the observer is."""
     quiet = {'noise_std': 0.0, 'sample_rate': 1000.0, 'disturbances': ['sines'], 'duration': 6.0}
     values = VALUES.changed(quiet | {'settled': 2.0})
     tuner = Tuner(simulated(values, 1), {}, values, 1)
-    start = {d.name: d.start for d in tuner.space}
-    judged = tuner.training(tuner.gains(start)).error
-    assert judged < 0.1
-    written = tuner.parameters(start)
-    assert 'noise_size' not in written
-    assert Objective(tuner.data.training, written, values)({}).error < 1.01 * judged
+    start = tuner.parameters({d.name: d.start for d in tuner.space})
+    assert tuner.training(start).error < 0.1
+    assert {'noise_size', 'unknown_input_size'}.isdisjoint(start)
 
 
 # output
@@ -239,7 +234,7 @@ def test_output_is_what_the_estimator_loads(tmp_path, capsys):
         assert word in report_
         assert word in printed
     # What the report says of the gains is what these very gains do.
-    judged = Objective(Family(SHORT).recordings(2, 1), values, VALUES)({})
+    judged = Objective(Family(SHORT).recordings(2, 1), VALUES)(values)
     assert f'{judged.error:.4f}' == row(report_, 'error, relative')[4].strip()
 
 
@@ -266,7 +261,7 @@ def test_model_may_stand_in_any_section(tmp_path, section):
     )
     values = TUNE_PARAMETERS.complete(SHORT | {'settled': 1.0, 'recordings': 1} | tuning)
     tuner = Tuner(simulated(values, 1), estimator, values, 1)
-    assert tuner.estimator['phi'] == ['-2.0*z1']
+    assert tuner.parameters({})['phi'] == ['-2.0*z1']
     # fuzzy_widths is passed over, as the variant does not use it.
     assert [d.name for d in tuner.space] == ['lambda[0]', 'lambda[1]']
     assert tuner.data.parameters['noise_std'] == 0.1
@@ -393,8 +388,5 @@ def test_presets_fit_the_noise_in_their_name(noise):
     family = Family({'noise_std': float(noise), 'integration_step': 1e-3})
     recordings = family.recordings(3, seed=77)
     demo = load(ROOT / 'config' / 'demo.yaml', 'estimator')
-    error, other = (
-        Objective(recordings, ESTIMATOR_PARAMETERS.complete(p), TUNE_PARAMETERS.defaults())({})
-        for p in (values, demo)
-    )
+    error, other = (Objective(recordings, TUNE_PARAMETERS.defaults())(p) for p in (values, demo))
     assert error.error < min(0.95, 0.9 * other.error)

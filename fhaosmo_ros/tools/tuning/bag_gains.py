@@ -16,13 +16,12 @@ from fhaosmo_ros.tools.tuning.identify import (
     SURE,
 )
 from fhaosmo_ros.tools.tuning.likelihood import CLIP
-from fhaosmo_ros.tools.tuning.linear_gains import GAMMA, kalman_gains, SCHEME, WIDTH
+from fhaosmo_ros.tools.tuning.linear_gains import GAMMA, kalman_gains, rounded, SCHEME, WIDTH
 from fhaosmo_ros.tools.tuning.objective import FIRST_STAMP
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-DIGITS = 4
 SIZE_OF_USUAL = 0.9616
 """RMS of a standard normal number among the 99 % that are nearest to 0."""
 UNSEEN = 0.97
@@ -69,35 +68,35 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
     """
     _refuse(found)
     likelihood, design = found.likelihood, found.best.design
-    model, period = likelihood.model, _rounded(likelihood.period)
-    noise, begin = _rounded(found.best.low_noise), int(BEGIN * len(likelihood.samples.y))
-    states = found.best.estimates[begin:, : model.order]
+    order, period = likelihood.model.order, rounded(likelihood.period)
+    noise, begin = rounded(found.best.low_noise), int(BEGIN * len(likelihood.samples.y))
+    states = found.best.estimates[begin:, :order]
     sizes = np.maximum(np.sqrt(np.nanmean(np.square(states), axis=0)), noise)
     values = {
         **SCHEME,
         'correction_period': period,
         'noise_size': noise,
-        'state_sizes': [_rounded(x) for x in sizes],
-        'unknown_input_size': _rounded(found.size_of_input),
+        'state_sizes': [rounded(x) for x in sizes],
+        'unknown_input_size': rounded(found.size_of_input),
         'unknown_input_derivatives': design.derivatives,
-        'unknown_input_decay': _rounded(design.decay),
-        'fuzzy_widths': [_rounded(WIDTH * noise)],
+        'unknown_input_decay': rounded(design.decay),
+        'fuzzy_widths': [rounded(WIDTH * noise)],
         'gamma_initial': GAMMA,
         **given,
     }
     checked = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(values))
-    lambdas, k, p, variance = kalman_gains(model, checked, period)
-    values['lambda'] = [_rounded(x) for x in lambdas]
+    lambdas, k, p, variance = kalman_gains(checked, period)
+    values['lambda'] = [rounded(x) for x in lambdas]
     errors = np.sqrt(np.maximum(np.diag(p) - k**2 * variance, 0.0))
-    share = errors[model.order] / found.size_of_input
+    share = errors[order] / found.size_of_input
     if share > UNSEEN:
         raise NothingToFind(
             f'd: it changes too fast to be seen through this noise: the expected error is '
             f'{min(share, 1.0):.2f} of its size, and an estimate of 0 has 1.00. Does y drift or '
-            f'jump by itself, or is the order ({model.order}) too high by one? '
+            f'jump by itself, or is the order ({order}) too high by one? '
             'Else a sensor with less noise, or a higher rate, is needed'
         )
-    return Gains(values, errors[: model.order + 1], math.sqrt(variance), 1.0 - float(k[0]))
+    return Gains(values, errors[: order + 1], math.sqrt(variance), 1.0 - float(k[0]))
 
 
 def _refuse(found: Identified) -> None:
@@ -147,7 +146,3 @@ def run(found: Identified, gains: Gains) -> Run:
     size = float(np.sqrt(np.mean(usual**2))) / SIZE_OF_USUAL
     whiteness = ljung_box(np.clip(r, -CLIP, CLIP))
     return Run(t, trajectory.unknown_input, size, *whiteness, estimator.counters)
-
-
-def _rounded(value: float) -> float:
-    return float(f'{value:.{DIGITS}g}')

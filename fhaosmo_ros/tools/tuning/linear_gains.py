@@ -57,16 +57,15 @@ def chosen_otherwise(estimator: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def kalman_gains(model: TriangularModel, p: Mapping[str, Any], period: float) -> KalmanGains:
+def kalman_gains(p: Mapping[str, Any], period: float) -> KalmanGains:
     """
     Return lambda with which predict_correct is the Kalman filter that parameters ask for (D 19).
 
     Parameters
     ----------
-    model : TriangularModel
     p : mapping
-        Of the observer, complete: noise_size, the model of d, the first of fuzzy_widths for all
-        levels, and gamma_initial.
+        Of the observer, complete: its model, noise_size, the model of d, the first of fuzzy_widths
+        for all levels, and gamma_initial.
     period : float
         Sampling period (s).
 
@@ -76,6 +75,7 @@ def kalman_gains(model: TriangularModel, p: Mapping[str, Any], period: float) ->
         There is no such filter in floating-point numbers, or psi is 0 at the size of the noise.
 
     """
+    model = TriangularModel.of(p)
     uncertainty = Uncertainty(model, p, np.zeros(model.order))
     predicted = uncertainty.steady(period)
     variance = predicted[0, 0] + uncertainty.variance
@@ -97,6 +97,11 @@ def kalman_gains(model: TriangularModel, p: Mapping[str, Any], period: float) ->
     lambdas = injections * small ** (1.0 - power) / psi
     lambdas = lambdas.clip(LEAST, OBSERVER_PARAMETERS['lambda'].upper)
     return KalmanGains(lambdas, gain, predicted, variance)
+
+
+def rounded(value: float) -> float:
+    """Return a number as it is written to files, with four digits."""
+    return float(f'{value:.4g}')
 
 
 def matern(rate: float, derivatives: int) -> float:

@@ -44,8 +44,6 @@ class Objective:
     ----------
     recordings : sequence of Recording
         Each longer than `settled`.
-    fixed : mapping
-        Parameters of the estimator that do not change.
     tuning : mapping
         Of `TUNING`, complete.
     scale : array, optional
@@ -54,60 +52,56 @@ class Objective:
     Raises
     ------
     ConfigurationError
-        A recording that is too short, parameters of another model, or weights that do not fit.
+        A recording that is too short, or weights that do not fit.
 
     """
 
     def __init__(
         self,
         recordings: Sequence[Recording],
-        fixed: Mapping[str, Any],
         tuning: Mapping[str, Any],
         scale: Floats | None = None,
     ) -> None:
-        self.recordings = list(recordings)
-        self.fixed, self._tuning = ONLINE_PARAMETERS.complete(fixed), tuning
-        order, settled = OnlineEstimator(self.fixed).observer.order, tuning['settled']
-        for r in recordings:
-            if r.t[-1] - r.t[0] <= settled or r.z.shape[1] != order:
-                raise ConfigurationError(
-                    f'recording: expected more than {settled:g} s (settled) of {order} states '
-                    f'(order of the estimator), got {r.t[-1] - r.t[0]:g} s of {r.z.shape[1]}'
-                )
+        self.recordings, self._tuning = list(recordings), tuning
+        settled, shortest = tuning['settled'], min(r.t[-1] - r.t[0] for r in recordings)
+        if shortest <= settled:
+            raise ConfigurationError(
+                f'recording: expected more than {settled:g} s (settled), got {shortest:g} s'
+            )
         late = [np.column_stack([r.z, r.d])[r.t - r.t[0] >= settled] for r in recordings]
         self.scale = _rms(np.concatenate(late)) if scale is None else scale
         # A d that is constant has no variation: its size takes the place of it.
         varies = [total_variation(truth[:, -1]) for truth in late]
         self._truth_varies = np.maximum(varies, self.scale[-1] or 1.0)
-        weights = np.array(tuning['weights'])
+        weights, count = np.array(tuning['weights']), len(self.scale)
         if len(weights) == 1:
-            weights = np.append(np.zeros(order), weights)
-        if len(weights) != order + 1 or not weights.sum() > 0.0:
+            weights = np.append(np.zeros(count - 1), weights)
+        if len(weights) != count or not weights.sum() > 0.0:
             raise TUNE_PARAMETERS['weights'].error(
-                tuning['weights'], f'1 or {order + 1} numbers, not all of them 0'
+                tuning['weights'], f'1 or {count} numbers, not all of them 0'
             )
         self._weights = weights / weights.sum()
-        if not (self.scale[weights > 0.0] > 0.0).all():
-            raise ConfigurationError(
-                'recordings: expected a truth that is not 0 throughout where its weight is not 0, '
-                f'got RMS values {self.scale.tolist()}'
-            )
 
-    def __call__(self, changes: Mapping[str, Any]) -> Evaluation:
+    def __call__(self, parameters: Mapping[str, Any]) -> Evaluation:
         """
-        Evaluate the fixed parameters with some changed.
+        Evaluate parameters of the estimator.
 
         Raises
         ------
         ConfigurationError
-            As `OnlineEstimator`.
+            As `OnlineEstimator`, or parameters of another model than that of the recordings.
 
         """
-        estimator = OnlineEstimator(self.fixed.changed(changes))
+        estimator = OnlineEstimator(ONLINE_PARAMETERS.part_of(parameters))
+        order, states = estimator.observer.order, len(self.scale) - 1
+        if order != states:
+            raise ConfigurationError(
+                f"'order': expected {states}, the states of the plant's recordings, got {order}"
+            )
         found = [self._judge(estimator, r) for r in self.recordings]
         errors = np.array([wrong for wrong, _ in found])
         used = self._weights > 0.0
-        with np.errstate(over='ignore'):
+        with np.errstate(over='ignore', divide='ignore'):  # of a truth that is 0 throughout
             relative = np.square(errors[:, used] / self.scale[used])
         each = np.sqrt(relative @ self._weights[used])
         error = float(np.exp(np.mean(np.log(np.maximum(each, SMALLEST)))))

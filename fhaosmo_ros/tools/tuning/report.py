@@ -36,7 +36,7 @@ def write(folder: Path, tuner: Tuner, result: Result, command: str) -> str:
     """Write everything into a new folder; return the report's main part, to be printed."""
     begin, best = {d.name: d.start for d in tuner.space}, result.best
     found = {
-        f'{title}, {data}': objective(tuner.gains(values))
+        f'{title}, {data}': objective(tuner.parameters(values))
         for title, values in (('given' if tuner.given else 'start', begin), ('tuned', best))
         for data, objective in (('training', tuner.training), ('held out', tuner.held_out))
     }

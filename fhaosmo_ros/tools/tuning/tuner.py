@@ -15,12 +15,12 @@ import json
 import math
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.declaration import Parameters, unknown_parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
+from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Family, Recording
 from fhaosmo_ros.tools.cli.progress import progress
@@ -28,6 +28,7 @@ from fhaosmo_ros.tools.tuning.linear_gains import (
     chosen_otherwise,
     GAMMA,
     kalman_gains,
+    rounded,
     SCHEME,
     WIDTH,
 )
@@ -47,8 +48,6 @@ DERIVATIVES, RATES = (0, 1, 2, 3), np.geomspace(0.1, 30.0, 8)
 """The grid: unknown_input_derivatives, and unknown_input_decay (1/s)."""
 DECADES = 3.0
 """Powers of ten around its start to which a search in logarithms goes."""
-DIGITS = 4
-"""Of the numbers that are tried and written."""
 LOST_TIME, LOST_SAMPLES = 0.1, 20
 """
 Seconds, and at least so many samples, for which the innovation exceeds the largest half-width
@@ -96,7 +95,6 @@ class Tuner:
     """
 
     space: list[Dimension]
-    estimator: dict[str, Any]  # what does not follow from a point of the space
     training: Objective
     held_out: Objective
     given: bool  # the search begins with gains that the user set
@@ -109,41 +107,35 @@ class Tuner:
         seed: int,
     ) -> None:
         self.data, self.tuning, self._seed = data, tuning, seed
-        self._period = float(f'{np.median(np.diff(data.training[0].t)):.4g}')
+        self._period = rounded(float(np.median(np.diff(data.training[0].t))))
         self.given = 'lambda' in estimator
         # The estimator may have a model of its own, other than the plant's.
         own = {name: tuning[name] for name in ('order', 'phi')} | dict(estimator)
-        self._noise, self.estimator, names = 0.0, own, tuning['search']
+        self._noise, self._fixed, names = 0.0, own, tuning['search']
+        self.training = Objective(data.training, tuning)
+        self.held_out = Objective(data.held_out, tuning, self.training.scale)
         fuzzy = own.get('variant', SCHEME['variant']).startswith('fuzzy')
         kalman = fuzzy and not chosen_otherwise(own)
         if kalman:
             self._noise, known = self._kalman_start(own)
-            self.estimator = known | own
-        complete = ESTIMATOR_PARAMETERS.complete(self.estimator)
-        self.training = Objective(data.training, complete, tuning)
-        self.held_out = Objective(data.held_out, complete, tuning, self.training.scale)
-        if kalman:
+            self._fixed = known | own
             grid = {'unknown_input_derivatives': DERIVATIVES, 'unknown_input_decay': RATES}
             free = {k: v if k not in own else [own[k]] for k, v in grid.items()}
             points = [dict(zip(grid, point, strict=True)) for point in product(*free.values())]
-            best = _changes(min(points, key=self.evaluate))
-            self.estimator |= best
-            for objective in (self.training, self.held_out):
-                objective.fixed = objective.fixed.changed(best)
+            self._fixed |= _changes(min(points, key=self.evaluate))
+        start = self.parameters({})
+        self.training(start)  # raises what `evaluate` takes for a bad point
         if names == ['auto']:
             model = [k for k in ('unknown_input_size', 'unknown_input_decay') if k not in own]
             names = model if kalman else GAINS
-        start = self.estimator | self.gains({})
         self.space = _make_space(names, Observer(ESTIMATOR_PARAMETERS.complete(start)))
-        searched = _changes({d.name: d.start for d in self.space})
-        self.estimator = {k: v for k, v in self.estimator.items() if k not in searched}
 
     def _kalman_start(self, own: Mapping[str, Any]) -> tuple[float, dict[str, Any]]:
         """Return the size of the noise, and what the recordings say of the estimator."""
         # With quantum and jitter.
-        noise = _rms(np.concatenate([r.y - r.z[:, 0] for r in self.data.training]))
+        noise = rms(np.concatenate([r.y - r.z[:, 0] for r in self.data.training]))
         truth = np.concatenate([np.column_stack([r.z, r.d]) for r in self.data.training])
-        sizes = [_rounded(_rms(column)) for column in truth.T]
+        sizes = [rounded(rms(column)) for column in truth.T]
         found = {
             **SCHEME,
             'correction_period': self._period,
@@ -156,8 +148,8 @@ class Tuner:
             # The largest innovations are those of the start: what z_2 moves y by in a period.
             width = WIDTH * max(sizes[1] * self._period, least)
             return least, found | {'fuzzy_widths': [width]}
-        noise = _rounded(noise)
-        if min(sizes) > 0.0:  # else nothing says how sure the observer is
+        noise = rounded(noise)
+        if min(sizes) > 0.0:
             found |= {'noise_size': noise, 'state_sizes': sizes[:-1]}
         return noise, found | {'fuzzy_widths': [WIDTH * noise]}
 
@@ -165,40 +157,41 @@ class Tuner:
     def _study_name(self) -> str:
         """Name of the study: a digest of all that its trials depend on."""
         samples = [recording.y.tobytes() for recording in self.data.training]
-        problem = json.dumps([dict(self.tuning), self.estimator, self.space], sort_keys=True)
+        problem = json.dumps([dict(self.tuning), self._fixed, self.space], sort_keys=True)
         return f'tune-{hashlib.sha256(b"".join([problem.encode(), *samples])).hexdigest()[:16]}'
 
-    def gains(self, values: Values) -> dict[str, Any]:
-        """Return the parameters of the estimator that follow from a point of the space."""
-        found = _changes(values)
-        if self._noise and 'lambda' not in found:
-            p = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(self.estimator | found))
+    def parameters(self, values: Values) -> dict[str, Any]:
+        """
+        Return the parameters of the estimator at a point of the space.
+
+        Raises
+        ------
+        ConfigurationError
+            Values that are out of their bounds, or do not fit together.
+
+        """
+        changes = _changes(values)
+        found = self._fixed | changes
+        p = ESTIMATOR_PARAMETERS.complete(found)
+        if self._noise and 'lambda' not in changes:
             power = p['gamma_initial'] if p['variant'].endswith('_adaptive') else FIXED_GAMMA
             noise = p['noise_size'] or self._noise
-            p = p.changed({'noise_size': noise, 'gamma_initial': power})
-            lambdas = kalman_gains(TriangularModel.of(p), p, self._period).lambdas
-            found['lambda'] = [_rounded(x) for x in lambdas]
-        return found
+            design = p.changed({'noise_size': noise, 'gamma_initial': power})
+            found['lambda'] = [*map(rounded, kalman_gains(design, self._period).lambdas)]
+            if not p['noise_size']:  # nothing says how sure the observer is
+                found.pop('unknown_input_size')
+        if p['structure'] == 'levant' and p['variant'].startswith('fuzzy') and not p['noise_size']:
+            lost = rounded(max(LOST_TIME, LOST_SAMPLES * self._period))
+            found = {'epsilon': max(p['fuzzy_widths']), 'divergence_time': lost} | found
+        # The gains fit these only, so a file has them even where they are the defaults.
+        return found | {name: p[name] for name in ('variant', 'scheme', 'unknown_input')}
 
     def evaluate(self, values: Values) -> float:
         """Return the objective at a point of the space."""
         try:
-            return self.training(self.gains(values)).objective
-        except ConfigurationError:  # a value out of its bounds, or values that do not fit
+            return self.training(self.parameters(values)).objective
+        except ConfigurationError:  # values out of their bounds, or that do not fit
             return math.inf
-
-    def parameters(self, values: Values) -> dict[str, Any]:
-        """Return all parameters of the estimator at a point of the space."""
-        found = self.estimator | self.gains(values)
-        shown = ESTIMATOR_PARAMETERS.complete(found)
-        fuzzy = shown['structure'] == 'levant' and shown['variant'].startswith('fuzzy')
-        if fuzzy and not shown['noise_size']:
-            lost = _rounded(max(LOST_TIME, LOST_SAMPLES * self._period))
-            found = {'epsilon': max(shown['fuzzy_widths']), 'divergence_time': lost} | found
-        # The gains fit these only, so the file has them even where they are the defaults.
-        for name in ('variant', 'scheme', 'unknown_input'):
-            found[name] = shown[name]
-        return ESTIMATOR_PARAMETERS.part_of(found)
 
     def search(
         self,
@@ -252,9 +245,9 @@ def _changes(values: Values) -> dict[str, Any]:
     for label, value in values.items():
         name, level, _ = label.partition('[')
         if level:
-            found.setdefault(name, []).append(_rounded(value))
+            found.setdefault(name, []).append(rounded(value))
         else:
-            found[name] = value if isinstance(value, int) else _rounded(value)
+            found[name] = value if isinstance(value, int) else rounded(value)
     return found
 
 
@@ -277,11 +270,3 @@ def _bounds(name: str, value: float, start: Mapping[str, Any]) -> tuple[float, f
         return lower, upper
     middle = value or 1.0  # such as unknown_input_decay, which may be 0
     return max(middle / 10.0**DECADES, lower), min(middle * 10.0**DECADES, upper)
-
-
-def _rounded(value: float) -> float:
-    return float(f'{value:.{DIGITS}g}')
-
-
-def _rms(x: Any) -> float:
-    return float(np.sqrt(np.mean(np.square(x))))
