@@ -17,7 +17,7 @@ from fhaosmo_ros.tools.tuning.identify import (
 )
 from fhaosmo_ros.tools.tuning.likelihood import CLIP
 from fhaosmo_ros.tools.tuning.linear_gains import GAMMA, kalman_gains, rounded, SCHEME, WIDTH
-from fhaosmo_ros.tools.tuning.objective import FIRST_STAMP
+from fhaosmo_ros.tools.tuning.objective import stamps_of
 import numpy as np
 from numpy.typing import NDArray
 
@@ -139,7 +139,7 @@ def run(found: Identified, gains: Gains) -> Run:
     t, begin = np.cumsum(samples.h), int(BEGIN * len(samples.y))
     estimator = OnlineEstimator(ESTIMATOR_PARAMETERS.complete(gains.parameters))
     u = samples.u if estimator.observer.uses_input else None
-    trajectory = estimator.run(FIRST_STAMP + np.round(t * 1e9), samples.y, u)
+    trajectory = estimator.run(stamps_of(t), samples.y, u)
     r = trajectory.innovation[:, 0] / (gains.share * gains.innovation)
     r = r[np.isfinite(r) & samples.used & (np.arange(len(r)) >= begin)]
     usual = r[np.abs(r) <= np.quantile(np.abs(r), 0.99)]

@@ -115,7 +115,7 @@ class Objective:
         """Return the errors of z and d, and the variation of the estimate of d."""
         estimator.reset()
         u = r.u if estimator.observer.uses_input else None
-        found = estimator.run(FIRST_STAMP + np.round((r.t - r.t[0]) * 1e9), r.y, u)
+        found = estimator.run(stamps_of(r.t - r.t[0]), r.y, u)
         t = r.t[0] + (found.t - FIRST_STAMP) * 1e-9  # before the sample's, if that is delayed
         late = t - r.t[0] >= self._tuning['settled']
         t, d = t[late], found.unknown_input[late]
@@ -125,6 +125,11 @@ class Objective:
             variation = total_variation(d)
         # An estimate that is not finite is infinitely wrong, not undefined.
         return np.nan_to_num(errors, nan=np.inf), np.nan_to_num(variation, nan=np.inf)
+
+
+def stamps_of(t: Floats) -> NDArray[np.int64]:
+    """Return stamps (ns) for times since the first sample."""
+    return FIRST_STAMP + np.round(t * 1e9).astype(np.int64)
 
 
 def _rms(x: Floats) -> Floats:
