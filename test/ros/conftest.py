@@ -27,7 +27,7 @@ def _launcher(folders):
         """Start an estimator or a plant, which code may do, with parameters and other words."""
         path = folders.mktemp('node') / 'output'
         program = ['-c', name, 'estimator'] if '\n' in name else ['-m', 'fhaosmo_ros', name]
-        processes.append(Process(path, *program, *arguments(**values), *words))
+        processes.append(Process(path, *program, *arguments(*words, **values)))
         return processes[-1]
 
     try:

@@ -58,12 +58,12 @@ def as_time(stamp: int) -> Time:
     return Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
 
 
-def arguments(namespace: str = '', **values: object) -> list[str]:
-    """Return the words that set a node's namespace and parameters; `lambda_` sets lambda."""
-    words = ['--ros-args', *(['-r', f'__ns:={namespace}'] if namespace else [])]
-    for name, value in values.items():
-        words += ['-p', f'{name.rstrip("_")}:={value}']
-    return words
+def arguments(*words: object, namespace: str = '', **values: object) -> list[object]:
+    """Return ROS arguments: those given, a namespace, and parameters; `lambda_` sets lambda."""
+    if namespace:
+        words = ('-r', f'__ns:={namespace}', *words)
+    rules = [f'{name.rstrip("_")}:={value}' for name, value in values.items()]
+    return ['--ros-args', *words, *(part for rule in rules for part in ('-p', rule))]
 
 
 class Process:
@@ -430,9 +430,9 @@ class Estimator:
     def wait_count(self, key: str, value: int) -> None:
         self.user.wait(lambda: self.count(key) >= value, f'{key!r} of {value} in diagnostics')
 
-    def wait_status(self, task: str, level: bytes, *words: str, since: int | None = None):
+    def wait_status(self, task: str, level: bytes | None, *words: str, since: int | None = None):
         """
-        Return a status of a task with this level and these words in its message.
+        Return a status of a task with this level (None: any) and these words in its message.
 
         Of those that come from now on, or from the `since`-th report on.
         """
@@ -442,7 +442,7 @@ class Estimator:
         def look() -> bool:
             found[:] = [
                 status for report in self.reports[since:] for name, status in
-                report.statuses.items() if name == task and status.level == level
+                report.statuses.items() if name == task and level in (None, status.level)
                 and all(word in status.message for word in words)
             ]  # fmt: skip
             return bool(found)
