@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The plant node: what it publishes belongs to the time at which it publishes it."""
+
+import re
+import time
+
+from fhaosmo_ros.core.simulation.disturbance import KINDS
+from fhaosmo_ros.core.simulation.plant import Plant
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
+pytestmark = pytest.mark.ros
+
+from running import Parameters, SECOND  # noqa: E402
+from std_msgs.msg import Float64, Float64MultiArray  # noqa: E402
+
+AMPLITUDE, OMEGA = 2.0, 3.0
+
+
+class PlantRig:
+    """A running plant, heard."""
+
+    def __init__(self, user, process, namespace):
+        self.user, self.process = user, process
+        self.y = user.record(f'{namespace}/y', Float64)
+        self.state = user.record(f'{namespace}/plant/state', Float64MultiArray)
+        self.d = user.record(f'{namespace}/plant/unknown_input', Float64)
+        self.parameters = Parameters(user, f'{namespace}/plant')
+        user.wait(lambda: self.y and self.state and self.d, 'samples')
+
+    def ticks(self, messages: list, count: int) -> list:
+        """Return pairs of a sample and what the plant published behind it, from now on."""
+        first = len(self.y)
+        pairs = []
+
+        def look() -> bool:
+            samples, others = self.y[first:], list(messages)
+            after = np.searchsorted([m.stamp for m in samples], [m.stamp for m in others])
+            # Behind a sample and before the next one; a stall may have lost one of the two.
+            pairs[:] = [
+                (samples[k - 1], others[i]) for i, k in enumerate(after)
+                if k and (i == 0 or after[i - 1] != k)
+            ]  # fmt: skip
+            return len(pairs) >= count
+
+        self.user.wait(look, 'ticks')
+        return pairs[:count]
+
+    def fresh(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return stamps [s], y and d of samples that come from now on."""
+        ticks = self.ticks(self.d, count)
+        stamps = np.array([y.stamp - self.y[0].stamp for y, _ in ticks]) / SECOND
+        return stamps, *np.array([(y.message.data, d.message.data) for y, d in ticks]).T
+
+
+@pytest.fixture(scope='module')
+def plant(user, launch):
+    """Return a function that starts a plant in a namespace."""
+    return lambda namespace, **values: PlantRig(
+        user, launch('plant', namespace=namespace, **values), namespace
+    )
+
+
+@pytest.fixture(scope='module')
+def rig(plant):
+    return plant(
+        '/stable', sample_rate=250.0, disturbance_amplitude=AMPLITUDE, disturbance_omega=OMEGA,
+        phi=['0', '0', '-6.0*z1 - 11.0*z2 - 6.0*z3'],  # poles -1, -2, -3: stays bounded
+    )  # fmt: skip
+
+
+def test_y_belongs_to_its_stamp(plant):
+    """y against the plant simulated at the messages' source stamps."""
+    rig = plant('/exact', sample_rate=250.0)
+    rig.user.wait(lambda: len(rig.y) >= 500 and len(rig.state) >= 500, 'samples')
+    samples = list(rig.y)
+    t = np.array([m.stamp - samples[0].stamp for m in samples]) / SECOND
+    y = np.array([m.message.data for m in samples])
+    # The plant started before the first message arrived here: find its time by y itself.
+    grid = np.arange(0.0, t[-1] + 20.0, 1e-3)
+    reference = Plant().simulate(grid).y
+
+    def residuals(start: float) -> np.ndarray:
+        return np.abs(np.interp(t + start, grid, reference) - y)
+
+    coarse = min(np.arange(0.0, 19.0, 0.05), key=lambda start: np.median(residuals(start)))
+    fine = np.arange(max(coarse - 0.06, 0.0), coarse + 0.06, 1e-4)
+    best = min(np.median(residuals(start)) for start in fine)
+    # Had y been computed for the tick's nominal time, timer jitter would show here: a millisecond
+    # of it is speed * 1e-3.
+    speed = max(abs(m.message.data[1]) for m in list(rig.state))
+    assert best < 2e-4 * speed
+
+
+def test_truth_is_labelled_and_y_is_its_first_state(rig):
+    assert rig.state[-1].message.layout.dim[0].label == 'z1,z2,z3'
+    for sample, state in rig.ticks(rig.state, 50):
+        assert state.message.data[0] == sample.message.data
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_each_disturbance_live(rig, kind):
+    rig.parameters.set(disturbance=kind, disturbance_offset=0.5, disturbance_start=0.0)
+    low, high = 0.5 - AMPLITUDE, 0.5 + AMPLITUDE
+
+    def settled() -> bool:
+        value = rig.d[-1].message.data
+        return {'none': value == 0.0, 'step': value == high, 'square': value in (low, high)}.get(
+            kind, low < value < high
+        )
+
+    rig.fresh(5)  # those of the kind before may have been on their way
+    rig.user.wait(settled, f'{kind} on the wire')
+    if kind in ('sine', 'chirp'):
+        t, _, d = rig.fresh(250)
+        assert low <= d.min() < d.max() <= high
+        assert np.ptp(d) > 0.1
+        # d' <= amplitude * omega, here with the chirp's last omega
+        assert np.abs(np.diff(d)).max() <= AMPLITUDE * 10.0 * np.diff(t).max() * 1.5 + 1e-3
+    if kind == 'sine':
+        # d'' = -omega^2 (d - offset): fit sine and cosine at the stamps
+        basis = np.stack([np.sin(OMEGA * t), np.cos(OMEGA * t), np.ones_like(t)], axis=1)
+        coefficients = np.linalg.lstsq(basis, d, rcond=None)[0]
+        assert np.hypot(*coefficients[:2]) == pytest.approx(AMPLITUDE, rel=0.05)
+        assert coefficients[2] == pytest.approx(0.5, abs=0.1)
+
+
+def test_noise_live(rig):
+    def roughness() -> float:
+        """Standard deviation of y about its own neighbours."""
+        _, y, _ = rig.fresh(250)
+        return float(np.std(np.diff(y, 2)) / np.sqrt(6.0))
+
+    for noise in (0.05, 0.0):
+        rig.parameters.set(disturbance='none', noise_std=noise)
+        rig.fresh(5)
+        # What a stall adds is gone with the next samples.
+        rig.user.wait(
+            lambda noise=noise: roughness() == pytest.approx(noise, rel=0.25, abs=1e-3), 'noise'
+        )
+
+
+def test_sample_rate_live_does_not_change_the_plant(rig):
+    rig.parameters.set(disturbance='step', disturbance_offset=0.0, disturbance_start=0.0)
+    for rate in (50.0, 125.0):
+        rig.parameters.set(sample_rate=rate)
+
+        def sampled(rate=rate) -> bool:
+            t, y, _ = rig.fresh(50)
+            assert np.isfinite(y).all()
+            return np.median(np.diff(t)) == pytest.approx(1.0 / rate, rel=0.2)
+
+        rig.user.wait(sampled, f'rate of {rate} Hz')
+    rig.user.wait(
+        lambda: abs(rig.y[-1].message.data - AMPLITUDE / 6.0) < 1e-2, 'steady state d / 6'
+    )
+    rig.parameters.set(sample_rate=250.0)
+
+
+def test_known_input_comes_from_its_topic(plant, user):
+    rig = plant('/driven', order=1, phi=['2.0*u - 4.0*z1'], disturbance='none')
+    u = user.publisher('/driven/u')
+    for value, expected in ((1.0, 0.5), (-3.0, -1.5)):
+
+        def follows(value=value, expected=expected) -> bool:
+            u.publish(Float64(data=value))
+            return abs(rig.y[-1].message.data - expected) < 1e-3
+
+        user.wait(follows, f'y = {expected}')
+    u.publish(Float64(data=float('nan')))
+    user.wait(lambda: 'rejected u = nan' in rig.process.output, 'complaint about u')
+    _, y, _ = rig.fresh(20)
+    np.testing.assert_allclose(y, -1.5, rtol=0.0, atol=1e-3)
+
+
+def test_unstable_plant_says_so_once_and_publishes_nothing_more(user, launch):
+    y = user.record('/unstable/y', Float64)
+    process = launch('plant', namespace='/unstable', order=1, phi=['2000.0*z1 + 1.0'])
+    words = 'has left the finite numbers'
+    user.wait(lambda: words in process.output, 'error')
+    said = re.search(rf'\[(\d+)\.(\d{{9}})\].*{words}', process.output)
+    error = int(said[1] + said[2])  # ns
+    user.wait(lambda: time.time_ns() > error + SECOND // 3, 'some hundred periods')
+    assert process.output.count(words) == 1
+    for stamp, message in y:
+        assert stamp <= error
+        assert np.isfinite(message.data)
