@@ -5,7 +5,7 @@ import contextlib
 
 import pytest
 
-pytest.register_assert_rewrite('rig', 'running')
+pytest.register_assert_rewrite('running')
 
 FED = {
     'publish_on': 'sample', 'max_gap': 60.0, 'input_reliability': 'reliable',
@@ -101,31 +101,3 @@ def fed(_fed):
     _fed.parameters.set(**{name: start[name] for name in live})
     _fed.reset()
     return _fed
-
-
-# Fixtures of the tests that still use rig.
-
-
-@pytest.fixture(scope='module')
-def folder(tmp_path_factory):
-    return lambda: tmp_path_factory.mktemp('node')
-
-
-@pytest.fixture(scope='module')
-def stack():
-    with contextlib.ExitStack() as exit_stack:
-        yield exit_stack
-
-
-@pytest.fixture(scope='module')
-def client(stack):
-    from rig import Client
-
-    return stack.enter_context(Client())
-
-
-@pytest.fixture(scope='module')
-def start(stack, folder):
-    from rig import node_process
-
-    return lambda *arguments: stack.enter_context(node_process(folder(), *arguments))

@@ -36,7 +36,7 @@ except ImportError:  # an older rclpy
     Executor = SingleThreadedExecutor
 
 ROOT = Path(fhaosmo_ros.__file__).parents[1]
-DEADLINE = 12.0
+DEADLINE = 60.0
 """Seconds for what takes one on a quiet machine."""
 TRIES = 4
 """Of a call, which share the deadline: the middleware may lose the first one of a new client."""

@@ -12,15 +12,15 @@ import pytest
 rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
 pytestmark = pytest.mark.ros
 
-from rig import Parameters, parameters, Process  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from running import Manager, Parameters  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
-from waiting import wait_until  # noqa: E402
 
-GRACE = 20.0
+GRACE = 30.0
 """Seconds: one, and what a loaded machine adds."""
 
 
-def ends_well(process: Process) -> None:
+def ends_well(process) -> None:
     assert process.wait(GRACE) == 0, process.output
     for word in ('Traceback', 'Exception', 'Error', 'error', 'terminate called'):
         assert word not in process.output, process.output
@@ -29,65 +29,94 @@ def ends_well(process: Process) -> None:
 @pytest.mark.parametrize(
     'signals',
     [
-        (signal.SIGINT,),
         (signal.SIGTERM,),
         (signal.SIGHUP,),
         (signal.SIGINT, signal.SIGINT, signal.SIGTERM),
     ],
-    ids=['SIGINT', 'SIGTERM', 'SIGHUP', 'three'],
+    ids=['SIGTERM', 'SIGHUP', 'three'],
 )
-def test_running_pair_ends(client, folder, signals):
+def test_running_pair_ends(user, launch, signals):
     """Both at full rate, so that callbacks run when the signal comes."""
-    namespace = f'/end{len(signals)}{signals[0]}'
+    namespace = f'/end{signals[0]}'
+    d = user.record(f'{namespace}/estimator/unknown_input', Float64)
     nodes = [
-        Process(folder(), 'plant', *parameters(namespace=namespace)),
-        Process(folder(), 'estimator', *parameters(namespace=namespace, publish_rate=1000.0)),
+        launch('plant', namespace=namespace),
+        launch('estimator', namespace=namespace, publish_rate=1000.0),
     ]
-    try:
-        d = client.record(f'{namespace}/estimator/unknown_input', Float64)
-        client.wait(lambda: len(d) > 10, 'estimates')
-        for number in signals:
-            for node in nodes:
-                node.send(number)
+    user.wait(lambda: len(d) > 10, 'estimates')
+    for number in signals:
         for node in nodes:
-            ends_well(node)
-        name = f'{namespace}/estimator/unknown_input'
-        client.wait(lambda: client.node.count_publishers(name) == 0, 'end of the publishers')
-    finally:
-        for node in nodes:
-            node.kill()
+            node.send(number)
+    for node in nodes:
+        ends_well(node)
+    topic = f'{namespace}/estimator/unknown_input'
+    user.wait(lambda: user.node.count_publishers(topic) == 0, 'end of the publishers')
 
 
-def test_signal_while_parameters_are_set(client, folder):
+@pytest.mark.parametrize(
+    'transitions', [[], ['configure'], ['shutdown']], ids=['unconfigured', 'inactive', 'finalized']
+)
+def test_a_signal_ends_it_in_every_state(user, launch, transitions, request):
+    namespace = f'/{request.node.callspec.id}'
+    process = launch('estimator', namespace=namespace, autostart=False)
+    manager = Manager(user, f'{namespace}/estimator')
+    for transition in transitions:
+        assert manager.change(transition)
+    assert manager.state() == namespace[1:]
+    process.send(signal.SIGINT)
+    ends_well(process)
+
+
+def test_signal_while_parameters_are_set(user, launch):
     """A call that is being answered, or waits to be, when the signal comes."""
-    process = Process(folder(), 'estimator', *parameters(namespace='/set'))
-    try:
-        values = Parameters(client, '/set/estimator')
-        assert values.set(epsilon=4.0)[0].successful
-        request = values.request(fuzzy_systems=['terms gaussian 5'], variant='fuzzy')
-        for _ in range(20):
-            client.call_later('/set/estimator/set_parameters', *request)
-        process.send(signal.SIGINT)
-        ends_well(process)
-    finally:
-        process.kill()
+    process = launch('estimator', namespace='/set')
+    parameters = Parameters(user, '/set/estimator')
+    parameters.set(epsilon=4.0)
+    changes = {'fuzzy_systems': ['terms gaussian 5'], 'variant': 'fuzzy'}
+    for _ in range(20):
+        parameters.service.set_parameters([Parameter(n, value=v) for n, v in changes.items()])
+    process.send(signal.SIGINT)
+    ends_well(process)
 
 
 @pytest.mark.parametrize('name', ['estimator', 'plant'])
 @pytest.mark.parametrize('delay', [0.2, 0.5, 0.8, 1.1])
-def test_signal_while_it_starts(folder, name, delay):
+def test_signal_while_it_starts(launch, name, delay):
     """The delay is the test's subject: anywhere within the start, or just behind it."""
-    process = Process(folder(), name, *parameters(namespace='/early'))
-    try:
-        time.sleep(delay)
-        process.send(signal.SIGTERM)
-        process.send(signal.SIGINT)
-        code = process.wait(GRACE)
-        assert 'Traceback' not in process.output, process.output
-        # Python itself dies of a signal before it has begun with our code.
-        assert code in (0, -signal.SIGTERM, -signal.SIGINT), process.output
-    finally:
-        process.kill()
+    process = launch(name, namespace='/early')
+    time.sleep(delay)
+    process.send(signal.SIGTERM)
+    process.send(signal.SIGINT)
+    code = process.wait(GRACE)
+    # Python itself dies of a signal before it has begun with our code.
+    assert code in (0, -signal.SIGTERM, -signal.SIGINT), process.output
+
+
+STUCK = """
+import sys, time
+from fhaosmo_ros.__main__ import main
+from rclpy.node import Node
+
+def stuck(self, period, callback, *args, create=Node.create_timer, **options):
+    def sleep():
+        print('asleep', flush=True)
+        time.sleep(3600.0)
+    return create(self, period, sleep, *args, **options)
+
+Node.create_timer = stuck
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_callback_that_does_not_end_does_not_hold_the_node(user, launch):
+    process = launch(STUCK)
+    user.wait(lambda: 'asleep' in process.output, 'callback')
+    process.send(signal.SIGINT)
+    ends_well(process)
+    assert 'ended while a callback was running' in process.output
+
+
+# What they are made of.
 
 
 def test_a_signal_cuts_only_what_may_be_cut_and_only_once():
@@ -120,32 +149,3 @@ def test_what_python_cannot_interrupt_ends_too():
     command = [sys.executable, '-c', IN_A_LIBRARY]
     ended = subprocess.run(command, capture_output=True, timeout=60.0, check=False)
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, b'', b'')
-
-
-STUCK = """
-import signal, sys, time
-from fhaosmo_ros.nodes.middleware.spin import run_node
-from rclpy.node import Node
-
-class Sleeper(Node):
-    def __init__(self, given):
-        super().__init__('sleeper')
-        self.create_timer(0.01, self.sleep)
-
-    def sleep(self):
-        print('asleep', flush=True)
-        time.sleep(3600.0)
-
-sys.exit(run_node('plant', Sleeper, []))
-"""
-
-
-def test_a_callback_that_does_not_end_does_not_hold_the_node(folder):
-    process = Process(folder(), code=STUCK)
-    try:
-        wait_until(lambda: 'asleep' in process.output, 'callback')
-        process.send(signal.SIGINT)
-        ends_well(process)
-        assert 'ended while a callback was running' in process.output
-    finally:
-        process.kill()
