@@ -15,6 +15,7 @@ from fhaosmo_ros.tools.cli.command import Interrupted, run_command
 from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.cli.progress import progress
 import pytest
+from waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[1]
 PARSER = argparse.ArgumentParser(prog='try')
@@ -44,66 +45,56 @@ if __name__ == '__main__':
 """
 
 
-def run(capsys, error):
-    def body(arguments, stop):
-        raise error
-
-    code = run_command(PARSER, [], body)
-    return code, capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ('error', 'code', 'said'),
     [
-        (ConfigurationError('wrong'), 2, 'try: error: wrong\n'),
-        (FileNotFoundError(2, 'No such file', 'x'), 2, 'try: error: No such file: x\n'),
-        (Interrupted('nothing written'), 130, 'try: interrupted, nothing written\n'),
-        (Stopped(), 130, 'try: interrupted\n'),
+        (ConfigurationError('wrong'), 2, 'error: wrong\n'),
+        (FileNotFoundError(2, 'No such file', 'x'), 2, 'error: No such file: x\n'),
+        (ConfigurationError("'sql://u:p@ss@h/db': no"), 2, "error: 'sql://u:***@h/db': no\n"),
+        (Interrupted('nothing written'), 130, 'interrupted, nothing written\n'),
+        (Stopped(), 130, 'interrupted\n'),
     ],
 )
 def test_errors_are_one_line_and_have_their_exit_code(capsys, error, code, said):
-    assert run(capsys, error) == (code, said)
+    def body(arguments, stop):
+        raise error
+
+    assert run_command(PARSER, [], body) == code
+    assert capsys.readouterr().err == f'try: {said}'
 
 
-def test_other_errors_keep_their_trace(capsys):
+def test_other_errors_keep_their_trace():
     with pytest.raises(ZeroDivisionError):
-        run(capsys, ZeroDivisionError())
+        run_command(PARSER, [], lambda *_: 1 / 0)
 
 
-def test_body_gets_arguments_and_its_code_is_returned():
+def test_body_gets_its_arguments_and_its_code_is_returned():
+    """Those of ROS are apart, as a launch file gives them to every program."""
     parser = argparse.ArgumentParser(prog='try')
     parser.add_argument('--number', type=int)
     seen = []
 
     def body(arguments, stop):
-        seen.append((arguments.number, arguments.command_line, stop.is_set()))
+        seen.append((arguments.number, arguments.ros_arguments, stop.is_set()))
+        seen.append(arguments.command_line)
         return 7
 
-    assert run_command(parser, ['--number', '3'], body) == 7
-    assert seen == [(3, 'try --number 3', False)]
+    words = ['--ros-args', '-r', '__node:=x', '--params-file', 'f', '--', '--number', '3']
+    assert run_command(parser, words, body) == 7
+    assert seen[0] == (3, ['-r', '__node:=x', '--params-file', 'f'], False)
+    assert seen[1] == 'try --ros-args -r __node:=x --params-file f -- --number 3'
+    assert run_command(parser, words[:3], body) == 7
+    assert seen[2] == (None, ['-r', '__node:=x'], False)
     assert run_command(parser, [], lambda arguments, stop: None) == 0
 
 
-def test_passwords_of_urls_are_not_said(capsys):
-    def body(arguments, stop):
-        assert 'postgresql://u:***@h/db' in arguments.command_line
-        raise ConfigurationError("storage 'postgresql://u:p@ss@h/db': no answer")
-
+def test_passwords_of_urls_are_not_kept():
     parser = argparse.ArgumentParser(prog='try')
     parser.add_argument('--storage')
-    assert run_command(parser, ['--storage', 'postgresql://u:p@ss@h/db'], body) == 2
-    assert capsys.readouterr().err == "try: error: storage 'postgresql://u:***@h/db': no answer\n"
-
-
-def test_arguments_of_ros_are_accepted():
-    """As a launch file gives them to every program."""
-    parser = argparse.ArgumentParser(prog='try')
-    parser.add_argument('--number', type=int)
     seen = []
-    words = ['--ros-args', '-r', '__node:=x', '--params-file', 'f', '--', '--number', '3']
-    assert run_command(parser, words, lambda a, _: seen.append((a.number, a.ros_arguments))) == 0
-    assert run_command(parser, words[:5], lambda a, _: seen.append((a.number, [])) or 0) == 0
-    assert seen == [(3, ['-r', '__node:=x', '--params-file', 'f']), (None, [])]
+    words = ['--storage', 'postgresql://u:p@ss@h/db']
+    assert run_command(parser, words, lambda a, _: seen.append(a.command_line)) == 0
+    assert seen == ['try --storage postgresql://u:***@h/db']
 
 
 def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(capsys, monkeypatch):
@@ -162,48 +153,53 @@ def test_what_is_there_stays_until_the_new_output_is_complete(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ['out']
 
 
-def disposition(ignored: bool) -> None:
-    """Set what a child does at SIGINT; and at SIGHUP, which these tests under nohup ignore."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
-
-
 @pytest.fixture
-def busy(tmp_path):
-    """Return a function that starts a command with two workers, and waits until they work."""
-    (tmp_path / 'busy.py').write_text(BUSY)
+def begin():
+    """Return a function that starts Python in a session of its own, SIGINT ignored or not."""
     started = []
 
-    def start(ignored: bool) -> tuple[subprocess.Popen, list[int]]:
-        process = subprocess.Popen(
-            [sys.executable, tmp_path / 'busy.py', tmp_path],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-            preexec_fn=lambda: disposition(ignored),
-            env={**os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])},
-        )
-        started.append(process)
-        deadline = time.monotonic() + 90
-        while len(pids := [p.read_text() for p in tmp_path.glob('*.pid')]) < 2 or not all(pids):
-            assert process.poll() is None, process.communicate()
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        return process, [int(pid) for pid in pids]
+    def begin(*words: object, ignored: bool) -> subprocess.Popen:
+        def disposition() -> None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # these tests under nohup ignore it
 
-    yield start
+        started.append(
+            subprocess.Popen(
+                [sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                text=True, start_new_session=True, preexec_fn=disposition,
+                env={**os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])},
+            )
+        )  # fmt: skip
+        return started[-1]
+
+    yield begin
     for process in started:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
+        process.communicate()
+
+
+@pytest.fixture
+def busy(tmp_path, begin):
+    """Return a function that starts a command with two workers, and waits until they work."""
+    (tmp_path / 'busy.py').write_text(BUSY)
+
+    def start(ignored: bool) -> tuple[subprocess.Popen, list[int]]:
+        process = begin(tmp_path / 'busy.py', tmp_path, ignored=ignored)
+        pids = []
+
+        def working() -> bool:
+            pids[:] = [path.read_text() for path in tmp_path.glob('*.pid')]
+            return len(pids) == 2 and all(pids)
+
+        wait_until(working, 'workers', process=process)
+        return process, [int(pid) for pid in pids]
+
+    return start
 
 
 def wait_for_end(pids: list[int]) -> None:
-    deadline = time.monotonic() + 20
-    while any(Path(f'/proc/{pid}').exists() for pid in pids):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_until(lambda: not any(Path(f'/proc/{pid}').exists() for pid in pids), 'end of workers')
 
 
 @pytest.mark.signals
@@ -212,7 +208,6 @@ def wait_for_end(pids: list[int]) -> None:
     [
         (signal.SIGINT, False, True),  # Ctrl-C in a terminal
         (signal.SIGINT, True, False),  # kill -INT of a script's background job
-        (signal.SIGTERM, False, False),
         (signal.SIGTERM, True, True),  # timeout(1)
         (signal.SIGHUP, False, True),  # the terminal or the SSH connection closes
     ],
@@ -220,7 +215,7 @@ def wait_for_end(pids: list[int]) -> None:
 def test_signal_ends_command_and_workers(busy, tmp_path, number, ignored, group):
     process, pids = busy(ignored)
     (os.killpg if group else os.kill)(process.pid, number)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert (out, err) == ('', 'busy: interrupted\n')
     wait_for_end(pids)
@@ -231,35 +226,27 @@ def test_signal_ends_command_and_workers(busy, tmp_path, number, ignored, group)
 def test_workers_end_when_their_parent_is_killed(busy):
     process, pids = busy(False)
     process.kill()
-    process.communicate()
     wait_for_end(pids)
+
+
+SLOW = """
+import sys
+from fhaosmo_ros.__main__ import COMMANDS, main
+sys.path.insert(0, sys.argv[1])
+COMMANDS['slow'] = ('slow', '')
+raise SystemExit(main(['slow']))
+"""
 
 
 @pytest.mark.signals
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signal_ends_a_command_that_still_loads(tmp_path, number):
+def test_signal_ends_a_command_that_still_loads(begin, tmp_path, number):
     (tmp_path / 'slow.py').write_text('import time\nprint("loads", flush=True)\ntime.sleep(600)\n')
-    script = (
-        'from fhaosmo_ros.__main__ import COMMANDS, main\n'
-        "COMMANDS['slow'] = ('slow', '')\n"
-        "raise SystemExit(main(['slow']))\n"
-    )
-    process = subprocess.Popen(
-        [sys.executable, '-c', script],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: disposition(True),
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join([str(tmp_path), str(ROOT), *sys.path])},
-    )
-    with process:
-        assert process.stdout.readline() == 'loads\n'
-        process.send_signal(number)
-        try:
-            assert process.wait(10) == 130
-        finally:
-            process.kill()
-        assert process.stderr.read() == ''
+    process = begin('-c', SLOW, tmp_path, ignored=True)
+    assert process.stdout.readline() == 'loads\n'
+    process.send_signal(number)
+    assert process.wait(60) == 130
+    assert process.stderr.read() == ''
 
 
 NOHUP = """

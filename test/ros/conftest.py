@@ -2,25 +2,28 @@
 """Nodes for the tests: some live for one module, some for the whole session."""
 
 import contextlib
+from pathlib import Path
 
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
 
 pytest.register_assert_rewrite('running')
+try:
+    from running import arguments, Estimator, FED, LAX, Parameters, Process, User
+except ModuleNotFoundError:  # no ROS 2 in this Python
+    collect_ignore_glob = ['test_*.py']
 
-FED = {
-    'publish_on': 'sample', 'max_gap': 60.0, 'input_reliability': 'reliable',
-    'diagnostics_period': 0.2,
-}  # fmt: skip
-"""For an estimator that a test feeds: each sample is answered at once, and no gap restarts it."""
 
-LAX = {'warn_jitter_above': 1e6, 'warn_delay_above': 1e6, 'diagnostics_period': 0.2}
-"""A loaded machine is no reason for a warning here."""
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Mark the tests of this folder."""
+    for item in items:
+        if item.path.parent == Path(__file__).parent:
+            item.add_marker(pytest.mark.ros)
 
 
 @contextlib.contextmanager
 def _launcher(folders):
-    from running import arguments, Process
-
     processes = []
 
     def launch(name, *words, **values):
@@ -44,8 +47,6 @@ def _launcher(folders):
 @pytest.fixture(scope='session')
 def user():
     """Return a node that hears, publishes and asks."""
-    from running import User
-
     user = User()
     yield user
     user.close()
@@ -61,7 +62,6 @@ def launch(tmp_path_factory):
 @pytest.fixture(scope='module')
 def estimator(launch, user):
     """Return a function that starts an estimator and knows its topics."""
-    from running import Estimator
 
     def start(namespace, *words, **values):
         process = launch('estimator', *words, namespace=namespace, **values)
@@ -73,8 +73,6 @@ def estimator(launch, user):
 @pytest.fixture(scope='session')
 def pair(tmp_path_factory, user):
     """Return an estimator that hears a plant; the plant's parameters are its attribute."""
-    from running import Estimator, Parameters
-
     with _launcher(tmp_path_factory) as launch:
         launch('plant', namespace='/pair', sample_rate=500.0)
         estimator = Estimator(user, launch('estimator', namespace='/pair', **LAX), '/pair')
@@ -84,8 +82,6 @@ def pair(tmp_path_factory, user):
 
 @pytest.fixture(scope='session')
 def _fed(tmp_path_factory, user):
-    from running import Estimator
-
     with _launcher(tmp_path_factory) as launch:
         process = launch('estimator', namespace='/fed', **FED)
         yield Estimator(user, process, '/fed').greet()
@@ -94,8 +90,6 @@ def _fed(tmp_path_factory, user):
 @pytest.fixture
 def fed(_fed):
     """Return an estimator that a test feeds, as it was at its start."""
-    from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-
     live = [name for name, parameter in ESTIMATOR_PARAMETERS.items() if parameter.live]
     start = {name: ESTIMATOR_PARAMETERS[name].default for name in live} | FED
     _fed.parameters.set(**{name: start[name] for name in live})

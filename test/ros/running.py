@@ -48,6 +48,13 @@ ESTIMATES = {
     'state': Float64MultiArray, 'unknown_input': Float64, 'gamma': Float64,
     'innovation': Float64MultiArray, 'stamp': Time,
 }  # fmt: skip
+FED = {
+    'publish_on': 'sample', 'max_gap': 60.0, 'input_reliability': 'reliable',
+    'diagnostics_period': 0.2,
+}  # fmt: skip
+"""For an estimator that a test feeds: each sample is answered at once, and no gap restarts it."""
+LAX = {'warn_jitter_above': 1e6, 'warn_delay_above': 1e6, 'diagnostics_period': 0.2}
+"""A loaded machine is no reason for a warning here."""
 
 
 def nanoseconds(stamp: Time) -> int:

@@ -4,19 +4,14 @@
 import itertools
 import math
 
+from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 import numpy as np
 import pytest
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
-pytestmark = pytest.mark.ros
-
-from builtin_interfaces.msg import Time  # noqa: E402
-from conftest import FED  # noqa: E402
-from running import as_time, nanoseconds, Parameters, SECOND  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
-from std_msgs.msg import Float64, Float64MultiArray, Header  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
+from running import as_time, FED, nanoseconds, Parameters, SECOND
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Float64MultiArray, Header
+from std_srvs.srv import Trigger
 
 FILE = """
 /**:

@@ -5,20 +5,18 @@ import math
 
 import numpy as np
 import pytest
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
-pytestmark = pytest.mark.ros
-
-from conftest import FED, LAX  # noqa: E402
-from rclpy.context import Context  # noqa: E402
-from rclpy.node import Node  # noqa: E402
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
-from rclpy.signals import SignalHandlerOptions  # noqa: E402
-from rosgraph_msgs.msg import Clock  # noqa: E402
-from running import (  # noqa: E402
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+from running import (
     as_time,
     ERROR,
+    FED,
     LATCHED,
+    LAX,
     OK,
     Parameters,
     ROOT,
@@ -26,9 +24,9 @@ from running import (  # noqa: E402
     STALE,
     WARN,
 )  # fmt: skip
-from sensor_msgs.msg import JointState  # noqa: E402
-from std_msgs.msg import Float64, Header, Int64  # noqa: E402
-from std_srvs.srv import SetBool  # noqa: E402
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Header, Int64
+from std_srvs.srv import SetBool
 
 RATE = 500.0
 """Of the pair's plant."""

@@ -8,15 +8,10 @@ import time
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 import pytest
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
-pytestmark = pytest.mark.ros
-
-from conftest import FED, LAX  # noqa: E402
-from rosgraph_msgs.msg import Clock  # noqa: E402
-from running import as_time, ERROR, Parameters, SECOND, STALE, WARN  # noqa: E402
-from std_msgs.msg import Float64  # noqa: E402
-from std_srvs.srv import SetBool  # noqa: E402
+from rosgraph_msgs.msg import Clock
+from running import as_time, ERROR, FED, LAX, Parameters, SECOND, STALE, WARN
+from std_msgs.msg import Float64
+from std_srvs.srv import SetBool
 
 MS = 1_000_000
 

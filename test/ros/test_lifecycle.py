@@ -1,16 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimator as a managed node, driven through its services as `ros2 lifecycle` does."""
 
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 import pytest
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
-pytestmark = pytest.mark.ros
-
-from conftest import FED  # noqa: E402
-from lifecycle_msgs.msg import Transition  # noqa: E402
-from lifecycle_msgs.srv import ChangeState  # noqa: E402
-from running import ESTIMATES, Estimator, Manager, OK, Parameters, STALE  # noqa: E402
-from std_srvs.srv import Trigger  # noqa: E402
+from running import ESTIMATES, Estimator, FED, Manager, OK, Parameters, STALE
+from std_srvs.srv import Trigger
 
 NODE = '/managed/estimator'
 

@@ -5,19 +5,14 @@ import bisect
 import math
 import time
 
+from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.core.observer.estimates import TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np
 import pytest
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
-pytestmark = pytest.mark.ros
-
-from conftest import FED  # noqa: E402
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from running import LATCHED, nanoseconds, OK, WARN  # noqa: E402
-from std_msgs.msg import Float64, Float64MultiArray  # noqa: E402
+from running import FED, LATCHED, nanoseconds, OK, WARN
+from std_msgs.msg import Float64, Float64MultiArray
 
 RATE = 100.0
 

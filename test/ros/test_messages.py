@@ -3,20 +3,15 @@
 
 import math
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from geometry_msgs.msg import AccelStamped, PoseStamped, Quaternion, WrenchStamped
 import numpy as np
 import pytest
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
-pytestmark = pytest.mark.ros
-
-from conftest import FED  # noqa: E402
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
-from geometry_msgs.msg import AccelStamped, PoseStamped, Quaternion, WrenchStamped  # noqa: E402
-from running import as_time, nanoseconds, ROOT, SECOND, WARN  # noqa: E402
-from sensor_msgs.msg import Imu, JointState  # noqa: E402
-from std_msgs.msg import (  # noqa: E402
+from running import as_time, FED, nanoseconds, ROOT, SECOND, WARN
+from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import (
     Bool,
     ByteMultiArray,
     Float32,

@@ -5,12 +5,8 @@ import contextlib
 from xml.etree import ElementTree
 
 import pytest
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
-pytestmark = pytest.mark.ros
-
-from rclpy.node import NodeNameNonExistentError  # noqa: E402
-from running import ROOT  # noqa: E402
+from rclpy.node import NodeNameNonExistentError
+from running import ROOT
 
 
 def expand(name: str, profile: ElementTree.Element) -> str:

@@ -8,13 +8,9 @@ import time
 
 from fhaosmo_ros.stop_signals import Stop, Stopped
 import pytest
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
-pytestmark = pytest.mark.ros
-
-from rclpy.parameter import Parameter  # noqa: E402
-from running import Manager, Parameters  # noqa: E402
-from std_msgs.msg import Float64  # noqa: E402
+from rclpy.parameter import Parameter
+from running import Manager, Parameters
+from std_msgs.msg import Float64
 
 GRACE = 30.0
 """Seconds: one, and what a loaded machine adds."""

@@ -12,12 +12,9 @@ from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.core.parameters.files import read
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
+import rclpy
+from running import DEADLINE, Estimator, Manager, Parameters, ROOT
 from yaml_texts import HOSTILE
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
-pytestmark = pytest.mark.ros
-
-from running import DEADLINE, Estimator, Manager, Parameters, ROOT  # noqa: E402
 
 CONFIGURATIONS = sorted((ROOT / 'config').glob('**/*.yaml'))
 

@@ -8,12 +8,8 @@ from fhaosmo_ros.core.simulation.disturbance import KINDS
 from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np
 import pytest
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
-pytestmark = pytest.mark.ros
-
-from running import Parameters, SECOND  # noqa: E402
-from std_msgs.msg import Float64, Float64MultiArray  # noqa: E402
+from running import Parameters, SECOND
+from std_msgs.msg import Float64, Float64MultiArray
 
 AMPLITUDE, OMEGA = 2.0, 3.0
 

@@ -12,19 +12,14 @@ from fhaosmo_ros.core.parameters.tables import (
     PLANT_NODE_PARAMETERS,
 )
 import numpy as np
-from observer_cases import SYSTEMS
 import pytest
+from rcl_interfaces.msg import LoggerLevel, Parameter, ParameterValue
+from rcl_interfaces.srv import SetLoggerLevels
+from running import as_time, FED, LATCHED, Parameters, SECOND
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header, String
+from test_any_input import valid
 from yaml_texts import HOSTILE, random_texts
-
-rclpy = pytest.importorskip('rclpy', reason='rclpy is not installed: needs ROS 2 Jazzy')
-pytestmark = pytest.mark.ros
-
-from conftest import FED  # noqa: E402
-from rcl_interfaces.msg import LoggerLevel, Parameter, ParameterValue  # noqa: E402
-from rcl_interfaces.srv import SetLoggerLevels  # noqa: E402
-from running import as_time, LATCHED, Parameters, SECOND  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
-from std_msgs.msg import Header, String  # noqa: E402
 
 TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}
 LIVE = {node: [p for p in table.values() if p.live] for node, table in TABLES.items()}
@@ -280,42 +275,17 @@ ODD = (
 )  # fmt: skip
 
 
-def number(rng, parameter) -> float:
-    """Return a number within the bounds, of any magnitude."""
-    low = parameter.lower if parameter.lower is not None else -1e6
-    high = parameter.upper if parameter.upper is not None else 1e6
-    value = 10.0 ** rng.uniform(-6.0, 6.0) * (rng.choice([-1.0, 1.0]) if low < 0.0 else 1.0)
-    return float(np.clip(value, max(low, low + 1e-9), high))
-
-
-def valid(rng, parameter) -> object:
-    if parameter.choices:
-        return str(rng.choice(parameter.choices))
-    match parameter.kind:
-        case 'bool':
-            return bool(rng.integers(2))
-        case 'int':
-            return int(rng.integers(parameter.lower, min(parameter.upper, 2**31) + 1))
-        case 'double':
-            return number(rng, parameter)
-        case 'string':
-            return 'any'
-        case 'string_array':  # fuzzy_systems
-            return rng.choice([*SYSTEMS, 'terms 4'], rng.integers(1, 4)).tolist()
-    return [number(rng, parameter) for _ in range(rng.choice([1, 4]))]
-
-
 def test_random_sets_hurt_nobody_and_each_refusal_has_its_reason(user, estimator):
     node = estimator('/random', input_topic='joints', input_field='position[a]', **FED)
     joints = user.publisher('/random/joints', JointState)
     rng = np.random.default_rng(5)
     table = ESTIMATOR_PARAMETERS
-    names = [p.name for p in LIVE['estimator']] + ['order', 'gains']
+    names = [name for name, p in ONLINE_PARAMETERS.items() if p.live or name == 'order']
     stamp, accepted, values = SECOND, 0, node.parameters.messages(*table)
     for _ in range(COUNT):
         changes = {
             str(name): ODD[rng.integers(len(ODD))] if rng.random() < 0.15
-            else valid(rng, table[name])
+            else valid(table[name], rng)
             for name in rng.choice(names, size=rng.integers(1, 4), replace=False)
         }  # fmt: skip
         result = node.parameters.try_to_set_together(**changes)
