@@ -65,7 +65,7 @@ def estimator(launch, user):
 
     def start(namespace, *words, **values):
         process = launch('estimator', *words, namespace=namespace, **values)
-        return Estimator(user, process, namespace, values.get('gains') != 'self_tuning')
+        return Estimator(user, process, namespace, gamma=values.get('gains') != 'self_tuning')
 
     return start
 

@@ -320,23 +320,31 @@ class Manager:
 class Estimator:
     """A running estimator: what it publishes, what it says and what it can be asked."""
 
-    def __init__(self, user: User, process: Process, namespace: str, gamma: bool = True) -> None:
+    def __init__(
+        self,
+        user: User,
+        process: Process,
+        namespace: str,
+        channel: str = '',
+        gamma: bool = True,
+    ) -> None:
         self.user, self.process = user, process
-        self.name = f'{namespace}/estimator'
+        node, part = f'{namespace}/estimator', f'/{channel}' if channel else ''
+        self.name = node + part
         self.topics = {
             topic: user.record(f'{self.name}/{topic}', kind)
             for topic, kind in ESTIMATES.items() if gamma or topic != 'gamma'
         }  # fmt: skip
-        self.reports = user.reports[self.name.lstrip('/')]
-        self.y = user.record(f'{namespace}/y', Float64)
-        self._topic = f'{namespace}/y'
+        self.reports = user.reports[node.lstrip('/')]
+        self._topic = f'{namespace}{part}/y'
+        self.y = user.record(self._topic, Float64)
         self._estimates: list[Estimate] = []
         self._ticks = 0
         user.wait(
             lambda: all(user.node.count_publishers(f'{self.name}/{t}') for t in self.topics),
             f'publishers of {self.name}',
         )
-        self.parameters = Parameters(user, self.name)
+        self.parameters = Parameters(user, node)
 
     # What it is sent.
 

@@ -4,101 +4,63 @@
 import itertools
 import math
 
-from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-import numpy as np
 import pytest
-from running import as_time, FED, nanoseconds, Parameters, SECOND
+from running import as_time, Estimator, FED, nanoseconds, OK, SECOND
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64, Float64MultiArray, Header
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-FILE = """
-/**:
-  ros__parameters:
-    channels: [hip, knee]
-    epsilon: 5.0
-    hip:
-      variant: sign
-      lambda: [15.0]
-    knee:
-      order: 2
-      phi: ['0', '-z2']
-"""
 OWN = {
     'hip': {'variant': 'sign', 'lambda': [15.0]},
     'knee': {'order': 2, 'phi': ['0', '-z2']},
 }
-NODE = '/many/estimator'
+COMMON = {'max_gap': 60.0, 'epsilon': 5.0}
 
 
 @pytest.fixture(scope='module')
-def parameters(user, launch, tmp_path_factory):
-    path = tmp_path_factory.mktemp('channels') / 'many.yaml'
-    path.write_text(FILE)
-    launch('estimator', '--params-file', path, namespace='/many', **FED)
-    return Parameters(user, NODE)
+def rigs(user, launch):
+    """Return what belongs to each channel, by its name."""
+    own = {f'{name}.{key}': value for name, values in OWN.items() for key, value in values.items()}
+    common = FED | COMMON | {'channels': list(OWN)}
+    process = launch('estimator', namespace='/many', **common, **own)
+    return {name: Estimator(user, process, '/many', name).greet() for name in OWN}
 
 
-class Joint:
-    """One channel, fed and heard."""
-
-    def __init__(self, user, name):
-        self.user = user
-        self.sent = user.record(f'/many/{name}/y', Float64)
-        self.state = user.record(f'{NODE}/{name}/state', Float64MultiArray)
-        self.stamps = user.record(f'{NODE}/{name}/stamp', Time)
-        self.y = user.publisher(f'/many/{name}/y', heard=2)
-        user.wait(self.answers, 'first estimate')
-
-    def answers(self) -> bool:
-        self.y.publish(Float64(data=0.0))
-        return bool(self.state and self.stamps)
-
-    def wait(self, count: int) -> None:
-        """Wait for so many samples, and the estimate of the last one, which has come whole."""
-        self.user.wait(lambda: len(self.sent) >= count, 'own samples')
-        last = self.sent[-1].stamp
-        self.user.wait(lambda: nanoseconds(self.stamps[-1].message) == last, 'last estimate')
-        published = self.stamps[-2].stamp
-        self.user.wait(lambda: self.state[-1].stamp > published, 'its state')
+@pytest.fixture
+def parameters(rigs):
+    return rigs['hip'].parameters
 
 
-@pytest.fixture(scope='module')
-def joints(user, parameters):
-    return {name: Joint(user, name) for name in OWN}
-
-
-def test_each_channel_is_bit_for_bit_an_estimator_of_its_own(user, joints, parameters):
+def test_each_channel_is_bit_for_bit_an_estimator_of_its_own(user, rigs, parameters):
     """Also after a common parameter has changed, which serves knee only: hip has its own."""
-    for joint in joints.values():
-        joint.wait(len(joint.sent))
-    assert user.call(f'{NODE}/reset', Trigger, Trigger.Request()).success
-    common = {'max_gap': 60.0, 'epsilon': 5.0}
-    estimators = {name: OnlineEstimator(common | own) for name, own in OWN.items()}
+    assert user.call('/many/estimator/reset', Trigger, Trigger.Request()).success
+    estimators = {name: OnlineEstimator(COMMON | own) for name, own in OWN.items()}
     for part in range(2):
-        begin = {name: len(joint.sent) for name, joint in joints.items()}
         for k in range(30):
-            for name, joint in joints.items():
-                y = math.nan if (k, name) == (10, 'hip') else math.sin(0.1 * k) + part + len(name)
-                joint.y.publish(Float64(data=y))
-        for name, joint in joints.items():
-            joint.wait(begin[name] + 30)
-            for stamp, message in joint.sent[begin[name] :]:
-                estimate = estimators[name].update(stamp, message.data)
-            np.testing.assert_array_equal(list(joint.state[-1].message.data), estimate.z)
+            for name, rig in rigs.items():
+                if (k, name) == (10, 'hip'):
+                    estimators[name].update(rig.send(math.nan), math.nan)
+                    continue
+                found = rig.feed(math.sin(0.1 * k) + part + len(name))
+                expected = estimators[name].update(found.stamp, rig.y[-1].message.data)
+                assert found.z == list(expected.z)
+                assert found.unknown_input == expected.unknown_input
         parameters.set(lambda_=[20.0])
         estimators['knee'].configure({'lambda': [20.0]})
 
 
-def test_topics_reports_and_services_are_each_channels_own(user, joints):
-    labels = {n: joint.state[-1].message.layout.dim[0].label for n, joint in joints.items()}
+def test_topics_reports_and_services_are_each_channels_own(rigs):
+    states = {name: rig.topics['state'][-1].message for name, rig in rigs.items()}
+    labels = {name: state.layout.dim[0].label for name, state in states.items()}
     assert labels == {'hip': 'z1,z2,z3', 'knee': 'z1,z2'}
-    reports = user.reports[NODE[1:]]
+    rigs['hip'].wait_status('state', OK)
     tasks = {f'{name} {task}' for name in OWN for task in ('input', 'observer')}
-    user.wait(lambda: reports and tasks <= set(reports[-1].statuses), 'reports of each')
-    for name in OWN:
-        assert user.call(f'{NODE}/{name}/reset', Trigger, Trigger.Request()).success
+    assert set(rigs['hip'].reports[-1].statuses) == {'state', *tasks}
+    rigs['knee'].feed(1.0)
+    assert rigs['hip'].reset().success
+    assert rigs['hip'].feed(3.0).z == [3.0, 0.0, 0.0]
+    assert rigs['knee'].feed(1.1).z[1] != 0.0
 
 
 def test_common_parameter_serves_channels_without_their_own(parameters):

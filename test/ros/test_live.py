@@ -27,16 +27,6 @@ def truth(pair, user):
     return states, inputs
 
 
-def test_rate_is_the_timers(pair, truth):
-    for topic, messages in pair.topics.items():
-
-        def at_rate(messages=messages) -> bool:
-            stamps = [m.stamp for m in messages[-100:]]
-            return np.median(np.diff(stamps)) * 1e-9 == pytest.approx(1.0 / RATE, rel=0.1)
-
-        pair.user.wait(at_rate, f'{topic} at {RATE} Hz')
-
-
 def test_state_is_labelled_and_sized(pair, truth):
     for messages in (pair.topics['state'], truth[0]):
         message = messages[-1].message

@@ -134,17 +134,6 @@ def test_publish_rate_acts_on_the_wire(fed):
         fed.user.wait(at_rate, f'rate of {rate} Hz')
 
 
-def test_parameters_and_a_reset_seed_the_start(fed):
-    fed.parameters.set(
-        start_from_measurement=False, initial_estimate=[0.1, 0.0, 0.0, 0.0],
-        initial_internal=[0.2, 0.3, 0.4, 0.0],
-    )  # fmt: skip
-    assert fed.reset().success
-    estimate = fed.feed(0.1)
-    assert estimate.z == [0.1, 0.2, 0.3]
-    assert estimate.unknown_input == 0.4
-
-
 def test_constants_are_parameters_of_their_own(user, launch):
     launch(
         'estimator', namespace='/motor', order=2, phi=['0', 'k*a + b'], inputs=['a', 'b'],
