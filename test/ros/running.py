@@ -43,7 +43,7 @@ TRIES = 4
 SECOND = 1_000_000_000
 OK, WARN, ERROR, STALE = b'\0', b'\1', b'\2', b'\3'
 QOS = QoSProfile(depth=10_000)
-LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 ESTIMATES = {
     'state': Float64MultiArray, 'unknown_input': Float64, 'gamma': Float64,
     'innovation': Float64MultiArray, 'stamp': Time,

@@ -3,6 +3,7 @@
 
 import math
 
+from builtin_interfaces.msg import Time
 import numpy as np
 import pytest
 import rclpy
@@ -272,47 +273,40 @@ def test_what_was_published_before_is_heard_if_asked_for(estimator, stranger):
 # Policies of what is published.
 
 
-def test_policies_of_estimates(user, estimator):
-    prefix = 'qos_overrides./out/estimator'
-    rig = estimator('/out', gains='self_tuning', **FED, **{
+def test_policies_of_estimates(user, launch):
+    """An estimate that nobody listens to is not made, unless its publisher keeps the last ones."""
+    node = '/out/estimator'
+    prefix = f'qos_overrides.{node}'
+    launch('estimator', namespace='/out', gains='self_tuning', **FED, **{
         f'{prefix}/state.publisher.reliability': 'best_effort',
         f'{prefix}/unknown_input.publisher.durability': 'transient_local',
         f'{prefix}/standard_deviation.publisher.depth': 7,
     })  # fmt: skip
-    infos = {
-        topic: user.node.get_publishers_info_by_topic(f'/out/estimator/{topic}')[0].qos_profile
-        for topic in ('state', 'unknown_input', 'stamp')
-    }
-    assert infos['state'].reliability == ReliabilityPolicy.BEST_EFFORT
-    assert infos['stamp'].reliability == ReliabilityPolicy.RELIABLE
-    assert infos['unknown_input'].durability == DurabilityPolicy.TRANSIENT_LOCAL
-    assert infos['stamp'].durability == DurabilityPolicy.VOLATILE
-    assert rig.parameters.get(f'{prefix}/standard_deviation.publisher.depth') == 7
-    assert rig.parameters.get(f'{prefix}/innovation.publisher.depth') == 1000
+    parameters = Parameters(user, node)
+    assert parameters.get(f'{prefix}/standard_deviation.publisher.depth') == 7
+    assert parameters.get(f'{prefix}/innovation.publisher.depth') == 1000
 
+    def policies(topic: str):
+        return user.node.get_publishers_info_by_topic(f'{node}/{topic}')[0].qos_profile
 
-def test_who_comes_later_hears_the_latched_estimates_too(user, launch):
-    """An estimate that nobody listens to is not made, unless its publisher keeps the last ones."""
-    name = '/later/estimator'
-    latched = {f'qos_overrides.{name}/gamma.publisher.durability': 'transient_local'}
-    launch('estimator', namespace='/later', **FED, **latched)
-    y = user.publisher('/later/y')
-    accepted = user.reports['later/estimator']
+    assert policies('state').reliability == ReliabilityPolicy.BEST_EFFORT
+    assert policies('stamp').reliability == ReliabilityPolicy.RELIABLE
+    assert policies('unknown_input').durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert policies('stamp').durability == DurabilityPolicy.VOLATILE
 
-    def heard() -> bool:
+    y, reports = user.publisher('/out/y'), user.reports[node[1:]]
+
+    def used() -> bool:
         y.publish(Float64(data=0.5))
-        return (
-            bool(accepted) and int(numbers(accepted[-1].statuses['input'])['samples accepted']) > 0
-        )
+        values = numbers(reports[-1].statuses['input']) if reports else {}
+        return int(values.get('samples accepted', 0)) > 0
 
-    user.wait(heard, 'accepted samples')
-    reports = len(accepted)
-    user.wait(lambda: len(accepted) > reports, 'report')
-    before = accepted[-1].stamp
-    gamma = user.record(f'{name}/gamma', Float64, LATCHED)
-    state = user.record(f'{name}/unknown_input', Float64)
-    user.wait(lambda: y.publish(Float64(data=0.5)) or (gamma and len(state) > 10), 'estimates')
-    assert gamma[0].stamp < before < state[0].stamp
+    user.wait(used, 'accepted samples')
+    before = reports[-1].stamp
+    kept = user.record(f'{node}/unknown_input', Float64, LATCHED)
+    fresh = user.record(f'{node}/stamp', Time)
+    user.wait(lambda: y.publish(Float64(data=0.5)) or (kept and len(fresh) > 10), 'estimates')
+    assert kept[0].stamp < before < fresh[0].stamp
 
 
 def test_policies_of_the_plant(user, launch):

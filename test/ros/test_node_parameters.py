@@ -305,61 +305,57 @@ def test_random_sets_hurt_nobody_and_each_refusal_has_its_reason(user, estimator
 # What the estimator is set to, on a latched topic: the text of a parameter file.
 
 
-class Told:
-    """The values on a node's topic."""
+def told(user, node: str):
+    """Return a function that waits for values on a node's topic."""
+    messages = user.record(f'{node}/parameters', String, LATCHED)
 
-    def __init__(self, user, node: str) -> None:
-        self._user, self._node = user, node
-        self._messages = user.record(f'{node}/parameters', String, LATCHED)
+    def wait(condition=lambda values: True) -> dict:
+        found = []
 
-    def wait(self, condition) -> dict:
-        self._user.wait(
-            lambda: self._messages and condition(self.latest), 'parameters on their topic'
-        )
-        return self.latest
+        def look() -> bool:
+            texts = [published.message.data for published in messages[-1:]]
+            found[:] = [loads(text, node, ESTIMATOR_PARAMETERS) for text in texts]
+            return bool(found) and condition(found[0])
 
-    @property
-    def latest(self) -> dict:
-        return loads(self._messages[-1].message.data, self._node, ESTIMATOR_PARAMETERS)
+        user.wait(look, 'parameters on their topic')
+        return found[0]
+
+    return wait
 
 
 def test_topic_tells_who_comes_late_and_every_change(user, fed):
     changes = {'epsilon': 3.5, 'gamma_rate': 0.25}
     fed.parameters.set(**changes)
-    told = Told(user, fed.name)
+    wait = told(user, fed.name)
     expected = ESTIMATOR_PARAMETERS.defaults() | FED | changes
-    assert told.wait(lambda v: v['gamma_rate'] == 0.25) == expected
+    assert wait(lambda v: v['gamma_rate'] == 0.25) == expected
     assert not fed.parameters.try_to_set('gamma_rate', -1.0).successful
     fed.parameters.set(epsilon=0.125, publish_rate=50.0)
-    values = told.wait(lambda v: v['epsilon'] != 3.5)
+    values = wait(lambda v: v['epsilon'] != 3.5)
     assert values == expected | {'epsilon': 0.125, 'publish_rate': 50.0}
 
 
 def test_channels_tell_what_is_their_own(user, launch):
     own = {'knee.epsilon': 5.0}
     launch('estimator', namespace='/told', channels=['hip', 'knee'], epsilon=3.0, **own)
-    told = Told(user, '/told/estimator')
+    wait = told(user, '/told/estimator')
     parameters = Parameters(user, '/told/estimator')
-    assert set(told.wait(lambda v: True)) - set(ESTIMATOR_PARAMETERS) == {'knee.epsilon'}
+    assert set(wait()) - set(ESTIMATOR_PARAMETERS) == {'knee.epsilon'}
     parameters.set(epsilon=2.0)  # hip follows
-    told.wait(lambda v: v['epsilon'] == 2.0)
+    wait(lambda v: v['epsilon'] == 2.0)
     parameters.set(**{'hip.gamma_rate': 0.5})
-    values = told.wait(lambda v: 'hip.gamma_rate' in v)
+    values = wait(lambda v: 'hip.gamma_rate' in v)
     assert set(values) <= set(with_channels(ESTIMATOR_PARAMETERS, ['hip', 'knee']))
     for channel, epsilon in (('hip', 2.0), ('knee', 5.0)):
         assert of_channel(values, channel)['epsilon'] == epsilon
     assert of_channel(values, 'knee')['gamma_rate'] != 0.5
 
 
-@pytest.mark.parametrize(('node', 'name'), [('estimator', 'epsilon'), ('plant', 'noise_std')])
-def test_levels_of_the_log_can_be_set(user, launch, node, name):
-    process = launch(node, namespace='/log')
-    parameters = Parameters(user, f'/log/{node}')
+def test_levels_of_the_log_can_be_set(user, fed):
     for level, value in ((LoggerLevel.LOG_LEVEL_WARN, 0.5), (LoggerLevel.LOG_LEVEL_INFO, 0.25)):
-        levels = [LoggerLevel(name=f'log.{node}', level=level)]
-        request = SetLoggerLevels.Request(levels=levels)
-        (result,) = user.call(f'/log/{node}/set_logger_levels', SetLoggerLevels, request).results
+        request = SetLoggerLevels.Request(levels=[LoggerLevel(name='fed.estimator', level=level)])
+        (result,) = user.call(f'{fed.name}/set_logger_levels', SetLoggerLevels, request).results
         assert result.successful
-        parameters.set(**{name: value})
-    user.wait(lambda: '= 0.25' in process.output, 'word of the change')
-    assert '= 0.5' not in process.output
+        fed.parameters.set(epsilon=value)
+    fed.wait_said('set epsilon = 0.25')
+    assert not fed.said('set epsilon = 0.5')
