@@ -14,35 +14,33 @@ ARGUMENTS = {
     'name': ('estimator', 'name of the node'),
     'input_topic': ('', 'topic of y; empty: as the file says, else y'),
     'input_field': ('', 'number in its messages; empty: as the file says, else the only one'),
-    'log_level': ('info', 'least severity that is logged'),
-}
-SWITCHES = {
     'use_sim_time': ('false', 'take the time from /clock'),
     'autostart': ('true', 'false: a lifecycle manager configures and activates the node'),
+    'respawn': ('false', 'start the node again, after 2 s, if it ends'),
+    'log_level': ('info', 'least severity that is logged'),
 }
 
 
 def start(context):
     """Return the node; an argument that is empty leaves the parameter to the file."""
-    names = [*ARGUMENTS, *SWITCHES]
-    given = {name: LaunchConfiguration(name).perform(context) for name in names}
+    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     path = given['params_file']
     if path and not Path(path).is_file():
         raise FileNotFoundError(f'params_file: expected a file, got {path}')
-    # Later entries win, but only over the wildcard keys (/**) that the shipped YAML uses.
-    values = {name: given[name] == 'true' for name in SWITCHES}
+    values = {name: given[name].lower() == 'true' for name in ('use_sim_time', 'autostart')}
     values |= {name: given[name] for name in ('input_topic', 'input_field') if given[name]}
-    parameters = [*([path] if path else []), values]
     return [
         Node(
             package='fhaosmo_ros',
             executable='estimator',
             name=given['name'],
             namespace=given['namespace'],
-            parameters=parameters,
+            parameters=[*([path] if path else []), values],
             ros_arguments=['--log-level', given['log_level']],
             output='screen',
             emulate_tty=True,
+            respawn=given['respawn'].lower() == 'true',
+            respawn_delay=2.0,
         )
     ]
 
@@ -52,11 +50,5 @@ def generate_launch_description():
     arguments = [
         DeclareLaunchArgument(name, default_value=default, description=text)
         for name, (default, text) in ARGUMENTS.items()
-    ]
-    arguments += [
-        DeclareLaunchArgument(
-            name, default_value=default, choices=['true', 'false'], description=text
-        )
-        for name, (default, text) in SWITCHES.items()
     ]
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])

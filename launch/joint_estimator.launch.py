@@ -7,36 +7,26 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
 
-PASSED_ON = ('params_file', 'namespace', 'name', 'input_topic', 'use_sim_time', 'log_level')
+SHARE = FindPackageShare('fhaosmo_ros')
+ARGUMENTS = {
+    'params_file': (PathJoinSubstitution([SHARE, 'config', 'joint_states.yaml']), 'YAML file'),
+    'namespace': ('', 'namespace of the node'),
+    'name': ('joint_estimator', 'name of the node'),
+    'input_topic': ('', 'empty: as the file says (joint_states)'),
+    'use_sim_time': ('false', 'take the time from /clock'),
+    'log_level': ('info', 'least severity that is logged'),
+}
 
 
 def generate_launch_description():
     """Return estimator.launch.py with the defaults for joints."""
-    share = FindPackageShare('fhaosmo_ros')
-    defaults = PathJoinSubstitution([share, 'config', 'joint_states.yaml'])
     arguments = [
-        DeclareLaunchArgument('params_file', default_value=defaults, description='YAML file'),
-        DeclareLaunchArgument('namespace', default_value='', description='namespace of the node'),
-        DeclareLaunchArgument(
-            'name', default_value='joint_estimator', description='name of the node'
-        ),
-        DeclareLaunchArgument(
-            'input_topic', default_value='', description='empty: as the file says (joint_states)'
-        ),
-        DeclareLaunchArgument(
-            'use_sim_time', default_value='false', description='take the time from /clock'
-        ),
-        DeclareLaunchArgument(
-            'log_level', default_value='info', description='least severity that is logged'
-        ),
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in ARGUMENTS.items()
     ]
-    estimator = PathJoinSubstitution([share, 'launch', 'estimator.launch.py'])
-    return LaunchDescription(
-        [
-            *arguments,
-            IncludeLaunchDescription(
-                PythonLaunchDescriptionSource(estimator),
-                launch_arguments={name: LaunchConfiguration(name) for name in PASSED_ON}.items(),
-            ),
-        ]
+    source = PythonLaunchDescriptionSource(
+        PathJoinSubstitution([SHARE, 'launch', 'estimator.launch.py'])
     )
+    passed_on = {name: LaunchConfiguration(name) for name in ARGUMENTS}.items()
+    include = IncludeLaunchDescription(source, launch_arguments=passed_on)
+    return LaunchDescription([*arguments, include])

@@ -8,7 +8,7 @@ import runpy
 import shutil
 import subprocess
 import sys
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from xml.etree import ElementTree
 
 import fhaosmo_ros
@@ -257,7 +257,7 @@ def given(monkeypatch):
     for name in ('launch', 'launch_ros'):
         for part in (
             '', '.actions', '.launch_description_sources', '.substitutions',
-            '.parameter_descriptions',
+            '.parameter_descriptions', '.conditions',
         ):  # fmt: skip
             monkeypatch.setitem(sys.modules, name + part, Stub(name + part))
     monkeypatch.setattr(Recorded, 'given', {}, raising=False)
@@ -280,60 +280,26 @@ def test_demo_launch_file_starts_both_nodes(given):
     file, arguments, entities = launch_file('demo.launch.py')
     nodes = {e.kwargs['executable']: e.kwargs for kind, e in entities if kind == 'Node'}
     assert set(arguments) == {
-        'params_file', 'namespace', 'use_sim_time', 'autostart', 'respawn', 'plotjuggler',
-        'log_level',
+        'params_file', 'namespace', 'use_sim_time', 'plotjuggler', 'log_level',
     }  # fmt: skip
-    ((share, *path),) = arguments['params_file']['default_value'].args
-    assert (share.args, path) == ((NAME,), ['config', 'demo.yaml'])
-    assert set(nodes) == {'plant', 'estimator'}
+    assert set(nodes) == {'plant', 'estimator', 'plotjuggler'}
+    ((share, folder),) = file['CONFIG'].args
+    assert (share.args, folder) == ((NAME,), 'config')
+    layout = nodes.pop('plotjuggler')['arguments'][-1]
+    for path in (arguments['params_file']['default_value'], layout):
+        ((config, *parts),) = path.args
+        assert config is file['CONFIG']
+        assert (ROOT / 'config' / Path(*parts)).is_file()
     for node in nodes.values():
         assert node['namespace'].args == ('namespace',)
         params_file, overrides = node['parameters']
         assert params_file.args == ('params_file',)
         # A bare substitution would reach the node as a string.
-        assert set(overrides) == {'use_sim_time', 'autostart'}
-        assert all(value.kwargs == {'value_type': bool} for value in overrides.values())
+        assert overrides['use_sim_time'].kwargs == {'value_type': bool}
         assert node['ros_arguments'][0] == '--log-level'
-        assert node['on_exit'] is file['end']
-        assert node['respawn'].args == ('respawn',)
-        assert node['respawn_delay'] > 0.0  # `end` is called first, and has time to end the launch
-    checks = [e.kwargs['function'] for kind, e in entities if kind == 'OpaqueFunction']
-    assert checks == [file['check_params_file'], file['plotjuggler']]
-    assert {kind for kind, _ in entities[-2:]} == {'Node'}  # behind the checks
-
-
-def test_plotjuggler_is_started_where_it_is_installed(given, tmp_path, monkeypatch):
-    function = launch_file('demo.launch.py')[0]['plotjuggler']
-    given['plotjuggler'] = 'false'
-    assert function(None) == []
-    given['plotjuggler'] = 'true'
-    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
-    with pytest.raises(RuntimeError, match='apt install ros-jazzy-plotjuggler-ros'):
-        function(None)
-    for package in ('plotjuggler', NAME):
-        index = tmp_path / 'share/ament_index/resource_index/packages'
-        index.mkdir(parents=True, exist_ok=True)
-        (index / package).touch()
-        (tmp_path / 'share' / package).mkdir()
-    (node,) = function(None)
-    layout = Path(node.kwargs['arguments'][-1]).relative_to(tmp_path / 'share' / NAME)
-    assert (ROOT / layout).is_file()
-
-
-@pytest.mark.parametrize('respawn', ['false', 'true'])
-def test_launch_ends_with_a_node_and_fails_with_one_that_failed(given, respawn):
-    """An exception in an event's handler makes `ros2 launch` exit with 1."""
-    end = launch_file('demo.launch.py')[0]['end']
-    given['respawn'] = respawn
-    ended = SimpleNamespace(process_name='plant-1', returncode=0)
-    assert type(end(ended, None)).__name__ == 'Shutdown'
-    for code in (1, 2, -11):
-        ended.returncode = code
-        if respawn == 'true' and code != 2:  # bad parameters do not become better
-            assert end(ended, None) is None
-            continue
-        with pytest.raises(RuntimeError, match=f'plant-1 ended with exit code {code}'):
-            end(ended, None)
+        assert type(node['on_exit']).__name__ == 'Shutdown'
+    kinds = [kind for kind, _ in entities[len(arguments) :]]
+    assert kinds == ['OpaqueFunction', 'Node', 'Node', 'Node']  # the check of the file first
 
 
 def test_estimator_launch_file_leaves_to_the_file_what_is_not_given(given, tmp_path):
