@@ -9,6 +9,7 @@ a rosbags typestore (``fielddefs``): by type, its constants and its fields as pa
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
+import math
 from math import asin, atan2, copysign, pi
 import re
 from typing import Any, NamedTuple
@@ -27,10 +28,11 @@ NUMBERS = frozenset({
     'bool', 'byte', 'char', 'octet', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32',
     'int64', 'uint64', 'float32', 'float64',
 })  # fmt: skip
+OF_HEADERS = ('.stamp.sec', '.stamp.nanosec')
+"""Ends of the names of numbers that nobody means if he does not say so."""
 MOST_LISTED, LONGEST_LISTED = 10, 60
 """Names that one line lists, and letters of each: a message may have thousands."""
-IDENTIFIER = r'[A-Za-z]\w*'
-SUBSCRIPT = r'\[[^\[\]]+\]'
+SUBSCRIPT = r'\[([^\[\]]+)\]'
 
 
 class Key(NamedTuple):
@@ -39,6 +41,21 @@ class Key(NamedTuple):
     name: str
     names: str
     """Field with the names, beside the list."""
+
+
+class Elements(NamedTuple):
+    """A list in the way to a number, of which the user says the element."""
+
+    length: float
+    """inf where it is not fixed."""
+    names: str
+    """Field beside it that holds the elements' names, '' if there is none."""
+
+    def element(self, text: str) -> int | Key | None:
+        """Return the element that is meant, None if there is no such one."""
+        if text.isdigit():
+            return int(text) if int(text) < self.length else None
+        return Key(text, self.names) if self.names else None
 
 
 class Field(NamedTuple):
@@ -169,100 +186,61 @@ def find_field(
         There is no such field, or it holds no number; the message lists the fields that do.
 
     """
+    known = {path: (steps, angle) for path, steps, angle in _numbers(types, message_type)}
+    usual = [path for path in known if not path.endswith(OF_HEADERS)]
+    listing = ', '.join(usual) or 'none: it holds no number'
     if not text:
-        text = 'position' if name and message_type == JOINT_STATE else None
-    if text is None:
-        text = _only_number(types, message_type)
-    found = _follow(types, message_type, text, name)
-    if found is None:
-        known = list(_numbers(types, message_type))
-        hint = suggestion(text, known)
+        if name and message_type == JOINT_STATE:
+            text = 'position'
+        elif len(usual) == 1 and '[' not in usual[0]:
+            text = usual[0]
+        elif 'data' in known:
+            text = 'data'
+        else:
+            raise ConfigurationError(
+                f'a field (input_field, --field) is needed for {message_type}: expected one of '
+                f'{listing}, got nothing'
+            )
+    path, elements = re.sub(SUBSCRIPT, '[i]', text), re.findall(SUBSCRIPT, text)
+    if path not in known and name:
+        path, elements = f'{path}[i]', [*elements, name]
+    steps, angle = known.get(path, ((None,), ''))
+    wanted = iter(elements)
+    found = [s.element(next(wanted)) if isinstance(s, Elements) else s for s in steps]
+    if None in found:
         raise ConfigurationError(
-            f'field {text!r}: expected a number in {message_type}, one of '
-            f'{", ".join(known) or "none: it holds no number"}, got {text!r}{hint}'
+            f'field {text!r}: expected a number in {message_type}, one of {listing}, got {text!r}'
+            f'{suggestion(text, usual)}'
         )
-    steps, angle = found
     fields = types[message_type][1]
     has_header = bool(fields) and tuple(fields[0][1]) == (NAME, HEADER)
-    return Field(text, steps, fields[0][0] if has_header else '', angle)
+    return Field(text, found, fields[0][0] if has_header else '', angle)
 
 
-def _only_number(types: Mapping[str, Any], message_type: str) -> str:
-    known = list(_numbers(types, message_type))
-    if len(known) == 1 and '[' not in known[0]:
-        return known[0]
-    if 'data' in known:
-        return 'data'
-    raise ConfigurationError(
-        f'a field (input_field, --field) is needed for {message_type}: expected one of '
-        f'{", ".join(known) or "none: it holds no number"}, got nothing'
-    )
-
-
-def _numbers(types: Mapping[str, Any], message_type: str, prefix: str = '') -> Iterator[str]:
-    """Yield the paths of all numbers of a type, lists with [i]."""
-    for name, (node, detail) in types[message_type][1]:
-        path = prefix + name
-        if node in (ARRAY, SEQUENCE):
-            node, detail = detail[0]
-            path += '[i]'
-        if node == NAME:
-            if detail != HEADER:
-                yield from _numbers(types, detail, f'{path}.')
-            if detail == QUATERNION:
-                yield from (f'{path}.{angle}' for angle in ANGLES)
-        elif detail[0] in NUMBERS:
-            yield path
-
-
-def _follow(
-    types: Mapping[str, Any], message_type: str, text: str, name: str
-) -> tuple[list[str | int | Key], str] | None:
-    """Return the steps to a number, and the angle; None if they lead to none."""
-    part = f'{IDENTIFIER}({SUBSCRIPT})*'
-    if not re.fullmatch(rf'{part}(\.{part})*', text):
-        return None
-    words = re.findall(rf'(?:^|\.)({IDENTIFIER})|\[([^\[\]]+)\]', text)
-    steps: list[str | int | Key] = []
-    node: Any = (NAME, message_type)
-    beside: list[Any] = []  # the fields among which the present one stands
-    for k, (word, subscript) in enumerate(words):
-        if word and node[0] == NAME and node[1] in types:
-            if node[1] == QUATERNION and word in ANGLES and k == len(words) - 1:
-                return [*steps, 'x'], word
-            beside = types[node[1]][1]
-            node = dict(beside).get(word, (None, None))
-            steps.append(word)
-        elif subscript and node[0] in (ARRAY, SEQUENCE):
-            step = _element(subscript, node, beside)
-            if step is None:
-                return None
-            steps.append(step)
-            node = node[1][0]
-        else:
-            return None
-    if node[0] in (ARRAY, SEQUENCE) and name:
-        step = _element(name, node, beside, by_name=True)
-        if step is None:
-            return None
-        steps.append(step)
-        node = node[1][0]
-    return (steps, '') if node[0] == BASE and node[1][0] in NUMBERS else None
-
-
-def _element(text: str, node: Any, beside: list[Any], by_name: bool = False) -> int | Key | None:
-    if text.isdigit() and not by_name:
-        inside = node[0] == SEQUENCE or int(text) < node[1][1]
-        return int(text) if inside else None
+def _numbers(
+    types: Mapping[str, Any], message_type: str, prefix: str = '', before: tuple[Any, ...] = ()
+) -> Iterator[tuple[str, tuple[Any, ...], str]]:
+    """Yield path, steps and angle of each number of a type; a list is [i] in a path."""
+    fields = types[message_type][1]
     names = [
         name
-        for name, (kind, detail) in beside
+        for name, (kind, detail) in fields
         if kind in (ARRAY, SEQUENCE)
-        and detail[0][0] == BASE
-        and detail[0][1][0] == 'string'
+        and (detail[0][0], detail[0][1][0]) == (BASE, 'string')
         and (name in ('name', 'names') or name.endswith('_names'))
     ]
-    return Key(text, names[0]) if names else None
+    for name, (kind, detail) in fields:
+        path, steps = prefix + name, (*before, name)
+        if kind in (ARRAY, SEQUENCE):
+            length = detail[1] if kind == ARRAY else math.inf
+            path, steps = f'{path}[i]', (*steps, Elements(length, names[0] if names else ''))
+            kind, detail = detail[0]
+        if kind == NAME:
+            yield from _numbers(types, detail, f'{path}.', steps)
+        if kind == BASE and detail[0] in NUMBERS:
+            yield path, steps, ''
+    if message_type == QUATERNION:
+        yield from ((prefix + angle, (*before, 'x'), angle) for angle in ANGLES)
 
 
 def angle_of(angle: str, x: float, y: float, z: float, w: float) -> float:

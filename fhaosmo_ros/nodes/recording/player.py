@@ -4,17 +4,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-from fhaosmo_ros.nodes.middleware.messages import message_class
+from fhaosmo_ros.nodes.middleware.messages import message_class, time_message
 from fhaosmo_ros.nodes.recording.private_node import PrivateNode
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 
-QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-LATCHED = QoSProfile(
-    depth=1000,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+DEPTH = 1000
 
 
 class Player(PrivateNode):
@@ -38,26 +33,25 @@ class Player(PrivateNode):
     def __init__(
         self, topics: dict[str, tuple[str, bool]], ros_arguments: Sequence[str] = ()
     ) -> None:
-        self.missing: list[str] = []
         super().__init__('fhaosmo_player', ros_arguments)
-        self._publish: dict[str, Any] = {}
-        self._clock = self.node.create_publisher(Clock, '/clock', 10).publish
+        self.missing: list[str] = []
+        self._publishers: dict[str, Any] = {}
+        self._clock = self.node.create_publisher(Clock, '/clock', 10)
         for topic, (message_type, latched) in topics.items():
+            qos = QoSProfile(depth=DEPTH)
+            if latched:
+                qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
             try:
                 kind = message_class(message_type)
+                self._publishers[topic] = self.node.create_publisher(kind, topic, qos)
             except LookupError:
                 self.missing.append(topic)
-                continue
-            qos = LATCHED if latched else QOS
-            self._publish[topic] = self.node.create_publisher(kind, topic, qos).publish
 
     def publish(self, topic: str, data: bytes) -> None:
         """Publish a message in CDR."""
-        if topic in self._publish:
-            self._publish[topic](data)
+        if topic in self._publishers:
+            self._publishers[topic].publish(data)
 
     def tick(self, now: int) -> None:
         """Publish the time in nanoseconds on /clock."""
-        message = Clock()
-        message.clock.sec, message.clock.nanosec = divmod(now, 1_000_000_000)
-        self._clock(message)
+        self._clock.publish(Clock(clock=time_message(now)))

@@ -4,7 +4,6 @@
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 import shlex
-from types import TracebackType
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -46,15 +45,11 @@ class PrivateNode:
         self._context = Context()
         self._clients: dict[str, AsyncParameterClient] = {}
         acting = ['--ros-args']
-        for flag, word in pairwise(ros_arguments):
-            if flag in ACTING:
-                acting += [flag, word]
+        for pair in pairwise(ros_arguments):
+            acting += pair if pair[0] in ACTING else ()
+        no_handlers = SignalHandlerOptions.NO
         try:
-            rclpy.init(
-                args=acting,
-                context=self._context,
-                signal_handler_options=SignalHandlerOptions.NO,
-            )
+            rclpy.init(args=acting, context=self._context, signal_handler_options=no_handlers)
             self.node = Node(name, context=self._context)
         except RuntimeError as error:
             raise ConfigurationError(f'ROS arguments {shlex.join(acting)}: {error}') from None
@@ -63,13 +58,8 @@ class PrivateNode:
         self._spinner = Spinner(self.node).__enter__()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._spinner.__exit__(kind, error, trace)
+    def __exit__(self, *error: object) -> None:
+        self._spinner.__exit__(*error)
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 

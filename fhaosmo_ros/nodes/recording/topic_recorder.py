@@ -93,21 +93,18 @@ class TopicRecorder(PrivateNode):
         listeners: Sequence[str] = (),
         ros_arguments: Sequence[str] = (),
     ) -> None:
+        super().__init__('fhaosmo_recorder', ros_arguments)
         self.counts: dict[str, int] = {}
         self.problems: SimpleQueue[str] = SimpleQueue()
         self.lost: dict[str, int] = {}
         self._sink, self._wanted = sink, wanted
-        self._seen: set[str] = set()
         self._begin = time_ns()
-        super().__init__('fhaosmo_recorder', ros_arguments)
         self._listeners = [self.resolved(name) for name in listeners]
+        self._seen: set[str] = set()
         for topic, message_type, transient_local in expected:
             self._seen.add(topic)
-            durability = DURABILITIES[transient_local]
-            qos = QoSProfile(depth=DEPTH, durability=durability)
-            limit = self._begin - OLD if transient_local else 0
-            receive = self._callback(topic, topic not in SHARED, limit)
-            self._subscribe(topic, message_class(message_type), receive, qos)
+            qos = QoSProfile(depth=DEPTH, durability=DURABILITIES[transient_local])
+            self._subscribe(topic, message_class(message_type), qos, True, transient_local)
 
     def __enter__(self) -> 'TopicRecorder':
         if self._wanted is not None:
@@ -122,8 +119,8 @@ class TopicRecorder(PrivateNode):
             if topic in self._seen or not (topic in inputs or self._wanted(topic)):
                 continue
             publishers = self.node.get_publishers_info_by_topic(topic)
-            publishers = [p for p in publishers if p.node_name != self.node.get_name()]
-            if not publishers:
+            profiles = [p.qos_profile for p in publishers if p.node_name != self.node.get_name()]
+            if not profiles:
                 continue
             self._seen.add(topic)  # also if it can't be recorded
             try:
@@ -131,30 +128,19 @@ class TopicRecorder(PrivateNode):
             except LookupError as error:
                 self.problems.put(f'{topic}: {error}')
                 continue
-            profiles = [p.qos_profile for p in publishers]
             qos = _matching(profiles)
-            transient_local = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
             # Measured samples keep their stamps, even those of a clock that is wrong.
-            limit = self._begin - OLD if transient_local and topic not in inputs else 0
-            numbered = len(publishers) == 1 and topic not in SHARED
+            bounded = qos.durability == DURABILITIES[True] and topic not in inputs
             self._sink(NewTopic(topic, types[0], [_plain(p) for p in profiles]))
-            self._subscribe(topic, kind, self._callback(topic, numbered, limit), qos)
+            self._subscribe(topic, kind, qos, len(profiles) == 1, bounded)
 
-    def _subscribe(self, topic: str, kind: Any, receive: Any, qos: QoSProfile) -> None:
-        self.counts[topic] = 0
-        subscribe_with_info(self.node, kind, topic, receive, qos, raw=True)
-
-    def _inputs(self) -> set[str]:
-        found = set()
-        for listener in self._listeners:
-            space, _, name = listener.rpartition('/')
-            with suppress(NodeNameNonExistentError):  # not there yet
-                topics = self.node.get_subscriber_names_and_types_by_node(name, space or '/')
-                found |= {topic for topic, _ in topics}
-        return found
-
-    def _callback(self, topic: str, numbered: bool, limit: int) -> Any:
-        latest = 0
+    def _subscribe(
+        self, topic: str, kind: Any, qos: QoSProfile, numbered: bool, bounded: bool
+    ) -> None:
+        """Record a topic; numbered: of one publisher; bounded: no stamp is older than `OLD`."""
+        self.counts[topic] = latest = 0
+        numbered = numbered and topic not in SHARED
+        earliest = self._begin - OLD if bounded else 0
 
         def receive(data: bytes, info: Mapping[str, int]) -> None:
             nonlocal latest
@@ -166,10 +152,19 @@ class TopicRecorder(PrivateNode):
                 number = 2**63
             latest = max(latest, number)
             stamp = info['source_timestamp'] or info['received_timestamp']
-            self._sink(Sample(topic, stamp if stamp >= limit else self._begin, data))
+            self._sink(Sample(topic, stamp if stamp >= earliest else self._begin, data))
             self.counts[topic] += 1
 
-        return receive
+        subscribe_with_info(self.node, kind, topic, receive, qos, raw=True)
+
+    def _inputs(self) -> set[str]:
+        found = set()
+        for listener in self._listeners:
+            space, _, name = listener.rpartition('/')
+            with suppress(NodeNameNonExistentError):  # not there yet
+                topics = self.node.get_subscriber_names_and_types_by_node(name, space or '/')
+                found |= {topic for topic, _ in topics}
+        return found
 
 
 def _matching(profiles: list[QoSProfile]) -> QoSProfile:
@@ -185,13 +180,12 @@ def _matching(profiles: list[QoSProfile]) -> QoSProfile:
 
 def _plain(profile: QoSProfile) -> dict[str, Any]:
     """Return a QoS as names and numbers."""
-    return {
-        'history': profile.history.name,
-        'depth': profile.depth,
-        'reliability': profile.reliability.name,
-        'durability': profile.durability.name,
-        'deadline': profile.deadline.nanoseconds,
-        'lifespan': profile.lifespan.nanoseconds,
-        'liveliness': profile.liveliness.name,
-        'liveliness_lease_duration': profile.liveliness_lease_duration.nanoseconds,
+    names = {
+        name: getattr(profile, name).name
+        for name in ('history', 'reliability', 'durability', 'liveliness')
     }
+    times = {
+        name: getattr(profile, name).nanoseconds
+        for name in ('deadline', 'lifespan', 'liveliness_lease_duration')
+    }
+    return {'depth': profile.depth, **names, **times}
