@@ -4,16 +4,11 @@
 import atexit
 from collections.abc import Iterator
 import contextlib
-import math
-import os
 import select
 import signal
 import socket
-import threading
 from types import FrameType
 
-LOOK = 0.05
-"""Seconds between two looks at whether a block has ended."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """What ends a node or a command."""
 
@@ -46,8 +41,7 @@ class Stop:
     def __init__(self) -> None:
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
-        self._set = False
-        self._raises = False
+        self._set = self._raises = False
 
     def wake_on_signals(self) -> None:
         """Let signals end a wait; in the main thread only."""
@@ -67,31 +61,15 @@ class Stop:
             raise Stopped
 
     @contextlib.contextmanager
-    def raising(self, patience: float = math.inf) -> Iterator[None]:
-        """
-        Let the first signal interrupt the block; for long work that leaves nothing behind.
-
-        Python takes a signal between two of its instructions only, and a call of a library can
-        last for seconds: where the block has not ended `patience` seconds after the signal, the
-        process ends here, with exit code 0.
-        """
+    def raising(self) -> Iterator[None]:
+        """Let the first signal interrupt the block; for long work that leaves nothing behind."""
         self._raises = True
-        left = threading.Event()
-        if patience < math.inf:
-            threading.Thread(target=self._watch, args=(left, patience), daemon=True).start()
         try:
             if self._set:
                 raise Stopped
             yield
         finally:
             self._raises = False
-            left.set()
-
-    def _watch(self, left: threading.Event, patience: float) -> None:
-        while not left.is_set():
-            ready, _, _ = select.select([self._reader], [], [], LOOK)
-            if ready and not left.wait(patience):
-                os._exit(0)
 
     def is_set(self) -> bool:
         """Return True once `set` has been called."""
@@ -111,8 +89,7 @@ def stop_on_signals() -> Stop:
     """
     Make the signals that end a process set the returned event, from now to the process's end.
 
-    They raise nothing (but see `Stop.raising`), so a second Ctrl-C can't interrupt the clean-up
-    that the first one began.
+    They raise nothing outside of `Stop.raising`: a second Ctrl-C can't interrupt the clean-up.
     """
     stop = Stop()
     for number in ending_signals():

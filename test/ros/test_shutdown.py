@@ -2,8 +2,6 @@
 """Signals end a node cleanly, whenever they come."""
 
 import signal
-import subprocess
-import sys
 import time
 
 from fhaosmo_ros.stop_signals import Stop, Stopped
@@ -126,22 +124,3 @@ def test_a_signal_cuts_only_what_may_be_cut_and_only_once():
     quiet = Stop()
     quiet.signal()
     assert quiet.wait(0.0)
-
-
-IN_A_LIBRARY = """
-import ctypes, signal
-from threading import Timer
-from fhaosmo_ros.stop_signals import stop_on_signals
-
-with stop_on_signals().raising(0.2):
-    # In the timer's thread, so that the system call of this one goes on.
-    Timer(0.5, signal.raise_signal, (signal.SIGTERM,)).start()
-    ctypes.CDLL(None).sleep(3600)
-    print('ended')
-"""
-
-
-def test_what_python_cannot_interrupt_ends_too():
-    command = [sys.executable, '-c', IN_A_LIBRARY]
-    ended = subprocess.run(command, capture_output=True, timeout=60.0, check=False)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (0, b'', b'')

@@ -145,7 +145,7 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
     node = None
     origins: dict[str, str | None] = {}
     try:
-        with ended.raising(GRACE):  # one import can last for a second
+        with ended.raising():
             given, origins, rest = read_arguments(name, argv)
             rclpy.init(args=[name, *rest], signal_handler_options=SignalHandlerOptions.NO)
             node = factory(given)
