@@ -5,6 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from math import isfinite
 from time import perf_counter, time_ns
+from typing import Any
 
 from fhaosmo_ros.core.observer.status import REJECTED, Status, UNUSED
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
@@ -19,10 +20,17 @@ from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, WARN
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
-TOLD = REJECTED | int(Status.RESTARTED | Status.DIVERGED | Status.JUMPED)
-"""Flags of a step that are logged."""
+NEWS = int(Status.RESTARTED | Status.DIVERGED | Status.JUMPED)
+"""Flags of a step that are logged beside those of a rejected sample."""
 QUIET = 5.0
 """Seconds between two warnings of one kind."""
+UNPAIRED = {
+    'late': 'late inputs, which came after their sample had been used: raise known_input_wait, or '
+    'their header stamps are of another clock',
+    'ahead': 'samples before any input, whose stamps are all later: are the header stamps of one '
+    'clock?',
+}
+"""What is said of known inputs and samples that do not find each other."""
 
 
 class Channel:
@@ -30,23 +38,8 @@ class Channel:
     Takes y and the known inputs out of messages, steps the observer, publishes the estimates.
 
     A new channel is inactive: its topics and services exist, but samples are dropped and nothing
-    is published.
-
-    Parameters
-    ----------
-    node : Node
-        Owns the topics and the services.
-    values : Parameters
-        Those of an estimator node, as they are for this channel.
-    estimator : OnlineEstimator
-        Made with `values`.
-    sources : Sources
-        Of the node. They are not open yet.
-    estimated : callable
-        Called with the channel for each sample that was used.
-    name : str
-        Of the channel: in its topics and services, its reports and its log; '' without names.
-
+    is published. `estimated` is called with the channel for each sample that was used; `name` is
+    in its topics, services, reports and log, '' without names.
     """
 
     def __init__(
@@ -66,6 +59,7 @@ class Channel:
         self._values = values
         self._active = False
         self._lost_before = 0
+        self._unpaired: dict[str, int] = {}
         self._forget()
         observer = estimator.observer
         prefix = f'~/{name}/' if name else '~/'
@@ -93,7 +87,6 @@ class Channel:
         self._forget()
         if self._pairing is not None:
             self._pairing.forget_samples()
-            self._unpaired = self._pairing.late, self._pairing.ahead
         self._lost_before = self._y.source.lost
         self._active = True
         if self.estimator.events.on:
@@ -136,22 +129,13 @@ class Channel:
         return reports
 
     def _report_pairing(self, report: Report) -> None:
-        before, now = self._unpaired, (self._pairing.late, self._pairing.ahead)
-        self._unpaired = now
-        report.values |= {'late inputs': now[0], 'samples before any input': now[1]}
-        late, ahead = (b - a for a, b in zip(before, now, strict=True))
-        if late:
-            report.find(
-                WARN,
-                f'{late} known inputs came after their sample had been used: raise '
-                'known_input_wait, or their header stamps are of another clock',
-            )
-        if ahead:
-            report.find(
-                WARN,
-                f'{ahead} samples are older than every known input: are their header stamps of '
-                'one clock?',
-            )
+        for name, text in UNPAIRED.items():
+            count = getattr(self._pairing, name)
+            report.values[text.partition(',')[0]] = count
+            news = count - self._unpaired.get(name, 0)
+            self._unpaired[name] = count
+            if news:
+                report.find(WARN, f'{news} {text}')
 
     def _forget(self) -> None:
         self._arrived = False
@@ -159,7 +143,6 @@ class Channel:
         self._quiet_until: dict[int, float] = {}
         self._silent_since: int | None = None
         self._waits_since = 0.0
-        self._unpaired = 0, 0
 
     def _on_sample(self, stamp: int, y: float, source: int) -> None:
         """Take a sample; `source` is when its message was published (all times in ns)."""
@@ -205,7 +188,7 @@ class Channel:
             health.latest = now
             health.stamps.append(stamp)
             health.unknown_inputs.append(estimator.observer.unknown_input)
-        if word & TOLD:
+        if word & (REJECTED | NEWS):
             self._tell(word, stamp, y)
         if estimator.events.waiting:
             self._tell_events()
@@ -221,36 +204,51 @@ class Channel:
                 self._logger.warning(f'event: {text}', throttle_duration_sec=QUIET)
 
     def _tell(self, word: int, stamp: int, y: float) -> None:
-        counters = self.estimator.counters
-        if word & Status.RESTARTED:
-            self._logger.warning(
-                'the stamps jumped by more than max_gap, ahead or back: restarted from the new one'
-                f' ({counters.restarts_forward + counters.restarts_backward} restarts so far); '
-                'where y always comes so slowly, set max_gap to several of its periods',
-                throttle_duration_sec=QUIET,
-            )
-        if word & Status.DIVERGED:
-            self._logger.error(
+        """Log what became of a sample, each kind at most every `QUIET` seconds."""
+        counters, offset = self.estimator.counters, self.estimator.offset
+        late = 'expected a stamp later than the one before'
+        if not stamp and self._values['sampling'] != 'clock':
+            hint = '; input_stamp: source does without it' if self._y.stamps == 'header' else ''
+            late = f'its {self._y.stamps} stamp is 0: nobody fills it{hint}'
+        jumped = 'z1 follows it, the other estimates go on'
+        if offset:
+            jumped = f'the model contradicts it: y is taken as {offset:.4g} too large'
+        restarts = counters.restarts_forward + counters.restarts_backward
+        flag, text = next((flag, text) for flag, text in (
+            (
+                Status.RESTARTED,
+                'the stamps jumped by more than max_gap, ahead or back: restarted from the new '
+                f'one ({restarts} restarts so far); where y always comes so slowly, set max_gap to '
+                'several of its periods',
+            ),
+            (
+                Status.DIVERGED,
                 'the observer had lost y and started again from it; its gains do not fit '
                 f'({counters.divergences} divergences so far)',
-                throttle_duration_sec=QUIET,
-            )
-        if word & Status.JUMPED:
-            offset = self.estimator.offset
-            then = f'the model contradicts it: y is taken as {offset:.4g} too large'
-            self._logger.warning(
-                f'y jumped; {then if offset else "z1 follows it, the other estimates go on"}'
-                f' ({counters.jumps} jumps so far)',
-                throttle_duration_sec=QUIET,
-            )
-        elif word & REJECTED:
-            flag, reason = self._reason(word, stamp, y)
-            now = perf_counter()
-            if now >= self._quiet_until.get(flag, 0.0):  # each reason by itself
-                self._quiet_until[flag] = now + QUIET
-                self._logger.warning(
-                    f'rejected a sample: {reason} ({counters.rejected} rejected so far)'
-                )
+            ),
+            (Status.JUMPED, f'y jumped; {jumped} ({counters.jumps} jumps so far)'),
+            (
+                Status.HELD,
+                'its stamp lies more than max_gap from the one before; the next one decides',
+            ),
+            (Status.REJECTED_PERIOD, late),
+            (Status.REJECTED_SPIKE, f'y = {y} lies beyond spike_gate'),
+            (Status.REJECTED_STUCK, f'y = {y} repeats itself: its sensor is stuck'),
+            (
+                Status.REJECTED_MEASUREMENT,
+                f'expected a finite y of at most divergence_limit, got {y}',
+            ),
+            (REJECTED, f'y = {y} would have made the estimate infinite'),
+        ) if word & flag)  # fmt: skip
+        if not flag & NEWS:
+            text = f'rejected a sample: {text} ({counters.rejected} rejected so far)'
+        now = perf_counter()
+        if now >= self._quiet_until.get(flag, 0.0):
+            self._quiet_until[flag] = now + QUIET
+            if flag == Status.DIVERGED:
+                self._logger.error(text)
+            else:
+                self._logger.warning(text)
 
     def _on_input(self, index: int, name: str, stamp: int, u: float, _: int) -> None:
         if self._pairing is not None and isfinite(u):
@@ -298,39 +296,16 @@ class Channel:
         """Start the observer afresh with the next sample."""
         self.estimator.reset()
         self._snapshots.reset()
-        response.success = True
-        response.message = 'the observer starts afresh with the next sample'
-        self._logger.info(f'reset: {response.message}')
-        return response
+        return self._done(response, 'reset: the observer starts afresh with the next sample')
 
     def freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         """Hold gamma, or let it adapt again."""
         self.estimator.freeze(request.data)
         self._snapshots.changed()
-        response.success = True
-        response.message = 'gamma is held' if request.data else 'gamma adapts again'
-        self._logger.info(f'freeze: {response.message}')
-        return response
+        text = 'gamma is held' if request.data else 'gamma adapts again'
+        return self._done(response, f'freeze: {text}')
 
-    def _reason(self, word: int, stamp: int, y: float) -> tuple[int, str]:
-        """Return the flag that says why a sample was rejected, and the reason in words."""
-        late = 'expected a stamp later than the one before'
-        if not stamp and self._values['sampling'] != 'clock':
-            hint = '; input_stamp: source does without it' if self._y.stamps == 'header' else ''
-            late = f'its {self._y.stamps} stamp is 0: nobody fills it{hint}'
-        for flag, text in (
-            (
-                Status.HELD,
-                'its stamp lies more than max_gap from the one before; the next tells',
-            ),
-            (Status.REJECTED_PERIOD, late),
-            (Status.REJECTED_SPIKE, f'y = {y} lies beyond spike_gate'),
-            (Status.REJECTED_STUCK, f'y = {y} repeats itself: its sensor is stuck'),
-            (
-                Status.REJECTED_MEASUREMENT,
-                f'expected a finite y of at most divergence_limit, got {y}',
-            ),
-        ):
-            if word & flag:
-                return int(flag), text
-        return int(Status.REJECTED_STEP), f'y = {y} would have made the estimate infinite'
+    def _done(self, response: Any, text: str) -> Any:
+        response.success, response.message = True, text.partition(': ')[2]
+        self._logger.info(text)
+        return response
