@@ -218,8 +218,8 @@ class Channel:
             (
                 Status.RESTARTED,
                 'the stamps jumped by more than max_gap, ahead or back: restarted from the new '
-                f'one ({restarts} restarts so far); where y always comes so slowly, set max_gap to '
-                'several of its periods',
+                f'one ({restarts} restarts so far); where y always comes so slowly, set max_gap '
+                'to several of its periods',
             ),
             (
                 Status.DIVERGED,

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The channels of an estimator node, one or many: their timer and their common messages."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
+from typing import Any
 
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
@@ -29,13 +31,9 @@ class Channels:
     values : Parameters
         Of the node, the channels' own ones included.
     estimators : mapping of str to OnlineEstimator
-        As `make_estimators` returns them.
+        By the names of the channels.
     sources : Sources
         Of the node. They are not open yet.
-
-    Attributes
-    ----------
-    channels : list of Channel
 
     """
 
@@ -56,8 +54,8 @@ class Channels:
             for name, estimator in estimators.items()
         ]
         sources.after_message = self._publish_typed
-        node.create_service(Trigger, '~/reset', self._reset)
-        node.create_service(SetBool, '~/freeze', self._freeze)
+        node.create_service(Trigger, '~/reset', partial(self._each_answers, 'reset'))
+        node.create_service(SetBool, '~/freeze', partial(self._each_answers, 'freeze'))
         self._timer = node.create_timer(1.0 / values['publish_rate'], self._tick)
         self._timer.cancel()
 
@@ -74,15 +72,7 @@ class Channels:
             channel.deactivate()
 
     def prepare(self, values: Parameters) -> list[ChannelChange]:
-        """
-        Return what `adopt` takes to go on with other live parameters; change nothing.
-
-        Raises
-        ------
-        ConfigurationError
-            They do not fit together in one of the channels.
-
-        """
+        """Return what `adopt` takes, or raise ConfigurationError with the channel's name."""
         changes = []
         for channel in self.channels:
             own = of_channel(values, channel.name)
@@ -126,32 +116,10 @@ class Channels:
             self._typed.publish(list(self._outputs.values()))
             self._outputs.clear()
 
-    def _reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _each_answers(self, name: str, request: Any, response: Any) -> Any:
         for channel in self.channels:
-            channel.reset(request, response)
+            getattr(channel, name)(request, response)
         return response
-
-    def _freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        for channel in self.channels:
-            channel.freeze(request, response)
-        return response
-
-
-def make_estimators(values: Parameters, names: Iterable[str]) -> dict[str, OnlineEstimator]:
-    """
-    Return the estimators of an estimator node by the names of its channels.
-
-    Raises
-    ------
-    ConfigurationError
-        Values that do not fit together, with the name of the channel.
-
-    """
-    estimators = {}
-    for name in names:
-        with naming_channel(name):
-            estimators[name] = OnlineEstimator(of_channel(values, name))
-    return estimators
 
 
 @contextmanager

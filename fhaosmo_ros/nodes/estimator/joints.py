@@ -14,18 +14,11 @@ from rclpy.node import Node
 MOST_KNOWN = 1000
 """After so many names, new ones are neither looked at nor told any more."""
 QUIET = 5.0
-"""Seconds between two warnings of one kind."""
+"""Seconds between two warnings of joints that have come late."""
 
 
 class Joints:
-    """
-    Checks and bounds the names in messages, and tells of each kind of problem in one line.
-
-    Parameters
-    ----------
-    node : Node
-
-    """
+    """Checks and bounds the names in messages, and tells of each kind of problem in one line."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -43,45 +36,40 @@ class Joints:
 
     def choose(self, names: Iterable[str], most: int) -> list[str]:
         """Return those names of the first message that become channels, at most so many."""
-        fit, bad, reason = [], [], ''
+        fit: list[str] = []
+        bad: dict[str, str] = {}
         for name in names:
             try:
                 channel_names({CHANNELS: [name or '?']})  # '' is no channel's name
                 full_name(self._node, f'~/{name}/{STANDARD_DEVIATION}')  # its longest topic
                 fit.append(name)
             except ConfigurationError as error:
-                bad.append(name)
-                reason = reason or shorten(str(error), 200)
+                bad[name] = shorten(str(error), 200)
         if bad:
-            self._logger.error(
-                f"{self._leave_out(bad)} can't be the name of a channel ({reason}); name a "
-                'channel and set its input_field to position[NAME]'
-            )
+            why = f"can't be the name of a channel ({next(iter(bad.values()))})"
+            hint = 'name a channel and set its input_field to position[NAME]'
+            self._logger.error(f'{self._leave_out(list(bad))} {why}; {hint}')
         if fit[most:]:
-            self._logger.error(
-                f'{self._leave_out(fit[most:])} beyond max_channels ({most}); raise '
-                'it, or name in channels those that are to be estimated'
-            )
+            why = f'beyond max_channels ({most})'
+            hint = 'raise it, or name in channels those that are to be estimated'
+            self._logger.error(f'{self._leave_out(fit[most:])} {why}; {hint}')
         return fit[:most]
 
     def refuse(self, names: list[str]) -> None:
         """Tell that names have come too late to become channels."""
-        self._logger.warning(
-            f'{self._leave_out(names)} has come after the first message; start the node again to '
-            'take it',
-            throttle_duration_sec=QUIET,
-        )
+        why = 'has come after the first message; start the node again to take it'
+        self._logger.warning(f'{self._leave_out(names)} {why}', throttle_duration_sec=QUIET)
 
     def _leave_out(self, names: list[str]) -> str:
         self._left_out += names
-        return f'left out: {_in_words(names)}'
+        return _in_words(names)
 
     @property
     def problem(self) -> str:
         """What is left out, in words; '' for nothing."""
-        return f'left out: {_in_words(self._left_out)}' if self._left_out else ''
+        return _in_words(self._left_out) if self._left_out else ''
 
 
 def _in_words(names: list[str]) -> str:
     count = 'joint' if len(names) == 1 else f'{len(names)} joints'
-    return f'{count} {listed(map(repr, names))}'
+    return f'left out: {count} {listed(map(repr, names))}'

@@ -18,7 +18,7 @@ from fhaosmo_ros.core.parameters.per_channel import (
 )
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
-from fhaosmo_ros.nodes.estimator.channels import Channels, make_estimators
+from fhaosmo_ros.nodes.estimator.channels import Channels, naming_channel
 from fhaosmo_ros.nodes.estimator.joints import Joints
 from fhaosmo_ros.nodes.estimator.parameter_topic import ParameterTopic
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
@@ -109,10 +109,12 @@ class EstimatorNode(ManagedNode):
             for name in names
             for topic in [*estimates_of(own[name]), EVENT]
         ])  # fmt: skip
-        estimators = make_estimators(values, names)
-        for name, estimator in estimators.items():
-            known = known_inputs(own[name], estimator.observer.used_inputs, name)
-            check_inputs(self, [measured_output(own[name], name), *known.values()])
+        estimators = {}
+        for name, mine in own.items():
+            with naming_channel(name):
+                estimators[name] = OnlineEstimator(mine)
+            known = known_inputs(mine, estimators[name].observer.used_inputs, name)
+            check_inputs(self, [measured_output(mine, name), *known.values()])
         check_axes(values['typed_outputs'], {name: own[name] for name in self._names})
         return estimators
 

@@ -19,18 +19,10 @@ ERROR, STALE = DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 
 
 class Report:
-    """
-    One status of /diagnostics: values, findings, and the worst level of the findings.
-
-    Parameters
-    ----------
-    task : str
-        What it is about; its name is 'node: task'.
-
-    """
+    """One status of /diagnostics, 'node: task': values, findings, and the worst level of these."""
 
     def __init__(self, task: str) -> None:
-        self.task = task
+        self._task = task
         self.values: dict[str, Any] = {}
         self._level = OK
         self._findings: list[str] = []
@@ -44,25 +36,18 @@ class Report:
         """Return the status message."""
         return DiagnosticStatus(
             level=self._level,
-            name=f'{node}: {self.task}',
+            name=f'{node}: {self._task}',
             message='; '.join(self._findings) or 'OK',
             hardware_id=hardware_id,
-            values=[KeyValue(key=k, value=_text(v)) for k, v in self.values.items()],
+            values=[
+                KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else str(value))
+                for key, value in self.values.items()
+            ],
         )
 
 
 class DiagnosticsPublisher:
-    """
-    Publishes a node's reports.
-
-    Parameters
-    ----------
-    reports : callable
-        Returns the present reports.
-    period : float
-        Seconds between two, of the host's steady clock.
-
-    """
+    """Publishes what `reports` returns each `period` seconds of the host's steady clock."""
 
     def __init__(
         self,
@@ -84,7 +69,3 @@ class DiagnosticsPublisher:
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.status = [r.message(name, self.hardware_id) for r in self._reports()]
         self._publisher.publish(message)
-
-
-def _text(value: Any) -> str:
-    return f'{value:.6g}' if isinstance(value, float) else str(value)

@@ -40,13 +40,10 @@ def descriptor(
     parameter: Parameter, read_only: bool, values: Mapping[str, Any]
 ) -> ParameterDescriptor:
     """
-    Return the ROS descriptor of a declared parameter.
-
-    It says the unit of y where `values` have one and the parameter is in that unit.
+    Return the ROS descriptor of a declared parameter; it says the unit of y where `values` do.
 
     Typing is dynamic so that a wrong type reaches our own check, whose message names the
-    parameter; the check accepts no other type. Bounds are a ROS range only where a slider of
-    rqt_reconfigure makes sense; our own check holds all of them.
+    parameter. Bounds are a ROS range only where a slider of rqt_reconfigure makes sense.
     """
     constraints = [parameter.allowed]
     if parameter.lengths:
@@ -67,27 +64,16 @@ def descriptor(
         read_only=read_only,
         dynamic_typing=True,
     )
+    bounds = {'from_value': parameter.lower, 'to_value': parameter.upper}
     if parameter.slider and parameter.kind == 'double':
-        result.floating_point_range = [
-            FloatingPointRange(from_value=float(parameter.lower), to_value=float(parameter.upper))
-        ]
+        result.floating_point_range = [FloatingPointRange(**bounds)]
     elif parameter.slider:
-        result.integer_range = [
-            IntegerRange(from_value=int(parameter.lower), to_value=int(parameter.upper))
-        ]
+        result.integer_range = [IntegerRange(**bounds)]
     return result
 
 
 def built_in(given: Mapping[str, Any]) -> list[RosParameter]:
-    """
-    Return those given parameters that are rclpy's own, such as use_sim_time.
-
-    Raises
-    ------
-    ConfigurationError
-        One that is no single value.
-
-    """
+    """Return those given parameters that are rclpy's own, such as use_sim_time."""
     for name, value in given.items():
         if is_built_in(name) and not isinstance(value, bool | int | float | str):
             raise ConfigurationError(f"parameter '{name}': expected one value, got {shown(value)}")
@@ -106,14 +92,9 @@ class NodeParameters:
     ----------
     node : Node
     values : Parameters
-        Checked and complete.
+        Checked and complete; later the present ones.
     fixed : iterable of str
         Parameters that can't change in any state of the node.
-
-    Attributes
-    ----------
-    values : Parameters
-        The present values.
 
     """
 

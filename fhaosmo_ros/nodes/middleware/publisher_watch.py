@@ -12,20 +12,12 @@ UNKNOWN = '_NODE_NAME_UNKNOWN_'
 
 
 class Publishers(NamedTuple):
-    """
-    The publishers of a topic.
-
-    Attributes
-    ----------
-    heard : dict of tuple to str
-        Node names of those that can be heard, by the publisher's gid.
-    unheard : dict of tuple to str
-        For each of the others, a sentence that names the node and says what to do about it.
-
-    """
+    """The publishers of a topic, by their gid."""
 
     heard: dict[tuple[int, ...], str]
+    """Node names of those that can be heard."""
     unheard: dict[tuple[int, ...], str]
+    """For each of the others, a sentence that names the node and says what to do about it."""
 
 
 class PublisherWatch:
@@ -33,15 +25,13 @@ class PublisherWatch:
     Looks at the publishers of a subscription's topic, and logs what has changed.
 
     The middleware has an event for incompatible QoS, but it does not name the publisher, and there
-    is none for another message type. The ROS graph has both; asking it takes 50 µs a second.
+    is none for another message type. The ROS graph has both.
     """
 
     def __init__(self, node: Node, subscription: Any) -> None:
-        self._node = node
+        self._node, self._topic = node, subscription.topic_name
         self._logger = node.get_logger()
-        self._topic = subscription.topic_name
-        self._type = type_name(subscription.msg_type)
-        self._qos = subscription.qos_profile
+        self._type, self._qos = type_name(subscription.msg_type), subscription.qos_profile
         self._seen = Publishers({}, {})
         self._last: dict[tuple[int, ...], str] = {}
         self._nameless: set[tuple[int, ...]] = set()

@@ -39,16 +39,14 @@ class Spinner:
     """
     Runs an executor in a thread of its own while it is open.
 
-    The usual main (`rclpy.init`, ``executor.spin()``, except KeyboardInterrupt) does not work with
-    the events executor of the PyPI wheels (rclpy 7.1): on SIGINT and SIGTERM it hung 24 times of
-    24, and its `spin` without a timeout runs no callback. So the executor spins in this thread,
-    with a finite timeout and until a future is done; the main thread waits for signals, because
-    Python runs signal handlers there only; `wake` makes the executor look at the future.
+    The usual main (`rclpy.init`, ``executor.spin()``, except KeyboardInterrupt) hangs on SIGINT
+    with the events executor of rclpy 7.1. So the executor spins in this thread until a future is
+    done; the main thread waits for signals, because Python runs signal handlers there only; `wake`
+    makes the executor look at the future.
 
     Parameters
     ----------
-    *nodes : Node
-        All of one context.
+    node : Node
     on_end : callable
         Called in the executor's thread when it ends, also by the error of a callback.
 
@@ -59,15 +57,14 @@ class Spinner:
 
     """
 
-    def __init__(self, *nodes: Node, on_end: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, node: Node, on_end: Callable[[], None] = lambda: None) -> None:
         self.error: BaseException | None = None
         self._on_end = on_end
-        self._logger = nodes[0].get_logger()
+        self._logger = node.get_logger()
         # At 1 kHz the events executor takes a fifth of the CPU of the single-threaded one.
         kind = EventsExecutor or SingleThreadedExecutor
-        self._executor = kind(context=nodes[0].context)
-        for node in nodes:
-            self._executor.add_node(node)
+        self._executor = kind(context=node.context)
+        self._executor.add_node(node)
         self._stop = Future()
         self._thread = threading.Thread(target=self._spin, name='executor', daemon=True)
 
@@ -118,8 +115,7 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
     Run a node until SIGINT, SIGTERM or SIGHUP.
 
     rclpy's own signal handlers are off: SIGINT would come out of the events executor as a
-    RuntimeError, and a second Ctrl-C would cut the clean-up short. See `Spinner` and
-    `stop_on_signals`.
+    RuntimeError, and a second Ctrl-C would cut the clean-up short.
 
     Parameters
     ----------
