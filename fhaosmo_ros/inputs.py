@@ -21,29 +21,18 @@ BACK = 0.5
 
 
 class Input(NamedTuple):
-    """
-    A number that an estimator reads.
-
-    Attributes
-    ----------
-    topic : str
-        As the user wrote it: relative to the node's namespace, unless it begins with /.
-    message_type : str
-        '' if it is the one that the topic has.
-    field : str
-        '' for the only number.
-    stamp : str
-        auto, header, source or reception; of a known input header or reception.
-    name : str
-        Of the channel: the element of a list that is meant where the field has no index.
-
-    """
+    """A number that an estimator reads."""
 
     topic: str
+    """As the user wrote it: relative to the node's namespace, unless it begins with /."""
     message_type: str
+    """'' if it is the one that the topic has."""
     field: str
+    """'' for the only number."""
     stamp: str
+    """auto, header, source or reception; of a known input header or reception."""
     name: str
+    """Of the channel: the element of a list that is meant where the field has no index."""
 
     def absolute(self, namespace: str) -> str:
         """Return the topic's full name in a namespace such as '/rig' ('' or '/' for none)."""
@@ -74,14 +63,12 @@ def measured_output(values: Mapping[str, Any], channel: str = '') -> Input:
         Its name, '' without named channels.
 
     """
-    get = _values(values)
-    topic, kind, field = get('input_topic'), get('input_type'), get('input_field')
-    stamp = get('input_stamp')
-    if stamp == 'auto' and 'header' in get('known_input_stamps'):
+    topic, kind, field, stamp = (
+        _value(values, f'input_{part}') for part in ('topic', 'type', 'field', 'stamp')
+    )
+    if stamp == 'auto' and 'header' in _value(values, 'known_input_stamps'):
         stamp = 'header'
-    if not (topic or kind or field):
-        kind = FLOAT
-    return Input(topic or _below(channel, 'y'), kind, field, stamp, channel)
+    return _input('y', topic, kind, field, stamp, channel)
 
 
 def known_inputs(
@@ -104,22 +91,17 @@ def known_inputs(
         stamp where y is not.
 
     """
-    get = _values(values)
-    stamps = CHANNEL_PARAMETERS['known_input_stamps']
-    if 'header' in get(stamps.name) and get('input_stamp') not in ('auto', 'header'):
-        raise stamps.error(
-            get(stamps.name), f'reception where input_stamp is {get("input_stamp")}'
-        )
-    columns = []
-    for part in ('topics', 'types', 'fields', 'stamps'):
-        declared = CHANNEL_PARAMETERS[f'known_input_{part}']
-        columns.append(_one_each(declared, get(declared.name), names))
-    found = {}
-    for name, topic, kind, field, stamp in zip(names, *columns, strict=True):
-        if not (topic or kind or field):
-            kind = FLOAT
-        found[name] = Input(topic or _below(channel, name), kind, field, stamp, channel)
-    return found
+    stamps, by = CHANNEL_PARAMETERS['known_input_stamps'], _value(values, 'input_stamp')
+    given = _value(values, stamps.name)
+    if 'header' in given and by not in ('auto', 'header'):
+        raise stamps.error(given, f'reception where input_stamp is {by}')
+    columns = [
+        _one_each(CHANNEL_PARAMETERS[f'known_input_{part}'], values, names)
+        for part in ('topics', 'types', 'fields', 'stamps')
+    ]
+    return {
+        name: _input(name, *parts, channel) for name, *parts in zip(names, *columns, strict=True)
+    }
 
 
 def make_pairing(
@@ -146,16 +128,17 @@ def make_pairing(
     by_stamp = [name in known and known[name].stamp == 'header' for name in names]
     if not any(by_stamp):
         return None
-    get = _values(values)
-    wait, max_gap = round(get('known_input_wait') * 1e9), round((get('max_gap') or BACK) * 1e9)
+    wait = round(_value(values, 'known_input_wait') * 1e9)
+    max_gap = round((_value(values, 'max_gap') or BACK) * 1e9)
     return StampPairing(by_stamp, wait, max_gap, held)
 
 
-def _values(values: Mapping[str, Any]) -> Any:
-    return lambda name: values.get(name, CHANNEL_PARAMETERS[name].default)
+def _value(values: Mapping[str, Any], name: str) -> Any:
+    return values.get(name, CHANNEL_PARAMETERS[name].default)
 
 
-def _one_each(declared: Parameter, given: list[str], names: Sequence[str]) -> list[str]:
+def _one_each(declared: Parameter, values: Mapping[str, Any], names: Sequence[str]) -> list[str]:
+    given: list[str] = _value(values, declared.name)
     if len(given) == 1:
         return given * len(names)
     if len(given) != len(names):
@@ -165,5 +148,11 @@ def _one_each(declared: Parameter, given: list[str], names: Sequence[str]) -> li
     return given
 
 
-def _below(channel: str, name: str) -> str:
-    return f'{channel}/{name}' if channel else name
+def _input(
+    name: str, topic: str, message_type: str, field: str, stamp: str, channel: str
+) -> Input:
+    """Return an input; one of which nothing is said is a Float64 on the topic of its name."""
+    if not (topic or message_type or field):
+        message_type = FLOAT
+    below = f'{channel}/{name}' if channel else name
+    return Input(topic or below, message_type, field, stamp, channel)

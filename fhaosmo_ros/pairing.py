@@ -3,17 +3,10 @@
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 MOST = 1000
 """This many inputs, and samples, are kept at most."""
-
-
-class Paired(NamedTuple):
-    """A sample, as it was given, and the known inputs at its stamp."""
-
-    sample: Any
-    u: list[float]
 
 
 class StampPairing:
@@ -38,10 +31,9 @@ class StampPairing:
 
     Attributes
     ----------
-    late : int
-        Inputs that came after the sample that they belong to had been released.
-    ahead : int
-        Samples that were released when all of an input's stamps were later than theirs.
+    late, ahead : int
+        Inputs that came after their sample had been released; samples that were released when
+        all of an input's stamps were later than theirs.
 
     """
 
@@ -84,8 +76,8 @@ class StampPairing:
         """Take a sample of y; those known inputs that are not paired are those of now."""
         self._waiting.append((stamp, sample, self._held.copy()))
 
-    def released(self, at_once: bool = False) -> Iterator[Paired]:
-        """Yield the samples that need not wait any more, in their order; `at_once`: all."""
+    def released(self, at_once: bool = False) -> Iterator[tuple[Any, list[float]]]:
+        """Yield the samples that need not wait any more, and their inputs; `at_once`: all."""
         while self._waiting:
             stamp, sample, u = self._waiting[0]
             newest = self._waiting[-1][0]
@@ -100,7 +92,7 @@ class StampPairing:
             for j in self._columns:
                 u[j] = self._at(j, stamp)
             self._done = stamp
-            yield Paired(sample, u)
+            yield sample, u
 
     def _at(self, j: int, stamp: int) -> float:
         coming = self._coming[j]
