@@ -122,8 +122,8 @@ class Channel:
             found = u.source.publishers
             for text in [u.error] if u.error else found.unheard.values():
                 reports[0].find(ERROR if u.error else WARN, text)
-            if not found.heard and not found.unheard:
-                reports[0].find(WARN, f'no publisher of {name}')
+            nobody = not found.heard and not found.unheard
+            reports[0].find(WARN, f'no publisher of {name}', nobody)
         if self._pairing is not None:
             self._report_pairing(reports[0])
         return reports
@@ -134,8 +134,7 @@ class Channel:
             report.values[text.partition(',')[0]] = count
             news = count - self._unpaired.get(name, 0)
             self._unpaired[name] = count
-            if news:
-                report.find(WARN, f'{news} {text}')
+            report.find(WARN, f'{news} {text}', news)
 
     def _forget(self) -> None:
         self._arrived = False

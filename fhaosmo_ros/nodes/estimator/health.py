@@ -40,55 +40,30 @@ UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
 
 
 class Interval(NamedTuple):
-    """
-    What happened between two reports.
-
-    Attributes
-    ----------
-    mean, jitter, longest : float
-        Of the intervals between the samples' stamps: mean, standard deviation over the mean, and
-        longest one; s, NaN without samples.
-    counts, news : dict of str to int
-        Counters now, and by how much each has grown.
-    stale : bool
-        No estimates are published, because no samples come.
-
-    """
+    """What happened between two reports."""
 
     mean: float
+    """Of the intervals between the samples' stamps, in s; NaN without samples."""
     jitter: float
+    """Their standard deviation over their mean."""
     longest: float
     counts: dict[str, int]
+    """Counters now."""
     news: dict[str, int]
+    """By how much each has grown."""
     stale: bool
+    """No estimates are published, because no samples come."""
 
 
 class Health:
     """
     Remembers a few numbers of each sample, and makes two reports of them.
 
-    Parameters
-    ----------
-    estimator : OnlineEstimator
-    limits : Parameters
-        The channel's; the thresholds warn_* and error_* are among them.
-    simulated : bool
-        True if stamps are in simulated time.
-
-    Attributes
-    ----------
-    limits : Parameters
-        The present ones.
-    stamps, delays, durations, unknown_inputs : deque
-        To be appended to on each sample: stamp (ns); time from the source stamp to the callback
-        (ns); time that the callback took (s); estimate of d.
-    lost, damaged, lacking : int
-        Messages that did not arrive, are shorter than their type, lack the field.
-    offset : int
-        From the latest sample's stamp to the publication of its message (ns).
-    latest : float
-        Time of the last sample on `perf_counter`, NaN before the first.
-
+    Appended to on each sample: `stamps` (ns), `delays` from the source stamp to the callback (ns),
+    `durations` of the callback (s), `unknown_inputs`. Set before each report: `lost`, `damaged`
+    and `lacking` messages. `latest` is the time of the last sample on `perf_counter`, `offset`
+    from its stamp to the publication of its message (ns). `limits` are the channel's parameters,
+    warn_* and error_* among them; `simulated`: stamps are in simulated time.
     """
 
     def __init__(
@@ -107,20 +82,7 @@ class Health:
         self._events_before = 0
 
     def reports(self, y: Listener, publishers: Publishers, stale: bool, name: str) -> list[Report]:
-        """
-        Return the reports on the time since the last ones.
-
-        Parameters
-        ----------
-        y : Listener
-        publishers : Publishers
-            Of the topic of y.
-        stale : bool
-            No estimates are published, because no samples come.
-        name : str
-            Of the channel, as a prefix of 'input' and 'observer'.
-
-        """
+        """Return the reports on the time since the last ones, titled by the channel's `name`."""
         counts = self._counts()
         news = {key: count - self._before[key] for key, count in counts.items()}
         self._before = counts
@@ -145,6 +107,7 @@ class Health:
         delay = max(self.delays) * NANOSECONDS if self.delays else nan
         offset = self.offset * NANOSECONDS
         age = perf_counter() - self.latest
+        rate = 1.0 / mean if mean > 0.0 else nan
         names = ', '.join(sorted(publishers.heard.values()))
         report.values = {
             'topic': y.source.topic,
@@ -152,7 +115,7 @@ class Health:
             'field': y.field.text if y.field else 'not known yet',
             'stamps': 'clock' if limits['sampling'] == 'clock' else y.stamps or 'not known yet',
             'publishers': names or 'none',
-            'sample rate [Hz]': 1.0 / mean if mean > 0.0 else nan,
+            'sample rate [Hz]': rate,
             'jitter (std / mean of the period)': interval.jitter,
             'longest period [s]': interval.longest,
             'longest delay [s]': delay,
@@ -160,49 +123,45 @@ class Health:
             'age of the last sample [s]': age,
             **interval.counts,
         }
-        if y.error:
-            report.find(ERROR, y.error)
+        report.find(ERROR, y.error, y.error)
         for text in publishers.unheard.values():
             report.find(WARN if names else ERROR, text)
         silence = ERROR if publishers.unheard and not names else STALE
-        if interval.stale:
-            since = f'for {age:.3g} s' if age == age else 'yet'
-            report.find(silence, f'no usable sample {since}')
-        if not names and not y.error:
-            report.find(silence, f'no publisher of {y.source.topic} that can be heard')
-        elif len(publishers.heard) > 1 and not news['messages without y']:
-            report.find(WARN, f'{len(publishers.heard)} publishers, their samples mix')
-        used, spread = news['samples accepted'], news['spread stamps']
-        if news['messages without y'] and not used:
-            report.find(WARN, f'{news["messages without y"]} messages without y: {y.why}')
+        since = f'for {age:.3g} s' if age == age else 'yet'
+        report.find(silence, f'no usable sample {since}', interval.stale)
+        nobody = not names and not y.error
+        report.find(silence, f'no publisher of {y.source.topic} that can be heard', nobody)
+        used, lacking, spread = (
+            news[key] for key in ('samples accepted', 'messages without y', 'spread stamps')
+        )
+        several = len(publishers.heard)
+        report.find(WARN, f'{several} publishers, their samples mix', several > 1 and not lacking)
+        report.find(WARN, f'{lacking} messages without y: {y.why}', lacking and not used)
         bad = {key: news[key] for key in UNUSED if news[key]}
-        if bad:
-            share = sum(bad.values()) / (sum(bad.values()) + used)
-            level = ERROR if share > limits['error_bad_share_above'] else WARN
-            report.find(level, ', '.join(f'{key} {n}' for key, n in bad.items()))
-        if used < 2 * spread:
-            report.find(
-                WARN,
-                f'/clock ticks once for {used / max(1, used - spread):.0f} samples, which makes '
-                "their times inexact: let it tick with each, or do not use sampling 'clock'",
-            )
+        share = sum(bad.values()) / max(1, sum(bad.values()) + used)
+        level = ERROR if share > limits['error_bad_share_above'] else WARN
+        report.find(level, ', '.join(f'{key} {n}' for key, n in bad.items()), bad)
+        report.find(
+            WARN,
+            f'/clock ticks once for {used / max(1, used - spread):.0f} samples, which makes their '
+            "times inexact: let it tick with each, or do not use sampling 'clock'",
+            used < 2 * spread,
+        )
         for key in ('restarts', 'stuck'):
-            if news[key]:
-                report.find(WARN, f'{key} {news[key]}')
-        if mean * limits['warn_rate_below'] > 1.0:
-            report.find(WARN, f'sample rate {1.0 / mean:.4g} Hz')
-        if interval.jitter > limits['warn_jitter_above']:
-            report.find(WARN, f'jitter {interval.jitter:.3g}')
-        if delay > limits['warn_delay_above']:
-            report.find(WARN, f'samples arrive {delay:.3g} s after their stamps')
-        by_header = y.stamps == 'header' and not self._simulated
-        if by_header and abs(offset) > limits['warn_delay_above']:
-            side = 'before' if offset > 0.0 else 'after'
-            report.find(
-                WARN,
-                f'header stamps lie {abs(offset):.3g} s {side} publication: another clock '
-                "than the host's, or an old measurement; dt is not affected",
-            )
+            report.find(WARN, f'{key} {news[key]}', news[key])
+        slow = rate < limits['warn_rate_below']
+        report.find(WARN, f'sample rate {rate:.4g} Hz', slow)
+        jitters = interval.jitter > limits['warn_jitter_above']
+        report.find(WARN, f'jitter {interval.jitter:.3g}', jitters)
+        latest = limits['warn_delay_above']
+        report.find(WARN, f'samples arrive {delay:.3g} s after their stamps', delay > latest)
+        side = 'before' if offset > 0.0 else 'after'
+        report.find(
+            WARN,
+            f'header stamps lie {abs(offset):.3g} s {side} publication: another clock than the '
+            "host's, or an old measurement; dt is not affected",
+            y.stamps == 'header' and not self._simulated and abs(offset) > latest,
+        )
         return report
 
     def _observer(self, report: Report, interval: Interval) -> Report:
@@ -243,34 +202,26 @@ class Health:
         if limits['unknown_input_unit']:
             scaled = titled('unknown input, scaled', limits['unknown_input_unit'])
             report.values[scaled] = d_now * limits['unknown_input_scale']
-        if interval.stale:
-            report.find(STALE, 'no usable samples')
-        elif estimate is not None and estimate.open_levels < observer.levels:
-            first = estimate.open_levels + 1
-            report.find(WARN, f'levels from {first} on hold: an innovation is above epsilon')
+        report.find(STALE, 'no usable samples', interval.stale)
+        first = estimate.open_levels + 1 if estimate else observer.levels + 1
+        held = f'levels from {first} on hold: an innovation is above epsilon'
+        report.find(WARN, held, first <= observer.levels and not interval.stale)
         diverged, jumps = interval.news['divergences'], interval.news['jumps']
-        if diverged:
-            report.find(ERROR, f'diverged and started again from y, {diverged} times')
-        if jumps:
-            report.find(WARN, f'y jumped {jumps} times')
-        if offset:
-            report.find(WARN, f'y is taken as {offset:.3g} too large since it jumped')
-        if abs(away) > GAMMA_AWAY:
-            report.find(WARN, f'gamma is {away:+.2g} away from gamma_initial')
+        report.find(ERROR, f'diverged and started again from y, {diverged} times', diverged)
+        report.find(WARN, f'y jumped {jumps} times', jumps)
+        report.find(WARN, f'y is taken as {offset:.3g} too large since it jumped', offset)
+        moved = abs(away) > GAMMA_AWAY
+        report.find(WARN, f'gamma is {away:+.2g} away from gamma_initial', moved)
         tuned = observer.parameters['correction_period']
-        by_period = observer.parameters['scheme'] == 'predict_correct' and tuned and mean > 0.0
-        if by_period and not tuned / RATE_RATIO < mean < tuned * RATE_RATIO:
-            report.find(
-                WARN, f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / mean:.4g} Hz'
-            )
-        if estimator.spread > SPREAD:
-            report.find(
-                WARN, f'innovations are {estimator.spread:.3g} times as large as noise_size says'
-            )
-        if overruns:
-            report.find(WARN, f'{overruns} steps took longer than the sampling period')
-        if 0.0 < limits['warn_chatter_above'] < chatter:
-            report.find(WARN, f'the estimate of d chatters by {chatter:.3g}')
+        if tuned and mean > 0.0 and observer.parameters['scheme'] == 'predict_correct':
+            rates = f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / mean:.4g} Hz'
+            report.find(WARN, rates, not tuned / RATE_RATIO < mean < tuned * RATE_RATIO)
+        spread = estimator.spread
+        wide = f'innovations are {spread:.3g} times as large as noise_size says'
+        report.find(WARN, wide, spread > SPREAD)
+        report.find(WARN, f'{overruns} steps took longer than the sampling period', overruns)
+        chatters = 0.0 < limits['warn_chatter_above'] < chatter
+        report.find(WARN, f'the estimate of d chatters by {chatter:.3g}', chatters)
         return report
 
     def _find_events(self, report: Report, unit: str) -> None:

@@ -240,10 +240,9 @@ class EstimatorNode(ManagedNode):
         state.find(OK if active else STALE, self.state)
         for level, text in self._clock_watch.look():
             state.find(level, text)
-        if active and self._channels is None:
-            state.find(STALE, 'no message with the names of the joints yet')
-        if self._joints.problem:
-            state.find(WARN, self._joints.problem)
+        waits = active and self._channels is None
+        state.find(STALE, 'no message with the names of the joints yet', waits)
+        state.find(WARN, self._joints.problem, self._joints.problem)
         if not active or self._channels is None:
             return [state]
         return [state, *self._channels.reports()]

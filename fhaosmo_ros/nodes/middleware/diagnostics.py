@@ -27,10 +27,11 @@ class Report:
         self._level = OK
         self._findings: list[str] = []
 
-    def find(self, level: bytes, text: str) -> None:
-        """Add a finding; the status gets the worst level, and the messages of all findings."""
-        self._level = max(self._level, level)
-        self._findings.append(text)
+    def find(self, level: bytes, text: str, when: object = True) -> None:
+        """Add a finding where `when` is true; the status gets the worst level and all texts."""
+        if when:
+            self._level = max(self._level, level)
+            self._findings.append(text)
 
     def message(self, node: str, hardware_id: str) -> DiagnosticStatus:
         """Return the status message."""
