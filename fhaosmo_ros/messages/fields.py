@@ -59,26 +59,16 @@ class Elements(NamedTuple):
 
 
 class Field(NamedTuple):
-    """
-    A number in the messages of a topic.
-
-    Attributes
-    ----------
-    text : str
-        As the user wrote it, such as 'angular_velocity.z', 'position[2]' or 'position[elbow]'.
-    steps : list of str, int and Key
-        Names of fields and elements of lists, from the message inwards.
-    header : str
-        Name of the std_msgs/Header that the message begins with, '' if there is none.
-    angle : str
-        One of `ANGLES` where the steps lead to the x of a quaternion, else ''.
-
-    """
+    """A number in the messages of a topic."""
 
     text: str
+    """As the user wrote it, such as 'angular_velocity.z', 'position[2]' or 'position[elbow]'."""
     steps: list[str | int | Key]
+    """Names of fields and elements of lists, from the message inwards."""
     header: str
+    """Name of the std_msgs/Header that the message begins with, '' if there is none."""
     angle: str = ''
+    """One of `ANGLES` where the steps lead to the x of a quaternion, else ''."""
 
     @property
     def wraps(self) -> bool:

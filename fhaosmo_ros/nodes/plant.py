@@ -28,18 +28,8 @@ class PlantNode(TimedNode):
     Publishes ``y``, ``~/state`` and ``~/unknown_input`` at `sample_rate`.
 
     A plant that becomes unstable stays where it is: from the first value on that is not finite,
-    nothing is published, and an error is logged once.
-
-    Parameters
-    ----------
-    given : mapping, optional
-        Values of parameters, of the node and of rclpy's own such as use_sim_time.
-
-    Raises
-    ------
-    ConfigurationError
-        Parameters that can't be used; nothing has been published then.
-
+    nothing is published, and an error is logged once. `given` are values of parameters, also of
+    rclpy's own such as use_sim_time; those that can't be used raise ConfigurationError.
     """
 
     def __init__(self, given: Mapping[str, Any] | None = None, **options: Any) -> None:
@@ -75,9 +65,8 @@ class PlantNode(TimedNode):
         """
         Bring the simulation to the clock's present time and publish; y first.
 
-        The middleware stamps y when it is published, and every microsecond between the clock's
-        reading and that moment acts as noise on y. So the long way is integrated first, and the
-        plant is checked to be finite; then the clock is read again for the little that is left.
+        The time between the clock's reading and the stamp of y acts as noise on y. So the long way
+        is integrated first; then the clock is read again for the little that is left.
         """
         clock = self.get_clock()
         self.plant.advance(self._plant_time(clock.now().nanoseconds), self._u)

@@ -25,16 +25,8 @@ class Channels:
     """
     Channels that share a timer and the typed messages.
 
-    Parameters
-    ----------
-    node : Node
-    values : Parameters
-        Of the node, the channels' own ones included.
-    estimators : mapping of str to OnlineEstimator
-        By the names of the channels.
-    sources : Sources
-        Of the node. They are not open yet.
-
+    `values` are those of the node, the channels' own ones included; estimators come by the names
+    of their channels; the sources are not open yet.
     """
 
     def __init__(

@@ -43,16 +43,8 @@ class EstimatorNode(ManagedNode):
     deactivate stops that; cleanup destroys them, and then every parameter can be set, except the
     names of the channels.
 
-    Parameters
-    ----------
-    given : mapping, optional
-        Values of parameters, of the node and of rclpy's own such as use_sim_time.
-
-    Raises
-    ------
-    ConfigurationError
-        Parameters that can't be used; nothing has been subscribed or published then.
-
+    `given` are values of parameters, also of rclpy's own such as use_sim_time. Those that can't be
+    used raise ConfigurationError before anything is subscribed or published.
     """
 
     def __init__(self, given: Mapping[str, Any] | None = None, **options: Any) -> None:

@@ -34,22 +34,9 @@ class Listener:
     """
     Somebody who takes one number out of each message of a source.
 
-    Attributes
-    ----------
-    source : Source
-    is_sample : bool
-        True for y, False for a known input, which a message gives first.
-    field : Field or None
-        None until the topic's type is known.
-    stamps : str
-        Which stamps its samples have: header, source or reception; '' if not known yet.
-    error : str
-        Why no field can be found in the topic's type, else ''.
-    lacking : int
-        Messages that lacked the field.
-    why : MissingElementError or None
-        Why the latest one of them did.
-
+    `is_sample`: of y, not of a known input, which a message gives first. `field` and `stamps`
+    (header, source or reception) are not known before the topic's type, and `error` says why its
+    type has no such field. `lacking` messages were without it; `why`: the latest one of them.
     """
 
     def __init__(self, wanted: Input, take: Take, source: 'Source', is_sample: bool) -> None:
@@ -100,21 +87,9 @@ class Source:
     """
     A topic and all that its messages are read for.
 
-    Attributes
-    ----------
-    topic : str
-        Full name, after remapping.
-    message_type : str
-        '' while it is not known.
-    publishers : Publishers
-        As `look` has seen them.
-    lost : int
-        Messages missing between the publisher's sequence numbers.
-    damaged : int
-        Messages that are shorter than their type.
-    on_names : callable or None
-        Called with the names in a message when they are not those of the one before.
-
+    `message_type` is '' while it is not known; `publishers` are as `look` has seen them; `lost`
+    and `damaged` count messages that did not arrive or are shorter than their type. `on_names` is
+    called with the names in a message when they are not those of the one before.
     """
 
     def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
@@ -241,21 +216,10 @@ class Source:
 
 class Sources:
     """
-    The sources of a node: one for each topic.
+    The sources of a node, one for each topic, all with one QoS.
 
-    Parameters
-    ----------
-    node : Node
-    qos : QoSProfile
-        Of all subscriptions.
-    on_type : callable
-        Called when the type of a topic has become known.
-
-    Attributes
-    ----------
-    after_message : callable
-        Called after each message.
-
+    `on_type` is called when the type of a topic has become known, `after_message` after each
+    message.
     """
 
     def __init__(self, node: Node, qos: QoSProfile, on_type: Callable[[], None]) -> None:
@@ -264,15 +228,7 @@ class Sources:
         self.after_message: Callable[[], None] = lambda: None
 
     def of(self, wanted: Input) -> Source:
-        """
-        Return the source that an input is read from; new ones are not open yet.
-
-        Raises
-        ------
-        ConfigurationError
-            Another input is read from the same topic with another type.
-
-        """
+        """Return the source that an input is read from; new ones are not open yet."""
         topic = self._node.resolve_topic_name(wanted.topic)
         source = self._by_topic.setdefault(topic, Source(self._node, self, topic))
         source.expect_type(wanted.message_type)
@@ -308,15 +264,7 @@ def find_wanted(types: Mapping[str, Any], wanted: Input) -> Field:
 
 
 def check_inputs(node: Node, inputs: Iterable[Input]) -> None:
-    """
-    Raise for inputs that cannot be, as far as their message types are given.
-
-    Raises
-    ------
-    ConfigurationError
-        A name that no topic can have, a type that is not installed, or no such field.
-
-    """
+    """Raise ConfigurationError for names, types or fields that cannot be, as far as given."""
     for wanted in inputs:
         try:
             full_name(node, wanted.topic)

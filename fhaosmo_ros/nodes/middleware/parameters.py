@@ -128,13 +128,13 @@ class NodeParameters:
         Parameters
         ----------
         prepare : callable
-            Called with all values as they would be and with those that somebody sets, all of them
-            checked; returns what `adopt` needs, or raises ConfigurationError. Changes nothing.
+            Gets all values as they would be, and the changes; returns what `adopt` needs, or
+            raises ConfigurationError. Changes nothing.
         adopt : callable
-            Called with what `prepare` has returned, once ROS has accepted the changes.
+            Gets what `prepare` has returned, once ROS has accepted the changes.
         followers : callable
-            Called with the names that somebody sets; returns the parameters that change along,
-            and which of those names each of them follows.
+            Gets the names that somebody sets; returns the parameters that change along, and
+            which of those names each of them follows.
 
         """
         self._prepare, self._adopt_change, self._followers = prepare, adopt, followers

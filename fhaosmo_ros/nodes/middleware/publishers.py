@@ -41,25 +41,13 @@ def create_publisher(node: Node, kind: Any, topic: str, latched: bool = False) -
 
 
 def has_listeners(publisher: Any) -> bool:
-    """
-    Return whether anybody listens, so that nothing is encoded for nobody.
-
-    A transient-local publisher always has one: whoever comes later gets its last messages.
-    """
+    """Return whether anybody listens; to a latched topic always those who come later."""
     latched = publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     return bool(latched or publisher.get_subscription_count())
 
 
 def full_name(node: Node, topic: str) -> str:
-    """
-    Return the full name of a topic, after remapping.
-
-    Raises
-    ------
-    ConfigurationError
-        No topic can have this name, for instance because it is too long.
-
-    """
+    """Return the full name of a topic, after remapping; raise if no topic can have it."""
     try:
         return str(node.resolve_topic_name(topic))
     except RuntimeError as error:  # rcl's
@@ -80,12 +68,6 @@ def check_overrides(node: Node, given: Mapping[str, Any], topics: Iterable[str])
         All that files and the command line set.
     topics : iterable of str
         All topics that the node makes by `create_publisher`.
-
-    Raises
-    ------
-    ConfigurationError
-        A name that is none of a topic, an override of another topic, or a policy or value that
-        can't be set.
 
     """
     names = [full_name(node, topic) for topic in topics]

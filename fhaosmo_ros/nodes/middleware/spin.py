@@ -44,17 +44,7 @@ class Spinner:
     done; the main thread waits for signals, because Python runs signal handlers there only; `wake`
     makes the executor look at the future.
 
-    Parameters
-    ----------
-    node : Node
-    on_end : callable
-        Called in the executor's thread when it ends, also by the error of a callback.
-
-    Attributes
-    ----------
-    error : BaseException or None
-        What a callback raised.
-
+    `on_end` is called in that thread when it ends, also by the `error` that a callback raised.
     """
 
     def __init__(self, node: Node, on_end: Callable[[], None] = lambda: None) -> None:
@@ -124,7 +114,7 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
     factory : callable
         Makes the node out of the parameters that are given.
     argv : list of str or None
-        None for those of the process.
+        None for the arguments of the process.
 
     Returns
     -------

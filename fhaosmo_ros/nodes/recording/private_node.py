@@ -21,7 +21,7 @@ ACTING = ('-r', '--remap', '-e', '--enclave')
 
 class PrivateNode:
     """
-    A node in a context of its own, without signal handlers; spun while open.
+    A `node` in a context of its own, without signal handlers; spun while open.
 
     Parameters
     ----------
@@ -29,15 +29,6 @@ class PrivateNode:
     ros_arguments : sequence of str
         What follows ``--ros-args``. Names and remappings (-r) and the enclave (-e) act; the rest,
         parameters and log levels that launch gives to every node, does not concern this one.
-
-    Raises
-    ------
-    ConfigurationError
-        A remapping that ROS can't read.
-
-    Attributes
-    ----------
-    node : Node
 
     """
 

@@ -59,7 +59,7 @@ class TopicRecorder(PrivateNode):
         Called with `NewTopic`, then with the topic's `Sample`s, from the executor's thread; with
         samples only for `expected` topics.
     expected : iterable of ExpectedTopic
-        Subscribed at once, and reliably.
+        Subscribed at once, and reliably; LookupError if a message type is not installed.
     wanted : callable, optional
         Says of the name of a topic that has a publisher whether to record it, too. Called while
         it is open.
@@ -70,18 +70,11 @@ class TopicRecorder(PrivateNode):
 
     Attributes
     ----------
-    counts : dict of str to int
-        Messages by topic so far.
+    counts, lost : dict of str to int
+        Messages by topic that have come, and those that did not arrive; the latter only of topics
+        with one publisher, whose messages are numbered.
     problems : SimpleQueue
         Lines that say why a topic can't be recorded.
-    lost : dict of str to int
-        Messages by topic that were published but did not arrive; only of topics with one
-        publisher, whose messages are numbered.
-
-    Raises
-    ------
-    LookupError
-        The message type of an expected topic is not installed.
 
     """
 
