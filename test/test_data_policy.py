@@ -253,17 +253,6 @@ def test_frozen_gamma_holds_against_leakage_and_in_gaps():
     assert feed.estimator.estimate.gamma == gamma
 
 
-def test_seed_after_a_gap_is_not_taken_back_with_the_gap():
-    feed = Feed()
-    feed.sine(100)
-    feed.count += 100
-    feed.sine(1)
-    feed.estimator.seed([0.2, 50.0, 60.0], 70.0)
-    feed.count -= 50  # a late sample from inside the gap
-    assert feed.sine(1)[0].rejected
-    assert feed.estimator.estimate.unknown_input == 70.0
-
-
 @pytest.mark.parametrize('structure', ['cascade', 'levant'])
 def test_seed_takes_derivatives_of_the_unknown_input_for_zero(structure):
     estimator = OnlineEstimator({'unknown_input_derivatives': 2, 'structure': structure})
@@ -275,36 +264,6 @@ def test_seed_takes_derivatives_of_the_unknown_input_for_zero(structure):
     values = estimator.observer.state.values
     np.testing.assert_array_equal(values['z_hat'], [0.2, 1.0, 2.0, 3.0, 0.0, 0.0])
     np.testing.assert_array_equal(values['z_tilde'], [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
-
-
-def after_a_gap() -> Feed:
-    """Return a feed whose latest sample ended a gap, and whose gamma moves."""
-    feed = Feed(gamma_rate=50.0, gamma_dead_zone=0.0)
-    feed.sine(100)
-    before = feed.estimator.estimate.gamma
-    feed.count += 100
-    feed.sine(1)
-    assert feed.estimator.estimate.gamma != before
-    return feed
-
-
-@pytest.mark.parametrize('change', [{'variant': 'fuzzy'}, {'gamma_min': 0.6}])
-def test_gap_before_a_change_of_parameters_is_not_withdrawn(change):
-    feed = after_a_gap()
-    feed.estimator.configure(change)
-    gamma = feed.estimator.estimate.gamma
-    feed.count -= 50  # a late sample from inside the gap
-    assert feed.sine(1)[0].rejected
-    assert feed.estimator.estimate.gamma == gamma
-
-
-def test_frozen_gamma_stays_where_a_gap_could_be_withdrawn():
-    feed = after_a_gap()
-    feed.estimator.freeze(True)
-    gamma = feed.estimator.estimate.gamma
-    feed.count -= 50
-    feed.sine(200)
-    assert feed.estimator.estimate.gamma == gamma
 
 
 def test_seed_in_the_middle_of_a_run():

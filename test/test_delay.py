@@ -83,7 +83,7 @@ def test_prediction_ends_at_the_present_state(share, estimate_from):
 
 TWO = {
     'order': 1, 'phi': ['0*a*b'], 'inputs': ['a', 'b'], 'gains': 'fixed', 'variant': 'sign',
-    'max_step': 10.0, 'spike_gate': 1.0,
+    'spike_gate': 1.0,
 }  # fmt: skip
 FIRST = 10**18
 
@@ -160,7 +160,8 @@ def test_one_by_one_many_and_resumed_are_the_same(parameters):
     stamps, y, u = disturbed()
     one, many, resumed = (OnlineEstimator(parameters) for _ in range(3))
     found = many.run(stamps, y, u)
-    assert many.counters.withdrawn_gaps == many.counters.rejected_spikes == 1
+    assert many.counters.rejected_spikes == 1
+    assert many.counters.backward_stamps > 5  # after the stamp ahead
     assert many.counters.restarts == 1
     for k in range(COUNT):
         one.set_input(u[k])
@@ -180,20 +181,6 @@ def test_one_by_one_many_and_resumed_are_the_same(parameters):
     resumed.load_state_dict(unpack(vector, labels).values)
     rest = resumed.run(stamps[700:], y[700:], u[700:])
     np.testing.assert_array_equal(rest.z, found.z[700:])
-
-
-def test_a_withdrawn_gap_leaves_no_trace_in_the_past_of_the_inputs():
-    stamps, u = STAMPS[:300].copy(), voltage()[:300]
-    y = truth()[0][:300, 0]
-    stamps[200] += 100_000_000
-    with_it, without = OnlineEstimator(DELAYED), OnlineEstimator(DELAYED)
-    with_it.run(stamps[:202], y[:202], u[:202])
-    keep = np.delete(np.arange(202), 200)
-    without.run(stamps[keep], y[keep], u[keep])
-    assert with_it.counters.withdrawn_gaps == 1
-    rest = slice(202, 300)
-    found, wanted = (e.run(stamps[rest], y[rest], u[rest]) for e in (with_it, without))
-    np.testing.assert_array_equal(found.z, wanted.z)
 
 
 def test_memory_of_another_delay_is_refused():

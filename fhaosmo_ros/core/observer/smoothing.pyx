@@ -121,7 +121,7 @@ cdef class Rows:
         if (n, model.order, len(model.inputs)) != (self.n, self.order, self.inputs):
             raise ValueError('smoothing: the parameters are those of another model')
         if self.tunes:
-            linear = LinearModel(model.slopes_at_rest, 0.0)
+            linear = LinearModel(model.slopes_at_rest + np.eye(self.order, k=1), 0.0)
         elif p['noise_size'] > 0.0 and p['unknown_input']:
             its = Uncertainty(model, p, configuration.state_sizes)
             linear, self.fresh = its.linear, its.fresh
@@ -155,8 +155,24 @@ cdef class Rows:
         self.look_at(larger)
         self.count, self.done, self.began = kept, self.done - drop, self.began - drop
 
-    def append(self, own, samples, times, kinds, models):
-        """Go forward (D 24) through more rows: `own` of each, and the rest as `Smoother.take`."""
+    def append(self, own, y, h, u, times, kinds, models):
+        """
+        Go forward (D 24) through more rows.
+
+        Parameters
+        ----------
+        own : (K, 1 or 2, N) array
+            The observer's estimates; if it tunes itself, the variances of their errors.
+        y, h : (K,) arrays
+            Samples less their offset (D 23), and the time since the row before (s).
+        u : (K, m) array
+            Known inputs meanwhile.
+        times, kinds : (K,) arrays
+            In ns, for a lag; MEASURED and so on.
+        models : (K, 4) or (K, 0) array
+            `model` of a `Trajectory`.
+
+        """
         cdef Py_ssize_t more = len(own), k
         self.make_room(more)
         rows = slice(self.count, self.count + more)
@@ -165,7 +181,7 @@ cdef class Rows:
             point[name] = values
         point['last'] = self.order + (point['derivatives'].astype(int) & (ORDERS - 1))
         point['time'], point['kind'] = times, kinds
-        point['y'], point['h'], self.columns['u'][rows] = samples
+        point['y'], point['h'], self.columns['u'][rows] = y, h, u
         self.columns['own'][rows] = own
         self.new = self.count
         for k in range(self.count, self.count + more):
@@ -187,12 +203,6 @@ cdef class Rows:
                 self.x[k, 0] = now.y
             return
         before = &self.point[k - 1]
-        if now.kind != UNMEASURED and now.h <= 0.0 and k > 1 and before.kind != BEGINS:
-            # The policy has withdrawn the sample before: its stamp was ahead.
-            now.kind, now.h = max(now.kind, before.kind), now.h + before.h
-            before.kind, before.h, before.time = UNMEASURED, 0.0, self.point[k - 2].time
-            before.pull = before.certainty = 0.0
-            self.predict(k - 1)
         if not now.h > 0.0:  # no time has passed
             now.h, now.time = 0.0, before.time
             if now.kind == MEASURED:
@@ -451,12 +461,6 @@ cdef class Rows:
         change, allowed = np.abs(np.asarray(out)[:, 0] - x), TOLERANCE * np.sqrt(np.abs(variance))
         open_rows = np.flatnonzero((change > allowed + ROUNDING * np.abs(x)).any(axis=1))
         return self.done + (open_rows[0] if len(open_rows) else len(x))
-
-    def innovations(self):
-        """Return e and S of the samples that are remembered, for their likelihood."""
-        points = self.columns['point'][:self.count]
-        points = points[points['certainty'] > 0.0]
-        return points['pull'] / points['certainty'], 1.0 / points['certainty']
 
     def __reduce__(self):
         columns = {name: rows[:self.count].copy() for name, rows in self.columns.items()}

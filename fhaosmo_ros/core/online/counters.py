@@ -35,11 +35,9 @@ class Counters(NamedTuple):
     """u was NaN or infinite; the one before is held."""
 
     gaps: int = 0
-    """Intervals longer than max_step that were bridged in sub-steps."""
+    """Intervals of more than twice the mean that were bridged in sub-steps."""
     sub_steps: int = 0
     """Steps that these took."""
-    withdrawn_gaps: int = 0
-    """Bridged gaps that the next stamp disproved: taken back, with the sample that ended them."""
     spread_stamps: int = 0
     """Samples that came at the same clock time as the one before (sampling = clock): spread."""
     bursts: int = 0
@@ -70,6 +68,6 @@ class Counters(NamedTuple):
 
 UNUSED_SAMPLES = (
     'rejected_measurements', 'rejected_spikes', 'rejected_stuck', 'rejected_steps',
-    'duplicate_stamps', 'backward_stamps', 'zero_stamps', 'far_stamps', 'withdrawn_gaps',
+    'duplicate_stamps', 'backward_stamps', 'zero_stamps', 'far_stamps',
 )  # fmt: skip
 """Counters that together are `Counters.rejected`."""

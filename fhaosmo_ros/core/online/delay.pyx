@@ -63,12 +63,9 @@ cdef class PastInputs:
         latest[0] += elapsed
 
     cdef void withdraw(self, long long elapsed) noexcept nogil:
-        """Take the latest `elapsed` nanoseconds back."""
-        while elapsed > 0 and self.ring.past_count > 0:
-            if self.piece(0)[0] > elapsed:
-                self.piece(0)[0] -= elapsed
-                return
-            elapsed -= <long long>self.piece(0)[0]
+        """Take back what `note` has appended last."""
+        self.piece(0)[0] -= elapsed
+        if self.piece(0)[0] <= 0.0:
             self.ring.past_place = (self.ring.past_place + MOST_PIECES - 1) % MOST_PIECES
             self.ring.past_count -= 1
 

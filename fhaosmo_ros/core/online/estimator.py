@@ -12,10 +12,11 @@ from fhaosmo_ros.core.model.inputs import column, known_inputs_of_run
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, Tuning
 from fhaosmo_ros.core.observer.observer import Observer
+from fhaosmo_ros.core.observer.smoother import Smoother
+from fhaosmo_ros.core.observer.smoothing import Rows
 from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.delay import PastInputs
 from fhaosmo_ros.core.online.events import check_events, EventDetector
-from fhaosmo_ros.core.online.past_estimates import check_lag, PastEstimates
 from fhaosmo_ros.core.online.policy import Policy
 from fhaosmo_ros.core.online.snapshots import array_of, checked, VERSION
 from fhaosmo_ros.core.parameters.declaration import Parameters
@@ -85,10 +86,9 @@ class OnlineEstimator:
                 f'one, got {p["input_delay"]} and {p["measurement_delay"]}'
             )
         check_events(p)
-        self._smoothing: PastEstimates | None = None
+        self._smoothing: Smoother | None = None
         if p['smoothing_lag'] > 0.0:
-            check_lag(p, self.observer.configuration)
-            self._smoothing = PastEstimates(self.observer, round(p['smoothing_lag'] / NANOSECONDS))
+            self._smooth(round(p['smoothing_lag'] / NANOSECONDS))
         self._u = np.zeros(len(self.observer.inputs))
         settings = self._settings(p)
         past = PastInputs(len(self._u), settings['lag'] > 0)
@@ -173,7 +173,7 @@ class OnlineEstimator:
         configuration = self.observer.prepare(parameters)
         check_events(parameters)
         if self._smoothing is not None:
-            check_lag(parameters, configuration)
+            _check_smoothing(parameters, configuration)
         return Change(parameters, configuration)
 
     def adopt(self, change: Change) -> None:
@@ -203,7 +203,7 @@ class OnlineEstimator:
     def _settings(self, p: Mapping[str, Any]) -> dict[str, Any]:
         """Return what the policy reads of parameters; times in nanoseconds."""
         times = {
-            'period': p['nominal_period'], 'max_gap': p['max_gap'], 'max_step': p['max_step'],
+            'period': p['nominal_period'], 'max_gap': p['max_gap'],
             'stuck_time': p['stuck_time'], 'divergence_time': p['divergence_time'],
             'delay': p['measurement_delay'],
             'lag': (p['measurement_delay'] - p['input_delay']) * self.observer.uses_input,
@@ -240,8 +240,11 @@ class OnlineEstimator:
             `noise_size` is 0, which says how much to trust a sample; or `predict_to_now`.
 
         """
-        check_lag(self._parameters, self.observer.configuration)
-        self._smoothing = PastEstimates(self.observer, None)
+        self._smooth(None)
+
+    def _smooth(self, lag: int | None) -> None:
+        _check_smoothing(self._parameters, self.observer.configuration)
+        self._smoothing = Smoother(self.observer, lag)
 
     @property
     def due(self) -> NDArray[np.int64]:
@@ -331,13 +334,12 @@ class OnlineEstimator:
                 f'{limit:g} (divergence_limit), got {z!r} and {unknown_input!r}'
             )
         self.observer.structure.seed(values)
-        self.policy.change(bridged=False)
         if self._smoothing is not None:
             self._smoothing.cut()
 
     def freeze(self, held: bool) -> None:
         """Hold gamma where it is, or let it adapt again; no parameter changes."""
-        self.policy.change(frozen=held, bridged=False)  # another gamma than before a gap
+        self.policy.change(frozen=held)
 
     @property
     def frozen(self) -> bool:
@@ -515,3 +517,13 @@ class OnlineEstimator:
         if self._smoothing is not None:
             return Tuning.of(self._smoothing.tuning)
         return self.observer.tuning
+
+
+def _check_smoothing(p: Mapping[str, Any], configuration: ObserverConfiguration) -> None:
+    """Raise ConfigurationError where estimates can not be smoothed."""
+    if p['predict_to_now']:
+        raise ConfigurationError(
+            "smoothing, 'predict_to_now': expected estimates of the past or of the present, "
+            'got both'
+        )
+    Rows(configuration)

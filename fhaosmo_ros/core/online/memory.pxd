@@ -9,7 +9,6 @@ cdef struct Settings:
     bint filtered  # estimates are z_hat
     long long period  # nominal one
     long long max_gap  # 0: so many intervals as policy.pyx says
-    long long max_step  # 0: twice the mean interval
     long long stuck_time  # 0: off
     long long divergence_time  # 0: off
     long long delay  # of y
@@ -23,7 +22,7 @@ cdef struct Counters:
     # One for each case of docs/node.md; counters.py says what they mean.
     long long accepted, rejected_measurements, rejected_spikes, rejected_stuck, rejected_steps
     long long duplicate_stamps, backward_stamps, zero_stamps, far_stamps, rejected_inputs
-    long long gaps, sub_steps, withdrawn_gaps, spread_stamps, bursts, spikes_believed, stuck
+    long long gaps, sub_steps, spread_stamps, bursts, spikes_believed, stuck
     long long restarts_forward, restarts_backward, divergences, jumps
 
 
@@ -33,13 +32,11 @@ cdef struct Course:
     bint valid  # there is an estimate, of the time `stamp`
     bint timed  # False: the next sample's stamp is of another clock
     bint held  # a sample far away waits for the next one's word
-    bint bridged  # the latest sample ended a bridged gap
     bint lost  # eps_1 is above epsilon, or steps fail
     long long stamp  # of the latest sample that was used
     long long latest  # time up to which the observer has been stepped
     long long now  # the clock that counts nominal periods
     long long held_stamp
-    long long before  # `latest` before the bridged gap
     long long lost_since
     long long spikes  # rejected by the gate, in a row
     long long intervals  # number of intervals in the mean

@@ -30,11 +30,10 @@ cdef class Policy:
     ) noexcept nogil
     cdef int step_to(self, long long elapsed, double y, const double* u) noexcept nogil
     cdef int step_over(self, long long elapsed, double y, const double* u) noexcept nogil
-    cdef int sub_steps(self, long long elapsed) noexcept nogil
     cdef bint has_diverged(self, bint failed, long long now) noexcept nogil
     cdef long long max_gap(self) noexcept nogil
     cdef long long max_late(self) noexcept nogil
-    cdef int begin_again(self) noexcept nogil
+    cdef int begin_again(self, long long* counter) noexcept nogil
     cdef void forget_clock(self, long long now) noexcept nogil
     cdef void update_mean(self, long long elapsed) noexcept nogil
     cdef void refresh(self) noexcept nogil

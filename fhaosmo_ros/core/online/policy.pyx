@@ -25,7 +25,7 @@ from fhaosmo_ros.core.online.outliers cimport (
 
 import numpy as np
 
-# With max_step = 0 an interval of more mean intervals than this is a gap.
+# An interval of more mean intervals than this is a gap.
 cdef double GAP_RATIO = 2.0
 # Bounds what one sample may cost: a few milliseconds.
 cdef int MOST_STEPS = 10_000
@@ -64,7 +64,6 @@ cdef class Policy:
             self.structure.enter()
         self.structure, self.settings = structure, new
         self.tuner = structure if isinstance(structure, SelfTuning) else None
-        self.course.bridged = False  # the state before a gap is that of the parameters before
 
     # One sample
 
@@ -157,23 +156,19 @@ cdef class Policy:
 
     cdef long long since_latest(self, long long now, double y, int* word) noexcept nogil:
         """Return the time since the latest sample, 0 where there is none; add flags to `word`."""
-        cdef long long latest, elapsed
+        cdef long long elapsed
         if not self.course.timed:
             self.forget_clock(now)
-        latest = self.course.latest
-        elapsed = difference(now, latest)
-        if 0 < elapsed <= self.max_gap():
-            self.course.held = False
-            if self.settings.max_gap == 0 and self.course.intervals == 1 and (
-                MOST_INTERVALS * elapsed < self.course.mean_interval
-            ):
-                word[0] = self.begin_again()
-            return elapsed
-        elapsed = self.settle(now, elapsed, y, word)
-        if word[0] & RESTARTED:
-            self.past.ring.past_count = 0
-        elif elapsed > 0 and self.settings.lag > 0:  # a gap was withdrawn
-            self.past.withdraw(latest - self.course.latest)
+        elapsed = difference(now, self.course.latest)
+        if not 0 < elapsed <= self.max_gap():
+            return self.settle(now, elapsed, y, word)
+        self.course.held = False
+        if self.settings.max_gap == 0 and self.course.intervals == 1 and (
+            MOST_INTERVALS * elapsed < self.course.mean_interval
+        ):  # the interval that led to the sample before was a gap: begin at that sample
+            y = self.structure.memory.y + self.structure.memory.offset
+            word[0] = self.begin_again(&self.counters.restarts_forward)
+            self.structure.start(y)
         return elapsed
 
     cdef long long settle(
@@ -190,41 +185,32 @@ cdef class Policy:
 
         """
         cdef Course* course = &self.course
-        cdef long long max_gap = self.max_gap(), follow
+        cdef Counters* counters = &self.counters
+        cdef bint again = course.held and now == course.held_stamp
+        cdef long long follow
         if self.settings.nominal:
             if 0 < elapsed <= self.settings.period:
                 return elapsed  # nothing was lost: the period itself is longer than max_gap
-            self.counters.restarts_forward += 1
-            self.refresh()
-            word[0] = RESTARTED
+            word[0] = self.begin_again(&counters.restarts_forward)
             return 0
-        if elapsed == 0 or (course.held and now == course.held_stamp):
-            self.counters.duplicate_stamps += 1
-            word[0] = REJECTED_PERIOD
+        word[0] = REJECTED_PERIOD
+        if elapsed == 0 or again:
+            counters.duplicate_stamps += 1
             return 0
         if -self.max_late() <= elapsed < 0:
-            if not (course.bridged and now > course.before):
-                self.counters.backward_stamps += 1
-                word[0] = REJECTED_PERIOD
-                return 0
-            self.structure.go_back()  # the gap was none: its sample's stamp was ahead
-            course.latest, course.bridged = course.before, False
-            self.counters.withdrawn_gaps += 1
-            self.counters.accepted -= 1
-            return difference(now, course.before)
+            counters.backward_stamps += 1
+            return 0
         if not course.held:
             course.held, course.held_stamp, course.held_y = True, now, y
-            self.counters.far_stamps += 1
-            word[0] = REJECTED_PERIOD | HELD
+            counters.far_stamps += 1
+            word[0] |= HELD
             return 0
-        if elapsed > 0:
-            self.counters.restarts_forward += 1
-        else:
-            self.counters.restarts_backward += 1
-        self.refresh()
-        word[0] = RESTARTED
         follow = difference(now, course.held_stamp)
-        if not 0 < follow <= max_gap:  # the rate is not known any more
+        again = 0 < follow <= self.max_gap()
+        word[0] = self.begin_again(
+            &counters.restarts_forward if elapsed > 0 else &counters.restarts_backward
+        )
+        if not again:  # the rate is not known any more
             course.usual_interval = 0.0
             return 0
         if 0 < elapsed <= FIRST_GAP:  # the next one like this is none
@@ -251,13 +237,11 @@ cdef class Policy:
             return self.max_gap()
         return <long long>fmin(MOST_INTERVALS * self.course.mean_interval, FAR)
 
-    cdef int begin_again(self) noexcept nogil:
-        """Begin at the sample before, as the interval that led to it was a gap; return flags."""
-        cdef double y = self.structure.memory.y + self.structure.memory.offset
+    cdef int begin_again(self, long long* counter) noexcept nogil:
+        """Make a fresh observer, and count it; return flags."""
         self.refresh()
-        self.structure.start(y)
         self.past.ring.past_count = 0
-        self.counters.restarts_forward += 1
+        counter[0] += 1
         return RESTARTED
 
     cdef void forget_clock(self, long long now) noexcept nogil:
@@ -267,7 +251,7 @@ cdef class Policy:
             <long long>course.mean_interval if course.intervals else self.settings.period
         )
         self.sensor.changed = self.sensor.seen = now
-        course.held = course.bridged = course.lost = False
+        course.held = course.lost = False
         course.timed = True
 
     cdef void refresh(self) noexcept nogil:
@@ -277,7 +261,7 @@ cdef class Policy:
         self.structure.reset()
         if course.frozen:
             self.structure.memory.gamma = gamma
-        course.held = course.bridged = course.lost = False
+        course.held = course.lost = False
         course.spikes = course.intervals = 0
         course.mean_interval = course.mean_jitter = 0.0
 
@@ -301,17 +285,6 @@ cdef class Policy:
             self.past.withdraw(elapsed)
         return word
 
-    cdef int sub_steps(self, long long elapsed) noexcept nogil:
-        """Return the number of steps that an interval is divided into: more than 1 for a gap."""
-        cdef long long longest = self.settings.max_step
-        cdef double mean = self.course.mean_interval
-        if longest > 0:
-            if elapsed > longest:
-                return <int>min((elapsed + longest - 1) // longest, MOST_STEPS)
-        elif self.course.intervals == WINDOW and elapsed > GAP_RATIO * mean:
-            return <int>fmin(elapsed / mean + 0.5, MOST_STEPS)
-        return 1
-
     cdef int step_over(self, long long elapsed, double y, const double* u) noexcept nogil:
         """
         Step to a sample `elapsed` later, through a gap in sub-steps; return the status word.
@@ -320,16 +293,18 @@ cdef class Policy:
         internal estimates, plus a straight line that ends in the new sample. A scheme that
         predicts follows the model by itself, so it takes a gap in one step.
         """
-        cdef Course* course = &self.course
         cdef Counters* counters = &self.counters
         cdef Memory* memory = &self.structure.memory
-        cdef int count = self.sub_steps(elapsed), word = 0, k
-        cdef bint is_gap = count > 1 and memory.beyond == 0.0  # after rejected samples it is none
-        cdef bint modelled = True, kept
-        cdef double corrected = y - memory.offset, gamma = memory.gamma, bend = 0.0
-        cdef double h, end, sample, beyond, spread
-        if self.structure.predicting or not is_gap:
-            count = 1
+        cdef double mean = self.course.mean_interval, corrected = y - memory.offset
+        cdef double gamma = memory.gamma, bend = 0.0, h, end, sample
+        cdef int count = 1, word = 0, k
+        cdef bint is_gap, modelled = True
+        # After rejected samples it is none.
+        is_gap = self.course.intervals == WINDOW and memory.beyond == 0.0 and (
+            elapsed > GAP_RATIO * mean
+        )
+        if is_gap and not self.structure.predicting:
+            count = <int>fmin(elapsed / mean + 0.5, MOST_STEPS)
         h = elapsed * NANOSECONDS / count
         if count > 1 or self.settings.gate > 0.0:
             self.structure.begin_at_estimates()
@@ -340,18 +315,11 @@ cdef class Policy:
             if not modelled:
                 end = memory.y
             if self.settings.gate > 0.0 and is_spike(
-                course, &self.settings, counters, corrected - end
+                &self.course, &self.settings, counters, corrected - end
             ):
                 return REJECTED_SPIKE
             bend = (corrected - end) / count
             self.structure.begin_at_estimates()
-        kept = is_gap and self.structure.keep()  # an observer may be too large for that
-        course.bridged = kept
-        if is_gap:
-            course.before = course.latest
-            counters.gaps += 1
-            counters.sub_steps += count
-            word = GAP
         for k in range(1, count + 1):
             sample = y
             if k < count:  # then the scheme leaves the prediction alone
@@ -359,30 +327,21 @@ cdef class Policy:
                     self.structure.prediction.step(h, u)
                 sample = self.structure.prediction.z[0] + k * bend + memory.offset
             word = word & FLAGS_MASK | self.structure.step(sample, h, u)
-            if word & REJECTED_SPIKE:  # as if it had not come: the next one is stepped to instead
-                memory.pending = 0.0
-                counters.rejected_spikes += 1
-                counters.jumps += word & JUMPED != 0
-                if is_gap:
-                    counters.gaps -= 1
-                    counters.sub_steps -= count
-                    course.bridged = False
-                if kept:
-                    beyond, spread = memory.beyond, memory.spread
-                    self.structure.go_back()
-                    memory.beyond, memory.spread = beyond, spread
-                return word & ~GAP
-            if course.frozen:
-                memory.gamma = gamma
             if word & REJECTED:
                 break
+            if self.course.frozen:
+                memory.gamma = gamma
+        counters.jumps += word & JUMPED != 0
+        if word & REJECTED_SPIKE:  # as if it had not come: the next one is stepped to instead
+            memory.pending = 0.0
+            counters.rejected_spikes += 1
+            return word
+        if is_gap:
+            counters.gaps += 1
+            counters.sub_steps += count
+            word |= GAP
         if not word & REJECTED:
             self.update_mean(elapsed)
-            counters.jumps += word & JUMPED != 0
-        elif kept:
-            self.structure.go_back()
-            memory.y = corrected  # as where a single step fails
-            word = word & FLAGS_MASK | self.structure.measure(corrected)
         return word
 
     cdef void update_mean(self, long long elapsed) noexcept nogil:

@@ -29,7 +29,7 @@ INTEGERS = -(2**63), 2**63 - 1
 COUNTS = 0, 2**62
 YES_OR_NO = 0, 1
 RANGES: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(('frozen', 'valid', 'timed', 'held', 'bridged', 'lost'), YES_OR_NO),
+    **dict.fromkeys(('frozen', 'valid', 'timed', 'held', 'lost'), YES_OR_NO),
     **dict.fromkeys(('stuck', 'holds'), YES_OR_NO),
     **dict.fromkeys(('spikes', 'tick_count', 'repeats', 'held_for'), COUNTS),
     **dict.fromkeys(('mean_interval', 'mean_jitter', 'usual_interval'), COUNTS),

@@ -9,6 +9,7 @@ REMOVED = {
     'disturbance_phase': 'leave it out: waves of d begin at their offset',
     'disturbance_omega_end': "leave it out: a chirp ends at ten times 'disturbance_omega'",
     'disturbance_sweep_time': 'leave it out: a chirp sweeps for 20 s',
+    'max_step': 'leave it out: intervals of more than twice the mean are bridged',
     'spike_gate_samples': "leave it out: 'spike_gate' rejects five samples in a row at most",
 }
 """What a message says of a name that was a parameter once."""

@@ -153,12 +153,9 @@ SAMPLING = (
               'A longer time between two usable samples, or a stamp that lies further back, '
               'restarts the observer from the new samples, once a second one confirms the jump. '
               '0: the time of 500 samples; the node says that y is silent after 0.5 s, or 5 '
-              'samples.', unit='s', lower=0.0, upper=1e6),
-    Parameter('max_step', 0.0,
-              'A longer interval, up to max_gap, is bridged: y in between is predicted by the '
-              'model and bent to the new sample, and the observer takes steps of at most this '
-              'long. 0: intervals of more than twice the mean are bridged, in steps of about the '
-              'mean interval.', unit='s', lower=0.0, upper=3600.0),
+              'samples. An interval of more than twice the mean, up to this, is bridged: y in '
+              'between is predicted by the model and bent to the new sample.',
+              unit='s', lower=0.0, upper=1e6),
     Parameter('spike_gate', 0.0,
               'A sample that lies further than this from what the model predicts from the one '
               'before is rejected (unit of y), five in a row at most: the next one is believed, '
