@@ -133,16 +133,16 @@ def try_to_configure(estimator: OnlineEstimator, values: dict) -> bool:
     return True
 
 
-def test_three_thousand_parameter_sets():
+def test_a_thousand_parameter_sets():
     rng = np.random.default_rng(1)
     estimator = OnlineEstimator(SMALL)
     accepted, now = 0, START
-    for k in range(3000):
+    for k in range(1000):
         accepted += try_to_configure(estimator, changes(rng, 0.15))
         for y in (0.3, rng.normal(), 0.3 + 0.1 * np.sin(0.01 * k)):
             now += 10**6
             assert finite(estimator.update(now, y))
-    assert 300 < accepted < 2700  # both happen
+    assert 100 < accepted < 900  # both happen
 
 
 @pytest.mark.parametrize('name', sorted(FIXED))

@@ -23,19 +23,15 @@ def test_recording_is_a_function_of_parameters_number_and_seed():
 
 
 @pytest.mark.parametrize('shape', ['sines', 'steps', 'chirp'])
-def test_d_has_the_size_that_was_asked_for(shape):
-    family = Family({'rms_of_d': 0.3, 'disturbances': [shape], 'integration_step': 1e-3})
-    sizes = [np.sqrt(np.mean(r.d**2)) for r in family.recordings(3)]
-    np.testing.assert_allclose(sizes, 0.3, rtol=0.05)
-
-
-@pytest.mark.parametrize('shape', ['sines', 'chirp'])
-def test_d_stays_in_its_band_and_is_not_one_sine(shape):
+def test_d_has_its_size_stays_in_its_band_and_is_not_one_sine(shape):
     family = Family(
-        {'band_of_d': [2.0, 6.0], 'disturbances': [shape], 'duration': 60.0,
+        {'rms_of_d': 0.3, 'band_of_d': [2.0, 6.0], 'disturbances': [shape], 'duration': 60.0,
          'integration_step': 1e-3, 'sample_rate': 100.0}
     )  # fmt: skip
     d = family.recording(0).d
+    np.testing.assert_allclose(np.sqrt(np.mean(d**2)), 0.3, rtol=0.05)
+    if shape == 'steps':
+        return
     power = np.abs(np.fft.rfft(d * np.hanning(len(d)))) ** 2
     omega = 2.0 * np.pi * np.fft.rfftfreq(len(d), 0.01)
     inside = (omega > 1.7) & (omega < 6.5)

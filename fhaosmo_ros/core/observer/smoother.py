@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Ints = NDArray[np.int64]
-BLOCK = 8192
+BLOCK = 2048
 """Rows after which a recording is smoothed as far as later samples no longer matter."""
 BEGINNING = 1000
 """
@@ -102,26 +102,28 @@ class Smoother:
         """
         kinds = self._kinds(found.status)
         kept = np.flatnonzero(self._every | ((found.status & UNUSED) == 0))
-        self._numbers = np.concatenate([self._numbers, self._taken + kept])
+        numbers, smoothed = self._taken + kept, []
         self._taken += len(times)
-        if len(kept):
-            found, times, u = part_of(found, kept), times[kept], u[kept]
-            before = times[0] if self._time is None else self._time
-            h = np.diff(times, prepend=before)
-            self._time = times[-1]
-            ages = times if self._lag is not None else np.zeros(len(times), dtype=np.int64)
-            self._hold(found, h * 1e-9 if h.dtype.kind == 'i' else h, u, ages, kinds[kept])
-            self._found = Trajectory._make(
-                map(np.concatenate, zip(self._found, found, strict=True))
-            )
+        found, times, u, kinds = part_of(found, kept), times[kept], u[kept], kinds[kept]
+        for begin in range(0, max(len(kept), 1), BLOCK):
+            block = slice(begin, begin + BLOCK)
+            if len(kept):
+                self._hold(part_of(found, block), times[block], u[block], kinds[block])
+            smoothed.append(self._due())
+        self._found = Trajectory._make(map(np.concatenate, zip(self._found, found, strict=True)))
+        self._numbers = np.concatenate([self._numbers, numbers])
+        return self._handed_out(np.concatenate(smoothed))
+
+    def _due(self) -> Floats:
+        """Return the estimates that have become final since the last call."""
         rows = self._rows
         if self._lag is not None:
-            return self._handed_out(rows.smooth(rows.count, self._lag))
+            return rows.smooth(rows.count, self._lag)  # type: ignore[no-any-return]
         end = rows.done
         if rows.count - end >= self._wait:
             end = rows.settled()
             self._wait = rows.count - end + BLOCK
-        return self._handed_out(rows.smooth(end))
+        return rows.smooth(end)  # type: ignore[no-any-return]
 
     def finish(self) -> Trajectory:
         """Return the rows that still wait: nothing comes after them."""
@@ -147,8 +149,12 @@ class Smoother:
             self._expected[kind] = int(len(status) > 0 and marks[-1] > latest)
         return kinds
 
-    def _hold(self, found: Trajectory, h: Floats, u: Floats, times: Any, kinds: Ints) -> None:
+    def _hold(self, found: Trajectory, times: NDArray[Any], u: Floats, kinds: Ints) -> None:
         """Append rows; a self-tuning observer's wait until it knows a model."""
+        h = np.diff(times, prepend=times[0] if self._time is None else self._time)
+        h, self._time = h * 1e-9 if h.dtype.kind == 'i' else h, times[-1]
+        if self._lag is None:  # no age matters
+            times = np.zeros(len(times), dtype=np.int64)
         c = self._observer.configuration
         own = np.full((len(h), 1 + c.self_tuning, c.levels), np.inf)
         own[:, 0] = found.z_hat
@@ -226,10 +232,8 @@ def smooth(observer: Any, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None
     u = known_inputs_of_run(0.0 if u is None else u, len(whole.t), observer.inputs).copy()
     for k in np.flatnonzero(~np.isfinite(u).all(axis=1)).tolist():  # the last ones are held
         u[k] = u[max(k - 1, first)]
-    smoother, found = Smoother(observer, every=True), []
-    for begin in range(first, len(whole.t), BLOCK):
-        block = slice(begin, begin + BLOCK)
-        found.append(smoother.take(part_of(whole, block), whole.t[block], u[block]))
+    smoother = Smoother(observer, every=True)
+    found = [smoother.take(part_of(whole, slice(first, None)), whole.t[first:], u[first:])]
     found.append(smoother.finish())
     for name in ('z', 'unknown_input', 'standard_deviation'):
         getattr(whole, name)[first:] = np.concatenate([getattr(rows, name) for rows in found])

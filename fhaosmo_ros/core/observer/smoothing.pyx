@@ -19,7 +19,7 @@ from fhaosmo_ros.core.observer.kalman cimport (
 )
 from fhaosmo_ros.core.observer.levant cimport HUBER, follow_spread
 from fhaosmo_ros.core.observer.self_tuning.members cimport by_binomials, ORDERS
-from fhaosmo_ros.core.observer.structure cimport Memory
+from fhaosmo_ros.core.observer.structure cimport MOST_INPUTS, Memory
 
 from fhaosmo_ros.core.observer.kalman import STATES_DOUBT, Uncertainty
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -43,7 +43,7 @@ cpdef enum:
 
 
 cdef struct Point:
-    # What a row has one number of.
+    # A row.
     double y  # sample, less its offset (D 23)
     double h  # time since the row before (s)
     double variance  # of the noise on y
@@ -56,6 +56,11 @@ cdef struct Point:
     long long time  # ns
     int kind  # MEASURED .. BEGINS
     int last  # the level that white noise drives
+    double u[MOST_INPUTS]  # known inputs since the row before
+    Row own[2]  # the observer's estimates; if it tunes itself, their variances
+    double x[MOST_LEVELS]  # z, d and its derivatives, predicted from the rows before
+    Row p[MOST_LEVELS]  # P of its errors
+    Row f[MOST_LEVELS]  # F from the row before; 0 where a row begins
 
 cdef Point example
 POINT = np.asarray(<Point[:1]> &example).dtype
@@ -87,31 +92,19 @@ cdef class Rows:
     cdef double[::1] first  # estimates of a fresh observer
     cdef double[::1] state_sizes
     cdef double[:, ::1] fresh  # P of a fresh observer with fixed gains
-    # What it remembers beside the rows.
+    # What it remembers.
     cdef Memory memory  # the size of the innovations (D 21), nothing else
     cdef readonly Py_ssize_t count  # rows
     cdef readonly Py_ssize_t done  # those of them that have been handed out
     cdef readonly Py_ssize_t began  # the latest one that begins; below 0 if it has been dropped
     cdef Py_ssize_t new  # the first of those that came last
-    # The rows, with room for some more.
-    cdef dict columns  # the arrays by name
-    cdef Point[::1] point
-    cdef double[:, ::1] u  # known inputs since the row before
-    cdef double[:, :, ::1] own  # the observer's estimates; if it tunes itself, their variances
-    cdef double[:, ::1] x  # z, d and its derivatives, predicted from the rows before
-    cdef double[:, :, ::1] p  # P of its errors; the rows of a matrix are `Row`
-    cdef double[:, :, ::1] f  # F from the row before; 0 where a row begins
+    cdef object rows  # an array of `Point`, with room for some more
+    cdef Point[::1] point  # the same
 
     def __cinit__(self, configuration):
-        cdef int n = configuration.levels
-        self.n, self.order = n, configuration.model.order
+        self.n, self.order = configuration.levels, configuration.model.order
         self.inputs, self.tunes = len(configuration.model.inputs), configuration.self_tuning
-        shapes = {
-            'u': (self.inputs,), 'own': (1 + self.tunes, n), 'x': (n,),
-            'p': (n, MOST_LEVELS), 'f': (n, MOST_LEVELS),
-        }
-        columns = {name: np.empty((0, *shape)) for name, shape in shapes.items()}
-        self.look_at(columns | {'point': np.empty(0, dtype=POINT)})
+        self.rows = self.point = np.empty(0, dtype=POINT)
         self.configure(configuration)
 
     def configure(self, configuration):
@@ -137,27 +130,9 @@ cdef class Rows:
         self.from_measurement = self.tunes or p['start_from_measurement']
         self.first, self.state_sizes = configuration.initial_estimate, configuration.state_sizes
 
-    cdef look_at(self, dict columns):
-        """Hold the rows in these arrays."""
-        self.columns, self.point, self.u = columns, columns['point'], columns['u']
-        self.own, self.x, self.p, self.f = (columns[name] for name in ('own', 'x', 'p', 'f'))
-
-    cdef make_room(self, Py_ssize_t more):
-        """Drop rows that are done, all but two to go on from, where memory is needed for more."""
-        cdef Py_ssize_t drop = max(min(self.done, self.count - 2), 0)
-        cdef Py_ssize_t kept = self.count - drop
-        if self.count + more <= self.point.shape[0]:
-            return
-        larger = {}
-        for name, rows in self.columns.items():
-            larger[name] = np.empty((2 * (kept + more) + 64, *rows.shape[1:]), rows.dtype)
-            larger[name][:kept] = rows[drop:self.count]
-        self.look_at(larger)
-        self.count, self.done, self.began = kept, self.done - drop, self.began - drop
-
     def append(self, own, y, h, u, times, kinds, models):
         """
-        Go forward (D 24) through more rows.
+        Go forward (D 24) through more rows; some that are done are dropped.
 
         Parameters
         ----------
@@ -173,171 +148,162 @@ cdef class Rows:
             `model` of a `Trajectory`.
 
         """
-        cdef Py_ssize_t more = len(own), k
-        self.make_room(more)
-        rows = slice(self.count, self.count + more)
-        point, model = self.columns['point'][rows], models.T if self.tunes else self.model
-        for name, values in zip(('variance', 'intensity', 'decay', 'derivatives'), model):
-            point[name] = values
-        point['last'] = self.order + (point['derivatives'].astype(int) & (ORDERS - 1))
-        point['time'], point['kind'] = times, kinds
-        point['y'], point['h'], self.columns['u'][rows] = y, h, u
-        self.columns['own'][rows] = own
+        cdef Py_ssize_t more = len(own), drop = max(min(self.done, self.count - 2), 0)
+        if self.count + more > len(self.rows):
+            kept = self.rows[drop:self.count]
+            self.rows = np.concatenate([kept, np.zeros(len(kept) + 2 * more + 64, dtype=POINT)])
+            self.point = self.rows
+            self.count, self.done, self.began = len(kept), self.done - drop, self.began - drop
+        rows = self.rows[self.count:self.count + more]
+        for name, values in zip(
+            ('variance', 'intensity', 'decay', 'derivatives'),
+            models.T if self.tunes else self.model,
+        ):
+            rows[name] = values
+        rows['last'] = self.order + (rows['derivatives'].astype(int) & (ORDERS - 1))
+        rows['time'], rows['kind'], rows['y'], rows['h'] = times, kinds, y, h
+        rows['u'][:, :self.inputs] = u
+        rows['own'][:, :1 + self.tunes, :self.n] = own
         self.new = self.count
-        for k in range(self.count, self.count + more):
-            self.forward(k)
-        self.count += more
+        for _ in range(more):
+            self.forward(self.count)
+            self.count += 1
 
     # Forward
 
     cdef void forward(self, Py_ssize_t k) noexcept nogil:
         """Go forward to row k (D 24), which holds the sample and the observer's estimate."""
         cdef Point* now = &self.point[k]
-        cdef Point* before
         cdef int i
         now.pull = now.certainty = 0.0
         if k == 0 or now.kind == BEGINS:
             self.began, self.memory.spread = k, 1.0
-            self.begin(k, &self.first[0])
+            self.begin(now, &self.first[0])
             if self.from_measurement:
-                self.x[k, 0] = now.y
+                now.x[0] = now.y
             return
-        before = &self.point[k - 1]
         if not now.h > 0.0:  # no time has passed
-            now.h, now.time = 0.0, before.time
+            now.h, now.time = 0.0, self.point[k - 1].time
             if now.kind == MEASURED:
                 now.kind = UNMEASURED
-        self.predict(k)
+        self.predict(&self.point[k - 1], now)
         if now.kind == JUMPS:  # nothing before it matters to z_1, which is y (D 23)
             for i in range(self.n):
-                self.f[k, 0, i] = self.p[k, 0, i] = self.p[k, i, 0] = 0.0
-            self.p[k, 0, 0], self.x[k, 0] = now.variance, now.y
+                now.f[0][i] = now.p[0][i] = now.p[i][0] = 0.0
+            now.p[0][0], now.x[0] = now.variance, now.y
         elif now.kind == MEASURED:
-            self.measure(k)
+            self.measure(now)
 
-    cdef void begin(self, Py_ssize_t k, const double* x) noexcept nogil:
-        """Begin at row k with an estimate: nothing before it matters."""
-        cdef Point* now = &self.point[k]
-        cdef Row* p = <Row*> &self.p[k, 0, 0]
+    cdef void begin(self, Point* now, const double* x) noexcept nogil:
+        """Begin at a row with an estimate: nothing before it matters."""
         cdef int i, j, d = self.order, chain = now.last - d
         cdef double size
         now.kind = BEGINS
-        memset(p, 0, self.n * sizeof(Row))
-        memset(&self.f[k, 0, 0], 0, self.n * sizeof(Row))
-        memcpy(&self.x[k, 0], x, self.n * sizeof(double))
+        memset(now.p, 0, sizeof(now.p))
+        memset(now.f, 0, sizeof(now.f))
+        memcpy(now.x, x, self.n * sizeof(double))
         if not self.tunes:
             for i in range(self.n):
-                memcpy(p[i], &self.fresh[i, 0], self.n * sizeof(double))
+                memcpy(now.p[i], &self.fresh[i, 0], self.n * sizeof(double))
             return
-        p[0][0] = now.variance
+        now.p[0][0] = now.variance
         for i in range(1, d):
-            size = DOUBT * max(self.state_sizes[i], fabs(self.own[k, 0, i]))
-            p[i][i] = size * size
-            if size * size < self.own[k, 1, i] < INFINITY:
-                p[i][i] = self.own[k, 1, i]
+            size = DOUBT * max(self.state_sizes[i], fabs(now.own[0][i]))
+            now.p[i][i] = size * size
+            if size * size < now.own[1][i] < INFINITY:
+                now.p[i][i] = now.own[1][i]
         for i in range(chain + 1):
             for j in range(chain + 1):
-                p[d + i][d + j] = usual(now, chain - i, chain - j)
+                now.p[d + i][d + j] = usual(now, chain - i, chain - j)
 
-    cdef void predict(self, Py_ssize_t k) noexcept nogil:
-        """Predict row k from row k - 1 (D 24); if that can't be, begin at the observer's."""
+    cdef void predict(self, const Point* before, Point* now) noexcept nogil:
+        """Predict a row from the one before (D 24); if that can't be, begin at the observer's."""
         cdef Row slope[MOST_LEVELS]
-        cdef Row* p = <Row*> &self.p[k, 0, 0]
-        cdef Row* f = <Row*> &self.f[k, 0, 0]
-        cdef double* x = &self.x[k, 0]
-        cdef Point* now = &self.point[k]
-        cdef Point* before = &self.point[k - 1]
         cdef int i, j, n = self.n, count = sub_steps(now.h, max(self.fastest, now.decay))
         cdef bint finite
-        memcpy(p, &self.p[k - 1, 0, 0], n * sizeof(Row))
-        memset(f, 0, n * sizeof(Row))
+        memcpy(now.p, before.p, sizeof(now.p))
+        memset(now.f, 0, sizeof(now.f))
         for i in range(n):
-            x[i], f[i][i] = self.x[k - 1, i] + p[i][0] * before.pull, 1.0
+            now.x[i], now.f[i][i] = before.x[i] + now.p[i][0] * before.pull, 1.0
         if before.certainty > 0.0:
-            correct(n, p, before.noise)
+            correct(n, now.p, before.noise)
         if now.decay != before.decay or now.last != before.last:
-            self.change_model(k)
+            self.change_model(before, now)
         for _ in range(count):
-            self.step(k, now.h / count, slope)
-            multiply(n, slope, f)
-            carry(n, slope, p)
-            add_drive(now.last, now.intensity, now.h / count, p)
-        finite = p[0][0] + now.variance > 0.0
+            self.step(now, now.h / count, slope)
+            multiply(n, slope, now.f)
+            carry(n, slope, now.p)
+            add_drive(now.last, now.intensity, now.h / count, now.p)
+        finite = now.p[0][0] + now.variance > 0.0
         for i in range(n):
             for j in range(i):
-                p[i][j] = p[j][i] = 0.5 * (p[i][j] + p[j][i])
-            finite = finite and isfinite(x[i] * x[i]) and isfinite(p[i][i])
+                now.p[i][j] = now.p[j][i] = 0.5 * (now.p[i][j] + now.p[j][i])
+            finite = finite and isfinite(now.x[i] * now.x[i]) and isfinite(now.p[i][i])
         if not finite:
-            self.begin(k, &self.own[k, 0, 0])
+            self.begin(now, now.own[0])
 
-    cdef void step(self, Py_ssize_t k, double h, Row* slope) noexcept nogil:
-        """Go on by `h` with x of row k; write the exact derivative of the Runge-Kutta steps."""
-        cdef double* x = &self.x[k, 0]
+    cdef void step(self, Point* now, double h, Row* slope) noexcept nogil:
+        """Go on by `h` with x of a row; write the exact derivative of the Runge-Kutta steps."""
         cdef double* z = self.prediction.z
         cdef double* dz = self.prediction.dz
-        cdef double kappa = self.point[k].decay
+        cdef double kappa = now.decay
         cdef int i, j, n = self.n, d = self.order
         for j in range(n):
             for i in range(n):
-                z[i], dz[i] = x[i], 1.0 if i == j else 0.0
+                z[i], dz[i] = now.x[i], 1.0 if i == j else 0.0
             if kappa > 0.0:  # phi has plain derivatives of d
                 by_binomials(z + d, ORDERS, -kappa)
                 by_binomials(dz + d, ORDERS, -kappa)
-            self.prediction.over(h, &self.u[k, 0])
+            self.prediction.over(h, now.u)
             for i in range(n):
                 slope[i][j] = dz[i]
-        memcpy(x, z, (d if kappa > 0.0 else n) * sizeof(double))
+        memcpy(now.x, z, (d if kappa > 0.0 else n) * sizeof(double))
         for i in range(d, n if kappa > 0.0 else d):
             memset(slope[i], 0, sizeof(Row))
             slope[i][i] = exp(-kappa * h)
-            x[i] *= slope[i][i]
+            now.x[i] *= slope[i][i]
             for j in range(i + 1, n):
                 slope[i][j] = slope[i][j - 1] * h / (j - i)
-                x[i] += slope[i][j] * x[j]
+                now.x[i] += slope[i][j] * now.x[j]
 
-    cdef void change_model(self, Py_ssize_t k) noexcept nogil:
+    cdef void change_model(self, const Point* before, Point* now) noexcept nogil:
         """
-        Go over to the model of d of row k, with its own derivatives of d (D 34).
+        Go over to the model of d of a row, with its own derivatives of d (D 34).
 
         A derivative that the model before did not have begins as ever. If the model before was
         surer of an estimate than the observer is now, it was wrong.
         """
-        cdef Row* p = <Row*> &self.p[k, 0, 0]
-        cdef Row* f = <Row*> &self.f[k, 0, 0]
-        cdef Point* now = &self.point[k]
         cdef int i, j, d = self.order
-        cdef double more = now.decay - self.point[k - 1].decay
-        by_binomials(&self.x[k, 0] + d, ORDERS, more)
+        cdef double more = now.decay - before.decay
+        by_binomials(now.x + d, ORDERS, more)
         for i in range(d + 1, self.n):  # row by row: (D + kappa)^j = (D + kappa)^(j-1) (D + kappa)
             for j in range(d, i + 1):
-                f[i][j] = more * f[i - 1][j] + (f[i - 1][j - 1] if j > d else 0.0)
+                now.f[i][j] = more * now.f[i - 1][j] + (now.f[i - 1][j - 1] if j > d else 0.0)
         for i in range(now.last + 1, self.n):
-            self.x[k, i] = 0.0
-            memset(f[i], 0, sizeof(Row))
-        carry(self.n, f, p)
-        for i in range(self.point[k - 1].last + 1, now.last + 1):
-            p[i][i] = max(p[i][i], usual(now, now.last - i, now.last - i))
+            now.x[i] = 0.0
+            memset(now.f[i], 0, sizeof(Row))
+        carry(self.n, now.f, now.p)
+        for i in range(before.last + 1, now.last + 1):
+            now.p[i][i] = max(now.p[i][i], usual(now, now.last - i, now.last - i))
         for i in range(d + 1):
-            if SURER * p[i][i] < self.own[k, 1, i] < INFINITY:
-                p[i][i] = self.own[k, 1, i]
+            if SURER * now.p[i][i] < now.own[1][i] < INFINITY:
+                now.p[i][i] = now.own[1][i]
 
-    cdef void measure(self, Py_ssize_t k) noexcept nogil:
-        """Weigh the sample of row k (D 24); after a jump of d it says of what size (D 34)."""
-        cdef Point* now = &self.point[k]
-        cdef Row* p = <Row*> &self.p[k, 0, 0]
+    cdef void measure(self, Point* now) noexcept nogil:
+        """Weigh the sample of a row (D 24); after a jump of d it says of what size (D 34)."""
         cdef int i, j, d = self.order
-        cdef double s = p[0][0] + now.variance, e = now.y - self.x[k, 0], share
+        cdef double s = now.p[0][0] + now.variance, e = now.y - now.x[0], share
         cdef double factor = max(fabs(e) / (HUBER * follow_spread(&self.memory, e, sqrt(s))), 1.0)
         if now.derivatives < 0.0 and factor > 1.0:
             for i in range(self.n):
-                share = (e * e - s) * self.f[k, i, d] / (self.f[k, 0, d] * self.f[k, 0, d])
+                share = (e * e - s) * now.f[i][d] / (now.f[0][d] * now.f[0][d])
                 for j in range(self.n):
-                    p[i][j] += share * self.f[k, j, d]
+                    now.p[i][j] += share * now.f[j][d]
                 if 0 < i <= d:  # when it has jumped is not known
-                    p[i][i] += share * self.f[k, i, d]
+                    now.p[i][i] += share * now.f[i][d]
             factor = 1.0
         now.noise = now.variance * factor
-        now.certainty = 1.0 / (p[0][0] + now.noise)
+        now.certainty = 1.0 / (now.p[0][0] + now.noise)
         now.pull = e * now.certainty
 
     # Back
@@ -355,64 +321,60 @@ cdef class Rows:
         cdef double behind[MOST_LEVELS]
         cdef Row known[MOST_LEVELS]  # X of D 34
         cdef Row a[MOST_LEVELS]  # of X <- A X A'
-        cdef Row* p
-        cdef Row* f
-        cdef Point* now
+        cdef Point* now = &self.point[last]
         cdef double total, size
         cdef Py_ssize_t k
         cdef int i, j, n = self.n
         memset(known, 0, sizeof(known))
         memset(a, 0, sizeof(a))
         for i in range(n):
-            a[i][i], total = 1.0, self.p[last, i, i]
-            costate[i] = doubt / sqrt(total) if total > 0.0 else 0.0
+            a[i][i] = 1.0
+            costate[i] = doubt / sqrt(now.p[i][i]) if now.p[i][i] > 0.0 else 0.0
         for k in range(last, self.done - 1, -1):
-            now, p, f = &self.point[k], <Row*> &self.p[k, 0, 0], <Row*> &self.f[k, 0, 0]
+            now = &self.point[k]
             total = 0.0 if doubt > 0.0 else now.pull
             for i in range(n):
-                total += now.certainty * p[0][i] * costate[i]
+                total += now.certainty * now.p[0][i] * costate[i]
             costate[0] -= total
             if self.tunes:
                 for j in range(n):
                     total = 0.0
                     for i in range(n):
-                        total += p[0][i] * a[i][j]
+                        total += now.p[0][i] * a[i][j]
                     a[0][j] -= now.certainty * total
                 carry(n, a, known)
                 known[0][0] += now.certainty
             if k < end:
-                self.write(k, costate, known, &out[k - self.done, 0, 0])
+                self.write(now, costate, known, &out[k - self.done, 0, 0])
             for i in range(n if self.tunes else 0):
                 for j in range(n):
-                    a[j][i] = f[i][j]
+                    a[j][i] = now.f[i][j]
             memcpy(behind, costate, n * sizeof(double))
             size = 0.0
             for j in range(n):
-                total = 0.0
+                costate[j] = 0.0
                 for i in range(n):
-                    total += f[i][j] * behind[i]
-                costate[j] = total
-                size += total + known[j][j]
+                    costate[j] += now.f[i][j] * behind[i]
+                size += costate[j] + known[j][j]
             if not isfinite(size):  # nothing is known of what comes later
                 memset(costate, 0, sizeof(costate))
                 memset(known, 0, sizeof(known))
 
     cdef void write(
-        self, Py_ssize_t k, const double* costate, const Row* known, double* out
+        self, const Point* now, const double* costate, const Row* known, double* out
     ) noexcept nogil:
-        """Write the estimates of row k, and of a self-tuning observer the variances of errors."""
-        cdef Row* p = <Row*> &self.p[k, 0, 0]
+        """Write the estimates of a row, and of a self-tuning observer the variances of errors."""
         cdef Row less[MOST_LEVELS]
         cdef int i, j, n = self.n
         for i in range(n):
-            out[i] = self.x[k, i]
+            out[i] = now.x[i]
             for j in range(n):
-                out[i] -= p[i][j] * costate[j]
+                out[i] -= now.p[i][j] * costate[j]
         if self.tunes:
             memcpy(less, known, n * sizeof(Row))
-            carry(n, p, less)
+            carry(n, now.p, less)
             for i in range(n):
-                out[n + i] = max(p[i][i] - less[i][i], ROUNDING * p[i][i])
+                out[n + i] = max(now.p[i][i] - less[i][i], ROUNDING * now.p[i][i])
 
     def smooth(self, Py_ssize_t end, lag=None):
         """
@@ -445,7 +407,8 @@ cdef class Rows:
                 self.go_back(k, due, 0.0, out[self.done - first:])
                 self.done = due
         self.new = self.count
-        found, own = np.asarray(out)[:due - first], self.columns['own'][first:due]
+        found = np.asarray(out)[:due - first]
+        own = self.rows['own'][first:due, :1 + self.tunes, :self.n]
         if not np.isfinite(found).all():
             bad = ~np.isfinite(found).all(axis=(1, 2))
             found[bad] = own[bad]
@@ -454,30 +417,25 @@ cdef class Rows:
     def settled(self):
         """Return how many rows samples to come can change by `TOLERANCE` at most."""
         cdef double[:, :, ::1] out = np.empty((self.count - self.done, 1 + self.tunes, self.n))
-        rows = slice(self.done, self.count)
         if self.done < self.count:
             self.go_back(self.count - 1, self.count, 1.0, out)
-        x, variance = self.columns['x'][rows], self.columns['p'][rows].diagonal(0, 1, 2)
+        rows = self.rows[self.done:self.count]
+        x, variance = rows['x'][:, :self.n], rows['p'].diagonal(0, 1, 2)[:, :self.n]
         change, allowed = np.abs(np.asarray(out)[:, 0] - x), TOLERANCE * np.sqrt(np.abs(variance))
         open_rows = np.flatnonzero((change > allowed + ROUNDING * np.abs(x)).any(axis=1))
         return self.done + (open_rows[0] if len(open_rows) else len(x))
 
     def __reduce__(self):
-        columns = {name: rows[:self.count].copy() for name, rows in self.columns.items()}
         numbers = self.done, self.began, self.new, self.memory.spread
-        return Rows, (self.configuration,), (columns, *numbers)
+        return Rows, (self.configuration,), (self.rows[:self.count].copy(), *numbers)
 
     def __setstate__(self, state):
-        columns, done, began, new, spread = state
-        last = columns['point']['last']
-        shapes = {name: (len(last), *rows.shape[1:]) for name, rows in self.columns.items()}
-        if not (shapes == {name: rows.shape for name, rows in columns.items()}
-                and 0 <= done <= len(last) and new >= 0
-                and self.order <= last.min(initial=self.order) and last.max(initial=0) < self.n):
+        self.rows, self.done, self.began, self.new, self.memory.spread = state
+        self.point, self.count = self.rows, len(self.rows)
+        last = self.rows['last']
+        if not (0 <= self.done <= self.count and self.new >= 0 and (last >= self.order).all()
+                and (last < self.n).all()):
             raise ValueError('smoothing: numbers of rows or levels that can not be')
-        self.look_at({name: np.array(rows) for name, rows in columns.items()})
-        self.done, self.began, self.new, self.memory.spread = done, began, new, spread
-        self.count = len(last)
 
 
 cdef double usual(const Point* now, int i, int j) noexcept nogil:
