@@ -18,7 +18,7 @@ import sys
 from time import monotonic, sleep, time_ns
 from typing import Any, NamedTuple
 
-from children import Children, ROOT, wait_until
+from children import Children, wait_until
 from fhaosmo_ros.nodes.recording.private_node import PrivateNode
 from fhaosmo_ros.topics import ARRAY, FLOAT, TIME
 import numpy as np
@@ -33,13 +33,7 @@ from std_srvs.srv import Trigger
 from tqdm import tqdm
 from watch import Watch
 
-PARAMETERS = ('--ros-args', '--params-file', str(ROOT / 'config' / 'demo.yaml'))
-ESTIMATOR = (
-    '-r', 'y:=faulty_y', '-p', 'spike_gate:=1.0', '-p', 'gamma_leakage:=1.0',
-    '-p', 'gamma_dead_zone:=0.0',
-)  # fmt: skip
-"""What docs/node.md advises for a node that nobody looks after."""
-RATE = 500.0
+PARAMETERS = ('--ros-args', '--params-file', 'benchmark/soak.yaml')
 TRUTH, ESTIMATE = '/plant/unknown_input', '/estimator/unknown_input'
 GAMMA, STAMP = '/estimator/gamma', '/estimator/stamp'
 TOPICS = {
@@ -188,10 +182,10 @@ def soak(seed: int, minutes: float, output: Path) -> set[str]:
 def run(seed: int, seconds: float) -> Course:
     """Run a soak and return its course."""
     with Children() as children, Watch(TOPICS.items()) as watch, Client() as client:
-        estimator = children.start_node('estimator', *PARAMETERS, *ESTIMATOR)
+        estimator = children.start_node('estimator', *PARAMETERS, '-r', 'y:=faulty_y')
         plant = children.start(
             'plant', 'benchmark/soak_plant.py', '--seed', str(seed), '--seconds', str(seconds),
-            *PARAMETERS, '-p', f'sample_rate:={RATE}',
+            *PARAMETERS,
         )  # fmt: skip
         estimator.wait_for('estimating')
         plant.wait_for('injecting')

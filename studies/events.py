@@ -11,29 +11,26 @@ recordings.
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 import sys
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import EventDetector, Observer, TriangularModel
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation import recordings
-from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.plot.figures import COLOURS
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 from studies import evidence
 from studies.comparison.methods.linear import estimates
 from studies.comparison.methods.sampled import SampledModel
 from studies.evidence import Row
-from studies.harness import SELF_TUNING
+from studies.harness import Floats, Found, Results, run_study, SELF_TUNING
 
 NAME = 'events'
 H, NOISE, LOAD, FAULT, LASTS, EVERY, SETTLED = 0.01, 1e-3, 0.05, 1.0, 2.0, 20.0, 60.0
-HOURS = 10.0
+HOURS, QUICK_HOURS = 10.0, 0.5
 MODEL: dict[str, Any] = {'order': 2, 'phi': ['0', '-z2']}
 SELF_TUNED = MODEL | SELF_TUNING
 THRESHOLDS = np.geomspace(0.08, 0.9, 14)
@@ -41,16 +38,15 @@ DEVIATIONS, DURATION = 5.0, 0.03
 FACTORS, NEVER = (1.0, 3.0), 0.05
 INTENSITIES = np.geomspace(1e-3, 1e1, 9)
 FILTER, OURS = 'Kalman filter', 'self-tuning'
-Array = NDArray[np.float64]
-Estimates = tuple[Array, Array]
+Estimates = tuple[Floats, Floats]
 
 
 class Recording(NamedTuple):
     """y and d at 100 Hz, and the begins of the faults in seconds."""
 
-    y: Array
-    d: Array
-    faults: Array
+    y: Floats
+    d: Floats
+    faults: Floats
 
 
 def record(hours: float, seed: int, noise: float = NOISE, faults: bool = False) -> Recording:
@@ -72,7 +68,7 @@ def record(hours: float, seed: int, noise: float = NOISE, faults: bool = False) 
     return Recording(z1 + noise * rng.standard_normal(count), d, begins)
 
 
-def kalman(y: Array, intensity: float) -> tuple[Array, Array]:
+def kalman(y: Floats, intensity: float) -> tuple[Floats, Floats]:
     """Return d by the filter whose d is a random walk, and no standard deviation."""
     model = TriangularModel(MODEL['phi'])
     gain = SampledModel(model, H).kalman([intensity / NOISE**2])
@@ -81,7 +77,7 @@ def kalman(y: Array, intensity: float) -> tuple[Array, Array]:
     return estimates(model, gain, 0.0, samples, 1.5 * H)[:, model.order], none
 
 
-def self_tuning(y: Array) -> tuple[Array, Array]:
+def self_tuning(y: Floats) -> tuple[Floats, Floats]:
     """Return d and its standard deviation by an observer that is told the model and no more."""
     observer, parts = Observer(SELF_TUNED), []
     for part in np.array_split(np.arange(len(y)), max(1, len(y) // 100_000)):
@@ -91,7 +87,7 @@ def self_tuning(y: Array) -> tuple[Array, Array]:
     return d, deviation
 
 
-def alarms(d: Array, deviation: Array, **settings: float) -> Array:
+def alarms(d: Floats, deviation: Floats, **settings: float) -> Floats:
     """Return the times at which events begin, after the first minute."""
     detector = EventDetector(ESTIMATOR_PARAMETERS.defaults() | settings)
     stamps, found = np.round(1e9 * H * np.arange(len(d))).astype(np.int64), []
@@ -102,7 +98,7 @@ def alarms(d: Array, deviation: Array, **settings: float) -> Array:
     return times[times > SETTLED]
 
 
-def delays(begun: Array, faults: Array) -> Array:
+def delays(begun: Floats, faults: Floats) -> Floats:
     """Return how long after the begin of each fault an event began; infinite if none did."""
     found = np.append(begun, np.inf)[np.searchsorted(begun, faults)]
     return np.where(found - faults < LASTS, found - faults, np.inf)
@@ -117,7 +113,7 @@ class Point(NamedTuple):
     found: float
 
 
-def curve(quiet: Estimates, faulty: Estimates, faults: Array, deviations: float) -> list[Point]:
+def curve(quiet: Estimates, faulty: Estimates, faults: Floats, deviations: float) -> list[Point]:
     """Return a point for each threshold."""
     points = []
     hours = (len(quiet[0]) * H - SETTLED) / 3600.0
@@ -140,35 +136,37 @@ def best(points: Sequence[Point], false: float = 1.0) -> Point:
     return min(fit, key=lambda p: p.delay) if fit else points[-1]
 
 
-def tuned_intensity(hours: float) -> float:
-    """Return the intensity of d with which the Kalman filter finds faults soonest."""
+def late(intensity: float, hours: float) -> float:
+    """Return how soon a Kalman filter finds faults, on recordings that judge nothing else."""
     quiet, faulty = record(hours, 11), record(hours, 12, faults=True)
-    return float(min(
-        INTENSITIES,
-        key=lambda q: best(
-            curve(kalman(quiet.y, q), kalman(faulty.y, q), faulty.faults, 0.0)
-        ).delay,
-    ))  # fmt: skip
+    both = kalman(quiet.y, intensity), kalman(faulty.y, intensity)
+    return best(curve(*both, faulty.faults, 0.0)).delay
 
 
-def measure(hours: float) -> list[Row]:
+def lines(factor: float, name: str, intensity: float, hours: float) -> list[Row]:
+    """Return a line for each threshold of an estimator at the noise times a factor."""
+    noise = factor * NOISE
+    quiet, faulty = record(hours, 1, noise), record(0.1 * hours, 2, noise, faults=True)
+    if name == FILTER:
+        both, deviations = [kalman(r.y, intensity) for r in (quiet, faulty)], 0.0
+    else:
+        both, deviations = [self_tuning(r.y) for r in (quiet, faulty)], DEVIATIONS
+    told = intensity if name == FILTER else None
+    return [
+        {'noise': noise, 'estimator': name, 'intensity': told} | point._asdict()
+        for point in curve(*both, faulty.faults, deviations)
+    ]
+
+
+def measure(arguments: argparse.Namespace, results: Results) -> Found:
     """Return a line for each factor on the noise, estimator and threshold."""
-    intensity = tuned_intensity(0.1 * hours)
-    ways: dict[str, tuple[Callable[[Array], Estimates], float]] = {
-        FILTER: (lambda y: kalman(y, intensity), 0.0),
-        OURS: (self_tuning, DEVIATIONS),
-    }
-    rows = []
-    for factor in FACTORS:
-        noise = factor * NOISE
-        quiet, faulty = record(hours, 1, noise), record(0.1 * hours, 2, noise, faults=True)
-        for name, (way, deviations) in ways.items():
-            told = intensity if name == FILTER else None
-            rows += [
-                {'noise': noise, 'estimator': name, 'intensity': told} | point._asdict()
-                for point in curve(way(quiet.y), way(faulty.y), faulty.faults, deviations)
-            ]
-    return rows
+    hours = QUICK_HOURS if arguments.quick else HOURS
+    delay = results({q: (late, q, 0.1 * hours) for q in INTENSITIES.tolist()})
+    intensity = min(delay, key=delay.__getitem__)
+    cells = [(factor, name) for factor in FACTORS for name in (FILTER, OURS)]
+    found = results({cell: (lines, *cell, intensity, hours) for cell in cells})
+    rows = evidence.rounded(row for cell in cells for row in found[cell])
+    return Found({NAME: rows}, {}, {NAME: draw(rows)})
 
 
 def points_of(rows: Sequence[Row], factor: float, name: str) -> list[Point]:
@@ -203,14 +201,8 @@ def draw(rows: Sequence[Row]) -> Figure:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; return 0, 2 for a bad argument or output, 130 if it was interrupted."""
-
-    def body(_: argparse.Namespace, stop: Stop) -> None:
-        with stop.raising():
-            rows = evidence.rounded(measure(HOURS))
-            evidence.publish(evidence.DOCS, {NAME: rows}, {}, {NAME: draw(rows)})
-
-    return run_command(argparse.ArgumentParser(prog='events', description=__doc__), argv, body)
+    """Run the command; see `run_study`."""
+    return run_study(NAME, __doc__, measure, argv)
 
 
 if __name__ == '__main__':

@@ -16,24 +16,26 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import quantised, respond
-from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.cli.share import shipped
-from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 from studies import evidence, ratios
 from studies.comparison.evaluation import METHODS, tune
 from studies.comparison.methods.adaptive import HUBER, IMM, NOISE
 from studies.comparison.methods.linear import LINEAR_LIMIT
-from studies.comparison.methods.method import Setting, Values
-from studies.comparison.scores import Estimates, JUDGED_FROM, mean, objective
+from studies.comparison.methods.method import (
+    Estimates,
+    JUDGED_FROM,
+    mean,
+    objective,
+    Setting,
+    Values,
+)
+from studies.comparison.methods.ours import model_of
 from studies.evidence import markdown, Row
-from studies.harness import called, observed, output, SELF_TUNING, study, with_jobs
+from studies.harness import Floats, Found, observed, Results, run_study, SELF_TUNING
 from studies.waves import wave
 
-Floats = NDArray[np.float64]
 NAME = 'everywhere'
 STEP, RATE, SEED = 5e-4, 1000.0, 1
 
@@ -242,21 +244,19 @@ def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row,
     once = once or Once(found, best_peers(setting, anew, recordings))
     values = once.member.at(setting.model.order, c.rate)
     preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | model_of(setting)
+    ours, inside = self_tuned(model_of(setting), recordings)
     errors = {
+        SELF: ours,
         ONCE: errors_of(LINEAR_LIMIT, setting, values, recordings),
         PRESET: [error(r, observed(preset, r.t, r.y).unknown_input) for r in recordings],
     }
     for peer, number in once.peers.items():
         errors[peer] = errors_of(peer, setting, {**values, **PEERS[peer][number]}, recordings)
     yard = mean(errors_of(LINEAR_LIMIT, setting, anew, recordings))
-    row: Row = {'plant': name, 'condition': condition, ANEW: yard, SELF: 0.0}
-    row |= {peer: mean(e) / yard for peer, e in errors.items()}
-    return again(row, size), once
-
-
-def model_of(setting: Setting) -> dict[str, Any]:
-    """Return what the estimators are told, as parameters."""
-    return {'order': setting.model.order, 'phi': list(setting.model.phi)}
+    row: Row = {'plant': name, 'condition': condition, ANEW: yard}
+    row |= {name: mean(found) / yard for name, found in errors.items()}
+    known = implied(plant, c, recordings) / yard if c.phi != 1.0 else None
+    return row | {KNOWN: known, 'inside 1 σ': inside[0], 'inside 1.96 σ': inside[1]}, once
 
 
 def self_tuned(
@@ -270,39 +270,6 @@ def self_tuned(
         away = np.abs(found.unknown_input - r.d) / found.standard_deviation[:, -1]
         inside.append([np.mean((away < k)[r.t >= JUDGED_FROM]) for k in (1.0, 1.96)])
     return errors, [round(float(x), 3) for x in np.mean(inside, axis=0)]
-
-
-def again(row: Row, size: Size) -> Row:
-    """Return a cell with self-tuning measured anew, and all else as it was."""
-    plant, c = PLANTS[row['plant']], CONDITIONS[row['condition']]
-    recordings = [recording(plant, c, kind, size.duration) for kind in size.kinds]
-    errors, (one, two) = self_tuned(model_of(setting_of(plant, c)), recordings)
-    known = implied(plant, c, recordings) / row[ANEW] if c.phi != 1.0 else None
-    return row | {
-        SELF: mean(errors) / row[ANEW], KNOWN: known, 'inside 1 σ': one, 'inside 1.96 σ': two,
-    }  # fmt: skip
-
-
-def compute(size: Size, jobs: int, stop: Stop, before: list[Row]) -> list[Row]:
-    """Return all cells: those of the tuning first; with `before` only self-tuning is measured."""
-    if before:
-        rows = called({k: (again, row, size) for k, row in enumerate(before)}, NAME, jobs, stop)
-        return [rows[k] for k in range(len(before))]
-    keys = [(p, c) for p in size.plants for c in size.conditions]
-    first = {(p, c): (cell, p, c, size, None) for p, c in keys if c == TUNED}
-    found = called(first, NAME, jobs, stop)
-    others = {(p, c): (cell, p, c, size, found[p, TUNED][1]) for p, c in keys if c != TUNED}
-    found |= called(others, NAME, jobs, stop)
-    return [found[key][0] for key in keys]
-
-
-def draw(cells: list[Row]) -> Figure:
-    """Draw the ratios: a panel a plant, a row a condition, a marker a method."""
-    panels: dict[str, dict[str, Row]] = {}
-    for cell in cells:
-        panels.setdefault(cell['plant'], {})[cell['condition']] = cell
-    text = 'error of d over that of a Kalman filter tuned anew with the truth'
-    return ratios.draw(panels, STYLES, text)
 
 
 def number(ratio: float) -> str:
@@ -322,21 +289,24 @@ def texts(cells: list[Row]) -> dict[str, str]:
     return {'methods': markdown(['method', 'geometric mean', 'worst', 'cells above 1.25'], lines)}
 
 
-def _study(arguments: argparse.Namespace, stop: Stop) -> None:
-    docs, size = output(arguments, NAME), QUICK if arguments.quick else Size()
-    before = evidence.read(NAME, docs) if arguments.only_self_tuning else []
-    cells = evidence.rounded(compute(size, arguments.jobs, stop, before))
-    evidence.publish(docs, {NAME: cells}, texts(cells), {NAME: draw(cells)})
+def measure(arguments: argparse.Namespace, results: Results) -> Found:
+    """Return all cells; those of the tuning are computed first."""
+    size = QUICK if arguments.quick else Size()
+    keys = [(p, c) for p in size.plants for c in size.conditions]
+    found = results({(p, c): (cell, p, c, size, None) for p, c in keys if c == TUNED})
+    once = {p: found[p, TUNED][1] for p in size.plants}
+    found |= results({(p, c): (cell, p, c, size, once[p]) for p, c in keys if c != TUNED})
+    cells = evidence.rounded(found[key][0] for key in keys)
+    panels: dict[str, dict[str, Row]] = {p: {} for p in size.plants}
+    for row in cells:
+        panels[row['plant']][row['condition']] = row
+    text = 'error of d over that of a Kalman filter tuned anew with the truth'
+    return Found({NAME: cells}, texts(cells), {NAME: ratios.draw(panels, STYLES, text)})
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command; return 0, 2 for a bad argument or output, 130 if it was interrupted."""
-    parser = with_jobs(study(NAME, __doc__))
-    parser.add_argument(
-        '--only-self-tuning', action='store_true',
-        help='measure self-tuning anew, and take the rest from the results that are there',
-    )  # fmt: skip
-    return run_command(parser, argv, _study)
+    """Run the command; see `run_study`."""
+    return run_study(NAME, __doc__, measure, argv)
 
 
 if __name__ == '__main__':

@@ -1,64 +1,93 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all studies share: their command line, many calls at once, and our observer as a node."""
+"""What all studies share: their command, many calls at once, and our observer as a node."""
 
 import argparse
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 import multiprocessing
 from multiprocessing import resource_tracker
 import os
 from pathlib import Path
 import signal
 import threading
-from typing import Any
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import OnlineEstimator, Trajectory
 from fhaosmo_ros.core.parameters.tables import CONSTANTS
 from fhaosmo_ros.stop_signals import Stop, Stopped
+from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.tools.cli.progress import progress
+from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from studies.evidence import DOCS
+from studies import evidence
+from studies.evidence import DOCS, Row
 
 SELF_TUNING = {'gains': 'self_tuning'}
 MODEL = ('order', 'phi', 'inputs')
 POLL = 0.1
 """Seconds between two looks at what has come."""
 Floats = NDArray[np.float64]
+Call = tuple[Any, ...]
+"""A function of a module, and its arguments."""
+Results = Callable[[Mapping[Hashable, Call]], dict[Any, Any]]
+"""Returns what calls return, by key: `called` for one study."""
 
 
-def model_alone(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters that are the model: what a self-tuning observer is told."""
-    return {k: v for k, v in parameters.items() if k in MODEL or k.startswith(CONSTANTS)}
+class Found(NamedTuple):
+    """What a study publishes: lines by table, parts of the page, figures by name."""
+
+    tables: Mapping[str, list[Row]]
+    texts: Mapping[str, str]
+    figures: Mapping[str, Figure]
 
 
-def observed(
-    parameters: Mapping[str, Any], t: Floats, y: Floats, u: Floats | None = None
-) -> Trajectory:
-    """Return what the node would have estimated from samples, the first one at t[0]."""
-    stamps = 10**9 + np.round((t - t[0]) * 1e9).astype(np.int64)
-    return OnlineEstimator(parameters).run(stamps, y, u)
+def run_study(
+    name: str,
+    description: str | None,
+    measure: Callable[[argparse.Namespace, Results], Found],
+    argv: list[str] | None,
+    options: Iterable[tuple[str, dict[str, Any]]] = (),
+) -> int:
+    """
+    Run the command of a study: measure, and write what was found into a folder.
 
+    Parameters
+    ----------
+    name, description : str
+    measure : callable
+        Gets the arguments, with the folder as `output`, and a function that computes calls in
+        several processes.
+    argv : list of str, optional
+    options : iterable
+        Arguments of the command beside those that all studies have.
 
-def study(name: str, description: str | None) -> argparse.ArgumentParser:
-    """Return a parser with the options that all studies have."""
+    Returns
+    -------
+    int
+        0; 2 for a bad argument or output; 130 if it was interrupted.
+
+    """
     parser = argparse.ArgumentParser(prog=name, description=description)
-    parser.add_argument(
-        '--quick', action='store_true', help='little of everything: for a first look and for tests'
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    for argument, settings in options:
+        add(argument, **settings)
+    add('--quick', action='store_true', help='little of everything: for a first look, for tests')
+    add(
         '--output', type=Path, metavar='FOLDER',
         help=f'folder for results and figures (default: docs; {name}_output with --quick)',
     )  # fmt: skip
-    return parser
-
-
-def with_jobs(parser: argparse.ArgumentParser) -> argparse.ArgumentParser:
-    """Return the parser with an option for the number of processes."""
-    parser.add_argument(
+    add(
         '--jobs', type=positive, metavar='N', default=os.cpu_count() or 1,
         help='processes (default: one a core)',
     )  # fmt: skip
-    return parser
+
+    def body(arguments: argparse.Namespace, stop: Stop) -> None:
+        own = Path(f'{name}_output') if arguments.quick else DOCS
+        arguments.output = arguments.output or own
+        found = measure(arguments, lambda calls: called(calls, name, arguments.jobs, stop))
+        evidence.publish(arguments.output, *found)
+
+    return run_command(parser, argv, body)
 
 
 def positive(text: str) -> int:
@@ -69,17 +98,9 @@ def positive(text: str) -> int:
     return value
 
 
-def output(arguments: argparse.Namespace, name: str) -> Path:
-    """Return the folder that the results go to."""
-    chosen: Path | None = arguments.output
-    return chosen or (Path(f'{name}_output') if arguments.quick else DOCS)
-
-
-def called(
-    calls: Mapping[Hashable, tuple[Any, ...]], name: str, jobs: int, stop: Stop
-) -> dict[Hashable, Any]:
+def called(calls: Mapping[Hashable, Call], name: str, jobs: int, stop: Stop) -> dict[Any, Any]:
     """
-    Return the results of calls (function, arguments) in several processes, by key, in order.
+    Return the results of calls in several processes, by key, in order.
 
     The main process only waits, and a signal sets `stop`: nothing is raised in the middle of
     anything, where a lock would stay locked or a library would make another error of it.
@@ -119,3 +140,16 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def model_alone(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters that are the model: what a self-tuning observer is told."""
+    return {k: v for k, v in parameters.items() if k in MODEL or k.startswith(CONSTANTS)}
+
+
+def observed(
+    parameters: Mapping[str, Any], t: Floats, y: Floats, u: Floats | None = None
+) -> Trajectory:
+    """Return what the node would have estimated from samples, the first one at t[0]."""
+    stamps = 10**9 + np.round((t - t[0]) * 1e9).astype(np.int64)
+    return OnlineEstimator(parameters).run(stamps, y, u)

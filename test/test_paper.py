@@ -8,7 +8,8 @@ import numpy as np
 from on_terminal import OnTerminal
 import pytest
 from studies import evidence
-from studies.paper import beyond, cases, command, findings
+from studies.paper import cases, findings
+from studies.paper.__main__ import main
 
 REWRITE = 'run make paper'
 
@@ -39,10 +40,10 @@ def test_new_simulation_agrees_with_the_table(documented, solver, name, omega):
         check(findings.simulation(s, name, omega), old, name.startswith('sign'))
 
 
-@pytest.mark.parametrize('case', beyond.SAMPLED[1::4], ids=str)
+@pytest.mark.parametrize('case', cases.SAMPLED[1::4], ids=str)
 def test_new_samples_agree_with_the_table(case):
     rows = [row for row in evidence.read('paper_sampled') if tuple(row.values())[1:5] == case]
-    for new, old in zip(beyond.sampled_rows(*case), rows, strict=True):
+    for new, old in zip(cases.sampled_rows(*case), rows, strict=True):
         assert new['observer'] == old['observer']
         check(new, old, new['observer'].startswith('sign'))
 
@@ -50,7 +51,7 @@ def test_new_samples_agree_with_the_table(case):
 def test_new_long_run_agrees_with_the_table():
     """Its first window."""
     old = evidence.read('paper_long')[:2]
-    for a, b in zip(beyond.long_rows(*beyond.LONG[0], beyond.WINDOW), old, strict=True):
+    for a, b in zip(cases.long_rows(*cases.LONG[0], cases.WINDOW), old, strict=True):
         assert a['law'] == b['law']
         for name in ('rms_d_first', 'gamma_first'):
             assert a[name] == pytest.approx(b[name], rel=0.03), REWRITE
@@ -90,7 +91,7 @@ def test_shipped_half_widths_lie_inside_the_region():
 @pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
 @pytest.mark.parametrize('omega', cases.FREQUENCIES)
 def test_default_law_is_never_worse_than_none(scheme, omega):
-    papers, run = beyond.long_rows(scheme, omega, 0.0, 250.0)
+    papers, run = cases.long_rows(scheme, omega, 0.0, 250.0)
     assert run['rms_d_last'] <= 1.05 * run['rms_d_fixed']
     if omega == cases.FREQUENCIES[0]:
         # What the transient did to gamma goes by.
@@ -115,7 +116,7 @@ def test_high_passed_sees_chatter_and_not_the_signal():
 
 @pytest.mark.slow
 def test_quick_run_writes_everything(tmp_path, capsys):
-    assert command.main(['--quick', '--output', str(tmp_path)]) == 0
+    assert main(['--quick', '--output', str(tmp_path)]) == 0
     assert '| F2 |' in capsys.readouterr().out
     written = {path.name for path in (tmp_path / evidence.FOLDER).iterdir()}
     kept = {path.name for path in (evidence.DOCS / evidence.FOLDER).glob('paper*')}

@@ -1,9 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m studies.comparison`; see command.py."""
+"""Compare the observer with what people would use instead, all tuned by the same rules."""
 
+import argparse
 import sys
 
-from studies.comparison.command import main
+from studies import evidence
+from studies.comparison.cells import sensors
+from studies.comparison.evaluation import evaluate, methods_for
+from studies.comparison.results import best_of_kinds, Cell, draw, texts
+from studies.harness import Found, positive, Results, run_study
+
+NAME = 'comparison'
+TRIALS, QUICK_TRIALS = 200, 15
+TRAINING, QUICK_TRAINING = 4, 1
+OPTIONS = (('--trials', {'type': positive, 'metavar': 'N', 'help': 'trials of each tuning'}),)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; see `run_study`."""
+    return run_study(NAME, __doc__, measure, argv, OPTIONS)
+
+
+def measure(arguments: argparse.Namespace, results: Results) -> Found:
+    """Return a line for each cell and method."""
+    quick = arguments.quick
+    trials = arguments.trials or (QUICK_TRIALS if quick else TRIALS)
+    training = QUICK_TRAINING if quick else TRAINING
+    found = results({
+        (sensor, name): (evaluate, sensor, name, training, trials)
+        for sensor in sensors(quick)
+        for name in methods_for(sensor)
+    })  # fmt: skip
+    rows = evidence.rounded(
+        Cell(s.plant, d, s.noise, s.rate, s.timing)._asdict()
+        | {'method': name, 'training': tuned.training, 'error': error}
+        for (s, name), (tuned, errors) in found.items()
+        for d, error in zip(s.disturbances, errors, strict=True)
+    )
+    chosen = best_of_kinds(rows)
+    drawn = {'comparison_smooth': draw(chosen, False), 'comparison_jumps': draw(chosen, True)}
+    return Found({NAME: rows}, texts(rows), drawn)
+
 
 if __name__ == '__main__':
     sys.exit(main())

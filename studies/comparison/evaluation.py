@@ -13,10 +13,16 @@ import numpy as np
 from studies.comparison.cells import Sensor
 from studies.comparison.methods.adaptive import ADAPTIVE
 from studies.comparison.methods.linear import FILTERS
-from studies.comparison.methods.method import Method, Search, Setting, Values
+from studies.comparison.methods.method import (
+    mean,
+    Method,
+    objective,
+    Search,
+    Setting,
+    Values,
+)
 from studies.comparison.methods.ours import OUR_METHODS
 from studies.comparison.methods.sliding import OBSERVERS
-from studies.comparison.scores import mean, objective
 
 HOPELESS = 1.5
 """A trial this many times worse than the best one so far is not run on more recordings."""
@@ -34,24 +40,14 @@ class Tuned(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """
-    What one set of values brings.
-
-    Attributes
-    ----------
-    value : float
-        Geometric mean of the objective over the recordings, of the best readout; an estimate
-        where not all of them were run.
-    readout : str
-        Its name.
-    averages : list of float
-        The same over the first recordings, so many as were run.
-
-    """
+    """What one set of values brings."""
 
     value: float
+    """Geometric mean of the objective over the recordings, guessed where not all were run."""
     readout: str
+    """The best one, which this is about."""
     averages: list[float]
+    """The same over the first recordings, so many as were run."""
 
 
 def trial(
@@ -122,20 +118,13 @@ def _scan(judged: Callable[[Values], float], d: Dimension, trials: int) -> dict[
     return {d.name: float(min([best, *closer], key=lambda x: judged({d.name: x})))}
 
 
-def errors(
-    method: Method, setting: Setting, tuned: Tuned, recordings: Sequence[Recording]
-) -> list[float]:
-    """Return the error of d of a tuned method on each recording."""
-    run = method.prepare(setting, tuned.values)
-    return [objective(recording, run(recording)[tuned.readout]) for recording in recordings]
-
-
 def evaluate(sensor: Sensor, name: str, training: int, trials: int) -> tuple[Tuned, list[float]]:
     """Tune a method for a sensor and return its error for each of the sensor's disturbances."""
     method, setting = METHODS[name], sensor.setting()
     tuned = tune(method, setting, sensor.training(training), trials, seed=1)
+    run = method.prepare(setting, tuned.values)
     return tuned, [
-        mean(errors(method, setting, tuned, sensor.held_out(disturbance)))
+        mean(objective(r, run(r)[tuned.readout]) for r in sensor.held_out(disturbance))
         for disturbance in sensor.disturbances
     ]
 

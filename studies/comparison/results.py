@@ -11,6 +11,7 @@ from studies.comparison.evaluation import METHODS
 from studies.comparison.methods.method import (
     KINDS,
     LINEAR,
+    mean,
     OURS,
     PAPER,
     ROBUST,
@@ -18,7 +19,6 @@ from studies.comparison.methods.method import (
     SLIDING,
     USUAL,
 )
-from studies.comparison.scores import mean
 from studies.evidence import markdown, Row
 
 STYLES = {

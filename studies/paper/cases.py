@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's simulations and ours beside them: what is run, and how it is judged."""
+"""
+The paper's simulations and ours beside them: what is run, and how it is judged.
+
+Where the paper stops: the implicit scheme, measurement noise, 2,000 s of adaptation.
+"""
 
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -11,10 +15,9 @@ from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAME
 from fhaosmo_ros.core.simulation.metrics import chatter, high_passed, rms, settling_time
 from fhaosmo_ros.tools.cli.share import shipped
 import numpy as np
-from numpy.typing import NDArray
+from studies.evidence import Row
+from studies.harness import Floats
 from studies.paper.plant_and_observer import JointRun, simulate
-
-Floats = NDArray[np.float64]
 
 FREQUENCIES = (1.0, 5.0)
 """Low (the paper's own) and high; the paper does not print its high one. rad/s."""
@@ -29,6 +32,12 @@ SETTLED = 0.02
 """Half-width of the settling band of d: a tenth of the range of d."""
 Score = dict[str, float]
 """Scores of a run by name; see `score`."""
+SAFE = {
+    p.name: p.default
+    for p in OBSERVER_PARAMETERS.values()
+    if p.name.startswith('gamma_') and p.name != 'gamma_initial'
+}
+"""The law of gamma with its default settings, where config/paper.yaml has the paper's."""
 
 
 class Case(NamedTuple):
@@ -44,15 +53,34 @@ OBSERVERS = {
     'sign, 1e-3 s': Case('sign', 1e-3, {}),
     'fuzzy, 1e-3 s': Case('fuzzy', 1e-3, {}),
     'fuzzy adaptive, 1e-3 s': Case('fuzzy_adaptive', 1e-3, {}),
+    'fuzzy adaptive, default law, 1e-3 s': Case('fuzzy_adaptive', 1e-3, SAFE),
 }
-"""The four observers of the paper's section 3 and 4; below one of ours."""
-SAFE = {
-    p.name: p.default
-    for p in OBSERVER_PARAMETERS.values()
-    if p.name.startswith('gamma_') and p.name != 'gamma_initial'
-}
-"""The law of gamma with its default settings, where config/paper.yaml has the paper's."""
-OBSERVERS |= {'fuzzy adaptive, default law, 1e-3 s': Case('fuzzy_adaptive', 1e-3, SAFE)}
+"""The four observers of the paper's section 3 and 4, and one of ours."""
+VARIANTS = ('sign', 'fuzzy', 'fuzzy_adaptive', 'sign_adaptive')
+SAMPLED = (
+    *(
+        (scheme, step, omega, 0.0)
+        for scheme, step in (('explicit', 1e-3), ('implicit', 1e-3), ('implicit', 1e-2))
+        for omega in FREQUENCIES
+    ),
+    *(
+        (scheme, 1e-3, FREQUENCIES[0], noise)
+        for noise in (1e-4, 1e-3, 1e-2)  # the amplitude of z1 is of order 0.1 to 1
+        for scheme in ('explicit', 'implicit')
+    ),
+)
+"""As a node runs: scheme, step (s), angular frequency, standard deviation of the noise on y."""
+LONG = tuple(
+    (scheme, omega, noise)
+    for noise in (0.0, 1e-4)
+    for scheme in ('explicit', 'implicit')
+    for omega in FREQUENCIES
+)
+"""Long runs: scheme, angular frequency, noise on y."""
+LONG_DURATION, WINDOW, THINNED = 2000.0, 100.0, 10
+"""Seconds of a long run, and of the windows that are judged; it records every 10th sample."""
+LAWS: dict[str, dict[str, Any]] = {"the paper's": {}, 'default': SAFE}
+"""Laws of gamma by name: what differs from config/paper.yaml."""
 
 
 class Preset(NamedTuple):
@@ -66,26 +94,27 @@ class Preset(NamedTuple):
 def preset() -> Preset:
     """Read the paper's numbers from the shipped configuration."""
     path = shipped('config/paper.yaml')
-    return Preset(
-        *(
-            table.complete(load(path, node, table))
-            for node, table in (('estimator', OBSERVER_PARAMETERS), ('plant', PLANT_PARAMETERS))
-        )
-    )
+    tables = {'estimator': OBSERVER_PARAMETERS, 'plant': PLANT_PARAMETERS}
+    return Preset(*(table.complete(load(path, node, table)) for node, table in tables.items()))
 
 
 def simulated(name: str, omega: float, solver: str, **changes: Any) -> JointRun:
     """Simulate one of `OBSERVERS` as the paper does: plant and observer together."""
     variant, step, own = OBSERVERS[name]
-    numbers = preset()
-    return simulate(
-        numbers.observer.changed({'variant': variant} | own | changes),
-        numbers.plant.changed({'disturbance_omega': omega}),
-        solver,
-        step,
-        DURATION,
-        max(1, round(GRID / step)),
-    )
+    observer = preset().observer.changed({'variant': variant} | own | changes)
+    plant = preset().plant.changed({'disturbance_omega': omega})
+    return simulate(observer, plant, solver, step, DURATION, max(1, round(GRID / step)))
+
+
+def first_observer(step: float, solver: str, duration: float, every: int) -> JointRun:
+    """Simulate figure sim1: sign, n = 3, no model of Phi_3, theta estimates eta = -z3 + d."""
+    observer = preset().observer
+    three = {k: observer[k][:3] for k in ('lambda', 'alpha')}
+    observer = observer.changed({
+        'variant': 'sign', 'unknown_input': False, 'phi': ['0', '0', '0'],
+        'initial_estimate': [0.05, 0.0, 0.05], 'initial_internal': [0.05, 0.0, 0.05],
+    } | three)  # fmt: skip
+    return simulate(observer, preset().plant, solver, step, duration, every)
 
 
 class Truth(NamedTuple):
@@ -121,30 +150,6 @@ def observe(truth: Truth, variant: str, scheme: str, every: int = 1, **changes: 
     return JointRun(run.t, z, d, run.z_hat, run.z_tilde, run.gamma)
 
 
-def sampled(
-    variant: str, omega: float, step: float, scheme: str, noise: float = 0.0, **changes: Any
-) -> JointRun:
-    """Simulate as a node runs: samples of a plant, one observer step a sample."""
-    return observe(truth_of(omega, step, noise, DURATION), variant, scheme, **changes)
-
-
-def first_observer(step: float, solver: str, duration: float, every: int) -> JointRun:
-    """Simulate figure sim1: sign, n = 3, no model of Phi_3, theta estimates eta = -z3 + d."""
-    numbers = preset()
-    three = {k: numbers.observer[k][:3] for k in ('lambda', 'alpha')}
-    observer = numbers.observer.changed(
-        three
-        | {
-            'variant': 'sign',
-            'unknown_input': False,
-            'phi': ['0', '0', '0'],
-            'initial_estimate': [0.05, 0.0, 0.05],
-            'initial_internal': [0.05, 0.0, 0.05],
-        }
-    )
-    return simulate(observer, numbers.plant, solver, step, duration, every)
-
-
 def score(run: JointRun, start: float = CONVERGED) -> Score:
     """
     Judge the filtered estimates (the paper's 'estimated state') from `start` on.
@@ -161,8 +166,7 @@ def score(run: JointRun, start: float = CONVERGED) -> Score:
     n = run.z.shape[1]
     d, estimate = run.unknown_input, run.z_hat[:, n]
     errors = run.z_hat[late, :n] - run.z[late]
-    result = {f'rms_z{i + 1}': rms(errors[:, i]) for i in range(n)}
-    return result | {
+    return {f'rms_z{i + 1}': rms(errors[:, i]) for i in range(n)} | {
         'rms_d': rms((estimate - d)[late]),
         'true_d': rms(d[late]),
         'bias_d': float(np.mean((estimate - d)[late])),
@@ -171,3 +175,50 @@ def score(run: JointRun, start: float = CONVERGED) -> Score:
         'high_pass': high_passed(estimate[late], max(1, round(HIGH_PASS / run.t[1]))),
         'gamma': float(run.gamma[-1]),
     }
+
+
+def sampled_rows(scheme: str, step: float, omega: float, noise: float) -> list[Row]:
+    """Measure observers as a node runs them, a step a sample."""
+    truth = truth_of(omega, step, noise, DURATION)
+    return [
+        {'observer': variant, 'scheme': scheme, 'step': step, 'omega': omega, 'noise': noise}
+        | score(observe(truth, variant, scheme))
+        for variant in VARIANTS
+    ]
+
+
+def long_rows(
+    scheme: str, omega: float, noise: float, duration: float = LONG_DURATION
+) -> list[Row]:
+    """
+    Adapt gamma by each of `LAWS` for a long time, from `CONVERGED` on.
+
+    Returns
+    -------
+    list of dict
+        gamma_first, gamma_last: at the end of the first and the last window; rms_d_first,
+        rms_d_last: error of d within it; rms_d_fixed: that of the last with gamma = 1/2.
+
+    """
+    truth = truth_of(omega, 1e-3, noise, duration + CONVERGED)
+    first, size = (round(seconds / (THINNED * 1e-3)) for seconds in (CONVERGED, WINDOW))
+
+    def windows(variant: str, changes: dict[str, Any]) -> tuple[Floats, Floats]:
+        run = observe(truth, variant, scheme, THINNED, **changes)
+        error = run.z_hat[:, -1] - run.unknown_input
+        starts = range(first, len(error) - size + 1, size)
+        return (
+            np.array([rms(error[k : k + size]) for k in starts]),
+            np.array([run.gamma[k + size - 1] for k in starts]),
+        )
+
+    fixed = float(windows('fuzzy', {})[0][-1])
+    rows = []
+    for law, changes in LAWS.items():
+        rms_d, gamma = windows('fuzzy_adaptive', changes)
+        rows.append({
+            'law': law, 'scheme': scheme, 'omega': omega, 'noise': noise,
+            'gamma_first': float(gamma[0]), 'gamma_last': float(gamma[-1]),
+            'rms_d_first': float(rms_d[0]), 'rms_d_last': float(rms_d[-1]), 'rms_d_fixed': fixed,
+        })  # fmt: skip
+    return rows

@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 RED = {'color': COLOURS[0], 'linewidth': 0.9, 'label': 'estimate'}
 BLUE = {'color': TRUTH['color'], 'linewidth': 1.7, 'linestyle': (0, (5, 2)), 'label': 'truth'}
 TIME = 'time [s]'
+ZOOM = 0.1
+"""Seconds that figure sim1 enlarges."""
 
 
 def draw_pair(axes: Axes, t: Floats, truth: Floats, estimate: Floats) -> None:
@@ -25,27 +27,29 @@ def draw_pair(axes: Axes, t: Floats, truth: Floats, estimate: Floats) -> None:
     axes.grid(alpha=0.3)
 
 
-def sim1(run: JointRun, zoom: float) -> Figure:
-    """Figure sim1: z1, z2, z3 and eta, and the last `zoom` seconds of each."""
+def sim1(run: JointRun) -> Figure:
+    """Figure sim1: z1, z2, z3 and eta, and the last `ZOOM` seconds of each."""
     figure = Figure(figsize=(9.0, 8.0), layout='constrained')
     panels = figure.subplots(4, 2, width_ratios=(2, 1))
     eta = run.unknown_input - run.z[:, 2]
     truths = [*run.z.T, eta]
     estimates = [*run.z_hat.T, run.z_tilde[:, 2]]
     labels = ('z₁', 'z₂', 'z₃', 'η')
-    late = run.t >= run.t[-1] - zoom
-    for row, (label, truth, estimate) in enumerate(zip(labels, truths, estimates, strict=True)):
-        left, right = panels[row]
+    late = run.t >= run.t[-1] - ZOOM
+    after = 1e3 * (run.t[late] - run.t[late][0])
+    for (left, right), label, truth, estimate in zip(
+        panels, labels, truths, estimates, strict=True
+    ):
         draw_pair(left, run.t, truth, estimate)
         left.set_ylabel(f'{label} [1]')
-        right.plot(1e3 * (run.t[late] - run.t[late][0]), estimate[late], **RED)
-        right.plot(1e3 * (run.t[late] - run.t[late][0]), truth[late], **BLUE)
+        right.plot(after, estimate[late], **RED)
+        right.plot(after, truth[late], **BLUE)
         right.ticklabel_format(useOffset=False)
         right.margins(x=0.0)
         right.grid(alpha=0.3)
     panels[0, 0].legend(loc='upper left', ncols=2)
     panels[0, 0].set_title('sign, n = 3, step 1e-5 s')
-    panels[0, 1].set_title(f'zoom: the last {1e3 * zoom:g} ms')
+    panels[0, 1].set_title(f'zoom: the last {1e3 * ZOOM:g} ms')
     panels[3, 0].set_xlabel(TIME)
     panels[3, 1].set_xlabel(f'time after {run.t[late][0]:.2f} s [ms]')
     return figure

@@ -29,35 +29,21 @@ Scores = dict[tuple[str, float], Score]
 
 
 class Verdict(NamedTuple):
-    """
-    One finding.
-
-    Attributes
-    ----------
-    name, claim : str
-    holds : bool
-    numbers : str
-        What decides.
-    estimates : bool
-        False if every observer that is judged has a larger RMS error of d than the estimate 0.
-
-    """
+    """One finding."""
 
     name: str
     claim: str
     holds: bool
     numbers: str
+    """What decides."""
     estimates: bool
+    """False if every observer that is judged has a larger RMS error of d than the estimate 0."""
 
     @property
     def words(self) -> str:
         """Whether it holds, and what that is worth."""
         text = 'yes' if self.holds else 'no'
         return f'**{text}**' if self.estimates else f'{text}, but no estimate'
-
-
-def _estimates(*scores: Score) -> bool:
-    return any(s['rms_d'] < s['true_d'] for s in scores)
 
 
 def simulation(solver: str, name: str, omega: float) -> Row:
@@ -90,43 +76,38 @@ def choose_solver(scores: dict[str, Scores]) -> str:
 
 def verdicts(s: Scores) -> list[Verdict]:
     """Judge the findings F1, F2, F3 from the scores of one solver."""
-    result = []
+    found = []
+
+    def judge(name: str, claim: str, holds: bool, numbers: str, *judged: Score) -> None:
+        estimates = any(one['rms_d'] < one['true_d'] for one in judged)
+        found.append(Verdict(name, claim, holds, numbers, estimates))
+
     for label, w in (('low', LOW), ('high', HIGH)):
         fine, coarse, fuzzy, adaptive = (s[name, w] for name in (FINE, COARSE, FUZZY, ADAPTIVE))
         chatter, smooth = fine['high_pass'], fuzzy['high_pass']
-        result += [
-            Verdict(
-                f'F1a {label}', 'sign at 1e-5 s chatters visibly', chatter >= VISIBLE,
-                f'high-passed {chatter:.1e}; error {fine["rms_d"]:.3f}', _estimates(fine),
-            ),
-            Verdict(
-                f'F1b {label}', 'sign at 1e-3 s is bad',
-                coarse['rms_d'] >= BADLY * fine['rms_d'],
-                f'error {coarse["rms_d"]:.3f}, at 1e-5 s {fine["rms_d"]:.3f}',
-                _estimates(coarse, fine),
-            ),
-            Verdict(
-                f'F1c {label}', 'fuzzy at 1e-3 s does not chatter', smooth <= SMOOTH * chatter,
-                f'high-passed {smooth:.1e}, sign at 1e-5 s {chatter:.1e}',
-                _estimates(fuzzy, fine),
-            ),
-            Verdict(
-                f'F3 {label}', 'adaptation improves fuzzy, and γ moves',
-                adaptive['rms_d'] < fuzzy['rms_d'] and abs(adaptive['gamma'] - 0.5) >= MOVED,
-                f'error {adaptive["rms_d"]:.4f}, without {fuzzy["rms_d"]:.4f}; γ ends at '
-                f'{adaptive["gamma"]:.3f}',
-                _estimates(adaptive, fuzzy),
-            ),
-        ]  # fmt: skip
-    fuzzy, fine = s[FUZZY, HIGH], s[FINE, HIGH]
-    result.append(
-        Verdict(
-            'F2', 'at the high frequency fuzzy is worse than sign', fuzzy['rms_d'] > fine['rms_d'],
-            f'error {fuzzy["rms_d"]:.3f}, sign at 1e-5 s {fine["rms_d"]:.3f}',
-            _estimates(fuzzy, fine),
-        )
+        judge(
+            f'F1a {label}', 'sign at 1e-5 s chatters visibly', chatter >= VISIBLE,
+            f'high-passed {chatter:.1e}; error {fine["rms_d"]:.3f}', fine,
+        )  # fmt: skip
+        judge(
+            f'F1b {label}', 'sign at 1e-3 s is bad', coarse['rms_d'] >= BADLY * fine['rms_d'],
+            f'error {coarse["rms_d"]:.3f}, at 1e-5 s {fine["rms_d"]:.3f}', coarse, fine,
+        )  # fmt: skip
+        judge(
+            f'F1c {label}', 'fuzzy at 1e-3 s does not chatter', smooth <= SMOOTH * chatter,
+            f'high-passed {smooth:.1e}, sign at 1e-5 s {chatter:.1e}', fuzzy, fine,
+        )  # fmt: skip
+        judge(
+            f'F3 {label}', 'adaptation improves fuzzy, and γ moves',
+            adaptive['rms_d'] < fuzzy['rms_d'] and abs(adaptive['gamma'] - 0.5) >= MOVED,
+            f'error {adaptive["rms_d"]:.4f}, without {fuzzy["rms_d"]:.4f}; γ ends at '
+            f'{adaptive["gamma"]:.3f}', adaptive, fuzzy,
+        )  # fmt: skip
+    judge(
+        'F2', 'at the high frequency fuzzy is worse than sign', fuzzy['rms_d'] > fine['rms_d'],
+        f'error {fuzzy["rms_d"]:.3f}, sign at 1e-5 s {fine["rms_d"]:.3f}', fuzzy, fine,
     )  # fmt: skip
-    return sorted(result)
+    return sorted(found)
 
 
 def texts(rows: Iterable[Row]) -> dict[str, str]:

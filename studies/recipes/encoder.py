@@ -3,30 +3,15 @@
 
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from fhaosmo_ros.core import Family
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter, savgol_coeffs
-from studies.harness import SELF_TUNING
-from studies.recipes import peers
-from studies.recipes.judging import (
-    FIXED,
-    fixed_gains,
-    Fold,
-    Method,
-    model,
-    OURS,
-    Recorded,
-    run,
-)
+from studies.harness import Floats, SELF_TUNING
+from studies.recipes import judging, peers
+from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
-Floats = NDArray[np.float64]
-DATA = None
-QUANTITY, SCALE = 'acceleration [rad/s²]', 1.0
-SHOWN, SHOWN_FOLD, BAND = (2.0, 4.0), 0, False
 ACCELERATION, VELOCITY = 'acceleration', 'velocity'
 KINDS = ('smooth', 'steps')
 """Of acceleration, as `disturbances` below has them in turn."""
@@ -51,30 +36,19 @@ def savitzky_golay(degree: int, _: Mapping[str, Any], r: Recorded, window: float
     """Return the derivative, at the newest sample, of a polynomial through the last ones."""
     count, derivative = round(window), 1 if r.quantity == VELOCITY else 2
     weights = savgol_coeffs(count, degree, derivative, r.period, pos=count - 1)
-    found: Floats = lfilter(weights, [1.0], r.y)
-    return found
+    return np.asarray(lfilter(weights, [1.0], r.y))
 
 
 def this_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
     """Return z2 or d of the observer with gains of a bandwidth; 0: self-tuning."""
-    gains = fixed_gains(2, bandwidth, r.period) if bandwidth else SELF_TUNING
-    found = run(dict(p) | gains, r)
+    gains = judging.fixed_gains(2, bandwidth, r.period) if bandwidth else SELF_TUNING
+    found = judging.run(dict(p) | gains, r)
     return found.z[:, 1] if r.quantity == VELOCITY else found.unknown_input
 
 
-METHODS = {
-    'difference, low-passed': Method(difference, BANDWIDTHS),
-    'Savitzky-Golay, causal, degree 2': Method(partial(savitzky_golay, 2), WINDOWS, 'samples'),
-    'Savitzky-Golay, causal, degree 3': Method(partial(savitzky_golay, 3), WINDOWS, 'samples'),
-    OURS: Method(this_observer),
-    FIXED: Method(this_observer, BANDWIDTHS),
-}
-DRAWN = ('Savitzky-Golay, causal, degree 3', OURS)
-
-
-def recorded(count: int, changes: Mapping[str, Any] | None = None) -> dict[str, list[Fold]]:
+def recorded(count: int, **changes: float) -> dict[str, list[Fold]]:
     """Return a fold for each quantity and kind of acceleration; peers are tuned on both kinds."""
-    found, p = Family(JOINT | dict(changes or {})).recordings(2 * count), model('encoder')
+    found, p = Family(JOINT | changes).recordings(2 * count), judging.model('encoder')
     folds = {}
     for quantity in (ACCELERATION, VELOCITY):
         rs = [
@@ -89,17 +63,24 @@ def recorded(count: int, changes: Mapping[str, Any] | None = None) -> dict[str, 
     return folds
 
 
-def conditions(_: Path | None) -> tuple[dict[str, list[Fold]], dict[str, float]]:
-    """Return the folds; and remarks: what the errors are relative to."""
-    folds = recorded(RECORDINGS)
-    squares = {
-        name: np.mean([np.mean(r.d[r.judged] ** 2) for r in f.judged])
-        for name, [f] in folds.items()
-    }
-    return folds, {f'RMS of {name}': float(np.sqrt(x)) for name, x in squares.items()}
+def conditions(_: object) -> dict[str, list[Fold]]:
+    """Return all folds."""
+    return recorded(RECORDINGS)
 
 
 def short() -> dict[str, list[Fold]]:
     """Return a fold of four short recordings."""
-    folds = recorded(2, {'duration': 3.0})
-    return {'simulated': folds[f'{ACCELERATION}, {KINDS[0]}']}
+    return {'simulated': recorded(2, duration=3.0)[f'{ACCELERATION}, {KINDS[0]}']}
+
+
+RECIPE = Recipe(
+    {
+        'difference, low-passed': Method(difference, BANDWIDTHS),
+        'Savitzky-Golay, causal, degree 2': Method(partial(savitzky_golay, 2), WINDOWS, 'samples'),
+        'Savitzky-Golay, causal, degree 3': Method(partial(savitzky_golay, 3), WINDOWS, 'samples'),
+        OURS: Method(this_observer),
+        FIXED: Method(this_observer, BANDWIDTHS),
+    },
+    conditions, short, 'acceleration [rad/s²]', ('Savitzky-Golay, causal, degree 3', OURS),
+    (2.0, 4.0), band=False,
+)  # fmt: skip

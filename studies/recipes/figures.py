@@ -2,23 +2,22 @@
 """A recipe's figure: estimates over time, and the errors of all methods."""
 
 from collections.abc import Mapping
-from types import ModuleType
 
 from fhaosmo_ros.tools.plot.figures import COLOURS, TRUTH
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from studies.harness import SELF_TUNING
-from studies.recipes.judging import Fold, OURS, Results, run
+from studies.recipes.judging import Fold, Folds, Judgements, OURS, Recipe, run
 
 
-def draw(recipe: ModuleType, folds: Mapping[str, list[Fold]], results: Results) -> Figure:
+def draw(recipe: Recipe, folds: Folds, results: Judgements) -> Figure:
     """Draw the first condition over time, and the errors of all methods in all conditions."""
     figure = Figure(figsize=(10.0, 4.4), layout='constrained')
     over_time, errors = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
     condition = next(iter(folds))
     chosen = {name: found.chosen for name, found in results[condition].items()}
-    _estimates(over_time, recipe, folds[condition][recipe.SHOWN_FOLD], chosen)
+    _estimates(over_time, recipe, folds[condition][recipe.fold], chosen)
     width = 0.8 / len(results)
     for k, (condition, found) in enumerate(results.items()):
         place = np.arange(len(found)) + k * width - 0.4 + width / 2.0
@@ -30,7 +29,7 @@ def draw(recipe: ModuleType, folds: Mapping[str, list[Fold]], results: Results) 
         where = f'  {condition}' if len(results) > 1 else ''
         labels = [f'{value:#.3g}{where}' for value in values]
         errors.bar_label(bars, labels, fontsize='x-small', padding=2)
-    names = [name.replace(', ', ',\n').replace(' less ', '\nless ') for name in recipe.METHODS]
+    names = [name.replace(', ', ',\n').replace(' less ', '\nless ') for name in recipe.methods]
     errors.set_yticks(np.arange(len(names)), names)
     errors.tick_params(axis='y', labelsize='x-small')
     errors.invert_yaxis()
@@ -43,20 +42,18 @@ def draw(recipe: ModuleType, folds: Mapping[str, list[Fold]], results: Results) 
     return figure
 
 
-def _estimates(
-    axes: Axes, recipe: ModuleType, fold: Fold, chosen: Mapping[str, list[float]]
-) -> None:
+def _estimates(axes: Axes, recipe: Recipe, fold: Fold, chosen: Mapping[str, list[float]]) -> None:
     """Draw the truth, the estimates of some methods, and the self-tuning one's error band."""
-    r, scale = fold.judged[0], recipe.SCALE
-    part = (r.t - r.t[0] >= recipe.SHOWN[0]) & (r.t - r.t[0] <= recipe.SHOWN[1])
+    r, scale = fold.judged[0], recipe.scale
+    part = (r.t - r.t[0] >= recipe.shown[0]) & (r.t - r.t[0] <= recipe.shown[1])
     axes.plot(r.t[part], scale * r.d[part], **TRUTH)
-    for k, (name, method) in enumerate(recipe.METHODS.items()):
-        if name not in recipe.DRAWN:
+    for k, (name, method) in enumerate(recipe.methods.items()):
+        if name not in recipe.drawn:
             continue
-        number = chosen[name][recipe.SHOWN_FOLD] if chosen[name] else 0.0
+        number = chosen[name][recipe.fold] if chosen[name] else 0.0
         found = scale * method.estimate(fold.parameters, r, number)
         axes.plot(r.t[part], found[part], color=COLOURS[k], lw=1.1, label=name)
-        if name == OURS and recipe.BAND:
+        if name == OURS and recipe.band:
             width = 2.0 * abs(scale) * run(fold.parameters | SELF_TUNING, r).standard_deviation
             low, high = found - width[:, -1], found + width[:, -1]
             axes.fill_between(
@@ -67,6 +64,6 @@ def _estimates(
     room = 0.6 * (high - low)
     axes.set_ylim(low - 0.5 * room, high + room)
     axes.set_xlabel('time [s]')
-    axes.set_ylabel(recipe.QUANTITY)
+    axes.set_ylabel(recipe.quantity)
     axes.set_title(r.name, fontsize='small')
     axes.legend(fontsize='x-small', loc='upper left', ncols=2)

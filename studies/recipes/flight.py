@@ -6,10 +6,9 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from studies.harness import Floats
 
-Floats = NDArray[np.float64]
 RATE = 100.0
 """Of the simulation and of the sensors (Hz)."""
 NEEDED = "pip install '.[recipes]'"

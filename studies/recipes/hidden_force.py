@@ -7,26 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from studies.harness import SELF_TUNING
-from studies.recipes import peers
-from studies.recipes.judging import (
-    FIXED,
-    fixed_gains,
-    Fold,
-    Method,
-    model,
-    OURS,
-    Recorded,
-    run,
-    self_tuning,
-    simulated,
-)
+from studies.harness import Floats, SELF_TUNING
+from studies.recipes import judging, peers
+from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
-Floats = NDArray[np.float64]
-DATA = 'SNLS80mV.csv of Silverbox'
-QUANTITY, SCALE = 'V1 [V]', 1.0 / 186_024.0
-SHOWN, SHOWN_FOLD, BAND = (5.0, 5.12), 0, False
 PERIOD = 2**14 / 1e7
 MULTISINES, HALF = 45_000, 65_000
 """Row from which on the input is a multisine; model and peers come from the rows up to `HALF`."""
@@ -40,9 +24,9 @@ FREQUENCIES = 2 * np.pi * np.arange(10.0, 200.0, 10.0)
 BANDWIDTHS = np.geomspace(500.0, 10000.0, 10).tolist()
 
 
-def identify(y: Floats, force: Floats) -> tuple[list[float], float]:
+def identify(y: Floats, force: Floats) -> list[float]:
     """
-    Return b, k1, k2, k3, c, g of y'' = c + g force - b y' - k1 y - k2 y² - k3 y³, and the R².
+    Return b, k1, k2, k3, c, g of y'' = c + g force - b y' - k1 y - k2 y² - k3 y³.
 
     Least squares with modulating functions (Shinbrot 1957): integrals over windows, by parts, so
     that nothing is differentiated.
@@ -64,35 +48,24 @@ def identify(y: Floats, force: Floats) -> tuple[list[float], float]:
             wanted.append(p2 @ x)
     both = np.concatenate([np.real(table), np.imag(table)])
     target = np.concatenate([np.real(wanted), np.imag(wanted)])
-    found = np.linalg.lstsq(both, target, rcond=None)[0]
-    explained = 1.0 - np.var(target - both @ found) / np.var(target)
-    return found.tolist(), float(explained)
+    found: list[float] = np.linalg.lstsq(both, target, rcond=None)[0].tolist()
+    return found
 
 
 def fixed(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
     """Return d of the observer with one derivative of d and all four poles at a bandwidth."""
-    gains = fixed_gains(2, bandwidth, r.period) | {
+    gains = judging.fixed_gains(2, bandwidth, r.period) | {
         'unknown_input_derivatives': 1,
         'lambda': [comb(4, k) * bandwidth**k for k in range(1, 5)],
     }
-    return run(dict(p) | gains, r).unknown_input
+    return judging.run(dict(p) | gains, r).unknown_input
 
 
 def lagging(p: Mapping[str, Any], r: Recorded, _: float) -> Floats:
     """Return what the observer that is told only the model says of d one sample later."""
-    found = run(dict(p) | SELF_TUNING | {'smoothing_lag': SMOOTHING}, r)
+    found = judging.run(dict(p) | SELF_TUNING | {'smoothing_lag': SMOOTHING}, r)
     told = 1e-9 * (found.t - 10**9) + LAG * PERIOD
     return np.interp(r.t - r.t[0], told, found.unknown_input)
-
-
-METHODS = {
-    'disturbance observer': Method(peers.disturbance_observer, BANDWIDTHS),
-    'Kalman filter, d a random walk': Method(peers.kalman_filter, BANDWIDTHS),
-    FIXED: Method(fixed, BANDWIDTHS),
-    OURS: Method(self_tuning),
-    LAGGING: Method(lagging),
-}
-DRAWN = ('disturbance observer', LAGGING)
 
 
 def described(found: list[float]) -> dict[str, Any]:
@@ -102,17 +75,16 @@ def described(found: list[float]) -> dict[str, Any]:
     return {'order': 2, 'phi': ['0', phi]}
 
 
-def conditions(data: Path) -> tuple[dict[str, list[Fold]], dict[str, float]]:
-    """Return model and peers from one half of the multisines, judged on the other; and remarks."""
+def conditions(data: Path | None) -> dict[str, list[Fold]]:
+    """Return model and peers from one half of the multisines, judged on the other."""
     force, y = np.genfromtxt(data, delimiter=',', skip_header=1, max_rows=END)[:, :2].T
-    found, explained = identify(y[MULTISINES:HALF], force[MULTISINES:HALF])
+    found = identify(y[MULTISINES:HALF], force[MULTISINES:HALF])
     # A third of the first half is enough for one number.
     training, judged = (
         recorded(f'rows {a} to {b}', y[a:b], found[-1] * force[a:b])
         for a, b in ((MULTISINES, MULTISINES + (HALF - MULTISINES) // 3), (HALF, END))
     )
-    remarks = dict(zip(('b', 'k1', 'k2', 'k3', 'c', 'g'), found, strict=True)) | {'R2': explained}
-    return {'second half': [Fold(described(found), [training], [judged])]}, remarks
+    return {'second half': [Fold(described(found), [training], [judged])]}
 
 
 def recorded(name: str, y: Floats, d: Floats) -> Recorded:
@@ -122,9 +94,20 @@ def recorded(name: str, y: Floats, d: Floats) -> Recorded:
     return Recorded(name, t, y, np.zeros((len(y), 0)), late, t > SETTLED)
 
 
-def short() -> dict[str, list[Fold]]:
+def short() -> judging.Folds:
     """Return a fold of two short simulations of the file's own oscillator."""
-    p = model('hidden_force')
-    both = simulated(p, 2, 1 / PERIOD, 1e-5, (4000.0, 200.0), seconds=1.5)
-    first, second = (recorded(r.name, r.y, r.d) for r in both)
-    return {'simulated': [Fold(p, [first], [second])]}
+    found = judging.simulated('hidden_force', 1 / PERIOD, 1e-5, (4000.0, 200.0), seconds=1.5)
+    return judging.changed(found, lambda _, r: recorded(r.name, r.y, r.d))
+
+
+RECIPE = Recipe(
+    {
+        'disturbance observer': Method(peers.disturbance_observer, BANDWIDTHS),
+        'Kalman filter, d a random walk': Method(peers.kalman_filter, BANDWIDTHS),
+        FIXED: Method(fixed, BANDWIDTHS),
+        OURS: Method(judging.self_tuning),
+        LAGGING: Method(lagging),
+    },
+    conditions, short, 'V1 [V]', ('disturbance observer', LAGGING), (5.0, 5.12),
+    scale=1.0 / 186_024.0, band=False, data='SNLS80mV.csv of Silverbox',
+)  # fmt: skip

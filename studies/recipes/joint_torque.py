@@ -2,30 +2,17 @@
 """Torque at the shoulder of a two-joint robot, beside the wrench that was measured there."""
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fhaosmo_ros.tools.bags.reader import BagReader
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import butter, filtfilt, savgol_filter
-from studies.recipes import peers
-from studies.recipes.judging import (
-    FIXED,
-    fixed,
-    Fold,
-    Method,
-    model,
-    OURS,
-    Recorded,
-    self_tuning,
-    simulated,
-)
+from studies.harness import Floats
+from studies.recipes import judging, peers
+from studies.recipes.judging import Estimate, FIXED, Fold, Method, OURS, Recipe, Recorded
 
-Floats = NDArray[np.float64]
-DATA = 'bag of the pendubot'
-QUANTITY, SCALE = 'torque at the shoulder [N m]', 1.0
-SHOWN, SHOWN_FOLD, BAND = (0.5, 4.7), 0, False
 JOINTS, WRENCH = '/pndbt/joint_states', '/pndbt/netft_data'
 RATE = 200.0
 """Of the joint states (Hz)."""
@@ -58,9 +45,9 @@ def read(path: Path) -> Recorded:
     return Recorded(path.stem, t - t[0], speed, u, torque, t > t[0] + SETTLED)
 
 
-def identify(r: Recorded) -> tuple[dict[str, float], float, float]:
+def identify(r: Recorded) -> tuple[dict[str, float], float]:
     """
-    Return the model's constants, the offset of the wrench, and the R² of the torque.
+    Return the model's constants, and the offset of the wrench.
 
     Least squares on the equations of both joints, with derivatives by a Savitzky-Golay smoother,
     which uses the future: with absolute angle s = q1 + q2 of link 2,
@@ -79,9 +66,7 @@ def identify(r: Recorded) -> tuple[dict[str, float], float, float]:
         acceleration, cos * absolute - sin * turning**2, np.cos(angle), speed,
         np.tanh(speed / SLIDING), np.ones_like(t),
     ]  # fmt: skip
-    (p, coupling, g1, v, c, offset), misfit, *_ = np.linalg.lstsq(
-        np.array(table).T, torque, rcond=None
-    )
+    p, coupling, g1, v, c, offset = np.linalg.lstsq(np.array(table).T, torque, rcond=None)[0]
     of_elbow = [
         -cos * acceleration - sin * speed**2, -np.cos(angle + elbow), elbow_speed,
         np.tanh(elbow_speed),
@@ -90,29 +75,17 @@ def identify(r: Recorded) -> tuple[dict[str, float], float, float]:
     constants = {
         'p': p, 'h': coupling, 'r': coupling * ratio, 'g1': g1, 'k': k, 'v': v, 'c': c,
     }  # fmt: skip
-    explained = 1.0 - float(misfit[0]) / float(np.sum((torque - torque.mean()) ** 2))
-    return {name: float(x) for name, x in constants.items()}, float(offset), explained
+    return {name: float(x) for name, x in constants.items()}, float(offset)
 
 
 def inertia(p: Mapping[str, Any], r: Recorded) -> Floats:
     """Return J(q2), by which the shoulder's acceleration is torque / J."""
-    result: Floats = p['constants.p'] - p['constants.r'] * np.cos(r.u[:, 1]) ** 2
-    return result
+    return np.asarray(p['constants.p'] - p['constants.r'] * np.cos(r.u[:, 1]) ** 2)
 
 
-def this_observer(p: Mapping[str, Any], r: Recorded, number: float) -> Floats:
-    """Return the torque: d J(q2)."""
-    return self_tuning(p, r, number) * inertia(p, r)
-
-
-def this_observer_fixed(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
-    """Return the torque: d J(q2)."""
-    return fixed(p, r, bandwidth) * inertia(p, r)
-
-
-def kalman_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
-    """Return the torque: d J(q2)."""
-    return peers.kalman_filter(p, r, bandwidth) * inertia(p, r)
+def torque(method: Estimate, p: Mapping[str, Any], r: Recorded, number: float) -> Floats:
+    """Return the torque by what a method says of d: d J(q2)."""
+    return method(p, r, number) * inertia(p, r)
 
 
 def momentum_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
@@ -139,24 +112,15 @@ def momentum_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Fl
     return found
 
 
-METHODS = {
-    'momentum observer': Method(momentum_observer, BANDWIDTHS),
-    'Kalman filter, d a random walk': Method(kalman_filter, BANDWIDTHS),
-    FIXED: Method(this_observer_fixed, BANDWIDTHS),
-    OURS: Method(this_observer),
-}
-DRAWN = ('momentum observer', FIXED, OURS)
-
-
-def conditions(data: Path) -> tuple[dict[str, list[Fold]], dict[str, float]]:
-    """Return model and peers from the first half of the bag, judged on the second; and remarks."""
+def conditions(data: Path | None) -> dict[str, list[Fold]]:
+    """Return model and peers from the first half of the bag, judged on the second."""
+    assert data is not None
     whole = read(data)
     half = len(whole.t) // 2
     first, second = (cut(whole, part) for part in (slice(half), slice(half, None)))
-    constants, offset, explained = identify(first)
+    constants, offset = identify(first)
     first, second = (r._replace(d=r.d - offset) for r in (first, second))
-    found = {'second half': [Fold(model('joint_torque', constants), [first], [second])]}
-    return found, constants | {'offset': offset, 'R2': explained}
+    return {'second half': [Fold(judging.model('joint_torque', constants), [first], [second])]}
 
 
 def cut(r: Recorded, part: slice) -> Recorded:
@@ -165,12 +129,20 @@ def cut(r: Recorded, part: slice) -> Recorded:
     return Recorded(r.name, t, r.y[part], r.u[part], r.d[part], t > t[0] + SETTLED)
 
 
-def short() -> dict[str, list[Fold]]:
+def short() -> judging.Folds:
     """Return a fold of two short simulations of the shoulder, below an elbow that is moved."""
-    p = model('joint_torque')
-    inputs = (-1.57, 0.1), (0.0, 0.1), (0.0, 0.5)
-    both = [
-        r._replace(d=r.d * inertia(p, r))
-        for r in simulated(p, 2, RATE, 0.02, (20.0, 6.0), inputs, SETTLED, 4.0)
-    ]
-    return {'simulated': [Fold(p, both[:1], both[1:])]}
+    inputs, d = [(-1.57, 0.1), (0.0, 0.1), (0.0, 0.5)], (20.0, 6.0)
+    found = judging.simulated('joint_torque', RATE, 0.02, d, inputs, SETTLED, 4.0)
+    return judging.changed(found, lambda p, r: r._replace(d=r.d * inertia(p, r)))
+
+
+RECIPE = Recipe(
+    {
+        'momentum observer': Method(momentum_observer, BANDWIDTHS),
+        'Kalman filter, d a random walk': Method(partial(torque, peers.kalman_filter), BANDWIDTHS),
+        FIXED: Method(partial(torque, judging.fixed), BANDWIDTHS),
+        OURS: Method(partial(torque, judging.self_tuning)),
+    },
+    conditions, short, 'torque at the shoulder [N m]', ('momentum observer', FIXED, OURS),
+    (0.5, 4.7), band=False, data='bag of the pendubot',
+)  # fmt: skip

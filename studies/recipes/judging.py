@@ -12,7 +12,7 @@ from fhaosmo_ros.core.simulation.plant import respond
 import numpy as np
 from numpy.typing import NDArray
 from studies.evidence import Row
-from studies.harness import model_alone, observed, SELF_TUNING
+from studies.harness import Floats, model_alone, observed, SELF_TUNING
 from studies.waves import wave
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'recipes'
@@ -21,35 +21,21 @@ BUTTERWORTH = {2: (np.sqrt(2.0), 1.0), 3: (2.0, 2.0, 1.0)}
 """Coefficients of Butterworth polynomials of degree N, without the first one."""
 FAR = 1.0
 """Half-width of psi; smaller innovations are corrected linearly."""
-Floats = NDArray[np.float64]
 
 
 class Recorded(NamedTuple):
-    """
-    A recording with its truth.
-
-    Attributes
-    ----------
-    name : str
-    t : (N,) array
-        Times (s).
-    y, d : (N,) array
-        Measured output, true unknown input.
-    u : (N, m) array
-        Known inputs, that of the interval which ends at each sample.
-    judged : (N,) array of bool
-        Samples that count.
-    quantity : str
-        What `d` holds and methods return, in a recipe that judges more than the unknown input.
-
-    """
+    """A recording with its truth, (N,) arrays but for u."""
 
     name: str
     t: Floats
+    """Seconds."""
     y: Floats
     u: Floats
+    """(N, m): known inputs, that of the interval which ends at each sample."""
     d: Floats
+    """The true unknown input, or the `quantity` that methods return in its place."""
     judged: NDArray[np.bool_]
+    """Samples that count."""
     quantity: str = 'd'
 
     @property
@@ -59,16 +45,7 @@ class Recorded(NamedTuple):
 
 
 class Fold(NamedTuple):
-    """
-    A model, the recordings on which peers are tuned, and those on which all are judged.
-
-    Attributes
-    ----------
-    parameters : dict
-        The model, as parameters of the estimator.
-    training, judged : sequence of Recorded
-
-    """
+    """A model as parameters, the recordings that tune the peers, and those that judge all."""
 
     parameters: dict[str, Any]
     training: Sequence[Recorded]
@@ -85,6 +62,44 @@ class Method(NamedTuple):
     estimate: Estimate
     numbers: Sequence[float] = (0.0,)
     unit: str = 'rad/s'
+
+
+class Judged(NamedTuple):
+    """The error of a method, and the numbers that were chosen for it, one a fold."""
+
+    error: float
+    chosen: list[float]
+    unit: str
+
+
+Folds = Mapping[str, Sequence[Fold]]
+"""By condition."""
+Judgements = Mapping[str, Mapping[str, Judged]]
+"""By condition and method."""
+
+
+class Recipe(NamedTuple):
+    """What is measured and how it is shown."""
+
+    methods: dict[str, Method]
+    conditions: Callable[[Path | None], Folds]
+    """From the recordings' place."""
+    short: Callable[[], Folds]
+    """The same from short simulations of the model alone."""
+    quantity: str
+    """What the figure shows, with its unit."""
+    drawn: Sequence[str]
+    """Methods in the figure."""
+    shown: tuple[float, float]
+    """Seconds in the figure."""
+    scale: float = 1.0
+    """From d to the quantity."""
+    fold: int = 0
+    """The fold in the figure."""
+    band: bool = True
+    """Whether it has the standard deviations."""
+    data: str = ''
+    """The recordings that have to be given."""
 
 
 def model(name: str, constants: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -132,42 +147,27 @@ def error(pairs: Sequence[tuple[Recorded, Floats]]) -> float:
     return float(np.sqrt(wrong / size))
 
 
-class Judged(NamedTuple):
-    """The error of a method, and the numbers that were chosen for it, one a fold."""
-
-    error: float
-    chosen: list[float]
-    unit: str
-
-
-Results = Mapping[str, Mapping[str, Judged]]
-"""By condition and method."""
-
-
-def judge(methods: Mapping[str, Method], folds: Sequence[Fold]) -> dict[str, Judged]:
+def judge(method: Method, folds: Sequence[Fold]) -> Judged:
     """
-    Return the error of each method over all recordings, and what was chosen.
+    Return the error of a method over all recordings, and what was chosen.
 
-    A method's number is the one with the least error on the training recordings of a fold.
+    Its number is the one with the least error on the training recordings of a fold.
     """
-    found = {}
-    for name, method in methods.items():
-        pairs, chosen = [], []
-        for p, training, judged in folds:
-            best = method.numbers[0]
-            if len(method.numbers) > 1:
-                scores = {
-                    number: error([(r, method.estimate(p, r, number)) for r in training])
-                    for number in method.numbers
-                }
-                best = min(scores, key=scores.__getitem__)
-                chosen.append(float(f'{best:.4g}'))
-            pairs += [(r, method.estimate(p, r, best)) for r in judged]
-        found[name] = Judged(float(f'{error(pairs):.4g}'), chosen, method.unit)
-    return found
+    pairs, chosen = [], []
+    for p, training, judged in folds:
+        best = method.numbers[0]
+        if len(method.numbers) > 1:
+            scores = {
+                number: error([(r, method.estimate(p, r, number)) for r in training])
+                for number in method.numbers
+            }
+            best = min(scores, key=scores.__getitem__)
+            chosen.append(float(f'{best:.4g}'))
+        pairs += [(r, method.estimate(p, r, best)) for r in judged]
+    return Judged(float(f'{error(pairs):.4g}'), chosen, method.unit)
 
 
-def table(recipe: str, results: Results) -> list[Row]:
+def table(recipe: str, judged: Judgements) -> list[Row]:
     """Return a line for each condition and method."""
     return [
         {
@@ -175,31 +175,40 @@ def table(recipe: str, results: Results) -> list[Row]:
             'chosen': ' '.join(f'{x:g}' for x in row.chosen),
             'unit': row.unit if row.chosen else '',
         }
-        for condition, found in results.items()
+        for condition, found in judged.items()
         for method, row in found.items()
     ]  # fmt: skip
 
 
 def simulated(
-    parameters: Mapping[str, Any], count: int, rate: float, noise: float, d: tuple[float, float],
+    name: str, rate: float, noise: float, d: tuple[float, float],
     inputs: Sequence[tuple[float, float]] = (), settled: float = 1.0, seconds: float = 8.0,
-) -> list[Recorded]:  # fmt: skip
+) -> dict[str, list[Fold]]:  # fmt: skip
     """
-    Simulate the model that the parameters describe, for a run without foreign data.
+    Return a fold of two simulations of a recipe's model, for a run without foreign data.
 
     `d` has the RMS of the unknown input and its speed (rad/s), `inputs` mean and RMS of each
     known one; what is judged begins `settled` seconds after the start.
     """
-    model, found = plant_of(parameters), []
+    parameters, found = model(name), []
+    plant = plant_of(parameters)
     t = np.arange(0.0, seconds, 1.0 / rate)
-    for seed in range(count):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         force = d[0] * wave('sine', t, d[1], rng)
         u = np.zeros((len(t), max(1, len(inputs))))
         for column, (mean, size) in zip(u.T, inputs, strict=False):
             column[:] = mean + size * wave('sine', t, 2.0, rng)
-        z, truth = respond(model, 0.0, t, force, 1.0 / rate, u, step=0.5 / rate)
+        z, truth = respond(plant, 0.0, t, force, 1.0 / rate, u, step=0.5 / rate)
         y = z[:, 0] + noise * rng.standard_normal(len(t))
-        known = u if inputs else u[:, :0]
+        known = u[:, : len(inputs)]
         found.append(Recorded(f'simulated {seed + 1}', t, y, known, truth, t > settled))
-    return found
+    return {'simulated': [Fold(parameters, found[:1], found[1:])]}
+
+
+def changed(folds: Folds, change: Callable[[dict[str, Any], Recorded], Recorded]) -> Folds:
+    """Return folds with each recording changed, by their parameters and itself."""
+    return {
+        name: [Fold(p, *([change(p, r) for r in rs] for rs in parts)) for p, *parts in these]
+        for name, these in folds.items()
+    }

@@ -5,11 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import bilinear, lfilter
+from studies.harness import Floats
 from studies.recipes.judging import plant_of, Recorded
-
-Floats = NDArray[np.float64]
 
 
 def low_passed(x: Floats, bandwidth: float, period: float, order: int, derivative: int) -> Floats:

@@ -1,19 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bias of a gyroscope, from a heading that has none: flights in RotorPy."""
 
-from pathlib import Path
+from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from studies.recipes import peers
+from studies.recipes import judging, peers
 from studies.recipes.flight import fly, gusts
-from studies.recipes.judging import Fold, Method, model, OURS, Recorded, self_tuning, simulated
+from studies.recipes.judging import Fold, Method, OURS, Recipe, Recorded
 
-Floats = NDArray[np.float64]
-DATA = None
-QUANTITY, SCALE = 'bias [rad/s]', -1.0
-SHOWN, SHOWN_FOLD, BAND = (0.0, 60.0), 0, True
 DURATION, SETTLED, TUNING, JUDGED = 60.0, 10.0, 2, 3
 OUTLIERS, JUMP = 0.01, 0.5
 """Share of headings that are wrong, by a normal distribution of this standard deviation (rad)."""
@@ -21,12 +16,6 @@ GYROSCOPE = {
     'noise_density': np.full(3, 5e-4), 'random_walk': np.full(3, 2e-3),
 }  # fmt: skip
 BANDWIDTHS = np.geomspace(0.1, 10.0, 11).tolist()
-METHODS = {
-    'complementary filter': Method(peers.complementary_filter, BANDWIDTHS),
-    'Kalman filter, bias a random walk': Method(peers.kalman_filter, BANDWIDTHS),
-    OURS: Method(self_tuning),
-}
-DRAWN = ('complementary filter', OURS)
 
 
 def flight(seed: int) -> Recorded:
@@ -46,18 +35,22 @@ def with_outliers(r: Recorded, seed: int) -> Recorded:
     return r._replace(y=r.y + wrong * JUMP * rng.standard_normal(len(r.t)))
 
 
-def conditions(_: Path | None) -> tuple[dict[str, list[Fold]], dict[str, float]]:
-    """Return the flights as simulated, and with outliers; and remarks."""
+def conditions(_: object) -> dict[str, list[Fold]]:
+    """Return the flights as simulated, and with outliers."""
     clean = [flight(seed) for seed in range(TUNING + JUDGED)]
     spoilt = [with_outliers(r, seed) for seed, r in enumerate(clean)]
-    both = {'as simulated': clean, '1 % wrong headings': spoilt}
-    p = model('sensor_bias')
-    return {name: [Fold(p, rs[:TUNING], rs[TUNING:])] for name, rs in both.items()}, {}
+    both, p = {'as simulated': clean, '1 % wrong headings': spoilt}, judging.model('sensor_bias')
+    return {name: [Fold(p, rs[:TUNING], rs[TUNING:])] for name, rs in both.items()}
 
 
-def short() -> dict[str, list[Fold]]:
-    """Return a fold of two short simulations of the model alone."""
-    p = model('sensor_bias')
-    inputs = (0.0, 0.3), (0.0, 0.5), (0.0, 0.2), (0.0, 0.2)
-    both = simulated(p, 2, 100.0, 3.5e-3, (0.05, 0.2), inputs, 2.0)
-    return {'simulated': [Fold(p, both[:1], both[1:])]}
+INPUTS = (0.0, 0.3), (0.0, 0.5), (0.0, 0.2), (0.0, 0.2)
+RECIPE = Recipe(
+    {
+        'complementary filter': Method(peers.complementary_filter, BANDWIDTHS),
+        'Kalman filter, bias a random walk': Method(peers.kalman_filter, BANDWIDTHS),
+        OURS: Method(judging.self_tuning),
+    },
+    conditions,
+    partial(judging.simulated, 'sensor_bias', 100.0, 3.5e-3, (0.05, 0.2), INPUTS, 2.0),
+    'bias [rad/s]', ('complementary filter', OURS), (0.0, 60.0), scale=-1.0,
+)  # fmt: skip

@@ -20,9 +20,8 @@ from fhaosmo_ros.tools.tuning.search import Dimension
 import numpy as np
 from studies.comparison.methods.filters import several_models
 from studies.comparison.methods.linear import each_order, LONGEST, matern_space, Samples
-from studies.comparison.methods.method import Method, ROBUST, Run, Setting, Values
+from studies.comparison.methods.method import Estimates, Method, ROBUST, Run, Setting, Values
 from studies.comparison.methods.sampled import SampledModel
-from studies.comparison.scores import Estimates
 
 HUBER, NOISE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'
 

@@ -26,9 +26,17 @@ from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise
 import numpy as np
 from studies.comparison.methods.filters import constant_gain
-from studies.comparison.methods.method import LINEAR, Method, Run, Search, Setting, USUAL, Values
+from studies.comparison.methods.method import (
+    Estimates,
+    LINEAR,
+    Method,
+    Run,
+    Search,
+    Setting,
+    USUAL,
+    Values,
+)
 from studies.comparison.methods.sampled import SampledModel
-from studies.comparison.scores import Estimates
 
 LINEAR_LIMIT = 'Kalman, Matern'
 """Our observer equals this filter for small innovations."""

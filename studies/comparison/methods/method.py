@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every method of the comparison is: parameters with logarithmic ranges, and a run."""
+"""What every method of the comparison is: parameters with logarithmic ranges, a run, a score."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.tools.tuning.objective import SMALLEST
 from fhaosmo_ros.tools.tuning.search import Dimension
-from studies.comparison.scores import Estimates
+import numpy as np
+from studies.harness import Floats
 
+JUDGED_FROM = 5.0
+"""Seconds of each recording that are the transient."""
 ROUNDING = 1e-15
 """Noise of a y about 1."""
 DEADBEAT = 3.0
@@ -17,31 +22,44 @@ LINEAR, USUAL, ROBUST = 'linear filter', 'usual Kalman filter', 'adaptive filter
 SLIDING, PAPER, OURS, SELF_TUNING = 'sliding mode', 'paper', 'ours, tuned', 'ours, self-tuning'
 KINDS = (LINEAR, USUAL, ROBUST, SLIDING, PAPER, OURS, SELF_TUNING)
 """Kinds of methods; the usual Kalman filter, whose d is a random walk, is one of its own."""
+
+
+class Estimates(NamedTuple):
+    """Estimated states (K, n) and unknown input (K,), one row a sample."""
+
+    z: Floats
+    d: Floats
+
+
 Values = Mapping[str, Any]
 Run = Callable[[Recording], dict[str, Estimates]]
 """Estimates by readout: one method may offer several (filtered and internal states)."""
 
 
+def objective(recording: Recording, estimates: Estimates) -> float:
+    """Return the RMS error of d over the RMS of d; tuning minimises its geometric mean."""
+    late = recording.t >= JUDGED_FROM
+    d = recording.d[late]
+    with np.errstate(over='ignore', invalid='ignore'):
+        value = rms(estimates.d[late] - d) / rms(d)
+    return value if np.isfinite(value) else float('inf')
+
+
+def mean(errors: Iterable[float]) -> float:
+    """Return the geometric mean: a tenth less counts the same on an easy case and a hard one."""
+    return float(np.exp(np.mean(np.log(np.maximum(list(errors), SMALLEST)))))
+
+
 class Setting(NamedTuple):
-    """
-    What a user knows before tuning.
-
-    Attributes
-    ----------
-    model : TriangularModel
-    period : float
-        Nominal sampling period in seconds.
-    size : float
-        About how large d is.
-    noise : float
-        Standard deviation of the noise on y, in its unit, with that of its rounding.
-
-    """
+    """What a user knows before tuning."""
 
     model: TriangularModel
     period: float
+    """Nominal sampling period in seconds."""
     size: float
+    """About how large d is."""
     noise: float
+    """Standard deviation of the noise on y, in its unit, with that of its rounding."""
 
     @property
     def speed(self) -> float:
@@ -62,62 +80,36 @@ class Setting(NamedTuple):
 
 
 class Search(NamedTuple):
-    """
-    What a method is tuned with.
-
-    Attributes
-    ----------
-    judged : callable
-        From values to the objective over all recordings.
-    setting : Setting
-    recordings : sequence of Recording
-    trials : int
-        How often an objective may be evaluated.
-    seed : int
-
-    """
+    """What a method is tuned with."""
 
     judged: Callable[[Values], float]
+    """From values to the objective over all recordings."""
     setting: Setting
     recordings: Sequence[Recording]
     trials: int
+    """How often an objective may be evaluated."""
     seed: int
 
 
 class Method(NamedTuple):
-    """
-    A way to estimate z and d.
-
-    Attributes
-    ----------
-    name : str
-        Key in results, and head of its column.
-    text : str
-        What it is, in a line.
-    kind : str
-        One of `KINDS`.
-    space : callable
-        Parameters to tune for a setting; empty where none is.
-    prepare : callable
-        From a setting and values to a run; raises ConfigurationError for values that make no
-        observer.
-    tune : callable, optional
-        A search of its own.
-    needs_noise : bool
-        True for one that is about the noise, which there has to be.
-
-    """
+    """A way to estimate z and d."""
 
     name: str
+    """Key in results, and head of its column."""
     text: str
+    """What it is, in a line."""
     kind: str
+    """One of `KINDS`."""
     space: Callable[[Setting], tuple[Dimension, ...]]
+    """Parameters to tune for a setting; empty where none is."""
     prepare: Callable[[Setting, Values], Run]
+    """Raises ConfigurationError for values that make no observer."""
     tune: Callable[[Search], Values] | None = None
+    """A search of its own."""
     needs_noise: bool = False
+    """True for one that is about the noise, which there has to be."""
 
 
-def untuned(setting: Setting) -> tuple[Dimension, ...]:
+def untuned(_: Setting) -> tuple[Dimension, ...]:
     """Return the space of a method that has no parameters."""
-    del setting
     return ()

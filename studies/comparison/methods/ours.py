@@ -6,7 +6,7 @@ Both run in the online estimator, by the node's code. The search is that of `tun
 weight on chatter, because those of the other methods have none.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import redirect_stderr
 from io import StringIO
 from typing import Any
@@ -17,7 +17,10 @@ from fhaosmo_ros.tools.tuning.objective import FIRST_STAMP
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, Tuner, TuningData
 import numpy as np
+from studies import harness
 from studies.comparison.methods.method import (
+    Estimates,
+    JUDGED_FROM,
     Method,
     OURS,
     Run,
@@ -27,21 +30,19 @@ from studies.comparison.methods.method import (
     untuned,
     Values,
 )
-from studies.comparison.scores import Estimates, JUDGED_FROM
 
 GOAL = {'settled': JUDGED_FROM, 'chatter_weight': 0.0}
 GRID = len(DERIVATIVES) * len(RATES)
 
 
-def _model(setting: Setting) -> dict[str, Any]:
+def model_of(setting: Setting) -> dict[str, Any]:
+    """Return what the estimators are told, as parameters."""
     return {'order': setting.model.order, 'phi': list(setting.model.phi)}
 
 
-def _prepared(
-    parameters: Callable[[Setting, Values], Mapping[str, Any]],
-) -> Callable[[Setting, Values], Run]:
+def _prepared(own: Values) -> Callable[[Setting, Values], Run]:
     def prepare(setting: Setting, values: Values) -> Run:
-        estimator = OnlineEstimator(_model(setting) | dict(parameters(setting, values)))
+        estimator = OnlineEstimator(model_of(setting) | dict(values) | own)
         u = estimator.observer.uses_input
 
         def estimate(r: Recording) -> dict[str, Estimates]:
@@ -57,7 +58,7 @@ def _prepared(
 
 def _tune(search: Search) -> Values:
     """Return the parameters of the estimator that `tune` writes; its grid uses trials, too."""
-    tuning = TUNE_PARAMETERS.complete(_model(search.setting) | GOAL)
+    tuning = TUNE_PARAMETERS.complete(model_of(search.setting) | GOAL)
     data = TuningData(list(search.recordings), list(search.recordings[:1]), {})
     with redirect_stderr(StringIO()):  # its progress bars
         tuner = Tuner(data, {}, tuning, search.seed)
@@ -67,10 +68,10 @@ def _tune(search: Search) -> Values:
 OUR_METHODS = (
     Method(
         OURS, 'levant, fuzzy, predict_correct, all gains and the model of d by `tune`', OURS,
-        untuned, _prepared(lambda _, values: values), _tune,
+        untuned, _prepared({}), _tune,
     ),
     Method(
         SELF_TUNING, 'told the model only, no tuning', SELF_TUNING, untuned,
-        _prepared(lambda *_: {'gains': 'self_tuning'}),
+        _prepared(harness.SELF_TUNING),
     ),
 )  # fmt: skip

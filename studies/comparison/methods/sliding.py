@@ -7,7 +7,7 @@ doi:10.1080/0020717031000099029.
 """
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 from fhaosmo_ros.core.observer.observer import Observer
@@ -18,6 +18,7 @@ from fhaosmo_ros.tools.cli.share import shipped
 from fhaosmo_ros.tools.tuning.search import Dimension
 import numpy as np
 from studies.comparison.methods.method import (
+    Estimates,
     Method,
     PAPER,
     Run,
@@ -26,36 +27,29 @@ from studies.comparison.methods.method import (
     untuned,
     Values,
 )
-from studies.comparison.scores import Estimates
-
-Parameters = Callable[[Setting, Values], Mapping[str, Any]]
+from studies.comparison.methods.ours import model_of
 
 RECURSIVE = (1.1, 1.5, 2.0, 3.0, 5.0, 7.0)
 """Levant's lambda_0 .. lambda_5 of the recursive form, for a Lipschitz constant of 1."""
 
 
-def prepared(parameters: Parameters) -> Callable[[Setting, Values], Run]:
-    """Return a `Method.prepare` for parameters of the core's Observer."""
+def prepared(
+    parameters: Callable[[Setting, Values], Mapping[str, Any]], setting: Setting, values: Values
+) -> Run:
+    """Return a run of the core's Observer with these parameters."""
+    observer = Observer(model_of(setting) | dict(parameters(setting, values)))
+    n = setting.model.order
 
-    def prepare(setting: Setting, values: Values) -> Run:
-        model = setting.model
-        observer = Observer(
-            {'order': model.order, 'phi': list(model.phi)} | dict(parameters(setting, values))
-        )
-        n = model.order
+    def estimate(r: Recording) -> dict[str, Estimates]:
+        observer.reset()
+        found = observer.run(r.t, r.y, r.u)
+        internal = np.column_stack([found.z_hat[:, 0], found.z_tilde[:, : n - 1]])
+        return {
+            'filtered': Estimates(found.z_hat[:, :n], found.z_hat[:, n]),
+            'internal': Estimates(internal, found.z_tilde[:, n - 1]),
+        }
 
-        def estimate(r: Recording) -> dict[str, Estimates]:
-            observer.reset()
-            found = observer.run(r.t, r.y, r.u)
-            internal = np.column_stack([found.z_hat[:, 0], found.z_tilde[:, : n - 1]])
-            return {
-                'filtered': Estimates(found.z_hat[:, :n], found.z_hat[:, n]),
-                'internal': Estimates(internal, found.z_tilde[:, n - 1]),
-            }
-
-        return estimate
-
-    return prepare
+    return estimate
 
 
 @lru_cache
@@ -67,12 +61,8 @@ def _paper() -> dict[str, Any]:
     return kept | {name: kept[name][:1] for name in ('lambda', 'alpha')}
 
 
-def _papers_gains(variant: str) -> Parameters:
-    def parameters(setting: Setting, values: Values) -> Mapping[str, Any]:
-        del setting, values
-        return _paper() | {'variant': variant, 'start_from_measurement': True}
-
-    return parameters
+def _papers_gains(variant: str, *_: Any) -> Mapping[str, Any]:
+    return _paper() | {'variant': variant, 'start_from_measurement': True}
 
 
 def _levant(setting: Setting, values: Values) -> Mapping[str, Any]:
@@ -85,24 +75,22 @@ def _levant(setting: Setting, values: Values) -> Mapping[str, Any]:
     return {'structure': 'levant', 'variant': 'sign', 'scheme': 'implicit', 'lambda': gains}
 
 
-def _levant_space(setting: Setting) -> list[Dimension]:
-    return [Dimension('lipschitz', 1e-4 * setting.size, 1e8 * setting.size, 10.0 * setting.size)]
+def _levant_space(setting: Setting) -> tuple[Dimension, ...]:
+    size = setting.size
+    return (Dimension('lipschitz', 1e-4 * size, 1e8 * size, 10.0 * size),)
 
 
 OBSERVERS = (
     Method(
         'Levant, implicit', "Levant's robust exact differentiator with Phi, implicit Euler",
-        SLIDING, _levant_space, prepared(_levant),
+        SLIDING, _levant_space, partial(prepared, _levant),
     ),
     *(
-        Method(name, text, PAPER, untuned, prepared(_papers_gains(variant)))
+        Method(name, text, PAPER, untuned, partial(prepared, partial(_papers_gains, variant)))
         for name, text, variant in (
             ('paper: sign', "sign observer with the paper's gains", 'sign'),
             ('paper: fuzzy', "fuzzy observer with the paper's gains", 'fuzzy'),
-            (
-                'paper: adaptive', "fuzzy observer with adapted gamma and the paper's gains",
-                'fuzzy_adaptive',
-            ),
+            ('paper: adaptive', 'the fuzzy one with adapted gamma', 'fuzzy_adaptive'),
         )
     ),
 )  # fmt: skip
