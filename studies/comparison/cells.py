@@ -10,16 +10,14 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS, SHAPES
-from fhaosmo_ros.core.simulation.recordings import Family, Floats, Recording
+from fhaosmo_ros.core.simulation.recordings import Family, Recording
 from fhaosmo_ros.tools.cli.share import shipped
 import numpy as np
 from studies.comparison.methods.method import Setting
+from studies.harness import Floats
 from studies.waves import wave
 
-NOISES = (0.0, 1e-4, 1e-3, 1e-2)
-RATES = (1000.0, 100.0)
-LOW, HIGH, WIDE = (0.3, 2.0), (4.0, 10.0), (0.5, 8.0)
-"""Bands of d in rad/s."""
+NOISES, RATES = (0.0, 1e-4, 1e-3, 1e-2), (1000.0, 100.0)
 TIMINGS: dict[str, dict[str, float]] = {
     'even': {},
     'jitter': {'period_jitter': 0.2},  # in periods
@@ -44,7 +42,8 @@ class Disturbance(NamedTuple):
     """Shape that the tuning sees."""
     judged: str
     """Shape that judges: one of the family's, or of waves.py, which no tuning sees."""
-    band: tuple[float, float] = WIDE
+    band: tuple[float, float] = (0.5, 8.0)
+    """rad/s."""
 
     @property
     def jumps(self) -> bool:
@@ -64,42 +63,28 @@ class PlantCase(NamedTuple):
     disturbances: dict[str, Disturbance]
 
 
-BOTH = ('sines', 'steps')
 SMOOTH = {
-    'mix': Disturbance('sines', 'sines'),
-    'chirp': Disturbance('sines', 'chirp'),
-    'noise': Disturbance('sines', 'ou'),
-    'pulses': Disturbance('sines', 'pulses'),
+    name: Disturbance('sines', judged)
+    for name, judged in (
+        ('mix', 'sines'), ('chirp', 'chirp'), ('noise', 'ou'), ('pulses', 'pulses'),
+    )
+}  # fmt: skip
+JUMPING = {name: Disturbance('steps', name) for name in JUMPS}
+SINES = {
+    'low sine': Disturbance('sines', 'sine', (0.3, 2.0)),
+    'high sine': Disturbance('sines', 'sine', (4.0, 10.0)),
 }
-JUMPING = {'steps': Disturbance('steps', 'steps')} | {
-    name: Disturbance('steps', name) for name in ('sawtooth', 'impulses', 'stick-slip')
-}
-SINES = {'low sine': LOW, 'high sine': HIGH}
 PLANTS = {
     'paper': PlantCase(
-        "the paper's plant", 'paper_plant', 0.07, 0.0, False,
-        {name: Disturbance('sines', 'sine', band) for name, band in SINES.items()}
-        | SMOOTH | JUMPING,
+        "the paper's plant", 'paper_plant', 0.07, 0.0, False, SINES | SMOOTH | JUMPING
     ),
     'pendulum': PlantCase('pendulum', 'pendulum', 2.5, 0.0, True, SMOOTH | JUMPING),
     'motor': PlantCase('DC motor', 'dc_motor', 70.0, 1.0, True, SMOOTH | JUMPING),
-}  # fmt: skip
+}
 
 
 class Unseen(Family):
-    """
-    A family whose d has a shape of waves.py.
-
-    Parameters
-    ----------
-    parameters : mapping
-        Of `Family`; its shape is `STAND_IN`.
-    kind : str
-        See `wave`.
-    omega : float
-        rad/s.
-
-    """
+    """A family, whose shape is `STAND_IN`, with a d of waves.py at `omega` rad/s in its place."""
 
     def __init__(self, parameters: Mapping[str, Any], kind: str, omega: float) -> None:
         super().__init__(parameters)
@@ -112,40 +97,27 @@ class Unseen(Family):
 
 
 class Sensor(NamedTuple):
-    """
-    A plant, its kinds of d, and how y is sampled. Each method is tuned once for each sensor.
-
-    Attributes
-    ----------
-    plant, disturbances : str and tuple of str
-        Keys of `PLANTS`, and of its disturbances.
-    noise : float
-        Standard deviation on y; see `PlantCase.relative`.
-    rate : float
-        Samples a second.
-    timing : str
-        Key of `TIMINGS`.
-
-    """
+    """A plant, its kinds of d, and how y is sampled. Methods are tuned once for each sensor."""
 
     plant: str
+    """Key of `PLANTS`."""
     disturbances: tuple[str, ...]
+    """Keys of the plant's disturbances."""
     noise: float
+    """Standard deviation on y; see `PlantCase.relative`."""
     rate: float
+    """Samples a second."""
     timing: str = 'even'
+    """Key of `TIMINGS`."""
 
     @property
     def case(self) -> PlantCase:
         """Return the plant's entry."""
         return PLANTS[self.plant]
 
-    def values(self) -> dict[str, Any]:
-        """Return the plant's parameters from its YAML."""
-        return plant_values(self.case.file)
-
     def setting(self) -> Setting:
         """Return what a user knows before tuning."""
-        values = self.values()
+        values = load(model_file(self.case.file), 'plant', PLANT_PARAMETERS)
         model = TriangularModel.of(PLANT_PARAMETERS.complete(values))
         # An encoder's rounding is spread evenly over a quantum.
         rounding = values.get('quantisation', 0.0) / math.sqrt(12.0)
@@ -184,46 +156,37 @@ class Sensor(NamedTuple):
         return self.noise * (amplitude(self.plant) if self.case.relative else 1.0)
 
     def _family(self, shapes: Sequence[str], disturbance: str) -> dict[str, Any]:
-        timing = dict(TIMINGS[self.timing])
-        if 'period_jitter' in timing:
-            timing['period_jitter'] /= self.rate
-        if 'dropout_length' in timing:
-            timing['dropout_length'] *= self.rate
-        if 'outlier_std' in timing:
-            timing['outlier_std'] *= self._noise()
-        return {
-            **family_values(self.plant),
+        units = {
+            'period_jitter': 1.0 / self.rate, 'dropout_length': self.rate,
+            'outlier_std': self._noise(),
+        }  # fmt: skip
+        timing = {k: v * units.get(k, 1.0) for k, v in TIMINGS[self.timing].items()}
+        return family_values(self.plant) | timing | {
             'disturbances': list(shapes),
             'band_of_d': list(self.case.disturbances[disturbance].band),
             'noise_std': self._noise(),
             'sample_rate': self.rate,
-            **timing,
-        }
+        }  # fmt: skip
 
 
-@lru_cache
-def plant_values(file: str) -> dict[str, Any]:
-    """Return the plant's parameters in a YAML of config/models."""
-    return load(shipped(f'config/models/{file}.yaml'), 'plant', PLANT_PARAMETERS)
+def model_file(name: str) -> Any:
+    """Return the path of a plant in config/models."""
+    return shipped(f'config/models/{name}.yaml')
 
 
 @lru_cache
 def family_values(plant: str) -> dict[str, Any]:
     """Return the parameters of a plant's family that do not depend on the sensor."""
     case = PLANTS[plant]
-    path = shipped(f'config/models/{case.file}.yaml')
-    values = load(path, 'plant', FAMILY_PARAMETERS)
-    return values | {
-        'rms_of_d': case.rms_of_d,
-        'rms_of_u': case.rms_of_u,
-        'integration_step': STEP,
-    }
+    sizes = {'rms_of_d': case.rms_of_d, 'rms_of_u': case.rms_of_u, 'integration_step': STEP}
+    return load(model_file(case.file), 'plant', FAMILY_PARAMETERS) | sizes
 
 
 @lru_cache
 def amplitude(plant: str) -> float:
     """Return half the range of y without noise, averaged over some recordings."""
-    family = Family(family_values(plant) | {'disturbances': list(BOTH), 'sample_rate': 100.0})
+    both = {'disturbances': ['sines', 'steps'], 'sample_rate': 100.0}
+    family = Family(family_values(plant) | both)
     return float(np.mean([np.ptp(r.y) / 2.0 for r in family.recordings(4, TRAINING_SEED)]))
 
 
@@ -235,20 +198,15 @@ def sensors(quick: bool = False) -> list[Sensor]:
             Sensor('paper', ('low sine',), 0.0, 100.0),
             Sensor('motor', ('mix', 'steps', 'pulses'), 1e-3, 100.0),
         ]
-    chosen = []
+    chosen, smooth, jumping = [], tuple(SMOOTH), tuple(JUMPING)
     for rate in RATES:
         for noise in NOISES:
-            chosen += [
-                Sensor('paper', names, noise, rate)
-                for names in (('low sine',), ('high sine',), tuple(SMOOTH), tuple(JUMPING))
-            ]
             # Without noise gains for steps are deadbeat, and gains for smooth d are not.
-            both = (tuple(SMOOTH | JUMPING),)
-            groups = (tuple(SMOOTH), tuple(JUMPING)) if noise == 0.0 else both
+            groups = (smooth, jumping) if noise == 0.0 else ((*smooth, *jumping),)
+            of_paper = *((name,) for name in SINES), smooth, jumping
+            chosen += [Sensor('paper', names, noise, rate) for names in of_paper]
             chosen += [
-                Sensor(plant, names, noise, rate)
-                for plant in ('pendulum', 'motor')
-                for names in groups
+                Sensor(p, names, noise, rate) for p in ('pendulum', 'motor') for names in groups
             ]
     for timing in ('jitter', 'dropouts', 'outliers'):
         chosen += [Sensor('paper', (name,), 1e-3, 1000.0, timing) for name in ('mix', 'steps')]

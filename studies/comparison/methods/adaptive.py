@@ -11,6 +11,7 @@ of innovation-based adaptive estimation (A. H. Mohamed and K. P. Schwarz, Journa
 doi:10.1109/9.1299). Between samples the covariance takes as many steps as there are periods.
 """
 
+from functools import partial
 import math
 from typing import NamedTuple
 
@@ -70,7 +71,8 @@ def _method(name: str, text: str, *options: Dimension) -> Method:
     def space(setting: Setting) -> tuple[Dimension, ...]:
         return (*matern_space(setting), *options)
 
-    return Method(name, text, ROBUST, space, _prepare, each_order(*options), needs_noise=True)
+    tune = partial(each_order, more=options)
+    return Method(name, text, ROBUST, space, _prepare, tune, needs_noise=True)
 
 
 ADAPTIVE = (

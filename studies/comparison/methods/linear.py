@@ -14,7 +14,7 @@ doi:10.1109/TIE.2008.2011621.
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 import math
 from typing import NamedTuple
 
@@ -47,6 +47,7 @@ LONGEST = 1.5
 DERIVATIVES = (0, 1, 2, 3)
 """Of d, that are tried."""
 Gain = Callable[[SampledModel, Values], np.ndarray]
+Space = Callable[[Setting], tuple[Dimension, ...]]
 
 
 class Samples(NamedTuple):
@@ -67,19 +68,9 @@ def estimates(
     model: TriangularModel, gain: np.ndarray, decay: float, r: Recording, longest: float
 ) -> np.ndarray:
     """
-    Return the estimates of z, d, d_1, .. of a recording, a row for each sample.
+    Return the estimates of z, d, d_1, .. of a recording, a row for each sample, by the gain K.
 
-    Parameters
-    ----------
-    model : TriangularModel
-    gain : (n + m,) array
-        K.
-    decay : float
-        See the top of this file; 0 for a random walk.
-    r : Recording
-    longest : float
-        Longest step of the prediction in seconds; a longer interval takes several.
-
+    `decay` is 0 for a random walk; intervals beyond `longest` (s) take several steps.
     """
     expressions = model.with_unknown_input(decay, len(gain) - model.order - 1)
     return constant_gain(Prediction(expressions, longest), Samples.of(r, model), gain)
@@ -92,32 +83,20 @@ def _sampled(
     return SampledModel(TriangularModel(phi), period, chain, integrators_only, decay)
 
 
-def _bandwidth(name: str, setting: Setting) -> Dimension:
-    """
-    Return the range of a frequency in rad/s.
+def _run(
+    gain: Gain, shortest: int, integrators_only: bool, setting: Setting, values: Values
+) -> Run:
+    model, chain = setting.model, shortest + int(values.get('derivatives', 0))
+    decay = values.get('decay', 0.0)
+    sampled = _sampled(model.phi, setting.period, chain, integrators_only, decay)
+    k = gain(sampled, values)
+    n, longest = model.order, min(LONGEST * setting.period, sampled.resolution)
 
-    It reaches from far below any disturbance to 5 / period, where the observer is deadbeat.
-    """
-    return Dimension(name, 0.05, 5.0 / setting.period, setting.speed)
+    def estimate(r: Recording) -> dict[str, Estimates]:
+        out = estimates(model, k, decay, r, longest)
+        return {'filtered': Estimates(out[:, :n], out[:, n])}
 
-
-def _prepare(
-    shortest: int, gain: Gain, integrators_only: bool = False
-) -> Callable[[Setting, Values], Run]:
-    def prepare(setting: Setting, values: Values) -> Run:
-        model, chain = setting.model, shortest + int(values.get('derivatives', 0))
-        decay = values.get('decay', 0.0)
-        sampled = _sampled(model.phi, setting.period, chain, integrators_only, decay)
-        k = gain(sampled, values)
-        n, longest = model.order, min(LONGEST * setting.period, sampled.resolution)
-
-        def estimate(r: Recording) -> dict[str, Estimates]:
-            out = estimates(model, k, decay, r, longest)
-            return {'filtered': Estimates(out[:, :n], out[:, n])}
-
-        return estimate
-
-    return prepare
+    return estimate
 
 
 def _kalman(model: SampledModel, values: Values) -> np.ndarray:
@@ -179,15 +158,26 @@ def _luenberger(model: SampledModel, values: Values) -> np.ndarray:
     return placed(model, poles)
 
 
+def _bandwidth(name: str, setting: Setting) -> Dimension:
+    """Return a range in rad/s, from far below any d to where the observer is deadbeat."""
+    return Dimension(name, 0.05, 5.0 / setting.period, setting.speed)
+
+
+def _one_bandwidth(setting: Setting) -> tuple[Dimension, ...]:
+    return (_bandwidth('bandwidth', setting),)
+
+
+def _two_bandwidths(setting: Setting) -> tuple[Dimension, ...]:
+    return (*_one_bandwidth(setting), _bandwidth('drift_bandwidth', setting))
+
+
 def _luenberger_space(setting: Setting) -> tuple[Dimension, ...]:
-    size = setting.model.order + 1
+    pairs, odd = divmod(setting.model.order + 1, 2)
     space = []
-    for i in range(size // 2):
-        space.append(_bandwidth(f'frequency_{i + 1}', setting))
-        space.append(Dimension(f'damping_{i + 1}', 0.1, 5.0, 0.7))
-    if size % 2:
-        space.append(_bandwidth('real_pole', setting))
-    return tuple(space)
+    for i in range(1, pairs + 1):
+        space.append(_bandwidth(f'frequency_{i}', setting))
+        space.append(Dimension(f'damping_{i}', 0.1, 5.0, 0.7))
+    return (*space, *[_bandwidth('real_pole', setting)] * odd)
 
 
 def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...]:
@@ -199,58 +189,52 @@ def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...
     )
 
 
-def each_order(*more: Dimension) -> Callable[[Search], Values]:
-    """Return a search of bandwidth, decay and `more`, with each number of derivatives of d."""
-
-    def tune(search: Search) -> Values:
-        best: tuple[float, Values] = (float('inf'), {})
-        for k in DERIVATIVES:
-            fixed = {'derivatives': float(k)}
-            found = minimise(
-                lambda v, fixed=fixed: search.judged(fixed | v),
-                (*matern_space(search.setting, k), *more),
-                max(1, search.trials // len(DERIVATIVES)),
-                search.seed,
-                jobs=1,
-            )
-            if not best[1] or found.value < best[0]:
-                best = found.value, fixed | found.best
-        return best[1]
-
-    return tune
+def each_order(search: Search, more: Sequence[Dimension] = ()) -> Values:
+    """Search bandwidth, decay and `more` with each number of derivatives of d."""
+    best: tuple[float, Values] = (float('inf'), {})
+    for k in DERIVATIVES:
+        fixed = {'derivatives': float(k)}
+        found = minimise(
+            lambda v, fixed=fixed: search.judged(fixed | v),
+            (*matern_space(search.setting, k), *more),
+            max(1, search.trials // len(DERIVATIVES)),
+            search.seed,
+            jobs=1,
+        )
+        if not best[1] or found.value < best[0]:
+            best = found.value, fixed | found.best
+    return best[1]
 
 
-def _one_bandwidth(setting: Setting) -> tuple[Dimension, ...]:
-    return (_bandwidth('bandwidth', setting),)
-
-
-def _two_bandwidths(setting: Setting) -> tuple[Dimension, ...]:
-    return (*_one_bandwidth(setting), _bandwidth('drift_bandwidth', setting))
+def _method(
+    name: str, text: str, kind: str, space: Space, gain: Gain, shortest: int = 1,
+    integrators_only: bool = False, tune: Callable[[Search], Values] | None = None,
+) -> Method:  # fmt: skip
+    return Method(name, text, kind, space, partial(_run, gain, shortest, integrators_only), tune)
 
 
 FILTERS = (
-    Method(
-        'Kalman', 'steady-state Kalman filter, d a random walk', USUAL,
-        _one_bandwidth, _prepare(1, _kalman),
+    _method(
+        'Kalman', 'steady-state Kalman filter, d a random walk', USUAL, _one_bandwidth, _kalman
     ),
-    Method(
+    _method(
         'Kalman, ramp', 'steady-state Kalman filter, d and its derivative random walks', LINEAR,
-        _two_bandwidths, _prepare(2, _kalman_ramp),
+        _two_bandwidths, _kalman_ramp, shortest=2,
     ),
-    Method(
+    _method(
         'Kalman, decaying', 'steady-state Kalman filter, d a random walk that decays', LINEAR,
-        matern_space, _prepare(1, _kalman),
+        matern_space, _kalman,
     ),
-    Method(
+    _method(
         LINEAR_LIMIT, 'steady-state Kalman filter, d a Matern process as in ours', LINEAR,
-        matern_space, _prepare(1, _kalman), each_order(),
+        matern_space, _kalman, tune=each_order,
     ),
-    Method(
+    _method(
         'ESO', 'high-gain (extended state) observer, all poles at one place', LINEAR,
-        _one_bandwidth, _prepare(1, _eso, integrators_only=True),
+        _one_bandwidth, _eso, integrators_only=True,
     ),
-    Method(
+    _method(
         'Luenberger', 'Luenberger observer with disturbance state, all poles free', LINEAR,
-        _luenberger_space, _prepare(1, _luenberger),
+        _luenberger_space, _luenberger,
     ),
 )  # fmt: skip

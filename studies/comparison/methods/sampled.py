@@ -23,7 +23,7 @@ LONGEST_STEP = 1.0
 
 class SampledModel:
     """
-    The model, linearised at rest and extended by a chain of `chain` integrators that makes d.
+    The model, linearised at rest and extended by a chain of integrators that makes d.
 
     Parameters
     ----------
@@ -37,17 +37,6 @@ class SampledModel:
     decay : float
         Rate (1/s) at which all states of the chain decay, so that d is a Matern process.
 
-    Attributes
-    ----------
-    scale : (N,) array
-        Powers of the period, 0 to N - 1.
-    a : (N, N) array
-        Transition over a period, in scaled states x_i * period^(i - 1).
-    resolution : float
-        Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
-        0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as
-        dry friction, needs shorter ones.
-
     """
 
     def __init__(
@@ -58,17 +47,23 @@ class SampledModel:
         integrators_only: bool = False,
         decay: float = 0.0,
     ) -> None:
-        self.size = model.order + chain
-        self.period = period
+        n, self.size, self.period = model.order, model.order + chain, period
         self.scale = period ** np.arange(self.size)
+        """Powers of the period: scaled states are x_i * period^(i - 1)."""
         self._rates = np.eye(self.size, k=1)
-        self._rates[range(model.order, self.size), range(model.order, self.size)] = -decay
-        jacobian = model.jacobian(np.zeros(model.order))
-        fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(model.order, k=1))))
+        self._rates[range(n, self.size), range(n, self.size)] = -decay
+        jacobian = model.jacobian(np.zeros(n))
+        fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(n, k=1))))
         self.resolution = min(0.03 / max(float(fastest), 1e-9), LONGEST_STEP)
+        """
+        Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
+        0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as dry
+        friction, needs shorter ones.
+        """
         if not integrators_only:
-            self._rates[: model.order, : model.order] += jacobian
+            self._rates[:n, :n] += jacobian
         self.a = self._scaled(expm(self._rates * period))
+        """(N, N): transition over a period, in scaled states."""
         self._c = np.eye(self.size)[:1]
 
     def _scaled(self, matrix: Matrix) -> Matrix:
@@ -78,12 +73,8 @@ class SampledModel:
         """
         Return the steady-state Kalman gain for noise of variance 1 on y.
 
-        Parameters
-        ----------
-        intensities : sequence of float
-            Of the continuous white noises that drive the last states of the chain; the first one
-            is that of the last state.
-
+        `intensities` are those of the white noises that drive the last states of the chain, the
+        last state's first.
         """
         noise = self.process_noise(intensities)
         try:
@@ -98,10 +89,9 @@ class SampledModel:
 
     def process_noise(self, intensities: Sequence[float]) -> Matrix:
         """Return what noise as in `kalman` adds to the scaled covariance (Van Loan 1978)."""
-        spectrum = np.zeros(self.size)
-        for i, value in enumerate(intensities):
-            spectrum[self.size - 1 - i] = value
         n, rates = self.size, self._scaled(self._rates) * self.period
+        spectrum = np.zeros(n)
+        spectrum[n - len(intensities) :] = intensities[::-1]
         spectrum = spectrum * self.scale**2 * self.period
         largest = float(spectrum.max()) or 1.0
         block = np.zeros((2 * n, 2 * n))
