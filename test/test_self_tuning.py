@@ -297,6 +297,22 @@ def test_inexact_stamps_are_not_taken_for_jumps(noise):
     assert rms((run.unknown_input - d)[t > 3.0]) < 0.05 * rms(d)
 
 
+@pytest.mark.parametrize('jitter', [0.03, 0.15])
+def test_stamps_are_the_only_noise(jitter):
+    """Four states, and a y without noise: its error grows with its speed, from 0 on."""
+    random, rates = np.random.default_rng(6), np.eye(4, k=1)
+    rates[3, 2:] = -40.0, -2.0
+    t = np.arange(8000) * 2e-3
+    d = 50.0 * (np.sin(0.6 * t + 1.0) + np.sin(2.0 * t))
+    y = states_of(rates, d, np.zeros(4), 2e-3)[:, 0]
+    late = np.maximum.accumulate(t + jitter * 2e-3 * abs(random.standard_normal(len(t))))
+    late[30] += 1.5e-3  # before the members begin
+    observer = Observer({**SELF_TUNING, 'order': 4, 'phi': ['0', '0', '0', '-40*z3 - 2*z4']})
+    error = observer.run(late + 1e-8 * np.arange(len(t)), y).unknown_input - d
+    assert rms(error[t > 3.0]) < 0.4 * rms(d)
+    assert np.abs(error).max() < 20.0 * rms(d)
+
+
 def test_a_jump_of_d_is_followed_at_once():
     """After a jump of 2,000 times the noise a sample, d is right again within 25 samples."""
     t, y, d = swept(FRICTION, 70.0, 1e-2, 10.0, lambda phase: np.where(phase < 15.0, 1.0, -1.0))
@@ -605,7 +621,7 @@ def members_of(values):
     return np.concatenate([values['z'], values['d']]), p
 
 
-def filtered(y, periods, rates, intensity, variance, first, covariance):
+def filtered(y, periods, rates, intensity, variances, first, covariance):
     """Return estimate and covariance of a textbook Kalman filter, the noise being a state."""
     size = len(rates)
     x, p = np.append(first, 0.0), np.zeros((size + 1, size + 1))
@@ -615,7 +631,7 @@ def filtered(y, periods, rates, intensity, variance, first, covariance):
     whole, chain = np.zeros((2 * size, 2 * size)), np.eye(size, k=1)
     whole[:size, :size], whole[size:, size:] = -chain, chain.T
     whole[size - 1, 2 * size - 1] = 1.0
-    for measured, h in zip(y, periods, strict=True):
+    for measured, h, variance in zip(y, periods, variances, strict=True):
         exponential = expm(whole * h)  # Van Loan; Q is that of integrators (D 20)
         a = np.zeros((size + 1, size + 1))
         a[:size, :size] = expm(rates * h)
@@ -638,8 +654,9 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
     observer.run(t[:300], y[:300])
     values = observer.state.values
     moving, kappa, (x, covariances) = int(values['moving']), values['kappa'], members_of(values)
-    samples, periods = y[300:315], [stretch * PERIOD] * 15
+    samples, periods, variances = y[300:315], [stretch * PERIOD] * 15, []
     for measured, h in zip(samples, periods, strict=True):
+        variances.append(observer.state.values['noise'][0])
         observer.step(measured, h)
     after_x, after_covariances = members_of(observer.state.values)
     derivatives = np.tile(np.repeat(np.arange(4), 2), 30)
@@ -652,8 +669,8 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
         rates = np.eye(size, k=1)
         rates[2, 2] = -1.0
         rates[range(3, size), range(3, size)] = -kappa[g]
-        drive, variance = values['drive'][k, g], values['used_noise'][0]
-        found, expected = filtered(samples, periods, rates, drive, variance, first, covariance)
+        drive = values['drive'][k, g]
+        found, expected = filtered(samples, periods, rates, drive, variances, first, covariance)
         estimate = after_x[:, g]
         deviations = np.sqrt(np.diag(expected)[:size])
         assert (np.abs(estimate[:size] - found[:size]) < 1e-6 * deviations).all(), k

@@ -178,12 +178,12 @@ cdef VECTORISED take_interval(Members* m, double kept) noexcept nogil:
     cdef double y = w.sample.y, before = w.sample.before, half = sqrt(3.0 * w.sample.quanta)
     cdef double vague = 2.0 * VAGUE * half
     # Noise that is not of rounding, and what no P knows.
-    cdef double least = fmax(m.noise[0] - w.sample.quanta, 0.0) + vague * vague
+    cdef double least = fmax(w.now[0] - w.sample.quanta, 0.0) + vague * vague
     cdef double carried = 2.0 * fmin(OF_BACK * m.shared.goes_back, 1.0) * least
     cdef double* speed = entry(&m.p, m.n, 1, 1)  # variance of the state behind z_1
     for g in range(active):
         m.far[g] = (
-            m.far[g] + 1.0 if w.b[g] * w.b[g] > GATE * GATE * w.s[g] * m.noise[0] else 0.0
+            m.far[g] + 1.0 if w.b[g] * w.b[g] > GATE * GATE * w.s[g] * w.now[0] else 0.0
         )
     truncate(m, half, least, y == before)
     if kept < 0.0:
@@ -214,6 +214,7 @@ cdef bint choose_members(Members* m, double quanta) noexcept nogil:
         m.shared.unsettled = 0.0
         for i in range(COLOURS):
             m.noise[i] = m.used_noise[i] = m.noise[0]
+            m.late[i] = m.late[0]
         for g in range(HALF, COUNT):
             white = GRID.white[g]
             for i in range(m.n + ORDERS):

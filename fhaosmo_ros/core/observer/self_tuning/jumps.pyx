@@ -83,7 +83,7 @@ cdef bint follow_growth(Members* m, double beyond) noexcept nogil:
     if count == 0:
         begin_growth(m)
     shared.uneven += (sample.uneven - shared.uneven) / (count + 1.0)
-    least = FARTHER * shared.first_off + HUBER * sqrt(m.noise[0])
+    least = FARTHER * shared.first_off + HUBER * sqrt(m.work.now[0])
     if count > 0:
         least = fmax(
             least, POWER * shared.first_off * growth(m, hidden / shared.first_off, count)
@@ -118,7 +118,7 @@ cdef void follow_innovations(Members* m) noexcept nogil:
     else:
         for j in range(WINDOW - 1):
             m.window[j] = m.window[j + 1]
-        m.window[WINDOW - 1] = m.work.b[g] / sqrt(m.work.s[g] * m.noise[0])
+        m.window[WINDOW - 1] = m.work.b[g] / sqrt(m.work.s[g] * m.work.now[0])
     shared.since_mark += 1
     if shared.since_mark >= WINDOW:
         shared.since_mark = 0
@@ -189,7 +189,7 @@ cdef double otherwise(const double* r, int n) noexcept nogil:
 cdef void follow_jump(Members* m, int count) noexcept nogil:
     """Let all members go on from the one that is followed, as if only z_1 had jumped (D 35)."""
     cdef double estimate[MOST_STATES]
-    cdef double variance = m.work.s[m.shared.followed] * m.noise[0], total = 0.0
+    cdef double variance = m.work.s[m.shared.followed] * m.work.now[0], total = 0.0
     cdef int n = m.n, g = m.shared.followed, i
     for i in range(WINDOW - count, WINDOW):
         total += m.window[i] * sqrt(variance)

@@ -55,7 +55,7 @@ cdef struct Sample:
     double roughness  # square of its difference over the usual one
     double roughness_before  # mean of those before
     double uneven  # square of the highest difference, as a variance of y, and of its stamps
-    double of_stamps  # variance of y if its stamps are why innovations are large
+    double of_stamps  # variance of y if the irregularity of its stamps is their error
     double floor  # the least that the variance of the noise can be
     double largest  # variance of the innovations with which a member can judge it
     double average  # number of samples to average the noise over
@@ -67,11 +67,12 @@ cdef struct Sample:
 cdef struct Work:
     # What a step needs for itself.
     Sample sample
+    double now[COLOURS]  # variance of the noise of each colour at this sample
     int first, last  # members whose covariances move, and the one behind them
     Line b  # innovations
     Line s  # their variances over that of the noise
     Line believed  # the same, as far as it is believed
-    Line noise  # variance of each member's noise
+    Line noise  # variance of each member's noise at this sample
     Line inverse  # P C' times this are gains
     Line taken  # P loses P C' C P times this
     Line size  # standard deviation of z_1 - y where y is quantised
@@ -105,7 +106,7 @@ cdef struct Shared:
     double calm  # samples since the noise has grown
     double roughness  # short mean of the squared differences of y, over their usual size
     double interval  # last one between two samples that were taken (s)
-    double jitter  # variance of the stamps of late, over the square of the interval
+    double jitter  # variance that the intervals of late say the stamps have at most (s^2)
     double quantum  # step of y of which the others may be multiples (unit of y)
     double lattice  # of late, the share of the steps of y that are
     double goes_back  # of late, the share of the steps of y that go back at once
@@ -140,7 +141,8 @@ cdef struct Members:
     Estimates x
     Estimates gain  # by what an innovation corrects them
     Covariances p
-    double noise[COLOURS]  # variance of the noise of each colour
+    double noise[COLOURS]  # variance of the noise of each colour, but for that of stamps
+    double late[COLOURS]  # share of `jitter` that is error of the stamps (D 29)
     double used_noise[COLOURS]  # the one that P counts on
     double difference[DIFFERENCES]  # of y at the last sample
     double rough[COLOURS][DIFFERENCES]  # what those of order 1 to n + 1 say noise is at most

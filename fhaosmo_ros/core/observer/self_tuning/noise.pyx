@@ -26,6 +26,9 @@ cdef double LATTICE_STEPS = 30.0, LATTICE_SHARE = 0.9, NO_LATTICE = 0.5
 cdef double PASSED = 3.0
 cdef double HIDDEN = 4.0  # noise of so many times the variance of rounding hides the quanta
 cdef double ROUGH_SAMPLES = 100.0  # squared differences of y are averaged over so many
+# y and its stamps are taken to be no more exact than this: in parts of what y moves between
+# samples (RMS), and of the period.
+cdef double EXACT = 1e-5
 cdef double ROUGH = 2.0  # the variance of the noise is at most so many times what they say
 
 
@@ -104,21 +107,31 @@ cdef void follow_differences(Members* m, double y) noexcept nogil:
     )
 
 
-cdef double stamp_noise(Members* m, double h, bint in_sequence) noexcept nogil:
+cdef void follow_stamps(Members* m, double h, bint in_sequence) noexcept nogil:
     """
-    Follow how irregular the intervals are; return the variance of y if the stamps are why (D 29).
+    Follow what irregular intervals say that the variance of the stamps is at most (D 29).
 
     Differences of y do not show that its stamps are wrong, but innovations do. Unless the sample
     is `in_sequence`, the interval is that since the last one taken.
     """
     cdef Shared* shared = &m.shared
-    cdef double change
+    cdef double least = EXACT * shared.steady_period, change, r
     if in_sequence:
         if shared.interval > 0.0:  # three stamps, one of them twice: 1 + 4 + 1
-            change = (h - shared.interval) * (h - shared.interval) / (6.0 * h * shared.interval)
-            shared.jitter += (change - shared.jitter) / ROUGH_SAMPLES
+            change = h - shared.interval
+            r = fmin(change * change / (6.0 * shared.jitter), HUBER * HUBER)
+            shared.jitter *= 1.0 + (r / CLIPPED - 1.0) / ROUGH_SAMPLES
         shared.interval = h
-    return 2.0 * shared.jitter * m.rough[0][1]
+    shared.jitter = fmax(shared.jitter, least * least)
+
+
+cdef VECTORISED fill_noise(Members* m) noexcept nogil:
+    """Write the variance of the noise at this sample: late stamps make y be off if it moves."""
+    cdef Work* w = &m.work
+    cdef int c
+    for c in range(COLOURS):
+        w.now[c] = m.noise[c] + m.late[c] * w.sample.of_stamps
+    fill(w.noise, w.now)
 
 
 cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil:
@@ -132,7 +145,6 @@ cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil:
     cdef Work* w = &m.work
     cdef Py_ssize_t g, active = m.shared.active
     cdef double least, own, most = 4.0 if unlikely_before else INFINITY
-    fill(w.noise, m.noise)
     for g in range(active):
         w.believed[g] = w.s[g] if w.s[g] < most * m.variance[g] else most * m.variance[g]
         w.one[g] = -w.believed[g] * w.noise[g] if m.score[g] > -CLOSE else -INFINITY
@@ -182,7 +194,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
     cdef double best[COLOURS]
     cdef double weights[COLOURS]
     cdef double squares[COLOURS]
-    cdef double variance, ratio, off, weight, least, most, average = sample.average
+    cdef double variance, ratio, off, weight, least, most, more, share, average = sample.average
     cdef double widest = sample.largest
     cdef int c, p
     cdef Py_ssize_t g, active = m.shared.active
@@ -212,9 +224,13 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
     if least > STEADY:  # every member that can judge says so, and the differences do
         average = fmin(average, QUICK_SAMPLES)
     for c in range(COLOURS if active > HALF else 1):
-        m.noise[c] *= 1.0 + (squares[c] / weights[c] / CLIPPED - 1.0) / average
+        more = (squares[c] / weights[c] / CLIPPED - 1.0) / average
+        share = m.noise[c] / w.now[c]  # who adds to the noise answers for it
+        m.late[c] *= 1.0 + (1.0 - share) * more
+        m.late[c] = fmax(fmin(m.late[c], ROUGH), EXACT * EXACT)
+        m.noise[c] *= 1.0 + share * more
         most = m.rough[c][1]
         for p in range(2, m.n + 2):
             most = fmin(most, m.rough[c][p])
-        m.noise[c] = fmax(fmin(m.noise[c], ROUGH * (most + sample.of_stamps)), sample.floor)
-    fill(w.noise, m.noise)
+        m.noise[c] = fmax(fmin(m.noise[c], ROUGH * most), sample.floor)
+    fill_noise(m)

@@ -26,8 +26,8 @@ cdef class SelfTuning(Structure):
     cdef void begin_afresh(self) noexcept nogil
     # Parts of a step.
     cdef void step_members(self, double y, double h, const double* u) noexcept nogil
-    cdef void follow_period(self, double h) noexcept nogil
-    cdef void carry_flow(self, double h, const double* u) noexcept nogil
+    cdef void follow_period(self, double h, bint same) noexcept nogil
+    cdef void carry_flow(self, double h, const double* u, bint same) noexcept nogil
     cdef void pass_over(self, bint doubted) noexcept nogil
     cdef void take_sample(self, bint doubted) noexcept nogil
     cdef bint has_begun(self) noexcept nogil

@@ -18,8 +18,8 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    CALM_SAMPLES, STEADY, find_knowing, follow_differences, follow_noise, follow_quantum,
-    is_explained, is_likely, rounding, stamp_noise
+    CALM_SAMPLES, EXACT, STEADY, fill_noise, find_knowing, follow_differences, follow_noise,
+    follow_quantum, follow_stamps, is_explained, is_likely, rounding
 )
 from fhaosmo_ros.core.observer.self_tuning.start cimport gather
 from fhaosmo_ros.core.observer.self_tuning.weights cimport (
@@ -42,8 +42,6 @@ cdef double JUMP_SAMPLES = 10.0
 # and y itself moves as ever, members are judged by them too: those that were likely are wrong. A
 # sample whose difference is large counts as ROUGH_TURN of these: noise may have grown.
 cdef double TURNS_SAMPLES = 40.0, OFTEN = 0.07, ROUGH_TURN = -0.5
-# y is taken to be no more exact than this, in parts of what it moves between samples (RMS).
-cdef double EXACT = 1e-5
 # Factors on the variance of the noise, of the likeliest colour and others, that make P move.
 cdef double ANOTHER = 1.5, FAR_OFF = 3.0
 # Intervals that differ by this part are equal: seconds of a clock, as floats, are not exact.
@@ -70,7 +68,7 @@ RANGES |= dict.fromkeys((
     'score_before', 'z', 'd', 'gain_z', 'gain_d', 'p_zz', 'p_zd', 'p_dd',
 ), (-LARGEST, LARGEST))
 # What counts before the members run, too.
-EARLY = ('first_y', 'first_h', 'noise', 'used_noise', 'difference', 'rough', 'window')
+EARLY = ('first_y', 'first_h', 'noise', 'late', 'used_noise', 'difference', 'rough', 'window')
 
 
 cdef class SelfTuning(Structure):
@@ -183,7 +181,7 @@ cdef class SelfTuning(Structure):
             self.begin_afresh()
             return
         watch(m, shared.told)
-        self.variances[0] = m.noise[0]
+        self.variances[0] = m.work.now[0]
         for i in range(n):
             z = self.level[i].z_hat
             size = fmax(self.sizes[i], z * z)
@@ -194,7 +192,7 @@ cdef class SelfTuning(Structure):
                     entry(&m.p, n, i, j)[g] = size if i == j else 0.0
         for g in range(COUNT):
             a = m.correlation[g]
-            m.x.z[0][g], m.p.zz[0][g] = y, m.noise[GRID.colour[g]] / (1.0 - a * a)
+            m.x.z[0][g], m.p.zz[0][g] = y, m.work.now[GRID.colour[g]] / (1.0 - a * a)
             m.residual[g], m.far[g], m.short_mean[g] = 0.0, 0.0, 1.0
 
     cdef double innovation_variance(self) noexcept nogil:
@@ -241,22 +239,27 @@ cdef class SelfTuning(Structure):
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
         cdef double expected, off, sign, turn = 0.0, tau = 0.0
-        cdef bint growing, goes_on, likely, begins, jumped, doubted, rough
+        cdef double speed
+        cdef bint growing, goes_on, likely, begins, jumped, doubted, rough, same
         cdef int i, n = self.order, since_jump = 0
         sample.quanta = rounding(m)
         if choose_members(m, sample.quanta):
             weigh(m, FLOOR)
-        self.follow_period(h)
         follow_differences(m, y)
-        sample.of_stamps = stamp_noise(m, h, memory.beyond == 0.0)
+        follow_stamps(m, h, memory.beyond == 0.0)
+        same = fabs(h - shared.flow_period) <= SAME * shared.flow_period
+        self.carry_flow(h, u, same)
+        speed = (self.prediction.z[0] - self.trial[0].z_hat) / h
+        sample.of_stamps = shared.jitter * speed * speed
         sample.uneven += sample.of_stamps
+        fill_noise(m)
+        self.follow_period(h, same)
         rough = sample.roughness > HUBER * HUBER
         if shared.growing >= GROWTHS - 1.0 or shared.recent > 0.0 or sample.quanta > 0.0:
             shared.moving = HALF
         if sample.quanta > 0.0:  # P depends on the samples
             shared.unsettled = 0.0
         w.first, w.last = HALF - shared.moving, min(HALF + shared.moving, shared.active)
-        self.carry_flow(h, u)
         sample.off = y - self.prediction.z[0]
         # A sample that is not likely changes no member: what it makes of them stands apart.
         for i in range(self.levels):
@@ -297,7 +300,7 @@ cdef class SelfTuning(Structure):
             return
         if jumped:
             if begins:  # while it was within the gate, it could not be seen
-                tau = h / (1.0 - pow(fmin(GATE * sqrt(m.noise[0]) / off, 0.9), 1.0 / n))
+                tau = h / (1.0 - pow(fmin(GATE * sqrt(w.now[0]) / off, 0.9), 1.0 / n))
                 shared.recent = JUMP_SAMPLES
             allow_jump(m, y, tau)
             memset(m.far, 0, sizeof(m.far))
@@ -320,7 +323,7 @@ cdef class SelfTuning(Structure):
                 m.far[i] = 0.0
                 put(m, i, mean)
 
-    cdef void follow_period(self, double h) noexcept nogil:
+    cdef void follow_period(self, double h, bint same) noexcept nogil:
         """Decide which covariances move, and what depends on the period (D 27)."""
         cdef Members* m = self.members
         cdef Shared* shared = &m.shared
@@ -329,7 +332,7 @@ cdef class SelfTuning(Structure):
         cdef double slowed = 1.0
         cdef int g, c, moving = 0
         cdef bint changed
-        if not fabs(h - shared.flow_period) <= SAME * shared.flow_period:
+        if not same:
             for g in range(HALF):  # kappa does not depend on k
                 m.decayed[g] = (
                     m.decayed[g - KINDS] if GRID.order[g] > 0 else exp(-m.kappa[g] * h)
@@ -344,11 +347,11 @@ cdef class SelfTuning(Structure):
             or h > GAP * shared.steady_period
         )
         for c in range(COLOURS):
-            ratio = m.noise[c] / m.used_noise[c]
+            ratio = m.work.now[c] / m.used_noise[c]
             limit = ANOTHER if c == GRID.colour[shared.likeliest] else FAR_OFF
             changed = changed or not 1.0 / limit < ratio < limit
         if changed:
-            m.used_noise = m.noise
+            m.used_noise = m.work.now
         if changed or not self.is_linear:
             shared.unsettled, shared.steady_period = 0.0, mean
         shared.unsettled += h
@@ -362,10 +365,9 @@ cdef class SelfTuning(Structure):
                 moving += IN_BAND
         shared.moving = min((moving + EVEN - 1) // EVEN * EVEN, HALF)
 
-    cdef void carry_flow(self, double h, const double* u) noexcept nogil:
+    cdef void carry_flow(self, double h, const double* u, bint same) noexcept nogil:
         """Predict the mean, with its derivative by each of its entries (D 27)."""
         cdef Shared* shared = &self.members.shared
-        cdef bint same = fabs(h - shared.flow_period) <= SAME * shared.flow_period
         cdef int i, j
         for j in range(self.levels - 1 if self.is_linear and same else 0, self.levels):
             for i in range(self.levels):
@@ -468,6 +470,7 @@ cdef class SelfTuning(Structure):
             'first_y': (<size_t>m.first_y, (FIRST_SAMPLES,)),
             'first_h': (<size_t>m.first_h, (FIRST_SAMPLES,)),
             'noise': (<size_t>m.noise, (COLOURS,)),
+            'late': (<size_t>m.late, (COLOURS,)),
             'used_noise': (<size_t>m.used_noise, (COLOURS,)),
             'difference': (<size_t>m.difference, (DIFFERENCES,)),
             'rough': (<size_t>m.rough, (COLOURS, DIFFERENCES)),

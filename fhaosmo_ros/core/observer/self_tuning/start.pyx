@@ -10,7 +10,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     MOST_ORDER, Members, ORDERS, Shared, factorial, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    CALM_SAMPLES, LATTICE_SHARE, follow_differences, is_multiple
+    CALM_SAMPLES, EXACT, LATTICE_SHARE, follow_differences, is_multiple
 )
 from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, weigh
 
@@ -123,8 +123,7 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
     cdef double differences[FIRST_SAMPLES]
     cdef double values[FIRST_SAMPLES]
     cdef double rough[DIFFERENCES]
-    cdef double noise = INFINITY, binomial = 1.0, quantum = INFINITY, size, period = 0.0, h
-    cdef double before, jitter = 0.0
+    cdef double noise = INFINITY, binomial = 1.0, quantum = INFINITY, size, period = 0.0
     cdef int count = shared.samples, order, i, c
     for i in range(count):
         differences[i] = m.first_y[i]
@@ -148,17 +147,18 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
     if noise == INFINITY:
         noise = quantum
     for i in range(1, count):
-        h, before = m.first_h[i], m.first_h[i - 1]
-        period += h / (count - 1)
-        if i > 1:
-            jitter += (h - before) * (h - before) / (6.0 * h * before) / (count - 2)
-    shared.steady_period, shared.jitter = period, jitter
-    shared.interval = m.first_h[count - 1]
-    noise = fmax(fmax(noise, sqrt(2.0 * jitter * rough[1])), least)
+        period += m.first_h[i] / (count - 1)
+        values[i - 1] = fabs(m.first_h[i] - m.first_h[i - 1])
+    size = ranked(values + 1, count - 2, 0.5) / MEDIAN
+    shared.steady_period, shared.interval = period, m.first_h[count - 1]
+    shared.jitter = fmax(size * size / 6.0, (EXACT * period) * (EXACT * period))
+    noise = fmax(noise, least)
     for order in range(m.n + 2):
         for c in range(COLOURS):
             m.rough[c][order] = fmax(rough[order], noise * noise)
-    return noise
+    for c in range(COLOURS):
+        m.noise[c], m.late[c] = noise * noise, 1.0
+    return sqrt(noise * noise + shared.jitter * 2.0 * rough[1] / (period * period))
 
 
 cdef void find_sizes(Members* m, double* sizes) noexcept nogil:
@@ -189,7 +189,7 @@ cdef void begin(Members* m, double noise) noexcept nogil:
     shared.unsettled = shared.flow_period = 0.0
     shared.first_noise = noise * noise
     for c in range(COLOURS):
-        m.noise[c] = m.used_noise[c] = noise * noise
+        m.used_noise[c] = noise * noise
     for g in range(COUNT):
         c, omega = GRID.colour[g], GRID.bandwidth[g] / period
         m.kappa[g], m.correlation[g] = GRID.ratio[g] * omega, GRID.correlation[c]

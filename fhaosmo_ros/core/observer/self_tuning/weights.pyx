@@ -37,7 +37,7 @@ cdef VECTORISED judge(Members* m, double grown, double kept, bint calm) noexcept
         m.far[g] = m.far[g] + 1.0 if w.ratio[g] > GATE * GATE else 0.0
     if kept >= 0.0:
         for g in range(COLOURS):
-            logs[g] = log(m.noise[g] / m.shared.first_noise)
+            logs[g] = log(w.now[g] / m.shared.first_noise)
         fill(w.one, logs)
         for g in range(active):
             late = slack * (m.far[g] - 1.0 if m.far[g] > 1.0 else 0.0)
@@ -86,7 +86,7 @@ cdef void tell_model(Members* m, double slider, bint jumped, Model* model) noexc
     if m.score[shared.told] < -CLEARLY:
         shared.told = shared.likeliest
     g = shared.told
-    k, noise, a = GRID.order[g], m.noise[GRID.colour[g]], m.correlation[g]
+    k, noise, a = GRID.order[g], m.work.now[GRID.colour[g]], m.correlation[g]
     twice = 2.0 * (m.n + 1 + k)
     model.drive, model.loss = m.drive[k][g] * pow(slider, twice), m.kappa[g] * slider
     edge = fmin(pow(model.drive / noise * power(h, 2 * (m.n + 1 + k) - 1), 1.0 / twice), M_PI)
