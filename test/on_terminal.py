@@ -5,7 +5,6 @@ import contextlib
 import fcntl
 import os
 from pathlib import Path
-import signal
 import struct
 import subprocess
 import sys
@@ -14,50 +13,34 @@ import termios
 ROOT = Path(__file__).resolve().parents[1]
 
 
-class OnTerminal:
-    """`python -m MODULE ...`, started with SIGINT ignored if that is asked for."""
+class OnTerminal(subprocess.Popen):
+    """`python -m MODULE ...`; `said` is what it has written so far."""
 
-    def __init__(self, *arguments, ignored=False):
+    def __init__(self, *arguments):
         self._terminal, its_end = os.openpty()
         fcntl.ioctl(self._terminal, termios.TIOCSWINSZ, struct.pack('4H', 24, 80, 0, 0))
         self.said = ''
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN) if ignored else None
-        try:
-            self._process = subprocess.Popen(
-                [sys.executable, '-m', *map(str, arguments)],
-                cwd=ROOT,
-                stdin=subprocess.DEVNULL,
-                stdout=its_end,
-                stderr=its_end,
-            )
-        finally:
-            os.close(its_end)
-            if ignored:
-                signal.signal(signal.SIGINT, before)
-
-    def __enter__(self):
-        return self
+        words = [sys.executable, '-m', *map(str, arguments)]
+        super().__init__(words, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=its_end, stderr=its_end)
+        os.close(its_end)
 
     def __exit__(self, *_):
-        self._process.kill()
-        self._process.wait()
+        self.kill()
+        self.wait()
         os.close(self._terminal)
-
-    def _read(self):
-        self.said += os.read(self._terminal, 4096).decode(errors='replace')
 
     def wait_for(self, text):
         """Wait until the command has written `text`."""
-        try:
-            while text not in self.said:
-                self._read()
-        except OSError as error:  # EIO: it has ended
-            raise AssertionError(self.said) from error
+        while text not in self.said:
+            self._read()
 
     def end(self, number, timeout=60.0):
         """Send it this signal and return its exit code."""
-        self._process.send_signal(number)
-        with contextlib.suppress(OSError):
+        self.send_signal(number)
+        with contextlib.suppress(OSError):  # EIO: it has ended
             while True:
                 self._read()
-        return self._process.wait(timeout)
+        return self.wait(timeout)
+
+    def _read(self):
+        self.said += os.read(self._terminal, 4096).decode(errors='replace')

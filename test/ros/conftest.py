@@ -42,6 +42,7 @@ def _launcher(folders):
     finally:
         for process in processes:
             process.kill()
+            process.wait()
 
 
 @pytest.fixture(scope='session')
@@ -74,7 +75,7 @@ def estimator(launch, user):
 def pair(tmp_path_factory, user):
     """Return an estimator that hears a plant; the plant's parameters are its attribute."""
     with _launcher(tmp_path_factory) as launch:
-        launch('plant', namespace='/pair', sample_rate=500.0)
+        launch('plant', namespace='/pair', sample_rate=200.0)
         estimator = Estimator(user, launch('estimator', namespace='/pair', **LAX), '/pair')
         estimator.plant = Parameters(user, '/pair/plant')
         yield estimator
@@ -84,7 +85,7 @@ def pair(tmp_path_factory, user):
 def _fed(tmp_path_factory, user):
     with _launcher(tmp_path_factory) as launch:
         process = launch('estimator', namespace='/fed', **FED)
-        yield Estimator(user, process, '/fed').greet()
+        yield Estimator(user, process, '/fed').listen()
 
 
 @pytest.fixture

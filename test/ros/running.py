@@ -4,7 +4,6 @@
 from bisect import bisect_right
 from collections import defaultdict
 import inspect
-import os
 from pathlib import Path
 import signal
 import subprocess
@@ -27,7 +26,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
-from std_msgs.msg import Float64, Float64MultiArray
+from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 try:
@@ -38,7 +37,7 @@ except ImportError:  # an older rclpy
 ROOT = Path(fhaosmo_ros.__file__).parents[1]
 DEADLINE = 60.0
 """Seconds for what takes one on a quiet machine."""
-TRIES = 4
+TRIES = 20
 """Of a call, which share the deadline: the middleware may lose the first one of a new client."""
 SECOND = 1_000_000_000
 OK, WARN, ERROR, STALE = b'\0', b'\1', b'\2', b'\3'
@@ -73,17 +72,16 @@ def arguments(*words: object, namespace: str = '', **values: object) -> list[obj
     return ['--ros-args', *words, *(part for rule in rules for part in ('-p', rule))]
 
 
-class Process:
-    """A process whose output is kept in a file."""
+class Process(subprocess.Popen):
+    """Python with its output in a file."""
 
-    def __init__(self, path: Path, *words: object, **environment: object) -> None:
+    def __init__(self, path: Path, *words: object) -> None:
         self._path = path
         self._may_end = False
         with path.open('wb') as out:
-            self._process = subprocess.Popen(
+            super().__init__(
                 [sys.executable, *map(str, words)],
                 cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=out,
-                env=os.environ | {name: str(value) for name, value in environment.items()},
                 # A test under nohup ignores SIGHUP, and so would the node.
                 preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
             )  # fmt: skip
@@ -92,28 +90,16 @@ class Process:
     def output(self) -> str:
         return self._path.read_text(errors='replace')
 
-    @property
-    def running(self) -> bool:
-        return self._process.poll() is None
-
-    def send(self, number: int) -> None:
-        self._process.send_signal(number)
-
     def wait(self, timeout: float = DEADLINE) -> int:
         """Return the exit code of a process that is to end."""
         self._may_end = True
-        return self._process.wait(timeout)
-
-    def kill(self) -> None:
-        if self.running:
-            self._process.kill()
-            self._process.wait()
+        return super().wait(timeout)
 
     def interrupt(self) -> None:
         """Send SIGINT to a process that has to be running, if nobody has ended it."""
         if not self._may_end:
-            assert self.running, f'it has ended by itself:\n{self.output}'
-            self.send(signal.SIGINT)
+            assert self.poll() is None, f'it has ended by itself:\n{self.output}'
+            self.send_signal(signal.SIGINT)
 
     def check_end(self) -> None:
         """Wait for the end after `interrupt`: a good one, with nothing terrible said."""
@@ -340,33 +326,18 @@ class Estimator:
         self.y = user.record(self._topic, Float64)
         self._estimates: list[Estimate] = []
         self._ticks = 0
-        user.wait(
-            lambda: all(user.node.count_publishers(f'{self.name}/{t}') for t in self.topics),
-            f'publishers of {self.name}',
-        )
+        # An estimate that nobody hears is not made. Readers are announced in order: once it has
+        # written to this one, it knows those that this user made before.
+        told = user.record(f'{node}/parameters', String, LATCHED)
+        user.wait(lambda: told, f'parameters of {node}')
         self.parameters = Parameters(user, node)
 
     # What it is sent.
 
-    def greet(self) -> 'Estimator':
-        """Publish samples until one is answered, then have it start afresh."""
-        self.listen()
-
-        def answered() -> bool:
-            stamp = self.send(0.0)
-            try:
-                self.wait_estimate(lambda e: e.stamp == stamp, 'first estimate', 1.0)
-            except TimeoutError:
-                return False
-            return True
-
-        self.user.wait(answered, f'answer of {self.name} to samples')
-        assert self.reset().success
-        return self
-
-    def listen(self) -> None:
+    def listen(self) -> 'Estimator':
         """Wait until it hears y."""
         self._publisher = self.user.publisher(self._topic, heard=2)  # it and our own record
+        return self
 
     def reset(self):
         return self.user.call(f'{self.name}/reset', Trigger, Trigger.Request())
@@ -445,9 +416,9 @@ class Estimator:
     def wait_count(self, key: str, value: int) -> None:
         self.user.wait(lambda: self.count(key) >= value, f'{key!r} of {value} in diagnostics')
 
-    def wait_status(self, task: str, level: bytes | None, *words: str, since: int | None = None):
+    def wait_status(self, task: str, level: bytes, *words: str, since: int | None = None):
         """
-        Return a status of a task with this level (None: any) and these words in its message.
+        Return a status of a task with this level and these words in its message.
 
         Of those that come from now on, or from the `since`-th report on.
         """
@@ -457,7 +428,7 @@ class Estimator:
         def look() -> bool:
             found[:] = [
                 status for report in self.reports[since:] for name, status in
-                report.statuses.items() if name == task and level in (None, status.level)
+                report.statuses.items() if name == task and status.level == level
                 and all(word in status.message for word in words)
             ]  # fmt: skip
             return bool(found)

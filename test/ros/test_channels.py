@@ -24,7 +24,7 @@ def rigs(user, launch):
     own = {f'{name}.{key}': value for name, values in OWN.items() for key, value in values.items()}
     common = FED | COMMON | {'channels': list(OWN)}
     process = launch('estimator', namespace='/many', **common, **own)
-    return {name: Estimator(user, process, '/many', name).greet() for name in OWN}
+    return {name: Estimator(user, process, '/many', name).listen() for name in OWN}
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ from running import (
     LAX,
     OK,
     Parameters,
+    QOS,
     ROOT,
     SECOND,
     STALE,
@@ -29,7 +30,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Header, Int64
 from std_srvs.srv import SetBool
 
-RATE = 500.0
+RATE = 200.0
 """Of the pair's plant."""
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -240,7 +241,7 @@ def test_publishers_are_named(user, estimator, stranger):
     rig.wait_status('input', ERROR, '/stranger', 'std_msgs/msg/Int64', 'std_msgs/msg/Float64')
     stranger.destroy_publisher(unheard)
 
-    first = stranger.create_publisher(Float64, '/heard/y', 10)
+    first = stranger.create_publisher(Float64, '/heard/y', QOS)
     wait_values(rig, 'input', lambda v: v['publishers'] == '/stranger', 'name of the publisher')
     rig.listen()
     rig.wait_status('input', STALE, '2 publishers')
@@ -273,6 +274,11 @@ def test_what_was_published_before_is_heard_if_asked_for(estimator, stranger):
 # Policies of what is published.
 
 
+def policies(user, topic: str):
+    user.wait(lambda: user.node.count_publishers(topic), f'publisher of {topic}')
+    return user.node.get_publishers_info_by_topic(topic)[0].qos_profile
+
+
 def test_policies_of_estimates(user, launch):
     """An estimate that nobody listens to is not made, unless its publisher keeps the last ones."""
     node = '/out/estimator'
@@ -286,13 +292,10 @@ def test_policies_of_estimates(user, launch):
     assert parameters.get(f'{prefix}/standard_deviation.publisher.depth') == 7
     assert parameters.get(f'{prefix}/innovation.publisher.depth') == 1000
 
-    def policies(topic: str):
-        return user.node.get_publishers_info_by_topic(f'{node}/{topic}')[0].qos_profile
-
-    assert policies('state').reliability == ReliabilityPolicy.BEST_EFFORT
-    assert policies('stamp').reliability == ReliabilityPolicy.RELIABLE
-    assert policies('unknown_input').durability == DurabilityPolicy.TRANSIENT_LOCAL
-    assert policies('stamp').durability == DurabilityPolicy.VOLATILE
+    assert policies(user, f'{node}/state').reliability == ReliabilityPolicy.BEST_EFFORT
+    assert policies(user, f'{node}/stamp').reliability == ReliabilityPolicy.RELIABLE
+    assert policies(user, f'{node}/unknown_input').durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert policies(user, f'{node}/stamp').durability == DurabilityPolicy.VOLATILE
 
     y, reports = user.publisher('/out/y'), user.reports[node[1:]]
 
@@ -310,12 +313,9 @@ def test_policies_of_estimates(user, launch):
 
 
 def test_policies_of_the_plant(user, launch):
-    policies = {
-        'qos_overrides./policies/y.publisher.reliability': 'best_effort',
-        'qos_overrides./policies/plant/state.publisher.depth': 7,
-    }
-    launch('plant', namespace='/policies', **policies)
-    parameters = Parameters(user, '/policies/plant')
-    assert parameters.get('qos_overrides./policies/plant/state.publisher.depth') == 7
-    (y,) = user.node.get_publishers_info_by_topic('/policies/y')
-    assert y.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    prefix = 'qos_overrides./policies'
+    own = {f'{prefix}/y.publisher.reliability': 'best_effort'}
+    own |= {f'{prefix}/plant/state.publisher.depth': 7}
+    launch('plant', namespace='/policies', **own)
+    assert Parameters(user, '/policies/plant').all(own) == own
+    assert policies(user, '/policies/y').reliability == ReliabilityPolicy.BEST_EFFORT

@@ -100,9 +100,8 @@ def test_gap_stops_the_output_and_restarts_the_observer(fed):
 
 def test_slow_sensor_does_not_flood_the_log(estimator):
     """Each sample is a jump of the stamps: said at most every 5 s of each kind, with a count."""
-    rig = estimator('/flood', **LAX | {'max_gap': 0.001})
-    rig.greet()
     begin = time.monotonic()
+    rig = estimator('/flood', **LAX, max_gap=0.001).listen()
     for k in itertools.count():
         rig.send(math.nan if k % 10 == 5 else 1.0)
         if rig.count('restarts') >= 20 and rig.count('rejected measurements') >= 2:
@@ -113,18 +112,13 @@ def test_slow_sensor_does_not_flood_the_log(estimator):
     most = 2 + (time.monotonic() - begin) // 5.0
     for kind in set(kinds):
         assert kinds.count(kind) <= most, kind
-    for words in (
-        'restarted from the new one',
-        'no usable sample on /flood/y',
-        'got nan',
-        'restarts so far)',
-    ):
+    for words in ('restarted from the new one', 'restarts so far)', 'no usable sample', 'got nan'):
         rig.wait_said(words)
 
 
 def test_bad_inputs_are_rejected_and_the_last_one_is_held(user, estimator):
     model = {'order': 2, 'phi': ['0', 'u - z2'], 'max_gap': 60.0}
-    rig = estimator('/bad_u', **FED | model).greet()
+    rig = estimator('/bad_u', **FED | model).listen()
     u = user.publisher('/bad_u/u')
     for value in (1.0, math.nan, math.inf):
         u.publish(Float64(data=value))
@@ -188,7 +182,7 @@ def test_node_clock_sampling_follows_simulated_time(clock, estimator):
 def test_negative_time_on_clock_is_rejected(clock, launch, node):
     process = launch(node, namespace='/negative', use_sim_time=True)
     clock(-5 * SECOND, lambda: 'expected seconds >= 0, got -5' in process.output)
-    assert process.running
+    assert process.poll() is None
 
 
 def test_a_clock_that_does_not_run_is_said(clock, estimator):

@@ -92,7 +92,7 @@ def test_the_model_is_read_when_it_is_configured(user, unconfigured, process):
         # Its own value is taken, as `ros2 param load` of its own file sets it.
         parameters.set(**{name: parameters.get(name)})
     assert node.change('activate')
-    assert len(Estimator(user, process, '/managed').greet().estimates[-1].z) == 2
+    assert len(Estimator(user, process, '/managed').listen().feed(0.2).z) == 2
     assert node.change('deactivate')
     assert node.change('cleanup')
     parameters.set(**was)
@@ -144,7 +144,7 @@ def test_reset_that_waits_during_cleanup_does_not_end_the_node(user, unconfigure
         for _ in range(20):
             reset.call_async(Trigger.Request())
         user.wait(lambda: unconfigured.state() == 'unconfigured', 'cleanup')
-        assert process.running
+        assert process.poll() is None
 
 
 def test_it_starts_by_itself(user, fed):

@@ -89,7 +89,7 @@ def nearest(messages: list, stamp: int):
 def test_equals_a_replay_of_the_same_samples(user, estimator, values, request):
     namespace = f'/replay_{request.node.callspec.id}'
     tuning = user.record(f'{namespace}/estimator/tuning', Float64MultiArray)
-    rig = estimator(namespace, **FED | values).greet()
+    rig = estimator(namespace, **FED | values).listen()
     online = {n: v for n, v in values.items() if not n.startswith('publish')}
     replay = OnlineEstimator({'max_gap': 60.0} | online)
     rng = np.random.default_rng(1)
@@ -126,11 +126,9 @@ def test_estimates_of_the_past_are_those_of_a_replay(estimator):
     }  # fmt: skip
     rig = estimator('/past', **FED | values)
     rig.listen()
-    for k in range(200):
+    for k in range(100):
         rig.send(0.1 * math.sin(0.1 * k))
-        if len(rig.estimates) > 40:
-            break
-        time.sleep(0.005)
+        time.sleep(0.002)
     rig.user.wait(lambda: len(rig.estimates) > 40, 'estimates')
     replay = OnlineEstimator(values)
     rows = replay.run([m.stamp for m in rig.y], [m.message.data for m in rig.y])
@@ -164,7 +162,7 @@ def test_live_events_are_those_of_a_replay(user, estimator):
     early = user.record('/events/estimator/event', DiagnosticArray, LATCHED)
     user.wait(lambda: early, 'the state before any event')
     assert early[0].message.status[0].message == 'no event yet'
-    rig.greet()
+    rig.listen()
     samples = [(rig.send(y), y) for k in range(400) for y in [1.0 if 100 <= k < 200 else 0.0]]
     replay = OnlineEstimator(values)
     replay.run(*zip(*samples, strict=True))

@@ -23,7 +23,7 @@ from yaml_texts import HOSTILE, random_texts
 
 TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}
 LIVE = {node: [p for p in table.values() if p.live] for node, table in TABLES.items()}
-STARTED_WITH = {'estimator': FED, 'plant': {'sample_rate': 500.0}}
+STARTED_WITH = {'estimator': FED, 'plant': {'sample_rate': 200.0}}
 READ_ONLY = {
     'estimator': ['autostart', 'channels'],  # the rest can be set while the node is unconfigured
     'plant': [p.name for p in PLANT_NODE_PARAMETERS.values() if not p.live],

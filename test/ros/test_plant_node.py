@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plant node: what it publishes belongs to the time at which it publishes it."""
 
+from bisect import bisect
 import re
 import time
 
@@ -27,21 +28,13 @@ class PlantRig:
 
     def ticks(self, messages: list, count: int) -> list:
         """Return pairs of a sample and what the plant published behind it, from now on."""
-        first = len(self.y)
-        pairs = []
-
-        def look() -> bool:
-            samples, others = self.y[first:], list(messages)
-            after = np.searchsorted([m.stamp for m in samples], [m.stamp for m in others])
-            # Behind a sample and before the next one; a stall may have lost one of the two.
-            pairs[:] = [
-                (samples[k - 1], others[i]) for i, k in enumerate(after)
-                if k and (i == 0 or after[i - 1] != k)
-            ]  # fmt: skip
-            return len(pairs) >= count
-
-        self.user.wait(look, 'ticks')
-        return pairs[:count]
+        first, last = len(messages) + 1, len(messages) + count
+        self.user.wait(
+            lambda: len(messages) > last and self.y[-1].stamp > messages[last].stamp, 'ticks'
+        )
+        samples = list(self.y)
+        stamps = [sample.stamp for sample in samples]
+        return [(samples[bisect(stamps, m.stamp) - 1], m) for m in messages[first : last + 1]]
 
     def fresh(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return stamps [s], y and d of samples that come from now on."""

@@ -31,24 +31,18 @@ def allowed(policy, enclave: str, kind: str, verb: str) -> list[str]:
 def test_policy_has_the_form_that_sros2_reads(policy):
     """Schema 0.2.0 of sros2, as far as the file uses it."""
     assert (policy.tag, policy.attrib) == ('policy', {'version': '0.2.0'})
-    (enclaves,) = policy
-    assert enclaves.tag == 'enclaves'
-    for enclave in enclaves:
-        assert (enclave.tag, set(enclave.attrib)) == ('enclave', {'path'})
-        (profiles,) = enclave
-        (profile,) = profiles
-        assert (profiles.tag, profile.tag) == ('profiles', 'profile')
-        assert set(profile.attrib) == {'ns', 'node'}
-        for rules in profile:
-            ((verb, rule),) = rules.attrib.items()
-            verbs = {'topics': ('publish', 'subscribe'), 'services': ('reply', 'request')}
-            assert verb in verbs[rules.tag]
-            assert rule == 'ALLOW'
-            assert len(rules)
-            for item in rules:
-                assert item.tag == rules.tag[:-1]
-                assert item.text.strip() == item.text
-                assert not item.attrib
+    for path in ('enclaves', 'enclaves/enclave/profiles', 'enclaves/enclave/profiles/profile'):
+        parents = policy.findall(path.rpartition('/')[0] or '.')
+        assert [list(parent) for parent in parents] == [[x] for x in policy.findall(path)]
+    verbs = {'topics': ('publish', 'subscribe'), 'services': ('reply', 'request')}
+    for rules in policy.findall('enclaves/enclave/profiles/profile/*'):
+        ((verb, rule),) = rules.attrib.items()
+        assert verb in verbs[rules.tag]
+        assert rule == 'ALLOW'
+        assert len(rules)
+        for item in rules:
+            assert (item.tag, item.attrib) == (rules.tag[:-1], {})
+            assert item.text.strip() == item.text
 
 
 @pytest.mark.parametrize('name', ['estimator', 'plant'])

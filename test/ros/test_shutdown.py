@@ -40,7 +40,7 @@ def test_running_pair_ends(user, launch, signals):
     user.wait(lambda: len(d) > 10, 'estimates')
     for number in signals:
         for node in nodes:
-            node.send(number)
+            node.send_signal(number)
     for node in nodes:
         ends_well(node)
     topic = f'{namespace}/estimator/unknown_input'
@@ -57,7 +57,7 @@ def test_a_signal_ends_it_in_every_state(user, launch, transitions, request):
     for transition in transitions:
         assert manager.change(transition)
     assert manager.state() == namespace[1:]
-    process.send(signal.SIGINT)
+    process.send_signal(signal.SIGINT)
     ends_well(process)
 
 
@@ -69,7 +69,7 @@ def test_signal_while_parameters_are_set(user, launch):
     changes = {'fuzzy_systems': ['terms gaussian 5'], 'variant': 'fuzzy'}
     for _ in range(20):
         parameters.service.set_parameters([Parameter(n, value=v) for n, v in changes.items()])
-    process.send(signal.SIGINT)
+    process.send_signal(signal.SIGINT)
     ends_well(process)
 
 
@@ -79,8 +79,8 @@ def test_signal_while_it_starts(launch, name, delay):
     """The delay is the test's subject: anywhere within the start, or just behind it."""
     process = launch(name, namespace='/early')
     time.sleep(delay)
-    process.send(signal.SIGTERM)
-    process.send(signal.SIGINT)
+    process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGINT)
     code = process.wait(GRACE)
     # Python itself dies of a signal before it has begun with our code.
     assert code in (0, -signal.SIGTERM, -signal.SIGINT), process.output
@@ -105,7 +105,7 @@ sys.exit(main(sys.argv[1:]))
 def test_a_callback_that_does_not_end_does_not_hold_the_node(user, launch):
     process = launch(STUCK)
     user.wait(lambda: 'asleep' in process.output, 'callback')
-    process.send(signal.SIGINT)
+    process.send_signal(signal.SIGINT)
     ends_well(process)
     assert 'ended while a callback was running' in process.output
 

@@ -9,14 +9,10 @@ import sys
 from threading import Timer
 
 from fhaosmo_ros.__main__ import main
-from fhaosmo_ros.core.parameters.files import read
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
-import rclpy
 from running import DEADLINE, Estimator, Manager, Parameters, ROOT
 from yaml_texts import HOSTILE
-
-CONFIGURATIONS = sorted((ROOT / 'config').glob('**/*.yaml'))
 
 
 def section(text: str) -> str:
@@ -237,23 +233,6 @@ def test_arguments_and_files_execute_nothing(tmp_path, capfd):
     assert not mark.exists()
 
 
-@pytest.mark.parametrize('path', CONFIGURATIONS, ids=lambda p: p.stem)
-def test_rcl_reads_shipped_files_as_we_do(path):
-    """A bare y, for instance, is true for rcl."""
-    context = rclpy.Context()
-    rclpy.init(args=['--ros-args', '--params-file', str(path)], context=context)
-    try:
-        node = rclpy.create_node(
-            'estimator', context=context, automatically_declare_parameters_from_overrides=True
-        )
-        for name, value in read(path, 'estimator').items():
-            found = node.get_parameter(name).value
-            assert (list(found) if isinstance(value, list) else found) == value, name
-        node.destroy_node()
-    finally:
-        rclpy.shutdown(context=context)
-
-
 WITHOUT_EVENTS = """
 import sys
 sys.modules['rclpy.experimental'] = None  # an older rclpy
@@ -266,7 +245,7 @@ def test_without_the_events_executor_it_works_too(user, launch):
     process = launch(
         WITHOUT_EVENTS, namespace='/older', max_gap=60.0, input_reliability='reliable'
     )
-    rig = Estimator(user, process, '/older').greet()
+    rig = Estimator(user, process, '/older').listen()
     for y in (0.2, 0.21, 0.22):
         estimate = rig.feed(y)
     assert abs(estimate.z[0] - 0.22) < 0.1
