@@ -75,8 +75,8 @@ def estimator(launch, user):
 def pair(tmp_path_factory, user):
     """Return an estimator that hears a plant; the plant's parameters are its attribute."""
     with _launcher(tmp_path_factory) as launch:
-        launch('plant', namespace='/pair', sample_rate=200.0)
         estimator = Estimator(user, launch('estimator', namespace='/pair', **LAX), '/pair')
+        launch('plant', namespace='/pair', sample_rate=200.0)
         estimator.plant = Parameters(user, '/pair/plant')
         yield estimator
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes as a user starts them, and a user that hears, feeds and asks them."""
 
-from bisect import bisect_right
 from collections import defaultdict
+from collections.abc import Iterable
 import inspect
 from pathlib import Path
 import signal
@@ -26,7 +26,8 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
-from std_msgs.msg import Float64, Float64MultiArray, String
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Float64MultiArray, Header, String
 from std_srvs.srv import Trigger
 
 try:
@@ -62,6 +63,11 @@ def nanoseconds(stamp: Time) -> int:
 
 def as_time(stamp: int) -> Time:
     return Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
+
+
+def joint_state(stamp: int, names: Iterable[str], positions: Iterable[float]) -> JointState:
+    header = Header(stamp=as_time(stamp))
+    return JointState(header=header, name=list(names), position=map(float, positions))
 
 
 def arguments(*words: object, namespace: str = '', **values: object) -> list[object]:
@@ -325,7 +331,6 @@ class Estimator:
         self._topic = f'{namespace}{part}/y'
         self.y = user.record(self._topic, Float64)
         self._estimates: list[Estimate] = []
-        self._ticks = 0
         # An estimate that nobody hears is not made. Readers are announced in order: once it has
         # written to this one, it knows those that this user made before.
         told = user.record(f'{node}/parameters', String, LATCHED)
@@ -358,27 +363,17 @@ class Estimator:
 
     @property
     def estimates(self) -> list[Estimate]:
-        """What has been published, by tick: a tick publishes `stamp` last."""
-        ticks = self.topics['stamp']
-        while self._ticks < len(ticks):
-            until = ticks[self._ticks].stamp
-            since = ticks[self._ticks - 1].stamp if self._ticks else 0
-            found = {}
-            for topic, messages in self.topics.items():
-                k = bisect_right(messages, until, key=lambda m: m.stamp) - 1
-                if not messages or (k >= 0 and messages[k].stamp <= since):
-                    return self._estimates  # this one is still on its way
-                found[topic] = messages[k].message if k >= 0 else None
-            self._ticks += 1
-            if None not in found.values():  # else one was sent before this user listened
-                self._estimates.append(
-                    Estimate(
-                        nanoseconds(found['stamp']),
-                        list(found['state'].data), found['unknown_input'].data,
-                        found['gamma'].data if 'gamma' in found else None,
-                        list(found['innovation'].data),
-                    )
-                )  # fmt: skip
+        """What has been published; all topics have had all listeners from the first sample on."""
+        for k in range(len(self._estimates), min(map(len, self.topics.values()))):
+            found = {topic: messages[k].message for topic, messages in self.topics.items()}
+            self._estimates.append(
+                Estimate(
+                    nanoseconds(found['stamp']),
+                    list(found['state'].data), found['unknown_input'].data,
+                    found['gamma'].data if 'gamma' in found else None,
+                    list(found['innovation'].data),
+                )
+            )  # fmt: skip
         return self._estimates
 
     def wait_estimate(self, condition, what: str, timeout: float = DEADLINE) -> Estimate:

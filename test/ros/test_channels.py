@@ -3,12 +3,12 @@
 
 import itertools
 import math
+import time
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 import pytest
-from running import as_time, Estimator, FED, nanoseconds, OK, SECOND
+from running import Estimator, FED, joint_state, nanoseconds, OK, SECOND
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 OWN = {
@@ -108,32 +108,26 @@ class Arm:
 
     def send(self, **positions) -> int:
         self.stamp += 2_000_000
-        header = Header(stamp=as_time(self.stamp))
-        message = JointState(header=header, name=list(positions), position=positions.values())
-        self.publisher.publish(message)
+        self.publisher.publish(joint_state(self.stamp, positions, positions.values()))
         self.sent.append((self.stamp, positions))
         return self.stamp
 
     def answer(self, **positions):
         """Return the estimates of a message; it is sent again until they are heard."""
+        begin = self.stamp
 
         def answered() -> bool:
-            stamp = self.send(**positions)
-            try:
-                self.wait(stamp, 1.0)
-            except TimeoutError:
-                return False
-            return True
+            self.send(**positions)
+            time.sleep(0.2)
+            return self.out and nanoseconds(self.out[-1].message.header.stamp) > begin
 
         self.user.wait(answered, f'estimates of {len(positions)} joints')
         return self.out[-1].message
 
-    def wait(self, stamp: int, *timeout: float):
+    def wait(self, stamp: int) -> None:
         self.user.wait(
-            lambda: self.out and nanoseconds(self.out[-1].message.header.stamp) == stamp,
-            'estimates', *timeout,
-        )  # fmt: skip
-        return self.out[-1].message
+            lambda: nanoseconds(self.out[-1].message.header.stamp) == stamp, 'estimates'
+        )
 
     def wait_report(self, words: str) -> None:
         reports = self.user.reports[self.name[1:]]
@@ -159,8 +153,7 @@ def test_each_joint_is_a_channel_whatever_the_order_of_the_names(user, arm):
     orders = [('shoulder', 'elbow', 'wrist'), ('wrist', 'shoulder', 'elbow'), ('elbow', 'wrist')]
     arm.answer(shoulder=0.1, elbow=0.2, wrist=0.3)
     for k in range(24):
-        stamp = arm.send(**{name: 0.1 * len(name) + 0.01 * k for name in orders[k % 3]})
-        arm.wait(stamp)
+        arm.wait(arm.send(**{name: 0.1 * len(name) + 0.01 * k for name in orders[k % 3]}))
     values = {name: {'max_gap': 60.0} for name in orders[0]}
     values['elbow'] |= {'epsilon': 7.0}
     estimators = {name: OnlineEstimator(own) for name, own in values.items()}

@@ -16,6 +16,7 @@ from running import (
     as_time,
     ERROR,
     FED,
+    joint_state,
     LATCHED,
     LAX,
     OK,
@@ -27,7 +28,7 @@ from running import (
     WARN,
 )  # fmt: skip
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64, Header, Int64
+from std_msgs.msg import Float64, Int64
 from std_srvs.srv import SetBool
 
 RATE = 200.0
@@ -178,8 +179,7 @@ def test_what_no_longer_fits_is_said(user, estimator):
         sent += 200
         for y in noise * rng.standard_normal(200) + offset:
             stamp += period * 1_000_000
-            header = Header(stamp=as_time(stamp))
-            q.publish(JointState(header=header, name=['a'], position=[float(y)]))
+            q.publish(joint_state(stamp, ['a'], [y]))
         taken = ('samples accepted', 'samples rejected')
         user.wait(lambda: sum(map(rig.count, taken)) >= sent, 'use of all samples')
 

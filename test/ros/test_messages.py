@@ -9,7 +9,7 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from geometry_msgs.msg import AccelStamped, PoseStamped, Quaternion, WrenchStamped
 import numpy as np
 import pytest
-from running import as_time, FED, nanoseconds, ROOT, SECOND, STALE, User, WARN
+from running import as_time, FED, joint_state, nanoseconds, ROOT, SECOND, STALE, User, WARN
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import (
     Bool,
@@ -22,11 +22,6 @@ from std_msgs.msg import (
 
 STEP = 2_000_000
 """Nanoseconds between two header stamps."""
-
-
-def joint_state(stamp: int, **position: float) -> JointState:
-    header = Header(stamp=as_time(stamp))
-    return JointState(header=header, name=list(position), position=position.values())
 
 
 @pytest.fixture
@@ -67,7 +62,7 @@ def test_robot_is_estimated_live_as_in_a_replay(user, estimator, recorder, tmp_p
     process = recorder('/robot/estimator')
     joints = user.publisher('/robot/joint_states', JointState, heard=2)
     for k in range(len(t)):
-        joints.publish(joint_state(SECOND + k * STEP, shoulder=position[k]))
+        joints.publish(joint_state(SECOND + k * STEP, ['shoulder'], [position[k]]))
         user.wait(lambda k=k: len(typed) > k - 50, 'estimates')
     user.wait(lambda: len(rig.estimates) == len(typed) == len(t), 'estimate of every sample')
     rig.wait_count('samples accepted', len(t))
@@ -99,22 +94,22 @@ def test_robot_is_estimated_live_as_in_a_replay(user, estimator, recorder, tmp_p
 def test_bad_messages_are_told_counted_and_survived(user, estimator):
     rig = estimator('/bad', input_topic='data', input_field='position[elbow]', **FED)
     data = user.publisher('/bad/data', JointState)
-    data.publish(joint_state(SECOND, elbow=0.2))
+    data.publish(joint_state(SECOND, ['elbow'], [0.2]))
     rig.wait_count('samples accepted', 1)
     data.publish(b'\0\1\0\0' + bytes(9))  # shorter than any JointState
     rig.wait_count('damaged messages', 1)
-    data.publish(joint_state(SECOND + 1, elbwo=0.2))
+    data.publish(joint_state(SECOND + 1, ['elbwo'], [0.2]))
     rig.wait_count('messages without y', 1)
     assert rig.said("got 'elbow'; did you mean 'elbwo'?")
-    message = joint_state(SECOND + 2, elbow=0.2)
+    message = joint_state(SECOND + 2, ['elbow'], [0.2])
     message.position = []
     data.publish(message)
     rig.wait_count('messages without y', 2)
     assert rig.said("expected an element for each name, got none for 'elbow'")
-    data.publish(joint_state(0, elbow=0.2))
+    data.publish(joint_state(0, ['elbow'], [0.2]))
     rig.wait_count('zero stamps', 1)
     assert rig.said('its header stamp is 0: nobody fills it; input_stamp: source')
-    data.publish(joint_state(SECOND + 10 * STEP, elbow=0.21))
+    data.publish(joint_state(SECOND + 10 * STEP, ['elbow'], [0.21]))
     rig.wait_count('samples accepted', 2)
     rig.wait_status('input', WARN, 'header stamps lie', 'another clock')
 
@@ -128,7 +123,7 @@ def test_type_without_the_field_is_told_until_one_comes_that_has_it(user, estima
     assert len(rig.said('expected a number in')) == 1
     other.close()
     data = user.publisher('/kind/data', JointState)
-    data.publish(joint_state(SECOND, elbow=0.2))
+    data.publish(joint_state(SECOND, ['elbow'], [0.2]))
     rig.wait_count('samples accepted', 1)
 
 
@@ -245,17 +240,17 @@ def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(
     stamps = [SECOND + k * STEP for k in range(30)]
     expected = OnlineEstimator(model)
     for k, stamp in enumerate(stamps):
-        y.publish(joint_state(stamp, a=0.01 * k))
-        message = joint_state(stamp, a=0.0)
+        y.publish(joint_state(stamp, ['a'], [0.01 * k]))
+        message = joint_state(stamp, ['a'], [0.0])
         message.effort = [float(k % 5)]
         u.publish(message)
         expected.set_input(float(k % 5))
         e = expected.update(stamp, 0.01 * k)
         user.wait(lambda k=k: len(rig.estimates) > k, 'estimate with its input')
     assert rig.estimates[-1].unknown_input == e.unknown_input
-    y.publish(joint_state(stamps[-1] + STEP, a=0.3))  # its input never comes
+    y.publish(joint_state(stamps[-1] + STEP, ['a'], [0.3]))  # its input never comes
     user.wait(lambda: len(rig.estimates) == 31, 'end of the wait')
-    u.publish(joint_state(stamps[-1], a=0.0))  # no effort: left out
+    u.publish(joint_state(stamps[-1], ['a'], [0.0]))  # no effort: left out
     message.header.stamp = as_time(stamps[-1] + STEP)
     u.publish(message)
     user.wait(lambda: rig.value('late inputs') == '1', 'count of late inputs')
@@ -280,7 +275,7 @@ def test_header_stamps_are_the_time_in_simulation(user, estimator):
     expected = OnlineEstimator({'max_gap': 60.0})
     for k in range(20):
         stamp = SECOND + k * STEP
-        joints.publish(joint_state(stamp, a=0.01 * k))
+        joints.publish(joint_state(stamp, ['a'], [0.01 * k]))
         e = expected.update(stamp, 0.01 * k)
     found = rig.wait_estimate(lambda e: e.stamp == stamp, 'last estimate')
     assert found.unknown_input == e.unknown_input

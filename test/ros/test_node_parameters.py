@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from rcl_interfaces.msg import LoggerLevel, Parameter, ParameterValue
 from rcl_interfaces.srv import SetLoggerLevels
-from running import as_time, FED, LATCHED, Parameters, SECOND
+from running import FED, joint_state, LATCHED, Parameters, SECOND
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header, String
+from std_msgs.msg import String
 from test_any_input import valid
 from yaml_texts import HOSTILE, random_texts
 
@@ -291,8 +291,7 @@ def test_random_sets_hurt_nobody_and_each_refusal_has_its_reason(user, estimator
         for _ in range(2):
             stamp += int(rng.choice([1_000, 1_000_000, 20_000_000]))
             y = rng.normal() if rng.random() < 0.99 else rng.choice([math.nan, 1e300])
-            header = Header(stamp=as_time(stamp))
-            joints.publish(JointState(header=header, name=['a'], position=[float(y)]))
+            joints.publish(joint_state(stamp, ['a'], [y]))
     assert COUNT // 10 < accepted < COUNT - COUNT // 10
     node.parameters.set(publish_on='sample', diagnostics_period=0.2)
     node.wait_status('state', b'\0')  # whatever has been published before has come
