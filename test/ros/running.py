@@ -313,12 +313,7 @@ class Estimator:
     """A running estimator: what it publishes, what it says and what it can be asked."""
 
     def __init__(
-        self,
-        user: User,
-        process: Process,
-        namespace: str,
-        channel: str = '',
-        gamma: bool = True,
+        self, user: User, process: Process, namespace: str, channel: str = '', gamma: bool = True
     ) -> None:
         self.user, self.process = user, process
         node, part = f'{namespace}/estimator', f'/{channel}' if channel else ''

@@ -12,21 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
-from running import (
-    as_time,
-    ERROR,
-    FED,
-    joint_state,
-    LATCHED,
-    LAX,
-    OK,
-    Parameters,
-    QOS,
-    ROOT,
-    SECOND,
-    STALE,
-    WARN,
-)  # fmt: skip
+from running import as_time, ERROR, FED, joint_state, LATCHED, LAX, OK, Parameters, STALE, WARN
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Int64
 from std_srvs.srv import SetBool
@@ -155,7 +141,7 @@ def test_a_clock_that_is_slower_than_the_samples_is_said(user, estimator):
     def said() -> bool:
         nonlocal tick
         tick += 1
-        clock.publish(Clock(clock=as_time(tick * SECOND // 40)))
+        clock.publish(Clock(clock=as_time(tick * 25_000_000)))
         for _ in range(25):
             rig.send(0.2)
         statuses = [report.statuses['input'] for report in rig.reports[since:]]
@@ -166,12 +152,12 @@ def test_a_clock_that_is_slower_than_the_samples_is_said(user, estimator):
 
 
 def test_what_no_longer_fits_is_said(user, estimator):
-    file = ['--params-file', ROOT / 'config' / 'noise_1e-3.yaml']
+    file = ['--params-file', 'config/noise_1e-3.yaml']
     options = LAX | {'warn_chatter_above': 1e9, 'publish_on': 'sample', 'max_gap': 60.0}
     options |= {'input_topic': 'q', 'input_field': 'position[a]', 'input_reliability': 'reliable'}
     rig = estimator('/fits', *file, **options)
     q = user.publisher('/fits/q', JointState)
-    rng, stamp, sent = np.random.default_rng(1), SECOND, 0
+    rng, stamp, sent = np.random.default_rng(1), 0, 0
 
     def send(period: int = 1, noise: float = 1e-3, offset: float = 0.0) -> None:
         """Send 200 samples, whose stamps are so many ms apart, and wait until they are used."""
@@ -241,7 +227,7 @@ def test_publishers_are_named(user, estimator, stranger):
     rig.wait_status('input', ERROR, '/stranger', 'std_msgs/msg/Int64', 'std_msgs/msg/Float64')
     stranger.destroy_publisher(unheard)
 
-    first = stranger.create_publisher(Float64, '/heard/y', QOS)
+    first = stranger.create_publisher(Float64, '/heard/y', 10_000)
     wait_values(rig, 'input', lambda v: v['publishers'] == '/stranger', 'name of the publisher')
     rig.listen()
     rig.wait_status('input', STALE, '2 publishers')

@@ -82,10 +82,10 @@ def test_reset_starts_afresh_with_the_next_sample(fed):
 
 
 def test_gap_stops_the_output_and_restarts_the_observer(fed):
-    fed.parameters.set(max_gap=1.0, publish_on='timer')
+    fed.parameters.set(max_gap=2.0, publish_on='timer')
     before = fed.count('restarts')
     fed.feed(0.2)
-    fed.wait_said('for 1 s: not publishing until one comes')
+    fed.wait_said('for 2 s: not publishing until one comes')
     fed.wait_status('input', STALE, 'no usable sample for')
     # The timer is silent now: over the next reports nothing comes.
     ticks = len(fed.topics['stamp'])

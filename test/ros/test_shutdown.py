@@ -22,11 +22,7 @@ def ends_well(process) -> None:
 
 @pytest.mark.parametrize(
     'signals',
-    [
-        (signal.SIGTERM,),
-        (signal.SIGHUP,),
-        (signal.SIGINT, signal.SIGINT, signal.SIGTERM),
-    ],
+    [(signal.SIGTERM,), (signal.SIGHUP,), (signal.SIGINT, signal.SIGINT, signal.SIGTERM)],
     ids=['SIGTERM', 'SIGHUP', 'three'],
 )
 def test_running_pair_ends(user, launch, signals):
