@@ -69,32 +69,23 @@ def test_other_errors_keep_their_trace():
 
 
 def test_body_gets_its_arguments_and_its_code_is_returned():
-    """Those of ROS are apart, as a launch file gives them to every program."""
-    parser = argparse.ArgumentParser(prog='try')
-    parser.add_argument('--number', type=int)
-    seen = []
-
-    def body(arguments, stop):
-        seen.append((arguments.number, arguments.ros_arguments, stop.is_set()))
-        seen.append(arguments.command_line)
-        return 7
-
-    words = ['--ros-args', '-r', '__node:=x', '--params-file', 'f', '--', '--number', '3']
-    assert run_command(parser, words, body) == 7
-    assert seen[0] == (3, ['-r', '__node:=x', '--params-file', 'f'], False)
-    assert seen[1] == 'try --ros-args -r __node:=x --params-file f -- --number 3'
-    assert run_command(parser, words[:3], body) == 7
-    assert seen[2] == (None, ['-r', '__node:=x'], False)
-    assert run_command(parser, [], lambda arguments, stop: None) == 0
-
-
-def test_passwords_of_urls_are_not_kept():
+    """Those of ROS are apart, as launch files give them to all programs; no password is kept."""
     parser = argparse.ArgumentParser(prog='try')
     parser.add_argument('--storage')
     seen = []
-    words = ['--storage', 'postgresql://u:p@ss@h/db']
-    assert run_command(parser, words, lambda a, _: seen.append(a.command_line)) == 0
-    assert seen == ['try --storage postgresql://u:***@h/db']
+
+    def body(arguments, stop):
+        seen.append((arguments.storage, arguments.ros_arguments, stop.is_set()))
+        seen.append(arguments.command_line)
+        return 7
+
+    words = ['--ros-args', '-r', '__node:=x', '--', '--storage', 'postgresql://u:p@ss@h/db']
+    assert run_command(parser, words, body) == 7
+    assert seen[0] == (words[-1], ['-r', '__node:=x'], False)
+    assert seen[1] == 'try --ros-args -r __node:=x -- --storage postgresql://u:***@h/db'
+    assert run_command(parser, words[:3], body) == 7
+    assert seen[2] == (None, ['-r', '__node:=x'], False)
+    assert run_command(parser, [], lambda arguments, stop: None) == 0
 
 
 def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(capsys, monkeypatch):

@@ -15,7 +15,6 @@ from rosgraph_msgs.msg import Clock
 from running import as_time, ERROR, FED, joint_state, LATCHED, LAX, OK, Parameters, STALE, WARN
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Int64
-from std_srvs.srv import SetBool
 
 RATE = 200.0
 """Of the pair's plant."""
@@ -118,12 +117,6 @@ def test_what_holds_gamma_is_said(fed):
         fed.feed(0.2)
         wait_values(fed, 'observer', lambda v: v['gamma at'].startswith(word), f'gamma at {word}')
 
-    def freeze(data: bool) -> None:
-        fed.user.call(f'{fed.name}/freeze', SetBool, SetBool.Request(data=data))
-
-    freeze(True)
-    wait_word('the value that ~/freeze holds')
-    freeze(False)
     wait_word('neither bound')
     fed.parameters.set(gamma_min=0.3, gamma_initial=0.3, gamma_max=0.3)
     wait_word('gamma_m')

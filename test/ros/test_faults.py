@@ -65,6 +65,7 @@ def test_freeze_holds_gamma_and_lets_it_go(fed):
     assert freeze(True) == 'gamma is held'
     held = [fed.feed(0.2 + 0.1 * math.sin(k)).gamma for k in range(20)]
     assert held == [before.gamma] * 20
+    fed.user.wait(lambda: fed.value('gamma at') == 'the value that ~/freeze holds', 'report')
     assert freeze(False) == 'gamma adapts again'
     assert fed.feed(0.5).gamma != before.gamma
 
