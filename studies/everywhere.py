@@ -16,7 +16,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import quantised, respond
-from fhaosmo_ros.tools.cli.share import shipped
+from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from scipy.signal import lfilter
 from studies import evidence, ratios

@@ -8,7 +8,7 @@ import re
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.tools.cli.output import Output
+from fhaosmo_ros.tools.cli.command import Output
 from matplotlib.figure import Figure
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core import OnlineEstimator, Trajectory
 from fhaosmo_ros.core.parameters.tables import CONSTANTS
 from fhaosmo_ros.stop_signals import Stop, Stopped
-from fhaosmo_ros.tools.cli.command import run_command
-from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.tools.cli.command import progress, run_command
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray

@@ -11,9 +11,7 @@ import time
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stopped
-from fhaosmo_ros.tools.cli.command import Interrupted, run_command
-from fhaosmo_ros.tools.cli.output import Output
-from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 import pytest
 from waiting import wait_until
 
@@ -23,7 +21,7 @@ BUSY = """
 import argparse, os, signal, sys, time
 from pathlib import Path
 from fhaosmo_ros.tools.cli.command import run_command
-from fhaosmo_ros.tools.cli.output import Output
+from fhaosmo_ros.tools.cli.command import Output
 from studies.harness import called
 
 def work(folder, k):
@@ -51,7 +49,7 @@ if __name__ == '__main__':
         (ConfigurationError('wrong'), 2, 'error: wrong\n'),
         (FileNotFoundError(2, 'No such file', 'x'), 2, 'error: No such file: x\n'),
         (ConfigurationError("'sql://u:p@ss@h/db': no"), 2, "error: 'sql://u:***@h/db': no\n"),
-        (Interrupted('nothing written'), 130, 'interrupted, nothing written\n'),
+        (Stopped('nothing written'), 130, 'interrupted, nothing written\n'),
         (Stopped(), 130, 'interrupted\n'),
     ],
 )
@@ -92,7 +90,7 @@ def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(capsys, monk
     with progress(total=2, desc='short') as bar:
         bar.update(2)
     assert capsys.readouterr().err == ''
-    monkeypatch.setattr('fhaosmo_ros.tools.cli.progress.PERIOD', 0.01)
+    monkeypatch.setattr('fhaosmo_ros.tools.cli.command.PERIOD', 0.01)
     with progress(total=3, desc='long') as bar:
         for _ in range(3):
             time.sleep(0.02)

@@ -14,8 +14,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.types import make_qos, TYPES
 from fhaosmo_ros.tools.bags.writer import BagWriter
-from fhaosmo_ros.tools.cli.command import run_command
-from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.tools.cli.command import progress, run_command
 from fhaosmo_ros.topics import OF_ALL_NODES
 from tqdm import tqdm
 

@@ -11,7 +11,7 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS, SHAPES
 from fhaosmo_ros.core.simulation.recordings import Family, Recording
-from fhaosmo_ros.tools.cli.share import shipped
+from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from studies.comparison.methods.method import Setting
 from studies.harness import Floats

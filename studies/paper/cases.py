@@ -13,7 +13,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import chatter, high_passed, rms, settling_time
-from fhaosmo_ros.tools.cli.share import shipped
+from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from studies.evidence import Row
 from studies.harness import Floats

@@ -7,7 +7,7 @@ in time order with no message indexes'), as it closes chunks that hold no messag
 rosbag2 names a storage file, so that `ros2 bag reindex` finds it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 import os
 from pathlib import Path
 import struct
@@ -25,8 +25,6 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 import yaml
 
-BATCH = 8192
-"""Messages that are copied at a time."""
 CHUNK_SIZE = 1 << 20
 """Bytes of messages after which a chunk of mcap is closed."""
 
@@ -178,14 +176,12 @@ class BagWriter:
         statistics.message_count += len(rows)
         self._writer.flush()
 
-    def copy(self, reader: BagReader) -> Iterator[None]:
-        """Copy every topic as it is; yield now and then, so that the caller can stop."""
+    def copy(self, reader: BagReader) -> None:
+        """Copy every topic as it is."""
         for c in reader.connections:
             self.add(c.topic, c.msgtype, reader.types, c.ext.offered_qos_profiles, c.digest)
-        for k, (topic, stamp, data, published) in enumerate(reader.messages()):
+        for topic, stamp, data, published in reader.messages():
             self.write(topic, stamp, data, published)
-            if k % BATCH == 0:
-                yield
 
     def flush(self) -> None:
         """Hand what has been written to the operating system: a later kill cannot take it back."""

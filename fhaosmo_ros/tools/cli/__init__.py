@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol of all commands: options, output, signals, child processes."""
+"""What commands share: how they run, their options, child processes."""

@@ -1,22 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one way in which a command runs: arguments, signals, one-line errors, exit codes."""
+"""What all commands share: arguments, signals, one-line errors, exit codes, output, progress."""
 
 import argparse
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
+import os
+from pathlib import Path
 import re
 import shlex
+import shutil
 import sys
+from typing import Any
 
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals, Stopped
+from tqdm import tqdm
 
 Body = Callable[[argparse.Namespace, Stop], int | None]
-
-
-class Interrupted(Exception):
-    """Raised where a command gives up because of a signal; its text says what was written."""
+PERIOD = 30.0
+"""Seconds between two lines in a log; work that ends sooner leaves none."""
 
 
 def run_command(
@@ -30,9 +33,9 @@ def run_command(
 
     SIGINT, SIGTERM and SIGHUP do the same: they set the event `stop` that the body gets, also in a
     process that was started with SIGINT ignored, as a shell without job control starts its
-    background jobs. A body asks ``stop.is_set()`` or waits with ``stop.wait()``, and raises
-    `Interrupted`; or it computes ``with stop.raising():``, which raises `Stopped`. Either way its
-    context managers end: no child process and no half of an output stays behind.
+    background jobs. A body waits with ``stop.wait()`` and raises `Stopped`; or it computes
+    ``with stop.raising():``, which raises it. Either way its context managers end: no child
+    process and no half of an output stays behind.
 
     Parameters
     ----------
@@ -76,7 +79,7 @@ def run_command(
     except OSError as error:
         place = f': {error.filename}' if error.filename else ''
         return _say(parser, f'error: {error.strerror or error}{place}', 2)
-    except (Interrupted, Stopped, KeyboardInterrupt) as error:  # the last by a window's toolkit
+    except Stopped as error:
         return _say(parser, f'interrupted{f", {error}" if str(error) else ""}', 130)
 
 
@@ -103,3 +106,107 @@ def split_ros_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
 def _say(parser: argparse.ArgumentParser, text: str, code: int) -> int:
     print(f'{parser.prog}: {without_password(text)}', file=sys.stderr)
     return code
+
+
+class Output:
+    """
+    A file or folder that is made in a hidden folder beside its place, and moved once complete.
+
+    Parameters
+    ----------
+    final : path
+        Must be absent or an empty folder, unless `force`. What is there stays until the new one
+        is complete.
+    force : bool
+        Replace what is there.
+
+    Attributes
+    ----------
+    path : path
+        Where to write meanwhile: has the final name, and does not exist yet; its folder does.
+
+    Raises
+    ------
+    ConfigurationError
+        The path is in use, or it cannot be made.
+
+    """
+
+    def __init__(self, final: Path, force: bool = False) -> None:
+        if final.name in ('', '..'):  # nothing could be renamed to it
+            raise ConfigurationError(
+                f'output {final}: expected a name, got a folder that is in use'
+            )
+        self._final, self._force = final, force
+        self._folder = final.with_name(f'.{final.name}.part')
+        self.path = self._folder / final.name
+
+    def __enter__(self) -> 'Output':
+        final = self._final
+        try:
+            if not self._force and final.exists():
+                folder = final.is_dir()
+                if not folder or any(final.iterdir()):
+                    raise ConfigurationError(
+                        f'output {final}: expected a new name (or --force to replace it), got an '
+                        f'existing {"folder with something in it" if folder else "file"}'
+                    )
+            shutil.rmtree(self._folder, ignore_errors=True)  # of a run that was killed
+            self._folder.mkdir(parents=True)
+        except OSError as error:
+            raise ConfigurationError(
+                f'output {final}: expected a place that can be written, got: {error.strerror}'
+            ) from None
+        return self
+
+    def keep(self) -> Path:
+        """Give it its final name and return that."""
+        if self._final.exists():
+            self._final.rename(self._folder / 'replaced')
+        return self.path.rename(self._final)
+
+    def __exit__(self, *_: object) -> None:
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+class _Lines:
+    """stderr, where each state of a bar is a line without what moves a terminal's cursor."""
+
+    def write(self, text: str) -> None:
+        if line := text.strip():
+            sys.stderr.write(f'{line}\n')
+
+    def flush(self) -> None:
+        sys.stderr.flush()
+
+
+def progress(*arguments: Any, **options: Any) -> Any:
+    """Return a `tqdm` with these arguments, fit for a terminal or for a log."""
+    if not sys.stderr.isatty():
+        period = {'mininterval': PERIOD, 'maxinterval': PERIOD, 'delay': PERIOD}
+        options |= {'file': _Lines(), **period}
+    return tqdm(*arguments, **options)
+
+
+def shipped(relative: str) -> Path:
+    """
+    Return the path of a shipped file, such as 'config/demo.yaml'.
+
+    It looks beside the sources (a checkout, colcon build --symlink-install), then in the
+    prefixes of a sourced workspace, then in the Python environment (pip install).
+
+    Raises
+    ------
+    ConfigurationError
+        The file is in none of these places.
+
+    """
+    prefixes = [p for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    places = [Path(__file__).resolve().parents[3]]
+    places += [Path(prefix) / 'share' / 'fhaosmo_ros' for prefix in [*prefixes, sys.prefix]]
+    for place in places:
+        if (place / relative).is_file():
+            return place / relative
+    raise ConfigurationError(
+        f'{relative}: expected it in one of {", ".join(map(str, places))}, found it in none'
+    )

@@ -12,14 +12,11 @@ from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, TopicRecorder
-from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.bags.types import LATCHED_QOS, OFFERED_QOS
 from fhaosmo_ros.tools.bags.writer import BagWriter
-from fhaosmo_ros.tools.cli.command import Interrupted, run_command
-from fhaosmo_ros.tools.cli.output import Output
+from fhaosmo_ros.tools.cli.command import Output, progress, run_command, shipped
 from fhaosmo_ros.tools.cli.processes import Children
-from fhaosmo_ros.tools.cli.progress import progress
-from fhaosmo_ros.tools.cli.share import shipped
 from fhaosmo_ros.tools.demo.figure import save_figure
 from fhaosmo_ros.tools.demo.report import others, read_run, table
 from fhaosmo_ros.topics import (
@@ -173,7 +170,7 @@ def _wait(ready: Callable[[], bool], check: Callable[[], None], stop: Stop) -> N
     while not ready():
         check()
         if stop.wait(0.02):
-            raise Interrupted('before the first estimate, nothing written')
+            raise Stopped('before the first estimate, nothing written')
         if time.monotonic() > deadline:
             raise ConfigurationError(f'waited {START_DEADLINE:g} s for the first estimate in vain')
 

@@ -11,9 +11,8 @@ from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded_parameters import recorded_parameters
-from fhaosmo_ros.tools.cli.command import run_command
+from fhaosmo_ros.tools.cli.command import Output, run_command
 from fhaosmo_ros.tools.cli.options import add_parameter_options, online_parameters
-from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.plot.curves import metrics, read_curves
 from fhaosmo_ros.tools.plot.figures import save_curves
 from fhaosmo_ros.tools.plot.fuzzy import fuzzy_figure, rows_of

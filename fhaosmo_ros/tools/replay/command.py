@@ -12,11 +12,11 @@ from typing import Any
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
-from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
 from fhaosmo_ros.tools.bags.writer import BagWriter
-from fhaosmo_ros.tools.cli.command import Interrupted, run_command
+from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 from fhaosmo_ros.tools.cli.options import (
     add_input_options,
     add_parameter_options,
@@ -24,8 +24,6 @@ from fhaosmo_ros.tools.cli.options import (
     channel_parameters,
     named,
 )
-from fhaosmo_ros.tools.cli.output import Output
-from fhaosmo_ros.tools.cli.progress import progress
 from fhaosmo_ros.tools.replay.live_run import (
     find_estimator,
     LiveRun,
@@ -119,7 +117,10 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         finals = arguments.output or [Path(f'{name}_replayed')]
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
         name = _name(present, arguments.name)
-        _write(reader, samples, outputs, name, ONLINE_PARAMETERS.defaults() | own, stop)
+        with stop.raising():
+            _write(reader, samples, outputs, name, ONLINE_PARAMETERS.defaults() | own)
+        if stop.is_set():  # Python drops what a signal raises in a destructor
+            raise Stopped
         finals = [output.keep() for output in outputs]
     seconds = perf_counter() - begin
     c = estimator.counters
@@ -179,7 +180,6 @@ def _write(
     outputs: list[Output],
     name: str,
     parameters: Mapping[str, Any],
-    stop: Stop,
 ) -> None:
     observer = samples.estimator.observer
     with ExitStack() as stack:
@@ -190,17 +190,10 @@ def _write(
                 continue
             bag = stack.enter_context(BagWriter(output.path))
             sinks.append(BagSink(bag, name, observer.order, observer.levels, parameters).write)
-            for _ in bag.copy(reader):
-                _check_stop(stop)
+            bag.copy(reader)
         with progress(total=samples.total, unit='sample', unit_scale=True, desc='replay') as bar:
             for count, rows in samples:
-                _check_stop(stop)
                 for part in rows:
                     for sink in sinks:
                         sink(part)
                 bar.update(count)
-
-
-def _check_stop(stop: Stop) -> None:
-    if stop.is_set():
-        raise Interrupted('nothing written')

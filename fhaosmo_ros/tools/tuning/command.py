@@ -14,9 +14,8 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.recording_parameters import SENSOR
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.cli.command import run_command
+from fhaosmo_ros.tools.cli.command import Output, run_command
 from fhaosmo_ros.tools.cli.options import add_input_options, assigned, bag_inputs
-from fhaosmo_ros.tools.cli.output import Output
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 
 TRIALS = 1000

@@ -10,7 +10,7 @@ from fhaosmo_ros.core.observer.configuration import usual_step
 from fhaosmo_ros.core.online.policy import GAP_SAMPLES
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.tuning.likelihood import CLIP, Design, Evaluation, Likelihood, Samples
 from fhaosmo_ros.tools.tuning.linear_gains import matern
 from fhaosmo_ros.tools.tuning.recorded import quantum, RecordedOutput, usable

@@ -23,7 +23,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PA
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Family, Recording
-from fhaosmo_ros.tools.cli.progress import progress
+from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.tuning.linear_gains import (
     chosen_otherwise,
     GAMMA,

@@ -14,7 +14,7 @@ from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.cli.share import shipped
+from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.tuning.search import Dimension
 import numpy as np
 from studies.comparison.methods.method import (
