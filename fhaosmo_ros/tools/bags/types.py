@@ -9,32 +9,44 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
-FOREVER = QosTime(sec=9223372036, nsec=854775807)
-"""An unlimited duration, as rosbag2 writes it."""
-OFFERED_QOS = Qos(
-    QosHistory.KEEP_LAST,
-    10,
-    QosReliability.RELIABLE,
-    QosDurability.VOLATILE,
-    FOREVER,
-    FOREVER,
-    QosLiveliness.AUTOMATIC,
-    FOREVER,
-    False,
-)
+FOREVER = 2**63 - 1
+"""An unlimited duration in nanoseconds."""
+
+
+def make_qos(
+    history: str = 'KEEP_LAST',
+    depth: int = 10,
+    reliability: str = 'RELIABLE',
+    durability: str = 'VOLATILE',
+    deadline: int = FOREVER,
+    lifespan: int = FOREVER,
+    liveliness: str = 'AUTOMATIC',
+    liveliness_lease_duration: int = FOREVER,
+) -> dict[str, Any]:
+    """Return a QoS as bags describe it, from names of policies and durations in nanoseconds."""
+
+    def time(duration: int) -> dict[str, int]:
+        return dict(zip(('sec', 'nsec'), divmod(duration, 10**9), strict=True))
+
+    return {
+        'history': history.lower() if history.startswith('KEEP') else 'unknown',
+        'depth': depth,
+        'reliability': reliability.lower(),
+        'durability': durability.lower(),
+        'deadline': time(deadline),
+        'lifespan': time(lifespan),
+        'liveliness': liveliness.lower(),
+        'liveliness_lease_duration': time(liveliness_lease_duration),
+        'avoid_ros_namespace_conventions': False,
+    }
+
+
+OFFERED_QOS = make_qos()
 """QoS that this package's nodes offer; `ros2 bag play` publishes with it again."""
-LATCHED_QOS = OFFERED_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
+LATCHED_QOS = make_qos(durability='TRANSIENT_LOCAL')
 """The same, but transient-local: a late subscriber still gets the last message."""
 
 
@@ -52,30 +64,6 @@ def learn(message_type: str) -> bool:
                 TYPES.register(found)
                 return True
     return False
-
-
-def make_qos(
-    history: str,
-    depth: int,
-    reliability: str,
-    durability: str,
-    deadline: int,
-    lifespan: int,
-    liveliness: str,
-    liveliness_lease_duration: int,
-) -> Qos:
-    """Return a QoS from its policies' names and its durations in nanoseconds."""
-    return Qos(
-        QosHistory.__members__.get(history, QosHistory.UNKNOWN),
-        depth,
-        QosReliability[reliability],
-        QosDurability[durability],
-        QosTime(*divmod(deadline, 10**9)),
-        QosTime(*divmod(lifespan, 10**9)),
-        QosLiveliness[liveliness],
-        QosTime(*divmod(liveliness_lease_duration, 10**9)),
-        False,
-    )
 
 
 def serialise(message_type: str, **fields: Any) -> bytes:

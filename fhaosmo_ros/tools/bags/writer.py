@@ -20,7 +20,6 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import dump_qos_v9
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 import yaml
@@ -78,7 +77,7 @@ class BagWriter:
         topic: str,
         message_type: str,
         types: Any = TYPES,
-        qos: Sequence[Qos] = (OFFERED_QOS,),
+        qos: Sequence[dict[str, Any]] = (OFFERED_QOS,),
         digest: str = '',
     ) -> None:
         """Add a topic if the bag does not have it yet."""
@@ -97,14 +96,15 @@ class BagWriter:
             self._schemas[message_type] = self._writer.register_schema(
                 message_type, 'ros2msg', text.encode()
             )
-        offered = dump_qos_v9(list(qos))
-        metadata = {'offered_qos_profiles': yaml.safe_dump(offered), 'topic_type_hash': digest}
+        offered = yaml.safe_dump(list(qos))
+        metadata = {'offered_qos_profiles': offered, 'topic_type_hash': digest}
         self._channels[topic] = self._writer.register_channel(
             topic, 'cdr', self._schemas[message_type], metadata
         )
         self._topics.append({
             'name': topic, 'type': message_type, 'serialization_format': 'cdr',
-            'offered_qos_profiles': offered, 'type_description_hash': digest,
+            'offered_qos_profiles': yaml.safe_load(offered),  # a copy: YAML refers to what it has
+            'type_description_hash': digest,
         })  # fmt: skip
 
     def write(self, topic: str, stamp: int, data: bytes, published: int | None = None) -> None:
@@ -179,7 +179,8 @@ class BagWriter:
     def copy(self, reader: BagReader) -> None:
         """Copy every topic as it is."""
         for c in reader.connections:
-            self.add(c.topic, c.msgtype, reader.types, c.ext.offered_qos_profiles, c.digest)
+            qos = dump_qos_v9(c.ext.offered_qos_profiles)
+            self.add(c.topic, c.msgtype, reader.types, qos, c.digest)
         for topic, stamp, data, published in reader.messages():
             self.write(topic, stamp, data, published)
 
