@@ -406,14 +406,14 @@ def test_ctrl_c_leaves_nothing(bag, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ['bag']
 
 
-@pytest.mark.parametrize('way', ['--smooth', '--lag'])
+@pytest.mark.parametrize('way', [['--smooth'], ['-p', 'smoothing_lag:=0.2']])
 def test_smoothed_estimates_are_the_librarys(way, tmp_path, capsys):
     stamps, y = files.signal(3000)
     y[500:503] = np.nan
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
-    lag = [] if way == '--smooth' else ['0.2']
+    lag = way != ['--smooth']
     options = ['--params-file', ROOT / 'config' / 'demo.yaml']
-    assert run(bag, '-o', tmp_path / 'o.npz', way, *lag, *options) == 0
+    assert run(bag, '-o', tmp_path / 'o.npz', *way, *options) == 0
     estimator = OnlineEstimator.from_yaml(ROOT / 'config' / 'demo.yaml')
     if lag:
         estimator = OnlineEstimator(estimator.parameters | {'smoothing_lag': 0.2})

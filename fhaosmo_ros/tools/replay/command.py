@@ -67,14 +67,10 @@ def _parser() -> argparse.ArgumentParser:
     choice.add_argument(
         '--afresh', action='store_true', help='begin at the first sample, follow no live estimator'
     )
-    past = parser.add_mutually_exclusive_group()
-    past.add_argument(
+    add(
         '--smooth', action='store_true',
-        help='estimate each time from the samples before and after it; needs noise_size',
-    )  # fmt: skip
-    past.add_argument(
-        '--lag', type=float, metavar='SECONDS',
-        help='from those before it and for so long after it, as the node with smoothing_lag does',
+        help='estimate each time from the samples before and after it; needs noise_size (for '
+        'those until some time after it: -p smoothing_lag:=SECONDS)',
     )  # fmt: skip
     add(
         '--name', metavar='NAME',
@@ -98,9 +94,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         if recorded:
             arguments.channel = arguments.channel or recorded.channel
         own = channel_parameters(arguments, recorded)
-        if arguments.lag is not None or arguments.smooth:
-            lag = 0.0 if arguments.smooth else arguments.lag
-            own['smoothing_lag'] = ONLINE_PARAMETERS['smoothing_lag'].coerce(lag)
+        if arguments.smooth:
+            own['smoothing_lag'] = 0.0
         estimator = OnlineEstimator(ONLINE_PARAMETERS.part_of(own))
         if arguments.smooth:
             estimator.smooth()
