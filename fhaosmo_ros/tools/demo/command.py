@@ -3,6 +3,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 import os
 from pathlib import Path
 import time
@@ -128,13 +129,12 @@ def _record(
 ) -> list[tuple[int, str]]:
     """Record a run; return when the plant changed (ns), and how."""
     topics = topics_of(estimator)
-    with (
-        BagWriter(folder / 'bag') as bag,
-        TopicRecorder(lambda sample: bag.write(*sample), topics) as recorder,
-        Children(folder) as nodes,
-    ):
+    with ExitStack() as stack:
+        bag = stack.enter_context(BagWriter(folder / 'bag'))
         for topic, kind, transient_local in topics:
             bag.add(topic, kind, qos=[LATCHED_QOS if transient_local else OFFERED_QOS])
+        recorder = stack.enter_context(TopicRecorder(lambda sample: bag.write(*sample), topics))
+        nodes = stack.enter_context(Children(folder))
         options = ('--ros-args', '--params-file', str(parameters))
         # Together: Fast DDS finds a node that starts half a second after another one 3 s late.
         nodes.start_node('estimator', *options)
