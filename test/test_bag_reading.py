@@ -218,8 +218,8 @@ def test_replay_takes_the_source_stamps(preset, late, tmp_path, capsys):
     live = OnlineEstimator()
     pairs = zip(STAMPS.tolist(), Y.tolist(), strict=True)
     np.testing.assert_array_equal(d, [live.update(t, y).unknown_input for t, y in pairs])
-    np.testing.assert_array_equal(replayed(bag, tmp_path, '--stamp', 'source')[0], d)
-    received, stamps = replayed(bag, tmp_path, '--stamp', 'bag')
+    np.testing.assert_array_equal(replayed(bag, tmp_path, '-p', 'input_stamp:=source')[0], d)
+    received, stamps = replayed(bag, tmp_path, '-p', 'input_stamp:=reception')
     assert 'stamps: bag' in capsys.readouterr().out
     np.testing.assert_array_equal(stamps, late)
     assert not np.array_equal(received, d)
@@ -235,8 +235,9 @@ def test_publish_time_that_its_writer_did_not_know(tmp_path, capsys):
 
 def test_sqlite_has_no_publish_times(tmp_path, capsys):
     bag = files.write(tmp_path / 'bag', files.floats(STAMPS, Y), 'sqlite3')
-    assert replay.main([str(bag), '-o', str(tmp_path / 'o.npz'), '--stamp', 'source']) == 2
-    assert '--stamp source: expected an mcap bag' in capsys.readouterr().err
+    source = ['-p', 'input_stamp:=source']
+    assert replay.main([str(bag), '-o', str(tmp_path / 'o.npz'), *source]) == 2
+    assert 'input_stamp source: expected an mcap bag' in capsys.readouterr().err
 
 
 def test_tune_takes_them_too(late, tmp_path):

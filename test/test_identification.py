@@ -299,7 +299,7 @@ def _bag(tmp_path):
 @needs_optuna
 def test_command_says_what_a_bag_shows(bag, tmp_path, capsys):
     out = tmp_path / 'out'
-    assert main(['--bag', str(bag), '-o', str(out), '--topic', '/y']) == 0
+    assert main(['--bag', str(bag), '-o', str(out), '-p', 'input_topic:=/y']) == 0
     assert sorted(path.name for path in out.iterdir()) == [
         'estimates.png', 'gains.yaml', 'report.md',
     ]  # fmt: skip

@@ -53,7 +53,7 @@ def test_estimator_restarts_where_the_loop_begins_again(bag, tmp_path):
             ),
         ]  # fmt: skip
     try:
-        wait_until(lambda: 'restarted from the new one' in log.read_text(), 'restart', 120.0)
+        wait_until(lambda: 'restarted from the new one' in log.read_text(), 'restart', 300.0)
         wait_until(lambda: recorded.exists() and recorded.stat().st_size > 20_000, 'messages')
     finally:
         for process in processes:

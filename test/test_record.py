@@ -273,7 +273,7 @@ def test_input_that_was_remapped_and_channels_are_recorded(tmp_path):
     assert counts.get('/estimator/hip/state')
     out = tmp_path / 'out'
     result = run(
-        'replay', bag, '--topic', '/force', '-o', out, '--follow', '/estimator/hip',
+        'replay', bag, '-p', 'input_topic:=/force', '-o', out, '--follow', '/estimator/hip',
         '--name', '/replay/hip',
     )  # fmt: skip
     assert result.returncode == 0, result.stderr

@@ -170,13 +170,13 @@ def test_any_number_of_any_type(kind, field, make, rounding, tmp_path):
         for at, stamp, value in zip(late.tolist(), stamps.tolist(), y.tolist(), strict=True)
     ]
     bag = files.write(tmp_path / 'bag', messages)
-    choice = ['--field', field] if field else []
-    assert run(bag, '--topic', '/sensor', *choice, '-o', tmp_path / 'o.npz') == 0
+    choice = ['-p', 'input_topic:=/sensor', *(['-p', f'input_field:={field}'] if field else [])]
+    assert run(bag, *choice, '-o', tmp_path / 'o.npz') == 0
     used = stamps if b'header' in repr(files.TYPES.fielddefs[kind]).encode() else late
     y = y.astype(rounding).astype(np.float64)
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(used, y))
     assert run(
-        bag, '--topic', '/sensor', *choice, '--stamp', 'bag', '-o', tmp_path / 'b.npz'
+        bag, *choice, '-p', 'input_stamp:=reception', '-o', tmp_path / 'b.npz'
     ) == 0  # fmt: skip
     np.testing.assert_array_equal(table(tmp_path / 'b.npz'), expected(late, y))
 
@@ -193,7 +193,7 @@ def test_several_known_inputs_are_held_each_by_itself(tmp_path, capsys):
     parameters |= {'constants.k': 0.5}
     (tmp_path / 'p.yaml').write_text(dumps(parameters))
     arguments = ['--params-file', tmp_path / 'p.yaml', '-o', tmp_path / 'o.npz']
-    topics = ['--input-topic', '/left', '--input-topic', '/b']
+    topics = ['-p', 'known_input_topics:=[/left, /b]']
     assert run(bag, *arguments, *topics) == 0
     u = np.zeros((len(y), 3))
     for column, at, known in zip((0, 2), times, values, strict=True):
@@ -201,7 +201,7 @@ def test_several_known_inputs_are_held_each_by_itself(tmp_path, capsys):
     estimates = OnlineEstimator(parameters).run(stamps, y, u)
     with np.load(tmp_path / 'o.npz') as found:
         np.testing.assert_array_equal(found['unknown_input'], estimates.unknown_input)
-    assert run(bag, *arguments, '--force', *topics, '--input-topic', '/c') != 0
+    assert run(bag, *arguments, '--force', '-p', 'known_input_topics:=[/a, /b, /c]') != 0
     assert 'each known input that phi uses (a, b)' in capsys.readouterr().err
     assert run(bag, *arguments, '--force') != 0
     assert "'/a'" in capsys.readouterr().err
@@ -216,7 +216,8 @@ def test_stamps_that_go_back_are_rejected_as_live_if_asked(tmp_path, capsys):
         for at, s, v in zip(stamps.tolist(), shown.tolist(), y.tolist(), strict=True)
     ]
     bag = files.write(tmp_path / 'bag', messages)
-    arguments = [bag, '--topic', '/j', '--field', 'position[2]', '-o', tmp_path / 'o.npz']
+    arguments = [bag, '-p', 'input_topic:=/j', '-p', 'input_field:=position[2]']
+    arguments += ['-o', tmp_path / 'o.npz']
     assert run(*arguments) == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert str(shown[100]) in error
@@ -300,10 +301,14 @@ def lose_metadata(bag):
     ('harm', 'arguments', 'words'),
     [
         (None, ['/no/such/bag'], ['/no/such/bag', 'does not exist']),
-        (None, ['BAG', '--topic', '/yy'], ["'/yy'", '(/y)', "did you mean '/y'?"]),
-        (None, ['BAG', '--field', 'date'], ["'date'", "did you mean 'data'?"]),
-        (None, ['BAG', '--field', 'data..x'], ["'data..x'", 'one of data']),
-        (None, ['BAG', '--stamp', 'header'], ['--stamp header', 'std_msgs/msg/Float64']),
+        (None, ['BAG', '-p', 'input_topic:=/yy'], ["'/yy'", '(/y)', "did you mean '/y'?"]),
+        (None, ['BAG', '-p', 'input_field:=date'], ["'date'", "did you mean 'data'?"]),
+        (None, ['BAG', '-p', 'input_field:=data..x'], ["'data..x'", 'one of data']),
+        (
+            None,
+            ['BAG', '-p', 'input_stamp:=header'],
+            ['input_stamp header', files.FLOAT],
+        ),
         (None, ['BAG', '-p', 'order=3'], ['NAME:=VALUE', "'order=3'"]),
         (None, ['BAG', '-p', 'lamda:=3'], ["'lamda'", "did you mean 'lambda'?"]),
         (None, ['BAG', '-p', 'epsilon:=-3'], ["'epsilon'", '> 0', '-3']),
@@ -338,7 +343,7 @@ def test_list_that_is_too_short(tmp_path, capsys):
     bag = files.write(
         tmp_path / 'bag', [('/y', 'sensor_msgs/msg/JointState', 5, joint_state(5, 1.0))]
     )
-    assert run(bag, '--field', 'position[3]', '-o', tmp_path / 'o.npz') == 2
+    assert run(bag, '-p', 'input_field:=position[3]', '-o', tmp_path / 'o.npz') == 2
     assert 'position[3]' in (error := capsys.readouterr().err)
     assert '3 in one message' in error
     assert run(bag, '-o', tmp_path / 'o.npz') == 2
@@ -350,7 +355,7 @@ def test_existing_output_stays_without_force(bag, tmp_path, capsys):
     (tmp_path / 'out' / 'precious').write_text('mine')
     assert run(bag, '-o', tmp_path / 'out') == 2
     assert '--force' in capsys.readouterr().err
-    assert run(bag, '--topic', '/no', '-o', tmp_path / 'out', '--force') == 2
+    assert run(bag, '-p', 'input_topic:=/no', '-o', tmp_path / 'out', '--force') == 2
     assert (tmp_path / 'out' / 'precious').read_text() == 'mine'
     assert run(bag, '-o', tmp_path / 'out', '--force') == 0
     assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == ['metadata.yaml', 'out_0.mcap']

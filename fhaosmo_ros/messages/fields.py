@@ -188,7 +188,7 @@ def find_field(
             text = 'data'
         else:
             raise ConfigurationError(
-                f'a field (input_field, --field) is needed for {message_type}: expected one of '
+                f'a field (input_field) is needed for {message_type}: expected one of '
                 f'{listing}, got nothing'
             )
     path, elements = re.sub(SUBSCRIPT, '[i]', text), re.findall(SUBSCRIPT, text)

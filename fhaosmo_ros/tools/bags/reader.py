@@ -34,8 +34,6 @@ import zstandard
 
 BLOCK = 16_384
 """Samples in a block."""
-STAMPS = ('auto', 'header', 'source', 'bag')
-"""Stamps to choose from; see `BagReader.blocks`."""
 ZSTD = b'\x28\xb5\x2f\xfd'
 """Begin of what zstd has compressed; a message in CDR begins with a zero."""
 RECORD = struct.Struct('<BQ')
@@ -269,12 +267,12 @@ class BagReader:
         """
         if stamp == 'header' and not field.header:
             raise ConfigurationError(
-                f'--stamp header: expected messages with a header on {topic}, '
+                f'input_stamp header: expected messages with a header on {topic}, '
                 f'got {self.message_type(topic)}'
             )
         if stamp == 'source' and not all(isinstance(s, McapReader) for s in self._storages):
             raise ConfigurationError(
-                f'--stamp source: expected an mcap bag, got {self.path} without publish times'
+                f'input_stamp source: expected an mcap bag, got {self.path} without publish times'
             )
         if stamp == 'auto':
             stamp = 'header' if field.header else 'source'

@@ -193,8 +193,10 @@ class BagWriter:
         else:
             self._writer.flush()
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         with self._file:
+            if kind:  # what has been flushed can be read
+                return
             self.flush()
             text = yaml.safe_dump(information := self._information(), sort_keys=False)
             self._writer.add_metadata('rosbag2', {'serialized_metadata': text})

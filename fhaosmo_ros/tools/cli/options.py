@@ -2,7 +2,7 @@
 """Command-line options that several commands share."""
 
 import argparse
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +27,6 @@ from fhaosmo_ros.core.parameters.tables import (
 )
 from fhaosmo_ros.core.parameters.yaml_text import parse
 from fhaosmo_ros.inputs import Input, known_inputs, measured_output, with_joints
-from fhaosmo_ros.tools.bags.reader import STAMPS
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded
 
 
@@ -62,7 +61,7 @@ class BagInputs(NamedTuple):
     u : mapping of str to Input
         The known inputs that the model uses, likewise.
     stamp : str
-        One of `STAMPS` of the bag reader.
+        As for `BagReader.blocks`.
     values : mapping
         Parameters of the channel.
 
@@ -74,49 +73,18 @@ class BagInputs(NamedTuple):
     values: Mapping[str, Any]
 
 
-STAMP_OF = {'auto': 'auto', 'header': 'header', 'source': 'source', 'reception': 'bag'}
-"""Stamps of a bag's reader, by input_stamp of the node."""
-
-
-def add_input_options(add: Callable[..., Any]) -> None:
-    """Add the options that say where in a bag y and u are, with a parser's `add_argument`."""
-    add('--topic', help='topic of the measured output (default: input_topic, else /y)')
-    add(
-        '--field',
-        help="number in its messages, such as 'position[2]', 'position[elbow]' or "
-        "'orientation.yaw' (default: input_field, else the only one)",
-    )
-    add(
-        '--input-topic', action='append', default=[], metavar='TOPIC',
-        help='topic of the known input; given several times: of each one that phi uses, in the '
-        'order of inputs (default: known_input_topics, else /NAME)',
-    )  # fmt: skip
-    add(
-        '--input-field', action='append', default=[], metavar='FIELD',
-        help='number in its messages; given several times: of each input (default: '
-        'known_input_fields)',
-    )  # fmt: skip
-    add(
-        '--stamp', choices=STAMPS,
-        help='where dt comes from; header: of the messages; source: publish time (mcap only); '
-        'bag: log time; auto: the first of these that the bag has (default: input_stamp)',
-    )  # fmt: skip
-
-
 def bag_inputs(
-    arguments: argparse.Namespace,
     values: Mapping[str, Any],
     used: Sequence[str],
     present: Collection[str] = (),
     namespace: str = '',
+    channel: str = '',
 ) -> BagInputs:
     """
-    Return where y and u are: as the options say, else as the parameters of the estimator do.
+    Return where y and u are by the parameters of an estimator.
 
     Parameters
     ----------
-    arguments : Namespace
-        With the options of `add_input_options`.
     values : mapping
         Parameters of the channel.
     used : sequence of str
@@ -125,26 +93,20 @@ def bag_inputs(
         Topics of the bag.
     namespace : str
         Of the node.
+    channel : str
+        Its name, '' without named channels.
 
     """
-    channel = getattr(arguments, 'channel', '')
 
-    def full(wanted: Input) -> str:
+    def full(wanted: Input) -> Input:
         # A bag may hold the y of one channel, or of a node in another namespace, as /y.
         relative = wanted.topic.removeprefix(f'{channel}/')
         names = [wanted.absolute(namespace), wanted.absolute(''), f'/{relative.lstrip("/")}']
-        return next((name for name in names if name in present), names[1])
+        return wanted._replace(topic=next((n for n in names if n in present), names[1]))
 
-    y = measured_output(values, channel)
-    y = y._replace(topic=arguments.topic or full(y), field=arguments.field or y.field)
-    given = dict(values)
-    if arguments.input_topic:
-        given['known_input_topics'] = arguments.input_topic
-    if arguments.input_field:
-        given['known_input_fields'] = arguments.input_field
-    found = known_inputs(given, used, channel)
-    u = {name: its._replace(topic=full(its)) for name, its in found.items()}
-    return BagInputs(y, u, arguments.stamp or STAMP_OF[y.stamp], values)
+    y = full(measured_output(values, channel))
+    u = {name: full(its) for name, its in known_inputs(values, used, channel).items()}
+    return BagInputs(y, u, 'bag' if y.stamp == 'reception' else y.stamp, values)
 
 
 def channel_parameters(

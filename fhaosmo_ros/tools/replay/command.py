@@ -18,7 +18,6 @@ from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parame
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 from fhaosmo_ros.tools.cli.options import (
-    add_input_options,
     add_parameter_options,
     bag_inputs,
     channel_parameters,
@@ -53,7 +52,6 @@ def _parser() -> argparse.ArgumentParser:
         '(default: a bag BAG_replayed in the current folder)',
     )  # fmt: skip
     add('--force', action='store_true', help='replace an output that exists')
-    add_input_options(add)
     add(
         '--backwards', choices=('error', 'reject'), default='error',
         help='what to do with stamps that go back; reject: as the live node does (%(default)s)',
@@ -107,7 +105,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
                 _warn(f'{error}; {followed} is not followed, this begins at the first sample')
         namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
         present = {c.topic for c in reader.connections}
-        inputs = bag_inputs(arguments, own, estimator.observer.used_inputs, present, namespace)
+        used = estimator.observer.used_inputs
+        inputs = bag_inputs(own, used, present, namespace, arguments.channel)
         samples = Samples(reader, estimator, live, inputs, arguments.backwards, arguments.smooth)
         finals = arguments.output or [Path(f'{name}_replayed')]
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]

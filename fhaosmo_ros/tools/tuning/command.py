@@ -15,7 +15,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.recording_parameters import SENSOR
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import Output, run_command
-from fhaosmo_ros.tools.cli.options import add_input_options, assigned, bag_inputs
+from fhaosmo_ros.tools.cli.options import assigned, bag_inputs
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 
 TRIALS = 1000
@@ -66,8 +66,10 @@ def _parser() -> argparse.ArgumentParser:
         'sqlite:///study.db, postgresql+psycopg://... (default: in memory)',
     )  # fmt: skip
     bag = parser.add_argument_group('from a bag')
-    bag.add_argument('--bag', type=Path, help='find the gains that are likeliest for its y')
-    add_input_options(bag.add_argument)
+    bag.add_argument(
+        '--bag', type=Path,
+        help='find the gains that are likeliest for its y (of input_topic, input_field)',
+    )  # fmt: skip
     return parser
 
 
@@ -146,19 +148,11 @@ def _identify(
             'command finds them'
         )
     given = ParameterTable(MODEL).part_of(tuning) | estimator
-    for name, value in (
-        ('input_topic', arguments.topic),
-        ('input_field', arguments.field),
-        ('known_input_topics', arguments.input_topic),
-        ('known_input_fields', arguments.input_field),
-    ):
-        if value:
-            given[name] = value
     values = ESTIMATOR_PARAMETERS.complete(given)
     given |= {name: values[name] for name in ('order', 'phi')}
     model = TriangularModel.of(values)
     with stop.raising():
-        inputs = bag_inputs(arguments, estimator, model.used_inputs)
+        inputs = bag_inputs(estimator, model.used_inputs)
         data = recorded(arguments.bag, inputs, model)
         found = identify_input(data, model, values, given)
         made = bag_gains.make_gains(found, given)
