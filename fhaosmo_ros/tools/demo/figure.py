@@ -4,10 +4,9 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from fhaosmo_ros.tools.demo.report import Floats, Run, SELF_TUNING, START, true_noise
+from fhaosmo_ros.tools.demo.report import Floats, Run, SELF_TUNING, true_noise
 from fhaosmo_ros.tools.plot.figures import COLOURS, draw_band, TRUTH
 from fhaosmo_ros.topics import STANDARD_DEVIATION
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
@@ -28,7 +27,9 @@ def save_figure(
         if STANDARD_DEVIATION in run.of_gains:
             deviation = run.of_gains[STANDARD_DEVIATION][:, k]
             draw_band(axes[name], run.t, run.estimate[:, k], deviation)
-        _fit(axes[name], [run.truth[:, k], run.estimate[run.t >= START, k]])
+        low, high = run.truth[:, k].min(), run.truth[:, k].max()
+        margin = 0.3 * (high - low) or 1.0  # what is beyond leaves the picture
+        axes[name].set_ylim(low - margin, high + margin)
         axes[name].set_ylabel('unknown\ninput d' if name == 'd' else name)
     handles, labels = axes['d'].get_legend_handles_labels()
     figure.legend(handles, labels, loc='outside upper center', ncols=3)
@@ -65,10 +66,3 @@ def save_figure(
     last.set_xlabel('time since the first estimate [s]')
     last.set_xlim(run.t[0], run.t[-1])
     figure.savefig(path, dpi=150)
-
-
-def _fit(axes: Axes, curves: Sequence[Floats]) -> None:
-    """Fit the picture to curves, and let what is beyond them leave it."""
-    low, high = np.nanmin(np.concatenate(curves)), np.nanmax(np.concatenate(curves))
-    margin = 0.15 * (high - low) or 1.0
-    axes.set_ylim(low - margin, high + margin)

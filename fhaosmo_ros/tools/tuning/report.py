@@ -103,12 +103,8 @@ def warnings(training: float, held_out: float) -> list[str]:
             'the training: more recordings, or fewer parameters to search, would help.'
         )
     if held_out > 0.9:
-        why = (
-            'there is hardly anything to be known about this d through this sensor'
-            if training < 1.1
-            else 'the search has not found gains that work: more trials, or another start'
-        )
         found.append(
-            f'Note: An estimate that is always 0 has the error 1; this one {held_out:.2f}: {why}.'
+            f'Note: An estimate that is always 0 has the error 1; this one {held_out:.2f}. Either '
+            'this sensor hardly shows this d, or more trials, or another start, are needed.'
         )
     return found
