@@ -58,17 +58,13 @@ def test_own_value_wins_and_the_common_one_serves_the_rest():
     assert 'lambda' not in hip
 
 
-def test_own_parameters_are_checked_as_the_common_ones():
-    table = with_channels(ESTIMATOR_PARAMETERS, NAMES)
+def test_own_parameters_are_declared_and_checked_as_the_common_ones():
+    table = with_channels(ESTIMATOR_PARAMETERS, NAMES, {'epsilon': 9.0})
     assert len(table) == len(ESTIMATOR_PARAMETERS) + 2 * len(CHANNEL_PARAMETERS)
     with pytest.raises(ConfigurationError, match=r"'hip.epsilon': expected a number > 0 .*got -1"):
         table.coerce({'hip.epsilon': -1})
     assert table['hip.order'].live == ESTIMATOR_PARAMETERS['order'].live
-
-
-def test_defaults_are_the_common_values():
-    table = with_channels(ESTIMATOR_PARAMETERS, NAMES, {'epsilon': 9.0})
-    assert table['hip.epsilon'].default == 9.0
+    assert table['hip.epsilon'].default == 9.0  # the common value
     assert table['hip.max_gap'].default == ESTIMATOR_PARAMETERS['max_gap'].default
 
 
@@ -84,14 +80,20 @@ def test_a_channel_follows_what_it_has_not_of_its_own():
     assert followers('lambda', UNNAMED, ()) == []
 
 
-def test_one_file_serves_channels_and_plant(tmp_path):
+@pytest.fixture
+def rig(tmp_path):
     path = tmp_path / 'rig.yaml'
     path.write_text(
-        '/**:\n  ros__parameters:\n    channels: [hip]\n    sample_rate: 50.0\n'
-        '    hip:\n      lambda: [4.0]\n'
+        '/**:\n  ros__parameters:\n    channels: [hip, knee]\n    sample_rate: 50.0\n'
+        '    epsilon: 5.0\n    hip:\n      epsilon: 7.0\n'
     )
-    assert load(path, 'estimator') == {'channels': ['hip'], 'hip.lambda': [4.0]}
-    assert load(path, 'plant', PLANT_NODE_PARAMETERS) == {'sample_rate': 50.0}
+    return path
+
+
+def test_one_file_serves_channels_and_plant(rig):
+    channels = {'channels': ['hip', 'knee'], 'epsilon': 5.0, 'hip.epsilon': 7.0}
+    assert load(rig, 'estimator') == channels
+    assert load(rig, 'plant', PLANT_NODE_PARAMETERS) == {'sample_rate': 50.0}
 
 
 def replayed(*words):
@@ -100,13 +102,8 @@ def replayed(*words):
     return online_parameters(parser.parse_args(words))
 
 
-def test_a_replay_takes_the_parameters_of_one_channel(tmp_path):
-    path = tmp_path / 'rig.yaml'
-    path.write_text(
-        '/**:\n  ros__parameters:\n    channels: [hip, knee]\n    epsilon: 5.0\n'
-        '    hip:\n      epsilon: 7.0\n'
-    )
-    words = ['--params-file', str(path), '-p', 'knee.lambda:=3']
+def test_a_replay_takes_the_parameters_of_one_channel(rig):
+    words = ['--params-file', str(rig), '-p', 'knee.lambda:=3']
     assert replayed(*words, '--channel', 'hip') == {'epsilon': 7.0}
     assert replayed(*words, '--channel', 'knee') == {'epsilon': 5.0, 'lambda': [3.0]}
     with pytest.raises(ConfigurationError, match='--channel: expected hip or knee, got none'):

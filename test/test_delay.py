@@ -3,7 +3,6 @@
 
 from fhaosmo_ros.core import ConfigurationError, Family, OnlineEstimator
 from fhaosmo_ros.core.online.delay import PIECES
-from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot, unpack
 from fhaosmo_ros.core.simulation.plant import respond
 from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
@@ -133,54 +132,6 @@ def test_more_pieces_than_there_is_room_for_lose_the_oldest():
         found = acting(pieces, 10 * (back + 1), 10, now)
         np.testing.assert_array_equal(found, [newest, -newest])
     np.testing.assert_array_equal(acting(pieces, 10 * count, 10, now)[0], 101)
-
-
-CASES = {
-    'delay': DELAYED, 'predicted': DELAYED | {'predict_to_now': True},
-    'no input': DELAYED | {'phi': ['0', '-z2'], 'predict_to_now': True},
-    'input as late': DELAYED | {'input_delay': 0.04, 'predict_to_now': True},
-}  # fmt: skip
-
-
-def disturbed():
-    """Samples with everything that a live run has: jitter, a spike, gaps, a stamp ahead."""
-    rng = np.random.default_rng(4)
-    stamps = STAMPS + rng.integers(-300_000, 300_000, COUNT)
-    stamps[400:] += 30_000_000
-    stamps[600] += 50_000_000
-    stamps[1000:] += 10**9
-    y = truth()[0][:, 0] + 1e-4 * rng.standard_normal(COUNT)
-    y[200], y[300] = 9.0, np.nan
-    return stamps, y, voltage() + 0.1 * rng.standard_normal(COUNT)
-
-
-@pytest.mark.parametrize('parameters', CASES.values(), ids=CASES.keys())
-def test_one_by_one_many_and_resumed_are_the_same(parameters):
-    parameters = parameters | {'spike_gate': 1.0, 'max_gap': 0.5}
-    stamps, y, u = disturbed()
-    one, many, resumed = (OnlineEstimator(parameters) for _ in range(3))
-    found = many.run(stamps, y, u)
-    assert many.counters.rejected_spikes == 1
-    assert many.counters.backward_stamps > 5  # after the stamp ahead
-    assert many.counters.restarts == 1
-    for k in range(COUNT):
-        one.set_input(u[k])
-        e = one.update(int(stamps[k]), y[k])
-        np.testing.assert_array_equal(
-            [*e.z, e.unknown_input], [*found.z[k], found.unknown_input[k]]
-        )
-        one.set_input(-3.0)  # not yet: the next sample has another one
-        if k % 200 == 0:
-            assert one.stamp == (
-                one.latest - (0 if parameters.get('predict_to_now') else 40 * 10**6)
-            )
-            np.testing.assert_array_equal(one.estimate.z, e.z)
-    many = OnlineEstimator(parameters)
-    many.run(stamps[:700], y[:700], u[:700])
-    labels, vector = pack(Snapshot(many.latest, Flag(0), many.state_dict()))
-    resumed.load_state_dict(unpack(vector, labels).values)
-    rest = resumed.run(stamps[700:], y[700:], u[700:])
-    np.testing.assert_array_equal(rest.z, found.z[700:])
 
 
 def test_memory_of_another_delay_is_refused():

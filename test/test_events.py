@@ -3,7 +3,6 @@
 
 from fhaosmo_ros.core import ConfigurationError, EventDetector, OnlineEstimator
 from fhaosmo_ros.core.observer.status import REJECTED_SPIKE, RESTARTED
-from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot, unpack
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -35,25 +34,24 @@ def pulse(begin, end, count=1000, height=1.0):
     return d
 
 
-def test_an_event_lasts_from_the_least_duration_to_the_release():
-    for sign in (1.0, -1.0):
-        d = sign * pulse(300, 600)
-        assert found(d, event_threshold=0.5, event_duration=0.05) == [(350, True), (600, False)]
-    assert found(d, event_threshold=0.5, event_duration=0.0) == [(300, True), (600, False)]
-    assert found(d, event_threshold=1.0) == []  # not more than that
-    assert found(d, event_threshold=0.5, event_duration=0.3) == []
+DENT = pulse(100, 500) - pulse(200, 210, height=0.6)
 
 
-def test_what_lasts_for_less_counts_from_its_own_begin():
-    d = pulse(100, 140) + pulse(141, 180) + pulse(200, 300)
-    assert found(d, event_threshold=0.5, event_duration=0.05) == [(250, True), (300, False)]
-
-
-def test_hysteresis_keeps_an_event_together():
-    d = pulse(100, 500) - pulse(200, 210, height=0.6)
-    assert found(d, event_threshold=0.8, event_release=0.3) == [(150, True), (500, False)]
-    apart = [(150, True), (200, False), (260, True), (500, False)]
-    assert found(d, event_threshold=0.8, event_release=1.0) == apart
+@pytest.mark.parametrize(('d', 'own', 'events'), [
+    (pulse(300, 600), {}, [(350, True), (600, False)]),
+    (-pulse(300, 600), {}, [(350, True), (600, False)]),
+    (pulse(300, 600), {'event_duration': 0.0}, [(300, True), (600, False)]),
+    (pulse(300, 600), {'event_threshold': 1.0}, []),  # not more than that
+    (pulse(300, 600), {'event_duration': 0.3}, []),
+    # What lasts for less counts from its own begin.
+    (pulse(100, 140) + pulse(141, 180) + pulse(200, 300), {}, [(250, True), (300, False)]),
+    # Hysteresis keeps an event together.
+    (DENT, {'event_threshold': 0.8, 'event_release': 0.3}, [(150, True), (500, False)]),
+    (DENT, {'event_threshold': 0.8, 'event_release': 1.0},
+     [(150, True), (200, False), (260, True), (500, False)]),
+])  # fmt: skip
+def test_an_event_lasts_from_the_least_duration_to_the_release(d, own, events):
+    assert found(d, **{'event_threshold': 0.5, **own}) == events
 
 
 def test_deviations_and_threshold_both_have_to_be_exceeded():
@@ -166,32 +164,13 @@ def samples():
     return BEGIN + (1e9 * t).astype(np.int64), y
 
 
-def without_number(events):
-    return [event._replace(sample=0) for event in events]
-
-
 @pytest.mark.parametrize('case', CASES)
-def test_one_by_one_at_once_and_resumed_find_the_same(samples, case):
-    stamps, y = samples
-    at_once = OnlineEstimator(CASES[case])
-    at_once.run(stamps, y)
-    events = without_number(at_once.events.taken())
-    begins = [(e.stamp - BEGIN) * 1e-9 for e in events if e.begins]
-    assert len([t for t in begins if 10.0 < t < 11.0]) == 1  # found
-    assert not [t for t in begins if t < 10.0]  # and nothing else
-    one_by_one, resumed = OnlineEstimator(CASES[case]), None
-    for k, (stamp, value) in enumerate(zip(stamps.tolist(), y.tolist(), strict=True)):
-        one_by_one.update(stamp, value)
-        if k == 1100:
-            assert one_by_one.events.active
-            values = one_by_one.state_dict()
-            labels, vector = pack(Snapshot(one_by_one.latest, Flag(0), values))
-            resumed = OnlineEstimator(CASES[case])
-            resumed.load_state_dict(unpack(vector, labels).values)
-    assert without_number(one_by_one.events.taken()) == events
-    resumed.run(stamps[1101:], y[1101:])
-    left = [e for e in events if e.stamp > stamps[1100]]
-    assert without_number(resumed.events.taken()) == left
+def test_an_event_is_found_and_nothing_else(samples, case):
+    estimator = OnlineEstimator(CASES[case])
+    estimator.run(*samples)
+    begins = [(e.stamp - BEGIN) * 1e-9 for e in estimator.events.taken() if e.begins]
+    assert len([t for t in begins if 10.0 < t < 11.0]) == 1
+    assert not [t for t in begins if t < 10.0]
 
 
 def test_a_reset_ends_an_event_and_so_does_switching_off(samples):

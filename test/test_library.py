@@ -51,28 +51,17 @@ def test_channel_of_a_node(kind, tmp_path):
 
 
 @pytest.mark.parametrize('kind', [Observer, OnlineEstimator])
-@pytest.mark.parametrize(
-    ('changes', 'said'),
-    [
+def test_error_begins_with_the_path(kind, gains):
+    for changes, said in (
         ({'gamma_min': 0.9}, 'gamma_min'),
         ({'lamda': 1.0}, "'lambda'"),
-        ({'phi': ['0', 'b*z2']}, 'b'),
-    ],
-)
-def test_error_begins_with_the_path(kind, changes, said, gains):
-    gains.write_text(dumps(GAINS | changes, 'estimator'))
-    with pytest.raises(ConfigurationError, match=said) as error:
-        kind.from_yaml(gains)
-    assert str(error.value).startswith(f'{gains}: ')
-    assert str(error.value).count(str(gains)) == 1
-
-
-def test_a_model_without_inputs_needs_no_u(gains):
-    estimator, same = (OnlineEstimator.from_yaml(gains) for _ in range(2))
-    stamps = 10**9 + np.arange(50) * 10**6
-    found, wanted = estimator.run(stamps, Y), same.run(stamps, Y, np.zeros(50))
-    np.testing.assert_array_equal(found.z, wanted.z)
-    np.testing.assert_array_equal(Observer.from_yaml(gains).run(T, Y).t, T)
+        ({'phi': ['0', 'b']}, 'b'),
+    ):
+        gains.write_text(dumps(GAINS | changes, 'estimator'))
+        with pytest.raises(ConfigurationError, match=said) as error:
+            kind.from_yaml(gains)
+        assert str(error.value).startswith(f'{gains}: ')
+        assert str(error.value).count(str(gains)) == 1
 
 
 def test_without_u_the_inputs_that_are_held_go_on():

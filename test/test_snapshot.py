@@ -21,31 +21,6 @@ def feed(estimator, begin, end):
     return np.array(rows)
 
 
-@pytest.mark.parametrize('parameters', [
-    {'variant': 'fuzzy_adaptive'}, {'variant': 'sign', 'order': 2, 'phi': ['0', '-z2']},
-    {'scheme': 'explicit', 'variant': 'fuzzy_adaptive'}, {'noise_size': 1e-3},
-    {'order': 2, 'phi': ['0', 'a - b'], 'inputs': ['a', 'b']},
-    {'structure': 'levant', 'scheme': 'predict_correct', 'correction_period': 1e-3,
-     'lambda': [8.0, 20.0, 30.0, 16.0], 'fuzzy_widths': [0.1], 'noise_size': 1e-3},
-])  # fmt: skip
-def test_another_estimator_goes_on_bit_for_bit(parameters):
-    first, second = OnlineEstimator(parameters), OnlineEstimator(parameters)
-    feed(first, 0, 1500)
-    last = len(first.inputs) - 1
-    first.set_input(0.25, last)
-    labels, kept = pack(Snapshot(first.latest, Flag.CHANGED, first.state_dict()))
-    assert len(kept) == len(labels)
-    snapshot = unpack(kept.tolist(), labels)
-    assert snapshot.stamp == first.stamp
-    assert snapshot.flags == Flag.CHANGED
-    feed(second, 0, 100)  # whatever it was before
-    second.load_state_dict(snapshot.values)
-    assert second.inputs == first.inputs
-    assert second.inputs[last] == 0.25
-    assert second.stamp == first.stamp
-    np.testing.assert_array_equal(feed(second, 1500, 3000), feed(first, 1500, 3000))
-
-
 def test_labels_name_what_stands_there():
     estimator = OnlineEstimator()
     feed(estimator, 0, 700)

@@ -4,7 +4,7 @@
 import time
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import dumps, loads
+from fhaosmo_ros.core.parameters.files import dumps, load, loads
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.parameters.yaml_text import MAX_DEPTH, MAX_LENGTH, parse
 from fhaosmo_ros.tools.cli.options import assigned
@@ -18,16 +18,14 @@ LISTS = ('lambda', 'phi', 'channels')
 
 def error_of(function, *arguments):
     """Return the one line with which a call is refused, None if it is not."""
-    start = time.perf_counter()
+    start, message = time.process_time(), None
     try:
         repr(function(*arguments))
     except ConfigurationError as error:
         message = str(error)
         assert message.isprintable()
         assert len(message) < 600
-    else:
-        message = None
-    assert time.perf_counter() - start < 5.0
+    assert time.process_time() - start < 5.0
     return message
 
 
@@ -37,9 +35,9 @@ def test_hostile_text_is_content_or_one_line(text):
     for name in LISTS:
         assert error_of(ESTIMATOR_PARAMETERS[name].coerce, text) or name != 'lambda'
     error_of(assigned, [f'lambda:={text}'], ESTIMATOR_PARAMETERS)
-    assert error_of(loads, text, 'estimator', ESTIMATOR_PARAMETERS)
     section = f'/**: {{ros__parameters: {{lambda: {text}}}}}'
-    assert error_of(loads, section, 'estimator', ESTIMATOR_PARAMETERS)
+    for whole in (text, section):
+        assert error_of(loads, whole, 'estimator', ESTIMATOR_PARAMETERS)
 
 
 PIECES = [
@@ -68,27 +66,22 @@ def test_any_text_is_content_or_one_line(text):
     ('text', 'content'),
     [
         ('', None),
-        ('2001-02-30', '2001-02-30'),
-        ('2001-02-03 04:05:06', '2001-02-03 04:05:06'),
-        ('=', '='),
-        ('{<<: {a: 1}}', {'<<': {'a': 1}}),
-        ('!!float 3', 3.0),
-        ('!!str 3', '3'),
+        ('[2001-02-30, 2001-02-03 04:05:06]', ['2001-02-30', '2001-02-03 04:05:06']),
+        ('{<<: {a: =}}', {'<<': {'a': '='}}),
+        ('[!!float 3, !!str 3]', [3.0, '3']),
         ('[1, 0x10, 1e-3, .inf, yes, ~, a]', [1, 16, 0.001, float('inf'), True, None, 'a']),
         ('a: &anchor [1]', {'a': [1]}),
         ('1' * 300, int('1' * 300)),
-        ('[' * MAX_DEPTH + ']' * MAX_DEPTH, None),
     ],
 )
 def test_content(text, content):
-    assert content is None or parse(text) == content
-    parse(text)
+    assert parse(text) == content
+    parse('[' * MAX_DEPTH + ']' * MAX_DEPTH)
 
 
 @pytest.mark.parametrize(
     ('text', 'reason'),
     [
-        ('{a: 1, b: 2, a: 3}', "the key 'a' twice (line 1)"),
         ('a:\n  b: 1\n  b: 2', "the key 'b' twice (line 3)"),
         ('a: &x [1]\nb: *x', 'the alias *x, which ROS does not read either (line 2)'),
         (LAUGHS, 'the alias *a'),
@@ -119,19 +112,11 @@ def test_section_or_parameter_given_twice_is_refused():
     assert message == "section '/**': 'a.epsilon' is set twice"
 
 
-def test_written_file_has_no_alias():
+def test_written_file_has_no_alias_and_is_read_up_to_a_bound(tmp_path):
     gains = [1.0, 2.0]
     text = dumps({'lambda': gains, 'alpha': gains})
     assert loads(text, 'estimator', ESTIMATOR_PARAMETERS) == {'lambda': gains, 'alpha': gains}
-
-
-def test_file_is_read_up_to_a_bound(tmp_path):
     path = tmp_path / 'zero.yaml'
     path.write_text('#' * (3 * MAX_LENGTH))
-    from fhaosmo_ros.core.parameters.files import load
-
     assert f'at most {MAX_LENGTH} are read' in error_of(load, path, 'estimator')
-
-
-def test_long_integer_of_a_caller_is_refused():
     assert 'a longer integer' in error_of(ESTIMATOR_PARAMETERS['epsilon'].coerce, 10**5000)

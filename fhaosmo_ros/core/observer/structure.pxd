@@ -49,13 +49,6 @@ cdef struct Memory:
     double one_sided  # samples in a row beyond that limit on one side; < 0 on the lower (D 32)
 
 
-cdef struct Kept:
-    # A state to go back to.
-    Level level[MOST_LEVELS]
-    Row covariance[MOST_LEVELS]
-    Memory memory
-
-
 cdef class Structure:
     # What the parameters say.
     cdef readonly object configuration  # ObserverConfiguration
@@ -73,8 +66,6 @@ cdef class Structure:
     cdef Memory memory
     cdef Level level[MOST_LEVELS]
     cdef Row covariance[MOST_LEVELS]  # P of the errors (D 20); not used without noise_size
-    cdef Kept kept  # the state of the latest `keep`
-    cdef bint is_kept
     # A step's own: the levels and P while they are changed, and what it finds.
     cdef Level trial[MOST_LEVELS]
     cdef Row trial_covariance[MOST_LEVELS]
@@ -90,8 +81,6 @@ cdef class Structure:
     cdef void begin_at_estimates(self) noexcept nogil
     cdef double unknown_input(self) noexcept nogil
     cdef void reset(self) noexcept nogil
-    cdef bint keep(self) noexcept nogil
-    cdef void go_back(self) noexcept nogil
     cdef void enter(self) except *
     # For a structure to implement.
     cdef void advance(self, double y, double h, const double* u) noexcept nogil
@@ -104,8 +93,6 @@ cdef class Structure:
     cdef double variance(self, int i) noexcept nogil
     cdef void tell(self, double* model, double* tuning) noexcept nogil
     cdef bint jump(self, const double* u) noexcept nogil
-    cdef dict named(self, Kept state)
-    cdef Kept checked(self, values, str prefix) except *
     cdef number(self, values, str name, tuple shape)
     cdef finite(self, values, str name, tuple shape)
 

@@ -34,6 +34,7 @@ cdef double MOST_DRIFT = 35.0
 cdef double MUCH_SMALLER = 0.5
 # No number of a snapshot is larger, and these are not negative.
 cdef double LARGEST = 1.8e300
+OF_LEVELS = 'z_hat', 'z_tilde', 'p', 'q'
 POSITIVE = 'pending', 'period', 'beyond', 'watched', 'saturated', 'narrowed'
 
 
@@ -180,21 +181,6 @@ cdef class Structure:
         memset(self.innovation, 0, sizeof(self.innovation))
         self.memory.y = NAN
         self.memory.scale = self.memory.spread = 1.0
-        self.is_kept = False
-
-    cdef bint keep(self) noexcept nogil:
-        """Remember the present state; return False if it is too large for that."""
-        self.kept.level, self.kept.covariance = self.level, self.covariance
-        self.kept.memory = self.memory
-        self.is_kept = True
-        return True
-
-    cdef void go_back(self) noexcept nogil:
-        """Go back to the state of the latest `keep`."""
-        if self.is_kept:
-            self.level, self.covariance = self.kept.level, self.kept.covariance
-            self.memory = self.kept.memory
-            self.measure(self.memory.y)
 
     cdef void enter(self) except *:
         """Raise RuntimeError while another thread runs this observer."""
@@ -399,7 +385,6 @@ cdef class Structure:
         for i in range(self.order):
             self.level[i].z_tilde = values[i + 1]
         self.memory.settled = 1.0
-        self.is_kept = False
         self.measure(self.memory.y)
 
     # Snapshots and copies
@@ -408,28 +393,14 @@ cdef class Structure:
         """
         Return all that it remembers: name -> number, or array of one number a level.
 
-        `load_state_dict` takes it back. Names that begin with ``before_`` are of the state before
-        the latest gap.
+        `load_state_dict` takes it back.
         """
-        cdef Kept now
-        self.enter()
-        now.level, now.covariance, now.memory = self.level, self.covariance, self.memory
-        found = self.named(now)
-        if self.is_kept:
-            found |= {f'before_{name}': value for name, value in self.named(self.kept).items()}
-        return found
-
-    cdef dict named(self, Kept state):
-        """Return the named numbers of a state."""
         cdef int n = self.levels
-        cdef list levels = state.level
-        found = {
-            name: np.array([level[name] for level in levels[:n]])
-            for name in ('z_hat', 'z_tilde', 'p', 'q')
-        }
-        found['covariance'] = np.array(state.covariance)[:n, :n].copy()
-        memory = state.memory
-        return found | memory
+        cdef list levels = self.level
+        cdef dict memory = self.memory
+        self.enter()
+        found = {name: np.array([level[name] for level in levels[:n]]) for name in OF_LEVELS}
+        return found | {'covariance': np.array(self.covariance)[:n, :n].copy()} | memory
 
     def load_state_dict(self, values):
         """
@@ -442,45 +413,27 @@ cdef class Structure:
             has changed.
 
         """
-        cdef Kept now, before
-        self.enter()
-        has_before = 'before_y' in values
-        now = self.checked(values, '')
-        if has_before:
-            before = self.checked(values, 'before_')
-            self.kept = before
-        self.is_kept = has_before
-        self.level, self.covariance, self.memory = now.level, now.covariance, now.memory
-        self.measure(self.memory.y)
-
-    cdef Kept checked(self, values, str prefix) except *:
-        """Return a state from named numbers; raise where one can not be."""
-        cdef Kept state
         cdef int n = self.levels, i, j
-        memory = {}
-        memset(&state, 0, sizeof(Kept))
-        state_memory = state.memory
-        for name in state_memory:
-            number = self.number(values, prefix + name, ())
+        cdef dict memory = self.memory
+        self.enter()
+        levels = [self.finite(values, name, (n,)) for name in OF_LEVELS]
+        covariance = self.finite(values, 'covariance', (n, n))
+        for name in memory:
+            number = self.number(values, name, ())
             unknown = name == 'y' and np.isnan(number)  # before the first sample
             least = 0.0 if name in POSITIVE else 1.0 if name in ('spread', 'scale') else -LARGEST
             if not (unknown or least <= number <= LARGEST):
                 raise ConfigurationError(
-                    f"snapshot: '{prefix}{name}': expected a finite number of at least {least:g}, "
+                    f"snapshot: '{name}': expected a finite number of at least {least:g}, "
                     f'got {number}'
                 )
             memory[name] = float(number)
-        state.memory = memory
+        self.memory = memory
         for i in range(n):
-            state.level[i].z_hat = self.finite(values, prefix + 'z_hat', (n,))[i]
-            state.level[i].z_tilde = self.finite(values, prefix + 'z_tilde', (n,))[i]
-            state.level[i].p = self.finite(values, prefix + 'p', (n,))[i]
-            state.level[i].q = self.finite(values, prefix + 'q', (n,))[i]
-        covariance = self.finite(values, prefix + 'covariance', (n, n))
-        for i in range(n):
+            self.level[i] = Level(levels[0][i], levels[1][i], levels[2][i], levels[3][i])
             for j in range(n):
-                state.covariance[i][j] = covariance[i, j]
-        return state
+                self.covariance[i][j] = covariance[i, j]
+        self.measure(self.memory.y)
 
     cdef number(self, values, str name, tuple shape):
         """Return what a snapshot has of a name, as an array of that shape."""

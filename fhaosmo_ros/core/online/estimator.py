@@ -88,7 +88,7 @@ class OnlineEstimator:
         check_events(p)
         self._smoothing: Smoother | None = None
         if p['smoothing_lag'] > 0.0:
-            self._smooth(round(p['smoothing_lag'] / NANOSECONDS))
+            self.smooth(p['smoothing_lag'])
         self._u = np.zeros(len(self.observer.inputs))
         settings = self._settings(p)
         past = PastInputs(len(self._u), settings['lag'] > 0)
@@ -224,15 +224,14 @@ class OnlineEstimator:
         """Start afresh: the next sample is the first. Counters go on, and so does `freeze`."""
         self.policy.reset()
         self.events.reset()
-        if self._smoothing is not None:
-            self._smoothing.cut()
+        self._cut()
 
-    def smooth(self) -> None:
+    def smooth(self, lag: float | None = None) -> None:
         """
-        Let `run` return smoothed estimates, each once later samples no longer matter to it.
+        Let `run` return smoothed estimates, each `lag` seconds after its sample.
 
-        To be called before the first sample; `finish` returns the rest. The samples that come
-        later matter for some time constants of the observer, so memory stays bounded.
+        Without a lag each comes once later samples no longer matter to it, and `finish` returns
+        the rest. To be called before the first sample. Memory stays bounded.
 
         Raises
         ------
@@ -240,11 +239,10 @@ class OnlineEstimator:
             `noise_size` is 0, which says how much to trust a sample; or `predict_to_now`.
 
         """
-        self._smooth(None)
-
-    def _smooth(self, lag: int | None) -> None:
         _check_smoothing(self._parameters, self.observer.configuration)
-        self._smoothing = Smoother(self.observer, lag)
+        self._smoothing = Smoother(
+            self.observer, None if lag is None else round(lag / NANOSECONDS)
+        )
 
     @property
     def due(self) -> NDArray[np.int64]:
@@ -264,16 +262,12 @@ class OnlineEstimator:
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that it remembers, by name, but for counters and parameters; a copy."""
+        past = self.policy.past
         return {
             'version': VERSION, **self.observer.structure.state_dict(), **self.policy.memory,
-            **self.events.memory, **{name: array.copy() for name, array in self._inputs.items()},
+            **self.events.memory, 'u': self._u.copy(), 'past_latest': past.latest.copy(),
+            'past_pieces': past.pieces.copy(),
         }  # fmt: skip
-
-    @property
-    def _inputs(self) -> dict[str, NDArray[np.float64]]:
-        """The known inputs that it remembers; not copies."""
-        past = self.policy.past
-        return {'u': self._u, 'past_latest': past.latest, 'past_pieces': past.pieces}
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
         """
@@ -293,16 +287,22 @@ class OnlineEstimator:
         checked(values, {'version': VERSION})
         memory = checked(values, self.policy.memory)
         events = checked(values, self.events.memory)
-        if np.size(values.get('past_pieces', ())) != self.policy.past.pieces.size:
+        past = self.policy.past
+        if np.size(values.get('past_pieces', ())) != past.pieces.size:
             raise ConfigurationError(
                 'snapshot: expected that of an estimator with the same measurement_delay'
             )
-        inputs = {name: array_of(values, name, old.shape) for name, old in self._inputs.items()}
+        arrays = {'u': self._u, 'past_latest': past.latest, 'past_pieces': past.pieces}
+        found = {name: array_of(values, name, array.shape) for name, array in arrays.items()}
         self.observer.structure.load_state_dict(values)
         self.policy.change(**memory)
         self.events.memory = events
-        for name, array in self._inputs.items():
-            array[:] = inputs[name]
+        for name, array in arrays.items():
+            array[:] = found[name]
+        self._cut()
+
+    def _cut(self) -> None:
+        """Smooth nothing across what has happened."""
         if self._smoothing is not None:
             self._smoothing.cut()
 
@@ -334,8 +334,7 @@ class OnlineEstimator:
                 f'{limit:g} (divergence_limit), got {z!r} and {unknown_input!r}'
             )
         self.observer.structure.seed(values)
-        if self._smoothing is not None:
-            self._smoothing.cut()
+        self._cut()
 
     def freeze(self, held: bool) -> None:
         """Hold gamma where it is, or let it adapt again; no parameter changes."""
@@ -410,19 +409,11 @@ class OnlineEstimator:
 
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
-        u = self._u
         if self._smoothing is None and not self.events.on:
-            return self.policy.advance(stamp, y, u)  # type: ignore[no-any-return]
+            return self.policy.advance(stamp, y, self._u)  # type: ignore[no-any-return]
         stamps = np.array([min(max(int(stamp), -LARGEST_STAMP), LARGEST_STAMP)])
-        if self._smoothing is not None:
-            self._run(stamps, np.array([y], dtype=np.float64), u[np.newaxis])
-            return self.policy.word  # type: ignore[no-any-return]
-        word: int = self.policy.advance(stamp, y, u)
-        observer, latest = self.observer, self.policy.course['latest']
-        deviation = observer.standard_deviation[-1:] if observer.self_tuning else None
-        d = [observer.unknown_input]
-        self.events.take(stamps - self._behind, d, deviation, [latest], [word])
-        return word
+        self._run(stamps, np.array([y], dtype=np.float64), self._u[np.newaxis])
+        return self.policy.word  # type: ignore[no-any-return]
 
     def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
         """

@@ -90,12 +90,8 @@ def _labels(shapes: tuple[tuple[str, tuple[int, ...], bool], ...]) -> list[str]:
     """Return a label for each entry of numbers with these names and shapes, integers or not."""
     labels = list(HEAD)
     for name, shape, whole in shapes:
-        if whole:
-            labels += [f'{name}_upper', f'{name}_lower']
-        elif shape:
-            labels += [name + '_'.join(str(k + 1) for k in index) for index in np.ndindex(shape)]
-        else:
-            labels.append(name)
+        ends = ('_'.join(str(k + 1) for k in index) for index in np.ndindex(shape))
+        labels += [name + end for end in (('_upper', '_lower') if whole else ends)]
     return labels
 
 

@@ -108,10 +108,6 @@ cdef class SelfTuning(Structure):
             self.variances[i] = INFINITY
         memset(self.sizes, 0, sizeof(self.sizes))
 
-    cdef bint keep(self) noexcept nogil:
-        """Return False: the members are too many to be kept."""
-        return False
-
     cdef bint has_begun(self) noexcept nogil:
         """Return True once the members run."""
         return self.members.shared.samples > FIRST_SAMPLES
@@ -524,7 +520,7 @@ cdef class SelfTuning(Structure):
         Structure.load_state_dict(self, values)
         self.members.shared, self.members.work.q_interval = shared, 0.0
         self.model = Model(numbers[0], numbers[1], numbers[2], numbers[3])
-        self.is_kept = self.y_jumped = False
+        self.y_jumped = False
         for name, number in found.items():
             data = number.tobytes()
             memcpy(<void*><size_t>names[name][0], <char*>data, len(data))
