@@ -120,6 +120,10 @@ KNOWN = 'every z known'
 """What a wrong Phi makes of d, whoever estimates it."""
 
 
+Once = tuple[dict[str, float], dict[str, dict[str, float]]]
+"""What the tuning has found with the truth: a filter, and for each peer one of `PEERS`."""
+
+
 class Size(NamedTuple):
     """How much is computed."""
 
@@ -133,30 +137,14 @@ class Size(NamedTuple):
 QUICK = Size(7.0, ('sine', 'ou'), ('motor',), (TUNED, 'noise x 10'), 24)
 
 
-class Member(NamedTuple):
-    """A Kalman filter with D 17: its bandwidth (rad/s) is that at `RATE`."""
-
-    derivatives: int
-    bandwidth: float
-    decay: float
-
-    def at(self, order: int, rate: float) -> Values:
-        """Return the values of this model of d at a rate: its intensity stays (D 17)."""
-        return {
-            'derivatives': float(self.derivatives), 'decay': self.decay,
-            'bandwidth': self.bandwidth * self.quicker(order, rate),
-        }  # fmt: skip
-
-    def quicker(self, order: int, rate: float) -> float:
-        """Return the bandwidth at a rate over that at `RATE`."""
-        return float((rate / RATE) ** (0.5 / (order + 1 + self.derivatives)))
+def at(member: Values, order: int, rate: float) -> dict[str, float]:
+    """Return the values of a Kalman filter at a rate: the intensity of its d stays (D 17)."""
+    return {**member, 'bandwidth': member['bandwidth'] * quicker(member, order, rate)}
 
 
-class Once(NamedTuple):
-    """What the tuning has found with the truth: a filter, and for each peer which of `PEERS`."""
-
-    member: Member
-    peers: dict[str, int]
+def quicker(member: Values, order: int, rate: float) -> float:
+    """Return the bandwidth of a filter at a rate over that at `RATE`."""
+    return float((rate / RATE) ** (0.5 / (order + 1 + member['derivatives'])))
 
 
 def recording(
@@ -214,24 +202,11 @@ def implied(plant: Plant, c: Condition, recordings: list[Recording]) -> float:
     return mean([error(r, r.d + e) for r, e in zip(recordings, off, strict=True)])
 
 
-def best_member(setting: Setting, recordings: list[Recording], trials: int) -> Member:
-    """Tune the Kalman filter with the truth, as the comparison does."""
+def tuned(setting: Setting, recordings: list[Recording], trials: int) -> dict[str, float]:
+    """Return the Kalman filter at `RATE` that is best with the truth, as the comparison does."""
     found = tune(METHODS[LINEAR_LIMIT], setting, recordings, trials, SEED).values
-    member = Member(int(found['derivatives']), found['bandwidth'], found['decay'])
-    quicker = member.quicker(setting.model.order, 1.0 / setting.period)
-    return member._replace(bandwidth=member.bandwidth / quicker)
-
-
-def best_peers(setting: Setting, values: Values, recordings: list[Recording]) -> dict[str, int]:
-    """Tune the peers with the truth."""
-
-    def judged(name: str, number: int) -> float:
-        return mean(errors_of(name, setting, {**values, **PEERS[name][number]}, recordings))
-
-    return {
-        name: min(range(len(choices)), key=lambda number, name=name: judged(name, number))
-        for name, choices in PEERS.items()
-    }  # fmt: skip
+    times = quicker(found, setting.model.order, 1.0 / setting.period)
+    return {**found, 'bandwidth': found['bandwidth'] / times}
 
 
 def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row, Once]:
@@ -239,22 +214,28 @@ def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row,
     plant, c = PLANTS[name], CONDITIONS[condition]
     recordings = [recording(plant, c, kind, size.duration) for kind in size.kinds]
     setting = setting_of(plant, c)
-    found = best_member(setting, recordings, size.trials)
-    anew = found.at(setting.model.order, c.rate)
-    once = once or Once(found, best_peers(setting, anew, recordings))
-    values = once.member.at(setting.model.order, c.rate)
+    n = setting.model.order
+
+    def errors(method: str, values: Values) -> float:
+        return mean(errors_of(method, setting, values, recordings))
+
+    member = tuned(setting, recordings, size.trials)
+    anew = at(member, n, c.rate)
+    if once is None:
+        best = {
+            peer: min(choices, key=lambda own, peer=peer: errors(peer, anew | own))
+            for peer, choices in PEERS.items()
+        }
+        once = member, best
+    values = at(once[0], n, c.rate)
     preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | model_of(setting)
+    of_preset = [error(r, observed(preset, r.t, r.y).unknown_input) for r in recordings]
     ours, inside = self_tuned(model_of(setting), recordings)
-    errors = {
-        SELF: ours,
-        ONCE: errors_of(LINEAR_LIMIT, setting, values, recordings),
-        PRESET: [error(r, observed(preset, r.t, r.y).unknown_input) for r in recordings],
-    }
-    for peer, number in once.peers.items():
-        errors[peer] = errors_of(peer, setting, {**values, **PEERS[peer][number]}, recordings)
-    yard = mean(errors_of(LINEAR_LIMIT, setting, anew, recordings))
+    found = {SELF: mean(ours), ONCE: errors(LINEAR_LIMIT, values), PRESET: mean(of_preset)}
+    found |= {peer: errors(peer, values | own) for peer, own in once[1].items()}
+    yard = errors(LINEAR_LIMIT, anew)
     row: Row = {'plant': name, 'condition': condition, ANEW: yard}
-    row |= {name: mean(found) / yard for name, found in errors.items()}
+    row |= {method: value / yard for method, value in found.items()}
     known = implied(plant, c, recordings) / yard if c.phi != 1.0 else None
     return row | {KNOWN: known, 'inside 1 σ': inside[0], 'inside 1.96 σ': inside[1]}, once
 

@@ -17,7 +17,8 @@ def test_peers_without_their_options_are_the_kalman_filter(derivatives, rate):
     condition = TUNED._replace(rate=rate)
     r = everywhere.recording(MOTOR, condition, 'chirp', 10.0)
     setting = everywhere.setting_of(MOTOR, condition)
-    values = everywhere.Member(derivatives, 15.0, 4.5).at(setting.model.order, rate)
+    member = {'derivatives': derivatives, 'bandwidth': 15.0, 'decay': 4.5}
+    values = everywhere.at(member, setting.model.order, rate)
     [expected] = everywhere.errors_of(LINEAR_LIMIT, setting, values, [r])
     for name, options in ((HUBER, {}), (IMM, {'spread': 1.0 + 1e-9, 'stay': 1.0})):
         [found] = everywhere.errors_of(name, setting, values | options, [r])

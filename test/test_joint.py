@@ -3,7 +3,7 @@
 
 from itertools import pairwise
 
-from fhaosmo_ros.core import ConfigurationError, Observer
+from fhaosmo_ros.core import Observer
 import numpy as np
 import pytest
 from studies.paper.plant_and_observer import simulate
@@ -87,11 +87,3 @@ def test_a_model_that_differs_from_the_plant_is_the_observers_own():
     late = run.t > 5.0
     error = run.z_tilde[late, 2] - eta[late]
     assert np.sqrt(np.mean(error**2)) < 0.5 * np.sqrt(np.mean(eta[late] ** 2))
-
-
-@pytest.mark.parametrize(
-    'bad', [{'solver': 'ode2'}, {'step': 0.0}, {'step': np.nan}, {'every': 0}], ids=str
-)
-def test_bad_arguments_are_named(bad):
-    with pytest.raises(ConfigurationError, match=next(iter(bad))):
-        simulate(OBSERVER, PLANT, **bad)

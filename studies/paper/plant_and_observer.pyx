@@ -30,52 +30,30 @@ import numpy as np
 
 
 class Solver(NamedTuple):
-    """
-    How plant and observer are integrated.
+    """How plant and observer are integrated."""
 
-    Attributes
-    ----------
-    method : str
-        Euler ('ode1'), Bogacki-Shampine ('ode3') or classical Runge-Kutta ('ode4').
-    holds_sign : bool
-        True if sign(eps_i) is taken at the first stage of a step and held for its other stages,
-        as simulators with zero-crossing detection do with their sign block. All else, |eps_i|
-        included, follows every stage. For the variants with sign; a fuzzy curve is not held.
-
-    """
-
+    # Euler ('ode1'), Bogacki-Shampine ('ode3') or classical Runge-Kutta ('ode4').
     method: str
+    # True if sign(eps_i) is taken at the first stage of a step and held for its other stages, as
+    # simulators with zero-crossing detection do with their sign block. All else, |eps_i| included,
+    # follows every stage. For the variants with sign; a fuzzy curve is not held.
     holds_sign: bool = False
 
 
 SOLVERS = {name: Solver(name) for name in ('ode1', 'ode3', 'ode4')}
 SOLVERS['ode4 held'] = Solver('ode4', holds_sign=True)
 """What a fixed-step simulation offers, by its usual names."""
-ITS_EQUATIONS = {'scheme': 'explicit', 'noise_size': 0.0}
-"""Parameters of an observer that a solver integrates: it has no scheme of its own."""
+METHODS = {'ode1': EULER, 'ode3': BOGACKI_SHAMPINE, 'ode4': CLASSICAL}
 
 
 class JointRun(NamedTuple):
-    """
-    Truth and estimates on one time grid.
+    """Truth and estimates on one time grid, as (K, ...) arrays."""
 
-    Attributes
-    ----------
-    t : (K,) array
-        Seconds.
-    z, unknown_input : (K, n) and (K,) arrays
-        The plant's states and d.
-    z_hat, z_tilde : (K, N) arrays
-        Filtered and internal states; z_tilde[:, i] belongs to z_{i+2}.
-    gamma : (K,) array
-
-    """
-
-    t: Floats
-    z: Floats
-    unknown_input: Floats
-    z_hat: Floats
-    z_tilde: Floats
+    t: Floats  # s
+    z: Floats  # states of the plant
+    unknown_input: Floats  # d
+    z_hat: Floats  # filtered states
+    z_tilde: Floats  # internal states; z_tilde[:, i] belongs to z_{i+2}
     gamma: Floats
 
 
@@ -192,7 +170,7 @@ cdef class Joint(Dynamics):
 
     def run(self, str method, double h, Py_ssize_t count, int every):
         """Integrate and return `count` states, every `every`-th one, from the first one on."""
-        cdef Method used = {'ode1': EULER, 'ode3': BOGACKI_SHAMPINE, 'ode4': CLASSICAL}[method]
+        cdef Method used = METHODS[method]
         cdef int n = self.plant.size, levels = self.observer.levels, i, _
         cdef Py_ssize_t row, step = 0
         cdef double[:, ::1] z = np.empty((count, n))
@@ -218,45 +196,14 @@ cdef class Joint(Dynamics):
 
 def simulate(observer, plant, solver='ode3', step=1e-3, duration=20.0, every=1):
     """
-    Integrate plant and observer from their initial states over `duration`.
+    Integrate plant and observer from their initial states over `duration` (s).
 
-    Parameters
-    ----------
-    observer, plant : mapping
-        Parameters as for `Observer` and `Plant`; scheme, noise and integration_step play no part.
-    solver : {'ode1', 'ode3', 'ode4', 'ode4 held'}
-        See `SOLVERS`.
-    step : float
-        Fixed step in seconds.
-    duration : float
-        Simulated seconds.
-    every : int
-        Record every `every`-th step.
-
-    Returns
-    -------
-    JointRun
-
-    Raises
-    ------
-    ConfigurationError
-        A bad parameter, or one of the arguments here.
-
+    `observer` and `plant` are parameters as for `Observer` and `Plant`, with fixed gains; scheme,
+    noise and integration_step play no part. Records every `every`-th step.
     """
-    if solver not in SOLVERS:
-        raise ConfigurationError(f'solver: expected one of {", ".join(SOLVERS)}, got {solver!r}')
-    if not 0.0 < step <= duration < float('inf'):
-        raise ConfigurationError(
-            f'step: expected 0 < step <= duration (s), got {step} and {duration}'
-        )
-    if every < 1:
-        raise ConfigurationError(f'every: expected an integer >= 1, got {every}')
-    configuration = ObserverConfiguration(observer)
-    if configuration.self_tuning:
-        raise ConfigurationError(
-            "parameter 'gains': expected fixed for a solver's steps, got 'self_tuning'"
-        )
-    configuration = configuration.changed(ITS_EQUATIONS)
+    configuration = ObserverConfiguration(observer).changed(
+        {'scheme': 'explicit', 'noise_size': 0.0}  # a solver has no scheme of its own
+    )
     p = PLANT_PARAMETERS.complete(plant)
     (method, holds), model, d = SOLVERS[solver], TriangularModel.of(p), Wave(p)
     z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], model.order)
