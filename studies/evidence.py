@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """docs/evidence.md and the tables and figures in the folder beside it."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import csv
 from pathlib import Path
 import re
@@ -58,15 +58,13 @@ def filled(document: str, texts: Mapping[str, str]) -> str:
         The document has no markers of one of the names.
 
     """
-    present = set(parts(document))
-    if not set(texts) <= present:
+    present = parts(document) | texts
+    if len(present) > len(parts(document)):
         raise ConfigurationError(
             f'markers of the document: expected {", ".join(sorted(texts))}, '
-            f'got {", ".join(sorted(present)) or "none"}'
+            f'got {", ".join(sorted(parts(document))) or "none"}'
         )
-    return PATTERN.sub(
-        lambda match: PART.format(match['name'], texts.get(match['name'], match['text'])), document
-    )
+    return PATTERN.sub(lambda match: PART.format(match['name'], present[match['name']]), document)
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -87,35 +85,33 @@ def publish(
     ----------
     docs : path
         Folder of the page; made where there is none.
-    tables : mapping
-        Lines by name of the CSV.
-    texts : mapping
-        Generated parts of the page by name.
-    figures : mapping
-        By name of the PNG.
+    tables, texts, figures : mapping
+        Lines by name of the CSV, generated parts of the page, figures by name of the PNG.
 
     """
     page, folder = docs / PAGE, docs / FOLDER
     text = filled(page.read_text(encoding='utf-8'), texts) if page.exists() else ''
+
+    def write(path: Path, writer: Callable[[Path], object]) -> None:
+        with Output(path, force=True) as output:
+            writer(output.path)
+            print(output.keep())
+
     for name, rows in tables.items():
-        with Output(folder / f'{name}.csv', force=True) as output:
-            with output.path.open('w', newline='', encoding='utf-8') as file:
-                table = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
-                table.writeheader()
-                for row in rows:
-                    table.writerow({k: _text(v) for k, v in row.items()})
-            print(output.keep())
+        write(folder / f'{name}.csv', lambda path, rows=rows: _write_table(path, rows))
     for name, figure in figures.items():
-        with Output(folder / f'{name}.png', force=True) as output:
-            figure.savefig(output.path, dpi=110)
-            print(output.keep())
+        write(folder / f'{name}.png', lambda path, f=figure: f.savefig(path, dpi=110))
     if text:
-        with Output(page, force=True) as output:
-            output.path.write_text(text, encoding='utf-8')
-            print(output.keep())
+        write(page, lambda path: path.write_text(text, encoding='utf-8'))
     for body in texts.values():
         print(f'\n{body}')
 
 
-def _text(value: Any) -> str:
-    return f'{value:.6g}' if isinstance(value, float | int) else value or ''
+def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    with path.open('w', newline='', encoding='utf-8') as file:
+        table = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
+        table.writeheader()
+        for row in rows:
+            table.writerow({
+                k: f'{v:.6g}' if isinstance(v, float | int) else v or '' for k, v in row.items()
+            })  # fmt: skip

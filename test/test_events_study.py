@@ -65,14 +65,13 @@ def test_a_short_new_run_agrees_with_the_results(documented, name, seconds, late
     quiet = events.record(seconds / 3600.0, 1, factor * events.NOISE)
     faulty = events.record(0.1 * events.HOURS, 2, factor * events.NOISE, faults=True)
     faults = faulty.faults[faulty.faults < seconds - events.LASTS]
-    deviations = events.DEVIATIONS if name == events.OURS else 0.0
-
-    def way(y):
-        if name == events.OURS:
-            return events.self_tuning(y)
-        return events.kalman(y, documented[0]['intensity'])
-
-    new = events.curve(way(quiet.y), way(faulty.y[:count]), faults, deviations)
+    if name == events.OURS:
+        both, deviations = [events.self_tuning(y) for y in (quiet.y, faulty.y[:count])], 5.0
+    else:
+        intensity = documented[0]['intensity']
+        both = [events.kalman(y, intensity) for y in (quiet.y, faulty.y[:count])]
+        deviations = 0.0
+    new = events.curve(*both, faults, deviations)
     old = events.points_of(documented, factor, name)
     for k in (5, 8, 11):
         assert new[k].threshold == pytest.approx(old[k].threshold, rel=1e-5)

@@ -38,11 +38,6 @@ def fly(
         thrust over mass in the world by that attitude (m/s²); `rate` (N, 3) of the gyroscope;
         `wind` (N, 3), `bias` (N, 3): the truth.
 
-    Raises
-    ------
-    ConfigurationError
-        RotorPy is not installed.
-
     """
     try:
         from rotorpy.controllers.quadrotor_control import SE3Control
@@ -59,24 +54,21 @@ def fly(
     cameras, imu = MotionCapture(RATE), Imu(gyroscope_params=gyroscope, sampling_rate=RATE)
     state: dict[str, Any] = {k: np.array(v, float) for k, v in vehicle.initial_state.items()}
     state['x'] = circle.update(0.0)['x']
-    found: dict[str, list[Any]] = {
-        name: [] for name in ('t', 'position', 'attitude', 'thrust', 'rate', 'wind', 'bias')
-    }
-    thrust, before = np.zeros(3), state['w']
+    rows, thrust, before = [], np.zeros(3), state['w']
     for t in np.arange(0.0, duration, 1.0 / RATE):
         seen = cameras.measurement(state, with_noise=True)
         turning = state | {'w': (before + state['w']) / 2.0}  # mean of the interval
         rate = imu.measurement(turning, {'vdot': np.zeros(3), 'wdot': np.zeros(3)})['gyro']
         state['wind'] = wind(t)
         row = (t, seen['x'], seen['q'], thrust, rate, state['wind'], imu.gyro_bias)
-        for name, value in zip(found, row, strict=True):
-            found[name].append(np.copy(value))
+        rows.append([np.copy(value) for value in row])
         command = control.update(t, state, circle.update(t))
         up = Rotation.from_quat(seen['q']).as_matrix()[:, 2]
         thrust = command['cmd_thrust'] / quad_params['mass'] * up
         before = state['w']
         state = vehicle.step(state, command, 1.0 / RATE)
-    return {name: np.array(rows) for name, rows in found.items()}
+    names = ('t', 'position', 'attitude', 'thrust', 'rate', 'wind', 'bias')
+    return {name: np.array(column) for name, *column in zip(names, *rows, strict=True)}
 
 
 def gusts(seed: int, steps: bool) -> Callable[[float], Floats]:
@@ -91,8 +83,8 @@ def gusts(seed: int, steps: bool) -> Callable[[float], Floats]:
         times = np.cumsum(rng.exponential(4.0, 60))
         levels = rng.uniform(-6.0, 6.0, (61, 2))
         return lambda t: np.append(levels[np.searchsorted(times, t)], 0.0)
-    step, scale, size = 1.0 / RATE, 10.0 / 4.0, 1.5
-    keep = np.exp(-step / scale)
+    step, size = 1.0 / RATE, 1.5
+    keep = np.exp(-step / (10.0 / 4.0))
     moved = rng.standard_normal((12_000, 2)) * size * np.sqrt(1.0 - keep**2)
     mean, turbulence = rng.uniform(-4.0, 4.0, 2), np.zeros((12_000, 2))
     for k in range(1, 12_000):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings with their truth, methods that have one number to choose, and who is better."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -140,10 +140,10 @@ def fixed(parameters: Mapping[str, Any], r: Recorded, bandwidth: float) -> Float
     return run(dict(parameters) | gains, r).unknown_input
 
 
-def error(pairs: Sequence[tuple[Recorded, Floats]]) -> float:
+def error(pairs: Iterable[tuple[Recorded, Floats]]) -> float:
     """Return the RMS error of estimates over the RMS of the truth, all recordings as one."""
-    wrong = sum(float(np.sum((found - r.d)[r.judged] ** 2)) for r, found in pairs)
-    size = sum(float(np.sum(r.d[r.judged] ** 2)) for r, _ in pairs)
+    both = [((found - r.d)[r.judged], r.d[r.judged]) for r, found in pairs]
+    wrong, size = (sum(float(np.sum(x**2)) for x in column) for column in zip(*both, strict=True))
     return float(np.sqrt(wrong / size))
 
 

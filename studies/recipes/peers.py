@@ -20,6 +20,11 @@ def low_passed(x: Floats, bandwidth: float, period: float, order: int, derivativ
     return filtered + (first if derivative == 0 else 0.0)
 
 
+def inputs_of(r: Recorded) -> Floats:
+    """Return the known inputs, one that is 0 where there are none."""
+    return r.u if r.u.size else np.zeros((len(r.y), 1))
+
+
 def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
     """
     Return d = Q(s) (s² y - Phi_2), Q = (s / bandwidth + 1)^-2, for a model of order 2.
@@ -29,13 +34,8 @@ def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) ->
     """
     model, h = plant_of(p), r.period
     velocity = low_passed(r.y, bandwidth, h, 2, 1)
-    inputs = r.u if r.u.size else np.zeros((len(r.y), 1))
-    explained = np.array(
-        [
-            model.evaluate(np.array([y, v]), u)[1]
-            for y, v, u in zip(r.y, velocity, inputs, strict=True)
-        ]
-    )
+    samples = zip(np.column_stack([r.y, velocity]), inputs_of(r), strict=True)
+    explained = np.array([model.evaluate(z, u)[1] for z, u in samples])
     acceleration = low_passed(r.y, bandwidth, h, 2, 2)
     return acceleration - low_passed(explained, bandwidth, h, 2, 0)
 
@@ -53,8 +53,7 @@ def kalman_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats
     x = np.zeros(n + 1)
     x[0] = r.y[0]
     covariance = np.diag([(3.0 * bandwidth) ** (2 * k) for k in range(n + 1)])
-    chain, found = np.eye(n + 1, k=1), np.zeros(len(r.y))
-    inputs = r.u if r.u.size else np.zeros((len(r.y), 1))
+    chain, found, inputs = np.eye(n + 1, k=1), np.zeros(len(r.y)), inputs_of(r)
     for k in range(1, len(r.y)):
         dt, u = r.t[k] - r.t[k - 1], inputs[k]
         rates = [np.zeros(n + 1)]
