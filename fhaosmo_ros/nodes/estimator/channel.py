@@ -265,13 +265,8 @@ class Channel:
         if estimate is None:
             return None
         self._outputs.publish(estimate, stamp)
-        return Output(self.label, stamp, estimate, self._values)
-
-    @property
-    def label(self) -> str:
-        """Its name in messages: the channel's, else that of the joint that is y."""
-        field = self._y.field
-        return self.name or (field.key if field else '') or 'y'
+        joint = self._y.field.key if self._y.field else ''
+        return Output(self.name or joint or 'y', stamp, estimate, self._values)
 
     def is_stale(self) -> bool:
         """Return True while y is silent, and log it once."""

@@ -76,13 +76,10 @@ class EstimatorNode(ManagedNode):
             self, self._reports, values['diagnostics_period'], values['hardware_id']
         )
         try:
-            # For the first configure; made now, so that bad parameters end the node in any case.
-            self._made: tuple[Parameters, dict[str, OnlineEstimator]] | None = (
-                values, self._make_estimators(),
-            )  # fmt: skip
             if values['autostart']:
                 self.start()
             else:
+                self._make_estimators()  # bad parameters end the node in any case
                 self.get_logger().info(
                     'waiting to be configured, for instance by ros2 lifecycle set'
                 )
@@ -113,8 +110,7 @@ class EstimatorNode(ManagedNode):
     def configure(self) -> None:
         """Make the channel, or channels, from the present parameters."""
         values = self._node_parameters.values
-        made, self._made = self._made, None
-        estimators = made[1] if made and made[0] is values else self._make_estimators()
+        estimators = self._make_estimators()
         self._sources = Sources(self, input_qos(values), self._found_type)
         self._parameters_topic = ParameterTopic(self)
         if self._from_joints:

@@ -89,7 +89,7 @@ class Source:
 
     `message_type` is '' while it is not known; `publishers` are as `look` has seen them; `lost`
     and `damaged` count messages that did not arrive or are shorter than their type. `on_names` is
-    called with the names in a message when they are not those of the one before.
+    called with the names in each message.
     """
 
     def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
@@ -99,7 +99,6 @@ class Source:
         self.publishers = Publishers({}, {})
         self.lost = self.damaged = 0
         self.on_names: Callable[[list[str]], None] | None = None
-        self._names: list[str] = []
         self._sequence, self._mixed = 0, False
         self.listeners: list[Listener] = []
         self._heard: list[Listener] = []  # those with a field
@@ -183,20 +182,15 @@ class Source:
         except RuntimeError:  # in a subscription that is not raw it would end the node
             self.damaged += 1
         else:
-            if self.on_names is not None:
-                self._tell_names(message)
+            names = getattr(message, 'name', None) if self.on_names else None
+            if names and isinstance(names, list):
+                self.on_names(names)
             if self._heard and self._heard[0].field.header:  # type: ignore[union-attr]
                 header = self._heard[0].field.stamp(message)  # type: ignore[union-attr]
         lacking = [li for li in self._heard if not li.hear(message, header, info)]
         if lacking and len(self._whys) < MOST_WHYS:
             self._tell_lacking(lacking)
         self._sources.after_message()
-
-    def _tell_names(self, message: Any) -> None:
-        names = getattr(message, 'name', None)
-        if names and isinstance(names, list) and names != self._names:
-            self._names = names
-            self.on_names(names)  # type: ignore[misc]
 
     def _tell_lacking(self, lacking: list[Listener]) -> None:
         """Tell why a message lacks the field of some listeners, in one line, once a reason."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line of a node: its parameters, read once and by us, and its help."""
 
+import argparse
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
 import os
@@ -42,17 +43,24 @@ def read_arguments(name: str, argv: list[str]) -> Arguments:
         YAML, or an argument that no node has.
 
     """
-    files, rules, rest = _split(argv)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument('--params-file', action='append', default=[])
+    parser.add_argument('-p', '--param', action='append', default=[])
+    of_ros = '--ros-args' in argv
+    try:
+        found, rest = parser.parse_known_args(argv if of_ros else [])
+    except argparse.ArgumentError as error:
+        raise ConfigurationError(str(error)) from None
     full_name = _full_name(name, rest)
     given: dict[str, Any] = {}
     origins: dict[str, str | None] = {}
-    for path in files:
+    for path in map(os.path.expanduser, found.params_file):
         values = read(path, full_name)
         if not values:
             get_logger(name).warning(f'{path}: sets nothing for node {full_name}')
         given |= values
         origins |= dict.fromkeys(values, path)
-    for rule in rules:
+    for rule in found.param:
         target, separator, text = rule.partition(':=')
         node, _, parameter = target.rpartition(':')
         if not (separator and parameter):
@@ -71,34 +79,12 @@ def read_arguments(name: str, argv: list[str]) -> Arguments:
             raise ConfigurationError(f"parameter '{parameter}': {error}") from None
         check_one_type(parameter, value)
         given[parameter], origins[parameter] = value, None
-    others = remove_ros_args([name, *rest])[1:]
+    others = remove_ros_args([name, *(rest if of_ros else argv)])[1:]
     if others:
         raise ConfigurationError(
             f'unexpected argument {others[0]!r}; usage: {name} {USAGE}; parameters: {name} --help'
         )
     return Arguments(given, origins, rest)
-
-
-def _split(argv: list[str]) -> tuple[list[str], list[str], list[str]]:
-    """Return the parameter files, the rules of -p, and the other arguments."""
-    files: list[str] = []
-    rules: list[str] = []
-    rest: list[str] = []
-    words, of_ros = iter(argv), False
-    for word in words:
-        if word in ('--ros-args', '--'):
-            of_ros = word == '--ros-args'
-        if of_ros and word in ('-p', '--param', '--params-file'):
-            value = next(words, None)
-            if value is None:
-                raise ConfigurationError(f'{word}: expected a value, got nothing')
-            if word == '--params-file':
-                files.append(os.path.expanduser(value))
-            else:
-                rules.append(value)
-        else:
-            rest.append(word)
-    return files, rules, rest
 
 
 def _full_name(name: str, arguments: list[str]) -> str:
