@@ -58,7 +58,6 @@ class Channel:
         self.estimator = estimator
         self._values = values
         self._active = False
-        self._lost_before = 0
         self._unpaired: dict[str, int] = {}
         self._forget()
         observer = estimator.observer
@@ -66,10 +65,10 @@ class Channel:
         self._outputs = Outputs(node, prefix, estimator)
         self._events = EventOutput(node, prefix, name)
         self._snapshots = SnapshotOutput(node, prefix, estimator)
-        simulated = node.get_parameter('use_sim_time').value
-        self._health = Health(estimator, values, simulated)
         wanted = measured_output(values, name)
         self._y = sources.of(wanted).add(wanted, self._on_sample)
+        simulated = node.get_parameter('use_sim_time').value
+        self._health = Health(estimator, values, self._y, simulated)
         known = known_inputs(values, observer.used_inputs, name)
         self._pairing = make_pairing(values, observer.inputs, known, estimator.inputs)
         self._u: dict[str, Listener] = {}
@@ -87,7 +86,7 @@ class Channel:
         self._forget()
         if self._pairing is not None:
             self._pairing.forget_samples()
-        self._lost_before = self._y.source.lost
+        self._health.begin()
         self._active = True
         if self.estimator.events.on:
             self._events.say('no event yet', self._values['hardware_id'])
@@ -113,11 +112,7 @@ class Channel:
 
     def reports(self) -> list[Report]:
         """Return the reports for /diagnostics, on the time since the last ones."""
-        y, health = self._y, self._health
-        health.lost = y.source.lost - self._lost_before
-        health.damaged, health.lacking = y.source.damaged, y.lacking
-        title = f'{self.name} ' if self.name else ''
-        reports = health.reports(y, y.source.publishers, self._stale, title)
+        reports = self._health.reports(self._stale, f'{self.name} ' if self.name else '')
         for name, u in self._u.items():
             found = u.source.publishers
             for text in [u.error] if u.error else found.unheard.values():

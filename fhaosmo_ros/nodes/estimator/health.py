@@ -15,7 +15,6 @@ from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
 from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
-from fhaosmo_ros.nodes.middleware.publisher_watch import Publishers
 import numpy as np
 
 LIMIT = 20_000
@@ -60,28 +59,32 @@ class Health:
     Remembers a few numbers of each sample, and makes two reports of them.
 
     Appended to on each sample: `stamps` (ns), `delays` from the source stamp to the callback (ns),
-    `durations` of the callback (s), `unknown_inputs`. Set before each report: `lost`, `damaged`
-    and `lacking` messages. `latest` is the time of the last sample on `perf_counter`, `offset`
-    from its stamp to the publication of its message (ns). `limits` are the channel's parameters,
-    warn_* and error_* among them; `simulated`: stamps are in simulated time.
+    `durations` of the callback (s), `unknown_inputs`. `latest` is the time of the last sample on
+    `perf_counter`, `offset` from its stamp to the publication of its message (ns). `limits` are
+    the channel's parameters, warn_* and error_* among them; `simulated`: stamps are in simulated
+    time.
     """
 
     def __init__(
-        self, estimator: OnlineEstimator, limits: Parameters, simulated: bool = False
+        self, estimator: OnlineEstimator, limits: Parameters, y: Listener, simulated: bool
     ) -> None:
-        self._estimator = estimator
-        self._simulated = simulated
+        self._estimator, self._y, self._simulated = estimator, y, simulated
         self.limits = limits
         self.stamps: deque[int] = deque(maxlen=LIMIT)
         self.delays: deque[int] = deque(maxlen=LIMIT)
         self.durations: deque[float] = deque(maxlen=LIMIT)
         self.unknown_inputs: deque[float] = deque(maxlen=LIMIT)
-        self.lost = self.damaged = self.lacking = self.offset = 0
+        self.offset = self._lost_before = 0
         self.latest = nan
         self._before = self._counts()
         self._events_before = 0
 
-    def reports(self, y: Listener, publishers: Publishers, stale: bool, name: str) -> list[Report]:
+    def begin(self) -> None:
+        """Begin to count: what was lost before does not matter."""
+        self._lost_before = self._y.source.lost
+        self._before = self._counts()
+
+    def reports(self, stale: bool, name: str) -> list[Report]:
         """Return the reports on the time since the last ones, titled by the channel's `name`."""
         counts = self._counts()
         news = {key: count - self._before[key] for key, count in counts.items()}
@@ -93,16 +96,15 @@ class Health:
             jitter = float(np.std(periods)) / mean if mean > 0.0 else nan
         interval = Interval(mean, jitter, longest, counts, news, stale)
         reports = [
-            self._input(Report(f'{name}input'), interval, y, publishers),
+            self._input(Report(f'{name}input'), interval),
             self._observer(Report(f'{name}observer'), interval),
         ]
         for column in (self.stamps, self.delays, self.durations, self.unknown_inputs):
             column.clear()
         return reports
 
-    def _input(
-        self, report: Report, interval: Interval, y: Listener, publishers: Publishers
-    ) -> Report:
+    def _input(self, report: Report, interval: Interval) -> Report:
+        y, publishers = self._y, self._y.source.publishers
         limits, news, mean = self.limits, interval.news, interval.mean
         delay = max(self.delays) * NANOSECONDS if self.delays else nan
         offset = self.offset * NANOSECONDS
@@ -242,12 +244,12 @@ class Health:
             report.find(WARN, f'{news} events, the last one {text}')
 
     def _counts(self) -> dict[str, int]:
-        counters = self._estimator.counters
+        counters, source = self._estimator.counters, self._y.source
         return {
             'samples accepted': counters.accepted,
-            'samples lost': self.lost,
-            'damaged messages': self.damaged,
-            'messages without y': self.lacking,
+            'samples lost': source.lost - self._lost_before,
+            'damaged messages': source.damaged,
+            'messages without y': self._y.lacking,
             'samples rejected': counters.rejected,
             **{_words(name): n for name, n in counters._asdict().items() if name != 'accepted'},
             'restarts': counters.restarts,

@@ -20,7 +20,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
 from fhaosmo_ros.nodes.estimator.channels import Channels, naming_channel
 from fhaosmo_ros.nodes.estimator.joints import Joints
-from fhaosmo_ros.nodes.estimator.parameter_topic import ParameterTopic
+from fhaosmo_ros.nodes.estimator.outputs import ParameterTopic
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE, WARN

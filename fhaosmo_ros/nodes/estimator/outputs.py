@@ -1,12 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics on which a channel publishes: its estimates, its events, all that it remembers."""
+"""What a channel publishes, and the topic with the parameters of its node."""
+
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
+from fhaosmo_ros.core.parameters.declaration import Parameters
+from fhaosmo_ros.core.parameters.files import dumps
+from fhaosmo_ros.core.parameters.per_channel import CHANNELS, differing, of_channel
+from fhaosmo_ros.inputs import Input, known_inputs, measured_output
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
 from fhaosmo_ros.nodes.middleware.publishers import create_publisher, has_listeners, LATCHED
 from fhaosmo_ros.topics import (
@@ -14,11 +21,14 @@ from fhaosmo_ros.topics import (
     DIAGNOSTICS,
     estimates_of,
     EVENT,
+    PARAMETERS,
     SNAPSHOT,
     STANDARD_DEVIATION,
+    TEXT,
 )
 from rclpy.node import Node
-from std_msgs.msg import Float64
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import Float64, String
 
 PERIOD, PERIOD_OF_SELF_TUNING = 1_000_000_000, 30_000_000_000
 """Nanoseconds between two snapshots; a self-tuning estimator remembers thousands of numbers."""
@@ -129,3 +139,39 @@ class SnapshotOutput:
                 self._labels, self._message = labels, labelled(labels)
             self._publisher.publish(self._message(vector))
             self._first, self._latest = False, stamp
+
+
+class ParameterTopic:
+    """Publishes all parameters of a node as the text of a file that makes such a node."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        latest = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._publisher = node.create_publisher(message_class(TEXT), f'~/{PARAMETERS}', latest)
+
+    def publish(self, values: Parameters) -> None:
+        """Publish the node's values; the topic is transient-local."""
+        named = differing(values) | self._remapped(values)
+        text = dumps(named, self._node.get_fully_qualified_name())
+        self._publisher.publish(String(data=text))
+
+    def _remapped(self, values: Parameters) -> dict[str, Any]:
+        """Return the topics of y and u that a remapping has changed: a bag knows of none."""
+        found: dict[str, Any] = {}
+        for channel in values[CHANNELS]:
+            prefix = f'{channel}.' if channel else ''
+            own = of_channel(values, channel)
+            y = measured_output(own, channel)
+            if self._is_remapped(y):
+                found[f'{prefix}input_topic'] = self._node.resolve_topic_name(y.topic)
+                found[f'{prefix}input_type'] = y.message_type
+            u = known_inputs(own, TriangularModel.of(own).used_inputs, channel).values()
+            if any(map(self._is_remapped, u)):
+                topics = [self._node.resolve_topic_name(one.topic) for one in u]
+                found[f'{prefix}known_input_topics'] = topics
+                found[f'{prefix}known_input_types'] = [one.message_type for one in u]
+        return found
+
+    def _is_remapped(self, wanted: Input) -> bool:
+        plain = wanted.absolute(self._node.get_namespace())
+        return self._node.resolve_topic_name(wanted.topic) != plain

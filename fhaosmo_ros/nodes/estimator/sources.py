@@ -13,8 +13,7 @@ from typing import Any
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import Input
 from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError, Unwrapper
-from fhaosmo_ros.nodes.middleware.definitions import definitions
-from fhaosmo_ros.nodes.middleware.messages import message_class
+from fhaosmo_ros.nodes.middleware.messages import definitions, message_class
 from fhaosmo_ros.nodes.middleware.publisher_watch import Publishers, PublisherWatch
 from fhaosmo_ros.nodes.middleware.publishers import full_name
 from fhaosmo_ros.nodes.middleware.subscription import subscribe_with_info

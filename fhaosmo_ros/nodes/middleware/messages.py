@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of numbers; message classes by name."""
+"""Messages of numbers; message classes and their definitions by name."""
 
 from array import array
 from collections.abc import Callable
@@ -14,8 +14,12 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.parameters.declaration import suggestion
+from fhaosmo_ros.messages.fields import ARRAY, BASE, NAME, SEQUENCE
 from numpy.typing import NDArray
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+
+OTHER_NAMES = {'double': 'float64', 'float': 'float32', 'boolean': 'bool'}
+"""IDL's names, which classes have, and those of ROS."""
 
 
 def labelled(names: list[str]) -> Callable[[NDArray], Float64MultiArray]:
@@ -79,3 +83,30 @@ def _is_installed(package: str) -> bool:
     prefixes = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
     in_workspace = any(folder.is_relative_to(Path(prefix).resolve()) for prefix in prefixes)
     return in_workspace and folder.name in ('site-packages', 'dist-packages')
+
+
+def definitions(message_type: str) -> dict[str, Any]:
+    """Return the definitions, as `find_field` reads them, of a message type and all in it."""
+    found: dict[str, Any] = {}
+    waiting = [message_type]
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        fields = message_class(name).get_fields_and_field_types()
+        found[name] = [], [(field, _node(text, waiting)) for field, text in fields.items()]
+    return found
+
+
+def _node(text: str, others: list[str]) -> Any:
+    """Return the definition of a field; add the message types that it needs to `others`."""
+    if inner := re.fullmatch(r'sequence<(.+?)(?:, *(\d+))?>', text):
+        return SEQUENCE, (_node(inner[1], others), int(inner[2] or 0))
+    if inner := re.fullmatch(r'(.+)\[(\d+)\]', text):
+        return ARRAY, (_node(inner[1], others), int(inner[2]))
+    if '/' in text:
+        name = text.replace('/', '/msg/')
+        others.append(name)
+        return NAME, name
+    kind = re.sub(r'<\d+>', '', text)  # string<10>
+    return BASE, (OTHER_NAMES.get(kind, kind), 0)

@@ -79,7 +79,3 @@ class PrivateNode:
     def publishers(self, topic: str) -> int:
         """Return how many publishers of a topic have been discovered."""
         return int(self.node.count_publishers(topic))
-
-    def subscribers(self, topic: str) -> int:
-        """Return how many subscribers of a topic have been discovered."""
-        return int(self.node.count_subscribers(topic))
