@@ -165,10 +165,9 @@ class Source:
         self._heard = [listener for listener in self.listeners if listener.field]
         if self._watch is None and (self._heard or self.on_names):
             self._class, self.message_type = kind, message_type
-            subscription = subscribe_with_info(
-                self._node, kind, self.topic, self._on_message, self._sources.qos, raw=True
-            )
-            self._watch = PublisherWatch(self._node, subscription)
+            qos = self._sources.qos
+            subscribe_with_info(self._node, kind, self.topic, self._on_message, qos, raw=True)
+            self._watch = PublisherWatch(self._node, self.topic, message_type, qos)
 
     def _on_message(self, data: bytes, info: Mapping[str, Any]) -> None:
         sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none

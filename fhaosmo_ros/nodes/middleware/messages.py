@@ -36,12 +36,6 @@ def time_message(stamp: int) -> Time:
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
-def type_name(message_type: Any) -> str:
-    """Return the ROS name of a message class, such as 'std_msgs/msg/Float64'."""
-    package = message_type.__module__.split('.')[0]
-    return f'{package}/msg/{message_type.__name__}'
-
-
 def message_class(name: str) -> Any:
     """
     Return the class of a message type, such as 'std_msgs/msg/Float64'.

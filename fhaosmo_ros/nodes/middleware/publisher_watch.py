@@ -3,9 +3,8 @@
 
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.nodes.middleware.messages import type_name
 from rclpy.node import Node
-from rclpy.qos import qos_check_compatible, QoSCompatibility
+from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 
 UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """The name of a node that has been discovered later than its publisher, or is none of ROS."""
@@ -28,10 +27,9 @@ class PublisherWatch:
     is none for another message type. The ROS graph has both.
     """
 
-    def __init__(self, node: Node, subscription: Any) -> None:
-        self._node, self._topic = node, subscription.topic_name
+    def __init__(self, node: Node, topic: str, message_type: str, qos: QoSProfile) -> None:
+        self._node, self._topic, self._type, self._qos = node, topic, message_type, qos
         self._logger = node.get_logger()
-        self._type, self._qos = type_name(subscription.msg_type), subscription.qos_profile
         self._seen = Publishers({}, {})
         self._last: dict[tuple[int, ...], str] = {}
         self._nameless: set[tuple[int, ...]] = set()

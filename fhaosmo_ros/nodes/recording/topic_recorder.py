@@ -164,10 +164,11 @@ def _matching(profiles: list[QoSProfile]) -> QoSProfile:
     """Return the strictest QoS that every publisher offers."""
     reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
     local = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+    best_effort = ReliabilityPolicy.BEST_EFFORT
     return QoSProfile(
         depth=DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if local else DurabilityPolicy.VOLATILE,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else best_effort,
+        durability=DURABILITIES[local],
     )
 
 
