@@ -194,7 +194,7 @@ def find_field(
     path, elements = re.sub(SUBSCRIPT, '[i]', text), re.findall(SUBSCRIPT, text)
     if path not in known and name:
         path, elements = f'{path}[i]', [*elements, name]
-    steps, angle = known.get(path, ((None,), ''))
+    steps, angle = known.get(path, ((None,), ''))  # None: there is no such number
     wanted = iter(elements)
     found = [s.element(next(wanted)) if isinstance(s, Elements) else s for s in steps]
     if None in found:
@@ -225,7 +225,7 @@ def _numbers(
             length = detail[1] if kind == ARRAY else math.inf
             path, steps = f'{path}[i]', (*steps, Elements(length, names[0] if names else ''))
             kind, detail = detail[0]
-        if kind == NAME:
+        if kind == NAME and detail in types:
             yield from _numbers(types, detail, f'{path}.', steps)
         if kind == BASE and detail[0] in NUMBERS:
             yield path, steps, ''
