@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a channel publishes, and the topic with the parameters of its node."""
 
+from time import monotonic
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -30,8 +31,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Float64, String
 
-PERIOD, PERIOD_OF_SELF_TUNING = 1_000_000_000, 30_000_000_000
-"""Nanoseconds between two snapshots; a self-tuning estimator remembers thousands of numbers."""
+PERIOD, PERIOD_OF_SELF_TUNING = 1.0, 30.0
+"""Seconds between two snapshots; a self-tuning estimator remembers thousands of numbers."""
 
 
 class Outputs:
@@ -111,13 +112,13 @@ class SnapshotOutput:
     def __init__(self, node: Node, prefix: str, estimator: OnlineEstimator) -> None:
         self._estimator = estimator
         self._period = PERIOD_OF_SELF_TUNING if estimator.observer.self_tuning else PERIOD
-        self._first, self._latest = True, 0
+        self._first, self._published = True, 0.0
         self._labels: list[str] = []
         self._publisher = node.create_publisher(message_class(ARRAY), prefix + SNAPSHOT, LATCHED)
 
     def accepted(self, stamp: int) -> None:
         """Publish if it is time to; to be called for each sample that was accepted."""
-        if self._first or abs(stamp - self._latest) >= self._period:
+        if self._first or monotonic() - self._published >= self._period:
             # Where samples wait in a queue, the observer may be ahead of this one.
             begins = self._first and stamp == self._estimator.latest
             self._publish(Flag.STARTED if begins else Flag(0))
@@ -138,7 +139,7 @@ class SnapshotOutput:
             if labels != self._labels:  # a state before a gap is there only after one
                 self._labels, self._message = labels, labelled(labels)
             self._publisher.publish(self._message(vector))
-            self._first, self._latest = False, stamp
+            self._first, self._published = False, monotonic()
 
 
 class ParameterTopic:
