@@ -621,7 +621,7 @@ def members_of(values):
     return np.concatenate([values['z'], values['d']]), p
 
 
-def filtered(y, periods, rates, intensity, variances, first, covariance):
+def filtered(y, periods, rates, intensity, variance, first, covariance):
     """Return estimate and covariance of a textbook Kalman filter, the noise being a state."""
     size = len(rates)
     x, p = np.append(first, 0.0), np.zeros((size + 1, size + 1))
@@ -631,7 +631,7 @@ def filtered(y, periods, rates, intensity, variances, first, covariance):
     whole, chain = np.zeros((2 * size, 2 * size)), np.eye(size, k=1)
     whole[:size, :size], whole[size:, size:] = -chain, chain.T
     whole[size - 1, 2 * size - 1] = 1.0
-    for measured, h, variance in zip(y, periods, variances, strict=True):
+    for measured, h in zip(y, periods, strict=True):
         exponential = expm(whole * h)  # Van Loan; Q is that of integrators (D 20)
         a = np.zeros((size + 1, size + 1))
         a[:size, :size] = expm(rates * h)
@@ -654,9 +654,8 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
     observer.run(t[:300], y[:300])
     values = observer.state.values
     moving, kappa, (x, covariances) = int(values['moving']), values['kappa'], members_of(values)
-    samples, periods, variances = y[300:315], [stretch * PERIOD] * 15, []
+    samples, periods = y[300:315], [stretch * PERIOD] * 15
     for measured, h in zip(samples, periods, strict=True):
-        variances.append(observer.state.values['noise'][0])
         observer.step(measured, h)
     after_x, after_covariances = members_of(observer.state.values)
     derivatives = np.tile(np.repeat(np.arange(4), 2), 30)
@@ -669,8 +668,8 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
         rates = np.eye(size, k=1)
         rates[2, 2] = -1.0
         rates[range(3, size), range(3, size)] = -kappa[g]
-        drive = values['drive'][k, g]
-        found, expected = filtered(samples, periods, rates, drive, variances, first, covariance)
+        drive, variance = values['drive'][k, g], values['used_noise'][0]
+        found, expected = filtered(samples, periods, rates, drive, variance, first, covariance)
         estimate = after_x[:, g]
         deviations = np.sqrt(np.diag(expected)[:size])
         assert (np.abs(estimate[:size] - found[:size]) < 1e-6 * deviations).all(), k

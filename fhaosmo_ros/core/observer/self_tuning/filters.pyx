@@ -210,11 +210,11 @@ cdef VECTORISED expect(Members* m, double h, double y) noexcept nogil:
         three = entry(&w.p, n, 2, i)
         for g in range(w.first, w.last):
             row[g] = one[g] - m.correlation[g] * (one[g] - h * two[g] + half * three[g])
+    fill(w.one, m.used_noise)
     one, two, three = state(&w.pc, n, 0), state(&w.pc, n, 1), state(&w.pc, n, 2)
     for g in range(w.first, w.last):
         more = one[g] - m.correlation[g] * (one[g] - h * two[g] + half * three[g])
-        w.s[g] = INEXACT * (1.0 + (more if more > 0.0 else 0.0) / w.noise[g])
-        w.inverse[g] = 1.0 / (w.s[g] * w.noise[g])
+        w.s[g] = INEXACT * (1.0 + (more if more > 0.0 else 0.0) / w.one[g])
 
 
 cdef VECTORISED allow_jump(Members* m, double y, double tau) noexcept nogil:
@@ -231,13 +231,13 @@ cdef VECTORISED allow_jump(Members* m, double y, double tau) noexcept nogil:
     cdef double part, variance, square
     cdef double* row
     cdef double* one
+    fill(w.one, m.used_noise)
     for g in range(active):
         w.b[g] = y - w.x.z[0][g]
         square = w.b[g] * w.b[g]
-        variance = w.p.zz[0][g] + w.noise[g] / (1.0 - m.correlation[g] * m.correlation[g])
+        variance = w.p.zz[0][g] + w.one[g] / (1.0 - m.correlation[g] * m.correlation[g])
         w.two[g] = square - variance if square > HUBER * HUBER * variance else 0.0
-        w.s[g] = INEXACT * (variance + w.two[g]) / w.noise[g]
-        w.inverse[g] = 1.0 / (w.s[g] * w.noise[g])
+        w.s[g] = INEXACT * (variance + w.two[g]) / w.one[g]
         if tau == 0.0:
             w.two[g] = 1.0 + w.two[g] / w.p.zz[0][g]
     for i in range(n + ORDERS):
@@ -274,8 +274,9 @@ cdef VECTORISED correct(Members* m, bint by_interval) noexcept nogil:
     for g in range(first, last):
         m.variance[g] = w.s[g]
     if not by_interval and first < last:
+        fill(w.one, m.used_noise)
         for g in range(first, last):
-            w.taken[g] = w.inverse[g]
+            w.inverse[g] = w.taken[g] = 1.0 / (w.s[g] * w.one[g])
         for g in range(first, last):
             m.log_variance[g] = log(w.s[g])
     for i in range(n + ORDERS):
@@ -298,7 +299,7 @@ cdef VECTORISED correct_states(Members* m, double y) noexcept nogil:
     cdef double a, residual
     for i in range(COLOURS):
         a = m.correlation[GRID.first[i]]
-        limits[i] = HUBER * sqrt(w.now[i] / (1.0 - a * a))
+        limits[i] = HUBER * sqrt(m.work.now[i] / (1.0 - a * a))
     fill(w.one, limits)
     for i in range(m.n):
         for g in range(active):

@@ -55,6 +55,7 @@ cdef struct Sample:
     double roughness  # square of its difference over the usual one
     double roughness_before  # mean of those before
     double uneven  # square of the highest difference, as a variance of y, and of its stamps
+    double irregular  # square of the change of the interval (s^2)
     double of_stamps  # variance of y if the irregularity of its stamps is their error
     double floor  # the least that the variance of the noise can be
     double largest  # variance of the innovations with which a member can judge it
@@ -105,7 +106,8 @@ cdef struct Shared:
     double first_noise  # variance of the noise when the members began
     double calm  # samples since the noise has grown
     double roughness  # short mean of the squared differences of y, over their usual size
-    double interval  # last one between two samples that were taken (s)
+    double interval  # last one between two samples, taken or not (s)
+    double since  # time from the last sample taken to the last one (s)
     double jitter  # variance that the intervals of late say the stamps have at most (s^2)
     double quantum  # step of y of which the others may be multiples (unit of y)
     double lattice  # of late, the share of the steps of y that are
@@ -141,6 +143,7 @@ cdef struct Members:
     Estimates x
     Estimates gain  # by what an innovation corrects them
     Covariances p
+    double sizes[MOST_ORDER]  # mean squares of z; at first larger by the factor DOUBT^2
     double noise[COLOURS]  # variance of the noise of each colour, but for that of stamps
     double late[COLOURS]  # share of `jitter` that is error of the stamps (D 29)
     double used_noise[COLOURS]  # the one that P counts on

@@ -10,7 +10,7 @@ cdef bint is_multiple(double step, double quantum, double y) noexcept nogil
 cdef void follow_quantum(Members* m) noexcept nogil
 cdef double rounding(Members* m) noexcept nogil
 cdef void follow_differences(Members* m, double y) noexcept nogil
-cdef void follow_stamps(Members* m, double h, bint in_sequence) noexcept nogil
+cdef void follow_stamps(Members* m, double h, bint unlikely_before) noexcept nogil
 cdef VECTORISED fill_noise(Members* m) noexcept nogil
 cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil
 cdef bint is_likely(Members* m, double beyond, double gate) noexcept nogil

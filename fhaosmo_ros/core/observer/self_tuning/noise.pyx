@@ -107,22 +107,25 @@ cdef void follow_differences(Members* m, double y) noexcept nogil:
     )
 
 
-cdef void follow_stamps(Members* m, double h, bint in_sequence) noexcept nogil:
+cdef void follow_stamps(Members* m, double h, bint unlikely_before) noexcept nogil:
     """
     Follow what irregular intervals say that the variance of the stamps is at most (D 29).
 
-    Differences of y do not show that its stamps are wrong, but innovations do. Unless the sample
-    is `in_sequence`, the interval is that since the last one taken.
+    Differences of y do not show that its stamps are wrong, but innovations do. In the sample,
+    `irregular` is the square of what its own stamp may be off by, `roughness` counts it, too. If
+    samples before were unlikely, `h` is the time since one that was not.
     """
     cdef Shared* shared = &m.shared
-    cdef double least = EXACT * shared.steady_period, change, r
-    if in_sequence:
-        if shared.interval > 0.0:  # three stamps, one of them twice: 1 + 4 + 1
-            change = h - shared.interval
-            r = fmin(change * change / (6.0 * shared.jitter), HUBER * HUBER)
-            shared.jitter *= 1.0 + (r / CLIPPED - 1.0) / ROUGH_SAMPLES
-        shared.interval = h
+    cdef Sample* sample = &m.work.sample
+    cdef double least = EXACT * shared.steady_period, r
+    cdef double interval = h - shared.since if unlikely_before else h
+    sample.irregular = interval - shared.interval  # three stamps, one of them twice: 1 + 4 + 1
+    sample.irregular *= sample.irregular
+    r = sample.irregular / (6.0 * shared.jitter)
+    sample.roughness = fmax(sample.roughness, r)
+    shared.jitter *= 1.0 + (fmin(r, HUBER * HUBER) / CLIPPED - 1.0) / ROUGH_SAMPLES
     shared.jitter = fmax(shared.jitter, least * least)
+    shared.interval, shared.since = interval, h
 
 
 cdef VECTORISED fill_noise(Members* m) noexcept nogil:

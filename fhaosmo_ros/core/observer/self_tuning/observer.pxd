@@ -15,7 +15,6 @@ cdef class SelfTuning(Structure):
     # What it remembers.
     cdef Members* members
     cdef Model model  # the likeliest model of d, which a smoother goes by (D 34)
-    cdef double sizes[MOST_LEVELS]  # mean squares of z
     cdef double variances[MOST_LEVELS]  # of the errors of z, d, ..; infinite before it begins
     cdef bint y_jumped  # a sample tells that y has jumped (D 35)
     # A step's own.

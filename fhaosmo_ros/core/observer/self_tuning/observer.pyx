@@ -106,7 +106,6 @@ cdef class SelfTuning(Structure):
         self.y_jumped = False
         for i in range(self.levels):
             self.variances[i] = INFINITY
-        memset(self.sizes, 0, sizeof(self.sizes))
 
     cdef bint has_begun(self) noexcept nogil:
         """Return True once the members run."""
@@ -157,8 +156,8 @@ cdef class SelfTuning(Structure):
         cdef double square, size, count = fmin(self.members.shared.samples, NOISE_SAMPLES)
         Structure.accept(self, y, h)
         for i in range(self.order if self.has_begun() else 0):
-            square, size = self.level[i].z_hat * self.level[i].z_hat, self.sizes[i]
-            self.sizes[i] = size + (square - size) / count
+            square, size = self.level[i].z_hat * self.level[i].z_hat, self.members.sizes[i]
+            self.members.sizes[i] = size + (square - size) / count
         memcpy(self.variances, self.trial_variances, sizeof(self.variances))
         self.model, self.y_jumped = self.trial_model, False
         return word
@@ -180,7 +179,7 @@ cdef class SelfTuning(Structure):
         self.variances[0] = m.work.now[0]
         for i in range(n):
             z = self.level[i].z_hat
-            size = fmax(self.sizes[i], z * z)
+            size = fmax(m.sizes[i], z * z)
             if i > 0:
                 self.variances[i] = size
             for j in range(i, n + ORDERS):
@@ -242,12 +241,12 @@ cdef class SelfTuning(Structure):
         if choose_members(m, sample.quanta):
             weigh(m, FLOOR)
         follow_differences(m, y)
-        follow_stamps(m, h, memory.beyond == 0.0)
+        follow_stamps(m, h, memory.beyond > 0.0)
         same = fabs(h - shared.flow_period) <= SAME * shared.flow_period
         self.carry_flow(h, u, same)
         speed = (self.prediction.z[0] - self.trial[0].z_hat) / h
         sample.of_stamps = shared.jitter * speed * speed
-        sample.uneven += sample.of_stamps
+        sample.uneven += fmax(shared.jitter, sample.irregular) * speed * speed
         fill_noise(m)
         self.follow_period(h, same)
         rough = sample.roughness > HUBER * HUBER
@@ -430,7 +429,6 @@ cdef class SelfTuning(Structure):
         before.enter()
         self.level, self.memory, self.innovation = before.level, before.memory, before.innovation
         memcpy(self.variances, other.variances, sizeof(self.variances))
-        memcpy(self.sizes, other.sizes, sizeof(self.sizes))
         self.y_jumped = other.y_jumped
         self.members.shared = other.members.shared
         of = other.places()
@@ -465,6 +463,7 @@ cdef class SelfTuning(Structure):
             'p_dd': (<size_t>m.p.dd, (ORDERS, ORDERS, COUNT)),
             'first_y': (<size_t>m.first_y, (FIRST_SAMPLES,)),
             'first_h': (<size_t>m.first_h, (FIRST_SAMPLES,)),
+            'sizes': (<size_t>m.sizes, (n,)),
             'noise': (<size_t>m.noise, (COLOURS,)),
             'late': (<size_t>m.late, (COLOURS,)),
             'used_noise': (<size_t>m.used_noise, (COLOURS,)),
@@ -491,8 +490,7 @@ cdef class SelfTuning(Structure):
             found = {name: found[name] for name in EARLY}
         found |= shared | {'model': list(model.values())}
         found = {name: np.clip(np.nan_to_num(x), -LARGEST, LARGEST) for name, x in found.items()}
-        for name, numbers in (('variances', self.variances), ('sizes', self.sizes)):
-            found[name] = np.array([numbers[i] for i in range(self.levels)])
+        found['variances'] = np.array([self.variances[i] for i in range(self.levels)])
         return whole | found
 
     def load_state_dict(self, values):
@@ -509,13 +507,9 @@ cdef class SelfTuning(Structure):
                 f"snapshot: 'active': expected {HALF} or {COUNT} members, got {shared.active}"
             )
         found = {name: self.within(values, name, shape) for name, (_, shape) in names.items()}
-        variances, sizes = (
-            self.number(values, name, (self.levels,)) for name in ('variances', 'sizes')
-        )
-        if not (variances >= 0.0).all() or not (sizes >= 0.0).all():
-            raise ConfigurationError(
-                "snapshot: 'variances', 'sizes': expected numbers of at least 0"
-            )
+        variances = self.number(values, 'variances', (self.levels,))
+        if not (variances >= 0.0).all():
+            raise ConfigurationError("snapshot: 'variances': expected numbers of at least 0")
         numbers = self.finite(values, 'model', (4,))
         Structure.load_state_dict(self, values)
         self.members.shared, self.members.work.q_interval = shared, 0.0
@@ -525,7 +519,7 @@ cdef class SelfTuning(Structure):
             data = number.tobytes()
             memcpy(<void*><size_t>names[name][0], <char*>data, len(data))
         for i in range(self.levels):
-            self.variances[i], self.sizes[i] = variances[i], sizes[i]
+            self.variances[i] = variances[i]
 
     cdef within(self, values, str name, tuple shape):
         """Return what a snapshot has of a name, after a check that it is within its range."""

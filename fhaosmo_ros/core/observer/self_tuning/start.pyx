@@ -161,11 +161,12 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
     return sqrt(noise * noise + shared.jitter * 2.0 * rough[1] / (period * period))
 
 
-cdef void find_sizes(Members* m, double* sizes) noexcept nogil:
+cdef void find_sizes(Members* m) noexcept nogil:
     """Find the squares of the sizes of z by differences of the first samples."""
     cdef double first[FIRST_SAMPLES]
     cdef double values[FIRST_SAMPLES]
     cdef int count = m.shared.samples, stride = max((count - 1) // m.n, 1), length, i, j
+    m.sizes[0] = 0.0
     for j in range(count):
         first[j] = m.first_y[j]
     for i in range(1, m.n):
@@ -173,18 +174,16 @@ cdef void find_sizes(Members* m, double* sizes) noexcept nogil:
         for j in range(length):
             first[j] = (first[j + stride] - first[j]) / (stride * m.shared.steady_period)
             values[j] = first[j] * first[j]
-        sizes[i] = DOUBT * DOUBT * ranked(values, length, MOST)
+        m.sizes[i] = DOUBT * DOUBT * ranked(values, length, MOST)
 
 
 cdef void begin(Members* m, double noise) noexcept nogil:
     """Let the members begin at the last sample (D 28)."""
     cdef Shared* shared = &m.shared
-    cdef double sizes[MOST_ORDER]
     cdef double y = m.first_y[shared.samples - 1], period = shared.steady_period
     cdef double omega, kappa, intensity, size, least = INFINITY
     cdef int n = m.n, g, i, j, k, below, c
-    sizes[0] = 0.0
-    find_sizes(m, sizes)
+    find_sizes(m)
     shared.moving, shared.active = HALF, COUNT
     shared.unsettled = shared.flow_period = 0.0
     shared.first_noise = noise * noise
@@ -209,7 +208,7 @@ cdef void begin(Members* m, double noise) noexcept nogil:
         m.drive[k][g] = intensity
         m.x.z[0][g], m.p.zz[0][g] = y, noise * noise
         for i in range(1, n):
-            m.p.zz[pair(i, i)][g] = sizes[i]
+            m.p.zz[pair(i, i)][g] = m.sizes[i]
         for i in range(k + 1):
             for j in range(i, k + 1):
                 below = 2 * k - i - j
