@@ -51,7 +51,7 @@ class Case:
         """Return |error of d|."""
         if bare:
             values = {k: v for k, v in self.parameters.items() if k in OBSERVER_PARAMETERS}
-            found = Observer(values).run(self.t[: len(y)], y)
+            found = Observer(values).run(self.t[: len(y)], y, 0.0)
         else:
             stamps = 10**9 + np.round(self.t[: len(y)] * 1e9).astype(np.int64)
             found = OnlineEstimator(self.parameters).run(stamps, y, np.zeros(len(y)))
@@ -159,7 +159,7 @@ def test_jump_of_y_leaves_all_but_z1_of_a_plant_without_z1_in_its_model(case):
     y[HIT:] += 1000.0 * case.parameters['noise_size']
     values = {k: v for k, v in case.parameters.items() if k in OBSERVER_PARAMETERS}
     observer = Observer(values)
-    found = observer.run(case.t, y)
+    found = observer.run(case.t, y, 0.0)
     jumped = np.flatnonzero(found.status & Status.JUMPED)
     assert jumped.tolist() == [HIT + LOST_SAMPLES]
     if observer.structure.offset == 0.0:
@@ -279,8 +279,6 @@ def test_covariance_is_that_of_a_kalman_filter():
     speed = (intensity / (noise * values['correction_period'])) ** (0.5 / observer.levels)
     for _ in range(40):
         h = float(rng.uniform(0.5e-3, 3e-3))
-        predicted = observer.step(float('nan'), 0.0)  # changes nothing
-        assert predicted.status
         phi, q = schedule.linear.transition(h)
         p = phi @ p @ phi.T + q
         doubt = 3.0 ** math.exp(-0.5 * age * speed)

@@ -48,7 +48,7 @@ class Observer:
         estimator that are not the observer's are checked and left out, so that it takes what
         `tune` has written. `Parameters` have been checked and are taken as they are.
     **named
-        Parameters as keyword arguments, which win; lambda_ for lambda.
+        Parameters as keyword arguments, which win; ``lambda_`` for ``lambda``.
 
     Raises
     ------

@@ -55,7 +55,7 @@ class OnlineEstimator:
         Values for the observer's and the sampling parameters in docs/parameters.md; defaults for
         the rest. `Parameters` have been checked and are taken as they are.
     **named
-        Parameters as keyword arguments, which win; lambda_ for lambda.
+        Parameters as keyword arguments, which win; ``lambda_`` for ``lambda``.
 
     Attributes
     ----------
