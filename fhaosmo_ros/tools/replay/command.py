@@ -52,10 +52,6 @@ def _parser() -> argparse.ArgumentParser:
         '(default: a bag BAG_replayed in the current folder)',
     )  # fmt: skip
     add('--force', action='store_true', help='replace an output that exists')
-    add(
-        '--backwards', choices=('error', 'reject'), default='error',
-        help='what to do with stamps that go back; reject: as the live node does (%(default)s)',
-    )  # fmt: skip
     choice = parser.add_mutually_exclusive_group()
     choice.add_argument(
         '--follow', metavar='NAME',
@@ -107,7 +103,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         present = {c.topic for c in reader.connections}
         used = estimator.observer.used_inputs
         inputs = bag_inputs(own, used, present, namespace, arguments.channel)
-        samples = Samples(reader, estimator, live, inputs, arguments.backwards, arguments.smooth)
+        samples = Samples(reader, estimator, live, inputs, arguments.smooth)
         finals = arguments.output or [Path(f'{name}_replayed')]
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
         name = _name(present, arguments.name)

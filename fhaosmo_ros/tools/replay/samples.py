@@ -28,8 +28,6 @@ class Samples:
     live : LiveRun or None
         The live estimator to follow.
     inputs : BagInputs
-    backwards : str
-        'error' or 'reject': what stamps that go back are.
     whole : bool
         Smooth over the whole recording.
 
@@ -41,13 +39,11 @@ class Samples:
         estimator: OnlineEstimator,
         live: LiveRun | None,
         inputs: BagInputs,
-        backwards: str,
         whole: bool,
     ) -> None:
         y, self._stamp = inputs.y, inputs.stamp
         self.estimator, self._topic, self._live = estimator, y.topic, live
         self._reader, self._whole = reader, whole
-        self._backwards = backwards == 'error' and estimator.uses_stamps
         self._field = reader.field(y.topic, y.field, y.name)
         if self._stamp == 'auto' and not self._field.header:
             # An estimator that used its clock took a sample when it came, not when it was sent.
@@ -60,7 +56,6 @@ class Samples:
         self._tells, self._active = estimator.events.on, 0  # 1 while an event lasts
         self._found: list[tuple[int, Event]] = []
         self._waiting, self._dropped = np.zeros((2, 0), dtype=np.int64), 0  # to be smoothed
-        self._taken = 0
         self._first: int | None = None
         self._latest = 0
 
@@ -84,7 +79,7 @@ class Samples:
 
     def __iter__(self) -> Iterator[tuple[int, list[Rows]]]:
         """Yield the number of samples taken, and their estimates."""
-        blocks = map(self._checked, self._reader.blocks(self._topic, self._field, self._stamp))
+        blocks = map(self._noted, self._reader.blocks(self._topic, self._field, self._stamp))
         if self._live:
             blocks = self._live.begin(blocks)
         blocks = (block for block in blocks if len(block.times))
@@ -97,12 +92,9 @@ class Samples:
             yield len(block.times), list(self._rows(block, u))
         if self._whole:
             yield 0, list(self._due(self.estimator.finish()))
-        if not self._taken and self._reader.lacking:
-            raise ConfigurationError(f'topic {self._topic!r}: {next(iter(self._reader.lacking))}')
-        if not self._taken:
-            raise ConfigurationError(
-                f'topic {self._topic!r}: expected messages, read none although the bag lists them'
-            )
+        if self._first is None:
+            why = next(iter(self._reader.lacking), 'expected messages, read none')
+            raise ConfigurationError(f'topic {self._topic!r}: {why}')
 
     def _continuous(self, blocks: Iterator[Block]) -> Iterator[Block]:
         """Yield the blocks with the angle continuous, from the live estimator's y on."""
@@ -113,22 +105,12 @@ class Samples:
             values = np.array([unwrap(value) for value in block.values.tolist()])
             yield block._replace(values=values)
 
-    def _checked(self, block: Block) -> Block:
-        stamps = block.stamps
-        self._other_than_bag |= bool((stamps != block.times).any())
+    def _noted(self, block: Block) -> Block:
+        """Return a block, and remember what to say of it."""
+        self._other_than_bag |= bool((block.stamps != block.times).any())
         if self._first is None:
-            self._first = self._latest = int(stamps[0])
-        previous = np.concatenate([[self._latest], stamps[:-1]])
-        back = np.flatnonzero(stamps < previous)
-        if len(back) and self._backwards:
-            k = int(back[0])
-            raise ConfigurationError(
-                f'topic {self._topic!r}: expected stamps that never go back, got {stamps[k]} '
-                f'after {previous[k]} (sample {self._taken + k + 1}); --backwards reject treats '
-                'them as the live node does'
-            )
-        self._latest = int(stamps[-1])
-        self._taken += len(stamps)
+            self._first = int(block.stamps[0])
+        self._latest = int(block.stamps[-1])
         return block
 
     def _rows(self, block: Block, u: np.ndarray | None) -> Iterator[Rows]:
