@@ -114,11 +114,6 @@ class OnlineEstimator:
         return self._smoothing is not None
 
     @property
-    def uses_stamps(self) -> bool:
-        """True if dt comes from the samples' stamps."""
-        return bool(self._parameters['sampling'] != 'nominal')
-
-    @property
     def parameters(self) -> dict[str, Any]:
         """All parameters with their present values; a copy."""
         return dict(self._parameters)
