@@ -9,7 +9,7 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import Event
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.messages.fields import Unwrapper
-from fhaosmo_ros.tools.bags.held_input import HeldInputs
+from fhaosmo_ros.tools.bags.held_input import with_inputs
 from fhaosmo_ros.tools.bags.reader import BagReader, Block
 from fhaosmo_ros.tools.cli.options import BagInputs
 from fhaosmo_ros.tools.replay.live_run import LiveRun
@@ -41,6 +41,7 @@ class Samples:
         inputs: BagInputs,
         whole: bool,
     ) -> None:
+        self._inputs = inputs
         y, self._stamp = inputs.y, inputs.stamp
         self.estimator, self._topic, self._live = estimator, y.topic, live
         self._reader, self._whole = reader, whole
@@ -49,10 +50,6 @@ class Samples:
             # An estimator that used its clock took a sample when it came, not when it was sent.
             self._stamp = 'bag' if estimator.parameters['sampling'] == 'clock' else 'auto'
         self._other_than_bag = False
-        self._input = None
-        if estimator.observer.uses_input:
-            model, reject = estimator.observer.model, estimator.reject_inputs
-            self._input = HeldInputs(reader, model, inputs.u, inputs.values, reject)
         self._tells, self._active = estimator.events.on, 0  # 1 while an event lasts
         self._found: list[tuple[int, Event]] = []
         self._waiting, self._dropped = np.zeros((2, 0), dtype=np.int64), 0  # to be smoothed
@@ -86,8 +83,12 @@ class Samples:
         if self._field.wraps:
             blocks = self._continuous(blocks)
         pairs = ((block, None) for block in blocks)
-        if self._input:
-            pairs = self._input.along(blocks, lambda: self.estimator.inputs)
+        estimator, known = self.estimator, self._inputs
+        if estimator.observer.uses_input:
+            pairs = with_inputs(
+                blocks, self._reader, estimator.observer.model, known.u, known.values,
+                lambda: estimator.inputs, estimator.reject_inputs,
+            )  # fmt: skip
         for block, u in pairs:
             yield len(block.times), list(self._rows(block, u))
         if self._whole:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.messages.fields import Unwrapper
-from fhaosmo_ros.tools.bags.held_input import HeldInputs
+from fhaosmo_ros.tools.bags.held_input import with_inputs
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.options import BagInputs
 import numpy as np
@@ -40,8 +40,8 @@ def recorded(bag: Path, inputs: BagInputs, model: TriangularModel) -> RecordedOu
             y = np.array(list(map(Unwrapper(), y.tolist())))
         u = np.zeros((len(y), len(model.inputs)))
         if model.uses_input:
-            held = HeldInputs(reader, model, u_at, values)
-            u = np.concatenate([u for _, u in held.along(blocks)])
+            pairs = with_inputs(blocks, reader, model, u_at, values)
+            u = np.concatenate([u for _, u in pairs])
     if not len(y):
         raise ConfigurationError(f'bag {bag}: expected samples of y, got none')
     return RecordedOutput((stamps - stamps[0]) * 1e-9, y, u)
