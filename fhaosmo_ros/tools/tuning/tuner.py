@@ -122,7 +122,7 @@ class Tuner:
             grid = {'unknown_input_derivatives': DERIVATIVES, 'unknown_input_decay': RATES}
             free = {k: v if k not in own else [own[k]] for k, v in grid.items()}
             points = [dict(zip(grid, point, strict=True)) for point in product(*free.values())]
-            self._fixed |= _changes(min(points, key=self.evaluate))
+            self._fixed |= _changes(min(points, key=self.evaluate)) | own
         start = self.parameters({})
         self.training(start)  # raises what `evaluate` takes for a bad point
         if names == ['auto']:
