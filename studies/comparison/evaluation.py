@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tune a method for a sensor, and judge it on what the tuning has not seen."""
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 import math
 from typing import Any, NamedTuple
@@ -13,14 +14,7 @@ import numpy as np
 from studies.comparison.cells import Sensor
 from studies.comparison.methods.adaptive import ADAPTIVE
 from studies.comparison.methods.linear import FILTERS
-from studies.comparison.methods.method import (
-    mean,
-    Method,
-    objective,
-    Search,
-    Setting,
-    Values,
-)
+from studies.comparison.methods.method import mean, Method, objective, Search, Setting, Values
 from studies.comparison.methods.ours import OUR_METHODS
 from studies.comparison.methods.sliding import OBSERVERS
 
@@ -51,12 +45,9 @@ class Outcome(NamedTuple):
 
 
 def trial(
-    method: Method,
-    setting: Setting,
-    values: Values,
-    recordings: Sequence[Recording],
+    method: Method, setting: Setting, values: Values, recordings: Sequence[Recording],
     rival: Sequence[float] = (),
-) -> Outcome:
+) -> Outcome:  # fmt: skip
     """
     Evaluate a set of values on all recordings.
 
@@ -67,12 +58,11 @@ def trial(
         run = method.prepare(setting, values)
     except ConfigurationError:  # values that make no observer, such as an unsolvable Riccati
         return Outcome(float('inf'), '', [])
-    totals: dict[str, float] = {}
+    totals: dict[str, float] = defaultdict(float)
     averages: list[float] = []
     for count, recording in enumerate(recordings, 1):
         for name, estimates in run(recording).items():
-            logarithm = math.log(max(objective(recording, estimates), SMALLEST))
-            totals[name] = totals.get(name, 0.0) + logarithm
+            totals[name] += math.log(max(objective(recording, estimates), SMALLEST))
         best = min(totals, key=totals.__getitem__)
         averages.append(math.exp(totals[best] / count))
         if not averages[-1] <= (HOPELESS * rival[count - 1] if rival else BAD):

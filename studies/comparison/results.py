@@ -8,22 +8,13 @@ from matplotlib.figure import Figure
 from studies import ratios as figure
 from studies.comparison.cells import PLANTS
 from studies.comparison.evaluation import METHODS
-from studies.comparison.methods.method import (
-    KINDS,
-    LINEAR,
-    mean,
-    OURS,
-    PAPER,
-    ROBUST,
-    SELF_TUNING,
-    SLIDING,
-    USUAL,
-)
+from studies.comparison.methods import method
+from studies.comparison.methods.method import LINEAR, mean
 from studies.evidence import markdown, Row
 
 STYLES = {
-    USUAL: figure.USUAL, ROBUST: figure.ROBUST, SLIDING: figure.OTHER, PAPER: figure.GREY,
-    OURS: figure.TUNED, SELF_TUNING: figure.SELF,
+    method.USUAL: figure.USUAL, method.ROBUST: figure.ROBUST, method.SLIDING: figure.OTHER,
+    method.PAPER: figure.GREY, method.OURS: figure.TUNED, method.SELF_TUNING: figure.SELF,
 }  # fmt: skip
 CLOSE = 0.05
 """Errors within this part of another one count as equal."""
@@ -47,12 +38,11 @@ class Cell(NamedTuple):
 Chosen = dict[Cell, dict[str, float]]
 """Errors of d by cell and kind of method."""
 
-GROUPS: dict[str, Callable[[Cell], bool]] = {
-    'd without jumps': lambda c: c.noise > 0.0 and not c.jumps,
-    'd with jumps': lambda c: c.noise > 0.0 and c.jumps,
-    'no noise, without jumps': lambda c: c.noise == 0.0 and not c.jumps,
-    'no noise, with jumps': lambda c: c.noise == 0.0 and c.jumps,
-}
+GROUPS = {
+    'd without jumps': (True, False), 'd with jumps': (True, True),
+    'no noise, without jumps': (False, False), 'no noise, with jumps': (False, True),
+}  # fmt: skip
+"""Whether there is noise, and whether d jumps."""
 
 
 def best_of_kinds(rows: Iterable[Row]) -> Chosen:
@@ -66,18 +56,18 @@ def best_of_kinds(rows: Iterable[Row]) -> Chosen:
 
 def ratios(chosen: Chosen, kind: str, about: Callable[[Cell], bool]) -> list[float]:
     """Return the errors of d over those of the best linear filter, of the cells with both."""
-    return [
-        errors[kind] / errors[LINEAR]
-        for cell, errors in chosen.items()
-        if about(cell) and kind in errors
-    ]
+    both = [errors for cell, errors in chosen.items() if about(cell) and kind in errors]
+    return [errors[kind] / errors[LINEAR] for errors in both]
 
 
 def texts(rows: Iterable[Row]) -> dict[str, str]:
     """Return the part of the page: ratios by kind and group, and how often a kind is the best."""
     chosen, lines = best_of_kinds(rows), []
-    for kind in KINDS:
-        parts = [ratios(chosen, kind, about) for about in GROUPS.values()]
+    for kind in method.KINDS:
+        parts = [
+            ratios(chosen, kind, lambda c, group=group: (c.noise > 0.0, c.jumps) == group)
+            for group in GROUPS.values()
+        ]
         best = sum(
             kind in errors and errors[kind] <= (1.0 + CLOSE) * min(errors.values())
             for errors in chosen.values()
@@ -104,13 +94,13 @@ def number(x: float) -> str:
 
 def draw(chosen: Chosen, jumps: bool) -> Figure:
     """Draw each kind's error over that of the best linear filter, for d with or without jumps."""
-    about = [c for c in sorted(chosen, key=_order) if c.jumps == jumps]
     panels: dict[str, dict[str, dict[str, float]]] = {}
-    for plant in PLANTS:
+    about = [c for c in sorted(chosen, key=_order) if c.jumps == jumps]
+    for plant, case in PLANTS.items():
         for at in dict.fromkeys(_order(c) for c in about if c.plant == plant):
             cells = {c for c in about if c.plant == plant and _order(c) == at}
             found = {kind: ratios(chosen, kind, cells.__contains__) for kind in STYLES}
-            panels.setdefault(PLANTS[plant].text, {})[_text(next(iter(cells)))] = {
+            panels.setdefault(case.text, {})[_text(next(iter(cells)))] = {
                 kind: mean(values) for kind, values in found.items() if values
             }
     with_jumps = 'with' if jumps else 'without'
