@@ -27,22 +27,18 @@ def read(path: Path) -> Recorded:
     """Return the shoulder's speed, the angles and the elbow's speed, and the measured torque."""
     with BagReader(path) as bag:
         messages = bag.read_all([JOINTS, WRENCH])
-    stamps: dict[str, list[float]] = {JOINTS: [], WRENCH: []}
     rows: dict[str, list[list[float]]] = {JOINTS: [], WRENCH: []}
     for topic, _, message in messages:
-        stamp = message.header.stamp
-        stamps[topic].append(stamp.sec + stamp.nanosec * 1e-9)
-        if topic == JOINTS:
-            rows[topic].append([*message.position, *message.velocity])
-        else:
-            rows[topic].append([-message.wrench.torque.z])
-    t = np.array(stamps[JOINTS])
-    angle, elbow, speed, elbow_speed = np.array(rows[JOINTS]).T
-    torque = np.array(rows[WRENCH])[:, 0]
-    low_pass = butter(2, CUTOFF, fs=len(torque) / np.ptp(stamps[WRENCH]))
-    torque = np.interp(t, stamps[WRENCH], filtfilt(*low_pass, torque))
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        joints = topic == JOINTS
+        values = [*message.position, *message.velocity] if joints else [-message.wrench.torque.z]
+        rows[topic].append([stamp, *values])
+    t, angle, elbow, speed, elbow_speed = np.array(rows[JOINTS]).T
+    measured, wrench = np.array(rows[WRENCH]).T
+    low_pass = butter(2, CUTOFF, fs=len(wrench) / np.ptp(measured))
+    shoulder = np.interp(t, measured, filtfilt(*low_pass, wrench))
     u = np.column_stack([angle, np.unwrap(elbow), elbow_speed])
-    return Recorded(path.stem, t - t[0], speed, u, torque, t > t[0] + SETTLED)
+    return Recorded(path.stem, t - t[0], speed, u, shoulder, t > t[0] + SETTLED)
 
 
 def identify(r: Recorded) -> tuple[dict[str, float], float]:
