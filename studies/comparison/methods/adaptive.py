@@ -67,25 +67,17 @@ def _prepare(setting: Setting, values: Values) -> Run:
     return estimate
 
 
-def _method(name: str, text: str, *options: Dimension) -> Method:
+def _method(name: str, *options: Dimension) -> Method:
     def space(setting: Setting) -> tuple[Dimension, ...]:
         return (*matern_space(setting), *options)
 
     tune = partial(each_order, more=options)
-    return Method(name, text, ROBUST, space, _prepare, tune, needs_noise=True)
+    return Method(name, ROBUST, space, _prepare, tune, needs_noise=True)
 
 
 ADAPTIVE = (
-    _method(
-        HUBER, 'Kalman filter, d a Matern process, innovations bounded by Huber',
-        Dimension('huber', 1.0, 10.0, 2.5),
-    ),
-    _method(
-        NOISE, 'the same, variance of the noise from the innovations instead',
-        Dimension('memory', 0.1, 100.0, 3.0),
-    ),
-    _method(
-        IMM, 'three such filters with different bandwidths, an interacting multiple model',
-        Dimension('spread', 1.2, 10.0, 2.0), Dimension('stay', 0.1, 100.0, 3.0),
-    ),
-)  # fmt: skip
+    _method(HUBER, Dimension('huber', 1.0, 10.0, 2.5)),
+    _method(NOISE, Dimension('memory', 0.1, 100.0, 3.0)),
+    _method(IMM, Dimension('spread', 1.2, 10.0, 2.0), Dimension('stay', 0.1, 100.0, 3.0)),
+)
+"""All take d for a Matern process."""

@@ -207,34 +207,18 @@ def each_order(search: Search, more: Sequence[Dimension] = ()) -> Values:
 
 
 def _method(
-    name: str, text: str, kind: str, space: Space, gain: Gain, shortest: int = 1,
+    name: str, kind: str, space: Space, gain: Gain, shortest: int = 1,
     integrators_only: bool = False, tune: Callable[[Search], Values] | None = None,
 ) -> Method:  # fmt: skip
-    return Method(name, text, kind, space, partial(_run, gain, shortest, integrators_only), tune)
+    return Method(name, kind, space, partial(_run, gain, shortest, integrators_only), tune)
 
 
 FILTERS = (
-    _method(
-        'Kalman', 'steady-state Kalman filter, d a random walk', USUAL, _one_bandwidth, _kalman
-    ),
-    _method(
-        'Kalman, ramp', 'steady-state Kalman filter, d and its derivative random walks', LINEAR,
-        _two_bandwidths, _kalman_ramp, shortest=2,
-    ),
-    _method(
-        'Kalman, decaying', 'steady-state Kalman filter, d a random walk that decays', LINEAR,
-        matern_space, _kalman,
-    ),
-    _method(
-        LINEAR_LIMIT, 'steady-state Kalman filter, d a Matern process as in ours', LINEAR,
-        matern_space, _kalman, tune=each_order,
-    ),
-    _method(
-        'ESO', 'high-gain (extended state) observer, all poles at one place', LINEAR,
-        _one_bandwidth, _eso, integrators_only=True,
-    ),
-    _method(
-        'Luenberger', 'Luenberger observer with disturbance state, all poles free', LINEAR,
-        _luenberger_space, _luenberger,
-    ),
-)  # fmt: skip
+    _method('Kalman', USUAL, _one_bandwidth, _kalman),  # d a random walk
+    _method('Kalman, ramp', LINEAR, _two_bandwidths, _kalman_ramp, shortest=2),  # its rate, too
+    _method('Kalman, decaying', LINEAR, matern_space, _kalman),  # a random walk that decays
+    _method(LINEAR_LIMIT, LINEAR, matern_space, _kalman, tune=each_order),
+    _method('ESO', LINEAR, _one_bandwidth, _eso, integrators_only=True),  # all poles at one place
+    _method('Luenberger', LINEAR, _luenberger_space, _luenberger),  # all poles free
+)
+"""Steady-state Kalman filters by their d, an extended state observer, a Luenberger observer."""

@@ -96,8 +96,6 @@ class Method(NamedTuple):
 
     name: str
     """Key in results, and head of its column."""
-    text: str
-    """What it is, in a line."""
     kind: str
     """One of `KINDS`."""
     space: Callable[[Setting], tuple[Dimension, ...]]

@@ -66,12 +66,6 @@ def _tune(search: Search) -> Values:
 
 
 OUR_METHODS = (
-    Method(
-        OURS, 'levant, fuzzy, predict_correct, all gains and the model of d by `tune`', OURS,
-        untuned, _prepared({}), _tune,
-    ),
-    Method(
-        SELF_TUNING, 'told the model only, no tuning', SELF_TUNING, untuned,
-        _prepared(harness.SELF_TUNING),
-    ),
-)  # fmt: skip
+    Method(OURS, OURS, untuned, _prepared({}), _tune),  # levant, fuzzy, predict_correct
+    Method(SELF_TUNING, SELF_TUNING, untuned, _prepared(harness.SELF_TUNING)),
+)

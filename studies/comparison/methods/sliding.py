@@ -80,17 +80,11 @@ def _levant_space(setting: Setting) -> tuple[Dimension, ...]:
     return (Dimension('lipschitz', 1e-4 * size, 1e8 * size, 10.0 * size),)
 
 
+VARIANTS = {'sign': 'sign', 'fuzzy': 'fuzzy', 'adaptive': 'fuzzy_adaptive'}
 OBSERVERS = (
-    Method(
-        'Levant, implicit', "Levant's robust exact differentiator with Phi, implicit Euler",
-        SLIDING, _levant_space, partial(prepared, _levant),
-    ),
+    Method('Levant, implicit', SLIDING, _levant_space, partial(prepared, _levant)),
     *(
-        Method(name, text, PAPER, untuned, partial(prepared, partial(_papers_gains, variant)))
-        for name, text, variant in (
-            ('paper: sign', "sign observer with the paper's gains", 'sign'),
-            ('paper: fuzzy', "fuzzy observer with the paper's gains", 'fuzzy'),
-            ('paper: adaptive', 'the fuzzy one with adapted gamma', 'fuzzy_adaptive'),
-        )
+        Method(f'paper: {name}', PAPER, untuned, partial(prepared, partial(_papers_gains, own)))
+        for name, own in VARIANTS.items()
     ),
-)  # fmt: skip
+)
