@@ -18,7 +18,7 @@ class Tuning(NamedTuple):
     Attributes
     ----------
     noise : float
-        Standard deviation of the noise on y (unit of y).
+        Standard deviation of the noise on y (unit of y), without what late stamps make.
     correlation : float
         Correlation of the noise of neighbouring samples; 0 for white noise.
     bandwidth : float

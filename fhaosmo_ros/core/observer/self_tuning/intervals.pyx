@@ -248,13 +248,3 @@ def within(double low, double high):
     found = m.work.chance[0], m.work.mean[0], m.work.lost[0]
     free(m)
     return found
-
-
-def bell_and_mills(double x):
-    """Return exp(-x^2 / 2) and Mills' ratio for 0 <= x <= 12, as the loops have them."""
-    return exponential(-0.5 * x * x), mills(x)
-
-
-def passing(double to_edge, double variance, double moved, double spread):
-    """Return `passage`."""
-    return passage(to_edge, variance, moved, spread)

@@ -220,14 +220,3 @@ cdef void shift(Members* m, double of_state, double miss, double variance) noexc
     m.difference[0] += of_state - miss
     m.shared.unsettled = m.shared.growing = 0.0
     watch(m, m.shared.followed)
-
-
-def explained(innovations, int n):
-    """Return how well anything but a jump explains the innovations of a window; `otherwise`."""
-    cdef double r[WINDOW]
-    cdef int j
-    if len(innovations) != WINDOW or not 1 <= n <= 12:
-        raise ValueError(f'explained: expected {WINDOW} innovations and 1 <= n <= 12')
-    for j in range(WINDOW):
-        r[j] = innovations[j]
-    return otherwise(r, n)

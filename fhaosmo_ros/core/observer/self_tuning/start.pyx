@@ -6,8 +6,8 @@ from libc.string cimport memset
 
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    COLOURS, COUNT, DIFFERENCES, Estimates, FIRST_SAMPLES, GRID, HALF, Line,
-    Members, ORDERS, Shared, factorial, pair, power
+    COLOURS, COUNT, DIFFERENCES, Estimates, FIRST_SAMPLES, GRID, HALF, Line, Members, ORDERS,
+    Shared, factorial, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     CALM_SAMPLES, EXACT, LATTICE_SHARE, follow_differences, is_multiple
