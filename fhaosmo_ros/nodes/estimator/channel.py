@@ -3,7 +3,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from math import isfinite
+from math import isfinite, isnan
 from time import perf_counter, time_ns
 from typing import Any
 
@@ -24,6 +24,8 @@ NEWS = int(Status.RESTARTED | Status.DIVERGED | Status.JUMPED)
 """Flags of a step that are logged beside those of a rejected sample."""
 QUIET = 5.0
 """Seconds between two warnings of one kind."""
+TOLD_AFTER = 5
+"""Reports on /diagnostics without any sample, until the log says why there is no estimate."""
 UNPAIRED = {
     'late': 'late inputs, which came after their sample had been used: raise known_input_wait, or '
     'their header stamps are of another clock',
@@ -121,6 +123,10 @@ class Channel:
             reports[0].find(WARN, f'no publisher of {name}', nobody)
         if self._pairing is not None:
             self._report_pairing(reports[0])
+        if self._active and isnan(self._health.latest):
+            self._without_sample += 1
+            if self._without_sample == TOLD_AFTER:
+                self._logger.warning(f'still waiting: {reports[0].text}')
         return reports
 
     def _report_pairing(self, report: Report) -> None:
@@ -137,6 +143,7 @@ class Channel:
         self._quiet_until: dict[int, float] = {}
         self._silent_since: int | None = None
         self._waits_since = 0.0
+        self._without_sample = 0
 
     def _on_sample(self, stamp: int, y: float, source: int) -> None:
         """Take a sample; `source` is when its message was published (all times in ns)."""

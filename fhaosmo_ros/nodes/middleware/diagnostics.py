@@ -33,12 +33,17 @@ class Report:
             self._level = max(self._level, level)
             self._findings.append(text)
 
+    @property
+    def text(self) -> str:
+        """All findings in a line."""
+        return '; '.join(self._findings) or 'OK'
+
     def message(self, node: str, hardware_id: str) -> DiagnosticStatus:
         """Return the status message."""
         return DiagnosticStatus(
             level=self._level,
             name=f'{node}: {self._task}',
-            message='; '.join(self._findings) or 'OK',
+            message=self.text,
             hardware_id=hardware_id,
             values=[
                 KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else str(value))
