@@ -2,8 +2,8 @@
 """A plant and an estimator that hears it; estimates of a running node are those of a replay."""
 
 import bisect
+import itertools
 import math
-import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.core.observer.estimates import TUNING
@@ -126,10 +126,13 @@ def test_estimates_of_the_past_are_those_of_a_replay(estimator):
     }  # fmt: skip
     rig = estimator('/past', **FED | values)
     rig.listen()
-    for k in range(100):
-        rig.send(0.1 * math.sin(0.1 * k))
-        time.sleep(0.002)
-    rig.user.wait(lambda: len(rig.estimates) > 40, 'estimates')
+    ticks = itertools.count()
+
+    def heard() -> bool:
+        rig.send(0.1 * math.sin(0.1 * next(ticks)))
+        return len(rig.estimates) > 40
+
+    rig.user.wait(heard, 'estimates')
     replay = OnlineEstimator(values)
     rows = replay.run([m.stamp for m in rig.y], [m.message.data for m in rig.y])
     known = dict(zip(rows.t.tolist(), rows.unknown_input.tolist(), strict=True))
