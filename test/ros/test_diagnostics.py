@@ -206,7 +206,7 @@ def stranger():
 def test_publishers_are_named(user, estimator, stranger):
     rig = estimator('/heard', **FED)
     rig.wait_status('input', STALE, 'no usable sample yet', 'no publisher of /heard/y')
-    user.wait(lambda: rig.said('still waiting: .*no publisher of /heard/y'), 'line of the log')
+    rig.wait_said('still waiting', 'no publisher of /heard/y')
     assert numbers(rig.reports[-1].statuses['input'])['publishers'] == 'none'
 
     unheard = stranger.create_publisher(Float64, '/heard/y', BEST_EFFORT)
