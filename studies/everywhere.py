@@ -118,8 +118,6 @@ ANEW = 'tuned anew'
 """Error of d of the Kalman filter tuned for the condition; all others are over this."""
 KNOWN = 'every z known'
 """What a wrong Phi makes of d, whoever estimates it."""
-
-
 Once = tuple[dict[str, float], dict[str, dict[str, float]]]
 """What the tuning has found with the truth: a filter, and for each peer one of `PEERS`."""
 
