@@ -41,7 +41,7 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     solver = findings.choose_solver(scores)
     signs = {w: scores[solver][findings.FINE, w] for w in FREQUENCIES}
     found |= results(
-        {'sim1': (cases.first_observer, 1e-5, solver, cases.DURATION, 5)}
+        {'sim1': (cases.first_observer, solver)}
         | {(name, w): (cases.simulated, name, w, solver) for name in DRAWN for w in FREQUENCIES}
         | {width: (findings.width_rows, width, widths, signs, solver) for width in widths}
     )

@@ -106,7 +106,7 @@ def simulated(name: str, omega: float, solver: str, **changes: Any) -> JointRun:
     return simulate(observer, plant, solver, step, DURATION, max(1, round(GRID / step)))
 
 
-def first_observer(step: float, solver: str, duration: float, every: int) -> JointRun:
+def first_observer(solver: str, step: float = 1e-5, every: int = 5) -> JointRun:
     """Simulate figure sim1: sign, n = 3, no model of Phi_3, theta estimates eta = -z3 + d."""
     observer = preset().observer
     three = {k: observer[k][:3] for k in ('lambda', 'alpha')}
@@ -114,7 +114,7 @@ def first_observer(step: float, solver: str, duration: float, every: int) -> Joi
         'variant': 'sign', 'unknown_input': False, 'phi': ['0', '0', '0'],
         'initial_estimate': [0.05, 0.0, 0.05], 'initial_internal': [0.05, 0.0, 0.05],
     } | three)  # fmt: skip
-    return simulate(observer, preset().plant, solver, step, duration, every)
+    return simulate(observer, preset().plant, solver, step, DURATION, every)
 
 
 class Truth(NamedTuple):
