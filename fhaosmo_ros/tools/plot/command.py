@@ -22,7 +22,7 @@ SUFFIXES = ('.png', '.svg', '.pdf')
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0 if there is a figure, else none is written."""
-    return run_command(_parser(), argv, _run)
+    return run_command(_parser(), argv, _plot)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -45,11 +45,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(arguments: argparse.Namespace, stop: Stop) -> None:
-    with stop.raising():
-        _plot(arguments, stop)
-
-
 def _plot(arguments: argparse.Namespace, stop: Stop) -> None:
     if not arguments.bags and not arguments.fuzzy:
         raise ConfigurationError('expected a BAG or --fuzzy, got neither')
@@ -60,21 +55,23 @@ def _plot(arguments: argparse.Namespace, stop: Stop) -> None:
             f'--output: expected a name that ends in {", ".join(SUFFIXES)}, got {path}'
         )
     if arguments.fuzzy:
-        _plot_fuzzy(arguments, path)
+        _plot_fuzzy(arguments, path, stop)
         return
     values = online_parameters(arguments)
-    curves = [
-        c for bag in arguments.bags for c in read_curves(bag, arguments.names, arguments.plant)
-    ]
-    with Output(path, arguments.force) as output:
-        save_curves(curves, values.get('epsilon', curves[0].epsilon), output.path)
+    with stop.raising():
+        curves = [
+            c for bag in arguments.bags for c in read_curves(bag, arguments.names, arguments.plant)
+        ]
+    with Output(path, arguments.force) as output:  # not within raising: it leaves nothing behind
+        with stop.raising():
+            save_curves(curves, values.get('epsilon', curves[0].epsilon), output.path)
         if stop.is_set():  # Python drops what a signal raises in a destructor or weakref callback
             raise Stopped
         final = output.keep()
     print(f'{metrics(curves)}\nfigure: {final}', flush=True)
 
 
-def _plot_fuzzy(arguments: argparse.Namespace, path: Path) -> None:
+def _plot_fuzzy(arguments: argparse.Namespace, path: Path, stop: Stop) -> None:
     """Draw the fuzzy systems of the observer that a bag, files and -p describe."""
     if len(arguments.bags) > 1 or len(arguments.names or []) > 1:
         raise ConfigurationError('--fuzzy: expected at most one BAG and one name')
@@ -94,6 +91,7 @@ def _plot_fuzzy(arguments: argparse.Namespace, path: Path) -> None:
     )
     levels = Observer(parameters).levels
     with Output(path, arguments.force) as output:
-        fuzzy_figure(rows_of(parameters, levels)).savefig(output.path, dpi=150)
+        with stop.raising():
+            fuzzy_figure(rows_of(parameters, levels)).savefig(output.path, dpi=150)
         final = output.keep()
     print(f'figure: {final}', flush=True)
