@@ -121,6 +121,9 @@ compile() {
     fi
     [ "$compiler" = "$own_compiler" ] || export CC="$compiler" LDSHARED="$compiler -shared"
     say 'Compiling the core; this takes about a minute ...'
+    find fhaosmo_ros studies -name '*.so' | while read -r built; do  # of a source that is gone
+        [ -f "${built%%.*}.pyx" ] || rm "$built"
+    done
     "$bin/python" setup.py -q build_ext --inplace >&2 ||
         fail "the core could not be compiled (see above)"
     compiled >build/in_place
