@@ -22,8 +22,6 @@ cdef double STEADY = 1.5, CALM_SAMPLES = 40.0, QUICK_SAMPLES = 30.0
 # The share of steps of y that are multiples of the quantum is averaged over so many. With a share
 # above the second y is quantised; with one below the third the quantum is none.
 cdef double LATTICE_STEPS = 30.0, LATTICE_SHARE = 0.9, NO_LATTICE = 0.5
-# After more unlikely samples no member judges that was beyond the gate at the last likely one.
-cdef double PASSED = 3.0
 cdef double HIDDEN = 4.0  # noise of so many times the variance of rounding hides the quanta
 cdef double ROUGH_SAMPLES = 100.0  # squared differences of y are averaged over so many
 # y and its stamps are taken to be no more exact than this: in parts of what y moves between
@@ -156,20 +154,19 @@ cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil:
     w.sample.largest = fmax(IGNORANT * least, own)
 
 
-cdef bint is_likely(Members* m, double beyond, double gate) noexcept nogil:
+cdef bint is_likely(Members* m, double gate) noexcept nogil:
     """
     Return True if a member that can judge the sample finds it likely (D 29).
 
-    A member that is far off itself, or unlikely, would meet y by chance. `beyond` samples in a row
-    before this one were unlikely.
+    A member that is unlikely itself would meet y by chance.
     """
     cdef Work* w = &m.work
-    cdef double late = INFINITY if beyond <= PASSED else 1.0, variance
+    cdef double variance
     cdef int g
     for g in range(m.shared.active):
         variance = w.believed[g] * w.noise[g]
         if (w.b[g] * w.b[g] <= gate * gate * variance and variance <= w.sample.largest
-                and m.score[g] > -CLOSE and m.far[g] < late):
+                and m.score[g] > -CLOSE):
             return True
     return False
 

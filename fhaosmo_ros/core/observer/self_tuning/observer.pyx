@@ -273,7 +273,7 @@ cdef class SelfTuning(Structure):
             memory.beyond > 0.0 and sign == shared.far_sign and not rough
             and shared.roughness < HUBER
         )
-        likely = is_likely(m, memory.beyond, HUBER if goes_on else GATE)
+        likely = is_likely(m, HUBER if goes_on else GATE)
         shared.recent = fmax(shared.recent - 1.0, 0.0)
         begins = growing and not likely
         jumped = begins or (shared.recent > 0.0 and not rough)
