@@ -88,8 +88,8 @@ def test_shipped_demonstration_changes_the_plant(tmp_path):
     end = run_.t > run_.t[-1] - 0.5
     true = np.median(true_noise(run_)[end])
     assert true > 0.8e-4
-    found = run_.of_gains['tuning'][end, 0]
-    assert np.median(found) > 0.5 * true  # jitter of a busy machine adds to it
+    found = np.median(run_.of_gains['tuning'][end, 0])
+    assert 0.1 * true < found < 2.0 * true  # without the part that late stamps make
 
 
 def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(parameters):
