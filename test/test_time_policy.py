@@ -141,6 +141,14 @@ def test_bag_loop_restarts_once_a_round():
     only(estimator, far_stamps=3, restarts_backward=3)
 
 
+def test_bag_that_loops_within_max_gap_is_followed_after_so_many_late_samples():
+    """Time does not catch up then; each of its samples was rejected, for ever."""
+    estimator = OnlineEstimator({'max_gap': 5.0})
+    for _ in range(3):
+        run(estimator, 400)
+    only(estimator, backward_stamps=500, duplicate_stamps=1, restarts_backward=1)
+
+
 # Gaps
 
 

@@ -37,6 +37,7 @@ cdef struct Course:
     long long latest  # time up to which the observer has been stepped
     long long now  # the clock that counts nominal periods
     long long held_stamp
+    long long late_count  # samples in a row that lie before `latest`
     long long lost_since
     long long spikes  # rejected by the gate, in a row
     long long intervals  # number of intervals in the mean

@@ -163,6 +163,7 @@ cdef class Policy:
         if not 0 < elapsed <= self.max_gap():
             return self.settle(now, elapsed, y, word)
         self.course.held = False
+        self.course.late_count = 0
         if self.settings.max_gap == 0 and self.course.intervals == 1 and (
             MOST_INTERVALS * elapsed < self.course.mean_interval
         ):  # the interval that led to the sample before was a gap: begin at that sample
@@ -198,7 +199,12 @@ cdef class Policy:
             counters.duplicate_stamps += 1
             return 0
         if -self.max_late() <= elapsed < 0:
-            counters.backward_stamps += 1
+            course.late_count += 1
+            if course.late_count > MOST_INTERVALS:  # time does not catch up: a short bag loops
+                course.late_count = 0
+                word[0] = self.begin_again(&counters.restarts_backward)
+            else:
+                counters.backward_stamps += 1
             return 0
         if not course.held:
             course.held, course.held_stamp, course.held_y = True, now, y
