@@ -46,7 +46,9 @@ def test_estimator_restarts_where_the_loop_begins_again(bag, tmp_path):
     with log.open('w') as output:
         processes = [
             start('play', bag, '--loop', '--delay', '0', *remapped),
-            start('record', '-o', tmp_path / 'out', *remapped, '-r', '__node:=scribe'),
+            start(
+                'record', '-o', tmp_path / 'out', '--topics', '/y', *remapped, '-r', '__node:=scribe'
+            ),
             start(
                 'estimator', '--ros-args', '-p', 'use_sim_time:=true', '-p', 'sampling:=clock',
                 '-p', 'input_topic:=/rig/y', output=output,
