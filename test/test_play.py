@@ -47,7 +47,8 @@ def test_estimator_restarts_where_the_loop_begins_again(bag, tmp_path):
         processes = [
             start('play', bag, '--loop', '--delay', '0', *remapped),
             start(
-                'record', '-o', tmp_path / 'out', '--topics', '/y', *remapped, '-r', '__node:=scribe'
+                'record', '-o', tmp_path / 'out', '--topics', '/y', *remapped,
+                '-r', '__node:=scribe',
             ),
             start(
                 'estimator', '--ros-args', '-p', 'use_sim_time:=true', '-p', 'sampling:=clock',
