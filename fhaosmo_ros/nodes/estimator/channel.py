@@ -125,7 +125,8 @@ class Channel:
             self._report_pairing(reports[0])
         if self._active and isnan(self._health.latest):
             self._without_sample += 1
-            if self._without_sample == TOLD_AFTER:
+            # What is wrong with y itself has been logged already.
+            if self._without_sample == TOLD_AFTER and not self._y.error:
                 self._logger.warning(f'still waiting: {reports[0].text}')
         return reports
 
