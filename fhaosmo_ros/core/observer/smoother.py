@@ -104,11 +104,11 @@ class Smoother:
         kept = np.flatnonzero(self._every | ((found.status & UNUSED) == 0))
         numbers, smoothed = self._taken + kept, []
         self._taken += len(times)
-        found, times, u, kinds = part_of(found, kept), times[kept], u[kept], kinds[kept]
+        found, times, u, kinds = found.rows(kept), times[kept], u[kept], kinds[kept]
         for begin in range(0, max(len(kept), 1), BLOCK):
             block = slice(begin, begin + BLOCK)
             if len(kept):
-                self._hold(part_of(found, block), times[block], u[block], kinds[block])
+                self._hold(found.rows(block), times[block], u[block], kinds[block])
             smoothed.append(self._due())
         self._found = Trajectory._make(map(np.concatenate, zip(self._found, found, strict=True)))
         self._numbers = np.concatenate([self._numbers, numbers])
@@ -195,9 +195,7 @@ class Smoother:
     def _handed_out(self, smoothed: Floats) -> Trajectory:
         """Return the oldest rows with their smoothed estimates; they wait no more."""
         count, n = len(smoothed), self._observer.order
-        rows, self._found = (
-            part_of(self._found, part) for part in (slice(count), slice(count, None))
-        )
+        rows, self._found = self._found.rows(slice(count)), self._found.rows(slice(count, None))
         self.numbers, self._numbers = self._numbers[:count], self._numbers[count:]
         if not count:
             return rows
@@ -214,11 +212,6 @@ class Smoother:
         return rows
 
 
-def part_of(rows: Trajectory, index: Any) -> Trajectory:
-    """Return some rows."""
-    return Trajectory._make(column[index] for column in rows)
-
-
 def smooth(observer: Any, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
     """
     Let a fresh observer go forward through samples; estimate each from all of them.
@@ -233,7 +226,7 @@ def smooth(observer: Any, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None
     for k in np.flatnonzero(~np.isfinite(u).all(axis=1)).tolist():  # the last ones are held
         u[k] = u[max(k - 1, first)]
     smoother = Smoother(observer, every=True)
-    found = [smoother.take(part_of(whole, slice(first, None)), whole.t[first:], u[first:])]
+    found = [smoother.take(whole.rows(slice(first, None)), whole.t[first:], u[first:])]
     found.append(smoother.finish())
     for name in ('z', 'unknown_input', 'standard_deviation'):
         getattr(whole, name)[first:] = np.concatenate([getattr(rows, name) for rows in found])

@@ -9,7 +9,7 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import Event
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.messages.fields import Unwrapper
-from fhaosmo_ros.tools.bags.held_input import with_inputs
+from fhaosmo_ros.tools.bags.known_inputs import with_inputs
 from fhaosmo_ros.tools.bags.reader import BagReader, Block
 from fhaosmo_ros.tools.cli.options import BagInputs
 from fhaosmo_ros.tools.replay.live_run import LiveRun
@@ -135,7 +135,7 @@ class Samples:
         keep = np.flatnonzero((estimates.status & UNUSED) == 0)
         if len(keep):
             if len(keep) < len(block.times):
-                estimates = Trajectory._make(column[keep] for column in estimates)
+                estimates = estimates.rows(keep)
             active = active[keep] if self._tells else active[:0]
             yield Rows(block.times[keep], block.values[keep], estimates, active, self._events())
 

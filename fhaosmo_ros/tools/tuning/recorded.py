@@ -7,7 +7,7 @@ from typing import NamedTuple
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.messages.fields import Unwrapper
-from fhaosmo_ros.tools.bags.held_input import with_inputs
+from fhaosmo_ros.tools.bags.known_inputs import with_inputs
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.options import BagInputs
 import numpy as np

@@ -56,7 +56,6 @@ cdef struct Sample:
     double roughness_before  # mean of those before
     double uneven  # square of the highest difference, as a variance of y, and of its stamps
     double irregular  # square of the change of the interval (s^2)
-    double of_stamps  # variance of y if the irregularity of its stamps is their error
     double floor  # the least that the variance of the noise can be
     double largest  # variance of the innovations with which a member can judge it
     double average  # number of samples to average the noise over
@@ -109,6 +108,7 @@ cdef struct Shared:
     double interval  # last one between two samples, taken or not (s)
     double since  # time from the last sample taken to the last one (s)
     double jitter  # variance that the intervals of late say the stamps have at most (s^2)
+    double of_stamps  # variance that it makes of y at the latest sample
     double quantum  # step of y of which the others may be multiples (unit of y)
     double lattice  # of late, the share of the steps of y that are
     double goes_back  # of late, the share of the steps of y that go back at once

@@ -117,12 +117,12 @@ cdef void put(Members* m, int g, const double* estimate) noexcept nogil:
 cdef void find_tuning(Members* m, double* found) noexcept nogil:
     """Write noise, correlation, bandwidth and shares of models: the fields of `Tuning`."""
     cdef double variance = 0.0, correlation = 0.0, bands = 0.0, w, a
-    cdef int g
+    cdef int g, c
     for g in range(ORDERS):
         found[3 + g] = 0.0
     for g in range(COUNT):
-        w, a = m.weight[g], m.correlation[g]
-        variance += w * m.noise[GRID.colour[g]] / (1.0 - a * a)
+        w, a, c = m.weight[g], m.correlation[g], GRID.colour[g]
+        variance += w * (m.noise[c] + m.late[c] * m.shared.of_stamps) / (1.0 - a * a)
         correlation += w * a
         bands += w * GRID.band[g]
         found[3 + GRID.order[g]] += w

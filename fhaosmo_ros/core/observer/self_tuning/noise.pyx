@@ -131,7 +131,7 @@ cdef VECTORISED fill_noise(Members* m) noexcept nogil:
     cdef Work* w = &m.work
     cdef int c
     for c in range(COLOURS):
-        w.now[c] = m.noise[c] + m.late[c] * w.sample.of_stamps
+        w.now[c] = m.noise[c] + m.late[c] * m.shared.of_stamps
     fill(w.noise, w.now)
 
 

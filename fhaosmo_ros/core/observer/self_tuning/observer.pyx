@@ -245,7 +245,7 @@ cdef class SelfTuning(Structure):
         same = fabs(h - shared.flow_period) <= SAME * shared.flow_period
         self.carry_flow(h, u, same)
         speed = (self.prediction.z[0] - self.trial[0].z_hat) / h
-        sample.of_stamps = shared.jitter * speed * speed
+        shared.of_stamps = shared.jitter * speed * speed
         sample.uneven += fmax(shared.jitter, sample.irregular) * speed * speed
         fill_noise(m)
         self.follow_period(h, same)
