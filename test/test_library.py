@@ -142,7 +142,24 @@ def test_python_function_is_as_its_expression(gains, slopes, tolerance):
 
 
 def test_exception_of_a_python_function_comes_out():
-    observer = Observer(OSCILLATOR, phi=['0', Function(lambda z, u: z[2])])
-    for call in (lambda: observer.run(T, Y, 0.0), lambda: observer.step(0.1, 1e-3)):
-        with pytest.raises(IndexError):
+    def spring(z, u):
+        if z[0] > 0.004:
+            raise ArithmeticError
+        return -z[0]
+
+    with pytest.raises(IndexError):
+        Observer(OSCILLATOR, phi=['0', Function(lambda z, u: z[2])])
+    model = OSCILLATOR | {'phi': ['0', Function(spring)], 'noise_size': 1e-3}
+    observer, online = Observer(model), OnlineEstimator(model)
+    whole = OnlineEstimator(model)
+    whole.smooth()
+    stamps = np.round(T * 1e9).astype(np.int64) + 1
+    for call in (
+        lambda: observer.run(T, Y, 0.0), lambda: observer.smooth(T, Y, 0.0),
+        lambda: [observer.step(y, 1e-3, 0.0) for y in Y],
+        lambda: online.run(stamps, Y, 0.0),
+        lambda: [online.update(*sample) for sample in zip(stamps + stamps[-1], Y, strict=True)],
+        lambda: (whole.run(stamps, Y, 0.0), whole.finish()),
+    ):  # fmt: skip
+        with pytest.raises(ArithmeticError):
             call()

@@ -14,7 +14,6 @@ from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.estimates import Estimate, ObserverState, Trajectory, Tuning
 from fhaosmo_ros.core.observer.levant import Levant
 from fhaosmo_ros.core.observer.record import run
-from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import make_from_file
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
@@ -71,9 +70,9 @@ class Observer:
     """
 
     def __init__(self, parameters: Mapping[str, Any] | None = None, /, **named: Any) -> None:
-        if not isinstance(parameters, Parameters) or named:
-            parameters = ESTIMATOR_PARAMETERS.complete(parameters, named)
-        self._use(make_structure(ObserverConfiguration(parameters)))
+        given = ESTIMATOR_PARAMETERS.complete(parameters, named)
+        self._use(make_structure(ObserverConfiguration(given)))
+        self.check_functions()  # which have been called at rest
         defaults = {name for name in DEFINING if self.parameters[name] == DEFAULTS[name]}
         if 'phi' not in defaults and {'gains', *OF_PAPER} <= defaults:
             warnings.warn(
@@ -272,7 +271,7 @@ class Observer:
             u = self._no_input()
         estimate = self.structure.update(y, dt, u)
         if self._functions:
-            self._check_functions()
+            self.check_functions()
         return estimate
 
     @property
@@ -334,7 +333,7 @@ class Observer:
         if len(t):
             self._t = t[-1].item()
         record = run(self.structure, y, h, u, first, every)
-        self._check_functions()
+        self.check_functions()
         return Trajectory.of(self.structure, t[every - 1 :: every], record)
 
     def smooth(self, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
@@ -365,15 +364,17 @@ class Observer:
         """
         from fhaosmo_ros.core.observer.smoother import smooth
 
-        return smooth(Observer(self.configuration.parameters), t, y, u)
+        found = smooth(Observer(self.configuration.parameters), t, y, u)
+        self.check_functions()
+        return found
 
     def _use(self, structure: Any) -> None:
         self.structure = structure
         self._needs_input = self.uses_input
         self._functions = self.model.functions
 
-    def _check_functions(self) -> None:
-        """Raise what a Python function of phi has raised."""
+    def check_functions(self) -> None:
+        """Raise what a Python function of phi has raised since this was called last."""
         for function in self._functions:
             if function.failed is not None:
                 error, function.failed = function.failed, None

@@ -75,9 +75,8 @@ class OnlineEstimator:
     """
 
     def __init__(self, parameters: Mapping[str, Any] | None = None, /, **named: Any) -> None:
-        if not isinstance(parameters, Parameters) or named:
-            parameters = ESTIMATOR_PARAMETERS.complete(parameters, named)
-        self._parameters = ONLINE_PARAMETERS.complete(parameters)
+        given = ESTIMATOR_PARAMETERS.complete(parameters, named)
+        self._parameters = ONLINE_PARAMETERS.complete(given)
         self.observer = Observer(self._parameters)
         p = self._parameters
         if p['input_delay'] > p['measurement_delay']:
@@ -248,7 +247,9 @@ class OnlineEstimator:
         """Return the smoothed estimates that still wait: nothing comes after them."""
         if self._smoothing is None:
             raise ConfigurationError('finish: expected smoothing_lag > 0, or a call of `smooth`')
-        return self._smoothing.finish()
+        found = self._smoothing.finish()
+        self.observer.check_functions()
+        return found
 
     @property
     def latest(self) -> int | None:
@@ -400,6 +401,7 @@ class OnlineEstimator:
 
         """
         self.advance(operator.index(stamp), y)
+        self.observer.check_functions()
         return self.policy.report() if self._smoothing is None else self.estimate
 
     def advance(self, stamp: int, y: float) -> int:
@@ -458,7 +460,9 @@ class OnlineEstimator:
                 self.reject_inputs(1)
         if count:
             self._u[:] = inputs[-1]
-        return self._run(stamps, y, inputs)
+        found = self._run(stamps, y, inputs)
+        self.observer.check_functions()
+        return found
 
     def _run(self, stamps: Ints, y: NDArray[np.float64], u: NDArray[np.float64]) -> Trajectory:
         """Take samples with their known inputs, and look at them for events and for smoothing."""
