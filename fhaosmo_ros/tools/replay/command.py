@@ -6,15 +6,18 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 import sys
+from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import INPUT, ONLINE_PARAMETERS
 from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
+from fhaosmo_ros.tools.bags.table import bag_of_table
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 from fhaosmo_ros.tools.cli.options import (
@@ -45,7 +48,12 @@ def _parser() -> argparse.ArgumentParser:
         description='Estimate offline from a recorded bag, with the result of the live node.',
     )
     add = parser.add_argument
-    add('bag', type=Path, help='folder of a bag, or its .mcap or .db3 file')
+    add('bag', type=Path, help='folder of a bag, or its .mcap or .db3 file; or a .csv file')
+    add(
+        '--columns', metavar='T,Y,U', default='',
+        help='titles in a .csv file of the time in seconds, of y and of the known inputs '
+        '(default: the first columns)',
+    )  # fmt: skip
     add(
         '-o', '--output', type=Path, action='append', metavar='PATH',
         help='.csv, .npz, or else a new bag; may be given several times '
@@ -76,10 +84,17 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
-    name = arguments.bag.resolve().name.removesuffix('.mcap')
+    is_table = arguments.bag.suffix == '.csv'
+    if arguments.columns and not is_table:
+        raise ConfigurationError(f'--columns: expected a .csv file, got {arguments.bag}')
+    name = arguments.bag.resolve().name.removesuffix('.csv' if is_table else '.mcap')
     begin = perf_counter()
     with ExitStack() as stack:
-        reader = stack.enter_context(BagReader(arguments.bag))
+        path = arguments.bag
+        if is_table:
+            path = Path(stack.enter_context(TemporaryDirectory()), 'table')
+            _write_bag_of_table(arguments, path)
+        reader = stack.enter_context(BagReader(path))
         followed = recorded = live = None
         if not arguments.afresh:
             followed = find_estimator(reader, arguments.follow, arguments.channel)
@@ -88,6 +103,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         if recorded:
             arguments.channel = arguments.channel or recorded.channel
         own = channel_parameters(arguments, recorded)
+        if is_table:
+            own = _without_inputs(own)
         if arguments.smooth:
             own['smoothing_lag'] = 0.0
         estimator = OnlineEstimator(ONLINE_PARAMETERS.part_of(own))
@@ -138,6 +155,19 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     for final in finals:
         where = '' if final.suffix in TABLES else f' (estimates: {name}/...)'
         print(f'output: {final}{where}')
+
+
+def _write_bag_of_table(arguments: argparse.Namespace, bag: Path) -> None:
+    own = channel_parameters(arguments)
+    used = OnlineEstimator(ONLINE_PARAMETERS.part_of(own)).observer.used_inputs
+    titles = [title.strip() for title in arguments.columns.split(',') if title.strip()]
+    bag_of_table(arguments.bag, titles, _without_inputs(own), used, bag)
+
+
+def _without_inputs(own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return parameters without those that say on which topics a node finds y and u."""
+    inputs = ParameterTable(INPUT)
+    return {name: value for name, value in own.items() if name not in inputs}
 
 
 def _warn(text: str) -> None:

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag made of a table of numbers, so that a CSV file is replayed as any recording."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fhaosmo_ros.core.parameters.declaration import suggestion
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.inputs import known_inputs, measured_output
+from fhaosmo_ros.tools.bags.types import serialise
+from fhaosmo_ros.tools.bags.writer import BagWriter
+from fhaosmo_ros.topics import FLOAT
+import numpy as np
+from numpy.typing import NDArray
+
+DELIMITERS = ',;\t'
+LATEST = 9.2e9
+"""Seconds; the largest stamp in nanoseconds is a little more."""
+
+
+def bag_of_table(
+    path: Path, wanted: Sequence[str], values: Mapping[str, Any], used: Sequence[str], bag: Path
+) -> None:
+    """
+    Write the samples of a CSV file to a new bag, each with the time in its line as its stamp.
+
+    Parameters
+    ----------
+    path : path
+        Lines of numbers with commas, semicolons, tabs or spaces between them; an empty cell is a
+        missing sample. Titles may stand in the first line; without them the columns are 1, 2, ...
+    wanted : sequence of str
+        Titles of the time in seconds, of y and of the known inputs; empty for the first columns.
+    values : mapping
+        Parameters of the estimator, which say on which topics it looks for y and known inputs.
+    used : sequence of str
+        Known inputs that the model uses, in the order of their columns.
+    bag : path
+        Folder to make.
+
+    Raises
+    ------
+    ConfigurationError
+        A file that can't be read, a title that it lacks, a wrong number of them, a cell that is
+        no number, or times that are not finite or below 0.
+
+    """
+    names = ['the time', 'y', *used]
+    numbers = _columns(path, wanted, names)
+    t = numbers[:, 0]
+    bad = np.flatnonzero(~((t >= 0.0) & (t <= LATEST)))
+    if len(bad):
+        raise ConfigurationError(
+            f'{path}: expected times of 0 to {LATEST:g} s, got {t[bad[0]]} in sample {bad[0]}, '
+            'counted from 0'
+        )
+    topics = [measured_output(values), *known_inputs(values, used).values()]
+    begin = np.frombuffer(serialise(FLOAT, data=0.0)[:-8], np.uint8)  # then the number
+    begins, columns = np.tile(begin, (len(t), 1)), []
+    with BagWriter(bag) as writer:
+        for topic, values_of_it in zip(topics, numbers.T[1:], strict=True):
+            writer.add(topic.absolute(''), FLOAT)
+            ends = values_of_it.astype('<f8').view(np.uint8).reshape(-1, 8)
+            columns.append((topic.absolute(''), np.hstack([begins, ends])))
+        stamps = np.round(t * 1e9).astype(np.int64)
+        writer.write_columns(np.maximum(stamps, 1), columns)  # 0 is a stamp that nobody filled
+
+
+def _columns(path: Path, wanted: Sequence[str], names: Sequence[str]) -> NDArray[np.float64]:
+    """Return those columns of the file that have the wanted titles, (K, len(names))."""
+    with path.open(encoding='utf-8-sig') as file:
+        lines = file.readlines() or ['']
+    delimiter = next((mark for mark in DELIMITERS if mark in lines[0]), None)
+    cells = [cell.strip('# "\n') for cell in lines[0].split(delimiter)]
+    has_titles = not any(map(_is_number, cells))
+    titles = cells if has_titles else [str(k + 1) for k in range(len(cells))]
+    wanted = wanted or titles[: len(names)]
+    if len(wanted) != len(names):
+        raise ConfigurationError(
+            f'--columns: expected {len(names)} titles, of {", ".join(names)}, got '
+            f'{", ".join(wanted)}'
+        )
+    for title in wanted:
+        if title not in titles:
+            raise ConfigurationError(
+                f'--columns: expected titles of {path}, which are {", ".join(titles)}, '
+                f'got {title!r}{suggestion(title, titles)}'
+            )
+    del lines[:has_titles]
+    if not lines:
+        raise ConfigurationError(f'{path}: expected lines of numbers, got none')
+    places = [titles.index(title) for title in wanted]
+    try:
+        return np.loadtxt(lines, delimiter=delimiter, usecols=places, converters=_number, ndmin=2)
+    except ValueError as error:
+        raise ConfigurationError(f'{path}: expected lines of numbers: {error}') from None
+
+
+def _number(text: str) -> float:
+    return float(text) if text.strip() else np.nan
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
