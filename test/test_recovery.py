@@ -293,8 +293,9 @@ def test_covariance_is_that_of_a_kalman_filter():
 
 def test_steady_covariance_solves_its_equation():
     values = load(CONFIG / 'noise_1e-4.yaml', 'estimator', OBSERVER_PARAMETERS)
-    schedule = Observer(values).configuration.schedule
-    steady, (phi, q) = schedule.steady, schedule.linear.transition(1e-3)
+    configuration = Observer(values).configuration
+    schedule, steady = configuration.schedule, configuration.steady
+    phi, q = schedule.linear.transition(1e-3)
     gain = steady[:, 0] / (steady[0, 0] + schedule.variance)
     again = phi @ (steady - np.outer(gain, steady[0])) @ phi.T + q
     scale = np.sqrt(np.outer(np.diag(steady), np.diag(steady)))

@@ -3,7 +3,7 @@
 
 from collections.abc import Mapping
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.model.triangular import constants_of, TriangularModel
 from fhaosmo_ros.core.observer.fuzzy import curves, of_level, read_system
@@ -21,33 +21,6 @@ STEP = 0.1
 """Of a prediction, in parts of the time constant of the fastest motion of the model at rest."""
 DERIVATIVES = 3
 """Derivatives of d that a self-tuning observer has behind it (D 26)."""
-
-
-class Schedule(NamedTuple):
-    """
-    What gains that follow the covariance P are computed from (D 20).
-
-    Attributes
-    ----------
-    linear : LinearModel
-        The model with D 17, linearised at rest.
-    variance : float
-        Of the noise on y.
-    fresh, steady : (N, N) arrays
-        P of a fresh observer, and of the predictions once P is steady (levant; else 0).
-    tuned_over_kalman : (N,) array
-        The tuned corrections of a small innovation over those of the Kalman filter.
-    next_sizes : (N,) array
-        Sizes of z_2 .. z_n and d, 0 behind them.
-
-    """
-
-    linear: LinearModel
-    variance: float
-    fresh: Floats
-    steady: Floats
-    tuned_over_kalman: Floats
-    next_sizes: Floats
 
 
 class ObserverConfiguration:
@@ -81,8 +54,15 @@ class ObserverConfiguration:
         Gains, half-widths of psi, and decay of the internal states; with fixed gains only.
     curves : (N, K) array
         psi of each level at K points of [0, half-width]; with fixed gains only.
-    schedule : Schedule or None
-        None where gains are always the tuned ones.
+    schedule : Uncertainty or None
+        What gains that follow the covariance P are computed from (D 20); None where they are
+        always the tuned ones.
+    steady : (N, N) array
+        P of the predictions once it is steady; with levant and a schedule only.
+    tuned_over_kalman : (N,) array
+        The tuned corrections of a small innovation over those of the Kalman filter; likewise.
+    next_sizes : (N,) array
+        Sizes of z_2 .. z_n and d, 0 behind them; likewise.
 
     Raises
     ------
@@ -98,6 +78,9 @@ class ObserverConfiguration:
     widths: Floats
     decays: Floats
     curves: Floats
+    steady: Floats
+    tuned_over_kalman: Floats
+    next_sizes: Floats
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
         self.parameters = OBSERVER_PARAMETERS.complete(parameters)
@@ -135,7 +118,7 @@ class ObserverConfiguration:
                 f'next one, got {p["gamma_min"]}, {p["gamma_initial"]}, {p["gamma_max"]}'
             )
         self.self_tuning = p['gains'] == 'self_tuning'
-        self.schedule: Schedule | None = None
+        self.schedule: Uncertainty | None = None
         sizes = OBSERVER_PARAMETERS['state_sizes']
         self.state_sizes = per_level(sizes, p['state_sizes'], self.model.order)
         self.prediction_step = p['prediction_step'] or usual_step(self.model)
@@ -196,7 +179,9 @@ class ObserverConfiguration:
         self.state_sizes = np.where(self.state_sizes > 0.0, self.state_sizes, usual)
         starts = not self.levant or (self.predicting and p['correction_period'] > 0.0)
         if p['noise_size'] > 0.0 and p['unknown_input'] and starts:
-            self.schedule = self._make_schedule()
+            self.schedule = Uncertainty(self.model, p, self.state_sizes)
+            if self.levant:
+                self._complete_schedule(self.schedule)
 
     def _check_structure(self) -> None:
         p = self.parameters
@@ -226,21 +211,16 @@ class ObserverConfiguration:
     def _per_level(self, name: str) -> Floats:
         return per_level(OBSERVER_PARAMETERS[name], self.parameters[name], self.levels)
 
-    def _make_schedule(self) -> Schedule:
+    def _complete_schedule(self, schedule: Uncertainty) -> None:
         p, n = self.parameters, self.levels
-        uncertainty = Uncertainty(self.model, p, self.state_sizes)
-        sizes, steady, ratio = np.zeros(n), np.zeros((n, n)), np.ones(n)
-        sizes[: self.model.order] = [*self.state_sizes[1:], p['unknown_input_size']]
-        if self.levant:
-            period = p['correction_period']
-            steady = uncertainty.steady(period)
-            tuned = self.tuned_corrections(p['noise_size'], period)
-            wanted = steady[0] / uncertainty.variance
-            alike = (wanted > 0.0) & (tuned > 0.0)
-            ratio[alike] = np.clip(tuned[alike] / wanted[alike], 1e-6, 1e6)
-        return Schedule(
-            uncertainty.linear, uncertainty.variance, uncertainty.fresh, steady, ratio, sizes
-        )
+        self.next_sizes, self.tuned_over_kalman = np.zeros(n), np.ones(n)
+        self.next_sizes[: self.model.order] = [*self.state_sizes[1:], p['unknown_input_size']]
+        self.steady = schedule.steady(p['correction_period'])
+        tuned = self.tuned_corrections(p['noise_size'], p['correction_period'])
+        wanted = self.steady[0] / schedule.variance
+        alike = (wanted > 0.0) & (tuned > 0.0)
+        ratio = np.clip(tuned[alike] / wanted[alike], 1e-6, 1e6)
+        self.tuned_over_kalman[alike] = ratio
 
     def tuned_corrections(self, small: float, period: float) -> Floats:
         """Return S_1 .. S_N of D 19 with which an innovation of the size `small` is corrected."""

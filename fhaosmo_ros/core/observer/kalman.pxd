@@ -6,6 +6,7 @@ from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 ctypedef double[MOST_LEVELS] Row  # of a matrix
 
 
+cdef fill(Row* to, matrix)
 cdef int sub_steps(double h, double fastest) noexcept nogil
 cdef void carry(int n, const Row* f, Row* p) noexcept nogil
 cdef void multiply(int n, const Row* f, Row* p) noexcept nogil

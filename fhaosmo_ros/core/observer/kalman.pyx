@@ -34,6 +34,14 @@ DECIDING = (
 )
 
 
+cdef fill(Row* to, matrix):
+    """Copy an (N, N) array; N is at most `MOST_LEVELS`."""
+    cdef int i, j
+    for i, row in enumerate(matrix.tolist()):
+        for j, number in enumerate(row):
+            to[i][j] = number
+
+
 cdef int sub_steps(double h, double fastest) noexcept nogil:
     """Return in how many steps a covariance goes over `h`."""
     return <int>max(min(ceil(h * fastest / STEP), MOST_STEPS), 1.0)
@@ -108,13 +116,10 @@ cdef class LinearModel:
     """
 
     def __cinit__(self, rates, double intensity):
-        cdef int i, j
         self.n, self.intensity = len(rates), intensity
         if self.n > MOST_LEVELS:
             raise ValueError(f'expected at most {MOST_LEVELS} states, got {self.n}')
-        for i in range(self.n):
-            for j in range(self.n):
-                self.rates[i][j] = rates[i, j]
+        fill(self.rates, rates)
         self.fastest = np.abs(np.linalg.eigvals(rates)).max()
 
     def __reduce__(self):
@@ -330,9 +335,9 @@ def innovations(Prediction prediction, samples, linear):
         h.shape[0] == u.shape[0] == periods.shape[0] == used.shape[0] == count
     ):
         raise ValueError('innovations: arrays of sizes that do not fit')
-    for i in range(size):
-        for j in range(size):
-            a[i][j], q[i][j], fresh[i][j] = linear.a[i, j], linear.q[i, j], linear.fresh[i, j]
+    fill(a, linear.a)
+    fill(q, linear.q)
+    fill(fresh, linear.fresh)
     with nogil:
         for k in range(count):
             if periods[k] == 0:

@@ -19,7 +19,7 @@ from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.phi cimport Dual, evaluate
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
-from fhaosmo_ros.core.observer.kalman cimport Row
+from fhaosmo_ros.core.observer.kalman cimport Row, fill
 from fhaosmo_ros.core.observer.sliding_mode cimport (
     LONG_AGO, NEWTON_STEPS, NEWTON_TOLERANCE, TINY, SlidingMode, doubt_of_noise, psi
 )
@@ -100,14 +100,12 @@ cdef class Levant(SlidingMode):
             for j in range(n):
                 self.share[j][i] = shares[j, i] if self.predicting else 1.0
         self.correction_period = configuration.parameters['correction_period']
-        schedule = configuration.schedule
         if self.scheduled:
-            self.steady_variance = schedule.steady[0, 0] + schedule.variance
+            fill(self.steady, configuration.steady)
+            self.steady_variance = self.steady[0][0] + self.noise_variance
             for i in range(n):
-                self.tuned_over_kalman[i] = schedule.tuned_over_kalman[i]
-                self.next_size[i] = schedule.next_sizes[i]
-                for j in range(n):
-                    self.steady[i][j] = schedule.steady[i, j]
+                self.tuned_over_kalman[i] = configuration.tuned_over_kalman[i]
+                self.next_size[i] = configuration.next_sizes[i]
 
     cdef void restart(self, double y) noexcept nogil:
         """Begin afresh from `y`; the time of the next sample counts from it."""

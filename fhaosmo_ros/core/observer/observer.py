@@ -277,7 +277,7 @@ class Observer:
     @property
     def estimate(self) -> Estimate:
         """Estimate of the present state, with the status of the last step."""
-        return self.structure.report(self.structure.word)
+        return self.structure.report()
 
     @property
     def unknown_input(self) -> float:

@@ -30,7 +30,8 @@ cdef class SlidingMode(Structure):
     cdef readonly bint sensitive  # sensitivities are carried along
     cdef readonly bint scheduled  # gains follow P at first; with levant also after gaps (D 20)
     cdef Gains gains[MOST_LEVELS]
-    cdef double* curves  # psi of each level at `knots` points of [0, half-width]
+    cdef const double[:, ::1] table  # psi of each level at `knots` points of [0, half-width]
+    cdef const double* curves  # its numbers
     cdef int knots
     cdef Level first[MOST_LEVELS]  # levels of a fresh observer
     cdef double gamma_initial, gamma_rate, gamma_min, gamma_max  # law of gamma (D 7)
@@ -55,7 +56,7 @@ cdef double doubt_of_noise(double age, double speed) noexcept nogil
 cdef inline Dual psi(SlidingMode law, int i, double a) noexcept nogil:
     """Return psi_i at a = |eps| >= 0 and its slope; psi is odd, so negative eps need no more."""
     cdef int last = law.knots - 1, j
-    cdef double* curve = law.curves + i * law.knots
+    cdef const double* curve = law.curves + i * law.knots
     cdef double scale, position, rise
     if law.is_sign:
         return Dual(1.0, 0.0)

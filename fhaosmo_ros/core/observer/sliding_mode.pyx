@@ -8,11 +8,10 @@ of d and of the noise that parameters tell.
 """
 
 from libc.math cimport exp, fabs, isfinite, pow
-from libc.stdlib cimport free, malloc
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.phi cimport Dual
-from fhaosmo_ros.core.observer.kalman cimport correct
+from fhaosmo_ros.core.observer.kalman cimport correct, fill
 from fhaosmo_ros.core.observer.status cimport GAMMA_AT_MAX, GAMMA_AT_MIN, SENSITIVITY_RESET
 from fhaosmo_ros.core.observer.structure cimport Structure
 
@@ -37,7 +36,7 @@ cdef class SlidingMode(Structure):
     """An observer with fixed gains; `Cascade` and `Levant` are the two structures."""
 
     def __cinit__(self, configuration):
-        cdef int i, j, n = self.levels
+        cdef int i, n = self.levels
         p = configuration.parameters
         self.is_sign, self.adaptive = configuration.is_sign, configuration.adaptive
         self.sensitive = configuration.adaptive and p['gamma_rate'] > 0.0
@@ -48,13 +47,8 @@ cdef class SlidingMode(Structure):
             self.gains[i].decay = configuration.decays[i]
             self.first[i].z_hat = configuration.initial_estimate[i]
             self.first[i].z_tilde = configuration.initial_internal[i]
-        self.knots = configuration.curves.shape[1]
-        self.curves = <double*>malloc(n * self.knots * sizeof(double))
-        if self.curves == NULL:
-            raise MemoryError
-        for i in range(n):
-            for j in range(self.knots):
-                self.curves[i * self.knots + j] = configuration.curves[i, j]
+        self.table = configuration.curves
+        self.curves, self.knots = &self.table[0, 0], configuration.curves.shape[1]
         self.gamma_initial, self.gamma_rate = configuration.gamma_initial, p['gamma_rate']
         self.gamma_min, self.gamma_max = p['gamma_min'], p['gamma_max']
         self.dead_zone, self.leakage = p['gamma_dead_zone'], p['gamma_leakage']
@@ -62,12 +56,7 @@ cdef class SlidingMode(Structure):
         self.scheduled = schedule is not None
         if self.scheduled:
             self.linear, self.noise_variance = schedule.linear, schedule.variance
-            for i in range(n):
-                for j in range(n):
-                    self.fresh[i][j] = schedule.fresh[i, j]
-
-    def __dealloc__(self):
-        free(self.curves)
+            fill(self.fresh, schedule.fresh)
 
     cdef void reset(self) noexcept nogil:
         """Go back to the state before any sample."""

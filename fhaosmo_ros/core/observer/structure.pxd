@@ -93,8 +93,6 @@ cdef class Structure:
     cdef double variance(self, int i) noexcept nogil
     cdef void tell(self, double* model, double* tuning) noexcept nogil
     cdef bint jump(self, const double* u) noexcept nogil
-    cdef number(self, values, str name, tuple shape)
-    cdef finite(self, values, str name, tuple shape)
 
 
 cdef bint has_drifted(Memory* memory, double off) noexcept nogil

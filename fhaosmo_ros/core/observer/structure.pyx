@@ -9,11 +9,13 @@ from libc.math cimport INFINITY, NAN, fabs, isfinite, isnan, sqrt
 from libc.string cimport memset
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
+from fhaosmo_ros.core.observer.kalman cimport fill
 from fhaosmo_ros.core.observer.status cimport (
     DIVERGED, JUMPED, LEVEL_SHIFT, REJECTED_INPUT, REJECTED_MEASUREMENT,
     REJECTED_PERIOD, REJECTED_SPIKE, REJECTED_STEP
 )
 
+from fhaosmo_ros.core.observer.numbers import checked
 from fhaosmo_ros.core.observer.status import flags, open_levels
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
@@ -32,10 +34,7 @@ cdef double REMEMBERED = 100.0
 cdef double MOST_DRIFT = 35.0
 # If a jump of y would make |z_{i+1}| or |d| so much smaller, y was wrong before it (D 23).
 cdef double MUCH_SMALLER = 0.5
-# No number of a snapshot is larger, and these are not negative.
-cdef double LARGEST = 1.8e300
 OF_LEVELS = 'z_hat', 'z_tilde', 'p', 'q'
-POSITIVE = 'pending', 'period', 'beyond', 'watched', 'saturated', 'narrowed'
 
 
 cdef bint has_drifted(Memory* memory, double off) noexcept nogil:
@@ -281,14 +280,11 @@ cdef class Structure:
     def begin(self, double y):
         """Take the first sample; return the estimate."""
         self.enter()
-        return self.report(self.start(y))
+        self.word = self.start(y)
+        return self.report()
 
     def update(self, double y, double dt, u=0.0):
         """Advance by `dt` seconds to the sample `y`; return the estimate."""
-        return self.report(self.take(y, dt, u))
-
-    def take(self, double y, double dt, u=0.0):
-        """Do the same and return only the status word."""
         cdef double number
         cdef double inputs[MOST_INPUTS]
         cdef int i
@@ -298,18 +294,17 @@ cdef class Structure:
         if self.inputs == 1 and isinstance(u, float):
             number = u
             self.word = self.step(y, dt, &number)
-            return self.word
+            return self.report()
         for i, number in enumerate(self.configuration.model.known_inputs(u)):
             inputs[i] = number
         self.word = self.step(y, dt, inputs)
-        return self.word
+        return self.report()
 
-    def report(self, int word):
-        """Return the estimate of the present state after a step that ended with `word`."""
+    def report(self):
+        """Return the estimate of the present state, with the status of the latest sample."""
         cdef Estimate estimate = Estimate.__new__(Estimate)
         cdef int i
-        estimate.order, estimate.levels, estimate.word = self.order, self.levels, word
-        self.word = word
+        estimate.order, estimate.levels, estimate.word = self.order, self.levels, self.word
         for i in range(self.levels):
             estimate.innovations[i] = self.innovation[i]
         for i in range(self.order):
@@ -413,54 +408,22 @@ cdef class Structure:
             has changed.
 
         """
-        cdef int n = self.levels, i, j
+        cdef int i, n = self.levels
         cdef dict memory = self.memory
         self.enter()
-        levels = [self.finite(values, name, (n,)) for name in OF_LEVELS]
-        covariance = self.finite(values, 'covariance', (n, n))
-        for name in memory:
-            number = self.number(values, name, ())
-            unknown = name == 'y' and np.isnan(number)  # before the first sample
-            least = 0.0 if name in POSITIVE else 1.0 if name in ('spread', 'scale') else -LARGEST
-            if not (unknown or least <= number <= LARGEST):
-                raise ConfigurationError(
-                    f"snapshot: '{name}': expected a finite number of at least {least:g}, "
-                    f'got {number}'
-                )
-            memory[name] = float(number)
-        self.memory = memory
+        found = checked(values, Structure.state_dict(self))
+        self.memory = {name: found[name] for name in memory}
         for i in range(n):
-            self.level[i] = Level(levels[0][i], levels[1][i], levels[2][i], levels[3][i])
-            for j in range(n):
-                self.covariance[i][j] = covariance[i, j]
+            self.level[i] = {name: found[name][i] for name in OF_LEVELS}
+        fill(self.covariance, found['covariance'])
         self.measure(self.memory.y)
 
-    cdef number(self, values, str name, tuple shape):
-        """Return what a snapshot has of a name, as an array of that shape."""
-        try:
-            number = np.asarray(values[name], dtype=np.float64)
-        except KeyError:
-            raise ConfigurationError(f"snapshot: expected '{name}', got none") from None
-        except (TypeError, ValueError):
-            raise ConfigurationError(f"snapshot: '{name}': expected numbers") from None
-        if number.shape != shape:
-            raise ConfigurationError(
-                f"snapshot: '{name}': expected shape {shape}, got {number.shape}"
-            )
-        return number
-
-    cdef finite(self, values, str name, tuple shape):
-        """Return the same, after a check that all of it is finite."""
-        number = self.number(values, name, shape)
-        if not (np.abs(number) <= LARGEST).all():
-            raise ConfigurationError(f"snapshot: '{name}': expected finite numbers")
-        return number
-
     def __reduce__(self):
-        return type(self), (self.configuration,), self.state_dict()
+        return type(self), (self.configuration,), self.state_dict() | {'word': self.word}
 
     def __setstate__(self, values):
         self.load_state_dict(values)
+        self.word = values['word']
 
 
 cdef class Estimate:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.model.inputs import column, known_inputs_of_run
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, Tuning
+from fhaosmo_ros.core.observer.numbers import checked
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.smoother import Smoother
 from fhaosmo_ros.core.observer.smoothing import Rows
@@ -18,7 +19,7 @@ from fhaosmo_ros.core.online.counters import Counters
 from fhaosmo_ros.core.online.delay import PastInputs
 from fhaosmo_ros.core.online.events import check_events, EventDetector
 from fhaosmo_ros.core.online.policy import Policy
-from fhaosmo_ros.core.online.snapshots import array_of, checked, VERSION
+from fhaosmo_ros.core.online.snapshots import VERSION
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import make_from_file
@@ -258,11 +259,9 @@ class OnlineEstimator:
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that it remembers, by name, but for counters and parameters; a copy."""
-        past = self.policy.past
         return {
             'version': VERSION, **self.observer.structure.state_dict(), **self.policy.memory,
-            **self.events.memory, 'u': self._u.copy(), 'past_latest': past.latest.copy(),
-            'past_pieces': past.pieces.copy(),
+            **self.events.memory, **{name: x.copy() for name, x in self._arrays.items()},
         }  # fmt: skip
 
     def load_state_dict(self, values: Mapping[str, Any]) -> None:
@@ -280,22 +279,28 @@ class OnlineEstimator:
             Something is missing, of another size, or out of its range. Then nothing has changed.
 
         """
-        checked(values, {'version': VERSION})
-        memory = checked(values, self.policy.memory)
-        events = checked(values, self.events.memory)
-        past = self.policy.past
-        if np.size(values.get('past_pieces', ())) != past.pieces.size:
+        if values.get('version') != VERSION:
+            raise ConfigurationError(
+                f'snapshot: expected version {VERSION}, got {values.get("version")!r}'
+            )
+        if np.size(values.get('past_pieces', ())) != self.policy.past.pieces.size:
             raise ConfigurationError(
                 'snapshot: expected that of an estimator with the same measurement_delay'
             )
-        arrays = {'u': self._u, 'past_latest': past.latest, 'past_pieces': past.pieces}
-        found = {name: array_of(values, name, array.shape) for name, array in arrays.items()}
+        memory, arrays = checked(values, self.policy.memory), self._arrays
+        events, found = checked(values, self.events.memory), checked(values, arrays)
         self.observer.structure.load_state_dict(values)
         self.policy.change(**memory)
         self.events.memory = events
         for name, array in arrays.items():
             array[:] = found[name]
         self._cut()
+
+    @property
+    def _arrays(self) -> dict[str, NDArray[np.float64]]:
+        """What is remembered of the known inputs."""
+        past = self.policy.past
+        return {'u': self._u, 'past_latest': past.latest, 'past_pieces': past.pieces}
 
     def _cut(self) -> None:
         """Smooth nothing across what has happened."""
@@ -410,7 +415,7 @@ class OnlineEstimator:
             return self.policy.advance(stamp, y, self._u)  # type: ignore[no-any-return]
         stamps = np.array([min(max(int(stamp), -LARGEST_STAMP), LARGEST_STAMP)])
         self._run(stamps, np.array([y], dtype=np.float64), self._u[np.newaxis])
-        return self.policy.word  # type: ignore[no-any-return]
+        return self.observer.structure.word  # type: ignore[no-any-return]
 
     def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
         """

@@ -16,7 +16,6 @@ cdef class Policy:
     cdef Clock clock
     cdef Sensor sensor
     cdef readonly PastInputs past
-    cdef readonly int word  # status word of the latest sample
 
     # For whoever feeds it samples.
     cdef int take(self, long long stamp, double y, const double* u) noexcept nogil

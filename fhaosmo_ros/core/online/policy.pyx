@@ -126,7 +126,7 @@ cdef class Policy:
             word |= self.structure.measure(
                 self.structure.level[0].z_hat if isnan(memory.y) else memory.y
             )
-        self.word = self.structure.word = word
+        self.structure.word = word
         return word
 
     cdef int judge(self, long long stamp, long long now, double y) noexcept nogil:
@@ -475,7 +475,7 @@ cdef class Policy:
 
     def report(self):
         """Return the latest estimate as it is published, with the status of the last sample."""
-        cdef Estimate estimate = self.structure.report(self.word)
+        cdef Estimate estimate = self.structure.report()
         cdef double values[MOST_LEVELS + 1]
         if self.settings.to_now and self.settings.delay > 0:
             self.structure.enter()
@@ -503,9 +503,9 @@ cdef class Policy:
         self.course, self.clock, self.sensor = memory, memory, memory
 
     def __reduce__(self):
-        state = self.memory, self.counters, self.word
+        state = self.memory, self.counters
         return Policy, (self.structure, self.settings, self.past), state
 
     def __setstate__(self, state):
-        memory, self.counters, self.word = state
+        memory, self.counters = state
         self.change(**memory)

@@ -24,21 +24,6 @@ VERSION = 2
 HEAD = ['version', 'flags', 'sec', 'nanosec']
 HALF = 2**32
 SECOND = 1_000_000_000
-LARGEST = 1e300
-INTEGERS = -(2**63), 2**63 - 1
-COUNTS = 0, 2**62
-YES_OR_NO = 0, 1
-RANGES: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(('frozen', 'valid', 'timed', 'held', 'lost'), YES_OR_NO),
-    **dict.fromkeys(('stuck', 'holds'), YES_OR_NO),
-    **dict.fromkeys(('spikes', 'tick_count', 'repeats', 'held_for'), COUNTS),
-    **dict.fromkeys(('mean_interval', 'mean_jitter', 'usual_interval'), COUNTS),
-    'version': (VERSION, VERSION), 'intervals': (0, 32), 'regular': (0, 12),
-    'ticks': (-5000, 2**17),
-    'elsewhere': (0.0, 1.0), 'event': (0, 5), 'event_deviation': (0.0, math.inf),
-    'past_place': (0, 511), 'past_count': (0, 512),
-}  # fmt: skip
-"""Of what is remembered. Times may be any integers, other numbers as large as `LARGEST`."""
 INDEX = re.compile(r'(.*?)(\d{1,6}(?:_\d{1,6})*)')
 
 
@@ -144,42 +129,3 @@ def _values(entries: Mapping[str, float]) -> dict[str, Any]:
             raise ConfigurationError(f"snapshot: '{name}': expected all entries of an array")
         values[name] = np.array([part[place] for place in sorted(part)]).reshape(shape)
     return values
-
-
-def checked(values: Mapping[str, Any], like: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Return the numbers that `like` names, each of the type that it has there.
-
-    Raises
-    ------
-    ConfigurationError
-        One is missing, of another type, or out of its range.
-
-    """
-    found: dict[str, Any] = {}
-    for name, value in like.items():
-        number: Any = values.get(name)
-        whole = isinstance(value, Integral)
-        least, most = RANGES.get(name, INTEGERS if whole else (-LARGEST, LARGEST))
-        kind: Any = Integral if whole else (float, int, np.floating)
-        if not isinstance(number, kind) or not least <= number <= most:
-            raise ConfigurationError(
-                f"snapshot: '{name}': expected {'an integer' if whole else 'a number'} of "
-                f'{least:g} to {most:g}, got {number!r}'
-            )
-        found[name] = int(number) if whole else float(number)
-    return found
-
-
-def array_of(values: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return an array of that shape, all of it finite, or raise ConfigurationError."""
-    nothing = np.zeros(shape) if 0 in shape else np.nan  # an empty array has no entries
-    try:
-        array = np.asarray(values.get(name, nothing), dtype=np.float64)
-    except (OverflowError, TypeError, ValueError):
-        array = np.full(1, np.nan)
-    if array.shape != shape or not (np.abs(array) <= LARGEST).all():
-        raise ConfigurationError(
-            f"snapshot: '{name}': expected finite numbers of shape {shape}, got {array.shape}"
-        )
-    return array

@@ -32,4 +32,3 @@ cdef class SelfTuning(Structure):
     cdef bint has_begun(self) noexcept nogil
     # Snapshots.
     cdef dict places(self)
-    cdef within(self, values, str name, tuple shape)

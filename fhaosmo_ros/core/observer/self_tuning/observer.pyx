@@ -30,6 +30,7 @@ from fhaosmo_ros.core.observer.structure cimport (
     GATE, LOST_SAMPLES, Memory, Structure, has_drifted
 )
 
+from fhaosmo_ros.core.observer.numbers import array_of
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 
@@ -498,7 +499,7 @@ cdef class SelfTuning(Structure):
         cdef Shared shared = self.members.shared
         cdef int i
         self.enter()
-        shared = {name: self.within(values, name, ()).item() for name in (<dict>shared)}
+        shared = {name: within(values, name, ()).item() for name in (<dict>shared)}
         names = self.places()
         if shared.samples <= FIRST_SAMPLES:
             names = {name: names[name] for name in EARLY}
@@ -506,11 +507,9 @@ cdef class SelfTuning(Structure):
             raise ConfigurationError(
                 f"snapshot: 'active': expected {HALF} or {COUNT} members, got {shared.active}"
             )
-        found = {name: self.within(values, name, shape) for name, (_, shape) in names.items()}
-        variances = self.number(values, 'variances', (self.levels,))
-        if not (variances >= 0.0).all():
-            raise ConfigurationError("snapshot: 'variances': expected numbers of at least 0")
-        numbers = self.finite(values, 'model', (4,))
+        found = {name: within(values, name, shape) for name, (_, shape) in names.items()}
+        variances = array_of(values, 'variances', (self.levels,), 0.0, INFINITY)
+        numbers = array_of(values, 'model', (4,))
         Structure.load_state_dict(self, values)
         self.members.shared, self.members.work.q_interval = shared, 0.0
         self.model = Model(numbers[0], numbers[1], numbers[2], numbers[3])
@@ -521,12 +520,7 @@ cdef class SelfTuning(Structure):
         for i in range(self.levels):
             self.variances[i] = variances[i]
 
-    cdef within(self, values, str name, tuple shape):
-        """Return what a snapshot has of a name, after a check that it is within its range."""
-        numbers = self.number(values, name, shape)
-        low, high = RANGES.get(name, (0.0, LARGEST))
-        if not ((numbers >= low) & (numbers <= high)).all():
-            raise ConfigurationError(
-                f"snapshot: '{name}': expected numbers from {low:g} to {high:g}"
-            )
-        return numbers
+
+cdef within(values, str name, tuple shape):
+    """Return what a snapshot has of a name, after a check that it is within its range."""
+    return array_of(values, name, shape, *RANGES.get(name, (0.0, LARGEST)))

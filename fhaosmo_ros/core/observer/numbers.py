@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The numbers of a snapshot, checked as they come in: names, types, sizes, ranges, finiteness."""
+
+from collections.abc import Mapping
+import math
+from numbers import Integral
+from typing import Any
+
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+import numpy as np
+from numpy.typing import NDArray
+
+LARGEST = 1.8e300
+"""No number is larger."""
+INTEGERS = -(2**63), 2**63 - 1
+COUNTS = 0, 2**62
+YES_OR_NO = 0, 1
+FINITE, NOT_NEGATIVE, AT_LEAST_1 = (-LARGEST, LARGEST), (0.0, LARGEST), (1.0, LARGEST)
+RANGES: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(('pending', 'period', 'beyond', 'watched'), NOT_NEGATIVE),
+    **dict.fromkeys(('saturated', 'narrowed'), NOT_NEGATIVE),
+    **dict.fromkeys(('spread', 'scale'), AT_LEAST_1),
+    **dict.fromkeys(('spikes', 'tick_count', 'repeats', 'held_for'), COUNTS),
+    **dict.fromkeys(('mean_interval', 'mean_jitter', 'usual_interval'), COUNTS),
+    'intervals': (0, 32), 'regular': (0, 12), 'ticks': (-5000, 2**17), 'elsewhere': (0.0, 1.0),
+    'event': (0, 5), 'event_deviation': (0.0, math.inf), 'past_place': (0, 511),
+    'past_count': (0, 512),
+}  # fmt: skip
+"""Of what is remembered; other integers have 64 bits, other numbers are at most `LARGEST`."""
+
+
+def checked(values: Mapping[str, Any], like: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return the numbers and arrays that `like` names, each of the type and shape that it has there.
+
+    Raises
+    ------
+    ConfigurationError
+        One is missing, of another type or shape, or out of its range.
+
+    """
+    found: dict[str, Any] = {}
+    for name, value in like.items():
+        if not isinstance(value, Integral):
+            array = array_of(values, name, np.shape(value), *RANGES.get(name, FINITE))
+            found[name] = array if array.ndim else float(array)
+            continue
+        least, most = YES_OR_NO if isinstance(value, bool) else RANGES.get(name, INTEGERS)
+        number: Any = values.get(name)
+        if not isinstance(number, Integral) or not least <= int(number) <= most:
+            raise _refused(name, f'an integer of {least:g} to {most:g}', repr(number))
+        found[name] = int(number)
+    return found
+
+
+def array_of(
+    values: Mapping[str, Any],
+    name: str,
+    shape: tuple[int, ...],
+    least: float = -LARGEST,
+    most: float = LARGEST,
+) -> NDArray[np.float64]:
+    """Return an array of that shape whose numbers are within that range; raise as `checked`."""
+    nothing = np.zeros(shape) if 0 in shape else 'nothing'  # an empty array has no entries
+    number = values.get(name, nothing)
+    try:
+        array = np.asarray(number, dtype=np.float64)
+    except (OverflowError, TypeError, ValueError):
+        array = np.full(1, np.nan)
+    within = (least <= array) & (array <= most)
+    if name == 'y':  # not known before the first sample
+        within |= np.isnan(array)
+    if array.shape != shape or not within.all():
+        what = f'finite numbers of shape {shape},' if shape else 'a number of'
+        raise _refused(name, f'{what} {least:g} to {most:g}', f'{number!r:.60}')
+    return array
+
+
+def _refused(name: str, expected: str, got: str) -> ConfigurationError:
+    return ConfigurationError(f"snapshot: '{name}': expected {expected}, got {got}")
