@@ -76,7 +76,8 @@ def in_core(parameters: dict[str, Any], y: np.ndarray) -> Run:
     def run() -> tuple[np.ndarray, int]:
         observer.restore(start)
         record = run_structure(observer.structure, rest, h, u, 0, count)
-        return _numbers(observer), int(record.columns['words'][0])
+        [flags], [levels] = record.columns['status'], record.columns['open_levels']
+        return _numbers(observer), int(flags) | int(levels) << LEVEL_SHIFT
 
     return run
 

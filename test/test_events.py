@@ -2,7 +2,7 @@
 """Events: what begins and ends one, and that every way of running finds the same ones."""
 
 from fhaosmo_ros.core import ConfigurationError, EventDetector, OnlineEstimator
-from fhaosmo_ros.core.observer.status import REJECTED_SPIKE, RESTARTED
+from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -98,9 +98,9 @@ def test_a_change_is_judged_against_the_running_mean():
 
 def test_rejected_samples_do_not_count_and_a_restart_ends_an_event():
     d, words = pulse(300, 600), np.zeros(1000, dtype=np.int64)
-    d[400:420], words[400:420] = 0.0, REJECTED_SPIKE
+    d[400:420], words[400:420] = 0.0, Status.REJECTED_SPIKE
     assert found(d, words=words, event_threshold=0.5) == [(350, True), (600, False)]
-    words[500] = RESTARTED
+    words[500] = Status.RESTARTED
     detector = EventDetector(DEFAULTS | {'event_threshold': 0.5})
     detector.take(BEGIN + H * np.arange(1000), d, words=words)
     restarted = [(e.sample, e.begins) for e in detector.taken()]
@@ -118,7 +118,7 @@ def test_a_split_run_finds_what_the_whole_run_finds(cuts, seed, duration, change
     rng = np.random.default_rng(seed)
     d, deviations = np.cumsum(rng.standard_normal(200)), rng.uniform(0.1, 2.0, 200)
     stamps = BEGIN + np.cumsum(rng.integers(1, 3 * H, 200))
-    words = rng.choice([0, 0, 0, 0, 0, REJECTED_SPIKE, RESTARTED], 200)
+    words = rng.choice([0, 0, 0, 0, 0, Status.REJECTED_SPIKE, Status.RESTARTED], 200)
     p = DEFAULTS | {
         'event_deviations': 2.0, 'event_threshold': 0.7, 'event_duration': duration,
         'event_change_time': change,

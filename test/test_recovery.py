@@ -320,8 +320,9 @@ def influences(noise):
     p = {'structure': 'levant', 'scheme': 'predict_correct', 'correction_period': 1e-3}
     levant, counted, limits = Levant(ObserverConfiguration(p)), [], []
     for b in noise:
-        counted.append(levant.bounded(b, 1.0))
-        limits.append(HUBER - levant.narrowed)
+        as_large, limit = levant.bounded(b, 1.0)
+        counted.append(as_large)
+        limits.append(limit)
     return np.array(counted), np.array(limits)
 
 

@@ -85,7 +85,7 @@ def test_gamma_moves_down_the_gradient_of_the_loss(model, scheme, gamma):
         adaptive.run(t[:k], y[:k], u[:k])
         adaptive.configure({'gamma_rate': rate})
         adaptive.run(t[k : k + 1], y[k : k + 1], u[k : k + 1])
-        moved = adaptive.structure.gamma - gamma
+        moved = adaptive.estimate.gamma - gamma
 
         # Explicit: L at the beginning of the interval, as everything in forward Euler.
         at = k - 1 if scheme == 'explicit' else k

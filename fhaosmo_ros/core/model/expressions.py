@@ -31,23 +31,12 @@ evaluates every Phi 40,000 times in a simulated second.
 MAX_FUNCTIONS = 30
 """Functions of one expression."""
 
-FUNCTIONS = {
-    'sin': phi.SIN,
-    'cos': phi.COS,
-    'tan': phi.TAN,
-    'exp': phi.EXP,
-    'log': phi.LOG,
-    'sqrt': phi.SQRT,
-    'abs': phi.ABS,
-    'tanh': phi.TANH,
-    'sign': phi.SIGN,
+FUNCTIONS: dict[str, int] = {
+    name: getattr(phi, name.upper())
+    for name in ('sin', 'cos', 'tan', 'exp', 'log', 'sqrt', 'abs', 'tanh', 'sign')
 }
 """Functions of one argument."""
-FUNCTIONS_OF_SEVERAL = {
-    'atan2': phi.ATAN2,
-    'min': phi.MIN,
-    'max': phi.MAX,
-}
+FUNCTIONS_OF_SEVERAL = {'atan2': phi.ATAN2, 'min': phi.MIN, 'max': phi.MAX}
 """Functions of two arguments; min and max also take more."""
 NUMBERS = {'pi': math.pi}
 """Names of numbers."""

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.observer.status import FLAGS_MASK, LEVEL_SHIFT
 from fhaosmo_ros.core.observer.structure import Estimate as Estimate
 import numpy as np
 from numpy.typing import NDArray
@@ -97,30 +96,6 @@ class Trajectory(NamedTuple):
     def rows(self, index: Any) -> 'Trajectory':
         """Return those of its rows that an index of NumPy picks."""
         return Trajectory._make(column[index] for column in self)
-
-    @classmethod
-    def of(cls, structure: Any, t: NDArray[Any], record: Any) -> 'Trajectory':
-        """
-        Return what a run has recorded.
-
-        Parameters
-        ----------
-        structure : Structure
-        t : (K,) array
-        record : Record
-
-        """
-        columns = record.columns
-        z_hat, z_tilde, n = columns['z_hat'], columns['z_tilde'], structure.order
-        z, words = z_hat[:, :n].copy(), columns['words']
-        if structure.configuration.internal:
-            z[:, 1:] = z_tilde[:, : n - 1]
-        d = z_tilde[:, n - 1] if structure.d_is_internal else z_hat[:, n]
-        return cls(
-            t, z, d.copy(), columns['gamma'], columns['innovation'], words & FLAGS_MASK,
-            words >> LEVEL_SHIFT, z_hat, z_tilde, np.sqrt(columns['variance']),
-            columns['model'], columns['tuning'],
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)

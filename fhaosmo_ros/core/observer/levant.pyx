@@ -349,10 +349,5 @@ cdef class Levant(SlidingMode):
         return found.eps, found.w, found.s
 
     def bounded(self, double b, double usual):
-        """Return as how large an innovation `b` counts whose usual size is `usual` (D 32)."""
-        return self.influence(b, usual)
-
-    @property
-    def narrowed(self):
-        """By what the limit of the influence of innovations is below the largest one (D 32)."""
-        return self.memory.narrowed
+        """Return as how large an innovation counts, and the limit after it over `usual` (D 32)."""
+        return self.influence(b, usual), HUBER - self.memory.narrowed

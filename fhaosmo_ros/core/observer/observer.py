@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 import warnings
 
-from fhaosmo_ros.core.model.inputs import column, known_inputs_of_run
+from fhaosmo_ros.core.model.inputs import column, known_inputs
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.cascade import Cascade
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
@@ -324,7 +324,7 @@ class Observer:
                 f'run: expected t and y with one dimension and equal length, '
                 f'got shapes {t.shape} and {y.shape}'
             )
-        u = known_inputs_of_run(self._no_input() if u is None else u, len(y), self.inputs)
+        u = known_inputs(self._no_input() if u is None else u, self.inputs, len(y))
         first, start = 0, self._t
         if not self.started:
             good = np.flatnonzero(np.isfinite(HEADROOM * y))
@@ -334,7 +334,7 @@ class Observer:
             self._t = t[-1].item()
         record = run(self.structure, y, h, u, first, every)
         self.check_functions()
-        return Trajectory.of(self.structure, t[every - 1 :: every], record)
+        return Trajectory(t[every - 1 :: every], **record.columns)
 
     def smooth(self, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
         """

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a run of samples records."""
 
+from libc.math cimport sqrt
+
 from fhaosmo_ros.core.observer.status cimport FLAGS_MASK, LEVEL_SHIFT
 from fhaosmo_ros.core.observer.structure cimport Structure
 
@@ -9,7 +11,7 @@ import numpy as np
 
 cdef class Record:
     """
-    What a run records: a row for each recorded sample, as arrays in `columns`.
+    What a run records, a row for each recorded sample: arrays by the names of `Trajectory`.
 
     Parameters
     ----------
@@ -21,12 +23,21 @@ cdef class Record:
     def __cinit__(self, Structure structure not None, Py_ssize_t rows):
         cdef int n = structure.levels
         tunes = structure.configuration.self_tuning
-        self.z_hat, self.z_tilde = np.empty((rows, n)), np.empty((rows, n))
-        self.innovation, self.gamma = np.empty((rows, n)), np.empty(rows)
-        self.variance = np.empty((rows, structure.order + 1 if tunes else 0))
-        self.model = np.empty((rows, 4 if tunes else 0))
-        self.tuning = np.empty((rows, 7 if tunes else 0))
-        self.words = np.empty(rows, dtype=np.int64)
+        widths = {
+            'z': structure.order, 'innovation': n, 'z_hat': n, 'z_tilde': n,
+            'standard_deviation': structure.order + 1 if tunes else 0,
+            'model': 4 if tunes else 0, 'tuning': 7 if tunes else 0,
+        }
+        found = {name: np.empty((rows, width)) for name, width in widths.items()}
+        found |= {name: np.empty(rows) for name in ('unknown_input', 'gamma')}
+        found |= {name: np.empty(rows, dtype=np.int64) for name in ('status', 'open_levels')}
+        self.columns = found
+        self.z, self.unknown_input = found['z'], found['unknown_input']
+        self.gamma, self.innovation = found['gamma'], found['innovation']
+        self.status, self.open_levels = found['status'], found['open_levels']
+        self.z_hat, self.z_tilde = found['z_hat'], found['z_tilde']
+        self.standard_deviation = found['standard_deviation']
+        self.model, self.tuning = found['model'], found['tuning']
 
     cdef void write(self, Structure structure, Py_ssize_t row, int word) noexcept nogil:
         """Record what an observer knows."""
@@ -35,26 +46,15 @@ cdef class Record:
             self.z_hat[row, i] = structure.level[i].z_hat
             self.z_tilde[row, i] = structure.level[i].z_tilde
             self.innovation[row, i] = structure.innovation[i]
-        for i in range(<int>self.variance.shape[1]):
-            self.variance[row, i] = structure.variance(i)
+        for i in range(structure.order):
+            self.z[row, i] = structure.estimate(i)
+        for i in range(<int>self.standard_deviation.shape[1]):
+            self.standard_deviation[row, i] = sqrt(structure.variance(i))
         if self.model.shape[1] > 0:
             structure.tell(&self.model[row, 0], &self.tuning[row, 0])
+        self.unknown_input[row] = structure.estimate(structure.order)
         self.gamma[row] = structure.memory.gamma
-        self.words[row] = word
-
-    @property
-    def columns(self):
-        """Arrays by name: z_hat, z_tilde, innovation, variance, model, tuning, gamma, words."""
-        return {
-            'z_hat': np.asarray(self.z_hat),
-            'z_tilde': np.asarray(self.z_tilde),
-            'innovation': np.asarray(self.innovation),
-            'variance': np.asarray(self.variance),
-            'model': np.asarray(self.model),
-            'tuning': np.asarray(self.tuning),
-            'gamma': np.asarray(self.gamma),
-            'words': np.asarray(self.words),
-        }
+        self.status[row], self.open_levels[row] = word & FLAGS_MASK, word >> LEVEL_SHIFT
 
 
 def run(

@@ -3,19 +3,12 @@
 
 from typing import Any
 
-from fhaosmo_ros.core.model.inputs import known_inputs_of_run
+from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.observer.configuration import DERIVATIVES, Floats
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, TUNING
 from fhaosmo_ros.core.observer.record import Record
 from fhaosmo_ros.core.observer.smoothing import BEGINS, JUMPS, MEASURED, Rows, UNMEASURED
-from fhaosmo_ros.core.observer.status import (
-    DIVERGED,
-    JUMPED,
-    LEVEL_SHIFT,
-    REJECTED,
-    RESTARTED,
-    UNUSED,
-)  # fmt: skip
+from fhaosmo_ros.core.observer.status import LEVEL_SHIFT, REJECTED, Status, UNUSED
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -72,8 +65,7 @@ class Smoother:
         self._time: Any = None
         self._taken = 0
         nothing: Ints = np.zeros(0, dtype=np.int64)
-        structure = observer.structure
-        self._found = Trajectory.of(structure, nothing, Record(structure, 0))  # rows that wait
+        self._found = Trajectory(nothing, **Record(observer.structure, 0).columns)  # they wait
         self._numbers = self.numbers = nothing
         self.estimate: Estimate | None = None
         self.stamp = 0
@@ -142,7 +134,9 @@ class Smoother:
         """
         kinds: Ints = np.where(status & UNUSED, UNMEASURED, MEASURED)
         used = np.flatnonzero(kinds == MEASURED)
-        for kind, flags in ((JUMPS, JUMPED), (BEGINS, RESTARTED | DIVERGED)):
+        for kind, flags in (
+            (JUMPS, Status.JUMPED), (BEGINS, Status.RESTARTED | Status.DIVERGED),
+        ):  # fmt: skip
             marks = self._expected[kind] + np.cumsum((status & flags) > 0)
             kinds[used[np.diff(marks[used], prepend=0) > 0]] = kind
             latest = marks[used[-1]] if len(used) else 0
@@ -222,7 +216,7 @@ def smooth(observer: Any, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None
     if not observer.started:
         return whole
     first = int(np.argmax((whole.status & REJECTED) == 0))
-    u = known_inputs_of_run(0.0 if u is None else u, len(whole.t), observer.inputs).copy()
+    u = known_inputs(0.0 if u is None else u, observer.inputs, len(whole.t))
     for k in np.flatnonzero(~np.isfinite(u).all(axis=1)).tolist():  # the last ones are held
         u[k] = u[max(k - 1, first)]
     smoother = Smoother(observer, every=True)

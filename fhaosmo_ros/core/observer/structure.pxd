@@ -59,7 +59,6 @@ cdef class Structure:
     cdef bint implicit  # a step uses the sample at its end
     cdef bint from_measurement  # z_1 begins at the first sample
     cdef bint internal  # estimates are the internal states
-    cdef readonly bint d_is_internal  # the estimate of d is z_tilde_n, not z_hat_{n+1}
     cdef double epsilon  # threshold of the gates (unit of y)
     cdef Prediction prediction
     # What it remembers.
@@ -79,7 +78,7 @@ cdef class Structure:
     cdef int step(self, double y, double h, const double* u) noexcept nogil
     cdef int measure(self, double y) noexcept nogil
     cdef void begin_at_estimates(self) noexcept nogil
-    cdef double unknown_input(self) noexcept nogil
+    cdef double estimate(self, int i) noexcept nogil
     cdef void reset(self) noexcept nogil
     cdef void enter(self) except *
     # For a structure to implement.

@@ -75,7 +75,6 @@ cdef class Structure:
         self.predicting, self.implicit = configuration.predicting, configuration.implicit
         self.from_measurement = configuration.parameters['start_from_measurement']
         self.internal = configuration.internal
-        self.d_is_internal = configuration.internal or self.levels == self.order
         self.epsilon = configuration.epsilon
         self.prediction = Prediction(configuration.expressions, configuration.prediction_step)
 
@@ -166,11 +165,11 @@ cdef class Structure:
             self.prediction.z[i] = self.level[i - 1].z_tilde if i > 0 else self.memory.y
             self.prediction.dz[i] = 0.0
 
-    cdef double unknown_input(self) noexcept nogil:
-        """Return the estimate of d."""
-        if self.d_is_internal:
-            return self.level[self.order - 1].z_tilde
-        return self.level[self.order].z_hat
+    cdef double estimate(self, int i) noexcept nogil:
+        """Return the estimate of z_{i+1}, or of d for i = n, or of its derivatives behind it."""
+        if i > 0 and (self.internal or i >= self.levels):
+            return self.level[i - 1].z_tilde
+        return self.level[i].z_hat
 
     cdef void reset(self) noexcept nogil:
         """Go back to the state before any sample."""
@@ -308,10 +307,8 @@ cdef class Structure:
         for i in range(self.levels):
             estimate.innovations[i] = self.innovation[i]
         for i in range(self.order):
-            estimate.values[i] = self.level[i].z_hat
-            if self.internal and i > 0:
-                estimate.values[i] = self.level[i - 1].z_tilde
-        estimate.unknown_input, estimate.gamma = self.unknown_input(), self.memory.gamma
+            estimate.values[i] = self.estimate(i)
+        estimate.unknown_input, estimate.gamma = self.estimate(self.order), self.memory.gamma
         return estimate
 
     def forget(self):
@@ -327,12 +324,7 @@ cdef class Structure:
     @property
     def d(self):
         """The estimate of d."""
-        return self.unknown_input()
-
-    @property
-    def gamma(self):
-        """The adaptive power."""
-        return self.memory.gamma
+        return self.estimate(self.order)
 
     @property
     def spread(self):

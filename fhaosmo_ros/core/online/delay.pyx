@@ -10,7 +10,6 @@ sample needs the inputs that arrived a lag of measurement_delay - input_delay be
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.prediction cimport Prediction
-from fhaosmo_ros.core.observer.structure cimport MOST_INPUTS
 
 import numpy as np
 
@@ -33,8 +32,6 @@ cdef class PastInputs:
     """
 
     def __cinit__(self, int inputs, bint late):
-        if not 0 < inputs <= MOST_INPUTS:
-            raise ValueError(f'expected 1 to {MOST_INPUTS} known inputs, got {inputs}')
         cdef double[::1] latest = np.zeros(inputs)
         cdef double[:, ::1] pieces = np.zeros((MOST_PIECES if late else 0, 1 + inputs))
         self.inputs, self.is_late, self.pieces = inputs, late, np.asarray(pieces)
@@ -119,17 +116,3 @@ cdef class PastInputs:
             delay -= lag
         if delay > 0:
             prediction.over(delay * NANOSECONDS, self.present)
-
-    def remember(self, Ring ring):
-        """Let the pieces of the ring lie there."""
-        if not (0 <= ring.past_place < MOST_PIECES and 0 <= ring.past_count <= MOST_PIECES):
-            raise ValueError(f'expected places in a ring of {MOST_PIECES} pieces, got {ring}')
-        self.ring = ring
-
-    def __reduce__(self):
-        state = self.ring, self.latest, self.pieces
-        return PastInputs, (self.inputs, self.is_late), state
-
-    def __setstate__(self, state):
-        ring, self.latest[:], self.pieces[:] = state
-        self.remember(ring)

@@ -8,7 +8,7 @@ import operator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.model.inputs import column, known_inputs_of_run
+from fhaosmo_ros.core.model.inputs import column, known_inputs
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, Tuning
 from fhaosmo_ros.core.observer.numbers import checked
@@ -16,7 +16,6 @@ from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.smoother import Smoother
 from fhaosmo_ros.core.observer.smoothing import Rows
 from fhaosmo_ros.core.online.counters import Counters
-from fhaosmo_ros.core.online.delay import PastInputs
 from fhaosmo_ros.core.online.events import check_events, EventDetector
 from fhaosmo_ros.core.online.policy import Policy
 from fhaosmo_ros.core.online.snapshots import VERSION
@@ -90,9 +89,7 @@ class OnlineEstimator:
         if p['smoothing_lag'] > 0.0:
             self.smooth(p['smoothing_lag'])
         self._u = np.zeros(len(self.observer.inputs))
-        settings = self._settings(p)
-        past = PastInputs(len(self._u), settings['lag'] > 0)
-        self.policy = Policy(self.observer.structure, settings, past)
+        self.policy = Policy(self.observer.structure, self._settings(p))
         self.events = EventDetector(p, p['max_gap'])
 
     def __copy__(self) -> 'OnlineEstimator':
@@ -205,8 +202,8 @@ class OnlineEstimator:
         }  # fmt: skip
         return {name: round(seconds / NANOSECONDS) for name, seconds in times.items()} | {
             'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
-            'to_now': p['predict_to_now'], 'filtered': p['estimate_from'] == 'filtered',
-            'gate': p['spike_gate'], 'limit': p['divergence_limit'],
+            'to_now': p['predict_to_now'], 'gate': p['spike_gate'],
+            'limit': p['divergence_limit'],
             'epsilon': math.inf if self.observer.self_tuning else p['epsilon'],
         }  # fmt: skip
 
@@ -459,7 +456,7 @@ class OnlineEstimator:
         count = len(y)
         inputs = np.tile(self._u, (count, 1))
         if u is not None:
-            inputs = known_inputs_of_run(u, count, self.observer.inputs).copy()
+            inputs = known_inputs(u, self.observer.inputs, count)
             for k, j in np.argwhere(~np.isfinite(inputs)):
                 inputs[k, j] = inputs[k - 1, j] if k else self._u[j]
                 self.reject_inputs(1)
@@ -473,7 +470,7 @@ class OnlineEstimator:
         """Take samples with their known inputs, and look at them for events and for smoothing."""
         watched = self.events.on or self._smoothing is not None
         record, present, times, acting = self.policy.run(stamps, y, u, watched)
-        found = Trajectory.of(self.observer.structure, stamps - self._behind, record)
+        found = Trajectory(stamps - self._behind, **record.columns)
         if self.events.on:
             deviations = found.standard_deviation[:, -1] if self.observer.self_tuning else None
             self.events.take(found.t, found.unknown_input, deviations, times, found.status)

@@ -6,7 +6,6 @@ cdef struct Settings:
     bint nominal  # dt is `period`, whatever the stamps say
     bint by_clock  # stamps are the node clock's at reception
     bint to_now  # estimates are carried over the delay
-    bint filtered  # estimates are z_hat
     long long period  # nominal one
     long long max_gap  # 0: so many intervals as policy.pyx says
     long long stuck_time  # 0: off

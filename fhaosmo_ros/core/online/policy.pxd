@@ -19,7 +19,7 @@ cdef class Policy:
 
     # For whoever feeds it samples.
     cdef int take(self, long long stamp, double y, const double* u) noexcept nogil
-    cdef void published(self, bint filtered, double* out) noexcept nogil
+    cdef void carry(self, double* out) noexcept nogil
     cdef void forget_samples(self) noexcept nogil
     # Its parts.
     cdef int judge(self, long long stamp, long long now, double y) noexcept nogil

@@ -47,12 +47,11 @@ cdef class Policy:
         The observer.
     settings : dict
         Values of `Settings`.
-    past : PastInputs
 
     """
 
-    def __cinit__(self, Structure structure not None, dict settings, PastInputs past not None):
-        self.past = past
+    def __cinit__(self, Structure structure not None, dict settings):
+        self.past = PastInputs(structure.inputs, settings['lag'] > 0)
         self.configure(structure, settings)
 
     def configure(self, Structure structure not None, dict settings):
@@ -387,34 +386,19 @@ cdef class Policy:
             and difference(now, course.lost_since) > self.settings.divergence_time
         )
 
-    cdef void published(self, bint filtered, double* out) noexcept nogil:
-        """
-        Write z_1 .. z_n and d as they are published: at the sample, or carried to the present.
-
-        Parameters
-        ----------
-        filtered : bool
-            Choose z_hat, else the internal states.
-        out : (n + 1,) array
-
-        """
-        cdef int i, n = self.structure.order, count = self.structure.levels
+    cdef void carry(self, double* out) noexcept nogil:
+        """Write z_1 .. z_n and d, (n + 1,), carried over the delay to the present."""
+        cdef double* z = self.structure.prediction.z
+        cdef int i, n = self.structure.order
         cdef bint finite = True
         for i in range(self.structure.prediction.n):
-            if i > 0 and (not filtered or i >= count):
-                self.structure.prediction.z[i] = self.structure.level[i - 1].z_tilde
-            else:
-                self.structure.prediction.z[i] = self.structure.level[i].z_hat
-            self.structure.prediction.dz[i] = 0.0
-        memcpy(out, self.structure.prediction.z, (n + 1) * sizeof(double))
-        if self.settings.to_now and self.settings.delay > 0:
-            self.past.carry(
-                self.structure.prediction, self.settings.lag, self.settings.delay
-            )
-            for i in range(n + 1):
-                finite = finite and isfinite(self.structure.prediction.z[i])
-            if finite:  # else the model has left the finite numbers, and the estimates stay
-                memcpy(out, self.structure.prediction.z, (n + 1) * sizeof(double))
+            z[i], self.structure.prediction.dz[i] = self.structure.estimate(i), 0.0
+        memcpy(out, z, (n + 1) * sizeof(double))
+        self.past.carry(self.structure.prediction, self.settings.lag, self.settings.delay)
+        for i in range(n + 1):
+            finite = finite and isfinite(z[i])
+        if finite:  # else the model has left the finite numbers, and the estimates stay
+            memcpy(out, z, (n + 1) * sizeof(double))
 
     # What Python calls
 
@@ -462,7 +446,7 @@ cdef class Policy:
                 for k in range(count):
                     record.write(structure, k, self.take(stamps[k], y[k], &u[k, 0]))
                     if carried:
-                        self.published(self.settings.filtered, &present[k, 0])
+                        self.carry(&present[k, 0])
                     if watched:
                         times[k] = self.course.latest
                         inputs = &u[k, 0]
@@ -479,7 +463,7 @@ cdef class Policy:
         cdef double values[MOST_LEVELS + 1]
         if self.settings.to_now and self.settings.delay > 0:
             self.structure.enter()
-            self.published(self.settings.filtered, values)
+            self.carry(values)
             memcpy(estimate.values, values, self.structure.order * sizeof(double))
             estimate.unknown_input = values[self.structure.order]
         return estimate
@@ -499,13 +483,13 @@ cdef class Policy:
         """Remember other numbers: members of `memory` by name."""
         cdef dict memory = self.memory | numbers
         self.structure.enter()
-        self.past.remember(memory)
+        self.past.ring = memory
         self.course, self.clock, self.sensor = memory, memory, memory
 
     def __reduce__(self):
-        state = self.memory, self.counters
-        return Policy, (self.structure, self.settings, self.past), state
+        state = self.memory, self.counters, self.past.latest, self.past.pieces
+        return Policy, (self.structure, self.settings), state
 
     def __setstate__(self, state):
-        memory, self.counters = state
+        memory, self.counters, self.past.latest[:], self.past.pieces[:] = state
         self.change(**memory)

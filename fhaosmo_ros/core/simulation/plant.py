@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import math
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.model.inputs import Floats, known_inputs, known_inputs_of_run
+from fhaosmo_ros.core.model.inputs import Floats, known_inputs
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import per_level
 from fhaosmo_ros.core.parameters.declaration import Parameters
@@ -174,7 +174,7 @@ class Plant:
         t = np.ascontiguousarray(t, dtype=np.float64)
         if not np.all(np.isfinite(t)):
             raise ConfigurationError('plant: expected finite times, got some that are not')
-        u = known_inputs_of_run(u, len(t), self._model.inputs)
+        u = known_inputs(u, self._model.inputs, len(t))
         z = self._system.advance(t, u)
         return Truth(self._measured(z[:, 0]), z, self._d.along(t))
 
@@ -225,5 +225,5 @@ def respond(
     t, d = np.ascontiguousarray(t, dtype=np.float64), Table(table, spacing)
     z = np.broadcast_to(initial_state, model.order)
     system = System(model.expressions, d, step, z)
-    inputs = known_inputs_of_run(u, len(t), model.inputs)
+    inputs = known_inputs(u, model.inputs, len(t))
     return system.advance(t, inputs, on_grid=False), d.along(t)

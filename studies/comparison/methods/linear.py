@@ -18,7 +18,7 @@ from functools import lru_cache, partial
 import math
 from typing import NamedTuple
 
-from fhaosmo_ros.core.model.inputs import known_inputs_of_run
+from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -60,7 +60,7 @@ class Samples(NamedTuple):
     @classmethod
     def of(cls, r: Recording, model: TriangularModel) -> 'Samples':
         """Return those of a recording."""
-        u = known_inputs_of_run(r.u, len(r.y), model.inputs)
+        u = known_inputs(r.u, model.inputs, len(r.y))
         return cls(np.ascontiguousarray(r.y), np.diff(r.t, prepend=r.t[0]), u)
 
 
