@@ -8,7 +8,7 @@ cpdef enum:
     CALL
 
 cdef enum:
-    MOST_OPERANDS = 128  # on the stack of an expression
+    MOST_OPERANDS = 128  # on the stack of an expression; above `MAX_OPERATIONS` of expressions.py
 
 
 cdef struct Dual:
@@ -33,7 +33,6 @@ cdef class Expressions:
     cdef Dual call(
         self, int i, const double* z, const double* dz, const double* u
     ) noexcept with gil
-    cdef check(self, expression)
 
 
 cdef inline Dual evaluate(

@@ -34,10 +34,9 @@ cdef class Expressions:
     states, inputs : int
         How many states and known inputs there are.
 
-    Raises
-    ------
-    ValueError
-        An operation that there is not, an index out of range, or operands that do not fit.
+    Notes
+    -----
+    Operations are as `expressions.parse` makes them, which bounds their number and operands.
 
     """
 
@@ -60,7 +59,6 @@ cdef class Expressions:
                 self.code[k].code = CALL
                 k += 1
                 continue
-            self.check(expression)
             for code, operand in expression:
                 self.code[k].code = code
                 self.code[k].index = <int>operand if code in (STATE, INPUT) else 0
@@ -74,22 +72,6 @@ cdef class Expressions:
 
     def __reduce__(self):
         return Expressions, (self.source, self.states, self.inputs)
-
-    cdef check(self, expression):
-        """Raise ValueError unless an expression leaves one value on a stack of bounded size."""
-        cdef int depth = 0
-        for code, operand in expression:
-            limit = {STATE: self.states, INPUT: self.inputs}.get(code)
-            if not CONST <= code <= SIGN or (limit is not None and not 0 <= operand < limit):
-                raise ValueError(f'no operation ({code}, {operand})')
-            needed = 0 if code <= INPUT else 2 if code <= MAX else 1
-            if depth < needed:
-                raise ValueError(f'operation {code} needs {needed} operands, has {depth}')
-            depth += 1 - needed
-            if depth > MOST_OPERANDS:
-                raise ValueError(f'more than {MOST_OPERANDS} operands')
-        if depth > 1 or (depth == 0 and expression):
-            raise ValueError(f'an expression leaves {depth} values')
 
     cdef Dual evaluate(
         self, int i, const double* z, const double* dz, const double* u

@@ -7,7 +7,7 @@ linearised at rest, with a Matern model of d (D 17, D 20). It begins with the si
 of d and of the noise that parameters tell.
 """
 
-from libc.math cimport exp, fabs, isfinite, pow
+from libc.math cimport NAN, exp, fabs, isfinite, pow
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.phi cimport Dual
@@ -61,19 +61,14 @@ cdef class SlidingMode(Structure):
     cdef void reset(self) noexcept nogil:
         """Go back to the state before any sample."""
         Structure.reset(self)
+        SlidingMode.restart(self, NAN)
         self.level = self.first
-        self.memory.gamma = self.gamma_initial
-        self.covariance = self.fresh
-        self.memory.settled = 0.0 if self.scheduled else 1.0
 
     cdef void restart(self, double y) noexcept nogil:
         """Begin afresh from `y`; the time of the next sample counts from it."""
-        self.level = self.first
+        self.level, self.covariance = self.first, self.fresh
         self.level[0].z_hat = self.memory.y = y
-        if self.adaptive:
-            self.memory.gamma = self.gamma_initial
-        self.memory.pending = 0.0
-        self.covariance = self.fresh
+        self.memory.gamma, self.memory.pending = self.gamma_initial, 0.0
         self.memory.settled = 0.0 if self.scheduled else 1.0
 
     def take_over(self, Structure before):

@@ -304,8 +304,7 @@ cdef class Structure:
         cdef Estimate estimate = Estimate.__new__(Estimate)
         cdef int i
         estimate.order, estimate.levels, estimate.word = self.order, self.levels, self.word
-        for i in range(self.levels):
-            estimate.innovations[i] = self.innovation[i]
+        estimate.innovations = self.innovation
         for i in range(self.order):
             estimate.values[i] = self.estimate(i)
         estimate.unknown_input, estimate.gamma = self.estimate(self.order), self.memory.gamma

@@ -2,7 +2,6 @@
 """The simulated plant (paper eq. newsimpledynamics): triangular system, unknown input, sensor."""
 
 from collections.abc import Mapping
-import math
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.inputs import Floats, known_inputs
@@ -133,10 +132,7 @@ class Plant:
             A time that is not finite, or another number of inputs.
 
         """
-        if not math.isfinite(t):
-            raise ConfigurationError(f'plant: expected a finite time, got {t}')
-        inputs = known_inputs(u, self._model.inputs)
-        self._system.advance(np.array([t], dtype=np.float64), inputs[np.newaxis])
+        self._states([t], known_inputs(u, self._model.inputs)[np.newaxis])
 
     @property
     def finite(self) -> bool:
@@ -145,9 +141,8 @@ class Plant:
 
     def sample(self, t: float, u: ArrayLike = 0.0) -> Truth:
         """Advance to `t` and measure: y = z_1 + noise, quantised."""
-        self.advance(t, u)
-        z, d = self._system.states, self._d.along([t])
-        return Truth(float(self._measured(z[:1])[0]), z, float(d[0]))
+        found = self.simulate([t], known_inputs(u, self._model.inputs)[np.newaxis])
+        return Truth(float(found.y[0]), found.z[0], float(found.unknown_input[0]))
 
     def simulate(self, t: ArrayLike, u: ArrayLike | float = 0.0) -> Truth:
         """
@@ -171,12 +166,15 @@ class Plant:
             A time that is not finite, or u of another shape.
 
         """
+        t, z = self._states(t, known_inputs(u, self._model.inputs, np.size(t)))
+        return Truth(self._measured(z[:, 0]), z, self._d.along(t))
+
+    def _states(self, t: ArrayLike, u: Floats) -> tuple[Floats, Floats]:
+        """Return times, checked, and the states at them; the simulation has gone there."""
         t = np.ascontiguousarray(t, dtype=np.float64)
         if not np.all(np.isfinite(t)):
             raise ConfigurationError('plant: expected finite times, got some that are not')
-        u = known_inputs(u, self._model.inputs, len(t))
-        z = self._system.advance(t, u)
-        return Truth(self._measured(z[:, 0]), z, self._d.along(t))
+        return t, self._system.advance(t, u)
 
     def _measured(self, z1: Floats) -> Floats:
         p = self._parameters
