@@ -4,14 +4,14 @@ From fuzzy systems, the paper's or the user's, to curves psi that a step reads i
 
 A system is one text of `fuzzy_systems`, a level each (`read_system`). The default is the paper's:
 psi_1 has 5 terms (NB NS ZR PS PB), psi_2 and psi_3 have 7 (NBB .. PBB); rule k maps term k of the
-input to term k of the output (paper, section 3). scikit-fuzzy makes the membership functions and
-defuzzifies; this is the only module that imports it. It brings scipy along, half a second and
-40 MB, so the curves of the default systems are read from fuzzy_curves.csv, and scikit-fuzzy is
-imported when another one is first wanted. Input and output universes are [-1, 1]; a half-width
-scales the input, so that a width can change without a new inference.
+input to term k of the output (paper, section 3). scikit-fuzzy defuzzifies; this is the only module
+that imports it. It brings scipy along, half a second and 40 MB, so the curves of the default
+systems are read from fuzzy_curves.csv, and scikit-fuzzy is imported when another one is first
+wanted. Input and output universes are [-1, 1]; a half-width scales the input, so that a width can
+change without a new inference.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import csv
 from functools import cache, lru_cache
 from itertools import pairwise
@@ -29,7 +29,12 @@ NAMES = {
     7: ('NBB', 'NB', 'NS', 'ZR', 'PS', 'PB', 'PBB'),
 }
 """Names of terms by their number; those of the paper for 5 and 7."""
-SHAPES = ('triangle', 'trapezoid', 'gaussian')
+SHAPES: dict[str, Callable[[Any], Any]] = {
+    'triangle': lambda off: np.clip(1.0 - off, 0.0, 1.0),
+    'trapezoid': lambda off: np.clip(1.5 - 2.0 * off, 0.0, 1.0),
+    'gaussian': lambda off: 0.5 ** np.square(2.0 * off),
+}
+"""Membership by the distance from a term's peak, in parts of that to its neighbour's."""
 SINGLETON = 'singleton'
 """Terms of the output may also be points."""
 DEFUZZIFIERS = ('centroid', 'bisector')
@@ -60,14 +65,11 @@ class Terms(NamedTuple):
         One of `SHAPES`, or `SINGLETON`.
     peaks : tuple of float
         Ascending.
-    even : bool
-        True if they divide [-1, 1] evenly.
 
     """
 
     shape: str
     peaks: tuple[float, ...]
-    even: bool
 
 
 class FuzzySystem(NamedTuple):
@@ -134,28 +136,23 @@ def read_system(text: str) -> FuzzySystem | Curve:
     sides = [clauses.get(side, common) for side in ('input', 'output')]
     if sides[0] is None:
         raise _refused(text, 'terms, input or curve', ', '.join(clauses))
-    inputs = _terms(text, sides[0], SHAPES)
+    inputs = _terms(text, sides[0], [*SHAPES])
     outputs = _terms(text, sides[1] or sides[0], (*SHAPES, SINGLETON))
+    count, most = len(inputs.peaks), len(outputs.peaks)
+    numbers: Sequence[float] = range(1, count + 1)
     if 'rules' in clauses:
         numbers = _numbers(text, clauses['rules'])
-        rules = tuple(int(k) - 1 for k in numbers if k == int(k) and 1 <= k <= len(outputs.peaks))
-        if len(rules) < len(numbers) or len(rules) != len(inputs.peaks):
-            raise _refused(
-                text,
-                f'{len(inputs.peaks)} rules, each an output term from 1 to {len(outputs.peaks)}',
-                shown(numbers),
-            )
-    elif len(inputs.peaks) == len(outputs.peaks):
-        rules = tuple(range(len(inputs.peaks)))
-    else:
-        raise _refused(
-            text, 'rules where input and output have not the same number of terms',
-            f'{len(inputs.peaks)} and {len(outputs.peaks)} terms',
-        )  # fmt: skip
+    elif count != most:
+        allowed = 'rules where input and output have not the same number of terms'
+        raise _refused(text, allowed, f'{count} and {most} terms')
+    if len(numbers) != count or not all(k in range(1, most + 1) for k in numbers):
+        allowed = f'{count} rules, each an output term from 1 to {most}'
+        raise _refused(text, allowed, shown(numbers))
+    rules = tuple(int(k) - 1 for k in numbers)
     defuzzifier = ' '.join(clauses.get('defuzzify', DEFUZZIFIERS[:1]))
-    allowed = DEFUZZIFIERS[:1] if outputs.shape == SINGLETON else DEFUZZIFIERS
-    if defuzzifier not in allowed:
-        raise _refused(text, f'defuzzify {" or ".join(allowed)}', repr(defuzzifier))
+    known = DEFUZZIFIERS[:1] if outputs.shape == SINGLETON else DEFUZZIFIERS
+    if defuzzifier not in known:
+        raise _refused(text, f'defuzzify {" or ".join(known)}', repr(defuzzifier))
     return FuzzySystem(inputs, outputs, rules, defuzzifier)
 
 
@@ -189,7 +186,8 @@ def _terms(text: str, words: Sequence[str], shapes: Sequence[str]) -> Terms:
         count = numbers[0]
         if count not in range(3, MOST_TERMS + 1, 2):
             raise _refused(text, f'an odd number of terms, 3 to {MOST_TERMS}', f'{count:g}')
-        return Terms(shape, tuple(np.linspace(-1.0, 1.0, int(count)).tolist()), True)
+        half = np.linspace(0.0, 1.0, (int(count) + 1) // 2).tolist()
+        return Terms(shape, (*(-c for c in half[:0:-1]), *half))
     apart = min(high - low for low, high in pairwise(numbers))
     within = -1.0 <= numbers[0] <= numbers[-1] <= 1.0
     if not (apart >= LEAST_GAP and within and len(numbers) <= MOST_TERMS):
@@ -197,7 +195,7 @@ def _terms(text: str, words: Sequence[str], shapes: Sequence[str]) -> Terms:
             f'2 to {MOST_TERMS} peaks within [-1, 1], each {LEAST_GAP} or more above the last'
         )
         raise _refused(text, allowed, shown(numbers))
-    return Terms(shape, tuple(numbers), False)
+    return Terms(shape, tuple(numbers))
 
 
 def _samples(text: str, values: list[float]) -> Curve:
@@ -225,35 +223,21 @@ def memberships(universe: Curve, terms: Terms) -> Curve:
     universe : (K,) array
         Where to evaluate them, within [-1, 1].
     terms : Terms
+        No singletons.
 
     Returns
     -------
     (terms, K) array
-        One row a term. A singleton is 1 at the point next to its peak.
+        One row a term.
 
     """
-    import skfuzzy
-
-    peaks = np.array(terms.peaks)
-    gaps = np.full(len(peaks) - 1, peaks[1] - peaks[0]) if terms.even else np.diff(peaks)
-    rows = []
-    for c, left, right in zip(peaks, np.r_[gaps[0], gaps], np.r_[gaps, gaps[-1]], strict=True):
-        if terms.shape == 'triangle':
-            row = skfuzzy.trimf(universe, [c - left, c, c + right])
-        elif terms.shape == 'trapezoid':
-            knots = [c - 0.75 * left, c - 0.25 * left, c + 0.25 * right, c + 0.75 * right]
-            row = skfuzzy.trapmf(universe, knots)
-        elif terms.shape == 'gaussian':
-            bell = 2.0 * np.sqrt(2.0 * np.log(2.0))  # half its height at half a gap
-            row = skfuzzy.gauss2mf(universe, c, left / bell, c, right / bell)
-        else:
-            row = np.zeros(len(universe))
-            row[np.abs(universe - c).argmin()] = 1.0
-        rows.append(row)
-    if terms.shape != SINGLETON:
-        rows[0][universe < peaks[0]] = 1.0
-        rows[-1][universe > peaks[-1]] = 1.0
-    return np.array(rows)
+    peaks = np.array(terms.peaks)[:, np.newaxis]
+    gaps, off = np.diff(peaks, axis=0), universe - peaks
+    left, right = np.vstack([gaps[:1], gaps]), np.vstack([gaps, gaps[-1:]])
+    rows: Curve = SHAPES[terms.shape](np.abs(off) / np.where(off < 0.0, left, right))
+    rows[0][universe < peaks[0]] = 1.0
+    rows[-1][universe > peaks[-1]] = 1.0
+    return rows
 
 
 def infer(x: Curve, system: FuzzySystem) -> Curve:
@@ -367,7 +351,7 @@ def _is_mirrored(system: FuzzySystem) -> bool:
     """Return True if the system is its own mirror image, so that its curve is odd."""
     last = len(system.outputs.peaks) - 1
     return system.rules == tuple(last - k for k in reversed(system.rules)) and all(
-        terms.even or terms.peaks == tuple(-c for c in reversed(terms.peaks))
+        terms.peaks == tuple(-c for c in reversed(terms.peaks))
         for terms in (system.inputs, system.outputs)
     )
 
