@@ -2,6 +2,7 @@
 """Values of the known inputs, brought into the one form that the compiled functions take."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
@@ -42,7 +43,27 @@ def known_inputs(u: ArrayLike, names: Sequence[str], count: int | None = None) -
     return np.array(np.broadcast_to(values, shape), order='C')
 
 
-def column(values: ArrayLike) -> NDArray[np.generic]:
-    """Return one column of a table, (K, 1), as (K,); anything else as an array of its shape."""
-    values = np.asarray(values)
-    return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+def samples_of_run(t: ArrayLike, y: ArrayLike) -> tuple[NDArray[Any], Floats]:
+    """
+    Return times and samples as contiguous arrays (K,) of 64-bit numbers; integers stay integers.
+
+    Columns of a table, (K, 1), are taken as well.
+
+    Raises
+    ------
+    ConfigurationError
+        More dimensions, or different lengths.
+
+    """
+    columns: list[NDArray[Any]] = []
+    for values in (np.asarray(t), np.asarray(y, dtype=np.float64)):
+        column = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+        kind = np.int64 if np.issubdtype(column.dtype, np.integer) else np.float64
+        columns.append(np.ascontiguousarray(column, dtype=kind))
+    t, y = columns
+    if t.ndim != 1 or t.shape != y.shape:
+        raise ConfigurationError(
+            'run: expected times and y with one dimension and equal length, got shapes '
+            f'{t.shape} and {y.shape}'
+        )
+    return t, y

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import math
 from typing import Any
 
-from fhaosmo_ros.core.model.triangular import constants_of, TriangularModel
+from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.fuzzy import curves, of_level, read_system
 from fhaosmo_ros.core.observer.kalman import LinearModel, Uncertainty
 from fhaosmo_ros.core.parameters.declaration import Parameter
@@ -83,9 +83,22 @@ class ObserverConfiguration:
     next_sizes: Floats
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
-        self.parameters = OBSERVER_PARAMETERS.complete(parameters)
-        self.model = TriangularModel.of(self.parameters)
-        self._complete()
+        p = self.parameters = OBSERVER_PARAMETERS.complete(parameters)
+        self.model = TriangularModel.of(p)
+        if not p['gamma_min'] <= p['gamma_initial'] <= p['gamma_max']:
+            raise ConfigurationError(
+                "parameters 'gamma_min', 'gamma_initial', 'gamma_max': expected each at most the "
+                f'next one, got {p["gamma_min"]}, {p["gamma_initial"]}, {p["gamma_max"]}'
+            )
+        self.self_tuning = p['gains'] == 'self_tuning'
+        self.schedule: Uncertainty | None = None
+        sizes = OBSERVER_PARAMETERS['state_sizes']
+        self.state_sizes = per_level(sizes, p['state_sizes'], self.model.order)
+        self.prediction_step = p['prediction_step'] or usual_step(self.model)
+        if self.self_tuning:
+            self._complete_self_tuning()
+        else:
+            self._complete_fixed_gains()
 
     def changed(self, changes: Mapping[str, Any]) -> 'ObserverConfiguration':
         """
@@ -102,30 +115,7 @@ class ObserverConfiguration:
             As the constructor, or a change of a parameter that can't change live.
 
         """
-        other = object.__new__(ObserverConfiguration)
-        other.parameters = self.parameters.changed_live(changes, 'observer')
-        other.model = self.model
-        if constants_of(other.parameters) != constants_of(self.parameters):
-            other.model = TriangularModel.of(other.parameters)
-        other._complete()
-        return other
-
-    def _complete(self) -> None:
-        p = self.parameters
-        if not p['gamma_min'] <= p['gamma_initial'] <= p['gamma_max']:
-            raise ConfigurationError(
-                "parameters 'gamma_min', 'gamma_initial', 'gamma_max': expected each at most the "
-                f'next one, got {p["gamma_min"]}, {p["gamma_initial"]}, {p["gamma_max"]}'
-            )
-        self.self_tuning = p['gains'] == 'self_tuning'
-        self.schedule: Uncertainty | None = None
-        sizes = OBSERVER_PARAMETERS['state_sizes']
-        self.state_sizes = per_level(sizes, p['state_sizes'], self.model.order)
-        self.prediction_step = p['prediction_step'] or usual_step(self.model)
-        if self.self_tuning:
-            self._complete_self_tuning()
-        else:
-            self._complete_fixed_gains()
+        return ObserverConfiguration(self.parameters.changed_live(changes, 'observer'))
 
     def _complete_self_tuning(self) -> None:
         if not self.parameters['unknown_input']:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 import warnings
 
-from fhaosmo_ros.core.model.inputs import column, known_inputs
+from fhaosmo_ros.core.model.inputs import known_inputs, samples_of_run
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.cascade import Cascade
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
@@ -318,12 +318,7 @@ class Observer:
         """
         if every < 1:
             raise ConfigurationError(f'run: expected every >= 1, got {every}')
-        t, y = times(t), np.ascontiguousarray(column(y), dtype=np.float64)
-        if t.ndim != 1 or y.shape != t.shape:
-            raise ConfigurationError(
-                f'run: expected t and y with one dimension and equal length, '
-                f'got shapes {t.shape} and {y.shape}'
-            )
+        t, y = samples_of_run(t, y)
         u = known_inputs(self._no_input() if u is None else u, self.inputs, len(y))
         first, start = 0, self._t
         if not self.started:
@@ -387,12 +382,6 @@ class Observer:
                 f'u: expected values of {", ".join(self.used_inputs)}, which phi uses, got none'
             )
         return 0.0
-
-
-def times(t: ArrayLike) -> NDArray[Any]:
-    """Return times as a column of 64-bit numbers; integers stay integers."""
-    t = column(t)
-    return t.astype(np.int64 if np.issubdtype(t.dtype, np.integer) else np.float64)
 
 
 def intervals(t: NDArray[Any], start: float | int | None) -> NDArray[np.float64]:

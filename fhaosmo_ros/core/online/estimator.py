@@ -8,7 +8,7 @@ import operator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.model.inputs import column, known_inputs
+from fhaosmo_ros.core.model.inputs import known_inputs, samples_of_run
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, Tuning
 from fhaosmo_ros.core.observer.numbers import checked
@@ -442,18 +442,12 @@ class OnlineEstimator:
             Arrays whose shapes do not fit, or stamps that are no integers.
 
         """
-        stamps, y = column(stamps), np.ascontiguousarray(column(y), dtype=np.float64)
-        if len(stamps) and not np.issubdtype(stamps.dtype, np.integer):
+        stamps, y = samples_of_run(stamps, y)
+        if len(stamps) and stamps.dtype != np.int64:
             raise ConfigurationError(
                 f'run: expected stamps in nanoseconds, which are integers, got {stamps.dtype}'
             )
-        stamps = np.ascontiguousarray(stamps, dtype=np.int64)
-        if y.ndim != 1 or stamps.shape != y.shape:
-            raise ConfigurationError(
-                'run: expected stamps and y with one dimension and equal length, got shapes '
-                f'{stamps.shape} and {y.shape}'
-            )
-        count = len(y)
+        stamps, count = stamps.astype(np.int64, copy=False), len(y)
         inputs = np.tile(self._u, (count, 1))
         if u is not None:
             inputs = known_inputs(u, self.observer.inputs, count)
