@@ -6,6 +6,7 @@ import math
 from numbers import Integral
 from typing import Any
 
+from fhaosmo_ros.core.parameters.declaration import shown
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ def checked(values: Mapping[str, Any], like: Mapping[str, Any]) -> dict[str, Any
         least, most = YES_OR_NO if isinstance(value, bool) else RANGES.get(name, INTEGERS)
         number: Any = values.get(name)
         if not isinstance(number, Integral) or not least <= int(number) <= most:
-            raise _refused(name, f'an integer of {least:g} to {most:g}', repr(number))
+            raise _refused(name, f'an integer of {least:g} to {most:g}', number)
         found[name] = int(number)
     return found
 
@@ -72,9 +73,9 @@ def array_of(
         within |= np.isnan(array)
     if array.shape != shape or not within.all():
         what = f'finite numbers of shape {shape},' if shape else 'a number of'
-        raise _refused(name, f'{what} {least:g} to {most:g}', f'{number!r:.60}')
+        raise _refused(name, f'{what} {least:g} to {most:g}', number)
     return array
 
 
-def _refused(name: str, expected: str, got: str) -> ConfigurationError:
-    return ConfigurationError(f"snapshot: '{name}': expected {expected}, got {got}")
+def _refused(name: str, expected: str, got: Any) -> ConfigurationError:
+    return ConfigurationError(f"snapshot: '{name}': expected {expected}, got {shown(got)}")

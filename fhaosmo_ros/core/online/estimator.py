@@ -276,10 +276,9 @@ class OnlineEstimator:
             Something is missing, of another size, or out of its range. Then nothing has changed.
 
         """
-        if values.get('version') != VERSION:
-            raise ConfigurationError(
-                f'snapshot: expected version {VERSION}, got {values.get("version")!r}'
-            )
+        version = checked(values, {'version': VERSION})['version']
+        if version != VERSION:
+            raise ConfigurationError(f'snapshot: expected version {VERSION}, got {version}')
         if np.size(values.get('past_pieces', ())) != self.policy.past.pieces.size:
             raise ConfigurationError(
                 'snapshot: expected that of an estimator with the same measurement_delay'

@@ -347,7 +347,9 @@ def suggestion(word: str, known: Iterable[str]) -> str:
 
 def shown(value: Any) -> str:
     """Return a value as a message shows it: at most 120 characters."""
-    if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    elif isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
         value = list(value)
     try:
         text = repr(value)
