@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics on series whose numbers are known by hand."""
 
-from fhaosmo_ros.core.simulation.metrics import chatter, rms, settling_time, total_variation
+from fhaosmo_ros.core.simulation.metrics import chatter, rms, total_variation
 import numpy as np
 import pytest
+from studies.paper.cases import settling_time
 
 
 def test_rms():

@@ -12,7 +12,7 @@ from fhaosmo_ros.core import Observer, Plant
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
-from fhaosmo_ros.core.simulation.metrics import chatter, high_passed, rms, settling_time
+from fhaosmo_ros.core.simulation.metrics import chatter, high_passed, rms
 from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from studies.evidence import Row
@@ -175,6 +175,30 @@ def score(run: JointRun, start: float = CONVERGED) -> Score:
         'high_pass': high_passed(estimate[late], max(1, round(HIGH_PASS / run.t[1]))),
         'gamma': float(run.gamma[-1]),
     }
+
+
+def settling_time(t: Floats, error: Floats, band: float) -> float:
+    """
+    Return the time after which |error| stays within `band` to the end.
+
+    Parameters
+    ----------
+    t, error : (K,) arrays
+        Times (s) and the error at these times.
+    band : float
+        Half-width of the band, > 0, in the error's unit.
+
+    Returns
+    -------
+    float
+        Seconds since ``t[0]``; 0 if it never leaves the band, infinity if it ends outside.
+
+    """
+    outside = np.flatnonzero(~(np.abs(error) <= band))
+    if not len(outside):
+        return 0.0
+    last = outside[-1]
+    return float(t[last + 1] - t[0]) if last + 1 < len(t) else float('inf')
 
 
 def sampled_rows(scheme: str, step: float, omega: float, noise: float) -> list[Row]:

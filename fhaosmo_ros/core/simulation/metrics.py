@@ -12,30 +12,6 @@ def rms(error: Series) -> float:
     return float(np.sqrt(np.mean(np.square(error)))) if len(error) else float('nan')
 
 
-def settling_time(t: Series, error: Series, band: float) -> float:
-    """
-    Return the time after which |error| stays within `band` to the end.
-
-    Parameters
-    ----------
-    t, error : (K,) arrays
-        Times (s) and the error at these times.
-    band : float
-        Half-width of the band, > 0, in the error's unit.
-
-    Returns
-    -------
-    float
-        Seconds since ``t[0]``; 0 if it never leaves the band, infinity if it ends outside.
-
-    """
-    outside = np.flatnonzero(~(np.abs(error) <= band))
-    if not len(outside):
-        return 0.0
-    last = outside[-1]
-    return float(t[last + 1] - t[0]) if last + 1 < len(t) else float('inf')
-
-
 def total_variation(x: Series) -> float:
     """Return the sum of |x[k + 1] - x[k]|."""
     return float(np.sum(np.abs(np.diff(x))))
