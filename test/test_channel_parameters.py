@@ -17,7 +17,7 @@ from fhaosmo_ros.core.parameters.tables import (
     ESTIMATOR_PARAMETERS,
     PLANT_NODE_PARAMETERS,
 )
-from fhaosmo_ros.tools.cli.options import add_parameter_options, online_parameters
+from fhaosmo_ros.tools.cli.options import add_parameter_options, channel_parameters
 import pytest
 
 NAMES = ['hip', 'knee_2']
@@ -99,7 +99,7 @@ def test_one_file_serves_channels_and_plant(rig):
 def replayed(*words):
     parser = argparse.ArgumentParser()
     add_parameter_options(parser)
-    return online_parameters(parser.parse_args(words))
+    return channel_parameters(parser.parse_args(words))
 
 
 def test_a_replay_takes_the_parameters_of_one_channel(rig):

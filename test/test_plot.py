@@ -8,12 +8,10 @@ import subprocess
 import sys
 
 import bag_files as files
-from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.tools.bags.types import labelled_array
 from fhaosmo_ros.tools.plot import command as plot
 from fhaosmo_ros.tools.plot.curves import Curves, metrics, read_curves
 from fhaosmo_ros.tools.plot.figures import COLUMNS, envelope, save_curves
-from fhaosmo_ros.tools.plot.fuzzy import fuzzy_figure, rows_of
 from fhaosmo_ros.tools.replay import command as replay
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -39,7 +37,7 @@ def _bag(tmp_path):
 @pytest.mark.parametrize('kind', MAGIC)
 def test_formats_by_file_name(kind, bag, tmp_path, capsys):
     out = tmp_path / f'figure.{kind}'
-    assert plot.main([str(bag), '-o', str(out), '-p', 'epsilon:=2.0']) == 0
+    assert plot.main([str(bag), '-o', str(out)]) == 0
     assert out.read_bytes().startswith(MAGIC[kind])
     text = capsys.readouterr().out
     assert 'two /estimator' in text
@@ -53,9 +51,6 @@ def test_formats_by_file_name(kind, bag, tmp_path, capsys):
         (['BAG', '--names', '/no'], ['/estimator, /replay/estimator', "'/no'"]),
         (['/no/bag'], ['/no/bag', 'does not exist']),
         (['PLAIN'], ['topics of an estimator', '/y']),
-        ([], ['a BAG or --fuzzy']),
-        (['BAG', 'BAG', '--fuzzy'], ['at most one BAG']),
-        (['--fuzzy', '-p', "fuzzy_systems:=['terms 4']"], ['odd number of terms']),
     ],
 )
 def test_wrong_input_is_said_in_one_line(arguments, words, bag, tmp_path, capsys, monkeypatch):
@@ -95,10 +90,10 @@ def test_figure_of_many_estimates_is_thinned(tmp_path, monkeypatch):
     count = 20_000
     stamps, y = files.signal(count)
     both = np.column_stack([y, y])
-    curves = Curves('run', stamps, ['z1', 'd'], both, both, y, truth=both, unit='rad')
+    curves = Curves('run', stamps, ['z1', 'd'], both, both, y, truth=both, epsilon=1.0, unit='rad')
     drawn = []
     monkeypatch.setattr(Figure, 'savefig', lambda figure, *_, **__: drawn.extend(figure.axes))
-    save_curves([curves], 1.0, tmp_path / 'f.png')
+    save_curves([curves], tmp_path / 'f.png')
     lengths = [len(line.get_xdata()) for axes in drawn for line in axes.lines]
     assert len(lengths) == 7
     assert max(lengths) <= 2 * COLUMNS + 2 < count
@@ -122,7 +117,7 @@ def test_signal_in_a_destructor_is_not_lost(bag, tmp_path, monkeypatch, capsys):
             signal.raise_signal(signal.SIGINT)
 
     read = plot.read_curves
-    monkeypatch.setattr(plot, 'save_curves', lambda c, e, path: path.write_bytes(b'x'))
+    monkeypatch.setattr(plot, 'save_curves', lambda c, path: path.write_bytes(b'x'))
     monkeypatch.setattr(plot, 'read_curves', lambda *a: (Collected(), read(*a))[1])
     assert plot.main([str(bag), '-o', str(tmp_path / 'f.png')]) == 130
     assert capsys.readouterr().err.endswith('plot: interrupted\n')
@@ -156,39 +151,6 @@ def test_ctrl_c_leaves_nothing(bag, tmp_path):
     assert error.strip().splitlines()[-1] == 'plot: interrupted'
     assert 'Traceback' not in error
     assert sorted(p.name for p in tmp_path.iterdir()) == ['bag', 'one', 'two']
-
-
-def test_fuzzy_systems_are_drawn_without_a_bag_or_as_it_was_made(tmp_path, capsys, monkeypatch):
-    out = tmp_path / 'fuzzy.svg'
-    systems = "['input -1 -0.2 0 0.2 1; output singleton 5', 'terms 11', 'curve 0 0.8 1']"
-    assert plot.main(['--fuzzy', '-p', f'fuzzy_systems:={systems}', '-o', str(out)]) == 0
-    assert out.read_bytes().startswith(MAGIC['svg'])
-    assert capsys.readouterr().out == f'figure: {out}\n'
-    bag = files.write(tmp_path / 'bag', files.floats(*files.signal(100)))
-    own = ['curve 0 0.8 1']
-    made = tmp_path / 'made'
-    assert replay.main([str(bag), '-o', str(made), '-p', f'fuzzy_systems:={own}']) == 0
-    drawn = []
-    monkeypatch.setattr(plot, 'rows_of', lambda p, n: drawn.append(p) or rows_of(p, n))
-    assert plot.main(['--fuzzy', str(made), '-o', str(tmp_path / 'f.png')]) == 0
-    assert drawn[0]['fuzzy_systems'] == own
-
-
-def test_figure_of_fuzzy_systems_shows_memberships_and_curve():
-    parameters = OBSERVER_PARAMETERS.complete({'fuzzy_widths': [2.0, 0.5]})
-    rows = rows_of(parameters, 4)
-    assert [(row.text, row.width, row.levels) for row in rows] == [
-        ('terms 5', 2.0, '1'),
-        ('terms 7', 0.5, '2 to 4'),
-    ]
-    figure = fuzzy_figure(rows)
-    for row, axes, terms in zip(rows, np.reshape(figure.axes, (2, 3)), (5, 7), strict=True):
-        for side, scale in ((axes[0], row.width), (axes[1], 1.0)):
-            assert len(side.lines) == terms
-            peaks = [line.get_xdata()[line.get_ydata().argmax()] for line in side.lines]
-            np.testing.assert_allclose(peaks, scale * np.linspace(-1, 1, terms), atol=2e-3 * scale)
-        x, psi = axes[2].lines[-1].get_data()
-        assert (x[0], x[-1], psi[0], psi[-1]) == (-row.width, row.width, -1.0, 1.0)
 
 
 def test_truth_is_unknown_where_the_bag_lacks_it(tmp_path):

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 import sys
 
 from fhaosmo_ros.core.observer.fuzzy import of_level
-from fhaosmo_ros.tools.plot.fuzzy import fuzzy_figure
-from fhaosmo_ros.tools.plot.fuzzy import Row as FuzzyRow
 from matplotlib.figure import Figure
 from studies import evidence
 from studies.harness import Found, Results, run_study
 from studies.paper import cases, figures, findings
 from studies.paper.cases import FREQUENCIES, LONG, SAMPLED
+from studies.paper.fuzzy_systems import fuzzy_figure, Row
 from studies.paper.plant_and_observer import JointRun, SOLVERS
 
 NAME = 'paper'
@@ -60,8 +59,7 @@ def draw(first: JointRun, runs: Sequence[Sequence[JointRun]]) -> dict[str, Figur
     preset = cases.preset().observer
     systems, widths = preset['fuzzy_systems'], preset['fuzzy_widths']
     rows = [  # psi_1, psi_2, psi_3, as in the paper
-        FuzzyRow(of_level(systems, i), of_level(widths, i), ('1', '2', '3, 4')[i])
-        for i in range(3)
+        Row(of_level(systems, i), of_level(widths, i), ('1', '2', '3, 4')[i]) for i in range(3)
     ]
     *fixed, adaptive = runs
     return {

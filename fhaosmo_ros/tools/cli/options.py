@@ -157,13 +157,6 @@ def channel_parameters(
     return CHANNEL_PARAMETERS.part_of(own)
 
 
-def online_parameters(
-    arguments: argparse.Namespace, recorded: Recorded | None = None
-) -> dict[str, Any]:
-    """Return those of `channel_parameters` that belong to the update path."""
-    return ONLINE_PARAMETERS.part_of(channel_parameters(arguments, recorded))
-
-
 def named(arguments: argparse.Namespace) -> list[str]:
     """Return the parameters of the update path that -p sets."""
     names = [name.removeprefix(f'{arguments.channel}.') for name in _on_command_line(arguments)]

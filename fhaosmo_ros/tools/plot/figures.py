@@ -43,7 +43,7 @@ def envelope(t: NDArray[Any], x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[An
     return t[rows], x[rows]
 
 
-def save_curves(curves: list[Curves], epsilon: float | None, path: Path) -> None:
+def save_curves(curves: list[Curves], path: Path) -> None:
     """
     Write a figure of several estimates laid one over another.
 
@@ -53,8 +53,6 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path) -> None
     Parameters
     ----------
     curves : list of Curves
-    epsilon : float or None
-        Threshold of the gates, drawn if known.
     path : path
         Its suffix names the format.
 
@@ -90,7 +88,7 @@ def save_curves(curves: list[Curves], epsilon: float | None, path: Path) -> None
         _fit_after_transient(axes[name], [c.estimate[:, c.names.index(name)] for c in those])
         axes[name].set_ylabel(those[0].title(name))
     t = (first.stamps - origin) * 1e-9
-    _draw_innovations(axes['innovation'], t, first.innovation, epsilon)
+    _draw_innovations(axes['innovation'], t, first.innovation, first.epsilon)
     axes['innovation'].set_ylabel('|innovation|' + ('\n(first)' if len(curves) > 1 else ''))
     for row in axes.values():
         row.grid(alpha=0.3)

@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The figure of the paper about its fuzzy systems: membership functions and curves."""
 
-from collections.abc import Mapping, Sequence
-from itertools import groupby
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from fhaosmo_ros.core.observer.fuzzy import (
     curve,
     FuzzySystem,
     memberships,
     NAMES,
-    of_level,
     read_system,
     SINGLETON,
     Terms,
@@ -45,34 +43,8 @@ class Row(NamedTuple):
     levels: str
 
 
-def rows_of(parameters: Mapping[str, Any], levels: int) -> list[Row]:
-    """Return the systems of an observer with that many levels; levels that share one, together."""
-    named = [
-        (of_level(parameters['fuzzy_systems'], i), of_level(parameters['fuzzy_widths'], i))
-        for i in range(levels)
-    ]
-    rows, first = [], 1
-    for (text, width), same in groupby(named):
-        last = first + len(list(same)) - 1
-        rows.append(Row(text, width, f'{first}' if first == last else f'{first} to {last}'))
-        first = last + 1
-    return rows
-
-
 def fuzzy_figure(rows: Sequence[Row]) -> Figure:
-    """
-    Draw a row a system: membership functions of input and output, and the curve.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-
-    Raises
-    ------
-    ConfigurationError
-        A system that is none.
-
-    """
+    """Draw a row a system: membership functions of input and output, and the curve."""
     figure = Figure(figsize=(9.0, 0.6 + 2.0 * len(rows)), layout='constrained')
     panels = figure.subplots(len(rows), 3, squeeze=False)
     for row, (left, middle, right) in zip(rows, panels, strict=True):
