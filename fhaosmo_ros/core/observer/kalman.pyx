@@ -285,11 +285,10 @@ def stationary(chain, intensity):
 
 def innovations(Prediction prediction, samples, linear):
     """
-    Run the filter of one model of d and of the noise along a recorded y (D 30).
+    Run the filter of one model of d along a recorded y (D 30).
 
     States follow the model by Runge-Kutta steps, their covariance follows a linear model of one
-    sampling period. The last state is the coloured part of the noise, v_j = a v_{j-1} + w_j, which
-    is 0 for white noise.
+    sampling period.
 
     Parameters
     ----------
@@ -300,8 +299,8 @@ def innovations(Prediction prediction, samples, linear):
         time in sampling periods, 0 where the filter begins afresh; `u` (K, m): known inputs;
         `used` (K,): False for samples that do not correct.
     linear
-        With `a`, `q`, `fresh` of shape (N + 1, N + 1): transition, added covariance of a period,
-        and covariance where the filter begins; `variance` of the white noise on y; `clip`:
+        With `a`, `q`, `fresh` of shape (N, N): transition, added covariance of a period, and
+        covariance where the filter begins; `variance` of the noise on y; `clip`:
         innovations of more standard deviations correct as so many (Huber 1964); `settled`:
         samples without a gap after which the covariance counts as steady.
 
@@ -318,20 +317,20 @@ def innovations(Prediction prediction, samples, linear):
     cdef const double[:, ::1] u = samples.u
     cdef const long long[::1] periods = samples.periods
     cdef const unsigned char[::1] used = np.asarray(samples.used, dtype=np.uint8)
-    cdef int n = prediction.n, size = prediction.n + 1, settled = min(linear.settled, 2**30)
+    cdef int n = prediction.n, settled = min(linear.settled, 2**30)
     cdef Py_ssize_t k, count = y.shape[0]
     cdef double[::1] b = np.empty(count), s = np.empty(count)
     cdef double[:, ::1] x = np.empty((count, n))
-    cdef double clip = linear.clip, white = linear.variance
+    cdef double clip = linear.clip, noise = linear.variance
     cdef Row a[MOST_LEVELS]
     cdef Row q[MOST_LEVELS]
     cdef Row fresh[MOST_LEVELS]
     cdef Row p[MOST_LEVELS]
     cdef double gain[MOST_LEVELS]
-    cdef double noise = 0.0, variance = 0.0, residual, limit
+    cdef double variance = 0.0, residual, limit
     cdef long long since = 0, _
     cdef int i, j
-    if size > MOST_LEVELS or u.shape[1] < max(prediction.phi.inputs, 1) or not (
+    if n > MOST_LEVELS or u.shape[1] < max(prediction.phi.inputs, 1) or not (
         h.shape[0] == u.shape[0] == periods.shape[0] == used.shape[0] == count
     ):
         raise ValueError('innovations: arrays of sizes that do not fit')
@@ -344,7 +343,7 @@ def innovations(Prediction prediction, samples, linear):
                 memcpy(p, fresh, sizeof(p))
                 memset(prediction.x, 0, sizeof(prediction.x))
                 prediction.z[0] = y[k]
-                noise, since, b[k], s[k] = 0.0, 0, NAN, NAN
+                since, b[k], s[k] = 0, NAN, NAN
                 for i in range(n):
                     x[k, i] = prediction.z[i]
                 continue
@@ -352,27 +351,25 @@ def innovations(Prediction prediction, samples, linear):
             if periods[k] > 1:
                 since = 0
             for _ in range(periods[k]):
-                noise *= a[n][n]
                 if since <= settled:
-                    carry(size, a, p)
-                    for i in range(size):
-                        for j in range(size):
+                    carry(n, a, p)
+                    for i in range(n):
+                        for j in range(n):
                             p[i][j] += q[i][j]
             if since <= settled:
-                variance = p[0][0] + 2.0 * p[0][n] + p[n][n] + white
-                for i in range(size):
-                    gain[i] = (p[i][0] + p[i][n]) / variance
-            residual = y[k] - prediction.z[0] - noise
+                variance = p[0][0] + noise
+                for i in range(n):
+                    gain[i] = p[i][0] / variance
+            residual = y[k] - prediction.z[0]
             b[k], s[k] = residual, variance
             if used[k]:
                 limit = clip * sqrt(variance)
                 residual = min(max(residual, -limit), limit)
                 for i in range(n):
                     prediction.z[i] += gain[i] * residual
-                noise += gain[n] * residual
                 if since <= settled:
-                    for i in range(size):
-                        for j in range(size):
+                    for i in range(n):
+                        for j in range(n):
                             p[i][j] -= gain[i] * gain[j] * variance
                     since += 1
             else:

@@ -28,8 +28,6 @@ UNSEEN = 0.97
 """Expected error of d over its size from which on an estimate tells nothing."""
 NO_NOISE = 1e-7
 """Noise over the size of y below which y is a simulated one without noise."""
-WANDERING = 0.99
-"""A correlation from which on the noise is a random walk."""
 BEGIN = 0.1
 """Part of the bag in which the estimates may still be settling."""
 
@@ -46,7 +44,6 @@ class Gains(NamedTuple):
 class Run(NamedTuple):
     """The estimator with these gains along the bag."""
 
-    t: Floats  # (K,) s
     unknown_input: Floats  # (K,)
     size: float  # RMS innovation over the expected one, without the largest hundredth
     correlations: Floats  # (LAGS,) autocorrelations of the innovations
@@ -69,7 +66,7 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
     _refuse(found)
     likelihood, design = found.likelihood, found.best.design
     order, period = likelihood.model.order, rounded(likelihood.period)
-    noise, begin = rounded(found.best.low_noise), int(BEGIN * len(likelihood.samples.y))
+    noise, begin = rounded(found.best.noise), int(BEGIN * len(likelihood.samples.y))
     states = found.best.estimates[begin:, :order]
     sizes = np.maximum(np.sqrt(np.nanmean(np.square(states), axis=0)), noise)
     values = {
@@ -93,8 +90,9 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
         raise NothingToFind(
             f'd: it changes too fast to be seen through this noise: the expected error is '
             f'{min(share, 1.0):.2f} of its size, and an estimate of 0 has 1.00. Does y drift or '
-            f'jump by itself, or is the order ({order}) too high by one? '
-            'Else a sensor with less noise, or a higher rate, is needed'
+            'jump by itself, is its noise correlated from sample to sample (`gains: self_tuning` '
+            f'follows that), or is the order ({order}) too high by one? Else a '
+            'sensor with less noise, or a higher rate, is needed'
         )
     return Gains(values, errors[: order + 1], math.sqrt(variance), 1.0 - float(k[0]))
 
@@ -104,7 +102,6 @@ def _refuse(found: Identified) -> None:
     likelihood, design, y = found.likelihood, found.best.design, found.likelihood.samples.y
     period, noise = likelihood.period, found.best.noise
     top = 0.9 * QUICKEST / period
-    white = found.white or found.best
     silent = noise < NO_NOISE * float(np.std(y)) and not found.quantum
     if silent and not likelihood.fixed:
         raise NothingToFind(
@@ -112,19 +109,12 @@ def _refuse(found: Identified) -> None:
             f'{np.std(y):.3g}), as in a simulation without noise: the less noise, the larger the '
             'gains, without limit. Say what the sensor will have: -p noise_size:=...'
         )
-    if not likelihood.fixed and max(white.design.bandwidth, design.bandwidth) > top:
+    if not likelihood.fixed and design.bandwidth > top:
         raise NothingToFind(
             f'y: the likeliest filter follows every sample ({design.bandwidth:.3g} rad/s at '
             f'{1.0 / period:.4g} Hz). Either y has no noise that shows, or it moves in a way that '
             'the model cannot: it jumps, or order or phi are wrong. Say what noise the sensor '
             'has (-p noise_size:=...), sample faster, or correct the model'
-        )
-    if design.colour > WANDERING:
-        step = found.best.noise / math.sqrt(period)
-        raise NothingToFind(
-            f'y: its error wanders like a random walk, by {step:.3g} in a second (in the unit of '
-            'y), which cannot be told from what d does. Either the sensor drifts, or y has no '
-            'noise that shows, or order or phi do not fit this plant'
         )
     if found.silent < SURE:
         raise NothingToFind(
@@ -145,4 +135,4 @@ def run(found: Identified, gains: Gains) -> Run:
     usual = r[np.abs(r) <= np.quantile(np.abs(r), 0.99)]
     size = float(np.sqrt(np.mean(usual**2))) / SIZE_OF_USUAL
     whiteness = ljung_box(np.clip(r, -CLIP, CLIP))
-    return Run(t, trajectory.unknown_input, size, *whiteness, estimator.counters)
+    return Run(trajectory.unknown_input, size, *whiteness, estimator.counters)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tuning by a bag says: gains.yaml, report.md with notes, and a figure."""
+"""What a tuning by a bag says: gains.yaml, and report.md with notes."""
 
 from collections.abc import Iterator
 import math
@@ -7,21 +7,16 @@ from pathlib import Path
 
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.tools.tuning import figures
 from fhaosmo_ros.tools.tuning.bag_gains import Gains, Run
 from fhaosmo_ros.tools.tuning.identify import Identified, LAGS, SURE
 from fhaosmo_ros.tools.tuning.report import save, table
 import numpy as np
 
-COLOURED = 0.1
-"""Correlation of neighbouring samples from which on the noise is told to be coloured."""
 TENTHS, CHANGED = 10, 1.5
 """Parts of a bag, and the factor by which innovations may differ between them."""
 SMALL_CORRELATION, UNLIKELY = 0.05, 0.01
 NEAR = 1.2
 """Sizes that differ by less than this factor are alike."""
-FLAT = 2.0
-"""A standard deviation of a logarithm from which on a number is not known."""
 
 
 def write(
@@ -36,7 +31,7 @@ def write(
         'Made by',
         f'    python -m fhaosmo_ros {command}',
         f'(fhaosmo_ros {__version__}) from {origin}: {read}.',
-        f'Found: noise {found.best.low_noise:.3g}; d with an RMS of {size:.3g}; '
+        f'Found: noise {found.best.noise:.3g}; d with an RMS of {size:.3g}; '
         f'its expected error is {error:.3g}.',
         *told,
     ]
@@ -55,50 +50,30 @@ def write(
         + f'. Model: order {likelihood.model.order}, phi = {list(likelihood.model.phi)}.',
         '## What y shows',
         main,
-        'Ranges hold 68 % where the model is right; they follow from the curvature of the '
-        'log-likelihood. What is found is that of y in this bag: where d will be quicker or '
-        'larger, record it so.',
-        '![d, and the innovations](estimates.png)',
+        'What is found is that of y in this bag: where d will be quicker or larger, record it so.',
         '## Gains',
         '\n'.join(f'    {name}: {value}' for name, value in parameters.items()),
     ]
     save(folder, parameters, comments, parts)
-    figures.save_identified(run, error, folder / 'estimates.png')
     return main
 
 
 def _found(found: Identified, gains: Gains) -> str:
     """Return the table of what y shows."""
-    best, spread = found.best, found.spread
-    noise = _number(best.low_noise, spread['noise'])
-    if found.likelihood.fixed:
-        noise = f'{best.noise:.4g} (given)'
+    best, given = found.best, ' (given)' if found.likelihood.fixed else ''
     rows = [
-        ('noise of y (standard deviation)', noise),
-        ('size of d (RMS)', _number(found.size_of_input, spread['size'])),
-        (
-            'time in which d changes (1/kappa), s',
-            _number(1.0 / best.design.decay, spread['decay']),
-        ),
+        ('noise of y (standard deviation)', f'{best.noise:.4g}{given}'),
+        ('size of d (RMS)', f'{found.size_of_input:.4g}'),
+        ('time in which d changes (1/kappa), s', f'{1.0 / best.design.decay:.4g}'),
         ('derivatives of d that are followed', f'{best.design.derivatives}'),
         ('bandwidth of the filter, rad/s', f'{best.design.bandwidth:.3g}'),
     ]
-    if best.design.colour > COLOURED:
-        rows.insert(1, ('of that, correlation from sample to sample', f'{best.design.colour:.2f}'))
     names = [*(f'z{i + 1}' for i in range(len(gains.expected) - 1)), 'd']
     rows += [
         (f'expected error of {name}', f'{e:.3g}')
         for name, e in zip(names, gains.expected, strict=True)
     ]
     return table(['found in y', ''], rows)
-
-
-def _number(value: float, spread: float) -> str:
-    """Return a number with its range."""
-    if not spread < FLAT:
-        return f'{value:.3g} (hardly known)'
-    low, high = value * math.exp(-spread), value * math.exp(spread)
-    return f'{value:.4g} ({low:.3g} to {high:.3g})'
 
 
 def _run(run: Run, innovation: float) -> str:
@@ -110,7 +85,7 @@ def _run(run: Run, innovation: float) -> str:
         (
             f'their largest correlation within {LAGS} samples',
             f'{run.correlations[largest]:+.3f} over {largest + 1}; chance explains '
-            f'{2.0 / math.sqrt(len(run.t)):.3f}',
+            f'{2.0 / math.sqrt(len(run.unknown_input)):.3f}',
         ),
         ('probability of that if they are white (Ljung-Box)', f'{run.probability:.2g}'),
         ('samples rejected, times begun afresh', f'{counts.rejected}, {counts.divergences}'),
@@ -120,17 +95,7 @@ def _run(run: Run, innovation: float) -> str:
 
 def notes(found: Identified, run: Run) -> Iterator[str]:
     """Say what a user should know before trusting the gains."""
-    best, samples, colour = found.best, found.likelihood.samples, found.best.design.colour
-    if found.white is not None and colour > COLOURED:
-        yield (
-            f'The noise of y is coloured: neighbouring samples correlate by {colour:.2f}, '
-            'as behind a low-pass filter in the sensor, or where its zero drifts. Fixed gains '
-            f'know white noise only. These count on white noise of {best.low_noise:.3g}, '
-            'which has the same power at low frequencies; so innovations are smaller than '
-            'expected, and correlated. `gains: self_tuning` follows the colour itself. (White '
-            f'noise is less likely by {best.log_likelihood - found.white.log_likelihood:.0f} in '
-            'the logarithm.)'
-        )
+    best, samples = found.best, found.likelihood.samples
     r = np.where(samples.used, np.abs(best.innovations), np.nan)
     tenths = [x[np.isfinite(x)] for x in np.array_split(r, TENTHS)]
     levels = [float(np.median(x)) / 0.6745 * best.noise for x in tenths if len(x) >= 30]
@@ -176,8 +141,6 @@ def notes(found: Identified, run: Run) -> Iterator[str]:
             f'With these gains the estimator lost y {lost} times in this bag and began afresh: '
             'do not use them before the notes above are settled.'
         )
-    if colour > COLOURED:
-        return
     if not 1.0 / NEAR < run.size < NEAR:
         yield (
             f'Innovations have {run.size:.2f} times the expected size: the model or the noise '
@@ -189,5 +152,5 @@ def notes(found: Identified, run: Run) -> Iterator[str]:
             f'Innovations are not white: they correlate by {run.correlations[lag]:+.2f} with '
             f'those {lag + 1} before them. The model of the plant, of d or of the noise does not '
             'quite fit; the gains are the best of their kind, but standard deviations are too '
-            'small.'
+            'small. `gains: self_tuning` follows noise that is coloured.'
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The likeliest model of d and of the noise for a recorded y, and how sure it is (D 30)."""
+"""The likeliest model of d and of the noise for a recorded y (D 30)."""
 
 from collections.abc import Callable, Iterable, Mapping
 import math
@@ -18,23 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
 from scipy.optimize import minimize
-from scipy.special import expit, logit
 from scipy.stats import chi2, median_abs_deviation
 
 Floats = NDArray[np.float64]
 DERIVATIVES = (0, 1, 2)
 BANDWIDTHS = tuple(float(w) for w in np.geomspace(2e-4, 2.0, 15))
 """First bandwidths, in rad a sample; at the first number of derivatives and ratio below."""
-FIRST_DERIVATIVES, FIRST_RATIO, COLOURS = 1, 0.5, (0.0, 0.9)
-COLOURED, SLOWER = 0.75, 0.35
-"""A colour, and a factor on the bandwidth found with white noise, to search a colour from."""
+FIRST_DERIVATIVES, FIRST_RATIO = 1, 0.5
 SLOWEST, QUICKEST = 1e-5, 3.0
 """Bandwidths of the filters, in rad a sample."""
-STEPS = np.array([0.3, 0.5, 0.4])
-"""Sides of the first simplex in ln bandwidth (rad a sample), ln ratio and logit colour."""
-LOW = np.array([*np.log([SLOWEST, 1e-3]), -9.0])
-HIGH = np.array([*np.log([QUICKEST, 30.0]), 6.2])
-"""Bounds of these."""
+STEPS = np.array([0.3, 0.5])
+"""Sides of the first simplex in ln bandwidth (rad a sample) and ln ratio."""
+BOUNDS = np.log([[SLOWEST, QUICKEST], [1e-3, 30.0]])
+"""Of these."""
 EVALUATIONS = 120
 WORTH = 3.0
 """By so much a richer model must raise the log-likelihood."""
@@ -45,13 +41,9 @@ STILL = 0.03
 """Bandwidth of a filter that takes d for 0, over the bag's length."""
 SHAKES = tuple(float(x) for x in np.geomspace(1e-4, 1e2, 7))
 """Intensities of white noise on a state that are tried; see `Design.shake`."""
-WHITE = 0.01
-"""Probability above which innovations pass for white, so that no colour is searched."""
 LAGS = 20
 SURE = 10.0
 """A difference of log-likelihoods that is no accident."""
-STEP = 0.1
-"""Of the differences of the log-likelihood in ln bandwidth, ln ratio and logit colour."""
 FEWEST = 500
 """Samples."""
 
@@ -65,11 +57,8 @@ class Identified(NamedTuple):
 
     likelihood: Likelihood
     best: Evaluation  # of the likeliest design
-    white: Evaluation | None  # the likeliest one with white noise, where the noise is coloured
     silent: float  # fall of the log-likelihood if d were 0
     shaken: dict[int, float]  # its rise if white noise drove state i = 1 .. n as well
-    spread: dict[str, float]
-    """Standard deviations of the logarithms of noise, decay, size of d; NaN: y does not tell."""
     outliers: int  # samples that were left out
     quantum: float  # of y; 0 for none that shows
 
@@ -112,16 +101,15 @@ def identify_input(
         search = _Search(likelihood, given, bar.update)
         start = search.start()
         outliers = _leave_out_outliers(likelihood, start)
-        best, white = search.likeliest_order(start)
+        best = search.likeliest_order(start)
         if not math.isfinite(best.log_likelihood):
             raise NothingToFind(
                 f'y: expected samples that the model can predict, got none that phi = '
                 f'{list(model.phi)} follows: its estimates leave the finite numbers'
             )
         silent, shaken = search.alternatives(best)
-        spread = search.spread(best)
     step = quantum(likelihood.samples.y)
-    return Identified(likelihood, best, white, silent, shaken, spread, outliers, step)
+    return Identified(likelihood, best, silent, shaken, outliers, step)
 
 
 def _prepared(
@@ -198,12 +186,10 @@ class _Search:
         return self._likelihood(design)
 
     def start(self) -> Evaluation:
-        """Scan bandwidths and colours, and bring the scale of clipping and the sizes about."""
+        """Scan bandwidths, and bring the scale of clipping and the sizes about."""
         likelihood = self._likelihood
         designs = (
-            Design(FIRST_DERIVATIVES, w / likelihood.period, FIRST_RATIO, colour)
-            for w in BANDWIDTHS
-            for colour in (COLOURS[:1] if likelihood.fixed else COLOURS)
+            Design(FIRST_DERIVATIVES, w / likelihood.period, FIRST_RATIO) for w in BANDWIDTHS
         )
         best = max(map(self._evaluate, designs), key=lambda e: e.log_likelihood)
         likelihood.clip = CLIP
@@ -216,57 +202,34 @@ class _Search:
             best = self._evaluate(best.design)
         return best
 
-    def likeliest_order(self, start: Evaluation) -> tuple[Evaluation, Evaluation | None]:
-        """Fit each number of derivatives; return the best, and that of white noise, if worse."""
-        design = start.design
-        white = [self._fit(design._replace(derivatives=k, colour=0.0)) for k in self._orders]
-        best = _simplest(white)
-        r = best.innovations[self._likelihood.samples.used & np.isfinite(best.innovations)]
-        if self._likelihood.fixed or (len(r) and ljung_box(np.clip(r, -CLIP, CLIP))[1] > WHITE):
-            return best, None
-        origins = [design._replace(derivatives=k) for k in self._orders]
-        if design.colour == 0.0:
-            origins = [
-                e.design._replace(colour=COLOURED, bandwidth=SLOWER * e.design.bandwidth)
-                for e in white
-            ]
-        coloured = _simplest(map(self._fit, origins))
-        if coloured.log_likelihood > best.log_likelihood + WORTH:
-            return coloured, best
-        return best, None
-
-    def _axes(self, design: Design) -> Floats:
-        """Return which of the three numbers of `_moved` are searched, as columns."""
-        return np.eye(3)[:, [True, not self._decay, design.colour > 0.0]]
-
-    def _moved(self, design: Design, change: Floats) -> Design:
-        """Change ln bandwidth, ln ratio and logit colour of a design."""
-        bandwidth = design.bandwidth * math.exp(change[0])
-        ratio = design.ratio * math.exp(change[1])
-        if self._decay:
-            ratio = self._decay / bandwidth
-        colour = float(expit(logit(design.colour) + change[2]))
-        return design._replace(bandwidth=bandwidth, ratio=ratio, colour=colour)
+    def likeliest_order(self, start: Evaluation) -> Evaluation:
+        """Fit each number of derivatives; return the best."""
+        return _simplest(self._fit(start.design._replace(derivatives=k)) for k in self._orders)
 
     def _fit(self, design: Design) -> Evaluation:
         """Return the likeliest design around this one (Nelder and Mead 1965)."""
-        axes, rate = self._axes(design), design.bandwidth * self._likelihood.period
-        point = np.array([math.log(rate), math.log(design.ratio), logit(design.colour)])
+        period = self._likelihood.period
 
-        def loss(change: Floats) -> float:
-            value = self._evaluate(self._moved(design, axes @ change)).log_likelihood
+        def at(point: Floats) -> Evaluation:
+            """Evaluate at ln bandwidth (rad a sample) and, unless decay is given, ln ratio."""
+            bandwidth = math.exp(point[0]) / period
+            ratio = self._decay / bandwidth if self._decay else math.exp(point[1])
+            return self._evaluate(design._replace(bandwidth=bandwidth, ratio=ratio))
+
+        def loss(point: Floats) -> float:
+            value = at(point).log_likelihood
             return -value if math.isfinite(value) else 1e300
 
-        start, used = np.zeros(axes.shape[1]), axes.any(axis=1)
-        low, high = np.minimum(LOW - point, 0.0)[used], np.maximum(HIGH - point, 0.0)[used]
+        count = 1 if self._decay else 2
+        start = np.log([design.bandwidth * period, design.ratio])[:count]
         found = minimize(
-            loss, start, method='Nelder-Mead', bounds=list(zip(low, high, strict=True)),
+            loss, start, method='Nelder-Mead', bounds=BOUNDS[:count],
             options={
-                'initial_simplex': np.vstack([start, np.diag(STEPS[used])]),
+                'initial_simplex': np.vstack([start, start + np.diag(STEPS[:count])]),
                 'xatol': 0.02, 'fatol': 0.1, 'maxfev': EVALUATIONS,
             },
         )  # fmt: skip
-        return self._evaluate(self._moved(design, axes @ found.x))
+        return at(found.x)
 
     def alternatives(self, best: Evaluation) -> tuple[float, dict[int, float]]:
         """Return `Identified.silent` and `Identified.shaken`."""
@@ -280,30 +243,6 @@ class _Search:
             for level in range(1, self._likelihood.model.order + 1)
         }
         return -rise(bandwidth=STILL / float(self._likelihood.samples.h.sum())), shaken
-
-    def spread(self, best: Evaluation) -> dict[str, float]:
-        """Return `Identified.spread`, by the curvature of the log-likelihood at its maximum."""
-        axes = self._axes(best.design)
-
-        def at(change: Floats) -> float:
-            return self._evaluate(self._moved(best.design, change)).log_likelihood
-
-        steps = STEP * axes.T
-        curvature = np.array([
-            [at(a - b) + at(b - a) - at(a + b) - at(-a - b) for b in steps] for a in steps
-        ])  # fmt: skip
-        k = best.design.derivatives
-        intensity = np.array([2.0 * (self._likelihood.model.order + 1 + k), 0.0, 0.0])
-        # ln kappa = ln omega + ln ratio
-        decay = np.zeros(3) if self._decay else np.array([1.0, 1.0, 0.0])
-        rows = {'decay': decay @ axes, 'size': (0.5 * intensity - (k + 0.5) * decay) @ axes}
-        try:
-            covariance = 4.0 * STEP**2 * np.linalg.inv(curvature)
-        except np.linalg.LinAlgError:
-            return dict.fromkeys(('noise', *rows), math.nan)
-        with np.errstate(invalid='ignore'):
-            found = {name: float(np.sqrt(row @ covariance @ row)) for name, row in rows.items()}
-        return {'noise': math.sqrt(0.5 / int(self._likelihood.samples.used.sum()))} | found
 
 
 def ljung_box(r: Floats, lags: int = LAGS) -> tuple[Floats, float]:

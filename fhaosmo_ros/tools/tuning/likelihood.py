@@ -38,7 +38,6 @@ class Design(NamedTuple):
     derivatives: int  # k of D 17
     bandwidth: float  # omega of the filter in rad/s, which says q (D 30)
     ratio: float  # kappa / omega
-    colour: float = 0.0  # a of the noise v_j = a v_{j-1} + w_j; 0 for white noise
     shaken: int = 0  # state that white noise drives as well, counted from 1; 0 for none
     shake: float = 0.0  # its intensity, over noise^2 h omega^(2 shaken)
 
@@ -52,15 +51,10 @@ class Evaluation(NamedTuple):
     """How well a design predicts y."""
 
     design: Design
-    noise: float  # standard deviation of the white noise w: the likeliest one for this design
+    noise: float  # standard deviation of the noise of y: the likeliest one for this design
     log_likelihood: float  # of all samples that are used; -inf for a filter that diverges
     innovations: Floats  # (K,) over their expected standard deviations; NaN where there is none
     estimates: Floats  # (K, N)
-
-    @property
-    def low_noise(self) -> float:
-        """Standard deviation of the white noise that has as much power at low frequencies."""
-        return self.noise / (1.0 - self.design.colour)
 
 
 @dataclass
@@ -83,10 +77,7 @@ class Likelihood:
     def intensity(self, design: Design, noise: float) -> float:
         """Return q of the white noise that drives the last derivative of d."""
         levels = self.model.order + 1 + design.derivatives
-        return self._density(design, noise) * design.bandwidth ** (2 * levels)
-
-    def _density(self, design: Design, noise: float) -> float:
-        return (noise / (1.0 - design.colour)) ** 2 * self.period
+        return noise**2 * self.period * design.bandwidth ** (2 * levels)
 
     def __call__(self, design: Design) -> Evaluation:
         """Evaluate a design."""
@@ -108,25 +99,20 @@ class Likelihood:
             return Evaluation(design, noise, mean * int(used.sum()), r / noise, x)
 
     def _linear(self, design: Design) -> SimpleNamespace:
-        """Return the linear model of a period, of N + 1 states: z, d, its derivatives, and v."""
+        """Return the linear model of a period, of N states: z, d and its derivatives."""
         n, noise = self.model.order, self.noise**2
         size, q = n + 1 + design.derivatives, self.intensity(design, self.noise)
         rates = np.eye(size, k=1)
         rates[:n, :n] += self._jacobian
         rates[range(n, size), range(n, size)] = -design.decay
-        a, added, fresh = (np.zeros((size + 1, size + 1)) for _ in range(3))
-        a[:size, :size], added[:size, :size] = LinearModel(rates, q).transition(self.period)
+        a, added = LinearModel(rates, q).transition(self.period)
         if i := design.shaken:
-            w = design.shake * self._density(design, self.noise) * design.bandwidth ** (2 * i)
+            w = design.shake * noise * self.period * design.bandwidth ** (2 * i)
             added[:i, :i] += LinearModel(rates[:i, :i], w).transition(self.period)[1]
+        fresh = np.zeros((size, size))
         fresh[range(1, n), range(1, n)] = np.square(self.sizes[1:])
-        fresh[n:size, n:size] = stationary(rates[n:, n:], q)
-        fresh[0, 0] = noise / (1.0 - design.colour**2)
-        if design.colour > 0.0:  # y = z_1 + v, and the filter begins with z_1 = y
-            a[size, size], added[size, size] = design.colour, noise
-            fresh[size, size] = fresh[0, 0]
-            fresh[0, size] = fresh[size, 0] = -fresh[0, 0]
-            noise = 0.0
+        fresh[n:, n:] = stationary(rates[n:, n:], q)
+        fresh[0, 0] = noise  # the filter begins with z_1 = y
         settled = int(min(SETTLED / (design.bandwidth * self.period), 2.0**40))
         return SimpleNamespace(
             a=a, q=added, fresh=fresh, variance=noise, clip=self.clip, settled=settled
