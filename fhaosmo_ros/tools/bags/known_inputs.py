@@ -1,41 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded known inputs at the samples of y, as the node finds them."""
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from heapq import merge
-from itertools import chain
 from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.inputs import Input, make_pairing
 from fhaosmo_ros.pairing import StampPairing
-from fhaosmo_ros.tools.bags.reader import BagReader, Block
+from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
 import numpy as np
 from numpy.typing import NDArray
 
-Rejects = Callable[[int], None]
-"""Gets the number of values that were not finite, and were left out."""
+Arrival = tuple[int, int, int, float]
+"""Time in the bag, number of the input or `SAMPLE`, stamp, and value."""
+SAMPLE = 1000
+"""A sample comes after the inputs that have its time."""
 
 
-def with_inputs(
-    blocks: Iterable[Block],
+def inputs_at(
+    samples: FieldSamples,
     reader: BagReader,
     model: TriangularModel,
     wanted: Mapping[str, Input],
     values: Mapping[str, Any],
-    held: Callable[[], Sequence[float]] | None = None,
-    reject: Rejects = lambda _: None,
-) -> Iterator[tuple[Block, NDArray[np.float64]]]:
+    held: Sequence[float] | None = None,
+    reject: Callable[[int], None] = lambda _: None,
+) -> NDArray[np.float64]:
     """
-    Yield each block of y with the known inputs at its samples, (K, m).
+    Return the known inputs at samples of y, (K, m).
 
     Samples and inputs are taken in the order of the bag, as the node takes them in that of
     arrival.
 
     Parameters
     ----------
-    blocks : iterable of Block
+    samples : FieldSamples
     reader : BagReader
     model : TriangularModel
         Says which known inputs there are, and which of them it uses; the others are 0.
@@ -43,11 +43,10 @@ def with_inputs(
         Where those that it uses are; full names of the topics.
     values : mapping
         Parameters of the estimator.
-    held : callable, optional
-        Returns the known inputs before the first ones in the bag, once the first block is there;
-        else they are 0.
+    held : sequence of float, optional
+        The known inputs before the first ones in the bag; else they are 0.
     reject : callable, optional
-        See `Rejects`.
+        Gets the number of values that were not finite, and were left out.
 
     Raises
     ------
@@ -55,63 +54,33 @@ def with_inputs(
         The bag has no such topic or field.
 
     """
-    inputs = merge(
-        *(
-            _finite(reader, model.inputs.index(name), wanted[name], reject)
-            for name in model.used_inputs
-        )
-    )
-    blocks = iter(blocks)
-    first = next(blocks, None)
-    if first is None:
-        return
-    before = list(held()) if held else [0.0] * len(model.inputs)
+    count = len(model.inputs)
+    before = list(held or [0.0] * count)
     # Without inputs by their headers' stamps, samples do not wait.
     pairing = make_pairing(values, model.inputs, wanted, before) or StampPairing(
-        [False] * len(before), 0, 0, before
+        [False] * count, 0, 0, before
     )
-    event = next(inputs, None)
-    rows: list[list[float]] = []
-    waiting: deque[Block] = deque()
-    for block in chain([first], blocks):
-        waiting.append(block)
-        for time, stamp in zip(block.times.tolist(), block.stamps.tolist(), strict=True):
-            while event is not None and event[0] <= time:
-                pairing.take_input(*event[1:])
-                rows += [u for _, u in pairing.released()]
-                event = next(inputs, None)
-            pairing.take_sample(stamp, None)
-            rows += [u for _, u in pairing.released()]
-        yield from _complete(waiting, rows)
-    for later in chain([event] if event else [], inputs):
-        pairing.take_input(*later[1:])
-        rows += [u for _, u in pairing.released()]
-        yield from _complete(waiting, rows)
-        if not waiting:
-            return
-    rows += [u for _, u in pairing.released(at_once=True)]
-    yield from _complete(waiting, rows)
-
-
-def _finite(
-    reader: BagReader, j: int, wanted: Input, reject: Rejects
-) -> Iterator[tuple[int, int, int, float]]:
-    """Yield time in the bag, number of the input, stamp and value of each of its messages."""
-    field = reader.field(wanted.topic, wanted.field, wanted.name)
-    stamp = 'header' if wanted.stamp == 'header' else 'bag'
-    for block in reader.blocks(wanted.topic, field, stamp):
-        good = np.isfinite(block.values)
+    arrivals = [_arrivals(samples, SAMPLE)]
+    for name in model.used_inputs:
+        its = wanted[name]
+        field = reader.field(its.topic, its.field, its.name)
+        found = reader.samples(its.topic, field, 'header' if its.stamp == 'header' else 'bag')
+        good = np.isfinite(found.values)
         reject(int((~good).sum()))
-        for time, stamp, u in zip(*(part[good].tolist() for part in block), strict=True):
-            yield time, j, stamp, u
+        arrivals.append(_arrivals(found.part(good), model.inputs.index(name)))
+
+    def paired() -> Iterator[list[float]]:
+        for _, j, stamp, u in merge(*arrivals):
+            if j == SAMPLE:
+                pairing.take_sample(stamp, None)
+            else:
+                pairing.take_input(j, stamp, u)
+            yield from (row for _, row in pairing.released())
+        yield from (row for _, row in pairing.released(at_once=True))
+
+    return np.fromiter(paired(), np.dtype((np.float64, count)), len(samples.times))
 
 
-def _complete(
-    waiting: deque[Block], rows: list[list[float]]
-) -> Iterator[tuple[Block, NDArray[np.float64]]]:
-    """Yield the blocks whose samples all have their inputs, and forget them."""
-    while waiting and len(waiting[0].times) <= len(rows):
-        block = waiting.popleft()
-        count = len(block.times)
-        yield block, np.array(rows[:count])
-        del rows[:count]
+def _arrivals(samples: FieldSamples, number: int) -> Iterator[Arrival]:
+    for time, stamp, value in zip(*(column.tolist() for column in samples), strict=True):
+        yield time, number, stamp, value

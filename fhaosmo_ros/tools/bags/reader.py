@@ -3,10 +3,10 @@
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, ExitStack, suppress
 from functools import cache
-from itertools import islice, pairwise, zip_longest
+from itertools import pairwise, zip_longest
 from operator import itemgetter
 from pathlib import Path
 import struct
@@ -32,8 +32,6 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2.storage_mcap import McapReader
 import zstandard
 
-BLOCK = 16_384
-"""Samples in a block."""
 ZSTD = b'\x28\xb5\x2f\xfd'
 """Begin of what zstd has compressed; a message in CDR begins with a zero."""
 RECORD = struct.Struct('<BQ')
@@ -42,11 +40,12 @@ MESSAGE = struct.Struct('<HIQQ')
 """Of mcap: channel, sequence, log time and publish time, before a message in CDR."""
 FOOTER = struct.Struct('<BQQQI8x')
 """Of mcap: opcode, length, begin of the summary and of its offsets, CRC; then the magic number."""
+Watch = Callable[[Iterator[Any]], Iterable[Any]]
 Row = tuple[int, int, int, bytes]
 """Log time and publish time (ns), number of the connection, and message in CDR."""
 
 
-class Block(NamedTuple):
+class FieldSamples(NamedTuple):
     """
     Samples of one field in the order of the bag.
 
@@ -63,6 +62,10 @@ class Block(NamedTuple):
     times: NDArray[np.int64]
     stamps: NDArray[np.int64]
     values: NDArray[np.float64]
+
+    def part(self, rows: slice | NDArray[np.bool_]) -> 'FieldSamples':
+        """Return some of the samples."""
+        return FieldSamples(*(column[rows] for column in self))
 
 
 class BagReader:
@@ -82,7 +85,7 @@ class BagReader:
     unchecked : bool
         True if something was read that has no CRC, so that damage may go unnoticed.
     lacking : Counter of str
-        Messages that `blocks` has left out, by why they lack the field.
+        Messages that `samples` has left out, by why they lack the field.
 
     Raises
     ------
@@ -244,9 +247,11 @@ class BagReader:
             raise ConfigurationError(f'bag {self.path}: expected a definition of {kind}, got none')
         return find_field(self.types.fielddefs, kind, text, name)
 
-    def blocks(self, topic: str, field: Field, stamp: str = 'bag') -> Iterator[Block]:
+    def samples(
+        self, topic: str, field: Field, stamp: str = 'bag', watch: Watch = iter
+    ) -> FieldSamples:
         """
-        Yield a field's samples in order, in blocks; memory does not grow with the bag.
+        Return the samples of a field.
 
         Messages whose lists are too short or lack the name are left out, as by the node.
 
@@ -258,6 +263,8 @@ class BagReader:
             'header': of the messages. 'source': the publish time, which only mcap has; `ros2 bag
             record` writes the publisher's source stamp there. 'bag': of the bag (mcap: log time),
             for `ros2 bag record` the time of reception. 'auto': the first of these that there is.
+        watch : callable
+            Passes the samples on, such as a progress bar.
 
         Raises
         ------
@@ -276,10 +283,9 @@ class BagReader:
             )
         if stamp == 'auto':
             stamp = 'header' if field.header else 'source'
-        samples = self._samples(topic, field, stamp)
-        while rows := list(islice(samples, BLOCK)):
-            times, stamps, values = zip(*rows, strict=True)
-            yield Block(np.array(times, np.int64), np.array(stamps, np.int64), np.array(values))
+        kinds = [('time', np.int64), ('stamp', np.int64), ('value', np.float64)]
+        rows = np.fromiter(watch(self._samples(topic, field, stamp)), dtype=kinds)
+        return FieldSamples(*(np.ascontiguousarray(rows[name]) for name, _ in kinds))
 
     def _samples(self, topic: str, field: Field, stamp: str) -> Iterator[tuple[int, int, float]]:
         for _, time, message, published in self.objects([topic]):

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.tools.bags.reader import BagReader, BLOCK
+from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.topics import TRUTH
 import numpy as np
 from numpy.typing import NDArray
 
+BLOCK = 16_384
+"""Messages that are made arrays of at a time."""
 LATE = 0.75
 """Periods of the plant by which the truth may follow its sample of y."""
 

@@ -4,6 +4,7 @@
 import argparse
 from collections.abc import Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 import sys
 from tempfile import TemporaryDirectory
@@ -120,11 +121,13 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         present = {c.topic for c in reader.connections}
         used = estimator.observer.used_inputs
         inputs = bag_inputs(own, used, present, namespace, arguments.channel)
-        samples = Samples(reader, estimator, live, inputs, arguments.smooth)
         finals = arguments.output or [Path(f'{name}_replayed')]
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
         name = _name(present, arguments.name)
         with stop.raising():
+            count = reader.count(inputs.y.topic)
+            bar = partial(progress, total=count, unit='sample', unit_scale=True, desc='replay')
+            samples = Samples(reader, estimator, live, inputs, arguments.smooth, bar)
             _write(reader, samples, outputs, name, ONLINE_PARAMETERS.defaults() | own)
         if stop.is_set():  # Python drops what a signal raises in a destructor
             raise Stopped
@@ -211,9 +214,6 @@ def _write(
             bag = stack.enter_context(BagWriter(output.path))
             sinks.append(BagSink(bag, name, observer.order, observer.levels, parameters).write)
             bag.copy(reader)
-        with progress(total=samples.total, unit='sample', unit_scale=True, desc='replay') as bar:
-            for count, rows in samples:
-                for part in rows:
-                    for sink in sinks:
-                        sink(part)
-                bar.update(count)
+        for rows in samples:
+            for sink in sinks:
+                sink(rows)

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Following a live estimator through a bag: the same first sample, resets and live changes."""
 
-from collections import deque
 from collections.abc import Collection, Iterator
-from itertools import chain
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
@@ -11,14 +9,14 @@ from fhaosmo_ros.core.online.snapshots import Flag, Snapshot, unpack
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import split
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
-from fhaosmo_ros.tools.bags.reader import BagReader, Block
+from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
 from fhaosmo_ros.topics import SNAPSHOT
 import numpy as np
 from numpy.typing import NDArray
 
 EVENTS = '/parameter_events'
-TRIES = 30
-"""Snapshots that may have no sample in the bag, before replay stops looking for the first one."""
+BLOCK = 16_384
+"""Samples that are searched for a stamp at a time."""
 AGREEMENT = 1e-12
 """Relative or absolute difference up to which two memories count as the same."""
 COMPARED = 'z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending'
@@ -32,9 +30,8 @@ VALUE_FIELDS = {
 
 
 class Event(NamedTuple):
-    """A snapshot of the live estimator, and the parameters that changed before it (stamp: ns)."""
+    """A snapshot of the live estimator, and the parameters that changed before it."""
 
-    time: int
     snapshot: Snapshot
     changes: dict[str, Any]
 
@@ -96,7 +93,7 @@ def read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[Ev
     events: list[Event] = []
     changes: dict[str, Any] = {}
     topics = {f'{name}/{SNAPSHOT}', EVENTS} & {c.topic for c in reader.connections}
-    for topic, time, message in reader.read_all(topics):
+    for topic, _, message in reader.read_all(topics):
         if topic == EVENTS:
             node, channel = message.node, name.removeprefix(message.node).strip('/')
             if name == node or name.startswith(f'{node}/'):
@@ -112,7 +109,7 @@ def read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[Ev
             raise UnknownSnapshot(f'topic {topic!r}: {error}') from None
         # The node publishes the change first, then the snapshot.
         took_them = not events or snapshot.flags & (Flag.CHANGED | Flag.STARTED)
-        events.append(Event(time, snapshot, changes if took_them else {}))
+        events.append(Event(snapshot, changes if took_them else {}))
         if took_them:
             changes = {}
     return events
@@ -138,37 +135,25 @@ class LiveRun:
     """
 
     def __init__(self, name: str, events: list[Event], estimator: OnlineEstimator) -> None:
-        self._name, self._events, self._estimator = name, deque(events), estimator
+        self._name, self._events, self._estimator = name, events, estimator
         self.left_out = 0
         self._followed = self._resumed = False
         self._unfit = ''
         self._same = self._other = 0
 
-    def begin(self, blocks: Iterator[Block]) -> Iterator[Block]:
-        """Yield the samples from the first one at which a snapshot tells the live state."""
-        held: list[Block] = []
-        for _ in range(min(TRIES, len(self._events))):
-            event = self._events[0]
-            while not held or held[-1].times[-1] <= event.time:
-                block = next(blocks, None)
-                if block is None:
-                    break
-                held.append(block)
-            for k, block in enumerate(held):
-                found = np.flatnonzero(block.stamps == event.snapshot.stamp)
-                if len(found):
-                    first = int(found[0]) + self._adopt(event)
-                    self._followed = True
-                    self.left_out = sum(len(b.times) for b in held[:k]) + first
-                    rest = Block(*(column[first:] for column in block))
-                    yield from chain([rest], held[k + 1 :], blocks)
-                    return
-            changes = self._events.popleft().changes
-            if self._events:
-                following = self._events[0]
-                self._events[0] = following._replace(changes=changes | following.changes)
-        self._events.clear()
-        yield from chain(held, blocks)
+    def begin(self, samples: FieldSamples) -> FieldSamples:
+        """Return the samples from the first one at which a snapshot tells the live state."""
+        changes: dict[str, Any] = {}
+        for number, event in enumerate(self._events):
+            changes |= event.changes
+            found = np.flatnonzero(samples.stamps == event.snapshot.stamp)
+            if len(found):
+                self._events = [event._replace(changes=changes), *self._events[number + 1 :]]
+                self.left_out = int(found[0]) + self._adopt(self._events[0])
+                self._followed = True
+                return samples.part(slice(self.left_out, None))
+        self._events = []
+        return samples
 
     def _adopt(self, event: Event) -> bool:
         """Take the memory after the event's sample; return True if the run goes on behind it."""
@@ -179,7 +164,7 @@ class LiveRun:
                 self._estimator.set_input(u, index)
             return False
         self._configure(event)
-        self._events.popleft()
+        self._events.pop(0)
         try:
             self._estimator.load_state_dict(event.snapshot.values)
         except ConfigurationError as error:  # as of an observer of another size
@@ -190,30 +175,24 @@ class LiveRun:
 
     def parts(self, stamps: NDArray[np.int64]) -> Iterator[slice]:
         """
-        Yield parts of a block; in between, do what was done to the live estimator there.
+        Yield parts of the samples; in between, do what was done to the live estimator there.
 
         A part may be empty.
         """
         position = 0
-        while self._events:
-            event = self._events[0]
+        for event in self._events:
             stamp, flags, _ = event.snapshot
-            found = np.flatnonzero(stamps[position:] == stamp)
-            if not len(found) and stamp > stamps.max():
-                break  # in a later block
-            self._events.popleft()
             # If the bag lacks that sample, the event takes place before the next one.
-            at = position + int(found[0]) if len(found) else _next(stamps, position, stamp)
+            at, found = _find(stamps, position, stamp)
             if flags & Flag.STARTED:
                 yield slice(position, at)
                 position = at
                 self._configure(event)
                 self._estimator.reset()
-            end = at + 1 if len(found) else at
-            yield slice(position, end)
-            position = end
+            yield slice(position, at + found)
+            position = at + found
             self._repeat(event)
-            if len(found) or self._estimator.latest == stamp:
+            if found or self._estimator.latest == stamp:
                 self._compare(event.snapshot)
         yield slice(position, len(stamps))
 
@@ -264,6 +243,11 @@ class LiveRun:
         )
 
 
-def _next(stamps: NDArray[np.int64], position: int, stamp: int) -> int:
-    later = np.flatnonzero(stamps[position:] > stamp)
-    return position + int(later[0]) if len(later) else len(stamps)
+def _find(stamps: NDArray[np.int64], position: int, stamp: int) -> tuple[int, bool]:
+    """Return where a stamp is, else where the first later one is, and which of the two it is."""
+    for begin in range(position, len(stamps), BLOCK):
+        block = stamps[begin : begin + BLOCK]
+        for found, wanted in ((True, block == stamp), (False, block > stamp)):
+            if wanted.any():
+                return begin + int(wanted.argmax()), found
+    return len(stamps), False

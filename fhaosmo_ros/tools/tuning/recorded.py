@@ -7,7 +7,7 @@ from typing import NamedTuple
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.messages.fields import Unwrapper
-from fhaosmo_ros.tools.bags.known_inputs import with_inputs
+from fhaosmo_ros.tools.bags.known_inputs import inputs_at
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.options import BagInputs
 import numpy as np
@@ -34,17 +34,16 @@ def recorded(bag: Path, inputs: BagInputs, model: TriangularModel) -> RecordedOu
     with BagReader(bag) as reader:
         topic = y_at.absolute('')
         found = reader.field(topic, y_at.field, y_at.name)
-        blocks = list(reader.blocks(topic, found, stamp))
-        stamps, y = (np.concatenate([block[k] for block in blocks]) for k in (1, 2))
+        samples = reader.samples(topic, found, stamp)
+        y = samples.values
         if found.wraps:
             y = np.array(list(map(Unwrapper(), y.tolist())))
         u = np.zeros((len(y), len(model.inputs)))
         if model.uses_input:
-            pairs = with_inputs(blocks, reader, model, u_at, values)
-            u = np.concatenate([u for _, u in pairs])
+            u = inputs_at(samples, reader, model, u_at, values)
     if not len(y):
         raise ConfigurationError(f'bag {bag}: expected samples of y, got none')
-    return RecordedOutput((stamps - stamps[0]) * 1e-9, y, u)
+    return RecordedOutput((samples.stamps - samples.stamps[0]) * 1e-9, y, u)
 
 
 def usable(data: RecordedOutput) -> RecordedOutput:
