@@ -17,9 +17,10 @@ pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 from domains import take_domain
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import read_ticks, series
+from fhaosmo_ros.tools.bags.topics import read_ticks
 from fhaosmo_ros.tools.demo.command import topics_of
 from fhaosmo_ros.topics import ESTIMATES
+from mcap.reader import NonSeekingReader
 import numpy as np
 import rclpy
 from rclpy.context import Context
@@ -67,10 +68,13 @@ def size(folder):
     return file.stat().st_size if file.exists() else 0
 
 
-def count(folder, topic):
-    """Messages of a topic in the storage file, which grows."""
-    with BagReader(folder / f'{folder.name}_0.mcap') as reader:
-        return reader.count(topic)
+def stamps(folder, topic):
+    """Stamps of a topic in a storage file that is not complete: it grows, or was cut."""
+    found = []
+    with (folder / f'{folder.name}_0.mcap').open('rb') as file, contextlib.suppress(Exception):
+        for _, _, message in NonSeekingReader(file).iter_messages([topic], log_time_order=False):
+            found.append(message.log_time)
+    return found
 
 
 def wait_for_more(bag, length, process):
@@ -97,7 +101,7 @@ def test_bag_is_complete_after_ctrl_c(number, live, tmp_path):
     process = start('record', '-o', bag)
     # Some six seconds; the estimator may be discovered later than the plant.
     wait_until(
-        lambda: size(bag) > 1_200_000 and count(bag, '/estimator/stamp') > 20,
+        lambda: size(bag) > 1_200_000 and len(stamps(bag, '/estimator/stamp')) > 20,
         'messages', 120.0, process,
     )  # fmt: skip
     process.send_signal(number)
@@ -221,9 +225,9 @@ def test_kill_leaves_what_was_flushed(live, tmp_path):
     process.kill()
     process.communicate(timeout=60)
     assert not (bag / 'metadata.yaml').exists()
-    y = series(bag / 'bag_0.mcap', '/y')
-    assert len(y.values) > 1000
-    assert killed - y.stamps[-1] < 20e9  # a busy machine; else half a second
+    found = stamps(bag, '/y')
+    assert len(found) > 1000
+    assert killed - found[-1] < 20e9  # a busy machine; else half a second
 
 
 def test_all_topics(live, tmp_path):
@@ -290,8 +294,8 @@ def test_full_disk_leaves_what_was_recorded(live, tmp_path):
     )  # fmt: skip
     assert result.returncode == 2, result.stderr
     assert 'Traceback' not in result.stderr
-    assert 'its storage file can be read as far as it goes' in result.stderr
-    assert len(series(tmp_path / 'bag' / 'bag_0.mcap', '/y').values) > 1500
+    assert '`mcap recover` saves what was recorded' in result.stderr
+    assert len(stamps(tmp_path / 'bag', '/y')) > 1500
 
 
 def test_existing_output_is_refused(tmp_path):

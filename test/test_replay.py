@@ -309,7 +309,7 @@ def lose_metadata(bag):
         (None, ['BAG', '-p', "phi:=['0','0','u']"], ["'/u'", '(/y)']),
         (old, ['old.bag'], ['ROS 1', 'rosbags-convert --src old.bag']),
         (None, ['BAG', '--params-file', '/no.yaml'], ['/no.yaml', 'No such file']),
-        (cut, ['BAG'], ['whole bag', 'mcap recover']),
+        (cut, ['BAG'], ['whole bag', 'was cut', 'mcap recover']),
         (spoil, ['BAG'], ['whole bag']),
         (lose_metadata, ['BAG'], ['metadata.yaml', 'bag.mcap: name that file']),
         (with_empty_topic, ['empty'], ["expected messages on topic '/y', got none"]),

@@ -74,7 +74,7 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
             count = _drain(queue, recorder.problems, bag, arguments.duration, stop)
             lost = dict(recorder.lost)
     except OSError as error:
-        hint = '; its storage file can be read as far as it goes' if path.exists() else ''
+        hint = '; `mcap recover` saves what was recorded' if path.exists() else ''
         raise ConfigurationError(
             f'output {path}: expected a place that can be written, got: '
             f'{error.strerror or error}{hint}'

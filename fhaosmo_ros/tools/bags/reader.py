@@ -4,14 +4,11 @@
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager, ExitStack, suppress
-from functools import cache
-from itertools import pairwise, zip_longest
+from contextlib import contextmanager, ExitStack
+from itertools import zip_longest
 from operator import itemgetter
 from pathlib import Path
 import struct
-import sys
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from zlib import crc32
 
@@ -24,7 +21,7 @@ from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader
 from mcap.records import Chunk
 from mcap.stream_reader import get_chunk_data_stream
-from mcap.writer import CompressionType, MCAP0_MAGIC, Writer
+from mcap.writer import MCAP0_MAGIC
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
@@ -38,7 +35,7 @@ RECORD = struct.Struct('<BQ')
 """Of mcap: opcode and length, before the content of each record."""
 MESSAGE = struct.Struct('<HIQQ')
 """Of mcap: channel, sequence, log time and publish time, before a message in CDR."""
-FOOTER = struct.Struct('<BQQQI8x')
+FOOTER = struct.Struct('<BQQQI8s')
 """Of mcap: opcode, length, begin of the summary and of its offsets, CRC; then the magic number."""
 Watch = Callable[[Iterator[Any]], Iterable[Any]]
 Row = tuple[int, int, int, bytes]
@@ -73,8 +70,8 @@ class BagReader:
     An open bag: a folder with metadata.yaml, or one storage file of it.
 
     Where the file has CRCs, what is read agrees with them; and a topic that is read to its end has
-    as many messages as the bag lists. An mcap file that was cut, or whose writer was killed, is
-    read up to there, which is said on stderr.
+    as many messages as the bag lists. Anything else is an error in one line, and so is a file that
+    was cut, or whose writer was killed.
 
     Attributes
     ----------
@@ -109,11 +106,9 @@ class BagReader:
 
     def _open(self, stack: ExitStack) -> None:
         path = self.path
-        if path.is_file():
-            path = _whole_part(path, Path(stack.enter_context(TemporaryDirectory())))
-        for file in path.glob('*.mcap') if path.is_dir() else [path]:
-            if file.suffix == '.mcap':
-                _check_summary(file)
+        for file in path.iterdir() if path.is_dir() else [path]:
+            if file.suffix in ('.mcap', '.db3'):
+                _expect_whole(file)
         reader = stack.enter_context(AnyReader([path], default_typestore=TYPES))
         self.connections: list[Connection] = list(reader.connections)
         self.types = reader.typestore
@@ -327,62 +322,22 @@ def _expect_bag(path: Path) -> None:
     )
 
 
-def _check_summary(path: Path) -> None:
-    """Compare the summary of an mcap file, which holds its topics and its index, with its CRC."""
-    with path.open('rb') as file:
-        place = file.seek(-FOOTER.size, 2)
-        _, _, start, _, crc = FOOTER.unpack(file.read())
-        if crc and start < place:
-            file.seek(start or place)
-            if crc32(file.read()[:-12]) != crc:
-                raise ValueError('the summary does not agree with its CRC')
-
-
-def _whole_part(path: Path, folder: Path) -> Path:
-    """Return a storage file; of an mcap file that was cut, a copy of what is whole."""
+def _expect_whole(path: Path) -> None:
+    """Refuse a storage file that was cut, or whose summary does not agree with its CRC."""
     if any(Path(f'{path}{end}').exists() for end in ('-journal', '-wal')):
         raise ValueError(
             f'a file whose writer was killed: `sqlite3 {path} .tables` takes back what is half'
         )
-    if path.suffix != '.mcap' or not _is_cut(path):
-        return path
-    copy = folder / path.name
-    _copy_whole_part(path, copy)
-    _say_once(f'bag {path}: cut, or its writer was killed; read up to its last whole part')
-    return copy
-
-
-@cache
-def _say_once(text: str) -> None:
-    print(text, file=sys.stderr)
-
-
-def _is_cut(path: Path) -> bool:
-    with path.open('rb') as file:
-        begin = file.read(len(MCAP0_MAGIC))
-        file.seek(max(0, file.seek(0, 2) - len(MCAP0_MAGIC)))
-        return begin == MCAP0_MAGIC and file.read() != MCAP0_MAGIC
-
-
-def _copy_whole_part(path: Path, copy: Path) -> None:
-    """Copy the messages of an mcap file that was cut, but for the last one: it may be cut, too."""
-    with path.open('rb') as source, copy.open('wb') as target:
-        writer = Writer(target, compression=CompressionType.NONE)
-        writer.start('ros2', 'fhaosmo_ros')
-        channels: dict[int, int] = {}
-        found = NonSeekingReader(source, validate_crcs=True).iter_messages(log_time_order=False)
-        with suppress(Exception):  # struct.error, those of compressors, ...
-            for (schema, channel, message), _ in pairwise(found):
-                if channel.id not in channels:
-                    kind = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    channels[channel.id] = writer.register_channel(
-                        channel.topic, channel.message_encoding, kind, channel.metadata
-                    )
-                number, sent = channels[channel.id], message.publish_time
-                writer.add_message(number, message.log_time, message.data, sent)
-        writer.finish()
-    if not channels:
-        raise ValueError('a file that was cut before its first chunk ended')
+    if path.suffix == '.mcap':
+        with path.open('rb') as file:
+            place = file.seek(-FOOTER.size, 2)
+            _, _, start, _, crc, magic = FOOTER.unpack(file.read())
+            if magic != MCAP0_MAGIC:
+                raise ValueError('a file that was cut, or whose writer was killed')
+            if crc and start < place:
+                file.seek(start or place)
+                if crc32(file.read()[:-12]) != crc:
+                    raise ValueError('the summary does not agree with its CRC')
 
 
 @contextmanager
