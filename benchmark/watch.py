@@ -7,7 +7,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.middleware.messages import message_class
-from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, Sample, TopicRecorder
+from fhaosmo_ros.nodes.recording.topic_recorder import NewTopic, Sample, TopicRecorder
 from fhaosmo_ros.topics import OF_ALL_NODES
 import numpy as np
 from rclpy.serialization import deserialize_message
@@ -38,10 +38,12 @@ class Watch(TopicRecorder):
         self._classes = {topic: message_class(kind) for topic, kind in kinds.items()}
         self._series: dict[str, list[tuple[int, float]]] = {topic: [] for topic in kinds}
         self._lock = threading.Lock()
-        super().__init__(self._receive, [ExpectedTopic(*pair) for pair in kinds.items()])
+        super().__init__(self._receive, lambda topic: topic in kinds)
 
-    def _receive(self, sample: Sample) -> None:
-        topic, published, data = sample
+    def _receive(self, item: NewTopic | Sample) -> None:
+        if isinstance(item, NewTopic):
+            return
+        topic, published, data = item
         message = deserialize_message(data, self._classes[topic])
         if topic == DIAGNOSTICS:
             for status in message.status:

@@ -18,8 +18,7 @@ pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 from domains import take_domain
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import read_ticks
-from fhaosmo_ros.tools.demo.command import topics_of
-from fhaosmo_ros.topics import ESTIMATES
+from fhaosmo_ros.topics import ESTIMATES, EVENT, PARAMETERS, SNAPSHOT
 from mcap.reader import NonSeekingReader
 import numpy as np
 import rclpy
@@ -119,13 +118,13 @@ def test_bag_is_complete_after_ctrl_c(number, live, tmp_path):
     assert information['message_count'] == sum(counts.values())
     assert str(information['message_count']) in out
     assert information['duration']['nanoseconds'] > 10**9
-    transient_local = {'/rosout'} | {t.topic for t in topics_of({}) if t.transient_local}
+    latched = [f'/estimator/{name}' for name in (EVENT, SNAPSHOT, PARAMETERS)]
     for topic in information['topics_with_message_count']:
         metadata = topic['topic_metadata']
         assert metadata['type_description_hash'].startswith('RIHS01_')
         assert metadata['offered_qos_profiles'][0]['reliability'] == 'reliable'
         durability = metadata['offered_qos_profiles'][0]['durability']
-        expected = 'transient_local' if metadata['name'] in transient_local else 'volatile'
+        expected = 'transient_local' if metadata['name'] in ('/rosout', *latched) else 'volatile'
         assert durability == expected, metadata['name']
     with AnyReader([bag]) as reader:
         read = {c.topic: 0 for c in reader.connections}

@@ -2,13 +2,14 @@
 """Record y and the estimator's topics to a bag."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from queue import SimpleQueue
 import re
 import shutil
 import sys
 import time
+from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
@@ -104,9 +105,38 @@ def _wanted(
     if arguments.topics:
         names = {resolved(_full(topic)) for topic in arguments.topics}
         return lambda topic: topic in names
-    below = tuple(f'{resolved(_full(name))}/' for name in arguments.names)
+    return topics_of([_full(name) for name in arguments.names], resolved)
+
+
+def topics_of(
+    names: Sequence[str], resolved: Callable[[str], str] = lambda name: name
+) -> Callable[[str], bool]:
+    """
+    Return a function that says of a topic whether it is of one of these nodes, or of all nodes.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Full names of nodes.
+    resolved : callable, optional
+        Returns a name after remapping.
+
+    """
+    below = tuple(f'{resolved(name)}/' for name in names)
     extra = [resolved(topic) for topic in EXTRA]
     return lambda topic: topic.startswith(below) or topic in extra
+
+
+def store(bag: BagWriter, item: Any) -> bool:
+    """Write what a recorder hands over, a topic or a sample; return True for a sample."""
+    if not hasattr(item, 'offered'):
+        bag.write(item.topic, item.stamp, item.data)
+        return True
+    qos = [make_qos(**profile) for profile in item.offered]
+    bag.add(item.topic, item.message_type, qos=_different(qos))
+    if item.message_type not in TYPES.fielddefs:
+        tqdm.write(f'{item.topic}: the bag will lack the definition of its type')
+    return False
 
 
 def _drain(
@@ -126,15 +156,7 @@ def _drain(
                 duration is not None and time.monotonic() - begin >= duration
             )
             for _ in range(queue.qsize()):
-                item = queue.get()
-                if hasattr(item, 'offered'):
-                    qos = [make_qos(**profile) for profile in item.offered]
-                    bag.add(item.topic, item.message_type, qos=_different(qos))
-                    if item.message_type not in TYPES.fielddefs:
-                        tqdm.write(f'{item.topic}: the bag will lack the definition of its type')
-                else:
-                    bag.write(item.topic, item.stamp, item.data)
-                    count += 1
+                count += store(bag, queue.get())
             while not problems.empty():
                 tqdm.write(f'record: not recorded: {problems.get()}', file=sys.stderr)
             if time.monotonic() - flushed >= FLUSH_PERIOD:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records topics: those that appear, with the QoS of their publishers, or expected ones."""
+"""Records topics as they appear, with the QoS of their publishers."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from queue import SimpleQueue
 from time import time_ns
@@ -23,14 +24,6 @@ stamp of the recording's beginning; else the bag would begin when somebody start
 DURABILITIES = (DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL)
 SHARED = ('/parameter_events', '/rosout', '/diagnostics', '/tf', '/tf_static')
 """Topics of many publishers: the sequence numbers of their messages say nothing."""
-
-
-class ExpectedTopic(NamedTuple):
-    """A topic that is subscribed at once, before anybody publishes it."""
-
-    topic: str
-    message_type: str
-    transient_local: bool = False
 
 
 class NewTopic(NamedTuple):
@@ -56,13 +49,10 @@ class TopicRecorder(PrivateNode):
     Parameters
     ----------
     sink : callable
-        Called with `NewTopic`, then with the topic's `Sample`s, from the executor's thread; with
-        samples only for `expected` topics.
-    expected : iterable of ExpectedTopic
-        Subscribed at once, and reliably; LookupError if a message type is not installed.
-    wanted : callable, optional
-        Says of the name of a topic that has a publisher whether to record it, too. Called while
-        it is open.
+        Called with `NewTopic`, then with the topic's `Sample`s, from the executor's thread.
+    wanted : callable
+        Says of the name of a topic that has a publisher whether to record it. Called while it is
+        open.
     listeners : sequence of str
         Names of nodes whose inputs to record as well, whatever their names.
     ros_arguments : sequence of str
@@ -70,7 +60,7 @@ class TopicRecorder(PrivateNode):
 
     Attributes
     ----------
-    counts, lost : dict of str to int
+    counts, lost : Counter of str
         Messages by topic that have come, and those that did not arrive; the latter only of topics
         with one publisher, whose messages are numbered.
     problems : SimpleQueue
@@ -81,28 +71,22 @@ class TopicRecorder(PrivateNode):
     def __init__(
         self,
         sink: Callable[[NewTopic | Sample], None],
-        expected: Iterable[ExpectedTopic] = (),
-        wanted: Callable[[str], bool] | None = None,
+        wanted: Callable[[str], bool],
         listeners: Sequence[str] = (),
         ros_arguments: Sequence[str] = (),
     ) -> None:
         super().__init__('fhaosmo_recorder', ros_arguments)
-        self.counts: dict[str, int] = {}
+        self.counts: Counter[str] = Counter()
         self.problems: SimpleQueue[str] = SimpleQueue()
-        self.lost: dict[str, int] = {}
+        self.lost: Counter[str] = Counter()
         self._sink, self._wanted = sink, wanted
         self._begin = time_ns()
         self._listeners = [self.resolved(name) for name in listeners]
         self._seen: set[str] = set()
-        for topic, message_type, transient_local in expected:
-            self._seen.add(topic)
-            qos = QoSProfile(depth=DEPTH, durability=DURABILITIES[transient_local])
-            self._subscribe(topic, message_class(message_type), qos, True, transient_local)
 
     def __enter__(self) -> 'TopicRecorder':
-        if self._wanted is not None:
-            self._discover()
-            self.node.create_timer(DISCOVERY_PERIOD, self._discover)
+        self._discover()
+        self.node.create_timer(DISCOVERY_PERIOD, self._discover)
         super().__enter__()
         return self
 
@@ -131,7 +115,7 @@ class TopicRecorder(PrivateNode):
         self, topic: str, kind: Any, qos: QoSProfile, numbered: bool, bounded: bool
     ) -> None:
         """Record a topic; numbered: of one publisher; bounded: no stamp is older than `OLD`."""
-        self.counts[topic] = latest = 0
+        latest = 0
         numbered = numbered and topic not in SHARED
         earliest = self._begin - OLD if bounded else 0
 
@@ -139,7 +123,7 @@ class TopicRecorder(PrivateNode):
             nonlocal latest
             number = info.get('publication_sequence_number') or 0 if numbered else 0
             if latest and number > latest + 1:
-                self.lost[topic] = self.lost.get(topic, 0) + number - latest - 1
+                self.lost[topic] += number - latest - 1
             elif 0 < number <= latest:  # another publisher: its numbers say nothing
                 self.lost.pop(topic, None)
                 number = 2**63

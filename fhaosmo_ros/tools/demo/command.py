@@ -2,36 +2,23 @@
 """The demonstration: plant and estimator as two processes over DDS, recorded and compared."""
 
 import argparse
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable
 import os
 from pathlib import Path
 import time
-from typing import Any
 
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.nodes.recording.topic_recorder import ExpectedTopic, TopicRecorder
+from fhaosmo_ros.nodes.recording.topic_recorder import TopicRecorder
 from fhaosmo_ros.stop_signals import Stop, Stopped
-from fhaosmo_ros.tools.bags.types import LATCHED_QOS, OFFERED_QOS
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command, shipped
 from fhaosmo_ros.tools.cli.processes import Children
 from fhaosmo_ros.tools.demo.figure import save_figure
 from fhaosmo_ros.tools.demo.report import others, read_run, table
-from fhaosmo_ros.topics import (
-    ARRAY,
-    DIAGNOSTICS,
-    estimates_of,
-    EVENT,
-    FLOAT,
-    OF_ALL_NODES,
-    PARAMETERS,
-    SNAPSHOT,
-    TEXT,
-    TRUTH,
-)
+from fhaosmo_ros.tools.record import store, topics_of
+from fhaosmo_ros.topics import TRUTH
 
 START_DEADLINE = 60.0
 """Seconds for a node to appear; it takes one or two where nothing else runs."""
@@ -39,20 +26,6 @@ NOISE = 'now with noise of 1e-4 on y', {'noise_std': 1e-4}
 """What happens to the plant of the shipped files: words, parameters."""
 NOISY_FROM = 2.0 / 3.0
 """Part of the duration after which it does."""
-
-
-def topics_of(estimator: Mapping[str, Any]) -> list[ExpectedTopic]:
-    """Return what is recorded, by the parameters of the estimator."""
-    estimates = estimates_of({'gains': 'fixed', **estimator})
-    return [
-        ExpectedTopic('/y', FLOAT),
-        *(ExpectedTopic(f'/plant/{name}', kind) for name, kind in TRUTH.items()),
-        *(ExpectedTopic(f'/estimator/{name}', kind) for name, kind in estimates.items()),
-        ExpectedTopic(f'/estimator/{EVENT}', DIAGNOSTICS, transient_local=True),
-        ExpectedTopic(f'/estimator/{SNAPSHOT}', ARRAY, transient_local=True),
-        ExpectedTopic(f'/estimator/{PARAMETERS}', TEXT, transient_local=True),
-        *(ExpectedTopic(name, kind) for name, kind in OF_ALL_NODES.items()),
-    ]
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -106,7 +79,7 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         folder = output.path
         folder.mkdir()
         noisy = arguments.params_file is None
-        marks = _record(folder, parameters, estimator, arguments.duration, noisy, stop)
+        marks = _record(folder, parameters, arguments.duration, noisy, stop)
         if stop.is_set():
             print('stopped early: reporting what has been recorded')
         run = read_run(folder / 'bag')
@@ -120,21 +93,15 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
 
 
 def _record(
-    folder: Path,
-    parameters: Path,
-    estimator: Mapping[str, Any],
-    duration: float,
-    noisy: bool,
-    stop: Stop,
+    folder: Path, parameters: Path, duration: float, noisy: bool, stop: Stop
 ) -> list[tuple[int, str]]:
     """Record a run; return when the plant changed (ns), and how."""
-    topics = topics_of(estimator)
-    with ExitStack() as stack:
-        bag = stack.enter_context(BagWriter(folder / 'bag'))
-        for topic, kind, transient_local in topics:
-            bag.add(topic, kind, qos=[LATCHED_QOS if transient_local else OFFERED_QOS])
-        recorder = stack.enter_context(TopicRecorder(lambda sample: bag.write(*sample), topics))
-        nodes = stack.enter_context(Children(folder))
+    wanted = topics_of(['/estimator', '/plant'])
+    with (
+        BagWriter(folder / 'bag') as bag,
+        TopicRecorder(lambda item: store(bag, item), wanted) as recorder,
+        Children(folder) as nodes,
+    ):
         options = ('--ros-args', '--params-file', str(parameters))
         # Together: Fast DDS finds a node that starts half a second after another one 3 s late.
         nodes.start_node('estimator', *options)
