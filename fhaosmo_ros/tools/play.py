@@ -8,8 +8,11 @@ import time
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.bags.types import serialise, TYPES
 from fhaosmo_ros.tools.cli.command import run_command
+from fhaosmo_ros.topics import TIME
 
+CLOCK = 'rosgraph_msgs/msg/Clock'
 CLOCK_PERIOD = 1_000_000
 """Longest time between two messages on /clock, in nanoseconds of the bag's time."""
 NEVER_PLAYED = ('/clock', '/rosout', '/parameter_events')
@@ -36,7 +39,8 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
         raise ConfigurationError(f'--rate: expected 0.001 to 1000, got {arguments.rate:g}')
     if not 0.0 <= arguments.delay <= 3600.0:
         raise ConfigurationError(f'--delay: expected 0 to 3600 s, got {arguments.delay:g}')
-    from fhaosmo_ros.nodes.recording.player import Player  # here, so that --help needs no ROS
+    # Here, so that --help needs no ROS.
+    from fhaosmo_ros.nodes.recording.private_node import PrivateNode
 
     with BagReader(arguments.bag) as reader:
         wanted = arguments.topics or [c.topic for c in reader.connections if c.msgcount]
@@ -48,25 +52,34 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
             for c in reader.connections
             if any(q.durability.name == 'TRANSIENT_LOCAL' for q in c.ext.offered_qos_profiles)
         }
-        kinds = {topic: (kind, topic in latched) for topic, kind in topics.items()}
-        with Player(kinds, arguments.ros_arguments) as player:
-            for topic in player.missing:
-                print(f'play: not played: {topic}: {topics[topic]} is not installed here')
-            print(f'playing {len(kinds) - len(player.missing)} topics; Ctrl-C ends it', flush=True)
+        with PrivateNode('fhaosmo_player', arguments.ros_arguments) as node:
+            clock = node.publisher('/clock', CLOCK, False)
+            publish = {}
+            for topic, kind in topics.items():
+                try:
+                    publish[topic] = node.publisher(topic, kind, topic in latched)
+                except LookupError:
+                    print(f'play: not played: {topic}: {kind} is not installed here')
+            print(f'playing {len(publish)} topics; Ctrl-C ends it', flush=True)
             if stop.wait(arguments.delay):
                 return
             while True:
                 now, begin = None, time.monotonic_ns()
-                for topic, stamp, data, _ in reader.messages(topics):
+                for topic, stamp, data, _ in reader.messages(publish):
                     if now is None:
                         first = now = stamp
-                        player.tick(now)
+                        clock(_clock(now))
                     while now < stamp:  # the clock goes on between the messages
                         now = min(now + CLOCK_PERIOD * max(1, round(arguments.rate)), stamp)
                         pause = (now - first) / arguments.rate - (time.monotonic_ns() - begin)
                         if stop.wait(max(0.0, pause * 1e-9)):
                             return
-                        player.tick(now)
-                    player.publish(topic, data)
+                        clock(_clock(now))
+                    publish[topic](data)
                 if not arguments.loop:
                     return
+
+
+def _clock(now: int) -> bytes:
+    """Return the message on /clock for a time in nanoseconds."""
+    return serialise(CLOCK, clock=TYPES.types[TIME](*divmod(now, 1_000_000_000)))

@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """A node that a tool makes for itself."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 import shlex
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
+DEPTH = 1000
 ACTING = ('-r', '--remap', '-e', '--enclave')
 """ROS arguments that act."""
 
@@ -75,6 +78,24 @@ class PrivateNode:
         if node not in self._clients:
             self._clients[node] = AsyncParameterClient(self.node, node)
         return self._clients[node]
+
+    def publisher(
+        self, topic: str, message_type: str, transient_local: bool
+    ) -> Callable[[bytes], None]:
+        """
+        Return a function that publishes messages in CDR.
+
+        Raises
+        ------
+        LookupError
+            The message type is not installed here.
+
+        """
+        qos = QoSProfile(depth=DEPTH)
+        if transient_local:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        publisher = self.node.create_publisher(message_class(message_type), topic, qos)
+        return publisher.publish  # type: ignore[no-any-return]
 
     def publishers(self, topic: str) -> int:
         """Return how many publishers of a topic have been discovered."""
