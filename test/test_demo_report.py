@@ -45,8 +45,8 @@ def report(stamp, **values):
     return files.cdr(DIAGNOSTICS, header=files.header(stamp), status=[status])
 
 
-def record(path, missing=(), count=5):
-    """Write a run; the first `count` messages of the topics in `missing` are not in the bag."""
+def record(path, missing=()):
+    """Write a run; topics in `missing` are not in the bag."""
     messages = []
     for k in range(COUNT):
         stamp = files.ORIGIN + round(k * PERIOD * 1e9)
@@ -64,7 +64,7 @@ def record(path, missing=(), count=5):
         messages += [
             (topic, kind, stamp + delay, data)
             for topic, kind, delay, data in rows
-            if k >= count or topic not in missing
+            if topic not in missing
         ]
     return files.write(path, messages)
 
@@ -109,25 +109,7 @@ def test_other_observers_go_through_the_same_samples(tmp_path):
     assert others(run, {'gains': 'self_tuning'}) == {}
 
 
-@pytest.mark.parametrize(
-    'missing',
-    [
-        *([f'/estimator/{name}'] for name in KINDS),
-        ['/y'],
-        ['/plant/unknown_input'],
-        ['/estimator/state', '/estimator/unknown_input', '/plant/state'],
-    ],
-)
-def test_early_messages_that_are_missing_change_no_number(missing, tmp_path):
-    """A recorder may hear some topics later than others."""
-    run = read_run(record(tmp_path / 'bag', missing))
-    begin = 0 if missing == ['/y'] else 5
-    np.testing.assert_array_equal(run.estimate, ESTIMATE[begin:])
-    np.testing.assert_array_equal(run.truth, TRUTH[begin:])
-    assert errors_of(table(run, {}, [])) == pytest.approx(expected(T >= START), rel=0.1)
-
-
 def test_bag_without_estimates_is_refused(tmp_path):
-    bag = record(tmp_path / 'bag', [f'/estimator/{name}' for name in KINDS], COUNT)
+    bag = record(tmp_path / 'bag', [f'/estimator/{name}' for name in KINDS])
     with pytest.raises(ConfigurationError, match='ended before an estimate arrived'):
         read_run(bag)

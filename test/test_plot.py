@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A figure and a table from the estimates in bags."""
 
-import os
 from pathlib import Path
 import signal
-import subprocess
-import sys
 
 import bag_files as files
 from fhaosmo_ros.tools.bags.types import labelled_array
@@ -18,7 +15,6 @@ from matplotlib.figure import Figure
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[1]
 MAGIC = {'png': b'\x89PNG\r\n\x1a\n', 'svg': b'<?xml', 'pdf': b'%PDF-'}
@@ -122,35 +118,6 @@ def test_signal_in_a_destructor_is_not_lost(bag, tmp_path, monkeypatch, capsys):
     assert plot.main([str(bag), '-o', str(tmp_path / 'f.png')]) == 130
     assert capsys.readouterr().err.endswith('plot: interrupted\n')
     assert not list(tmp_path.glob('*f.png*'))
-
-
-# The command, which draws so long that no signal can come too late.
-SLOW = """
-import sys, time
-from fhaosmo_ros.tools.plot import command
-draw = command.save_curves
-command.save_curves = lambda *arguments: (draw(*arguments), time.sleep(120.0))
-sys.exit(command.main(sys.argv[1:]))
-"""
-
-
-@pytest.mark.signals
-def test_ctrl_c_leaves_nothing(bag, tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, '-c', SLOW, bag, '-o', tmp_path / 'f.pdf'],
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])},
-    )
-    wait_until((tmp_path / '.f.pdf.part').exists, 'output', 90.0, process)
-    os.killpg(process.pid, signal.SIGTERM)
-    os.killpg(process.pid, signal.SIGINT)
-    _, error = process.communicate(timeout=60)
-    assert process.returncode == 130, error
-    assert error.strip().splitlines()[-1] == 'plot: interrupted'
-    assert 'Traceback' not in error
-    assert sorted(p.name for p in tmp_path.iterdir()) == ['bag', 'one', 'two']
 
 
 def test_truth_is_unknown_where_the_bag_lacks_it(tmp_path):

@@ -3,8 +3,6 @@
 
 import math
 from pathlib import Path
-import subprocess
-import sys
 
 from fhaosmo_ros.core import ConfigurationError
 import pytest
@@ -69,32 +67,6 @@ def test_study_is_continued(tmp_path):
     # A study that is complete, and another name, which is another study.
     assert minimise(bowl, SPACE, 5, storage=storage) == second
     assert minimise(bowl, SPACE, 2, storage=storage, name='other').trials == 2
-
-
-WORKER = """
-import sys
-sys.path.insert(0, 'test')
-from test_search import seen_by
-seen, result = seen_by(trials=30, storage=sys.argv[1])
-print(len(seen), result.trials)
-"""
-
-
-@pytest.mark.signals
-def test_two_processes_share_a_study(tmp_path):
-    storage = f'sqlite:///{tmp_path}/study.db'
-    minimise(bowl, SPACE, 1, storage=storage)  # makes its tables
-    command = [sys.executable, '-c', WORKER, storage]
-    both = [subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) for _ in 'ab']
-    try:
-        printed = [worker.communicate(timeout=300.0)[0].split() for worker in both]
-    finally:
-        for worker in both:
-            worker.kill()
-            worker.wait()
-    own, counts = zip(*(map(int, words) for words in printed), strict=True)
-    assert 30 <= max(counts) <= 31
-    assert 1 + sum(own) == max(counts)
 
 
 @pytest.mark.parametrize('storage', ['study.log', 'nodb://x', 'sqlite:////no/x.db', 'fails'])

@@ -357,14 +357,6 @@ def test_wrong_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, messa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_missing_optuna_says_how_to_install_it(monkeypatch, capsys):
-    from fhaosmo_ros.tools.cli import command as module
-
-    monkeypatch.setattr(module, 'find_spec', lambda name: None)
-    assert main([]) == 1
-    assert "pip install 'optuna" in capsys.readouterr().err
-
-
 # what is shipped
 
 

@@ -12,8 +12,6 @@ from fhaosmo_ros.tools.tuning.identify import Identified, LAGS, SURE
 from fhaosmo_ros.tools.tuning.report import save, table
 import numpy as np
 
-TENTHS, CHANGED = 10, 1.5
-"""Parts of a bag, and the factor by which innovations may differ between them."""
 SMALL_CORRELATION, UNLIKELY = 0.05, 0.01
 NEAR = 1.2
 """Sizes that differ by less than this factor are alike."""
@@ -96,15 +94,6 @@ def _run(run: Run, innovation: float) -> str:
 def notes(found: Identified, run: Run) -> Iterator[str]:
     """Say what a user should know before trusting the gains."""
     best, samples = found.best, found.likelihood.samples
-    r = np.where(samples.used, np.abs(best.innovations), np.nan)
-    tenths = [x[np.isfinite(x)] for x in np.array_split(r, TENTHS)]
-    levels = [float(np.median(x)) / 0.6745 * best.noise for x in tenths if len(x) >= 30]
-    if levels and max(levels) > CHANGED * min(levels):
-        yield (
-            'Noise, or d, changes along the bag: in tenths of it the innovations have a size of '
-            f'{min(levels):.3g} to {max(levels):.3g}. Fixed gains fit their mean; '
-            '`gains: self_tuning` follows such changes.'
-        )
     if found.quantum > 2.0 * best.noise:
         yield (
             f'y comes in steps of {found.quantum:.3g}, larger than its noise: the '
@@ -112,8 +101,8 @@ def notes(found: Identified, run: Run) -> Iterator[str]:
         )
     if found.outliers:
         yield (
-            f'{found.outliers} samples ({found.outliers / len(r):.2%}) are outliers. They were '
-            'left out; the estimator rejects such samples, too.'
+            f'{found.outliers} samples ({found.outliers / len(samples.y):.2%}) are outliers. They '
+            'were left out; the estimator rejects such samples, too.'
         )
     model, whole = found.likelihood.model, float(samples.h.sum())
     n = model.order
