@@ -61,7 +61,7 @@ class BagInputs(NamedTuple):
     u : mapping of str to Input
         The known inputs that the model uses, likewise.
     stamp : str
-        As for `BagReader.blocks`.
+        As for `BagReader.samples`.
     values : mapping
         Parameters of the channel.
 

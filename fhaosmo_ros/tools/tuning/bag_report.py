@@ -116,15 +116,6 @@ def notes(found: Identified, run: Run) -> Iterator[str]:
             'sign in phi is wrong; if one does, its command should be a known input, or d '
             'contains it.'
         )
-    level, gain = max(found.shaken.items(), key=lambda item: item[1])
-    if gain > SURE:
-        where = f"z{level}' = {f'z{level + 1}' if level < n else 'd'} + Phi_{level}"
-        yield (
-            f'The model misses something: y is likelier by {gain:.0f} in the logarithm if random '
-            f'shocks act in {where} as well. The order may be wrong (an unknown input that acts '
-            'there makes a model of fewer states the right one), phi may be, or y may slip or '
-            'drift. Standard deviations are too small then.'
-        )
     if lost := run.counters.divergences:
         yield (
             f'With these gains the estimator lost y {lost} times in this bag and began afresh: '

@@ -39,8 +39,6 @@ OUTLIER, LONGEST_RUN = 6.0, 3
 MOST_OUTLIERS = 0.05
 STILL = 0.03
 """Bandwidth of a filter that takes d for 0, over the bag's length."""
-SHAKES = tuple(float(x) for x in np.geomspace(1e-4, 1e2, 7))
-"""Intensities of white noise on a state that are tried; see `Design.shake`."""
 LAGS = 20
 SURE = 10.0
 """A difference of log-likelihoods that is no accident."""
@@ -58,7 +56,6 @@ class Identified(NamedTuple):
     likelihood: Likelihood
     best: Evaluation  # of the likeliest design
     silent: float  # fall of the log-likelihood if d were 0
-    shaken: dict[int, float]  # its rise if white noise drove state i = 1 .. n as well
     outliers: int  # samples that were left out
     quantum: float  # of y; 0 for none that shows
 
@@ -107,9 +104,9 @@ def identify_input(
                 f'y: expected samples that the model can predict, got none that phi = '
                 f'{list(model.phi)} follows: its estimates leave the finite numbers'
             )
-        silent, shaken = search.alternatives(best)
+        silent = search.silent(best)
     step = quantum(likelihood.samples.y)
-    return Identified(likelihood, best, silent, shaken, outliers, step)
+    return Identified(likelihood, best, silent, outliers, step)
 
 
 def _prepared(
@@ -231,18 +228,11 @@ class _Search:
         )  # fmt: skip
         return at(found.x)
 
-    def alternatives(self, best: Evaluation) -> tuple[float, dict[int, float]]:
-        """Return `Identified.silent` and `Identified.shaken`."""
-
-        def rise(**changes: Any) -> float:
-            design = best.design._replace(**changes)
-            return self._evaluate(design).log_likelihood - best.log_likelihood
-
-        shaken = {
-            level: max(rise(shaken=level, shake=shake) for shake in SHAKES)
-            for level in range(1, self._likelihood.model.order + 1)
-        }
-        return -rise(bandwidth=STILL / float(self._likelihood.samples.h.sum())), shaken
+    def silent(self, best: Evaluation) -> float:
+        """Return `Identified.silent`."""
+        still = STILL / float(self._likelihood.samples.h.sum())
+        found = self._evaluate(best.design._replace(bandwidth=still))
+        return best.log_likelihood - found.log_likelihood
 
 
 def ljung_box(r: Floats, lags: int = LAGS) -> tuple[Floats, float]:

@@ -38,8 +38,6 @@ class Design(NamedTuple):
     derivatives: int  # k of D 17
     bandwidth: float  # omega of the filter in rad/s, which says q (D 30)
     ratio: float  # kappa / omega
-    shaken: int = 0  # state that white noise drives as well, counted from 1; 0 for none
-    shake: float = 0.0  # its intensity, over noise^2 h omega^(2 shaken)
 
     @property
     def decay(self) -> float:
@@ -106,9 +104,6 @@ class Likelihood:
         rates[:n, :n] += self._jacobian
         rates[range(n, size), range(n, size)] = -design.decay
         a, added = LinearModel(rates, q).transition(self.period)
-        if i := design.shaken:
-            w = design.shake * noise * self.period * design.bandwidth ** (2 * i)
-            added[:i, :i] += LinearModel(rates[:i, :i], w).transition(self.period)[1]
         fresh = np.zeros((size, size))
         fresh[range(1, n), range(1, n)] = np.square(self.sizes[1:])
         fresh[n:, n:] = stationary(rates[n:, n:], q)
