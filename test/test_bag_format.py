@@ -4,7 +4,7 @@
 import struct
 
 import bag_files as files
-from fhaosmo_ros.tools.bags.types import LATCHED_QOS, make_qos
+from fhaosmo_ros.tools.bags.types import LATCHED_QOS
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.replay import command as replay
 from mcap.data_stream import ReadDataStream
@@ -30,12 +30,9 @@ LATCHED = RELIABLE | {'history': 'unknown', 'depth': 0, 'durability': 'transient
 
 def test_metadata(tmp_path):
     """Every field that rosbag2's parser asks for in version 9, of its type; twice."""
-    latched = make_qos(
-        'UNKNOWN', 0, 'RELIABLE', 'TRANSIENT_LOCAL', 2**63 - 1, 2**63 - 1, 'AUTOMATIC', 2**63 - 1
-    )
     with BagWriter(tmp_path / 'bag') as bag:
         bag.add('/y', KIND)
-        bag.add('/late', KIND, qos=[latched])
+        bag.add('/late', KIND, qos=[LATCHED])
         bag.write('/y', 5, files.float64(1.5))
         bag.write('/late', 7, files.float64(-2.5))
         bag.write('/y', 9, files.float64(2.5))

@@ -13,7 +13,7 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.bags.types import make_qos, TYPES
+from fhaosmo_ros.tools.bags.types import TYPES
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import progress, run_command
 from fhaosmo_ros.topics import OF_ALL_NODES
@@ -132,8 +132,9 @@ def store(bag: BagWriter, item: Any) -> bool:
     if not hasattr(item, 'offered'):
         bag.write(item.topic, item.stamp, item.data)
         return True
-    qos = [make_qos(**profile) for profile in item.offered]
-    bag.add(item.topic, item.message_type, qos=_different(qos))
+    offered = item.offered
+    different = [qos for k, qos in enumerate(offered) if qos not in offered[:k]]
+    bag.add(item.topic, item.message_type, qos=different)
     if item.message_type not in TYPES.fielddefs:
         tqdm.write(f'{item.topic}: the bag will lack the definition of its type')
     return False
@@ -164,7 +165,3 @@ def _drain(
                 flushed = time.monotonic()
             bar.update(count - bar.n)
     return count
-
-
-def _different(profiles: list) -> list:
-    return [p for k, p in enumerate(profiles) if p not in profiles[:k]]

@@ -157,13 +157,15 @@ def _matching(profiles: list[QoSProfile]) -> QoSProfile:
 
 
 def _plain(profile: QoSProfile) -> dict[str, Any]:
-    """Return a QoS as names and numbers."""
+    """Return a QoS as bags describe it."""
     names = {
-        name: getattr(profile, name).name
+        name: getattr(profile, name).name.lower()
         for name in ('history', 'reliability', 'durability', 'liveliness')
     }
-    times = {
-        name: getattr(profile, name).nanoseconds
-        for name in ('deadline', 'lifespan', 'liveliness_lease_duration')
-    }
-    return {'depth': profile.depth, **names, **times}
+    if not names['history'].startswith('keep'):
+        names['history'] = 'unknown'
+    times = {}
+    for name in ('deadline', 'lifespan', 'liveliness_lease_duration'):
+        seconds, nanoseconds = divmod(getattr(profile, name).nanoseconds, 1_000_000_000)
+        times[name] = {'sec': seconds, 'nsec': nanoseconds}
+    return {**names, **times, 'depth': profile.depth, 'avoid_ros_namespace_conventions': False}

@@ -12,41 +12,15 @@ from numpy.typing import NDArray
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
-FOREVER = 2**63 - 1
-"""An unlimited duration in nanoseconds."""
-
-
-def make_qos(
-    history: str = 'KEEP_LAST',
-    depth: int = 10,
-    reliability: str = 'RELIABLE',
-    durability: str = 'VOLATILE',
-    deadline: int = FOREVER,
-    lifespan: int = FOREVER,
-    liveliness: str = 'AUTOMATIC',
-    liveliness_lease_duration: int = FOREVER,
-) -> dict[str, Any]:
-    """Return a QoS as bags describe it, from names of policies and durations in nanoseconds."""
-
-    def time(duration: int) -> dict[str, int]:
-        return dict(zip(('sec', 'nsec'), divmod(duration, 10**9), strict=True))
-
-    return {
-        'history': history.lower() if history.startswith('KEEP') else 'unknown',
-        'depth': depth,
-        'reliability': reliability.lower(),
-        'durability': durability.lower(),
-        'deadline': time(deadline),
-        'lifespan': time(lifespan),
-        'liveliness': liveliness.lower(),
-        'liveliness_lease_duration': time(liveliness_lease_duration),
-        'avoid_ros_namespace_conventions': False,
-    }
-
-
-OFFERED_QOS = make_qos()
+FOREVER = {'sec': 9223372036, 'nsec': 854775807}
+"""An unlimited duration."""
+OFFERED_QOS = {
+    'history': 'keep_last', 'depth': 10, 'reliability': 'reliable', 'durability': 'volatile',
+    'deadline': FOREVER, 'lifespan': FOREVER, 'liveliness': 'automatic',
+    'liveliness_lease_duration': FOREVER, 'avoid_ros_namespace_conventions': False,
+}  # fmt: skip
 """QoS that this package's nodes offer; `ros2 bag play` publishes with it again."""
-LATCHED_QOS = make_qos(durability='TRANSIENT_LOCAL')
+LATCHED_QOS = {**OFFERED_QOS, 'durability': 'transient_local'}
 """The same, but transient-local: a late subscriber still gets the last message."""
 
 
