@@ -41,6 +41,7 @@ QUICK = [f'-p{name}:={value}' for name, value in SHORT.items()] + [
 ]  # fmt: skip
 EXPLICIT = [*QUICK, '-pscheme:=explicit']
 FILES = ['gains.yaml', 'report.md']
+MODEL_OF_D = ['unknown_input_size:=1.0', 'unknown_input_decay:=1.0']
 GAINS = {'lambda': [3.0, 2.0, 2.0, 0.5], 'alpha': [2.0, 1.0, 2.0, 1.5], 'epsilon': 40.0,
          'fuzzy_widths': [0.11, 0.05, 0.59, 0.34]}  # fmt: skip
 
@@ -257,13 +258,14 @@ def test_model_may_stand_in_any_section(tmp_path, section):
     path = tmp_path / 'model.yaml'
     path.write_text(f"{section}:\n  ros__parameters: {{order: 1, phi: ['-2.0*z1']}}\n")
     estimator, tuning = read_parameters(
-        [path], ['noise_std:=0.1', 'variant:=sign', 'search:=[lambda, fuzzy_widths]']
+        [path], ['noise_std:=0.1', 'variant:=sign', 'structure:=levant', 'lambda:=1.0']
     )
     values = TUNE_PARAMETERS.complete(SHORT | {'settled': 1.0, 'recordings': 1} | tuning)
     tuner = Tuner(simulated(values, 1), estimator, values, 1)
     assert tuner.parameters({})['phi'] == ['-2.0*z1']
-    # fuzzy_widths is passed over, as the variant does not use it.
-    assert [d.name for d in tuner.space] == ['lambda[0]', 'lambda[1]']
+    # What levant or the variant does not use is passed over.
+    names = ['lambda[0]', 'lambda[1]', 'unknown_input_decay']
+    assert [d.name for d in tuner.space] == names
     assert tuner.data.parameters['noise_std'] == 0.1
 
 
@@ -336,8 +338,11 @@ def test_interrupt_keeps_the_best_and_the_next_run_goes_on(tmp_path):
     ('arguments', 'message'),
     [
         (['-pnoise:=1'], "unknown parameter 'noise'"),
-        (['-psearch:=[lamda]'], "'lamda'; did you mean 'lambda'"),
-        (['-psearch:=[fuzzy_widths]', '-pvariant:=sign'], 'the variant sign uses'),
+        (['-psearch:=[lambda]'], "'search'.*leave it out"),
+        (
+            [f'-p{p}' for p in ('scheme:=predict_correct', *MODEL_OF_D)],
+            'expected one of unknown_input_size, unknown_input_decay to search',
+        ),
         (['-pweights:=[1.0, 2.0]'], 'weights.*1 or 4 numbers'),
         (['-psettled:=4.0'], 'more than 4 s'),
         (['--trials=0'], '--trials >= 1'),

@@ -11,5 +11,6 @@ REMOVED = {
     'disturbance_sweep_time': 'leave it out: a chirp sweeps for 20 s',
     'max_step': 'leave it out: intervals of more than twice the mean are bridged',
     'spike_gate_samples': "leave it out: 'spike_gate' rejects five samples in a row at most",
+    'search': "leave it out: 'tune' searches the model of d, or the gains where 'lambda' is set",
 }
 """What a message says of a name that was a parameter once."""

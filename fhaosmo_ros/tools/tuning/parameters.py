@@ -29,13 +29,6 @@ TUNING = (
         'estimate over that of d).',
         lower=0.0, upper=1e6, live=False,
     ),
-    Parameter(
-        'search', ['auto'],
-        'Parameters of the estimator to search, up to three powers of ten around their start; a '
-        'list level by level. auto: the model of d that makes the gains of a Kalman filter (D '
-        '19); for other schemes, or where lambda is set, the gains themselves.',
-        live=False, lengths='1 or more',
-    ),
 )  # fmt: skip
 
 TUNE_PARAMETERS = ParameterTable(MODEL, SENSOR, SHARED, FAMILY, TUNING)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA
 from fhaosmo_ros.core.observer.observer import Observer
-from fhaosmo_ros.core.parameters.declaration import Parameters, unknown_parameter
+from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
@@ -38,10 +38,8 @@ import numpy as np
 
 HELD_OUT_SEED = 1_000_003
 """Added to the seed: held-out recordings share no random number with the others."""
-SEARCHABLE = [
-    p.name for p in OBSERVER_PARAMETERS.values()
-    if 'double' in p.kind and p.lower is not None and p.lower >= 0.0
-]  # fmt: skip
+MODEL_OF_D = ('unknown_input_size', 'unknown_input_decay')
+"""What is searched where gains follow from the model of d."""
 GAINS = ('lambda', 'alpha', 'fuzzy_widths', 'epsilon', 'gamma_initial', 'unknown_input_decay')
 """What is searched with gains of the user's, or another scheme."""
 DERIVATIVES, RATES = (0, 1, 2, 3), np.geomspace(0.1, 30.0, 8)
@@ -111,7 +109,7 @@ class Tuner:
         self.given = 'lambda' in estimator
         # The estimator may have a model of its own, other than the plant's.
         own = {name: tuning[name] for name in ('order', 'phi')} | dict(estimator)
-        self._noise, self._fixed, names = 0.0, own, tuning['search']
+        self._noise, self._fixed = 0.0, own
         self.training = Objective(data.training, tuning)
         self.held_out = Objective(data.held_out, tuning, self.training.scale)
         fuzzy = own.get('variant', SCHEME['variant']).startswith('fuzzy')
@@ -125,9 +123,7 @@ class Tuner:
             self._fixed |= _changes(min(points, key=self.evaluate)) | own
         start = self.parameters({})
         self.training(start)  # raises what `evaluate` takes for a bad point
-        if names == ['auto']:
-            model = [k for k in ('unknown_input_size', 'unknown_input_decay') if k not in own]
-            names = model if kalman else GAINS
+        names = [k for k in MODEL_OF_D if k not in own] if kalman else GAINS
         self.space = _make_space(names, Observer(ESTIMATOR_PARAMETERS.complete(start)))
 
     def _kalman_start(self, own: Mapping[str, Any]) -> tuple[float, dict[str, Any]]:
@@ -218,8 +214,6 @@ def _make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
     space: list[Dimension] = []
     start = observer.parameters
     for name in names:
-        if name not in SEARCHABLE:
-            raise unknown_parameter(name, SEARCHABLE)
         if not _used(name, start):
             continue
         values, labels = [start[name]], [name]
@@ -233,8 +227,7 @@ def _make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
             space.append(Dimension(label, low, high, min(max(begin, low), high), log))
     if not space:
         raise ConfigurationError(
-            f"parameter 'search': expected one that the variant {start['variant']} uses, "
-            f'got {list(names)!r}'
+            f'expected one of {", ".join(MODEL_OF_D)} to search, got both set'
         )
     return space
 
