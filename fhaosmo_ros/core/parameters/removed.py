@@ -11,6 +11,7 @@ REMOVED = {
     'disturbance_sweep_time': 'leave it out: a chirp sweeps for 20 s',
     'max_step': 'leave it out: intervals of more than twice the mean are bridged',
     'spike_gate_samples': "leave it out: 'spike_gate' rejects five samples in a row at most",
+    'chatter_weight': "leave it out: 'tune' counts the errors alone",
     'search': "leave it out: 'tune' searches the model of d, or the gains where 'lambda' is set",
 }
 """What a message says of a name that was a parameter once."""

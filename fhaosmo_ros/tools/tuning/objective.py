@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a set of gains is worth: error and chatter as one number."""
+"""What a set of gains is worth: its errors as one number."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
-from fhaosmo_ros.core.simulation.metrics import total_variation
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 import numpy as np
@@ -23,15 +22,11 @@ SMALLEST = 1e-12
 class Evaluation(NamedTuple):
     """How good one set of parameters is."""
 
-    objective: float
-    """error + chatter_weight * chatter."""
     error: float
     """
     Weighted RMS error relative to the RMS of the truth; geometric mean over the recordings, so
     that an error smaller by a tenth counts the same on an easy recording and on a hard one.
     """
-    chatter: float
-    """Powers of ten between the total variation of the estimate of d and that of d; at least 0."""
     errors: Floats
     """(R, n + 1) RMS errors of z_1 .. z_n and d of each recording."""
 
@@ -70,9 +65,6 @@ class Objective:
             )
         late = [np.column_stack([r.z, r.d])[r.t - r.t[0] >= settled] for r in recordings]
         self.scale = _rms(np.concatenate(late)) if scale is None else scale
-        # A d that is constant has no variation: its size takes the place of it.
-        varies = [total_variation(truth[:, -1]) for truth in late]
-        self._truth_varies = np.maximum(varies, self.scale[-1] or 1.0)
         weights, count = np.array(tuning['weights']), len(self.scale)
         if len(weights) == 1:
             weights = np.append(np.zeros(count - 1), weights)
@@ -98,21 +90,16 @@ class Objective:
             raise ConfigurationError(
                 f"'order': expected {states}, the states of the plant's recordings, got {order}"
             )
-        found = [self._judge(estimator, r) for r in self.recordings]
-        errors = np.array([wrong for wrong, _ in found])
+        errors = np.array([self._judge(estimator, r) for r in self.recordings])
         used = self._weights > 0.0
         with np.errstate(over='ignore', divide='ignore'):  # of a truth that is 0 throughout
             relative = np.square(errors[:, used] / self.scale[used])
         each = np.sqrt(relative @ self._weights[used])
         error = float(np.exp(np.mean(np.log(np.maximum(each, SMALLEST)))))
-        varies = np.array([variation for _, variation in found])
-        tenfold = np.log10(np.maximum(varies / self._truth_varies, 1.0))
-        chatter = float(np.mean(tenfold))
-        weighted = self._tuning['chatter_weight'] * chatter
-        return Evaluation(error + weighted, error, chatter, errors)
+        return Evaluation(error, errors)
 
-    def _judge(self, estimator: OnlineEstimator, r: Recording) -> tuple[Floats, float]:
-        """Return the errors of z and d, and the variation of the estimate of d."""
+    def _judge(self, estimator: OnlineEstimator, r: Recording) -> Floats:
+        """Return the errors of z and d."""
         estimator.reset()
         u = r.u if estimator.observer.uses_input else None
         found = estimator.run(stamps_of(r.t - r.t[0]), r.y, u)
@@ -122,9 +109,8 @@ class Objective:
         truth = np.column_stack([np.interp(t, r.t, x) for x in (*r.z.T, r.d)])
         with np.errstate(over='ignore', invalid='ignore'):
             errors = _rms(np.column_stack([found.z[late], d]) - truth)
-            variation = total_variation(d)
         # An estimate that is not finite is infinitely wrong, not undefined.
-        return np.nan_to_num(errors, nan=np.inf), np.nan_to_num(variation, nan=np.inf)
+        return np.nan_to_num(errors, nan=np.inf)
 
 
 def stamps_of(t: Floats) -> NDArray[np.int64]:

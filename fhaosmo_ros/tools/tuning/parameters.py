@@ -23,12 +23,6 @@ TUNING = (
         'Weight of the error of each estimate, squared and relative to the RMS of its truth.',
         lower=0.0, upper=1e9, live=False, lengths='1 (d alone) or n + 1 (z1 .. zn, d)',
     ),
-    Parameter(
-        'chatter_weight', 0.02,
-        'Added to the objective for every tenfold of the chatter of d (total variation of the '
-        'estimate over that of d).',
-        lower=0.0, upper=1e6, live=False,
-    ),
 )  # fmt: skip
 
 TUNE_PARAMETERS = ParameterTable(MODEL, SENSOR, SHARED, FAMILY, TUNING)

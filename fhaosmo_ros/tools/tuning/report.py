@@ -60,7 +60,7 @@ def write(folder: Path, tuner: Tuner, result: Result, command: str) -> str:
         '## Result',
         main,
         'The error is the weighted RMS error over that of the truth, a geometric mean over the '
-        'recordings. The objective adds chatter by its weight. Held-out recordings took no part '
+        'recordings. Held-out recordings took no part '
         'in the search.',
         '## Searched',
         table(
@@ -83,13 +83,11 @@ def _evaluations(columns: Mapping[str, Evaluation]) -> str:
     errors = np.sqrt([np.mean(np.square(e.errors), axis=0) for e in found]).T
     names = [*(f'z{k}' for k in range(1, len(errors))), 'd']
     rows = [
-        ['objective', *(f'{e.objective:.4f}' for e in found)],
         ['error, relative to the truth', *(f'{e.error:.4f}' for e in found)],
         *(
             [f'RMS error of {name}', *(f'{error:.3g}' for error in of_name)]
             for name, of_name in zip(names, errors, strict=True)
         ),
-        ['chatter of d, powers of ten', *(f'{e.chatter:.2f}' for e in found)],
     ]
     return table(['', *columns], rows)
 

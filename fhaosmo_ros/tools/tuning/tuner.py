@@ -185,7 +185,7 @@ class Tuner:
     def evaluate(self, values: Values) -> float:
         """Return the objective at a point of the space."""
         try:
-            return self.training(self.parameters(values)).objective
+            return self.training(self.parameters(values)).error
         except ConfigurationError:  # values out of their bounds, or that do not fit
             return math.inf
 

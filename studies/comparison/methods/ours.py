@@ -2,8 +2,7 @@
 """
 Our observer as users get it: with the gains that `tune` finds, and self-tuning.
 
-Both run in the online estimator, by the node's code. The search is that of `tune`, without its
-weight on chatter, because those of the other methods have none.
+Both run in the online estimator, by the node's code. The search is that of `tune`.
 """
 
 from collections.abc import Callable
@@ -31,7 +30,7 @@ from studies.comparison.methods.method import (
     Values,
 )
 
-GOAL = {'settled': JUDGED_FROM, 'chatter_weight': 0.0}
+GOAL = {'settled': JUDGED_FROM}
 GRID = len(DERIVATIVES) * len(RATES)
 
 
