@@ -206,17 +206,6 @@ def test_afresh_begins_at_the_first_sample(tmp_path, capsys):
     assert 'followed' not in text
 
 
-def test_fixed_parameter_stays(tmp_path, capsys):
-    stamps, y = files.signal(1500)
-    live = Live().run(stamps, y, 0, 700)
-    live.change(stamps[699], 'epsilon', 1e-6)
-    live.run(stamps, y, 700, 1500)
-    bag = write(tmp_path / 'bag', stamps, y, live)
-    text, found = run(capsys, bag, *OPTIONS, '-p', 'epsilon:=3.0')
-    assert 'parameters differ' in text
-    expect(found, Live().run(stamps, y, 0, 1500))
-
-
 def test_observer_of_another_size_begins_afresh(tmp_path, capsys):
     stamps, y = files.signal(1500)
     live = Live().run(stamps, y, 0, 1500)

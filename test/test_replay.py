@@ -132,29 +132,12 @@ def joint_state(stamp, value):
     )  # fmt: skip
 
 
-def imu(stamp, value):
-    types, zeros = files.TYPES.types, np.zeros(9)
-    vector, turn = types['geometry_msgs/msg/Vector3'], types['geometry_msgs/msg/Quaternion']
-    return files.cdr(
-        'sensor_msgs/msg/Imu', header=files.header(stamp, 'i'),
-        orientation=turn(0.0, 0.0, 0.0, 1.0),
-        orientation_covariance=zeros, angular_velocity=vector(0.0, 0.0, value),
-        angular_velocity_covariance=zeros, linear_acceleration=vector(0.0, 0.0, 9.8),
-        linear_acceleration_covariance=zeros,
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ('kind', 'field', 'make', 'rounding'),
     [
         ('sensor_msgs/msg/JointState', 'position[2]', joint_state, np.float64),
-        ('sensor_msgs/msg/Imu', 'angular_velocity.z', imu, np.float64),
         ('std_msgs/msg/Float32', None,
          lambda _, v: files.cdr('std_msgs/msg/Float32', data=v), np.float32),
-        ('geometry_msgs/msg/Twist', 'angular.y', lambda _, v: files.cdr(
-            'geometry_msgs/msg/Twist',
-            linear=files.TYPES.types['geometry_msgs/msg/Vector3'](1.0, 2.0, 3.0),
-            angular=files.TYPES.types['geometry_msgs/msg/Vector3'](1.0, v, 3.0)), np.float64),
     ],
 )  # fmt: skip
 def test_any_number_of_any_type(kind, field, make, rounding, tmp_path):

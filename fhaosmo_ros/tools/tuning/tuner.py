@@ -40,8 +40,6 @@ HELD_OUT_SEED = 1_000_003
 """Added to the seed: held-out recordings share no random number with the others."""
 MODEL_OF_D = ('unknown_input_size', 'unknown_input_decay')
 """What is searched where gains follow from the model of d."""
-GAINS = ('lambda', 'alpha', 'fuzzy_widths', 'epsilon', 'gamma_initial', 'unknown_input_decay')
-"""What is searched with gains of the user's, or another scheme."""
 DERIVATIVES, RATES = (0, 1, 2, 3), np.geomspace(0.1, 30.0, 8)
 """The grid: unknown_input_derivatives, and unknown_input_decay (1/s)."""
 DECADES = 3.0
@@ -123,8 +121,9 @@ class Tuner:
             self._fixed |= _changes(min(points, key=self.evaluate)) | own
         start = self.parameters({})
         self.training(start)  # raises what `evaluate` takes for a bad point
-        names = [k for k in MODEL_OF_D if k not in own] if kalman else GAINS
-        self.space = _make_space(names, Observer(ESTIMATOR_PARAMETERS.complete(start)))
+        observer = Observer(ESTIMATOR_PARAMETERS.complete(start))
+        model = [name for name in MODEL_OF_D if name not in own]
+        self.space = _make_space(model if kalman else _gains(observer.parameters), observer)
 
     def _kalman_start(self, own: Mapping[str, Any]) -> tuple[float, dict[str, Any]]:
         """Return the size of the noise, and what the recordings say of the estimator."""
@@ -210,12 +209,10 @@ class Tuner:
 
 
 def _make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
-    """Return the dimensions of a search; names that the variant does not use are passed over."""
+    """Return the dimensions of a search."""
     space: list[Dimension] = []
     start = observer.parameters
     for name in names:
-        if not _used(name, start):
-            continue
         values, labels = [start[name]], [name]
         if isinstance(start[name], list):
             values = [start[name][min(k, len(start[name]) - 1)] for k in range(observer.levels)]
@@ -244,14 +241,16 @@ def _changes(values: Values) -> dict[str, Any]:
     return found
 
 
-def _used(name: str, start: Mapping[str, Any]) -> bool:
-    """Return True if the structure and the variant use a parameter."""
-    variant = str(start['variant'])
-    if start['structure'] == 'levant' and name in ('alpha', 'epsilon'):
-        return False
-    if name.startswith('fuzzy_'):
-        return variant.startswith('fuzzy')
-    return not name.startswith('gamma_') or variant.endswith('_adaptive')
+def _gains(start: Mapping[str, Any]) -> list[str]:
+    """Return the gains that the structure and the variant use."""
+    names = ['lambda', 'unknown_input_decay']
+    if start['structure'] == 'cascade':
+        names += ['alpha', 'epsilon']
+    if start['variant'].startswith('fuzzy'):
+        names.append('fuzzy_widths')
+    if start['variant'].endswith('_adaptive'):
+        names.append('gamma_initial')
+    return names
 
 
 def _bounds(name: str, value: float, start: Mapping[str, Any]) -> tuple[float, float]:
@@ -259,7 +258,5 @@ def _bounds(name: str, value: float, start: Mapping[str, Any]) -> tuple[float, f
     if name == 'gamma_initial':
         return start['gamma_min'], start['gamma_max']
     lower, upper = OBSERVER_PARAMETERS[name].lower or 0.0, OBSERVER_PARAMETERS[name].upper or 1.0
-    if upper <= 1.0:
-        return lower, upper
     middle = value or 1.0  # such as unknown_input_decay, which may be 0
     return max(middle / 10.0**DECADES, lower), min(middle * 10.0**DECADES, upper)
