@@ -1,40 +1,115 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The comparison: its score, its fairness, its recordings, its tuning, and a short run."""
+"""The studies of other observers: peers that are what they say, fairness, and short runs."""
 
-from fhaosmo_ros.core import Family
+from fhaosmo_ros.core import Family, TriangularModel
 from fhaosmo_ros.core.simulation.recordings import Recording
 import numpy as np
 import pytest
-from studies import evidence
+from scipy.linalg import expm
+from studies import everywhere, evidence
 from studies.comparison import cells
-from studies.comparison.__main__ import main
 from studies.comparison.cells import PLANTS, Sensor, sensors
 from studies.comparison.evaluation import METHODS, trial, tune
-from studies.comparison.methods.method import Estimates, KINDS, mean, objective, OURS
-from studies.comparison.results import best_of_kinds, Cell, texts
+from studies.comparison.methods.adaptive import ADAPTIVE, HUBER, IMM
+from studies.comparison.methods.linear import FILTERS, LINEAR_LIMIT
+from studies.comparison.methods.method import OURS, Setting
+from studies.comparison.methods.sampled import SampledModel
 
-T = np.linspace(0.0, 20.0, 2001)
-D = np.sin(T)
-RECORDING = Recording(T, T, 0.0 * T, np.column_stack([T, 2.0 * np.cos(T)]), D, 'sines')
-SENSOR = Sensor('paper', ('steps',), 1e-3, 100.0)
-
-
-def test_errors_are_relative_and_after_the_transient():
-    wrong = np.where(T < 5.0, 100.0, 0.3 * D)
-    assert objective(RECORDING, Estimates(RECORDING.z, D + wrong)) == pytest.approx(0.3)
-    for bad in (np.nan, np.inf, 1e200):
-        diverged = Estimates(RECORDING.z, np.where(T > 15.0, bad, 0.0))
-        assert objective(RECORDING, diverged) > 1e100
+MODELS = {
+    'paper': TriangularModel(['0', '0', '-z3']),
+    'pendulum': TriangularModel(['0', '-19.62*sin(z1) - 0.3*z2 - 0.5*tanh(z2/0.1)']),
+    'motor': TriangularModel(['0', '500*u - 25*z2']),
+}
 
 
-def test_a_tenth_less_counts_the_same_on_an_easy_recording_and_on_a_hard_one():
-    assert mean([0.9, 0.01]) == pytest.approx(mean([1.0, 0.009]))
-    method = METHODS['Kalman']._replace(
-        prepare=lambda _, v: lambda r: {'filtered': Estimates(r.z, r.d * (1.0 + v[r.shape]))}
-    )
-    several = [RECORDING._replace(shape=name) for name in ('a', 'b')]
-    found = trial(method, SENSOR.setting(), {'a': 0.9, 'b': 0.01}, several)
-    assert found.averages == [pytest.approx(0.9), pytest.approx(mean([0.9, 0.01]))]
+def rates(model, chain=1, decay=0.0):
+    """Return the linearised, extended model, written down once more."""
+    n = model.order
+    a = np.diag(np.ones(n + chain - 1), 1)
+    a[:n, :n] += model.jacobian(np.zeros(n))
+    a[-1, -1] = -decay
+    return a
+
+
+def recording(model, t, z0, d, u=0.0):
+    """Return the exact response of a linear model to constant d and u."""
+    n = model.order
+    a, b = rates(model), np.zeros(n + 1)
+    b[n - 1] = model.evaluate(np.zeros(n), u)[-1]
+    extended = np.block([[a, b[:, None]], [np.zeros((1, n + 2))]])
+    over = {h: expm(extended * h) for h in set(np.diff(t).round(9))}
+    x = [np.array([*z0, d, 1.0])]
+    for h in np.diff(t).round(9):
+        x.append(over[h] @ x[-1])
+    x = np.array(x)
+    return Recording(t, x[:, 0], np.full(len(t), u), x[:, :n], x[:, n], 'steps')
+
+
+@pytest.mark.parametrize(('chain', 'decay'), [(1, 0.0), (2, 0.0), (1, 0.7)])
+@pytest.mark.parametrize('name', MODELS)
+def test_kalman_gain_is_the_limit_of_the_riccati_recursion(name, chain, decay):
+    model, period = MODELS[name], 1e-2
+    intensities = [5.0, 0.3][:chain]
+    gain = SampledModel(model, period, chain, decay=decay).kalman(intensities)
+    a = rates(model, chain, decay)
+    spectrum = np.diag([0.0] * model.order + intensities[::-1])
+    # The noise's covariance by the midpoint rule, and the recursion itself.
+    middles = (np.arange(200) + 0.5) * period / 200
+    noise = sum(expm(a * s) @ spectrum @ expm(a * s).T for s in middles) * period / 200
+    transition, p = expm(a * period), np.eye(len(a))
+    for _ in range(5000):
+        predicted = transition @ p @ transition.T + noise
+        k = predicted[:, 0] / (predicted[0, 0] + 1.0)
+        p = predicted - np.outer(k, predicted[0])
+    np.testing.assert_allclose(gain, k, rtol=1e-4)
+
+
+@pytest.mark.parametrize('period', [1e-3, 1e-2])
+@pytest.mark.parametrize('name', ['paper', 'motor'])
+@pytest.mark.parametrize(
+    'peer', [m.name for m in FILTERS if all(word not in m.name for word in ('decaying', 'Matern'))]
+)
+def test_error_of_each_linear_peer_decays_exactly_to_zero(peer, name, period):
+    """Without noise and with constant d the error is the transition's power, so it vanishes."""
+    model, method = MODELS[name], METHODS[peer]
+    setting = Setting(model, period, 1.0, 0.0)
+    values = {d.name: d.start for d in method.space(setting)}
+    t = np.arange(0.0, 15.0, period)
+    r = recording(model, t, [0.3, -0.2, 0.1][: model.order], 0.8, u=0.02)
+    found = method.prepare(setting, values)(r)['filtered']
+    assert abs(found.d[0] - 0.8) > 0.5
+    assert abs(found.d[-1] - 0.8) < 1e-5
+    np.testing.assert_allclose(found.z[-1], r.z[-1], atol=1e-6)
+
+
+@pytest.mark.parametrize('name', ['ESO', *(m.name for m in ADAPTIVE)])
+def test_peers_know_the_input_and_bridge_a_gap(name):
+    """A constant d from a noise-free y with a known input."""
+    model, method = MODELS['motor'], METHODS[name]
+    setting = Setting(model, 1e-2, 1.0, 1e-4)
+    t = np.concatenate([np.arange(0.0, 5.0, 1e-2), np.arange(5.3, 8.0, 1e-2)])
+    r = recording(model, t, [0.3, -0.2], 0.8, u=0.02)
+    values = {d.name: d.start for d in method.space(setting)} | {'decay': 1e-6}
+    found = method.prepare(setting, values)(r)['filtered']
+    after = t > 4.0
+    np.testing.assert_allclose(found.d[after], 0.8, atol=1e-3)
+    np.testing.assert_allclose(found.z[after], r.z[after], atol=1e-3)
+
+
+@pytest.mark.parametrize('derivatives', [0, 2])
+@pytest.mark.parametrize('rate', [100.0, 1000.0])
+def test_peers_without_their_options_are_the_kalman_filter(derivatives, rate):
+    """Its covariance converges to the steady one; three equal models are one."""
+    motor = everywhere.PLANTS['motor']
+    condition = everywhere.CONDITIONS['as tuned']._replace(rate=rate)
+    r = everywhere.recording(motor, condition, 'chirp', 10.0)
+    setting = everywhere.setting_of(motor, condition)
+    member = {'derivatives': derivatives, 'bandwidth': 15.0, 'decay': 4.5}
+    values = everywhere.at(member, setting.model.order, rate)
+    [expected] = everywhere.errors_of(LINEAR_LIMIT, setting, values, [r])
+    for name, options in ((HUBER, {}), (IMM, {'spread': 1.0 + 1e-9, 'stay': 1.0})):
+        [found] = everywhere.errors_of(name, setting, values | options, [r])
+        assert found == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize('plant', PLANTS)
@@ -47,41 +122,6 @@ def test_no_judge_was_seen_in_training(plant):
         assert not any(np.allclose(r.d, judge.d) for r in seen if len(r.d) == len(judge.d))
         noise = [np.round(r.y - r.z[:, 0], 12)[:50] for r in (*seen, judge)]
         assert not any(np.array_equal(noise[-1], n) for n in noise[:-1])
-
-
-def test_noise_is_absolute_on_the_papers_plant_and_relative_elsewhere():
-    for plant in PLANTS:
-        sensor = Sensor(plant, ('mix',), 1e-2, 100.0)
-        r = sensor.training(1)[0]
-        expected = 1e-2 * (1.0 if plant == 'paper' else cells.amplitude(plant))
-        assert np.std(r.y - r.z[:, 0]) == pytest.approx(expected, rel=0.1)
-    quiet = Sensor('motor', ('mix',), 0.0, 1000.0)  # but for its encoder's quantum
-    r = quiet.training(2)[0]
-    assert quiet.setting().noise == pytest.approx(np.std(r.y - r.z[:, 0]), rel=0.1)
-
-
-@pytest.mark.parametrize('name', PLANTS['motor'].disturbances)
-def test_every_kind_of_d_has_its_size_and_jumps_or_does_not(name):
-    sensor = Sensor('motor', (name,), 0.0, 1000.0)
-    r = sensor.held_out(name)[2]
-    assert np.sqrt(np.mean(r.d**2)) == pytest.approx(sensor.case.rms_of_d, rel=0.1)
-    assert np.std(r.u) > 0.5
-    assert (np.max(np.abs(np.diff(r.d))) > 0.3 * sensor.case.rms_of_d) == (
-        sensor.case.disturbances[name].jumps
-    )
-
-
-def test_timings_do_what_they_say():
-    even, jitter, dropouts, outliers = (
-        Sensor('paper', ('mix',), 1e-3, 1000.0, timing).training(1)[0] for timing in cells.TIMINGS
-    )
-    np.testing.assert_allclose(np.diff(even.t), 1e-3, rtol=1e-6)
-    assert np.std(np.diff(jitter.t)) == pytest.approx(np.sqrt(2.0) * 0.2e-3, rel=0.1)
-    assert len(dropouts.t) == pytest.approx(0.9 * len(even.t), rel=0.05)
-    assert 0.02 < np.max(np.diff(dropouts.t)) < 0.5
-    np.testing.assert_array_equal(outliers.z, even.z)
-    wrong = np.abs(outliers.y - outliers.z[:, 0]) > 6e-3
-    assert np.mean(wrong) == pytest.approx(0.009, rel=0.3)  # a tenth of the outliers is small
 
 
 @pytest.mark.parametrize('name', METHODS)
@@ -99,38 +139,9 @@ def test_every_method_estimates_a_slow_d_with_little_noise(name):
     assert value < (3.0 if name.startswith('paper') else 0.6)
 
 
-@pytest.mark.parametrize('name', ['Kalman', 'Levant, implicit', 'Luenberger'])
-def test_hopeless_trials_are_cut_short_and_nothing_is_lost_by_it(name):
-    """The easiest recording is the first one here: what counts is how far behind it is there."""
-    method, setting = METHODS[name], SENSOR.setting()
-    recordings = [*Sensor('paper', ('low sine',), 1e-5, 100.0).training(1), *SENSOR.training(1)]
-    full = tune(method, setting, recordings, 20, 1)
-    assert full == tune(method, setting, recordings, 20, 1)
-    recordings.sort(key=lambda r: trial(method, setting, full.values, [r]).value)
-    good = trial(method, setting, full.values, recordings)
-    assert good.averages == sorted(good.averages)
-    low = {d.name: d.low for d in method.space(setting)}
-    bad = trial(method, setting, low, recordings)
-    cut = trial(method, setting, low, recordings, good.averages)
-    assert len(cut.averages) < len(recordings) == len(good.averages)
-    assert min(bad.value, cut.value) > 1.5 * good.value
-    assert trial(method, setting, full.values, recordings, good.averages) == good
-
-
-def test_each_kind_is_shown_by_the_method_that_training_prefers():
-    cell = Cell('paper', 'steps', 1e-3, 100.0, 'even')._asdict()
-    rows = [
-        cell | {'method': name, 'training': -float(k), 'error': k + 1.0}
-        for k, name in enumerate(METHODS)
-    ]
-    [row] = best_of_kinds(rows).values()
-    assert row == {method.kind: k + 1.0 for k, method in enumerate(METHODS.values())}
-    assert set(row) == set(KINDS)
-
-
-@pytest.mark.slow
-def test_quick_run_writes_everything(tmp_path):
-    assert main(['--quick', '--trials', '3', '--output', str(tmp_path)]) == 0
-    rows = evidence.read('comparison', tmp_path)
-    assert {row['method'] for row in rows} == set(METHODS)
-    assert texts(rows)['summary'].count('\n') == len(KINDS) + 1
+def test_everywhere_in_short(tmp_path):
+    assert everywhere.main(['--quick', '--jobs', '1', '--output', str(tmp_path)]) == 0
+    found = evidence.read(everywhere.NAME, tmp_path)
+    assert [c['condition'] for c in found] == list(everywhere.QUICK.conditions)
+    assert all(0.0 < c[everywhere.SELF] < 1.25 for c in found)
+    assert found[0][everywhere.ONCE] == 1.0

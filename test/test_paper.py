@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper: tables beside docs/evidence.md, parts of them anew, and what they must show."""
 
-import signal
+from itertools import pairwise
 
+from fhaosmo_ros.core import Observer
 from fhaosmo_ros.core.simulation.metrics import high_passed
 import numpy as np
-from on_terminal import OnTerminal
 import pytest
 from studies import evidence
 from studies.paper import cases, findings
-from studies.paper.__main__ import main
+from studies.paper.plant_and_observer import simulate
 
 REWRITE = 'run make paper'
 
@@ -40,32 +40,6 @@ def test_new_simulation_agrees_with_the_table(documented, solver, name, omega):
         check(findings.simulation(s, name, omega), old, name.startswith('sign'))
 
 
-@pytest.mark.parametrize('case', cases.SAMPLED[1::4], ids=str)
-def test_new_samples_agree_with_the_table(case):
-    rows = [row for row in evidence.read('paper_sampled') if tuple(row.values())[1:5] == case]
-    for new, old in zip(cases.sampled_rows(*case), rows, strict=True):
-        assert new['observer'] == old['observer']
-        check(new, old, new['observer'].startswith('sign'))
-
-
-def test_new_long_run_agrees_with_the_table():
-    """Its first window."""
-    old = evidence.read('paper_long')[:2]
-    for a, b in zip(cases.long_rows(*cases.LONG[0], cases.WINDOW), old, strict=True):
-        assert a['law'] == b['law']
-        for name in ('rms_d_first', 'gamma_first'):
-            assert a[name] == pytest.approx(b[name], rel=0.03), REWRITE
-
-
-def test_new_half_widths_agree_with_the_table(documented, solver):
-    """Verdicts may change where one number is just at its limit."""
-    signs = {w: documented[solver][findings.FINE, w] for w in cases.FREQUENCIES}
-    old = {tuple(row.values())[:2]: row for row in evidence.read('paper_half_widths')}
-    new = findings.width_rows(findings.WIDTHS[6], findings.WIDTHS[::6], signs, solver)
-    differ = [row[k] != old[tuple(row.values())[:2]][k] for row in new for k in list(row)[2:]]
-    assert sum(differ) <= 1, REWRITE
-
-
 def test_all_findings_come_out_with_the_shipped_half_widths(documented, solver):
     for name in (solver, 'ode4 held'):
         found = findings.verdicts(documented[name])
@@ -88,24 +62,6 @@ def test_shipped_half_widths_lie_inside_the_region():
     assert {(a, b) for a in around[0] for b in around[1]} <= holds
 
 
-@pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
-@pytest.mark.parametrize('omega', cases.FREQUENCIES)
-def test_default_law_is_never_worse_than_none(scheme, omega):
-    papers, run = cases.long_rows(scheme, omega, 0.0, 250.0)
-    assert run['rms_d_last'] <= 1.05 * run['rms_d_fixed']
-    if omega == cases.FREQUENCIES[0]:
-        # What the transient did to gamma goes by.
-        assert abs(run['gamma_last'] - 0.5) < 0.25 * abs(papers['gamma_last'] - 0.5)
-    else:
-        assert run['rms_d_last'] < 0.9 * run['rms_d_fixed']  # and where it helps, it does
-
-
-def test_preset_has_the_law_of_the_paper():
-    observer = cases.preset().observer
-    assert (observer['gamma_dead_zone'], observer['gamma_leakage']) == (0.0, 0.0)
-    assert (observer['gamma_rate'], observer['gamma_initial']) == (0.004, 0.5)
-
-
 def test_high_passed_sees_chatter_and_not_the_signal():
     t = np.arange(0.0, 10.0, 1e-3)
     signal_, chatter = np.sin(t), 0.01 * np.sign(np.sin(2 * np.pi * 50.0 * t + 0.1))
@@ -114,22 +70,66 @@ def test_high_passed_sees_chatter_and_not_the_signal():
     assert np.isnan(high_passed(signal_[:10], 50))
 
 
-@pytest.mark.slow
-def test_quick_run_writes_everything(tmp_path, capsys):
-    assert main(['--quick', '--output', str(tmp_path)]) == 0
-    assert '| F2 |' in capsys.readouterr().out
-    written = {path.name for path in (tmp_path / evidence.FOLDER).iterdir()}
-    kept = {path.name for path in (evidence.DOCS / evidence.FOLDER).glob('paper*')}
-    assert written == kept
+def test_default_law_of_gamma_is_never_worse_than_none():
+    rows = [row for row in evidence.read('paper_long') if row['law'] == 'default']
+    assert rows
+    for row in rows:
+        assert row['rms_d_last'] <= row['rms_d_fixed']
 
 
-@pytest.mark.signals
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signal_ends_it_in_one_line_and_leaves_nothing(tmp_path, number):
-    arguments = 'studies.paper', '--quick', '--output', tmp_path / 'out'
-    with OnTerminal(*arguments) as paper:
-        paper.wait_for('part')  # the bar
-        assert paper.end(number) == 130
-    assert 'Traceback' not in paper.said
-    assert paper.said.rstrip().endswith('paper: interrupted')
-    assert list(tmp_path.iterdir()) == []
+# Plant and observer as one system
+
+OBSERVER = {
+    'lambda': 15, 'alpha': 30, 'epsilon': 0.5, 'fuzzy_widths': [0.5],
+    'fuzzy_systems': ['terms gaussian 5', 'terms gaussian 7'],
+    'gamma_initial': 0.5, 'gamma_rate': 0.01, 'initial_estimate': [0.1, 0.2, 0.2, 0.05],
+    'initial_internal': [0.2, 0.2, 0.05, 0.0], 'start_from_measurement': False,
+}  # fmt: skip
+PLANT = {'disturbance_omega': 5.0}
+
+
+@pytest.mark.parametrize('variant', ['sign', 'fuzzy', 'fuzzy_adaptive'])
+def test_euler_is_the_explicit_scheme_fed_with_an_euler_plant(variant):
+    observer = OBSERVER | {'variant': variant}
+    step = 1e-3
+    run = simulate(observer, PLANT, 'ode1', step, duration=0.3)
+    z = np.empty_like(run.z)
+    z[0] = 0.2
+    for k, d in enumerate(run.unknown_input[:-1]):
+        z1, z2, z3 = z[k]
+        z[k + 1] = z1 + step * z2, z2 + step * z3, z3 + step * (d - z3)
+    np.testing.assert_allclose(run.z, z, rtol=1e-12)
+    sampled = Observer(observer | {'scheme': 'explicit'}).run(run.t, run.z[:, 0])
+    np.testing.assert_allclose(run.z_hat, sampled.z_hat, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(run.z_tilde, sampled.z_tilde, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(run.gamma, sampled.gamma, rtol=1e-9)
+    assert (run.gamma[-1] != 0.5) == (variant == 'fuzzy_adaptive')
+
+
+@pytest.mark.parametrize(('solver', 'order'), [('ode1', 1), ('ode3', 3), ('ode4', 4)])
+def test_solvers_have_their_order(solver, order):
+    """On a smooth problem: the plant alone, against its closed solution."""
+    phi = {'order': 1, 'phi': ['-z1']}
+    errors = []
+    for step in (0.1, 0.05, 0.025, 0.0125):
+        run = simulate(
+            phi | {'gains': 'fixed'}, phi | {'disturbance_omega': 2.0}, solver, step, duration=2.0
+        )
+        # z' = -z + 0.1 sin 2t, z(0) = 0.2
+        exact = 0.24 * np.exp(-run.t) + 0.02 * np.sin(2 * run.t) - 0.04 * np.cos(2 * run.t)
+        errors.append(np.abs(run.z[:, 0] - exact).max())
+    slopes = [np.log2(coarse / fine) for coarse, fine in pairwise(errors)]
+    assert slopes[-1] == pytest.approx(order, abs=0.2)
+
+
+def test_held_signs_are_those_at_the_beginning_of_a_step():
+    """Two steps of a chain with lambda -> 0: theta moves by h alpha times the held sign."""
+    chain = {'order': 1, 'phi': ['0'], 'initial_state': [1e-5], 'disturbance': 'none'}
+    p = {'variant': 'sign', 'order': 1, 'phi': ['0'], 'epsilon': 1.0}
+    p |= {'lambda': [1e-9, 1.0], 'alpha': 1.0, 'initial_estimate': [0.0, 1.0]}
+    p |= {'initial_internal': [1.0, 0.0], 'start_from_measurement': False}
+    one, held = (simulate(p, chain, s, 1e-2, duration=1e-2) for s in ('ode4', 'ode4 held'))
+    # eps_1 changes its sign within the step, between its first two stages.
+    moved = [run.z_tilde[-1, 0] - 1.0 for run in (one, held)]
+    assert moved[1] == pytest.approx(1e-2, rel=1e-6)
+    assert abs(moved[0]) < 0.9e-2

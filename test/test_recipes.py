@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recipes: short runs, and files and results that say the same as the page."""
+"""The recipes, that for events too: files that run, and pages that say what was measured."""
 
 from itertools import groupby
 import re
@@ -7,9 +7,9 @@ import re
 from fhaosmo_ros.core import OnlineEstimator
 import numpy as np
 import pytest
-from studies import evidence
-from studies.recipes import judging, peers
-from studies.recipes.__main__ import main, NAME, RECIPES
+from studies import events, evidence
+from studies.recipes import judging
+from studies.recipes.__main__ import NAME, RECIPES
 from studies.recipes.judging import FIXED, OURS
 
 CHANNEL = {
@@ -39,13 +39,6 @@ def test_short_run_of_all_methods(name):
     assert found.pop(OURS) < 1.01  # no worse than an estimate of 0
     found.pop('momentum observer', None)  # it needs an elbow that moves as it has to
     assert max(found.values()) < 0.5
-
-
-def test_the_command_in_short(tmp_path):
-    assert main(['wind', '--quick', '--jobs', '2', '--output', str(tmp_path)]) == 0
-    rows = evidence.read(NAME, tmp_path)
-    assert [row['method'] for row in rows] == list(RECIPES['wind'].methods)
-    assert (tmp_path / evidence.FOLDER / 'recipe_wind.png').exists()
 
 
 @recipes
@@ -89,21 +82,37 @@ def test_file_runs_as_the_node_would_run_it(name):
         np.testing.assert_array_equal(found.unknown_input, same.unknown_input)
 
 
-@pytest.mark.parametrize('peer', [peers.disturbance_observer, peers.kalman_filter])
-def test_peers_find_a_constant_d(peer):
-    """Without noise, a quick peer has the truth after some time constants."""
-    t = np.arange(0.0, 2.0, 2e-3)
-    p = {'order': 2, 'phi': ['0', 'u - 3*z1']}
-    w = np.sqrt(3.0)
-    y = (0.7 + 0.2) / 3.0 * (1.0 - np.cos(w * t))  # z1'' = 0.2 + 0.7 - 3 z1
-    r = judging.Recorded('', t, y, np.full((len(t), 1), 0.2), np.full_like(t, 0.7), t > 1.0)
-    assert judging.error([(r, peer(p, r, 60.0))]) < 0.03
+# Events
 
 
-def test_complementary_filter_finds_a_constant_bias():
-    t = np.arange(0.0, 10.0, 0.01)
-    rate = np.sin(t)
-    y = 1.0 - np.cos(t)
-    r = judging.Recorded('', t, y, rate[:, None] + 0.1, np.full_like(t, -0.1), t > 8.0)
-    found = peers.complementary_filter({'order': 1, 'phi': ['u']}, r, 2.0)
-    assert judging.error([(r, found)]) < 0.05
+NODE_PAGE = (evidence.DOCS / 'node.md').read_text(encoding='utf-8')
+EVENTS = NODE_PAGE.split('## Events')[1].split('\n## ')[0]
+
+
+@pytest.mark.parametrize('factor', events.FACTORS)
+def test_the_file_of_the_page_finds_faults_and_nothing_else(tmp_path, factor):
+    path = tmp_path / 'faults.yaml'
+    path.write_text(EVENTS.split('```yaml\n')[1].split('```')[0])
+    r = events.record(0.07, 5, factor * events.NOISE, faults=True)
+    found = OnlineEstimator.from_yaml(path)
+    found.run(np.round(1e9 * events.H * np.arange(len(r.y))).astype(np.int64), r.y)
+    begun = np.array([e.stamp * 1e-9 for e in found.events.taken() if e.begins])
+    late = events.delays(begun, r.faults)
+    assert len(late) >= 8
+    assert np.isfinite(late).all()
+    assert np.median(late) < 0.35
+    quiet = begun[begun < r.faults[0]]
+    assert not len(quiet[quiet > 10.0])
+
+
+def test_page_of_events_says_what_was_measured():
+    documented = evidence.read(events.NAME)
+    told, changed = events.FACTORS
+    for name in (events.FILTER, events.OURS):
+        point = events.best(events.points_of(documented, told, name))
+        [kept] = [
+            p for p in events.points_of(documented, changed, name)
+            if p.threshold == point.threshold
+        ]  # fmt: skip
+        assert f'{point.delay:.2f} s' in EVENTS
+        assert f'{kept.false:.1f}' in EVENTS or f'{kept.false:,.0f}' in EVENTS
