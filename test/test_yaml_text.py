@@ -11,7 +11,7 @@ from fhaosmo_ros.tools.cli.options import assigned
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 import pytest
-from yaml_texts import HOSTILE, LAUGHS
+from yaml_texts import ANY_TEXT, HOSTILE, LAUGHS
 
 LISTS = ('lambda', 'phi', 'channels')
 
@@ -48,7 +48,7 @@ PIECES = [
     '\ufeff', '@', '`', '!', '\\x', '\r', '\x85', '0o7', '1_0', '+', '-', '.', '_', '0',
 ]  # fmt: skip
 TEXTS = st.one_of(
-    st.text(),
+    ANY_TEXT,
     st.lists(st.sampled_from(PIECES), max_size=30).map(''.join),
     st.text('[]{}?:,-&*!ab01. \n"\'|>#%@`', max_size=60),
 )

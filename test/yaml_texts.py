@@ -3,6 +3,11 @@
 
 import random
 
+from hypothesis import strategies as st
+
+# As st.text(), which first makes a table of all of Unicode: seconds in a clean checkout.
+ANY_TEXT = st.lists(st.integers(0, 0x10FFFF).map(chr)).map(''.join)
+
 LAUGHS = 'a: &a {' + ', '.join(f'{k}: x' for k in range(9)) + '}\n'
 for one, other in zip('abcdefgh', 'bcdefghi', strict=True):
     LAUGHS += f'{other}: &{other} {{' + ', '.join(f'{k}: *{one}' for k in range(9)) + '}\n'
