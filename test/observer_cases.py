@@ -4,6 +4,7 @@
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 # Every number that a test relies on; the defaults may change.
 SMALL = {'order': 2, 'phi': ['0', '-z2*z2*z1 + u'], 'lambda': 3.0, 'alpha': 4.0}
@@ -40,6 +41,19 @@ def samples(count=200, seed=1):
     y[[0, 1, 30, 31, 100]] = np.nan
     y[120], u[140] = np.inf, np.nan
     return t, y, u
+
+
+def states_of(rates, d, start=0.0, period=1e-3):
+    """Return the states of z' = A z + e_n d from sample to sample, d held."""
+    n = len(rates)
+    whole = np.zeros((n + 1, n + 1))
+    whole[:n, :n], whole[n - 1, n] = rates, 1.0
+    step = expm(whole * period)
+    z = np.empty((len(d), n))
+    z[0] = start
+    for k in range(1, len(d)):
+        z[k] = step[:n, :n] @ z[k - 1] + step[:n, n] * d[k - 1]
+    return z
 
 
 def concatenated(runs):

@@ -148,6 +148,7 @@ def test_a_thousand_parameter_sets():
 @pytest.mark.parametrize('name', sorted(FIXED))
 def test_fixed_parameter_says_that_it_is_fixed(name):
     estimator = OnlineEstimator(SMALL)
+    estimator.configure({name: estimator.parameters[name]})
     other = {
         'order': 3, 'phi': ['0', '0'], 'unknown_input': False, 'unknown_input_derivatives': 2,
         'inputs': ['v'], 'measurement_delay': 0.1, 'input_delay': 0.1, 'smoothing_lag': 0.1,

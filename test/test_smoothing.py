@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimates from the samples before and after: theorems of smoothing, faults of data, lags."""
 
-import copy
 import math
-import pickle
 
 from fhaosmo_ros.core import Observer, OnlineEstimator, Plant
 from fhaosmo_ros.core.observer import smoother
 from fhaosmo_ros.core.observer.kalman import INPUT_DOUBT, STATES_DOUBT
-from fhaosmo_ros.core.observer.smoothing import BEGINS, MEASURED, Rows
 from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.simulation.metrics import rms
 import numpy as np
+from observer_cases import states_of
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov
 
@@ -40,26 +39,12 @@ def stamps_of(t):
     return np.round(t * 1e9).astype(np.int64) + MS
 
 
-def rms(values):
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def in_parts(estimator, stamps, y, size):
     """Return what an estimator smooths of a recording that it gets in parts, and its rows."""
     estimator.smooth()
     rows = [estimator.run(stamps[k : k + size], y[k : k + size]) for k in range(0, len(y), size)]
     rows.append(estimator.finish())
     return np.concatenate([row.unknown_input for row in rows]), rows
-
-
-def respond(rates, d, period):
-    """Return z of z' = A z + e_2 d, which begins at rest; d is held between the samples."""
-    whole = np.zeros((3, 3))
-    whole[:2, :2], whole[1, 2] = rates, 1.0
-    step, z = expm(whole * period), np.zeros((len(d), 2))
-    for k in range(1, len(d)):
-        z[k] = step[:2, :2] @ z[k - 1] + step[:2, 2] * d[k - 1]
-    return z
 
 
 def matern(seconds, noise=1e-3, bandwidth=4.0, seed=1):
@@ -72,7 +57,7 @@ def matern(seconds, noise=1e-3, bandwidth=4.0, seed=1):
         for k in range(1, len(d)):
             d[k] += share * d[k - 1]
     d = d[5000:] / d[5000:].std()
-    y = respond(RATES, d, 1e-3)[:, 0] + noise * rng.standard_normal(count)
+    y = states_of(RATES, d)[:, 0] + noise * rng.standard_normal(count)
     return np.arange(count) * 1e-3, y, d
 
 
@@ -328,7 +313,7 @@ def test_a_jump_of_d_is_seen_where_it_is():
     """The estimate changes within some samples of the jump, and not before."""
     t = np.arange(6000) * 1e-3
     d = np.where(t < 4.0, 0.0, 50.0)
-    y = respond(RATES, d, 1e-3)[:, 0] + 1e-5 * np.random.default_rng(4).standard_normal(len(t))
+    y = states_of(RATES, d)[:, 0] + 1e-5 * np.random.default_rng(4).standard_normal(len(t))
     found = Observer(SELF_TUNING).smooth(t, y)
     assert np.abs(found.unknown_input[2000:3950]).max() < 5.0
     assert np.abs(found.unknown_input[4100:5900] - 50.0).max() < 5.0
@@ -343,7 +328,7 @@ def test_a_quick_d_that_comes_back_is_not_taken_for_noise(seed):
     d = np.sin(np.outer(t, omega) + phase).sum(axis=1)
     d *= 4e3 / d.std()
     d[pause.start * fine : pause.stop * fine] = 0.0
-    z = respond(np.array([[0.0, 1.0], [-184e3, -42.0]]), d, period / fine)
+    z = states_of(np.array([[0.0, 1.0], [-184e3, -42.0]]), d, period=period / fine)
     y, d = z[::fine, 0] + 1e-4 * rng.standard_normal(3000), d[::fine]
     stamps = np.round(np.arange(1, len(y) + 1) * period * 1e9).astype(np.int64)
     found = online('self', phi=['0', '-184e3*z1 - 42*z2'], smoothing_lag=0.01).run(stamps, y)
@@ -461,53 +446,3 @@ def test_any_data_gives_finite_estimates(gains, seed):
                 assert np.isfinite(row.z).all()
                 assert np.isfinite(row.unknown_input).all()
                 assert not np.isnan(row.standard_deviation).any()
-
-
-@pytest.mark.parametrize('lag', [None, 5 * MS])
-@pytest.mark.parametrize('bad', ['y', 'u', 'h', 'own'])
-def test_what_is_not_finite_leaves_the_observers_own_estimates(bad, lag):
-    """Where numbers overflow the observer's estimate stands; elsewhere it is smoothed."""
-    observer = Observer(Observer.from_yaml(CONFIG).parameters | {'phi': ['0', '0', 'u - z3']})
-    count, found = 400, []
-    for damage in (0.0, {'y': np.nan, 'u': 1e308, 'h': 1e300, 'own': 1e200}[bad]):
-        rows = {
-            'own': np.zeros((count, 1, observer.levels)),  # an observer that estimates 0
-            'y': NOISE * np.random.default_rng(1).standard_normal(count),
-            'h': np.full(count, 1e-3), 'u': np.zeros((count, 1)), 'times': MS * np.arange(count),
-            'kinds': np.full(count, MEASURED), 'models': np.empty((count, 0)),
-        }  # fmt: skip
-        rows['kinds'][0] = BEGINS
-        if damage:
-            rows[bad][200 : 205 if bad == 'u' else 201] = damage
-        smoothing = Rows(observer.configuration)
-        smoothing.append(**rows)
-        parts = [smoothing.smooth(count, lag), smoothing.smooth(count)]
-        found.append(np.concatenate(parts)[:, 0])
-    assert np.isfinite(found[1]).all()
-    assert len(found[1]) == count
-    others = np.arange(count) != 200
-    assert np.abs(found[1][others] - found[0][others])[:, 0].max() < 3.0 * NOISE
-    # Where nothing passes, y is smoothed on both sides: the estimates are not just the observer's.
-    assert np.abs(found[1][210:, 0]).min() > 0.0
-
-
-def test_parameters_of_another_model_are_refused():
-    rows = Rows(Observer.from_yaml(CONFIG).configuration)
-    with pytest.raises(ValueError, match='another model'):
-        rows.configure(Observer.from_yaml('config/models/pendulum.yaml').configuration)
-
-
-COPIES = (copy.copy, copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e)))  # noqa: S301
-
-
-@pytest.mark.parametrize('way', COPIES)
-@pytest.mark.parametrize('gains', ['fixed', 'self'])
-def test_a_copy_goes_on_alike(way, gains):
-    t, y, _ = recording(1.5)
-    stamps = stamps_of(t)
-    one = online(gains, smoothing_lag=0.05)
-    one.run(stamps[:900], y[:900])
-    found = [e.run(stamps[900:], y[900:]) for e in (way(one), one)]
-    for name in ('t', 'unknown_input', 'standard_deviation'):
-        np.testing.assert_array_equal(getattr(found[0], name), getattr(found[1], name))
-    assert len(found[0].t) == len(t) - 900
