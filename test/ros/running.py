@@ -15,6 +15,8 @@ from typing import NamedTuple
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 import fhaosmo_ros
+from fhaosmo_ros.core.parameters.files import loads
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 import rclpy
@@ -425,3 +427,21 @@ class Estimator:
 
         self.user.wait(look, f'{task} with level {level} and {words}')
         return found[-1]
+
+
+def told_parameters(user, node: str):
+    """Return a function that waits for values on the topic of a node's parameters."""
+    messages = user.record(f'{node}/parameters', String, LATCHED)
+
+    def wait(condition=lambda values: True) -> dict:
+        found = []
+
+        def look() -> bool:
+            texts = [published.message.data for published in messages[-1:]]
+            found[:] = [loads(text, node, ESTIMATOR_PARAMETERS) for text in texts]
+            return bool(found) and condition(found[0])
+
+        user.wait(look, 'parameters on their topic')
+        return found[0]
+
+    return wait

@@ -6,8 +6,10 @@ import math
 import time
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.per_channel import of_channel, with_channels
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
-from running import Estimator, FED, joint_state, nanoseconds, OK, SECOND
+from running import Estimator, FED, joint_state, nanoseconds, OK, SECOND, told_parameters
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -75,6 +77,18 @@ def test_common_parameter_serves_channels_without_their_own(parameters):
     parameters.set(**{'knee.epsilon': 7.0})
     parameters.set(epsilon=8.0)
     assert epsilons() == [8.0, 7.0]
+
+
+def test_topic_tells_what_is_a_channels_own(user, rigs, parameters):
+    wait = told_parameters(user, '/many/estimator')
+    parameters.set(epsilon=2.0)
+    wait(lambda v: v['epsilon'] == 2.0)
+    parameters.set(**{'knee.epsilon': 5.0, 'hip.gamma_rate': 0.5})
+    values = wait(lambda v: v.get('hip.gamma_rate') == 0.5)
+    assert set(values) <= set(with_channels(ESTIMATOR_PARAMETERS, OWN))
+    for channel, epsilon in (('hip', 2.0), ('knee', 5.0)):
+        assert of_channel(values, channel)['epsilon'] == epsilon
+    assert of_channel(values, 'knee')['gamma_rate'] != 0.5
 
 
 def test_bad_set_names_the_channel_and_changes_nothing(parameters):

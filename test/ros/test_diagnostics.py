@@ -184,11 +184,6 @@ def test_what_no_longer_fits_is_said(user, estimator):
     wait_said('gains are for 1000 Hz, y comes at 500 Hz', period=2)
 
 
-def test_missing_known_input_is_said(estimator):
-    rig = estimator('/missing', phi=['0', '0', 'u'], **LAX)
-    rig.wait_status('input', STALE, 'no publisher of u')
-
-
 # Publishers that can't be heard, or are too many.
 
 
@@ -290,12 +285,3 @@ def test_policies_of_estimates(user, launch):
     fresh = user.record(f'{node}/stamp', Time)
     user.wait(lambda: y.publish(Float64(data=0.5)) or (kept and len(fresh) > 10), 'estimates')
     assert kept[0].stamp < before < fresh[0].stamp
-
-
-def test_policies_of_the_plant(user, launch):
-    prefix = 'qos_overrides./policies'
-    own = {f'{prefix}/y.publisher.reliability': 'best_effort'}
-    own |= {f'{prefix}/plant/state.publisher.depth': 7}
-    launch('plant', namespace='/policies', **own)
-    assert Parameters(user, '/policies/plant').all(own) == own
-    assert policies(user, '/policies/y').reliability == ReliabilityPolicy.BEST_EFFORT

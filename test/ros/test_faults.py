@@ -119,7 +119,9 @@ def test_slow_sensor_does_not_flood_the_log(estimator):
 
 def test_bad_inputs_are_rejected_and_the_last_one_is_held(user, estimator):
     model = {'order': 2, 'phi': ['0', 'u - z2'], 'max_gap': 60.0}
-    rig = estimator('/bad_u', **FED | model).listen()
+    rig = estimator('/bad_u', **FED | model)
+    rig.wait_status('input', STALE, 'no publisher of u')
+    rig.listen()
     u = user.publisher('/bad_u/u')
     for value in (1.0, math.nan, math.inf):
         u.publish(Float64(data=value))
@@ -181,10 +183,13 @@ def test_node_clock_sampling_follows_simulated_time(clock, estimator):
 
 
 @pytest.mark.parametrize('node', ['estimator', 'plant'])
-def test_negative_time_on_clock_is_rejected(clock, launch, node):
-    process = launch(node, namespace='/negative', use_sim_time=True)
+def test_negative_time_on_clock_is_rejected(clock, user, launch, node):
+    given = {'sampling': 'nominal'} if node == 'estimator' else {}
+    process = launch(node, namespace='/negative', use_sim_time=True, **given)
     clock(-5 * SECOND, lambda: 'expected seconds >= 0, got -5' in process.output)
     assert process.poll() is None
+    # What is given stays as it is in simulated time.
+    assert Parameters(user, f'/negative/{node}').all(given) == given
 
 
 def test_a_clock_that_does_not_run_is_said(clock, estimator):
@@ -196,8 +201,3 @@ def test_a_clock_that_does_not_run_is_said(clock, estimator):
     clock.end()
     rig.wait_status('state', ERROR, 'stands still', 'nobody publishes it any more')
     assert len(rig.said('stands still')) == 1  # once, not five times a second
-
-
-def test_sampling_is_the_given_one_in_simulation_too(user, launch):
-    launch('estimator', namespace='/given', use_sim_time=True, sampling='nominal')
-    assert Parameters(user, '/given/estimator').get('sampling') == 'nominal'

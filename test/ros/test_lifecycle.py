@@ -39,14 +39,11 @@ def listeners(user) -> list[str]:
     return [info.node_name for info in found if info.node_name != 'user']
 
 
-def test_it_waits_and_has_neither_topics_nor_services(user, unconfigured):
-    user.wait(lambda: topics(user) == 0, 'end of the topics')
-    user.wait(lambda: not listeners(user), 'end of the subscription')
-    assert unconfigured.transitions() == {'configure', 'shutdown'}
-
-
 def test_life_of_a_node(user, unconfigured, process):
     node = unconfigured
+    user.wait(lambda: topics(user) == 0, 'end of the topics')
+    user.wait(lambda: not listeners(user), 'end of the subscription')
+    assert node.transitions() == {'configure', 'shutdown'}
     assert node.change(Transition.TRANSITION_CONFIGURE)
     assert node.state() == 'inactive'
     rig = Estimator(user, process, '/managed')
@@ -145,7 +142,3 @@ def test_reset_that_waits_during_cleanup_does_not_end_the_node(user, unconfigure
             reset.call_async(Trigger.Request())
         user.wait(lambda: unconfigured.state() == 'unconfigured', 'cleanup')
         assert process.poll() is None
-
-
-def test_it_starts_by_itself(user, fed):
-    assert Manager(user, fed.name).state() == 'active'

@@ -13,6 +13,7 @@ from running import Parameters, SECOND
 from std_msgs.msg import Float64, Float64MultiArray
 
 AMPLITUDE = 2.0
+OF_STATE = 'qos_overrides./stable/plant/state.publisher.depth'
 
 
 class PlantRig:
@@ -56,6 +57,7 @@ def rig(plant):
     return plant(
         '/stable', sample_rate=250.0, disturbance_amplitude=AMPLITUDE,
         phi=['0', '0', '-6.0*z1 - 11.0*z2 - 6.0*z3'],  # poles -1, -2, -3: stays bounded
+        **{OF_STATE: 7},
     )  # fmt: skip
 
 
@@ -84,6 +86,7 @@ def test_y_belongs_to_its_stamp(plant):
 
 def test_truth_is_labelled_and_y_is_its_first_state(rig):
     assert rig.state[-1].message.layout.dim[0].label == 'z1,z2,z3'
+    assert rig.parameters.get(OF_STATE) == 7
     for sample, state in rig.ticks(rig.state, 50):
         assert state.message.data[0] == sample.message.data
 

@@ -11,7 +11,7 @@ from threading import Timer
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
-from running import DEADLINE, Estimator, Manager, Parameters, ROOT
+from running import DEADLINE, Estimator, Parameters, ROOT
 from yaml_texts import HOSTILE
 
 
@@ -207,20 +207,6 @@ def attacks(mark: Path) -> list[str]:
         f'| {touch}',
         f'!!python/object/apply:os.system ["{touch}"]',
     ]
-
-
-def test_parameters_through_services_execute_nothing(user, launch, tmp_path):
-    mark = tmp_path / 'mark'
-    process = launch('estimator', namespace='/attack', autostart=False)
-    values, manager = Parameters(user, '/attack/estimator'), Manager(user, '/attack/estimator')
-    for text in attacks(mark):
-        for name in ('variant', 'lambda', 'epsilon', 'order'):
-            assert not values.try_to_set(name, text).successful
-        # A text like any other; and a model, looked at as a whole when the node is configured.
-        values.set(hardware_id=text, phi=['0', '0', text])
-        assert not manager.change('configure'), text
-    assert process.output.count("'phi': Phi_3") == len(attacks(mark))
-    assert not mark.exists()
 
 
 def test_arguments_and_files_execute_nothing(tmp_path, capfd):
