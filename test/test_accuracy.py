@@ -44,14 +44,6 @@ def test_plant_is_accurate_to_fourth_order():
     assert 3.7 < order(steps, errors) < 4.5
 
 
-def test_linear_plant_follows_its_exact_solution():
-    # z1' = z2, z2' = -z1: a rotation
-    p = {'order': 2, 'phi': ['0', '-z1'], 'initial_state': [1.0, 0.0], 'disturbance': 'none'}
-    t = np.linspace(0.0, 20.0, 37)
-    truth = Plant(p | {'integration_step': 1e-3}).simulate(t)
-    np.testing.assert_allclose(truth.z, np.stack([np.cos(t), -np.sin(t)], axis=1), atol=1e-11)
-
-
 def test_trajectory_does_not_depend_on_the_sampling_times():
     rng = np.random.default_rng(4)
     coarse = np.linspace(0.0, 3.0, 31)
@@ -97,17 +89,6 @@ def test_observer_is_accurate_to_first_order_where_it_is_smooth(scheme, variant)
     np.testing.assert_allclose(slopes, 1.0, atol=0.25)
 
 
-def test_schemes_agree_in_the_limit():
-    p = {'order': 2, 'phi': ['0', '-z2'], 'variant': 'fuzzy', 'epsilon': 1e6}
-    p |= {'lambda': 3.0, 'alpha': 2.0, 'fuzzy_widths': [1.0]}
-    t = np.arange(20001) * 5e-5
-    explicit, implicit = (
-        Observer(p | {'scheme': scheme}).run(t, np.sin(2.0 * t)).z[-1]
-        for scheme in ('explicit', 'implicit')
-    )
-    np.testing.assert_allclose(explicit, implicit, atol=1e-3)
-
-
 # The paper's example
 
 
@@ -128,11 +109,6 @@ def test_states_converge_implicitly(variant):
     assert max(rms(e) for e in errors[late].T) < 2e-3
 
 
-def test_unknown_input_converges_implicitly():
-    t, _, d, truth = paper_errors(1e-3, variant='sign', scheme='implicit')
-    assert rms((d - truth)[t >= 10.0]) < 1e-3  # amplitude of d: 0.1
-
-
 @pytest.mark.parametrize('omega', [1.0, 5.0])
 def test_error_of_the_unknown_input_shrinks_with_the_step(omega):
     steps, errors = [8e-3, 4e-3, 2e-3, 1e-3], []
@@ -140,6 +116,7 @@ def test_error_of_the_unknown_input_shrinks_with_the_step(omega):
         t, _, d, truth = paper_errors(h, omega=omega, variant='sign', scheme='implicit')
         errors.append(rms((d - truth)[t >= 10.0]))
     assert order(steps, errors) > 0.8
+    assert errors[-1] < 1e-3 * omega  # amplitude of d: 0.1
 
 
 def test_sign_chatters_and_fuzzy_does_not():

@@ -7,7 +7,6 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load, select
 from fhaosmo_ros.core.parameters.per_channel import (
     channel_names,
-    followers,
     of_channel,
     UNNAMED,
     with_channels,
@@ -72,12 +71,6 @@ def test_own_parameters_are_declared_and_checked_as_the_common_ones():
 def test_unknown_names_are_told(name):
     with pytest.raises(ConfigurationError, match=f"unknown parameter '{name}'"):
         select({'channels': NAMES, name: 1.0}, ESTIMATOR_PARAMETERS)
-
-
-def test_a_channel_follows_what_it_has_not_of_its_own():
-    assert followers('lambda', NAMES, {'hip.lambda'}) == ['knee_2.lambda']
-    assert followers('publish_rate', NAMES, ()) == []
-    assert followers('lambda', UNNAMED, ()) == []
 
 
 @pytest.fixture

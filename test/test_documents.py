@@ -10,7 +10,6 @@ from fhaosmo_ros.commands import COMMANDS
 from fhaosmo_ros.core import Counters, Observer, OnlineEstimator, Plant
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import (
-    ESTIMATOR_PARAMETERS,
     NODE_TABLES,
     OBSERVER_PARAMETERS,
     PLANT_PARAMETERS,
@@ -110,13 +109,6 @@ def test_counters_in_the_tables_are_those_of_the_code():
     tables = [part for part in text.split('\n\n') if '| counter |' in part]
     written = [name for part in tables for row in cells(part)[1:] for name in names(row[-1])]
     assert set(written) == set(Counters._fields)
-
-
-def test_parameters_in_the_first_table_are_declared():
-    text = NODE.split('## Parameters that matter first')[1].split('\n\n')[1]
-    written = [name for row in cells(text)[1:] for name in names(row[0])]
-    assert written
-    assert set(written) <= {*ESTIMATOR_PARAMETERS, 'constants'}
 
 
 @pytest.mark.parametrize('page', [page for page in PAGES if blocks(page, 'yaml')])

@@ -8,7 +8,7 @@ solves the implicit equations, its solve_ivp follows the model.
 
 import math
 
-from fhaosmo_ros.core import ConfigurationError, Observer, Plant
+from fhaosmo_ros.core import Observer, Plant
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.fuzzy import curves
 from fhaosmo_ros.core.observer.levant import Levant
@@ -54,7 +54,7 @@ def parameters(n, derivatives=0, **others):
     return p | {'start_from_measurement': False, 'unknown_input_decay': 0.0} | others
 
 
-def signals(steps=150):
+def signals(steps=100):
     rng = np.random.default_rng(7)
     t = np.concatenate([[0.0], np.cumsum(4e-3 * rng.uniform(0.5, 1.5, steps))])
     return t, 0.3 * np.sin(2.0 * t) + 0.2 * np.sign(np.sin(9.0 * t)), np.cos(3.0 * t)
@@ -243,6 +243,7 @@ def test_errors_shrink_with_the_step_as_levants_theorem_says(scheme, level):
         assert slope > 0.8
 
 
+@settings(max_examples=40)
 @given(st.floats(1e-3, 1e3), st.sampled_from(SCHEMES))
 def test_sign_is_homogeneous(scale, scheme):
     """Time scaled by k, y by k^N: z_hat_i scales by k^(N - i + 1) (degree -1)."""
@@ -259,7 +260,7 @@ def powers(low, high):
     return st.floats(low, high).map(lambda x: 10.0**x)
 
 
-@settings(max_examples=1000)
+@settings(max_examples=400)
 @given(
     st.sampled_from(VARIANTS), powers(-20.0, 6.0), powers(-6.0, 0.5),
     powers(-3.0, 0.0) | st.sampled_from([1e-9, 1e-16, 1e-300]),
@@ -296,21 +297,6 @@ def test_gamma_of_next_to_nothing_is_the_limit_of_small_ones(scheme):
         np.testing.assert_allclose(z_hat, smaller, rtol=0.0, atol=2e-3 * error)
 
 
-def test_structure_changes_live_without_a_jump():
-    p = {'lambda': 8.0, 'alpha': 9.0, 'epsilon': 10.0, 'fuzzy_widths': 0.5, 'phi': ['0'] * 3}
-    p |= {'estimate_from': 'filtered'}
-    t, y, _ = signals()
-    observer = Observer(p | {'scheme': 'implicit'})
-    for structure in ('levant', 'cascade'):
-        observer.run(t, y)
-        before = observer.estimate.z
-        observer.configure({'structure': structure})
-        h = 1e-9
-        after = observer.step(float(y[-1]), h).z
-        np.testing.assert_allclose(after, before, atol=1e-4)
-        t = t + 2.0 * t[-1]
-
-
 def test_more_levels_follow_a_smooth_unknown_input_closer():
     t = np.arange(4000) * 5e-3
     p = {'structure': 'levant', 'order': 1, 'phi': ['0'], 'variant': 'sign'}
@@ -321,26 +307,6 @@ def test_more_levels_follow_a_smooth_unknown_input_closer():
         run = Observer(q).run(t, np.sin(t))
         errors.append(rms((run.unknown_input - np.cos(t))[t > 10.0]))
     assert errors[1] < 0.05 * errors[0]
-
-
-def test_derivatives_without_their_level_are_refused():
-    with pytest.raises(ConfigurationError, match='expected unknown_input = true or'):
-        Observer({'unknown_input': False, 'unknown_input_derivatives': 1})
-
-
-def test_predict_correct_is_no_scheme_of_the_cascade():
-    with pytest.raises(ConfigurationError, match="expected structure = 'levant' or another"):
-        Observer({'scheme': 'predict_correct'})
-
-
-def test_without_its_last_level_it_is_refused():
-    with pytest.raises(ConfigurationError, match='unknown_input = true'):
-        Observer({'structure': 'levant', 'unknown_input': False})
-
-
-def test_explicit_is_no_scheme_of_levant():
-    with pytest.raises(ConfigurationError, match="expected scheme = 'implicit' or 'predict"):
-        Observer({'structure': 'levant', 'scheme': 'explicit'})
 
 
 @pytest.mark.parametrize('scheme', SCHEMES)

@@ -162,6 +162,24 @@ def test_list_of_the_wrong_length_is_refused(name, value, allowed):
             assert part in message
 
 
+@pytest.mark.parametrize(
+    ('values', 'reason'),
+    [
+        (
+            {'unknown_input': False, 'unknown_input_derivatives': 1},
+            'expected unknown_input = true',
+        ),
+        ({'scheme': 'predict_correct'}, "expected structure = 'levant' or another"),
+        ({'structure': 'levant', 'unknown_input': False}, 'unknown_input = true'),
+        ({'structure': 'levant', 'scheme': 'explicit'}, "scheme = 'implicit' or 'predict"),
+        ({'gains': 'self_tuning', 'unknown_input': False}, 'unknown_input'),
+    ],
+)
+def test_values_that_do_not_fit_together_are_refused(values, reason):
+    with pytest.raises(ConfigurationError, match=reason):
+        Observer(values)
+
+
 def test_default_gains_with_the_plant_of_a_user_are_warned_of():
     """Whether a value is given or is the default makes no difference."""
     model = {'order': 2, 'phi': ['0', '-z2']}

@@ -5,7 +5,6 @@ import math
 from pathlib import Path
 
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.kalman import stationary
 from fhaosmo_ros.core.observer.levant import Levant
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.status import Status
@@ -302,12 +301,6 @@ def test_steady_covariance_solves_its_equation():
     np.testing.assert_allclose(again / scale, steady / scale, atol=1e-8)
 
 
-def test_fresh_covariance_is_stationary():
-    chain = np.eye(3, k=1) - 2.0 * np.eye(3)
-    p = stationary(chain, 5.0)
-    np.testing.assert_allclose(chain @ p + p @ chain.T, -np.diag([0.0, 0.0, 5.0]), atol=1e-12)
-
-
 # influence of innovations (D 32)
 
 
@@ -367,14 +360,3 @@ def test_bare_observer_comes_back_from_anywhere(power):
     values['initial_estimate'] = [10.0**power, 0.0, 0.0, 0.0]
     wrong = np.abs(Observer(values).run(t, truth.y).unknown_input - truth.unknown_input)
     assert wrong[11 * RATE :].max() < 0.2
-
-
-def test_growth_begins_after_so_many_samples():
-    values = dict(load(CONFIG / 'noise_1e-3.yaml', 'estimator', OBSERVER_PARAMETERS))
-    observer = Observer(values | {'noise_size': 0.0})
-    observer.start(0.0)
-    for _ in range(20 - 1):
-        observer.step(1e6, 1e-3)
-    assert remembered(observer, 'scale') == 1.0
-    observer.step(1e6, 1e-3)
-    assert remembered(observer, 'scale') == 2.0

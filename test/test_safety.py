@@ -8,7 +8,7 @@ import pickle
 import re
 import threading
 
-from fhaosmo_ros.core import Observer, Status
+from fhaosmo_ros.core import Status
 from fhaosmo_ros.core.observer.status import FLAGS_MASK, LEVEL_SHIFT, REJECTED, UNUSED
 from fuzz import fuzz_calls, fuzz_snapshots, KINDS, running
 import numpy as np
@@ -87,14 +87,3 @@ def test_flags_of_compiled_code_are_those_of_status():
     named = {'REJECTED': REJECTED, 'UNUSED': UNUSED}
     named |= {'LEVEL_SHIFT': LEVEL_SHIFT, 'FLAGS_MASK': FLAGS_MASK}
     assert found == named | {flag.name: int(flag) for flag in Status if flag}
-
-
-@pytest.mark.parametrize('parameters', [{}, {'noise_size': 1e-3}, {'variant': 'sign'}])
-def test_snapshot_of_an_observer_has_names_and_goes_on(parameters):
-    t = np.arange(400) * 1e-3
-    observer, other = Observer(parameters), Observer(parameters)
-    observer.run(t[:200], np.sin(t[:200]))
-    state = observer.state
-    assert {'z_hat', 'z_tilde', 'gamma', 'y'} <= state.values.keys()
-    other.restore(state)
-    same(other.run(t[200:], np.sin(t[200:])), observer.run(t[200:], np.sin(t[200:])))

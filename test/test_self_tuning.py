@@ -3,7 +3,7 @@
 
 import math
 
-from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Status
+from fhaosmo_ros.core import Observer, OnlineEstimator, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.self_tuning.intervals import within
 from fhaosmo_ros.core.simulation.metrics import rms
@@ -11,7 +11,6 @@ import numpy as np
 from observer_cases import states_of
 import pytest
 from scipy.linalg import expm
-from scipy.signal import lfilter
 from scipy.stats import norm, truncnorm
 from studies.everywhere import Condition, CONDITIONS, model_of, PLANTS, recording, setting_of
 from studies.harness import observed
@@ -126,8 +125,9 @@ def test_outliers_and_jumps_of_y(case):
         assert np.abs(error).max() < 2.0 * np.abs(d).max()
 
 
-@pytest.mark.parametrize('size', [0.05, 1.0, -2.0])
-@pytest.mark.parametrize('seconds', [0.05, 0.5, 5.0])
+@pytest.mark.parametrize(
+    ('size', 'seconds'), [(0.05, 0.5), (0.05, 5.0), (1.0, 0.05), (-2.0, 0.5), (-2.0, 5.0)]
+)
 def test_a_wrong_angle_is_no_wrong_gravity(size, seconds):
     """Believed, it would be a d of up to 19.6: y less its offset is used instead (D 23)."""
     r, values = study('pendulum', seed=5)
@@ -151,8 +151,10 @@ def test_a_plant_that_is_elsewhere_is_no_jump_of_y():
     assert rms(wrong[13_000:]) < 0.05 * rms(d)
 
 
-@pytest.mark.parametrize('sigmas', [3.5, 5.0, 6.5, 8.0, -5.0])
-@pytest.mark.parametrize('seconds', [0.02, 0.5])
+@pytest.mark.parametrize(
+    ('sigmas', 'seconds'),
+    [(3.5, 0.02), (3.5, 0.5), (5.0, 0.02), (-5.0, 0.5), (6.5, 0.5), (8.0, 0.02)],
+)
 def test_an_offset_of_y_is_not_taken_for_d(case, sigmas, seconds):
     """Just within, and just beyond what counts as lost; before D 35 d was off by 100s of times."""
     t, z, d, noise = case
@@ -421,15 +423,6 @@ def test_y_that_stands_still_says_no_more_with_every_sample():
     assert deviation.max() < 0.5
 
 
-def test_quanta_bound_the_noise():
-    """An encoder at rest repeats itself: the noise does not fall below the error of rounding."""
-    t, y, d = swept(FRICTION, 70.0, PERIOD, 15.0, lambda phase: np.sin(phase) ** 31)
-    observer = Observer(MOTOR)
-    run = observer.run(t, np.round(y / 2.2e-3) * 2.2e-3)
-    assert observer.tuning.noise > 0.99 * 2.2e-3 / math.sqrt(12.0)
-    assert rms((run.unknown_input - d)[5000:]) < 0.4 * rms(d)
-
-
 def test_slider(case):
     """A larger bandwidth makes the estimate noisier; 1 is what it chooses."""
     t, z, _, noise = case
@@ -438,12 +431,6 @@ def test_slider(case):
         run = Observer({**SELF_TUNING, 'bandwidth': bandwidth}).run(t[:8000], y)
         roughness.append(rms(np.diff(run.unknown_input[4000:])))
     assert roughness[0] < 0.5 * roughness[1] < 0.25 * roughness[2]
-
-
-def test_it_needs_the_unknown_input():
-    """Without it there is nothing to tune."""
-    with pytest.raises(ConfigurationError, match='unknown_input'):
-        Observer({**SELF_TUNING, 'unknown_input': False})
 
 
 @pytest.mark.parametrize(
@@ -473,38 +460,6 @@ def test_a_constant_changes_live():
     assert flow[1, 1] == pytest.approx(math.exp(-5.0 * PERIOD), rel=1e-9)
     run = observer.run(t[8001:], y[8001:])
     assert rms((run.unknown_input - d[8001:])[4000:]) < 0.02 * rms(d)
-
-
-def test_a_sample_that_is_not_likely_changes_no_member(case):
-    """Neither estimates nor covariances nor gains, although all are predicted to it."""
-    t, z, _, noise = case
-    y = z[:, 0] + 1e-3 * noise
-    observer = Observer(SELF_TUNING)
-    observer.run(t[:300], y[:300])
-    before = observer.state.values
-    assert observer.step(y[300] + 10.0, PERIOD).status & Status.REJECTED_SPIKE
-    after = observer.state.values
-    for name in ('z', 'd', 'p_zz', 'p_zd', 'p_dd', 'gain_z', 'gain_d'):
-        np.testing.assert_array_equal(before[name], after[name])
-
-
-@pytest.mark.parametrize('noise', [0.0, 4.4e-7])
-def test_covariances_stay_positive(noise):
-    """Also where y is far more exact than its prediction, as after a jump of d."""
-    t, y, _ = swept(FRICTION, 70.0, PERIOD, 10.0, lambda phase: np.sign(np.sin(phase)))
-    y, observer = y + noise * np.random.default_rng(7).standard_normal(len(t)), Observer(MOTOR)
-    for part in np.array_split(np.arange(len(t)), 150):
-        observer.run(t[part], y[part])
-        expect_positive(observer.state.values)
-
-
-def expect_positive(values):
-    records = ('weight', 'score', 'variance', 'log_variance', 'residual', 'far', 'short_mean')
-    assert all(np.isfinite(values[name]).all() for name in records)
-    n, derivatives = len(values['z']), np.tile(np.repeat(np.arange(4), 2), 30)
-    assert (values['p_zz'][np.cumsum(range(1, n + 1)) - 1] > 0.0).all()
-    for i in range(4):  # other models of d do not have it
-        assert (values['p_dd'][i, i, derivatives >= i] > 0.0).all()
 
 
 def members_of(values):
@@ -597,29 +552,6 @@ def test_an_interval_far_off_counts_as_its_nearer_end(sign):
     assert 20.0 <= sign * mean <= 20.1
     assert chance == LEAST_CHANCE
     assert 0.0 < lost < 1.0
-
-
-@pytest.mark.parametrize('counts', [1024, 2**20])
-def test_covariances_stay_positive_where_y_is_quantised(counts):
-    quantum, t = 2.0 * np.pi / counts, np.arange(4000) * PERIOD
-    observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
-    observer.run(t, np.round(np.sin(5.0 * t) / quantum) * quantum)
-    expect_positive(observer.state.values)
-
-
-def test_coloured_noise_is_found_where_y_is_quantised_no_more():
-    """Members with coloured noise take no part before, and go on from the others then."""
-    quantum, t = 1e-2, np.arange(8000) * PERIOD
-    observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
-    y = np.round(np.sin(2.0 * t) / quantum) * quantum
-    observer.run(t[:4000], y[:4000])
-    assert observer.tuning.correlation == 0.0
-    assert observer.state.values['active'] < 240
-    noise = 0.1 * lfilter([1.0], [1.0, -0.9], np.random.default_rng(3).standard_normal(4000))
-    observer.run(t[4000:], np.sin(2.0 * t[4000:]) + noise)
-    assert observer.state.values['active'] == 240
-    assert observer.tuning.correlation > 0.6
-    expect_positive(observer.state.values)
 
 
 def test_outliers_do_not_hide_the_quanta():

@@ -190,8 +190,8 @@ def test_it_is_better_than_the_filter_and_the_longer_lag_than_the_shorter():
 def test_more_of_the_future_is_better_and_the_band_holds():
     errors, inside = [], []
     for seed in range(3):
-        t, y, d = matern(15.0, seed=seed)
-        judged, stamps = slice(3000, 14_000), stamps_of(t)
+        t, y, d = matern(10.0, seed=seed)
+        judged, stamps = slice(3000, 9000), stamps_of(t)
         found = [online('self').run(stamps, y)]
         for lag in (0.05, 0.3):
             found.append(online('self', smoothing_lag=lag).run(stamps, y))

@@ -103,15 +103,3 @@ def test_state_of_another_size_is_refused():
     ):
         with pytest.raises(ConfigurationError, match=said):
             OnlineEstimator(other).load_state_dict(two.state_dict())
-
-
-@pytest.mark.parametrize('parameters', [
-    {}, {'structure': 'levant'}, {'order': 2, 'phi': ['0', '0'], 'gains': 'self_tuning'},
-])  # fmt: skip
-def test_no_name_means_two_things(parameters):
-    estimator = OnlineEstimator(parameters)
-    feed(estimator, 0, 200)
-    parts = [estimator.observer.structure.state_dict(), estimator.policy.memory]
-    names = [name for part in (*parts, estimator.events.memory) for name in part]
-    assert len(names) == len(set(names))
-    assert set(estimator.state_dict()) >= set(names)
