@@ -101,8 +101,8 @@ def test_random_expression(text, point):
 FIXED = [
     'sin(z1*z2)', 'cos(z3 - u)', 'tan(z1/2)', 'exp(-z1**2)', 'log(z1 + z2)', 'sqrt(z1*z3)',
     'abs(z1 - z2)', 'tanh(3*z3)', 'sign(z1 - z2)*z3', 'z1**3', 'z1**-2.5', 'z1**z2', 'z1**(-u)',
-    '2**z1', '(z1*z2)**(z3 - u)', '(z1 - z2)**2', '(z1 - z2)**3', '(-z1)**3', 'z1/z2/z3',
-    'z1 - z2 - z3', 'z3*u', 'u**2', '1/(1 + exp(-z1))', 'z1**0', '1**z2',
+    '2**z1', '(z1*z2)**(z3 - u)', '(z1 - z2)**2', '(z1 - z2)**3', '(-z1)**3', '(-z1)**-2',
+    'z1/z2/z3', 'z1 - z2 - z3', 'z3*u', 'u**2', '1/(1 + exp(-z1))', 'z1**0', '1**z2',
     'atan2(z1, z2)', 'atan2(z2 - 2, z1 - u)', 'atan2(-z1, -z3)', 'min(z1*z2, z3)', 'max(z2, u)',
     'max(min(z1, 1.1), 0.3)*z2', 'sin(cos(tan(tanh(z1))))', 'z1**2**0.5', '-z1**2',
     '(z1**2 + z2**2)**1.5', 'z1*0', 'z2 - z2',
@@ -136,12 +136,6 @@ def test_fixed_expression(text, point):
 )
 def test_derivative_at_0_is_finite(text, slope):
     np.testing.assert_array_equal(TriangularModel([text]).jacobian(np.zeros(1)), [[slope]])
-
-
-def test_negative_base_with_an_integer_power():
-    model = TriangularModel(['z1**3 + z1**-2'])
-    np.testing.assert_allclose(model.evaluate(np.array([-2.0])), [-8.0 + 0.25])
-    np.testing.assert_allclose(model.jacobian(np.array([-2.0])), [[12.0 + 0.25]])
 
 
 def test_jacobian_is_lower_triangular():

@@ -7,6 +7,12 @@ import pytest
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
+STORE.register(get_types_from_msg('float32[3] three\nint8[<=4] few\nbool flag', 'rig/msg/Part'))
+STORE.register(
+    get_types_from_msg(
+        'std_msgs/Header header\nPart one\nPart[] parts\nuint16 count', 'rig/msg/Whole'
+    )
+)
 JOINTS = 'sensor_msgs/msg/JointState'
 
 
@@ -47,6 +53,36 @@ def joints(names, positions):
     header = STORE.types['std_msgs/msg/Header'](stamp=stamp, frame_id='a')
     lists = {'position': np.array(positions), 'velocity': np.zeros(0), 'effort': np.zeros(0)}
     return STORE.types[JOINTS](header=header, name=names, **lists)
+
+
+@pytest.mark.parametrize(
+    ('text', 'expected'),
+    [
+        ('count', 7.0), ('header.stamp.sec', 1.0), ('one.flag', 1.0), ('one.three[2]', 2.5),
+        ('one.few[1]', -3.0), ('parts[1].few[0]', 9.0), ('parts[0].flag', 0.0),
+        ('one.few[2]', None), ('parts[2].flag', None), ('parts[0].few[0]', None),
+    ],
+)  # fmt: skip
+def test_number_of_a_message_of_any_type(text, expected):
+    """Some lists may be too short."""
+
+    def part(few, flag):
+        three = np.array([0.5, 1.5, 2.5], dtype=np.float32)
+        return STORE.types['rig/msg/Part'](three=three, few=np.array(few, np.int8), flag=flag)
+
+    whole = STORE.types['rig/msg/Whole']
+    header = joints([], []).header
+    made = whole(
+        header=header, one=part([1, -3], True), parts=[part([], False), part([9], True)], count=7
+    )
+    message = STORE.deserialize_cdr(STORE.serialize_cdr(made, 'rig/msg/Whole'), 'rig/msg/Whole')
+    field = find_field(STORE.fielddefs, 'rig/msg/Whole', text)
+    assert field.header == 'header'
+    if expected is None:
+        with pytest.raises(MissingElementError, match='index below the number'):
+            field.value(message)
+    else:
+        assert field.value(message) == expected
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import math
 from fhaosmo_ros.core import Observer
 from fhaosmo_ros.core.observer.fuzzy import curves
 import numpy as np
-from observer_cases import levels_of, VARIANTS
+from observer_cases import VARIANTS
 import pytest
 from scipy.optimize import brentq
 
@@ -299,48 +299,3 @@ def test_run_follows_the_equations(scheme, variant, n, extra):
 def test_options_follow_the_equations(scheme, options):
     extra = options.get('unknown_input', True)
     compare(parameters(3, extra, scheme=scheme, variant='fuzzy_adaptive') | options)
-
-
-def test_explicit_step_acts_on_the_sample_at_the_beginning_of_the_interval():
-    p = {'order': 1, 'phi': ['0'], 'unknown_input': False, 'variant': 'sign'}
-    p |= {'scheme': 'explicit', 'lambda': 2.0, 'alpha': 3.0, 'start_from_measurement': False}
-    observer = Observer(p)
-    observer.start(0.25)
-    first = observer.step(-9.0, 0.1)  # eps = 0.25 at the beginning, whatever arrives at the end
-    np.testing.assert_allclose(first.z, [0.1 * 2.0 * 0.5])
-    np.testing.assert_allclose(first.unknown_input, 0.1 * 3.0)
-    np.testing.assert_allclose(first.innovation, [-9.0 - 0.1])
-
-
-def test_implicit_step_acts_on_the_sample_at_the_end_of_the_interval():
-    p = {'order': 1, 'phi': ['0'], 'unknown_input': False, 'variant': 'sign'}
-    p |= {'scheme': 'implicit', 'lambda': 2.0, 'alpha': 3.0, 'start_from_measurement': False}
-    observer = Observer(p)
-    observer.start(9.0)
-    # Sliding: |b| = 0.01 <= h^2 alpha = 0.03, so eps = 0 and s = 1/3.
-    first = observer.step(0.01, 0.1)
-    np.testing.assert_allclose(first.z, [0.01])
-    np.testing.assert_allclose(first.unknown_input, 0.1 * 3.0 / 3.0)
-    np.testing.assert_allclose(first.innovation, [0.0], atol=1e-18)
-
-
-def test_known_input_acts_during_the_interval_that_ends_at_its_sample():
-    p = {'order': 1, 'phi': ['u'], 'unknown_input': False, 'variant': 'fuzzy'}
-    for scheme in ('explicit', 'implicit'):
-        observer = Observer(p | {'scheme': scheme, 'lambda': 1e-6, 'alpha': 1e-6})
-        z = observer.run([0.0, 0.1, 0.2], [0.0, 0.0, 0.0], [9.0, 1.0, -3.0]).z[:, 0]
-        np.testing.assert_allclose(z, [0.0, 0.1, -0.2], atol=1e-6)
-
-
-def test_level_holds_while_a_level_before_it_is_off_by_more_than_epsilon():
-    p = {'order': 2, 'phi': ['0', '0'], 'epsilon': 0.1, 'start_from_measurement': False}
-    for scheme in ('explicit', 'implicit'):
-        observer = Observer(p | {'scheme': scheme, 'initial_estimate': [0.0, 0.5, 0.7]})
-        observer.start(10.0)
-        estimate = observer.step(10.0, 1e-3)
-        levels = levels_of(observer)
-        assert estimate.open_levels == 1
-        np.testing.assert_array_equal(levels[0, 1:], [0.5, 0.7])  # z_hat_2, z_hat_3
-        np.testing.assert_array_equal(levels[1, 1:], [0.0, 0.0])  # z_tilde_3, theta
-        assert levels[0, 0] > 0.0  # the first level runs
-        assert levels[1, 0] > 0.0

@@ -100,17 +100,6 @@ def test_gamma_moves_down_the_gradient_of_the_loss(model, scheme, gamma):
 
 
 @schemes
-def test_gamma_follows_the_leakage_when_the_loss_rests(scheme):
-    observer = make('paper', scheme, 0.5, gamma_leakage=2.0, gamma_dead_zone=1e3)
-    observer.start(0.0)
-    observer.configure({'gamma_initial': 0.9})
-    gamma = [observer.step(0.0, 0.01).gamma for _ in range(50)]
-    # Euler of gamma' = -leakage (gamma - gamma_initial)
-    expected = 0.9 - 0.4 * (1.0 - 0.01 * 2.0) ** np.arange(1, 51)
-    np.testing.assert_allclose(gamma, expected, rtol=1e-12)
-
-
-@schemes
 def test_change_of_variant_starts_the_sensitivities_at_zero(scheme):
     t, y, u = signals('paper')
     observer = make('paper', scheme, 0.5)

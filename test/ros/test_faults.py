@@ -70,18 +70,6 @@ def test_freeze_holds_gamma_and_lets_it_go(fed):
     assert fed.feed(0.5).gamma != before.gamma
 
 
-def test_reset_starts_afresh_with_the_next_sample(fed):
-    for k in range(20):
-        estimate = fed.feed(0.2 + 0.01 * k)
-    assert estimate.z[1] != 0.0
-    answer = fed.reset()
-    assert answer.success
-    assert answer.message
-    estimate = fed.feed(3.0)
-    assert estimate.z == [3.0, 0.0, 0.0]
-    assert estimate.unknown_input == 0.0
-
-
 def test_gap_stops_the_output_and_restarts_the_observer(fed):
     fed.parameters.set(max_gap=2.0, publish_on='timer')
     before = fed.count('restarts')

@@ -5,7 +5,6 @@ from bisect import bisect
 import re
 import time
 
-from fhaosmo_ros.core.simulation.disturbance import KINDS
 from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np
 import pytest
@@ -89,36 +88,6 @@ def test_truth_is_labelled_and_y_is_its_first_state(rig):
     assert rig.parameters.get(OF_STATE) == 7
     for sample, state in rig.ticks(rig.state, 50):
         assert state.message.data[0] == sample.message.data
-
-
-@pytest.mark.parametrize('kind', KINDS)
-def test_each_disturbance_live(rig, kind):
-    rig.parameters.set(disturbance=kind, disturbance_offset=0.5, disturbance_start=0.0)
-    low, high = 0.5 - AMPLITUDE, 0.5 + AMPLITUDE
-
-    def settled() -> bool:
-        value = rig.d[-1].message.data
-        return {'none': value == 0.0, 'step': value == high, 'square': value in (low, high)}.get(
-            kind, low < value < high
-        )
-
-    rig.fresh(5)  # those of the kind before may have been on their way
-    rig.user.wait(settled, f'{kind} on the wire')
-
-
-def test_noise_live(rig):
-    def roughness() -> float:
-        """Standard deviation of y about its own neighbours."""
-        _, y, _ = rig.fresh(250)
-        return float(np.std(np.diff(y, 2)) / np.sqrt(6.0))
-
-    for noise in (0.05, 0.0):
-        rig.parameters.set(disturbance='none', noise_std=noise)
-        rig.fresh(5)
-        # What a stall adds is gone with the next samples.
-        rig.user.wait(
-            lambda noise=noise: roughness() == pytest.approx(noise, rel=0.25, abs=1e-3), 'noise'
-        )
 
 
 def test_sample_rate_live_does_not_change_the_plant(rig):
