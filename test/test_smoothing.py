@@ -6,6 +6,7 @@ import math
 from fhaosmo_ros.core import Observer, OnlineEstimator, Plant
 from fhaosmo_ros.core.observer import smoother
 from fhaosmo_ros.core.observer.kalman import INPUT_DOUBT, STATES_DOUBT
+from fhaosmo_ros.core.observer.smoothing import BEGINS, MEASURED, Rows
 from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.metrics import rms
@@ -446,3 +447,31 @@ def test_any_data_gives_finite_estimates(gains, seed):
                 assert np.isfinite(row.z).all()
                 assert np.isfinite(row.unknown_input).all()
                 assert not np.isnan(row.standard_deviation).any()
+
+
+@pytest.mark.parametrize('lag', [None, 5 * MS])
+@pytest.mark.parametrize('bad', ['y', 'u', 'h', 'own'])
+def test_what_is_not_finite_leaves_the_observers_own_estimates(bad, lag):
+    """Where numbers overflow the observer's estimate stands; elsewhere it is smoothed."""
+    observer = Observer(Observer.from_yaml(CONFIG).parameters | {'phi': ['0', '0', 'u - z3']})
+    count, found = 400, []
+    for damage in (0.0, {'y': np.nan, 'u': 1e308, 'h': 1e300, 'own': 1e200}[bad]):
+        rows = {
+            'own': np.zeros((count, 1, observer.levels)),  # an observer that estimates 0
+            'y': NOISE * np.random.default_rng(1).standard_normal(count),
+            'h': np.full(count, 1e-3), 'u': np.zeros((count, 1)), 'times': MS * np.arange(count),
+            'kinds': np.full(count, MEASURED), 'models': np.empty((count, 0)),
+        }  # fmt: skip
+        rows['kinds'][0] = BEGINS
+        if damage:
+            rows[bad][200 : 205 if bad == 'u' else 201] = damage
+        smoothing = Rows(observer.configuration)
+        smoothing.append(**rows)
+        parts = [smoothing.smooth(count, lag), smoothing.smooth(count)]
+        found.append(np.concatenate(parts)[:, 0])
+    assert np.isfinite(found[1]).all()
+    assert len(found[1]) == count
+    others = np.arange(count) != 200
+    assert np.abs(found[1][others] - found[0][others])[:, 0].max() < 3.0 * NOISE
+    # Where nothing passes, y is smoothed on both sides: the estimates are not just the observer's.
+    assert np.abs(found[1][210:, 0]).min() > 0.0
