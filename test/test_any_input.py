@@ -133,18 +133,6 @@ def try_to_configure(estimator: OnlineEstimator, values: dict) -> bool:
     return True
 
 
-def test_a_thousand_parameter_sets():
-    rng = np.random.default_rng(1)
-    estimator = OnlineEstimator(SMALL)
-    accepted, now = 0, START
-    for k in range(1000):
-        accepted += try_to_configure(estimator, changes(rng, 0.15))
-        for y in (0.3, rng.normal(), 0.3 + 0.1 * np.sin(0.01 * k)):
-            now += 10**6
-            assert finite(estimator.update(now, y))
-    assert 100 < accepted < 900  # both happen
-
-
 @pytest.mark.parametrize('name', sorted(FIXED))
 def test_fixed_parameter_says_that_it_is_fixed(name):
     estimator = OnlineEstimator(SMALL)

@@ -49,20 +49,6 @@ def test_steps_equal_a_run(law):
         assert estimate.open_levels == expected.open_levels[k]
 
 
-@laws
-def test_snapshot_brings_an_observer_back(law):
-    t, y, u = samples()
-    observer, other = Observer(SMALL | law), Observer(SMALL | law)
-    observer.run(t[:100], y[:100], u[:100])
-    snapshot = observer.state
-    first = observer.run(t[100:], y[100:], u[100:])
-    observer.restore(snapshot)
-    other.restore(snapshot)
-    for again in (observer, other):
-        for got, wanted in zip(again.run(t[100:], y[100:], u[100:]), first, strict=True):
-            np.testing.assert_array_equal(got, wanted)
-
-
 def test_snapshot_is_a_copy():
     observer = Observer(SMALL)
     observer.run(*samples())
