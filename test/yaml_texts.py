@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Texts that YAML libraries fail on, or work on for long; and random ones."""
-
-import random
+"""Texts that YAML libraries fail on, or work on for long; and any text."""
 
 from hypothesis import strategies as st
 
@@ -32,14 +30,3 @@ HOSTILE = {
     'byte order mark': '[\ufeff', 'control character': '[\x07', 'at sign': '@',
 }  # fmt: skip
 """Texts by what is odd about them."""
-
-
-def random_texts(count: int, seed: int = 1) -> list[str]:
-    """Return texts of YAML's special characters; none of them is a number, or a list of them."""
-    source = random.Random(seed)
-    alphabet = '[]{}?:,-&*!ab \n"\'|>#%@`\u00e9'
-    starts = ['a', '[a', '{a', '!!int a', '&a ', '- a', '"a']
-    return [
-        source.choice(starts) + ''.join(source.choices(alphabet, k=source.randrange(40)))
-        for _ in range(count)
-    ]
