@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Known inputs paired with y by header stamps: whatever arrives first, the result is one."""
 
-import bag_files as files
-from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import known_inputs
 from fhaosmo_ros.pairing import MOST, StampPairing
-from fhaosmo_ros.tools.replay import command as replay
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -14,7 +11,6 @@ import pytest
 
 MS = 1_000_000
 GAP = 500 * MS
-JOINT_STATE = 'sensor_msgs/msg/JointState'
 
 
 def fed(pairing, events):
@@ -91,47 +87,6 @@ def test_clock_that_jumps_back_and_silence_leave_nothing_behind():
     for k in range(3 * MOST):  # y alone: memory stays bounded, samples go on
         pairing.take_sample((20_000 + k) * MS // 1000, k)
     assert len(list(pairing.released())) > 2 * MOST - 10
-
-
-def test_replay_of_inputs_that_came_late_is_that_of_inputs_in_time(tmp_path):
-    """Zero-order hold at the stamps of y, whatever the bag's order; equal to the last bit."""
-    stamps, y = files.signal(1500)
-    at = stamps[5::3] - 300_000
-    values = np.sin(at % 10**12 * 1e-9 * 4.0)
-
-    def joints(topic, arrival, stamp, **fields):
-        empty = dict.fromkeys(('position', 'velocity', 'effort'), np.zeros(0))
-        data = files.cdr(JOINT_STATE, header=files.header(stamp), name=['a'], **(empty | fields))
-        return topic, JOINT_STATE, arrival, data
-
-    tables = []
-    rng = np.random.default_rng(3)
-    for k, lateness in enumerate((np.zeros(len(at), int), rng.integers(0, 4 * MS, len(at)))):
-        messages = [
-            joints('/q', s + 100, s, position=np.array([v]))
-            for s, v in zip(stamps.tolist(), y.tolist(), strict=True)
-        ]
-        arrivals = np.maximum.accumulate(at + lateness)
-        messages += [
-            joints('/tau', arrival, s, effort=np.array([v]))
-            for arrival, s, v in zip(arrivals.tolist(), at.tolist(), values.tolist(), strict=True)
-        ]
-        bag = files.write(tmp_path / f'bag{k}', sorted(messages, key=lambda m: m[2]))
-        rules = (
-            'input_topic:=/q', 'input_field:=position[a]', "phi:=['0', '0', 'u - z3']",
-            'known_input_topics:=[/tau]',
-            'known_input_fields:=["effort[a]"]', 'known_input_stamps:=header',
-            'known_input_wait:=0.008',
-        )  # fmt: skip
-        options = [part for rule in rules for part in ('-p', rule)]
-        out = tmp_path / f'{k}.npz'
-        assert replay.main([str(bag), *options, '-o', str(out)]) == 0
-        with np.load(out) as found:
-            tables.append(np.column_stack([found['stamp_ns'], found['unknown_input']]))
-    u = newest(at, values, stamps)
-    expected = OnlineEstimator({'phi': ['0', '0', 'u - z3']}).run(stamps, y, u)
-    for got in tables:
-        np.testing.assert_array_equal(got[:, 1], expected.unknown_input)
 
 
 def test_pairing_needs_headers_on_both_sides():
