@@ -87,7 +87,7 @@ def compare(text, point):
     return True
 
 
-@settings(max_examples=200)
+@settings(max_examples=120)
 @given(expressions(), points)
 def test_random_expression(text, point):
     try:

@@ -47,13 +47,14 @@ def matern(size, rate, count, rng):
 
 @pytest.fixture(scope='module')
 def case():
-    """Return times, z, d of the paper's plant for 30 s, and unit noise."""
+    """Return times, z, d of the paper's plant for 20 s, and unit noise."""
     rng = np.random.default_rng(4)
     count = 30_000
     d = matern(0.07, 1.5, count, rng)
     rates = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     z = states_of(rates, d, [0.2, 0.2, 0.2])
-    return np.arange(count) * PERIOD, z, d, rng.standard_normal(count)
+    noise = rng.standard_normal(count)
+    return tuple(values[:20_000] for values in (np.arange(count) * PERIOD, z, d, noise))
 
 
 @pytest.mark.parametrize(
