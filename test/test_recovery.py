@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whoever ships gains ships an estimator that starts at once and forgets an upset at once."""
 
+from functools import cache
 import math
 from pathlib import Path
 
@@ -57,9 +58,12 @@ class Case:
         return np.abs(found.unknown_input - d)
 
 
+case_of = cache(Case)
+
+
 @pytest.fixture(scope='module', params=FILES, ids=[path.stem for path in FILES])
 def case(request):
-    return Case(request.param)
+    return case_of(request.param)
 
 
 @pytest.mark.parametrize('bare', [False, True], ids=['node', 'bare'])
@@ -116,7 +120,7 @@ def pendulum(t, y):
 
 
 def test_offset_that_the_model_contradicts_is_taken_off_and_forgotten():
-    case = Case(CONFIG / 'models' / 'pendulum.yaml')
+    case = case_of(CONFIG / 'models' / 'pendulum.yaml')
     y = case.y.copy()
     y[HIT:] += 1.0
     end = HIT + 5 * RATE
@@ -128,7 +132,7 @@ def test_offset_that_the_model_contradicts_is_taken_off_and_forgotten():
 
 
 def test_jumps_are_counted_and_a_snapshot_goes_on_from_them():
-    case = Case(CONFIG / 'models' / 'pendulum.yaml')
+    case = case_of(CONFIG / 'models' / 'pendulum.yaml')
     y, stamps = case.y.copy(), 10**9 + np.round(case.t * 1e9).astype(np.int64)
     y[HIT:BACK] += 1.0
     whole, middle = OnlineEstimator(case.parameters), HIT + RATE // 4
@@ -144,7 +148,7 @@ def test_jumps_are_counted_and_a_snapshot_goes_on_from_them():
 
 def test_sensor_that_is_put_right_is_believed():
     """As a zero that is found after the start: the wrong one had needed a large d."""
-    case = Case(CONFIG / 'models' / 'pendulum.yaml')
+    case = case_of(CONFIG / 'models' / 'pendulum.yaml')
     y = case.y.copy()
     y[:HIT] += 1.0
     found, observer = pendulum(case.t, y)

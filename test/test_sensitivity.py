@@ -109,16 +109,3 @@ def test_change_of_variant_starts_the_sensitivities_at_zero(scheme):
     observer.run(t[100:200], y[100:200], u[100:200])
     observer.configure({'variant': 'fuzzy_adaptive'})
     np.testing.assert_array_equal(levels_of(observer)[P:], 0.0)
-
-
-@schemes
-def test_without_learning_nothing_is_carried_along_and_the_estimates_are_the_same(scheme):
-    t, y, u = signals('nonlinear')
-    learning, resting = (make('nonlinear', scheme, 0.6, gamma_rate=rate) for rate in (HOLD, 0.0))
-    one, other = (observer.run(t, y, u) for observer in (learning, resting))
-    np.testing.assert_array_equal(one.z_hat, other.z_hat)
-    np.testing.assert_array_equal(one.z_tilde, other.z_tilde)
-    assert np.any(levels_of(learning)[P:] != 0.0)
-    np.testing.assert_array_equal(levels_of(resting)[P:], 0.0)
-    learning.configure({'gamma_rate': 0.0})
-    np.testing.assert_array_equal(levels_of(learning)[P:], 0.0)
