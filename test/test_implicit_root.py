@@ -42,7 +42,7 @@ gammas = st.sampled_from([0.5, 0.01, 0.1, 0.3, 0.67, 0.8, 1.0])
 shapes = st.sampled_from(['triangle', 'gaussian'])
 
 
-@settings(max_examples=1000)
+@settings(max_examples=500)
 @given(sizes, periods, gammas, gains, gains, widths, shapes, st.integers(0, 1))
 @example(1e-12, 1.0, 0.01, 1e6, 1e-6, 1e-12, 'triangle', 0)
 @example(1e6, 1e-6, 1.0, 1e6, 1e6, 1e-12, 'triangle', 0)
