@@ -49,7 +49,7 @@ def checked(values: Mapping[str, Any], like: Mapping[str, Any]) -> dict[str, Any
         least, most = YES_OR_NO if isinstance(value, bool) else RANGES.get(name, INTEGERS)
         number: Any = values.get(name)
         if not isinstance(number, Integral) or not least <= int(number) <= most:
-            raise _refused(name, f'an integer of {least:g} to {most:g}', number)
+            raise _refused(name, f'an integer of {least:g} to {most:g}', shown(number))
         found[name] = int(number)
     return found
 
@@ -64,18 +64,20 @@ def array_of(
     """Return an array of that shape whose numbers are within that range; raise as `checked`."""
     nothing = np.zeros(shape) if 0 in shape else 'nothing'  # an empty array has no entries
     number = values.get(name, nothing)
+    what = f'finite numbers of shape {shape}' if shape else 'a number'
     try:
         array = np.asarray(number, dtype=np.float64)
     except (OverflowError, TypeError, ValueError):
-        array = np.full(1, np.nan)
+        raise _refused(name, what, shown(number)) from None
+    if array.shape != shape:
+        raise _refused(name, what, f'shape {array.shape}')
     within = (least <= array) & (array <= most)
     if name == 'y':  # not known before the first sample
         within |= np.isnan(array)
-    if array.shape != shape or not within.all():
-        what = f'finite numbers of shape {shape},' if shape else 'a number of'
-        raise _refused(name, f'{what} {least:g} to {most:g}', number)
+    if not within.all():
+        raise _refused(name, f'{what} of {least:g} to {most:g}', shown(array))
     return array
 
 
-def _refused(name: str, expected: str, got: Any) -> ConfigurationError:
-    return ConfigurationError(f"snapshot: '{name}': expected {expected}, got {shown(got)}")
+def _refused(name: str, expected: str, got: str) -> ConfigurationError:
+    return ConfigurationError(f"snapshot: '{name}': expected {expected}, got {got}")
