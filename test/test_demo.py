@@ -12,9 +12,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
-from fhaosmo_ros.tools.bags.topics import series
-from fhaosmo_ros.tools.demo.report import OTHERS
-from fhaosmo_ros.tools.plot.curves import read_curves
+from fhaosmo_ros.tools.demo.report import OTHERS, read_run, true_noise
 from fhaosmo_ros.topics import ESTIMATES, PARAMETERS, SNAPSHOT
 from rosbags.highlevel import AnyReader
 from waiting import wait_until
@@ -70,25 +68,29 @@ def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(parameters):
     assert {'/y', '/plant/state', '/plant/unknown_input', *found} <= set(topics)
     assert all(c.digest.startswith('RIHS01_') for c in topics.values())
     assert topics['/y'].msgcount > 1000
-    (live,) = read_curves(folder / 'bag', None, '/plant')
-    late = (live.stamps > live.stamps[0] + 3e9) & np.isfinite(live.truth).all(axis=1)
+    run_ = read_run(folder / 'bag')
+    late = run_.t > 3.0
     assert late.any()
-    error = np.median(np.abs(live.estimate[late] - live.truth[late]), axis=0)
+    error = np.median(np.abs(run_.estimate[late] - run_.truth[late]), axis=0)
     # Not d: other tests load the machine meanwhile, and its stamps jitter in bursts then.
-    assert (error[:2] < 0.05 * np.abs(live.truth[late][:, :2]).max(axis=0)).all()
+    assert (error[:2] < 0.05 * np.abs(run_.truth[late][:, :2]).max(axis=0)).all()
     assert np.isfinite(error).all()
 
 
 def test_shipped_demonstration_changes_the_plant(tmp_path):
-    """The second engine: what it has found is in the bag."""
+    """The second engine: what it has found is in the bag and in words."""
     folder = tmp_path / 'out'
     result = run('--duration', 6, '--output', folder, '--self-tuning')
     assert result.returncode == 0, result.stderr
     assert 'now with noise of 1e-4 on y' in result.stdout
-    (live,) = read_curves(folder / 'bag', None, '/plant')
-    assert live.gamma is None  # there is no power
-    noise = series(folder / 'bag', '/estimator/tuning').values[-1, 0]
-    assert noise > 0.4e-4  # jitter of a busy machine adds to it
+    assert 'd lay within two standard deviations' in result.stdout
+    run_ = read_run(folder / 'bag')
+    assert 'gamma' not in run_.of_gains  # there is no power
+    end = run_.t > run_.t[-1] - 0.5
+    true = np.median(true_noise(run_)[end])
+    assert true > 0.8e-4
+    found = np.median(run_.of_gains['tuning'][end, 0])
+    assert found > 0.5 * true  # jitter of a busy machine adds to it
 
 
 def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(parameters):

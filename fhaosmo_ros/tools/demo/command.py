@@ -83,9 +83,9 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         marks = _record(folder, parameters, arguments.duration, noisy, stop)
         if stop.is_set():
             print('stopped early: reporting what has been recorded')
-        (live,) = read_curves(folder / 'bag', ['/estimator'], '/plant')
-        run = read_run(folder / 'bag', live)
+        run = read_run(folder / 'bag')
         compared = others(run, estimator)
+        (live,) = read_curves(folder / 'bag', ['/estimator'], '/plant')
         changed = [(stamp, int(live.stamps[-1])) for stamp, _ in marks]
         drawn = live._replace(label='estimated live', events=changed)
         save_curves([drawn], folder / 'demo.png')

@@ -9,22 +9,25 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
-from fhaosmo_ros.tools.bags.topics import messages, Series, series
-from fhaosmo_ros.tools.plot.curves import Curves
+from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.bags.topics import messages, read_ticks, Series, series, truth_at
+from fhaosmo_ros.topics import ESTIMATES, OF_GAINS, STANDARD_DEVIATION
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 START = 2.0
 """Seconds of the start that the table leaves out."""
-HELD = 'fuzzy, the power held'
+RECENT = 50
+"""Estimates over which the true noise is averaged."""
+SELF_TUNING, HELD = 'self-tuning', 'fuzzy, the power held'
 OTHERS: dict[str, dict[str, Any]] = {
     'sign, gains of the paper': {
         'variant': 'sign', 'scheme': 'explicit', 'lambda': [15.0], 'alpha': [30.0],
         'epsilon': 0.025, 'noise_size': 0.0,
     },
     HELD: {'gamma_rate': 0.0, 'gamma_leakage': 0.0},
-    'self-tuning': {'gains': 'self_tuning'},
+    SELF_TUNING: {'gains': 'self_tuning'},
 }  # fmt: skip
 """Observers that go through the same y: how their parameters differ from those of the file."""
 WORDS = """
@@ -42,14 +45,15 @@ class Run(NamedTuple):
     names: list[str]  # z1 .. zn and d
     truth: Floats  # (K, n + 1) states, and d as the last column
     estimate: Floats  # (K, n + 1) likewise
+    of_gains: dict[str, Floats]  # gamma; or standard_deviation and tuning
     y: Series  # all samples
     rows: NDArray[np.int64]  # (K,) the sample behind each estimate
     counters: dict[str, str]  # of the estimator's last diagnostics
 
 
-def read_run(bag: Path, live: Curves) -> Run:
+def read_run(bag: Path) -> Run:
     """
-    Read what the bag of a demonstration has beside the estimates of the live estimator.
+    Read the bag of a demonstration.
 
     Each estimate is compared with the truth of the sample behind it (``~/stamp``), not with that
     of the moment at which it was published.
@@ -60,22 +64,31 @@ def read_run(bag: Path, live: Curves) -> Run:
         The bag holds no estimate with its truth.
 
     """
-    known = np.zeros(0, bool) if live.truth is None else np.isfinite(live.truth).all(axis=1)
-    if live.truth is None or not known.any():
+    y = series(bag, '/y')
+    with BagReader(bag) as reader:
+        found = [
+            topic for topics in OF_GAINS.values() for topic in topics
+            if reader.count(f'/estimator/{topic}')
+        ]  # fmt: skip
+    ticks = read_ticks(bag, '/estimator', [*found, *ESTIMATES])
+    when = ticks['stamp'].astype(np.int64)
+    truth = truth_at(bag, '/plant', when) if len(when) else None
+    known = None if truth is None else np.isfinite(truth.values).all(axis=1)
+    if known is None or not known.any():
         raise ConfigurationError('the run ended before an estimate arrived beside its truth')
-    y, when = series(bag, '/y'), live.stamps[known]
     counters: dict[str, str] = {}
     for _, message in messages(bag, '/diagnostics'):
         for status in message.status:
             if 'estimator' in status.name:
                 counters |= {pair.key: pair.value for pair in status.values}
     return Run(
-        (when - when[0]) * 1e-9,
-        live.names,
-        live.truth[known],
-        live.estimate[known],
+        (when[known] - when[known][0]) * 1e-9,
+        [*truth.labels, 'd'],
+        truth.values[known],
+        np.column_stack([ticks['state'], ticks['unknown_input']])[known],
+        {topic: ticks[topic][known] for topic in found},
         y,
-        np.searchsorted(y.stamps, when).clip(max=len(y.stamps) - 1),
+        np.searchsorted(y.stamps, when[known]).clip(max=len(y.stamps) - 1),
         counters,
     )
 
@@ -129,6 +142,8 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
         for k, name in enumerate(run.names[:-1])
     ]
     lines += ['', f'RMS errors of the states from {parts[0][0]:.0f} s on: {", ".join(errors)}']
+    if STANDARD_DEVIATION in run.of_gains:
+        lines.append(_found(run))
     span = (run.y.stamps[-1] - run.y.stamps[0]) * 1e-9
     counts = [run.counters.get(f'samples {n}', '?') for n in ('accepted', 'lost', 'rejected')]
     lines.append(
@@ -136,3 +151,26 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
         f'{(len(run.y.stamps) - 1) / span if span > 0.0 else float("nan"):.1f} a second'
     )
     return '\n'.join(lines)
+
+
+def _found(run: Run) -> str:
+    """Return what a self-tuning estimator has found, in words."""
+    deviation = run.of_gains[STANDARD_DEVIATION][:, -1]
+    known = np.isfinite(deviation) & (run.t > START)
+    if not known.any():
+        return 'the run was too short for the estimator to find the noise'
+    error = np.abs(run.estimate[:, -1] - run.truth[:, -1])[known]
+    noise, _, bandwidth, *_ = run.of_gains['tuning'][-1]
+    return (
+        'd lay within two standard deviations of its estimate for '
+        f'{np.mean(error <= 2.0 * deviation[known]):.0%} of the time\n'
+        f'noise on y at the end: found {noise:.2g}, true {true_noise(run)[-1]:.2g}; '
+        f'd is followed within {1.0 / bandwidth:.2g} s'
+    )
+
+
+def true_noise(run: Run) -> Floats:
+    """Return the standard deviation of the latest y minus z1 behind each estimate."""
+    wrong = run.y.values.ravel()[run.rows] - run.truth[:, 0]
+    mean = np.convolve(wrong**2, np.full(RECENT, 1.0 / RECENT))[: len(wrong)]
+    return np.asarray(np.sqrt(mean / np.minimum(1.0, np.arange(1, len(wrong) + 1) / RECENT)))
