@@ -15,9 +15,8 @@ from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command, shipped
 from fhaosmo_ros.tools.cli.processes import Children
+from fhaosmo_ros.tools.demo.figure import save_figure
 from fhaosmo_ros.tools.demo.report import others, read_run, table
-from fhaosmo_ros.tools.plot.curves import read_curves
-from fhaosmo_ros.tools.plot.figures import save_curves
 from fhaosmo_ros.tools.record import store, topics_of
 from fhaosmo_ros.topics import TRUTH
 
@@ -85,10 +84,7 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
             print('stopped early: reporting what has been recorded')
         run = read_run(folder / 'bag')
         compared = others(run, estimator)
-        (live,) = read_curves(folder / 'bag', ['/estimator'], '/plant')
-        changed = [(stamp, int(live.stamps[-1])) for stamp, _ in marks]
-        drawn = live._replace(label='estimated live', events=changed)
-        save_curves([drawn], folder / 'demo.png')
+        save_figure(run, compared, marks, folder / 'demo.png')
         text = table(run, compared, marks)
         (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
         print(f'\n{text}\n')
