@@ -17,8 +17,9 @@ from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
 from fhaosmo_ros.core.observer.kalman cimport (
     LinearModel, Row, add_drive, carry, correct, multiply, sub_steps
 )
+from fhaosmo_ros.core.observer.levant cimport HUBER, follow_spread
 from fhaosmo_ros.core.observer.self_tuning.members cimport by_binomials, ORDERS
-from fhaosmo_ros.core.observer.structure cimport HUBER, MOST_INPUTS, Memory, follow_spread
+from fhaosmo_ros.core.observer.structure cimport MOST_INPUTS, Memory
 
 from fhaosmo_ros.core.observer.kalman import STATES_DOUBT, Uncertainty
 from fhaosmo_ros.core.parameters.errors import ConfigurationError

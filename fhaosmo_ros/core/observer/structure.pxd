@@ -18,8 +18,6 @@ cdef enum:
 # are too unlikely to be used (D 21).
 cdef int LOST_SAMPLES
 cdef double GATE
-# Innovations of more standard deviations count as so many, at most (D 32).
-cdef double HUBER
 
 
 cdef struct Level:
@@ -97,7 +95,6 @@ cdef class Structure:
 
 
 cdef bint has_drifted(Memory* memory, double off) noexcept nogil
-cdef double follow_spread(Memory* memory, double b, double expected) noexcept nogil
 
 
 cdef class Estimate:

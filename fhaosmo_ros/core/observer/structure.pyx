@@ -22,10 +22,6 @@ import numpy as np
 
 LOST_SAMPLES = 20
 GATE = 6.0
-HUBER = 2.0
-# Median of |x| where x is normal with variance 1, and by what part the spread follows a sample.
-cdef double MEDIAN = 0.6745
-cdef double SPREAD_RATE = 0.005
 # Intervals that the running mean remembers.
 cdef double MEAN_OF = 32.0
 # Values above the largest double over this are rejected, so that differences cannot overflow.
@@ -52,32 +48,6 @@ cdef bint has_drifted(Memory* memory, double off) noexcept nogil:
     memory.watched = max(memory.watched - 1.0, 0.0)
     memory.drift += off - memory.drift / REMEMBERED
     return fabs(memory.drift) > MOST_DRIFT
-
-
-cdef double follow_spread(Memory* memory, double b, double expected) noexcept nogil:
-    """
-    Return the size that innovations have: the expected one times the spread, which follows (D 21).
-
-    The spread goes up by a small part of it where |b| is above its median if it were normal, and
-    down by as much where |b| is below. So its size does not matter, and outliers hardly do. A
-    sample that is too far off is counted in `Memory.beyond`.
-    """
-    cdef double usual
-    if fabs(b) > MEDIAN * memory.spread * expected:
-        memory.spread *= 1.0 + SPREAD_RATE
-    else:
-        memory.spread = max(memory.spread / (1.0 + SPREAD_RATE), 1.0)
-    usual = memory.spread * expected
-    if fabs(b) > GATE * usual:
-        memory.beyond += 1.0
-        memory.miss = b
-        if memory.beyond == 1.0:
-            memory.first_miss = b
-        return usual
-    memory.beyond = 0.0
-    if has_drifted(memory, b / usual):
-        memory.beyond = INFINITY
-    return usual
 
 
 cdef class Structure:
