@@ -40,12 +40,8 @@ cdef double EVENLY = log(0.917), KNOWN = log(0.88)
 # In models of more states a repeated sample narrows no member: many of them in a row would narrow
 # one whose z_1 is wrong, and one with a d that is thousands of times too large would be likelier.
 cdef int FEW_STATES = 3
-# If both edges are so many standard deviations off, z_1 is within them more likely than both.
-cdef double WELL_WITHIN = 1.75
 # In an interval of twice so few standard deviations the density is taken to be constant.
 cdef double HALF_NARROW = 0.015
-# An interval that is so many standard deviations off counts as its nearer end.
-cdef double FAR_TAIL = 5.5
 # Log-likelihood of members with coloured noise, which errors of rounding are not.
 cdef double UNUSED = -1e6
 
@@ -62,8 +58,7 @@ cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) n
     cdef Work* w = &m.work
     cdef double inverse, off, width, near, far, to_near, left, right, beyond, share, by_near
     cdef double center, less, square
-    cdef double well_within = WELL_WITHIN if repeated else FAR_TAIL
-    cdef double known = KNOWN if repeated else INFINITY
+    cdef double known = KNOWN if repeated else INFINITY, tail = GATE
     cdef double narrowing = 0.0 if repeated and m.n > FEW_STATES else 1.0
     cdef Py_ssize_t g, active = m.shared.active
     for g in range(active):
@@ -80,22 +75,23 @@ cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) n
         inverse, by_near = 1.0 / share, 1.0 / near
         center = (left - right) * inverse
         less = center * center - (near * left - far * right) * inverse
-        # In a narrow interval the density is constant; one far off is its nearer end.
-        share = share if near > -well_within else ROOT
-        share = share if near < FAR_TAIL else ROOT
+        # In a narrow interval the density is constant; one beyond the gate is its nearer end, and
+        # one that has both its edges beyond it is certain.
+        share = share if near > -tail else ROOT
+        share = share if near < tail else ROOT
         share = share if width > HALF_NARROW else 2.0 * width
         w.chance[g] = share / ROOT
-        square = near * near if near > FAR_TAIL else 0.0
+        square = near * near if near > tail else 0.0
         w.one[g] = square if width > HALF_NARROW else off * off
-        center = center if near < FAR_TAIL else near + by_near
+        center = center if near < tail else near + by_near
         center = center if width > HALF_NARROW else off
         center = copysign(center, w.b[g])
-        w.mean[g] = center if near > -well_within else 0.0
-        less = less if near < FAR_TAIL else 1.0 - by_near * by_near
+        w.mean[g] = center if near > -tail else 0.0
+        less = less if near < tail else 1.0 - by_near * by_near
         less = less if width > HALF_NARROW else 1.0 - width * width / 3.0
         less = less if less > 0.0 else 0.0
         less = less if less < 1.0 else 1.0
-        w.lost[g] = less if near > -well_within else 0.0
+        w.lost[g] = less if near > -tail else 0.0
     for g in range(active):
         share = (log(w.chance[g]) if w.chance[g] != 1.0 else 0.0) - 0.5 * w.one[g]
         w.chance[g] = share if share > LEAST_CHANCE else LEAST_CHANCE
