@@ -13,11 +13,10 @@ from fhaosmo_ros.core.observer.structure cimport GATE
 
 # No log-likelihood falls further below the best one (D 28, D 31), but by what the member's prior
 # is below that of the likeliest: a larger d needs more reason to be believed.
+# One that is FLOOR below has no weight.
 cdef double FLOOR = 30.0, QUANTISED_FLOOR = 100.0
 # A member is clearly likelier than another one if its log-likelihood is so much larger.
 cdef double CLEARLY = 2.0
-# Members whose log-likelihood is so far below the best one have no weight.
-cdef double NEGLIGIBLE = 25.0
 
 
 cdef VECTORISED judge(Members* m, double grown, double kept, bint calm) noexcept nogil:
@@ -66,7 +65,7 @@ cdef VECTORISED weigh(Members* m, double floor) noexcept nogil:
         m.score[g] = score if score > least else least
         m.weight[g] = 0.0
     for g in range(active):
-        if m.score[g] > -NEGLIGIBLE:  # few of them
+        if m.score[g] > -FLOOR:  # few of them
             m.weight[g] = exp(m.score[g])
             total += m.weight[g]
     for g in range(active):
