@@ -4,7 +4,7 @@
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 
-cdef double CALM_SAMPLES, EXACT, LATTICE_SHARE, ROUGH, STEADY
+cdef double CALM_SAMPLES, EXACT, LATTICE_SHARE, ROUGH, ROUNDED, STEADY
 
 cdef bint is_multiple(double step, double quantum, double y) noexcept nogil
 cdef void follow_quantum(Members* m) noexcept nogil
@@ -13,6 +13,5 @@ cdef void follow_differences(Members* m, double y) noexcept nogil
 cdef void follow_stamps(Members* m, double h, bint unlikely_before) noexcept nogil
 cdef VECTORISED fill_noise(Members* m) noexcept nogil
 cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil
-cdef bint is_likely(Members* m, double gate) noexcept nogil
-cdef bint is_explained(Members* m) noexcept nogil
+cdef bint is_likely(Members* m, double gate, bint to_any) noexcept nogil
 cdef VECTORISED follow_noise(Members* m) noexcept nogil

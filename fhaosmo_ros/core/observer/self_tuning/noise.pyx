@@ -18,15 +18,18 @@ cdef double SHORT_SHARE = 0.05  # of the last sample in short means
 # If squared innovations over S are larger of late for every member that can judge, and squared
 # differences of y are too, the noise has grown. It is averaged over QUICK_SAMPLES then. Until
 # CALM_SAMPLES later a sample judges the members only if one of them explains it.
-cdef double STEADY = 1.5, CALM_SAMPLES = 40.0, QUICK_SAMPLES = 30.0
-# The share of steps of y that are multiples of the quantum is averaged over so many. With a share
-# above the second y is quantised; with one below the third the quantum is none.
-cdef double LATTICE_STEPS = 30.0, LATTICE_SHARE = 0.9, NO_LATTICE = 0.5
+cdef double STEADY = 1.5, CALM_SAMPLES = 40.0
+# Averages that have to follow soon are over so many samples, or steps of y.
+cdef double QUICK_SAMPLES = 30.0
+# With a larger share of multiples of the quantum among the steps of y it is quantised; with a
+# smaller one than the second the quantum is none.
+cdef double LATTICE_SHARE = 0.9, NO_LATTICE = 0.5
 cdef double HIDDEN = 4.0  # noise of so many times the variance of rounding hides the quanta
 cdef double ROUGH_SAMPLES = 100.0  # squared differences of y are averaged over so many
 # y and its stamps are taken to be no more exact than this: in parts of what y moves between
 # samples (RMS), and of the period.
 cdef double EXACT = 1e-5
+cdef double ROUNDED = 1e-12  # what is less than this part of a number may be an error of 64 bits
 cdef double ROUGH = 2.0  # the variance of the noise is at most so many times what they say
 
 
@@ -47,19 +50,19 @@ cdef void follow_quantum(Members* m) noexcept nogil:
     cdef Shared* shared = &m.shared
     cdef double y = m.work.sample.y, step = fabs(y - m.work.sample.before), change
     cdef bint fits
-    if step <= 1e-12 * fabs(y):
+    if step <= ROUNDED * fabs(y):
         return
     change = fabs(m.difference[2])  # from the step before, which may be 0
-    shared.goes_back += ((1.0 if change > 1.5 * step else 0.0) - shared.goes_back) / LATTICE_STEPS
+    shared.goes_back += ((1.0 if change > 1.5 * step else 0.0) - shared.goes_back) / QUICK_SAMPLES
     fits = is_multiple(step, shared.quantum, y)
     if not fits:
         fits = is_multiple(shared.quantum, step, y)
         if fits or shared.lattice < NO_LATTICE:
             shared.quantum = step
     if not fits:
-        shared.lattice -= shared.lattice / LATTICE_STEPS
+        shared.lattice -= shared.lattice / QUICK_SAMPLES
     elif change > 0.5 * shared.quantum:
-        shared.lattice += (1.0 - shared.lattice) / LATTICE_STEPS
+        shared.lattice += (1.0 - shared.lattice) / QUICK_SAMPLES
 
 
 cdef double rounding(Members* m) noexcept nogil:
@@ -80,7 +83,7 @@ cdef void follow_differences(Members* m, double y) noexcept nogil:
     noise if noise is why y is off its prediction, and far less if d has moved it there.
     """
     cdef Sample* sample = &m.work.sample
-    cdef double value = y, binomial = 1.0, least = 1e-12 * m.shared.first_noise
+    cdef double value = y, binomial = 1.0, least = ROUNDED * m.shared.first_noise
     cdef double bound = INFINITY, before, value_before, white, r, grown
     cdef int p, c
     sample.roughness, sample.roughness_before = 0.0, m.shared.roughness
@@ -154,9 +157,9 @@ cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil:
     w.sample.largest = fmax(IGNORANT * least, own)
 
 
-cdef bint is_likely(Members* m, double gate) noexcept nogil:
+cdef bint is_likely(Members* m, double gate, bint to_any) noexcept nogil:
     """
-    Return True if a member that can judge the sample finds it likely (D 29).
+    Return True if a member that can judge the sample finds it likely (D 29), or any at all.
 
     A member that is unlikely itself would meet y by chance.
     """
@@ -165,18 +168,9 @@ cdef bint is_likely(Members* m, double gate) noexcept nogil:
     cdef int g
     for g in range(m.shared.active):
         variance = w.believed[g] * w.noise[g]
-        if (w.b[g] * w.b[g] <= gate * gate * variance and variance <= w.sample.largest
-                and m.score[g] > -CLOSE):
-            return True
-    return False
-
-
-cdef bint is_explained(Members* m) noexcept nogil:
-    """Return True if any member finds a sample usual, however unlikely the member itself is."""
-    cdef Work* w = &m.work
-    cdef int g
-    for g in range(m.shared.active):
-        if w.b[g] * w.b[g] <= HUBER * HUBER * w.believed[g] * w.noise[g]:
+        if w.b[g] * w.b[g] <= gate * gate * variance and (
+            to_any or (variance <= w.sample.largest and m.score[g] > -CLOSE)
+        ):
             return True
     return False
 

@@ -18,8 +18,8 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    CALM_SAMPLES, EXACT, STEADY, fill_noise, find_knowing, follow_differences, follow_noise,
-    follow_quantum, follow_stamps, is_explained, is_likely, rounding
+    CALM_SAMPLES, EXACT, ROUNDED, STEADY, fill_noise, find_knowing, follow_differences,
+    follow_noise, follow_quantum, follow_stamps, is_likely, rounding
 )
 from fhaosmo_ros.core.observer.self_tuning.start cimport gather
 from fhaosmo_ros.core.observer.self_tuning.weights cimport (
@@ -39,12 +39,13 @@ cdef double MEMORY = 8000.0
 cdef double NOISE_SAMPLES = 1000.0  # the noise is averaged over so many
 # What is beyond 3 sigma in so many samples after a jump of d is due to it, too.
 cdef double JUMP_SAMPLES = 10.0
-# If unlikely samples are on the other side than the last one in a larger share of so many samples,
+# If unlikely samples are on the other side than the last one in a larger share of CALM_SAMPLES,
 # and y itself moves as ever, members are judged by them too: those that were likely are wrong. A
 # sample whose difference is large counts as ROUGH_TURN of these: noise may have grown.
-cdef double TURNS_SAMPLES = 40.0, OFTEN = 0.07, ROUGH_TURN = -0.5
-# Factors on the variance of the noise, of the likeliest colour and others, that make P move.
-cdef double ANOTHER = 1.5, FAR_OFF = 3.0
+cdef double OFTEN = 0.07, ROUGH_TURN = -0.5
+# P moves if the variance of the noise has changed by STEADY, or by so much if its colour is not
+# the likeliest one.
+cdef double FAR_OFF = 3.0
 # Intervals that differ by this part are equal: seconds of a clock, as floats, are not exact.
 cdef double SAME = 1e-9
 # P is not the steady one if the mean interval has changed by more than the first part of it, nor
@@ -53,12 +54,9 @@ cdef double NEAR = 0.25, GAP = 2.5
 cdef double LONG = 8.0  # time constants of a member after which its P is steady
 # Covariances of so many members, or of a multiple, move: whole vectors of the processor.
 cdef int EVEN = 16
-# A jump of y contradicts the model if it changes a Phi by so many standard deviations (D 23).
-cdef double OF_DEVIATION = 3.0
 # A y has noise if its differences are all more than the first part of its first difference, RMS;
-# none if they are less than the second part of the noise at the start, as variances. Those that
-# are smaller than the last part of y may be errors of its rounding to 64 bits.
-cdef double LEAST_NOISE = 1e-3, NO_NOISE = 1e-9, ROUNDED = 1e-12
+# none if they are less than the second part of the noise at the start, as variances.
+cdef double LEAST_NOISE = 1e-3, NO_NOISE = 1e-9
 cdef double LARGEST = 1e300  # no number of a snapshot is larger, nor is an error of a prediction
 # Ranges of the numbers of a snapshot; others are from 0 to LARGEST.
 RANGES = {'likeliest': (0, COUNT - 1), 'told': (0, COUNT - 1), 'followed': (0, COUNT - 1)}
@@ -199,7 +197,7 @@ cdef class SelfTuning(Structure):
         """Return how much Phi_{i+1} may change in a jump of y that it does not contradict."""
         if i + 1 == self.levels:
             return INFINITY
-        return OF_DEVIATION * sqrt(self.trial_variances[i + 1])
+        return HUBER * sqrt(self.trial_variances[i + 1])
 
     cdef void go_on_after_jump(self, double of_state) noexcept nogil:
         """Let the members go on after y has jumped (D 23)."""
@@ -274,7 +272,7 @@ cdef class SelfTuning(Structure):
             memory.beyond > 0.0 and sign == shared.far_sign and not rough
             and shared.roughness < HUBER
         )
-        likely = is_likely(m, HUBER if goes_on else GATE)
+        likely = is_likely(m, HUBER if goes_on else GATE, False)
         shared.recent = fmax(shared.recent - 1.0, 0.0)
         begins = growing and not likely
         jumped = begins or (shared.recent > 0.0 and not rough)
@@ -282,7 +280,7 @@ cdef class SelfTuning(Structure):
             turn = ROUGH_TURN
         elif not likely and sign != shared.far_sign:
             turn = 1.0
-        shared.turns = fmax(shared.turns + (turn - shared.turns) / TURNS_SAMPLES, 0.0)
+        shared.turns = fmax(shared.turns + (turn - shared.turns) / CALM_SAMPLES, 0.0)
         doubted = shared.turns > OFTEN and shared.roughness < HUBER and sample.quanta == 0.0
         if not likely and not jumped:
             self.pass_over(doubted)
@@ -344,7 +342,7 @@ cdef class SelfTuning(Structure):
         )
         for c in range(COLOURS):
             ratio = m.work.now[c] / m.used_noise[c]
-            limit = ANOTHER if c == GRID.colour[shared.likeliest] else FAR_OFF
+            limit = STEADY if c == GRID.colour[shared.likeliest] else FAR_OFF
             changed = changed or not 1.0 / limit < ratio < limit
         if changed:
             m.used_noise = m.work.now
@@ -383,7 +381,7 @@ cdef class SelfTuning(Structure):
         cdef Memory* memory = &self.memory
         cdef double sign = copysign(1.0, sample.off)
         cdef bint other_side = memory.beyond > 0.0 and sign != shared.far_sign
-        if doubted and is_explained(m):
+        if doubted and is_likely(m, HUBER, True):
             judge(m, 1.0, sample.kept, True)
             weigh(m, FLOOR)
         if other_side:

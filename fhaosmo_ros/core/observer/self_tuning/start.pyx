@@ -10,7 +10,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     Shared, factorial, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    CALM_SAMPLES, EXACT, LATTICE_SHARE, follow_differences, is_multiple
+    CALM_SAMPLES, EXACT, LATTICE_SHARE, ROUNDED, follow_differences, is_multiple
 )
 from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, weigh
 
@@ -52,7 +52,7 @@ cdef void gather(Members* m) noexcept nogil:
     for i in range(count):
         largest = fmax(largest, fabs(m.first_y[i]))
     # Number of the first sample that is another one.
-    while changed < count and fabs(m.first_y[changed] - m.first_y[0]) <= 1e-12 * largest:
+    while changed < count and fabs(m.first_y[changed] - m.first_y[0]) <= ROUNDED * largest:
         changed += 1
     since = count - changed
     if changed > 1 and not (
@@ -133,7 +133,7 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
         for i in range(count - order):
             differences[i] = differences[i + 1] - differences[i]
             values[i] = fabs(differences[i])
-            if order == 1 and values[i] > 1e-12 * largest:
+            if order == 1 and values[i] > ROUNDED * largest:
                 quantum = fmin(quantum, values[i])
         size = ranked(values, count - order, 0.5) / MEDIAN / sqrt(binomial)
         if size > 0.0:
