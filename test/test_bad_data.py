@@ -10,7 +10,10 @@ import pytest
 
 USABLE = 1e-8 * np.finfo(float).max
 """Beyond this, numbers count as infinite."""
-STEEP = {'order': 1, 'phi': ['-z1**7']}
+STEEP = {
+    'order': 1, 'phi': ['-z1**7'], 'lambda': [740.0], 'alpha': [155.0], 'epsilon': 80.0,
+    'fuzzy_widths': [0.1],
+}  # fmt: skip
 wild = st.floats() | st.sampled_from([0.0, 1e-320, 1e-300, 1e150, 1e300, 1.797e308, -1.797e308])
 wild_sample = st.tuples(wild, st.floats(1e-6, 0.1) | wild, st.floats(-1.0, 1.0) | wild)
 

@@ -167,7 +167,7 @@ def test_wild_sample_does_not_spoil_the_rest(law):
 
 
 def test_state_beyond_the_limit_starts_afresh_at_once():
-    feed = Feed(divergence_limit=100.0)
+    feed = Feed(divergence_limit=100.0, epsilon=200.0)
     feed.sine(10)
     feed.estimator.seed([0.2, 99.99999, 99.99999], 99.99999)
     words = feed.sine(20)

@@ -53,7 +53,7 @@ def test_channel_of_a_node(kind, tmp_path):
 @pytest.mark.parametrize('kind', [Observer, OnlineEstimator])
 def test_error_begins_with_the_path(kind, gains):
     for changes, said in (
-        ({'gamma_min': 0.9}, 'gamma_min'),
+        ({'gamma_min': 0.97}, 'gamma_min'),
         ({'lamda': 1.0}, "'lambda'"),
         ({'phi': ['0', 'b']}, 'b'),
     ):

@@ -30,7 +30,8 @@ PREDICTING = {'structure': 'levant', 'scheme': 'predict_correct'}
 PREDICTING |= {'lambda': [8.0, 20.0, 30.0, 16.0], 'fuzzy_widths': [1.0]}
 SCHEDULED = PREDICTING | {'noise_size': 0.01, 'correction_period': 1e-3}
 SELF_TUNING = {'gains': 'self_tuning'}
-EVENTS = {'event_threshold': 2.0}
+EVENTS = {'event_threshold': 2.0, 'lambda': [740.0], 'alpha': [155.0], 'epsilon': 80.0}
+EVENTS |= {'fuzzy_widths': [0.1, 1.4], 'gamma_initial': 0.67}
 CHANGES = {
     'unknown_input_decay': Change(50.0),
     'bandwidth': Change(3.0, SELF_TUNING),

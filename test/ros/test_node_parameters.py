@@ -25,6 +25,7 @@ READ_ONLY = {
     'plant': [p.name for p in PLANT_NODE_PARAMETERS.values() if not p.live],
 }
 OTHER = {
+    'gamma_max': {'gamma_max': 0.97},
     'structure': {'structure': 'levant', 'scheme': 'predict_correct'},
     'scheme': {'scheme': 'explicit'},
     'sampling': {'sampling': 'nominal'},
@@ -154,7 +155,7 @@ def test_constants_are_parameters_of_their_own(user, launch):
 @pytest.mark.parametrize(
     ('node', 'name', 'value', 'words'),
     [
-        ('estimator', 'gamma_min', 0.9, ['gamma_initial', '0.9']),
+        ('estimator', 'gamma_min', 0.97, ['gamma_initial', '0.97']),
         ('estimator', 'epsilon', 'wide', ['a number', "'wide'"]),
         ('estimator', 'variant', 'fuzy', ["'fuzy'", "did you mean 'fuzzy'?"]),
         ('estimator', 'lambda', [15.0, 15.0], ['1 or 4', '[15.0, 15.0]']),

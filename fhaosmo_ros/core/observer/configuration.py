@@ -265,7 +265,14 @@ def usual_step(model: TriangularModel) -> float:
 
 
 def per_level(parameter: Parameter, values: list[float], count: int) -> Floats:
-    """Return one value a level from a list of 1 or `count` values, or raise."""
+    """
+    Return one value a level from a list of 1 or `count` values, or raise.
+
+    A default is for the paper's plant; of another size, its last value serves the levels that
+    follow.
+    """
+    if values == parameter.default:
+        values = [of_level(values, i) for i in range(count)]
     if len(values) not in (1, count):
         raise parameter.error(values, f'1 or {count} values')
     return np.broadcast_to(np.array(values, dtype=np.float64), count).copy()

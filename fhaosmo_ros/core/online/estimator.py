@@ -194,6 +194,8 @@ class OnlineEstimator:
 
     def _settings(self, p: Mapping[str, Any]) -> dict[str, Any]:
         """Return what the policy reads of parameters; times in nanoseconds."""
+        c = self.observer.configuration
+        knows_noise = c.self_tuning or (c.levant and c.schedule is not None)
         times = {
             'period': p['nominal_period'], 'max_gap': p['max_gap'],
             'stuck_time': p['stuck_time'], 'divergence_time': p['divergence_time'],
@@ -204,7 +206,7 @@ class OnlineEstimator:
             'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
             'to_now': p['predict_to_now'], 'gate': p['spike_gate'],
             'limit': p['divergence_limit'],
-            'epsilon': math.inf if self.observer.self_tuning else p['epsilon'],
+            'epsilon': math.inf if knows_noise else p['epsilon'],
         }  # fmt: skip
 
     @property

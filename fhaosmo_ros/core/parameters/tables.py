@@ -93,18 +93,19 @@ OBSERVER = (
     Parameter('unknown_input_rate', 1.0,
               'How fast d changes, where unknown_input_decay is 0. Used with noise_size.',
               unit='1/s', lower=1e-6, upper=1e6),
-    Parameter('lambda', [740.0],
+    Parameter('lambda', [1.4, 7.2, 6.4, 2.0],
               'Correction factors lambda_i of the injection: |eps_i|^gamma psi_i(eps_i); levant: '
               '|eps_1|^(2 gamma (N - i) / N) psi_i(eps_1).', lower=0.0, lower_open=True,
               upper=1e30, lengths=PER_LEVEL),
-    Parameter('alpha', [155.0],
+    Parameter('alpha', [2.1, 5.3, 0.9, 0.0014],
               'Gains alpha_i of the internal states. Not used by levant, which has none.',
               lower=0.0, lower_open=True, upper=1e30, lengths=PER_LEVEL),
-    Parameter('epsilon', 80.0,
+    Parameter('epsilon', 0.05,
               'A level runs while |eps_j| <= epsilon for every level j before it (unit of y, and '
               'of the derivatives for the later levels). With levant all levels run: only '
-              'divergence_time goes by it.', lower=0.0, lower_open=True, upper=1e12),
-    Parameter('fuzzy_widths', [0.1, 1.4],
+              'divergence_time goes by it, and without noise_size alone.', lower=0.0,
+              lower_open=True, upper=1e12),
+    Parameter('fuzzy_widths', [1.5e-6, 0.035],
               'Half-widths of the fuzzy input universes of levels 1, 2, ...; the last one serves '
               'the levels that follow. Beyond its half-width psi is +-1. In the unit of the '
               'innovation eps_i; levant: of y at every level.', lower=1e-12, upper=1e12,
@@ -114,7 +115,7 @@ OBSERVER = (
               'membership functions, rules and defuzzifier, or a sampled curve '
               '(docs/mathematics.md, Fuzzy curves). A curve that is not odd, falls, or stays 0 '
               'is refused.', lengths='1 to N; the last one serves the levels that follow'),
-    Parameter('gamma_initial', 0.67, 'Power gamma at the start of an adaptive variant.', lower=0.0,
+    Parameter('gamma_initial', 0.95, 'Power gamma at the start of an adaptive variant.', lower=0.0,
               lower_open=True, upper=1.0),
     Parameter('gamma_rate', 0.004,
               "Learning rate Gamma of gamma' = -Gamma dL/dgamma; 0 holds gamma.", lower=0.0,
@@ -122,7 +123,7 @@ OBSERVER = (
     Parameter('gamma_min', 0.1, 'Lower bound of gamma, not above gamma_max.', lower=0.0,
               lower_open=True, upper=1.0),
     Parameter('gamma_max', 1.0, 'Upper bound of gamma.', lower=0.0, lower_open=True, upper=1.0),
-    Parameter('gamma_dead_zone', 0.006,
+    Parameter('gamma_dead_zone', 0.2,
               'Adaptation rests while the norm of the innovations is at most this (their unit; '
               'set it below the norm at which the estimate has become good enough). 0: it never '
               'rests.', lower=0.0, upper=1e12),

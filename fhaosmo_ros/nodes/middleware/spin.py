@@ -2,6 +2,7 @@
 """Starting, spinning and stopping a node: what both nodes' `main` share."""
 
 from collections.abc import Callable
+import faulthandler
 import gc
 import os
 import re
@@ -28,6 +29,8 @@ except ImportError:  # an older rclpy
 
 GRACE = 0.5
 """Seconds that a callback has to end after a signal."""
+PATIENCE = 20.0
+"""Seconds after a signal in which the middleware has to end, or the process ends without it."""
 FOREVER = 3600.0
 """
 Seconds. Without a finite timeout, the events executor of the PyPI wheels (rclpy 7.1) never runs a
@@ -137,6 +140,8 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
             node = factory(given)
         with Spinner(node, on_end=ended.set) as spinner:
             ended.wait()
+            # Says where each thread was: an end that takes so long is an error to look into.
+            faulthandler.dump_traceback_later(PATIENCE, exit=True)
         if spinner.stuck:  # a node has nothing to save
             print(f'{name}: ended while a callback was running', file=sys.stderr, flush=True)
             os._exit(0)
@@ -158,6 +163,7 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
                 node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
+        faulthandler.cancel_dump_traceback_later()
 
 
 def _one_line(error: BaseException) -> str:
