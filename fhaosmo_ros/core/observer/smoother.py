@@ -8,7 +8,7 @@ from fhaosmo_ros.core.observer.configuration import DERIVATIVES, Floats
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, TUNING
 from fhaosmo_ros.core.observer.record import Record
 from fhaosmo_ros.core.observer.smoothing import BEGINS, JUMPS, MEASURED, Rows, UNMEASURED
-from fhaosmo_ros.core.observer.status import LEVEL_SHIFT, REJECTED, Status, UNUSED
+from fhaosmo_ros.core.observer.status import AFRESH, JUMPED, LEVEL_SHIFT, REJECTED, UNUSED
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -134,9 +134,7 @@ class Smoother:
         """
         kinds: Ints = np.where(status & UNUSED, UNMEASURED, MEASURED)
         used = np.flatnonzero(kinds == MEASURED)
-        for kind, flags in (
-            (JUMPS, Status.JUMPED), (BEGINS, Status.RESTARTED | Status.DIVERGED),
-        ):  # fmt: skip
+        for kind, flags in ((JUMPS, JUMPED), (BEGINS, AFRESH)):
             marks = self._expected[kind] + np.cumsum((status & flags) > 0)
             kinds[used[np.diff(marks[used], prepend=0) > 0]] = kind
             latest = marks[used[-1]] if len(used) else 0

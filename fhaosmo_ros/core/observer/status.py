@@ -54,6 +54,9 @@ REJECTED = int(
 """Mask of the flags that say that a sample was not used."""
 UNUSED = REJECTED | int(Status.REPEATED)
 """The same, and that it repeats a value which its sensor holds: the estimate is of that one."""
+AFRESH = int(Status.RESTARTED | Status.DIVERGED)
+"""Mask of the flags that say that the observer began anew."""
+JUMPED = int(Status.JUMPED)
 
 
 def flags(word: int) -> Status:

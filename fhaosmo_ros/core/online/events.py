@@ -24,7 +24,7 @@ from collections.abc import Mapping
 import math
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.observer.status import Status, UNUSED
+from fhaosmo_ros.core.observer.status import AFRESH, UNUSED
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,7 +36,6 @@ MOST = 10_000
 GROWTH, QUICKER = 800.0, 4.0
 """The lag of sigma in samples, with tuning_memory = 0; how much quicker while an event lasts."""
 EARLIEST = -(2**63)
-AFRESH = int(Status.RESTARTED | Status.DIVERGED)
 
 
 # What a detector does: it waits for a standard deviation; learns the mean; nothing is beyond the

@@ -7,7 +7,7 @@ from math import isfinite, isnan
 from time import perf_counter, time_ns
 from typing import Any
 
-from fhaosmo_ros.core.observer.status import REJECTED, Status, UNUSED
+from fhaosmo_ros.core.observer.status import AFRESH, JUMPED, REJECTED, Status, UNUSED
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit
@@ -20,7 +20,7 @@ from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, WARN
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
-NEWS = int(Status.RESTARTED | Status.DIVERGED | Status.JUMPED)
+NEWS = AFRESH | JUMPED
 """Flags of a step that are logged beside those of a rejected sample."""
 QUIET = 5.0
 """Seconds between two warnings of one kind."""

@@ -8,7 +8,7 @@ from typing import Any
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import known_inputs, measured_output
-from fhaosmo_ros.tools.bags.types import serialise
+from fhaosmo_ros.tools.bags.types import serialise, with_numbers
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.topics import FLOAT
 import numpy as np
@@ -56,13 +56,13 @@ def bag_of_table(
             'counted from 0'
         )
     topics = [measured_output(values), *known_inputs(values, used).values()]
-    begin = np.frombuffer(serialise(FLOAT, data=0.0)[:-8], np.uint8)  # then the number
-    begins, columns = np.tile(begin, (len(t), 1)), []
+    columns = [
+        (topic.absolute(''), with_numbers(serialise(FLOAT, data=0.0), its))
+        for topic, its in zip(topics, numbers.T[1:], strict=True)
+    ]
     with BagWriter(bag) as writer:
-        for topic, values_of_it in zip(topics, numbers.T[1:], strict=True):
-            writer.add(topic.absolute(''), FLOAT)
-            ends = values_of_it.astype('<f8').view(np.uint8).reshape(-1, 8)
-            columns.append((topic.absolute(''), np.hstack([begins, ends])))
+        for name, _ in columns:
+            writer.add(name, FLOAT)
         stamps = np.round(t * 1e9).astype(np.int64)
         writer.write_columns(np.maximum(stamps, 1), columns)  # 0 is a stamp that nobody filled
 

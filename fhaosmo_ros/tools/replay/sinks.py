@@ -11,7 +11,13 @@ from fhaosmo_ros.core.observer.estimates import Trajectory, TUNING
 from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.units import derivative_unit
-from fhaosmo_ros.tools.bags.types import diagnostics, labelled_array, LATCHED_QOS, serialise
+from fhaosmo_ros.tools.bags.types import (
+    diagnostics,
+    labelled_array,
+    LATCHED_QOS,
+    serialise,
+    with_numbers,
+)
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.topics import (
     ARRAY,
@@ -156,12 +162,10 @@ class BagSink:
             'state': e.z, 'unknown_input': e.unknown_input, 'innovation': e.innovation,
             'stamp': stamp,
         }  # fmt: skip
-        columns = []
-        for topic, message in self._messages.items():
-            ends = _bytes(numbers[topic], len(rows.times))
-            begin = np.frombuffer(message[: len(message) - ends.shape[1]], np.uint8)
-            begins = np.tile(begin, (len(rows.times), 1))
-            columns.append((f'{self._name}/{topic}', np.hstack([begins, ends])))
+        columns = [
+            (f'{self._name}/{topic}', with_numbers(message, numbers[topic]))
+            for topic, message in self._messages.items()
+        ]
         self._bag.write_columns(rows.times, columns)
         for time, event in rows.events:
             topic = f'{self._name}/{EVENT}'
@@ -170,9 +174,3 @@ class BagSink:
             name = f'{self._name.lstrip("/")}: event'
             message = diagnostics(event.stamp, event.begins, name, text, values)
             self._bag.write(topic, time, message)
-
-
-def _bytes(values: NDArray, count: int) -> NDArray[np.uint8]:
-    """Return the bytes of each row."""
-    rows = np.ascontiguousarray(values).reshape(count, -1)
-    return rows.view(np.uint8).reshape(count, -1)
