@@ -154,11 +154,10 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         *files(
-            'config/**/*.yaml',
-            'config/*.xml',
+            'config/**/*.*',
             'launch/*.py',
             'docs/*.md',
-            'docs/*.png',
+            'docs/**/*.png',
             'docs/*.svg',
         ),
     ],

@@ -19,6 +19,7 @@ ARGUMENTS = {
     'plotjuggler': ('false', 'show the curves in PlotJuggler, which has to be installed'),
     'log_level': ('info', 'least severity that is logged'),
 }
+CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
 
 
 def check_params_file(context):
@@ -31,7 +32,9 @@ def check_params_file(context):
 def generate_launch_description():
     """Return both nodes; when one of them ends, so does the launch."""
     arguments = [
-        DeclareLaunchArgument(name, default_value=default, description=text)
+        DeclareLaunchArgument(
+            name, default_value=default, description=text, choices=CHOICES.get(name)
+        )
         for name, (default, text) in ARGUMENTS.items()
     ]
     simulated = ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)

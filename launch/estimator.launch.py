@@ -19,6 +19,7 @@ ARGUMENTS = {
     'respawn': ('false', 'start the node again, after 2 s, if it ends'),
     'log_level': ('info', 'least severity that is logged'),
 }
+CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
 
 
 def start(context):
@@ -48,7 +49,9 @@ def start(context):
 def generate_launch_description():
     """Return the arguments and the node."""
     arguments = [
-        DeclareLaunchArgument(name, default_value=default, description=text)
+        DeclareLaunchArgument(
+            name, default_value=default, description=text, choices=CHOICES.get(name)
+        )
         for name, (default, text) in ARGUMENTS.items()
     ]
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])

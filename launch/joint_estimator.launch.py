@@ -16,12 +16,15 @@ ARGUMENTS = {
     'use_sim_time': ('false', 'take the time from /clock'),
     'log_level': ('info', 'least severity that is logged'),
 }
+CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
 
 
 def generate_launch_description():
     """Return estimator.launch.py with the defaults for joints."""
     arguments = [
-        DeclareLaunchArgument(name, default_value=default, description=text)
+        DeclareLaunchArgument(
+            name, default_value=default, description=text, choices=CHOICES.get(name)
+        )
         for name, (default, text) in ARGUMENTS.items()
     ]
     source = PythonLaunchDescriptionSource(

@@ -16,6 +16,7 @@ from fhaosmo_ros.nodes.middleware.publishers import check_overrides, create_publ
 from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
 from fhaosmo_ros.nodes.middleware.timers import set_period
+import numpy as np
 from std_msgs.msg import Float64, Float64MultiArray
 
 MAX_PAUSE = 1_000_000_000
@@ -66,11 +67,12 @@ class PlantNode(TimedNode):
         Bring the simulation to the clock's present time and publish; y first.
 
         The time between the clock's reading and the stamp of y acts as noise on y. So the long way
-        is integrated first; then the clock is read again for the little that is left.
+        is integrated first; then the clock is read again for the little that is left, and nothing
+        else is done before y is out.
         """
         clock = self.get_clock()
         self.plant.advance(self._plant_time(clock.now().nanoseconds), self._u)
-        if not self.plant.finite:
+        if not np.isfinite(self.plant.states).all():
             if not self._diverged:
                 self._diverged = True
                 self.get_logger().error(
@@ -79,12 +81,13 @@ class PlantNode(TimedNode):
                     'them and start the node again'
                 )
             return
-        truth = self.plant.sample(self._plant_time(clock.now().nanoseconds), self._u)
-        if not math.isfinite(truth.y):
+        now = self._plant_time(clock.now().nanoseconds)
+        y = self.plant.measure(now)
+        if not math.isfinite(y):
             return
-        self._publish_y(Float64(data=truth.y))
-        self._publish_state(self._state_message(truth.z))
-        self._publish_d(Float64(data=truth.unknown_input))
+        self._publish_y(Float64(data=y))
+        self._publish_state(self._state_message(self.plant.states))
+        self._publish_d(Float64(data=self.plant.unknown_input(now)))
 
     def _plant_time(self, now: int) -> float:
         """Return the plant's time in seconds; it stands still while the clock jumps."""

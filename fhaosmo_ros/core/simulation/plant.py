@@ -135,14 +135,26 @@ class Plant:
         self._states([t], known_inputs(u, self._model.inputs)[np.newaxis])
 
     @property
-    def finite(self) -> bool:
-        """False once the states have left the finite numbers."""
-        return bool(np.isfinite(self._system.states).all())
+    def states(self) -> Floats:
+        """States at the latest time, (n,); a copy."""
+        return np.asarray(self._system.states)
+
+    def unknown_input(self, t: float) -> float:
+        """Return d at the time `t`."""
+        return float(self._d.along(np.array([t]))[0])
+
+    def measure(self, t: float) -> float:
+        """
+        Advance to `t`, with the known inputs of the latest `advance`, and return y.
+
+        This is the quick part of `sample`, for a node: what it takes is jitter of the stamp of y.
+        """
+        return float(self._measured(self._system.go_on(t)))
 
     def sample(self, t: float, u: ArrayLike = 0.0) -> Truth:
         """Advance to `t` and measure: y = z_1 + noise, quantised."""
-        found = self.simulate([t], known_inputs(u, self._model.inputs)[np.newaxis])
-        return Truth(float(found.y[0]), found.z[0], float(found.unknown_input[0]))
+        self.advance(t, u)
+        return Truth(self.measure(t), self.states, self.unknown_input(t))
 
     def simulate(self, t: ArrayLike, u: ArrayLike | float = 0.0) -> Truth:
         """
@@ -176,13 +188,13 @@ class Plant:
             raise ConfigurationError('plant: expected finite times, got some that are not')
         return t, self._system.advance(t, u)
 
-    def _measured(self, z1: Floats) -> Floats:
-        p = self._parameters
-        y = z1 + p['noise_std'] * self._random.standard_normal(len(z1))
-        return quantised(y, p['quantisation'])
+    def _measured(self, z1: Any) -> Any:
+        noise = self._parameters['noise_std']
+        y = z1 + noise * self._random.standard_normal(np.shape(z1)) if noise > 0.0 else z1
+        return quantised(y, self._parameters['quantisation'])
 
 
-def quantised(y: Floats, step: float) -> Floats:
+def quantised(y: Any, step: float) -> Any:
     """Return y rounded to multiples of `step`; as it is for 0, or if it has too many of them."""
     if step <= 0.0:
         return y

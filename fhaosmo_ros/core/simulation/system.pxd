@@ -12,6 +12,7 @@ cdef class System(Dynamics):
     cdef Disturbance d
     cdef double h  # step of the grid of time (s)
     cdef const double* u  # known inputs of the present interval
+    cdef const double[::1] held  # and of the latest one
     cdef long long taken  # steps of the grid since t = 0
     cdef double on_grid[MOST_LEVELS]  # z_1 .. z_n then, at taken * h
     cdef double z[MOST_LEVELS]  # and at the time of the latest `advance`

@@ -36,6 +36,7 @@ cdef class System(Dynamics):
         if self.size > MOST_LEVELS or len(z) != self.size or not h > 0.0:
             raise ValueError(f'expected {phi.count} <= {MOST_LEVELS} states and a step > 0')
         self.phi, self.d = phi, d
+        self.held = np.zeros(max(phi.inputs, 1))
         for i in range(self.size):
             self.on_grid[i] = self.z[i] = z[i]
 
@@ -114,4 +115,11 @@ cdef class System(Dynamics):
             else:
                 self.go_evenly(times[k - 1] if k > 0 else 0.0, times[k], &inputs[k, 0])
             memcpy(&states[k, 0], self.z, self.size * sizeof(double))
+        if times.shape[0]:
+            self.held = inputs[times.shape[0] - 1]
         return np.asarray(states)
+
+    def go_on(self, double t):
+        """Return z_1 at `t`, with the known inputs of the latest `advance`; in a microsecond."""
+        self.go_to(t, &self.held[0])
+        return self.z[0]
