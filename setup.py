@@ -22,6 +22,7 @@ NAME = 'fhaosmo_ros'
 FOR_ROS2_RUN = bool({'install', 'develop'} & set(sys.argv))
 CHECK = ['hypothesis', 'pytest', 'pytest-xdist']
 TUNE = ['cmaes', 'optuna>=4,<6']
+ARM = ['pin>=3,<5']
 DOCS = ['myst-parser', 'sphinx', 'sphinx-rtd-theme']
 
 
@@ -42,7 +43,7 @@ def extensions():
     for path in sorted([*Path(NAME).rglob('*.pyx'), *Path('studies').rglob('*.pyx')]):
         options = ['-O1', '-g'] if debug else ['-O2', '-g0']
         options += ['-fno-math-errno', *sanitize]
-        if 'self_tuning' in path.parts:
+        if {'self_tuning', 'arm'} & set(path.parts):
             options += ['-fno-trapping-math', '-fno-signed-zeros', '-fassociative-math']
             options += [] if debug else ['-O3']
         else:
@@ -177,6 +178,14 @@ setup(
     ],
     # Not tests_require: colcon then finds no tests.
     extras_require={
+        'arm': ARM,
+        'arm-study': [
+            *ARM,
+            *TUNE,
+            'mujoco>=4,<5',
+            'pybullet',
+            'example-robot-data',
+        ],  # worlds and robots of studies/arm
         'docs': DOCS,
         'recipes': ['rotorpy>=3,<4'],  # a simulator of drones, for studies/recipes
         # Community builds, for machines without ROS. Never beside an installed ROS.
@@ -185,6 +194,7 @@ setup(
         'compare': TUNE,
         'check': CHECK,
         'test': [
+            *ARM,
             *CHECK,
             *DOCS,
             *TUNE,

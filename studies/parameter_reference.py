@@ -4,6 +4,7 @@
 from pathlib import Path
 import sys
 
+from fhaosmo_ros.core.parameters.arm import ARM, ARM_NODE
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.tables import (
     CHANNEL_OUTPUT,
@@ -44,6 +45,8 @@ GROUPS = (
     ('Messages out (estimator)', CHANNEL_OUTPUT),
     ('Node (estimator)', ESTIMATOR_NODE),
     ('Diagnostics (estimator)', DIAGNOSTICS),
+    ('Arm (arm, calibrate, replay_arm)', ARM),
+    ('Node (arm; it has diagnostics_period and hardware_id, too)', ARM_NODE),
     ('Simulation (plant)', PLANT_MODEL),
     ('Publishing (plant)', PLANT_NODE),
     ('Family of recordings (tune)', FAMILY),

@@ -5,6 +5,7 @@ Every parameter of the package, declared once.
 YAML checks, ROS descriptors, docs/parameters.md and error messages derive from these tables.
 """
 
+from fhaosmo_ros.core.parameters.arm import ARM, ARM_NODE
 from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
 
 MAX_ORDER = 12
@@ -367,10 +368,17 @@ CHANNEL_PARAMETERS = ParameterTable(CHANNEL)
 ESTIMATOR_PARAMETERS = ParameterTable(CHANNEL, ESTIMATOR_NODE, DIAGNOSTICS)
 PLANT_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL)
 PLANT_NODE_PARAMETERS = ParameterTable(MODEL, PLANT_MODEL, PLANT_NODE)
-NODE_TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}
+ARM_NODE_PARAMETERS = ParameterTable(ARM, ARM_NODE, DIAGNOSTICS[:2])
+NODE_TABLES = {
+    'estimator': ESTIMATOR_PARAMETERS,
+    'plant': PLANT_NODE_PARAMETERS,
+    'arm': ARM_NODE_PARAMETERS,
+}
 FIRST = (
     'order', 'phi', 'inputs', 'structure', 'variant', 'scheme', 'lambda', 'alpha', 'epsilon',
     'fuzzy_widths', 'unknown_input_decay', 'sampling', 'max_gap', 'input_topic', 'input_field',
     'channels', 'publish_on', 'publish_rate', 'disturbance', 'noise_std', 'sample_rate',
+    'robot_description_file', 'measurement', 'effort', 'calibration_file', 'payload',
+    'wrench_frame',
 )  # fmt: skip
-"""The parameters that matter first, of both nodes."""
+"""The parameters that matter first, of all nodes."""

@@ -1,0 +1,409 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Identification of an arm from a recording of free motion.
+
+Linear regression of the filtered torque on Pinocchio's regressor (C. Atkeson, C. An, J.
+Hollerbach, International Journal of Robotics Research 5(3), 1986, doi:10.1177/027836498600500306),
+with friction, motor inertia and offset beside it; robust by Huber's weights, and drawn towards the
+URDF, so that what the motion does not show stays as it is.
+"""
+
+from typing import NamedTuple
+
+from fhaosmo_ros.core.arm.calibration import Calibration, WIDTHS
+from fhaosmo_ros.core.arm.model import ArmModel, Payload
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.signal import butter, sosfiltfilt
+
+Floats = NDArray[np.float64]
+CUTOFF = 8.0
+"""Hz: both sides are low-passed alike; arms move slower."""
+QUICK = 40.0
+"""Hz: for the velocity by which friction changes its sign."""
+ROWS = 100.0
+"""Hz, at most: rows of the regression."""
+BLOCK, HELD_OUT = 2.0, 4
+"""Seconds of a block of the recording; one in so many is held out."""
+DRAWS = tuple(10.0**k for k in range(-4, 3))
+"""How strongly parameters are drawn to the URDF: what is held out says which of these is best."""
+HUBER, ROUNDS = 2.0, 6
+SHARE = 0.3
+"""Standard deviation of URDFs' masses and inertias, as a share of them."""
+LEAST_ROWS, SHORTEST = 200, 10.0
+"""Samples, and seconds, of the shortest recording."""
+LEVER = 0.1
+"""m: how far a link's centre may lie from where the URDF has it."""
+SWEEPS, LEAST_SHARE = 500, 1e-3
+"""Of the search for links that can exist; their least pseudo-inertia, as a share."""
+STILL = 0.05
+"""rad/s: a joint that never moved faster has hardly moved."""
+ONE_WAY = 0.05
+"""Share of its moving time a joint has to move the other way, to tell friction from offset."""
+TOLD, WEAK = 0.7, 0.01
+"""
+A torque constant is told where the URDF's torque explains so much of the effort that friction and
+rotor leave, and is no less than this share of the largest joint's.
+"""
+
+
+def _pseudo_inertia() -> Floats:
+    """Return the 4 x 4 pseudo-inertia for a unit of each inertial parameter, (4, 4, 10)."""
+    out = np.zeros((4, 4, 10))
+    out[3, 3, 0] = 1.0
+    for axis in range(3):
+        out[axis, 3, 1 + axis] = out[3, axis, 1 + axis] = 1.0
+    for k, (a, b) in enumerate(((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)), start=4):
+        if a == b:  # half the trace of the inertia, less the inertia
+            out[[0, 1, 2], [0, 1, 2], k] = 0.5
+            out[a, a, k] = -0.5
+        else:
+            out[a, b, k] = out[b, a, k] = -1.0
+    return out
+
+
+_PSEUDO = _pseudo_inertia()
+
+
+class Identified(NamedTuple):
+    """What was found; torques are low-passed, K rows."""
+
+    calibration: Calibration
+    before: Floats  # (n,) RMS of the held-out torque that the URDF alone leaves, N m
+    after: Floats  # (n,) and that the calibrated model leaves
+    notes: list[str]  # what the motion did not show
+    t: Floats  # (K,) s
+    torque: Floats  # (K, n) measured
+    by_urdf: Floats  # (K, n)
+    by_calibration: Floats  # (K, n)
+    held_out: NDArray[np.bool_]  # (K,)
+
+
+class Motion(NamedTuple):
+    """Filtered samples, K rows."""
+
+    t: Floats  # (K,) s
+    q: Floats  # (K, n)
+    velocity: Floats
+    acceleration: Floats
+    torque: Floats
+    rubbing: Floats  # (K, n, k) tanh(velocity / width) of each of `WIDTHS`
+
+    @classmethod
+    def of(cls, t: Floats, q: Floats, torque: Floats) -> 'Motion':
+        """
+        Low-pass positions, torques and friction alike, forwards and backwards.
+
+        Friction changes within milliseconds where a joint turns round. So it is computed from a
+        velocity that is hardly filtered, and then filtered as the torque is.
+        """
+        period = float(np.median(np.diff(t)))
+        even = np.arange(t[0], t[-1], period)
+
+        def low(array: Floats, cutoff: float) -> Floats:
+            sos = butter(2, min(cutoff * period * 2.0, 0.5), output='sos')
+            return np.asarray(sosfiltfilt(sos, array, axis=0))
+
+        raw, effort = (
+            np.column_stack([np.interp(even, t, column) for column in array.T])
+            for array in (q, torque)
+        )
+        quick = np.gradient(low(raw, QUICK), period, axis=0)
+        rubbing = low(np.tanh(quick[..., np.newaxis] / np.array(WIDTHS)), CUTOFF)
+        smooth = low(raw, CUTOFF)
+        velocity = np.gradient(smooth, period, axis=0)
+        acceleration = np.gradient(velocity, period, axis=0)
+        edge, every = int(0.5 / period), max(1, round(1.0 / (ROWS * period)))
+        kept = slice(edge, len(even) - edge, every)
+        parts = (even, smooth, velocity, acceleration, low(effort, CUTOFF), rubbing)
+        return cls(*(part[kept] for part in parts))
+
+
+def noise_of(samples: ArrayLike) -> Floats:
+    """
+    Return the standard deviation of white noise on each column, from third differences.
+
+    The root mean square within six times the 90 % quantile, so that gaps and shocks do not count
+    but the rare steps of a resting encoder do.
+    """
+    third = np.diff(np.asarray(samples, dtype=np.float64), n=3, axis=0)
+    bound = 6.0 * np.quantile(np.abs(third), 0.9, axis=0)
+    kept = np.where(np.abs(third) <= np.maximum(bound, 1e-300), third, 0.0)
+    return np.asarray(np.sqrt(np.mean(kept**2, axis=0) / 20.0))  # 20 = 1 + 9 + 9 + 1
+
+
+def identify(
+    model: ArmModel,
+    t: ArrayLike,
+    q: ArrayLike,
+    effort: ArrayLike,
+    *,
+    torque_constants: ArrayLike = 1.0,
+) -> Identified:
+    """
+    Find what the torque of an arm in free motion says about it.
+
+    Parameters
+    ----------
+    model : ArmModel
+        By the URDF.
+    t : (K,) array
+        s, increasing.
+    q, effort : (K, n) array
+        Positions, and torques or currents.
+    torque_constants : number or (n,) array
+        Torque for a unit of effort; 0 where that is not known and has to be found.
+
+    Raises
+    ------
+    ConfigurationError
+        Too short a recording, or arrays that do not fit.
+
+    """
+    t, q, effort = (np.asarray(a, dtype=np.float64) for a in (t, q, effort))
+    n = len(model.joints)
+    if t.ndim != 1 or q.shape != (len(t), n) or effort.shape != q.shape:
+        raise ConfigurationError(
+            f'identify: expected q and effort of shape {(len(t), n)}, got {q.shape} and '
+            f'{effort.shape}'
+        )
+    if len(t) < LEAST_ROWS or not np.all(np.diff(t) > 0.0) or t[-1] - t[0] < SHORTEST:
+        raise ConfigurationError(
+            f'identify: expected at least {SHORTEST:g} s of samples with increasing times, got '
+            f'{len(t)} samples'
+        )
+    motion = Motion.of(t, np.where(model.continuous, np.unwrap(q, axis=0), q), effort)
+    problem = _Problem(model, motion, torque_constants)
+    held = ((motion.t - motion.t[0]) // BLOCK).astype(int) % HELD_OUT == HELD_OUT - 1
+    found = [problem.solve(~held, draw) for draw in DRAWS]
+    errors = [np.sum((problem.left(x)[held] / problem.size) ** 2) for x in found]
+    x = problem.solve(~held, DRAWS[int(np.argmin(errors))], possible=True)
+    left = problem.left(x)
+    calibration = problem.calibration(x)
+    calibration = calibration.changed(
+        position_noise=np.maximum(noise_of(q), 1e-9),
+        torque_noise=noise_of(effort) * np.abs(calibration.torque_constants),
+        model_error=np.maximum(_rms(left[held]), 1e-9),
+    )
+    notes = problem.notes + _notes(model.joints, motion.velocity)
+    torque = motion.torque * calibration.torque_constants
+    return Identified(
+        calibration, _rms(problem.unexplained[held]), _rms(left[held]), notes, motion.t,
+        torque, problem.by_urdf, torque - left, held,
+    )  # fmt: skip
+
+
+def payload_of_motion(
+    model: ArmModel, t: ArrayLike, q: ArrayLike, effort: ArrayLike, calibration: Calibration
+) -> tuple[Payload, Floats, Floats]:
+    """
+    Return what the last link carries, and the RMS of the torque left without and with it, (n,).
+
+    Everything else is taken from `calibration`, of the arm without payload.
+    """
+    t, q, effort = (np.asarray(a, dtype=np.float64) for a in (t, q, effort))
+    motion = Motion.of(t, np.where(model.continuous, np.unwrap(q, axis=0), q), effort)
+    problem = _Problem(model, motion, calibration.torque_constants, calibration)
+    last = 10 * (len(model.joints) - 1)
+    moving = problem.columns[..., last : last + 4]
+    turning = problem.columns[..., last + 4 : last + 10]
+    weighted = moving / problem.size[:, np.newaxis]
+    mass, center, explained = 0.0, np.zeros(3), np.zeros(problem.unexplained.shape)
+    for _ in range(ROUNDS):
+        # Of a point mass about the joint: xx, xy, yy, xz, yz, zz. It needs the mass and its place.
+        inertia = mass * (center @ center * np.eye(3) - np.outer(center, center))
+        turned = turning @ inertia[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]
+        left = (problem.unexplained - turned) / problem.size
+        x, *_ = np.linalg.lstsq(weighted.reshape(-1, 4), left.ravel(), rcond=None)
+        mass, explained = max(float(x[0]), 0.0), moving @ x + turned
+        center = np.array(x[1:] / mass if mass > 0.0 else np.zeros(3), dtype=np.float64)
+    payload = Payload(mass, (float(center[0]), float(center[1]), float(center[2])))
+    return payload, _rms(problem.unexplained), _rms(problem.unexplained - explained)
+
+
+class _Problem:
+    """
+    The regression: what the URDF leaves unexplained, as a sum of columns.
+
+    Columns, by joint: changes of the ten inertial parameters, motor inertia, offset, viscous
+    friction, and dry friction of each width.
+    """
+
+    def __init__(
+        self,
+        model: ArmModel,
+        motion: Motion,
+        torque_constants: ArrayLike,
+        known: Calibration | None = None,
+    ) -> None:
+        self._model, self._motion = model, motion
+        n, k = len(model.joints), len(motion.t)
+        known = known or Calibration.none(model.joints)
+        own = model.inertial if len(known.inertial) == 0 else known.inertial
+        regressors = np.array([
+            model.regressor(*row)
+            for row in zip(motion.q, motion.velocity, motion.acceleration, strict=True)
+        ])  # fmt: skip
+        self.by_urdf = regressors @ own.ravel()
+        self.by_urdf += known.offset + known.viscous * motion.velocity
+        self.by_urdf += np.sum(known.coulomb * motion.rubbing, axis=-1)
+        self.by_urdf += known.motor_inertia * motion.acceleration
+        ones = np.ones((k, n))
+        rubbing = list(np.moveaxis(motion.rubbing, -1, 0))
+        own_columns: list[Floats] = [motion.acceleration, ones, motion.velocity, *rubbing]
+        constants = np.broadcast_to(np.asarray(torque_constants, dtype=np.float64), n).copy()
+        self.notes: list[str] = []
+        unknown = np.flatnonzero(constants == 0.0)
+        if len(unknown):
+            constants[unknown] = self._told(unknown, own_columns)
+        self._constants = constants
+        measured = motion.torque * constants
+        self.unexplained = measured - self.by_urdf
+        diagonal = [np.eye(n) * column[:, np.newaxis, :] for column in own_columns]
+        self.columns = np.concatenate([regressors, *diagonal], axis=2)
+        mass, spread = model.inertial[:, 0], np.abs(model.inertial[:, [4, 6, 9]]).max(axis=1)
+        inertial = np.column_stack([
+            mass, *[mass * LEVER] * 3, *[spread + mass * LEVER**2] * 6
+        ])  # fmt: skip
+        level = np.maximum(_rms(measured), 1e-9)
+        fastest = np.maximum(np.abs(motion.acceleration).max(axis=0), 1e-3)
+        sizes = [level / fastest, *[level] * (2 + len(WIDTHS))]
+        self._scale = np.concatenate([
+            np.maximum(SHARE * inertial, 1e-9).ravel(), *sizes
+        ])  # fmt: skip
+        self.size = np.maximum(_rms(self.unexplained), 1e-9)
+
+    def _told(self, unknown: NDArray[np.intp], columns: list[Floats]) -> Floats:
+        """Return torque constants by the URDF; where it does not tell, those of the others."""
+        names, effort = self._model.joints, self._motion.torque
+        found = np.array([
+            _constant(self.by_urdf[:, j], effort[:, j], [column[:, j] for column in columns])
+            for j in unknown
+        ])  # fmt: skip
+        constants, explained, size = found.T
+        told = (explained > TOLD) & (size > WEAK * self.by_urdf.std(axis=0).max())
+        told &= constants > 0.0
+        if not told.any():
+            raise ConfigurationError(
+                'torque_constants: expected them as a parameter, because this motion does not '
+                'tell the torque of a unit of effort, got none'
+            )
+        usual = float(np.median(constants[told]))
+        self.notes += [
+            f'{names[j]}: the torque of a unit of effort cannot be told from this motion; taken '
+            f'for {usual:.3g}, as of the other joints (parameter torque_constants)'
+            for j in unknown[~told]
+        ]  # fmt: skip
+        return np.asarray(np.where(told, constants, usual))
+
+    def solve(self, rows: NDArray[np.bool_], draw: float, possible: bool = False) -> Floats:
+        """
+        Return the columns' factors by robust least squares, drawn towards the URDF.
+
+        With `possible` they are those of links that can exist.
+        """
+        a = (self.columns[rows] * self._scale).reshape(-1, len(self._scale))
+        b, count = self.unexplained[rows], len(self.size)
+        x, size = np.zeros(len(self._scale)), self.size
+        for _ in range(ROUNDS):
+            left = b - (a @ x).reshape(-1, count)
+            size = np.maximum(1.4826 * np.median(np.abs(left), axis=0), 1e-3 * self.size)
+            far = np.abs(left) / size
+            weights = (np.minimum(1.0, HUBER / np.maximum(far, 1e-12)) ** 0.5 / size).ravel()
+            weighted = a * weights[:, np.newaxis]
+            normal = weighted.T @ weighted
+            normal.flat[:: len(x) + 1] += draw * len(b) * 1e-3 + 1e-9
+            right = weighted.T @ (b.ravel() * weights)
+            x = np.linalg.solve(normal, right)
+        return np.asarray((self._possible(normal, right) if possible else x) * self._scale)
+
+    def _possible(self, normal: Floats, right: Floats) -> Floats:
+        """
+        Return the best factors of links and rotors that can exist.
+
+        A link can exist if its pseudo-inertia is positive (P. Wensing, S. Kim, J.-J. Slotine,
+        IEEE Robotics and Automation Letters 3(1), 2018, doi:10.1109/LRA.2017.2729659), so that
+        every mass matrix is. The alternating direction method of multipliers finds the least of
+        x^T normal x / 2 - right^T x there.
+        """
+        n = len(self.size)
+        links = self._model.unloaded
+        unit = np.sqrt(np.maximum(links[:, :1], 1e-3)) * np.array([LEVER, LEVER, LEVER, 1.0])
+        shape = _PSEUDO / (unit[:, :, np.newaxis] * unit[:, np.newaxis, :])[..., np.newaxis]
+        map_ = np.zeros((17 * n, len(right)))
+        for i in range(n):
+            own = slice(10 * i, 10 * i + 10)
+            map_[16 * i : 16 * i + 16, own] = shape[i].reshape(16, 10) * self._scale[own]
+        map_[16 * n :, 10 * n : 11 * n] = np.eye(n)
+        start = np.concatenate([np.einsum('iabk,ik->iab', shape, links).ravel(), np.zeros(n)])
+        # As stiff as the data in the middle between the directions it knows well and hardly.
+        rate = float(np.sqrt(np.prod(np.linalg.eigvalsh(normal)[[0, -1]])))
+        inverse = np.linalg.inv(normal + rate * map_.T @ map_)
+        near, dual = start, np.zeros(len(start))
+        for _ in range(SWEEPS):
+            x = inverse @ (right + rate * map_.T @ (near - start - dual))
+            there = start + map_ @ x + dual
+            values, vectors = np.linalg.eigh(there[: 16 * n].reshape(n, 4, 4))
+            clipped = (vectors * np.maximum(values, LEAST_SHARE)[:, np.newaxis]) @ np.swapaxes(
+                vectors, 1, 2
+            )
+            near = np.concatenate([clipped.ravel(), np.maximum(there[16 * n :], 0.0)])
+            dual = there - near
+        bodies, others = slice(0, 11 * n), slice(11 * n, None)
+        x[bodies] = np.linalg.lstsq(map_[:, bodies], near - start, rcond=None)[0]
+        x[others] = np.linalg.solve(
+            normal[others, others], right[others] - normal[others, bodies] @ x[bodies]
+        )
+        return np.asarray(x)
+
+    def left(self, x: Floats) -> Floats:
+        """Return the torque that is left unexplained, (K, n)."""
+        return np.asarray(self.unexplained - self.columns @ x)
+
+    def calibration(self, x: Floats) -> Calibration:
+        """Return what the factors mean."""
+        n, w = len(self._model.joints), len(WIDTHS)
+        own = x[10 * n :].reshape(-1, n)
+        return Calibration.none(self._model.joints).changed(
+            inertial=self._model.unloaded + x[: 10 * n].reshape(n, 10),
+            motor_inertia=own[0], offset=own[1], viscous=own[2], coulomb=own[3 : 3 + w].T.copy(),
+            torque_constants=self._constants,
+        )  # fmt: skip
+
+
+def _constant(torque: Floats, effort: Floats, others: list[Floats]) -> tuple[float, float, float]:
+    """
+    Return the torque for a unit of effort by the URDF, how much that explains, and its size.
+
+    The effort is fitted by the torque, not the torque by the effort: what else is in the effort
+    would make the constant too small. Friction and the rotor, which the URDF lacks, are `others`.
+    """
+    columns = np.column_stack(others)
+    both = np.column_stack([torque, effort])
+    torque, effort = (both - columns @ np.linalg.lstsq(columns, both, rcond=None)[0]).T
+    common, power = float(torque @ effort), float(torque @ torque)
+    explained = common**2 / max(power * float(effort @ effort), 1e-300)
+    size = float(np.sqrt(power / len(torque)))
+    return (power / common if common else 0.0), explained, size
+
+
+def _notes(joints: tuple[str, ...], velocity: Floats) -> list[str]:
+    """Return what the motion of the joints (K, n) does not show."""
+    notes = []
+    for name, v in zip(joints, velocity.T, strict=True):
+        moving = np.abs(v) > STILL
+        if not moving.any():
+            notes.append(
+                f'{name} hardly moved (at most {np.abs(v).max():.2g} rad/s): what is found of it '
+                'is mostly the URDF'
+            )
+            continue
+        ahead = float(np.mean(v[moving] > 0.0))
+        if min(ahead, 1.0 - ahead) < ONE_WAY:
+            notes.append(f'{name} moved one way only: its friction cannot be told from its offset')
+    return notes
+
+
+def _rms(values: Floats) -> Floats:
+    return np.asarray(np.sqrt(np.mean(values**2, axis=0)))

@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rigid-body terms, the filters over all joints, and what an arm makes of its samples."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+
+pytest.importorskip('pinocchio')
+
+from fhaosmo_ros.core.arm.arm import Arm
+from fhaosmo_ros.core.arm.bank import Bank
+from fhaosmo_ros.core.arm.calibration import Calibration
+from fhaosmo_ros.core.arm.model import ArmModel, Payload
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from robots import joint, JOINTS, link, motion, URDF
+
+NOISE = 2e-5
+
+
+@pytest.fixture(scope='module')
+def model():
+    return ArmModel(URDF)
+
+
+@pytest.fixture(scope='module')
+def free(model):
+    t, q, v, torque = motion(model, 4.0)
+    random = np.random.default_rng(0)
+    return t, q + NOISE * random.standard_normal(q.shape), v, torque
+
+
+def random_state(n, seed=0):
+    random = np.random.default_rng(seed)
+    return (random.uniform(-2.0, 2.0, n) for _ in range(3))
+
+
+def test_momentum_follows_from_the_terms(model):
+    """p' = torque + C^T qd - g, by a difference of M(q) qd along a motion with torque."""
+    q, v, a = random_state(3)
+    torque = model.regressor(q, v, a) @ model.inertial.ravel()
+    terms, h = model.terms(q, v), 1e-5
+    p = [model.terms(q + s * v + 0.5 * s * s * a, v).mass @ (v + s * a) for s in (-h, h)]
+    np.testing.assert_allclose(
+        (p[1] - p[0]) / (2 * h), torque + terms.coriolis - terms.gravity, atol=1e-6
+    )
+    np.testing.assert_allclose(terms.mass, terms.mass.T)
+    assert np.all(np.linalg.eigvalsh(terms.mass) > 0.0)
+
+
+def test_forces_on_a_link_do_not_reach_joints_behind_it(model):
+    q, v, _ = random_state(3)
+    reach = model.terms(q, v).reach
+    for k, matrix in enumerate(reach):
+        np.testing.assert_allclose(matrix, matrix.T, atol=1e-15)
+        assert not matrix[k + 1 :].any()
+        assert np.all(np.linalg.eigvalsh(matrix) > -1e-12)
+
+
+def test_a_payload_is_weight_at_its_place():
+    model = ArmModel(URDF, payload=Payload(1.5, (0.0, 0.0, 0.4)))
+    bare = ArmModel(URDF)
+    q = np.array([0.0, np.pi / 2, 0.0])  # stretched out along x
+    rest = np.zeros(3)
+    more = model.terms(q, rest).gravity - bare.terms(q, rest).gravity
+    np.testing.assert_allclose(more, [0.0, -1.5 * 9.81 * 0.8, -1.5 * 9.81 * 0.4], atol=1e-9)
+
+
+@pytest.mark.parametrize(('urdf', 'options', 'text'), [
+    ('rubbish', {}, 'expected the XML of a URDF, got'),
+    ('<sdf/>', {}, 'expected a URDF'),
+    ('<robot name="r"><link name="a"/></robot>', {}, 'expected a joint that moves'),
+    (URDF.replace('type="revolute"', 'type="floating"', 1), {}, 'got a floating one'),
+    (URDF, {'joints': ['elbo']}, 'joints: expected some of turn, shoulder, elbow, got elbo'),
+    (URDF.replace('<mass value="2.0"/>', '<mass value="0"/>').replace(
+        link('lower', 2.0, 0.4).split('<inertia ')[1].split('/>')[0],
+        'ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"', 1), {}, 'mass'),
+    (URDF, {'inertial': np.zeros((2, 10))}, 'inertial: expected an array of shape'),
+])  # fmt: skip
+def test_robots_that_cannot_be_used_are_refused_in_one_line(urdf, options, text):
+    with pytest.raises(ConfigurationError, match=text) as error:
+        ArmModel(urdf, **options)
+    assert '\n' not in str(error.value)
+
+
+def test_mimic_joints_and_grippers_are_left_out_and_joints_may_be_chosen():
+    more = URDF.replace('</robot>', ''.join([
+        link('jaw', 0.1, 0.1), link('other', 0.1, 0.1),
+        joint('left_finger', 'tool', 'jaw', '1 0 0', 0.0, 'prismatic'),
+        joint('second', 'tool', 'other', '1 0 0', 0.0).replace(
+            '</joint>', '<mimic joint="left_finger"/></joint>'),
+        '</robot>',
+    ]))  # fmt: skip
+    assert ArmModel(more).joints == JOINTS
+    assert ArmModel(more, joints=['shoulder', 'elbow']).joints == ('shoulder', 'elbow')
+
+
+@pytest.mark.parametrize('kind', ['continuous', 'prismatic'])
+def test_other_joints_than_revolute_ones(kind):
+    urdf = URDF.replace('name="turn" type="revolute"', f'name="turn" type="{kind}"')
+    arm = Arm(urdf, position_noise=[NOISE])
+    t, q, _, torque = motion(arm.model, 1.0)
+    if kind == 'continuous':
+        q[:, 0] = np.remainder(q[:, 0] + 3.0, 2 * np.pi)  # it passes the seam
+        torque = motion(ArmModel(urdf), 1.0)[3]
+    found = arm.run(t, q, torque)
+    assert np.abs(found.external_torque[500:]).max() < 2.0
+    assert arm.counters['used'] == len(t) - 1
+
+
+def test_without_noise_one_filter_is_the_kalman_filter():
+    """One joint, weights fixed by rates of zero: compare with the textbook recursion."""
+    h, w, r, e = 1e-3, 4.0, 1e-8, 0.01
+    bank = Bank([w], 1e-9, [1.0], 0.0, 0.0, 0.0, 0.0)
+    bank.start([0.0], [[1.0]], [1.0])
+    x, p = np.zeros(3), np.diag([0.0, 1.0, 1.0])
+    f = np.array([[1, h, h * h / 2], [0, 1, h], [0, 0, 1]])
+    g = np.array([h * h / 2, h, 0.0])
+    q = w * np.array([
+        [h**5 / 20, h**4 / 8, h**3 / 6], [h**4 / 8, h**3 / 3, h * h / 2], [h**3 / 6, h * h / 2, h]
+    ]) + np.outer(g, g) * e  # fmt: skip
+    random, y = np.random.default_rng(1), 0.0
+    for _ in range(50):
+        moved, u = 1e-4 * random.standard_normal(), random.standard_normal()
+        y += moved
+        bank.step(h, np.array([moved]), np.array([u]), np.array([[r]]), np.array([e]), np.eye(1))
+        x, p = f @ x + g * u, f @ p @ f.T + q
+        k = p[:, 0] / (p[0, 0] + r)
+        x, p = x + k * (y - x[0]), p - np.outer(k, p[0])
+    np.testing.assert_allclose(bank.mean[1:, 0], x[1:], rtol=1e-6)
+    np.testing.assert_allclose(bank.mean[0, 0], x[0] - y, atol=1e-12)
+    np.testing.assert_allclose(bank.covariance, [[p[2, 2]]], rtol=1e-6)
+
+
+def test_a_force_that_is_there_at_once_is_not_taken_for_one_that_grows():
+    """The first sample of a step of d = 1: its mean over the sample, not half as much again."""
+    h, seen = 1e-3, {}
+    for onset in (0.0, 0.1):
+        bank = Bank([1e-9], 3.0, [1.0], 1.0, 1.0, 0.0, onset, of_position=False)
+        arrays = (np.zeros(1), np.eye(1) * 1e-16, np.ones(1) * 1e-16, np.eye(1))
+        for _ in range(20):
+            bank.step(h, np.zeros(1), *arrays)
+        bank.step(h, np.array([h]), *arrays)
+        seen[onset] = float(bank.mean[2, 0])
+    assert 1.3 < seen[0.0] < 1.6
+    assert abs(seen[0.1] - 1.0) < 0.05
+
+
+def test_weights_are_probabilities_and_copies_go_on_alike(free, model):
+    arm = Arm(URDF, position_noise=[NOISE])
+    t, q, _, torque = free
+    arm.run(t[:300], q[:300], torque[:300])
+    bank = arm._bank
+    assert np.isclose(bank.weights.sum(), 1.0)
+    assert np.all(bank.weights > 0.0)
+    np.testing.assert_allclose(bank.covariance, bank.covariance.T, rtol=1e-9)
+    arrays = (np.zeros(3), np.ones(3), np.eye(3) * 1e-8, np.ones(3), np.eye(3))
+    others = [copy.deepcopy(bank), pickle.loads(pickle.dumps(bank))]  # noqa: S301
+    for one in (bank, *others):
+        one.step(1e-3, *arrays)
+    for one in others:
+        np.testing.assert_array_equal(one.mean, bank.mean)
+        assert one.log_odds == bank.log_odds
+    with pytest.raises(ValueError, match='arrays of 3 joints'):
+        bank.step(1e-3, np.zeros(2), *arrays[1:])
+
+
+@pytest.mark.parametrize('measurement', ['position', 'velocity'])
+def test_a_push_is_found_told_and_located(free, model, measurement):
+    t, q, v, torque = free
+    arm = Arm(URDF, measurement=measurement, position_noise=[NOISE], velocity_noise=[1e-4])
+    began = 2000
+    pushed = np.where(t >= t[began], 1.0, 0.0)[:, np.newaxis] * np.array([3.0, -4.0, 0.0])
+    # The motion is the same because the drives hold against the push.
+    found = arm.run(t, q, torque - pushed, v)
+    late = slice(began + 200, None)
+    np.testing.assert_allclose(
+        found.external_torque[late].mean(axis=0), [3.0, -4.0, 0.0], atol=0.15
+    )
+    assert not found.contact[200:began].any()
+    assert found.contact[late].mean() > 0.95
+    links = found.link[began + 200 :]
+    assert links.count('upper') > 0.9 * len(links)
+    assert np.sqrt(np.mean((found.velocity - v)[late] ** 2)) < 0.03
+
+
+def test_tare_takes_the_present_torque_for_zero(free):
+    t, q, _, torque = free
+    arm = Arm(URDF, position_noise=[NOISE])
+    arm.run(t[:2000], q[:2000], torque[:2000] - 2.0)
+    before = arm.run(t[2000:2100], q[2000:2100], torque[2000:2100] - 2.0)
+    arm.tare()
+    after = arm.run(t[2100:3000], q[2100:3000], torque[2100:3000] - 2.0)
+    assert np.abs(before.external_torque[-1] - 2.0).max() < 0.3
+    assert np.abs(after.external_torque[-1]).max() < 0.3
+
+
+def test_gravity_compensated_effort_and_a_late_torque(free, model):
+    t, q, v, torque = free
+    gravity = np.array([model.terms(*row).gravity for row in zip(q, v, strict=True)])
+    plain = Arm(URDF, position_noise=[NOISE]).run(t, q, torque)
+    other = Arm(URDF, position_noise=[NOISE], effort='gravity_compensated')
+    np.testing.assert_allclose(
+        other.run(t, q, torque - gravity).external_torque, plain.external_torque, atol=1e-9
+    )
+    late = np.vstack([np.repeat(torque[:1], 5, axis=0), torque[:-5]])
+    found = Arm(URDF, position_noise=[NOISE], torque_delay=0.005).run(t, q, late)
+    ignored = Arm(URDF, position_noise=[NOISE]).run(t, q, late)
+    rms = [np.sqrt(np.nanmean(e.external_torque[500:] ** 2)) for e in (found, ignored)]
+    assert rms[0] < 0.5 * rms[1]
+
+
+@pytest.mark.parametrize(('change', 'counter'), [
+    (lambda q, e: (q * np.nan, e), 'not finite'),
+    (lambda q, e: (q, e * np.inf), 'not finite'),
+    (lambda q, e: (np.degrees(q) + 90.0, e), 'beyond limits'),
+    (lambda q, e: (q[:2], e), 'wrong size'),
+    (lambda q, e: (q, e[:0]), 'wrong size'),
+    (lambda q, e: (['a', None, 0.0], e), 'wrong size'),
+    (lambda q, e: (q, e * 1e300), 'too strong'),
+    (lambda q, e: (q + 0.5, e), 'jumped'),
+])  # fmt: skip
+def test_bad_samples_are_counted_and_survived(free, change, counter):
+    t, q, _, torque = free
+    arm = Arm(URDF, position_noise=[NOISE])
+    arm.run(t[:500], q[:500], torque[:500])
+    stamp = round(t[499] * 1e9)
+    assert arm.take(stamp + 1_000_000, *change(q[500], torque[500])) is None
+    assert arm.counters[counter] == 1
+    found = arm.run(t[501:1500], q[501:1500], torque[501:1500])
+    assert np.abs(found.external_torque[-1]).max() < 0.5
+    assert arm.take(round(t[1490] * 1e9), q[1490], torque[1490]) is None
+    assert arm.counters['not newer'] == 1
+    arm.run(t[1500:1502] + 10.0, q[1500:1502], torque[1500:1502])
+    assert arm.counters['restarts'] == 1
+    found = arm.run(t[1502:1600], q[1502:1600], torque[1502:1600])
+    assert arm.counters['clock set back'] == 1
+    assert np.isfinite(found.external_torque[5:]).all()
+
+
+@pytest.mark.parametrize('limit', ['velocity="5"', 'effort="100"', 'lower="-3" upper="3"'])
+def test_a_limit_that_the_urdf_does_not_say_is_none(free, limit):
+    t, q, _, torque = free
+    name = limit.split('=')[0]
+    arm = Arm(URDF.replace(limit, '' if name == 'lower' else f'{name}="0"'))
+    arm.run(t[:100], q[:100], torque[:100])
+    assert arm.counters == {'used': 99}
+
+
+def test_samples_that_nearly_coincide_are_no_jump(free):
+    t, q, _, torque = free
+    arm = Arm(URDF, position_noise=[NOISE])
+    arm.run(t[:100], q[:100], torque[:100])
+    assert arm.take(round(t[99] * 1e9) + 1000, q[99] + 3 * NOISE, torque[99]) is not None
+
+
+@pytest.mark.parametrize(('named', 'text'), [
+    ({'position_noise': [1e-5, 1e-5]}, '1 or 3 numbers'),
+    ({'payload': [-1.0, 0.0, 0.0, 0.0]}, 'mass >= 0'),
+    ({'gravity': [9.81]}, 'three numbers'),
+    ({'calibration_file': '/none.yaml'}, 'calibration_file'),
+    ({'effort': 'force'}, 'one of torque, current'),
+    ({'efort': 'torque'}, "did you mean 'effort'"),
+])  # fmt: skip
+def test_bad_parameters_are_refused(named, text):
+    with pytest.raises(ConfigurationError, match=text):
+        Arm(URDF, **named)
+
+
+def test_a_wrench_is_found_at_a_frame_and_what_cannot_be_seen_is_said(free):
+    t, q, _, torque = free
+    arm = Arm(URDF, position_noise=[NOISE])
+    jacobian, _ = arm.model.frame_jacobian(q[999], 'tool')
+    force = np.array([8.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    for k in range(1000):
+        at, _ = arm.model.frame_jacobian(q[k], 'tool')
+        estimate = arm.take(round(t[k] * 1e9), q[k], torque[k] - at.T @ force)
+    wrench = arm.wrench(estimate, 'tool')
+    assert wrench.near_singular  # three joints do not see six numbers
+    explained = jacobian.T @ np.concatenate([wrench.force, wrench.torque])
+    np.testing.assert_allclose(explained, estimate.external_torque, atol=0.3)
+    with pytest.raises(ConfigurationError, match='frame: expected one of'):
+        arm.wrench(estimate, 'tol')
+
+
+def test_run_and_calibration_refuse_what_does_not_fit(free):
+    t, q, _, torque = free
+    with pytest.raises(ConfigurationError, match='effort: expected shape'):
+        Arm(URDF).run(t, q, torque[:, :2])
+    with pytest.raises(ConfigurationError, match='expected the joints turn, shoulder, elbow'):
+        Arm(URDF, calibration=Calibration.none(['a', 'b', 'c']))
