@@ -24,7 +24,7 @@ from fhaosmo_ros.stop_signals import ending_signals
 def usage() -> str:
     """Return the help text: one line for each command."""
     program = 'fhaosmo' if Path(sys.argv[0]).name == 'fhaosmo' else 'python -m fhaosmo_ros'
-    lines = [f'  {name:<10} {text}' for name, (_, text) in COMMANDS.items()]
+    lines = [f'  {name:<11} {text}' for name, (_, text) in COMMANDS.items()]
     return '\n'.join([f'usage: {program} COMMAND [ARGUMENTS]', '', *lines])
 
 

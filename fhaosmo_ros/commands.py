@@ -11,6 +11,18 @@ COMMANDS = {
         'fhaosmo_ros.nodes.estimator.node',
         'node: estimate states and unknown input of y',
     ),
+    'arm': (
+        'fhaosmo_ros.nodes.arm',
+        'node: estimate external torques and contacts of a robot arm',
+    ),
+    'calibrate': (
+        'fhaosmo_ros.tools.arm.calibrate',
+        'find what the URDF of an arm does not say, from free motion',
+    ),
+    'replay_arm': (
+        'fhaosmo_ros.tools.arm.replay',
+        'estimate external torques from a bag, as the node arm would',
+    ),
     'plant': ('fhaosmo_ros.nodes.plant', 'node: simulate a plant and publish y and the truth'),
     'demo': (
         'fhaosmo_ros.tools.demo.command',

@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arm node: external torques and contacts out of /joint_states and a URDF."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from fhaosmo_ros.core.arm.arm import Arm, ArmEstimate, payload_of
+from fhaosmo_ros.core.parameters.declaration import Parameters, suggestion, Value
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import complete
+from fhaosmo_ros.core.parameters.tables import ARM_NODE_PARAMETERS
+from fhaosmo_ros.nodes.middleware.diagnostics import (
+    DiagnosticsPublisher,
+    ERROR,
+    OK,
+    Report,
+    STALE,
+    WARN,
+)
+from fhaosmo_ros.nodes.middleware.messages import time_message
+from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
+from fhaosmo_ros.nodes.middleware.publishers import (
+    check_overrides,
+    create_publisher,
+    has_listeners,
+    LATCHED,
+)
+from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
+from fhaosmo_ros.nodes.middleware.spin import run_node
+from fhaosmo_ros.nodes.middleware.subscription import SENSOR_QOS
+from fhaosmo_ros.nodes.middleware.timers import set_period
+from geometry_msgs.msg import WrenchStamped
+import numpy as np
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+SILENT = 0.5
+"""Seconds without a sample that are reported."""
+QUIET = 5.0
+"""Seconds between two lines of the log about one problem."""
+TOPICS = {
+    '~/external_torque': JointState, '~/standard_deviation': JointState,
+    '~/joint_states': JointState, '~/external_wrench': WrenchStamped,
+}  # fmt: skip
+EVENT = '~/event'
+MEANT = {
+    'beyond limits': 'positions lie beyond the limits of the URDF: are they in degrees, or is it '
+    'another robot?',
+    'jumped': 'positions jumped faster than three times the velocity limit of the URDF: the '
+    'estimates began anew',
+    'not finite': 'positions, efforts or velocities are NaN or infinite',
+    'not newer': 'the stamp is not later than that of the sample before',
+    'too strong': 'efforts are a hundred times those of the URDF: what is the unit of effort?',
+    'too fast': 'velocities are more than three times the limit of the URDF: are they in degrees?',
+    'clock set back': 'stamps are more than 0.1 s older than before: the estimates began anew',
+    'restarts': 'a gap of more than 0.1 s: the estimates began anew',
+}
+"""What the counters of `Arm` mean."""
+
+
+class ArmNode(TimedNode):
+    """
+    Estimates external torques, from the first sample after the robot's description on.
+
+    `given` are values of parameters, also of rclpy's own. Those that can't be used raise
+    ConfigurationError; what a topic delivers and can't be used is logged, reported and survived.
+    """
+
+    def __init__(self, given: Mapping[str, Any] | None = None, **options: Any) -> None:
+        given = given or {}
+        values = complete(given, ARM_NODE_PARAMETERS)
+        super().__init__(
+            'arm', parameter_overrides=built_in(given), enable_logger_service=True, **options
+        )
+        check_overrides(self, given, [*TOPICS, EVENT])
+        self._values = values
+        self._arm: Arm | None = None
+        self._description = ''
+        self._problem = ''
+        self._logged: dict[str, float] = {}  # when each kind of problem was, by perf_counter
+        self._order: dict[tuple[str, ...], NDArrayInt | None] = {}
+        self._counted: dict[str, int] = {}
+        self._published, self._latest = -np.inf, -np.inf
+        self._contact: bool | None = False  # None: not known
+        self._near = False
+        self._estimate: ArmEstimate | None = None
+        self._outputs = {
+            topic.removeprefix('~/'): create_publisher(self, kind, topic)
+            for topic, kind in TOPICS.items()
+            if topic != '~/external_wrench' or values['wrench_frame']
+        }
+        self._events = create_publisher(self, DiagnosticArray, EVENT, latched=True)
+        fixed = [name for name, p in ARM_NODE_PARAMETERS.items() if not p.live]
+        NodeParameters(self, values, fixed).on_change(self._prepare, self._adopt)
+        path = values['robot_description_file']
+        if path:
+            self._use(_text_of(path))
+        else:
+            self._topic = self.resolve_topic_name('robot_description')
+            self.create_subscription(String, 'robot_description', self._on_description, LATCHED)
+            self.get_logger().info(f'waiting for the robot on {self._topic}')
+        self.create_subscription(JointState, values['input_topic'], self._on_sample, SENSOR_QOS)
+        self.create_service(Trigger, '~/reset', self._reset)
+        self.create_service(Trigger, '~/tare', self._tare)
+        self._diagnostics = DiagnosticsPublisher(
+            self, self._reports, values['diagnostics_period'], values['hardware_id']
+        )
+
+    def _use(self, urdf: str) -> None:
+        """Begin to estimate for this robot."""
+        values = self._values
+        self._arm = Arm(urdf, values)
+        frame = values['wrench_frame']
+        if frame:
+            rest = np.zeros(len(self._arm.joints))
+            self._arm.model.frame_jacobian(rest, frame)  # raises for an unknown one
+        self._description = urdf
+        self._order.clear()
+        self._say_event(0, OK, 'no contact yet', {})
+        self.get_logger().info(
+            f'estimating the external torques of {", ".join(self._arm.joints)} from '
+            f'{self.resolve_topic_name(values["input_topic"])} '
+            f'({values["measurement"]}, effort: {values["effort"]})'
+        )
+
+    def _on_description(self, message: String) -> None:
+        if self._arm is not None:
+            if message.data != self._description:
+                self._warn(
+                    f'a second robot on {self._topic} is ignored: start the node again for it'
+                )
+            return
+        try:
+            self._use(message.data)
+        except ConfigurationError as error:
+            self._arm = None
+            self._problem = str(error)
+            self.get_logger().error(str(error))
+
+    def _on_sample(self, message: JointState) -> None:
+        """Take a message, if it is of this arm."""
+        arm = self._arm
+        if arm is None:
+            return
+        names = tuple(message.name)
+        if names not in self._order:
+            self._learn(names)
+        order = self._order[names]
+        if order is None:
+            return
+        stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+        parts = [message.position, message.effort]
+        if self._values['measurement'] == 'velocity':
+            parts.append(message.velocity)
+        arrays = [np.asarray(part, dtype=np.float64) for part in parts]
+        for what, array in zip(('position', 'effort', 'velocity'), arrays, strict=False):
+            if len(array) != len(names):
+                self._warn(
+                    f'{what}: expected {len(names)} numbers, one for each name, got {len(array)}: '
+                    'no estimate without them'
+                )
+                return
+        if stamp == 0:
+            self._warn('the header stamp is 0: nobody fills it, and no time is known without it')
+            return
+        estimate = arm.take(stamp, *(array[order] for array in arrays))
+        for what, count in arm.counters.items():
+            if what in MEANT and count != self._counted.get(what, 0):
+                self._counted[what] = count
+                self._warn(f'{MEANT[what]} ({count} so far)', what)
+        if arm.doubts.text:
+            self._warn(arm.doubts.text, 'payload' if arm.doubts.payload else 'doubt')
+        if estimate is not None:
+            self._latest = perf_counter()
+            self._estimate = estimate
+            self._publish(estimate)
+
+    def _learn(self, names: tuple[str, ...]) -> None:
+        """Remember where the arm's joints are in messages with these names."""
+        assert self._arm is not None
+        wanted = self._arm.joints
+        missing = [name for name in wanted if name not in names]
+        self._order[names] = None
+        if len(self._order) > 100:  # names that change all the time
+            self._order = {names: None}
+        if not missing:
+            self._order[names] = np.array([names.index(name) for name in wanted])
+        elif len(missing) < len(wanted) or not any(v is not None for v in self._order.values()):
+            self._warn(
+                f'a message lacks {", ".join(missing)}{suggestion(missing[0], names)}: no '
+                'estimate from it'
+            )
+
+    def _publish(self, estimate: ArmEstimate) -> None:
+        self._tell(estimate)
+        period = 1e9 / self._values['publish_rate']
+        # Half a sample early rather than one late: rates that divide each other stay as they are.
+        if 0.0 <= estimate.stamp - self._published < 0.9 * period:
+            return
+        self._published = estimate.stamp
+        assert self._arm is not None
+        names, stamp = list(self._arm.joints), time_message(estimate.stamp)
+        parts = {
+            'external_torque': lambda: {'effort': estimate.external_torque},
+            'standard_deviation': lambda: {'effort': estimate.standard_deviation},
+            'joint_states': lambda: {
+                'position': estimate.position, 'velocity': estimate.velocity,
+            },
+        }  # fmt: skip
+        for topic, arrays in parts.items():
+            publisher = self._outputs[topic]
+            if has_listeners(publisher):
+                message = JointState(name=names)
+                message.header.stamp = stamp
+                for name, array in arrays().items():
+                    setattr(message, name, array.tolist())
+                publisher.publish(message)
+        frame = self._values['wrench_frame']
+        if frame and has_listeners(self._outputs['external_wrench']):
+            wrench = self._arm.wrench(estimate, frame)
+            self._near = wrench.near_singular
+            wrenched = WrenchStamped()
+            wrenched.header.stamp, wrenched.header.frame_id = stamp, frame
+            for part, values in (
+                (wrenched.wrench.force, wrench.force), (wrenched.wrench.torque, wrench.torque),
+            ):  # fmt: skip
+                part.x, part.y, part.z = values.tolist()
+            self._outputs['external_wrench'].publish(wrenched)
+
+    def _tell(self, estimate: ArmEstimate) -> None:
+        """Publish that a contact has begun or ended."""
+        if estimate.contact == self._contact:
+            return
+        self._contact = estimate.contact
+        assert self._arm is not None
+        values = {
+            'link': estimate.link, 'log odds': f'{estimate.log_odds:.3g}',
+            **{
+                f'external torque {name}': f'{torque:.4g}'
+                for name, torque in zip(self._arm.joints, estimate.external_torque, strict=True)
+            },
+        }  # fmt: skip
+        if estimate.contact:
+            text = f'contact, most likely at {estimate.link}'
+            self._say_event(estimate.stamp, WARN, text, values)
+            self.get_logger().warning(f'event: {text}', throttle_duration_sec=QUIET)
+        else:
+            at = f', most likely it was at {estimate.link}' if estimate.link else ''
+            text = f'contact has ended{at}'
+            self._say_event(estimate.stamp, OK, text, values)
+
+    def _say_event(self, stamp: int, level: bytes, text: str, values: dict[str, str]) -> None:
+        message = DiagnosticArray()
+        message.header.stamp = (
+            time_message(stamp) if stamp else self.get_clock().now().to_msg()
+        )  # fmt: skip
+        message.status = [DiagnosticStatus(
+            level=level, name=f'{self.get_fully_qualified_name().lstrip("/")}: contact',
+            message=text, hardware_id=self._values['hardware_id'],
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )]  # fmt: skip
+        self._events.publish(message)
+
+    def _warn(self, text: str, kind: str = '') -> None:
+        """Log a problem, each kind at most every `QUIET` seconds, and report it."""
+        now, kind = perf_counter(), kind or text
+        if now - self._logged.get(kind, -np.inf) > QUIET:
+            if len(self._logged) > 100:  # names that change all the time
+                self._logged.clear()
+            self._logged[kind] = now
+            self.get_logger().warning(text)
+        self._problem = text
+
+    def _reports(self) -> list[Report]:
+        report = Report('arm')
+        if self._problem:
+            report.find(WARN, self._problem)
+            self._problem = ''
+        if self._arm is None:
+            report.find(ERROR, f'no robot yet on {self._topic}')
+            return [report]
+        silent = perf_counter() - self._latest
+        if not silent < SILENT:
+            topic = self.resolve_topic_name(self._values['input_topic'])
+            since = f'for {silent:.3g} s' if np.isfinite(silent) else 'yet'
+            report.find(ERROR, f'no usable sample on {topic} {since}: nothing is published')
+            if self._contact:
+                self._contact = None
+                self._say_event(0, STALE, f'no usable sample {since}: contact is not known', {})
+        report.find(WARN, 'near a singular posture: part of the wrench is not seen', self._near)
+        report.values |= {f'samples {what}': n for what, n in self._arm.counters.items()}
+        estimate = self._estimate
+        if estimate is not None:
+            report.values['log odds of contact'] = float(estimate.log_odds)
+            report.values['contact'] = estimate.link or 'none'
+        return [report]
+
+    def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> Any:
+        payload_of(values)
+        for name, value in changes.items():
+            if not values.table[name].live and value != self._values[name]:
+                raise ConfigurationError(
+                    f"parameter '{name}': can't change in a running node (it is "
+                    f'{self._values[name]!r}), got {value!r}'
+                )
+        return values
+
+    def _adopt(self, values: Any) -> None:
+        self._values = values
+        if self._arm is not None:
+            self._arm.adopt(values)
+        set_period(self._diagnostics.timer, values['diagnostics_period'])
+        self._diagnostics.hardware_id = values['hardware_id']
+
+    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._served(response, 'reset', 'the estimates begin anew with the next sample')
+
+    def _tare(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._served(response, 'tare', 'the present external torque counts as zero')
+
+    def _served(self, response: Any, name: str, text: str) -> Any:
+        response.success = self._arm is not None and self._estimate is not None
+        response.message = text if response.success else 'there is no estimate yet'
+        if response.success:
+            getattr(self._arm, name)()
+        self.get_logger().info(f'{name}: {response.message}')
+        return response
+
+
+NDArrayInt = np.ndarray[Any, np.dtype[np.int64]]
+
+
+def _text_of(path: str) -> str:
+    try:
+        return Path(path).expanduser().read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(
+            f"parameter 'robot_description_file': expected a URDF, got {path} ({error})"
+        ) from None
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the arm node."""
+    return run_node('arm', ArmNode, argv)

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a recording of free motion says of an arm, and the file and commands around it."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip('pinocchio')
+
+from fhaosmo_ros.core.arm.calibration import Calibration, WIDTHS
+from fhaosmo_ros.core.arm.identification import identify, noise_of, payload_of_motion
+from fhaosmo_ros.core.arm.model import ArmModel, Payload
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.tools.arm import calibrate, replay
+from fhaosmo_ros.tools.bags.types import serialise, TYPES
+from fhaosmo_ros.tools.bags.writer import BagWriter
+from robots import JOINTS, motion, URDF
+
+PERIOD = 0.004
+OFFSET = np.array([0.5, -0.3, 0.2])
+
+
+def real_arm():
+    """Return an arm that is heavier than its URDF."""
+    model = ArmModel(URDF)
+    return ArmModel(URDF, inertial=model.inertial * np.array([1.1, 1.2, 0.8])[:, np.newaxis])
+
+
+def recorded(seed=1, duration=40.0, noise=0.05):
+    """Return a free motion of that arm, with friction, an offset and noise."""
+    t, q, v, torque = motion(real_arm(), duration, seed, PERIOD)
+    rubbing = np.array([1.0, 3.0, 2.0]) * np.tanh(v / 0.05) + np.array([0.2, 0.5, 0.3]) * v
+    random = np.random.default_rng(seed)
+    q = q + 1e-5 * random.standard_normal(q.shape)
+    return t, q, torque + rubbing + OFFSET + noise * random.standard_normal(q.shape)
+
+
+@pytest.fixture(scope='module')
+def found():
+    return identify(ArmModel(URDF), *recorded())
+
+
+def test_what_the_urdf_leaves_is_explained_also_in_another_motion(found):
+    assert np.all(found.after < 0.05 * found.before)
+    other = recorded(seed=5, duration=20.0)
+    _, before, _ = payload_of_motion(ArmModel(URDF), *other, Calibration.none(JOINTS))
+    _, after, _ = payload_of_motion(ArmModel(URDF), *other, found.calibration)
+    assert np.all(after < 0.1 * before)
+    assert not found.notes
+
+
+def test_noise_is_found_and_stays_finite_for_a_quantised_encoder(found):
+    np.testing.assert_allclose(found.calibration.torque_noise, 0.05, rtol=0.1)
+    np.testing.assert_allclose(found.calibration.position_noise, 1e-5, rtol=0.1)
+    t = np.arange(0.0, 10.0, 1e-3)
+    rounded = np.round(np.sin(t)[:, np.newaxis] / 1e-4) * 1e-4
+    assert 0.5 < noise_of(rounded)[0] / (1e-4 / np.sqrt(12.0)) < 2.0
+
+
+def test_a_joint_that_rests_keeps_its_urdf_and_is_named():
+    model = ArmModel(URDF)
+    t, q, v, torque = motion(model, 20.0, period=PERIOD)
+    q[:, 2] = 0.3
+    v[:, 2] = 0.0
+    a = np.gradient(v, PERIOD, axis=0)
+    torque = np.array([
+        model.regressor(*row) @ model.inertial.ravel() for row in zip(q, v, a, strict=True)
+    ])  # fmt: skip
+    noisy = torque + 0.02 * np.random.default_rng(1).standard_normal(torque.shape)
+    found = identify(model, t, q, noisy)
+    assert [note.split()[0] for note in found.notes] == ['elbow']
+    assert found.calibration.inertial[2, 0] == pytest.approx(model.inertial[2, 0], rel=0.2)
+
+
+def test_links_that_cannot_exist_are_not_found():
+    model = ArmModel(URDF, payload=Payload(0.5, (0.0, 0.0, 0.4)))
+    t, q, torque = recorded(
+        duration=12.0, noise=3.0
+    )  # so much noise that plain fits leave physics
+    inertial = identify(model, t, q, torque - 5.0 * np.gradient(q, t, axis=0)).calibration.inertial
+    ArmModel(URDF, inertial=inertial)  # without payload, and without what rotors add
+    for mass, x, y, z, xx, xy, yy, xz, yz, zz in inertial:
+        turning = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        pseudo = np.zeros((4, 4))
+        pseudo[:3, :3] = np.trace(turning) / 2.0 * np.eye(3) - turning
+        pseudo[3] = pseudo[:, 3] = x, y, z, mass
+        assert np.linalg.eigvalsh(pseudo)[0] > 0.0
+
+
+def test_a_joint_that_moves_one_way_only_is_named():
+    t, q, torque = recorded(duration=20.0)
+    q = np.column_stack([0.3 * t, q[:, 1:]])
+    notes = identify(ArmModel(URDF), t, q, torque).notes
+    assert notes == ['turn moved one way only: its friction cannot be told from its offset']
+
+
+def test_torque_constants_of_joints_that_gravity_acts_on():
+    t, q, torque = recorded(noise=0.02)
+    constants = np.array([8.0, 12.0, 9.0])
+    found = identify(ArmModel(URDF), t, q, torque / constants, torque_constants=0.0)
+    # The URDF is 20 % wrong, and so is what is found by it.
+    np.testing.assert_allclose(found.calibration.torque_constants[1:], constants[1:], rtol=0.3)
+    assert not found.notes
+    known = identify(ArmModel(URDF), t, q, torque / constants, torque_constants=constants)
+    np.testing.assert_array_equal(known.calibration.torque_constants, constants)
+
+
+def test_a_torque_constant_that_is_not_told_is_taken_from_other_joints():
+    t, q, torque = recorded(duration=20.0, noise=0.02)
+    q[:, 0], torque[:, 0] = 0.2, 0.02 * np.random.default_rng(2).standard_normal(len(t))
+    found = identify(ArmModel(URDF), t, q, torque / 9.0, torque_constants=0.0)
+    constants = found.calibration.torque_constants
+    assert [note.split()[0] for note in found.notes] == ['turn:', 'turn']
+    assert constants[0] == pytest.approx(constants[1:].mean())
+    with pytest.raises(ConfigurationError, match='torque_constants: expected them'):
+        identify(ArmModel(URDF), t, q, 0.0 * q, torque_constants=0.0)
+
+
+def test_a_payload_is_found(found):
+    carrying = real_arm()
+    carrying.set_payload(Payload(1.5, (0.02, 0.0, 0.35)))
+    torque = motion(carrying, 20.0, 7, PERIOD)[3]
+    plain = motion(real_arm(), 20.0, 7, PERIOD)[3]
+    t, q, measured = recorded(seed=7, duration=20.0)
+    payload, before, after = payload_of_motion(
+        ArmModel(URDF), t, q, measured + torque - plain, found.calibration
+    )
+    assert payload.mass == pytest.approx(1.5, rel=0.05)
+    np.testing.assert_allclose(payload.center, (0.02, 0.0, 0.35), atol=0.06)
+    assert np.all(after <= before)
+
+
+def test_the_file_gives_back_what_was_written_and_others_are_refused(found):
+    text = found.calibration.dumps()
+    again = Calibration.loads(text)
+    np.testing.assert_array_equal(again.inertial, found.calibration.inertial)
+    np.testing.assert_array_equal(again.coulomb, found.calibration.coulomb)
+    assert again.coulomb.shape == (3, len(WIDTHS))
+    for old, new, expected in (
+        ('offset:', 'ofset:', 'missing or unknown are offset, ofset'),
+        ('  - elbow\n', '', 'expected shape'),
+        (f'- {found.calibration.offset[0].item()}', '- .nan', 'offset: expected finite numbers'),
+    ):
+        assert old in text
+        with pytest.raises(ConfigurationError, match=expected):
+            Calibration.loads(text.replace(old, new, 1))
+    for text in ('', '[1, 2', 'a: b', 'arm_calibration: 3'):
+        with pytest.raises(ConfigurationError, match='expected a file of `calibrate`'):
+            Calibration.loads(text)
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """Return a bag of free motion, as `record` would have made it."""
+    path = tmp_path_factory.mktemp('arm') / 'free'
+    t, q, torque = recorded(duration=15.0)
+    kinds = TYPES.types
+    with BagWriter(path) as writer:
+        writer.add('/robot_description', 'std_msgs/msg/String')
+        writer.add('/joint_states', 'sensor_msgs/msg/JointState')
+        writer.write('/robot_description', 1, serialise('std_msgs/msg/String', data=URDF))
+        for k, moment in enumerate(t):
+            stamp = 10**9 + round(moment * 1e9)
+            second, nanosecond = divmod(stamp, 10**9)
+            time = kinds['builtin_interfaces/msg/Time'](sec=second, nanosec=nanosecond)
+            writer.write('/joint_states', stamp, serialise(
+                'sensor_msgs/msg/JointState',
+                header=kinds['std_msgs/msg/Header'](stamp=time, frame_id=''),
+                name=list(JOINTS), position=q[k], velocity=np.zeros(0), effort=torque[k],
+            ))  # fmt: skip
+    return path
+
+
+def test_commands_calibrate_and_replay_a_bag(bag, tmp_path, capsys):
+    file, table = tmp_path / 'three.yaml', tmp_path / 'torque.csv'
+    assert calibrate.main(['--bag', str(bag), '-o', str(file)]) == 0
+    assert (tmp_path / 'three.png').stat().st_size > 10_000
+    assert 'shoulder' in capsys.readouterr().out
+    assert replay.main([str(bag), '-o', str(table), '-p', f'calibration_file:={file}']) == 0
+    rows = np.genfromtxt(table, delimiter=',', skip_header=1, usecols=range(7))
+    assert np.abs(rows[500:, 1:4]).mean() < 0.5
+    assert Calibration.loads(file.read_text()).log_odds >= calibrate.LEAST
+    assert calibrate.main(['--bag', str(bag), '--payload']) == 2
+    assert calibrate.main(['--bag', str(bag), '--topic', '/none']) == 2
+    errors = capsys.readouterr().err
+    assert 'calibration_file:=FILE' in errors
+    assert 'expected messages on /none, got none' in errors
