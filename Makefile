@@ -6,11 +6,12 @@ MINUTES ?= 2
 # $(call with,EXTRA): set $python to the environment's Python, making the environment first.
 with = python=$$(PYTHON='$(PYTHON)' sh scripts/environment.sh $(1))
 
-.PHONY: help demo paper tune compare evidence test lint docs bench soak clean
+.PHONY: help demo demo-arm paper tune compare evidence test lint docs bench soak clean
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    run plant and estimator for 20 s, draw what was estimated'
+	@echo 'make demo-arm  a simulated robot arm is hit, leaned on a wall and pushed; needs MuJoCo'
 	@echo 'make paper   reproduce the paper, rewrite docs/evidence and its figures'
 	@echo 'make tune    find gains that fit a sensor: ARGS="--params-file my.yaml", or --bag run'
 	@echo 'make compare tune other observers by the same rules, rewrite docs/evidence'
@@ -28,6 +29,9 @@ help:
 # exec: the command is then make's own child, so Ctrl-C and exit codes pass through no shell.
 demo:
 	@$(call with) && exec "$$python" -m fhaosmo_ros demo $(ARGS)
+
+demo-arm:
+	@$(call with,arm-study) && exec "$$python" -m studies.arm.demo $(ARGS)
 
 paper:
 	@$(call with) && exec "$$python" -m studies.paper $(ARGS)

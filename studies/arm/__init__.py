@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""External torques of simulated arms: ours beside the observers that others use."""
