@@ -3,6 +3,7 @@
 
 from pathlib import Path
 import sys
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -198,6 +199,7 @@ def test_a_wrong_setting_is_said_once_and_the_estimates_stop(launch, user, tmp_p
     )  # fmt: skip
     samples = user.publisher('/wrong/joint_states', JointState)
     torques = user.record('/wrong/arm/external_torque', JointState)
+    begin = time.monotonic()
     text = 'the efforts of all joints have the wrong sign'
     for k, (q, torque) in enumerate(zip(MOTION[1], MOTION[3], strict=True)):
         message = JointState(header=Header(stamp=as_time(10**12 + k * 1_000_000)), name=JOINTS)
@@ -209,7 +211,8 @@ def test_a_wrong_setting_is_said_once_and_the_estimates_stop(launch, user, tmp_p
         text in s.message for r in user.reports['wrong/arm'] for s in r.statuses.values()
     ), 'report')  # fmt: skip
     assert len(torques) < len(MOTION[0]) - 200
-    assert process.output.count(text) == 1
+    lines = 1 + (time.monotonic() - begin) / 5.0  # once in five seconds
+    assert 1 <= process.output.count(text) <= lines
 
 
 def test_a_bag_that_begins_again_and_silence_are_said(limb, user):
