@@ -290,3 +290,16 @@ def test_run_and_calibration_refuse_what_does_not_fit(free):
         Arm(URDF).run(t, q, torque[:, :2])
     with pytest.raises(ConfigurationError, match='expected the joints turn, shoulder, elbow'):
         Arm(URDF, calibration=Calibration.none(['a', 'b', 'c']))
+
+
+def test_noise_of_torques_is_found_and_makes_no_contact(free):
+    t, q, _, torque = free
+    noise = np.array([0.02, 0.2, 0.1])
+    noisy = torque + noise * np.random.default_rng(5).standard_normal(torque.shape)
+    arm = Arm(URDF, position_noise=[NOISE])
+    found = arm.run(t, q, noisy)
+    np.testing.assert_allclose(np.sqrt(arm._torque_variance), noise, rtol=0.15)
+    assert not found.contact[500:].any()
+    told = Arm(URDF, position_noise=[NOISE], torque_noise=[0.5])
+    told.run(t[:500], q[:500], noisy[:500])
+    np.testing.assert_allclose(told._torque_variance, 0.25)

@@ -43,6 +43,8 @@ STRONGER = 100.0
 """Times the URDF's effort limit, or the torque of the arm's weight: no torque of this arm."""
 DAMPING = 0.02
 """Singular value of a frame's Jacobian, m, below which a force along it is damped."""
+FIRST_LEARNT, LONGEST_LEARNT = 10, 1000
+"""Samples over which the noise of torques is averaged, at the start and later."""
 SLIDING = 0.005
 """s: memory of the differences of positions that friction is computed from."""
 
@@ -163,7 +165,12 @@ class Arm:
             self._noise = self._values('velocity_noise') ** 2
         scale = model.torque_of_weight()
         scale = np.maximum(scale, LEAST * np.max(scale))
-        self._torque_variance = self._size('torque_noise', TORQUE_NOISE * scale) ** 2
+        told = self._size('torque_noise')
+        self._learns = told == 0.0
+        self._torque_variance = np.where(self._learns, TORQUE_NOISE * scale, told) ** 2
+        self._least_variance = 1e-2 * self._torque_variance
+        self._torques: deque[Floats] = deque(maxlen=4)
+        self._learnt = FIRST_LEARNT
         self._model_variance = self._size('model_error', MODEL_ERROR * scale) ** 2
         constants = self._values('torque_constants')
         self._constants = np.where(constants == 1.0, known.torque_constants, constants)
@@ -202,6 +209,7 @@ class Arm:
         self._contact, self._evidence = False, np.zeros(len(self.joints))
         self.doubts.reset()
         self._clock.reset()
+        self._torques.clear()
         self._waiting.clear()
 
     @property
@@ -332,6 +340,7 @@ class Arm:
             self.counters['jumped'] += 1
             self.reset()
             return None
+        self._learn_noise(torque)
         if not self._started:
             speed = moved / h if velocity is None else velocity
             spread = terms.mass * (2.0 * self._noise / (h * h if velocity is None else 1.0))
@@ -370,6 +379,19 @@ class Arm:
             stamp, q, self._velocity, torques, covariance, odds,
             self._contact, link,
         )  # fmt: skip
+
+    def _learn_noise(self, torque: Floats) -> None:
+        """Follow the noise of torques where nobody has told it, by their third differences."""
+        self._torques.append(torque)
+        if len(self._torques) < 4 or not self._learns.any():
+            return
+        a, b, c, d = self._torques
+        before = self._torque_variance
+        # 20 = 1 + 9 + 9 + 1. An impact counts as three standard deviations at most.
+        seen = np.minimum((d - 3.0 * (c - b) - a) ** 2 / 20.0, 9.0 * before)
+        self._learnt = min(self._learnt + 1, LONGEST_LEARNT)
+        after = np.maximum(before + (seen - before) / self._learnt, self._least_variance)
+        self._torque_variance = np.where(self._learns, after, before)
 
     def _drive(
         self, q: Floats, velocity: Floats, torque: Floats, sliding: Floats
