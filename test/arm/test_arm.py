@@ -202,7 +202,7 @@ def test_gravity_compensated_effort_and_a_late_torque(free, model):
     plain = Arm(URDF, position_noise=[NOISE]).run(t, q, torque)
     other = Arm(URDF, position_noise=[NOISE], effort='gravity_compensated')
     np.testing.assert_allclose(
-        other.run(t, q, torque - gravity).external_torque, plain.external_torque, atol=1e-9
+        other.run(t, q, torque - gravity).external_torque, plain.external_torque, atol=1e-6
     )
     late = np.vstack([np.repeat(torque[:1], 5, axis=0), torque[:-5]])
     found = Arm(URDF, position_noise=[NOISE], torque_delay=0.005).run(t, q, late)
