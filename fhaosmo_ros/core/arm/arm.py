@@ -355,6 +355,8 @@ class Arm:
         mass = 0.5 * (terms.mass + new.mass) if self._of_position else new.mass
         measured = mass @ (moved if velocity is None else velocity)
         noise = (mass * self._noise) @ mass.T
+        if self._of_position:  # p times what is not known of the interval
+            noise += np.outer(measured, measured) * (self._clock.apart / h) ** 2
         every = new.links.reshape(-1, len(q))
         self._bank.step(
             h, measured, 0.5 * (drive + drives), noise, self._torque_variance,

@@ -28,7 +28,8 @@ class Clock:
     Intervals from stamps, or from these evened out: whichever makes the smoother velocities.
 
     Stamps are evened out by the least squares of a line (constant period) over the last samples,
-    written as an alpha-beta filter; whole periods may be missing.
+    written as an alpha-beta filter; whole periods may be missing. `apart` says by how much the two
+    differ at the latest sample, s.
     """
 
     def __init__(self) -> None:
@@ -36,7 +37,7 @@ class Clock:
 
     def reset(self) -> None:
         """Forget everything."""
-        self.even = False
+        self.even, self.apart = False, 0.0
         self._phase = self._period = 0.0
         self._count = self._off = 0
         self._first: list[float] = []
@@ -46,6 +47,7 @@ class Clock:
     def interval(self, h: float, moved: Floats) -> float:
         """Return the time in which the joints `moved` (n,); `h` is that of the stamps, in s."""
         even = self._evened(h)
+        self.apart = abs(h - even)
         speeds = [moved / h, moved / even]
         if self._speeds:
             change = [
