@@ -271,10 +271,10 @@ def test_bad_parameters_are_refused(named, text):
 def test_a_wrench_is_found_at_a_frame_and_what_cannot_be_seen_is_said(free):
     t, q, _, torque = free
     arm = Arm(URDF, position_noise=[NOISE])
-    jacobian, _ = arm.model.frame_jacobian(q[999], 'tool')
+    jacobian = arm.model.frame_jacobian(q[999], 'tool')
     force = np.array([8.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     for k in range(1000):
-        at, _ = arm.model.frame_jacobian(q[k], 'tool')
+        at = arm.model.frame_jacobian(q[k], 'tool')
         estimate = arm.take(round(t[k] * 1e9), q[k], torque[k] - at.T @ force)
     wrench = arm.wrench(estimate, 'tool')
     assert wrench.near_singular  # three joints do not see six numbers

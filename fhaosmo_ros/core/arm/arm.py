@@ -154,7 +154,7 @@ class Arm:
         model = ArmModel(urdf, joints=chosen, gravity=p['gravity'])
         known = (calibration or Calibration.none(model.joints)).of(model.joints)
         if len(known.inertial):
-            model = ArmModel(urdf, joints=chosen, gravity=p['gravity'], inertial=known.inertial)
+            model.set_inertial(known.inertial)
         self.model, self.joints, self._known = model, model.joints, known
         self._calibrated = calibration is not None
         self.set_payload(payload_of(p))
@@ -459,7 +459,7 @@ class Arm:
         Damped least squares, weighted by the covariance of the torque. Raises ConfigurationError
         for an unknown frame.
         """
-        jacobian, _ = self.model.frame_jacobian(estimate.position, frame)
+        jacobian = self.model.frame_jacobian(estimate.position, frame)
         root = np.linalg.cholesky(estimate.covariance)
         weighted = np.linalg.solve(root, jacobian.T)  # (n, 6)
         values = np.linalg.svd(jacobian, compute_uv=False)

@@ -52,10 +52,9 @@ cdef class Bank:
     cdef readonly object covariance  # (n, n) of d, if the likelier of both is right
     cdef readonly object weights  # (m + 1,), the first of free motion
     cdef double decay, begin, end, change, onset
-    cdef double[::1] free, scales, w, mixed, likelihood
+    cdef double[::1] free, scales, w, mixed, share, likelihood
     cdef double[:, :, ::1] x, x0
     cdef double[:, :, :, ::1] p, p0
-    cdef double[:, :, ::1] scratch
     cdef double[:, ::1] s, gain, average, spread
     cdef double[::1] innovation
 
@@ -71,11 +70,10 @@ cdef class Bank:
         self.onset = onset
         self.x, self.x0 = np.zeros((m, 3, n)), np.zeros((m, 3, n))
         self.p, self.p0 = np.zeros((m, BLOCKS, n, n)), np.zeros((m, BLOCKS, n, n))
-        self.scratch = np.zeros((BLOCKS, n, n))
         self.s, self.gain, self.innovation = np.zeros((n, n)), np.zeros((n, 3 * n)), np.zeros(n)
         self.weights, self.mean, self.covariance = np.zeros(m), np.zeros((3, n)), np.zeros((n, n))
         self.w, self.average, self.spread = self.weights, self.mean, self.covariance
-        self.mixed, self.likelihood = np.zeros(m), np.zeros(m)
+        self.mixed, self.share, self.likelihood = np.zeros(m), np.zeros(m), np.zeros(m)
         self.start(np.zeros(n), np.zeros((n, n)), np.zeros(n))
 
     def __reduce__(self):
@@ -185,18 +183,19 @@ cdef class Bank:
         for j in range(m):
             self.mixed[j] = 0.0
             for i in range(m):
-                self.mixed[j] += self.transition(i, j, h) * self.w[i]
+                self.share[i] = self.transition(i, j, h) * self.w[i]
+                self.mixed[j] += self.share[i]
             for a in range(3):
                 for k in range(n):
                     self.x0[j, a, k] = 0.0
             self.p0[j, :, :, :] = 0.0
             for i in range(m):
-                share = self.transition(i, j, h) * self.w[i] / self.mixed[j]
+                self.share[i] /= self.mixed[j]
                 for a in range(2 if j == 0 and i > 0 else 3):
                     for k in range(n):
-                        self.x0[j, a, k] += share * self.x[i, a, k]
+                        self.x0[j, a, k] += self.share[i] * self.x[i, a, k]
             for i in range(m):
-                share = self.transition(i, j, h) * self.w[i] / self.mixed[j]
+                share = self.share[i]
                 if share < SMALLEST:
                     continue
                 known = 2 if j == 0 and i > 0 else 3

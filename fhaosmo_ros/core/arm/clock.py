@@ -14,7 +14,7 @@ LONGEST = 200
 KEEP = 0.995
 """Share of what was remembered that is still remembered one sample later."""
 BETTER = 0.8
-"""Even intervals are used where they make velocities rougher by this factor at most."""
+"""Even intervals are used where velocities by them are rough by this factor at most."""
 LATE = 5
 """Stamps in a row, off by half a period or more, after which the even clock starts from there."""
 LEARNT = 20

@@ -20,8 +20,8 @@ LARGE = 4.0
 """Times the model's error from which on a torque is worth explaining."""
 MOVED = 0.1
 """rad (m): standard deviation of a posture in which a push may look like anything."""
-SEEN = 1e-3
-"""Smallest share of the excitation at which a direction of gravity, or a payload, can be told."""
+SEEN = (1e-3, 1e-5)
+"""Least shares of the excitation at which a direction of gravity, and a payload, can be told."""
 
 
 class Doubts:
@@ -107,7 +107,7 @@ class Doubts:
     def _fit(self, k: int, total: float) -> Floats | None:
         """Return the factors of a mistake that explains the torque, None if it does not."""
         values = np.linalg.eigvalsh(self._normal[k])
-        if not values[0] > SEEN * values[-1] * (1e-2 if k else 1.0):
+        if not values[0] > SEEN[k] * values[-1]:
             return None
         factors = np.asarray(np.linalg.solve(self._normal[k], self._seen[k]), dtype=np.float64)
         return factors if self._seen[k] @ factors > EXPLAINED * total else None

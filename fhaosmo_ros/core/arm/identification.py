@@ -91,7 +91,7 @@ class Motion(NamedTuple):
     rubbing: Floats  # (K, n, k) tanh(velocity / width) of each of `WIDTHS`
 
     @classmethod
-    def of(cls, t: Floats, q: Floats, torque: Floats) -> 'Motion':
+    def of(cls, model: ArmModel, t: Floats, q: Floats, torque: Floats) -> 'Motion':
         """
         Low-pass positions, torques and friction alike, forwards and backwards.
 
@@ -107,7 +107,7 @@ class Motion(NamedTuple):
 
         raw, effort = (
             np.column_stack([np.interp(even, t, column) for column in array.T])
-            for array in (q, torque)
+            for array in (np.where(model.continuous, np.unwrap(q, axis=0), q), torque)
         )
         quick = np.gradient(low(raw, QUICK), period, axis=0)
         rubbing = low(np.tanh(quick[..., np.newaxis] / np.array(WIDTHS)), CUTOFF)
@@ -173,7 +173,7 @@ def identify(
             f'identify: expected at least {SHORTEST:g} s of samples with increasing times, got '
             f'{len(t)} samples'
         )
-    motion = Motion.of(t, np.where(model.continuous, np.unwrap(q, axis=0), q), effort)
+    motion = Motion.of(model, t, q, effort)
     problem = _Problem(model, motion, torque_constants)
     held = ((motion.t - motion.t[0]) // BLOCK).astype(int) % HELD_OUT == HELD_OUT - 1
     found = [problem.solve(~held, draw) for draw in DRAWS]
@@ -203,22 +203,20 @@ def payload_of_motion(
     Everything else is taken from `calibration`, of the arm without payload.
     """
     t, q, effort = (np.asarray(a, dtype=np.float64) for a in (t, q, effort))
-    motion = Motion.of(t, np.where(model.continuous, np.unwrap(q, axis=0), q), effort)
+    motion = Motion.of(model, t, q, effort)
     problem = _Problem(model, motion, calibration.torque_constants, calibration)
     last = 10 * (len(model.joints) - 1)
     moving = problem.columns[..., last : last + 4]
     turning = problem.columns[..., last + 4 : last + 10]
     weighted = moving / problem.size[:, np.newaxis]
-    mass, center, explained = 0.0, np.zeros(3), np.zeros(problem.unexplained.shape)
+    payload, explained = Payload(), np.zeros(problem.unexplained.shape)
     for _ in range(ROUNDS):
-        # Of a point mass about the joint: xx, xy, yy, xz, yz, zz. It needs the mass and its place.
-        inertia = mass * (center @ center * np.eye(3) - np.outer(center, center))
-        turned = turning @ inertia[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]
+        turned = turning @ model.inertial_of(payload)[4:]  # needs the mass and its place
         left = (problem.unexplained - turned) / problem.size
         x, *_ = np.linalg.lstsq(weighted.reshape(-1, 4), left.ravel(), rcond=None)
-        mass, explained = max(float(x[0]), 0.0), moving @ x + turned
-        center = np.array(x[1:] / mass if mass > 0.0 else np.zeros(3), dtype=np.float64)
-    payload = Payload(mass, (float(center[0]), float(center[1]), float(center[2])))
+        explained = moving @ x + turned
+        mass, *moment = x.tolist()
+        payload = Payload(mass, tuple(m / mass for m in moment)) if mass > 0.0 else Payload()
     return payload, _rms(problem.unexplained), _rms(problem.unexplained - explained)
 
 

@@ -165,9 +165,8 @@ class ArmModel:
             A link, with what it carries, has no mass.
 
         """
-        carried = self._pin.Inertia(payload.mass, np.array(payload.center), np.zeros((3, 3)))
         inertial = self.inertial = self.unloaded.copy()
-        inertial[-1] += carried.toDynamicParameters()
+        inertial[-1] += self.inertial_of(payload)
         for name, link, values in zip(self.joints, self.links, inertial, strict=True):
             if not (np.isfinite(values).all() and values[0] > 0.0):
                 raise ConfigurationError(f'link {link}: expected a mass > 0, got {values[0]:g}')
@@ -187,6 +186,11 @@ class ArmModel:
                 'robot description: expected links with mass and inertia, got a mass matrix that '
                 f'is not positive (diagonal {np.array2string(np.diag(mass), precision=3)})'
             )
+
+    def inertial_of(self, payload: Payload) -> Floats:
+        """Return the ten inertial parameters of a payload, about the last joint."""
+        point = self._pin.Inertia(payload.mass, np.array(payload.center), np.zeros((3, 3)))
+        return np.asarray(point.toDynamicParameters())
 
     def _configuration(self, q: ArrayLike) -> Floats:
         """Return q as Pinocchio has it: cosine and sine of a continuous joint's angle."""
@@ -216,9 +220,9 @@ class ArmModel:
         links *= self._moves
         return Terms(mass, coriolis, gravity, links)
 
-    def frame_jacobian(self, q: ArrayLike, frame: str) -> tuple[Floats, Floats]:
+    def frame_jacobian(self, q: ArrayLike, frame: str) -> Floats:
         """
-        Return the Jacobian (6, n) at a frame's origin, along its axes, and its rotation (3, 3).
+        Return the Jacobian (6, n) at a frame's origin, along its axes.
 
         Raises
         ------
@@ -231,10 +235,9 @@ class ArmModel:
                 f'frame: expected one of {", ".join(self.frames)}, got {frame!r}'
             )
         configuration, index = self._configuration(q), self._model.getFrameId(frame)
-        jacobian = self._pin.computeFrameJacobian(
+        return np.asarray(self._pin.computeFrameJacobian(
             self._model, self._data, configuration, index, self._pin.ReferenceFrame.LOCAL
-        )
-        return jacobian, self._data.oMf[index].rotation.copy()
+        ))  # fmt: skip
 
     def regressor(self, q: ArrayLike, velocity: ArrayLike, acceleration: ArrayLike) -> Floats:
         """Return the matrix (n, 10 n) whose product with `inertial`, as one row, is the torque."""
