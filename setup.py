@@ -179,13 +179,8 @@ setup(
     # Not tests_require: colcon then finds no tests.
     extras_require={
         'arm': ARM,
-        'arm-study': [
-            *ARM,
-            *TUNE,
-            'mujoco>=4,<5',
-            'pybullet',
-            'example-robot-data',
-        ],  # worlds and robots of studies/arm
+        # Worlds and robots of studies/arm.
+        'arm-study': [*ARM, *TUNE, 'example-robot-data', 'mujoco>=4,<5', 'pybullet'],
         'docs': DOCS,
         'recipes': ['rotorpy>=3,<4'],  # a simulator of drones, for studies/recipes
         # Community builds, for machines without ROS. Never beside an installed ROS.

@@ -3,8 +3,9 @@
 
 from pathlib import Path
 
+from fhaosmo_ros.launching import declared
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
@@ -18,7 +19,6 @@ ARGUMENTS = {
     'use_sim_time': ('false', 'take the time from /clock'),
     'log_level': ('info', 'least severity that is logged'),
 }
-CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
 
 
 def start(context):
@@ -46,10 +46,4 @@ def start(context):
 
 def generate_launch_description():
     """Return the arguments and the node."""
-    arguments = [
-        DeclareLaunchArgument(
-            name, default_value=default, description=text, choices=CHOICES.get(name)
-        )
-        for name, (default, text) in ARGUMENTS.items()
-    ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=start)])
+    return LaunchDescription([*declared(ARGUMENTS), OpaqueFunction(function=start)])

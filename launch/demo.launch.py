@@ -3,8 +3,9 @@
 
 from pathlib import Path
 
+from fhaosmo_ros.launching import declared
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.actions import OpaqueFunction, Shutdown
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
@@ -19,7 +20,6 @@ ARGUMENTS = {
     'plotjuggler': ('false', 'show the curves in PlotJuggler, which has to be installed'),
     'log_level': ('info', 'least severity that is logged'),
 }
-CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
 
 
 def check_params_file(context):
@@ -31,12 +31,6 @@ def check_params_file(context):
 
 def generate_launch_description():
     """Return both nodes; when one of them ends, so does the launch."""
-    arguments = [
-        DeclareLaunchArgument(
-            name, default_value=default, description=text, choices=CHOICES.get(name)
-        )
-        for name, (default, text) in ARGUMENTS.items()
-    ]
     simulated = ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
     nodes = [
         Node(
@@ -60,4 +54,4 @@ def generate_launch_description():
         condition=IfCondition(LaunchConfiguration('plotjuggler')),
     )
     check = OpaqueFunction(function=check_params_file)
-    return LaunchDescription([*arguments, check, *nodes, plotjuggler])
+    return LaunchDescription([*declared(ARGUMENTS), check, *nodes, plotjuggler])

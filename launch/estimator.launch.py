@@ -3,8 +3,9 @@
 
 from pathlib import Path
 
+from fhaosmo_ros.launching import declared
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
@@ -19,7 +20,6 @@ ARGUMENTS = {
     'respawn': ('false', 'start the node again, after 2 s, if it ends'),
     'log_level': ('info', 'least severity that is logged'),
 }
-CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
 
 
 def start(context):
@@ -48,10 +48,4 @@ def start(context):
 
 def generate_launch_description():
     """Return the arguments and the node."""
-    arguments = [
-        DeclareLaunchArgument(
-            name, default_value=default, description=text, choices=CHOICES.get(name)
-        )
-        for name, (default, text) in ARGUMENTS.items()
-    ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=start)])
+    return LaunchDescription([*declared(ARGUMENTS), OpaqueFunction(function=start)])

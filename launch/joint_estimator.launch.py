@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start an estimator of every joint of a JointState, by default with config/joint_states.yaml."""
 
+from fhaosmo_ros.launching import declared
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.actions import IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
@@ -16,20 +17,13 @@ ARGUMENTS = {
     'use_sim_time': ('false', 'take the time from /clock'),
     'log_level': ('info', 'least severity that is logged'),
 }
-CHOICES = {'log_level': ['debug', 'info', 'warn', 'error', 'fatal']}
 
 
 def generate_launch_description():
     """Return estimator.launch.py with the defaults for joints."""
-    arguments = [
-        DeclareLaunchArgument(
-            name, default_value=default, description=text, choices=CHOICES.get(name)
-        )
-        for name, (default, text) in ARGUMENTS.items()
-    ]
     source = PythonLaunchDescriptionSource(
         PathJoinSubstitution([SHARE, 'launch', 'estimator.launch.py'])
     )
     passed_on = {name: LaunchConfiguration(name) for name in ARGUMENTS}.items()
     include = IncludeLaunchDescription(source, launch_arguments=passed_on)
-    return LaunchDescription([*arguments, include])
+    return LaunchDescription([*declared(ARGUMENTS), include])

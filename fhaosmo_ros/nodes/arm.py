@@ -6,13 +6,14 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.core.arm.arm import Arm, ArmEstimate, payload_of
 from fhaosmo_ros.core.parameters.declaration import Parameters, suggestion, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.tables import ARM_NODE_PARAMETERS
 from fhaosmo_ros.nodes.middleware.diagnostics import (
+    array_of,
     DiagnosticsPublisher,
     ERROR,
     OK,
@@ -34,6 +35,7 @@ from fhaosmo_ros.nodes.middleware.subscription import SENSOR_QOS
 from fhaosmo_ros.nodes.middleware.timers import set_period
 from geometry_msgs.msg import WrenchStamped
 import numpy as np
+from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -82,7 +84,7 @@ class ArmNode(TimedNode):
         self._description = ''
         self._problem = ''
         self._logged: dict[str, float] = {}  # when each kind of problem was, by perf_counter
-        self._order: dict[tuple[str, ...], NDArrayInt | None] = {}
+        self._order: dict[tuple[str, ...], NDArray[np.int64] | None] = {}
         self._counted: dict[str, int] = {}
         self._published, self._latest = -np.inf, -np.inf
         self._contact: bool | None = False  # None: not known
@@ -254,16 +256,11 @@ class ArmNode(TimedNode):
             self._say_event(estimate.stamp, OK, text, values)
 
     def _say_event(self, stamp: int, level: bytes, text: str, values: dict[str, str]) -> None:
-        message = DiagnosticArray()
-        message.header.stamp = (
-            time_message(stamp) if stamp else self.get_clock().now().to_msg()
-        )  # fmt: skip
-        message.status = [DiagnosticStatus(
-            level=level, name=f'{self.get_fully_qualified_name().lstrip("/")}: contact',
-            message=text, hardware_id=self._values['hardware_id'],
-            values=[KeyValue(key=key, value=value) for key, value in values.items()],
-        )]  # fmt: skip
-        self._events.publish(message)
+        report = Report('contact')
+        report.find(level, text)
+        report.values = values
+        when = time_message(stamp) if stamp else self.get_clock().now().to_msg()
+        self._events.publish(array_of(self, when, [report], self._values['hardware_id']))
 
     def _warn(self, text: str, kind: str = '') -> None:
         """Log a problem, each kind at most every `QUIET` seconds, and report it."""
@@ -299,17 +296,11 @@ class ArmNode(TimedNode):
             report.values['contact'] = estimate.link or 'none'
         return [report]
 
-    def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> Any:
-        payload_of(values)
-        for name, value in changes.items():
-            if not values.table[name].live and value != self._values[name]:
-                raise ConfigurationError(
-                    f"parameter '{name}': can't change in a running node (it is "
-                    f'{self._values[name]!r}), got {value!r}'
-                )
+    def _prepare(self, values: Parameters, _: Mapping[str, Value]) -> Parameters:
+        payload_of(values)  # raises; what can't change live is read-only in ROS
         return values
 
-    def _adopt(self, values: Any) -> None:
+    def _adopt(self, values: Parameters) -> None:
         self._values = values
         if self._arm is not None:
             self._arm.adopt(values)
@@ -329,9 +320,6 @@ class ArmNode(TimedNode):
             getattr(self._arm, name)()
         self.get_logger().info(f'{name}: {response.message}')
         return response
-
-
-NDArrayInt = np.ndarray[Any, np.dtype[np.int64]]
 
 
 def _text_of(path: str) -> str:

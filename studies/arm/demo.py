@@ -17,7 +17,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.recording.topic_recorder import TopicRecorder
 from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.types import serialise, TYPES
+from fhaosmo_ros.tools.bags.types import header, serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 from fhaosmo_ros.tools.cli.processes import Children
@@ -77,18 +77,14 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
 
 def _write(path: Path, model: ArmModel, world: Touched) -> None:
     """Write the joint states as a bag to publish."""
-    kinds = TYPES.types
     with BagWriter(path) as bag:
         bag.add('/joint_states', 'sensor_msgs/msg/JointState')
         for k, moment in enumerate(world.t):
             stamp = FIRST + round(moment * 1e9)
-            second, nanosecond = divmod(stamp, 10**9)
-            time_ = kinds['builtin_interfaces/msg/Time'](sec=second, nanosec=nanosecond)
             bag.write('/joint_states', stamp, serialise(
                 'sensor_msgs/msg/JointState',
-                header=kinds['std_msgs/msg/Header'](stamp=time_, frame_id=''),
-                name=list(model.joints), position=world.q[k], velocity=world.velocity[k],
-                effort=world.torque[k],
+                header=header(stamp), name=list(model.joints), position=world.q[k],
+                velocity=world.velocity[k], effort=world.torque[k],
             ))  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from fhaosmo_ros.core.arm.identification import identify, noise_of, payload_of_m
 from fhaosmo_ros.core.arm.model import ArmModel, Payload
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.arm import calibrate, replay
-from fhaosmo_ros.tools.bags.types import serialise, TYPES
+from fhaosmo_ros.tools.bags.types import header, serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from robots import JOINTS, motion, URDF
 
@@ -153,19 +153,16 @@ def bag(tmp_path_factory):
     """Return a bag of free motion, as `record` would have made it."""
     path = tmp_path_factory.mktemp('arm') / 'free'
     t, q, torque = recorded(duration=15.0)
-    kinds = TYPES.types
     with BagWriter(path) as writer:
         writer.add('/robot_description', 'std_msgs/msg/String')
         writer.add('/joint_states', 'sensor_msgs/msg/JointState')
         writer.write('/robot_description', 1, serialise('std_msgs/msg/String', data=URDF))
         for k, moment in enumerate(t):
             stamp = 10**9 + round(moment * 1e9)
-            second, nanosecond = divmod(stamp, 10**9)
-            time = kinds['builtin_interfaces/msg/Time'](sec=second, nanosec=nanosecond)
             writer.write('/joint_states', stamp, serialise(
                 'sensor_msgs/msg/JointState',
-                header=kinds['std_msgs/msg/Header'](stamp=time, frame_id=''),
-                name=list(JOINTS), position=q[k], velocity=np.zeros(0), effort=torque[k],
+                header=header(stamp), name=list(JOINTS), position=q[k],
+                velocity=np.zeros(0), effort=torque[k],
             ))  # fmt: skip
     return path
 

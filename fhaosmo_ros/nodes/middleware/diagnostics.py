@@ -10,6 +10,7 @@ they still come when /clock stops.
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -52,6 +53,16 @@ class Report:
         )
 
 
+def array_of(
+    node: Node, stamp: Time, reports: Iterable[Report], hardware_id: str
+) -> DiagnosticArray:
+    """Return reports of a node as one message."""
+    name = node.get_fully_qualified_name().lstrip('/')
+    message = DiagnosticArray(status=[r.message(name, hardware_id) for r in reports])
+    message.header.stamp = stamp
+    return message
+
+
 class DiagnosticsPublisher:
     """Publishes what `reports` returns each `period` seconds of the host's steady clock."""
 
@@ -70,8 +81,5 @@ class DiagnosticsPublisher:
 
     def publish(self) -> None:
         """Publish all present reports."""
-        name = self._node.get_fully_qualified_name().lstrip('/')
-        message = DiagnosticArray()
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        message.status = [r.message(name, self.hardware_id) for r in self._reports()]
-        self._publisher.publish(message)
+        stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(array_of(self._node, stamp, self._reports(), self.hardware_id))

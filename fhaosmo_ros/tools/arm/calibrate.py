@@ -45,13 +45,7 @@ def main(argv: list[str] | None = None) -> int:
         help='find the payload only; everything else is that of calibration_file',
     )  # fmt: skip
     add_arm_options(parser)
-    return run_command(parser, argv, _calibrate, needs=['pin'] if not _installed() else [])
-
-
-def _installed() -> bool:
-    from importlib.util import find_spec
-
-    return find_spec('pinocchio') is not None
+    return run_command(parser, argv, _calibrate)
 
 
 def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:

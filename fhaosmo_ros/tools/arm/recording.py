@@ -12,7 +12,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import progress
-from fhaosmo_ros.tools.cli.options import assigned
+from fhaosmo_ros.tools.cli.options import add_value_options, assigned
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,14 +42,7 @@ def add_arm_options(parser: argparse.ArgumentParser) -> None:
         '--robot', type=Path, metavar='URDF',
         help=f'file of the robot (default: {DESCRIPTION} in the bag)',
     )  # fmt: skip
-    add(
-        '--params-file', type=Path, action='append', default=[], metavar='FILE',
-        help='parameters of the node arm',
-    )  # fmt: skip
-    add(
-        '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
-        help='set one of them; wins over the file',
-    )  # fmt: skip
+    add_value_options(parser, 'parameters of the node arm')
     add('--force', action='store_true', help='replace an output that exists')
 
 

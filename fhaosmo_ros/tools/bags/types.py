@@ -72,11 +72,16 @@ def labelled_array(names: list[str], values: NDArray[np.float64]) -> bytes:
     return serialise('std_msgs/msg/Float64MultiArray', layout=layout, data=values)
 
 
+def header(stamp: int) -> Any:
+    """Return a header with its stamp in nanoseconds."""
+    second, nanosecond = divmod(stamp, 1_000_000_000)
+    time = TYPES.types['builtin_interfaces/msg/Time'](sec=second, nanosec=nanosecond)
+    return TYPES.types['std_msgs/msg/Header'](stamp=time, frame_id='')
+
+
 def diagnostics(stamp: int, warns: bool, name: str, text: str, values: Mapping[str, str]) -> bytes:
     """Return a DiagnosticArray of one status in CDR, with its stamp in nanoseconds."""
     types = TYPES.types
-    second, nanosecond = divmod(stamp, 1_000_000_000)
-    time = types['builtin_interfaces/msg/Time'](sec=second, nanosec=nanosecond)
     pair = types['diagnostic_msgs/msg/KeyValue']
     status = types['diagnostic_msgs/msg/DiagnosticStatus'](
         level=int(warns),
@@ -85,5 +90,4 @@ def diagnostics(stamp: int, warns: bool, name: str, text: str, values: Mapping[s
         hardware_id='',
         values=[pair(key=key, value=value) for key, value in values.items()],
     )
-    header = types['std_msgs/msg/Header'](stamp=time, frame_id='')
-    return serialise('diagnostic_msgs/msg/DiagnosticArray', header=header, status=[status])
+    return serialise('diagnostic_msgs/msg/DiagnosticArray', header=header(stamp), status=[status])

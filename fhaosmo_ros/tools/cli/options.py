@@ -30,15 +30,22 @@ from fhaosmo_ros.inputs import Input, known_inputs, measured_output, with_joints
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded
 
 
-def add_parameter_options(parser: argparse.ArgumentParser) -> None:
-    """Add --params-file, -p, --node and --channel."""
+def add_value_options(parser: argparse.ArgumentParser, which: str, over: str = 'file') -> None:
+    """Add --params-file, whose help says `which` parameters, and -p, which wins `over` what."""
     parser.add_argument(
-        '--params-file', type=Path, action='append', default=[], metavar='FILE',
-        help="parameters of the estimator node, as in 'ros2 run' (default: those in the bag)",
-    )  # fmt: skip
+        '--params-file', type=Path, action='append', default=[], metavar='FILE', help=which
+    )
     parser.add_argument(
         '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
-        help='set one parameter; wins over the file, or the bag',
+        help=f'set one parameter; wins over the {over}',
+    )  # fmt: skip
+
+
+def add_parameter_options(parser: argparse.ArgumentParser) -> None:
+    """Add --params-file, -p, --node and --channel."""
+    add_value_options(
+        parser, "parameters of the estimator node, as in 'ros2 run' (default: those in the bag)",
+        'file, or the bag',
     )  # fmt: skip
     parser.add_argument(
         '--node', default='estimator', metavar='NAME',

@@ -15,7 +15,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.recording_parameters import SENSOR
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import Output, run_command
-from fhaosmo_ros.tools.cli.options import assigned, bag_inputs
+from fhaosmo_ros.tools.cli.options import add_value_options, assigned, bag_inputs
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 
 TRIALS = 1000
@@ -44,14 +44,9 @@ def _parser() -> argparse.ArgumentParser:
         help='for gains.yaml and report.md (default: %(default)s)',
     )  # fmt: skip
     add('--force', action='store_true', help='replace an output that exists')
-    add(
-        '--params-file', type=Path, action='append', default=[], metavar='FILE',
-        help="parameters: sections of the estimator, the plant and 'tune', or /**",
-    )  # fmt: skip
-    add(
-        '-p', '--param', action='append', default=[], metavar='NAME:=VALUE',
-        help='set one parameter; wins over the file',
-    )  # fmt: skip
+    add_value_options(
+        parser, "parameters: sections of the estimator, the plant and 'tune', or /**"
+    )
     search = parser.add_argument_group('from simulated recordings')
     add = search.add_argument
     add(
