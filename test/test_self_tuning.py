@@ -3,7 +3,7 @@
 
 import math
 
-from fhaosmo_ros.core import Observer, OnlineEstimator, Status
+from fhaosmo_ros.core import Observer, OnlineEstimator, Plant, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.self_tuning.intervals import within
 from fhaosmo_ros.core.simulation.metrics import rms
@@ -255,6 +255,20 @@ def test_inexact_stamps_are_not_taken_for_jumps(noise):
     late = np.maximum.accumulate(t + 1e-4 * abs(random.standard_normal(len(t))))
     run = Observer(MOTOR).run(late + 1e-7 * np.arange(len(t)), y)
     assert rms((run.unknown_input - d)[t > 3.0]) < 0.05 * rms(d)
+
+
+@pytest.mark.parametrize('seed', [0, 2, 4])
+def test_a_host_that_stamps_later_for_dozens_of_samples(seed):
+    """By 10 us, and it wakes unevenly by 25: that is y without noise, and no d."""
+    random, count = np.random.default_rng(seed), 20_000
+    t = PERIOD * np.arange(1, count) + 25e-6 * random.standard_normal(count - 1)
+    truth = Plant().simulate(np.concatenate([[0.0], t]))
+    y, d = truth.y[1:], truth.unknown_input[1:]
+    late = 1e-5 * (np.cumsum(random.random(count - 1) < 0.02) % 2)
+    stamps = stamps_of(t + late + 2e-6 * random.standard_normal(count - 1))
+    found = OnlineEstimator(SELF_TUNING).run(stamps, y).unknown_input
+    assert rms((found - d)[t > 5.0]) < 0.1 * rms(d)
+    assert np.abs(found).max() < 1.5 * np.abs(d).max()
 
 
 @pytest.mark.parametrize('jitter', [0.03, 0.15])

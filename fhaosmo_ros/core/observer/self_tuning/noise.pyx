@@ -29,6 +29,10 @@ cdef double ROUGH_SAMPLES = 100.0  # squared differences of y are averaged over 
 # y and its stamps are taken to be no more exact than this: in parts of what y moves between
 # samples (RMS), and of the period.
 cdef double EXACT = 1e-5
+# Where intervals are uneven by more than this part of the period, so are the stamps: a host stamps
+# a sample some microseconds late, by a little more or less for dozens of samples, and a y that is
+# taken to be free of that would make a d of it.
+cdef double PROMPT = 0.01
 cdef double ROUNDED = 1e-12  # what is less than this part of a number may be an error of 64 bits
 cdef double ROUGH = 2.0  # the variance of the noise is at most so many times what they say
 
@@ -189,7 +193,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
     cdef double weights[COLOURS]
     cdef double squares[COLOURS]
     cdef double variance, ratio, off, weight, least, most, more, share, average = sample.average
-    cdef double widest = sample.largest
+    cdef double widest = sample.largest, prompt = PROMPT * m.shared.steady_period
     cdef int c, p
     cdef Py_ssize_t g, active = m.shared.active
     for g in range(active):
@@ -221,7 +225,8 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
         more = (squares[c] / weights[c] / CLIPPED - 1.0) / average
         share = m.noise[c] / w.now[c]  # who adds to the noise answers for it
         m.late[c] *= 1.0 + (1.0 - share) * more
-        m.late[c] = fmax(fmin(m.late[c], ROUGH), EXACT * EXACT)
+        least = fmin(prompt * prompt / m.shared.jitter, 1.0)
+        m.late[c] = fmax(fmin(m.late[c], ROUGH), least)
         m.noise[c] *= 1.0 + share * more
         most = m.rough[c][1]
         for p in range(2, m.n + 2):
