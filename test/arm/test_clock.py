@@ -11,7 +11,7 @@ pytest.importorskip('pinocchio')
 sys.path.insert(0, str(Path(__file__).parent))
 
 from fhaosmo_ros.core.arm.arm import Arm
-from fhaosmo_ros.core.arm.clock import Clock
+from fhaosmo_ros.core.arm.samples import Clock
 from fhaosmo_ros.core.arm.model import ArmModel
 from robots import motion, URDF
 

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.arm.bank import Bank
 from fhaosmo_ros.core.arm.calibration import Calibration
-from fhaosmo_ros.core.arm.clock import Clock
 from fhaosmo_ros.core.arm.doubts import Doubts
 from fhaosmo_ros.core.arm.model import ArmModel, Payload, Terms
+from fhaosmo_ros.core.arm.samples import Clock, Limits, momentum_of, TorqueNoise
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -43,8 +43,6 @@ STRONGER = 100.0
 """Times the URDF's effort limit, or the torque of the arm's weight: no torque of this arm."""
 DAMPING = 0.02
 """Singular value of a frame's Jacobian, m, below which a force along it is damped."""
-FIRST_LEARNT, LONGEST_LEARNT = 10, 1000
-"""Samples over which the noise of torques is averaged, at the start and later."""
 SLIDING = 0.005
 """s: memory of the differences of positions that friction is computed from."""
 
@@ -153,8 +151,8 @@ class Arm:
             raise ARM_PARAMETERS['gravity'].error(p['gravity'], 'three numbers')
         model = ArmModel(urdf, joints=chosen, gravity=p['gravity'])
         known = (calibration or Calibration.none(model.joints)).of(model.joints)
-        if len(known.inertial):
-            model.set_inertial(known.inertial)
+        own = known.inertial if len(known.inertial) else model.unloaded
+        model.set_inertial(own, known.motor_inertia)
         self.model, self.joints, self._known = model, model.joints, known
         self._calibrated = calibration is not None
         self.set_payload(payload_of(p))
@@ -166,21 +164,18 @@ class Arm:
         scale = model.torque_of_weight()
         scale = np.maximum(scale, LEAST * np.max(scale))
         told = self._size('torque_noise')
-        self._learns = told == 0.0
-        self._torque_variance = np.where(self._learns, TORQUE_NOISE * scale, told) ** 2
-        self._least_variance = 1e-2 * self._torque_variance
-        self._torques: deque[Floats] = deque(maxlen=4)
-        self._learnt = FIRST_LEARNT
+        self._torques = TorqueNoise(np.where(told > 0.0, told, TORQUE_NOISE * scale), told == 0.0)
         self._model_variance = self._size('model_error', MODEL_ERROR * scale) ** 2
         constants = self._values('torque_constants')
         self._constants = np.where(constants == 1.0, known.torque_constants, constants)
         scales = np.array(INTENSITIES) * model.weight
         free = 2.0 * DECAY * self._model_variance
         self._bank = Bank(free, DECAY, scales, BEGIN, END, CHANGE, ONSET, self._of_position)
-        self._lowest, self._highest = model.lowest - FURTHER, model.highest + FURTHER
-        self._fastest = FASTER * model.velocity_limits
         finite = np.where(np.isfinite(model.effort_limits), model.effort_limits, 0.0)
-        self._strongest = STRONGER * np.maximum(finite, scale)
+        self._limits = Limits(
+            model.lowest - FURTHER, model.highest + FURTHER, FASTER * model.velocity_limits,
+            STRONGER * np.maximum(finite, scale), ENCODER * self._spread,
+        )  # fmt: skip
         self._waiting: deque[tuple[int, Floats, Floats | None]] = deque()
         self.doubts = Doubts(
             model, p['effort'] != 'gravity_compensated', np.sqrt(self._model_variance)
@@ -209,7 +204,7 @@ class Arm:
         self._contact, self._evidence = False, np.zeros(len(self.joints))
         self.doubts.reset()
         self._clock.reset()
-        self._torques.clear()
+        self._torques.reset()
         self._waiting.clear()
 
     @property
@@ -265,11 +260,15 @@ class Arm:
             arrays = [np.asarray(part, dtype=np.float64) for part in given]
         except (TypeError, ValueError):
             arrays = [np.empty(0)]  # no numbers
-        wrong = self._wrong(stamp, arrays)
+        if any(a.shape != self._constants.shape for a in arrays):
+            self.counters['wrong size'] += 1
+            return None
+        torque = arrays[1] * self._constants
+        wrong = self._limits.fault(arrays[0], torque, None if self._of_position else arrays[2])
+        wrong = wrong or self._too_old(stamp)
         if wrong:
             self.counters[wrong] += 1
             return None
-        torque = arrays[1] * self._constants
         delay = int(self._parameters['torque_delay'] * 1e9)
         if delay:
             found = self._at(stamp - delay, stamp, arrays)
@@ -278,18 +277,8 @@ class Arm:
             stamp, arrays = stamp - delay, found
         return self._go_on(stamp, arrays[0], torque, None if self._of_position else arrays[-1])
 
-    def _wrong(self, stamp: int, arrays: list[Floats]) -> str:
-        """Return why a sample can't be used; nothing if it can."""
-        if any(a.shape != (len(self.joints),) for a in arrays):
-            return 'wrong size'
-        if not all(np.isfinite(a).all() for a in arrays):
-            return 'not finite'
-        if (arrays[0] < self._lowest).any() or (arrays[0] > self._highest).any():
-            return 'beyond limits'
-        if not (np.abs(arrays[1] * self._constants) < self._strongest).all():
-            return 'too strong'
-        if not self._of_position and not (np.abs(arrays[2]) < self._fastest).all():
-            return 'too fast'
+    def _too_old(self, stamp: int) -> str:
+        """Return why a stamp can't be used; nothing if it can. A clock set back begins anew."""
         newest = self._waiting[-1][0] if self._waiting else self._last[0] if self._last else None
         if newest is None or stamp > newest:
             return ''
@@ -336,11 +325,11 @@ class Arm:
         before, old, terms, drive = self._last
         moved = self._moved(old, q)
         h = self._clock.interval((stamp - before) * 1e-9, moved)
-        if (np.abs(moved) > self._fastest * h + ENCODER * self._spread).any():
+        if self._limits.jumped(moved, h):
             self.counters['jumped'] += 1
             self.reset()
             return None
-        self._learn_noise(torque)
+        self._torques.take(torque)
         if not self._started:
             speed = moved / h if velocity is None else velocity
             spread = terms.mass * (2.0 * self._noise / (h * h if velocity is None else 1.0))
@@ -353,18 +342,17 @@ class Arm:
         else:
             new, drives = self._drive(q, velocity, torque, velocity)
         mass = 0.5 * (terms.mass + new.mass) if self._of_position else new.mass
-        measured = mass @ (moved if velocity is None else velocity)
-        noise = (mass * self._noise) @ mass.T
-        if self._of_position:  # p times what is not known of the interval
-            noise += np.outer(measured, measured) * (self._clock.apart / h) ** 2
-        every = new.links.reshape(-1, len(q))
+        # Of positions, p times what is not known of the interval is noise, too.
+        vague = self._clock.apart / h if velocity is None else 0.0
+        measured, noise = momentum_of(
+            mass, moved if velocity is None else velocity, self._noise, vague
+        )
         self._bank.step(
-            h, measured, 0.5 * (drive + drives), noise, self._torque_variance,
-            every.T @ every,
-        )  # fmt: skip
+            h, measured, 0.5 * (drive + drives), noise, self._torques.variance, new.reach
+        )
         self._last = stamp, q, new, drives
         bank = self._bank
-        self.doubts.take(h, q, torque, bank.mean[2], new)
+        self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             self.counters['doubted'] += 1
             return None
@@ -373,27 +361,14 @@ class Arm:
         touched = self._contact
         self._contact = odds > (0.0 if touched else self.threshold)
         if self._contact:
-            own = self._likelihoods(torques, covariance, new)
+            own = self._likelihoods(torques, covariance, q)
             self._evidence = self._evidence + own if touched else own
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
-        self._velocity = np.linalg.solve(new.mass, bank.mean[1])
+        self._velocity = self.model.velocity_of(bank.mean[1])
         return ArmEstimate(
             stamp, q, self._velocity, torques, covariance, odds,
             self._contact, link,
         )  # fmt: skip
-
-    def _learn_noise(self, torque: Floats) -> None:
-        """Follow the noise of torques where nobody has told it, by their third differences."""
-        self._torques.append(torque)
-        if len(self._torques) < 4 or not self._learns.any():
-            return
-        a, b, c, d = self._torques
-        before = self._torque_variance
-        # 20 = 1 + 9 + 9 + 1. An impact counts as three standard deviations at most.
-        seen = np.minimum((d - 3.0 * (c - b) - a) ** 2 / 20.0, 9.0 * before)
-        self._learnt = min(self._learnt + 1, LONGEST_LEARNT)
-        after = np.maximum(before + (seen - before) / self._learnt, self._least_variance)
-        self._torque_variance = np.where(self._learns, after, before)
 
     def _drive(
         self, q: Floats, velocity: Floats, torque: Floats, sliding: Floats
@@ -407,15 +382,14 @@ class Arm:
         terms = self.model.terms(q, velocity)
         drive = torque + terms.coriolis + self._tare
         if self._calibrated:
-            terms.mass.flat[:: len(q) + 1] += self._known.motor_inertia
             drive -= self._known.friction(sliding)
         if self._parameters['effort'] != 'gravity_compensated':
             drive -= terms.gravity
         return terms, drive
 
-    def _likelihoods(self, torque: Floats, covariance: Floats, terms: Terms) -> Floats:
+    def _likelihoods(self, torque: Floats, covariance: Floats, q: Floats) -> Floats:
         """Return for each link how likely a force on it makes this torque, as a logarithm."""
-        reach = terms.reach
+        reach = self.model.reach_of_links(q)
         size = torque @ torque / np.maximum(np.trace(reach, axis1=1, axis2=2), 1e-12)
         spread = covariance + size[:, np.newaxis, np.newaxis] * reach
         missed = np.linalg.solve(spread, np.tile(torque[:, np.newaxis], (len(size), 1, 1)))

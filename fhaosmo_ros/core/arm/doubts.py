@@ -5,7 +5,7 @@ What explains an external torque that does not go away: a setting that is wrong,
 One regression, with slow forgetting, of the external torque on what each mistake would make of it.
 """
 
-from fhaosmo_ros.core.arm.model import ArmModel, Floats, Terms
+from fhaosmo_ros.core.arm.model import ArmModel, Floats
 import numpy as np
 
 EVERY = 0.05
@@ -53,7 +53,7 @@ class Doubts:
         self._normal = [np.zeros((k, k)) for k in (3, 4)]  # of gravity's vector, and a payload
         self._seen = [np.zeros(k) for k in (3, 4)]
 
-    def take(self, h: float, q: Floats, effort: Floats, torque: Floats, terms: Terms) -> None:
+    def take(self, h: float, q: Floats, effort: Floats, torque: Floats) -> None:
         """Look at a sample, `h` seconds after the one before; `torque` is the external one."""
         self._time += h
         if self._time < EVERY:
@@ -61,8 +61,7 @@ class Doubts:
         keep, self._time = np.exp(-self._time / MEMORY), 0.0
         rest = np.zeros(len(q))
         last = 10 * (len(q) - 1)
-        weight = -np.tensordot(terms.links[:, :3], self._model.inertial[:, 0], (0, 0)).T
-        columns = (weight, -self._model.regressor(q, rest, rest)[:, last : last + 4])
+        columns = (self._model.gravity_columns(q), -self._model.regressor(q, rest, rest)[:, last : last + 4])
         scaled = torque / self._error
         self._seconds = self._seconds * keep + EVERY
         self._weight = self._weight * keep + 1.0

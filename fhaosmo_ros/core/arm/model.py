@@ -36,12 +36,7 @@ class Terms(NamedTuple):
     mass: Floats  # (n, n) M, kg m^2 (kg for a prismatic joint)
     coriolis: Floats  # (n,) C(q, qd)^T qd, N m: what drives p = M qd beside torque and gravity
     gravity: Floats  # (n,) g, N m
-    links: Floats  # (n, 6, n) Jacobian J of each link's centre; rows 4 to 6 times its radius, m
-
-    @property
-    def reach(self) -> Floats:
-        """J^T J of each link, the mean over the places of its mass, (n, n, n), m^2."""
-        return np.asarray(self.links.transpose(0, 2, 1) @ self.links)
+    reach: Floats  # (n, n) sum over the links of J^T J, the mean over places on a link, m^2
 
 
 class ArmModel:
@@ -110,6 +105,8 @@ class ArmModel:
         self.gravity = np.array(gravity, dtype=np.float64)
         self._model.gravity.linear = self.gravity
         self._data = self._model.createData()
+        self._even = pin.Model(self._model)  # links of 1 kg, see `set_payload`
+        self._even_data = self._even.createData()
         self.joints = tuple(self._model.names[1:])
         self.links = tuple(self._link_of(i) for i in range(1, self._model.njoints))
         self.frames = tuple(f.name for f in self._model.frames if f.type == pin.FrameType.BODY)
@@ -145,8 +142,13 @@ class ArmModel:
         ]  # fmt: skip
         return str(names[0] if names else self._model.names[joint])
 
-    def set_inertial(self, inertial: ArrayLike) -> None:
-        """Take other inertial parameters (n, 10), without payload; raise as `set_payload`."""
+    def set_inertial(self, inertial: ArrayLike, motor_inertia: ArrayLike = 0.0) -> None:
+        """
+        Take other inertial parameters (n, 10), without payload; raise as `set_payload`.
+
+        `motor_inertia` (n,) is that of rotors as joints see it, kg m^2, and part of `Terms.mass`.
+        """
+        self._model.armature = np.broadcast_to(motor_inertia, len(self.joints))
         self.unloaded = np.array(inertial, dtype=np.float64)
         n = len(self.joints)
         if self.unloaded.shape != (n, 10):
@@ -172,14 +174,16 @@ class ArmModel:
                 raise ConfigurationError(f'link {link}: expected a mass > 0, got {values[0]:g}')
             index = self._model.getJointId(name)
             self._model.inertias[index] = self._pin.Inertia.FromDynamicParameters(values)
-        own = list(self._model.inertias[1:])
-        self._levers = [np.array(i.lever) for i in own]
         # A force of any direction at the place r from the centre has the moment r x force. Over
         # places spread as the mass is, each component has 2/3 of their mean square distance, which
-        # is half the trace of the inertia over the mass.
-        self._radii = np.sqrt([
-            max(np.trace(i.inertia), 0.0) / (3.0 * i.mass) for i in own
-        ])[:, np.newaxis, np.newaxis]  # fmt: skip
+        # is half the trace of the inertia over the mass. So the sum of J^T J is the mass matrix of
+        # an arm with links of 1 kg and of an inertia of that mean square.
+        own = list(self._model.inertias[1:])
+        self._levers = [np.array(i.lever) for i in own]
+        squares = np.array([max(np.trace(i.inertia), 0.0) / (3.0 * i.mass) for i in own])
+        self._radii = np.sqrt(squares)[:, np.newaxis, np.newaxis]
+        for k, (lever, square) in enumerate(zip(self._levers, squares, strict=True), 1):
+            self._even.inertias[k] = self._pin.Inertia(1.0, lever, square * np.eye(3))
         mass = self.terms(np.zeros(len(self.joints)), np.zeros(len(self.joints))).mass
         if not np.all(np.linalg.eigvalsh(mass) > 0.0):
             raise ConfigurationError(
@@ -207,18 +211,35 @@ class ArmModel:
         pin, model, data = self._pin, self._model, self._data
         configuration, velocity = self._configuration(q), np.asarray(velocity, dtype=np.float64)
         coriolis = pin.computeCoriolisMatrix(model, data, configuration, velocity).T @ velocity
-        columns = data.J  # of spatial velocities at the base's origin, by joint
         gravity = pin.computeGeneralizedGravity(model, data, configuration).copy()
         mass = pin.crba(model, data, configuration).copy()
+        reach = pin.crba(self._even, self._even_data, configuration).copy()
+        return Terms(mass, coriolis, gravity, reach)
+
+    def velocity_of(self, momentum: Floats) -> Floats:
+        """Return M^-1 p of p (n,), at the posture of the latest `terms`."""
+        self._pin.cholesky.decompose(self._model, self._data)
+        return np.asarray(self._pin.cholesky.solve(self._model, self._data, momentum))
+
+    def reach_of_links(self, q: ArrayLike) -> Floats:
+        """Return J^T J of each link, the mean over the places of its mass, (n, n, n), m^2."""
+        pin, data = self._pin, self._data
+        columns = pin.computeJointJacobians(self._model, data, self._configuration(q))
         centers = np.array([
             place.act(lever) for place, lever in zip(data.oMi[1:], self._levers, strict=True)
         ])  # fmt: skip
-        turning = columns[3:]
+        turning = columns[3:]  # of spatial velocities at the base's origin, by joint
         links = np.empty((len(centers), 6, len(centers)))
         links[:, :3] = columns[:3] + (centers @ CROSS).reshape(-1, 3, 3) @ turning
         links[:, 3:] = turning * self._radii
         links *= self._moves
-        return Terms(mass, coriolis, gravity, links)
+        return np.asarray(links.transpose(0, 2, 1) @ links)
+
+    def gravity_columns(self, q: ArrayLike) -> Floats:
+        """Return the matrix (n, 3) whose product with a vector of gravity is g(q)."""
+        mass = np.sum(self.inertial[:, 0])
+        center = self._pin.jacobianCenterOfMass(self._model, self._data, self._configuration(q))
+        return np.asarray(-mass * center.T)
 
     def frame_jacobian(self, q: ArrayLike, frame: str) -> Floats:
         """
@@ -256,11 +277,10 @@ class ArmModel:
         large torques of this arm are, whatever its joints' axes.
         """
         random = np.random.default_rng(0)
-        rest = np.zeros(len(self.joints))
         weight = self.inertial[:, 0] * np.linalg.norm(self.gravity)
         squares = []
         for _ in range(POSTURES):
-            reach = self.terms(random.uniform(-np.pi, np.pi, len(rest)), rest).reach
+            reach = self.reach_of_links(random.uniform(-np.pi, np.pi, len(weight)))
             squares.append(weight**2 @ np.diagonal(reach, axis1=1, axis2=2) / 3.0)
         return np.asarray(np.sqrt(np.mean(squares, axis=0)))
 
