@@ -303,4 +303,4 @@ def test_noise_of_torques_is_found_and_makes_no_contact(free):
     assert not found.contact[500:].any()
     told = Arm(URDF, position_noise=[NOISE], torque_noise=[0.5])
     told.run(t[:500], q[:500], noisy[:500])
-    np.testing.assert_allclose(told._torque_variance, 0.25)
+    np.testing.assert_allclose(told._torques.variance, 0.25)

@@ -11,8 +11,8 @@ pytest.importorskip('pinocchio')
 sys.path.insert(0, str(Path(__file__).parent))
 
 from fhaosmo_ros.core.arm.arm import Arm
-from fhaosmo_ros.core.arm.samples import Clock
 from fhaosmo_ros.core.arm.model import ArmModel
+from fhaosmo_ros.core.arm.samples import Clock
 from robots import motion, URDF
 
 PERIOD = 1e-3

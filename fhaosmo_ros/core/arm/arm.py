@@ -154,6 +154,7 @@ class Arm:
         own = known.inertial if len(known.inertial) else model.unloaded
         model.set_inertial(own, known.motor_inertia)
         self.model, self.joints, self._known = model, model.joints, known
+        self._turns = bool(model.continuous.any())
         self._calibrated = calibration is not None
         self.set_payload(payload_of(p))
         self._of_position = p['measurement'] == 'position'
@@ -306,7 +307,7 @@ class Arm:
     def _moved(self, before: Floats, q: Floats) -> Floats:
         """Return q - before; of continuous joints the shorter way."""
         moved = q - before
-        if not self.model.continuous.any():
+        if not self._turns:
             return moved
         around = np.remainder(moved + np.pi, 2.0 * np.pi) - np.pi
         return np.where(self.model.continuous, around, moved)
@@ -337,19 +338,19 @@ class Arm:
             self._started = True
             self._velocity = self._sliding = speed
         if velocity is None:
-            self._sliding = self._sliding - np.expm1(-h / SLIDING) * (moved / h - self._sliding)
+            if self._calibrated:
+                share = -np.expm1(-h / SLIDING)
+                self._sliding = self._sliding + share * (moved / h - self._sliding)
             new, drives = self._drive(q, self._velocity, torque, self._sliding)
+            # p times what is not known of the interval is noise, too.
+            vague = self._clock.apart / h
+            measured, noise = momentum_of(terms.mass, new.mass, moved, self._noise, vague)
         else:
             new, drives = self._drive(q, velocity, torque, velocity)
-        mass = 0.5 * (terms.mass + new.mass) if self._of_position else new.mass
-        # Of positions, p times what is not known of the interval is noise, too.
-        vague = self._clock.apart / h if velocity is None else 0.0
-        measured, noise = momentum_of(
-            mass, moved if velocity is None else velocity, self._noise, vague
-        )
-        self._bank.step(
-            h, measured, 0.5 * (drive + drives), noise, self._torques.variance, new.reach
-        )
+            measured, noise = momentum_of(new.mass, new.mass, velocity, self._noise, 0.0)
+        drive += drives
+        drive *= 0.5
+        self._bank.step(h, measured, drive, noise, self._torques.variance, new.reach)
         self._last = stamp, q, new, drives
         bank = self._bank
         self.doubts.take(h, q, torque, bank.mean[2])
@@ -380,7 +381,8 @@ class Arm:
         would feed its own error of friction back, worst at joints of little inertia.
         """
         terms = self.model.terms(q, velocity)
-        drive = torque + terms.coriolis + self._tare
+        drive = terms.coriolis + torque
+        drive += self._tare
         if self._calibrated:
             drive -= self._known.friction(sliding)
         if self._parameters['effort'] != 'gravity_compensated':

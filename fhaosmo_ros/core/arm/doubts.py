@@ -61,7 +61,8 @@ class Doubts:
         keep, self._time = np.exp(-self._time / MEMORY), 0.0
         rest = np.zeros(len(q))
         last = 10 * (len(q) - 1)
-        columns = (self._model.gravity_columns(q), -self._model.regressor(q, rest, rest)[:, last : last + 4])
+        payload = -self._model.regressor(q, rest, rest)[:, last : last + 4]
+        columns = (self._model.gravity_columns(q), payload)
         scaled = torque / self._error
         self._seconds = self._seconds * keep + EVERY
         self._weight = self._weight * keep + 1.0

@@ -204,15 +204,16 @@ cdef class Clock:
 
 
 def momentum_of(
-    const double[:, ::1] mass, const double[::1] velocity, const double[::1] variance,
-    double vague,
+    const double[:, ::1] before, const double[:, ::1] after, const double[::1] velocity,
+    const double[::1] variance, double vague,
 ):
     """
     Return M v, and the covariance of its error: M S M' + (vague M v)(vague M v)'.
 
     Parameters
     ----------
-    mass : (n, n) array
+    before, after : (n, n) array
+        M is their mean.
     velocity : (n,) array
         v; or by how much positions have changed.
     variance : (n,) array
@@ -222,11 +223,12 @@ def momentum_of(
 
     """
     cdef int i, j, k, n = velocity.shape[0]
-    momentum, covariance = np.zeros(n), np.zeros((n, n))
+    momentum, covariance, mean = np.zeros(n), np.zeros((n, n)), np.empty((n, n))
     cdef double[::1] p = momentum
-    cdef double[:, ::1] r = covariance
+    cdef double[:, ::1] r = covariance, mass = mean
     for i in range(n):
         for k in range(n):
+            mass[i, k] = 0.5 * (before[i, k] + after[i, k])
             p[i] += mass[i, k] * velocity[k]
     for i in range(n):
         for j in range(n):
