@@ -43,6 +43,8 @@ STRONGER = 100.0
 """Times the URDF's effort limit, or the torque of the arm's weight: no torque of this arm."""
 DAMPING = 0.02
 """Singular value of a frame's Jacobian, m, below which a force along it is damped."""
+LOOK = 0.005
+"""s between two estimates that count for the link: neighbours say nearly the same."""
 SLIDING = 0.005
 """s: memory of the differences of positions that friction is computed from."""
 
@@ -203,6 +205,7 @@ class Arm:
         self._last: tuple[int, Floats, Terms, Floats] | None = None
         self._started, self._velocity = False, np.zeros(len(self.joints))
         self._contact, self._evidence = False, np.zeros(len(self.joints))
+        self._looked = 0  # when evidence was taken
         self.doubts.reset()
         self._clock.reset()
         self._torques.reset()
@@ -361,9 +364,10 @@ class Arm:
         odds, torques, covariance = bank.log_odds, bank.mean[2].copy(), bank.covariance.copy()
         touched = self._contact
         self._contact = odds > (0.0 if touched else self.threshold)
-        if self._contact:
+        if self._contact and not (touched and stamp - self._looked < LOOK * 1e9):
             own = self._likelihoods(torques, covariance, q)
             self._evidence = self._evidence + own if touched else own
+            self._looked = stamp
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
         self._velocity = self.model.velocity_of(bank.mean[1])
         return ArmEstimate(
