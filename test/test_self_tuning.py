@@ -14,6 +14,7 @@ from scipy.linalg import expm
 from scipy.stats import norm, truncnorm
 from studies.everywhere import Condition, CONDITIONS, model_of, PLANTS, recording, setting_of
 from studies.harness import observed
+from studies.self_tuning import estimate as plain_estimate
 
 LEAST_CHANCE = -6.0
 """Of quantised samples (D 31)."""
@@ -546,6 +547,23 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
         )
         assert not estimate[size:].any()
         assert not found_covariance[:, size:].any()
+
+
+@pytest.mark.parametrize('noise', [1e-4, 1e-3])
+@pytest.mark.parametrize(('shape', 'omega'), [('sine', 1.0), ('sine', 4.0), ('square', 1.0)])
+def test_it_does_what_the_plain_version_does(shape, omega, noise):
+    """Where noise is white and stamps are even, the idea is all that acts."""
+    t = 2e-3 * np.arange(5000)
+    truth = Plant(disturbance=shape, disturbance_omega=omega).simulate(t)
+    y = truth.y + noise * np.random.default_rng(3).standard_normal(len(t))
+    model = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    plain = plain_estimate(model, y, 2e-3)
+    found = Observer(order=3, phi=['0', '0', '-z3'], **SELF_TUNING).run(t, y)
+    late = t > 3.0
+    error = rms((found.unknown_input - truth.unknown_input)[late])
+    assert rms((plain.d - found.unknown_input)[late]) < 0.2 * error
+    between = np.median(plain.deviation[late] / found.standard_deviation[late, -1])
+    assert between == pytest.approx(1.0, abs=0.15)
 
 
 @pytest.mark.parametrize('width', [1e-6, 0.02, 0.04, 0.5, 2.0, 9.0, 30.0])
