@@ -8,6 +8,13 @@ import pytest
 from rclpy.node import NodeNameNonExistentError
 from running import ROOT
 
+KNOWN_INPUT = {'phi': ['0', '0', 'u - z3']}
+NODES = {
+    'estimator': {'gains': 'self_tuning', **KNOWN_INPUT}, 'plant': KNOWN_INPUT,
+    'arm': {'wrench_frame': 'tool'},
+}  # fmt: skip
+"""With what makes them have all that is optional."""
+
 
 def expand(name: str, profile: ElementTree.Element) -> str:
     """Return the full name, as sros2 does."""
@@ -45,12 +52,10 @@ def test_policy_has_the_form_that_sros2_reads(policy):
             assert item.text.strip() == item.text
 
 
-@pytest.mark.parametrize('name', ['estimator', 'plant'])
+@pytest.mark.parametrize('name', NODES)
 def test_policy_allows_exactly_what_the_node_has(user, launch, policy, name):
-    # With everything that is optional: a known input, simulated time, self-tuning.
     # In a namespace: other tests leave nodes of this name behind for a while.
-    own = {'gains': 'self_tuning'} if name == 'estimator' else {}
-    launch(name, namespace='/policy', phi=['0', '0', 'u - z3'], use_sim_time=True, **own)
+    launch(name, namespace='/policy', use_sim_time=True, **NODES[name])
 
     def has(look) -> set[str]:
         try:
@@ -76,5 +81,5 @@ def test_operator_may_watch_and_call_all_of_it(policy):
     for kind, of_node, of_operator in (
         ('topic', 'publish', 'subscribe'), ('service', 'reply', 'request'),
     ):  # fmt: skip
-        both = [n for name in ('estimator', 'plant') for n in allowed(policy, name, kind, of_node)]
+        both = [n for name in NODES for n in allowed(policy, name, kind, of_node)]
         assert set(allowed(policy, 'operator', kind, of_operator)) == set(both)
