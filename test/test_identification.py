@@ -11,7 +11,6 @@ from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.bags.types import serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.tuning.bag_gains import make_gains, run
-from fhaosmo_ros.tools.tuning.bag_report import notes
 from fhaosmo_ros.tools.tuning.command import main
 from fhaosmo_ros.tools.tuning.identify import (
     identify_input,
@@ -24,6 +23,7 @@ from fhaosmo_ros.tools.tuning.likelihood import (
     Samples,
 )
 from fhaosmo_ros.tools.tuning.recorded import quantum, RecordedOutput, usable
+from fhaosmo_ros.tools.tuning.report import notes
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -279,7 +279,6 @@ def test_command_says_what_a_bag_shows(bag, tmp_path, capsys):
         assert row in report
         assert row in printed
     # What this y has shown stands there, and no default of a simulated family.
-    assert f'noise_size: {values["noise_size"]}' in report
     assert 'noise_std' not in report
 
 

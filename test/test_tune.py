@@ -16,10 +16,12 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
+from fhaosmo_ros.tools.tuning import report
 from fhaosmo_ros.tools.tuning.command import main, read_parameters
 from fhaosmo_ros.tools.tuning.linear_gains import kalman_gains, SCHEME
 from fhaosmo_ros.tools.tuning.objective import Objective
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 import numpy as np
 import pytest
 from studies.comparison.methods.linear import estimates
@@ -29,8 +31,6 @@ from waiting import wait_until
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
 pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')
 
-from fhaosmo_ros.tools.tuning import report
-from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 
 ROOT = Path(__file__).resolve().parents[1]
 PHI = ['0', '0', '-z3']
@@ -322,7 +322,7 @@ def test_interrupt_keeps_the_best_and_the_next_run_goes_on(tmp_path):
     load(out / 'gains.yaml', 'estimator')
     trials = finished(storage) + 2
     assert main([*command, f'--trials={trials}']) == 0
-    assert f'({trials} trials' in (out / 'gains.yaml').read_text()
+    assert f'# {trials} trials' in (out / 'gains.yaml').read_text()
     assert finished(storage) == trials
 
 

@@ -16,7 +16,13 @@ from fhaosmo_ros.core.simulation.recording_parameters import SENSOR
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import Output, run_command
 from fhaosmo_ros.tools.cli.options import add_value_options, assigned, bag_inputs
+from fhaosmo_ros.tools.tuning import report
+from fhaosmo_ros.tools.tuning.bag_gains import make_gains, run
+from fhaosmo_ros.tools.tuning.identify import identify_input
+from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.recorded import recorded
+from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 
 TRIALS = 1000
 NEEDED = ('optuna>=4,<6', 'cmaes')
@@ -77,24 +83,18 @@ def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
     estimator, tuning = read_parameters(arguments.params_file, arguments.param)
     make = _search if arguments.bag is None else _identify
     with Output(arguments.output, arguments.force) as output:
-        text = make(arguments, estimator, tuning, output.path, stop)
+        found = make(arguments, estimator, tuning, stop)
+        report.save(output.path, arguments.command_line, found)
         folder = output.keep()
-    print(f'\n{text}\n')
+    print(f'\n{found.main}\n')
     print(f'output: {folder}/gains.yaml, report.md')
     print(f'use it: ros2 run fhaosmo_ros estimator --ros-args --params-file {folder}/gains.yaml')
 
 
 def _search(
-    arguments: argparse.Namespace,
-    estimator: dict[str, Any],
-    tuning: dict[str, Any],
-    folder: Path,
-    stop: Stop,
-) -> str:
-    """Write the gains for a simulated family; return the report's main part."""
-    from fhaosmo_ros.tools.tuning import report
-    from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
-
+    arguments: argparse.Namespace, estimator: dict[str, Any], tuning: dict[str, Any], stop: Stop
+) -> report.Report:
+    """Find the gains for a simulated family."""
     values = TUNE_PARAMETERS.complete(tuning)
     with stop.raising():
         data = simulated(values, arguments.seed)
@@ -102,7 +102,7 @@ def _search(
         tuner = Tuner(data, estimator, values, arguments.seed)
     jobs = arguments.jobs or os.cpu_count() or 1
     result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
-    return report.write(folder, tuner, result, arguments.command_line)
+    return report.of_search(tuner, result)
 
 
 def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -123,18 +123,9 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
 
 
 def _identify(
-    arguments: argparse.Namespace,
-    estimator: dict[str, Any],
-    tuning: dict[str, Any],
-    folder: Path,
-    stop: Stop,
-) -> str:
-    """Write the gains for what y itself shows; return the report's main part."""
-    from fhaosmo_ros.tools.tuning import bag_gains, bag_report
-    from fhaosmo_ros.tools.tuning.identify import identify_input
-    from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
-    from fhaosmo_ros.tools.tuning.recorded import recorded
-
+    arguments: argparse.Namespace, estimator: dict[str, Any], tuning: dict[str, Any], stop: Stop
+) -> report.Report:
+    """Find the gains for what y itself shows."""
     if others := chosen_otherwise(estimator):
         raise ConfigurationError(
             f'--bag: expected gains of structure levant and scheme '
@@ -147,13 +138,11 @@ def _identify(
     given |= {name: values[name] for name in ('order', 'phi')}
     model = TriangularModel.of(values)
     with stop.raising():
-        inputs = bag_inputs(estimator, model.used_inputs)
-        data = recorded(arguments.bag, inputs, model)
+        data = recorded(arguments.bag, bag_inputs(estimator, model.used_inputs), model)
         found = identify_input(data, model, values, given)
-        made = bag_gains.make_gains(found, given)
-        run = bag_gains.run(found, made)
-    name = f'bag {arguments.bag.resolve().name}'
-    return bag_report.write(folder, found, made, run, arguments.command_line, name)
+        made = make_gains(found, given)
+        along = run(found, made)
+    return report.of_bag(found, made, along, arguments.bag.resolve().name)
 
 
 if __name__ == '__main__':

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The output of a search: gains.yaml and report.md."""
+"""What a tuning says: gains.yaml, which the estimator loads, and report.md with notes."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.files import dumps
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.tools.tuning.bag_gains import Gains, Run
+from fhaosmo_ros.tools.tuning.identify import Identified, LAGS, SURE
 from fhaosmo_ros.tools.tuning.objective import Evaluation
 from fhaosmo_ros.tools.tuning.search import Result
 from fhaosmo_ros.tools.tuning.tuner import Tuner
@@ -14,15 +18,28 @@ import numpy as np
 
 OVERFITTED = 1.25
 """The report warns from this ratio of the held-out error to the training error on."""
+SMALL_CORRELATION, UNLIKELY = 0.05, 0.01
+NEAR = 1.2
+"""Sizes that differ by less than this factor are alike."""
 
 
-def save(
-    folder: Path, parameters: Mapping[str, Any], comments: Sequence[str], parts: Sequence[str]
-) -> None:
-    """Write a YAML that `estimator` loads as it is, and the parts of a report."""
+class Report(NamedTuple):
+    """What there is to say of gains."""
+
+    parameters: dict[str, Any]
+    summary: list[str]  # lines at the head of both files
+    main: str  # tables and notes, which are also printed
+    more: str
+
+
+def save(folder: Path, command: str, report: Report) -> None:
+    """Write a new folder with both files."""
     folder.mkdir()
-    head = ''.join(f'# {line}'.rstrip() + '\n' for line in comments)
-    (folder / 'gains.yaml').write_text(head + dumps(parameters), 'utf-8')
+    made = f'python -m fhaosmo_ros {command}'
+    lines = ['Made by', f'    {made}', f'(fhaosmo_ros {__version__}).', *report.summary]
+    head = ''.join(f'# {line}\n' for line in lines)
+    (folder / 'gains.yaml').write_text(head + dumps(report.parameters), 'utf-8')
+    parts = ['# Tuning', f'    {made}', '\n'.join(report.summary), report.main, report.more]
     (folder / 'report.md').write_text('\n\n'.join(parts) + '\n', 'utf-8')
 
 
@@ -32,8 +49,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return '\n'.join(f'| {" | ".join(cells)} |' for cells in lines)
 
 
-def write(folder: Path, tuner: Tuner, result: Result, command: str) -> str:
-    """Write everything into a new folder; return the report's main part, to be printed."""
+# from simulated recordings
+
+
+def of_search(tuner: Tuner, result: Result) -> Report:
+    """Report the gains for a simulated family."""
     begin, best = {d.name: d.start for d in tuner.space}, result.best
     found = {
         f'{title}, {data}': objective(tuner.parameters(values))
@@ -42,39 +62,22 @@ def write(folder: Path, tuner: Tuner, result: Result, command: str) -> str:
     }
     training, held_out = (found[f'tuned, {data}'].error for data in ('training', 'held out'))
     p = tuner.data.parameters
-    comments = [
-        'Made by',
-        f'    python -m fhaosmo_ros {command}',
-        f'({result.trials} trials, fhaosmo_ros {__version__}) for a simulated family.',
-        f'Noise of y {p["noise_std"]:.3g}, {p["sample_rate"]:g} Hz, '
+    summary = [
+        f'{result.trials} trials for a simulated family: noise of y {p["noise_std"]:.3g}, '
+        f'{p["sample_rate"]:g} Hz, '
         f'd: {", ".join(dict.fromkeys(p["disturbances"]))} with an RMS of {p["rms_of_d"]:.3g}.',
-        f'Error relative to the truth: {training:.3f} in training, {held_out:.3f} on held-out '
-        'recordings.',
+        f'Error relative to the truth: {training:.3f} in {len(tuner.data.training)} recordings, '
+        f'{held_out:.3f} in {len(tuner.data.held_out)} that took no part in the search.',
     ]
+    searched = table(
+        ['parameter', 'from', 'to', 'start', 'tuned'],
+        [
+            [d.name, *(f'{x:.4g}' for x in (d.low, d.high, d.start, best[d.name]))]
+            for d in tuner.space
+        ],
+    )
     main = '\n\n'.join([_evaluations(found), *warnings(training, held_out)])
-    parts = [
-        '# Tuning',
-        f'    python -m fhaosmo_ros {command}',
-        f'{result.trials} trials in the study; '
-        f'{len(tuner.data.training)} recordings to train on, {len(tuner.data.held_out)} held out.',
-        '## Result',
-        main,
-        'The error is the weighted RMS error over that of the truth, a geometric mean over the '
-        'recordings. Held-out recordings took no part '
-        'in the search.',
-        '## Searched',
-        table(
-            ['parameter', 'from', 'to', 'start', 'tuned'],
-            [
-                [d.name, *(f'{x:.4g}' for x in (d.low, d.high, d.start, best[d.name]))]
-                for d in tuner.space
-            ],
-        ),
-        '## Settings',
-        '\n'.join(f'    {name}: {value}' for name, value in (p | dict(tuner.tuning)).items()),
-    ]
-    save(folder, tuner.parameters(best), comments, parts)
-    return main
+    return Report(tuner.parameters(best), summary, main, searched)
 
 
 def _evaluations(columns: Mapping[str, Evaluation]) -> str:
@@ -106,3 +109,103 @@ def warnings(training: float, held_out: float) -> list[str]:
             'this sensor hardly shows this d, or more trials, or another start, are needed.'
         )
     return found
+
+
+# from a bag
+
+
+def of_bag(found: Identified, gains: Gains, run: Run, bag: str) -> Report:
+    """Report the gains for what the y of a bag shows."""
+    likelihood, best, size = found.likelihood, found.best, found.size_of_input
+    samples, told = likelihood.samples, [f'Note: {text}' for text in notes(found, run)]
+    summary = [
+        f'Bag {bag}: {len(samples.y)} samples, {samples.h.sum():.1f} s, '
+        f'{1.0 / likelihood.period:.4g} Hz'
+        + (f', steps of {found.quantum:.4g}.' if found.quantum else '.'),
+        f'Found: noise {best.noise:.3g}; d with an RMS of {size:.3g}; '
+        f'its expected error is {gains.expected[-1]:.3g}.',
+        *told,
+    ]
+    names = [*(f'z{i + 1}' for i in range(len(gains.expected) - 1)), 'd']
+    given = ' (given)' if likelihood.fixed else ''
+    rows = [
+        ('noise of y (standard deviation)', f'{best.noise:.4g}{given}'),
+        ('size of d (RMS)', f'{size:.4g}'),
+        ('time in which d changes (1/kappa), s', f'{1.0 / best.design.decay:.4g}'),
+        ('derivatives of d that are followed', f'{best.design.derivatives}'),
+        ('bandwidth of the filter, rad/s', f'{best.design.bandwidth:.3g}'),
+        *(
+            (f'expected error of {name}', f'{e:.3g}')
+            for name, e in zip(names, gains.expected, strict=True)
+        ),
+    ]
+    main = '\n\n'.join([
+        table(['found in y', ''], rows),
+        f'The error of d is expected to be {gains.expected[-1] / size:.2f} of its size.',
+        _along(run, gains.innovation),
+        *told,
+    ])  # fmt: skip
+    more = 'This is what y shows in this bag: where d will be quicker or larger, record it so.'
+    return Report(ESTIMATOR_PARAMETERS.part_of(gains.parameters), summary, main, more)
+
+
+def _along(run: Run, innovation: float) -> str:
+    """Return the table of what the estimator does with y."""
+    largest = int(np.abs(run.correlations).argmax())
+    counts = run.counters
+    rows = [
+        ('innovations, measured / expected', f'{run.size:.2f} (expected {innovation:.3g})'),
+        (
+            f'their largest correlation within {LAGS} samples',
+            f'{run.correlations[largest]:+.3f} over {largest + 1}; chance explains '
+            f'{2.0 / math.sqrt(len(run.unknown_input)):.3f}',
+        ),
+        ('probability of that if they are white (Ljung-Box)', f'{run.probability:.2g}'),
+        ('samples rejected, times begun afresh', f'{counts.rejected}, {counts.divergences}'),
+    ]
+    return table(['the estimator along the bag', ''], rows)
+
+
+def notes(found: Identified, run: Run) -> Iterator[str]:
+    """Say what a user should know before trusting the gains."""
+    best, samples = found.best, found.likelihood.samples
+    if found.quantum > 2.0 * best.noise:
+        yield (
+            f'y comes in steps of {found.quantum:.3g}, larger than its noise: the '
+            'error of the steps is not random. docs/recipes.md says what helps.'
+        )
+    if found.outliers:
+        yield (
+            f'{found.outliers} samples ({found.outliers / len(samples.y):.2%}) are outliers. They '
+            'were left out; the estimator rejects such samples, too.'
+        )
+    model, whole = found.likelihood.model, float(samples.h.sum())
+    n = model.order
+    rates = model.jacobian(np.zeros(n)) + np.eye(n, k=1)
+    growth = float(np.linalg.eigvals(rates).real.max())
+    if growth * whole > SURE:
+        yield (
+            f'The model is unstable: at rest, without d, it grows tenfold within '
+            f'{math.log(10.0) / growth:.2g} s, but y has stayed within {samples.y.min():.3g} and '
+            f'{samples.y.max():.3g} for {whole:.0f} s. If no controller holds this plant, then a '
+            'sign in phi is wrong; if one does, its command should be a known input, or d '
+            'contains it.'
+        )
+    if lost := run.counters.divergences:
+        yield (
+            f'With these gains the estimator lost y {lost} times in this bag and began afresh: '
+            'do not use them before the notes above are settled.'
+        )
+    if not 1.0 / NEAR < run.size < NEAR:
+        yield (
+            f'Innovations have {run.size:.2f} times the expected size: the model or the noise '
+            'are not what they are taken for, and so are the standard deviations.'
+        )
+    lag = int(np.abs(run.correlations).argmax())
+    if run.probability < UNLIKELY and abs(run.correlations[lag]) > SMALL_CORRELATION:
+        yield (
+            f'Innovations are not white: they correlate by {run.correlations[lag]:+.2f} with '
+            f'those {lag + 1} before them. The model of the plant, of d or of the noise does not '
+            'quite fit; the gains are the best of their kind, but standard deviations are too '
+            'small. `gains: self_tuning` follows noise that is coloured.'
+        )

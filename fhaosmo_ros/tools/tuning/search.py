@@ -8,13 +8,10 @@ Ostermeier, Evolutionary Computation 9(2), 2001, doi:10.1162/106365601750190398.
 
 from collections.abc import Callable, Sequence
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 import warnings
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-import optuna
-from optuna.study import MaxTrialsCallback
-from optuna.trial import TrialState
 
 Values = dict[str, float]
 
@@ -82,15 +79,19 @@ def minimise(
         A storage that can't be used.
 
     """
+    import optuna  # here, as a robot may lack it: nothing else needs it
+    from optuna.study import MaxTrialsCallback
+    from optuna.trial import TrialState
+
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     start = {d.name: d.start for d in space}
 
-    def evaluate(trial: optuna.Trial) -> float:
+    def evaluate(trial: Any) -> float:
         values = {d.name: trial.suggest_float(d.name, d.low, d.high, log=d.log) for d in space}
         value = float(objective(values))
         return value if math.isfinite(value) else BAD
 
-    def after(study: optuna.Study, _: object) -> None:
+    def after(study: Any, _: object) -> None:
         if on_trial():
             study.stop()
 
