@@ -36,10 +36,8 @@ class Child(processes.Child):
 
     def __init__(self, log: Path, *arguments: str) -> None:
         self.started = perf_counter()
-        environment = {'PYTHONUNBUFFERED': '1'}
-        super().__init__(
-            log, *arguments, environment=environment, start_new_session=True, cwd=ROOT
-        )
+        environment = {**os.environ, 'PYTHONUNBUFFERED': '1'}
+        super().__init__(log, *arguments, env=environment, start_new_session=True, cwd=ROOT)
 
     def wait_for(self, text: str) -> float:
         """Wait until `text` is in the output; return the seconds since the start."""

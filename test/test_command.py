@@ -101,14 +101,6 @@ def test_progress_is_a_line_now_and_then_where_there_is_no_terminal(capsys, monk
     assert all(line.startswith('long: ') for line in said.splitlines())
 
 
-def test_missing_modules_are_named_before_the_body_begins(capsys):
-    needs = ('no_such_module>=4,<6', 'numpy', 'nor_this')
-    assert run_command(PARSER, [], lambda *_: pytest.fail('began'), needs=needs) == 1
-    said = capsys.readouterr().err
-    assert said.startswith('try: error: no_such_module and nor_this not installed: make try')
-    assert said.endswith("pip install 'no_such_module>=4,<6' numpy nor_this\n")
-
-
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_signal_cuts_a_computation(capsys, number):
     def body(arguments, stop):

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `tune` finds in a y without the truth (D 30), and when it refuses."""
 
-from importlib.util import find_spec
-
 from fhaosmo_ros.core import Family, Observer, OnlineEstimator, TriangularModel
 from fhaosmo_ros.core.observer.kalman import LinearModel, stationary
 from fhaosmo_ros.core.parameters.files import load
@@ -28,9 +26,6 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-needs_optuna = pytest.mark.skipif(
-    find_spec('optuna') is None, reason='optuna is not installed (extra: tune)'
-)
 H, K = 5e-3, 4000
 PHI = ['0', '-2*z2']
 NOISE, SIZE, RATE = 1e-3, 1.0, 2.0
@@ -264,7 +259,6 @@ def _bag(tmp_path):
     return tmp_path / 'bag'
 
 
-@needs_optuna
 def test_command_says_what_a_bag_shows(bag, tmp_path, capsys):
     out = tmp_path / 'out'
     assert main(['--bag', str(bag), '-o', str(out), '-p', 'input_topic:=/y']) == 0
@@ -282,7 +276,6 @@ def test_command_says_what_a_bag_shows(bag, tmp_path, capsys):
     assert 'noise_std' not in report
 
 
-@needs_optuna
 @pytest.mark.parametrize(
     ('given', 'message'),
     [('structure:=cascade', 'got structure set'), ('noise_size:=1000.0', 'd = 0')],

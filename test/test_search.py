@@ -3,6 +3,7 @@
 
 import math
 from pathlib import Path
+import sys
 
 from fhaosmo_ros.core import ConfigurationError
 import pytest
@@ -85,3 +86,9 @@ def test_storage_that_fails_is_one_line(tmp_path, storage):
         minimise(fail_later, SPACE, 10_000, storage=storage)
     assert '\n' not in str(error.value)
     assert len(calls) <= 6
+
+
+def test_missing_package_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'optuna', None)
+    with pytest.raises(ConfigurationError, match=r"pip install 'optuna>=4,<6' cmaes"):
+        minimise(bowl, SPACE, 1)

@@ -3,7 +3,6 @@
 
 import argparse
 from collections.abc import Callable, Sequence
-from importlib.util import find_spec
 import os
 from pathlib import Path
 import re
@@ -22,12 +21,7 @@ PERIOD = 30.0
 """Seconds between two lines in a log; work that ends sooner leaves none."""
 
 
-def run_command(
-    parser: argparse.ArgumentParser,
-    argv: Sequence[str] | None,
-    body: Body,
-    needs: Sequence[str] = (),
-) -> int:
+def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, body: Body) -> int:
     """
     Run a command.
 
@@ -47,16 +41,12 @@ def run_command(
         Gets the parsed arguments and the event. ``arguments.command_line`` is what was typed,
         without the passwords in URLs, as outputs keep it; ``arguments.ros_arguments`` is the
         part of it between ``--ros-args`` and ``--``, which a launch file adds to every program.
-    needs : sequence of str, optional
-        Requirements, as for pip, that only this command has: a robot may lack them. The body
-        imports them.
 
     Returns
     -------
     int
-        What the body returns, 0 for None; 1 if a requirement is not installed; 2 for wrong input,
-        or an output that cannot be written; 130 if it was interrupted. Each but the first is said
-        in one line.
+        What the body returns, 0 for None; 2 for wrong input, or an output that cannot be written;
+        130 if it was interrupted. Each but the first is said in one line.
 
     """
     given = sys.argv[1:] if argv is None else argv
@@ -67,11 +57,6 @@ def run_command(
     arguments.ros_arguments = ros_arguments
     arguments.command_line = without_password(shlex.join([parser.prog, *given]))
     stop = stop_on_signals()
-    modules = [re.split(r'\W', need)[0] for need in needs]
-    missing = [name for name in modules if find_spec(name) is None]
-    if missing:
-        how = f'make {parser.prog} does it, or python3 -m pip install {shlex.join(needs)}'
-        return _say(parser, f'error: {" and ".join(missing)} not installed: {how}', 1)
     try:
         return body(arguments, stop) or 0
     except ConfigurationError as error:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Child processes that never outlive their parent's block."""
 
-from collections.abc import Mapping
-import os
 from pathlib import Path
 import signal
 import subprocess
@@ -16,7 +14,7 @@ GRACE = 5.0
 """Seconds that a child has to end by itself."""
 
 
-class Child:
+class Child(subprocess.Popen[bytes]):
     """
     A Python process whose output goes to a file.
 
@@ -26,8 +24,6 @@ class Child:
         Its output.
     arguments : str
         What follows ``python``.
-    environment : dict, optional
-        Variables to add.
     options
         For `subprocess.Popen`: ``start_new_session=True`` lets Ctrl-C in a terminal reach only
         the parent.
@@ -37,24 +33,13 @@ class Child:
     failure: ClassVar[type[Exception]] = ConfigurationError
     """What `check` raises."""
 
-    def __init__(
-        self,
-        log: Path,
-        *arguments: str,
-        environment: Mapping[str, str] | None = None,
-        **options: Any,
-    ) -> None:
+    def __init__(self, log: Path, *arguments: str, **options: Any) -> None:
         self._log = log
         with log.open('wb') as output:
-            self._process = subprocess.Popen(
-                [sys.executable, *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, **(environment or {})},
-                **options,
-            )
-        self.pid = self._process.pid
+            super().__init__(
+                [sys.executable, *arguments], stdin=subprocess.DEVNULL, stdout=output,
+                stderr=subprocess.STDOUT, **options,
+            )  # fmt: skip
 
     def output(self) -> str:
         """Return what the child has printed so far."""
@@ -62,24 +47,24 @@ class Child:
 
     def check(self) -> None:
         """Raise, with the end of its output, if the child has ended."""
-        if self._process.poll() is not None:
+        if self.poll() is not None:
             last = ' / '.join(self.output().splitlines()[-2:])
             raise self.failure(
-                f'{self._log.stem} ended with exit code {self._process.returncode}: '
+                f'{self._log.stem} ended with exit code {self.returncode}: '
                 f'{last or "without a word"}'
             )
 
     def interrupt(self) -> None:
         """Ask the child to end."""
-        self._process.send_signal(signal.SIGINT)
+        self.send_signal(signal.SIGINT)
 
     def end(self) -> None:
         """Wait for the child's end, and kill it if it takes more than `GRACE` seconds."""
         try:
-            self._process.wait(GRACE)
+            self.wait(GRACE)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            self.kill()
+            self.wait()
 
 
 class Children:

@@ -25,8 +25,6 @@ from fhaosmo_ros.tools.tuning.recorded import recorded
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 
 TRIALS = 1000
-NEEDED = ('optuna>=4,<6', 'cmaes')
-"""Only this command needs them, so a robot may lack them."""
 BOTH = ParameterTable(
     TUNE_PARAMETERS.values(), ESTIMATOR_PARAMETERS.values(), ESTIMATOR_PARAMETERS.families
 )
@@ -34,7 +32,7 @@ BOTH = ParameterTable(
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; a search that Ctrl-C ends after the first trial is written, too."""
-    return run_command(_parser(), argv, _tune, needs=NEEDED)
+    return run_command(_parser(), argv, _tune)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -76,10 +76,17 @@ def minimise(
     Raises
     ------
     ConfigurationError
-        A storage that can't be used.
+        A storage that can't be used, or Optuna is not installed.
 
     """
-    import optuna  # here, as a robot may lack it: nothing else needs it
+    try:  # here, as only this search needs them: a robot may lack them
+        import cmaes  # noqa: F401 (Optuna imports it, later)
+        import optuna
+    except ModuleNotFoundError as error:
+        raise ConfigurationError(
+            f'{error.name} is not installed: make tune does it, or '
+            "python3 -m pip install 'optuna>=4,<6' cmaes"
+        ) from None
     from optuna.study import MaxTrialsCallback
     from optuna.trial import TrialState
 
