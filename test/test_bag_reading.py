@@ -7,13 +7,12 @@ import bag_files as files
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.inputs import measured_output
+from fhaosmo_ros.tools.bags.inputs import bag_inputs
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import series
 from fhaosmo_ros.tools.bags.writer import BagWriter
-from fhaosmo_ros.tools.cli.options import BagInputs
 from fhaosmo_ros.tools.replay import command as replay
-from fhaosmo_ros.tools.tuning.recorded import recorded
+from fhaosmo_ros.tools.tuning.identify import recorded
 import numpy as np
 import pytest
 
@@ -238,6 +237,5 @@ def test_tune_takes_them_too(late, tmp_path):
     times = []
     for name, received in (('exact', STAMPS), ('late', late)):
         bag = files.write_preset(tmp_path / name, files.floats(received, Y), 'zstd', STAMPS)
-        inputs = BagInputs(measured_output({}), {}, 'auto', {})
-        times.append(recorded(bag, inputs, TriangularModel(['0'])).t)
+        times.append(recorded(bag, bag_inputs({}, []), TriangularModel(['0'])).t)
     np.testing.assert_array_equal(*times)

@@ -13,14 +13,16 @@ from fhaosmo_ros.tools.tuning.command import main
 from fhaosmo_ros.tools.tuning.identify import (
     identify_input,
     NothingToFind,
+    quantum,
+    RecordedOutput,
     size_of_input,
+    usable,
 )
 from fhaosmo_ros.tools.tuning.likelihood import (
     Design,
     Likelihood,
     Samples,
 )
-from fhaosmo_ros.tools.tuning.recorded import quantum, RecordedOutput, usable
 from fhaosmo_ros.tools.tuning.report import notes
 import numpy as np
 import pytest

@@ -64,6 +64,10 @@ class FieldSamples(NamedTuple):
         """Return some of the samples."""
         return FieldSamples(*(column[rows] for column in self))
 
+    def unwrapped(self, unwrap: Callable[[float], float]) -> 'FieldSamples':
+        """Return the samples of an angle with its turns counted."""
+        return self._replace(values=np.array([unwrap(value) for value in self.values.tolist()]))
+
 
 class BagReader:
     """

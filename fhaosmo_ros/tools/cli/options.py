@@ -2,9 +2,9 @@
 """Command-line options that several commands share."""
 
 import argparse
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import (
@@ -26,7 +26,7 @@ from fhaosmo_ros.core.parameters.tables import (
     ONLINE_PARAMETERS,
 )
 from fhaosmo_ros.core.parameters.yaml_text import parse
-from fhaosmo_ros.inputs import Input, known_inputs, measured_output, with_joints
+from fhaosmo_ros.inputs import with_joints
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded
 
 
@@ -55,65 +55,6 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
         '--channel', default='', metavar='NAME',
         help="take the parameters of this one of the node's channels",
     )  # fmt: skip
-
-
-class BagInputs(NamedTuple):
-    """
-    Where y and u are in a bag.
-
-    Attributes
-    ----------
-    y : Input
-        With the full name of its topic.
-    u : mapping of str to Input
-        The known inputs that the model uses, likewise.
-    stamp : str
-        As for `BagReader.samples`.
-    values : mapping
-        Parameters of the channel.
-
-    """
-
-    y: Input
-    u: Mapping[str, Input]
-    stamp: str
-    values: Mapping[str, Any]
-
-
-def bag_inputs(
-    values: Mapping[str, Any],
-    used: Sequence[str],
-    present: Collection[str] = (),
-    namespace: str = '',
-    channel: str = '',
-) -> BagInputs:
-    """
-    Return where y and u are by the parameters of an estimator.
-
-    Parameters
-    ----------
-    values : mapping
-        Parameters of the channel.
-    used : sequence of str
-        Known inputs that its model uses.
-    present : collection of str
-        Topics of the bag.
-    namespace : str
-        Of the node.
-    channel : str
-        Its name, '' without named channels.
-
-    """
-
-    def full(wanted: Input) -> Input:
-        # A bag may hold the y of one channel, or of a node in another namespace, as /y.
-        relative = wanted.topic.removeprefix(f'{channel}/')
-        names = [wanted.absolute(namespace), wanted.absolute(''), f'/{relative.lstrip("/")}']
-        return wanted._replace(topic=next((n for n in names if n in present), names[1]))
-
-    y = full(measured_output(values, channel))
-    u = {name: full(its) for name, its in known_inputs(values, used, channel).items()}
-    return BagInputs(y, u, 'bag' if y.stamp == 'reception' else y.stamp, values)
 
 
 def channel_parameters(

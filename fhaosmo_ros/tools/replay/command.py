@@ -16,6 +16,7 @@ from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import INPUT, ONLINE_PARAMETERS
 from fhaosmo_ros.stop_signals import Stop, Stopped
+from fhaosmo_ros.tools.bags.inputs import bag_inputs
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
 from fhaosmo_ros.tools.bags.table import bag_of_table
@@ -23,7 +24,6 @@ from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 from fhaosmo_ros.tools.cli.options import (
     add_parameter_options,
-    bag_inputs,
     channel_parameters,
     named,
 )

@@ -7,11 +7,9 @@ from fhaosmo_ros.core.observer.estimates import Trajectory
 from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import Event
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.messages.fields import Unwrapper
-from fhaosmo_ros.tools.bags.known_inputs import inputs_at
+from fhaosmo_ros.tools.bags.inputs import BagInputs, inputs_at, read_output
 from fhaosmo_ros.tools.bags.reader import BagReader, Watch
-from fhaosmo_ros.tools.cli.options import BagInputs
 from fhaosmo_ros.tools.replay.live_run import LiveRun
 from fhaosmo_ros.tools.replay.sinks import Rows
 import numpy as np
@@ -61,19 +59,12 @@ class Samples:
         watch: Watch,
     ) -> None:
         self.estimator, self._live, self._whole = estimator, live, whole
-        y, stamp = inputs.y, inputs.stamp
-        field = reader.field(y.topic, y.field, y.name)
-        if stamp == 'auto' and not field.header and estimator.parameters['sampling'] == 'clock':
-            stamp = 'bag'  # such an estimator took a sample when it came, not when it was sent
-        samples = reader.samples(y.topic, field, stamp, watch)
-        if not len(samples.times):
-            why = next(iter(reader.lacking), 'expected messages, read none')
-            raise ConfigurationError(f'topic {y.topic!r}: {why}')
+        samples, field = read_output(reader, inputs, watch)
         self.span = float(samples.stamps[-1] - samples.stamps[0]) * 1e-9
         self.stamps = 'source (publish times of the bag)'
         if np.array_equal(samples.stamps, samples.times):
             self.stamps = 'bag'
-        elif field.header and stamp != 'source':
+        elif field.header and inputs.stamp != 'source':
             self.stamps = 'header of the messages'
         if live:
             samples = live.begin(samples)
@@ -81,12 +72,12 @@ class Samples:
             unwrap = Unwrapper()
             if estimator.latest is not None:
                 unwrap.begin_near(estimator.state_dict()['y'] + estimator.offset)
-            samples = samples._replace(values=np.array(list(map(unwrap, samples.values.tolist()))))
+            samples = samples.unwrapped(unwrap)
         self._samples, self._u = samples, None
         if estimator.observer.uses_input:
             self._u = inputs_at(
-                samples, reader, estimator.observer.model, inputs.u, inputs.values,
-                estimator.inputs, estimator.reject_inputs,
+                samples, reader, estimator.observer.model, inputs, estimator.inputs,
+                estimator.reject_inputs,
             )  # fmt: skip
         self._active = 0  # 1 while an event lasts
         self._found: list[tuple[int, Event]] = []

@@ -14,14 +14,14 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.recording_parameters import SENSOR
 from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.tools.bags.inputs import bag_inputs
 from fhaosmo_ros.tools.cli.command import Output, run_command
-from fhaosmo_ros.tools.cli.options import add_value_options, assigned, bag_inputs
+from fhaosmo_ros.tools.cli.options import add_value_options, assigned
 from fhaosmo_ros.tools.tuning import report
 from fhaosmo_ros.tools.tuning.bag_gains import make_gains, run
-from fhaosmo_ros.tools.tuning.identify import identify_input
+from fhaosmo_ros.tools.tuning.identify import identify_input, recorded
 from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.recorded import recorded
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 
 TRIALS = 1000

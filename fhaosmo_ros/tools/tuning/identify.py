@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 import math
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
@@ -10,10 +11,12 @@ from fhaosmo_ros.core.observer.configuration import usual_step
 from fhaosmo_ros.core.online.policy import GAP_SAMPLES
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.messages.fields import Unwrapper
+from fhaosmo_ros.tools.bags.inputs import BagInputs, inputs_at, read_output
+from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.tuning.likelihood import CLIP, Design, Evaluation, Likelihood, Samples
 from fhaosmo_ros.tools.tuning.linear_gains import matern
-from fhaosmo_ros.tools.tuning.recorded import quantum, RecordedOutput, usable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
@@ -44,10 +47,22 @@ SURE = 10.0
 """A difference of log-likelihoods that is no accident."""
 FEWEST = 500
 """Samples."""
+FEWEST_STEPS = 20
+"""Changes of y that say a quantum."""
+ON_GRID = 0.02
+"""Values count as quantised if they are this close to multiples of the quantum, relatively."""
 
 
 class NothingToFind(ConfigurationError):
     """There are no gains for this y; the text says why."""
+
+
+class RecordedOutput(NamedTuple):
+    """The y of a bag, of K samples."""
+
+    t: Floats  # (K,) stamps from the first one on (s)
+    y: Floats  # (K,) samples
+    u: Floats  # (K, m) known inputs
 
 
 class Identified(NamedTuple):
@@ -69,6 +84,18 @@ class Identified(NamedTuple):
 def size_of_input(design: Design, intensity: float) -> float:
     """Return D of D 17 for a model of d whose last derivative has this intensity."""
     return math.sqrt(intensity / matern(design.decay, design.derivatives))
+
+
+def recorded(bag: Path, inputs: BagInputs, model: TriangularModel) -> RecordedOutput:
+    """Return the y of a bag, and the known inputs of a model."""
+    with BagReader(bag) as reader:
+        samples, field = read_output(reader, inputs)
+        if field.wraps:
+            samples = samples.unwrapped(Unwrapper())
+        u = np.zeros((len(samples.values), len(model.inputs)))
+        if model.uses_input:
+            u = inputs_at(samples, reader, model, inputs)
+    return RecordedOutput((samples.stamps - samples.stamps[0]) * 1e-9, samples.values, u)
 
 
 def identify_input(
@@ -143,6 +170,27 @@ def _prepared(
         model, period, samples, np.array(sizes), known or noise, fixed=bool(known),
         longest=values['prediction_step'] or usual_step(model), least_noise=rounding,
     )  # fmt: skip
+
+
+def usable(data: RecordedOutput) -> RecordedOutput:
+    """Return the samples that are finite and later than all before them."""
+    finite = np.isfinite(np.column_stack(data)).all(axis=1)
+    latest = np.maximum.accumulate(np.where(finite, data.t, -np.inf))
+    keep = finite & (data.t > np.concatenate([[-np.inf], latest[:-1]])[: len(data.t)])
+    return RecordedOutput(*(part[keep] for part in data))
+
+
+def quantum(y: Floats) -> float:
+    """Return the resolution of y, 0 if its values lie on no grid, or on a very fine one."""
+    steps = np.abs(np.diff(y))
+    steps = steps[steps > 0.0]
+    if len(steps) < FEWEST_STEPS:
+        return 0.0
+    multiples = steps / np.quantile(steps, 0.01)
+    whole = np.round(multiples)
+    few = len(np.unique(whole)) < len(steps) / 10
+    near = np.abs(multiples - whole) <= ON_GRID * np.maximum(multiples, 1.0)
+    return float(np.sum(steps) / np.sum(whole)) if few and near.mean() >= 0.99 else 0.0
 
 
 def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:
