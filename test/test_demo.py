@@ -5,32 +5,19 @@ import os
 from pathlib import Path
 import signal
 import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
+from commands import ROOT, run, start
 from fhaosmo_ros.tools.demo.report import OTHERS, read_run, true_noise
 from fhaosmo_ros.topics import ESTIMATES, PARAMETERS, SNAPSHOT
 from rosbags.highlevel import AnyReader
 from waiting import wait_until
 
 pytestmark = pytest.mark.ros
-ROOT = Path(__file__).resolve().parents[1]
-COMMAND = [sys.executable, '-m', 'fhaosmo_ros', 'demo']
-
-
-def environment():
-    return {**os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])}
-
-
-def run(*arguments):
-    return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=400,
-        env=environment(), check=False,
-    )  # fmt: skip
 
 
 def nodes_of(folder):
@@ -55,10 +42,10 @@ def parameters(tmp_path_factory):
 
 def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(parameters):
     folder = parameters.parent / 'out'
-    result = run('--duration', 6, '--output', folder, '--params-file', parameters)
+    result = run('demo', '--duration', 6, '--output', folder, '--params-file', parameters)
     assert result.returncode == 0, result.stderr
     assert nodes_of(parameters) == []
-    for word in (*OTHERS, 'RMS of d', 'z1', 'z2', 'z3', 'dropped'):
+    for word in (*OTHERS, 'RMS error', 'z1', 'z2', 'z3', 'dropped'):
         assert word in result.stdout
     assert (folder / 'report.txt').read_text().strip() in result.stdout
     assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
@@ -80,7 +67,7 @@ def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(parameters):
 def test_shipped_demonstration_changes_the_plant(tmp_path):
     """The second engine: what it has found is in the bag and in words."""
     folder = tmp_path / 'out'
-    result = run('--duration', 6, '--output', folder, '--self-tuning')
+    result = run('demo', '--duration', 6, '--output', folder, '--self-tuning')
     assert result.returncode == 0, result.stderr
     assert 'now with noise of 1e-4 on y' in result.stdout
     assert 'd lay within two standard deviations' in result.stdout
@@ -95,11 +82,7 @@ def test_shipped_demonstration_changes_the_plant(tmp_path):
 
 def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(parameters):
     folder = parameters.parent / 'interrupted'
-    process = subprocess.Popen(
-        [*COMMAND, '--duration', '600', '--output', folder, '--params-file', parameters],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(),
-        start_new_session=True,
-    )  # fmt: skip
+    process = start('demo', '--duration', 600, '--output', folder, '--params-file', parameters)
     part = folder.with_name('.interrupted.part') / 'interrupted' / 'bag' / 'bag_0.mcap'
     wait_until(
         lambda: part.exists() and part.stat().st_size > 300_000, 'recording', 120.0, process
@@ -117,9 +100,9 @@ def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(parameters):
 
 def test_another_plant_in_the_same_domain_is_refused(tmp_path):
     """The bag would hold the samples and estimates of both."""
-    with subprocess.Popen([*COMMAND[:-1], 'plant'], env=environment()) as plant:
+    with start('plant', stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as plant:
         try:
-            result = run('--duration', 600, '--output', tmp_path / 'out')
+            result = run('demo', '--duration', 600, '--output', tmp_path / 'out')
         finally:
             plant.send_signal(signal.SIGINT)
     assert result.returncode == 2
@@ -152,7 +135,7 @@ def test_bad_arguments_are_said_in_one_line(arguments, words, tmp_path, bad):
     busy.mkdir()
     (busy / 'precious.txt').write_text('mine')
     names = {'BAD': bad, 'BUSY': busy}
-    result = run('--output', tmp_path / 'out', *(names.get(x, x) for x in arguments))
+    result = run('demo', '--output', tmp_path / 'out', *(names.get(x, x) for x in arguments))
     assert result.returncode == 2
     assert len(result.stderr.strip().splitlines()) == 1
     assert all(word in result.stderr for word in words)

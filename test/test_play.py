@@ -2,10 +2,8 @@
 """A live estimator in simulation time, and a recorder, against a recording that is played."""
 
 import os
-from pathlib import Path
 import signal
 import subprocess
-import sys
 import time
 
 import pytest
@@ -14,20 +12,17 @@ from rosbags.typesys import get_types_from_msg
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 import bag_files as files
+from commands import start
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.tools.bags.reader import BagReader
 from waiting import wait_until
 
 pytestmark = pytest.mark.ros
-ROOT = Path(__file__).resolve().parents[1]
 
 
-def start(*arguments, folder=None, output=subprocess.PIPE):
-    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])}
-    return subprocess.Popen(
-        [sys.executable, '-m', 'fhaosmo_ros', *map(str, arguments)], env=environment,
-        stdout=output, stderr=subprocess.STDOUT, text=True, start_new_session=True, cwd=folder,
-    )  # fmt: skip
+def play(*arguments, **options):
+    """Start a command; what it says on stderr is with its output."""
+    return start(*arguments, stderr=subprocess.STDOUT, **options)
 
 
 @pytest.fixture(name='bag')
@@ -45,14 +40,14 @@ def test_estimator_restarts_where_the_loop_begins_again(bag, tmp_path):
     log, recorded = tmp_path / 'log', tmp_path / 'out' / 'out_0.mcap'
     with log.open('w') as output:
         processes = [
-            start('play', bag, '--loop', '--delay', '0', *remapped),
-            start(
+            play('play', bag, '--loop', '--delay', '0', *remapped),
+            play(
                 'record', '-o', tmp_path / 'out', '--topics', '/y', *remapped,
                 '-r', '__node:=scribe',
             ),
-            start(
+            play(
                 'estimator', '--ros-args', '-p', 'use_sim_time:=true', '-p', 'sampling:=clock',
-                '-p', 'input_topic:=/rig/y', output=output,
+                '-p', 'input_topic:=/rig/y', stdout=output,
             ),
         ]  # fmt: skip
     try:
@@ -69,7 +64,7 @@ def test_estimator_restarts_where_the_loop_begins_again(bag, tmp_path):
 
 def test_bag_takes_its_own_time_over_the_rate(bag):
     begin = time.monotonic()  # from before its start: a lower bound, however it is held up
-    process = start('play', bag, '--rate', '0.5', '--delay', '0.5')
+    process = play('play', bag, '--rate', '0.5', '--delay', '0.5')
     out, _ = process.communicate(timeout=120)
     assert process.returncode == 0
     assert 'playing' in out
@@ -87,7 +82,7 @@ def test_bag_takes_its_own_time_over_the_rate(bag):
     ],
 )
 def test_wrong_input_is_said_in_one_line(arguments, words, bag):
-    process = start('play', *[bag if a == 'BAG' else a for a in arguments])
+    process = play('play', *[bag if a == 'BAG' else a for a in arguments])
     out, _ = process.communicate(timeout=120)
     assert process.returncode == 2
     assert len(out.strip().splitlines()) == 1
@@ -110,7 +105,7 @@ def test_package_beside_the_bag_is_not_imported(tmp_path):
     stamps, y = files.signal(20)
     things = [('/x', 'planted_msgs/msg/Thing', s, d) for _, _, s, d in files.floats(stamps, y)]
     files.write(tmp_path / 'bag', [*files.floats(stamps, y), *things])
-    process = start('play', 'bag', '--delay', '0', folder=tmp_path)
+    process = play('play', 'bag', '--delay', '0', cwd=tmp_path)
     out, _ = process.communicate(timeout=120)
     assert process.returncode == 0, out
     assert 'not played: /x: planted_msgs/msg/Thing is not installed here' in out

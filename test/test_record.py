@@ -3,18 +3,17 @@
 
 import contextlib
 import os
-from pathlib import Path
 import re
 import shlex
 import signal
 import subprocess
-import sys
 import time
 
 import pytest
 
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
+from commands import COMMAND, environment, ROOT, run, start
 from domains import take_domain
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import read_ticks
@@ -32,33 +31,10 @@ from waiting import wait_until
 import yaml
 
 pytestmark = pytest.mark.ros
-ROOT = Path(__file__).resolve().parents[1]
-COMMAND = [sys.executable, '-m', 'fhaosmo_ros']
 DOMAIN = os.environ['ROS_DOMAIN_ID']
 APART = str(take_domain())
 """A domain without the plant that the other tests share."""
 NODES = ['--ros-args', '--params-file', str(ROOT / 'config' / 'demo.yaml')]
-
-
-def environment(domain=DOMAIN):
-    return {
-        **os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path]),
-        'ROS_DOMAIN_ID': domain,
-    }  # fmt: skip
-
-
-def start(*arguments, domain=DOMAIN):
-    return subprocess.Popen(
-        [*COMMAND, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True, env=environment(domain), start_new_session=True,
-    )  # fmt: skip
-
-
-def run(*arguments):
-    return subprocess.run(
-        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=120,
-        env=environment(), check=False,
-    )  # fmt: skip
 
 
 def size(folder):
@@ -257,9 +233,9 @@ def test_input_that_was_remapped_and_channels_are_recorded(tmp_path):
     bag = tmp_path / 'bag'
     channels = ['--ros-args', '-p', 'channels:=[hip, knee]', '-r', 'hip/y:=/force']
     processes = [
-        start('record', '-o', bag, '--names', '/estimator', domain=APART),
-        start('estimator', *channels, domain=APART),
-        start('plant', '--ros-args', '-r', '/y:=/force', domain=APART),
+        start('record', '-o', bag, '--names', '/estimator', env=environment(ROS_DOMAIN_ID=APART)),
+        start('estimator', *channels, env=environment(ROS_DOMAIN_ID=APART)),
+        start('plant', '--ros-args', '-r', '/y:=/force', env=environment(ROS_DOMAIN_ID=APART)),
     ]
     try:
         # It finds /force only as what the estimator listens to.

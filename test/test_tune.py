@@ -2,14 +2,13 @@
 """The command `tune` on simulated recordings: its start, its output, its inputs, its ends."""
 
 from contextlib import closing
-import os
 from pathlib import Path
 import re
 import signal
 import sqlite3
 import subprocess
-import sys
 
+from commands import start
 from fhaosmo_ros.core import ConfigurationError, Family, Observer, TriangularModel
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import load
@@ -134,7 +133,7 @@ def test_gains_of_a_kalman_filter_make_one(derivatives, decay):
 @pytest.fixture(scope='module', name='tuner')
 def _tuner():
     values = VALUES.changed({'duration': 6.0, 'settled': 2.0, 'recordings': 3})
-    return Tuner(simulated(values, 1), {}, values, 1)
+    return Tuner(*simulated(values, 1), {}, values, 1)
 
 
 def test_start_is_nearly_as_good_as_the_best_kalman_filter(tuner):
@@ -144,7 +143,7 @@ def test_start_is_nearly_as_good_as_the_best_kalman_filter(tuner):
         model = SampledModel(TriangularModel(PHI, 3), 1.0 / 200.0)
         gain = model.kalman([model.period * bandwidth**8])
         errors = []
-        for r in tuner.data.training:
+        for r in tuner.training.recordings:
             wrong = estimates(TriangularModel(PHI, 3), gain, 0.0, r, 0.1)[:, 3] - r.d
             errors.append(rms(wrong[r.t >= 2.0]) / tuner.training.scale[-1])
         best = min(best, float(np.exp(np.mean(np.log(errors)))))
@@ -152,8 +151,7 @@ def test_start_is_nearly_as_good_as_the_best_kalman_filter(tuner):
     assert tuner.training(tuner.parameters(start)).error < 1.03 * best
     assert [*start] == ['unknown_input_size', 'unknown_input_decay']
     # Held-out recordings are others, and errors relative to the same scale.
-    assert tuner.training.recordings == tuner.data.training
-    assert not any(a is b for a in tuner.data.training for b in tuner.held_out.recordings)
+    assert not any(a is b for a in tuner.training.recordings for b in tuner.held_out.recordings)
     np.testing.assert_array_equal(tuner.held_out.scale, tuner.training.scale)
 
 
@@ -167,7 +165,7 @@ def test_start_is_nearly_as_good_as_the_best_kalman_filter(tuner):
     ],
 )
 def test_what_the_user_sets_stays_with_gains_of_a_kalman_filter(given):
-    tuner = Tuner(simulated(VALUES, 1), given, VALUES, 1)
+    tuner = Tuner(*simulated(VALUES, 1), given, VALUES, 1)
     found = tuner.parameters({d.name: d.start for d in tuner.space})
     assert dict(SCHEME).items() <= (found | {k: SCHEME[k] for k in SCHEME if k in given}).items()
     assert given.items() <= found.items()
@@ -185,7 +183,7 @@ def test_what_the_user_sets_stays_with_gains_of_a_kalman_filter(given):
     ],
 )
 def test_another_scheme_begins_with_its_own_gains(given):
-    tuner = Tuner(simulated(VALUES, 1), given, VALUES, 1)
+    tuner = Tuner(*simulated(VALUES, 1), given, VALUES, 1)
     expected = Observer(given).parameters
     assert tuner.space[0].name == 'lambda[0]'
     assert tuner.space[0].start == expected['lambda'][0]
@@ -200,7 +198,7 @@ def test_start_without_noise_is_nearly_exact():
     """And nothing is written that would say how sure the observer is."""
     quiet = {'noise_std': 0.0, 'sample_rate': 1000.0, 'disturbances': ['sines'], 'duration': 6.0}
     values = VALUES.changed(quiet | {'settled': 2.0})
-    tuner = Tuner(simulated(values, 1), {}, values, 1)
+    tuner = Tuner(*simulated(values, 1), {}, values, 1)
     start = tuner.parameters({d.name: d.start for d in tuner.space})
     assert tuner.training(start).error < 0.1
     assert {'noise_size', 'unknown_input_size'}.isdisjoint(start)
@@ -256,24 +254,12 @@ def test_model_may_stand_in_any_section(tmp_path, section):
         [path], ['noise_std:=0.1', 'variant:=sign', 'structure:=levant', 'lambda:=1.0']
     )
     values = TUNE_PARAMETERS.complete(SHORT | {'settled': 1.0, 'recordings': 1} | tuning)
-    tuner = Tuner(simulated(values, 1), estimator, values, 1)
+    tuner = Tuner(*simulated(values, 1), estimator, values, 1)
     assert tuner.parameters({})['phi'] == ['-2.0*z1']
     # What levant or the variant does not use is passed over.
     names = ['lambda[0]', 'lambda[1]', 'unknown_input_decay']
     assert [d.name for d in tuner.space] == names
-    assert tuner.data.parameters['noise_std'] == 0.1
-
-
-def test_levant_is_tuned_without_what_it_does_not_use(tmp_path):
-    out = tmp_path / 'out'
-    assert main([*QUICK, '-pstructure:=levant', '-pscheme:=implicit', '-o', str(out)]) == 0
-    values = load(out / 'gains.yaml', 'estimator')
-    assert values['structure'] == 'levant'
-    assert 'alpha' not in values
-    assert '| epsilon |' not in (out / 'report.md').read_text()
-    assert values['epsilon'] == max(values['fuzzy_widths'])
-    assert values['divergence_time'] == 0.1  # 20 samples at 200 Hz
-    assert len(values['lambda']) == 4
+    assert tuner.tuning['noise_std'] == 0.1
 
 
 def test_report_warns_of_overfitting():
@@ -296,20 +282,8 @@ def finished(storage):
 @pytest.mark.signals
 def test_interrupt_keeps_the_best_and_the_next_run_goes_on(tmp_path):
     out, storage = tmp_path / 'out', tmp_path / 'study.db'
-    command = [
-        *EXPLICIT,
-        '--jobs=1',
-        '--storage',
-        f'sqlite:///{storage}',
-        '--force',
-        '-o',
-        str(out),
-    ]
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'fhaosmo_ros', 'tune', *command, '--trials=1000000'],
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-        env=os.environ | {'PYTHONPATH': str(ROOT)},
-    )  # fmt: skip
+    command = [*EXPLICIT, '--jobs=1', f'--storage=sqlite:///{storage}', '--force', f'-o{out}']
+    process = start('tune', *command, '--trials=1000000', stdout=subprocess.DEVNULL)
     try:
         wait_until(lambda: finished(storage) > 3, 'trial', process=process)
         process.send_signal(signal.SIGINT)

@@ -95,9 +95,9 @@ def _search(
     """Find the gains for a simulated family."""
     values = TUNE_PARAMETERS.complete(tuning)
     with stop.raising():
-        data = simulated(values, arguments.seed)
-        print(f'{len(data.training)} recordings to train on, {len(data.held_out)} held out')
-        tuner = Tuner(data, estimator, values, arguments.seed)
+        training, held_out = simulated(values, arguments.seed)
+        print(f'{len(training)} recordings to train on, {len(held_out)} held out')
+        tuner = Tuner(training, held_out, estimator, values, arguments.seed)
     jobs = arguments.jobs or os.cpu_count() or 1
     result = tuner.search(arguments.trials, jobs, arguments.storage, stop.is_set)
     return report.of_search(tuner, result)

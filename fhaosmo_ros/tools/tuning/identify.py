@@ -24,6 +24,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2, median_abs_deviation
 
 Floats = NDArray[np.float64]
+Evaluate = Callable[[Design], Evaluation]
 DERIVATIVES = (0, 1, 2)
 BANDWIDTHS = tuple(float(w) for w in np.geomspace(2e-4, 2.0, 15))
 """First bandwidths, in rad a sample; at the first number of derivatives and ratio below."""
@@ -121,19 +122,30 @@ def identify_input(
 
     """
     likelihood = _prepared(data, model, values, given)
+    decay, orders = given.get('unknown_input_decay') or None, DERIVATIVES
+    if 'unknown_input_derivatives' in given:
+        orders = (given['unknown_input_derivatives'],)
     with progress(unit='filter', desc='likelihood', leave=False) as bar:
-        search = _Search(likelihood, given, bar.update)
-        start = search.start()
+
+        def evaluate(design: Design) -> Evaluation:
+            bar.update()
+            return likelihood(design)
+
+        start = _start(likelihood, evaluate)
         outliers = _leave_out_outliers(likelihood, start)
-        best = search.likeliest_order(start)
+        best = _simplest(
+            _fit(evaluate, start.design._replace(derivatives=k), likelihood.period, decay)
+            for k in orders
+        )
         if not math.isfinite(best.log_likelihood):
             raise NothingToFind(
                 f'y: expected samples that the model can predict, got none that phi = '
                 f'{list(model.phi)} follows: its estimates leave the finite numbers'
             )
-        silent = search.silent(best)
-    step = quantum(likelihood.samples.y)
-    return Identified(likelihood, best, silent, outliers, step)
+        still = STILL / float(likelihood.samples.h.sum())
+        without = evaluate(best.design._replace(bandwidth=still))
+    silent = best.log_likelihood - without.log_likelihood
+    return Identified(likelihood, best, silent, outliers, quantum(likelihood.samples.y))
 
 
 def _prepared(
@@ -214,73 +226,44 @@ def _simplest(tried: Iterable[Evaluation]) -> Evaluation:
     return chosen
 
 
-class _Search:
-    """The search for one recording."""
+def _start(likelihood: Likelihood, evaluate: Evaluate) -> Evaluation:
+    """Scan bandwidths, and bring the scale of clipping and the sizes about."""
+    designs = (Design(FIRST_DERIVATIVES, w / likelihood.period, FIRST_RATIO) for w in BANDWIDTHS)
+    best = max(map(evaluate, designs), key=lambda e: e.log_likelihood)
+    likelihood.clip = CLIP
+    for _ in range(2):
+        if math.isfinite(best.log_likelihood):
+            likelihood.noise = best.noise
+            states = best.estimates[:, : len(likelihood.sizes)]
+            sizes = np.sqrt(np.nanmean(states**2, axis=0))
+            likelihood.sizes = np.where(np.isfinite(sizes), sizes, likelihood.sizes)
+        best = evaluate(best.design)
+    return best
 
-    def __init__(
-        self, likelihood: Likelihood, given: Mapping[str, Any], tick: Callable[[], object]
-    ) -> None:
-        self._likelihood, self._tick = likelihood, tick
-        self._decay = given.get('unknown_input_decay') or None
-        self._orders = DERIVATIVES
-        if 'unknown_input_derivatives' in given:
-            self._orders = (given['unknown_input_derivatives'],)
 
-    def _evaluate(self, design: Design) -> Evaluation:
-        self._tick()
-        return self._likelihood(design)
+def _fit(evaluate: Evaluate, design: Design, period: float, decay: float | None) -> Evaluation:
+    """Return the likeliest design around this one (Nelder and Mead 1965)."""
 
-    def start(self) -> Evaluation:
-        """Scan bandwidths, and bring the scale of clipping and the sizes about."""
-        likelihood = self._likelihood
-        designs = (
-            Design(FIRST_DERIVATIVES, w / likelihood.period, FIRST_RATIO) for w in BANDWIDTHS
-        )
-        best = max(map(self._evaluate, designs), key=lambda e: e.log_likelihood)
-        likelihood.clip = CLIP
-        for _ in range(2):
-            if math.isfinite(best.log_likelihood):
-                likelihood.noise = best.noise
-                states = best.estimates[:, : len(likelihood.sizes)]
-                sizes = np.sqrt(np.nanmean(states**2, axis=0))
-                likelihood.sizes = np.where(np.isfinite(sizes), sizes, likelihood.sizes)
-            best = self._evaluate(best.design)
-        return best
+    def at(point: Floats) -> Evaluation:
+        """Evaluate at ln bandwidth (rad a sample) and, unless decay is given, ln ratio."""
+        bandwidth = math.exp(point[0]) / period
+        ratio = decay / bandwidth if decay else math.exp(point[1])
+        return evaluate(design._replace(bandwidth=bandwidth, ratio=ratio))
 
-    def likeliest_order(self, start: Evaluation) -> Evaluation:
-        """Fit each number of derivatives; return the best."""
-        return _simplest(self._fit(start.design._replace(derivatives=k)) for k in self._orders)
+    def loss(point: Floats) -> float:
+        value = at(point).log_likelihood
+        return -value if math.isfinite(value) else 1e300
 
-    def _fit(self, design: Design) -> Evaluation:
-        """Return the likeliest design around this one (Nelder and Mead 1965)."""
-        period = self._likelihood.period
-
-        def at(point: Floats) -> Evaluation:
-            """Evaluate at ln bandwidth (rad a sample) and, unless decay is given, ln ratio."""
-            bandwidth = math.exp(point[0]) / period
-            ratio = self._decay / bandwidth if self._decay else math.exp(point[1])
-            return self._evaluate(design._replace(bandwidth=bandwidth, ratio=ratio))
-
-        def loss(point: Floats) -> float:
-            value = at(point).log_likelihood
-            return -value if math.isfinite(value) else 1e300
-
-        count = 1 if self._decay else 2
-        start = np.log([design.bandwidth * period, design.ratio])[:count]
-        found = minimize(
-            loss, start, method='Nelder-Mead', bounds=BOUNDS[:count],
-            options={
-                'initial_simplex': np.vstack([start, start + np.diag(STEPS[:count])]),
-                'xatol': 0.02, 'fatol': 0.1, 'maxfev': EVALUATIONS,
-            },
-        )  # fmt: skip
-        return at(found.x)
-
-    def silent(self, best: Evaluation) -> float:
-        """Return `Identified.silent`."""
-        still = STILL / float(self._likelihood.samples.h.sum())
-        found = self._evaluate(best.design._replace(bandwidth=still))
-        return best.log_likelihood - found.log_likelihood
+    count = 1 if decay else 2
+    start = np.log([design.bandwidth * period, design.ratio])[:count]
+    found = minimize(
+        loss, start, method='Nelder-Mead', bounds=BOUNDS[:count],
+        options={
+            'initial_simplex': np.vstack([start, start + np.diag(STEPS[:count])]),
+            'xatol': 0.02, 'fatol': 0.1, 'maxfev': EVALUATIONS,
+        },
+    )  # fmt: skip
+    return at(found.x)
 
 
 def ljung_box(r: Floats, lags: int = LAGS) -> tuple[Floats, float]:

@@ -61,13 +61,14 @@ def of_search(tuner: Tuner, result: Result) -> Report:
         for data, objective in (('training', tuner.training), ('held out', tuner.held_out))
     }
     training, held_out = (found[f'tuned, {data}'].error for data in ('training', 'held out'))
-    p = tuner.data.parameters
+    p = tuner.tuning
     summary = [
         f'{result.trials} trials for a simulated family: noise of y {p["noise_std"]:.3g}, '
         f'{p["sample_rate"]:g} Hz, '
         f'd: {", ".join(dict.fromkeys(p["disturbances"]))} with an RMS of {p["rms_of_d"]:.3g}.',
-        f'Error relative to the truth: {training:.3f} in {len(tuner.data.training)} recordings, '
-        f'{held_out:.3f} in {len(tuner.data.held_out)} that took no part in the search.',
+        f'Error relative to the truth: {training:.3f} in training '
+        f'({len(tuner.training.recordings)} recordings), {held_out:.3f} on '
+        f'{len(tuner.held_out.recordings)} that took no part in the search.',
     ]
     searched = table(
         ['parameter', 'from', 'to', 'start', 'tuned'],

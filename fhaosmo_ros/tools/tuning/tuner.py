@@ -13,7 +13,7 @@ import hashlib
 from itertools import product
 import json
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.observer.configuration import FIXED_GAMMA
 from fhaosmo_ros.core.observer.observer import Observer
@@ -52,21 +52,12 @@ without end.
 """
 
 
-class TuningData(NamedTuple):
-    """Recordings to train on, others to judge by, and the complete parameters of their family."""
-
-    training: list[Recording]
-    held_out: list[Recording]
-    parameters: dict[str, Any]
-
-
-def simulated(values: Parameters, seed: int) -> TuningData:
-    """Return recordings of the family that `values` (of `TUNE_PARAMETERS`) describe."""
+def simulated(values: Parameters, seed: int) -> tuple[list[Recording], list[Recording]]:
+    """Return recordings of the family of `TUNE_PARAMETERS`: to train on, and to judge by."""
     family = Family(FAMILY_PARAMETERS.complete(values))
-    return TuningData(
+    return (
         family.recordings(values['recordings'], seed),
         family.recordings(values['held_out'], seed + HELD_OUT_SEED),
-        family.parameters,
     )
 
 
@@ -76,7 +67,8 @@ class Tuner:
 
     Parameters
     ----------
-    data : TuningData
+    training, held_out : list of Recording
+        To train on, and to judge by.
     estimator : mapping
         What the user set for the estimator.
     tuning : mapping
@@ -97,19 +89,20 @@ class Tuner:
 
     def __init__(
         self,
-        data: TuningData,
+        training: list[Recording],
+        held_out: list[Recording],
         estimator: Mapping[str, Any],
         tuning: Mapping[str, Any],
         seed: int,
     ) -> None:
-        self.data, self.tuning, self._seed = data, tuning, seed
-        self._period = rounded(float(np.median(np.diff(data.training[0].t))))
+        self.tuning, self._seed = tuning, seed
+        self._period = rounded(float(np.median(np.diff(training[0].t))))
         self.given = 'lambda' in estimator
         # The estimator may have a model of its own, other than the plant's.
         own = {name: tuning[name] for name in ('order', 'phi')} | dict(estimator)
         self._noise, self._fixed = 0.0, own
-        self.training = Objective(data.training, tuning)
-        self.held_out = Objective(data.held_out, tuning, self.training.scale)
+        self.training = Objective(training, tuning)
+        self.held_out = Objective(held_out, tuning, self.training.scale)
         fuzzy = own.get('variant', SCHEME['variant']).startswith('fuzzy')
         kalman = fuzzy and not chosen_otherwise(own)
         if kalman:
@@ -128,8 +121,8 @@ class Tuner:
     def _kalman_start(self, own: Mapping[str, Any]) -> tuple[float, dict[str, Any]]:
         """Return the size of the noise, and what the recordings say of the estimator."""
         # With quantum and jitter.
-        noise = rms(np.concatenate([r.y - r.z[:, 0] for r in self.data.training]))
-        truth = np.concatenate([np.column_stack([r.z, r.d]) for r in self.data.training])
+        noise = rms(np.concatenate([r.y - r.z[:, 0] for r in self.training.recordings]))
+        truth = np.concatenate([np.column_stack([r.z, r.d]) for r in self.training.recordings])
         sizes = [rounded(rms(column)) for column in truth.T]
         found = {
             **SCHEME,
@@ -151,7 +144,7 @@ class Tuner:
     @property
     def _study_name(self) -> str:
         """Name of the study: a digest of all that its trials depend on."""
-        samples = [recording.y.tobytes() for recording in self.data.training]
+        samples = [recording.y.tobytes() for recording in self.training.recordings]
         problem = json.dumps([dict(self.tuning), self._fixed, self.space], sort_keys=True)
         return f'tune-{hashlib.sha256(b"".join([problem.encode(), *samples])).hexdigest()[:16]}'
 

@@ -14,7 +14,7 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.objective import FIRST_STAMP
 from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
-from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, Tuner, TuningData
+from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, Tuner
 import numpy as np
 from studies import harness
 from studies.comparison.methods.method import (
@@ -58,9 +58,9 @@ def _prepared(own: Values) -> Callable[[Setting, Values], Run]:
 def _tune(search: Search) -> Values:
     """Return the parameters of the estimator that `tune` writes; its grid uses trials, too."""
     tuning = TUNE_PARAMETERS.complete(model_of(search.setting) | GOAL)
-    data = TuningData(list(search.recordings), list(search.recordings[:1]), {})
+    recordings = list(search.recordings)
     with redirect_stderr(StringIO()):  # its progress bars
-        tuner = Tuner(data, {}, tuning, search.seed)
+        tuner = Tuner(recordings, recordings[:1], {}, tuning, search.seed)
         return tuner.parameters(tuner.search(max(1, search.trials - GRID)).best)
 
 
