@@ -4,15 +4,12 @@
 import sqlite3
 
 import bag_files as files
-from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.tools.bags.inputs import bag_inputs
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import series
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.replay import command as replay
-from fhaosmo_ros.tools.tuning.identify import recorded
 import numpy as np
 import pytest
 
@@ -230,12 +227,3 @@ def test_sqlite_has_no_publish_times(tmp_path, capsys):
     source = ['-p', 'input_stamp:=source']
     assert replay.main([str(bag), '-o', str(tmp_path / 'o.npz'), *source]) == 2
     assert 'input_stamp source: expected an mcap bag' in capsys.readouterr().err
-
-
-def test_tune_takes_them_too(late, tmp_path):
-    """Else it would see the jitter of reception."""
-    times = []
-    for name, received in (('exact', STAMPS), ('late', late)):
-        bag = files.write_preset(tmp_path / name, files.floats(received, Y), 'zstd', STAMPS)
-        times.append(recorded(bag, bag_inputs({}, []), TriangularModel(['0'])).t)
-    np.testing.assert_array_equal(*times)
