@@ -140,7 +140,7 @@ def test_file_that_was_cut_is_an_error(how, tmp_path):
         storage_file(bag).write_bytes(whole[: int(share * len(whole))])
         assert read(bag) is None
         assert read(storage_file(bag)) is None
-    with pytest.raises(ConfigurationError, match='whole bag.*mcap recover'):
+    with pytest.raises(ConfigurationError, match=r'whole bag.*mcap recover'):
         BagReader(bag).__enter__()
 
 
