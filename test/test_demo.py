@@ -67,7 +67,7 @@ def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(parameters):
 def test_shipped_demonstration_changes_the_plant(tmp_path):
     """The second engine: what it has found is in the bag and in words."""
     folder = tmp_path / 'out'
-    result = run('demo', '--duration', 6, '--output', folder, '--self-tuning')
+    result = run('demo', '--duration', 9, '--output', folder, '--self-tuning')
     assert result.returncode == 0, result.stderr
     assert 'now with noise of 1e-4 on y' in result.stdout
     assert 'd lay within two standard deviations' in result.stdout

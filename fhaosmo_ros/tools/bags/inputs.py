@@ -27,11 +27,9 @@ class BagInputs(NamedTuple):
     Attributes
     ----------
     y : Input
-        With the full name of its topic.
+        With the full name of its topic, and its stamp as for `BagReader.samples`.
     u : mapping of str to Input
-        The known inputs that the model uses, likewise.
-    stamp : str
-        As for `BagReader.samples`.
+        The known inputs that the model uses, with full names.
     values : mapping
         Parameters of the channel.
 
@@ -39,7 +37,6 @@ class BagInputs(NamedTuple):
 
     y: Input
     u: Mapping[str, Input]
-    stamp: str
     values: Mapping[str, Any]
 
 
@@ -76,7 +73,7 @@ def bag_inputs(
 
     y = full(measured_output(values, channel))
     u = {name: full(its) for name, its in known_inputs(values, used, channel).items()}
-    return BagInputs(y, u, 'bag' if y.stamp == 'reception' else y.stamp, values)
+    return BagInputs(y._replace(stamp='bag') if y.stamp == 'reception' else y, u, values)
 
 
 def read_output(
@@ -98,7 +95,7 @@ def read_output(
         The bag lacks the topic or the field, or has no samples.
 
     """
-    y, stamp = inputs.y, inputs.stamp
+    y, stamp = inputs.y, inputs.y.stamp
     field = reader.field(y.topic, y.field, y.name)
     if stamp == 'auto' and not field.header and inputs.values.get('sampling') == 'clock':
         stamp = 'bag'  # such an estimator took a sample when it came, not when it was sent

@@ -64,7 +64,7 @@ class Samples:
         self.stamps = 'source (publish times of the bag)'
         if np.array_equal(samples.stamps, samples.times):
             self.stamps = 'bag'
-        elif field.header and inputs.stamp != 'source':
+        elif field.header and inputs.y.stamp != 'source':
             self.stamps = 'header of the messages'
         if live:
             samples = live.begin(samples)
