@@ -262,6 +262,17 @@ def test_model_may_stand_in_any_section(tmp_path, section):
     assert tuner.tuning['noise_std'] == 0.1
 
 
+def test_levant_is_tuned_without_what_it_does_not_use(tmp_path):
+    out = tmp_path / 'out'
+    assert main([*QUICK, '-pstructure:=levant', '-pscheme:=implicit', '-o', str(out)]) == 0
+    values = load(out / 'gains.yaml', 'estimator')
+    assert values['structure'] == 'levant'
+    assert 'alpha' not in values
+    assert values['epsilon'] == max(values['fuzzy_widths'])
+    assert values['divergence_time'] == 0.1  # 20 samples at 200 Hz
+    assert len(values['lambda']) == 4
+
+
 def test_report_warns_of_overfitting():
     assert report.warnings(0.4, 0.49) == []
     assert '1.30 times' in report.warnings(0.4, 0.52)[0]
