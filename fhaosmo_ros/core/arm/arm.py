@@ -25,6 +25,8 @@ BEGIN, END, CHANGE = 0.15, 7.0, 30.0
 """Rates (1/s) at which contact begins and ends, and its intensity changes."""
 ONSET = 0.02
 """Seconds of a contact's intensity by which its force may be there at once."""
+SINCE = 0.005
+"""Seconds for which positions do not show a contact that has begun; velocities do at once."""
 DECAY = 1.5
 """Of d in free motion, 1/s: friction changes with the direction of motion."""
 INTENSITIES = (0.02, 0.07, 0.24, 0.8)
@@ -173,7 +175,10 @@ class Arm:
         self._constants = np.where(constants == 1.0, known.torque_constants, constants)
         scales = np.array(INTENSITIES) * model.weight
         free = 2.0 * DECAY * self._model_variance
-        self._bank = Bank(free, DECAY, scales, BEGIN, END, CHANGE, ONSET, self._of_position)
+        since = SINCE if self._of_position else 0.0
+        self._bank = Bank(
+            free, DECAY, scales, BEGIN, END, CHANGE, ONSET, since, self._of_position
+        )
         finite = np.where(np.isfinite(model.effort_limits), model.effort_limits, 0.0)
         self._limits = Limits(
             model.lowest - FURTHER, model.highest + FURTHER, FASTER * model.velocity_limits,

@@ -40,6 +40,9 @@ cdef class Bank:
     onset : float
         Seconds of W by which d may have jumped where contact begins: a force that is there at once
         would else be taken for one that still grows, and its estimate overshoots.
+    since : float
+        Seconds for which it may not have been seen: what it has done to Y and p until then would
+        else be taken for more force.
     of_position : bool
         True if Y is measured, False if p is.
 
@@ -51,7 +54,9 @@ cdef class Bank:
     cdef readonly object mean  # (3, n): Y less what was measured, p and d
     cdef readonly object covariance  # (n, n) of d, if the likelier of both is right
     cdef readonly object weights  # (m + 1,), the first of free motion
-    cdef double decay, begin, end, change, onset
+    cdef double decay, begin, end, change, onset, since
+    # Means of (t^2 / 2, t, 1)' (t^2 / 2, t, 1) over the times t since d may have jumped.
+    cdef double[BLOCKS] begun
     cdef double[::1] free, scales, w, mixed, share, likelihood
     cdef double[:, :, ::1] x, x0
     cdef double[:, :, :, ::1] p, p0
@@ -60,14 +65,16 @@ cdef class Bank:
 
     def __init__(
         self, free_intensity, double decay, scales, double begin, double end, double change,
-        double onset=0.0, bint of_position=True,
+        double onset=0.0, double since=0.0, bint of_position=True,
     ):
         cdef int n = len(free_intensity), m = len(scales) + 1
         self.joints, self.filters, self.of_position = n, m, of_position
         self.free = np.array(free_intensity, dtype=np.float64)
         self.scales = np.array(scales, dtype=np.float64)
         self.decay, self.begin, self.end, self.change = decay, begin, end, change
-        self.onset = onset
+        self.onset, self.since = onset, since
+        self.begun[YY], self.begun[YP], self.begun[YD] = since**4 / 20, since**3 / 8, since**2 / 6
+        self.begun[PP], self.begun[PD], self.begun[DD] = since**2 / 3, since / 2, 1.0
         self.x, self.x0 = np.zeros((m, 3, n)), np.zeros((m, 3, n))
         self.p, self.p0 = np.zeros((m, BLOCKS, n, n)), np.zeros((m, BLOCKS, n, n))
         self.s, self.gain, self.innovation = np.zeros((n, n)), np.zeros((n, 3 * n)), np.zeros(n)
@@ -79,7 +86,7 @@ cdef class Bank:
     def __reduce__(self):
         given = (
             np.asarray(self.free), self.decay, np.asarray(self.scales), self.begin, self.end,
-            self.change, self.onset, self.of_position,
+            self.change, self.onset, self.since, self.of_position,
         )
         return Bank, given, (self.log_odds, self.weights, self.mean, self.covariance,
                              np.asarray(self.x), np.asarray(self.p))
@@ -174,7 +181,7 @@ cdef class Bank:
         Write what each filter begins with: a mean over those that it may follow.
 
         Where contact ends, the torque ends: d begins anew, with what the model does not explain.
-        Where it begins, d may have jumped.
+        Where it begins, d may have jumped, now or a little earlier.
         """
         cdef int i, j, a, b, k, o, block, known, n = self.joints, m = self.filters
         cdef double share, c
@@ -217,9 +224,10 @@ cdef class Bank:
                         block += 1
                 if j > 0 and i == 0:
                     c = share * self.onset * self.scales[j - 1] * self.scales[j - 1]
-                    for k in range(n):
-                        for o in range(n):
-                            self.p0[j, DD, k, o] += c * shape[k, o]
+                    for block in range(BLOCKS):
+                        for k in range(n):
+                            for o in range(n):
+                                self.p0[j, block, k, o] += c * self.begun[block] * shape[k, o]
 
     cdef void predict(
         self, double h, const double[::1] measured, const double[::1] drive,
