@@ -13,9 +13,9 @@ import threading
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, Report
+from fhaosmo_ros.nodes.middleware.endpoints import SENSOR_QOS, subscribe_with_info
 from fhaosmo_ros.nodes.middleware.messages import labelled
 from fhaosmo_ros.nodes.middleware.spin import Spinner
-from fhaosmo_ros.nodes.middleware.subscription import SENSOR_QOS, subscribe_with_info
 import numpy as np
 import rclpy
 from rclpy.node import Node

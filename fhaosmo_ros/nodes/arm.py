@@ -21,18 +21,17 @@ from fhaosmo_ros.nodes.middleware.diagnostics import (
     STALE,
     WARN,
 )
-from fhaosmo_ros.nodes.middleware.messages import time_message
-from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
-from fhaosmo_ros.nodes.middleware.publishers import (
+from fhaosmo_ros.nodes.middleware.endpoints import (
     check_overrides,
     create_publisher,
     has_listeners,
     LATCHED,
+    SENSOR_QOS,
 )
-from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
+from fhaosmo_ros.nodes.middleware.messages import time_message
+from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
 from fhaosmo_ros.nodes.middleware.spin import run_node
-from fhaosmo_ros.nodes.middleware.subscription import SENSOR_QOS
-from fhaosmo_ros.nodes.middleware.timers import set_period
+from fhaosmo_ros.nodes.middleware.timing import set_period, TimedNode
 from geometry_msgs.msg import WrenchStamped
 import numpy as np
 from numpy.typing import NDArray

@@ -10,12 +10,11 @@ from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.tables import PLANT_NODE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import Plant
+from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, create_publisher
 from fhaosmo_ros.nodes.middleware.messages import labelled
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
-from fhaosmo_ros.nodes.middleware.publishers import check_overrides, create_publisher
-from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
-from fhaosmo_ros.nodes.middleware.timers import set_period
+from fhaosmo_ros.nodes.middleware.timing import set_period, TimedNode
 import numpy as np
 from std_msgs.msg import Float64, Float64MultiArray
 

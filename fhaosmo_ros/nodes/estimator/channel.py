@@ -1,22 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """One channel of an estimator node: y (and u) in, one observer, estimates out."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from math import isfinite, isnan
 from time import perf_counter, time_ns
+from types import MappingProxyType
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.observer.status import AFRESH, JUMPED, REJECTED, Status, UNUSED
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
+from fhaosmo_ros.core.online.events import described
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.inputs import known_inputs, make_pairing, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
-from fhaosmo_ros.nodes.estimator.outputs import EventOutput, Outputs, SnapshotOutput
+from fhaosmo_ros.nodes.estimator.outputs import Outputs, SnapshotOutput
 from fhaosmo_ros.nodes.estimator.sources import Listener, Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import Output
-from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, WARN
+from fhaosmo_ros.nodes.middleware.diagnostics import array_of, ERROR, OK, Report, WARN
+from fhaosmo_ros.nodes.middleware.endpoints import create_publisher
+from fhaosmo_ros.nodes.middleware.messages import message_class, time_message
+from fhaosmo_ros.topics import DIAGNOSTICS, EVENT
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
@@ -53,7 +59,7 @@ class Channel:
         estimated: Callable[['Channel'], None],
         name: str = '',
     ) -> None:
-        self._estimated = estimated
+        self._node, self._estimated = node, estimated
         self.name = name
         self._clock = node.get_clock()
         self._logger = node.get_logger().get_child(name) if name else node.get_logger()
@@ -65,7 +71,9 @@ class Channel:
         observer = estimator.observer
         prefix = f'~/{name}/' if name else '~/'
         self._outputs = Outputs(node, prefix, estimator)
-        self._events = EventOutput(node, prefix, name)
+        self._events = create_publisher(
+            node, message_class(DIAGNOSTICS), prefix + EVENT, latched=True
+        )
         self._snapshots = SnapshotOutput(node, prefix, estimator)
         wanted = measured_output(values, name)
         self._y = sources.of(wanted).add(wanted, self._on_sample)
@@ -91,7 +99,7 @@ class Channel:
         self._health.begin()
         self._active = True
         if self.estimator.events.on:
-            self._events.say('no event yet', self._values['hardware_id'])
+            self._say('no event yet')
         observer = self.estimator.observer
         self._logger.info(
             f'estimating {observer.order} states and the unknown input from '
@@ -109,17 +117,15 @@ class Channel:
         self._snapshots.changed()
         self._values = self._health.limits = values
         if self._active and found != self.estimator.events.on:
-            text = 'events are switched off' if found else 'no event yet'
-            self._events.say(text, values['hardware_id'])
+            self._say('events are switched off' if found else 'no event yet')
 
     def reports(self) -> list[Report]:
         """Return the reports for /diagnostics, on the time since the last ones."""
         reports = self._health.reports(self._stale, f'{self.name} ' if self.name else '')
         for name, u in self._u.items():
-            found = u.source.publishers
-            for text in [u.error] if u.error else found.unheard.values():
+            for text in [u.error] if u.error else u.source.unheard.values():
                 reports[0].find(ERROR if u.error else WARN, text)
-            nobody = not found.heard and not found.unheard
+            nobody = not u.source.heard and not u.source.unheard
             reports[0].find(WARN, f'no publisher of {name}', nobody)
         if self._pairing is not None:
             self._report_pairing(reports[0])
@@ -201,9 +207,21 @@ class Channel:
         """Publish, and log, the events that have begun or ended."""
         unit = derivative_unit(self._values['measurement_unit'], self.estimator.observer.order)
         for event in self.estimator.events.taken():
-            text = self._events.publish(event, unit, self._values['hardware_id'])
+            text, values = described(event, unit)
+            self._say(text, time_message(event.stamp), WARN if event.begins else OK, values)
             if event.begins:
                 self._logger.warning(f'event: {text}', throttle_duration_sec=QUIET)
+
+    def _say(
+        self, text: str, stamp: Time | None = None, level: bytes = OK,
+        values: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:  # fmt: skip
+        """Publish on the topic of events; without a stamp, with that of now."""
+        report = Report(f'{self.name} event' if self.name else 'event')
+        report.find(level, text)
+        report.values |= values
+        stamp = stamp or self._clock.now().to_msg()
+        self._events.publish(array_of(self._node, stamp, [report], self._values['hardware_id']))
 
     def _tell(self, word: int, stamp: int, y: float) -> None:
         """Log what became of a sample, each kind at most every `QUIET` seconds."""

@@ -2,9 +2,9 @@
 """What a channel reports on /diagnostics: on its input, and on its observer."""
 
 from collections import deque
+from collections.abc import Mapping
 from math import nan
 from time import perf_counter
-from typing import NamedTuple
 
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.counters import UNUSED_SAMPLES
@@ -16,6 +16,7 @@ from fhaosmo_ros.core.simulation.metrics import high_passed
 from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
 import numpy as np
+from numpy.typing import NDArray
 
 LIMIT = 20_000
 """Number of latest samples that are remembered for one report."""
@@ -36,22 +37,6 @@ def _words(name: str) -> str:
 
 UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
 """Counters of samples that the observer has not taken."""
-
-
-class Interval(NamedTuple):
-    """What happened between two reports."""
-
-    mean: float
-    """Of the intervals between the samples' stamps, in s; NaN without samples."""
-    jitter: float
-    """Their standard deviation over their mean."""
-    longest: float
-    counts: dict[str, int]
-    """Counters now."""
-    news: dict[str, int]
-    """By how much each has grown."""
-    stale: bool
-    """No estimates are published, because no samples come."""
 
 
 class Health:
@@ -89,55 +74,58 @@ class Health:
         counts = self._counts()
         news = {key: count - self._before[key] for key, count in counts.items()}
         self._before = counts
-        mean = jitter = longest = nan
         periods = np.diff(np.array(self.stamps, dtype=np.int64)) * NANOSECONDS
-        if len(periods):
-            mean, longest = float(np.mean(periods)), float(np.max(periods))
-            jitter = float(np.std(periods)) / mean if mean > 0.0 else nan
-        interval = Interval(mean, jitter, longest, counts, news, stale)
-        reports = [
-            self._input(Report(f'{name}input'), interval),
-            self._observer(Report(f'{name}observer'), interval),
-        ]
+        mean = float(np.mean(periods)) if len(periods) else nan
+        reports = [Report(f'{name}input'), Report(f'{name}observer')]
+        self._input(reports[0], periods, mean, news, stale)
+        self._observer(reports[1], mean, news, stale)
         for column in (self.stamps, self.delays, self.durations, self.unknown_inputs):
             column.clear()
         return reports
 
-    def _input(self, report: Report, interval: Interval) -> Report:
-        y, publishers = self._y, self._y.source.publishers
-        limits, news, mean = self.limits, interval.news, interval.mean
+    def _input(
+        self,
+        report: Report,
+        periods: NDArray[np.float64],
+        mean: float,
+        news: Mapping[str, int],
+        stale: bool,
+    ) -> None:
+        """Report on the samples; `news`: by how much the counters have grown."""
+        y, source, limits, heard = self._y, self._y.source, self.limits, self._y.source.heard
+        rate = 1.0 / mean if mean > 0.0 else nan
+        jitter = float(np.std(periods)) * rate if len(periods) else nan
         delay = max(self.delays) * NANOSECONDS if self.delays else nan
         offset = self.offset * NANOSECONDS
         age = perf_counter() - self.latest
-        rate = 1.0 / mean if mean > 0.0 else nan
-        names = ', '.join(sorted(publishers.heard.values()))
+        stamps = 'clock' if limits['sampling'] == 'clock' else y.stamps
         report.values = {
-            'topic': y.source.topic,
-            'type': y.source.message_type or 'not known yet',
+            'topic': source.topic,
+            'type': source.message_type or 'not known yet',
             'field': y.field.text if y.field else 'not known yet',
-            'stamps': 'clock' if limits['sampling'] == 'clock' else y.stamps or 'not known yet',
-            'publishers': names or 'none',
+            'stamps': stamps or 'not known yet',
+            'publishers': ', '.join(sorted(heard.values())) or 'none',
             'sample rate [Hz]': rate,
-            'jitter (std / mean of the period)': interval.jitter,
-            'longest period [s]': interval.longest,
+            'jitter (std / mean of the period)': jitter,
+            'longest period [s]': float(np.max(periods)) if len(periods) else nan,
             'longest delay [s]': delay,
             'from stamp to publication [s]': offset,
             'age of the last sample [s]': age,
-            **interval.counts,
+            **self._before,
         }
         report.find(ERROR, y.error, y.error)
-        for text in publishers.unheard.values():
-            report.find(WARN if names else ERROR, text)
-        silence = ERROR if publishers.unheard and not names else STALE
+        for text in source.unheard.values():
+            report.find(WARN if heard else ERROR, text)
+        silence = ERROR if source.unheard and not heard else STALE
         since = f'for {age:.3g} s' if age == age else 'yet'
-        report.find(silence, f'no usable sample {since}', interval.stale)
-        nobody = not names and not y.error
-        report.find(silence, f'no publisher of {y.source.topic} that can be heard', nobody)
+        report.find(silence, f'no usable sample {since}', stale)
+        nobody = not heard and not y.error
+        report.find(silence, f'no publisher of {source.topic} that can be heard', nobody)
         used, lacking, spread = (
             news[key] for key in ('samples accepted', 'messages without y', 'spread stamps')
         )
-        several = len(publishers.heard)
-        report.find(WARN, f'{several} publishers, their samples mix', several > 1 and not lacking)
+        several = len(heard) > 1 and not lacking
+        report.find(WARN, f'{len(heard)} publishers, their samples mix', several)
         report.find(WARN, f'{lacking} messages without y: {y.why}', lacking and not used)
         bad = {key: news[key] for key in UNUSED if news[key]}
         share = sum(bad.values()) / max(1, sum(bad.values()) + used)
@@ -153,8 +141,8 @@ class Health:
             report.find(WARN, f'{key} {news[key]}', news[key])
         slow = rate < limits['warn_rate_below']
         report.find(WARN, f'sample rate {rate:.4g} Hz', slow)
-        jitters = interval.jitter > limits['warn_jitter_above']
-        report.find(WARN, f'jitter {interval.jitter:.3g}', jitters)
+        jitters = jitter > limits['warn_jitter_above']
+        report.find(WARN, f'jitter {jitter:.3g}', jitters)
         latest = limits['warn_delay_above']
         report.find(WARN, f'samples arrive {delay:.3g} s after their stamps', delay > latest)
         side = 'before' if offset > 0.0 else 'after'
@@ -164,10 +152,9 @@ class Health:
             "host's, or an old measurement; dt is not affected",
             y.stamps == 'header' and not self._simulated and abs(offset) > latest,
         )
-        return report
 
-    def _observer(self, report: Report, interval: Interval) -> Report:
-        estimator, limits, mean = self._estimator, self.limits, interval.mean
+    def _observer(self, report: Report, mean: float, news: Mapping[str, int], stale: bool) -> None:
+        estimator, limits = self._estimator, self.limits
         observer, estimate, offset = estimator.observer, estimator.estimate, estimator.offset
         unit = derivative_unit(limits['measurement_unit'], observer.order)
         d_now = estimate.unknown_input if estimate else nan
@@ -204,11 +191,11 @@ class Health:
         if limits['unknown_input_unit']:
             scaled = titled('unknown input, scaled', limits['unknown_input_unit'])
             report.values[scaled] = d_now * limits['unknown_input_scale']
-        report.find(STALE, 'no usable samples', interval.stale)
+        report.find(STALE, 'no usable samples', stale)
         first = estimate.open_levels + 1 if estimate else observer.levels + 1
         held = f'levels from {first} on hold: an innovation is above epsilon'
-        report.find(WARN, held, first <= observer.levels and not interval.stale)
-        diverged, jumps = interval.news['divergences'], interval.news['jumps']
+        report.find(WARN, held, first <= observer.levels and not stale)
+        diverged, jumps = news['divergences'], news['jumps']
         report.find(ERROR, f'diverged and started again from y, {diverged} times', diverged)
         report.find(WARN, f'y jumped {jumps} times', jumps)
         report.find(WARN, f'y is taken as {offset:.3g} too large since it jumped', offset)
@@ -224,7 +211,6 @@ class Health:
         report.find(WARN, f'{overruns} steps took longer than the sampling period', overruns)
         chatters = 0.0 < limits['warn_chatter_above'] < chatter
         report.find(WARN, f'the estimate of d chatters by {chatter:.3g}', chatters)
-        return report
 
     def _find_events(self, report: Report, unit: str) -> None:
         """Tell of the event that lasts, or of those since the last report."""

@@ -7,7 +7,7 @@ from textwrap import shorten
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import channel_names, CHANNELS
 from fhaosmo_ros.messages.fields import listed
-from fhaosmo_ros.nodes.middleware.publishers import full_name
+from fhaosmo_ros.nodes.middleware.endpoints import full_name
 from fhaosmo_ros.topics import STANDARD_DEVIATION
 from rclpy.node import Node
 

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimator node: a managed node (ROS 2 lifecycle) of one channel or many."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
-from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import Parameters, suggestion, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
@@ -18,26 +20,25 @@ from fhaosmo_ros.core.parameters.per_channel import (
 )
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
-from fhaosmo_ros.nodes.estimator.channels import Channels, naming_channel
+from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.joints import Joints
 from fhaosmo_ros.nodes.estimator.outputs import ParameterTopic
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
-from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes
+from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes, Output, TypedOutputs
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE, WARN
+from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, input_qos
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
-from fhaosmo_ros.nodes.middleware.publishers import check_overrides
-from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
 from fhaosmo_ros.nodes.middleware.spin import run_node
-from fhaosmo_ros.nodes.middleware.subscription import input_qos
-from fhaosmo_ros.nodes.middleware.timers import set_period
+from fhaosmo_ros.nodes.middleware.timing import ClockWatch, set_period
 from fhaosmo_ros.topics import estimates_of, EVENT
 from rclpy.parameter import Parameter as RosParameter
+from std_srvs.srv import SetBool, Trigger
 
 
 class EstimatorNode(ManagedNode):
     """
-    A managed node around one channel, or many.
+    A managed node around one channel, or many, which share a timer and the typed messages.
 
     configure makes the channels from the parameters; activate lets them take samples and publish;
     deactivate stops that; cleanup destroys them, and then every parameter can be set, except the
@@ -67,7 +68,9 @@ class EstimatorNode(ManagedNode):
         self._own = {name for name in given if split(name)[0]}
         """Parameters of channels that do not change along with the common ones."""
         self._asked: set[str] = set()
-        self._channels: Channels | None = None
+        self._channels: list[Channel] = []  # none before the names of the joints are known
+        self._outputs: dict[str, Output] = {}
+        """Estimates that have been published, but not yet in the typed messages."""
         self._parameters_topic: ParameterTopic | None = None
         self._clock_watch = ClockWatch(self)
         self._node_parameters = NodeParameters(self, values, fixed=['autostart', CHANNELS])
@@ -125,9 +128,21 @@ class EstimatorNode(ManagedNode):
             self._make_channels(estimators)
         self._parameters_topic.publish(self._node_parameters.values)
 
-    def _make_channels(self, estimators: dict[str, OnlineEstimator]) -> None:
+    def _make_channels(self, estimators: Mapping[str, OnlineEstimator]) -> None:
+        """Make a channel for each estimator, by its name, and what they share."""
         values = self._node_parameters.values
-        self._channels = Channels(self, values, estimators, self._sources)
+        self._typed = TypedOutputs(self, values)
+        self._channels = [
+            Channel(
+                self, of_channel(values, name), estimator, self._sources, self._estimated, name
+            )
+            for name, estimator in estimators.items()
+        ]
+        self._sources.after_message = self._publish_typed
+        self.create_service(Trigger, '~/reset', partial(self._each_answers, 'reset'))
+        self.create_service(SetBool, '~/freeze', partial(self._each_answers, 'freeze'))
+        self._timer = self.create_timer(1.0 / values['publish_rate'], self._tick)
+        self._timer.cancel()
         self._sources.open()
 
     def _found_type(self) -> None:
@@ -180,18 +195,55 @@ class EstimatorNode(ManagedNode):
 
     def activate(self) -> None:
         """Take samples and publish."""
-        if self._channels is not None:  # else the joints' names are still to come
-            self._channels.activate()
+        for channel in self._channels:
+            channel.activate()
+        if self._channels:
+            self._timer.reset()
 
     def deactivate(self) -> None:
         """Drop samples and publish nothing."""
-        if self._channels is not None:
-            self._channels.deactivate()
+        if self._channels:
+            self._timer.cancel()
+        for channel in self._channels:
+            channel.deactivate()
 
     def cleanup(self) -> None:
         """Destroy the channels."""
         super().cleanup()
-        self._channels = self._parameters_topic = None
+        self._channels, self._parameters_topic = [], None
+
+    @property
+    def _publishes_each(self) -> bool:
+        return bool(self._node_parameters.values['publish_on'] == 'sample')
+
+    def _tick(self) -> None:
+        for channel in self._channels:
+            channel.end_waiting()
+        for channel in self._channels:
+            if not channel.is_stale() and not self._publishes_each:
+                self._publish(channel)
+        self._publish_typed()
+
+    def _estimated(self, channel: Channel) -> None:
+        if self._publishes_each:
+            self._publish(channel)
+
+    def _publish(self, channel: Channel) -> None:
+        if channel.name in self._outputs:  # several samples had waited for their known inputs
+            self._publish_typed()
+        output = channel.publish()
+        if output is not None:
+            self._outputs[channel.name] = output
+
+    def _publish_typed(self) -> None:
+        if self._outputs:
+            self._typed.publish(list(self._outputs.values()))
+            self._outputs.clear()
+
+    def _each_answers(self, name: str, request: Any, response: Any) -> Any:
+        for channel in self._channels:
+            getattr(channel, name)(request, response)
+        return response
 
     def _followers(self, names: Collection[str]) -> dict[str, str]:
         """Return the parameters of channels that change along with `names`, and with which."""
@@ -200,9 +252,12 @@ class EstimatorNode(ManagedNode):
         channels = with_own_parameters(self._names, self._node_parameters.values)
         return {f: name for name in names for f in followers(name, channels, own)}
 
-    def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> Any:
-        if self._channels is None:  # whether the values fit together is checked by configure
-            return None
+    def _prepare(
+        self, values: Parameters, changes: Mapping[str, Value]
+    ) -> list[tuple[Parameters, Change]]:
+        """Return the parameters of each channel and its change, or raise with its name."""
+        if not self._channels:  # whether the values fit together is checked by configure
+            return []
         present = self._node_parameters.values
         for name, value in changes.items():
             if not values.table[name].live and value != present[name]:
@@ -210,13 +265,20 @@ class EstimatorNode(ManagedNode):
                     f"parameter '{name}': read when the node is configured (it is "
                     f'{present[name]!r}), got {value!r}; set it after the transition cleanup'
                 )
-        return self._channels.prepare(values)
+        prepared = []
+        for channel in self._channels:
+            own = of_channel(values, channel.name)
+            with naming_channel(channel.name):
+                prepared.append((own, channel.estimator.prepare(own)))
+        return prepared
 
-    def _adopt(self, change: Any) -> None:
+    def _adopt(self, prepared: list[tuple[Parameters, Change]]) -> None:
         values = self._node_parameters.values
         self._own |= self._asked  # these no longer follow
-        if self._channels is not None:
-            self._channels.adopt(change)
+        for channel, (own, change) in zip(self._channels, prepared, strict=True):
+            channel.adopt(own, change)
+        if self._channels:
+            set_period(self._timer, 1.0 / values['publish_rate'])
         if self._parameters_topic is not None:
             self._parameters_topic.publish(values)
         set_period(self._diagnostics.timer, values['diagnostics_period'])
@@ -228,12 +290,24 @@ class EstimatorNode(ManagedNode):
         state.find(OK if active else STALE, self.state)
         for level, text in self._clock_watch.look():
             state.find(level, text)
-        waits = active and self._channels is None
+        waits = active and not self._channels
         state.find(STALE, 'no message with the names of the joints yet', waits)
         state.find(WARN, self._joints.problem, self._joints.problem)
-        if not active or self._channels is None:
+        if not active or waits:
             return [state]
-        return [state, *self._channels.reports()]
+        self._sources.look()
+        return [state, *(report for channel in self._channels for report in channel.reports())]
+
+
+@contextmanager
+def naming_channel(name: str) -> Iterator[None]:
+    """Put the channel's name, if it has one, in front of an error of its parameters."""
+    try:
+        yield
+    except ConfigurationError as error:
+        if not name:
+            raise
+        raise ConfigurationError(f"channel '{name}': {error}") from None
 
 
 def main(argv: list[str] | None = None) -> int:

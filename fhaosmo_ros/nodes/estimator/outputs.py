@@ -4,24 +4,19 @@
 from time import monotonic
 from typing import Any
 
-from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.per_channel import CHANNELS, differing, of_channel
 from fhaosmo_ros.inputs import Input, known_inputs, measured_output
-from fhaosmo_ros.nodes.middleware.diagnostics import array_of, OK, Report, WARN
+from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, has_listeners, LATCHED
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
-from fhaosmo_ros.nodes.middleware.publishers import create_publisher, has_listeners, LATCHED
 from fhaosmo_ros.topics import (
     ARRAY,
-    DIAGNOSTICS,
     estimates_of,
-    EVENT,
     PARAMETERS,
     SNAPSHOT,
     STANDARD_DEVIATION,
@@ -69,35 +64,6 @@ class Outputs:
         for name, publisher in self._publishers.items():
             if has_listeners(publisher):
                 publisher.publish(messages[name]())
-
-
-class EventOutput:
-    """Publisher of a channel's events: WARN where one begins, OK where it ends."""
-
-    def __init__(self, node: Node, prefix: str, channel: str) -> None:
-        self._node = node
-        self._task = f'{channel} event' if channel else 'event'
-        kind = message_class(DIAGNOSTICS)
-        self._publisher = create_publisher(node, kind, prefix + EVENT, latched=True)
-
-    def publish(self, event: Event, unit: str, hardware_id: str) -> str:
-        """Publish the begin or the end of an event; return it in words."""
-        text, values = described(event, unit)
-        level = WARN if event.begins else OK
-        self._send(time_message(event.stamp), level, text, hardware_id, values)
-        return text
-
-    def say(self, text: str, hardware_id: str) -> None:
-        """Publish that there is no event, and why."""
-        self._send(self._node.get_clock().now().to_msg(), OK, text, hardware_id, {})
-
-    def _send(
-        self, stamp: Time, level: bytes, text: str, hardware_id: str, values: dict[str, str]
-    ) -> None:
-        report = Report(self._task)
-        report.find(level, text)
-        report.values = values
-        self._publisher.publish(array_of(self._node, stamp, [report], hardware_id))
 
 
 class SnapshotOutput:

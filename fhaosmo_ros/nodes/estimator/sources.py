@@ -13,18 +13,19 @@ from typing import Any
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import Input
 from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError, Unwrapper
+from fhaosmo_ros.nodes.middleware.endpoints import full_name, subscribe_with_info
 from fhaosmo_ros.nodes.middleware.messages import definitions, message_class
-from fhaosmo_ros.nodes.middleware.publisher_watch import Publishers, PublisherWatch
-from fhaosmo_ros.nodes.middleware.publishers import full_name
-from fhaosmo_ros.nodes.middleware.subscription import subscribe_with_info
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
 from rclpy.serialization import deserialize_message
 
 DISCOVERY_PERIOD = 0.2
 MOST_WHYS = 3
 """Different reasons that are told, of a publisher that always has another one."""
+UNKNOWN = '_NODE_NAME_UNKNOWN_'
+"""The name of a node that has been discovered later than its publisher, or is none of ROS."""
+Gid = tuple[int, ...]
 Take = Callable[[int, float, int], None]
 """Gets the stamp of a sample, its value, and when it was published; times in nanoseconds."""
 
@@ -86,23 +87,27 @@ class Source:
     """
     A topic and all that its messages are read for.
 
-    `message_type` is '' while it is not known; `publishers` are as `look` has seen them; `lost`
-    and `damaged` count messages that did not arrive or are shorter than their type. `on_names` is
-    called with the names in each message.
+    `message_type` is '' while it is not known. Of the publishers that `look` has seen, by their
+    gid, `heard` are the names of nodes that can be heard; of the others `unheard` has a sentence
+    that names the node and says what to do about it. `lost` and `damaged` count messages that did
+    not arrive or are shorter than their type. `on_names` is called with the names in each message.
     """
 
     def __init__(self, node: Node, sources: 'Sources', topic: str) -> None:
         self._node, self._sources, self.topic = node, sources, topic
         self._logger = node.get_logger()
         self.message_type = ''
-        self.publishers = Publishers({}, {})
+        self.heard: dict[Gid, str] = {}
+        self.unheard: dict[Gid, str] = {}
         self.lost = self.damaged = 0
         self.on_names: Callable[[list[str]], None] | None = None
         self._sequence, self._mixed = 0, False
         self.listeners: list[Listener] = []
-        self._heard: list[Listener] = []  # those with a field
+        self._served: list[Listener] = []  # those with a field
         self._whys: set[str] = set()
-        self._watch: PublisherWatch | None = None
+        self._subscribed = False
+        self._last: dict[Gid, str] = {}  # the latest publishers that could be heard
+        self._nameless: set[Gid] = set()
         self._told = ''
         self._timer: Any = None
 
@@ -132,10 +137,52 @@ class Source:
             self._discover()
 
     def look(self) -> None:
-        """Look at the topic's publishers, and log what has changed."""
-        if self._watch is not None:
-            self.publishers = self._watch.look()
-            self._mixed = len(self.publishers.heard) > 1
+        """
+        Look at the topic's publishers, and log what has changed.
+
+        The middleware has an event for incompatible QoS, but it does not name the publisher, and
+        there is none for another message type. The ROS graph has both.
+        """
+        if not self._subscribed:
+            return
+        told = self.unheard
+        self.heard, self.unheard = {}, {}
+        for endpoint in self._node.get_publishers_info_by_topic(self.topic):
+            gid = tuple(endpoint.endpoint_gid)
+            if endpoint.node_name == UNKNOWN and gid not in self._nameless:
+                self._nameless.add(gid)  # its node is usually known at the next look
+                continue
+            name = f'{endpoint.node_namespace.rstrip("/")}/{endpoint.node_name}'
+            reason = self._mismatch(endpoint)
+            if not reason:
+                self.heard[gid] = name
+                continue
+            self.unheard[gid] = f'{name} publishes {self.topic} unheard: {reason}'
+            if told.get(gid) != self.unheard[gid]:
+                self._logger.error(self.unheard[gid])
+        self._mixed = len(self.heard) > 1
+        if self.heard and self.heard.keys() != self._last.keys():
+            names = ' and '.join(sorted(self.heard.values()))
+            if self._mixed:
+                self._logger.warning(
+                    f'{len(self.heard)} publishers of {self.topic}, their samples mix: {names}'
+                )
+            elif self._last:
+                self._logger.warning(f'the publisher of {self.topic} changed: now {names}')
+            self._last = self.heard
+
+    def _mismatch(self, endpoint: Any) -> str:
+        """Return why a publisher can't be heard, '' if it can."""
+        if endpoint.topic_type != self.message_type:
+            return f'its type is {endpoint.topic_type}, expected {self.message_type}'
+        verdict, reason = qos_check_compatible(endpoint.qos_profile, self._sources.qos)
+        if verdict != QoSCompatibility.ERROR:
+            return ''
+        clashes = [part.removeprefix('ERROR: ') for part in reason.split(';') if 'ERROR' in part]
+        return (
+            f'{", ".join(clashes).lower()}; change input_reliability or input_durability, or its '
+            'own QoS'
+        )
 
     def _discover(self) -> None:
         """Take the type of the topic's publishers; say once why if that is not possible."""
@@ -149,7 +196,7 @@ class Source:
             problems = [f'{self.topic}: {error}']
             for listener in self.listeners:
                 listener.error = problems[0]
-        if self._watch is not None:
+        if self._subscribed:
             self._node.destroy_timer(self._timer)
             self._sources.on_type()
         text = '; '.join(dict.fromkeys(problems))
@@ -162,12 +209,11 @@ class Source:
         kind, types = message_class(message_type), definitions(message_type)
         for listener in self.listeners:
             listener.find(types, message_type)
-        self._heard = [listener for listener in self.listeners if listener.field]
-        if self._watch is None and (self._heard or self.on_names):
-            self._class, self.message_type = kind, message_type
+        self._served = [listener for listener in self.listeners if listener.field]
+        if not self._subscribed and (self._served or self.on_names):
+            self._class, self.message_type, self._subscribed = kind, message_type, True
             qos = self._sources.qos
             subscribe_with_info(self._node, kind, self.topic, self._on_message, qos, raw=True)
-            self._watch = PublisherWatch(self._node, self.topic, message_type, qos)
 
     def _on_message(self, data: bytes, info: Mapping[str, Any]) -> None:
         sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
@@ -183,9 +229,9 @@ class Source:
             names = getattr(message, 'name', None) if self.on_names else None
             if names and isinstance(names, list):
                 self.on_names(names)
-            if self._heard and self._heard[0].field.header:  # type: ignore[union-attr]
-                header = self._heard[0].field.stamp(message)  # type: ignore[union-attr]
-        lacking = [li for li in self._heard if not li.hear(message, header, info)]
+            if self._served and self._served[0].field.header:  # type: ignore[union-attr]
+                header = self._served[0].field.stamp(message)  # type: ignore[union-attr]
+        lacking = [li for li in self._served if not li.hear(message, header, info)]
         if lacking and len(self._whys) < MOST_WHYS:
             self._tell_lacking(lacking)
         self._sources.after_message()

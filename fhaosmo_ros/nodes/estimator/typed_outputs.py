@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.observer.estimates import Estimate
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.nodes.middleware.endpoints import DEPTH, has_listeners
 from fhaosmo_ros.nodes.middleware.messages import message_class, time_message
-from fhaosmo_ros.nodes.middleware.publishers import DEPTH, has_listeners
 from fhaosmo_ros.topics import TYPED_ESTIMATES
 from geometry_msgs.msg import AccelStamped, WrenchStamped
 from rclpy.node import Node

@@ -8,8 +8,8 @@ from queue import SimpleQueue
 from time import time_ns
 from typing import Any, NamedTuple
 
+from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
 from fhaosmo_ros.nodes.middleware.messages import message_class
-from fhaosmo_ros.nodes.middleware.subscription import subscribe_with_info
 from fhaosmo_ros.nodes.recording.private_node import PrivateNode
 from rclpy.node import NodeNameNonExistentError
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy

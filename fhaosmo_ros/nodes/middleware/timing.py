@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time from /clock: a node survives whatever is published there, and says what is wrong."""
+"""Time from /clock: a node survives whatever comes, and says what is wrong; periods of timers."""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,6 +8,7 @@ from typing import Any
 
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, WARN
 from rclpy.node import Node
+from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
 PATIENCE = 2.0
@@ -73,3 +74,13 @@ class ClockWatch:
             self._told = True
             node.get_logger().warning(text)
         return [(ERROR if gone else WARN, text)]
+
+
+def set_period(timer: Timer, seconds: float) -> None:
+    """Change a timer's period; a timer that is cancelled stays so."""
+    period = round(seconds * 1e9)
+    if period != timer.timer_period_ns:
+        waits = not timer.is_canceled()
+        timer.timer_period_ns = period
+        if waits:
+            timer.reset()  # else the events executor waits for the end of the old period

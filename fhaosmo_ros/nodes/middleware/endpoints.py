@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers whose QoS a user may override by parameters qos_overrides./TOPIC.publisher.POLICY."""
+"""Publishers whose QoS a user may override, and subscriptions that deliver a source time stamp."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+import inspect
 import re
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 DEPTH = 1000
@@ -17,6 +19,8 @@ has joined; what the publisher still keeps then is sent again.
 """
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Who comes later still gets the latest messages."""
+SENSOR_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Best effort matches every publisher; the queue holds one second at 1 kHz."""
 POLICIES: dict[QoSPolicyKind, tuple[str, ...] | range] = {
     QoSPolicyKind.HISTORY: ('keep_last', 'keep_all'),
     QoSPolicyKind.DEPTH: range(1, 100_001),
@@ -87,3 +91,40 @@ def check_overrides(node: Node, given: Mapping[str, Any], topics: Iterable[str])
             number = f'an integer from {allowed[0]} to {allowed[-1]}'
             expected = number if isinstance(allowed, range) else ' or '.join(allowed)
             raise ConfigurationError(f"parameter '{name}': expected {expected}, got {value!r}")
+
+
+def input_qos(values: Mapping[str, Any]) -> QoSProfile:
+    """Return the QoS that the parameters input_reliability, _durability and _depth ask for."""
+    return QoSProfile(
+        depth=values['input_depth'],
+        reliability=ReliabilityPolicy[values['input_reliability'].upper()],
+        durability=DurabilityPolicy[values['input_durability'].upper()],
+    )
+
+
+def subscribe_with_info(
+    node: Node,
+    message_type: Any,
+    topic: str,
+    callback: Callable[[Any, dict[str, int]], None],
+    qos: QoSProfile,
+    raw: bool = False,
+) -> Any:
+    """
+    Subscribe with a callback that takes the message, in CDR if `raw`, and its info.
+
+    rclpy delivers the info if the callback's signature has two parameters. The events executor of
+    rclpy 7.1 passes both as one tuple, the other executors as two arguments; the adapter takes
+    either.
+    """
+
+    def adapter(message: Any, info: Any = None) -> None:
+        if info is None:
+            message, info = message
+        callback(message, info)
+
+    adapter.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
+    return node.create_subscription(
+        message_type, topic, adapter, qos, raw=raw,
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+    )  # fmt: skip
