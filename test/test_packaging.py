@@ -246,6 +246,9 @@ class Recorded:
     def __init__(self, *args, **kwargs):
         self.args, self.kwargs = args, kwargs
 
+    def add_action(self, action):
+        self.args[0].append(action)
+
     def perform(self, context):
         return self.given[self.args[0]]
 
@@ -260,83 +263,58 @@ class Stub(ModuleType):
 
 
 @pytest.fixture
-def given(monkeypatch):
-    """Return the values of the launch arguments, to be filled."""
+def started(monkeypatch):
+    """Return a function that gives the nodes of a launch file with some arguments."""
     for name in ('launch', 'launch_ros'):
-        for part in (
-            '', '.actions', '.launch_description_sources', '.substitutions',
-            '.parameter_descriptions', '.conditions',
-        ):  # fmt: skip
+        for part in ('', '.actions', '.substitutions', '.conditions'):
             monkeypatch.setitem(sys.modules, name + part, Stub(name + part))
-    monkeypatch.setattr(Recorded, 'given', {}, raising=False)
-    return Recorded.given
+
+    def start(name: str, **given: str) -> list[dict]:
+        path = ROOT / 'launch' / f'{name}.launch.py'
+        (entities,) = runpy.run_path(str(path))['generate_launch_description']().args
+        nodes, defaults = [], {}
+        for entity in entities:
+            match type(entity).__name__:
+                case 'DeclareLaunchArgument':
+                    defaults[entity.args[0]] = entity.kwargs['default_value']
+                case 'Node':
+                    nodes.append(entity)
+                case 'OpaqueFunction':
+                    start = entity.kwargs['function']
+        assert set(given) <= set(defaults)
+        monkeypatch.setattr(Recorded, 'given', defaults | given, raising=False)
+        return [node.kwargs for node in [*start(None), *nodes]]
+
+    return start
 
 
-def launch_file(name: str) -> tuple[dict, dict[str, dict], list]:
-    """Return what a launch file defines, its arguments, and everything that it starts."""
-    file = runpy.run_path(str(ROOT / 'launch' / name))
-    (entities,) = file['generate_launch_description']().args
-    kinds = [type(entity).__name__ for entity in entities]
-    arguments = {
-        entity.args[0]: entity.kwargs
-        for entity, kind in zip(entities, kinds, strict=True) if kind == 'DeclareLaunchArgument'
-    }  # fmt: skip
-    return file, arguments, list(zip(kinds, entities, strict=True))
-
-
-def test_demo_launch_file_starts_both_nodes(given):
-    file, arguments, entities = launch_file('demo.launch.py')
-    nodes = {e.kwargs['executable']: e.kwargs for kind, e in entities if kind == 'Node'}
-    assert set(nodes) == {'plant', 'estimator', 'plotjuggler'}
-    ((share, folder),) = file['CONFIG'].args
-    assert (share.args, folder) == ((NAME,), 'config')
-    layout = nodes.pop('plotjuggler')['arguments'][-1]
-    for path in (arguments['params_file']['default_value'], layout):
-        ((config, *parts),) = path.args
-        assert config is file['CONFIG']
-        assert (ROOT / 'config' / Path(*parts)).is_file()
-    for node in nodes.values():
-        assert node['namespace'].args == ('namespace',)
-        params_file, overrides = node['parameters']
-        assert params_file.args == ('params_file',)
-        # A bare substitution would reach the node as a string.
-        assert overrides['use_sim_time'].kwargs == {'value_type': bool}
+def test_launch_files_start_their_nodes_with_files_that_are_there(started, tmp_path):
+    plant, estimator, plotjuggler = started('demo', namespace='/rig', use_sim_time='True')
+    assert Path(plotjuggler['arguments'][-1]).is_file()
+    expected = [str(ROOT / 'config/demo.yaml'), {'use_sim_time': True}]
+    for node in (plant, estimator):
+        assert (node['parameters'], node['namespace']) == (expected, '/rig')
         assert type(node['on_exit']).__name__ == 'Shutdown'
-    kinds = [kind for kind, _ in entities[len(arguments) :]]
-    assert kinds[0] == 'OpaqueFunction'  # the check of the file first
+    for name, file, executable in (
+        ('arm', 'arm', 'arm'), ('joint_estimator', 'joint_states', 'estimator'),
+    ):  # fmt: skip
+        (node,) = started(name)
+        assert (node['executable'], node['name'], node['on_exit']) == (executable, name, None)
+        assert node['parameters'][0] == str(ROOT / f'config/{file}.yaml')
+    for name in ('demo', 'estimator', 'arm'):
+        with pytest.raises(FileNotFoundError, match=f'params_file: .* got {tmp_path}'):
+            started(name, params_file=str(tmp_path))
 
 
-def test_estimator_launch_file_leaves_to_the_file_what_is_not_given(given, tmp_path):
-    file, arguments, _ = launch_file('estimator.launch.py')
-    given |= {name: kwargs['default_value'] for name, kwargs in arguments.items()}
-    (node,) = file['start'](None)
-    assert node.kwargs['parameters'] == [{'use_sim_time': False, 'autostart': True}]
+def test_estimator_launch_file_leaves_to_the_file_what_is_not_given(started, tmp_path):
+    (node,) = started('estimator')
+    assert node['parameters'] == [{'use_sim_time': False, 'autostart': True}]
     path = tmp_path / 'some.yaml'
     path.touch()
     own = {'input_topic': '/joint_states', 'input_field': 'position[elbow]'}
-    given |= {'params_file': str(path), 'use_sim_time': 'true', 'namespace': '/arm'} | own
-    (node,) = file['start'](None)
-    assert node.kwargs['namespace'] == '/arm'
-    assert node.kwargs['parameters'] == [
-        str(path), {'use_sim_time': True, 'autostart': True} | own
-    ]  # fmt: skip
-    given['params_file'] = str(tmp_path)
-    for function in (file['start'], launch_file('demo.launch.py')[0]['check_params_file']):
-        with pytest.raises(FileNotFoundError, match=f'params_file: .* got {tmp_path}'):
-            function(None)
-
-
-def test_joint_launch_file_includes_the_other_with_arguments_that_it_has(given):
-    """Composition: every argument passed on is declared by the file that is included."""
-    _, arguments, entities = launch_file('joint_estimator.launch.py')
-    (include,) = (e for kind, e in entities if kind == 'IncludeLaunchDescription')
-    for path in (arguments['params_file']['default_value'], include.args[0].args[0]):
-        ((share, *parts),) = path.args
-        assert share.args == (NAME,)
-        assert (ROOT / Path(*parts)).is_file()
-    passed_on = dict(include.kwargs['launch_arguments'])
-    assert set(passed_on) <= set(arguments) & set(launch_file('estimator.launch.py')[1])
-    assert all(value.args == (name,) for name, value in passed_on.items())
+    (node,) = started('estimator', params_file=str(path), autostart='false', respawn='true', **own)
+    assert node['parameters'] == [str(path), {'use_sim_time': False, 'autostart': False} | own]
+    assert node['respawn'] is True
 
 
 # scripts/environment.sh
