@@ -11,8 +11,7 @@ from fhaosmo_ros.core.parameters.tables import (
 )
 import numpy as np
 import pytest
-from rcl_interfaces.msg import LoggerLevel, Parameter, ParameterValue
-from rcl_interfaces.srv import SetLoggerLevels
+from rcl_interfaces.msg import Parameter, ParameterValue
 from running import FED, joint_state, Parameters, SECOND, told_parameters
 from sensor_msgs.msg import JointState
 from test_any_input import valid
@@ -288,13 +287,3 @@ def test_topic_tells_who_comes_late_and_every_change(user, fed):
     fed.parameters.set(epsilon=0.125, publish_rate=50.0)
     values = wait(lambda v: v['epsilon'] != 3.5)
     assert values == expected | {'epsilon': 0.125, 'publish_rate': 50.0}
-
-
-def test_levels_of_the_log_can_be_set(user, fed):
-    for level, value in ((LoggerLevel.LOG_LEVEL_WARN, 0.5), (LoggerLevel.LOG_LEVEL_INFO, 0.25)):
-        request = SetLoggerLevels.Request(levels=[LoggerLevel(name='fed.estimator', level=level)])
-        (result,) = user.call(f'{fed.name}/set_logger_levels', SetLoggerLevels, request).results
-        assert result.successful
-        fed.parameters.set(epsilon=value)
-    fed.wait_said('set epsilon = 0.25')
-    assert not fed.said('set epsilon = 0.5')
