@@ -55,7 +55,9 @@ class EmptyNode(Node):
             (self.create_publisher(type(message), topic, 10).publish, message)
             for topic, message in outputs
         ]
-        self._diagnostics = DiagnosticsPublisher(self, self._reports)
+        self._diagnostics = DiagnosticsPublisher(
+            self, self._reports, {'diagnostics_period': 1.0, 'hardware_id': 'none'}
+        )
         self._each = not rate
         if rate:
             self._timer = self.create_timer(1.0 / rate, self._publish)

@@ -30,8 +30,8 @@ from fhaosmo_ros.nodes.middleware.endpoints import (
 )
 from fhaosmo_ros.nodes.middleware.messages import time_message
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
+from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
-from fhaosmo_ros.nodes.middleware.timing import set_period, TimedNode
 from geometry_msgs.msg import WrenchStamped
 import numpy as np
 from numpy.typing import NDArray
@@ -95,8 +95,7 @@ class ArmNode(TimedNode):
             if topic != '~/external_wrench' or values['wrench_frame']
         }
         self._events = create_publisher(self, DiagnosticArray, EVENT, latched=True)
-        fixed = [name for name, p in ARM_NODE_PARAMETERS.items() if not p.live]
-        NodeParameters(self, values, fixed).on_change(self._prepare, self._adopt)
+        NodeParameters(self, values, self._prepare, self._adopt)
         path = values['robot_description_file']
         if path:
             self._use(_text_of(path))
@@ -107,9 +106,7 @@ class ArmNode(TimedNode):
         self.create_subscription(JointState, values['input_topic'], self._on_sample, SENSOR_QOS)
         self.create_service(Trigger, '~/reset', self._reset)
         self.create_service(Trigger, '~/tare', self._tare)
-        self._diagnostics = DiagnosticsPublisher(
-            self, self._reports, values['diagnostics_period'], values['hardware_id']
-        )
+        self._diagnostics = DiagnosticsPublisher(self, self._reports, values)
 
     def _use(self, urdf: str) -> None:
         """Begin to estimate for this robot."""
@@ -303,8 +300,7 @@ class ArmNode(TimedNode):
         self._values = values
         if self._arm is not None:
             self._arm.adopt(values)
-        set_period(self._diagnostics.timer, values['diagnostics_period'])
-        self._diagnostics.hardware_id = values['hardware_id']
+        self._diagnostics.adopt(values)
 
     def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         return self._served(response, 'reset', 'the estimates begin anew with the next sample')

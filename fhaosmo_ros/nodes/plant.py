@@ -10,11 +10,11 @@ from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.tables import PLANT_NODE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import Plant
-from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, create_publisher
+from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, create_publisher, set_period
 from fhaosmo_ros.nodes.middleware.messages import labelled
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
+from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
-from fhaosmo_ros.nodes.middleware.timing import set_period, TimedNode
 import numpy as np
 from std_msgs.msg import Float64, Float64MultiArray
 
@@ -52,8 +52,7 @@ class PlantNode(TimedNode):
             if name in self.plant.model.used_inputs:
                 take = partial(self._on_input, index, name)
                 self.create_subscription(Float64, name, take, 10)
-        fixed = [name for name, p in PLANT_NODE_PARAMETERS.items() if not p.live]
-        NodeParameters(self, values, fixed).on_change(self._prepare, self._adopt)
+        NodeParameters(self, values, self._prepare, self._adopt)
         self.plant.sample(0.0)
         self._timer = self.create_timer(1.0 / values['sample_rate'], self._tick)
         self.get_logger().info(

@@ -26,11 +26,11 @@ from fhaosmo_ros.nodes.estimator.outputs import ParameterTopic
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes, Output, TypedOutputs
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE, WARN
-from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, input_qos
+from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, input_qos, set_period
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
+from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
 from fhaosmo_ros.nodes.middleware.spin import run_node
-from fhaosmo_ros.nodes.middleware.timing import ClockWatch, set_period
 from fhaosmo_ros.topics import estimates_of, EVENT
 from rclpy.parameter import Parameter as RosParameter
 from std_srvs.srv import SetBool, Trigger
@@ -73,11 +73,10 @@ class EstimatorNode(ManagedNode):
         """Estimates that have been published, but not yet in the typed messages."""
         self._parameters_topic: ParameterTopic | None = None
         self._clock_watch = ClockWatch(self)
-        self._node_parameters = NodeParameters(self, values, fixed=['autostart', CHANNELS])
-        self._node_parameters.on_change(self._prepare, self._adopt, self._followers)
-        self._diagnostics = DiagnosticsPublisher(
-            self, self._reports, values['diagnostics_period'], values['hardware_id']
+        self._node_parameters = NodeParameters(
+            self, values, self._prepare, self._adopt, self._followers, ['autostart', CHANNELS]
         )
+        self._diagnostics = DiagnosticsPublisher(self, self._reports, values)
         try:
             if values['autostart']:
                 self.start()
@@ -281,15 +280,13 @@ class EstimatorNode(ManagedNode):
             set_period(self._timer, 1.0 / values['publish_rate'])
         if self._parameters_topic is not None:
             self._parameters_topic.publish(values)
-        set_period(self._diagnostics.timer, values['diagnostics_period'])
-        self._diagnostics.hardware_id = values['hardware_id']
+        self._diagnostics.adopt(values)
 
     def _reports(self) -> list[Report]:
         state = Report('state')
         active = self.state == 'active'
         state.find(OK if active else STALE, self.state)
-        for level, text in self._clock_watch.look():
-            state.find(level, text)
+        self._clock_watch.look(state)
         waits = active and not self._channels
         state.find(STALE, 'no message with the names of the joints yet', waits)
         state.find(WARN, self._joints.problem, self._joints.problem)

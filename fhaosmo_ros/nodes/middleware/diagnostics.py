@@ -7,11 +7,12 @@ tested without an installed ROS. Reports follow the host's steady clock, so that
 they still come when /clock stops.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from fhaosmo_ros.nodes.middleware.endpoints import set_period
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
@@ -64,22 +65,22 @@ def array_of(
 
 
 class DiagnosticsPublisher:
-    """Publishes what `reports` returns each `period` seconds of the host's steady clock."""
+    """Publishes what `reports` returns each `diagnostics_period` of the host's steady clock."""
 
     def __init__(
-        self,
-        node: Node,
-        reports: Callable[[], Iterable[Report]],
-        period: float = 1.0,
-        hardware_id: str = 'none',
+        self, node: Node, reports: Callable[[], Iterable[Report]], values: Mapping[str, Any]
     ) -> None:
-        self.hardware_id = hardware_id
-        self._node, self._reports = node, reports
+        self._node, self._reports, self._hardware_id = node, reports, values['hardware_id']
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self.timer = node.create_timer(period, self.publish, clock=clock)
+        self._timer = node.create_timer(values['diagnostics_period'], self._publish, clock=clock)
 
-    def publish(self) -> None:
+    def adopt(self, values: Mapping[str, Any]) -> None:
+        """Go on with other values of its parameters."""
+        set_period(self._timer, values['diagnostics_period'])
+        self._hardware_id = values['hardware_id']
+
+    def _publish(self) -> None:
         """Publish all present reports."""
         stamp = self._node.get_clock().now().to_msg()
-        self._publisher.publish(array_of(self._node, stamp, self._reports(), self.hardware_id))
+        self._publisher.publish(array_of(self._node, stamp, self._reports(), self._hardware_id))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers whose QoS a user may override, and subscriptions that deliver a source time stamp."""
+"""Publishers with QoS that a user may override, subscriptions with stamps, periods of timers."""
 
 from collections.abc import Callable, Iterable, Mapping
 import inspect
@@ -11,6 +11,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.timer import Timer
 
 DEPTH = 1000
 """
@@ -128,3 +129,13 @@ def subscribe_with_info(
         message_type, topic, adapter, qos, raw=raw,
         event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
     )  # fmt: skip
+
+
+def set_period(timer: Timer, seconds: float) -> None:
+    """Change a timer's period; a timer that is cancelled stays so."""
+    period = round(seconds * 1e9)
+    if period != timer.timer_period_ns:
+        waits = not timer.is_canceled()
+        timer.timer_period_ns = period
+        if waits:
+            timer.reset()  # else the events executor waits for the end of the old period

@@ -7,7 +7,7 @@ import traceback
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.nodes.middleware.timing import TimedNode
+from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
 from lifecycle_msgs.srv import ChangeState
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 

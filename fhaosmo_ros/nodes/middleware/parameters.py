@@ -93,20 +93,41 @@ class NodeParameters:
     node : Node
     values : Parameters
         Checked and complete; later the present ones.
-    fixed : iterable of str
-        Parameters that can't change in any state of the node.
+    prepare : callable
+        Gets all values as they would be, and the changes; returns what `adopt` needs, or raises
+        ConfigurationError. Changes nothing.
+    adopt : callable
+        Gets what `prepare` has returned, once ROS has accepted the changes.
+    followers : callable
+        Gets the names that somebody sets; returns the parameters that change along, and which of
+        those names each of them follows.
+    fixed : iterable of str, optional
+        Parameters that can't change in any state of the node; without it, those that are not live.
 
     """
 
-    def __init__(self, node: Node, values: Parameters, fixed: Iterable[str]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        values: Parameters,
+        prepare: Callable[[Parameters, Mapping[str, Value]], Any],
+        adopt: Callable[[Any], None],
+        followers: Callable[[Collection[str]], Mapping[str, str]] = lambda _: {},
+        fixed: Iterable[str] | None = None,
+    ) -> None:
         self.values = values
         self._node = node
-        self._read_only = set(fixed)
+        self._prepare, self._adopt_change, self._followers = prepare, adopt, followers
+        not_live = (name for name, parameter in values.table.items() if not parameter.live)
+        self._read_only = set(not_live if fixed is None else fixed)
         self._coerced: dict[str, Value] = {}
         self._refused: ConfigurationError | None = None
         self._next: Parameters = values
         self._prepared: Any = None
         self.extend(values)
+        node.add_pre_set_parameters_callback(self._coerce)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._adopt)
 
     def extend(self, values: Parameters) -> None:
         """Go on with values, perhaps of a larger table: what is new is declared."""
@@ -115,32 +136,6 @@ class NodeParameters:
                 declared = descriptor(values.table[name], name in self._read_only, values)
                 self._node.declare_parameter(name, value, declared, ignore_override=True)
         self.values = values
-
-    def on_change(
-        self,
-        prepare: Callable[[Parameters, Mapping[str, Value]], Any],
-        adopt: Callable[[Any], None],
-        followers: Callable[[Collection[str]], Mapping[str, str]] = lambda _: {},
-    ) -> None:
-        """
-        Take live changes from now on.
-
-        Parameters
-        ----------
-        prepare : callable
-            Gets all values as they would be, and the changes; returns what `adopt` needs, or
-            raises ConfigurationError. Changes nothing.
-        adopt : callable
-            Gets what `prepare` has returned, once ROS has accepted the changes.
-        followers : callable
-            Gets the names that somebody sets; returns the parameters that change along, and
-            which of those names each of them follows.
-
-        """
-        self._prepare, self._adopt_change, self._followers = prepare, adopt, followers
-        self._node.add_pre_set_parameters_callback(self._coerce)
-        self._node.add_on_set_parameters_callback(self._check)
-        self._node.add_post_set_parameters_callback(self._adopt)
 
     def _coerce(self, parameters: list[RosParameter]) -> list[RosParameter]:
         """Return the parameters, and those that follow, in their declared types if they fit."""

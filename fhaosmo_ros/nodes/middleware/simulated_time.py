@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time from /clock: a node survives whatever comes, and says what is wrong; periods of timers."""
+"""Time from /clock: a node survives whatever is published there, and says what is wrong."""
 
 from collections.abc import Callable
 from functools import partial
 from time import monotonic
 from typing import Any
 
-from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, WARN
+from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, WARN
 from rclpy.node import Node
-from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
 PATIENCE = 2.0
@@ -54,33 +53,24 @@ class ClockWatch:
         self._since = monotonic()
         self._told = False
 
-    def look(self) -> list[tuple[bytes, str]]:
-        """Return what is wrong, with its level for /diagnostics; log it once."""
+    def look(self, report: Report) -> None:
+        """Add what is wrong to a report; log it once."""
         node = self._node
         if not node.get_parameter('use_sim_time').value:
-            return []
+            return
         time, now = node.get_clock().now().nanoseconds, monotonic()
         if time == 0:
-            return [(ERROR, f'use_sim_time, but nothing on {self._topic} yet')]
+            report.find(ERROR, f'use_sim_time, but nothing on {self._topic} yet')
+            return
         if time != self._time:
             self._time, self._since, self._told = time, now, False
         still = now - self._since
         if still < PATIENCE:
-            return []
+            return
         gone = not node.count_publishers(self._topic)
         reason = 'nobody publishes it any more' if gone else 'paused, or its publisher hangs'
         text = f'the time on {self._topic} stands still for {still:.0f} s: {reason}'
         if not self._told:
             self._told = True
             node.get_logger().warning(text)
-        return [(ERROR if gone else WARN, text)]
-
-
-def set_period(timer: Timer, seconds: float) -> None:
-    """Change a timer's period; a timer that is cancelled stays so."""
-    period = round(seconds * 1e9)
-    if period != timer.timer_period_ns:
-        waits = not timer.is_canceled()
-        timer.timer_period_ns = period
-        if waits:
-            timer.reset()  # else the events executor waits for the end of the old period
+        report.find(ERROR if gone else WARN, text)
