@@ -3,7 +3,6 @@
 
 from collections import defaultdict
 from collections.abc import Iterable
-import inspect
 from pathlib import Path
 import signal
 import subprocess
@@ -17,25 +16,16 @@ from diagnostic_msgs.msg import DiagnosticArray
 import fhaosmo_ros
 from fhaosmo_ros.core.parameters.files import loads
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
+from fhaosmo_ros.nodes.recording.private_node import PrivateNode
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.signals import SignalHandlerOptions
-from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header, String
 from std_srvs.srv import Trigger
-
-try:
-    from rclpy.experimental import EventsExecutor as Executor
-except ImportError:  # an older rclpy
-    Executor = SingleThreadedExecutor
 
 ROOT = Path(fhaosmo_ros.__file__).parents[1]
 DEADLINE = 60.0
@@ -144,31 +134,17 @@ class Estimate(NamedTuple):
 class User:
     """A node of the tests' own, with a thread that receives."""
 
-    def __init__(self) -> None:
-        context = Context()
-        rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-        self.node = Node('user', context=context, use_global_arguments=False)
+    def __init__(self, name: str = 'user') -> None:
+        self._private = PrivateNode(name)
+        self.node = self._private.node
         self._changed = threading.Condition()
         self._clients: dict[str, object] = {}
         self.reports: dict[str, list[Report]] = defaultdict(list)
         self._listen('/diagnostics', DiagnosticArray, self._on_report)
-        self._executor = Executor(context=context)
-        self._executor.add_node(self.node)
-        self._end = Future()
-        self._thread = threading.Thread(target=self._spin, daemon=True)
-        self._thread.start()
+        self._private.__enter__()
 
     def close(self) -> None:
-        self._end.set_result(None)
-        self._executor.wake()
-        self._thread.join()
-        self.node.destroy_node()
-        self.node.context.try_shutdown()
-
-    def _spin(self) -> None:
-        while not self._end.done():
-            # Without a timeout, the events executor of rclpy 7.1 runs no callback.
-            self._executor.spin_until_future_complete(self._end, timeout_sec=3600.0)
+        self._private.__exit__()
 
     def _on_report(self, stamp: int, message: DiagnosticArray) -> None:
         node = message.status[0].name.partition(': ')[0]
@@ -177,16 +153,12 @@ class User:
         self.reports[node].append(Report(stamp, time, statuses))
 
     def _listen(self, topic: str, kind: type, callback, qos: QoSProfile = QOS) -> None:
-        # By its signature rclpy knows that it takes both, but the events executor of rclpy 7.1
-        # hands them over as a tuple.
-        def receive(message: object, info: dict | None = None) -> None:
-            message, info = message if info is None else (message, info)
+        def receive(message: object, info: dict) -> None:
             with self._changed:
                 callback(info['source_timestamp'], message)
                 self._changed.notify_all()
 
-        receive.__signature__ = inspect.signature(lambda message, info: None)
-        self.node.create_subscription(kind, topic, receive, qos)
+        subscribe_with_info(self.node, kind, topic, receive, qos)
 
     def record(self, topic: str, kind: type, qos: QoSProfile = QOS) -> list[Published]:
         """Return a list that grows with the messages of a topic."""

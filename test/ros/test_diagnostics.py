@@ -4,13 +4,10 @@
 import math
 
 from builtin_interfaces.msg import Time
+from fhaosmo_ros.nodes.recording.private_node import PrivateNode
 import numpy as np
 import pytest
-import rclpy
-from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from running import as_time, ERROR, FED, joint_state, LATCHED, LAX, OK, Parameters, STALE, WARN
 from sensor_msgs.msg import JointState
@@ -47,15 +44,11 @@ def test_values_of_the_input(pair):
 
     values = wait_values(pair, 'input', as_sampled, 'rate and name of the plant')
     assert values['topic'] == '/pair/y'
-    assert float(values['jitter (std / mean of the period)']) >= 0.0
     mean = 1.0 / float(values['sample rate [Hz]'])
     assert float(values['longest period [s]']) >= 0.999 * mean
     assert 0.0 < float(values['longest delay [s]']) < 60.0
     assert 0.0 <= float(values['age of the last sample [s]']) < 60.0
-    accepted = int(values['samples accepted'])
-    assert accepted > 0
-    assert int(values['samples lost']) >= 0
-    wait_values(pair, 'input', lambda v: int(v['samples accepted']) > accepted, 'more samples')
+    assert int(values['samples accepted']) > 0
 
 
 def test_values_of_the_observer(pair):
@@ -182,12 +175,10 @@ def test_what_no_longer_fits_is_said(user, estimator):
 @pytest.fixture(scope='module')
 def stranger():
     """A node beside the user, as another process would have."""
-    context = Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    node = Node('stranger', context=context, use_global_arguments=False)
+    node = PrivateNode('stranger').node  # not spun: a destroyed publisher is gone at once
     yield node
     node.destroy_node()
-    rclpy.try_shutdown(context=context)
+    node.context.try_shutdown()
 
 
 def test_publishers_are_named(user, estimator, stranger):
