@@ -182,7 +182,8 @@ def test_parameters_and_files_of_commands_exist():
             if not name.startswith(('constants.', 'hip.')):
                 table[name].coerce(value)
         if words[:3] == ['ros2', 'launch', 'fhaosmo_ros']:
-            text = (ROOT / 'launch' / words[3]).read_text()
+            files = ROOT / 'launch' / words[3], ROOT / 'fhaosmo_ros' / 'launching.py'
+            text = ''.join(path.read_text() for path in files)
             wrong += [
                 (page, word) for word in words[4:] if ':=' in word
                 and f"'{word.split(':=')[0]}'" not in text

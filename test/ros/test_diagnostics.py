@@ -71,7 +71,6 @@ def test_values_of_the_observer(pair):
         ('input', {'warn_rate_below': 1e4}, ['sample rate']),
         ('input', {'warn_jitter_above': 0.0}, ['jitter']),
         ('input', {'warn_delay_above': 0.0}, ['after their stamps']),
-        ('observer', {'warn_chatter_above': 1e-30}, ['chatters by']),
         ('observer', {'epsilon': 1e-12}, ['levels from 2 on hold', 'epsilon']),
     ],
     ids=str,
@@ -131,7 +130,7 @@ def test_a_clock_that_is_slower_than_the_samples_is_said(user, estimator):
 
 def test_what_no_longer_fits_is_said(user, estimator):
     file = ['--params-file', 'config/noise_1e-3.yaml']
-    options = LAX | {'warn_chatter_above': 1e9, 'publish_on': 'sample', 'max_gap': 60.0}
+    options = LAX | {'publish_on': 'sample', 'max_gap': 60.0}
     options |= {'input_topic': 'q', 'input_field': 'position[a]', 'input_reliability': 'reliable'}
     rig = estimator('/fits', *file, **options)
     q = user.publisher('/fits/q', JointState)

@@ -38,17 +38,14 @@ def test_bad_samples_are_rejected_and_counted(fed):
 
 
 def test_share_of_bad_samples_makes_an_error(fed):
-    fed.feed(0.2)
-    for level, share in ((ERROR, 0.1), (WARN, 1.0)):
-        fed.parameters.set(error_bad_share_above=share)
-        since = len(fed.reports)
+    since = len(fed.reports)
 
-        def said(level=level, since=since) -> bool:
-            fed.send(math.nan)  # until a report has no good sample of before
-            statuses = [report.statuses['input'] for report in fed.reports[since:]]
-            return any(s.level == level and 'rejected measurements' in s.message for s in statuses)
+    def said() -> bool:
+        fed.send(math.nan)  # until a report has no good sample of before
+        statuses = [report.statuses['input'] for report in fed.reports[since:]]
+        return any(s.level == ERROR and 'rejected measurements' in s.message for s in statuses)
 
-        fed.user.wait(said, f'level {level}')
+    fed.user.wait(said, 'error')
 
 
 def test_freeze_holds_gamma_and_lets_it_go(fed):

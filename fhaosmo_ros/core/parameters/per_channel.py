@@ -9,7 +9,7 @@ the common table and m prefixed copies of it.
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 import re
-from typing import Any, overload
+from typing import Any, TypeVar
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.tables import (
@@ -18,6 +18,7 @@ from fhaosmo_ros.core.parameters.tables import (
     ESTIMATOR_PARAMETERS,
 )
 
+Values = TypeVar('Values', bound=Mapping[str, Any])
 CHANNELS = 'channels'
 UNNAMED = ['']
 """The default: one channel, whose topics and parameters have no prefix."""
@@ -94,15 +95,7 @@ def with_channels(
     return ParameterTable(table.values(), families, own)
 
 
-@overload
-def of_channel(values: Parameters, name: str) -> Parameters: ...
-
-
-@overload
-def of_channel(values: Mapping[str, Any], name: str) -> Mapping[str, Any]: ...
-
-
-def of_channel(values: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+def of_channel(values: Values, name: str) -> Values:
     """
     Return the values of one channel: its own ones, and the common ones for the rest.
 
@@ -112,8 +105,8 @@ def of_channel(values: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     common = {key: value for key, value in values.items() if not split(key)[0]}
     own = {split(k)[1]: v for k, v in values.items() if name and split(k)[0] == name}
     if isinstance(values, Parameters):
-        return Parameters(ESTIMATOR_PARAMETERS, common | own)
-    return common | own
+        return Parameters(ESTIMATOR_PARAMETERS, common | own)  # type: ignore[return-value]
+    return common | own  # type: ignore[return-value]
 
 
 def differing(values: Parameters) -> dict[str, Any]:

@@ -12,6 +12,8 @@ REMOVED = {
     'max_step': 'leave it out: intervals of more than twice the mean are bridged',
     'spike_gate_samples': "leave it out: 'spike_gate' rejects five samples in a row at most",
     'chatter_weight': "leave it out: 'tune' counts the errors alone",
+    'warn_chatter_above': 'leave it out: /diagnostics has the chatter of d as a number',
+    'error_bad_share_above': 'leave it out: ERROR if more than half of the samples were unused',
     'search': "leave it out: 'tune' searches the model of d, or the gains where 'lambda' is set",
 }
 """What a message says of a name that was a parameter once."""

@@ -322,12 +322,6 @@ DIAGNOSTICS = (
               'WARN if a sample is taken later than this after its source stamp: this host is '
               "too slow, or its clock and the publisher's differ.", unit='s', lower=0.0,
               upper=1e6),
-    Parameter('warn_chatter_above', 0.0,
-              'WARN if the estimate of d chatters more (RMS of what a moving average of 5 '
-              'samples leaves, unit of d); 0 for never.', lower=0.0, upper=1e12),
-    Parameter('error_bad_share_above', 0.5,
-              'ERROR if a larger share of the samples was lost or rejected; any at all is a '
-              'WARN.', lower=0.0, upper=1.0),
 )  # fmt: skip
 
 PLANT_MODEL = (

@@ -23,6 +23,8 @@ LIMIT = 20_000
 WINDOW = 5
 """Samples in the moving average that separates chatter from the signal."""
 NANOSECONDS = 1e-9
+BAD_SHARE = 0.5
+"""Share of samples lost or rejected that is an error; any at all deserves a warning."""
 GAMMA_AWAY = 0.2
 """Distance of gamma from where it began that deserves a warning."""
 RATE_RATIO = 1.5
@@ -129,7 +131,7 @@ class Health:
         report.find(WARN, f'{lacking} messages without y: {y.why}', lacking and not used)
         bad = {key: news[key] for key in UNUSED if news[key]}
         share = sum(bad.values()) / max(1, sum(bad.values()) + used)
-        level = ERROR if share > limits['error_bad_share_above'] else WARN
+        level = ERROR if share > BAD_SHARE else WARN
         report.find(level, ', '.join(f'{key} {n}' for key, n in bad.items()), bad)
         report.find(
             WARN,
@@ -209,8 +211,6 @@ class Health:
         wide = f'innovations are {spread:.3g} times as large as noise_size says'
         report.find(WARN, wide, spread > SPREAD)
         report.find(WARN, f'{overruns} steps took longer than the sampling period', overruns)
-        chatters = 0.0 < limits['warn_chatter_above'] < chatter
-        report.find(WARN, f'the estimate of d chatters by {chatter:.3g}', chatters)
 
     def _find_events(self, report: Report, unit: str) -> None:
         """Tell of the event that lasts, or of those since the last report."""
