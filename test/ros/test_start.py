@@ -168,16 +168,11 @@ def attacks(mark: Path) -> list[str]:
     return [
         f"__import__('os').system('{touch}')",
         f"().__class__.__base__.__subclasses__()[0].__init__.__globals__['os'].system('{touch}')",
-        f"z1 if __import__('os').system('{touch}') else z1",
-        f"[__import__('os').system('{touch}') for _ in (1,)][0]",
-        f"(lambda: __import__('os').system('{touch}'))()",
         f'f\'{{open({str(mark)!r}, "w")}}\'',
         f"open('{mark}', 'w')",
         f"eval('{touch}')",
         f'$({touch})',
         f'`{touch}`',
-        f'0; {touch}',
-        f'| {touch}',
         f'!!python/object/apply:os.system ["{touch}"]',
     ]
 

@@ -22,7 +22,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
 from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.joints import Joints
-from fhaosmo_ros.nodes.estimator.outputs import ParameterTopic
+from fhaosmo_ros.nodes.estimator.outputs import parameter_text
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
 from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes, Output, TypedOutputs
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE, WARN
@@ -31,8 +31,10 @@ from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
 from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
 from fhaosmo_ros.nodes.middleware.spin import run_node
-from fhaosmo_ros.topics import estimates_of, EVENT
+from fhaosmo_ros.topics import estimates_of, EVENT, PARAMETERS
 from rclpy.parameter import Parameter as RosParameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 
@@ -71,7 +73,7 @@ class EstimatorNode(ManagedNode):
         self._channels: list[Channel] = []  # none before the names of the joints are known
         self._outputs: dict[str, Output] = {}
         """Estimates that have been published, but not yet in the typed messages."""
-        self._parameters_topic: ParameterTopic | None = None
+        self._parameters_topic: Any = None
         self._clock_watch = ClockWatch(self)
         self._node_parameters = NodeParameters(
             self, values, self._prepare, self._adopt, self._followers, ['autostart', CHANNELS]
@@ -114,7 +116,8 @@ class EstimatorNode(ManagedNode):
         values = self._node_parameters.values
         estimators = self._make_estimators()
         self._sources = Sources(self, input_qos(values), self._found_type)
-        self._parameters_topic = ParameterTopic(self)
+        latest = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._parameters_topic = self.create_publisher(String, f'~/{PARAMETERS}', latest)
         if self._from_joints:
             self._sources.of(measured_output(values)).on_names = self._take_joints
         if self._names == FROM_JOINTS:
@@ -125,11 +128,18 @@ class EstimatorNode(ManagedNode):
             )
         else:
             self._make_channels(estimators)
-        self._parameters_topic.publish(self._node_parameters.values)
+        self._publish_parameters()
+
+    def _publish_parameters(self) -> None:
+        if self._parameters_topic is not None:
+            text = parameter_text(self, self._node_parameters.values)
+            self._parameters_topic.publish(String(data=text))
 
     def _make_channels(self, estimators: Mapping[str, OnlineEstimator]) -> None:
         """Make a channel for each estimator, by its name, and what they share."""
         values = self._node_parameters.values
+        self._timer = self.create_timer(1.0 / values['publish_rate'], self._tick)
+        self._timer.cancel()
         self._typed = TypedOutputs(self, values)
         self._channels = [
             Channel(
@@ -140,8 +150,6 @@ class EstimatorNode(ManagedNode):
         self._sources.after_message = self._publish_typed
         self.create_service(Trigger, '~/reset', partial(self._each_answers, 'reset'))
         self.create_service(SetBool, '~/freeze', partial(self._each_answers, 'freeze'))
-        self._timer = self.create_timer(1.0 / values['publish_rate'], self._tick)
-        self._timer.cancel()
         self._sources.open()
 
     def _found_type(self) -> None:
@@ -186,8 +194,7 @@ class EstimatorNode(ManagedNode):
         except ConfigurationError as error:
             self.get_logger().error(str(error))
             return
-        assert self._parameters_topic is not None
-        self._parameters_topic.publish(values)
+        self._publish_parameters()
         self.get_logger().info(f'channels: {", ".join(fit)}')
         if self.state == 'active':
             self.activate()
@@ -278,8 +285,7 @@ class EstimatorNode(ManagedNode):
             channel.adopt(own, change)
         if self._channels:
             set_period(self._timer, 1.0 / values['publish_rate'])
-        if self._parameters_topic is not None:
-            self._parameters_topic.publish(values)
+        self._publish_parameters()
         self._diagnostics.adopt(values)
 
     def _reports(self) -> list[Report]:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a channel publishes, and the topic with the parameters of its node."""
+"""What a channel publishes, and the text with the parameters of its node."""
 
 from time import monotonic
-from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
@@ -17,14 +16,11 @@ from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_
 from fhaosmo_ros.topics import (
     ARRAY,
     estimates_of,
-    PARAMETERS,
     SNAPSHOT,
     STANDARD_DEVIATION,
-    TEXT,
 )
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from std_msgs.msg import Float64, String
+from std_msgs.msg import Float64
 
 PERIOD, PERIOD_OF_SELF_TUNING = 1.0, 30.0
 """Seconds between two snapshots; a self-tuning estimator remembers thousands of numbers."""
@@ -106,37 +102,27 @@ class SnapshotOutput:
             self._first, self._published = False, monotonic()
 
 
-class ParameterTopic:
-    """Publishes all parameters of a node as the text of a file that makes such a node."""
+def parameter_text(node: Node, values: Parameters) -> str:
+    """
+    Return the parameters of a node as the text of a file that makes such a node.
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        latest = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._publisher = node.create_publisher(message_class(TEXT), f'~/{PARAMETERS}', latest)
+    It has the topics of y and u that a remapping has changed: a bag knows of none.
+    """
+    resolved = node.resolve_topic_name
 
-    def publish(self, values: Parameters) -> None:
-        """Publish the node's values; the topic is transient-local."""
-        named = differing(values) | self._remapped(values)
-        text = dumps(named, self._node.get_fully_qualified_name())
-        self._publisher.publish(String(data=text))
+    def is_remapped(wanted: Input) -> bool:
+        return bool(resolved(wanted.topic) != wanted.absolute(node.get_namespace()))
 
-    def _remapped(self, values: Parameters) -> dict[str, Any]:
-        """Return the topics of y and u that a remapping has changed: a bag knows of none."""
-        found: dict[str, Any] = {}
-        for channel in values[CHANNELS]:
-            prefix = f'{channel}.' if channel else ''
-            own = of_channel(values, channel)
-            y = measured_output(own, channel)
-            if self._is_remapped(y):
-                found[f'{prefix}input_topic'] = self._node.resolve_topic_name(y.topic)
-                found[f'{prefix}input_type'] = y.message_type
-            u = known_inputs(own, TriangularModel.of(own).used_inputs, channel).values()
-            if any(map(self._is_remapped, u)):
-                topics = [self._node.resolve_topic_name(one.topic) for one in u]
-                found[f'{prefix}known_input_topics'] = topics
-                found[f'{prefix}known_input_types'] = [one.message_type for one in u]
-        return found
-
-    def _is_remapped(self, wanted: Input) -> bool:
-        plain = wanted.absolute(self._node.get_namespace())
-        return self._node.resolve_topic_name(wanted.topic) != plain
+    named = differing(values)
+    for channel in values[CHANNELS]:
+        prefix = f'{channel}.' if channel else ''
+        own = of_channel(values, channel)
+        y = measured_output(own, channel)
+        if is_remapped(y):
+            named[f'{prefix}input_topic'] = resolved(y.topic)
+            named[f'{prefix}input_type'] = y.message_type
+        u = known_inputs(own, TriangularModel.of(own).used_inputs, channel).values()
+        if any(map(is_remapped, u)):
+            named[f'{prefix}known_input_topics'] = [resolved(one.topic) for one in u]
+            named[f'{prefix}known_input_types'] = [one.message_type for one in u]
+    return dumps(named, node.get_fully_qualified_name())
