@@ -18,7 +18,7 @@ from fhaosmo_ros.core.observer.status cimport (
 from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, Structure
 from fhaosmo_ros.core.online.clock cimport FAR, WINDOW, clock_time, difference
 from fhaosmo_ros.core.online.delay cimport NANOSECONDS, PastInputs
-from fhaosmo_ros.core.online.memory cimport Counters, Course, Settings
+from fhaosmo_ros.core.online.memory cimport Clock, Counters, Course, Sensor, Settings
 from fhaosmo_ros.core.online.outliers cimport (
     is_held, is_spike, is_stuck, may_have_noise, repeats_noise
 )
@@ -49,6 +49,15 @@ cdef class Policy:
         Values of `Settings`.
 
     """
+
+    cdef readonly Structure structure  # the observer; another one after a live change
+    cdef SelfTuning tuner  # the same, where it is self-tuning, else None
+    cdef readonly Settings settings
+    cdef public Counters counters
+    cdef readonly Course course
+    cdef Clock clock
+    cdef Sensor sensor
+    cdef readonly PastInputs past
 
     def __cinit__(self, Structure structure not None, dict settings):
         self.past = PastInputs(structure.inputs, settings['lag'] > 0)
