@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a parameter is: declared once, checked everywhere by the same rules."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 import difflib
 import math
@@ -23,39 +23,23 @@ KINDS = {
     'double_array': 'a list of numbers',
     'string_array': 'a list of strings',
 }
-
-
-def _whole(value: Any) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) else None
-
-
-def _number(value: Any) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        return float(value)
-    except OverflowError:
-        return None
-
-
-def _text(value: Any) -> str | None:
-    return value if isinstance(value, str) else None
-
-
-def _expression(value: Any) -> str | None:
-    """Return a text: a bare 0 in `phi: [0, 0, -z3]` is a number to YAML, not to its writer."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return repr(value) if number else _text(value)
-
-
-ITEMS: dict[str, Callable[[Any], Any]] = {
-    'bool': lambda value: value if isinstance(value, bool) else None,
-    'int': _whole, 'double': _number, 'string': _text,
-    'double_array': _number, 'string_array': _expression,
-}  # fmt: skip
-"""What makes a value, or an item of a list, of what arrives; None where it is of another type."""
 ANY_NAME = '.NAME'
 """End of the name of a declaration that stands for any number of parameters."""
+
+
+def _typed(kind: str, item: Any) -> Any:
+    """Return a value, or an item of a list, in the type of a kind; None where it has another."""
+    is_number = isinstance(item, int | float) and not isinstance(item, bool)
+    if kind.startswith('double'):
+        try:
+            return float(item) if is_number else None
+        except OverflowError:
+            return None
+    if kind == 'string_array' and is_number:
+        return repr(item)  # a bare 0 in `phi: [0, 0, -z3]` is a number to YAML, not to its writer
+    if kind == 'int':
+        return item if is_number and isinstance(item, int) else None
+    return item if isinstance(item, bool if kind == 'bool' else str) else None
 
 
 @dataclass(frozen=True)
@@ -163,7 +147,7 @@ class Parameter:
             value = [value]
         elif isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
             raise self.error(given)  # rclpy delivers array.array, so any other iterable will do
-        items = [ITEMS[kind](item) for item in value]
+        items = [_typed(kind, item) for item in value]
         if not items or not all(self._within(item) for item in items):
             raise self.error(given)
         return items if is_list else items[0]
