@@ -90,7 +90,7 @@ class OnlineEstimator:
             self.smooth(p['smoothing_lag'])
         self._u = np.zeros(len(self.observer.inputs))
         self.policy = Policy(self.observer.structure, self._settings(p))
-        self.events = EventDetector(p, p['max_gap'])
+        self.events = EventDetector(p)
 
     def __copy__(self) -> 'OnlineEstimator':
         return deepcopy(self)
@@ -176,7 +176,7 @@ class OnlineEstimator:
         self._parameters = change.parameters
         if self._smoothing is not None:
             self._smoothing.configure()
-        self.events.configure(change.parameters, change.parameters['max_gap'])
+        self.events.configure(change.parameters)
         if change.parameters['sampling'] != before:
             self.forget_stamp()
 

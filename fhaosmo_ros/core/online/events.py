@@ -81,9 +81,8 @@ class EventDetector:
     Parameters
     ----------
     parameters : mapping
-        Those whose names begin with ``event_``, and tuning_memory; others are left alone.
-    max_gap : float
-        After a longer time durations begin anew, in seconds; 0: never.
+        Those whose names begin with ``event_``, tuning_memory, and max_gap: after a longer time
+        durations begin anew (0: never). Others are left alone.
 
     Attributes
     ----------
@@ -97,14 +96,14 @@ class EventDetector:
 
     """
 
-    def __init__(self, parameters: Mapping[str, Any], max_gap: float = 0.0) -> None:
+    def __init__(self, parameters: Mapping[str, Any]) -> None:
         self.waiting: deque[Event] = deque(maxlen=MOST)
         self.latest: Event | None = None
         self.on, self.count, self._change_time = False, 0, 0.0
         self._doing = FRESH
         self._since = self._stamp = self._time = 0
         self._mean = self._deviation = 0.0
-        self.configure(parameters, max_gap)
+        self.configure(parameters)
 
     @property
     def memory(self) -> dict[str, Any]:
@@ -130,12 +129,13 @@ class EventDetector:
         """True while an event lasts."""
         return self._doing >= ACTIVE
 
-    def configure(self, parameters: Mapping[str, Any], max_gap: float = 0.0) -> None:
+    def configure(self, parameters: Mapping[str, Any]) -> None:
         """Go on with other parameters; an event that lasts ends if none are asked for."""
         change_time = float(round(parameters['event_change_time'] * SECOND))
         if self.on and change_time != self._change_time:
             self.reset()
-        self._change_time, self._max_gap = change_time, round((max_gap or LONG) * SECOND)
+        self._change_time = change_time
+        self._max_gap = round((parameters['max_gap'] or LONG) * SECOND)
         self._threshold, self._deviations, self._release = (
             parameters[f'event_{name}'] for name in ('threshold', 'deviations', 'release')
         )
