@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from types import ModuleType
+from xml.etree import ElementTree
 
 import fhaosmo_ros
 from fhaosmo_ros.__main__ import main
@@ -170,6 +171,20 @@ def test_a_debug_build_checks_bounds_and_is_not_taken_for_a_normal_one(tmp_path)
         assert ('IndexError' in done.stderr) == bool(debug)
     assert built[0] == built[1] < built[2]  # what has not changed is not built again
     assert not list(package.rglob('*.c'))
+
+
+def test_package_xml():
+    package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    assert package.findtext('version') == fhaosmo_ros.__version__
+    needed = {tag.text for tag in package.findall('exec_depend')}
+    assert {'rclpy', 'std_msgs', 'std_srvs', 'launch_ros', 'python3-numpy'} <= needed
+    assert {'cython3', 'python3-dev'} <= {tag.text for tag in package.findall('build_depend')}
+    catkin_pkg = pytest.importorskip('catkin_pkg.package', reason='catkin_pkg is not installed')
+    warnings: list[str] = []
+    catkin_pkg.parse_package(str(ROOT / 'package.xml'), warnings=warnings).validate(
+        warnings=warnings
+    )
+    assert warnings == []
 
 
 # launch

@@ -176,9 +176,7 @@ class Arm:
         scales = np.array(INTENSITIES) * model.weight
         free = 2.0 * DECAY * self._model_variance
         since = SINCE if self._of_position else 0.0
-        self._bank = Bank(
-            free, DECAY, scales, BEGIN, END, CHANGE, ONSET, since, self._of_position
-        )
+        self._bank = Bank(free, DECAY, scales, BEGIN, END, CHANGE, ONSET, since, self._of_position)
         finite = np.where(np.isfinite(model.effort_limits), model.effort_limits, 0.0)
         self._limits = Limits(
             model.lowest - FURTHER, model.highest + FURTHER, FASTER * model.velocity_limits,

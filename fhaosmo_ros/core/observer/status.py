@@ -26,7 +26,7 @@ class Status(IntFlag):
     GAMMA_AT_MIN = 16
     GAMMA_AT_MAX = 32
     SENSITIVITY_RESET = 64  # the sensitivities grew beyond use and start again at 0
-    REJECTED_SPIKE = 128  # y is further than spike_gate from its prediction
+    REJECTED_SPIKE = 128  # y is too far from its prediction: spike_gate, or 6 usual deviations
     REJECTED_STUCK = (
         256  # y has not changed for stuck_time, or repeats itself although it has noise
     )

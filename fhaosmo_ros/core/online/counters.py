@@ -17,7 +17,7 @@ class Counters(NamedTuple):
     rejected_measurements: int = 0
     """y was NaN, infinite or beyond divergence_limit."""
     rejected_spikes: int = 0
-    """y lay further than spike_gate from its prediction."""
+    """y lay too far from its prediction: beyond spike_gate, or 6 usual deviations."""
     rejected_stuck: int = 0
     """y had not changed for stuck_time, or repeated itself although it has noise (self-tuning)."""
     rejected_steps: int = 0

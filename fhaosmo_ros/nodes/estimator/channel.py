@@ -252,7 +252,7 @@ class Channel:
                 'its stamp lies more than max_gap from the one before; the next one decides',
             ),
             (Status.REJECTED_PERIOD, late),
-            (Status.REJECTED_SPIKE, f'y = {y} lies beyond spike_gate'),
+            (Status.REJECTED_SPIKE, f'y = {y} is too far from its prediction'),
             (Status.REJECTED_STUCK, f'y = {y} repeats itself: its sensor is stuck'),
             (
                 Status.REJECTED_MEASUREMENT,
