@@ -44,7 +44,7 @@ compare:
 
 evidence: paper compare
 	@$(call with,compare) && "$$python" -m studies.everywhere && "$$python" -m studies.power && \
-	"$$python" -m studies.self_tuning && exec "$$python" -m studies.events
+	"$$python" -m studies.elsewhere && "$$python" -m studies.self_tuning && exec "$$python" -m studies.events
 
 lint:
 	@$(call with,test) && set -x && \
