@@ -5,13 +5,11 @@ import argparse
 from collections.abc import Sequence
 import sys
 
-from fhaosmo_ros.core.observer.fuzzy import of_level
 from matplotlib.figure import Figure
 from studies import evidence
 from studies.harness import Found, Results, run_study
 from studies.paper import cases, figures, findings
 from studies.paper.cases import FREQUENCIES, LONG, SAMPLED
-from studies.paper.fuzzy_systems import fuzzy_figure, Row
 from studies.paper.plant_and_observer import JointRun, SOLVERS
 
 NAME = 'paper'
@@ -56,15 +54,10 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
 
 def draw(first: JointRun, runs: Sequence[Sequence[JointRun]]) -> dict[str, Figure]:
     """Draw the paper's own four figures from the run of sim1 and those of `DRAWN`."""
-    preset = cases.preset().observer
-    systems, widths = preset['fuzzy_systems'], preset['fuzzy_widths']
-    rows = [  # psi_1, psi_2, psi_3, as in the paper
-        Row(of_level(systems, i), of_level(widths, i), ('1', '2', '3, 4')[i]) for i in range(3)
-    ]
     *fixed, adaptive = runs
     return {
         'paper_sim1': figures.sim1(first),
-        'paper_fuzzysystems': fuzzy_figure(rows),
+        'paper_fuzzysystems': figures.fuzzy_systems(),
         'paper_simz': figures.simz(list(zip(DRAWN, fixed, strict=False)), FREQUENCIES),
         'paper_simu': figures.simu(adaptive, FREQUENCIES),
     }

@@ -3,14 +3,23 @@
 
 from collections.abc import Sequence
 
+from fhaosmo_ros.core.observer.fuzzy import (
+    curve,
+    memberships,
+    NAMES,
+    of_level,
+    read_system,
+    SINGLETON,
+    Terms,
+)
 from fhaosmo_ros.tools.plot.figures import COLOURS, envelope, TRUTH
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
+from studies.harness import Floats
+from studies.paper import cases
 from studies.paper.plant_and_observer import JointRun
 
-Floats = NDArray[np.float64]
 # Estimates that chatter are solid and below; the truth lies on top, dashed so that both are seen.
 RED = {'color': COLOURS[0], 'linewidth': 0.9, 'label': 'estimate'}
 BLUE = {'color': TRUTH['color'], 'linewidth': 1.7, 'linestyle': (0, (5, 2)), 'label': 'truth'}
@@ -91,3 +100,41 @@ def _unknown_input(axes: Axes, run: JointRun) -> None:
     late = run.t >= 2.0  # the transient may leave the picture
     reach = 1.15 * max(np.abs(estimate[late]).max(), np.abs(run.unknown_input).max())
     axes.set_ylim(-reach, reach)
+
+
+def fuzzy_systems() -> Figure:
+    """Figure fuzzysystems: membership functions of input and output, and the curve, by level."""
+    preset, levels = cases.preset().observer, ('1', '2', '3, 4')
+    figure = Figure(figsize=(9.0, 0.6 + 2.0 * len(levels)), layout='constrained')
+    for k, (left, middle, right) in enumerate(figure.subplots(len(levels), 3)):
+        text, width = of_level(preset['fuzzy_systems'], k), of_level(preset['fuzzy_widths'], k)
+        system, half = read_system(text), curve(text)
+        _draw_terms(left, system.inputs, width)
+        _draw_terms(middle, system.outputs, 1.0)
+        grid = np.linspace(0.0, width, len(half))
+        right.plot([-width, 0, 0, width], [-1, -1, 1, 1], color='#999999', linestyle=':')
+        right.plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')
+        right.locator_params(axis='x', nbins=4)
+        right.grid(alpha=0.3)
+        left.set_xlabel(f'ε of level {levels[k]} [its unit]')
+        middle.set_xlabel('ψ [1], before scaling to ±1')
+        right.set_xlabel(f'ε of level {levels[k]} [its unit]')
+        right.set_ylabel('ψ(ε) [1]')
+    figure.suptitle('membership functions of input and output, and the curve (dotted: sign)')
+    return figure
+
+
+def _draw_terms(axes: Axes, terms: Terms, scale: float) -> None:
+    """Draw membership functions over [-scale, scale], and their names above them."""
+    x = np.linspace(-1.0, 1.0, 1001)
+    for k, (name, peak) in enumerate(zip(NAMES[len(terms.peaks)], terms.peaks, strict=True)):
+        style = {'color': COLOURS[k % 2], 'linestyle': '--' if k % 2 else '-'}
+        if terms.shape == SINGLETON:
+            axes.plot([scale * peak] * 2, [0.0, 1.0], marker='o', markevery=[1], **style)
+        else:
+            axes.plot(scale * x, memberships(x, terms)[k], **style)
+        axes.text(scale * peak, 1.05, name, ha='center', fontsize=6)
+    axes.set_xlim(-1.05 * scale, 1.05 * scale)
+    axes.set_ylim(0.0, 1.18)
+    axes.set_ylabel('membership [1]')
+    axes.locator_params(axis='x', nbins=4)

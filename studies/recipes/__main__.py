@@ -13,14 +13,14 @@ from typing import Any
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from studies import evidence
 from studies.harness import Found, Results, run_study
-from studies.recipes import encoder, hidden_force, joint_torque, motor_load, sensor_bias, wind
+from studies.recipes import drone, encoder, hidden_force, joint_torque, motor_load
 from studies.recipes.figures import draw
 from studies.recipes.judging import judge, Recipe, table
 
 NAME = 'recipes'
 RECIPES: dict[str, Recipe] = {
-    'encoder': encoder.RECIPE, 'motor_load': motor_load.RECIPE, 'wind': wind.RECIPE,
-    'joint_torque': joint_torque.RECIPE, 'sensor_bias': sensor_bias.RECIPE,
+    'encoder': encoder.RECIPE, 'motor_load': motor_load.RECIPE, 'wind': drone.WIND,
+    'joint_torque': joint_torque.RECIPE, 'sensor_bias': drone.BIAS,
     'hidden_force': hidden_force.RECIPE,
 }  # fmt: skip
 NEEDS = '; '.join(f'{name}: {r.data}' for name, r in RECIPES.items() if r.data)

@@ -59,12 +59,12 @@ def conditions(data: Path | None) -> dict[str, list[Fold]]:
     recordings = [read(path) for path in sorted(data.glob('*.json'))]
     everything = identify(recordings)
 
-    def fold(k: int, judging: Floats, constants: dict[str, float], weight: Floats) -> Fold:
-        """Return a fold that judges one recording by one weight and tunes by another."""
+    def fold(k: int, own: Floats, constants: dict[str, float], weight: Floats) -> Fold:
+        """Return a fold that judges one recording by its own weight and tunes by another."""
         both = [
             r._replace(d=w[0] * np.sin(r.y) + w[1] * np.cos(r.y))
             for n, r in enumerate(recordings)
-            for w in [judging if n == k else weight]
+            for w in [own if n == k else weight]
         ]
         return Fold(judging.model('motor_load', constants), both[:k] + both[k + 1 :], [both[k]])
 

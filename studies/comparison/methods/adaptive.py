@@ -20,7 +20,7 @@ from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.search import Dimension
 import numpy as np
 from studies.comparison.methods.filters import several_models
-from studies.comparison.methods.linear import each_order, LONGEST, matern_space, Samples
+from studies.comparison.methods.linear import each_order, LONGEST, matern_space, samples_of
 from studies.comparison.methods.method import Estimates, Method, ROBUST, Run, Setting, Values
 from studies.comparison.methods.sampled import SampledModel
 
@@ -61,7 +61,7 @@ def _prepare(setting: Setting, values: Values) -> Run:
     prediction = Prediction(model.with_unknown_input(values['decay'], derivatives), longest)
 
     def estimate(r: Recording) -> dict[str, Estimates]:
-        out = several_models(prediction, Samples.of(r, model), bank)
+        out = several_models(prediction, samples_of(r, model), bank)
         return {'filtered': Estimates(out[:, : model.order], out[:, model.order])}
 
     return estimate

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The loops over samples of the filters that ours is compared with.
+The loop over samples of the filters that bend or adapt; see adaptive.py.
 
-All of them predict by Runge-Kutta steps of the whole (nonlinear) model, so they know Phi exactly
-as ours does, and correct by y. Each estimate uses the sample of its own time. Covariances are of
-scaled states and relative to a variance of the noise.
+They predict by Runge-Kutta steps of the whole (nonlinear) model, so they know Phi exactly as ours
+does, and correct by y. Each estimate uses the sample of its own time. Covariances are of scaled
+states and relative to a variance of the noise.
 """
 
 from libc.math cimport INFINITY, exp, fabs, fmax, log, rint, sqrt
@@ -12,7 +12,7 @@ from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
-from fhaosmo_ros.core.observer.kalman cimport Row, carry, correct
+from fhaosmo_ros.core.observer.kalman cimport Row, carry, correct, fill
 
 import numpy as np
 
@@ -30,12 +30,10 @@ cdef struct Filter:
 cdef void predict(
     Prediction prediction, Filter* f, double h, const double* u
 ) noexcept nogil:
-    """Follow the model for `h` seconds, in equal steps shorter than the longest one."""
-    cdef int _, count = <int>(h / prediction.longest) + 1
+    """Follow the model for `h` seconds."""
     memcpy(prediction.z, f.x, prediction.n * sizeof(double))
     memset(prediction.dz, 0, prediction.n * sizeof(double))
-    for _ in range(count if h > 0.0 else 0):
-        prediction.step(h / count, u)
+    prediction.over(h, u)
     memcpy(f.x, prediction.z, prediction.n * sizeof(double))
 
 
@@ -92,74 +90,17 @@ cdef inline double chance(bint same, int count, double switch) noexcept nogil:
     return 1.0 - switch * (count - 1) if same else switch
 
 
-cdef void fill(matrix, Row* rows) except *:
-    """Write the numbers of a matrix."""
-    cdef int i, j, n = len(matrix)
-    for i in range(n):
-        for j in range(n):
-            rows[i][j] = matrix[i, j]
-
-
-def check(Prediction prediction, samples, *matrices):
-    """Raise ValueError unless samples and matrices fit the model."""
-    n, count = prediction.n, len(samples.y)
-    if any(part.shape != (n, n) for part in matrices):
-        raise ValueError(f'expected matrices of {n} states')
-    if samples.h.shape != (count,) or samples.u.shape[0] != count:
-        raise ValueError(f'expected {count} samples')
-    if samples.u.shape[1] < max(prediction.phi.inputs, 1):
-        raise ValueError(f'expected {prediction.phi.inputs} known inputs')
-
-
-def constant_gain(Prediction prediction, samples, gain):
+def several_models(Prediction prediction, samples, bank):
     """
-    Run x(t_k) = prediction(t_k) + K (y_k - prediction_1(t_k)).
+    Run Kalman filters that bend or adapt, one for each model.
 
     Parameters
     ----------
     prediction : Prediction
-        With its longest step; a longer interval takes several.
+        Of N states, with its longest step; a longer interval takes several.
     samples
-        With `y`, `h` of shape (K,), `u` of shape (K, m); the first h is not used.
-    gain : (N,) array
-        K.
-
-    Returns
-    -------
-    (K, N) array
-        Estimates of z, d, d', ..
-
-    """
-    check(prediction, samples, np.diag(gain))
-    cdef const double[::1] y = samples.y, h = samples.h
-    cdef const double[::1] weights = np.ascontiguousarray(gain, dtype=np.float64)
-    cdef const double[:, ::1] u = samples.u
-    cdef int i, n = prediction.n
-    cdef double[:, ::1] out = np.empty((y.shape[0], n))
-    cdef double e
-    cdef Filter f
-    cdef Py_ssize_t k
-    memset(&f, 0, sizeof(Filter))
-    for k in range(y.shape[0]):
-        if k == 0:
-            f.x[0] = y[0]
-        else:
-            predict(prediction, &f, h[k], &u[k, 0])
-            e = y[k] - f.x[0]
-            for i in range(n):
-                f.x[i] += weights[i] * e
-        memcpy(&out[k, 0], f.x, n * sizeof(double))
-    return np.asarray(out)
-
-
-def several_models(Prediction prediction, samples, bank):
-    """
-    Run Kalman filters that bend or adapt, one for each model; see adaptive.py.
-
-    Parameters
-    ----------
-    prediction, samples
-        As for `constant_gain`.
+        With `y`, `h` of shape (K,): samples, time since the one before (s), of which the first is
+        not used; `u` (K, m): known inputs.
     bank
         With `a`, `fresh` (N, N): transition of a period and covariance at the first sample; `q`
         (M, N, N): what a period adds, by model; `scale` (N,): scaled states over states; `period`
@@ -169,13 +110,19 @@ def several_models(Prediction prediction, samples, bank):
     Returns
     -------
     (K, N) array
+        Estimates of z, d, d', ..
 
     """
-    check(prediction, samples, bank.a, bank.fresh, np.diag(bank.scale), *bank.q)
     cdef const double[::1] y = samples.y, h = samples.h
     cdef const double[:, ::1] u = samples.u
     cdef const double[::1] scale = np.ascontiguousarray(bank.scale)
     cdef int n = prediction.n, count = len(bank.q), i, j, _, periods
+    if not (
+        all(len(matrix) == n for matrix in (bank.a, bank.fresh, bank.scale, *bank.q))
+        and len(samples.h) == len(samples.u) == len(samples.y)
+        and samples.u.shape[1] >= max(prediction.phi.inputs, 1)
+    ):
+        raise ValueError('several_models: arrays of sizes that do not fit')
     cdef double period = bank.period, huber = bank.huber, memory = bank.memory
     cdef double switch = bank.switch / max(count - 1, 1) if count > 1 else 0.0
     cdef double[:, ::1] out = np.zeros((y.shape[0], n))
@@ -188,10 +135,10 @@ def several_models(Prediction prediction, samples, bank):
     try:
         if filters == NULL or mixed == NULL:
             raise MemoryError
-        fill(bank.a, a)
+        fill(a, bank.a)
         for j in range(count):
-            fill(bank.q[j], filters[j].q)
-            fill(bank.fresh, filters[j].p)
+            fill(filters[j].q, bank.q[j])
+            fill(filters[j].p, bank.fresh)
             filters[j].x[0], filters[j].r, filters[j].share = y[0], 1.0, 1.0 / count
         for k in range(y.shape[0]):
             periods = <int>fmax(rint(h[k] / period), 1.0)

@@ -16,16 +16,17 @@ doi:10.1109/TIE.2008.2011621.
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 import math
-from typing import NamedTuple
+from types import SimpleNamespace
 
 from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.kalman import innovations
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.tools.tuning.likelihood import Samples
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise
 import numpy as np
-from studies.comparison.methods.filters import constant_gain
 from studies.comparison.methods.method import (
     Estimates,
     LINEAR,
@@ -50,18 +51,13 @@ Gain = Callable[[SampledModel, Values], np.ndarray]
 Space = Callable[[Setting], tuple[Dimension, ...]]
 
 
-class Samples(NamedTuple):
-    """Samples y (K,), times h (K,) since the one before (s), and known inputs u (K, m) since."""
-
-    y: np.ndarray
-    h: np.ndarray
-    u: np.ndarray
-
-    @classmethod
-    def of(cls, r: Recording, model: TriangularModel) -> 'Samples':
-        """Return those of a recording."""
-        u = known_inputs(r.u, model.inputs, len(r.y))
-        return cls(np.ascontiguousarray(r.y), np.diff(r.t, prepend=r.t[0]), u)
+def samples_of(r: Recording, model: TriangularModel) -> Samples:
+    """Return the samples of a recording, as if each came one period after the one before."""
+    count = len(r.y)
+    periods, used = np.ones(count, np.int64), np.ones(count, np.bool_)
+    periods[0] = 0  # there a filter begins
+    u = known_inputs(r.u, model.inputs, count)
+    return Samples(np.diff(r.t, prepend=r.t[0]), periods, np.ascontiguousarray(r.y), u, used)
 
 
 def estimates(
@@ -70,10 +66,18 @@ def estimates(
     """
     Return the estimates of z, d, d_1, .. of a recording, a row for each sample, by the gain K.
 
-    `decay` is 0 for a random walk; intervals beyond `longest` (s) take several steps.
+    `decay` is 0 for a random walk; intervals beyond `longest` (s) take several steps. This is a
+    Kalman filter whose covariance P is as it has to be for K from the beginning, and stays.
     """
-    expressions = model.with_unknown_input(decay, len(gain) - model.order - 1)
-    return constant_gain(Prediction(expressions, longest), Samples.of(r, model), gain)
+    expressions, size = model.with_unknown_input(decay, len(gain) - model.order - 1), len(gain)
+    fresh = np.zeros((size, size))
+    fresh[:, 0] = gain  # K = P_1 / (P_11 + variance)
+    steady = SimpleNamespace(
+        a=np.eye(size), q=np.zeros((size, size)), fresh=fresh, variance=1.0 - gain[0],
+        clip=math.inf, settled=0,
+    )  # fmt: skip
+    _, _, found = innovations(Prediction(expressions, longest), samples_of(r, model), steady)
+    return np.asarray(found)
 
 
 @lru_cache(maxsize=64)
