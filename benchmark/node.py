@@ -4,18 +4,17 @@
 from time import monotonic, sleep, time_ns
 from typing import NamedTuple
 
-from children import Children, wait_until
 from fhaosmo_ros.topics import TIME
+from live import Children, wait_until, Watch
 import numpy as np
 from results import Row
 from tqdm import tqdm
-from watch import Watch
 
 BAR, JOINT_BAR, START_BAR = 1.2, 1.5, 2.0
 WARM_UP = 1.5
 HELD = 0.97
 """A run counts for the ratio if each node published at this part of the rate at least."""
-EMPTY, ESTIMATOR = 'empty_node', 'estimator'
+AROUND, EMPTY, ESTIMATOR = 'benchmark/around.py', 'empty_node', 'estimator'
 START = ('-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-p')
 
 
@@ -118,16 +117,11 @@ def observe(case: Case, seconds: float) -> dict[str, Figures]:
     with Children() as children, Watch((topic, TIME) for topic in watched.values()) as watch:
         nodes = {
             ESTIMATOR: children.start(ESTIMATOR, *estimator),
-            EMPTY: children.start(
-                EMPTY, 'benchmark/empty_node.py', '--rate', str(case.out), *joints
-            ),
+            EMPTY: children.start(EMPTY, AROUND, EMPTY, '--rate', str(case.out), *joints),
         }
         nodes[ESTIMATOR].wait_for('waiting' if case.joints else 'estimating')
         nodes[EMPTY].wait_for('computing nothing')
-        source = children.start(
-            'source', 'benchmark/source.py', '--rate', str(case.rate), '--subscribers', '2',
-            *joints,
-        )  # fmt: skip
+        source = children.start('source', AROUND, 'source', '--rate', str(case.rate), *joints)
         source.wait_for('publishing')
         wait_until(lambda: all(map(watch.count, watched.values())), 'not all nodes published')
         sleep(WARM_UP)

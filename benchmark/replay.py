@@ -18,43 +18,32 @@ SAMPLES, BAR = 1_000_000, 2.5
 
 
 def measure(quick: bool) -> list[Row]:
-    """Return the ratio of times of a replay to a bag."""
+    """Return the ratio of times of a replay to a bag, with its process's start."""
     samples, rounds = (50_000, 1) if quick else (SAMPLES, 3)
+    times = []
     with TemporaryDirectory() as folder:
-        bag = make_bag(Path(folder) / 'bag', samples)
-        out = Path(folder) / 'out'
-        times = [(replay(bag, out), read_by_rosbags(bag)) for _ in range(rounds)]
+        bag, out = Path(folder) / 'bag', Path(folder) / 'out'
+        make_bag(bag, samples)
+        command = [sys.executable, '-m', 'fhaosmo_ros', 'replay', bag, '-o', out, '--force']
+        for _ in range(rounds):
+            start = perf_counter()
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode:
+                raise CannotMeasureError(f'replay failed: {done.stderr.splitlines()[-1]}')
+            middle = perf_counter()
+            with AnyReader([bag]) as reader:
+                for connection, _, data in reader.messages():
+                    reader.deserialize(data, connection.msgtype)
+            times.append((middle - start, perf_counter() - middle))
     ours, theirs = np.median(times, axis=0).tolist()
     note = f'{samples:,} Float64, a process with its start: {ours:.2f} / {theirs:.2f} s'
     bar = None if quick else BAR
     return [Row('replay to a bag / rosbags reads', ours / theirs, '', bar, note)]
 
 
-def make_bag(path: Path, samples: int) -> Path:
+def make_bag(path: Path, samples: int) -> None:
     """Write y at 1 kHz."""
     with BagWriter(path) as bag:
         bag.add('/y', FLOAT)
         for k, value in enumerate((0.2 + 0.1 * np.sin(1e-3 * np.arange(samples))).tolist()):
             bag.write('/y', 10**18 + k * 1_000_000, serialise(FLOAT, data=value))
-    return path
-
-
-def read_by_rosbags(bag: Path) -> float:
-    """Return the seconds that rosbags takes to iterate and deserialise."""
-    start = perf_counter()
-    with AnyReader([bag]) as reader:
-        for connection, _, data in reader.messages():
-            reader.deserialize(data, connection.msgtype)
-    return perf_counter() - start
-
-
-def replay(bag: Path, out: Path) -> float:
-    """Return the seconds that a replay takes, with its process's start."""
-    start = perf_counter()
-    done = subprocess.run(
-        [sys.executable, '-m', 'fhaosmo_ros', 'replay', str(bag), '-o', str(out), '--force'],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    if done.returncode:
-        raise CannotMeasureError(f'replay failed: {done.stderr.strip().splitlines()[-1]}')
-    return perf_counter() - start

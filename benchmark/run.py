@@ -8,13 +8,12 @@ Exit code 0 if all bars are met, 1 if one is missed, 130 after Ctrl-C.
 """
 
 import argparse
-import signal
 import sys
 
 import core_step
 import node
 import replay
-from results import CannotMeasureError, machine, publish, render, Row
+from results import CannotMeasureError, machine, publish, raise_on_signals, render, Row
 
 PARTS = {
     'core': core_step.measure, 'node': node.measure, 'startup': node.startup,
@@ -33,9 +32,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.page and arguments.quick:
         parser.error('--page shows full measurements: expected no --quick, got --quick')
-    # A job in the background starts with SIGINT ignored; SIGTERM must end the children as well.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+    raise_on_signals()
     rows: list[Row] = []
     where = machine()
     try:

@@ -8,30 +8,28 @@ transport because a process could not read, and errors of d because stamps were 
 """
 
 import argparse
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Mapping
 import json
 import os
 from pathlib import Path
-import signal
 import sys
 from time import monotonic, sleep
-from typing import Any, NamedTuple
+from typing import Any
 
-from children import Children, wait_until
 from fhaosmo_ros.nodes.recording.private_node import PrivateNode
 from fhaosmo_ros.topics import ARRAY, FLOAT, TIME
+from live import Children, wait_until, Watch
 import numpy as np
 from numpy.typing import NDArray
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from results import CannotMeasureError, render, Row
+from results import CannotMeasureError, raise_on_signals, render, Row
 from scipy.stats import theilslopes
-from soak_plant import CALLS, CYCLE, JUDGED, RESTORE, schedule
+from soak_plant import CALLS, CYCLE, schedule
 from std_srvs.srv import Trigger
 from tqdm import tqdm
-from watch import Watch
 
 PARAMETERS = ('--ros-args', '--params-file', 'benchmark/soak.yaml')
 TRUTH, ESTIMATE = '/plant/unknown_input', '/estimator/unknown_input'
@@ -40,12 +38,14 @@ TOPICS = {
     TRUTH: FLOAT, ESTIMATE: FLOAT, GAMMA: FLOAT, STAMP: TIME, '/estimator/state': ARRAY,
     '/estimator/innovation': ARRAY,
 }  # fmt: skip
+RESTORE, JUDGED = 12.0, (15.0, 19.5)
+"""When in a cycle parameters are put back, and when the estimate must be right."""
 PAIRED = 5_000_000
 """Nanoseconds within which the topics of one estimate are published."""
 LAST = 10.0
 """Seconds that the last samples, and the report of them, may take on a busy machine."""
 MEMORY = 2.0
-"""MB that memory may grow by over the run."""
+"""MB that the estimator's memory may grow by over the run."""
 ERROR, ERROR_GROWTH, MANY = 0.05, 0.01, 15
 """
 Largest median error of d in any judged window (half of d's amplitude), what it may grow by between
@@ -56,17 +56,19 @@ DRIFT = 0.02
 LOST, GROWTH, WORST = (
     'samples lost, by sequence number', 'error of d, growth', 'error of d, worst window',
 )  # fmt: skip
-GOOD = (
-    {'variant': 'sign'}, {'variant': 'fuzzy'}, {'variant': 'fuzzy_adaptive'},
-    {'scheme': 'explicit', 'variant': 'fuzzy'}, {'scheme': 'implicit'},
-    {'lambda': [15.0], 'alpha': [30.0]}, {'epsilon': 0.5}, {'publish_rate': 250.0},
-    {'estimate_from': 'filtered'}, {'gamma_rate': 4.0, 'gamma_min': 0.4, 'gamma_max': 0.6},
-)  # fmt: skip
-BAD = (
-    {'variant': 'fuzy'}, {'lambda': [-1.0]}, {'alpha': [1.0, 2.0]}, {'epsilon': float('nan')},
-    {'gamma_min': 0.9, 'gamma_max': 0.2}, {'order': 7}, {'publish_rate': 0.0},
-    {'no_such_parameter': 1.0},
-)  # fmt: skip
+SETS = {
+    'good parameters': (
+        {'variant': 'sign'}, {'variant': 'fuzzy'}, {'variant': 'fuzzy_adaptive'},
+        {'scheme': 'explicit', 'variant': 'fuzzy'}, {'scheme': 'implicit'},
+        {'lambda': [15.0], 'alpha': [30.0]}, {'epsilon': 0.5}, {'publish_rate': 250.0},
+        {'estimate_from': 'filtered'}, {'gamma_rate': 4.0, 'gamma_min': 0.4, 'gamma_max': 0.6},
+    ),
+    'bad parameters': (
+        {'variant': 'fuzy'}, {'lambda': [-1.0]}, {'alpha': [1.0, 2.0]}, {'epsilon': float('nan')},
+        {'gamma_min': 0.9, 'gamma_max': 0.2}, {'order': 7}, {'publish_rate': 0.0},
+        {'no_such_parameter': 1.0},
+    ),
+}  # fmt: skip
 
 
 class Client(PrivateNode):
@@ -81,32 +83,28 @@ class Client(PrivateNode):
     """
 
     def __init__(self) -> None:
-        self.counts: Counter[str] = Counter()
         super().__init__('soak_client')
+        self.counts: Counter[str] = Counter()
         self._parameters = AsyncParameterClient(self.node, '/estimator')
         self._reset = self.node.create_client(Trigger, '/estimator/reset')
         self._base: dict[str, Any] = {}
 
     def learn(self) -> None:
         """Remember the present parameters as those that `restore` puts back."""
-        names = sorted({name for changes in GOOD for name in changes})
+        names = sorted({name for changes in SETS['good parameters'] for name in changes})
         wait_until(self._parameters.services_are_ready, 'the estimator offers no parameters')
-        answer = self._answer(self._parameters.get_parameters(names))
-        messages = (
-            ParameterMessage(name=name, value=value)
-            for name, value in zip(names, answer.values, strict=True)
-        )
-        self._base = {m.name: Parameter.from_parameter_msg(m).value for m in messages}
+        values = self._answer(self._parameters.get_parameters(names)).values
+        for name, value in zip(names, values, strict=True):
+            message = ParameterMessage(name=name, value=value)
+            self._base[name] = Parameter.from_parameter_msg(message).value
 
     def call(self, kind: str) -> None:
         """Make the next call of a kind of `CALLS`."""
-        turn = self.counts[kind]
         if kind == 'reset':
             right = self._answer(self._reset.call_async(Trigger.Request())).success
-        elif kind == 'good parameters':
-            right = self._set(GOOD[turn % len(GOOD)])
         else:
-            right = not self._set(BAD[turn % len(BAD)])
+            accepted = self._set(SETS[kind][self.counts[kind] % len(SETS[kind])])
+            right = accepted == (kind == 'good parameters')
         self.counts[kind] += 1
         self.counts['wrong answers'] += not right
 
@@ -124,18 +122,6 @@ class Client(PrivateNode):
         return future.result()
 
 
-class Course(NamedTuple):
-    """What was measured over time."""
-
-    memory: Mapping[str, list[tuple[float, float]]]
-    """Seconds and MB (resident), by process."""
-    windows: NDArray[np.float64]
-    """Of each judged window: seconds, median error of d, median of gamma."""
-    faults: Counter[str]
-    calls: Counter[str]
-    watch: Watch
-
-
 def main() -> int:
     """Run, print the verdict; see the top of this file for the exit code."""
     parser = argparse.ArgumentParser(prog='make soak', description='Run for long, with faults.')
@@ -148,8 +134,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.minutes < 2.0:
         parser.error(f'argument --minutes: expected at least 2, got {arguments.minutes:g}')
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+    raise_on_signals()
     try:
         for _ in range(arguments.retries + 1):
             missed = soak(arguments.seed, arguments.minutes, arguments.output)
@@ -166,42 +151,26 @@ def main() -> int:
 
 def soak(seed: int, minutes: float, output: Path) -> set[str]:
     """Run once, write and print the verdict; return the names of what was missed."""
-    course = run(seed, minutes * 60.0)
-    rows = verdict(course)
-    faults = ', '.join(f'{n:,} {k}' for k, n in sorted(course.faults.items()))
-    text = (
-        f'{minutes:g} minutes, seed {seed}, {os.cpu_count()} cores, load '
-        f'{os.getloadavg()[1]:.1f}: {faults}\n\n{render(rows)}\n'
-    )
-    output.mkdir(parents=True, exist_ok=True)
-    (output / 'soak.txt').write_text(text)
-    np.savetxt(output / 'windows.csv', course.windows, delimiter=',', header='t,error,gamma')
-    missed = [row.name for row in rows if row.missed]
-    print(text, f'FAILED: {"; ".join(missed)}' if missed else 'passed', sep='\n')
-    return set(missed)
-
-
-def run(seed: int, seconds: float) -> Course:
-    """Run a soak and return its course."""
+    seconds, memory, windows = 60.0 * minutes, [], []
     with Children() as children, Watch(TOPICS.items()) as watch, Client() as client:
         estimator = children.start_node('estimator', *PARAMETERS, '-r', 'y:=faulty_y')
         plant = children.start(
-            'plant', 'benchmark/soak_plant.py', '--seed', str(seed), '--seconds', str(seconds),
-            *PARAMETERS,
-        )  # fmt: skip
+            'plant', 'benchmark/soak_plant.py', '--seed', str(seed), *PARAMETERS
+        )
         estimator.wait_for('estimating')
         plant.wait_for('injecting')
         client.learn()
-        calls = [event for event in schedule(seed, seconds) if event.kind in CALLS][::-1]
-        memory: dict[str, list[tuple[float, float]]] = defaultdict(list)
-        windows, restored, judging, start = [], 0, False, monotonic()
+        calls = (event for event in schedule(seed) if event[1] in CALLS)
+        time, kind, _ = next(calls)
+        restored, judging, start = 0, False, monotonic()
         with tqdm(total=round(seconds), desc='soak', unit='s', mininterval=1.0) as progress:
             while (now := monotonic() - start) < seconds:
                 sleep(0.02)
                 children.check()
                 cycle, phase = divmod(now, CYCLE)
-                if calls and calls[-1].time <= now:
-                    client.call(calls.pop().kind)
+                if time <= now:
+                    client.call(kind)
+                    time, kind, _ = next(calls)
                 if phase >= RESTORE and restored <= cycle:
                     client.restore()
                     restored += 1
@@ -214,15 +183,24 @@ def run(seed: int, seconds: float) -> Course:
                 if now >= progress.n + 1:
                     progress.update(int(now) - progress.n)
                     if now > CYCLE:
-                        for name, node in (('estimator', estimator), ('plant', plant)):
-                            memory[name].append((now, node.resident_megabytes()))
+                        memory.append((now, estimator.resident_megabytes()))
         plant.interrupt()
         plant.wait_for('}')
         faults = Counter(json.loads(plant.output().splitlines()[-1]))
         deadline = monotonic() + LAST
         while unaccounted(faults, watch) and monotonic() < deadline:
             sleep(0.1)
-        return Course(memory, np.array(windows), faults, client.counts, watch)
+    course = np.array(windows)
+    rows = verdict(np.array(memory), course, faults, client.counts, watch)
+    said = ', '.join(f'{n:,} {k}' for k, n in sorted(faults.items()))
+    load = f'{os.cpu_count()} cores, load {os.getloadavg()[1]:.1f}'
+    text = f'{minutes:g} minutes, seed {seed}, {load}: {said}\n\n{render(rows)}\n'
+    output.mkdir(parents=True, exist_ok=True)
+    (output / 'soak.txt').write_text(text)
+    np.savetxt(output / 'windows.csv', course, delimiter=',', header='t,error,gamma')
+    missed = [row.name for row in rows if row.missed]
+    print(text, f'FAILED: {"; ".join(missed)}' if missed else 'passed', sep='\n')
+    return set(missed)
 
 
 def unaccounted(faults: Counter[str], watch: Watch) -> int:
@@ -246,23 +224,27 @@ def judged(watch: Watch) -> tuple[float, float]:
     return float(np.median(np.abs(d[paired] - true))), float(np.median(watch.series(GAMMA)[1]))
 
 
-def verdict(course: Course) -> list[Row]:
-    """Return one row for each thing that a soak may fail on."""
-    rows, watch = [], course.watch
-    for name, memory in course.memory.items():
-        t, used = np.array(memory)[:: max(1, len(memory) // 300)].T
-        growth = float(theilslopes(used, t).slope * (t[-1] - t[0]))  # the median of all slopes
-        note = f'{used[0]:.1f} to {used[-1]:.1f} MB after warm-up'
-        rows.append(Row(f'memory of {name}, growth', growth, 'MB', MEMORY, note))
-    _, error, gamma = course.windows.T
+def verdict(
+    memory: NDArray[np.float64], windows: NDArray[np.float64], faults: Counter[str],
+    calls: Counter[str], watch: Watch,
+) -> list[Row]:  # fmt: skip
+    """
+    Return one row for each thing that a soak may fail on.
+
+    `memory` has seconds and MB of the estimator; `windows` the end of each judged one (s), and
+    the medians of error of d and of gamma in it.
+    """
+    t, used = memory[:: max(1, len(memory) // 300)].T
+    growth = float(theilslopes(used, t).slope * (t[-1] - t[0]))  # the median of all slopes
+    _, error, gamma = windows.T
     errors, gammas = _ends(error), _ends(gamma)
-    wrong = course.calls['wrong answers']
     taken, lost = watch.taken('estimator'), watch.reported('estimator', 'samples lost')
-    calls = ', '.join(f'{n} {kind}' for kind, n in course.calls.items() if kind != 'wrong answers')
+    made = ', '.join(f'{n} {kind}' for kind, n in calls.items() if kind != 'wrong answers')
     return [
-        *rows,
-        Row('samples unaccounted for', unaccounted(course.faults, watch), '', 0.0,
-            f'{course.faults["published"]:,} published, {taken:,} used or rejected'),
+        Row('memory of estimator, growth', growth, 'MB', MEMORY,
+            f'{used[0]:.1f} to {used[-1]:.1f} MB after warm-up'),
+        Row('samples unaccounted for', unaccounted(faults, watch), '', 0.0,
+            f'{faults["published"]:,} published, {taken:,} used or rejected'),
         Row(LOST, lost, '', 0.0),
         Row('outputs that are not finite', watch.not_finite, '', 0.0, f'of {watch.outputs:,}'),
         Row(GROWTH, errors[1] - errors[0], '', ERROR_GROWTH if len(error) >= MANY else ERROR,
@@ -270,7 +252,7 @@ def verdict(course: Course) -> list[Row]:
         Row(WORST, error.max(), '', ERROR, f'{len(error)} windows, median {np.median(error):.2g}'),
         Row('gamma, drift', abs(gammas[1] - gammas[0]), '', DRIFT,
             f'{gammas[0]:.4f} to {gammas[1]:.4f}'),
-        Row('wrong answers to calls', wrong, '', 0.0, calls),
+        Row('wrong answers to calls', calls['wrong answers'], '', 0.0, made),
     ]  # fmt: skip
 
 

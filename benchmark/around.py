@@ -1,15 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A node with the estimator's subscription, timer, publishers and executor that computes nothing.
+What stands around an estimator in the benchmark: `around.py source`, `around.py empty_node`.
 
-It publishes messages that were made once, except for the stamp of the latest sample, from which
+The source publishes y at an exact rate: sample k comes k periods after the first one, and a late
+one does not delay those behind it. It begins once it has two subscribers, and says at its end how
+many samples it has published.
+
+The empty node has the estimator's subscription, timer, publishers and executor, and computes
+nothing. Its messages were made once, except for the stamp of the latest sample, from which
 latencies are measured. What an estimator costs more than this is ours; what this costs is the
 middleware's.
 """
 
 import argparse
+import math
 import signal
 import threading
+import time
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, Report
@@ -21,22 +28,48 @@ import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
-from source import joint_state, JOINTS
 from std_msgs.msg import Float64
+
+JOINTS = [f'joint{k}' for k in range(1, 33)]
+SUBSCRIBERS = 2
+SETTLE = 0.5
+"""Seconds between the match as seen from here and the first sample: the other side's match."""
+
+
+def joint_state(count: int) -> JointState:
+    """Return a message of so many joints with zeros."""
+    zeros = [0.0] * count
+    return JointState(name=JOINTS[:count], position=zeros, velocity=zeros, effort=zeros)
+
+
+def source(rate: float, joints: int, ended: threading.Event) -> None:
+    """Publish y, or the positions of some joints, at a rate (Hz) until the end."""
+    node = Node('source', start_parameter_services=False)
+    message = joint_state(joints) if joints else Float64()
+    publisher = node.create_publisher(type(message), 'joint_states' if joints else 'y', 10)
+    while not ended.is_set() and publisher.get_subscription_count() < SUBSCRIBERS:
+        time.sleep(0.02)
+    time.sleep(SETTLE)
+    print('publishing', flush=True)
+    count, start = 0, time.monotonic()
+    while not ended.is_set():
+        time.sleep(max(0.0, start + count / rate - time.monotonic()))
+        y = 0.2 + 0.1 * math.sin(count / rate)
+        if joints:
+            message.position = [y] * joints
+            stamp = divmod(time.time_ns(), 1_000_000_000)
+            message.header.stamp.sec, message.header.stamp.nanosec = stamp
+        else:
+            message.data = y
+        publisher.publish(message)
+        count += 1
+    time.sleep(SETTLE)  # the last samples leave before their writer does
+    print('published', count, flush=True)
+    node.destroy_node()
 
 
 class EmptyNode(Node):
-    """
-    Counts samples; publishes constants, and the stamp of the latest sample.
-
-    Parameters
-    ----------
-    rate : float
-        Rate of the timer, in Hz; 0: publish on each sample.
-    joints : int
-        0: a Float64 on ``y``. Else so many joints of a JointState, with the messages of each.
-
-    """
+    """Counts samples; publishes constants, and the stamp of the latest sample; see `source`."""
 
     def __init__(self, rate: float, joints: int = 0) -> None:
         super().__init__('empty_node')
@@ -89,18 +122,22 @@ class EmptyNode(Node):
 
 
 def main() -> None:
-    """Run the node until SIGINT."""
-    parser = argparse.ArgumentParser(description='A node that computes nothing.')
-    parser.add_argument('--rate', type=float, default=100.0, help='of the timer; 0: on samples')
+    """Run one of them until SIGINT."""
+    parser = argparse.ArgumentParser(description='Source of y, and a node that computes nothing.')
+    parser.add_argument('what', choices=('source', 'empty_node'))
+    parser.add_argument('--rate', type=float, default=1000.0, help='Hz; 0: on samples')
     parser.add_argument('--joints', type=int, default=0, help='of a JointState instead of y')
     arguments = parser.parse_args()
     ended = threading.Event()
     signal.signal(signal.SIGINT, lambda *_: ended.set())
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = EmptyNode(arguments.rate, arguments.joints)
-    with Spinner(node, on_end=ended.set):
-        ended.wait()
-    node.destroy_node()
+    if arguments.what == 'source':
+        source(arguments.rate, arguments.joints, ended)
+    else:
+        node = EmptyNode(arguments.rate, arguments.joints)
+        with Spinner(node, on_end=ended.set):
+            ended.wait()
+        node.destroy_node()
     rclpy.try_shutdown()
 
 
