@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Processes whose start, CPU time and memory are measured, and what nodes say."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
+from functools import partial
 import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,11 +12,12 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.middleware.messages import message_class
-from fhaosmo_ros.nodes.recording.topic_recorder import NewTopic, Sample, TopicRecorder
+from fhaosmo_ros.nodes.middleware.subscription import subscribe_with_info
+from fhaosmo_ros.nodes.recording.private_node import PrivateNode
 from fhaosmo_ros.tools.cli import processes
 from fhaosmo_ros.topics import OF_ALL_NODES
 import numpy as np
-from rclpy.serialization import deserialize_message
+from rclpy.qos import QoSProfile
 from results import CannotMeasureError
 
 ROOT = Path(__file__).parents[1]
@@ -82,7 +84,7 @@ class Children(processes.Children):
         self._logs.cleanup()
 
 
-class Watch(TopicRecorder):
+class Watch(PrivateNode):
     """
     Listens to /diagnostics and to some topics (name and type of each) while it is open.
 
@@ -98,27 +100,25 @@ class Watch(TopicRecorder):
 
     """
 
-    def __init__(self, topics: Iterable[tuple[str, str]]) -> None:
+    def __init__(self, topics: Mapping[str, str]) -> None:
+        super().__init__('watch')
         self.reports: dict[str, dict[str, str]] = {}
         self.outputs = self.not_finite = 0
-        kinds = {**dict(topics), DIAGNOSTICS: OF_ALL_NODES[DIAGNOSTICS]}
-        self._classes = {topic: message_class(kind) for topic, kind in kinds.items()}
-        self._series: dict[str, list[tuple[int, float]]] = {topic: [] for topic in kinds}
+        self._series: dict[str, list[tuple[int, float]]] = {topic: [] for topic in topics}
         self._lock = threading.Lock()
-        super().__init__(self._receive, lambda topic: topic in kinds)
+        qos = QoSProfile(depth=5000)
+        for topic, kind in {**topics, DIAGNOSTICS: OF_ALL_NODES[DIAGNOSTICS]}.items():
+            take = self._report if topic == DIAGNOSTICS else partial(self._receive, topic)
+            subscribe_with_info(self.node, message_class(kind), topic, take, qos)
 
-    def _receive(self, item: NewTopic | Sample) -> None:
-        if isinstance(item, NewTopic):
-            return
-        topic, published, data = item
-        message = deserialize_message(data, self._classes[topic])
-        if topic == DIAGNOSTICS:
-            for status in message.status:
-                values = {item.key: item.value for item in status.values}
-                if 'samples accepted' in values:
-                    node = status.name.partition(': ')[0]
-                    self.reports[node] = values | {'received': str(published)}
-            return
+    def _report(self, message: Any, info: Mapping[str, int]) -> None:
+        for status in message.status:
+            values = {item.key: item.value for item in status.values}
+            if 'samples accepted' in values:
+                node = status.name.partition(': ')[0]
+                self.reports[node] = values | {'received': str(info['source_timestamp'])}
+
+    def _receive(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
         if isinstance(message, Time):
             value = message.sec * 1_000_000_000 + message.nanosec
         else:
@@ -126,7 +126,7 @@ class Watch(TopicRecorder):
         self.outputs += 1
         self.not_finite += not np.isfinite(value)
         with self._lock:
-            self._series[topic].append((published, value))
+            self._series[topic].append((info['source_timestamp'], value))
 
     def forget(self) -> None:
         """Keep what comes from now on."""

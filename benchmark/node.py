@@ -114,7 +114,7 @@ def observe(case: Case, seconds: float) -> dict[str, Figures]:
     estimator += ['-p', 'channels:=[from_joint_names]'] if case.joints else []
     joints, joint = ('--joints', str(case.joints)), '/joint1' if case.joints else ''
     watched = {name: f'/{name}{joint}/stamp' for name in (ESTIMATOR, EMPTY)}
-    with Children() as children, Watch((topic, TIME) for topic in watched.values()) as watch:
+    with Children() as children, Watch(dict.fromkeys(watched.values(), TIME)) as watch:
         nodes = {
             ESTIMATOR: children.start(ESTIMATOR, *estimator),
             EMPTY: children.start(EMPTY, AROUND, EMPTY, '--rate', str(case.out), *joints),

@@ -152,7 +152,7 @@ def main() -> int:
 def soak(seed: int, minutes: float, output: Path) -> set[str]:
     """Run once, write and print the verdict; return the names of what was missed."""
     seconds, memory, windows = 60.0 * minutes, [], []
-    with Children() as children, Watch(TOPICS.items()) as watch, Client() as client:
+    with Children() as children, Watch(TOPICS) as watch, Client() as client:
         estimator = children.start_node('estimator', *PARAMETERS, '-r', 'y:=faulty_y')
         plant = children.start(
             'plant', 'benchmark/soak_plant.py', '--seed', str(seed), *PARAMETERS

@@ -31,7 +31,7 @@ from studies.comparison.methods.method import (
     Setting,
     Values,
 )
-from studies.comparison.methods.ours import model_of
+from studies.comparison.methods.observers import model_of
 from studies.evidence import markdown, Row
 from studies.harness import Floats, Found, observed, Results, run_study, SELF_TUNING
 from studies.waves import wave

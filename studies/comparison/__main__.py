@@ -8,24 +8,22 @@ from studies import evidence
 from studies.comparison.cells import sensors
 from studies.comparison.evaluation import evaluate, methods_for
 from studies.comparison.results import best_of_kinds, Cell, draw, texts
-from studies.harness import Found, positive, Results, run_study
+from studies.harness import Found, Results, run_study
 
 NAME = 'comparison'
-TRIALS, QUICK_TRIALS = 200, 15
-TRAINING, QUICK_TRAINING = 4, 1
-OPTIONS = (('--trials', {'type': positive, 'metavar': 'N', 'help': 'trials of each tuning'}),)
+FULL, QUICK = (4, 200), (1, 15)
+"""Recordings that tune a method, and trials."""
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; see `run_study`."""
-    return run_study(NAME, __doc__, measure, argv, OPTIONS)
+    return run_study(NAME, __doc__, measure, argv)
 
 
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
     """Return a line for each cell and method."""
     quick = arguments.quick
-    trials = arguments.trials or (QUICK_TRIALS if quick else TRIALS)
-    training = QUICK_TRAINING if quick else TRAINING
+    training, trials = QUICK if quick else FULL
     found = results({
         (sensor, name): (evaluate, sensor, name, training, trials)
         for sensor in sensors(quick)

@@ -15,14 +15,11 @@ from studies.comparison.cells import Sensor
 from studies.comparison.methods.adaptive import ADAPTIVE
 from studies.comparison.methods.linear import FILTERS
 from studies.comparison.methods.method import mean, Method, objective, Search, Setting, Values
-from studies.comparison.methods.ours import OUR_METHODS
-from studies.comparison.methods.sliding import OBSERVERS
+from studies.comparison.methods.observers import OBSERVERS
 
 HOPELESS = 1.5
 """A trial this many times worse than the best one so far is not run on more recordings."""
-METHODS: dict[str, Method] = {
-    method.name: method for method in (*FILTERS, *ADAPTIVE, *OBSERVERS, *OUR_METHODS)
-}
+METHODS: dict[str, Method] = {m.name: m for m in (*FILTERS, *ADAPTIVE, *OBSERVERS)}
 
 
 class Tuned(NamedTuple):

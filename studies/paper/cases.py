@@ -13,6 +13,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import chatter, high_passed, rms
+from fhaosmo_ros.core.simulation.plant import Truth
 from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from studies.evidence import Row
@@ -117,34 +118,21 @@ def first_observer(solver: str, step: float = 1e-5, every: int = 5) -> JointRun:
     return simulate(observer, preset().plant, solver, step, DURATION, every)
 
 
-class Truth(NamedTuple):
-    """Samples of a plant."""
-
-    t: Floats
-    y: Floats
-    z: Floats
-    unknown_input: Floats
-
-
 @lru_cache(maxsize=len(FREQUENCIES))
-def truth_of(omega: float, step: float, noise: float, duration: float) -> Truth:
+def truth_of(omega: float, step: float, noise: float, duration: float) -> tuple[Floats, Truth]:
     """Simulate the plant alone; the last results are kept, because several observers use them."""
-    plant = Plant(
-        preset().plant.changed(
-            {'disturbance_omega': omega, 'noise_std': noise, 'integration_step': min(step, 1e-3)}
-        )
-    )
     t = np.arange(round(duration / step) + 1) * step
-    truth = plant.simulate(t)
-    return Truth(t, truth.y, truth.z, truth.unknown_input)
+    given = {'disturbance_omega': omega, 'noise_std': noise, 'integration_step': min(step, 1e-3)}
+    return t, Plant(preset().plant.changed(given)).simulate(t)
 
 
-def observe(truth: Truth, variant: str, scheme: str, every: int = 1, **changes: Any) -> JointRun:
+def observe(
+    case: tuple[Floats, Truth], variant: str, scheme: str, every: int = 1, **changes: Any
+) -> JointRun:
     """Run an observer as a node does, one step a sample; record every `every`-th step."""
-    observer = Observer(
-        preset().observer.changed({'variant': variant, 'scheme': scheme} | changes)
-    )
-    run = observer.run(truth.t, truth.y, every=every)
+    t, truth = case
+    given = {'variant': variant, 'scheme': scheme} | changes
+    run = Observer(preset().observer.changed(given)).run(t, truth.y, every=every)
     rows = slice(every - 1, None, every)
     z, d = truth.z[rows], truth.unknown_input[rows]
     return JointRun(run.t, z, d, run.z_hat, run.z_tilde, run.gamma)
