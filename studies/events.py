@@ -200,10 +200,5 @@ def draw(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; see `run_study`."""
-    return run_study(NAME, __doc__, measure, argv)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_study(NAME, __doc__, measure))

@@ -283,10 +283,5 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     return Found({NAME: cells}, texts(cells), {NAME: ratios.draw(panels, STYLES, text)})
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; see `run_study`."""
-    return run_study(NAME, __doc__, measure, argv)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_study(NAME, __doc__, measure))

@@ -44,7 +44,7 @@ def run_study(
     name: str,
     description: str | None,
     measure: Callable[[argparse.Namespace, Results], Found],
-    argv: list[str] | None,
+    argv: list[str] | None = None,
     options: Iterable[tuple[str, dict[str, Any]]] = (),
 ) -> int:
     """

@@ -194,10 +194,5 @@ def measure(arguments: argparse.Namespace, _: Results) -> Found:
     return Found({}, {}, {'self_tuning': figure})
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; see `run_study`."""
-    return run_study('self_tuning', __doc__, measure, argv)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_study('self_tuning', __doc__, measure))

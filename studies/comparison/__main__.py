@@ -15,11 +15,6 @@ FULL, QUICK = (4, 200), (1, 15)
 """Recordings that tune a method, and trials."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; see `run_study`."""
-    return run_study(NAME, __doc__, measure, argv)
-
-
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
     """Return a line for each cell and method."""
     quick = arguments.quick
@@ -41,4 +36,4 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_study(NAME, __doc__, measure))

@@ -17,11 +17,6 @@ QUICK_WIDTHS, QUICK_LONG = 6, 200.0
 DRAWN = (findings.FINE, findings.COARSE, findings.FUZZY, findings.ADAPTIVE)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; see `run_study`."""
-    return run_study(NAME, __doc__, measure, argv)
-
-
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
     """Return all tables: first the simulations, whose best solver the half-widths take."""
     quick = arguments.quick
@@ -64,4 +59,4 @@ def draw(first: JointRun, runs: Sequence[Sequence[JointRun]]) -> dict[str, Figur
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_study(NAME, __doc__, measure))

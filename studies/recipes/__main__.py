@@ -30,11 +30,6 @@ OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
 )
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; see `run_study`."""
-    return run_study(NAME, __doc__, measure, argv, OPTIONS)
-
-
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
     """Return the table with the lines of the recipe made anew, and its figure."""
     name, data, quick = arguments.recipe, arguments.data, arguments.quick
@@ -61,4 +56,4 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_study(NAME, __doc__, measure, options=OPTIONS))

@@ -13,7 +13,7 @@ doi:10.1109/9.1299). Between samples the covariance takes as many steps as there
 
 from functools import partial
 import math
-from typing import NamedTuple
+from types import SimpleNamespace
 
 from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.simulation.recordings import Recording
@@ -25,19 +25,6 @@ from studies.comparison.methods.method import Estimates, Method, ROBUST, Run, Se
 from studies.comparison.methods.sampled import SampledModel
 
 HUBER, NOISE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'
-
-
-class Bank(NamedTuple):
-    """What `filters.several_models` takes."""
-
-    a: np.ndarray
-    q: np.ndarray
-    fresh: np.ndarray
-    scale: np.ndarray
-    period: float
-    huber: float
-    memory: float
-    switch: float
 
 
 def _prepare(setting: Setting, values: Values) -> Run:
@@ -53,9 +40,10 @@ def _prepare(setting: Setting, values: Values) -> Run:
     about = setting.balance(derivatives) ** np.arange(1.0 + derivatives)
     sizes = np.concatenate([np.ones(model.order), setting.size * about])
     sizes[0] = setting.noise
-    bank = Bank(
-        sampled.a, q, np.diag((scale * sizes) ** 2), scale, h, values.get('huber', math.inf),
-        h / values.get('memory', math.inf), h / values.get('stay', 1.0),
+    bank = SimpleNamespace(
+        a=sampled.a, q=q, fresh=np.diag((scale * sizes) ** 2), scale=scale, period=h,
+        huber=values.get('huber', math.inf), memory=h / values.get('memory', math.inf),
+        switch=h / values.get('stay', 1.0),
     )  # fmt: skip
     longest = min(LONGEST * h, sampled.resolution)
     prediction = Prediction(model.with_unknown_input(values['decay'], derivatives), longest)
