@@ -46,17 +46,17 @@ CASES = (
 )
 
 
-class Figures(NamedTuple):
-    """What one node did in one run."""
+class Run(NamedTuple):
+    """What was seen in one run."""
 
-    cpu: float
-    """CPU time over wall time."""
-    held: float
-    """Publications over those that the timer was to make: a starved node does, and costs, less."""
+    share: float
+    """CPU time of the estimator over wall time."""
+    ratio: float | None
+    """CPU over that of the empty node; None if one was starved, which then costs less."""
     sent: int
     """Samples that were published."""
-    taken: int
-    """Samples that the node has taken."""
+    lost: int
+    """Samples that the estimator has not taken."""
     latency: tuple[float, float]
     """Seconds from a sample's publication to its first estimate: median and 99 %."""
 
@@ -67,28 +67,19 @@ def measure(quick: bool) -> list[Row]:
     rows: list[Row] = []
     for case in tqdm(CASES[:1] if quick else CASES, desc='node', unit='case', leave=False):
         runs = [observe(case, seconds) for _ in range(repetitions)]
-        ours = [run[ESTIMATOR] for run in runs]
-        ratios = [
-            run[ESTIMATOR].cpu / run[EMPTY].cpu
-            for run in runs
-            if min(f.held for f in run.values()) >= HELD
-        ]
+        shares, ratios, sent, lost, latencies = zip(*runs, strict=True)
+        ratios = [ratio for ratio in ratios if ratio is not None]
         note = ', '.join(f'{r:.2f}' for r in ratios) or 'a node was starved in every run'
-        share = f'{np.median([f.cpu for f in ours]):.1%} of a core; ratios {note}'
-        lost, sent = sum(f.sent - f.taken for f in ours), sum(f.sent for f in ours)
-        latency = 1e3 * np.median([f.latency for f in ours], axis=0)
+        note = f'{np.median(shares):.1%} of a core; ratios {note}'
+        value = float(np.median(ratios)) if ratios else None
+        median, most = 1e3 * np.median(latencies, axis=0)
+        of = f'of {sum(sent):,}, over {repetitions} runs'
         rows += [
-            Row(
-                f'CPU, estimator / empty node, {case.title}',
-                float(np.median(ratios)) if ratios else None, '', case.bar, share,
-            ),
-            Row(
-                f'samples lost, {case.title}', float(lost), '', 0.0,
-                f'of {sent:,}, over {repetitions} runs',
-            ),
-            Row(f'latency, median, {case.title}', float(latency[0]), 'ms'),
-            Row(f'latency, 99 %, {case.title}', float(latency[1]), 'ms'),
-        ]  # fmt: skip
+            Row(f'CPU, estimator / empty node, {case.title}', value, '', case.bar, note),
+            Row(f'samples lost, {case.title}', float(sum(lost)), '', 0.0, of),
+            Row(f'latency, median, {case.title}', float(median), 'ms'),
+            Row(f'latency, 99 %, {case.title}', float(most), 'ms'),
+        ]
     return rows
 
 
@@ -107,47 +98,36 @@ def startup(quick: bool) -> list[Row]:
     return rows
 
 
-def observe(case: Case, seconds: float) -> dict[str, Figures]:
+def observe(case: Case, seconds: float) -> Run:
     """Start a source of y, an estimator and an empty node, both on the same samples."""
     estimator = [*START, f'gains:={case.gains}']
     estimator += ['-p', f'publish_rate:={case.out}' if case.out else 'publish_on:=sample']
     estimator += ['-p', 'channels:=[from_joint_names]'] if case.joints else []
     joints, joint = ('--joints', str(case.joints)), '/joint1' if case.joints else ''
-    watched = {name: f'/{name}{joint}/stamp' for name in (ESTIMATOR, EMPTY)}
-    with Children() as children, Watch(dict.fromkeys(watched.values(), TIME)) as watch:
-        nodes = {
-            ESTIMATOR: children.start(ESTIMATOR, *estimator),
-            EMPTY: children.start(EMPTY, AROUND, EMPTY, '--rate', str(case.out), *joints),
-        }
-        nodes[ESTIMATOR].wait_for('waiting' if case.joints else 'estimating')
-        nodes[EMPTY].wait_for('computing nothing')
+    watched = [f'/{name}{joint}/stamp' for name in (ESTIMATOR, EMPTY)]
+    with Children() as children, Watch(dict.fromkeys(watched, TIME)) as watch:
+        ours = children.start(ESTIMATOR, *estimator)
+        empty = children.start(EMPTY, AROUND, EMPTY, '--rate', str(case.out), *joints)
+        ours.wait_for('waiting' if case.joints else 'estimating')
+        empty.wait_for('computing nothing')
         source = children.start('source', AROUND, 'source', '--rate', str(case.rate), *joints)
         source.wait_for('publishing')
-        wait_until(lambda: all(map(watch.count, watched.values())), 'not all nodes published')
+        wait_until(lambda: all(map(watch.count, watched)), 'not all nodes published')
         sleep(WARM_UP)
         watch.forget()
-        before, start = {name: node.cpu_seconds() for name, node in nodes.items()}, monotonic()
+        before, start = np.array([ours.cpu_seconds(), empty.cpu_seconds()]), monotonic()
         sleep(seconds)
         elapsed = monotonic() - start
-        cpu = {name: (n.cpu_seconds() - before[name]) / elapsed for name, n in nodes.items()}
+        cpu = np.array([ours.cpu_seconds(), empty.cpu_seconds()]) - before
         asked = (case.out or case.rate) * elapsed
-        held = {name: watch.count(topic) / asked for name, topic in watched.items()}
-        latency = {name: _latency(*watch.series(topic)) for name, topic in watched.items()}
+        held = min(map(watch.count, watched)) >= HELD * asked
+        published, stamps = watch.series(watched[0])
         source.interrupt()
         source.end()
         sent, ended = int(source.output().split()[-1]), time_ns()
-        wait_until(
-            lambda: all(watch.reported(name, 'received') > ended for name in nodes),
-            'not all nodes reported at the end',
-        )
-        return {
-            name: Figures(cpu[name], held[name], sent, watch.taken(name), latency[name])
-            for name in nodes
-        }
-
-
-def _latency(published: np.ndarray, stamps: np.ndarray) -> tuple[float, float]:
-    """Return median and 99 % of the time from a sample to the first estimate with its stamp."""
+        wait_until(lambda: watch.reported(ESTIMATOR, 'received') > ended, 'no report at the end')
     _, first = np.unique(stamps, return_index=True)
-    median, most = np.quantile(1e-9 * np.abs(published - stamps)[first], [0.5, 0.99])
-    return float(median), float(most)
+    median, most = np.quantile(1e-9 * np.abs(published - stamps)[first], [0.5, 0.99]).tolist()
+    ratio = float(cpu[0] / cpu[1]) if held else None
+    share, lost = float(cpu[0]) / elapsed, sent - watch.taken(ESTIMATOR)
+    return Run(share, ratio, sent, lost, (median, most))
