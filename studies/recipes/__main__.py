@@ -15,7 +15,7 @@ from studies import evidence
 from studies.harness import Found, Results, run_study
 from studies.recipes import drone, encoder, hidden_force, joint_torque, motor_load
 from studies.recipes.figures import draw
-from studies.recipes.judging import judge, Recipe, table
+from studies.recipes.judging import judge, Recipe
 
 NAME = 'recipes'
 RECIPES: dict[str, Recipe] = {
@@ -48,7 +48,11 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
         for method in recipe.methods
     })  # fmt: skip
     judged = {c: {method: found[c, method] for method in recipe.methods} for c in folds}
-    rows = table(name, judged)
+    rows = [
+        {'recipe': name, 'condition': condition, 'method': method} | row
+        for condition, found in judged.items()
+        for method, row in found.items()
+    ]
     for row in rows:
         print(f'{row["condition"]}: {row["method"]}: {row["error"]:.3g} {row["chosen"]}')
     others = [row for row in evidence.read(NAME, arguments.output) if row['recipe'] != name]

@@ -64,18 +64,10 @@ class Method(NamedTuple):
     unit: str = 'rad/s'
 
 
-class Judged(NamedTuple):
-    """The error of a method, and the numbers that were chosen for it, one a fold."""
-
-    error: float
-    chosen: list[float]
-    unit: str
-
-
 Folds = Mapping[str, Sequence[Fold]]
 """By condition."""
-Judgements = Mapping[str, Mapping[str, Judged]]
-"""By condition and method."""
+Judgements = Mapping[str, Mapping[str, Row]]
+"""Error, chosen numbers (one a fold) and their unit, by condition and method."""
 
 
 class Recipe(NamedTuple):
@@ -147,7 +139,7 @@ def error(pairs: Iterable[tuple[Recorded, Floats]]) -> float:
     return float(np.sqrt(wrong / size))
 
 
-def judge(method: Method, folds: Sequence[Fold]) -> Judged:
+def judge(method: Method, folds: Sequence[Fold]) -> Row:
     """
     Return the error of a method over all recordings, and what was chosen.
 
@@ -164,20 +156,8 @@ def judge(method: Method, folds: Sequence[Fold]) -> Judged:
             best = min(scores, key=scores.__getitem__)
             chosen.append(float(f'{best:.4g}'))
         pairs += [(r, method.estimate(p, r, best)) for r in judged]
-    return Judged(float(f'{error(pairs):.4g}'), chosen, method.unit)
-
-
-def table(recipe: str, judged: Judgements) -> list[Row]:
-    """Return a line for each condition and method."""
-    return [
-        {
-            'recipe': recipe, 'condition': condition, 'method': method, 'error': row.error,
-            'chosen': ' '.join(f'{x:g}' for x in row.chosen),
-            'unit': row.unit if row.chosen else '',
-        }
-        for condition, found in judged.items()
-        for method, row in found.items()
-    ]  # fmt: skip
+    wrong, unit = float(f'{error(pairs):.4g}'), method.unit if chosen else ''
+    return {'error': wrong, 'chosen': ' '.join(f'{x:g}' for x in chosen), 'unit': unit}
 
 
 def simulated(
