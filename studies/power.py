@@ -48,11 +48,6 @@ LAW = (
 )
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; see `run_study`."""
-    return run_study('power', __doc__, measure, argv)
-
-
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
     """Search and judge."""
     trials = QUICK if arguments.quick else TRIALS
@@ -160,4 +155,4 @@ def kalman(trials: int) -> dict[str, Any]:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_study('power', __doc__, measure))
