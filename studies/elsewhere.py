@@ -21,7 +21,7 @@ from studies import evidence
 from studies.comparison.evaluation import METHODS
 from studies.comparison.methods.linear import LINEAR_LIMIT
 from studies.comparison.methods.method import mean, Search, Setting, Values
-from studies.comparison.methods.ours import model_of
+from studies.comparison.methods.observers import model_of
 from studies.evidence import markdown, Row
 from studies.harness import Floats, Found, observed, Results, run_study, SELF_TUNING
 from studies.waves import wave
@@ -153,10 +153,5 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     return Found({NAME: rows}, {NAME: markdown(head, lines)}, {})
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; see `run_study`."""
-    return run_study(NAME, __doc__, measure, argv)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run_study(NAME, __doc__, measure))
