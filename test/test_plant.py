@@ -2,8 +2,8 @@
 """The simulated plant: each disturbance against its formula, noise, the known input, bad input."""
 
 from fhaosmo_ros.core import ConfigurationError, Plant
-from fhaosmo_ros.core.simulation.disturbance import KINDS
 from fhaosmo_ros.core.simulation.plant import quantised
+from fhaosmo_ros.core.simulation.system import KINDS
 import numpy as np
 import pytest
 

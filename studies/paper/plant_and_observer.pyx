@@ -9,10 +9,9 @@ the solver. Its rates are those of its explicit scheme (D 2 to D 7 in docs/mathe
 from libc.math cimport fmax, fmin
 from libc.string cimport memcpy, memset
 
-from fhaosmo_ros.core.model.integrate cimport (
-    BOGACKI_SHAMPINE, CLASSICAL, EULER, Dynamics, Method, take_step
+from fhaosmo_ros.core.model.prediction cimport (
+    CLASSICAL, Dynamics, MOST_LEVELS, Method, take_step
 )
-from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.sliding_mode cimport SlidingMode
 from fhaosmo_ros.core.observer.structure cimport Level, MOST_INPUTS
 from fhaosmo_ros.core.simulation.system cimport System
@@ -25,7 +24,7 @@ from fhaosmo_ros.core.observer.configuration import ObserverConfiguration, per_l
 from fhaosmo_ros.core.observer.observer import make_structure
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
-from fhaosmo_ros.core.simulation.disturbance import Wave
+from fhaosmo_ros.core.simulation.system import Wave
 import numpy as np
 
 
@@ -43,6 +42,11 @@ class Solver(NamedTuple):
 SOLVERS = {name: Solver(name) for name in ('ode1', 'ode3', 'ode4')}
 SOLVERS['ode4 held'] = Solver('ode4', holds_sign=True)
 """What a fixed-step simulation offers, by its usual names."""
+cdef Method EULER = Method(1, [0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0])
+# Bogacki and Shampine 1989, doi:10.1016/0893-9659(89)90079-7.
+cdef Method BOGACKI_SHAMPINE = Method(
+    3, [0.0, 0.5, 0.75, 0.0], [2.0 / 9.0, 1.0 / 3.0, 4.0 / 9.0, 0.0]
+)
 METHODS = {'ode1': EULER, 'ode3': BOGACKI_SHAMPINE, 'ode4': CLASSICAL}
 
 

@@ -1,11 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A triangular model alone: what it says of the time between two samples (D 1, D 17)."""
+"""The one Runge-Kutta integrator, and a triangular model alone between two samples (D 1, D 17)."""
 
-from fhaosmo_ros.core.model.integrate cimport Dynamics
 from fhaosmo_ros.core.model.phi cimport Expressions
 
 cdef enum:
     MOST_LEVELS = 17  # order <= 12, d and at most 3 derivatives of it, and coloured noise
+    MOST_STAGES = 4
+    MOST_STATES = 96  # of a system: plant and observer together have at most 12 + 4 * 16 + 1
+
+
+cdef struct Method:
+    # An explicit Runge-Kutta method; a stage starts from the slope of the one before alone.
+    int stages
+    double node[MOST_STAGES]  # when a stage is evaluated, as a part of the step
+    double weight[MOST_STAGES]  # of its slope
+
+
+cdef Method CLASSICAL  # order 4
+
+
+cdef class Dynamics:
+    # A system x' = f(t, x).
+    cdef int size  # number of states, at most MOST_STATES
+    cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil
+
+
+cdef void take_step(
+    Dynamics system, const Method* method, double t, double h, double* x
+) noexcept nogil
 
 
 cdef class Prediction(Dynamics):

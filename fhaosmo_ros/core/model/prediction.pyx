@@ -1,22 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A triangular model alone: what it says of the time between two samples (D 1, D 17).
+The one Runge-Kutta integrator, and a triangular model alone between two samples (D 1, D 17).
 
-Whoever predicts writes the state to `z` and a direction to `dz`, calls `over`, and finds both at
-the end of the interval: the estimate there, and its exact derivative in that direction.
+Prediction, plant, and the simulation of plant and observer together are a `Dynamics` each.
 """
 
 from libc.math cimport ceil
 
-from fhaosmo_ros.core.model.integrate cimport CLASSICAL, Dynamics, take_step
 from fhaosmo_ros.core.model.phi cimport Dual, Expressions, evaluate
 
+CLASSICAL = Method(4, [0.0, 0.5, 0.5, 1.0], [1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0])
 cdef int MOST_STEPS = 4000  # of one prediction: bounds what a sample may cost
+
+
+cdef class Dynamics:
+    """A system x' = f(t, x) of at most 96 states; others implement `rates`."""
+
+    cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil:
+        """Write f(t, x) to `slope`; `stage` is 0 at the beginning of a step."""
+
+
+cdef void take_step(
+    Dynamics system, const Method* method, double t, double h, double* x
+) noexcept nogil:
+    """Go from x(t) to x(t + h), in place."""
+    cdef double point[MOST_STATES]
+    cdef double slope[MOST_STATES]
+    cdef double total[MOST_STATES]
+    cdef int stage, i, size = system.size
+    cdef double share, reach
+    for i in range(size):
+        point[i] = total[i] = x[i]
+    for stage in range(method.stages):
+        system.rates(stage, t + method.node[stage] * h, point, slope)
+        share = h * method.weight[stage]
+        for i in range(size):
+            total[i] += share * slope[i]
+        if stage + 1 < method.stages:
+            reach = h * method.node[stage + 1]
+            for i in range(size):
+                point[i] = x[i] + reach * slope[i]
+    for i in range(size):
+        x[i] = total[i]
 
 
 cdef class Prediction(Dynamics):
     """
     A triangular model and a point that moves along it.
+
+    Whoever predicts writes the state to `z` and a direction to `dz`, calls `over`, and finds both
+    at the end of the interval: the estimate there, and its exact derivative in that direction.
 
     Parameters
     ----------

@@ -10,8 +10,7 @@ from fhaosmo_ros.core.observer.configuration import per_level
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
-from fhaosmo_ros.core.simulation.disturbance import Table, Wave
-from fhaosmo_ros.core.simulation.system import System
+from fhaosmo_ros.core.simulation.system import System, Table, Wave
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

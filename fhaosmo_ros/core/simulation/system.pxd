@@ -1,10 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated plant as differential equations (paper eq. newsimpledynamics)."""
+"""The simulated plant as differential equations (paper eq. newsimpledynamics), and its d(t)."""
 
-from fhaosmo_ros.core.model.integrate cimport Dynamics
 from fhaosmo_ros.core.model.phi cimport Expressions
-from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
-from fhaosmo_ros.core.simulation.disturbance cimport Disturbance
+from fhaosmo_ros.core.model.prediction cimport Dynamics, MOST_LEVELS
+
+cdef enum Kind:
+    NONE, SINE, STEP, SQUARE, CHIRP
+
+
+cdef class Disturbance:
+    cdef double at(self, double t) noexcept nogil
+
+
+cdef class Wave(Disturbance):
+    cdef Kind kind
+    cdef double amplitude  # of the wave, or height of the step (unit of d)
+    cdef double omega  # angular frequency; a chirp's at t = 0 (rad/s)
+    cdef double offset  # added to it (unit of d)
+    cdef double start  # time of the step (s)
+
+
+cdef class Table(Disturbance):
+    cdef double spacing  # of its values (s)
+    cdef double[::1] values  # from t = 0 on, at least 2 (unit of d)
 
 
 cdef class System(Dynamics):
