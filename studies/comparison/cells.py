@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
-from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS, SHAPES
-from fhaosmo_ros.core.simulation.recordings import Family, Recording
+from fhaosmo_ros.core.simulation.recordings import Family, FAMILY_PARAMETERS, Recording, SHAPES
 from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from studies.comparison.methods.method import Setting

@@ -12,7 +12,7 @@ from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
-from fhaosmo_ros.core.simulation.recording_parameters import SENSOR
+from fhaosmo_ros.core.simulation.recordings import SENSOR
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import bag_inputs
 from fhaosmo_ros.tools.cli.command import Output, run_command

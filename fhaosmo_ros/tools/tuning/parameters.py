@@ -3,7 +3,7 @@
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
 from fhaosmo_ros.core.parameters.tables import MODEL
-from fhaosmo_ros.core.simulation.recording_parameters import FAMILY, SENSOR, SHARED
+from fhaosmo_ros.core.simulation.recordings import FAMILY, SENSOR, SHARED
 
 TUNING = (
     Parameter(

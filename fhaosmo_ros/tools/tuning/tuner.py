@@ -21,8 +21,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
-from fhaosmo_ros.core.simulation.recording_parameters import FAMILY_PARAMETERS
-from fhaosmo_ros.core.simulation.recordings import Family, Recording
+from fhaosmo_ros.core.simulation.recordings import Family, FAMILY_PARAMETERS, Recording
 from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.tuning.linear_gains import (
     chosen_otherwise,
