@@ -18,7 +18,7 @@ SETTLED = 0.5
 LATEST = 0.5
 """Seconds after which a contact counts as not found."""
 TRAINED, JUDGED, FREE = 1, (21, 22), 29
-"""Seeds; ours was tuned on 1 and 4 of the iiwa."""
+"""Seeds; ours was tuned once, on 1 and 4 of all three arms."""
 TRIALS = {1: 40, 2: 60, 4: 120}
 """Evaluations by the number of parameters of a peer."""
 SITUATIONS: dict[str, dict[str, Any]] = {

@@ -23,13 +23,13 @@ MAX_GAP = 0.1
 """Seconds without a sample, or back in time, after which the estimates begin anew."""
 BEGIN, END, CHANGE = 0.15, 7.0, 30.0
 """Rates (1/s) at which contact begins and ends, and its intensity changes."""
-ONSET = 0.02
+ONSET = 0.05
 """Seconds of a contact's intensity by which its force may be there at once."""
 SINCE = 0.005
 """Seconds for which positions do not show a contact that has begun; velocities do at once."""
 DECAY = 1.5
 """Of d in free motion, 1/s: friction changes with the direction of motion."""
-INTENSITIES = (0.02, 0.07, 0.24, 0.8)
+INTENSITIES = (0.012, 0.044, 0.16, 0.6)
 """Of contact forces, in the arm's weight over the root of a second."""
 TORQUE_NOISE, MODEL_ERROR, LEAST = 0.015, 0.015, 0.05
 """Shares of the torque of the arm's weight, which counts at least so much of the largest."""
