@@ -161,9 +161,9 @@ cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil:
     w.sample.largest = fmax(IGNORANT * least, own)
 
 
-cdef bint is_likely(Members* m, double gate) noexcept nogil:
+cdef bint is_likely(Members* m, double gate, bint to_any) noexcept nogil:
     """
-    Return True if a member that can judge the sample finds it likely (D 29).
+    Return True if a member that can judge the sample finds it likely (D 29), or any at all.
 
     A member that is unlikely itself would meet y by chance.
     """
@@ -172,8 +172,9 @@ cdef bint is_likely(Members* m, double gate) noexcept nogil:
     cdef int g
     for g in range(m.shared.active):
         variance = w.believed[g] * w.noise[g]
-        if (w.b[g] * w.b[g] <= gate * gate * variance and variance <= w.sample.largest
-                and m.score[g] > -CLOSE):
+        if w.b[g] * w.b[g] <= gate * gate * variance and (
+            to_any or (variance <= w.sample.largest and m.score[g] > -CLOSE)
+        ):
             return True
     return False
 
