@@ -106,7 +106,7 @@ setup = run_setup("setup.py", stop_after="init")
 name = sys.argv[1]
 print(*setup.install_requires if name == "run" else setup.extras_require[name], sep="\n")
 ' "$1" >"$venv/requirements-$1.txt"
-    "$bin/python" -m pip install -qq --disable-pip-version-check \
+    "$bin/python" -m pip install -qq --disable-pip-version-check --no-compile \
         -r "$venv/requirements-$1.txt" -c "$venv/constraints.txt" ||
         fail "pip could not install what $venv/requirements-$1.txt lists (see above);" \
             "the ROS 2 wheels are for Linux on x86-64, elsewhere source a ROS 2 Jazzy"
@@ -129,9 +129,16 @@ compile() {
     compiled >build/in_place
 }
 
+building=
 if ! current run; then
     say "Making the environment $venv, once; this takes $cost ..."
     make_venv
+    if [ -n "$compiler" ] && ! is_compiled; then  # downloads leave the cores free
+        compile &
+        building=$!
+        trap 'kill "$building" 2>/dev/null || :' EXIT
+        trap 'exit 130' INT TERM
+    fi
     install run
     [ "$wheels" = no ] || install "ros-$wheels"
     "$bin/python" -c 'import rclpy' || fail "rclpy cannot be imported in $venv (see above)"
@@ -144,5 +151,10 @@ for extra; do
         printf '%s' "$origin" >"$venv/made-$extra"
     fi
 done
-is_compiled || compile
+if [ -n "$building" ]; then
+    wait "$building" || exit 1
+    trap - EXIT
+elif ! is_compiled; then
+    compile
+fi
 printf '%s\n' "$bin/python"
