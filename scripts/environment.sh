@@ -106,7 +106,7 @@ setup = run_setup("setup.py", stop_after="init")
 name = sys.argv[1]
 print(*setup.install_requires if name == "run" else setup.extras_require[name], sep="\n")
 ' "$1" >"$venv/requirements-$1.txt"
-    "$bin/python" -m pip install -qq --disable-pip-version-check --no-compile \
+    "$bin/python" -m pip install -qq --disable-pip-version-check \
         -r "$venv/requirements-$1.txt" -c "$venv/constraints.txt" ||
         fail "pip could not install what $venv/requirements-$1.txt lists (see above);" \
             "the ROS 2 wheels are for Linux on x86-64, elsewhere source a ROS 2 Jazzy"
