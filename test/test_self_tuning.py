@@ -270,6 +270,9 @@ def test_a_host_that_stamps_later_for_dozens_of_samples(seed):
     found = OnlineEstimator(SELF_TUNING).run(stamps, y).unknown_input
     assert rms((found - d)[t > 5.0]) < 0.1 * rms(d)
     assert np.abs(found).max() < 1.5 * np.abs(d).max()
+    noisy = y + 1e-4 * random.standard_normal(count - 1) * (t > 13.0)
+    found = OnlineEstimator(SELF_TUNING).run(stamps, noisy).unknown_input
+    assert np.abs(found).max() < 2.0 * np.abs(d).max()
 
 
 @pytest.mark.parametrize('jitter', [0.03, 0.15])
