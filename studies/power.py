@@ -10,6 +10,7 @@ judged on noise and initial states that no search has seen.
 """
 
 import argparse
+from functools import cache
 import sys
 from typing import Any
 
@@ -98,9 +99,15 @@ def error(recordings: list[Recording], estimates: list[np.ndarray]) -> float:
     return float(np.exp(np.mean(np.log(errors))))
 
 
+@cache
+def demonstrated() -> dict[str, Any]:
+    """Return the demonstration's parameters: a search asks for them thousands of times."""
+    return dict(load(shipped('config/demo.yaml'), 'estimator', OBSERVER_PARAMETERS))
+
+
 def run(values: Values, law: Values, recordings: list[Recording]) -> tuple[float, str]:
     """Return the error of the cascade with these gains and this law, and how far gamma moves."""
-    given = dict(load(shipped('config/demo.yaml'), 'estimator', OBSERVER_PARAMETERS))
+    given = demonstrated()
     values = dict(values)
     lists = {n: [values.pop(f'{n} {i}') for i in range(k)] for n, k in LISTS.items()}
     lists['alpha'].append(given['alpha'][3])
@@ -122,7 +129,7 @@ def judged(values: Values, law: Values) -> dict[str, Any]:
 
 def searched(adapts: bool, seed: int, trials: int, start: Values) -> Values:
     """Return the best gains, with those of the law if the power adapts."""
-    given = dict(load(shipped('config/demo.yaml'), 'estimator', OBSERVER_PARAMETERS))
+    given = demonstrated()
     entries = {
         f'{name} {i}': given[name][i] for name, count in LISTS.items() for i in range(count)
     }

@@ -126,7 +126,7 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
     ]  # fmt: skip
     for name, estimate in estimates.items():
         cells = (
-            f'{rms((estimate - d)[part]):12.2g}{chatter(estimate[part], d[part]):8.3g}'
+            f' {rms((estimate - d)[part]):11.2g} {chatter(estimate[part], d[part]):7.3g}'
             for _, part in parts
         )
         lines.append(f'{name:{width}}' + ''.join(cells))
