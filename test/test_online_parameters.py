@@ -4,9 +4,10 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from fhaosmo_ros.core import OnlineEstimator
-from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
+from fhaosmo_ros.core import Observer, OnlineEstimator
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
 import numpy as np
+from observer_cases import LAWS, samples
 import pytest
 
 START = 1_700_000_000 * 10**9
@@ -126,3 +127,34 @@ def test_live_change_has_an_effect_and_makes_no_jump(name):
     assert np.isfinite(other).all()
     assert not np.array_equal(one, other)
     np.testing.assert_array_equal(one, outputs(change, None))  # nothing else differs
+
+
+MODEL = {'phi': ['0', 'sin(z1)', '-z2*z3 + u'], 'gamma_initial': 0.65, 'gamma_rate': 0.004}
+
+
+@pytest.mark.parametrize('law', LAWS, ids=lambda law: '-'.join(law.values()))
+def test_live_change_does_not_move_the_state(law):
+    for name in LIVE:
+        value = CHANGES[name].value
+        levants = law['structure'] == 'levant' or value == 'levant'
+        if name in OBSERVER_PARAMETERS and not (levants and 'explicit' in (law['scheme'], value)):
+            change_a_running_observer(MODEL | law, {name: value})
+
+
+def change_a_running_observer(parameters, changes):
+    observer = Observer(parameters)
+    observer.run(*samples())
+    before = observer.state
+    observer.configure(changes)
+    after = observer.state
+    for quantity in before.values.keys() - {'p', 'q', 'gamma'}:
+        found, wanted = after.values[quantity], before.values[quantity]
+        np.testing.assert_array_equal(found, wanted, err_msg=f'{quantity} after {changes}')
+    # A fresh observer in the same state goes on in the same way: nothing else is remembered.
+    fresh = Observer(observer.parameters)
+    fresh.restore(after)
+    for k in range(20):
+        one, other = (o.step(0.01 * k, 1e-3, 0.0) for o in (observer, fresh))
+        assert not one.status.rejected
+        np.testing.assert_array_equal(one.z, other.z, err_msg=f'after {changes}')
+        assert one.gamma == other.gamma

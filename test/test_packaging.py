@@ -173,6 +173,22 @@ def test_a_debug_build_checks_bounds_and_is_not_taken_for_a_normal_one(tmp_path)
     assert not list(package.rglob('*.c'))
 
 
+def test_without_cython_the_build_says_so(tmp_path):
+    for name in ('setup.py', 'setup.cfg'):
+        shutil.copy(ROOT / name, tmp_path)
+    for name, text in (
+        ('Cython.py', 'raise ImportError'), (f'{NAME}/__init__.py', "__version__ = '0'"),
+        (f'{NAME}/commands.py', 'COMMANDS = {}'), (f'{NAME}/number.pyx', NUMBERS),
+    ):  # fmt: skip
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    done = attempt(
+        sys.executable, 'setup.py', '-q', 'build_ext', cwd=tmp_path, PYTHONPATH=tmp_path
+    )
+    assert done.returncode == 1
+    assert done.stderr == "error: Cython is needed to build: pip install 'Cython>=3'\n"
+
+
 def test_package_xml():
     package = ElementTree.parse(ROOT / 'package.xml').getroot()
     assert package.findtext('version') == fhaosmo_ros.__version__

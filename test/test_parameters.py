@@ -6,7 +6,7 @@ import warnings
 
 from fhaosmo_ros.core import ConfigurationError, Observer
 from fhaosmo_ros.core.parameters import files
-from fhaosmo_ros.core.parameters.declaration import KINDS
+from fhaosmo_ros.core.parameters.declaration import KINDS, Parameter
 from fhaosmo_ros.core.parameters.removed import REMOVED
 from fhaosmo_ros.core.parameters.tables import (
     ESTIMATOR_PARAMETERS,
@@ -123,6 +123,12 @@ def test_numbers_in_a_list_of_expressions_become_text():
     assert phi.coerce(('0', 'u*z1')) == ['0', 'u*z1']
     for value in (['0', True], ['0', None], ['0', ['z1']], 5, '[0, true]'):
         refused(phi, value)
+
+
+@pytest.mark.parametrize('number', ['1e-3', '1E3', '-2e+2', '.5e1', '1.e2'])
+def test_exponent_without_a_point_is_a_number(number):
+    # As in C and in rcl; YAML 1.1 itself would take it for text.
+    assert Parameter('p', [0.0], 'A list.').coerce(f'[{number}, 1]') == [float(number), 1.0]
 
 
 def test_unknown_names_get_the_closest_match():

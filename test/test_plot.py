@@ -2,6 +2,7 @@
 """A figure and a table from the estimates in bags."""
 
 from pathlib import Path
+import signal
 
 import bag_files as files
 from fhaosmo_ros.tools.bags.types import labelled_array
@@ -102,6 +103,21 @@ def test_thinning_leaves_short_curves_and_times_that_go_back():
     for count in (0, 1, 100):
         assert envelope(t[:count], t[:count])[1].tolist() == t[:count].tolist()
     assert len(envelope(np.ones(9999), np.arange(9999.0))[0]) == 9999
+
+
+@pytest.mark.signals
+@pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
+def test_signal_in_a_destructor_is_not_lost(bag, tmp_path, monkeypatch, capsys):
+    class Collected:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    read = plot.read_curves
+    monkeypatch.setattr(plot, 'save_curves', lambda c, path: path.write_bytes(b'x'))
+    monkeypatch.setattr(plot, 'read_curves', lambda *a: (Collected(), read(*a))[1])
+    assert plot.main([str(bag), '-o', str(tmp_path / 'f.png')]) == 130
+    assert capsys.readouterr().err.endswith('plot: interrupted\n')
+    assert not list(tmp_path.glob('*f.png*'))
 
 
 def test_truth_is_unknown_where_the_bag_lacks_it(tmp_path):

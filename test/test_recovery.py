@@ -189,6 +189,17 @@ def test_after_a_jump_of_y_the_next_sample_gives_the_time_of_the_estimate():
     np.testing.assert_allclose(estimator.estimate.z[0], 1.0, atol=0.01)
 
 
+def test_jump_of_a_few_counts_of_an_encoder():
+    """Some of its samples lie within 6 standard deviations, some beyond."""
+    case = Case(CONFIG / 'models' / 'dc_motor.yaml')
+    y, end = case.y.copy(), HIT + 5 * RATE
+    y[HIT:end] += 10.0 * case.parameters['noise_size']
+    wrong = case.errors(y, case.d)
+    assert wrong[HIT:].max() < 0.1 * case.largest
+    for moment in (HIT, end):
+        assert wrong[moment + 3 * RATE // 10 : moment + RATE].max() < 1.5 * case.usual
+
+
 def test_outliers_and_bursts_are_passed_over(case):
     rng, y = np.random.default_rng(8), case.y.copy()
     for k in np.flatnonzero(rng.random(len(y)) < 2e-3):

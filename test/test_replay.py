@@ -242,6 +242,18 @@ def _bag(tmp_path):
     return files.write(tmp_path / 'bag', files.floats(stamps, y))
 
 
+def cut(bag):
+    path = next(bag.glob('*.mcap'))
+    path.write_bytes(path.read_bytes()[:-2000])
+
+
+def spoil(bag):
+    path = next(bag.glob('*.mcap'))
+    data = bytearray(path.read_bytes())
+    data[5000:5060] = b'\xff' * 60  # longer than a record
+    path.write_bytes(data)
+
+
 def old(bag):
     bag.with_name('old.bag').write_bytes(b'#ROSBAG V2.0')
 
@@ -275,6 +287,8 @@ def lose_metadata(bag):
         (None, ['BAG', '-p', "phi:=['0','0','u']"], ["'/u'", '(/y)']),
         (old, ['old.bag'], ['ROS 1', 'rosbags-convert --src old.bag']),
         (None, ['BAG', '--params-file', '/no.yaml'], ['/no.yaml', 'No such file']),
+        (cut, ['BAG'], ['whole bag', 'was cut', 'mcap recover']),
+        (spoil, ['BAG'], ['whole bag']),
         (lose_metadata, ['BAG'], ['metadata.yaml', 'bag.mcap: name that file']),
         (with_empty_topic, ['empty'], ["expected messages on topic '/y', got none"]),
     ],

@@ -19,6 +19,18 @@ def test_times_that_do_not_increase_are_refused(bad):
 
 
 @laws
+def test_nanoseconds_equal_seconds(law):
+    nanoseconds = np.cumsum(np.random.default_rng(2).integers(500_000, 2_000_000, 300))
+    y = np.sin(3e-9 * nanoseconds)
+    one = Observer(SMALL | law).run(nanoseconds, y, 0.0)
+    other = Observer(SMALL | law).run(nanoseconds * 1e-9, y, 0.0)
+    # Rounding of t only; sign's chatter would amplify it, explicitly.
+    tolerance = 1e-6 if law['scheme'] == 'explicit' else 1e-9
+    np.testing.assert_allclose(one.z, other.z, atol=tolerance)
+    np.testing.assert_array_equal(one.t, nanoseconds)
+
+
+@laws
 @pytest.mark.parametrize('epoch', [1_700_000_000_000_000_000, 1_799_999_999_999_999_999])
 @pytest.mark.parametrize('kind', [np.int64, np.uint64])
 def test_nanoseconds_stay_exact_at_a_large_epoch(law, epoch, kind):

@@ -126,6 +126,21 @@ def test_one_stamp_ahead_by_less_than_max_gap_ends_a_gap_and_time_goes_on_from_i
     only(estimator, backward_stamps=29, duplicate_stamps=1, gaps=1, sub_steps=30)
 
 
+def test_clock_set_back_a_little_holds_until_it_has_caught_up():
+    estimator = OnlineEstimator()
+    last = run(estimator)
+    words = [estimator.update(last - 100 * MS + k * MS, 0.2).word for k in range(1, 150)]
+    assert [bool(w & REJECTED) for w in words] == [True] * 100 + [False] * 49
+    only(estimator, backward_stamps=99, duplicate_stamps=1)
+
+
+def test_bag_loop_restarts_once_a_round():
+    estimator = OnlineEstimator()
+    for _ in range(4):
+        run(estimator, 2000)
+    only(estimator, far_stamps=3, restarts_backward=3)
+
+
 def test_bag_that_loops_within_max_gap_is_followed_after_so_many_late_samples():
     """Time does not catch up then; each of its samples was rejected, for ever."""
     estimator = OnlineEstimator({'max_gap': 5.0})

@@ -44,11 +44,15 @@ def test_values_of_the_input(pair):
 
     values = wait_values(pair, 'input', as_sampled, 'rate and name of the plant')
     assert values['topic'] == '/pair/y'
+    assert float(values['jitter (std / mean of the period)']) >= 0.0
     mean = 1.0 / float(values['sample rate [Hz]'])
     assert float(values['longest period [s]']) >= 0.999 * mean
     assert 0.0 < float(values['longest delay [s]']) < 60.0
     assert 0.0 <= float(values['age of the last sample [s]']) < 60.0
-    assert int(values['samples accepted']) > 0
+    accepted = int(values['samples accepted'])
+    assert accepted > 0
+    assert int(values['samples lost']) >= 0
+    wait_values(pair, 'input', lambda v: int(v['samples accepted']) > accepted, 'more samples')
 
 
 def test_values_of_the_observer(pair):

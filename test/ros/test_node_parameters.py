@@ -11,8 +11,11 @@ from fhaosmo_ros.core.parameters.tables import (
 )
 import numpy as np
 import pytest
-from rcl_interfaces.msg import Parameter, ParameterValue
-from running import FED, Parameters, told_parameters
+from rcl_interfaces.msg import LoggerLevel, Parameter, ParameterValue
+from rcl_interfaces.srv import SetLoggerLevels
+from running import FED, joint_state, Parameters, SECOND, told_parameters
+from sensor_msgs.msg import JointState
+from test_any_input import valid
 
 TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}
 LIVE = {node: [p for p in table.values() if p.live] for node, table in TABLES.items()}
@@ -225,6 +228,9 @@ def test_texts_of_ros2_param_set(fed, name, text, value):
     assert p.messages(name)[0].type == kind
 
 
+# Random sets.
+
+COUNT = 400
 ODD = (
     math.nan, math.inf, -math.inf, -1.0, 0.0, 1e308, -1e308, 5e-324, 2**62, -1, True, '', 'fuzzy',
     '[1.0, 2.0]', '1e-3', "__import__('os').abort()", '!!python/name:os.abort', [1.0, math.nan],
@@ -232,22 +238,41 @@ ODD = (
 )  # fmt: skip
 
 
-def test_odd_values_hurt_nobody_and_each_refusal_has_its_reason(fed):
-    rng, accepted = np.random.default_rng(5), 0
-    for parameter in LIVE['estimator']:
-        for k in rng.choice(len(ODD), 6, replace=False):
-            was = fed.parameters.messages(*ESTIMATOR_PARAMETERS)
-            result = fed.parameters.try_to_set(parameter.name, ODD[k])
-            if result.successful:
-                accepted += 1
-                fed.send(rng.normal())
-                continue
-            assert parameter.name in result.reason
-            assert '\n' not in result.reason
-            assert fed.parameters.messages(*ESTIMATOR_PARAMETERS) == was
-    assert accepted > len(LIVE['estimator']) // 2
-    for e in fed.estimates:
+def test_random_sets_hurt_nobody_and_each_refusal_has_its_reason(user, estimator):
+    node = estimator('/random', input_topic='joints', input_field='position[a]', **FED)
+    joints = user.publisher('/random/joints', JointState)
+    rng = np.random.default_rng(5)
+    table = ESTIMATOR_PARAMETERS
+    names = [name for name, p in ONLINE_PARAMETERS.items() if p.live or name == 'order']
+    stamp, accepted, values = SECOND, 0, node.parameters.messages(*table)
+    for _ in range(COUNT):
+        changes = {
+            str(name): ODD[rng.integers(len(ODD))] if rng.random() < 0.15
+            else valid(table[name], rng)
+            for name in rng.choice(names, size=rng.integers(1, 4), replace=False)
+        }  # fmt: skip
+        result = node.parameters.try_to_set_together(**changes)
+        before, values = values, node.parameters.messages(*table)
+        changed = {n for n, a, b in zip(table, before, values, strict=True) if a != b}
+        if result.successful:
+            accepted += 1
+            assert changed <= set(changes), changes
+        else:
+            assert not changed, changes
+            assert result.reason, changes
+            assert '\n' not in result.reason, result.reason
+            assert any(name in result.reason for name in [*changes, 'gamma_']), (changes, result)
+        for _ in range(2):
+            stamp += int(rng.choice([1_000, 1_000_000, 20_000_000]))
+            y = rng.normal() if rng.random() < 0.99 else rng.choice([math.nan, 1e300])
+            joints.publish(joint_state(stamp, ['a'], [y]))
+    assert COUNT // 10 < accepted < COUNT - COUNT // 10
+    node.parameters.set(publish_on='sample', diagnostics_period=0.2)
+    node.wait_status('state', b'\0')  # whatever has been published before has come
+    assert len(node.estimates) > COUNT // 2
+    for e in node.estimates:
         assert all(map(math.isfinite, [*e.z, e.unknown_input, e.gamma, *e.innovation])), e
+        assert 0.0 < e.gamma <= 1.0
 
 
 # What the estimator is set to, on a latched topic: the text of a parameter file.
@@ -263,3 +288,13 @@ def test_topic_tells_who_comes_late_and_every_change(user, fed):
     fed.parameters.set(epsilon=0.125, publish_rate=50.0)
     values = wait(lambda v: v['epsilon'] != 3.5)
     assert values == expected | {'epsilon': 0.125, 'publish_rate': 50.0}
+
+
+def test_levels_of_the_log_can_be_set(user, fed):
+    for level, value in ((LoggerLevel.LOG_LEVEL_WARN, 0.5), (LoggerLevel.LOG_LEVEL_INFO, 0.25)):
+        request = SetLoggerLevels.Request(levels=[LoggerLevel(name='fed.estimator', level=level)])
+        (result,) = user.call(f'{fed.name}/set_logger_levels', SetLoggerLevels, request).results
+        assert result.successful
+        fed.parameters.set(epsilon=value)
+    fed.wait_said('set epsilon = 0.25')
+    assert not fed.said('set epsilon = 0.5')

@@ -12,6 +12,7 @@ from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
 from running import DEADLINE, Estimator, Parameters, ROOT
+from yaml_texts import HOSTILE
 
 
 def section(text: str) -> str:
@@ -38,6 +39,7 @@ REFUSED = [
      ["5.yaml: unknown parameter 'lamda'"]),
     (E, set_in_file("phi: ['0', '0', '__import__(1)']"), ["'phi'", 'allowed', '__import__']),
     (P, set_in_file("phi: ['0', '-z2']"), ["'phi'", '3 expressions', 'got 2']),
+    (E, ['--ros-args', '--params-file', 'a: b: c\n'], ['.yaml', 'expected YAML']),
     (E, ['--ros-args', '--params-file', 'lambda: [15.0]\n'], ['.yaml', 'ros__parameters']),
     (P, ['--ros-args', '-r', '__node:=plans', '--params-file', OF_PLANT],
      ["got 'plant'; did you mean '/plans'"]),
@@ -46,6 +48,7 @@ REFUSED = [
      ['/nowhere/demo.yaml', 'expected a readable file', 'No such file']),
     # Arguments.
     (E, rules('lamda:=4'), ["'lamda'", "mean 'lambda'?"]),
+    (E, rules('estimator:noise:=0.1'), ["'noise'"]),
     (E, rules('max_gap:=soon'), ["'max_gap'", 'a number', "'soon'"]),
     (E, rules('epsilon'), ["'-p epsilon'"]),
     (E, ['--ros-args', '-p'], ['-p']),
@@ -73,6 +76,7 @@ REFUSED = [
     # QoS.
     (E, rules('qos_overrides./estimator/state.publisher.reliability:=sometimes'),
      ['/estimator/state', 'sometimes']),
+    (E, rules('qos_overrides./estimator/state.publisher.depth:=-1'), ['/estimator/state', '-1']),
     (E, rules('qos_overrides./estimator/stat.publisher.depth:=5'),
      ["'qos_overrides./estimator/stat", 'one of']),
     (E, rules('qos_overrides./estimator/state.publisher.deadline:=5'),
@@ -134,6 +138,19 @@ def test_process_ends_with_one_line(node):
     assert "'phi'" in check_refusal(node, done.returncode, done.stdout, done.stderr)
 
 
+@pytest.mark.parametrize('text', HOSTILE.values(), ids=HOSTILE.keys())
+def test_hostile_text_gives_no_more_than_a_line(text, tmp_path, capfd):
+    path = tmp_path / 'file.yaml'
+    for words, content in (
+        (rules(f'lambda:={text}'), ''),
+        (['--ros-args', '--params-file', str(path)], text),
+        (['--ros-args', '--params-file', str(path)], section(f'lambda: {text}')),
+    ):
+        path.write_text(content)
+        code = start('estimator', words)
+        assert len(check_refusal('estimator', code, *capfd.readouterr())) < 600
+
+
 def test_files_and_rules_reach_the_node_for_which_they_are(user, launch, tmp_path):
     """One that is renamed, in a namespace, with a file of another node, and lists over values."""
     text = (
@@ -168,11 +185,16 @@ def attacks(mark: Path) -> list[str]:
     return [
         f"__import__('os').system('{touch}')",
         f"().__class__.__base__.__subclasses__()[0].__init__.__globals__['os'].system('{touch}')",
+        f"z1 if __import__('os').system('{touch}') else z1",
+        f"[__import__('os').system('{touch}') for _ in (1,)][0]",
+        f"(lambda: __import__('os').system('{touch}'))()",
         f'f\'{{open({str(mark)!r}, "w")}}\'',
         f"open('{mark}', 'w')",
         f"eval('{touch}')",
         f'$({touch})',
         f'`{touch}`',
+        f'0; {touch}',
+        f'| {touch}',
         f'!!python/object/apply:os.system ["{touch}"]',
     ]
 
