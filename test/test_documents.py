@@ -78,6 +78,15 @@ def test_every_key_of_a_shipped_configuration_is_declared_and_used(path):
     Plant({k: v for k, v in plant.items() if k in PLANT_PARAMETERS})
 
 
+def test_paper_configuration_has_the_papers_numbers():
+    estimator = load(ROOT / 'config' / 'paper.yaml', 'estimator')
+    assert estimator['lambda'] == [15.0] * 4
+    assert estimator['alpha'] == [30.0] * 4
+    assert estimator['epsilon'] == 0.025
+    assert (estimator['gamma_rate'], estimator['gamma_initial']) == (0.004, 0.5)
+    assert load(ROOT / 'config' / 'paper.yaml', 'plant')['disturbance_amplitude'] == 0.1
+
+
 def test_topics_in_the_table_are_those_of_the_code():
     written = {
         (row[0], name): kind

@@ -143,55 +143,88 @@ def test_colcon_installs_executables_and_data(options, wheel, checkout, tmp_path
 
 # setup.py build_ext
 
-NUMBERS = """
+SMALL = {
+    'fhaosmo_ros/__init__.py': "__version__ = '0'",
+    'fhaosmo_ros/commands.py': 'COMMANDS = {}',
+    'fhaosmo_ros/number.pxd': (
+        'cdef enum: NUMBER = 3\ncdef class Numbers:\n    cdef double[4] values'
+    ),
+    'fhaosmo_ros/number.pyx': """
 cdef class Numbers:
-    cdef double[4] values
     def __getitem__(self, Py_ssize_t index):
         cdef double[:] values = self.values
         return values[index]
+""",
+    'fhaosmo_ros/taken.pyx': (
+        'from fhaosmo_ros.number cimport NUMBER\ndef number():\n    return NUMBER'
+    ),
+}
+OUT_OF_BOUNDS = """
+from fhaosmo_ros.number import Numbers
+try:
+    Numbers()[4]
+except IndexError:
+    print('checked')
+else:
+    print('unchecked')
 """
 
 
-def test_a_debug_build_checks_bounds_and_is_not_taken_for_a_normal_one(tmp_path):
-    package = tmp_path / NAME
-    package.mkdir()
-    (package / '__init__.py').write_text("__version__ = '0'")
-    (package / 'commands.py').write_text('COMMANDS = {}')
-    (package / 'number.pyx').write_text(NUMBERS)
-    for name in ('setup.py', 'setup.cfg'):
-        shutil.copy(ROOT / name, tmp_path)
-    built = []
-    for debug in (1, 1, 0):
-        command = (sys.executable, 'setup.py', '-q', 'build_ext', '-i')
-        assert run(*command, cwd=tmp_path, FHAOSMO_DEBUG=debug) == ''
-        (library,) = (tmp_path / 'build').glob('lib*/**/*.so')
-        built.append(library.stat().st_mtime_ns)
-        query = f'from {NAME}.number import Numbers; Numbers()[4]'
-        done = attempt(sys.executable, '-c', query, cwd=tmp_path)
-        assert ('IndexError' in done.stderr) == bool(debug)
-    assert built[0] == built[1] < built[2]  # what has not changed is not built again
-    assert not list(package.rglob('*.c'))
-
-
-def test_without_cython_the_build_says_so(tmp_path):
-    for name in ('setup.py', 'setup.cfg'):
-        shutil.copy(ROOT / name, tmp_path)
-    for name, text in (
-        ('Cython.py', 'raise ImportError'), (f'{NAME}/__init__.py', "__version__ = '0'"),
-        (f'{NAME}/commands.py', 'COMMANDS = {}'), (f'{NAME}/number.pyx', NUMBERS),
-    ):  # fmt: skip
+@pytest.fixture
+def small(tmp_path) -> Path:
+    """Return a package of two small extensions with this package's setup.py."""
+    for name, text in SMALL.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
-    done = attempt(
-        sys.executable, 'setup.py', '-q', 'build_ext', cwd=tmp_path, PYTHONPATH=tmp_path
-    )
+    for name in ('setup.py', 'setup.cfg'):
+        shutil.copy(ROOT / name, tmp_path)
+    return tmp_path
+
+
+def build(folder: Path, debug: int = 1) -> dict[str, int]:
+    """Return when each extension was compiled (ns); a debug build takes half the time."""
+    command = (sys.executable, 'setup.py', '-q', 'build_ext', '-i')
+    assert run(*command, cwd=folder, FHAOSMO_DEBUG=debug) == ''
+    libraries = (folder / 'build').glob('lib*/**/*.so')
+    return {path.name.split('.')[0]: path.stat().st_mtime_ns for path in libraries}
+
+
+def test_only_what_has_changed_is_built(small):
+    first = build(small)
+    assert set(first) == {'number', 'taken'}
+    assert not list((small / NAME).rglob('*.c'))
+    assert build(small) == first
+    taken = small / NAME / 'taken.pyx'
+    taken.write_text(taken.read_text() + ' + 0')
+    second = build(small)
+    assert second['number'] == first['number']
+    assert second['taken'] > first['taken']
+    declarations = small / NAME / 'number.pxd'
+    declarations.write_text(declarations.read_text().replace('NUMBER = 3', 'NUMBER = 4'))
+    build(small)
+    query = f'from {NAME}.taken import number; print(number())'
+    assert run(sys.executable, '-c', query, cwd=small) == '4\n'
+    # A debug build checks bounds, and is not taken for a normal one.
+    assert run(sys.executable, '-c', OUT_OF_BOUNDS, cwd=small) == 'checked\n'
+    build(small, debug=0)
+    assert run(sys.executable, '-c', OUT_OF_BOUNDS, cwd=small) == 'unchecked\n'
+
+
+def test_without_cython_the_build_says_so(small):
+    (small / 'Cython.py').write_text('raise ImportError')
+    done = attempt(sys.executable, 'setup.py', '-q', 'build_ext', cwd=small, PYTHONPATH=small)
     assert done.returncode == 1
     assert done.stderr == "error: Cython is needed to build: pip install 'Cython>=3'\n"
 
 
+# package.xml
+
+
 def test_package_xml():
     package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    assert package.findtext('name') == NAME
     assert package.findtext('version') == fhaosmo_ros.__version__
+    assert package.findtext('export/build_type') == 'ament_python'
     needed = {tag.text for tag in package.findall('exec_depend')}
     assert {'rclpy', 'std_msgs', 'std_srvs', 'launch_ros', 'python3-numpy'} <= needed
     assert {'cython3', 'python3-dev'} <= {tag.text for tag in package.findall('build_depend')}
@@ -352,6 +385,7 @@ def test_without_the_headers_of_python_nothing_is_begun(tmp_path):
     ('arguments', 'code', 'words'),
     [
         (['estimater'], 2, ["no command 'estimater'", "did you mean 'estimator'?", *COMMANDS]),
+        (['compare'], 2, ['make compare in a checkout']),
         ([], 2, COMMANDS),
         (['-h'], 0, COMMANDS),
         (['--help'], 0, COMMANDS),

@@ -33,10 +33,10 @@ cdef double EXACT = 1e-5
 # a sample some microseconds late, by a little more or less for dozens of samples, and a y that is
 # taken to be free of that would make a d of it.
 cdef double PROMPT = 0.01
-# Where the highest differences of y are so large beside those of the order below, as variances of
-# white noise, they are noise, whose variance is at least this squared of theirs: what is smooth
+# Where the highest differences of y are more than FLAT times those of the order below, as
+# variances of white noise, they are noise, of at least OF_FLAT times that variance: what is smooth
 # has far smaller ones.
-cdef double FLAT = 0.5
+cdef double FLAT = 0.5, OF_FLAT = 0.25
 cdef double ROUNDED = 1e-12  # what is less than this part of a number may be an error of 64 bits
 cdef double ROUGH = 2.0  # the variance of the noise is at most so many times what they say
 
@@ -229,13 +229,12 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
         more = (squares[c] / weights[c] / CLIPPED - 1.0) / average
         share = m.noise[c] / w.now[c]  # who adds to the noise answers for it
         m.late[c] *= 1.0 + (1.0 - share) * more
-        least = fmin(prompt * prompt / m.shared.jitter, 1.0)
-        m.late[c] = fmax(fmin(m.late[c], ROUGH), least)
+        m.late[c] = fmax(fmin(m.late[c], ROUGH), fmin(prompt * prompt / m.shared.jitter, 1.0))
         m.noise[c] *= 1.0 + share * more
         most = m.rough[c][1]
         for p in range(2, m.n + 2):
             most = fmin(most, m.rough[c][p])
         m.noise[c] = fmax(fmin(m.noise[c], ROUGH * most), sample.floor)
         if m.rough[c][m.n + 1] > FLAT * m.rough[c][m.n]:
-            m.noise[c] = fmax(m.noise[c], FLAT * FLAT * m.rough[c][m.n + 1])
+            m.noise[c] = fmax(m.noise[c], OF_FLAT * m.rough[c][m.n + 1])
     fill_noise(m)
