@@ -57,6 +57,8 @@ MEANT = {
     'not newer': 'the stamp is not later than that of the sample before',
     'too strong': 'efforts are a hundred times those of the URDF: what is the unit of effort?',
     'too fast': 'velocities are more than three times the limit of the URDF: are they in degrees?',
+    'standing still': 'positions stay the same to the last digit though the arm was moving: is '
+    'the driver stuck, or does it publish faster than it reads?',
     'clock set back': 'stamps are more than 0.1 s older than before: the estimates began anew',
     'restarts': 'a gap of more than 0.1 s: the estimates began anew',
 }

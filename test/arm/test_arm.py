@@ -240,6 +240,40 @@ def test_bad_samples_are_counted_and_survived(free, change, counter):
     assert np.isfinite(found.external_torque[5:]).all()
 
 
+@pytest.mark.parametrize('measurement', ['position', 'velocity'])
+def test_positions_that_freeze_stop_the_estimates(free, measurement):
+    t, q, v, torque = free
+    arm = Arm(URDF, measurement=measurement, position_noise=[NOISE])
+    arm.run(t[:1500], q[:1500], torque[:1500], v[:1500])
+    stuck = np.repeat(q[1499:1500], 500, axis=0)
+    speed = np.repeat(v[1499:1500], 500, axis=0)
+    found = arm.run(t[1500:2000], stuck, torque[1500:2000], speed)
+    assert arm.counters['standing still'] == 500
+    assert np.isnan(found.external_torque).all()
+    after = arm.run(t[2000:3000], q[2000:3000], torque[2000:3000], v[2000:3000])
+    assert np.abs(after.external_torque[-500:]).max() < 0.5
+
+
+def test_a_driver_that_repeats_each_position_is_one_of_half_the_rate(free):
+    t, q, _, torque = free
+    twice = Arm(URDF, position_noise=[NOISE])
+    found = twice.run(t, np.repeat(q[::2], 2, axis=0), np.repeat(torque[::2], 2, axis=0))
+    once = Arm(URDF, position_noise=[NOISE]).run(t[::2], q[::2], torque[::2])
+    assert twice.counters['standing still'] > 0.4 * len(t)
+    late = [e.external_torque[len(e.contact) // 4 :] for e in (found, once)]
+    off = [np.sqrt(np.nanmean(torques**2)) for torques in late]
+    assert off[0] < 1.5 * off[1]
+
+
+def test_noise_of_positions_that_nobody_told_is_found(free):
+    t, q, _, torque = free
+    noisy = q + 20.0 * NOISE * np.random.default_rng(1).standard_normal(q.shape)
+    told = Arm(URDF, position_noise=[20.0 * NOISE]).run(t, noisy, torque)
+    found = Arm(URDF, position_noise=[NOISE]).run(t, noisy, torque)
+    off = [np.sqrt(np.mean(e.external_torque[500:] ** 2)) for e in (found, told)]
+    assert off[0] < 1.1 * off[1]
+
+
 @pytest.mark.parametrize('limit', ['velocity="5"', 'effort="100"', 'lower="-3" upper="3"'])
 def test_a_limit_that_the_urdf_does_not_say_is_none(free, limit):
     t, q, _, torque = free

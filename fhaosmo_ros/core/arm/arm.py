@@ -11,7 +11,7 @@ from fhaosmo_ros.core.arm.bank import Bank
 from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.doubts import Doubts
 from fhaosmo_ros.core.arm.model import ArmModel, Payload, Terms
-from fhaosmo_ros.core.arm.samples import Clock, Limits, momentum_of, TorqueNoise
+from fhaosmo_ros.core.arm.samples import Clock, Limits, momentum_of, Noise
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -33,6 +33,8 @@ INTENSITIES = (0.012, 0.044, 0.16, 0.6)
 """Of contact forces, in the arm's weight over the root of a second."""
 TORQUE_NOISE, MODEL_ERROR, LEAST = 0.015, 0.015, 0.05
 """Shares of the torque of the arm's weight, which counts at least so much of the largest."""
+LEAST_FOUND = 0.1
+"""Share of that noise of torques below which none is found."""
 ODDS = 3.0
 """Logarithm of the odds above which contact is reported, if calibration says nothing."""
 FURTHER = 0.5
@@ -43,6 +45,8 @@ ENCODER = 10.0
 """Standard deviations by which the noise of positions may add to that, however near they are."""
 STRONGER = 100.0
 """Times the URDF's effort limit, or the torque of the arm's weight: no torque of this arm."""
+STOPPING = 2.0
+"""Times the same, by which no arm is stopped between two samples."""
 DAMPING = 0.02
 """Singular value of a frame's Jacobian, m, below which a force along it is damped."""
 LOOK = 0.005
@@ -162,14 +166,14 @@ class Arm:
         self._calibrated = calibration is not None
         self.set_payload(payload_of(p))
         self._of_position = p['measurement'] == 'position'
-        self._spread = self._size('position_noise')
-        self._noise = self._spread**2
-        if not self._of_position:
-            self._noise = self._values('velocity_noise') ** 2
+        spread = self._size('position_noise')
+        size = spread if self._of_position else self._values('velocity_noise')
+        self._noise = Noise(size, size, np.ones(len(size), dtype=bool))
         scale = model.torque_of_weight()
         scale = np.maximum(scale, LEAST * np.max(scale))
         told = self._size('torque_noise')
-        self._torques = TorqueNoise(np.where(told > 0.0, told, TORQUE_NOISE * scale), told == 0.0)
+        size = np.where(told > 0.0, told, TORQUE_NOISE * scale)
+        self._torques = Noise(size, LEAST_FOUND * size, told == 0.0)
         self._model_variance = self._size('model_error', MODEL_ERROR * scale) ** 2
         constants = self._values('torque_constants')
         self._constants = np.where(constants == 1.0, known.torque_constants, constants)
@@ -178,10 +182,12 @@ class Arm:
         since = SINCE if self._of_position else 0.0
         self._bank = Bank(free, DECAY, scales, BEGIN, END, CHANGE, ONSET, since, self._of_position)
         finite = np.where(np.isfinite(model.effort_limits), model.effort_limits, 0.0)
+        strong = np.maximum(finite, scale)
         self._limits = Limits(
             model.lowest - FURTHER, model.highest + FURTHER, FASTER * model.velocity_limits,
-            STRONGER * np.maximum(finite, scale), ENCODER * self._spread,
+            STRONGER * strong, ENCODER * spread,
         )  # fmt: skip
+        self._stopping = STOPPING * strong
         self._waiting: deque[tuple[int, Floats, Floats | None]] = deque()
         self.doubts = Doubts(
             model, p['effort'] != 'gravity_compensated', np.sqrt(self._model_variance)
@@ -207,11 +213,13 @@ class Arm:
         """Begin anew with the next sample."""
         self._last: tuple[int, Floats, Terms, Floats] | None = None
         self._started, self._velocity = False, np.zeros(len(self.joints))
+        self._still, self._momentum = False, np.zeros(len(self.joints))
         self._contact, self._evidence = False, np.zeros(len(self.joints))
         self._looked = 0  # when evidence was taken
         self.doubts.reset()
         self._clock.reset()
         self._torques.reset()
+        self._noise.reset()
         self._waiting.clear()
 
     @property
@@ -322,6 +330,9 @@ class Arm:
         self, stamp: int, q: Floats, torque: Floats, velocity: Floats | None
     ) -> ArmEstimate | None:
         """Bring the bank to a sample that can be used."""
+        if self._stands_still(stamp, q, velocity):
+            self.counters['standing still'] += 1
+            return None
         if self._last is not None and (stamp - self._last[0]) * 1e-9 > MAX_GAP:
             self.counters['restarts'] += 1
             self.reset()
@@ -337,9 +348,11 @@ class Arm:
             self.reset()
             return None
         self._torques.take(torque)
+        self._noise.take(q if velocity is None else velocity)
         if not self._started:
             speed = moved / h if velocity is None else velocity
-            spread = terms.mass * (2.0 * self._noise / (h * h if velocity is None else 1.0))
+            variance = 2.0 * self._noise.variance / (h * h if velocity is None else 1.0)
+            spread = terms.mass * variance
             self._bank.start(terms.mass @ speed, spread @ terms.mass.T, self._model_variance)
             self._started = True
             self._velocity = self._sliding = speed
@@ -350,14 +363,15 @@ class Arm:
             new, drives = self._drive(q, self._velocity, torque, self._sliding)
             # p times what is not known of the interval is noise, too.
             vague = self._clock.apart / h
-            measured, noise = momentum_of(terms.mass, new.mass, moved, self._noise, vague)
+            measured, noise = momentum_of(terms.mass, new.mass, moved, self._noise.variance, vague)
         else:
             new, drives = self._drive(q, velocity, torque, velocity)
-            measured, noise = momentum_of(new.mass, new.mass, velocity, self._noise, 0.0)
+            measured, noise = momentum_of(new.mass, new.mass, velocity, self._noise.variance, 0.0)
         drive += drives
         drive *= 0.5
         self._bank.step(h, measured, drive, noise, self._torques.variance, new.reach)
         self._last = stamp, q, new, drives
+        self._momentum = measured / h if velocity is None else measured
         bank = self._bank
         self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
@@ -377,6 +391,18 @@ class Arm:
             stamp, q, self._velocity, torques, covariance, odds,
             self._contact, link,
         )  # fmt: skip
+
+    def _stands_still(self, stamp: int, q: Floats, velocity: Floats | None) -> bool:
+        """Return True if all joints stand at once, to the bit, though the arm was in motion."""
+        if self._last is None:
+            return False
+        before, old, terms, _ = self._last
+        momentum = self._momentum if velocity is None else terms.mass @ velocity
+        most = self._stopping * (stamp - before) * 1e-9
+        self._still = np.array_equal(q, old) and (
+            self._still or bool(np.any(np.abs(momentum) > most))
+        )
+        return self._still
 
     def _drive(
         self, q: Floats, velocity: Floats, torque: Floats, sliding: Floats

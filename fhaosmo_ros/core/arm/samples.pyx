@@ -21,10 +21,10 @@ cdef int LATE = 5, GONE = 500
 cdef int LEARNT = 20
 # By such a share of a period a stamp has to be late until a sample is taken as missing.
 cdef double MISSING = 0.7
-# Samples over which the noise of torques is averaged, at the start and later; an impact counts as
-# three standard deviations at most, and the variance falls to a hundredth at most.
+# Samples over which noise is averaged, at the start and later; an impact counts as three standard
+# deviations at most.
 cdef int FIRST_LEARNT = 10, LONGEST_LEARNT = 1000
-cdef double LARGEST = 9.0, SMALLEST = 0.01
+cdef double LARGEST = 9.0
 
 
 cdef class Limits:
@@ -79,28 +79,30 @@ cdef class Limits:
         return False
 
 
-cdef class TorqueNoise:
+cdef class Noise:
     """
-    The variance of the noise of torques: as it is told, or followed by their third differences.
+    The variance of the noise of samples, followed by their third differences.
 
     Parameters
     ----------
     size : (n,) array
-        Standard deviation, to begin with, N m.
+        Standard deviation, to begin with.
+    least : (n,) array
+        The smallest that it can become.
     follows : (n,) array of bool
-        Where nobody has told it.
+        Where it is followed, and not as it was told.
 
     """
 
-    cdef readonly object variance  # (n,), N^2 m^2
+    cdef readonly object variance  # (n,)
     cdef double[::1] now, least
     cdef double[:, ::1] before  # the three samples before
     cdef list follows
     cdef int seen, count
 
-    def __init__(self, size, follows):
+    def __init__(self, size, least, follows):
         self.variance = np.asarray(size, dtype=np.float64) ** 2
-        self.now, self.least = self.variance, SMALLEST * self.variance
+        self.now, self.least = self.variance, np.asarray(least, dtype=np.float64) ** 2
         self.before, self.follows = np.zeros((3, len(size))), list(follows)
         self.seen, self.count = 0, FIRST_LEARNT
 
@@ -108,7 +110,7 @@ cdef class TorqueNoise:
         """Take the next sample as the first one."""
         self.seen = 0
 
-    def take(self, const double[::1] torque):
+    def take(self, const double[::1] sample):
         """Take a sample."""
         cdef double[:, ::1] b = self.before
         cdef double change, square
@@ -118,12 +120,12 @@ cdef class TorqueNoise:
             self.count = min(self.count + 1, LONGEST_LEARNT)
         for k in range(b.shape[1]):
             if known and self.follows[k]:
-                change = torque[k] - 3.0 * (b[2, k] - b[1, k]) - b[0, k]
+                change = sample[k] - 3.0 * (b[2, k] - b[1, k]) - b[0, k]
                 square = fmin(change * change / 20.0, LARGEST * self.now[k])  # 1 + 9 + 9 + 1
                 self.now[k] = fmax(
                     self.now[k] + (square - self.now[k]) / self.count, self.least[k]
                 )
-            b[0, k], b[1, k], b[2, k] = b[1, k], b[2, k], torque[k]
+            b[0, k], b[1, k], b[2, k] = b[1, k], b[2, k], sample[k]
         self.seen = min(self.seen + 1, 3)
 
 

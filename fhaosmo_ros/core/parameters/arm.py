@@ -28,10 +28,12 @@ ARM = (
     Parameter('calibration_file', '', 'YAML file of `calibrate`; empty: the model as it is.',
               live=False),
     Parameter('position_noise', [2e-5],
-              'Standard deviation of the noise of a position: a step of the encoder over the root '
-              'of 12. Say rather twice than half of it. That of calibration_file wins.',
+              'Standard deviation of the noise of a position, at least: a step of the encoder '
+              'over the root of 12. More is found while the node runs. That of calibration_file '
+              'wins.',
               unit='rad', lower=1e-9, upper=1.0, live=False, lengths='1 or n'),
-    Parameter('velocity_noise', [1e-3], 'Standard deviation of the noise of a velocity.',
+    Parameter('velocity_noise', [1e-3],
+              'Standard deviation of the noise of a velocity, at least; more is found.',
               unit='rad/s', lower=1e-9, upper=100.0, live=False, lengths='1 or n'),
     Parameter('torque_noise', [0.0],
               'Standard deviation of the noise of a torque, from sample to sample; 0: it is '
