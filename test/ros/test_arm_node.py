@@ -165,7 +165,7 @@ def test_stamps_of_zero_and_a_second_robot_are_refused(limb):
 
 
 def test_tare_reset_and_payload(limb, user):
-    for k in range(1201, 1500):
+    for k in range(1202, 1500):
         limb.estimate(k, push=1.0)
     answer = user.call(f'{NODE}/tare', Trigger, Trigger.Request())
     assert answer.success, answer.message
