@@ -34,19 +34,18 @@ OBSERVER = (
               'Estimate d as one more level (N = n + 1). Without it N = n, and d is the '
               'internal state theta of level n.', live=False),
     Parameter('unknown_input_derivatives', 0,
-              'Number k of derivatives of d that are estimated, too, as further levels (N = n + '
-              '1 + k): a smooth d is followed with less lag, and noise disturbs more. Needs '
-              'unknown_input.', lower=0, upper=3, live=False),
+              'Number k of derivatives of d that are estimated as further levels (N = n + 1 + '
+              'k): less lag behind a smooth d, and more noise. Needs unknown_input.', lower=0,
+              upper=3, live=False),
     Parameter('unknown_input_decay', 0.0,
-              "Rate kappa of the model d' = -kappa d + what the innovations say; 0 assumes "
-              'nothing. Greater where d varies around 0: less noise in the estimate, which is '
-              'too small where d stays. Explicit: below 2 / dt.', unit='1/s', lower=0.0,
-              upper=1e3),
+              "Rate kappa of the model d' = -kappa d + what the innovations say. Greater where "
+              'd varies around 0: less noise in the estimate, which is too small where d stays. '
+              'Explicit: below 2 / dt.', unit='1/s', lower=0.0, upper=1e3),
     Parameter('gains', 'fixed',
-              'fixed: those below; their defaults are for the default phi. self_tuning: many '
-              'observers, weighted by how well they predict y, find and follow noise, size and '
-              'speed of d. Of the parameters from structure to gamma_leakage it uses '
-              'prediction_step alone.', choices=('fixed', 'self_tuning'), live=False),
+              'fixed: those below; their defaults are for the default phi. self_tuning: noise, '
+              'size and speed of d are found and followed (docs/self_tuning.md). Of the '
+              'parameters from structure to gamma_leakage it uses prediction_step alone.',
+              choices=('fixed', 'self_tuning'), live=False),
     Parameter('bandwidth', 1.0,
               'self_tuning: factor on the bandwidth that it would choose. Higher: quicker and '
               'noisier.', lower=0.1, upper=10.0),
@@ -72,13 +71,13 @@ OBSERVER = (
               lower=0.0, upper=1e12),
     Parameter('correction_period', 0.0,
               'predict_correct: a sample corrects as if it stood for at most this time, usually '
-              'the sampling period, so that after a gap it weighs no more than any other. 0: '
-              'for all the time since the one before.', unit='s', lower=0.0, upper=10.0),
+              'the sampling period, however long the gap before it. 0: for all the time since '
+              'the one before.', unit='s', lower=0.0, upper=10.0),
     Parameter('noise_size', 0.0,
               'Standard deviation of the noise on y; 0: not known. With it cascade starts as a '
-              'Kalman filter does. predict_correct, with correction_period set, too, has the '
-              'gains of a Kalman filter at the start and at other rates, rejects unlikely '
-              'samples, and takes y that stays unlikely for lost.', lower=0.0, upper=1e12),
+              'Kalman filter does. predict_correct with correction_period has the gains of a '
+              'Kalman filter at the start and at other rates, rejects unlikely samples, and '
+              'notices that y is lost.', lower=0.0, upper=1e12),
     Parameter('state_sizes', [0.0],
               'RMS of z_1 .. z_n in usual operation: how far off a fresh observer may be. Used '
               'with noise_size. 0: what size and rate of d make of them.', lower=0.0, upper=1e100,
@@ -90,8 +89,8 @@ OBSERVER = (
               unit='1/s', lower=1e-6, upper=1e6),
     Parameter('lambda', [1.4, 7.2, 6.4, 2.0],
               'Gains lambda_i of the injection |eps_i|^gamma psi_i(eps_i); levant: |eps_1|^(2 '
-              'gamma (N - i) / N) psi_i(eps_1).', lower=0.0, lower_open=True, upper=1e30,
-              lengths=PER_LEVEL),
+              'gamma (N - i) / N) psi_i(eps_1). Higher: quicker and noisier.', lower=0.0,
+              lower_open=True, upper=1e30, lengths=PER_LEVEL),
     Parameter('alpha', [2.1, 5.3, 0.9, 0.0014],
               'Gains alpha_i of the internal states; levant has none.', lower=0.0,
               lower_open=True, upper=1e30, lengths=PER_LEVEL),
@@ -105,8 +104,7 @@ OBSERVER = (
               lengths='1 to N; the last one serves later levels'),
     Parameter('fuzzy_systems', ['terms 5', 'terms 7'],
               'The fuzzy systems of levels 1, 2, ...: membership functions, rules and '
-              'defuzzifier, or a sampled curve (docs/mathematics.md, Fuzzy curves). A curve '
-              'that is not odd, falls, or stays 0 is refused.',
+              'defuzzifier, or a sampled curve (docs/mathematics.md, Fuzzy curves).',
               lengths='1 to N; the last one serves later levels'),
     Parameter('gamma_initial', 0.95, 'Power gamma at the start of an adaptive variant.', lower=0.0,
               lower_open=True, upper=1.0),
@@ -132,8 +130,7 @@ OBSERVER = (
               'Start z_hat_1 at the first sample of y instead of at initial_estimate[0].'),
     Parameter('estimate_from', 'internal',
               'What is published as z_2 .. z_n and d: internal (z_tilde, no lag) or filtered '
-              '(z_hat, smoother). The same for levant, which has only z_hat.',
-              choices=('internal', 'filtered')),
+              '(z_hat, smoother; levant has only this).', choices=('internal', 'filtered')),
 )  # fmt: skip
 
 SAMPLING = (
@@ -146,8 +143,8 @@ SAMPLING = (
     Parameter('max_gap', 0.0,
               'A longer time between two usable samples, or a stamp further back, restarts the '
               'observer once a second sample confirms it; a shorter gap is bridged by the '
-              'model. 0: the time of 500 samples; the node says that y is silent after 0.5 s, '
-              'or 5 samples.', unit='s', lower=0.0, upper=1e6),
+              'model. 0: the time of 500 samples, but y counts as silent after 0.5 s, or 5 '
+              'samples.', unit='s', lower=0.0, upper=1e6),
     Parameter('spike_gate', 0.0,
               "A sample further than this from the model's prediction is rejected (unit of y). "
               'After five in a row it is a step of y, and believed. 0: no gate.', lower=0.0,
@@ -223,41 +220,36 @@ INPUT = (
               'The numbers in their messages, as input_field; also of the message of y.',
               live=False, lengths='1 (for all) or one each'),
     Parameter('known_input_stamps', ['reception'],
-              'From when on each holds. reception: from its arrival; one of the message of y is '
-              'that of its sample. header: a sample gets the newest one whose header stamp is '
-              'not after its own, whatever arrived first; y is then read with that of its '
-              'header, too.', choices=('reception', 'header'), live=False,
-              lengths='1 (for all) or one each'),
+              'reception: an input holds from its arrival; one of the message of y is that of '
+              'its sample. header: a sample gets the newest one whose header stamp is not after '
+              'its own; y is then read with that of its header, too.',
+              choices=('reception', 'header'), live=False, lengths='1 (for all) or one each'),
     Parameter('known_input_wait', 0.0,
-              'How long, by the stamps of y, a sample waits for inputs with known_input_stamps '
-              '= header, until each has come with its stamp or a later one. If that is enough, '
-              'estimates do not depend on the order of arrival. For inputs that come about as '
-              'often as y.', unit='s', lower=0.0, upper=10.0, live=False),
+              'How long, by the stamps of y, a sample waits until each input with '
+              'known_input_stamps = header has come with its stamp or a later one. Then the '
+              'order of arrival does not matter. For inputs that come about as often as y.',
+              unit='s', lower=0.0, upper=10.0, live=False),
 )  # fmt: skip
 
 CHANNEL_OUTPUT = (
     Parameter('measurement_unit', '',
               'Unit of y, such as rad; those of the states and of d follow from it. Shown in '
-              'diagnostics, descriptors and figures; nothing is converted.'),
+              'diagnostics and figures; nothing is converted.'),
     Parameter('unknown_input_scale', 1.0,
               'What one unit of d stands for in ~/joint_states (effort) and ~/wrench: the mass '
               'or inertia.', lower=-1e12, upper=1e12),
     Parameter('unknown_input_unit', '',
               'Unit of d times unknown_input_scale, such as N m. Shown in diagnostics.'),
-    Parameter('output_axis', 'linear.x',
-              'Axis of ~/wrench and ~/accel that d is written to: linear for a force or '
-              'acceleration, angular for a torque or angular acceleration.',
+    Parameter('output_axis', 'linear.x', 'Axis of ~/wrench and ~/accel that d is written to.',
               choices=('linear.x', 'linear.y', 'linear.z', 'angular.x', 'angular.y', 'angular.z'),
               live=False),
 )  # fmt: skip
 
 ESTIMATOR_NODE = (
     Parameter('channels', [''],
-              'Names of the outputs that one process estimates from. Channel hip reads hip/y, '
-              'publishes ~/hip/state and so on, and takes each parameter but those of node and '
-              "diagnostics from hip.NAME where that is set, else from NAME. ['']: one channel, "
-              'no prefix. from_joint_names: one for each joint of the first JointState on '
-              'input_topic.', live=False, lengths='any'),
+              'Names of the outputs that one process estimates from (docs/node.md, Many '
+              "channels). ['']: one, without prefix. from_joint_names: one for each joint of "
+              'the first JointState on input_topic.', live=False, lengths='any'),
     Parameter('max_channels', 64,
               'Most channels that from_joint_names makes; further joints are left out.', lower=1,
               upper=10_000, live=False),
@@ -276,11 +268,11 @@ ESTIMATOR_NODE = (
               choices=('none', 'joint_states', 'wrench', 'accel'), live=False, lengths='any'),
     Parameter('frame_id', '', 'frame_id of these messages.', live=False),
     Parameter('input_reliability', 'best_effort',
-              'QoS of the subscriptions of y and u. best_effort hears every publisher; reliable '
-              'hears reliable ones only, and has lost samples sent again.',
-              choices=('best_effort', 'reliable'), live=False),
+              'QoS of y and u. best_effort hears every publisher; reliable hears reliable ones '
+              'only, and has lost samples sent again.', choices=('best_effort', 'reliable'),
+              live=False),
     Parameter('input_durability', 'volatile',
-              'QoS of the same. transient_local also hears what was published before, of '
+              'QoS of y and u. transient_local also hears what was published before, of '
               'transient_local publishers only.', choices=('volatile', 'transient_local'),
               live=False),
     Parameter('input_depth', 1000,
