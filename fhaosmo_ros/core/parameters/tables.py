@@ -11,7 +11,7 @@ from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
 MAX_ORDER = 12
 CONSTANTS = 'constants.'
 """Begin of the names of constants in expressions."""
-PER_LEVEL = '1 (for all) or N'
+PER_LEVEL = '1 or N'
 
 MODEL = (
     Parameter('order', 3, 'Number n of states of the model.', lower=1, upper=MAX_ORDER,
@@ -35,8 +35,8 @@ OBSERVER = (
               'internal state theta of level n.', live=False),
     Parameter('unknown_input_derivatives', 0,
               'Number k of derivatives of d that are estimated as further levels (N = n + 1 + '
-              'k): less lag behind a smooth d, and more noise. Needs unknown_input.', lower=0,
-              upper=3, live=False),
+              'k): less lag behind a smooth d, and more noise; 0 suits a d that jumps. Needs '
+              'unknown_input.', lower=0, upper=3, live=False),
     Parameter('unknown_input_decay', 0.0,
               "Rate kappa of the model d' = -kappa d + what the innovations say. Greater where "
               'd varies around 0: less noise in the estimate, which is too small where d stays. '
@@ -74,14 +74,14 @@ OBSERVER = (
               'the sampling period, however long the gap before it. 0: for all the time since '
               'the one before.', unit='s', lower=0.0, upper=10.0),
     Parameter('noise_size', 0.0,
-              'Standard deviation of the noise on y; 0: not known. With it cascade starts as a '
-              'Kalman filter does. predict_correct with correction_period has the gains of a '
-              'Kalman filter at the start and at other rates, rejects unlikely samples, and '
+              'Standard deviation of the noise on y; 0: not known. With it cascade, or '
+              'predict_correct with correction_period, starts as a Kalman filter does; '
+              'predict_correct then also follows other rates, rejects unlikely samples, and '
               'notices that y is lost.', lower=0.0, upper=1e12),
     Parameter('state_sizes', [0.0],
               'RMS of z_1 .. z_n in usual operation: how far off a fresh observer may be. Used '
               'with noise_size. 0: what size and rate of d make of them.', lower=0.0, upper=1e100,
-              lengths='1 (for all) or n'),
+              lengths='1 or n'),
     Parameter('unknown_input_size', 1.0, 'RMS of d in usual operation. Used with noise_size.',
               lower=1e-12, upper=1e12),
     Parameter('unknown_input_rate', 1.0,
@@ -142,20 +142,18 @@ SAMPLING = (
               lower=1e-6, upper=10.0),
     Parameter('max_gap', 0.0,
               'A longer time between two usable samples, or a stamp further back, restarts the '
-              'observer once a second sample confirms it; a shorter gap is bridged by the '
-              'model. 0: the time of 500 samples, but y counts as silent after 0.5 s, or 5 '
-              'samples.', unit='s', lower=0.0, upper=1e6),
+              'observer; a shorter gap is bridged (docs/node.md, Time). 0: the time of 500 '
+              'samples, but y counts as silent after 0.5 s, or 5 samples.', unit='s', lower=0.0,
+              upper=1e6),
     Parameter('spike_gate', 0.0,
-              "A sample further than this from the model's prediction is rejected (unit of y). "
-              'After five in a row it is a step of y, and believed. 0: no gate.', lower=0.0,
-              upper=1e12),
+              'A sample further than this from its prediction is rejected (unit of y), five in '
+              'a row at most. 0: no gate.', lower=0.0, upper=1e12),
     Parameter('stuck_time', 0.0,
               'Samples are rejected while y has not changed at all for longer than this. 0: '
               'never.', unit='s', lower=0.0, upper=3600.0),
     Parameter('divergence_time', 1.0,
-              '|eps_1| above epsilon, or steps that leave the finite numbers, for longer than '
-              'this: y is lost, and the observer starts afresh from it. 0: never.', unit='s',
-              lower=0.0, upper=3600.0),
+              '|eps_1| above epsilon, or steps that fail, for longer than this: y is lost, and '
+              'the observer starts afresh. 0: never.', unit='s', lower=0.0, upper=3600.0),
     Parameter('divergence_limit', 1e60,
               'A larger sample is rejected, and an observer with a larger state starts afresh '
               'from y.', lower=1.0, upper=1e100),
@@ -203,10 +201,9 @@ INPUT = (
               'std_msgs/msg/Float64 where input_topic and input_field are not set either.',
               live=False),
     Parameter('input_field', '',
-              'The number in its messages that is y: angular_velocity.z, position[0], '
-              'position[elbow] (by name), pose.pose.orientation.yaw. In a channel, a list '
-              "without index means the element with the channel's name. '': the only number, or "
-              'data; position of a JointState in a channel.', live=False),
+              'The number in its messages that is y, such as position[elbow] or '
+              "angular_velocity.z (docs/node.md, Any message). '': the only number, or data; "
+              'position of a JointState in a channel.', live=False),
     Parameter('input_stamp', 'auto',
               'Which stamp is the time of a sample: header (when it was measured), source (when '
               'published), reception (when it arrived here). auto: header where there is one, '
@@ -296,9 +293,8 @@ DIAGNOSTICS = (
 
 PLANT_MODEL = (
     Parameter('initial_state', [0.2], 'States z_1 .. z_n at the start.', lower=-1e12, upper=1e12,
-              live=False, lengths='1 (for all) or n'),
-    Parameter('integration_step', 1e-4,
-              'Step of the Runge-Kutta integration, independent of sample_rate.', unit='s',
+              live=False, lengths='1 or n'),
+    Parameter('integration_step', 1e-4, 'Step of the Runge-Kutta integration.', unit='s',
               lower=1e-6, upper=0.1, live=False),
     Parameter('disturbance', 'sine',
               'The unknown input d(t): none (0), sine (amplitude sin(omega t) + offset), step '
