@@ -19,7 +19,7 @@ ARM = (
               choices=('torque', 'current', 'gravity_compensated'), live=False),
     Parameter('torque_constants', [1.0],
               'Joint torque for one unit of effort; those of calibration_file count where this is '
-              '1.', lower=-1e6, upper=1e6, live=False, lengths='1 (used for every joint) or n'),
+              '1.', lower=-1e6, upper=1e6, live=False, lengths='1 or n'),
     Parameter('torque_delay', 0.0, 'Time by which effort is older than the positions beside it.',
               unit='s', lower=0.0, upper=0.1, live=False),
     Parameter('payload', [0.0, 0.0, 0.0, 0.0],
