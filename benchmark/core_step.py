@@ -70,11 +70,11 @@ def output(count: int) -> np.ndarray:
 def in_core(parameters: dict[str, Any], y: np.ndarray) -> Run:
     """Return a callable that steps through y[1:] by the loop behind `Observer.run`."""
     observer, rest = _started(parameters, y[0]), np.ascontiguousarray(y[1:])
-    start, count = observer.state, len(rest)
+    start, count = observer.structure.state_dict(), len(rest)
     h, u = np.full(count, PERIOD), np.zeros((count, 1))
 
     def run() -> np.ndarray:
-        observer.restore(start)
+        observer.structure.load_state_dict(start)
         run_structure(observer.structure, rest, h, u, 0, count)
         return _numbers(observer)
 

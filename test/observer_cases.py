@@ -62,16 +62,20 @@ def concatenated(runs):
 
 def levels_of(observer):
     """Return rows z_hat, z_tilde, p and q of all levels, a copy."""
-    values = observer.state.values
+    values = observer.structure.state_dict()
     return np.array([values[name] for name in ('z_hat', 'z_tilde', 'p', 'q')])
 
 
 def remembered(observer, name):
-    return observer.state.values[name]
+    return observer.structure.state_dict()[name]
+
+
+def state_of(observer):
+    """Return all that an observer remembers."""
+    return observer.structure.state_dict() | {'t': observer._t}
 
 
 def assert_same_state(one, other):
-    assert one.values.keys() == other.values.keys()
-    for name, value in one.values.items():
-        np.testing.assert_array_equal(value, other.values[name])
-    np.testing.assert_equal(one.t, other.t)
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, other[name])

@@ -140,7 +140,7 @@ def test_fixed_parameter_says_that_it_is_fixed(name):
     other = {
         'order': 3, 'phi': ['0', '0'], 'unknown_input': False, 'unknown_input_derivatives': 2,
         'inputs': ['v'], 'measurement_delay': 0.1, 'input_delay': 0.1, 'smoothing_lag': 0.1,
-        'gains': 'self_tuning',
+        'gains': 'self_tuning', 'structure': 'levant',
     }[name]  # fmt: skip
     with pytest.raises(ConfigurationError, match=f"'{name}': can't change in a running observer"):
         estimator.prepare({name: other, 'max_gap': 1.0})

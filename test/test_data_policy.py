@@ -230,7 +230,7 @@ def test_seed_in_the_middle_takes_derivatives_of_the_unknown_input_for_zero(stru
     feed.sine(100)
     feed.estimator.seed([0.2, 1.0, 2.0], 3.0)
     assert feed.numbers == [0.2, 1.0, 2.0, 3.0]
-    values = feed.estimator.observer.state.values
+    values = feed.estimator.observer.structure.state_dict()
     np.testing.assert_array_equal(values['z_hat'], [0.2, 1.0, 2.0, 3.0, 0.0, 0.0])
     np.testing.assert_array_equal(values['z_tilde'], [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
     assert not any(w.rejected for w in feed.sine(10))
@@ -275,7 +275,7 @@ def test_parameters_and_a_reset_seed_the_start(from_measurement):
     feed.estimator.reset()
     feed(0.7)
     assert feed.numbers == [0.7 if from_measurement else 0.5, 1.0, 2.0, 3.0]
-    assert feed.estimator.observer.state.values['z_hat'][0] == feed.numbers[0]
+    assert feed.estimator.observer.structure.state_dict()['z_hat'][0] == feed.numbers[0]
 
 
 def test_reset_keeps_counters_and_forgets_the_rest():

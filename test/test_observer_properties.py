@@ -13,7 +13,8 @@ from observer_cases import (
     remembered,
     samples,
     SMALL,
-)  # fmt: skip
+    state_of,
+)
 import pytest
 
 
@@ -26,7 +27,7 @@ def test_split_run_equals_whole_run(law, a, b):
     parts = concatenated(split.run(t[cut], y[cut], u[cut]) for cut in cuts)
     for name, got, wanted in zip(expected._fields, parts, expected, strict=True):
         np.testing.assert_array_equal(got, wanted, err_msg=name)
-    assert_same_state(split.state, whole.state)
+    assert_same_state(state_of(split), state_of(whole))
 
 
 @laws
@@ -52,8 +53,8 @@ def test_steps_equal_a_run(law):
 def test_snapshot_is_a_copy():
     observer = Observer(SMALL)
     observer.run(*samples())
-    snapshot = observer.state
-    snapshot.values['z_hat'][:] = 7.0
+    snapshot = state_of(observer)
+    snapshot['z_hat'][:] = 7.0
     assert not np.any(remembered(observer, 'z_hat') == 7.0)
     estimate = observer.step(0.1, 1e-3, 0.0)
     z, innovation = estimate.z.copy(), estimate.innovation.copy()
@@ -65,10 +66,10 @@ def test_snapshot_is_a_copy():
 def test_snapshot_of_another_variant_gives_a_power_that_fits():
     adaptive = Observer(SMALL | {'variant': 'fuzzy_adaptive', 'gamma_initial': 0.7})
     sign = Observer(SMALL | {'variant': 'sign'})
-    sign.restore(adaptive.state)
+    sign.structure.load_state_dict(state_of(adaptive))
     assert remembered(sign, 'gamma') == 0.5
     narrow = Observer(SMALL | {'variant': 'fuzzy_adaptive', 'gamma_max': 0.6})
-    narrow.restore(adaptive.state)
+    narrow.structure.load_state_dict(state_of(adaptive))
     assert remembered(narrow, 'gamma') == 0.6
 
 
@@ -76,7 +77,7 @@ def test_reset_equals_a_new_observer():
     observer = Observer(SMALL)
     observer.run(*samples())
     observer.reset()
-    assert_same_state(observer.state, Observer(SMALL).state)
+    assert_same_state(state_of(observer), state_of(Observer(SMALL)))
     assert not observer.started
 
 

@@ -475,7 +475,7 @@ def test_a_constant_changes_live():
     observer.run(t[:8000], y[:8000])
     observer.configure({'constants.b': 5.0})
     observer.run(t[8000:8001], y[8000:8001])
-    flow = observer.state.values['flow']
+    flow = observer.structure.state_dict()['flow']
     assert flow[1, 1] == pytest.approx(math.exp(-5.0 * PERIOD), rel=1e-9)
     run = observer.run(t[8001:], y[8001:])
     assert rms((run.unknown_input - d[8001:])[4000:]) < 0.02 * rms(d)
@@ -523,12 +523,12 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
     y = z[:, 0] + 1e-3 * np.where(t < 0.3, noise, 0.3 * noise)
     observer = Observer(SELF_TUNING)
     observer.run(t[:300], y[:300])
-    values = observer.state.values
+    values = observer.structure.state_dict()
     moving, kappa, (x, covariances) = int(values['moving']), values['kappa'], members_of(values)
     samples, periods = y[300:315], [stretch * PERIOD] * 15
     for measured, h in zip(samples, periods, strict=True):
         observer.step(measured, h)
-    after_x, after_covariances = members_of(observer.state.values)
+    after_x, after_covariances = members_of(observer.structure.state_dict())
     derivatives = np.tile(np.repeat(np.arange(4), 2), 30)
     for k in range(4):
         scores = np.where((np.arange(240) < 120) & (k == derivatives), values['score'], -np.inf)
@@ -600,6 +600,6 @@ def test_outliers_do_not_hide_the_quanta():
         y[k : k + 15] += 0.0224 * (-1) ** k
     observer = Observer(MOTOR)
     run = observer.run(t, y)
-    assert observer.state.values['quantum'] == pytest.approx(1.5e-3, rel=1e-6)
-    assert observer.state.values['lattice'] > 0.9
+    assert observer.structure.state_dict()['quantum'] == pytest.approx(1.5e-3, rel=1e-6)
+    assert observer.structure.state_dict()['lattice'] > 0.9
     assert rms((run.unknown_input - d)[5000:]) < 1.5 * expected

@@ -28,7 +28,7 @@ def test_labels_name_what_stands_there():
     entries = dict(zip(labels, vector.tolist(), strict=True))
     assert len(entries) == len(vector)  # no name twice
     assert labels[0] == 'version'
-    state = estimator.observer.state.values
+    state = estimator.observer.structure.state_dict()
     assert entries['z_hat2'] == state['z_hat'][1]
     assert entries['z_tilde1'] == state['z_tilde'][0]
     assert entries['gamma'] == estimator.estimate.gamma

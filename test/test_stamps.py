@@ -3,7 +3,7 @@
 
 from fhaosmo_ros.core import ConfigurationError, Observer
 import numpy as np
-from observer_cases import assert_same_state, laws, samples, SMALL
+from observer_cases import assert_same_state, laws, samples, SMALL, state_of
 import pytest
 
 
@@ -11,11 +11,11 @@ import pytest
 def test_times_that_do_not_increase_are_refused(bad):
     observer = Observer(SMALL)
     observer.run([0.0, 0.001], [0.1, 0.1], 0.0)
-    before = observer.state
+    before = state_of(observer)
     for t in ([0.002, bad, 0.003], [bad, 0.002, 0.003]):
         with pytest.raises(ConfigurationError, match=r'increase, got t\[[01]\] = '):
             observer.run(t, [0.1, 0.2, 0.3], 0.0)
-    assert_same_state(observer.state, before)
+    assert_same_state(state_of(observer), before)
 
 
 @laws
@@ -45,7 +45,7 @@ def test_nanoseconds_stay_exact_at_a_large_epoch(law, epoch, kind):
 
 def test_arrays_that_do_not_fit_are_refused():
     observer = Observer(SMALL)
-    before = observer.state
+    before = state_of(observer)
     for arguments in (
         ([0.0, 1.0], [0.0]),
         ([[0.0, 1.0]], [[0.0, 1.0]]),
@@ -54,13 +54,13 @@ def test_arrays_that_do_not_fit_are_refused():
     ):
         with pytest.raises(ConfigurationError, match='expected'):
             observer.run(*arguments)
-    assert_same_state(observer.state, before)
+    assert_same_state(state_of(observer), before)
 
 
 def test_empty_run_changes_nothing():
     observer = Observer(SMALL)
     assert observer.run([], [], 0.0).z.shape == (0, 2)
     observer.run(*samples())
-    before = observer.state
+    before = state_of(observer)
     assert observer.run([], [], 0.0).z.shape == (0, 2)
-    assert_same_state(observer.state, before)
+    assert_same_state(state_of(observer), before)

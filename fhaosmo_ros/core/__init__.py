@@ -3,7 +3,7 @@
 
 from fhaosmo_ros.core.model.function import Function
 from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.observer.estimates import Estimate, ObserverState, Trajectory
+from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.counters import Counters
@@ -22,7 +22,6 @@ __all__ = [
     'Family',
     'Function',
     'Observer',
-    'ObserverState',
     'OnlineEstimator',
     'Plant',
     'Recording',

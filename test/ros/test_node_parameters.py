@@ -26,7 +26,6 @@ READ_ONLY = {
 }
 OTHER = {
     'gamma_max': {'gamma_max': 0.97},
-    'structure': {'structure': 'levant', 'scheme': 'predict_correct'},
     'scheme': {'scheme': 'explicit'},
     'sampling': {'sampling': 'nominal'},
     'fuzzy_systems': {'fuzzy_systems': ['curve 0 0.8 1']},

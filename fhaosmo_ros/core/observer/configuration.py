@@ -58,7 +58,7 @@ class ObserverConfiguration:
         What gains that follow the covariance P are computed from (D 20); None where they are
         always the tuned ones.
     steady : (N, N) array
-        P of the predictions once it is steady; with levant and a schedule only.
+        P of the predictions once it is steady; with levant and a schedule, else (0, 0).
     tuned_over_kalman : (N,) array
         The tuned corrections of a small innovation over those of the Kalman filter; likewise.
     next_sizes : (N,) array
@@ -78,7 +78,6 @@ class ObserverConfiguration:
     widths: Floats
     decays: Floats
     curves: Floats
-    steady: Floats
     tuned_over_kalman: Floats
     next_sizes: Floats
 
@@ -92,6 +91,7 @@ class ObserverConfiguration:
             )
         self.self_tuning = p['gains'] == 'self_tuning'
         self.schedule: Uncertainty | None = None
+        self.steady = np.zeros((0, 0))
         sizes = OBSERVER_PARAMETERS['state_sizes']
         self.state_sizes = per_level(sizes, p['state_sizes'], self.model.order)
         self.prediction_step = p['prediction_step'] or usual_step(self.model)
@@ -116,6 +116,18 @@ class ObserverConfiguration:
 
         """
         return ObserverConfiguration(self.parameters.changed_live(changes, 'observer'))
+
+    def forgotten(self, before: 'ObserverConfiguration') -> dict[str, float]:
+        """Return what an observer forgets that goes on from a snapshot of one with `before`."""
+        if self.self_tuning:
+            same = self.expressions.source == before.expressions.source
+            if same and self.prediction_step == before.prediction_step:
+                return {}
+            return {'flow_period': 0.0, 'unsettled': 0.0}  # members know another model (D 27)
+        same = (self.schedule is None) == (before.schedule is None)
+        if same and np.array_equal(self.steady, before.steady):
+            return {}
+        return {'settled': 1.0}  # P is of other sizes, or there is none
 
     def _complete_self_tuning(self) -> None:
         if not self.parameters['unknown_input']:

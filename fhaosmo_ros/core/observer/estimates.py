@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the observer gives: after a sample, of a run, and all that it remembers."""
+"""What the observer gives: after a sample, and of a run."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.observer.structure import Estimate as Estimate
@@ -96,21 +94,3 @@ class Trajectory(NamedTuple):
     def rows(self, index: Any) -> 'Trajectory':
         """Return those of its rows that an index of NumPy picks."""
         return Trajectory._make(column[index] for column in self)
-
-
-@dataclass(frozen=True)
-class ObserverState:
-    """
-    All that an observer remembers; a copy, safe to keep.
-
-    Attributes
-    ----------
-    values : mapping
-        Numbers and arrays by name; see `Structure.state_dict`.
-    t : float or int or None
-        Time of the last sample of `Observer.run`, in its unit (s, or ns for integers).
-
-    """
-
-    values: Mapping[str, Any]
-    t: float | int | None = None

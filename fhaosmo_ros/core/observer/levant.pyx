@@ -23,7 +23,7 @@ from fhaosmo_ros.core.observer.kalman cimport Row, fill
 from fhaosmo_ros.core.observer.sliding_mode cimport (
     LONG_AGO, NEWTON_STEPS, NEWTON_TOLERANCE, TINY, SlidingMode, doubt_of_noise, psi
 )
-from fhaosmo_ros.core.observer.structure cimport GATE, Memory, Structure, has_drifted
+from fhaosmo_ros.core.observer.structure cimport GATE, Memory, has_drifted
 
 from fhaosmo_ros.core.observer.configuration import deadbeat_shares
 
@@ -114,21 +114,6 @@ cdef class Levant(SlidingMode):
         memory.saturated = memory.beyond = memory.offset = memory.watched = 0.0
         memory.drift = memory.one_sided = 0.0
         memory.scale = 1.0
-
-    def take_over(self, Structure before):
-        """Go on with the state of an observer that has other live parameters."""
-        cdef Levant other
-        cdef int i, j
-        cdef bint same = isinstance(before, Levant)
-        SlidingMode.take_over(self, before)
-        if same:
-            other = before
-            same = self.scheduled == other.scheduled
-            for i in range(self.levels):
-                for j in range(self.levels):
-                    same = same and self.steady[i][j] == other.steady[i][j]
-        if not same:  # P is of other sizes
-            self.memory.settled = 1.0
 
     cdef void follow(self, double y, double h, const double* u) noexcept nogil:
         """Advance `trial` by the scheme."""

@@ -11,7 +11,7 @@ from fhaosmo_ros.core.model.inputs import known_inputs, samples_of_run
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.cascade import Cascade
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
-from fhaosmo_ros.core.observer.estimates import Estimate, ObserverState, Trajectory, Tuning
+from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, Tuning
 from fhaosmo_ros.core.observer.levant import Levant
 from fhaosmo_ros.core.observer.record import run
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -185,24 +185,6 @@ class Observer:
         """True once a sample has arrived."""
         return bool(self.structure.started)
 
-    @property
-    def state(self) -> ObserverState:
-        """Snapshot of the state."""
-        return ObserverState(self.structure.state_dict(), self._t)
-
-    def restore(self, state: ObserverState) -> None:
-        """
-        Go back to a snapshot, of this observer or of another one of the same size.
-
-        Raises
-        ------
-        ConfigurationError
-            The snapshot is of another size, or has a number that can not be.
-
-        """
-        self.structure.load_state_dict(state.values)
-        self._t = state.t
-
     def prepare(self, changes: Mapping[str, Any]) -> ObserverConfiguration:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
         return self.configuration.changed(changes)
@@ -224,7 +206,8 @@ class Observer:
     def adopt(self, configuration: ObserverConfiguration) -> None:
         """Go on with a configuration that `prepare` has returned, from the next sample on."""
         structure = make_structure(configuration)
-        structure.take_over(self.structure)
+        remembered = self.structure.state_dict() | configuration.forgotten(self.configuration)
+        structure.load_state_dict(remembered)
         structure.word = self.structure.word
         self._use(structure)
 

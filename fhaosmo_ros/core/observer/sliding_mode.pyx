@@ -71,18 +71,6 @@ cdef class SlidingMode(Structure):
         self.memory.gamma, self.memory.pending = self.gamma_initial, 0.0
         self.memory.settled = 0.0 if self.scheduled else 1.0
 
-    def take_over(self, Structure before):
-        """Go on with the state of an observer that has other live parameters."""
-        cdef SlidingMode other = before
-        before.enter()
-        self.level, self.covariance, self.memory = before.level, before.covariance, before.memory
-        self.innovation = before.innovation
-        if self.scheduled != other.scheduled:  # there is no P
-            self.memory.settled = 1.0
-        if not other.sensitive or type(self) is not type(before):
-            self.forget_sensitivities()  # they were not carried along
-        self.fit()
-
     def load_state_dict(self, values):
         """Go on where an observer of the same size was; see `Structure.load_state_dict`."""
         Structure.load_state_dict(self, values)

@@ -420,24 +420,7 @@ cdef class SelfTuning(Structure):
         correct_states(m, sample.y)
         weigh(m, QUANTISED_FLOOR if quantised else FLOOR)
 
-    # Live changes, snapshots and copies
-
-    def take_over(self, Structure before not None):
-        """Go on with the state of an observer that has other live parameters."""
-        cdef SelfTuning other = before
-        before.enter()
-        self.level, self.memory, self.innovation = before.level, before.memory, before.innovation
-        memcpy(self.variances, other.variances, sizeof(self.variances))
-        self.y_jumped = other.y_jumped
-        self.members.shared = other.members.shared
-        of = other.places()
-        for name, (to, shape) in self.places().items():
-            memcpy(<void*><size_t>to, <void*><size_t>of[name][0], 8 * np.prod(shape))
-        source = self.configuration.expressions.source
-        if (source != before.configuration.expressions.source
-                or self.prediction.longest != before.prediction.longest):
-            # What members know of the model (D 27) is that of another one.
-            self.members.shared.flow_period = self.members.shared.unsettled = 0.0
+    # Snapshots and copies
 
     cdef dict places(self):
         """Return where the arrays lie: name -> (address, shape)."""
