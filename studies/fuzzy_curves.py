@@ -24,7 +24,7 @@ def main() -> None:
     for text in TEXTS:
         system = read_system(text)
         assert isinstance(system, FuzzySystem)
-        columns.append(inferred(text, system).tolist())
+        columns.append(inferred(system).tolist())
     with DEFAULT_CURVES.open('w', newline='') as file:
         table = csv.writer(file, lineterminator='\n')
         table.writerow(TEXTS)

@@ -24,6 +24,11 @@ cdef double MOST_SIGMAS = 3.0
 cdef int BISECTIONS = 60
 
 
+cdef struct Root:
+    double eps  # |eps| >= 0
+    double s  # psi(eps), or what the set-valued sign takes
+
+
 cdef class Cascade(SlidingMode):
     """The paper's observer: level i follows z_i by the super-twisting algorithm."""
 

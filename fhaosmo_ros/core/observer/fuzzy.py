@@ -37,8 +37,6 @@ SHAPES: dict[str, Callable[[Any], Any]] = {
 """Membership by the distance from a term's peak, in parts of that to its neighbour's."""
 SINGLETON = 'singleton'
 """Terms of the output may also be points."""
-DEFUZZIFIERS = ('centroid', 'bisector')
-"""Those of scikit-fuzzy whose result does not jump: mom, som and lom do."""
 MOST_TERMS = 99
 LEAST_GAP = 0.001
 """Between two peaks; about the spacing of the output universe."""
@@ -46,8 +44,8 @@ KNOTS = 193
 """Samples of a curve on [0, 1]: halves, thirds and quarters, where it has corners, are knots."""
 UNIVERSE = np.linspace(-1.0, 1.0, 2049)
 """Output universe; its grid holds every peak of 5 terms, and 0 and +-1 of 7."""
-ODD = 1e-6
-"""psi(x) + psi(-x) of an odd curve may differ from 0 by this; a smaller psi(1) is 0."""
+SMALL = 1e-6
+"""The grid of the output universe can not tell less; a smaller psi(1) is 0."""
 
 DEFAULT_CURVES = Path(__file__).with_name('fuzzy_curves.csv')
 """A column for each default system and shape, a row for each knot; see studies/fuzzy_curves.py."""
@@ -81,15 +79,12 @@ class FuzzySystem(NamedTuple):
     inputs, outputs : Terms
     rules : tuple of int
         Rule k maps input term k to output term rules[k]; both count from 0.
-    defuzzifier : str
-        One of `DEFUZZIFIERS`.
 
     """
 
     inputs: Terms
     outputs: Terms
     rules: tuple[int, ...]
-    defuzzifier: str
 
 
 def read_system(text: str) -> FuzzySystem | Curve:
@@ -101,18 +96,16 @@ def read_system(text: str) -> FuzzySystem | Curve:
     ``input [S] P``      those of the input alone
     ``output [S] P``     those of the output alone
     ``rules k1 k2 ..``   output term of each input term, counted from 1; default: 1 2 3 ..
-    ``defuzzify D``      centroid (default) or bisector
-    ``curve v0 v1 ..``   instead of all these: samples of psi
+    ``curve 0 v1 v2 ..`` instead of all these: evenly spaced samples of psi over [0, 1]
     ==================== ==========================================================================
 
     S is a shape, triangle where it is left out. P is the number of terms that divide [-1, 1]
-    evenly, or their peaks. Samples are evenly spaced, over [0, 1] if the first one is 0, else
-    over [-1, 1].
+    evenly, or their peaks. Peaks and rules are their own mirror images: psi is odd.
 
     Returns
     -------
     FuzzySystem, or array
-        Of the samples over [0, 1].
+        Of the samples.
 
     Raises
     ------
@@ -129,7 +122,10 @@ def read_system(text: str) -> FuzzySystem | Curve:
     if 'curve' in clauses:
         if len(clauses) > 1:
             raise _refused(text, 'curve by itself', ', '.join(clauses))
-        return _samples(text, _numbers(text, clauses['curve']))
+        samples = np.array(_numbers(text, clauses['curve']))
+        if len(samples) < 2 or samples[0] != 0.0:
+            raise _refused(text, '2 samples or more, the first one 0', shown(samples))
+        return samples
     if 'terms' in clauses and {'input', 'output'} <= clauses.keys():
         raise _refused(text, 'terms, or input and output', ', '.join(clauses))
     common = clauses.get('terms')
@@ -149,14 +145,14 @@ def read_system(text: str) -> FuzzySystem | Curve:
         allowed = f'{count} rules, each an output term from 1 to {most}'
         raise _refused(text, allowed, shown(numbers))
     rules = tuple(int(k) - 1 for k in numbers)
-    defuzzifier = ' '.join(clauses.get('defuzzify', DEFUZZIFIERS[:1]))
-    known = DEFUZZIFIERS[:1] if outputs.shape == SINGLETON else DEFUZZIFIERS
-    if defuzzifier not in known:
-        raise _refused(text, f'defuzzify {" or ".join(known)}', repr(defuzzifier))
-    return FuzzySystem(inputs, outputs, rules, defuzzifier)
+    for what, row in ('peaks', inputs.peaks), ('peaks', outputs.peaks), ('rules', numbers):
+        sums = np.add(row, row[::-1])
+        if np.any(sums != (most + 1 if row is numbers else 0.0)):
+            raise _refused(text, f'an odd curve, from {what} that are mirrored', shown(row))
+    return FuzzySystem(inputs, outputs, rules)
 
 
-CLAUSES = ('terms', 'input', 'output', 'rules', 'defuzzify', 'curve')
+CLAUSES = ('terms', 'input', 'output', 'rules', 'curve')
 
 
 def _refused(text: str, allowed: str, got: str) -> ConfigurationError:
@@ -198,19 +194,6 @@ def _terms(text: str, words: Sequence[str], shapes: Sequence[str]) -> Terms:
     return Terms(shape, tuple(numbers))
 
 
-def _samples(text: str, values: list[float]) -> Curve:
-    samples = np.array(values)
-    if samples[0] != 0.0:
-        if len(values) % 2 == 0:
-            raise _refused(text, 'an odd number of samples over [-1, 1]', f'{len(values)}')
-        _expect_odd(text, np.linspace(-1.0, 1.0, len(samples)), samples, samples[::-1])
-        samples = samples[len(samples) // 2 :]
-    if len(samples) < 2:
-        raise _refused(text, '2 samples or more over [0, 1]', f'{len(samples)}')
-    samples[0] = 0.0
-    return samples
-
-
 def memberships(universe: Curve, terms: Terms) -> Curve:
     """
     Return the membership functions of terms.
@@ -242,7 +225,7 @@ def memberships(universe: Curve, terms: Terms) -> Curve:
 
 def infer(x: Curve, system: FuzzySystem) -> Curve:
     """
-    Mamdani inference: minimum, maximum, defuzzification; singletons: their weighted mean.
+    Mamdani inference: minimum, maximum, centroid; singletons: their weighted mean.
 
     Parameters
     ----------
@@ -263,7 +246,7 @@ def infer(x: Curve, system: FuzzySystem) -> Curve:
         return np.asarray(peaks @ activations / activations.sum(axis=0))
     outputs = memberships(UNIVERSE, system.outputs)[rules]
     regions = (np.minimum(a[:, None], outputs).max(axis=0) for a in activations.T)
-    return np.array([skfuzzy.defuzz(UNIVERSE, r, system.defuzzifier) for r in regions])
+    return np.array([skfuzzy.defuzz(UNIVERSE, r, 'centroid') for r in regions])
 
 
 @lru_cache(maxsize=32)
@@ -285,13 +268,13 @@ def curve(text: str) -> Curve:
     Raises
     ------
     ConfigurationError
-        The text is no system, or its curve is not odd, falls, stays 0, or leaves [-1, 1].
+        The text is no system, or its curve falls, stays 0, or leaves [-1, 1].
 
     """
     system = read_system(text)
     if isinstance(system, FuzzySystem):
         shipped = default_curves().get(system)
-        psi = inferred(text, system) if shipped is None else shipped.copy()
+        psi = inferred(system) if shipped is None else shipped.copy()
     else:
         psi = np.interp(np.linspace(0.0, 1.0, KNOTS), np.linspace(0.0, 1.0, len(system)), system)
     _expect_rising(text, psi)
@@ -335,33 +318,13 @@ def default_curves() -> dict[FuzzySystem, Curve]:
     return {s: c for s, c in zip(systems, columns, strict=True) if isinstance(s, FuzzySystem)}
 
 
-def inferred(text: str, system: FuzzySystem) -> Curve:
-    """Return psi of a system at the knots, not normalised; raise if it is not odd."""
-    x = np.linspace(0.0, 1.0, KNOTS)
-    psi = infer(x, system)
-    if not _is_mirrored(system):
-        _expect_odd(text, x, psi, infer(-x, system))
+def inferred(system: FuzzySystem) -> Curve:
+    """Return psi of a system at the knots, not normalised."""
+    psi = infer(np.linspace(0.0, 1.0, KNOTS), system)
     psi[0] = 0.0  # an odd curve is 0 there; the inference leaves rounding errors
     # What falls by less than the grid of the output universe can tell does not fall.
     level = np.maximum.accumulate(psi)
-    return np.where(level - psi < ODD, level, psi)
-
-
-def _is_mirrored(system: FuzzySystem) -> bool:
-    """Return True if the system is its own mirror image, so that its curve is odd."""
-    last = len(system.outputs.peaks) - 1
-    return system.rules == tuple(last - k for k in reversed(system.rules)) and all(
-        terms.peaks == tuple(-c for c in reversed(terms.peaks))
-        for terms in (system.inputs, system.outputs)
-    )
-
-
-def _expect_odd(text: str, x: Curve, psi: Curve, mirrored: Curve) -> None:
-    """Raise unless psi(-x), which is `mirrored`, is -psi(x)."""
-    k = int(np.abs(psi + mirrored).argmax())
-    if not abs(psi[k] + mirrored[k]) <= ODD:
-        values = f'psi({x[k]:.3g}) = {psi[k]:.3g} and psi({-x[k]:.3g}) = {mirrored[k]:.3g}'
-        raise _refused(text, 'an odd curve psi(-x) = -psi(x)', values)
+    return np.where(level - psi < SMALL, level, psi)
 
 
 def _expect_rising(text: str, psi: Curve) -> None:
@@ -370,7 +333,7 @@ def _expect_rising(text: str, psi: Curve) -> None:
     where = f'psi({k / (KNOTS - 1):.3g}) = {psi[k]:.4g}, psi({(k + 1) / (KNOTS - 1):.3g}) = '
     if psi[k + 1] < psi[k]:
         raise _refused(text, 'a curve that does not fall', f'{where}{psi[k + 1]:.4g}')
-    if not ODD < psi[-1] <= 1.0:
+    if not SMALL < psi[-1] <= 1.0:
         raise _refused(
             text, 'a curve that ends above 0 and at most at 1', f'psi(1) = {psi[-1]:.4g}'
         )

@@ -21,9 +21,10 @@ from fhaosmo_ros.core.model.phi cimport Dual, evaluate
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.kalman cimport Row, fill
 from fhaosmo_ros.core.observer.sliding_mode cimport (
-    LONG_AGO, NEWTON_STEPS, NEWTON_TOLERANCE, TINY, SlidingMode, doubt_of_noise, psi
+    HUBER, LONG_AGO, NEWTON_STEPS, NEWTON_TOLERANCE, TINY, SlidingMode, doubt_of_noise,
+    follow_spread, psi
 )
-from fhaosmo_ros.core.observer.structure cimport GATE, Memory, has_drifted
+from fhaosmo_ros.core.observer.structure cimport Memory
 
 from fhaosmo_ros.core.observer.configuration import deadbeat_shares
 
@@ -35,7 +36,6 @@ cdef double CLOSE = 0.02
 cdef double NEARLY_STEADY = 1.5
 # So many samples in a row beyond all half-widths widen them.
 cdef double SATURATED_SAMPLES = 20.0
-HUBER = 2.0
 # Innovations of more standard deviations count as so many, at least (D 32).
 cdef double LEAST_HUBER = 1.0
 # The share within the largest limit if the noise is normal: with it the gains are the tuned ones.
@@ -44,37 +44,14 @@ cdef double WITHIN = 0.9465
 cdef double NARROWING = 0.01
 # More samples in a row beyond the limit on the same side are no outliers (D 32).
 cdef double ISOLATED = 20.0
-# Median of |x| where x is normal with variance 1, and by what part the spread follows a sample.
-cdef double MEDIAN = 0.6745
-cdef double SPREAD_RATE = 0.005
 # A jump of y contradicts the model if it changes a Phi by more than this part of its size.
 cdef double OF_SIZE = 0.25
 
 
-cdef double follow_spread(Memory* memory, double b, double expected) noexcept nogil:
-    """
-    Return the size that innovations have: the expected one times the spread, which follows (D 21).
-
-    The spread goes up by a small part of it where |b| is above its median if it were normal, and
-    down by as much where |b| is below. So its size does not matter, and outliers hardly do. A
-    sample that is too far off is counted in `Memory.beyond`.
-    """
-    cdef double usual
-    if fabs(b) > MEDIAN * memory.spread * expected:
-        memory.spread *= 1.0 + SPREAD_RATE
-    else:
-        memory.spread = max(memory.spread / (1.0 + SPREAD_RATE), 1.0)
-    usual = memory.spread * expected
-    if fabs(b) > GATE * usual:
-        memory.beyond += 1.0
-        memory.miss = b
-        if memory.beyond == 1.0:
-            memory.first_miss = b
-        return usual
-    memory.beyond = 0.0
-    if has_drifted(memory, b / usual):
-        memory.beyond = INFINITY
-    return usual
+cdef struct Root:
+    double eps  # |eps| >= 0
+    double w  # |eps|^(2 gamma / N)
+    double s  # of the last level, which is set-valued for sign
 
 
 cdef inline double beyond(double c) noexcept nogil:
@@ -85,6 +62,17 @@ cdef inline double beyond(double c) noexcept nogil:
 
 cdef class Levant(SlidingMode):
     """Levant's differentiator: one innovation, of the powers of D 11, drives all levels."""
+
+    cdef double widest  # half-width (unit of y); growth begins beyond it (D 22)
+    cdef double relaxation  # at which the scale returns to 1 (1/s)
+    cdef double share[MOST_LEVELS][MOST_LEVELS]  # beta of D 18; 1 for implicit
+    cdef double ratio[MOST_LEVELS]  # factors of the corrections of the levels, P / steady P
+    cdef double correction_period  # interval that the gains are tuned for (s); 0: any
+    # For scheduled gains (D 20).
+    cdef double steady_variance  # of the innovations once P is steady
+    cdef Row steady[MOST_LEVELS]  # P of the predictions then
+    cdef double tuned_over_kalman[MOST_LEVELS]  # corrections of a small innovation
+    cdef double next_size[MOST_LEVELS]  # sizes of z_2 .. z_n, d
 
     def __cinit__(self, configuration):
         cdef int i, j, n = self.levels

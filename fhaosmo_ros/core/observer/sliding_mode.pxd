@@ -4,7 +4,7 @@
 from fhaosmo_ros.core.model.phi cimport Dual
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
 from fhaosmo_ros.core.observer.kalman cimport LinearModel, Row
-from fhaosmo_ros.core.observer.structure cimport Level, Structure
+from fhaosmo_ros.core.observer.structure cimport Level, Memory, Structure
 
 
 # Seconds since the start where it does not matter when it was (D 20).
@@ -14,6 +14,8 @@ cdef int NEWTON_STEPS
 cdef double NEWTON_TOLERANCE
 # Innovations below this are taken for 0: their powers would underflow.
 cdef double TINY
+# Innovations of more standard deviations count as so many, at most (D 32).
+cdef double HUBER
 
 
 cdef struct Gains:
@@ -51,6 +53,7 @@ cdef class SlidingMode(Structure):
 
 
 cdef double doubt_of_noise(double age, double speed) noexcept nogil
+cdef double follow_spread(Memory* memory, double b, double expected) noexcept nogil
 
 
 cdef inline Dual psi(SlidingMode law, int i, double a) noexcept nogil:

@@ -7,13 +7,13 @@ linearised at rest, with a Matern model of d (D 17, D 20). It begins with the si
 of d and of the noise that parameters tell.
 """
 
-from libc.math cimport NAN, exp, fabs, isfinite, pow
+from libc.math cimport INFINITY, NAN, exp, fabs, isfinite, pow
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.phi cimport Dual
 from fhaosmo_ros.core.observer.kalman cimport correct, fill
 from fhaosmo_ros.core.observer.status cimport GAMMA_AT_MAX, GAMMA_AT_MIN, SENSITIVITY_RESET
-from fhaosmo_ros.core.observer.structure cimport Structure
+from fhaosmo_ros.core.observer.structure cimport GATE, Memory, Structure, has_drifted
 
 # Sensitivities beyond it are set to 0.
 cdef double SENSITIVITY_LIMIT = 1e9
@@ -25,6 +25,36 @@ LONG_AGO = 1e12
 NEWTON_STEPS = 60
 NEWTON_TOLERANCE = 3e-8
 TINY = 1e-300
+HUBER = 2.0
+# Median of |x| where x is normal with variance 1, and by what part the spread follows a sample.
+cdef double MEDIAN = 0.6745
+cdef double SPREAD_RATE = 0.005
+
+
+cdef double follow_spread(Memory* memory, double b, double expected) noexcept nogil:
+    """
+    Return the size that innovations have: the expected one times the spread, which follows (D 21).
+
+    The spread goes up by a small part of it where |b| is above its median if it were normal, and
+    down by as much where |b| is below. So its size does not matter, and outliers hardly do. A
+    sample that is too far off is counted in `Memory.beyond`.
+    """
+    cdef double usual
+    if fabs(b) > MEDIAN * memory.spread * expected:
+        memory.spread *= 1.0 + SPREAD_RATE
+    else:
+        memory.spread = max(memory.spread / (1.0 + SPREAD_RATE), 1.0)
+    usual = memory.spread * expected
+    if fabs(b) > GATE * usual:
+        memory.beyond += 1.0
+        memory.miss = b
+        if memory.beyond == 1.0:
+            memory.first_miss = b
+        return usual
+    memory.beyond = 0.0
+    if has_drifted(memory, b / usual):
+        memory.beyond = INFINITY
+    return usual
 
 
 cdef double doubt_of_noise(double age, double speed) noexcept nogil:

@@ -17,8 +17,8 @@ from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
 from fhaosmo_ros.core.observer.kalman cimport (
     LinearModel, Row, add_drive, carry, correct, multiply, sub_steps
 )
-from fhaosmo_ros.core.observer.levant cimport HUBER, follow_spread
 from fhaosmo_ros.core.observer.self_tuning.members cimport by_binomials, ORDERS
+from fhaosmo_ros.core.observer.sliding_mode cimport HUBER, follow_spread
 from fhaosmo_ros.core.observer.structure cimport MOST_INPUTS, Memory
 
 from fhaosmo_ros.core.observer.kalman import STATES_DOUBT, Uncertainty
