@@ -75,7 +75,7 @@ def in_core(parameters: dict[str, Any], y: np.ndarray) -> Run:
 
     def run() -> np.ndarray:
         observer.structure.load_state_dict(start)
-        run_structure(observer.structure, rest, h, u, 0, count)
+        run_structure(observer.structure, rest, h, u, count)
         return _numbers(observer)
 
     return run

@@ -83,7 +83,7 @@ def test_samples_equal_a_simulation():
 
 def test_known_input_acts_during_the_interval_that_ends_at_its_time():
     plant = Plant(REST | {'phi': ['u'], 'initial_state': 0.0})
-    assert plant.uses_input
+    assert plant.model.uses_input
     truth = plant.simulate([0.0, 0.5, 1.0], [99.0, 2.0, -6.0])
     np.testing.assert_allclose(truth.z[:, 0], [0.0, 1.0, -2.0], atol=1e-12)
 

@@ -125,10 +125,10 @@ def test_offset_that_the_model_contradicts_is_taken_off_and_forgotten():
     y[HIT:] += 1.0
     end = HIT + 5 * RATE
     found, observer = pendulum(case.t[:end], y[:end])
-    assert observer.structure.offset == pytest.approx(1.0, abs=0.01)
+    assert observer.structure.memory['offset'] == pytest.approx(1.0, abs=0.01)
     np.testing.assert_allclose(found.z[HIT + RATE :, 0], case.z[HIT + RATE : end, 0], atol=0.01)
     observer.run(case.t[end:], case.y[end:])
-    assert observer.structure.offset == 0.0
+    assert observer.structure.memory['offset'] == 0.0
 
 
 def test_jumps_are_counted_and_a_snapshot_goes_on_from_them():
@@ -152,7 +152,7 @@ def test_sensor_that_is_put_right_is_believed():
     y = case.y.copy()
     y[:HIT] += 1.0
     found, observer = pendulum(case.t, y)
-    assert observer.structure.offset == 0.0
+    assert observer.structure.memory['offset'] == 0.0
     wrong = np.abs(found.unknown_input - case.d)[HIT + SOON :]
     assert wrong.max() < max(1.5 * case.usual, 0.1 * case.largest)
 
@@ -165,7 +165,7 @@ def test_jump_of_y_leaves_all_but_z1_of_a_plant_without_z1_in_its_model(case):
     found = observer.run(case.t, y, 0.0)
     jumped = np.flatnonzero(found.status & Status.JUMPED)
     assert jumped.tolist() == [HIT + LOST_SAMPLES]
-    if observer.structure.offset == 0.0:
+    if observer.structure.memory['offset'] == 0.0:
         np.testing.assert_allclose(found.z[HIT + RATE :, 0], y[HIT + RATE :], atol=0.1)
     wrong = np.abs(found.unknown_input - case.d)[HIT:]
     assert wrong.max() < max(1.5 * case.usual, 0.6 * case.largest)

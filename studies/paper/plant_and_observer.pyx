@@ -23,7 +23,7 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration, per_level
 from fhaosmo_ros.core.observer.observer import make_structure
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.system import Wave
 import numpy as np
 
@@ -205,9 +205,8 @@ def simulate(observer, plant, solver='ode3', step=1e-3, duration=20.0, every=1):
     `observer` and `plant` are parameters as for `Observer` and `Plant`, with fixed gains; scheme,
     noise and integration_step play no part. Records every `every`-th step.
     """
-    configuration = ObserverConfiguration(observer).changed(
-        {'scheme': 'explicit', 'noise_size': 0.0}  # a solver has no scheme of its own
-    )
+    own = {'scheme': 'explicit', 'noise_size': 0.0}  # a solver has no scheme of its own
+    configuration = ObserverConfiguration(OBSERVER_PARAMETERS.complete(observer).changed(own))
     p = PLANT_PARAMETERS.complete(plant)
     (method, holds), model, d = SOLVERS[solver], TriangularModel.of(p), Wave(p)
     z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], model.order)

@@ -20,7 +20,6 @@ from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 
 MAX_LENGTH = 500
-MAX_NESTING = 50
 MAX_OPERATIONS = 100
 """
 Operators and functions of one expression.
@@ -28,8 +27,6 @@ Operators and functions of one expression.
 An operator takes some 15 ns, a function up to 100 ns, and with its default step the plant
 evaluates every Phi 40,000 times in a simulated second.
 """
-MAX_FUNCTIONS = 30
-"""Functions of one expression."""
 
 FUNCTIONS: dict[str, int] = {
     name: getattr(phi, name.upper())
@@ -136,8 +133,10 @@ def parse(text: str, level: int, names: Names = ONLY_U) -> list[Instruction]:
             body = ast.parse(text.strip(), mode='eval').body
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise parser.error('this is not an arithmetic expression') from None
-    parser.check_work(body)
-    instructions = parser.emit(body, 0)
+    work = sum(isinstance(node, ast.Call | ast.BinOp | ast.UnaryOp) for node in ast.walk(body))
+    if work > MAX_OPERATIONS:  # at every evaluation
+        raise parser.error(f'{work} operations, at most {MAX_OPERATIONS}')
+    instructions = parser.emit(body)
     return [] if instructions == [Instruction(phi.CONST, 0.0)] else instructions
 
 
@@ -151,21 +150,7 @@ class _Parser:
         for name, number in (NUMBERS | dict(names.constants)).items():
             self.names[name] = Instruction(phi.CONST, number)
 
-    def check_work(self, body: ast.expr) -> None:
-        """Refuse an expression that would take long at every evaluation."""
-        kinds = [type(node) for node in ast.walk(body)]
-        functions = kinds.count(ast.Call)
-        operations = functions + kinds.count(ast.BinOp) + kinds.count(ast.UnaryOp)
-        for count, limit, what in (
-            (functions, MAX_FUNCTIONS, 'functions'),
-            (operations, MAX_OPERATIONS, 'operations'),
-        ):
-            if count > limit:
-                raise self.error(f'{count} {what}, at most {limit}')
-
-    def emit(self, node: ast.expr, nesting: int) -> list[Instruction]:
-        if nesting > MAX_NESTING:
-            raise self.error(f'nested deeper than {MAX_NESTING}')
+    def emit(self, node: ast.expr) -> list[Instruction]:
         match node:
             case ast.Constant(value=bool()):
                 raise self.error(f'{node.value!r} is not a number')
@@ -174,17 +159,16 @@ class _Parser:
             case ast.Name(id=name):
                 return [self.name(name)]
             case ast.UnaryOp(op=ast.UAdd(), operand=operand):
-                return self.emit(operand, nesting + 1)
+                return self.emit(operand)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
-                inner = self.emit(operand, nesting + 1)
-                return self.fold([*inner, Instruction(phi.NEG)])
+                return self.fold([*self.emit(operand), Instruction(phi.NEG)])
             case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
-                a, b = self.emit(left, nesting + 1), self.emit(right, nesting + 1)
+                a, b = self.emit(left), self.emit(right)
                 return self.fold([*a, *b, Instruction(OPERATORS[type(op)])])
             case ast.BinOp(op=ast.BitXor()):
                 raise self.error("'^' is not allowed, a power is written z1**2")
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
-                return self.call(name, [self.emit(a, nesting + 1) for a in arguments])
+                return self.call(name, [self.emit(a) for a in arguments])
         part = ast.get_source_segment(self.text.strip(), node) or ''
         raise self.error(f'{part[:60]!r} is not allowed')
 

@@ -67,9 +67,6 @@ cdef class Prediction(Dynamics):
         self.size = 2 * self.n
         self.z, self.dz = self.x, self.x + self.n
 
-    def __reduce__(self):
-        return Prediction, (self.phi, self.longest)
-
     cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil:
         """Write the rates of P triangular and their derivatives."""
         cdef int i, n = self.n

@@ -104,18 +104,14 @@ class TriangularModel:
         expressions = [*self._parsed, *behind]
         return Expressions(expressions, len(expressions), len(self.inputs))
 
-    def known_inputs(self, u: ArrayLike) -> np.ndarray:
-        """Return values of the known inputs as an array (m,); see `inputs.known_inputs`."""
-        return known_inputs(u, self.inputs)
-
     def evaluate(self, z: np.ndarray, u: ArrayLike = 0.0) -> np.ndarray:
         """Return Phi(z, u), shape (n,); u is a number or an array (m,)."""
-        values, _ = self.expressions.along(z, np.zeros(self.order), self.known_inputs(u))
+        values, _ = self.expressions.along(z, np.zeros(self.order), known_inputs(u, self.inputs))
         return np.asarray(values)
 
     def jacobian(self, z: np.ndarray, u: ArrayLike = 0.0) -> np.ndarray:
         """Return the exact Jacobian dPhi_i/dz_j, shape (n, n), lower triangular."""
-        inputs = self.known_inputs(u)
+        inputs = known_inputs(u, self.inputs)
         columns = [self.expressions.along(z, e, inputs)[1] for e in np.eye(self.order)]
         return np.stack(columns, axis=1)
 

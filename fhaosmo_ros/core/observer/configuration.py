@@ -100,23 +100,6 @@ class ObserverConfiguration:
         else:
             self._complete_fixed_gains()
 
-    def changed(self, changes: Mapping[str, Any]) -> 'ObserverConfiguration':
-        """
-        Return a configuration with some live parameters changed.
-
-        Parameters
-        ----------
-        changes : mapping
-            Values to change, or complete `Parameters`.
-
-        Raises
-        ------
-        ConfigurationError
-            As the constructor, or a change of a parameter that can't change live.
-
-        """
-        return ObserverConfiguration(self.parameters.changed_live(changes, 'observer'))
-
     def forgotten(self, before: 'ObserverConfiguration') -> dict[str, float]:
         """Return what an observer forgets that goes on from a snapshot of one with `before`."""
         if self.self_tuning:

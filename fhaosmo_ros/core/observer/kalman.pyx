@@ -158,15 +158,13 @@ cdef class LinearModel:
         cdef Row f[MOST_LEVELS]
         cdef Row whole[MOST_LEVELS]
         cdef Row q[MOST_LEVELS]
-        cdef int k, count = sub_steps(h, self.fastest), n = self.n
+        cdef int _, count = sub_steps(h, self.fastest), n = self.n
         memset(q, 0, sizeof(q))
+        self.predict(q, h)
         self.flow(h / count, f)
         memcpy(whole, f, sizeof(f))
-        for k in range(count):
-            carry(n, f, q)
-            add_drive(n - 1, self.intensity, h / count, q)
-            if k > 0:
-                multiply(n, f, whole)
+        for _ in range(count - 1):
+            multiply(n, f, whole)
         return np.array(whole)[:n, :n].copy(), np.array(q)[:n, :n].copy()
 
 

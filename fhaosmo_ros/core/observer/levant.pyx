@@ -27,6 +27,7 @@ from fhaosmo_ros.core.observer.sliding_mode cimport (
 from fhaosmo_ros.core.observer.structure cimport Memory
 
 from fhaosmo_ros.core.observer.configuration import deadbeat_shares
+import numpy as np
 
 # An interval that differs from the tuned one by at most this part of it needs no other gains.
 cdef double NEAR = 0.25
@@ -65,35 +66,32 @@ cdef class Levant(SlidingMode):
 
     cdef double widest  # half-width (unit of y); growth begins beyond it (D 22)
     cdef double relaxation  # at which the scale returns to 1 (1/s)
-    cdef double share[MOST_LEVELS][MOST_LEVELS]  # beta of D 18; 1 for implicit
+    cdef const double[:, ::1] share  # beta of D 18; 1 for implicit
     cdef double ratio[MOST_LEVELS]  # factors of the corrections of the levels, P / steady P
     cdef double correction_period  # interval that the gains are tuned for (s); 0: any
     # For scheduled gains (D 20).
     cdef double steady_variance  # of the innovations once P is steady
     cdef Row steady[MOST_LEVELS]  # P of the predictions then
-    cdef double tuned_over_kalman[MOST_LEVELS]  # corrections of a small innovation
-    cdef double next_size[MOST_LEVELS]  # sizes of z_2 .. z_n, d
+    cdef const double[::1] tuned_over_kalman  # corrections of a small innovation
+    cdef const double[::1] next_size  # sizes of z_2 .. z_n, d
 
     def __cinit__(self, configuration):
-        cdef int i, j, n = self.levels
+        cdef int i, n = self.levels
         self.widest = INFINITY
         # With larger powers saturated levels find y again by themselves.
         if self.predicting and not self.is_sign and self.gamma_initial < 0.5:
             self.widest = max(configuration.widths)
             speed = (configuration.lambdas[n - 1] / configuration.widths[n - 1]) ** (1.0 / n)
             self.relaxation = speed / 3.0
-        shares = deadbeat_shares(n)
+        self.share = deadbeat_shares(n) if self.predicting else np.ones((n, n))
         for i in range(n):
             self.ratio[i] = 1.0
-            for j in range(n):
-                self.share[j][i] = shares[j, i] if self.predicting else 1.0
         self.correction_period = configuration.parameters['correction_period']
         if self.scheduled:
             fill(self.steady, configuration.steady)
             self.steady_variance = self.steady[0][0] + self.noise_variance
-            for i in range(n):
-                self.tuned_over_kalman[i] = configuration.tuned_over_kalman[i]
-                self.next_size[i] = configuration.next_sizes[i]
+            self.tuned_over_kalman = configuration.tuned_over_kalman
+            self.next_size = configuration.next_sizes
 
     cdef void restart(self, double y) noexcept nogil:
         """Begin afresh from `y`; the time of the next sample counts from it."""
@@ -195,7 +193,7 @@ cdef class Levant(SlidingMode):
             power *= root.w
         for i in range(n):
             for j in range(i, n):
-                share = scale * self.ratio[i] * power_of_h[j - i] * self.share[j][i]
+                share = scale * self.ratio[i] * power_of_h[j - i] * self.share[j, i]
                 self.trial[i].z_hat += share * self.trial[j].z_tilde
         self.grow(root.eps, h)
         # What the sum above is but for rounding.

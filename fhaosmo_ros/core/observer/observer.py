@@ -20,8 +20,6 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PA
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-HEADROOM = 1e8
-"""Samples above the largest double over this are rejected."""
 OF_PAPER = 'lambda', 'alpha', 'fuzzy_widths'
 DEFINING = 'phi', 'gains', *OF_PAPER
 DEFAULTS = OBSERVER_PARAMETERS.defaults()
@@ -183,11 +181,7 @@ class Observer:
     @property
     def started(self) -> bool:
         """True once a sample has arrived."""
-        return bool(self.structure.started)
-
-    def prepare(self, changes: Mapping[str, Any]) -> ObserverConfiguration:
-        """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
-        return self.configuration.changed(changes)
+        return not math.isnan(self.structure.memory['y'])
 
     def configure(self, changes: Mapping[str, Any]) -> None:
         """
@@ -201,10 +195,11 @@ class Observer:
             As the constructor, or a change of a parameter that fixes the observer's size.
 
         """
-        self.adopt(self.prepare(changes))
+        parameters = self.configuration.parameters.changed_live(changes, 'observer')
+        self.adopt(ObserverConfiguration(parameters))
 
     def adopt(self, configuration: ObserverConfiguration) -> None:
-        """Go on with a configuration that `prepare` has returned, from the next sample on."""
+        """Go on with a configuration of the same model and size, from the next sample on."""
         structure = make_structure(configuration)
         remembered = self.structure.state_dict() | configuration.forgotten(self.configuration)
         structure.load_state_dict(remembered)
@@ -262,11 +257,6 @@ class Observer:
         """Estimate of the present state, with the status of the last step."""
         return self.structure.report()
 
-    @property
-    def unknown_input(self) -> float:
-        """The estimate's unknown input alone, which costs less."""
-        return self.structure.d  # type: ignore[no-any-return]
-
     def run(
         self, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None, every: int = 1
     ) -> Trajectory:
@@ -303,14 +293,10 @@ class Observer:
             raise ConfigurationError(f'run: expected every >= 1, got {every}')
         t, y = samples_of_run(t, y)
         u = known_inputs(self._no_input() if u is None else u, self.inputs, len(y))
-        first, start = 0, self._t
-        if not self.started:
-            good = np.flatnonzero(np.isfinite(HEADROOM * y))
-            first, start = good[0] + 1 if len(good) else len(y), None
-        h = intervals(t, start)
+        h = intervals(t, self._t if self.started else None)
         if len(t):
             self._t = t[-1].item()
-        record = run(self.structure, y, h, u, first, every)
+        record = run(self.structure, y, h, u, every)
         self.check_functions()
         return Trajectory(t[every - 1 :: every], **record.columns)
 

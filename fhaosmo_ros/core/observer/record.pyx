@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a run of samples records."""
 
-from libc.math cimport sqrt
+from libc.math cimport isnan, sqrt
 
 from fhaosmo_ros.core.observer.status cimport FLAGS_MASK, LEVEL_SHIFT
 from fhaosmo_ros.core.observer.structure cimport Structure
@@ -59,10 +59,10 @@ cdef class Record:
 
 def run(
     Structure structure not None, const double[::1] y, const double[::1] h,
-    const double[:, ::1] u, Py_ssize_t first, Py_ssize_t every
+    const double[:, ::1] u, Py_ssize_t every
 ):
     """
-    Start with the samples before index `first`, step from it on; record every `every`-th one.
+    Start with samples until one is good, step from the next one on; record every `every`-th one.
 
     Row r of the record is the state after sample (r + 1) * every - 1; its flags are those of
     all samples since the row before it.
@@ -84,10 +84,10 @@ def run(
     structure.busy = True
     with nogil:
         for k in range(y.shape[0]):
-            if k >= first:
-                word = structure.step(y[k], h[k], &u[k, 0])
-            else:
+            if isnan(structure.memory.y):
                 word = structure.start(y[k])
+            else:
+                word = structure.step(y[k], h[k], &u[k, 0])
             seen |= word & FLAGS_MASK
             if (k + 1) % every == 0:
                 record.write(structure, row, (word >> LEVEL_SHIFT << LEVEL_SHIFT) | seen)

@@ -62,7 +62,7 @@ cdef class Structure:
     cdef double epsilon  # threshold of the gates (unit of y)
     cdef Prediction prediction
     # What it remembers.
-    cdef Memory memory
+    cdef readonly Memory memory
     cdef Level level[MOST_LEVELS]
     cdef Row covariance[MOST_LEVELS]  # P of the errors (D 20); not used without noise_size
     # A step's own: the levels and P while they are changed, and what it finds.

@@ -15,6 +15,7 @@ from fhaosmo_ros.core.observer.status cimport (
     REJECTED_PERIOD, REJECTED_SPIKE, REJECTED_STEP
 )
 
+from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.observer.numbers import checked
 from fhaosmo_ros.core.observer.status import flags, open_levels
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -294,7 +295,7 @@ cdef class Structure:
             number = u
             self.word = self.step(y, dt, &number)
             return self.report()
-        for i, number in enumerate(self.configuration.model.known_inputs(u)):
+        for i, number in enumerate(known_inputs(u, self.configuration.model.inputs)):
             inputs[i] = number
         self.word = self.step(y, dt, inputs)
         return self.report()
@@ -314,26 +315,6 @@ cdef class Structure:
         """Go back to the state before any sample."""
         self.enter()
         self.reset()
-
-    @property
-    def started(self):
-        """True once a sample has arrived."""
-        return not isnan(self.memory.y)
-
-    @property
-    def d(self):
-        """The estimate of d."""
-        return self.estimate(self.order)
-
-    @property
-    def spread(self):
-        """Size of the innovations over that expected from noise_size, at least 1 (D 21)."""
-        return self.memory.spread
-
-    @property
-    def offset(self):
-        """What y is taken to be too large by, since a jump that the model contradicts (D 23)."""
-        return self.memory.offset
 
     @property
     def variances(self):
@@ -363,8 +344,6 @@ cdef class Structure:
         """
         cdef int i
         self.enter()
-        if len(values) != self.order + 1:
-            raise ValueError(f'seed: expected {self.order + 1} values, got {len(values)}')
         memset(self.level, 0, sizeof(self.level))
         for i in range(min(self.order + 1, self.levels)):  # derivatives of d, behind it, are 0
             self.level[i].z_hat = values[i]

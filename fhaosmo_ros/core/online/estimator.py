@@ -152,17 +152,17 @@ class OnlineEstimator:
     @property
     def spread(self) -> float:
         """Size of the innovations over that expected from noise_size, at least 1 (D 21)."""
-        return float(self.observer.structure.spread)
+        return float(self.observer.structure.memory['spread'])
 
     @property
     def offset(self) -> float:
         """What y is taken to be too large by, since a jump that the model contradicts (D 23)."""
-        return float(self.observer.structure.offset)
+        return float(self.observer.structure.memory['offset'])
 
     def prepare(self, changes: Mapping[str, Any]) -> Change:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
         parameters = self._parameters.changed_live(changes, 'observer')
-        configuration = self.observer.prepare(parameters)
+        configuration = ObserverConfiguration(parameters)
         check_events(parameters)
         if self._smoothing is not None:
             _check_smoothing(parameters, configuration)
@@ -409,10 +409,10 @@ class OnlineEstimator:
 
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
+        stamp = min(max(stamp, -LARGEST_STAMP), LARGEST_STAMP)
         if self._smoothing is None and not self.events.on:
             return self.policy.advance(stamp, y, self._u)  # type: ignore[no-any-return]
-        stamps = np.array([min(max(int(stamp), -LARGEST_STAMP), LARGEST_STAMP)])
-        self._run(stamps, np.array([y], dtype=np.float64), self._u[np.newaxis])
+        self._run(np.array([stamp]), np.array([y], dtype=np.float64), self._u[np.newaxis])
         return self.observer.structure.word  # type: ignore[no-any-return]
 
     def run(self, stamps: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:

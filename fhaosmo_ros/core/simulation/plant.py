@@ -84,11 +84,6 @@ class Plant:
         """Phi, and the names of the known inputs."""
         return self._model
 
-    @property
-    def uses_input(self) -> bool:
-        """True if the model uses a known input."""
-        return self._model.uses_input
-
     def configure(self, changes: Mapping[str, Any]) -> None:
         """
         Change live parameters from now on; all or nothing.

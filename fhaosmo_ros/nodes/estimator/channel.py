@@ -195,7 +195,7 @@ class Channel:
             self._snapshots.accepted(stamp)
             health.latest = now
             health.stamps.append(stamp)
-            health.unknown_inputs.append(estimator.observer.unknown_input)
+            health.unknown_inputs.append(estimator.observer.estimate.unknown_input)
         if word & (REJECTED | NEWS):
             self._tell(word, stamp, y)
         if estimator.events.waiting:
