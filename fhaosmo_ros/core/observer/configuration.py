@@ -71,16 +71,6 @@ class ObserverConfiguration:
 
     """
 
-    self_tuning: bool
-    levels: int
-    lambdas: Floats
-    alphas: Floats
-    widths: Floats
-    decays: Floats
-    curves: Floats
-    tuned_over_kalman: Floats
-    next_sizes: Floats
-
     def __init__(self, parameters: Mapping[str, Any]) -> None:
         p = self.parameters = OBSERVER_PARAMETERS.complete(parameters)
         self.model = TriangularModel.of(p)
@@ -89,7 +79,7 @@ class ObserverConfiguration:
                 "parameters 'gamma_min', 'gamma_initial', 'gamma_max': expected each at most the "
                 f'next one, got {p["gamma_min"]}, {p["gamma_initial"]}, {p["gamma_max"]}'
             )
-        self.self_tuning = p['gains'] == 'self_tuning'
+        self.self_tuning: bool = p['gains'] == 'self_tuning'
         self.schedule: Uncertainty | None = None
         self.steady = np.zeros((0, 0))
         sizes = OBSERVER_PARAMETERS['state_sizes']

@@ -8,7 +8,7 @@ class Counters(NamedTuple):
     """
     Numbers since the estimator was made; a snapshot. A reset does not clear them.
 
-    The policy counts into a struct with these names (memory.pxd).
+    The policy counts into a struct with these names (samples.pxd).
     """
 
     accepted: int = 0

@@ -2,7 +2,7 @@
 """
 The policy of time and of bad data: one function for node, replay and trials.
 
-What it does, case by case, is in docs/node.md; its memory is described in memory.pxd.
+What it does, case by case, is in docs/node.md; its memory is described in samples.pxd.
 """
 
 from libc.math cimport fabs, fmin, isfinite, isnan
@@ -16,11 +16,10 @@ from fhaosmo_ros.core.observer.status cimport (
     REJECTED_SPIKE, REJECTED_STEP, REJECTED_STUCK, REPEATED, RESTARTED, UNUSED
 )
 from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, Structure
-from fhaosmo_ros.core.online.clock cimport FAR, WINDOW, clock_time, difference
 from fhaosmo_ros.core.online.delay cimport NANOSECONDS, PastInputs
-from fhaosmo_ros.core.online.memory cimport Clock, Counters, Course, Sensor, Settings
-from fhaosmo_ros.core.online.outliers cimport (
-    is_held, is_spike, is_stuck, may_have_noise, repeats_noise
+from fhaosmo_ros.core.online.samples cimport (
+    FAR, WINDOW, Clock, Counters, Course, Sensor, Settings, clock_time, difference, is_held,
+    is_spike, is_stuck, may_have_noise, repeats_noise
 )
 
 import numpy as np

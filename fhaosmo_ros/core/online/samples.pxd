@@ -1,5 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an estimator remembers beside its observer's state. Times are in nanoseconds."""
+"""
+What an estimator remembers beside its observer's state, and the rules for single samples.
+
+Times are in nanoseconds.
+"""
+
+cdef long long FAR
+
+cdef enum:
+    WINDOW = 32  # intervals, or ticks, that a running mean remembers
 
 
 cdef struct Settings:
@@ -47,7 +56,7 @@ cdef struct Course:
 
 
 cdef struct Clock:
-    # A line through the ticks of a clock that stands still between them; see clock.pyx.
+    # A line through the ticks of a clock that stands still between them.
     long long tick  # latest reading
     long long tick_length  # time from the reading before it
     long long tick_count  # samples at it
@@ -61,7 +70,7 @@ cdef struct Clock:
 
 
 cdef struct Sensor:
-    # Whether y's sensor is stuck, or holds its values; see outliers.pyx.
+    # Whether y's sensor is stuck, or holds its values.
     bint stuck
     bint holds  # it holds each value for several samples
     long long seen  # time of the latest sample, used or not
@@ -73,3 +82,21 @@ cdef struct Sensor:
     double change  # by what it last differed from the one before
     double repeated  # the y that has repeated itself last
     double elsewhere  # share of values of late that repeat themselves, another one each
+
+
+cdef long long difference(long long a, long long b) noexcept nogil
+cdef long long clock_time(
+    Clock* clock, long long stamp, long long max_gap, Counters* counters
+) noexcept nogil
+cdef bint is_stuck(
+    Sensor* sensor, const Settings* settings, Counters* counters, double last, double y,
+    long long now, long long max_gap
+) noexcept nogil
+cdef bint is_held(
+    Sensor* sensor, long long max_gap, const Course* course, double y, long long now
+) noexcept nogil
+cdef bint may_have_noise(const Sensor* sensor) noexcept nogil
+cdef bint repeats_noise(Sensor* sensor, Counters* counters, double y, bint noisy) noexcept nogil
+cdef bint is_spike(
+    Course* course, const Settings* settings, Counters* counters, double innovation
+) noexcept nogil
