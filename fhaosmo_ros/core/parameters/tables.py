@@ -19,7 +19,7 @@ MODEL = (
     Parameter('phi', ['0', '0', '-z3'],
               "The functions Phi_i of z_i' = z_{i+1} + Phi_i. Phi_i may use z1 .. zi, the known "
               'inputs, the constants, numbers, pi, + - * / **, sin cos tan exp log sqrt abs '
-              'tanh sign atan2 min max; at most 100 operations, 30 of them functions.',
+              'tanh sign atan2 min max; at most 100 operations.',
               live=False, lengths='n (order)'),
     Parameter('inputs', ['u'],
               'Names of the known inputs that Phi may use: letters, digits and _. Columns of an '
@@ -55,7 +55,7 @@ OBSERVER = (
     Parameter('structure', 'cascade',
               "cascade: the paper's levels, each with its own innovation. levant: Levant's "
               'differentiator, every level driven by y - z_hat_1; it needs unknown_input and '
-              'other gains (docs/mathematics.md).', choices=('cascade', 'levant')),
+              'other gains (docs/mathematics.md).', choices=('cascade', 'levant'), live=False),
     Parameter('variant', 'fuzzy_adaptive',
               'sign: discontinuous injection, gamma = 1/2. fuzzy: a fuzzy curve instead. '
               'sign_adaptive, fuzzy_adaptive: gamma adapts; with levant it stays gamma_initial.',
@@ -103,8 +103,8 @@ OBSERVER = (
               'half-width psi is +-1. Unit of eps_i; levant: of y.', lower=1e-12, upper=1e12,
               lengths='1 to N; the last one serves later levels'),
     Parameter('fuzzy_systems', ['terms 5', 'terms 7'],
-              'The fuzzy systems of levels 1, 2, ...: membership functions, rules and '
-              'defuzzifier, or a sampled curve (docs/mathematics.md, Fuzzy curves).',
+              'The fuzzy systems of levels 1, 2, ...: membership functions and '
+              'rules, or a sampled curve (docs/mathematics.md, Fuzzy curves).',
               lengths='1 to N; the last one serves later levels'),
     Parameter('gamma_initial', 0.95, 'Power gamma at the start of an adaptive variant.', lower=0.0,
               lower_open=True, upper=1.0),
