@@ -67,8 +67,13 @@ class TriangularModel:
     @classmethod
     def of(cls, parameters: Mapping[str, Any]) -> 'TriangularModel':
         """Return the model that checked parameters describe."""
-        p = parameters
-        return cls(p['phi'], p['order'], Names(p['inputs'], constants_of(p)))
+        constants = {
+            name.removeprefix(CONSTANTS): value
+            for name, value in parameters.items()
+            if name.startswith(CONSTANTS)
+        }
+        names = Names(parameters['inputs'], constants)
+        return cls(parameters['phi'], parameters['order'], names)
 
     @property
     def used_inputs(self) -> tuple[str, ...]:
@@ -120,12 +125,3 @@ class TriangularModel:
         """The Jacobian at z = 0, with 0 where a slope is not finite."""
         slopes = self.jacobian(np.zeros(self.order))
         return np.asarray(np.nan_to_num(slopes, posinf=0.0, neginf=0.0))
-
-
-def constants_of(parameters: Mapping[str, Any]) -> dict[str, float]:
-    """Return the named constants among some parameters."""
-    return {
-        name.removeprefix(CONSTANTS): value
-        for name, value in parameters.items()
-        if name.startswith(CONSTANTS)
-    }

@@ -284,21 +284,7 @@ def curve(text: str) -> Curve:
 
 
 def curves(parameters: Mapping[str, Any], levels: int) -> Curve:
-    """
-    Return psi of each level.
-
-    Parameters
-    ----------
-    parameters : mapping
-        With `fuzzy_systems`.
-    levels : int
-        N.
-
-    Returns
-    -------
-    (N, KNOTS) array
-
-    """
+    """Return psi of each level, (N, KNOTS), as `fuzzy_systems` among the parameters says."""
     texts = parameters['fuzzy_systems']
     return np.array([curve(of_level(texts, i)) for i in range(levels)])
 
