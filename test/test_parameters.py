@@ -169,7 +169,7 @@ def test_list_of_the_wrong_length_is_refused(name, value, allowed):
             {'unknown_input': False, 'unknown_input_derivatives': 1},
             'expected unknown_input = true',
         ),
-        ({'scheme': 'predict_correct'}, "expected structure = 'levant' or another"),
+        ({'scheme': 'predict_correct'}, "scheme = 'explicit' or 'implicit' with cascade"),
         ({'structure': 'levant', 'unknown_input': False}, 'unknown_input = true'),
         ({'structure': 'levant', 'scheme': 'explicit'}, "scheme = 'implicit' or 'predict"),
         ({'gains': 'self_tuning', 'unknown_input': False}, 'unknown_input'),

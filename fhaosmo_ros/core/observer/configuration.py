@@ -19,6 +19,8 @@ FIXED_GAMMA = 0.5
 """Power of the variants that do not adapt (paper eq. triangularObserver, fuzzysuper)."""
 STEP = 0.1
 """Of a prediction, in parts of the time constant of the fastest motion of the model at rest."""
+SCHEMES = {'cascade': ('explicit', 'implicit'), 'levant': ('implicit', 'predict_correct')}
+"""The two of each structure."""
 DERIVATIVES = 3
 """Derivatives of d that a self-tuning observer has behind it (D 26)."""
 
@@ -85,6 +87,7 @@ class ObserverConfiguration:
         sizes = OBSERVER_PARAMETERS['state_sizes']
         self.state_sizes = per_level(sizes, p['state_sizes'], self.model.order)
         self.prediction_step = p['prediction_step'] or usual_step(self.model)
+        self._check_structure()
         if self.self_tuning:
             self._complete_self_tuning()
         else:
@@ -103,11 +106,6 @@ class ObserverConfiguration:
         return {'settled': 1.0}  # P is of other sizes, or there is none
 
     def _complete_self_tuning(self) -> None:
-        if not self.parameters['unknown_input']:
-            raise ConfigurationError(
-                "parameters 'gains', 'unknown_input': self_tuning follows the unknown input, "
-                'expected unknown_input = true, got false'
-            )
         self.levant = self.predicting = self.implicit = True
         self.internal = self.adaptive = self.is_sign = False
         self.gamma_initial, self.epsilon = 0.0, np.inf  # no power, no gates
@@ -117,7 +115,6 @@ class ObserverConfiguration:
 
     def _complete_fixed_gains(self) -> None:
         p, n = self.parameters, self.model.order
-        self._check_structure()
         self.levant = p['structure'] == 'levant'
         self.predicting = p['scheme'] == 'predict_correct'
         self.implicit = p['scheme'] != 'explicit'
@@ -160,27 +157,21 @@ class ObserverConfiguration:
 
     def _check_structure(self) -> None:
         p = self.parameters
-        if p['structure'] == 'levant' and not p['unknown_input']:
+        needing = {
+            'gains': self.self_tuning, 'structure': p['structure'] == 'levant',
+            'unknown_input_derivatives': p['unknown_input_derivatives'] > 0,
+        }  # fmt: skip
+        for name, needs in needing.items():
+            if needs and not p['unknown_input']:
+                raise ConfigurationError(
+                    f"parameters '{name}', 'unknown_input': {name} = {p[name]} needs levels of "
+                    'the unknown input, expected unknown_input = true, got false'
+                )
+        first, second = SCHEMES[p['structure']]
+        if not self.self_tuning and p['scheme'] not in (first, second):
             raise ConfigurationError(
-                "parameters 'structure', 'unknown_input': levant estimates the unknown input as "
-                'its last level, expected unknown_input = true, got false'
-            )
-        if p['unknown_input_derivatives'] and not p['unknown_input']:
-            raise ConfigurationError(
-                "parameters 'unknown_input_derivatives', 'unknown_input': derivatives are levels "
-                'behind that of the unknown input, expected unknown_input = true or '
-                f'unknown_input_derivatives = 0, got false and {p["unknown_input_derivatives"]}'
-            )
-        if p['scheme'] == 'predict_correct' and p['structure'] != 'levant':
-            raise ConfigurationError(
-                "parameters 'scheme', 'structure': predict_correct is a scheme of levant alone, "
-                "expected structure = 'levant' or another scheme (explicit, implicit), got "
-                f'{p["structure"]!r} and {p["scheme"]!r}'
-            )
-        if p['scheme'] == 'explicit' and p['structure'] == 'levant':
-            raise ConfigurationError(
-                "parameters 'scheme', 'structure': levant has no explicit scheme any more, "
-                "expected scheme = 'implicit' or 'predict_correct', got 'explicit'"
+                f"parameters 'scheme', 'structure': expected scheme = {first!r} or {second!r} "
+                f'with {p["structure"]}, got {p["scheme"]!r}'
             )
 
     def _per_level(self, name: str) -> Floats:
