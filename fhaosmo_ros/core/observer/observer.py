@@ -2,6 +2,7 @@
 """The observer: one sample at a time, or arrays of samples, by the same compiled recursion."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 import math
 from pathlib import Path
 from typing import Any
@@ -202,7 +203,8 @@ class Observer:
         """Go on with a configuration of the same model and size, from the next sample on."""
         structure = make_structure(configuration)
         remembered = self.structure.state_dict() | configuration.forgotten(self.configuration)
-        structure.load_state_dict(remembered)
+        with suppress(ConfigurationError):  # where numbers have overflowed it begins afresh
+            structure.load_state_dict(remembered)
         structure.word = self.structure.word
         self._use(structure)
 
