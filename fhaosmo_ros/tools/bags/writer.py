@@ -79,13 +79,14 @@ class BagWriter:
         types: Any = TYPES,
         qos: Sequence[dict[str, Any]] = (OFFERED_QOS,),
         digest: str = '',
-    ) -> None:
-        """Add a topic if the bag does not have it yet."""
-        if topic in self._channels:
-            return
+    ) -> bool:
+        """Add a topic if the bag lacks it; return False if its type has no definition here."""
         if types is TYPES:
             learn(message_type)
-        if message_type not in types.fielddefs:
+        known = message_type in types.fielddefs
+        if topic in self._channels:
+            return known
+        if not known:
             # A type that is not installed, or an old bag without definitions. Readers compare
             # the hash with the definition, so both are those of a message without fields.
             types, digest = get_typestore(Stores.EMPTY), ''
@@ -106,6 +107,7 @@ class BagWriter:
             'offered_qos_profiles': yaml.safe_load(offered),  # a copy: YAML refers to what it has
             'type_description_hash': digest,
         })  # fmt: skip
+        return known
 
     def write(self, topic: str, stamp: int, data: bytes, published: int | None = None) -> None:
         """
