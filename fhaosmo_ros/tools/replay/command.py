@@ -16,7 +16,7 @@ from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import INPUT, ONLINE_PARAMETERS
 from fhaosmo_ros.stop_signals import Stop, Stopped
-from fhaosmo_ros.tools.bags.inputs import bag_inputs
+from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
 from fhaosmo_ros.tools.bags.table import bag_of_table
@@ -119,15 +119,15 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
                 _warn(f'{error}; {followed} is not followed, this begins at the first sample')
         namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
         present = {c.topic for c in reader.connections}
-        used = estimator.observer.used_inputs
-        inputs = bag_inputs(own, used, present, namespace, arguments.channel)
+        model = estimator.observer.model
+        inputs = BagInputs(reader, own, model, namespace, arguments.channel)
         finals = arguments.output or [Path(f'{name}_replayed')]
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
         name = _name(present, arguments.name)
         with stop.raising():
             count = reader.count(inputs.y.topic)
             bar = partial(progress, total=count, unit='sample', unit_scale=True, desc='replay')
-            samples = Samples(reader, estimator, live, inputs, arguments.smooth, bar)
+            samples = Samples(estimator, live, inputs, arguments.smooth, bar)
             _write(reader, samples, outputs, name, ONLINE_PARAMETERS.defaults() | own)
         if stop.is_set():  # Python drops what a signal raises in a destructor
             raise Stopped
