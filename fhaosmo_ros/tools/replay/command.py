@@ -105,7 +105,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             arguments.channel = arguments.channel or recorded.channel
         own = channel_parameters(arguments, recorded)
         if is_table:
-            own = _without_inputs(own)
+            # The file says where y and u are, not the topics of a node.
+            own = {k: v for k, v in own.items() if k not in ParameterTable(INPUT)}
         if arguments.smooth:
             own['smoothing_lag'] = 0.0
         estimator = OnlineEstimator(ONLINE_PARAMETERS.part_of(own))
@@ -164,13 +165,7 @@ def _write_bag_of_table(arguments: argparse.Namespace, bag: Path) -> None:
     own = channel_parameters(arguments)
     used = OnlineEstimator(ONLINE_PARAMETERS.part_of(own)).observer.used_inputs
     titles = [title.strip() for title in arguments.columns.split(',') if title.strip()]
-    bag_of_table(arguments.bag, titles, _without_inputs(own), used, bag)
-
-
-def _without_inputs(own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return parameters without those that say on which topics a node finds y and u."""
-    inputs = ParameterTable(INPUT)
-    return {name: value for name, value in own.items() if name not in inputs}
+    bag_of_table(arguments.bag, titles, used, bag)
 
 
 def _warn(text: str) -> None:

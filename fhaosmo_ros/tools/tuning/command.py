@@ -22,7 +22,7 @@ from fhaosmo_ros.tools.tuning import report
 from fhaosmo_ros.tools.tuning.bag_gains import make_gains, run
 from fhaosmo_ros.tools.tuning.identify import identify_input, recorded
 from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
-from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 
 TRIALS = 1000
