@@ -97,31 +97,26 @@ class BagReader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        _expect_bag(path)
         self.unchecked = False
         self.lacking: Counter[str] = Counter()
-        self._stack = ExitStack()
+        _expect_bag(path)
+        with _readable(path), ExitStack() as stack:
+            for file in path.iterdir() if path.is_dir() else [path]:
+                if file.suffix in ('.mcap', '.db3'):
+                    _expect_whole(file)
+            reader = stack.enter_context(AnyReader([path], default_typestore=TYPES))
+            self.connections: list[Connection] = list(reader.connections)
+            self.types = reader.typestore
+            storage: Any = reader.readers[0].storage
+            self._storages = storage.storages if path.is_dir() else [storage]
+            stored = [c for storage in self._storages for c in storage.connections]
+            for topic in {c.topic for c in self.connections}:
+                there = sum(c.msgcount for c in stored if c.topic == topic)
+                _expect(topic, self.count(topic), there)
+            self._stack = stack.pop_all()
 
     def __enter__(self) -> 'BagReader':
-        with _readable(self.path), ExitStack() as stack:
-            self._open(stack)
-            self._stack = stack.pop_all()
         return self
-
-    def _open(self, stack: ExitStack) -> None:
-        path = self.path
-        for file in path.iterdir() if path.is_dir() else [path]:
-            if file.suffix in ('.mcap', '.db3'):
-                _expect_whole(file)
-        reader = stack.enter_context(AnyReader([path], default_typestore=TYPES))
-        self.connections: list[Connection] = list(reader.connections)
-        self.types = reader.typestore
-        storage: Any = reader.readers[0].storage
-        self._storages = storage.storages if path.is_dir() else [storage]
-        stored = [c for storage in self._storages for c in storage.connections]
-        for topic in {c.topic for c in self.connections}:
-            there = sum(c.msgcount for c in stored if c.topic == topic)
-            _expect(topic, self.count(topic), there)
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
