@@ -15,7 +15,7 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import INPUT, ONLINE_PARAMETERS
-from fhaosmo_ros.stop_signals import Stop, Stopped
+from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
@@ -130,8 +130,6 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             bar = partial(progress, total=count, unit='sample', unit_scale=True, desc='replay')
             samples = Samples(estimator, live, inputs, arguments.smooth, bar)
             _write(reader, samples, outputs, name, ONLINE_PARAMETERS.defaults() | own)
-        if stop.is_set():  # Python drops what a signal raises in a destructor
-            raise Stopped
         finals = [output.keep() for output in outputs]
     seconds = perf_counter() - begin
     c = estimator.counters
