@@ -79,10 +79,6 @@ class PrivateNode:
         if self._spinner.error is not None:
             raise self._spinner.error
 
-    def resolved(self, name: str) -> str:
-        """Return the full name of a topic, or of a node, after remapping."""
-        return self.node.resolve_topic_name(name)
-
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
         """Ask another node to change parameters; what it answers is not waited for."""
         changes = [Parameter(name, value=value) for name, value in values.items()]
@@ -163,8 +159,9 @@ class TopicRecorder(PrivateNode):
         self.lost: Counter[str] = Counter()
         self.problems: list[str] = []
         self._bag, self._everything = bag, everything
-        self._nodes = [self.resolved(name) for name in nodes]
-        self._topics = {self.resolved(name) for name in [*topics, *(OF_NODES if nodes else ())]}
+        resolved = self.node.resolve_topic_name  # after remapping; names of nodes, too
+        self._nodes = [resolved(name) for name in nodes]
+        self._topics = {resolved(name) for name in [*topics, *(OF_NODES if nodes else ())]}
         self._begin = time_ns()
         self._seen: set[str] = set()
 

@@ -52,17 +52,16 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     # Here, so that --help needs no ROS.
     from fhaosmo_ros.nodes.recording import TopicRecorder
 
+    bag = BagWriter(path)
+    recorder = TopicRecorder(
+        bag,
+        [] if arguments.topics else [_full(name) for name in arguments.names],
+        [_full(topic) for topic in arguments.topics or []],
+        arguments.all,
+        arguments.ros_arguments,
+    )
     try:
-        with (
-            BagWriter(path) as bag,
-            TopicRecorder(
-                bag,
-                [] if arguments.topics else [_full(name) for name in arguments.names],
-                [_full(topic) for topic in arguments.topics or []],
-                arguments.all,
-                arguments.ros_arguments,
-            ) as recorder,
-        ):
+        with bag, recorder:
             # Says when it listens, so that a user knows when to start what is to be recorded.
             print(f'recording to {path}; Ctrl-C ends it', flush=True)
             _watch(recorder, arguments.duration, stop)
