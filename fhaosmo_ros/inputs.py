@@ -23,16 +23,11 @@ BACK = 0.5
 class Input(NamedTuple):
     """A number that an estimator reads."""
 
-    topic: str
-    """As the user wrote it: relative to the node's namespace, unless it begins with /."""
-    message_type: str
-    """'' if it is the one that the topic has."""
-    field: str
-    """'' for the only number."""
-    stamp: str
-    """auto, header, source or reception; of a known input header or reception."""
-    name: str
-    """Of the channel: the element of a list that is meant where the field has no index."""
+    topic: str  # as the user wrote it: below the node's namespace, unless it begins with /
+    message_type: str  # '' if it is the one that the topic has
+    field: str  # '' for the only number
+    stamp: str  # auto, header, source or reception; of a known input header or reception
+    name: str  # of the channel: the element of a list that is meant where the field has no index
 
     def absolute(self, namespace: str) -> str:
         """Return the topic's full name in a namespace such as '/rig' ('' or '/' for none)."""

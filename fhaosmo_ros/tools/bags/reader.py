@@ -43,22 +43,11 @@ Row = tuple[int, int, int, bytes]
 
 
 class FieldSamples(NamedTuple):
-    """
-    Samples of one field in the order of the bag.
+    """Samples of one field in the order of the bag."""
 
-    Attributes
-    ----------
-    times : (K,) array of int
-        Stamps that the bag keeps with the messages (mcap: log time), in nanoseconds.
-    stamps : (K,) array of int
-        The stamps that were asked for, in nanoseconds.
-    values : (K,) array
-
-    """
-
-    times: NDArray[np.int64]
-    stamps: NDArray[np.int64]
-    values: NDArray[np.float64]
+    times: NDArray[np.int64]  # (K,) that the bag keeps with the messages (mcap: log time), in ns
+    stamps: NDArray[np.int64]  # (K,) those that were asked for, in ns
+    values: NDArray[np.float64]  # (K,)
 
     def part(self, rows: slice | NDArray[np.bool_]) -> 'FieldSamples':
         """Return some of the samples."""

@@ -11,22 +11,11 @@ from fhaosmo_ros.topics import PARAMETERS, TEXT
 
 
 class Recorded(NamedTuple):
-    """
-    Parameters of a node, as its first message in the bag has them.
-
-    Attributes
-    ----------
-    topic : str
-    values : dict
-        Checked, in their own types; those of channels with the channels' names.
-    channel : str
-        The channel that was asked for, '' if the node has no named channels.
-
-    """
+    """Parameters of a node, as its first message in the bag has them."""
 
     topic: str
-    values: dict[str, Any]
-    channel: str
+    values: dict[str, Any]  # checked, in their own types; those of channels with channels' names
+    channel: str  # the one that was asked for, '' if the node has no named channels
 
     @property
     def namespace(self) -> str:

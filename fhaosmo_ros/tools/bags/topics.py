@@ -24,23 +24,11 @@ LATE = 0.75
 
 
 class Series(NamedTuple):
-    """
-    The messages of a topic as arrays.
+    """The messages of a topic as arrays."""
 
-    Attributes
-    ----------
-    stamps : (K,) array of int
-        Stamps in nanoseconds.
-    values : (K,) or (K, n) array
-        Numbers of a Float64, a Float64MultiArray, or a Time (in nanoseconds, as integers).
-    labels : list of str
-        Names of the n columns, where the messages have a label.
-
-    """
-
-    stamps: NDArray[np.int64]
-    values: NDArray[Any]
-    labels: list[str]
+    stamps: NDArray[np.int64]  # (K,) in nanoseconds
+    values: NDArray[Any]  # (K,) or (K, n), of Float64, Float64MultiArray, or Time (ns, integers)
+    labels: list[str]  # names of the n columns, where the messages have a label
 
 
 def messages(path: Path, topic: str) -> list[tuple[int, Any]]:
