@@ -103,11 +103,7 @@ class PrivateNode:
         """
         Return a function that publishes messages in CDR.
 
-        Raises
-        ------
-        LookupError
-            The message type is not installed here.
-
+        Raises LookupError if the message type is not installed here.
         """
         qos = QoSProfile(depth=PLAYED_DEPTH)
         if transient_local:

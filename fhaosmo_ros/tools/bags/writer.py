@@ -111,17 +111,9 @@ class BagWriter:
 
     def write(self, topic: str, stamp: int, data: bytes, published: int | None = None) -> None:
         """
-        Append one message in CDR.
+        Append one message in CDR, with its stamp in nanoseconds.
 
-        Parameters
-        ----------
-        topic : str
-        stamp : int
-            In nanoseconds.
-        data : bytes
-        published : int, optional
-            Publish time, which mcap keeps beside the stamp; default: the stamp.
-
+        Its publish time, which mcap keeps beside, is the stamp unless it is given.
         """
         channel, sent = self._channels[topic], stamp if published is None else published
         self._rows.append((channel, stamp, len(self._data)))
@@ -137,13 +129,8 @@ class BagWriter:
         """
         Append a message of each topic at each time, all at once.
 
-        Parameters
-        ----------
-        times : (K,) array of int
-            In nanoseconds.
-        columns : sequence of (str, (K, size) array)
-            Topics, and the bytes of their messages in CDR.
-
+        `times` are K stamps in nanoseconds, `columns` topics with the bytes of their messages in
+        CDR, (K, size).
         """
         self.flush()
         stamps = times.astype('<i8').view(np.uint8).reshape(len(times), -1)
