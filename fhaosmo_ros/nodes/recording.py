@@ -12,7 +12,7 @@ from typing import Any
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
 from fhaosmo_ros.nodes.middleware.messages import message_class
-from fhaosmo_ros.nodes.middleware.spin import Spinner
+from fhaosmo_ros.nodes.middleware.spin import GRACE, Spinner
 from fhaosmo_ros.topics import OF_ALL_NODES
 import rclpy
 from rclpy.context import Context
@@ -52,6 +52,8 @@ class PrivateNode:
 
     """
 
+    grace: float | None = GRACE
+
     def __init__(self, name: str, ros_arguments: Sequence[str] = ()) -> None:
         self._context = Context()
         self._clients: dict[str, AsyncParameterClient] = {}
@@ -66,7 +68,7 @@ class PrivateNode:
             raise ConfigurationError(f'ROS arguments {shlex.join(acting)}: {error}') from None
 
     def __enter__(self) -> 'PrivateNode':
-        self._spinner = Spinner(self.node).__enter__()
+        self._spinner = Spinner(self.node, grace=self.grace).__enter__()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -141,6 +143,8 @@ class TopicRecorder(PrivateNode):
         Lines that say why a topic can't be recorded, or not as a whole.
 
     """
+
+    grace = None  # what is being written is written before the bag is closed
 
     def __init__(
         self,
