@@ -88,7 +88,11 @@ class BuildExtensions(build_ext):
             sys.exit("error: Cython is needed to build: pip install 'Cython>=3'")
         # The mark of scripts/environment.sh that what lies in the checkout is up to date.
         Path('build/in_place').unlink(missing_ok=True)
-        self._forget_other_builds(version)
+        options = {(*e.extra_compile_args, *e.cython_directives.items()) for e in self.extensions}
+        compiler = [os.environ.get(name) for name in ('CC', 'CFLAGS', 'LDFLAGS')]
+        made_with = repr((version, compiler, sorted(options, key=repr)))
+        mark = Path(self.build_temp, 'made_with')
+        self.force = self.force or not mark.is_file() or mark.read_text() != made_with
         # Processes, not threads: Cython is Python. They must not run this file again.
         multiprocessing.set_start_method('fork', force=True)
         translated = cythonize(
@@ -102,21 +106,6 @@ class BuildExtensions(build_ext):
         for extension, c in zip(self.extensions, translated, strict=True):
             extension.sources = c.sources
         super().run()
-
-    def _forget_other_builds(self, version):
-        """Remove what was built with other options, another compiler or another Cython."""
-        options = {(*e.extra_compile_args, *e.cython_directives.items()) for e in self.extensions}
-        compiler = [os.environ.get(name) for name in ('CC', 'CFLAGS', 'LDFLAGS')]
-        made_with = repr((version, compiler, sorted(options, key=repr)))
-        mark = Path(self.build_temp, 'made_with')
-        if mark.is_file() and mark.read_text() == made_with:
-            return
-        for extension in self.extensions:
-            c = Path(self.build_temp, extension.sources[0]).with_suffix('.c')
-            library = Path(self.build_lib, self.get_ext_filename(extension.name))
-            for path in (c, library):
-                path.unlink(missing_ok=True)
-        mark.parent.mkdir(parents=True, exist_ok=True)
         mark.write_text(made_with)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
 from fhaosmo_ros.nodes.middleware.messages import message_class
-from fhaosmo_ros.nodes.recording.private_node import PrivateNode
+from fhaosmo_ros.nodes.recording import PrivateNode
 from fhaosmo_ros.tools.cli import processes
 from fhaosmo_ros.topics import OF_ALL_NODES
 import numpy as np

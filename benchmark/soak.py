@@ -17,7 +17,7 @@ import sys
 from time import monotonic, sleep
 from typing import Any
 
-from fhaosmo_ros.nodes.recording.private_node import PrivateNode
+from fhaosmo_ros.nodes.recording import PrivateNode
 from fhaosmo_ros.topics import ARRAY, FLOAT, TIME
 from live import Children, wait_until, Watch
 import numpy as np

@@ -68,6 +68,8 @@ class Stop:
             if self._set:
                 raise Stopped
             yield
+            if self._set:  # Python drops what a signal raises in a destructor or weakref callback
+                raise Stopped
         finally:
             self._raises = False
 

@@ -4,8 +4,7 @@
 from fhaosmo_ros.core import ConfigurationError, Family, OnlineEstimator
 from fhaosmo_ros.core.online.delay import PIECES
 from fhaosmo_ros.core.simulation.plant import respond
-from fhaosmo_ros.tools.tuning.objective import Objective
-from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.objective import Objective, TUNE_PARAMETERS
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np

@@ -16,7 +16,7 @@ from fhaosmo_ros.core.parameters.tables import (
     OBSERVER_PARAMETERS,
     PLANT_PARAMETERS,
 )
-from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
 from fhaosmo_ros.topics import (
     DIAGNOSTICS,
     ESTIMATES,

@@ -18,8 +18,7 @@ from fhaosmo_ros.core.simulation.recordings import FAMILY_PARAMETERS
 from fhaosmo_ros.tools.tuning import report
 from fhaosmo_ros.tools.tuning.command import main, read_parameters
 from fhaosmo_ros.tools.tuning.linear_gains import kalman_gains, SCHEME
-from fhaosmo_ros.tools.tuning.objective import Objective
-from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.objective import Objective, TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 import numpy as np
 import pytest

@@ -39,17 +39,14 @@ class Key(NamedTuple):
     """An element of a list by its name, which stands in another list of the same message."""
 
     name: str
-    names: str
-    """Field with the names, beside the list."""
+    names: str  # field with the names, beside the list
 
 
 class Elements(NamedTuple):
     """A list in the way to a number, of which the user says the element."""
 
-    length: float
-    """inf where it is not fixed."""
-    names: str
-    """Field beside it that holds the elements' names, '' if there is none."""
+    length: float  # inf where it is not fixed
+    names: str  # field beside it that holds the elements' names, '' if there is none
 
     def element(self, text: str) -> int | Key | None:
         """Return the element that is meant, None if there is no such one."""
@@ -61,14 +58,10 @@ class Elements(NamedTuple):
 class Field(NamedTuple):
     """A number in the messages of a topic."""
 
-    text: str
-    """As the user wrote it, such as 'angular_velocity.z', 'position[2]' or 'position[elbow]'."""
-    steps: list[str | int | Key]
-    """Names of fields and elements of lists, from the message inwards."""
-    header: str
-    """Name of the std_msgs/Header that the message begins with, '' if there is none."""
-    angle: str = ''
-    """One of `ANGLES` where the steps lead to the x of a quaternion, else ''."""
+    text: str  # as the user wrote it: 'angular_velocity.z', 'position[2]' or 'position[elbow]'
+    steps: list[str | int | Key]  # fields and elements of lists, from the message inwards
+    header: str  # name of the std_msgs/Header that the message begins with, '' if there is none
+    angle: str = ''  # one of `ANGLES` where the steps lead to the x of a quaternion, else ''
 
     @property
     def wraps(self) -> bool:

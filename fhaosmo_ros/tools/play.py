@@ -40,7 +40,7 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
     if not 0.0 <= arguments.delay <= 3600.0:
         raise ConfigurationError(f'--delay: expected 0 to 3600 s, got {arguments.delay:g}')
     # Here, so that --help needs no ROS.
-    from fhaosmo_ros.nodes.recording.private_node import PrivateNode
+    from fhaosmo_ros.nodes.recording import PrivateNode
 
     with BagReader(arguments.bag) as reader:
         wanted = arguments.topics or [c.topic for c in reader.connections if c.msgcount]

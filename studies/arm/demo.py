@@ -14,14 +14,13 @@ import time
 
 from fhaosmo_ros.core.arm.model import ArmModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.nodes.recording.topic_recorder import TopicRecorder
+from fhaosmo_ros.nodes.recording import TopicRecorder
 from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.types import header, serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 from fhaosmo_ros.tools.cli.processes import Children
-from fhaosmo_ros.tools.record import store
 from matplotlib.figure import Figure
 import numpy as np
 from studies.arm.judging import rmse
@@ -92,7 +91,7 @@ def _run(folder: Path, stop: Stop) -> None:
     """Let the robot and the node run, and record what the node says."""
     with (
         BagWriter(folder / 'bag') as bag,
-        TopicRecorder(lambda item: store(bag, item), lambda t: t in (TORQUE, EVENT)) as recorder,
+        TopicRecorder(bag, topics=(TORQUE, EVENT)) as recorder,
         Children(folder) as children,
     ):
         # The encoders' steps, and what the torque sensors' data sheet would say.
@@ -107,6 +106,7 @@ def _run(folder: Path, stop: Stop) -> None:
             while count < 1 or recorder.counts[TORQUE] != count:
                 count = recorder.counts[TORQUE]
                 node.check()
+                recorder.check()
                 if not count:
                     robot.check()
                     if time.monotonic() - begin > 60.0:

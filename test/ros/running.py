@@ -17,7 +17,7 @@ import fhaosmo_ros
 from fhaosmo_ros.core.parameters.files import loads
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
-from fhaosmo_ros.nodes.recording.private_node import PrivateNode
+from fhaosmo_ros.nodes.recording import PrivateNode
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python

@@ -4,7 +4,7 @@
 import math
 
 from builtin_interfaces.msg import Time
-from fhaosmo_ros.nodes.recording.private_node import PrivateNode
+from fhaosmo_ros.nodes.recording import PrivateNode
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy

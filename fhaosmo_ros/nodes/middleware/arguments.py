@@ -24,12 +24,9 @@ USAGE = '[--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r FROM:=TO] ...]'
 class Arguments(NamedTuple):
     """What a command line says."""
 
-    given: dict[str, Any]
-    """Values of parameters by name; neither names nor values are checked yet."""
-    origins: dict[str, str | None]
-    """Where each of them comes from: the file, or None for the command line."""
-    rest: list[str]
-    """What is left for ROS: remappings, levels of the log."""
+    given: dict[str, Any]  # parameters by name; neither names nor values are checked yet
+    origins: dict[str, str | None]  # the file of each of them, or None for the command line
+    rest: list[str]  # what is left for ROS: remappings, levels of the log
 
 
 def read_arguments(name: str, argv: list[str]) -> Arguments:

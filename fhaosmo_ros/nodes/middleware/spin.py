@@ -47,12 +47,18 @@ class Spinner:
     done; the main thread waits for signals, because Python runs signal handlers there only; `wake`
     makes the executor look at the future.
 
-    `on_end` is called in that thread when it ends, also by the `error` that a callback raised.
+    `on_end` is called in that thread when it ends, also by the `error` that a callback raised. At
+    the end a callback has `grace` seconds to end; None: as long as it takes.
     """
 
-    def __init__(self, node: Node, on_end: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        node: Node,
+        on_end: Callable[[], None] = lambda: None,
+        grace: float | None = GRACE,
+    ) -> None:
         self.error: BaseException | None = None
-        self._on_end = on_end
+        self._on_end, self._grace = on_end, grace
         self._logger = node.get_logger()
         # At 1 kHz the events executor takes a fifth of the CPU of the single-threaded one.
         kind = EventsExecutor or SingleThreadedExecutor
@@ -72,7 +78,7 @@ class Spinner:
     def __exit__(self, *_: object) -> None:
         self._stop.set_result(None)
         self._executor.wake()
-        self._thread.join(timeout=GRACE)
+        self._thread.join(timeout=self._grace)
         if not self.stuck:
             self._executor.shutdown()
 
@@ -110,21 +116,9 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
     rclpy's own signal handlers are off: SIGINT would come out of the events executor as a
     RuntimeError, and a second Ctrl-C would cut the clean-up short.
 
-    Parameters
-    ----------
-    name : str
-        estimator or plant.
-    factory : callable
-        Makes the node out of the parameters that are given.
-    argv : list of str or None
-        None for the arguments of the process.
-
-    Returns
-    -------
-    int
-        Exit code: 0 after a signal, 1 if a callback failed, 2 for a bad configuration (said in
-        one line on stderr).
-
+    `factory` makes the node, called `name`, out of the parameters that are given; `argv` are the
+    arguments of the process by default. Returns the exit code: 0 after a signal, 1 if a callback
+    failed, 2 for a bad configuration (said in one line on stderr).
     """
     argv = sys.argv[1:] if argv is None else argv
     if text := help_of(name, argv):

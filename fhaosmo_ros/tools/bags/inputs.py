@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded samples of y, and the known inputs at them, as the node finds them."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from heapq import merge
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -20,149 +20,106 @@ SAMPLE = 1000
 """A sample comes after the inputs that have its time."""
 
 
-class BagInputs(NamedTuple):
+class BagInputs:
     """
-    Where y and u are in a bag.
+    Where a bag has y and the known inputs of an estimator, by its parameters.
+
+    Parameters
+    ----------
+    reader : BagReader
+    values : mapping
+        Parameters of the channel.
+    model : TriangularModel
+        Says which known inputs there are, and which of them it uses; the others are 0.
+    namespace, channel : str
+        Namespace of the node, and name of the channel, '' without named channels.
 
     Attributes
     ----------
     y : Input
         With the full name of its topic, and its stamp as for `BagReader.samples`.
-    u : mapping of str to Input
-        The known inputs that the model uses, with full names.
-    values : mapping
-        Parameters of the channel.
 
     """
 
-    y: Input
-    u: Mapping[str, Input]
-    values: Mapping[str, Any]
+    def __init__(
+        self,
+        reader: BagReader,
+        values: Mapping[str, Any],
+        model: TriangularModel,
+        namespace: str = '',
+        channel: str = '',
+    ) -> None:
+        self._reader, self._values, self._model = reader, values, model
+        present = {c.topic for c in reader.connections}
 
+        def full(wanted: Input) -> Input:
+            # A bag may hold the y of one channel, or of a node in another namespace, as /y.
+            relative = wanted.topic.removeprefix(f'{channel}/')
+            names = [wanted.absolute(namespace), wanted.absolute(''), f'/{relative.lstrip("/")}']
+            return wanted._replace(topic=next((n for n in names if n in present), names[1]))
 
-def bag_inputs(
-    values: Mapping[str, Any],
-    used: Sequence[str],
-    present: Collection[str] = (),
-    namespace: str = '',
-    channel: str = '',
-) -> BagInputs:
-    """
-    Return where y and u are by the parameters of an estimator.
+        known = known_inputs(values, model.used_inputs, channel)
+        self._u = {name: full(its) for name, its in known.items()}
+        self.y = full(measured_output(values, channel))
+        if self.y.stamp == 'reception':
+            self.y = self.y._replace(stamp='bag')
 
-    Parameters
-    ----------
-    values : mapping
-        Parameters of the channel.
-    used : sequence of str
-        Known inputs that its model uses.
-    present : collection of str
-        Topics of the bag.
-    namespace : str
-        Of the node.
-    channel : str
-        Its name, '' without named channels.
+    def samples(self, watch: Watch = iter) -> tuple[FieldSamples, Field]:
+        """
+        Return the samples of y, and the field that they were in.
 
-    """
+        `watch` is as for `BagReader.samples`. Raises ConfigurationError if the bag lacks the topic
+        or the field, or has no samples.
+        """
+        y, stamp, reader = self.y, self.y.stamp, self._reader
+        field = reader.field(y.topic, y.field, y.name)
+        if stamp == 'auto' and not field.header and self._values.get('sampling') == 'clock':
+            stamp = 'bag'  # such an estimator took a sample when it came, not when it was sent
+        samples = reader.samples(y.topic, field, stamp, watch)
+        if not len(samples.times):
+            why = next(iter(reader.lacking), 'expected messages, read none')
+            raise ConfigurationError(f'topic {y.topic!r}: {why}')
+        return samples, field
 
-    def full(wanted: Input) -> Input:
-        # A bag may hold the y of one channel, or of a node in another namespace, as /y.
-        relative = wanted.topic.removeprefix(f'{channel}/')
-        names = [wanted.absolute(namespace), wanted.absolute(''), f'/{relative.lstrip("/")}']
-        return wanted._replace(topic=next((n for n in names if n in present), names[1]))
+    def at(
+        self,
+        samples: FieldSamples,
+        held: Sequence[float] | None = None,
+        reject: Callable[[int], None] = lambda _: None,
+    ) -> NDArray[np.float64]:
+        """
+        Return the known inputs at samples of y, (K, m).
 
-    y = full(measured_output(values, channel))
-    u = {name: full(its) for name, its in known_inputs(values, used, channel).items()}
-    return BagInputs(y._replace(stamp='bag') if y.stamp == 'reception' else y, u, values)
+        Samples and inputs are taken in the order of the bag, as the node takes them in that of
+        arrival. `held` are the inputs before the first ones in the bag, else 0; `reject` gets the
+        number of values that were not finite, and were left out. Raises ConfigurationError if the
+        bag has no such topic or field.
+        """
+        names, count = self._model.inputs, len(self._model.inputs)
+        before = list(held or [0.0] * count)
+        # Without inputs by their headers' stamps, samples do not wait.
+        pairing = make_pairing(self._values, names, self._u, before) or StampPairing(
+            [False] * count, 0, 0, before
+        )
+        arrivals = [_arrivals(samples, SAMPLE)]
+        for name, its in self._u.items():
+            field = self._reader.field(its.topic, its.field, its.name)
+            stamp = 'header' if its.stamp == 'header' else 'bag'
+            found = self._reader.samples(its.topic, field, stamp)
+            good = np.isfinite(found.values)
+            reject(int((~good).sum()))
+            arrivals.append(_arrivals(found.part(good), names.index(name)))
 
+        def paired() -> Iterator[list[float]]:
+            for _, j, stamp, u in merge(*arrivals):
+                if j == SAMPLE:
+                    pairing.take_sample(stamp, None)
+                else:
+                    pairing.take_input(j, stamp, u)
+                yield from (row for _, row in pairing.released())
+            yield from (row for _, row in pairing.released(at_once=True))
 
-def read_output(
-    reader: BagReader, inputs: BagInputs, watch: Watch = iter
-) -> tuple[FieldSamples, Field]:
-    """
-    Return the samples of y, and the field that they were in.
-
-    Parameters
-    ----------
-    reader : BagReader
-    inputs : BagInputs
-    watch : callable
-        See `BagReader.samples`.
-
-    Raises
-    ------
-    ConfigurationError
-        The bag lacks the topic or the field, or has no samples.
-
-    """
-    y, stamp = inputs.y, inputs.y.stamp
-    field = reader.field(y.topic, y.field, y.name)
-    if stamp == 'auto' and not field.header and inputs.values.get('sampling') == 'clock':
-        stamp = 'bag'  # such an estimator took a sample when it came, not when it was sent
-    samples = reader.samples(y.topic, field, stamp, watch)
-    if not len(samples.times):
-        why = next(iter(reader.lacking), 'expected messages, read none')
-        raise ConfigurationError(f'topic {y.topic!r}: {why}')
-    return samples, field
-
-
-def inputs_at(
-    samples: FieldSamples,
-    reader: BagReader,
-    model: TriangularModel,
-    inputs: BagInputs,
-    held: Sequence[float] | None = None,
-    reject: Callable[[int], None] = lambda _: None,
-) -> NDArray[np.float64]:
-    """
-    Return the known inputs at samples of y, (K, m).
-
-    Samples and inputs are taken in the order of the bag, as the node takes them in that of
-    arrival.
-
-    Parameters
-    ----------
-    samples : FieldSamples
-    reader : BagReader
-    model : TriangularModel
-        Says which known inputs there are, and which of them it uses; the others are 0.
-    inputs : BagInputs
-    held : sequence of float, optional
-        The known inputs before the first ones in the bag; else they are 0.
-    reject : callable, optional
-        Gets the number of values that were not finite, and were left out.
-
-    Raises
-    ------
-    ConfigurationError
-        The bag has no such topic or field.
-
-    """
-    count = len(model.inputs)
-    before = list(held or [0.0] * count)
-    # Without inputs by their headers' stamps, samples do not wait.
-    pairing = make_pairing(inputs.values, model.inputs, inputs.u, before) or StampPairing(
-        [False] * count, 0, 0, before
-    )
-    arrivals = [_arrivals(samples, SAMPLE)]
-    for name in model.used_inputs:
-        its = inputs.u[name]
-        field = reader.field(its.topic, its.field, its.name)
-        found = reader.samples(its.topic, field, 'header' if its.stamp == 'header' else 'bag')
-        good = np.isfinite(found.values)
-        reject(int((~good).sum()))
-        arrivals.append(_arrivals(found.part(good), model.inputs.index(name)))
-
-    def paired() -> Iterator[list[float]]:
-        for _, j, stamp, u in merge(*arrivals):
-            if j == SAMPLE:
-                pairing.take_sample(stamp, None)
-            else:
-                pairing.take_input(j, stamp, u)
-            yield from (row for _, row in pairing.released())
-        yield from (row for _, row in pairing.released(at_once=True))
-
-    return np.fromiter(paired(), np.dtype((np.float64, count)), len(samples.times))
+        return np.fromiter(paired(), np.dtype((np.float64, count)), len(samples.times))
 
 
 def _arrivals(samples: FieldSamples, number: int) -> Iterator[Arrival]:

@@ -43,22 +43,11 @@ Row = tuple[int, int, int, bytes]
 
 
 class FieldSamples(NamedTuple):
-    """
-    Samples of one field in the order of the bag.
+    """Samples of one field in the order of the bag."""
 
-    Attributes
-    ----------
-    times : (K,) array of int
-        Stamps that the bag keeps with the messages (mcap: log time), in nanoseconds.
-    stamps : (K,) array of int
-        The stamps that were asked for, in nanoseconds.
-    values : (K,) array
-
-    """
-
-    times: NDArray[np.int64]
-    stamps: NDArray[np.int64]
-    values: NDArray[np.float64]
+    times: NDArray[np.int64]  # (K,) that the bag keeps with the messages (mcap: log time), in ns
+    stamps: NDArray[np.int64]  # (K,) those that were asked for, in ns
+    values: NDArray[np.float64]  # (K,)
 
     def part(self, rows: slice | NDArray[np.bool_]) -> 'FieldSamples':
         """Return some of the samples."""
@@ -97,31 +86,26 @@ class BagReader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        _expect_bag(path)
         self.unchecked = False
         self.lacking: Counter[str] = Counter()
-        self._stack = ExitStack()
+        _expect_bag(path)
+        with _readable(path), ExitStack() as stack:
+            for file in path.iterdir() if path.is_dir() else [path]:
+                if file.suffix in ('.mcap', '.db3'):
+                    _expect_whole(file)
+            reader = stack.enter_context(AnyReader([path], default_typestore=TYPES))
+            self.connections: list[Connection] = list(reader.connections)
+            self.types = reader.typestore
+            storage: Any = reader.readers[0].storage
+            self._storages = storage.storages if path.is_dir() else [storage]
+            stored = [c for storage in self._storages for c in storage.connections]
+            for topic in {c.topic for c in self.connections}:
+                there = sum(c.msgcount for c in stored if c.topic == topic)
+                _expect(topic, self.count(topic), there)
+            self._stack = stack.pop_all()
 
     def __enter__(self) -> 'BagReader':
-        with _readable(self.path), ExitStack() as stack:
-            self._open(stack)
-            self._stack = stack.pop_all()
         return self
-
-    def _open(self, stack: ExitStack) -> None:
-        path = self.path
-        for file in path.iterdir() if path.is_dir() else [path]:
-            if file.suffix in ('.mcap', '.db3'):
-                _expect_whole(file)
-        reader = stack.enter_context(AnyReader([path], default_typestore=TYPES))
-        self.connections: list[Connection] = list(reader.connections)
-        self.types = reader.typestore
-        storage: Any = reader.readers[0].storage
-        self._storages = storage.storages if path.is_dir() else [storage]
-        stored = [c for storage in self._storages for c in storage.connections]
-        for topic in {c.topic for c in self.connections}:
-            there = sum(c.msgcount for c in stored if c.topic == topic)
-            _expect(topic, self.count(topic), there)
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()

@@ -11,22 +11,11 @@ from fhaosmo_ros.topics import PARAMETERS, TEXT
 
 
 class Recorded(NamedTuple):
-    """
-    Parameters of a node, as its first message in the bag has them.
-
-    Attributes
-    ----------
-    topic : str
-    values : dict
-        Checked, in their own types; those of channels with the channels' names.
-    channel : str
-        The channel that was asked for, '' if the node has no named channels.
-
-    """
+    """Parameters of a node, as its first message in the bag has them."""
 
     topic: str
-    values: dict[str, Any]
-    channel: str
+    values: dict[str, Any]  # checked, in their own types; those of channels with channels' names
+    channel: str  # the one that was asked for, '' if the node has no named channels
 
     @property
     def namespace(self) -> str:
@@ -38,20 +27,9 @@ def recorded_parameters(reader: BagReader, name: str | None = None) -> Recorded 
     """
     Return an estimator's parameters at the begin of the bag, or None if the bag lacks them.
 
-    Later live changes are not among them.
-
-    Parameters
-    ----------
-    reader : BagReader
-    name : str, optional
-        Name of the estimator: its node's, followed by the channel's if it has channels. Default:
-        the only node in the bag that has published its parameters, if it has no channels.
-
-    Raises
-    ------
-    ConfigurationError
-        They are not parameters of this version.
-
+    Later live changes are not among them. `name` is the node's, followed by the channel's if it
+    has channels; by default, it is the only node in the bag that has published its parameters, if
+    it has no channels. Raises ConfigurationError if they are not parameters of this version.
     """
     topics = {
         c.topic

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag made of a table of numbers, so that a CSV file is replayed as any recording."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.inputs import known_inputs, measured_output
 from fhaosmo_ros.tools.bags.types import serialise, with_numbers
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.topics import FLOAT
@@ -19,11 +17,12 @@ LATEST = 9.2e9
 """Seconds; the largest stamp in nanoseconds is a little more."""
 
 
-def bag_of_table(
-    path: Path, wanted: Sequence[str], values: Mapping[str, Any], used: Sequence[str], bag: Path
-) -> None:
+def bag_of_table(path: Path, wanted: Sequence[str], used: Sequence[str], bag: Path) -> None:
     """
     Write the samples of a CSV file to a new bag, each with the time in its line as its stamp.
+
+    They are Float64 on /y, and on topics of the known inputs' names: where an estimator looks for
+    them of whose inputs nothing is said.
 
     Parameters
     ----------
@@ -32,8 +31,6 @@ def bag_of_table(
         missing sample. Titles may stand in the first line; without them the columns are 1, 2, ...
     wanted : sequence of str
         Titles of the time in seconds, of y and of the known inputs; empty for the first columns.
-    values : mapping
-        Parameters of the estimator, which say on which topics it looks for y and known inputs.
     used : sequence of str
         Known inputs that the model uses, in the order of their columns.
     bag : path
@@ -46,8 +43,7 @@ def bag_of_table(
         no number, or times that are not finite or below 0.
 
     """
-    names = ['the time', 'y', *used]
-    numbers = _columns(path, wanted, names)
+    numbers = _columns(path, wanted, ['the time', 'y', *used])
     t = numbers[:, 0]
     bad = np.flatnonzero(~((t >= 0.0) & (t <= LATEST)))
     if len(bad):
@@ -55,14 +51,14 @@ def bag_of_table(
             f'{path}: expected times of 0 to {LATEST:g} s, got {t[bad[0]]} in sample {bad[0]}, '
             'counted from 0'
         )
-    topics = [measured_output(values), *known_inputs(values, used).values()]
+    empty = serialise(FLOAT, data=0.0)
     columns = [
-        (topic.absolute(''), with_numbers(serialise(FLOAT, data=0.0), its))
-        for topic, its in zip(topics, numbers.T[1:], strict=True)
+        (f'/{name}', with_numbers(empty, its))
+        for name, its in zip(['y', *used], numbers.T[1:], strict=True)
     ]
     with BagWriter(bag) as writer:
-        for name, _ in columns:
-            writer.add(name, FLOAT)
+        for topic, _ in columns:
+            writer.add(topic, FLOAT)
         stamps = np.round(t * 1e9).astype(np.int64)
         writer.write_columns(np.maximum(stamps, 1), columns)  # 0 is a stamp that nobody filled
 

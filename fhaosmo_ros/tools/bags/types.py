@@ -47,14 +47,9 @@ def serialise(message_type: str, **fields: Any) -> bytes:
 
 def with_numbers(message: bytes, numbers: NDArray[Any]) -> NDArray[np.uint8]:
     """
-    Return a message for each row of numbers, (K, size), all at once.
+    Return a message for each row of numbers, (K,) or (K, m), all at once: bytes, (K, size).
 
-    Parameters
-    ----------
-    message : bytes
-        In CDR; it ends with the numbers, of the same type, which those of a row replace.
-    numbers : (K,) or (K, m) array
-
+    `message` is one in CDR; it ends with numbers of the same type, which those of a row replace.
     """
     rows = np.ascontiguousarray(numbers).reshape(len(numbers), -1)
     ends = rows.view(np.uint8).reshape(len(rows), -1)

@@ -79,13 +79,14 @@ class BagWriter:
         types: Any = TYPES,
         qos: Sequence[dict[str, Any]] = (OFFERED_QOS,),
         digest: str = '',
-    ) -> None:
-        """Add a topic if the bag does not have it yet."""
-        if topic in self._channels:
-            return
+    ) -> bool:
+        """Add a topic if the bag lacks it; return False if its type has no definition here."""
         if types is TYPES:
             learn(message_type)
-        if message_type not in types.fielddefs:
+        known = message_type in types.fielddefs
+        if topic in self._channels:
+            return known
+        if not known:
             # A type that is not installed, or an old bag without definitions. Readers compare
             # the hash with the definition, so both are those of a message without fields.
             types, digest = get_typestore(Stores.EMPTY), ''
@@ -106,20 +107,13 @@ class BagWriter:
             'offered_qos_profiles': yaml.safe_load(offered),  # a copy: YAML refers to what it has
             'type_description_hash': digest,
         })  # fmt: skip
+        return known
 
     def write(self, topic: str, stamp: int, data: bytes, published: int | None = None) -> None:
         """
-        Append one message in CDR.
+        Append one message in CDR, with its stamp in nanoseconds.
 
-        Parameters
-        ----------
-        topic : str
-        stamp : int
-            In nanoseconds.
-        data : bytes
-        published : int, optional
-            Publish time, which mcap keeps beside the stamp; default: the stamp.
-
+        Its publish time, which mcap keeps beside, is the stamp unless it is given.
         """
         channel, sent = self._channels[topic], stamp if published is None else published
         self._rows.append((channel, stamp, len(self._data)))
@@ -135,13 +129,8 @@ class BagWriter:
         """
         Append a message of each topic at each time, all at once.
 
-        Parameters
-        ----------
-        times : (K,) array of int
-            In nanoseconds.
-        columns : sequence of (str, (K, size) array)
-            Topics, and the bytes of their messages in CDR.
-
+        `times` are K stamps in nanoseconds, `columns` topics with the bytes of their messages in
+        CDR, (K, size).
         """
         self.flush()
         stamps = times.astype('<i8').view(np.uint8).reshape(len(times), -1)

@@ -8,7 +8,6 @@ import sys
 from typing import Any, ClassVar
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.stop_signals import ending_signals
 
 GRACE = 5.0
 """Seconds that a child has to end by itself."""
@@ -103,13 +102,8 @@ class Children:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # A second Ctrl-C must not cut the clean-up.
-        handlers = {n: signal.signal(n, lambda *_: None) for n in ending_signals()}
-        try:
-            for child in self._children:
-                child.interrupt()
-            for child in self._children:
-                child.end()
-        finally:
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
+        # A second Ctrl-C does not cut this short: a command's handlers of signals raise nothing.
+        for child in self._children:
+            child.interrupt()
+        for child in self._children:
+            child.end()

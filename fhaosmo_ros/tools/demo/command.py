@@ -10,14 +10,13 @@ import time
 from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.nodes.recording.topic_recorder import TopicRecorder
+from fhaosmo_ros.nodes.recording import TopicRecorder
 from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command, shipped
 from fhaosmo_ros.tools.cli.processes import Children
 from fhaosmo_ros.tools.demo.figure import save_figure
 from fhaosmo_ros.tools.demo.report import others, read_run, table
-from fhaosmo_ros.tools.record import store, topics_of
 from fhaosmo_ros.topics import TRUTH
 
 START_DEADLINE = 60.0
@@ -96,10 +95,9 @@ def _record(
     folder: Path, parameters: Path, duration: float, noisy: bool, stop: Stop
 ) -> list[tuple[int, str]]:
     """Record a run; return when the plant changed (ns), and how."""
-    wanted = topics_of(['/estimator', '/plant'])
     with (
         BagWriter(folder / 'bag') as bag,
-        TopicRecorder(lambda item: store(bag, item), wanted) as recorder,
+        TopicRecorder(bag, ['/estimator', '/plant']) as recorder,
         Children(folder) as nodes,
     ):
         options = ('--ros-args', '--params-file', str(parameters))
@@ -114,6 +112,7 @@ def _record(
 
         def check() -> None:
             nodes.check()
+            recorder.check()
             _check_alone(recorder)
 
         _wait(ready, check, stop)
@@ -123,7 +122,7 @@ def _record(
 def _check_alone(recorder: TopicRecorder) -> None:
     """Raise if another node publishes what is recorded: the bag would hold a mixture."""
     for topic in ('/y', '/estimator/state'):
-        if recorder.publishers(topic) > 1:
+        if recorder.node.count_publishers(topic) > 1:
             raise ConfigurationError(
                 f'expected one publisher of {topic}, got another one on this host with '
                 f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}; set another ROS_DOMAIN_ID'

@@ -5,7 +5,7 @@ import argparse
 from pathlib import Path
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.stop_signals import Stop, Stopped
+from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import Output, run_command
 from fhaosmo_ros.tools.plot.curves import metrics, read_curves
 from fhaosmo_ros.tools.plot.figures import save_curves
@@ -48,7 +48,5 @@ def _plot(arguments: argparse.Namespace, stop: Stop) -> None:
     with Output(path, arguments.force) as output:  # not within raising: it leaves nothing behind
         with stop.raising():
             save_curves(curves, output.path)
-        if stop.is_set():  # Python drops what a signal raises in a destructor or weakref callback
-            raise Stopped
         final = output.keep()
     print(f'{metrics(curves)}\nfigure: {final}', flush=True)

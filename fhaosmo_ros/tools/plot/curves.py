@@ -17,47 +17,23 @@ from fhaosmo_ros.topics import ESTIMATES, EVENT, STANDARD_DEVIATION
 import numpy as np
 from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
+
 
 class Curves(NamedTuple):
-    """
-    Estimates of one estimator over the stamps of their samples.
+    """Estimates of one estimator over the stamps of their samples."""
 
-    Attributes
-    ----------
-    label : str
-        Bag and estimator.
-    stamps : (K,) array of int
-        In nanoseconds.
-    names : list of str
-        z1 .. zn and d.
-    estimate : (K, n + 1) array
-    innovation : (K, N) array
-    gamma : (K,) array or None
-        None of a self-tuning estimator, which has no power.
-    deviation : (K, n + 1) array or None
-        Standard deviations of the estimates, of a self-tuning estimator.
-    truth : (K, n + 1) array or None
-        NaN where the bag lacks it.
-    epsilon : float or None
-        Threshold of its gates, if it has gates and the bag has its parameters.
-    unit : str
-        Of y, '' if the bag does not say it.
-    events : list of (int, int)
-        Begin and end of each event, in nanoseconds.
-
-    """
-
-    label: str
-    stamps: NDArray[np.int64]
-    names: list[str]
-    estimate: NDArray[np.float64]
-    innovation: NDArray[np.float64]
-    gamma: NDArray[np.float64] | None = None
-    deviation: NDArray[np.float64] | None = None
-    truth: NDArray[np.float64] | None = None
-    epsilon: float | None = None
-    unit: str = ''
-    events: Sequence[tuple[int, int]] = ()
+    label: str  # bag and estimator
+    stamps: NDArray[np.int64]  # (K,) in nanoseconds
+    names: list[str]  # z1 .. zn and d
+    estimate: Floats  # (K, n + 1)
+    innovation: Floats  # (K, N)
+    gamma: Floats | None = None  # (K,); None of a self-tuning estimator, which has no power
+    deviation: Floats | None = None  # (K, n + 1) standard deviations, of a self-tuning estimator
+    truth: Floats | None = None  # (K, n + 1); NaN where the bag lacks it
+    epsilon: float | None = None  # of its gates, if it has gates and the bag has its parameters
+    unit: str = ''  # of y, '' if the bag does not say it
+    events: Sequence[tuple[int, int]] = ()  # begin and end of each, in nanoseconds
 
     def title(self, name: str) -> str:
         """Return one of `names` with its unit, which follows from that of y."""
@@ -69,11 +45,7 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
     """
     Read the estimates of some estimators, or of all that a bag holds.
 
-    Raises
-    ------
-    ConfigurationError
-        It is not a bag, or it holds no estimates.
-
+    Raises ConfigurationError if it is not a bag, or holds no estimates.
     """
     with BagReader(path) as reader:
         topics = {c.topic for c in reader.connections if c.msgcount}

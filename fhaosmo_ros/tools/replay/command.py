@@ -15,8 +15,8 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import INPUT, ONLINE_PARAMETERS
-from fhaosmo_ros.stop_signals import Stop, Stopped
-from fhaosmo_ros.tools.bags.inputs import bag_inputs
+from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
 from fhaosmo_ros.tools.bags.table import bag_of_table
@@ -105,7 +105,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             arguments.channel = arguments.channel or recorded.channel
         own = channel_parameters(arguments, recorded)
         if is_table:
-            own = _without_inputs(own)
+            # The file says where y and u are, not the topics of a node.
+            own = {k: v for k, v in own.items() if k not in ParameterTable(INPUT)}
         if arguments.smooth:
             own['smoothing_lag'] = 0.0
         estimator = OnlineEstimator(ONLINE_PARAMETERS.part_of(own))
@@ -119,18 +120,16 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
                 _warn(f'{error}; {followed} is not followed, this begins at the first sample')
         namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
         present = {c.topic for c in reader.connections}
-        used = estimator.observer.used_inputs
-        inputs = bag_inputs(own, used, present, namespace, arguments.channel)
+        model = estimator.observer.model
+        inputs = BagInputs(reader, own, model, namespace, arguments.channel)
         finals = arguments.output or [Path(f'{name}_replayed')]
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
         name = _name(present, arguments.name)
         with stop.raising():
             count = reader.count(inputs.y.topic)
             bar = partial(progress, total=count, unit='sample', unit_scale=True, desc='replay')
-            samples = Samples(reader, estimator, live, inputs, arguments.smooth, bar)
+            samples = Samples(estimator, live, inputs, arguments.smooth, bar)
             _write(reader, samples, outputs, name, ONLINE_PARAMETERS.defaults() | own)
-        if stop.is_set():  # Python drops what a signal raises in a destructor
-            raise Stopped
         finals = [output.keep() for output in outputs]
     seconds = perf_counter() - begin
     c = estimator.counters
@@ -164,13 +163,7 @@ def _write_bag_of_table(arguments: argparse.Namespace, bag: Path) -> None:
     own = channel_parameters(arguments)
     used = OnlineEstimator(ONLINE_PARAMETERS.part_of(own)).observer.used_inputs
     titles = [title.strip() for title in arguments.columns.split(',') if title.strip()]
-    bag_of_table(arguments.bag, titles, _without_inputs(own), used, bag)
-
-
-def _without_inputs(own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return parameters without those that say on which topics a node finds y and u."""
-    inputs = ParameterTable(INPUT)
-    return {name: value for name, value in own.items() if name not in inputs}
+    bag_of_table(arguments.bag, titles, used, bag)
 
 
 def _warn(text: str) -> None:

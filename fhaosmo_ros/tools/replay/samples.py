@@ -8,8 +8,8 @@ from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import Event
 from fhaosmo_ros.messages.fields import Unwrapper
-from fhaosmo_ros.tools.bags.inputs import BagInputs, inputs_at, read_output
-from fhaosmo_ros.tools.bags.reader import BagReader, Watch
+from fhaosmo_ros.tools.bags.inputs import BagInputs
+from fhaosmo_ros.tools.bags.reader import Watch
 from fhaosmo_ros.tools.replay.live_run import LiveRun
 from fhaosmo_ros.tools.replay.sinks import Rows
 import numpy as np
@@ -23,35 +23,14 @@ class Samples:
     """
     The samples of a bag, and their estimates block by block.
 
-    Parameters
-    ----------
-    reader : BagReader
-    estimator : OnlineEstimator
-    live : LiveRun or None
-        The live estimator to follow.
-    inputs : BagInputs
-    whole : bool
-        Smooth over the whole recording.
-    watch : callable
-        See `BagReader.samples`.
-
-    Attributes
-    ----------
-    span : float
-        Seconds from the first sample to the latest.
-    stamps : str
-        Where the stamps came from, in words.
-
-    Raises
-    ------
-    ConfigurationError
-        The bag lacks a topic or a field, or has no samples.
-
+    `live` is what to follow, if anything; `whole` smooths over the whole recording; `watch` is as
+    for `BagReader.samples`. `span` has the seconds from the first sample to the latest, `stamps`
+    where the stamps came from, in words. Raises ConfigurationError if the bag lacks a topic or a
+    field, or has no samples.
     """
 
     def __init__(
         self,
-        reader: BagReader,
         estimator: OnlineEstimator,
         live: LiveRun | None,
         inputs: BagInputs,
@@ -59,7 +38,7 @@ class Samples:
         watch: Watch,
     ) -> None:
         self.estimator, self._live, self._whole = estimator, live, whole
-        samples, field = read_output(reader, inputs, watch)
+        samples, field = inputs.samples(watch)
         self.span = float(samples.stamps[-1] - samples.stamps[0]) * 1e-9
         self.stamps = 'source (publish times of the bag)'
         if np.array_equal(samples.stamps, samples.times):
@@ -75,10 +54,7 @@ class Samples:
             samples = samples.unwrapped(unwrap)
         self._samples, self._u = samples, None
         if estimator.observer.uses_input:
-            self._u = inputs_at(
-                samples, reader, estimator.observer.model, inputs, estimator.inputs,
-                estimator.reject_inputs,
-            )  # fmt: skip
+            self._u = inputs.at(samples, estimator.inputs, estimator.reject_inputs)
         self._active = 0  # 1 while an event lasts
         self._found: list[tuple[int, Event]] = []
 

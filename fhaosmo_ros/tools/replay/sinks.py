@@ -35,28 +35,13 @@ from numpy.typing import NDArray
 
 
 class Rows(NamedTuple):
-    """
-    Estimates of accepted samples.
+    """Estimates of accepted samples."""
 
-    Attributes
-    ----------
-    times : (K,) array of int
-        Stamps of the samples in the bag, in nanoseconds.
-    y : (K,) array
-    estimates : Trajectory
-        ``t`` holds the stamps that dt came from, in nanoseconds.
-    active : (K,) array of int
-        1 while an event lasts; empty where none are asked for.
-    events : list of (int, Event)
-        Those that begin or end, with their stamps in the bag.
-
-    """
-
-    times: NDArray[np.int64]
-    y: NDArray[np.float64]
-    estimates: Trajectory
-    active: NDArray[np.int64]
-    events: list[tuple[int, Event]]
+    times: NDArray[np.int64]  # (K,) stamps of the samples in the bag, in nanoseconds
+    y: NDArray[np.float64]  # (K,)
+    estimates: Trajectory  # `t` holds the stamps that dt came from, in nanoseconds
+    active: NDArray[np.int64]  # (K,) 1 while an event lasts; empty where none are asked for
+    events: list[tuple[int, Event]]  # those that begin or end, with their stamps in the bag
 
 
 Sink = Callable[[Rows], None]
@@ -112,18 +97,8 @@ class BagSink:
     The estimator's topics in an open bag: a message on each for every sample.
 
     All messages of a topic have the same length. So they are made a block at a time: the bytes of
-    one, and behind them each sample's numbers.
-
-    Parameters
-    ----------
-    bag : BagWriter
-    name : str
-        Name below which the topics go.
-    order, levels : int
-        Numbers of states and of innovations.
-    parameters : mapping
-        Parameters of the estimates; written once, as the node publishes them.
-
+    one, and behind them each sample's numbers. The topics go below `name`; there are `order`
+    states and `levels` innovations; `parameters` are written once, as the node publishes them.
     """
 
     def __init__(

@@ -14,14 +14,15 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.recordings import SENSOR
 from fhaosmo_ros.stop_signals import Stop
-from fhaosmo_ros.tools.bags.inputs import bag_inputs
+from fhaosmo_ros.tools.bags.inputs import BagInputs
+from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import Output, run_command
 from fhaosmo_ros.tools.cli.options import add_value_options, assigned
 from fhaosmo_ros.tools.tuning import report
 from fhaosmo_ros.tools.tuning.bag_gains import make_gains, run
 from fhaosmo_ros.tools.tuning.identify import identify_input, recorded
 from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
-from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 
 TRIALS = 1000
@@ -136,7 +137,8 @@ def _identify(
     given |= {name: values[name] for name in ('order', 'phi')}
     model = TriangularModel.of(values)
     with stop.raising():
-        data = recorded(arguments.bag, bag_inputs(estimator, model.used_inputs), model)
+        with BagReader(arguments.bag) as reader:
+            data = recorded(BagInputs(reader, estimator, model), model)
         found = identify_input(data, model, values, given)
         made = make_gains(found, given)
         along = run(found, made)

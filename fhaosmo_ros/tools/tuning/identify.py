@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Iterable, Mapping
 import math
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
@@ -12,8 +11,7 @@ from fhaosmo_ros.core.online.policy import GAP_SAMPLES
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.messages.fields import Unwrapper
-from fhaosmo_ros.tools.bags.inputs import BagInputs, inputs_at, read_output
-from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.tuning.likelihood import CLIP, Design, Evaluation, Likelihood, Samples
 from fhaosmo_ros.tools.tuning.linear_gains import matern
@@ -87,15 +85,14 @@ def size_of_input(design: Design, intensity: float) -> float:
     return math.sqrt(intensity / matern(design.decay, design.derivatives))
 
 
-def recorded(bag: Path, inputs: BagInputs, model: TriangularModel) -> RecordedOutput:
+def recorded(inputs: BagInputs, model: TriangularModel) -> RecordedOutput:
     """Return the y of a bag, and the known inputs of a model."""
-    with BagReader(bag) as reader:
-        samples, field = read_output(reader, inputs)
-        if field.wraps:
-            samples = samples.unwrapped(Unwrapper())
-        u = np.zeros((len(samples.values), len(model.inputs)))
-        if model.uses_input:
-            u = inputs_at(samples, reader, model, inputs)
+    samples, field = inputs.samples()
+    if field.wraps:
+        samples = samples.unwrapped(Unwrapper())
+    u = np.zeros((len(samples.values), len(model.inputs)))
+    if model.uses_input:
+        u = inputs.at(samples)
     return RecordedOutput((samples.stamps - samples.stamps[0]) * 1e-9, samples.values, u)
 
 
@@ -105,21 +102,9 @@ def identify_input(
     """
     Find the likeliest noise and model of d.
 
-    Parameters
-    ----------
-    data : RecordedOutput
-    model : TriangularModel
-    values : Parameters
-        Of the estimator, complete.
-    given : mapping
-        Those of them that the user set: `noise_size`, `unknown_input_derivatives` and
-        `unknown_input_decay` are not estimated then.
-
-    Raises
-    ------
-    NothingToFind
-        There are no gains for this y.
-
+    `given` are those `values` of the estimator that the user set: `noise_size`,
+    `unknown_input_derivatives` and `unknown_input_decay` are not estimated then. Raises
+    NothingToFind if there are no gains for this y.
     """
     likelihood = _prepared(data, model, values, given)
     decay, orders = given.get('unknown_input_decay') or None, DERIVATIVES

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a set of gains is worth: its errors as one number."""
+"""What a set of gains is worth: its errors as one number; and the parameters of `tune` itself."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.declaration import Parameter, ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
-from fhaosmo_ros.core.simulation.recordings import Recording
-from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import MODEL, ONLINE_PARAMETERS
+from fhaosmo_ros.core.simulation.recordings import FAMILY, Recording, SENSOR, SHARED
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,37 +18,45 @@ FIRST_STAMP = 1_000_000_000
 SMALLEST = 1e-12
 """Relative errors below this one count as this one, so that their logarithm is finite."""
 
+TUNING = (
+    Parameter(
+        'recordings', 36, 'Number of recordings that the search sees.', lower=1, upper=10_000,
+        live=False,
+    ),
+    Parameter(
+        'held_out', 36, 'Number of other recordings, with other seeds, that only the report sees.',
+        lower=1, upper=10_000, live=False,
+    ),
+    Parameter(
+        'settled', 5.0, 'Errors count from this time of a recording on.', unit='s',
+        lower=0.0, upper=1e5, live=False,
+    ),
+    Parameter(
+        'weights', [1.0],
+        'Weight of the error of each estimate, squared and relative to the RMS of its truth.',
+        lower=0.0, upper=1e9, live=False, lengths='1 (d alone) or n + 1 (z1 .. zn, d)',
+    ),
+)  # fmt: skip
+TUNE_PARAMETERS = ParameterTable(MODEL, SENSOR, SHARED, FAMILY, TUNING)
+"""All that `tune` takes beside the estimator's parameters."""
+
 
 class Evaluation(NamedTuple):
     """How good one set of parameters is."""
 
+    # Weighted RMS error relative to the RMS of the truth; geometric mean over the recordings, so
+    # that an error smaller by a tenth counts the same on an easy recording and on a hard one.
     error: float
-    """
-    Weighted RMS error relative to the RMS of the truth; geometric mean over the recordings, so
-    that an error smaller by a tenth counts the same on an easy recording and on a hard one.
-    """
-    errors: Floats
-    """(R, n + 1) RMS errors of z_1 .. z_n and d of each recording."""
+    errors: Floats  # (R, n + 1) RMS errors of z_1 .. z_n and d of each recording
 
 
 class Objective:
     """
     Evaluates parameters of the estimator on recordings, by the node's code.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Each longer than `settled`.
-    tuning : mapping
-        Of `TUNING`, complete.
-    scale : array, optional
-        RMS values that errors are divided by; by default those of the truth of these recordings.
-
-    Raises
-    ------
-    ConfigurationError
-        A recording that is too short, or weights that do not fit.
-
+    The recordings are longer than `settled`; `tuning` are all values of `TUNING`. `scale` has the
+    RMS values that errors are divided by, by default those of the truth of these recordings.
+    Raises ConfigurationError for a recording that is too short, or weights that do not fit.
     """
 
     def __init__(
@@ -78,11 +86,8 @@ class Objective:
         """
         Evaluate parameters of the estimator.
 
-        Raises
-        ------
-        ConfigurationError
-            As `OnlineEstimator`, or parameters of another model than that of the recordings.
-
+        Raises ConfigurationError as `OnlineEstimator` does, and for parameters of another model
+        than that of the recordings.
         """
         estimator = OnlineEstimator(ONLINE_PARAMETERS.part_of(parameters))
         order, states = estimator.observer.order, len(self.scale) - 1

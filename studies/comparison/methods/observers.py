@@ -18,7 +18,7 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.cli.command import shipped
-from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.search import Dimension
 from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, Tuner
 import numpy as np
