@@ -23,8 +23,7 @@ from matplotlib.figure import Figure
 import numpy as np
 from scipy.signal import lfilter
 from studies import evidence
-from studies.comparison.methods.linear import estimates
-from studies.comparison.methods.sampled import SampledModel
+from studies.comparison.methods.linear import estimates, SampledModel
 from studies.evidence import Row
 from studies.harness import Floats, Found, Results, run_study, SELF_TUNING
 
@@ -71,7 +70,7 @@ def record(hours: float, seed: int, noise: float = NOISE, faults: bool = False) 
 def kalman(y: Floats, intensity: float) -> tuple[Floats, Floats]:
     """Return d by the filter whose d is a random walk, and no standard deviation."""
     model = TriangularModel(MODEL['phi'])
-    gain = SampledModel(model, H).kalman([intensity / NOISE**2])
+    gain = SampledModel(model, H).kalman(intensity / NOISE**2)
     t, none = H * np.arange(len(y)), np.zeros(len(y))
     samples = recordings.Recording(t, y, none, none[:, None], none, FILTER)
     return estimates(model, gain, 0.0, samples, 1.5 * H)[:, model.order], none

@@ -20,7 +20,7 @@ from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from scipy.signal import lfilter
 from studies import evidence, ratios
-from studies.comparison.evaluation import METHODS, tune
+from studies.comparison.methods import METHODS
 from studies.comparison.methods.adaptive import HUBER, IMM, NOISE
 from studies.comparison.methods.linear import LINEAR_LIMIT
 from studies.comparison.methods.method import (
@@ -29,6 +29,7 @@ from studies.comparison.methods.method import (
     mean,
     objective,
     Setting,
+    tune,
     Values,
 )
 from studies.comparison.methods.observers import model_of

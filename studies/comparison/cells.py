@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of the comparison: plant, disturbance, noise, rate, timing; and their recordings."""
+"""The cells of the comparison: plant, d, noise, rate, timing; their recordings, and errors."""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -12,7 +12,8 @@ from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Family, FAMILY_PARAMETERS, Recording, SHAPES
 from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
-from studies.comparison.methods.method import Setting
+from studies.comparison.methods import METHODS
+from studies.comparison.methods.method import mean, objective, Setting, tune, Tuned
 from studies.harness import Floats
 from studies.waves import wave
 
@@ -210,3 +211,20 @@ def sensors(quick: bool = False) -> list[Sensor]:
     for timing in ('jitter', 'dropouts', 'outliers'):
         chosen += [Sensor('paper', (name,), 1e-3, 1000.0, timing) for name in ('mix', 'steps')]
     return chosen
+
+
+def evaluate(sensor: Sensor, name: str, training: int, trials: int) -> tuple[Tuned, list[float]]:
+    """Tune a method for a sensor and return its error for each of the sensor's disturbances."""
+    method, setting = METHODS[name], sensor.setting()
+    tuned = tune(method, setting, sensor.training(training), trials, seed=1)
+    run = method.prepare(setting, tuned.values)
+    return tuned, [
+        mean(objective(r, run(r)[tuned.readout]) for r in sensor.held_out(disturbance))
+        for disturbance in sensor.disturbances
+    ]
+
+
+def methods_for(sensor: Sensor) -> list[str]:
+    """Return the methods that are compared for a sensor."""
+    quiet = sensor.setting().noise == 0.0
+    return [name for name, method in METHODS.items() if not (quiet and method.needs_noise)]

@@ -20,22 +20,25 @@ from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.search import Dimension
 import numpy as np
 from studies.comparison.methods.filters import several_models
-from studies.comparison.methods.linear import each_order, LONGEST, matern_space, samples_of
+from studies.comparison.methods.linear import (
+    each_order,
+    LONGEST,
+    matern_space,
+    SampledModel,
+    samples_of,
+)
 from studies.comparison.methods.method import Estimates, Method, ROBUST, Run, Setting, Values
-from studies.comparison.methods.sampled import SampledModel
 
 HUBER, NOISE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'
 
 
 def _prepare(setting: Setting, values: Values) -> Run:
     model, h, derivatives = setting.model, setting.period, int(values.get('derivatives', 0))
-    sampled = SampledModel(model, h, derivatives + 1, decay=values['decay'])
+    sampled = SampledModel(model, h, derivatives + 1, values['decay'])
     size, spread = sampled.size, values.get('spread', 1.0)
     factors = (1.0,) if spread == 1.0 else (1.0 / spread, 1.0, spread)
-    q = np.array([
-        sampled.process_noise([h * (factor * values['bandwidth']) ** (2 * size)])
-        for factor in factors
-    ])  # fmt: skip
+    bandwidths = [factor * values['bandwidth'] for factor in factors]
+    q = np.array([sampled.process_noise(h * bandwidth ** (2 * size)) for bandwidth in bandwidths])
     scale = h ** np.arange(size) / setting.noise
     about = setting.balance(derivatives) ** np.arange(1.0 + derivatives)
     sizes = np.concatenate([np.ones(model.order), setting.size * about])

@@ -1,20 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The linear peers: constant gains, the same model and Phi as ours.
+The linear peers: steady-state Kalman filters with the same model and Phi as ours.
 
     z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d
-    d' = d_1 - decay d, d_1' = d_2 - decay d_1, ..., d_{m-1}' = -decay d_{m-1}
+    d' = d_1 - decay d, d_1' = d_2 - decay d_1, ..., d_{m-1}' = -decay d_{m-1} + white noise
     x(t_k) = prediction(t_k) + K (y_k - prediction_1(t_k))
 
 For a linear Phi the prediction equals the zero-order-hold discretisation, up to an error that
 decreases with the longest step.
-
-The extended state observer (ESO): J. Han, IEEE Transactions on Industrial Electronics 56(3), 2009,
-doi:10.1109/TIE.2008.2011621.
 """
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from collections.abc import Sequence
 import math
 from types import SimpleNamespace
 
@@ -27,6 +23,7 @@ from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.likelihood import Samples
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise
 import numpy as np
+from scipy.linalg import expm, solve_discrete_are
 from studies.comparison.methods.method import (
     Estimates,
     LINEAR,
@@ -37,18 +34,93 @@ from studies.comparison.methods.method import (
     USUAL,
     Values,
 )
-from studies.comparison.methods.sampled import SampledModel
+from studies.harness import Floats
 
 LINEAR_LIMIT = 'Kalman, Matern'
 """Our observer equals this filter for small innovations."""
 REACH = 10.0
 """How far a search for the bandwidth goes, as a factor to both sides."""
-LONGEST = 1.5
-"""Nominal periods that one step of a prediction may take."""
+LONGEST, LONGEST_STEP = 1.5, 1.0
+"""Steps of a prediction: nominal periods; seconds, for a model without dynamics of its own."""
 DERIVATIVES = (0, 1, 2, 3)
 """Of d, that are tried."""
-Gain = Callable[[SampledModel, Values], np.ndarray]
-Space = Callable[[Setting], tuple[Dimension, ...]]
+
+
+class SampledModel:
+    """
+    The model, linearised at rest and extended by a chain of integrators that makes d.
+
+    States are scaled by powers of the period, because the Riccati equation is badly conditioned
+    otherwise.
+
+    Parameters
+    ----------
+    model : TriangularModel
+    period : float
+        Sampling period in seconds.
+    chain : int
+        Integrators that model d: with 1 the white noise drives d itself, with 2 its derivative.
+    decay : float
+        Rate (1/s) at which all states of the chain decay, so that d is a Matern process.
+
+    """
+
+    def __init__(
+        self, model: TriangularModel, period: float, chain: int = 1, decay: float = 0.0
+    ) -> None:
+        n, self.size, self.period = model.order, model.order + chain, period
+        self.scale = period ** np.arange(self.size)
+        """Powers of the period: scaled states are x_i * period^(i - 1)."""
+        self._rates = np.eye(self.size, k=1)
+        self._rates[range(n, self.size), range(n, self.size)] = -decay
+        jacobian = model.jacobian(np.zeros(n))
+        fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(n, k=1))))
+        self.resolution = min(0.03 / max(float(fastest), 1e-9), LONGEST_STEP)
+        """
+        Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
+        0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as dry
+        friction, needs shorter ones.
+        """
+        self._rates[:n, :n] += jacobian
+        self.a = self._scaled(expm(self._rates * period))
+        """(N, N): transition over a period, in scaled states."""
+
+    def _scaled(self, matrix: Floats) -> Floats:
+        return matrix * self.scale[:, None] / self.scale[None, :]
+
+    def kalman(self, intensity: float) -> Floats:
+        """
+        Return the steady-state Kalman gain for noise of variance 1 on y.
+
+        It is for a filter that predicts to t_k and then corrects with y_k itself; white noise of
+        the intensity drives the last state of the chain.
+        """
+        noise = self.process_noise(intensity)
+        try:
+            with np.errstate(invalid='ignore'):  # the result is checked below
+                p = solve_discrete_are(self.a.T, np.eye(self.size)[:1].T, noise, np.eye(1))
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
+        gain = p[:, 0] / (p[0, 0] + 1.0) / self.scale
+        if not np.isfinite(gain).all():
+            raise ConfigurationError(f'Kalman gain: expected finite numbers, got {gain}')
+        return gain
+
+    def process_noise(self, intensity: float) -> Floats:
+        """
+        Return what such noise adds to the scaled covariance over a period.
+
+        By C. F. Van Loan, IEEE Transactions on Automatic Control 23(3), 1978,
+        doi:10.1109/TAC.1978.1101743.
+        """
+        n, rates, drive = self.size, self._scaled(self._rates) * self.period, np.zeros(self.size)
+        drive[-1] = 1.0
+        block = np.zeros((2 * n, 2 * n))
+        block[:n, :n], block[:n, n:], block[n:, n:] = -rates, np.diag(drive), rates.T
+        exponential = expm(block)
+        largest = intensity * self.scale[-1] ** 2 * self.period
+        covariance = largest * exponential[n:, n:].T @ exponential[:n, n:]
+        return 0.5 * (covariance + covariance.T)
 
 
 def samples_of(r: Recording, model: TriangularModel) -> Samples:
@@ -61,8 +133,8 @@ def samples_of(r: Recording, model: TriangularModel) -> Samples:
 
 
 def estimates(
-    model: TriangularModel, gain: np.ndarray, decay: float, r: Recording, longest: float
-) -> np.ndarray:
+    model: TriangularModel, gain: Floats, decay: float, r: Recording, longest: float
+) -> Floats:
     """
     Return the estimates of z, d, d_1, .. of a recording, a row for each sample, by the gain K.
 
@@ -80,108 +152,24 @@ def estimates(
     return np.asarray(found)
 
 
-@lru_cache(maxsize=64)
-def _sampled(
-    phi: tuple[str, ...], period: float, chain: int, integrators_only: bool, decay: float
-) -> SampledModel:
-    return SampledModel(TriangularModel(phi), period, chain, integrators_only, decay)
-
-
-def _run(
-    gain: Gain, shortest: int, integrators_only: bool, setting: Setting, values: Values
-) -> Run:
-    model, chain = setting.model, shortest + int(values.get('derivatives', 0))
-    decay = values.get('decay', 0.0)
-    sampled = _sampled(model.phi, setting.period, chain, integrators_only, decay)
-    k = gain(sampled, values)
+def _prepare(setting: Setting, values: Values) -> Run:
+    """Return a run of the filter whose speed is about `bandwidth`."""
+    model, decay = setting.model, values.get('decay', 0.0)
+    chain = 1 + int(values.get('derivatives', 0))
+    sampled = SampledModel(model, setting.period, chain, decay)
+    gain = sampled.kalman(setting.period * values['bandwidth'] ** (2 * sampled.size))
     n, longest = model.order, min(LONGEST * setting.period, sampled.resolution)
 
     def estimate(r: Recording) -> dict[str, Estimates]:
-        out = estimates(model, k, decay, r, longest)
+        out = estimates(model, gain, decay, r, longest)
         return {'filtered': Estimates(out[:, :n], out[:, n])}
 
     return estimate
 
 
-def _kalman(model: SampledModel, values: Values) -> np.ndarray:
-    """Intensity of d's random walk such that the filter's speed is about `bandwidth`."""
-    return model.kalman([model.period * values['bandwidth'] ** (2 * model.size)])
-
-
-def _kalman_ramp(model: SampledModel, values: Values) -> np.ndarray:
-    drift = model.period * values['drift_bandwidth'] ** (2 * model.size)
-    walk = model.period * values['bandwidth'] ** (2 * model.size - 2)
-    return model.kalman([drift, walk])
-
-
-def placed(model: SampledModel, poles: Sequence[complex]) -> np.ndarray:
-    """
-    Return the gain that places the poles of the error dynamics here in the s plane.
-
-    By Ackermann's formula, since poles may coincide. Slow poles lie so close to 1 in the z plane
-    that a placement of z fails: (z - 1) / period is placed, with time in units of the mean pole.
-    """
-    speed, size = math.exp(float(np.mean(np.log(np.abs(poles))))), model.size
-    scale = speed ** -np.arange(float(size))
-    difference = model.a / model.scale[:, None] * model.scale[None, :] - np.eye(size)
-    rates = difference * scale[:, None] / scale[None, :] / (model.period * speed)
-    seen = rates[0] * (model.period * speed) + np.eye(size)[0]  # y after the prediction
-    places = [np.expm1(pole * model.period) / (model.period * speed) for pole in poles]
-    observed = np.array([seen @ np.linalg.matrix_power(rates, i) for i in range(size)])
-    polynomial = np.zeros((size, size))
-    for coefficient in np.real(np.poly(places)):
-        polynomial = polynomial @ rates + coefficient * np.eye(size)
-    try:
-        gain = polynomial @ np.linalg.solve(observed, np.eye(size)[-1])
-    except np.linalg.LinAlgError as error:
-        raise ConfigurationError(f'pole placement: no solution ({error})') from None
-    if not np.isfinite(gain).all():
-        raise ConfigurationError('gain: expected finite numbers, got some that are not')
-    return gain * model.period * speed / scale
-
-
-def pair(frequency: float, damping: float) -> list[complex]:
-    """Return the poles of s^2 + 2 damping frequency s + frequency^2."""
-    if damping < 1.0:
-        imaginary = frequency * math.sqrt(1.0 - damping * damping)
-        return [complex(-damping * frequency, sign * imaginary) for sign in (1.0, -1.0)]
-    root = frequency * math.sqrt(damping * damping - 1.0)
-    return [complex(-damping * frequency + sign * root) for sign in (1.0, -1.0)]
-
-
-def _eso(model: SampledModel, values: Values) -> np.ndarray:
-    return placed(model, [complex(-values['bandwidth'])] * model.size)
-
-
-def _luenberger(model: SampledModel, values: Values) -> np.ndarray:
-    poles: list[complex] = []
-    for i in range(model.size // 2):
-        poles += pair(values[f'frequency_{i + 1}'], values[f'damping_{i + 1}'])
-    if model.size % 2:
-        poles.append(complex(-values['real_pole']))
-    return placed(model, poles)
-
-
-def _bandwidth(name: str, setting: Setting) -> Dimension:
-    """Return a range in rad/s, from far below any d to where the observer is deadbeat."""
-    return Dimension(name, 0.05, 5.0 / setting.period, setting.speed)
-
-
 def _one_bandwidth(setting: Setting) -> tuple[Dimension, ...]:
-    return (_bandwidth('bandwidth', setting),)
-
-
-def _two_bandwidths(setting: Setting) -> tuple[Dimension, ...]:
-    return (*_one_bandwidth(setting), _bandwidth('drift_bandwidth', setting))
-
-
-def _luenberger_space(setting: Setting) -> tuple[Dimension, ...]:
-    pairs, odd = divmod(setting.model.order + 1, 2)
-    space = []
-    for i in range(1, pairs + 1):
-        space.append(_bandwidth(f'frequency_{i}', setting))
-        space.append(Dimension(f'damping_{i}', 0.1, 5.0, 0.7))
-    return (*space, *[_bandwidth('real_pole', setting)] * odd)
+    """Return a range in rad/s, from far below any d to where the observer is deadbeat."""
+    return (Dimension('bandwidth', 0.05, 5.0 / setting.period, setting.speed),)
 
 
 def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...]:
@@ -203,26 +191,15 @@ def each_order(search: Search, more: Sequence[Dimension] = ()) -> Values:
             (*matern_space(search.setting, k), *more),
             max(1, search.trials // len(DERIVATIVES)),
             search.seed,
-            jobs=1,
         )
         if not best[1] or found.value < best[0]:
             best = found.value, fixed | found.best
     return best[1]
 
 
-def _method(
-    name: str, kind: str, space: Space, gain: Gain, shortest: int = 1,
-    integrators_only: bool = False, tune: Callable[[Search], Values] | None = None,
-) -> Method:  # fmt: skip
-    return Method(name, kind, space, partial(_run, gain, shortest, integrators_only), tune)
-
-
 FILTERS = (
-    _method('Kalman', USUAL, _one_bandwidth, _kalman),  # d a random walk
-    _method('Kalman, ramp', LINEAR, _two_bandwidths, _kalman_ramp, shortest=2),  # its rate, too
-    _method('Kalman, decaying', LINEAR, matern_space, _kalman),  # a random walk that decays
-    _method(LINEAR_LIMIT, LINEAR, matern_space, _kalman, tune=each_order),
-    _method('ESO', LINEAR, _one_bandwidth, _eso, integrators_only=True),  # all poles at one place
-    _method('Luenberger', LINEAR, _luenberger_space, _luenberger),  # all poles free
+    Method('Kalman', USUAL, _one_bandwidth, _prepare),  # d a random walk
+    Method('Kalman, decaying', LINEAR, matern_space, _prepare),  # a random walk that decays
+    Method(LINEAR_LIMIT, LINEAR, matern_space, _prepare, each_order),
 )
-"""Steady-state Kalman filters by their d, an extended state observer, a Luenberger observer."""
+"""Steady-state Kalman filters by their d."""
