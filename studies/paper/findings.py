@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from studies.evidence import markdown, Row
 from studies.paper.cases import FREQUENCIES, OBSERVERS, Score, score, simulated
-from studies.paper.plant_and_observer import SOLVERS
+from studies.paper.plant_and_observer import HELD
 
 LOW, HIGH = FREQUENCIES
 VISIBLE = 0.005
@@ -69,7 +69,7 @@ def choose_solver(scores: dict[str, Scores]) -> str:
     methods for the equations of the paper: they stand beside them.
     """
     return min(
-        (solver for solver in scores if not SOLVERS[solver].holds_sign),
+        (solver for solver in scores if solver != HELD),
         key=lambda solver: sum(scores[solver][FINE, omega]['rms_d'] for omega in FREQUENCIES),
     )
 
