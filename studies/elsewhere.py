@@ -19,7 +19,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from studies import evidence
 from studies.comparison.methods import METHODS
-from studies.comparison.methods.linear import LINEAR_LIMIT
+from studies.comparison.methods.kalman import LINEAR_LIMIT
 from studies.comparison.methods.method import mean, Search, Setting, Values
 from studies.comparison.methods.observers import model_of
 from studies.evidence import markdown, Row

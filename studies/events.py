@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 import numpy as np
 from scipy.signal import lfilter
 from studies import evidence
-from studies.comparison.methods.linear import estimates, SampledModel
+from studies.comparison.methods.kalman import estimates, SampledModel
 from studies.evidence import Row
 from studies.harness import Floats, Found, Results, run_study, SELF_TUNING
 

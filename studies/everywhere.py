@@ -21,8 +21,7 @@ import numpy as np
 from scipy.signal import lfilter
 from studies import evidence, ratios
 from studies.comparison.methods import METHODS
-from studies.comparison.methods.adaptive import HUBER, IMM, NOISE
-from studies.comparison.methods.linear import LINEAR_LIMIT
+from studies.comparison.methods.kalman import HUBER, IMM, LINEAR_LIMIT, NOISE
 from studies.comparison.methods.method import (
     Estimates,
     JUDGED_FROM,

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """docs/evidence.md and the tables and figures in the folder beside it."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import csv
 from pathlib import Path
 import re
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.tools.cli.command import Output
 from matplotlib.figure import Figure
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
@@ -90,28 +89,20 @@ def publish(
 
     """
     page, folder = docs / PAGE, docs / FOLDER
-    text = filled(page.read_text(encoding='utf-8'), texts) if page.exists() else ''
-
-    def write(path: Path, writer: Callable[[Path], object]) -> None:
-        with Output(path, force=True) as output:
-            writer(output.path)
-            print(output.keep())
-
+    if page.exists():
+        page.write_text(filled(page.read_text(encoding='utf-8'), texts), encoding='utf-8')
+    folder.mkdir(parents=True, exist_ok=True)
     for name, rows in tables.items():
-        write(folder / f'{name}.csv', lambda path, rows=rows: _write_table(path, rows))
+        with (folder / f'{name}.csv').open('w', newline='', encoding='utf-8') as file:
+            table = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
+            table.writeheader()
+            for row in rows:
+                table.writerow({
+                    k: f'{v:.6g}' if isinstance(v, float | int) else v or ''
+                    for k, v in row.items()
+                })  # fmt: skip
     for name, figure in figures.items():
-        write(folder / f'{name}.png', lambda path, f=figure: f.savefig(path, dpi=110))
-    if text:
-        write(page, lambda path: path.write_text(text, encoding='utf-8'))
+        figure.savefig(folder / f'{name}.png', dpi=110)
+    print(f'{docs}: {", ".join([*tables, *figures])}')
     for body in texts.values():
         print(f'\n{body}')
-
-
-def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    with path.open('w', newline='', encoding='utf-8') as file:
-        table = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
-        table.writeheader()
-        for row in rows:
-            table.writerow({
-                k: f'{v:.6g}' if isinstance(v, float | int) else v or '' for k, v in row.items()
-            })  # fmt: skip

@@ -24,7 +24,7 @@ from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise, Values
 import numpy as np
-from studies.comparison.methods.linear import each_order, FILTERS, LINEAR_LIMIT
+from studies.comparison.methods.kalman import each_order, FILTERS, LINEAR_LIMIT
 from studies.comparison.methods.method import Search, Setting
 from studies.evidence import markdown, Row
 from studies.harness import Found, Results, run_study

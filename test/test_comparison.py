@@ -9,8 +9,13 @@ from scipy.linalg import expm
 from studies import everywhere
 from studies.comparison.cells import PLANTS, sensors
 from studies.comparison.methods import METHODS
-from studies.comparison.methods.adaptive import ADAPTIVE, HUBER, IMM
-from studies.comparison.methods.linear import LINEAR_LIMIT, SampledModel
+from studies.comparison.methods.kalman import (
+    ADAPTIVE,
+    HUBER,
+    IMM,
+    LINEAR_LIMIT,
+    SampledModel,
+)
 from studies.comparison.methods.method import Setting
 
 MODELS = {

@@ -23,7 +23,7 @@ from fhaosmo_ros.tools.tuning.parameters import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 import numpy as np
 import pytest
-from studies.comparison.methods.linear import estimates, SampledModel
+from studies.comparison.methods.kalman import estimates, SampledModel
 from waiting import wait_until
 
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')

@@ -8,12 +8,10 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core import Trajectory, TriangularModel
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.core.simulation.plant import respond
 import numpy as np
 from numpy.typing import NDArray
 from studies.evidence import Row
 from studies.harness import Floats, model_alone, observed, SELF_TUNING
-from studies.waves import wave
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'recipes'
 OURS, FIXED = 'this observer, self-tuning', 'this observer, fixed gains'
@@ -34,9 +32,14 @@ class Recorded(NamedTuple):
     """(N, m): known inputs, that of the interval which ends at each sample."""
     d: Floats
     """The true unknown input, or the `quantity` that methods return in its place."""
-    judged: NDArray[np.bool_]
-    """Samples that count."""
+    settled: float
+    """Seconds after which errors count."""
     quantity: str = 'd'
+
+    @property
+    def judged(self) -> NDArray[np.bool_]:
+        """Samples that count."""
+        return self.t - self.t[0] > self.settled
 
     @property
     def period(self) -> float:
@@ -74,10 +77,8 @@ class Recipe(NamedTuple):
     """What is measured and how it is shown."""
 
     methods: dict[str, Method]
-    conditions: Callable[[Path | None], Folds]
-    """From the recordings' place."""
-    short: Callable[[], Folds]
-    """The same from short simulations of the model alone."""
+    conditions: Callable[[Any], Folds]
+    """From the recordings' path, None where the recipe needs no recordings."""
     quantity: str
     """What the figure shows, with its unit."""
     drawn: Sequence[str]
@@ -158,37 +159,3 @@ def judge(method: Method, folds: Sequence[Fold]) -> Row:
         pairs += [(r, method.estimate(p, r, best)) for r in judged]
     wrong, unit = float(f'{error(pairs):.4g}'), method.unit if chosen else ''
     return {'error': wrong, 'chosen': ' '.join(f'{x:g}' for x in chosen), 'unit': unit}
-
-
-def simulated(
-    name: str, rate: float, noise: float, d: tuple[float, float],
-    inputs: Sequence[tuple[float, float]] = (), settled: float = 1.0, seconds: float = 8.0,
-) -> dict[str, list[Fold]]:  # fmt: skip
-    """
-    Return a fold of two simulations of a recipe's model, for a run without foreign data.
-
-    `d` has the RMS of the unknown input and its speed (rad/s), `inputs` mean and RMS of each
-    known one; what is judged begins `settled` seconds after the start.
-    """
-    parameters, found = model(name), []
-    plant = plant_of(parameters)
-    t = np.arange(0.0, seconds, 1.0 / rate)
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        force = d[0] * wave('sine', t, d[1], rng)
-        u = np.zeros((len(t), max(1, len(inputs))))
-        for column, (mean, size) in zip(u.T, inputs, strict=False):
-            column[:] = mean + size * wave('sine', t, 2.0, rng)
-        z, truth = respond(plant, 0.0, t, force, 1.0 / rate, u, step=0.5 / rate)
-        y = z[:, 0] + noise * rng.standard_normal(len(t))
-        known = u[:, : len(inputs)]
-        found.append(Recorded(f'simulated {seed + 1}', t, y, known, truth, t > settled))
-    return {'simulated': [Fold(parameters, found[:1], found[1:])]}
-
-
-def changed(folds: Folds, change: Callable[[dict[str, Any], Recorded], Recorded]) -> Folds:
-    """Return folds with each recording changed, by their parameters and itself."""
-    return {
-        name: [Fold(p, *([change(p, r) for r in rs] for rs in parts)) for p, *parts in these]
-        for name, these in folds.items()
-    }

@@ -2,7 +2,6 @@
 """Load torque of a servo: recordings of BAM (Rhoban), whose load is a mass on a lever."""
 
 from collections.abc import Sequence
-from functools import partial
 import json
 from pathlib import Path
 
@@ -31,7 +30,7 @@ def read(path: Path) -> Recorded:
     )
     duty = np.where(load > 2**15, load - 2**16, load) / FULL_DUTY
     u = np.column_stack([duty * volt, powered])
-    return Recorded(path.stem, t, y, u, np.zeros_like(t), t > t[0] + SETTLED)
+    return Recorded(path.stem, t, y, u, np.zeros_like(t), SETTLED)
 
 
 def identify(recordings: Sequence[Recorded]) -> tuple[dict[str, float], Floats]:
@@ -53,9 +52,8 @@ def identify(recordings: Sequence[Recorded]) -> tuple[dict[str, float], Floats]:
     return dict(zip('abc', found[:3].tolist(), strict=True)), found[3:]
 
 
-def conditions(data: Path | None) -> dict[str, list[Fold]]:
+def conditions(data: Path) -> dict[str, list[Fold]]:
     """Return folds whose peers are tuned on the other recordings, for two models."""
-    assert data is not None
     recordings = [read(path) for path in sorted(data.glob('*.json'))]
     everything = identify(recordings)
 
@@ -76,7 +74,6 @@ def conditions(data: Path | None) -> dict[str, list[Fold]]:
     }
 
 
-INPUTS = (0.0, 2.0), (1.0, 0.0)
 RECIPE = Recipe(
     {
         'disturbance observer': Method(peers.disturbance_observer, BANDWIDTHS),
@@ -84,8 +81,7 @@ RECIPE = Recipe(
         FIXED: Method(judging.fixed, BANDWIDTHS),
         OURS: Method(judging.self_tuning),
     },
-    conditions,
-    partial(judging.simulated, 'motor_load', 190.0, 4e-4, (25.0, 6.0), INPUTS, SETTLED, 4.0),
-    'load torque [N m]', ('disturbance observer', OURS), (0.5, 6.0), scale=INERTIA, fold=3,
+    conditions, 'load torque [N m]', ('disturbance observer', OURS), (0.5, 6.0), scale=INERTIA,
+    fold=3,
     data='folder with the JSON files of one XL330 of BAM',
 )  # fmt: skip

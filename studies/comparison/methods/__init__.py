@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The observers that are compared, by name."""
 
-from studies.comparison.methods.adaptive import ADAPTIVE
-from studies.comparison.methods.linear import FILTERS
+from studies.comparison.methods.kalman import ADAPTIVE, FILTERS
 from studies.comparison.methods.method import Method
 from studies.comparison.methods.observers import OBSERVERS
 

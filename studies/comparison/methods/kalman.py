@@ -1,16 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The linear peers: steady-state Kalman filters with the same model and Phi as ours.
+The Kalman filters, with the same model and Phi as ours: steady ones, and ones that adapt.
 
     z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d
     d' = d_1 - decay d, d_1' = d_2 - decay d_1, ..., d_{m-1}' = -decay d_{m-1} + white noise
     x(t_k) = prediction(t_k) + K (y_k - prediction_1(t_k))
 
 For a linear Phi the prediction equals the zero-order-hold discretisation, up to an error that
-decreases with the longest step.
+decreases with the longest step. The others have one recursion, with covariances relative to the
+tuned noise; between samples the covariance takes as many steps as there are periods.
+
+Huber: an innovation e beyond `huber` standard deviations sqrt(S) counts as if its noise were
+larger, so that its influence is bounded. Noise: R <- R + share (max(e^2 - P_11, R_0 / 10^4) - R),
+the recursive form of innovation-based adaptive estimation (A. H. Mohamed and K. P. Schwarz,
+Journal of Geodesy 73, 1999, doi:10.1007/s001900050236). Several models: the interacting multiple
+model filter (H. A. P. Blom and Y. Bar-Shalom, IEEE Transactions on Automatic Control 33(8), 1988,
+doi:10.1109/9.1299).
 """
 
 from collections.abc import Sequence
+from functools import partial
 import math
 from types import SimpleNamespace
 
@@ -24,10 +33,12 @@ from fhaosmo_ros.tools.tuning.likelihood import Samples
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
+from studies.comparison.methods.filters import several_models
 from studies.comparison.methods.method import (
     Estimates,
     LINEAR,
     Method,
+    ROBUST,
     Run,
     Search,
     Setting,
@@ -38,6 +49,7 @@ from studies.harness import Floats
 
 LINEAR_LIMIT = 'Kalman, Matern'
 """Our observer equals this filter for small innovations."""
+HUBER, NOISE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'
 REACH = 10.0
 """How far a search for the bandwidth goes, as a factor to both sides."""
 LONGEST, LONGEST_STEP = 1.5, 1.0
@@ -203,3 +215,45 @@ FILTERS = (
     Method(LINEAR_LIMIT, LINEAR, matern_space, _prepare, each_order),
 )
 """Steady-state Kalman filters by their d."""
+
+
+def _prepare_adaptive(setting: Setting, values: Values) -> Run:
+    model, h, derivatives = setting.model, setting.period, int(values.get('derivatives', 0))
+    sampled = SampledModel(model, h, derivatives + 1, values['decay'])
+    size, spread = sampled.size, values.get('spread', 1.0)
+    factors = (1.0,) if spread == 1.0 else (1.0 / spread, 1.0, spread)
+    bandwidths = [factor * values['bandwidth'] for factor in factors]
+    q = np.array([sampled.process_noise(h * bandwidth ** (2 * size)) for bandwidth in bandwidths])
+    scale = h ** np.arange(size) / setting.noise
+    about = setting.balance(derivatives) ** np.arange(1.0 + derivatives)
+    sizes = np.concatenate([np.ones(model.order), setting.size * about])
+    sizes[0] = setting.noise
+    bank = SimpleNamespace(
+        a=sampled.a, q=q, fresh=np.diag((scale * sizes) ** 2), scale=scale, period=h,
+        huber=values.get('huber', math.inf), memory=h / values.get('memory', math.inf),
+        switch=h / values.get('stay', 1.0),
+    )  # fmt: skip
+    longest = min(LONGEST * h, sampled.resolution)
+    prediction = Prediction(model.with_unknown_input(values['decay'], derivatives), longest)
+
+    def estimate(r: Recording) -> dict[str, Estimates]:
+        out = several_models(prediction, samples_of(r, model), bank)
+        return {'filtered': Estimates(out[:, : model.order], out[:, model.order])}
+
+    return estimate
+
+
+def _adaptive(name: str, *options: Dimension) -> Method:
+    def space(setting: Setting) -> tuple[Dimension, ...]:
+        return (*matern_space(setting), *options)
+
+    tune = partial(each_order, more=options)
+    return Method(name, ROBUST, space, _prepare_adaptive, tune, needs_noise=True)
+
+
+ADAPTIVE = (
+    _adaptive(HUBER, Dimension('huber', 1.0, 10.0, 2.5)),
+    _adaptive(NOISE, Dimension('memory', 0.1, 100.0, 3.0)),
+    _adaptive(IMM, Dimension('spread', 1.2, 10.0, 2.0), Dimension('stay', 0.1, 100.0, 3.0)),
+)
+"""All take d for a Matern process."""
