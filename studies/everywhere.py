@@ -19,7 +19,7 @@ from fhaosmo_ros.core.simulation.plant import quantised, respond
 from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from scipy.signal import lfilter
-from studies import evidence, ratios
+from studies import evidence
 from studies.comparison.methods import METHODS
 from studies.comparison.methods.kalman import HUBER, IMM, LINEAR_LIMIT, NOISE
 from studies.comparison.methods.method import (
@@ -105,8 +105,8 @@ CONDITIONS = {
 TUNED = 'as tuned'
 SELF, ONCE, PRESET = 'self-tuning', 'Kalman, tuned once', 'shipped file'
 STYLES = {
-    SELF: ratios.SELF, ONCE: ratios.USUAL, PRESET: ratios.TUNED, HUBER: ratios.ROBUST,
-    NOISE: ratios.OTHER, IMM: ratios.GREY,
+    SELF: evidence.SELF, ONCE: evidence.USUAL, PRESET: evidence.TUNED, HUBER: evidence.ROBUST,
+    NOISE: evidence.OTHER, IMM: evidence.GREY,
 }  # fmt: skip
 PEERS: dict[str, list[dict[str, float]]] = {
     HUBER: [{'huber': limit} for limit in (1.5, 2.5, 4.0)],
@@ -280,7 +280,7 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     for row in cells:
         panels[row['plant']][row['condition']] = row
     text = 'error of d over that of a Kalman filter tuned anew with the truth'
-    return Found({NAME: cells}, texts(cells), {NAME: ratios.draw(panels, STYLES, text)})
+    return Found({NAME: cells}, texts(cells), {NAME: evidence.draw_ratios(panels, STYLES, text)})
 
 
 if __name__ == '__main__':

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 from studies import evidence
-from studies import ratios as figure
 from studies.comparison.cells import evaluate, methods_for, PLANTS, sensors
 from studies.comparison.methods import method, METHODS
 from studies.comparison.methods.method import LINEAR, mean
@@ -19,8 +18,8 @@ NAME = 'comparison'
 FULL, QUICK = (4, 200), (1, 15)
 """Recordings that tune a method, and trials."""
 STYLES = {
-    method.USUAL: figure.USUAL, method.ROBUST: figure.ROBUST, method.SLIDING: figure.OTHER,
-    method.PAPER: figure.GREY, method.OURS: figure.TUNED, method.SELF_TUNING: figure.SELF,
+    method.USUAL: evidence.USUAL, method.ROBUST: evidence.ROBUST, method.SLIDING: evidence.OTHER,
+    method.PAPER: evidence.GREY, method.OURS: evidence.TUNED, method.SELF_TUNING: evidence.SELF,
 }  # fmt: skip
 CLOSE = 0.05
 """Errors within this part of another one count as equal."""
@@ -111,7 +110,7 @@ def draw(chosen: Chosen, jumps: bool) -> Figure:
             }
     with_jumps = 'with' if jumps else 'without'
     text = f'd {with_jumps} jumps: error of d over that of the best linear filter'
-    return figure.draw(panels, STYLES, text)
+    return evidence.draw_ratios(panels, STYLES, text)
 
 
 def _order(cell: Cell) -> tuple[bool, str, float, float]:

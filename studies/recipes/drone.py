@@ -13,7 +13,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from scipy.spatial.transform import Rotation
 from studies.harness import Floats
-from studies.recipes import judging, peers
+from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
 RATE = 100.0
@@ -137,8 +137,8 @@ def winds(_: None) -> dict[str, list[Fold]]:
 
 WIND = Recipe(
     {
-        DIFFERENCE: Method(peers.disturbance_observer, WIND_BANDWIDTHS),
-        'Kalman filter, wind a random walk': Method(peers.kalman_filter, WIND_BANDWIDTHS),
+        DIFFERENCE: Method(judging.disturbance_observer, WIND_BANDWIDTHS),
+        'Kalman filter, wind a random walk': Method(judging.kalman_filter, WIND_BANDWIDTHS),
         FIXED: Method(judging.fixed, WIND_BANDWIDTHS),
         OURS: Method(judging.self_tuning),
     },
@@ -182,8 +182,8 @@ def biases(_: None) -> dict[str, list[Fold]]:
 
 BIAS = Recipe(
     {
-        'complementary filter': Method(peers.complementary_filter, BIAS_BANDWIDTHS),
-        'Kalman filter, bias a random walk': Method(peers.kalman_filter, BIAS_BANDWIDTHS),
+        'complementary filter': Method(judging.complementary_filter, BIAS_BANDWIDTHS),
+        'Kalman filter, bias a random walk': Method(judging.kalman_filter, BIAS_BANDWIDTHS),
         OURS: Method(judging.self_tuning),
     },
     biases, 'bias [rad/s]', ('complementary filter', OURS), (0.0, 60.0), scale=-1.0,

@@ -9,7 +9,7 @@ from fhaosmo_ros.core import Family
 import numpy as np
 from scipy.signal import lfilter, savgol_coeffs
 from studies.harness import Floats, SELF_TUNING
-from studies.recipes import judging, peers
+from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
 ACCELERATION, VELOCITY = 'acceleration', 'velocity'
@@ -29,7 +29,7 @@ WINDOWS = [float(window) for window in range(11, 202, 10)]
 def difference(_: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
     """Return differences behind a first-order low pass; of the velocity for the acceleration."""
     order = 1 if r.quantity == VELOCITY else 2
-    return peers.low_passed(r.y, bandwidth, r.period, order, order)
+    return judging.low_passed(r.y, bandwidth, r.period, order, order)
 
 
 def savitzky_golay(degree: int, _: Mapping[str, Any], r: Recorded, window: float) -> Floats:

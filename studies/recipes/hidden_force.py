@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from studies.harness import Floats, SELF_TUNING
-from studies.recipes import judging, peers
+from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
 PERIOD = 2**14 / 1e7
@@ -96,8 +96,8 @@ def recorded(name: str, y: Floats, d: Floats) -> Recorded:
 
 RECIPE = Recipe(
     {
-        'disturbance observer': Method(peers.disturbance_observer, BANDWIDTHS),
-        'Kalman filter, d a random walk': Method(peers.kalman_filter, BANDWIDTHS),
+        'disturbance observer': Method(judging.disturbance_observer, BANDWIDTHS),
+        'Kalman filter, d a random walk': Method(judging.kalman_filter, BANDWIDTHS),
         FIXED: Method(fixed, BANDWIDTHS),
         OURS: Method(judging.self_tuning),
         LAGGING: Method(lagging),

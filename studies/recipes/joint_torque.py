@@ -10,8 +10,17 @@ from fhaosmo_ros.tools.bags.reader import BagReader
 import numpy as np
 from scipy.signal import butter, filtfilt, savgol_filter
 from studies.harness import Floats
-from studies.recipes import judging, peers
-from studies.recipes.judging import Estimate, FIXED, Fold, Method, OURS, Recipe, Recorded
+from studies.recipes import judging
+from studies.recipes.judging import (
+    Estimate,
+    FIXED,
+    Fold,
+    kalman_filter,
+    Method,
+    OURS,
+    Recipe,
+    Recorded,
+)
 
 JOINTS, WRENCH = '/pndbt/joint_states', '/pndbt/netft_data'
 RATE = 200.0
@@ -124,7 +133,7 @@ def conditions(data: Path) -> dict[str, list[Fold]]:
 RECIPE = Recipe(
     {
         'momentum observer': Method(momentum_observer, BANDWIDTHS),
-        'Kalman filter, d a random walk': Method(partial(torque, peers.kalman_filter), BANDWIDTHS),
+        'Kalman filter, d a random walk': Method(partial(torque, kalman_filter), BANDWIDTHS),
         FIXED: Method(partial(torque, judging.fixed), BANDWIDTHS),
         OURS: Method(partial(torque, judging.self_tuning)),
     },

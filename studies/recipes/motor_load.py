@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import savgol_filter
 from studies.harness import Floats
-from studies.recipes import judging, peers
+from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
 INERTIA = 0.00732
@@ -76,8 +76,8 @@ def conditions(data: Path) -> dict[str, list[Fold]]:
 
 RECIPE = Recipe(
     {
-        'disturbance observer': Method(peers.disturbance_observer, BANDWIDTHS),
-        'Kalman filter, d a random walk': Method(peers.kalman_filter, BANDWIDTHS),
+        'disturbance observer': Method(judging.disturbance_observer, BANDWIDTHS),
+        'Kalman filter, d a random walk': Method(judging.kalman_filter, BANDWIDTHS),
         FIXED: Method(judging.fixed, BANDWIDTHS),
         OURS: Method(judging.self_tuning),
     },
