@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 from studies import evidence
-from studies.comparison.cells import evaluate, methods_for, PLANTS, sensors
+from studies.comparison.cells import evaluate, JUMPS, methods_for, PLANTS, sensors
 from studies.comparison.methods import method, METHODS
 from studies.comparison.methods.method import LINEAR, mean
 from studies.evidence import markdown, Row
@@ -37,7 +37,7 @@ class Cell(NamedTuple):
     @property
     def jumps(self) -> bool:
         """True for a d that jumps."""
-        return PLANTS[self.plant].disturbances[self.d].jumps
+        return self.d in JUMPS
 
 
 Chosen = dict[Cell, dict[str, float]]
@@ -99,15 +99,22 @@ def number(x: float) -> str:
 
 def draw(chosen: Chosen, jumps: bool) -> Figure:
     """Draw each kind's error over that of the best linear filter, for d with or without jumps."""
-    panels: dict[str, dict[str, dict[str, float]]] = {}
-    about = [c for c in sorted(chosen, key=_order) if c.jumps == jumps]
-    for plant, case in PLANTS.items():
-        for at in dict.fromkeys(_order(c) for c in about if c.plant == plant):
-            cells = {c for c in about if c.plant == plant and _order(c) == at}
-            found = {kind: ratios(chosen, kind, cells.__contains__) for kind in STYLES}
-            panels.setdefault(case.text, {})[_text(next(iter(cells)))] = {
-                kind: mean(values) for kind, values in found.items() if values
+    groups: dict[str, dict[str, list[Cell]]] = {case.text: {} for case in PLANTS.values()}
+    for cell in sorted(chosen, key=_order):
+        if cell.jumps == jumps:
+            groups[PLANTS[cell.plant].text].setdefault(_text(cell), []).append(cell)
+    panels = {
+        plant: {
+            text: {
+                kind: mean(values)
+                for kind in STYLES
+                if (values := ratios(chosen, kind, cells.__contains__))
             }
+            for text, cells in rows.items()
+        }
+        for plant, rows in groups.items()
+        if rows
+    }
     with_jumps = 'with' if jumps else 'without'
     text = f'd {with_jumps} jumps: error of d over that of the best linear filter'
     return evidence.draw_ratios(panels, STYLES, text)

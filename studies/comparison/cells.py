@@ -45,11 +45,6 @@ class Disturbance(NamedTuple):
     band: tuple[float, float] = (0.5, 8.0)
     """rad/s."""
 
-    @property
-    def jumps(self) -> bool:
-        """True for a d that jumps."""
-        return self.judged in JUMPS
-
 
 class PlantCase(NamedTuple):
     """A plant of config/models, and how its d and its noise are scaled."""
@@ -117,7 +112,7 @@ class Sensor(NamedTuple):
 
     def setting(self) -> Setting:
         """Return what a user knows before tuning."""
-        values = load(model_file(self.case.file), 'plant', PLANT_PARAMETERS)
+        values = load(shipped(f'config/models/{self.case.file}.yaml'), 'plant', PLANT_PARAMETERS)
         model = TriangularModel.of(PLANT_PARAMETERS.complete(values))
         # An encoder's rounding is spread evenly over a quantum.
         rounding = values.get('quantisation', 0.0) / math.sqrt(12.0)
@@ -169,17 +164,12 @@ class Sensor(NamedTuple):
         }  # fmt: skip
 
 
-def model_file(name: str) -> Any:
-    """Return the path of a plant in config/models."""
-    return shipped(f'config/models/{name}.yaml')
-
-
 @lru_cache
 def family_values(plant: str) -> dict[str, Any]:
     """Return the parameters of a plant's family that do not depend on the sensor."""
     case = PLANTS[plant]
     sizes = {'rms_of_d': case.rms_of_d, 'rms_of_u': case.rms_of_u, 'integration_step': STEP}
-    return load(model_file(case.file), 'plant', FAMILY_PARAMETERS) | sizes
+    return load(shipped(f'config/models/{case.file}.yaml'), 'plant', FAMILY_PARAMETERS) | sizes
 
 
 @lru_cache

@@ -36,7 +36,7 @@ ZOOM = 0.1
 
 
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
-    """Return all tables: first the simulations, whose best solver the half-widths take."""
+    """Return all tables: first the simulations, because the half-widths take scores of sign."""
     quick = arguments.quick
     widths = cases.WIDTHS[:: QUICK_WIDTHS if quick else 1]
     duration = QUICK_LONG if quick else cases.LONG_DURATION
@@ -47,13 +47,12 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
         | {('sampled', *case): (cases.sampled_rows, *case) for case in SAMPLED}
     )
     simulations = evidence.rounded(found[cell] for cell in cells)
-    scores = cases.scores_by_solver(simulations)
-    solver = cases.choose_solver(scores)
-    signs = {w: scores[solver][cases.FINE, w] for w in FREQUENCIES}
+    scores = cases.scores_of(simulations, cases.SOLVER)
+    signs = {key: score for key, score in scores.items() if key[0].startswith('sign')}
     found |= results(
-        {'sim1': (cases.first_observer, solver)}
-        | {(name, w): (cases.simulated, name, w, solver) for name in DRAWN for w in FREQUENCIES}
-        | {width: (cases.width_rows, width, widths, signs, solver) for width in widths}
+        {'sim1': (cases.first_observer,)}
+        | {(name, w): (cases.simulated, name, w) for name in DRAWN for w in FREQUENCIES}
+        | {width: (cases.width_rows, width, widths, signs) for width in widths}
     )
     tables = {
         'paper': simulations,
