@@ -23,6 +23,8 @@ import threading
 from time import monotonic, sleep
 from typing import Any
 
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.nodes.middleware.arguments import read_arguments
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.nodes.plant import PlantNode
@@ -30,10 +32,9 @@ from fhaosmo_ros.nodes.recording.private_node import PrivateNode
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.topics import ARRAY, FLOAT, TIME
-from live import Children, wait_until, Watch
+from live import Children, ROOT, wait_until, Watch
 import numpy as np
 from numpy.typing import NDArray
-from rcl_interfaces.msg import Parameter as ParameterMessage
 import rclpy
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
@@ -44,7 +45,8 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-PARAMETERS = ('--ros-args', '--params-file', 'benchmark/soak.yaml')
+FILE = 'benchmark/soak.yaml'
+PARAMETERS = ('--ros-args', '--params-file', FILE)
 TRUTH, ESTIMATE = '/plant/unknown_input', '/estimator/unknown_input'
 GAMMA, STAMP = '/estimator/gamma', '/estimator/stamp'
 TOPICS = {
@@ -98,6 +100,9 @@ SETS = {
         {'no_such_parameter': 1.0},
     ),
 }  # fmt: skip
+COMPLETE = ESTIMATOR_PARAMETERS.complete(load(ROOT / FILE, 'estimator'))
+BASE = {name: COMPLETE[name] for changes in SETS['good parameters'] for name in changes}
+"""What is put back."""
 
 
 def schedule(seed: int) -> Iterator[tuple[float, str, int]]:
@@ -195,16 +200,6 @@ class Client(PrivateNode):
         self.counts: Counter[str] = Counter()
         self._parameters = AsyncParameterClient(self.node, '/estimator')
         self._reset = self.node.create_client(Trigger, '/estimator/reset')
-        self._base: dict[str, Any] = {}
-
-    def learn(self) -> None:
-        """Remember the present parameters as those that `restore` puts back."""
-        names = sorted({name for changes in SETS['good parameters'] for name in changes})
-        wait_until(self._parameters.services_are_ready, 'the estimator offers no parameters')
-        values = self._answer(self._parameters.get_parameters(names)).values
-        for name, value in zip(names, values, strict=True):
-            message = ParameterMessage(name=name, value=value)
-            self._base[name] = Parameter.from_parameter_msg(message).value
 
     def call(self, kind: str) -> None:
         """Make the next call of a kind of `CALLS`."""
@@ -218,9 +213,10 @@ class Client(PrivateNode):
 
     def restore(self) -> None:
         """Put the parameters back."""
-        self.counts['wrong answers'] += not self._set(self._base)
+        self.counts['wrong answers'] += not self._set(BASE)
 
     def _set(self, values: Mapping[str, Any]) -> bool:
+        wait_until(self._parameters.services_are_ready, 'the estimator offers no parameters')
         parameters = [Parameter(name, value=value) for name, value in values.items()]
         answer = self._answer(self._parameters.set_parameters_atomically(parameters))
         return bool(answer.result.successful)
@@ -279,7 +275,6 @@ def soak(seed: int, minutes: float, output: Path) -> set[str]:
         plant = children.start('plant', 'benchmark/soak.py', 'plant', str(seed), *PARAMETERS)
         estimator.wait_for('estimating')
         plant.wait_for('injecting')
-        client.learn()
         calls = (event for event in schedule(seed) if event[1] in CALLS)
         time, kind, _ = next(calls)
         restored, judging, start = 0, False, monotonic()

@@ -119,7 +119,7 @@ ANEW = 'tuned anew'
 KNOWN = 'every z known'
 """What a wrong Phi makes of d, whoever estimates it."""
 Once = tuple[dict[str, float], dict[str, dict[str, float]]]
-"""What the tuning has found with the truth: a filter, and for each peer one of `PEERS`."""
+"""What the tuning has found with the truth: a filter for `RATE`, and one of each of `PEERS`."""
 
 
 class Size(NamedTuple):
@@ -136,13 +136,9 @@ QUICK = Size(7.0, ('sine', 'ou'), ('motor',), (TUNED, 'noise x 10'), 24)
 
 
 def at(member: Values, order: int, rate: float) -> dict[str, float]:
-    """Return the values of a Kalman filter at a rate: the intensity of its d stays (D 17)."""
-    return {**member, 'bandwidth': member['bandwidth'] * quicker(member, order, rate)}
-
-
-def quicker(member: Values, order: int, rate: float) -> float:
-    """Return the bandwidth of a filter at a rate over that at `RATE`."""
-    return float((rate / RATE) ** (0.5 / (order + 1 + member['derivatives'])))
+    """Return the values of a Kalman filter for `RATE` at a rate: the intensity of d stays."""
+    quicker = (rate / RATE) ** (0.5 / (order + 1 + member['derivatives']))  # D 17
+    return {**member, 'bandwidth': member['bandwidth'] * quicker}
 
 
 def recording(
@@ -200,13 +196,6 @@ def implied(plant: Plant, c: Condition, recordings: list[Recording]) -> float:
     return mean([error(r, r.d + e) for r, e in zip(recordings, off, strict=True)])
 
 
-def tuned(setting: Setting, recordings: list[Recording], trials: int) -> dict[str, float]:
-    """Return the Kalman filter at `RATE` that is best with the truth, as the comparison does."""
-    found = tune(METHODS[LINEAR_LIMIT], setting, recordings, trials, SEED).values
-    times = quicker(found, setting.model.order, 1.0 / setting.period)
-    return {**found, 'bandwidth': found['bandwidth'] / times}
-
-
 def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row, Once]:
     """Return the errors of all methods in a condition; without `once` tune them here."""
     plant, c = PLANTS[name], CONDITIONS[condition]
@@ -217,14 +206,13 @@ def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row,
     def errors(method: str, values: Values) -> float:
         return mean(errors_of(method, setting, values, recordings))
 
-    member = tuned(setting, recordings, size.trials)
-    anew = at(member, n, c.rate)
+    anew = tune(METHODS[LINEAR_LIMIT], setting, recordings, size.trials, SEED).values
     if once is None:
         best = {
             peer: min(choices, key=lambda own, peer=peer: errors(peer, anew | own))
             for peer, choices in PEERS.items()
         }
-        once = member, best
+        once = anew, best
     values = at(once[0], n, c.rate)
     preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | model_of(setting)
     of_preset = [error(r, observed(preset, r.t, r.y).unknown_input) for r in recordings]

@@ -41,9 +41,9 @@ Run = Callable[[Recording], dict[str, Estimates]]
 """Estimates by readout: one method may offer several (filtered and internal states)."""
 
 
-def objective(recording: Recording, estimates: Estimates) -> float:
+def objective(recording: Recording, estimates: Estimates, since: float = JUDGED_FROM) -> float:
     """Return the RMS error of d over the RMS of d; tuning minimises its geometric mean."""
-    late = recording.t >= JUDGED_FROM
+    late = recording.t >= since
     d = recording.d[late]
     with np.errstate(over='ignore', invalid='ignore'):
         value = rms(estimates.d[late] - d) / rms(d)
@@ -65,6 +65,8 @@ class Setting(NamedTuple):
     """About how large d is."""
     noise: float
     """Standard deviation of the noise on y, in its unit, with that of its rounding."""
+    judged_from: float = JUDGED_FROM
+    """Seconds of each recording that are the transient."""
 
     @property
     def speed(self) -> float:
@@ -155,7 +157,9 @@ def trial(
     averages: list[float] = []
     for count, recording in enumerate(recordings, 1):
         for name, estimates in run(recording).items():
-            totals[name] += math.log(max(objective(recording, estimates), SMALLEST))
+            totals[name] += math.log(
+                max(objective(recording, estimates, setting.judged_from), SMALLEST)
+            )
         best = min(totals, key=totals.__getitem__)
         averages.append(math.exp(totals[best] / count))
         if not averages[-1] <= (HOPELESS * rival[count - 1] if rival else BAD):
