@@ -7,11 +7,12 @@ import sys
 from tempfile import TemporaryDirectory
 from time import perf_counter
 
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.bags.types import serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.topics import FLOAT
 import numpy as np
-from results import CannotMeasureError, Row
+from results import Row
 from rosbags.highlevel import AnyReader
 
 SAMPLES, BAR = 1_000_000, 2.5
@@ -29,7 +30,7 @@ def measure(quick: bool) -> list[Row]:
             start = perf_counter()
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode:
-                raise CannotMeasureError(f'replay failed: {done.stderr.splitlines()[-1]}')
+                raise ConfigurationError(f'replay failed: {done.stderr.splitlines()[-1]}')
             middle = perf_counter()
             with AnyReader([bag]) as reader:
                 for connection, _, data in reader.messages():

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Mapping
 import os
 from pathlib import Path
 import platform
-import signal
 from typing import Any, NamedTuple
 
 from studies import evidence
@@ -24,20 +23,6 @@ SHOWN = (
     'replay to a bag / rosbags reads',
 )
 """Rows of the page."""
-
-
-class CannotMeasureError(Exception):
-    """Something that a measurement needs is missing; the message is one line."""
-
-
-def raise_on_signals() -> None:
-    """
-    Let SIGINT and SIGTERM raise KeyboardInterrupt, so that all children end.
-
-    A job in the background starts with SIGINT ignored.
-    """
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
 
 
 class Row(NamedTuple):

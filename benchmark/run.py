@@ -4,16 +4,19 @@ Measure speed as ratios within one run, and say which bars are met (`make bench`
 
 With `--page`, docs/evidence/speed.csv is written anew, each part as soon as it is measured.
 
-Exit code 0 if all bars are met, 1 if one is missed, 130 after Ctrl-C.
+Exit code 0 if all bars are met, 1 if one is missed, 2 if something cannot be measured, 130 after
+Ctrl-C.
 """
 
 import argparse
 import sys
 
 import core_step
+from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.tools.cli.command import run_command
 import node
 import replay
-from results import CannotMeasureError, machine, publish, raise_on_signals, render, Row
+from results import machine, publish, render, Row
 
 PARTS = {
     'core': core_step.measure, 'node': node.measure, 'startup': node.startup,
@@ -29,26 +32,25 @@ def main() -> int:
     )
     parser.add_argument('--only', choices=PARTS, help='one part only')
     parser.add_argument('--page', action='store_true', help='write the table in docs/ anew')
-    arguments = parser.parse_args()
-    if arguments.page and arguments.quick:
-        parser.error('--page shows full measurements: expected no --quick, got --quick')
-    raise_on_signals()
+
+    def body(arguments: argparse.Namespace, stop: Stop) -> int:
+        if arguments.page and arguments.quick:
+            parser.error('--page shows full measurements: expected no --quick, got --quick')
+        with stop.raising():
+            return measure(arguments)
+
+    return run_command(parser, None, body)
+
+
+def measure(arguments: argparse.Namespace) -> int:
+    """Return 1 if a bar is missed."""
     rows: list[Row] = []
     where = machine()
-    try:
-        for part in [arguments.only] if arguments.only else PARTS:
-            try:
-                found = PARTS[part](arguments.quick)
-            except CannotMeasureError as error:
-                print(f'{part}: {error}', file=sys.stderr)
-                found = [Row(part, None, bar=0.0, note=str(error))]
-            else:
-                if arguments.page:
-                    publish(part, found, where)
-            rows += found
-    except KeyboardInterrupt:
-        print('interrupted', file=sys.stderr)
-        return 130
+    for part in [arguments.only] if arguments.only else PARTS:
+        found = PARTS[part](arguments.quick)
+        if arguments.page:
+            publish(part, found, where)
+        rows += found
     print(f'{where}\n\n{render(rows)}')
     missed = [row.name for row in rows if row.missed]
     if missed:

@@ -5,39 +5,70 @@ Run plant, fault injector and estimator for a long time, and say what grew, drif
 `make soak MINUTES=30`. Exit code 0 if everything held, 1 if not, 130 after Ctrl-C. With
 ``--retries`` a run is repeated that missed nothing but what a busy machine makes: samples lost in
 transport because a process could not read, and errors of d because stamps were late.
+
+`soak.py plant` is the plant, with faults on its topic ``faulty_y``, and counts what it does. They
+are not made by a node between plant and estimator: that would stamp y anew, and on a busy machine
+the jitter of one more hop makes an error in d that hides the drift which a soak is to find.
 """
 
 import argparse
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 import json
 import os
 from pathlib import Path
+import signal
 import sys
+import threading
 from time import monotonic, sleep
 from typing import Any
 
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.nodes.middleware.arguments import read_arguments
+from fhaosmo_ros.nodes.middleware.spin import Spinner
+from fhaosmo_ros.nodes.plant import PlantNode
 from fhaosmo_ros.nodes.recording import PrivateNode
+from fhaosmo_ros.stop_signals import Stop
+from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.topics import ARRAY, FLOAT, TIME
-from live import Children, wait_until, Watch
+from live import Children, ROOT, wait_until, Watch
 import numpy as np
 from numpy.typing import NDArray
-from rcl_interfaces.msg import Parameter as ParameterMessage
+import rclpy
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from results import CannotMeasureError, raise_on_signals, render, Row
+from rclpy.signals import SignalHandlerOptions
+from results import render, Row
 from scipy.stats import theilslopes
-from soak_plant import CALLS, CYCLE, schedule
+from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-PARAMETERS = ('--ros-args', '--params-file', 'benchmark/soak.yaml')
+FILE = 'benchmark/soak.yaml'
+PARAMETERS = ('--ros-args', '--params-file', FILE)
 TRUTH, ESTIMATE = '/plant/unknown_input', '/estimator/unknown_input'
 GAMMA, STAMP = '/estimator/gamma', '/estimator/stamp'
 TOPICS = {
     TRUTH: FLOAT, ESTIMATE: FLOAT, GAMMA: FLOAT, STAMP: TIME, '/estimator/state': ARRAY,
     '/estimator/innovation': ARRAY,
 }  # fmt: skip
+CYCLE = 20.0
+"""Seconds: faults, then rest. The first cycle has no faults: caches fill."""
+FAULTS = (0.5, 11.0)
+"""When in a cycle faults begin."""
+PAUSE = (0.2, 1.2)
+"""Shortest and longest time between two faults, in seconds."""
+STREAM = {
+    'nan': (1, 20), 'infinity': (1, 20), 'spike': (1, 3), 'duplicate': (1, 50), 'stuck': (5, 100),
+    'burst': (2, 40), 'short gap': (2, 100), 'long gap': (300, 600), 'publisher restart': (1, 1),
+}  # fmt: skip
+"""Faults of y, with the smallest and largest number of samples that each concerns."""
+CALLS = ('good parameters', 'bad parameters', 'reset')
+"""What a client does meanwhile."""
+SPIKE = 1e3
+SETTLE = 0.5
+"""Seconds from the match of a new publisher, as seen from here, to its first sample."""
 RESTORE, JUDGED = 12.0, (15.0, 19.5)
 """When in a cycle parameters are put back, and when the estimate must be right."""
 PAIRED = 5_000_000
@@ -69,6 +100,88 @@ SETS = {
         {'no_such_parameter': 1.0},
     ),
 }  # fmt: skip
+COMPLETE = ESTIMATOR_PARAMETERS.complete(load(ROOT / FILE, 'estimator'))
+BASE = {name: COMPLETE[name] for changes in SETS['good parameters'] for name in changes}
+"""What is put back."""
+
+
+def schedule(seed: int) -> Iterator[tuple[float, str, int]]:
+    """
+    Yield the seconds since the start, the kind of each fault or call, and its samples.
+
+    Every kind comes up before one comes up again.
+    """
+    random, kinds, start = np.random.default_rng(seed), list[str](), 0.0
+    while start := start + CYCLE:
+        time = start + FAULTS[0]
+        while time < start + FAULTS[1]:
+            kinds = kinds or random.permutation([*STREAM, *CALLS]).tolist()
+            kind = kinds.pop()
+            low, high = STREAM.get(kind, (1, 1))
+            yield time, kind, int(random.integers(low, high + 1))
+            time += float(random.uniform(*PAUSE))
+
+
+class FaultyPlant(PlantNode):
+    """A plant whose y goes through faults; their time begins with the first sample."""
+
+    def __init__(self, given: dict[str, Any], seed: int) -> None:
+        super().__init__(given)
+        self.counts: Counter[str] = Counter()
+        self._left: Counter[str] = Counter()  # samples by fault
+        self._events = (event for event in schedule(seed) if event[1] in STREAM)
+        self._next = next(self._events)
+        self._held: list[float] = []  # of a burst
+        self._last = self._first_sample = self._matched = 0.0
+        self._faulty_y = self.create_publisher(Float64, 'faulty_y', 10)
+        self._publish_y = self._pass_on
+
+    def _pass_on(self, message: Float64) -> None:
+        """Publish what faults leave, or make, of a sample."""
+        now = monotonic()
+        if not self._matched and self._faulty_y.get_subscription_count():
+            self._matched = now
+        if not self._matched or now - self._matched < SETTLE:
+            return
+        if not self._first_sample:
+            self._first_sample = now
+            print('injecting', flush=True)
+        while self._next[0] <= now - self._first_sample:
+            _, kind, self._left[kind] = self._next
+            self._next = next(self._events)
+        for y in self._faulty(message.data):
+            self._faulty_y.publish(Float64(data=y))
+            self.counts['published'] += 1
+
+    def _faulty(self, y: float) -> list[float]:
+        """Return what is published in place of `y`."""
+        if self._take('publisher restart'):
+            self.destroy_publisher(self._faulty_y)
+            self._faulty_y = self.create_publisher(Float64, 'faulty_y', 10)
+            self._matched = 0.0
+            return []
+        if self._take('short gap') or self._take('long gap'):
+            return []
+        self._last = y = self._last if self._take('stuck') else y
+        if self._take('nan'):
+            y = float('nan')
+        elif self._take('infinity'):
+            y = float('inf')
+        elif self._take('spike'):
+            y += SPIKE
+        if self._take('burst'):
+            self._held.append(y)
+            return []
+        found = [*self._held, y]
+        self._held.clear()
+        return [*found, y] if self._take('duplicate') else found
+
+    def _take(self, kind: str) -> bool:
+        """Return True, and count one, while a fault lasts."""
+        lasts = self._left[kind] > 0
+        self._left[kind] -= lasts
+        self.counts[kind] += lasts
+        return lasts
 
 
 class Client(PrivateNode):
@@ -87,16 +200,6 @@ class Client(PrivateNode):
         self.counts: Counter[str] = Counter()
         self._parameters = AsyncParameterClient(self.node, '/estimator')
         self._reset = self.node.create_client(Trigger, '/estimator/reset')
-        self._base: dict[str, Any] = {}
-
-    def learn(self) -> None:
-        """Remember the present parameters as those that `restore` puts back."""
-        names = sorted({name for changes in SETS['good parameters'] for name in changes})
-        wait_until(self._parameters.services_are_ready, 'the estimator offers no parameters')
-        values = self._answer(self._parameters.get_parameters(names)).values
-        for name, value in zip(names, values, strict=True):
-            message = ParameterMessage(name=name, value=value)
-            self._base[name] = Parameter.from_parameter_msg(message).value
 
     def call(self, kind: str) -> None:
         """Make the next call of a kind of `CALLS`."""
@@ -110,9 +213,10 @@ class Client(PrivateNode):
 
     def restore(self) -> None:
         """Put the parameters back."""
-        self.counts['wrong answers'] += not self._set(self._base)
+        self.counts['wrong answers'] += not self._set(BASE)
 
     def _set(self, values: Mapping[str, Any]) -> bool:
+        wait_until(self._parameters.services_are_ready, 'the estimator offers no parameters')
         parameters = [Parameter(name, value=value) for name, value in values.items()]
         answer = self._answer(self._parameters.set_parameters_atomically(parameters))
         return bool(answer.result.successful)
@@ -131,22 +235,36 @@ def main() -> int:
     parser.add_argument(
         '--retries', type=int, default=0, help='if nothing failed but what a busy machine makes'
     )
-    arguments = parser.parse_args()
-    if arguments.minutes < 2.0:
-        parser.error(f'argument --minutes: expected at least 2, got {arguments.minutes:g}')
-    raise_on_signals()
-    try:
-        for _ in range(arguments.retries + 1):
-            missed = soak(arguments.seed, arguments.minutes, arguments.output)
-            if not missed or not missed <= {LOST, GROWTH, WORST}:
-                break
+
+    def body(arguments: argparse.Namespace, stop: Stop) -> int:
+        if arguments.minutes < 2.0:
+            parser.error(f'argument --minutes: expected at least 2, got {arguments.minutes:g}')
+        with stop.raising():
+            for _ in range(arguments.retries + 1):
+                missed = soak(arguments.seed, arguments.minutes, arguments.output)
+                if not missed or not missed <= {LOST, GROWTH, WORST}:
+                    break
         return 1 if missed else 0
-    except KeyboardInterrupt:
-        print('interrupted', file=sys.stderr)
-        return 130
-    except CannotMeasureError as error:
-        print(f'soak: {error}', file=sys.stderr)
-        return 1
+
+    return run_command(parser, None, body)
+
+
+def run_plant(seed: str, *arguments: str) -> None:
+    """Run until SIGINT, then print the counts as one line of JSON; end with the second SIGINT."""
+    given, _, rest = read_arguments('plant', list(arguments))
+    ended = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: ended.set())
+    rclpy.init(args=[sys.argv[0], *rest], signal_handler_options=SignalHandlerOptions.NO)
+    node = FaultyPlant(given, int(seed))
+    with Spinner(node, on_end=ended.set) as spinner:
+        ended.wait()
+    if spinner.error:
+        raise spinner.error
+    ended.clear()
+    print(json.dumps(node.counts), flush=True)
+    ended.wait()  # the last samples are taken before their writer leaves
+    node.destroy_node()
+    rclpy.try_shutdown()
 
 
 def soak(seed: int, minutes: float, output: Path) -> set[str]:
@@ -154,12 +272,9 @@ def soak(seed: int, minutes: float, output: Path) -> set[str]:
     seconds, memory, windows = 60.0 * minutes, [], []
     with Children() as children, Watch(TOPICS) as watch, Client() as client:
         estimator = children.start_node('estimator', *PARAMETERS, '-r', 'y:=faulty_y')
-        plant = children.start(
-            'plant', 'benchmark/soak_plant.py', '--seed', str(seed), *PARAMETERS
-        )
+        plant = children.start('plant', 'benchmark/soak.py', 'plant', str(seed), *PARAMETERS)
         estimator.wait_for('estimating')
         plant.wait_for('injecting')
-        client.learn()
         calls = (event for event in schedule(seed) if event[1] in CALLS)
         time, kind, _ = next(calls)
         restored, judging, start = 0, False, monotonic()
@@ -263,4 +378,7 @@ def _ends(values: NDArray[np.float64]) -> tuple[float, float]:
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    if sys.argv[1:2] == ['plant']:
+        run_plant(*sys.argv[2:])
+    else:
+        sys.exit(main())

@@ -13,14 +13,12 @@ import sys
 from typing import NamedTuple
 
 from fhaosmo_ros.core import Recording, TriangularModel
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.simulation.metrics import rms
 import numpy as np
 from scipy.integrate import solve_ivp
 from studies import evidence
-from studies.comparison.evaluation import METHODS
-from studies.comparison.methods.linear import LINEAR_LIMIT
-from studies.comparison.methods.method import mean, Search, Setting, Values
+from studies.comparison.methods import METHODS
+from studies.comparison.methods.kalman import LINEAR_LIMIT
+from studies.comparison.methods.method import Estimates, mean, objective, Setting, tune
 from studies.comparison.methods.observers import model_of
 from studies.evidence import markdown, Row
 from studies.harness import Floats, Found, observed, Results, run_study, SELF_TUNING
@@ -92,37 +90,21 @@ def recording(plant: Plant, kind: str, noise: float, samples: int) -> Recording:
     return Recording(t, y, np.zeros(samples), found.y.T, np.interp(t, fine, d), kind)
 
 
-def late(values: Floats) -> Floats:
-    """Return the rows that count: not the first quarter."""
-    return values[len(values) // 4 :]
-
-
 def cell(name: str, noise: float, samples: int, trials: int) -> Row:
     """Return how self-tuning does on a plant, over the Kalman filter."""
     plant = PLANTS[name]
+    begin = (samples // 4) / plant.rate  # the first quarter does not count
     setting = Setting(
-        TriangularModel(plant.phi), 1.0 / plant.rate, plant.size, noise * plant.noise
+        TriangularModel(plant.phi), 1.0 / plant.rate, plant.size, noise * plant.noise, begin
     )
-    method = METHODS[LINEAR_LIMIT]
-
     row: Row = {'plant': name, 'noise': noise}
     inside, peaks = [], []
     for r in (recording(plant, kind, noise, samples) for kind in KINDS):
-
-        def yard(values: Values, r: Recording = r) -> float:
-            try:
-                run = method.prepare(setting, values)
-            except ConfigurationError:
-                return np.inf
-            with np.errstate(over='ignore', invalid='ignore'):
-                return rms(late(run(r)['filtered'].d - r.d))
-
-        best = method.tune(Search(yard, setting, [r], trials, SEED))
+        yard = tune(METHODS[LINEAR_LIMIT], setting, [r], trials, SEED).training
         found = observed(model_of(setting) | SELF_TUNING, r.t, r.y)
-        off = found.unknown_input - r.d
-        row[r.shape] = rms(late(off)) / yard(best)
-        away = np.abs(late(off)) / late(found.standard_deviation[:, -1])
-        inside.append([np.mean(away < k) for k in (1.0, 1.96)])
+        row[r.shape] = objective(r, Estimates(r.z, found.unknown_input), begin) / yard
+        away = np.abs(found.unknown_input - r.d) / found.standard_deviation[:, -1]
+        inside.append([np.mean((away < k)[r.t >= begin]) for k in (1.0, 1.96)])
         peaks.append(np.abs(found.unknown_input).max() / np.abs(r.d).max())
     row['inside 1 σ'], row['inside 1.96 σ'] = np.mean(inside, axis=0).tolist()
     return {**row, 'largest': max(peaks)}

@@ -23,8 +23,7 @@ from matplotlib.figure import Figure
 import numpy as np
 from scipy.signal import lfilter
 from studies import evidence
-from studies.comparison.methods.linear import estimates
-from studies.comparison.methods.sampled import SampledModel
+from studies.comparison.methods.kalman import estimates, SampledModel
 from studies.evidence import Row
 from studies.harness import Floats, Found, Results, run_study, SELF_TUNING
 
@@ -38,7 +37,6 @@ DEVIATIONS, DURATION = 5.0, 0.03
 FACTORS, NEVER = (1.0, 3.0), 0.05
 INTENSITIES = np.geomspace(1e-3, 1e1, 9)
 FILTER, OURS = 'Kalman filter', 'self-tuning'
-Estimates = tuple[Floats, Floats]
 
 
 class Recording(NamedTuple):
@@ -71,7 +69,7 @@ def record(hours: float, seed: int, noise: float = NOISE, faults: bool = False) 
 def kalman(y: Floats, intensity: float) -> tuple[Floats, Floats]:
     """Return d by the filter whose d is a random walk, and no standard deviation."""
     model = TriangularModel(MODEL['phi'])
-    gain = SampledModel(model, H).kalman([intensity / NOISE**2])
+    gain = SampledModel(model, H).kalman(intensity / NOISE**2)
     t, none = H * np.arange(len(y)), np.zeros(len(y))
     samples = recordings.Recording(t, y, none, none[:, None], none, FILTER)
     return estimates(model, gain, 0.0, samples, 1.5 * H)[:, model.order], none
@@ -113,21 +111,30 @@ class Point(NamedTuple):
     found: float
 
 
-def curve(quiet: Estimates, faulty: Estimates, faults: Floats, deviations: float) -> list[Point]:
-    """Return a point for each threshold."""
-    points = []
-    hours = (len(quiet[0]) * H - SETTLED) / 3600.0
-    for threshold in THRESHOLDS:
+def points(
+    name: str, intensity: float, factor: float, seed: int, quiet_hours: float, hours: float
+) -> list[Point]:
+    """
+    Return a point for each threshold of an estimator, at the noise times a factor.
+
+    False alarms are counted over `quiet_hours` without faults, delays over `hours` with them.
+    """
+    noise = factor * NOISE
+    recordings = record(quiet_hours, seed, noise), record(hours, seed + 1, noise, faults=True)
+    quiet, faulty = (
+        kalman(r.y, intensity) if name == FILTER else self_tuning(r.y) for r in recordings
+    )
+    found, faults = [], recordings[1].faults
+    for threshold in THRESHOLDS.tolist():
         own = {
-            'event_threshold': float(threshold), 'event_deviations': deviations,
-            'event_duration': DURATION,
+            'event_threshold': threshold, 'event_duration': DURATION,
+            'event_deviations': 0.0 if name == FILTER else DEVIATIONS,
         }  # fmt: skip
         late = delays(alarms(*faulty, **own), faults)
-        points.append(Point(
-            float(threshold), len(alarms(*quiet, **own)) / hours, float(np.median(late)),
-            float(np.mean(np.isfinite(late))),
-        ))  # fmt: skip
-    return points
+        false = len(alarms(*quiet, **own)) / (quiet_hours - SETTLED / 3600.0)
+        median, share = float(np.median(late)), float(np.mean(np.isfinite(late)))
+        found.append(Point(threshold, false, median, share))
+    return found
 
 
 def best(points: Sequence[Point], false: float = 1.0) -> Point:
@@ -136,36 +143,24 @@ def best(points: Sequence[Point], false: float = 1.0) -> Point:
     return min(fit, key=lambda p: p.delay) if fit else points[-1]
 
 
-def late(intensity: float, hours: float) -> float:
-    """Return how soon a Kalman filter finds faults, on recordings that judge nothing else."""
-    quiet, faulty = record(hours, 11), record(hours, 12, faults=True)
-    both = kalman(quiet.y, intensity), kalman(faulty.y, intensity)
-    return best(curve(*both, faulty.faults, 0.0)).delay
-
-
-def lines(factor: float, name: str, intensity: float, hours: float) -> list[Row]:
-    """Return a line for each threshold of an estimator at the noise times a factor."""
-    noise = factor * NOISE
-    quiet, faulty = record(hours, 1, noise), record(0.1 * hours, 2, noise, faults=True)
-    if name == FILTER:
-        both, deviations = [kalman(r.y, intensity) for r in (quiet, faulty)], 0.0
-    else:
-        both, deviations = [self_tuning(r.y) for r in (quiet, faulty)], DEVIATIONS
-    told = intensity if name == FILTER else None
-    return [
-        {'noise': noise, 'estimator': name, 'intensity': told} | point._asdict()
-        for point in curve(*both, faulty.faults, deviations)
-    ]
-
-
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
     """Return a line for each factor on the noise, estimator and threshold."""
     hours = QUICK_HOURS if arguments.quick else HOURS
-    delay = results({q: (late, q, 0.1 * hours) for q in INTENSITIES.tolist()})
-    intensity = min(delay, key=delay.__getitem__)
+    few = 0.1 * hours
+    tried = results({q: (points, FILTER, q, 1.0, 11, few, few) for q in INTENSITIES.tolist()})
+    intensity = min(tried, key=lambda q: best(tried[q]).delay)
     cells = [(factor, name) for factor in FACTORS for name in (FILTER, OURS)]
-    found = results({cell: (lines, *cell, intensity, hours) for cell in cells})
-    rows = evidence.rounded(row for cell in cells for row in found[cell])
+    found = results({
+        (factor, name): (points, name, intensity, factor, 1, hours, few) for factor, name in cells
+    })  # fmt: skip
+    rows = evidence.rounded(
+        {
+            'noise': factor * NOISE, 'estimator': name,
+            'intensity': intensity if name == FILTER else None, **point._asdict(),
+        }
+        for factor, name in cells
+        for point in found[factor, name]
+    )  # fmt: skip
     return Found({NAME: rows}, {}, {NAME: draw(rows)})
 
 

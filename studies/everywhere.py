@@ -19,16 +19,16 @@ from fhaosmo_ros.core.simulation.plant import quantised, respond
 from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from scipy.signal import lfilter
-from studies import evidence, ratios
-from studies.comparison.evaluation import METHODS, tune
-from studies.comparison.methods.adaptive import HUBER, IMM, NOISE
-from studies.comparison.methods.linear import LINEAR_LIMIT
+from studies import evidence
+from studies.comparison.methods import METHODS
+from studies.comparison.methods.kalman import HUBER, IMM, LINEAR_LIMIT, NOISE
 from studies.comparison.methods.method import (
     Estimates,
     JUDGED_FROM,
     mean,
     objective,
     Setting,
+    tune,
     Values,
 )
 from studies.comparison.methods.observers import model_of
@@ -105,8 +105,8 @@ CONDITIONS = {
 TUNED = 'as tuned'
 SELF, ONCE, PRESET = 'self-tuning', 'Kalman, tuned once', 'shipped file'
 STYLES = {
-    SELF: ratios.SELF, ONCE: ratios.USUAL, PRESET: ratios.TUNED, HUBER: ratios.ROBUST,
-    NOISE: ratios.OTHER, IMM: ratios.GREY,
+    SELF: evidence.SELF, ONCE: evidence.USUAL, PRESET: evidence.TUNED, HUBER: evidence.ROBUST,
+    NOISE: evidence.OTHER, IMM: evidence.GREY,
 }  # fmt: skip
 PEERS: dict[str, list[dict[str, float]]] = {
     HUBER: [{'huber': limit} for limit in (1.5, 2.5, 4.0)],
@@ -119,7 +119,7 @@ ANEW = 'tuned anew'
 KNOWN = 'every z known'
 """What a wrong Phi makes of d, whoever estimates it."""
 Once = tuple[dict[str, float], dict[str, dict[str, float]]]
-"""What the tuning has found with the truth: a filter, and for each peer one of `PEERS`."""
+"""What the tuning has found with the truth: a filter for `RATE`, and one of each of `PEERS`."""
 
 
 class Size(NamedTuple):
@@ -136,13 +136,9 @@ QUICK = Size(7.0, ('sine', 'ou'), ('motor',), (TUNED, 'noise x 10'), 24)
 
 
 def at(member: Values, order: int, rate: float) -> dict[str, float]:
-    """Return the values of a Kalman filter at a rate: the intensity of its d stays (D 17)."""
-    return {**member, 'bandwidth': member['bandwidth'] * quicker(member, order, rate)}
-
-
-def quicker(member: Values, order: int, rate: float) -> float:
-    """Return the bandwidth of a filter at a rate over that at `RATE`."""
-    return float((rate / RATE) ** (0.5 / (order + 1 + member['derivatives'])))
+    """Return the values of a Kalman filter for `RATE` at a rate: the intensity of d stays."""
+    quicker = (rate / RATE) ** (0.5 / (order + 1 + member['derivatives']))  # D 17
+    return {**member, 'bandwidth': member['bandwidth'] * quicker}
 
 
 def recording(
@@ -200,13 +196,6 @@ def implied(plant: Plant, c: Condition, recordings: list[Recording]) -> float:
     return mean([error(r, r.d + e) for r, e in zip(recordings, off, strict=True)])
 
 
-def tuned(setting: Setting, recordings: list[Recording], trials: int) -> dict[str, float]:
-    """Return the Kalman filter at `RATE` that is best with the truth, as the comparison does."""
-    found = tune(METHODS[LINEAR_LIMIT], setting, recordings, trials, SEED).values
-    times = quicker(found, setting.model.order, 1.0 / setting.period)
-    return {**found, 'bandwidth': found['bandwidth'] / times}
-
-
 def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row, Once]:
     """Return the errors of all methods in a condition; without `once` tune them here."""
     plant, c = PLANTS[name], CONDITIONS[condition]
@@ -217,14 +206,13 @@ def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row,
     def errors(method: str, values: Values) -> float:
         return mean(errors_of(method, setting, values, recordings))
 
-    member = tuned(setting, recordings, size.trials)
-    anew = at(member, n, c.rate)
+    anew = tune(METHODS[LINEAR_LIMIT], setting, recordings, size.trials, SEED).values
     if once is None:
         best = {
             peer: min(choices, key=lambda own, peer=peer: errors(peer, anew | own))
             for peer, choices in PEERS.items()
         }
-        once = member, best
+        once = anew, best
     values = at(once[0], n, c.rate)
     preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | model_of(setting)
     of_preset = [error(r, observed(preset, r.t, r.y).unknown_input) for r in recordings]
@@ -280,7 +268,7 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     for row in cells:
         panels[row['plant']][row['condition']] = row
     text = 'error of d over that of a Kalman filter tuned anew with the truth'
-    return Found({NAME: cells}, texts(cells), {NAME: ratios.draw(panels, STYLES, text)})
+    return Found({NAME: cells}, texts(cells), {NAME: evidence.draw_ratios(panels, STYLES, text)})
 
 
 if __name__ == '__main__':

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """docs/evidence.md and the tables and figures in the folder beside it."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import csv
 from pathlib import Path
 import re
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.tools.cli.command import Output
 from matplotlib.figure import Figure
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
@@ -17,6 +16,14 @@ PART = '<!-- begin {0} -->\n{1}\n<!-- end {0} -->'
 PATTERN = re.compile(r'<!-- begin (?P<name>\S+) -->\n(?P<text>.*?)\n?<!-- end (?P=name) -->', re.S)
 Row = dict[str, Any]
 """A line of a table, by column; numbers are floats."""
+SELF, TUNED, USUAL, ROBUST, OTHER, GREY = (
+    ('#D55E00', '*', 90), ('#009E73', 's', 22), ('#0072B2', 'o', 24), ('#56B4E9', '^', 26),
+    ('#CC79A7', 'D', 20), ('#999999', 'x', 26),
+)  # fmt: skip
+"""Okabe-Ito, and a grey; marker and its area."""
+TICKS = (0.1, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
+FLOOR, CEILING = 0.1, 10.0
+"""Smallest and largest ratio that is drawn."""
 
 
 def read(name: str, docs: Path = DOCS) -> list[Row]:
@@ -90,28 +97,64 @@ def publish(
 
     """
     page, folder = docs / PAGE, docs / FOLDER
-    text = filled(page.read_text(encoding='utf-8'), texts) if page.exists() else ''
-
-    def write(path: Path, writer: Callable[[Path], object]) -> None:
-        with Output(path, force=True) as output:
-            writer(output.path)
-            print(output.keep())
-
+    if page.exists():
+        page.write_text(filled(page.read_text(encoding='utf-8'), texts), encoding='utf-8')
+    folder.mkdir(parents=True, exist_ok=True)
     for name, rows in tables.items():
-        write(folder / f'{name}.csv', lambda path, rows=rows: _write_table(path, rows))
+        with (folder / f'{name}.csv').open('w', newline='', encoding='utf-8') as file:
+            table = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
+            table.writeheader()
+            for row in rows:
+                table.writerow({
+                    k: f'{v:.6g}' if isinstance(v, float | int) else v or ''
+                    for k, v in row.items()
+                })  # fmt: skip
     for name, figure in figures.items():
-        write(folder / f'{name}.png', lambda path, f=figure: f.savefig(path, dpi=110))
-    if text:
-        write(page, lambda path: path.write_text(text, encoding='utf-8'))
+        figure.savefig(folder / f'{name}.png', dpi=110)
+    print(f'{docs}: {", ".join([*tables, *figures])}')
     for body in texts.values():
         print(f'\n{body}')
 
 
-def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    with path.open('w', newline='', encoding='utf-8') as file:
-        table = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
-        table.writeheader()
-        for row in rows:
-            table.writerow({
-                k: f'{v:.6g}' if isinstance(v, float | int) else v or '' for k, v in row.items()
-            })  # fmt: skip
+def draw_ratios(
+    panels: Mapping[str, Mapping[str, Mapping[str, float]]],
+    styles: Mapping[str, tuple[str, str, int]],
+    text: str,
+) -> Figure:
+    """
+    Draw ratios of errors, a panel a plant: for the comparison, and for use everywhere.
+
+    Parameters
+    ----------
+    panels : mapping
+        Ratios by title of the panel, row, and method.
+    styles : mapping
+        Colour, marker and area by method.
+    text : str
+        What the ratio is.
+
+    """
+    rows = list(dict.fromkeys(row for panel in panels.values() for row in panel))
+    figure = Figure(figsize=(11.0, 0.3 * len(rows) + 1.6), layout='constrained')
+    every = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for (title, panel), axes in zip(panels.items(), every, strict=True):
+        for name, (colour, marker, area) in styles.items():
+            points = [
+                (min(max(ratios[name], FLOOR), CEILING), rows.index(row))
+                for row, ratios in panel.items()
+                if name in ratios
+            ]
+            x, y = zip(*points, strict=True) if points else ((), ())
+            front = 4 if (colour, marker, area) == SELF else 3
+            axes.scatter(x, y, area, colour, marker=marker, label=name, zorder=front)
+        axes.axvline(1.0, color='#000000', linewidth=0.8)
+        axes.set(xscale='log', xlim=(0.8 * FLOOR, 1.2 * CEILING), title=title)
+        axes.set_yticks(range(len(rows)), rows)
+        axes.set_xticks(TICKS, [f'{x:g}' for x in TICKS])
+        axes.xaxis.set_minor_formatter('')
+        axes.grid(alpha=0.3)
+    every[0].invert_yaxis()
+    figure.supxlabel(f'{text} ({FLOOR:g}, {CEILING:g}: that or beyond)', fontsize='medium')
+    handles = every[0].get_legend_handles_labels()
+    figure.legend(*handles, loc='outside upper center', ncols=len(styles), fontsize='small')
+    return figure

@@ -12,6 +12,7 @@ import threading
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import OnlineEstimator, Trajectory
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import CONSTANTS
 from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.cli.command import progress, run_command
@@ -76,25 +77,19 @@ def run_study(
         help=f'folder for results and figures (default: docs; {name}_output with --quick)',
     )  # fmt: skip
     add(
-        '--jobs', type=positive, metavar='N', default=os.cpu_count() or 1,
+        '--jobs', type=int, metavar='N', default=os.cpu_count() or 1,
         help='processes (default: one a core)',
     )  # fmt: skip
 
     def body(arguments: argparse.Namespace, stop: Stop) -> None:
+        if arguments.jobs < 1:
+            raise ConfigurationError(f'--jobs: expected an integer >= 1, got {arguments.jobs}')
         own = Path(f'{name}_output') if arguments.quick else DOCS
         arguments.output = arguments.output or own
         found = measure(arguments, lambda calls: called(calls, name, arguments.jobs, stop))
         evidence.publish(arguments.output, *found)
 
     return run_command(parser, argv, body)
-
-
-def positive(text: str) -> int:
-    """Return the number in an argument, which has to be 1 or more."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f'expected an integer >= 1, got {text}')
-    return value
 
 
 def called(calls: Mapping[Hashable, Call], name: str, jobs: int, stop: Stop) -> dict[Any, Any]:

@@ -4,20 +4,8 @@
 from pathlib import Path
 import sys
 
-from fhaosmo_ros.core.parameters.arm import ARM, ARM_NODE
+from fhaosmo_ros.core.parameters import arm, tables
 from fhaosmo_ros.core.parameters.declaration import Parameter
-from fhaosmo_ros.core.parameters.tables import (
-    CHANNEL_OUTPUT,
-    DIAGNOSTICS,
-    ESTIMATOR_NODE,
-    EVENTS,
-    INPUT,
-    MODEL,
-    OBSERVER,
-    PLANT_MODEL,
-    PLANT_NODE,
-    SAMPLING,
-)
 from fhaosmo_ros.core.simulation.recordings import FAMILY
 from fhaosmo_ros.tools.tuning.objective import TUNING
 
@@ -37,18 +25,18 @@ the plant, and `autostart`, read them at the start.
 `initial_state`, `integration_step`, `noise_std`, `noise_seed` and `sample_rate` (docs/offline.md).
 """
 GROUPS = (
-    ('Model (estimator and plant)', MODEL),
-    ('Observer (estimator)', OBSERVER),
-    ('Sampling (estimator)', SAMPLING),
-    ('Events (estimator)', EVENTS),
-    ('Topics in (estimator)', INPUT),
-    ('Messages out (estimator)', CHANNEL_OUTPUT),
-    ('Node (estimator)', ESTIMATOR_NODE),
-    ('Diagnostics (estimator)', DIAGNOSTICS),
-    ('Arm (arm, calibrate, replay_arm)', ARM),
-    ('Node (arm; it has diagnostics_period and hardware_id, too)', ARM_NODE),
-    ('Simulation (plant)', PLANT_MODEL),
-    ('Publishing (plant)', PLANT_NODE),
+    ('Model (estimator and plant)', tables.MODEL),
+    ('Observer (estimator)', tables.OBSERVER),
+    ('Sampling (estimator)', tables.SAMPLING),
+    ('Events (estimator)', tables.EVENTS),
+    ('Topics in (estimator)', tables.INPUT),
+    ('Messages out (estimator)', tables.CHANNEL_OUTPUT),
+    ('Node (estimator)', tables.ESTIMATOR_NODE),
+    ('Diagnostics (estimator)', tables.DIAGNOSTICS),
+    ('Arm (arm, calibrate, replay_arm)', arm.ARM),
+    ('Node (arm; it has diagnostics_period and hardware_id, too)', arm.ARM_NODE),
+    ('Simulation (plant)', tables.PLANT_MODEL),
+    ('Publishing (plant)', tables.PLANT_NODE),
     ('Family of recordings (tune)', FAMILY),
     ('Tuning (tune)', TUNING),
 )

@@ -24,8 +24,9 @@ from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise, Values
 import numpy as np
-from studies.comparison.methods.linear import each_order, FILTERS, LINEAR_LIMIT
-from studies.comparison.methods.method import Search, Setting
+from studies.comparison.methods import METHODS
+from studies.comparison.methods.kalman import LINEAR_LIMIT
+from studies.comparison.methods.method import Setting, trial, tune
 from studies.evidence import markdown, Row
 from studies.harness import Found, Results, run_study
 
@@ -145,20 +146,14 @@ def searched(adapts: bool, seed: int, trials: int, start: Values) -> Values:
 
 def kalman(trials: int) -> dict[str, Any]:
     """Return the same of a steady-state Kalman filter with a Matern model of d."""
-    (method,) = (m for m in FILTERS if m.name == LINEAR_LIMIT)
-    setting = Setting(TriangularModel(('0', '0', '-z3')), PERIOD, 0.1, NOISE)
-
-    def error_of(values: Any, recordings: list[Recording]) -> float:
-        try:
-            estimate = method.prepare(setting, values)
-        except ConfigurationError:
-            return np.inf
-        return error(recordings, [estimate(r)['filtered'].d for r in recordings])
-
-    training = [recording(k) for k in TRAINED]
-    best = each_order(Search(lambda v: error_of(v, training), setting, training, trials, 1))
-    found = [error_of(best, group) for group in (training, [recording(k) for k in JUDGED])]
-    return {'training': found[0], 'judged': found[1], 'gamma': '', **best}
+    method = METHODS[LINEAR_LIMIT]
+    setting = Setting(TriangularModel(('0', '0', '-z3')), PERIOD, 0.1, NOISE, SETTLED)
+    training, others = ([recording(k) for k in seeds] for seeds in (TRAINED, JUDGED))
+    best = tune(method, setting, training, trials, 1)
+    return {
+        'training': best.training, 'judged': trial(method, setting, best.values, others).value,
+        'gamma': '', **best.values,
+    }  # fmt: skip
 
 
 if __name__ == '__main__':

@@ -8,11 +8,15 @@ import pytest
 from scipy.linalg import expm
 from studies import everywhere
 from studies.comparison.cells import PLANTS, sensors
-from studies.comparison.evaluation import METHODS
-from studies.comparison.methods.adaptive import ADAPTIVE, HUBER, IMM
-from studies.comparison.methods.linear import FILTERS, LINEAR_LIMIT
+from studies.comparison.methods import METHODS
+from studies.comparison.methods.kalman import (
+    ADAPTIVE,
+    HUBER,
+    IMM,
+    LINEAR_LIMIT,
+    SampledModel,
+)
 from studies.comparison.methods.method import Setting
-from studies.comparison.methods.sampled import SampledModel
 
 MODELS = {
     'paper': TriangularModel(['0', '0', '-z3']),
@@ -48,10 +52,9 @@ def recording(model, t, z0, d, u=0.0):
 @pytest.mark.parametrize('name', MODELS)
 def test_kalman_gain_is_the_limit_of_the_riccati_recursion(name, chain, decay):
     model, period = MODELS[name], 1e-2
-    intensities = [5.0, 0.3][:chain]
-    gain = SampledModel(model, period, chain, decay=decay).kalman(intensities)
+    gain = SampledModel(model, period, chain, decay).kalman(5.0)
     a = rates(model, chain, decay)
-    spectrum = np.diag([0.0] * model.order + intensities[::-1])
+    spectrum = np.diag([*[0.0] * (len(a) - 1), 5.0])
     # The noise's covariance by the midpoint rule, and the recursion itself.
     middles = (np.arange(200) + 0.5) * period / 200
     noise = sum(expm(a * s) @ spectrum @ expm(a * s).T for s in middles) * period / 200
@@ -65,12 +68,9 @@ def test_kalman_gain_is_the_limit_of_the_riccati_recursion(name, chain, decay):
 
 @pytest.mark.parametrize('period', [1e-3, 1e-2])
 @pytest.mark.parametrize('name', ['paper', 'motor'])
-@pytest.mark.parametrize(
-    'peer', [m.name for m in FILTERS if all(word not in m.name for word in ('decaying', 'Matern'))]
-)
-def test_error_of_each_linear_peer_decays_exactly_to_zero(peer, name, period):
+def test_error_of_the_usual_kalman_filter_decays_exactly_to_zero(name, period):
     """Without noise and with constant d the error is the transition's power, so it vanishes."""
-    model, method = MODELS[name], METHODS[peer]
+    model, method = MODELS[name], METHODS['Kalman']
     setting = Setting(model, period, 1.0, 0.0)
     values = {d.name: d.start for d in method.space(setting)}
     t = np.arange(0.0, 15.0, period)
@@ -81,7 +81,7 @@ def test_error_of_each_linear_peer_decays_exactly_to_zero(peer, name, period):
     np.testing.assert_allclose(found.z[-1], r.z[-1], atol=1e-6)
 
 
-@pytest.mark.parametrize('name', ['ESO', *(m.name for m in ADAPTIVE)])
+@pytest.mark.parametrize('name', ['Kalman', *(m.name for m in ADAPTIVE)])
 def test_peers_know_the_input_and_bridge_a_gap(name):
     """A constant d from a noise-free y with a known input."""
     model, method = MODELS['motor'], METHODS[name]

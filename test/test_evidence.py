@@ -5,17 +5,16 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import pytest
 import results
 from studies import everywhere, evidence
-from studies.comparison import results as comparison
-from studies.comparison.cells import sensors
-from studies.comparison.evaluation import methods_for
-from studies.paper import cases, findings
+from studies.comparison import __main__ as comparison
+from studies.comparison.cells import methods_for, sensors
+from studies.paper import cases
 from studies.paper.plant_and_observer import SOLVERS
 
 PARTS = {
     'speed': results.texts,
     'comparison': comparison.texts,
     'everywhere': everywhere.texts,
-    'paper': findings.texts,
+    'paper': cases.texts,
 }
 """What makes the parts of the page, by the name of the table they are made from."""
 

@@ -8,20 +8,16 @@ from fhaosmo_ros.core.simulation.metrics import high_passed
 import numpy as np
 import pytest
 from studies import evidence
-from studies.paper import cases, findings
-from studies.paper.plant_and_observer import simulate
+from studies.paper import cases
+from studies.paper.plant_and_observer import HELD, simulate, SOLVERS
 
 REWRITE = 'run make paper'
 
 
 @pytest.fixture(scope='module')
 def documented():
-    return findings.scores_by_solver(evidence.read('paper'))
-
-
-@pytest.fixture(scope='module')
-def solver(documented):
-    return findings.choose_solver(documented)
+    rows = evidence.read('paper')
+    return {solver: cases.scores_of(rows, solver) for solver in SOLVERS}
 
 
 def check(new, old, sign):
@@ -34,24 +30,31 @@ def check(new, old, sign):
 
 @pytest.mark.parametrize('name', [name for name, c in cases.OBSERVERS.items() if c.step == 1e-3])
 @pytest.mark.parametrize('omega', cases.FREQUENCIES)
-def test_new_simulation_agrees_with_the_table(documented, solver, name, omega):
-    for s in (solver, 'ode4 held'):
+def test_new_simulation_agrees_with_the_table(documented, name, omega):
+    for s in (cases.SOLVER, HELD):
         old = documented[s][name, omega]
-        check(findings.simulation(s, name, omega), old, name.startswith('sign'))
+        check(cases.simulation(s, name, omega), old, name.startswith('sign'))
 
 
-def test_all_findings_come_out_with_the_shipped_half_widths(documented, solver):
-    for name in (solver, 'ode4 held'):
-        found = findings.verdicts(documented[name])
+def test_best_solver_is_the_one_of_the_findings(documented):
+    def error(solver):
+        return sum(documented[solver][cases.FINE, w]['rms_d'] for w in cases.FREQUENCIES)
+
+    assert min(set(SOLVERS) - {HELD}, key=error) == cases.SOLVER
+
+
+def test_all_findings_come_out_with_the_shipped_half_widths(documented):
+    for name in (cases.SOLVER, HELD):
+        found = cases.verdicts(documented[name])
         failed = [v.name for v in found if not v.holds]
-        assert failed == (['F1b high'] if name == 'ode4 held' else [])
+        assert failed == (['F1b high'] if name == HELD else [])
 
 
 def test_shipped_half_widths_lie_inside_the_region():
     rows = evidence.read('paper_half_widths')
     holds = {tuple(row.values())[:2] for row in rows if all(list(row.values())[2:])}
     first, later = cases.preset().observer['fuzzy_widths'][:2]
-    around = [findings.WIDTHS[i - 1 : i + 2] for i in map(findings.WIDTHS.index, (first, later))]
+    around = [cases.WIDTHS[i - 1 : i + 2] for i in map(cases.WIDTHS.index, (first, later))]
     assert {(a, b) for a in around[0] for b in around[1]} <= holds
 
 

@@ -22,8 +22,7 @@ from fhaosmo_ros.tools.tuning.objective import Objective, TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 import numpy as np
 import pytest
-from studies.comparison.methods.linear import estimates
-from studies.comparison.methods.sampled import SampledModel
+from studies.comparison.methods.kalman import estimates, SampledModel
 from waiting import wait_until
 
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
@@ -140,7 +139,7 @@ def test_start_is_nearly_as_good_as_the_best_kalman_filter(tuner):
     best = np.inf
     for bandwidth in np.geomspace(2.0, 200.0, 25):
         model = SampledModel(TriangularModel(PHI, 3), 1.0 / 200.0)
-        gain = model.kalman([model.period * bandwidth**8])
+        gain = model.kalman(model.period * bandwidth**8)
         errors = []
         for r in tuner.training.recordings:
             wrong = estimates(TriangularModel(PHI, 3), gain, 0.0, r, 0.1)[:, 3] - r.d

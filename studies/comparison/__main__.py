@@ -2,17 +2,132 @@
 """Compare the observer with what people would use instead, all tuned by the same rules."""
 
 import argparse
+from collections.abc import Callable, Iterable
 import sys
+from typing import NamedTuple
 
+from matplotlib.figure import Figure
 from studies import evidence
-from studies.comparison.cells import sensors
-from studies.comparison.evaluation import evaluate, methods_for
-from studies.comparison.results import best_of_kinds, Cell, draw, texts
+from studies.comparison.cells import evaluate, JUMPS, methods_for, PLANTS, sensors
+from studies.comparison.methods import method, METHODS
+from studies.comparison.methods.method import LINEAR, mean
+from studies.evidence import markdown, Row
 from studies.harness import Found, Results, run_study
 
 NAME = 'comparison'
 FULL, QUICK = (4, 200), (1, 15)
 """Recordings that tune a method, and trials."""
+STYLES = {
+    method.USUAL: evidence.USUAL, method.ROBUST: evidence.ROBUST, method.SLIDING: evidence.OTHER,
+    method.PAPER: evidence.GREY, method.OURS: evidence.TUNED, method.SELF_TUNING: evidence.SELF,
+}  # fmt: skip
+CLOSE = 0.05
+"""Errors within this part of another one count as equal."""
+
+
+class Cell(NamedTuple):
+    """Plant, kind of d, standard deviation of the noise on y, samples a second, timing."""
+
+    plant: str
+    d: str
+    noise: float
+    rate: float
+    timing: str
+
+    @property
+    def jumps(self) -> bool:
+        """True for a d that jumps."""
+        return self.d in JUMPS
+
+
+Chosen = dict[Cell, dict[str, float]]
+"""Errors of d by cell and kind of method."""
+
+GROUPS = {
+    'd without jumps': (True, False), 'd with jumps': (True, True),
+    'no noise, without jumps': (False, False), 'no noise, with jumps': (False, True),
+}  # fmt: skip
+"""Whether there is noise, and whether d jumps."""
+
+
+def best_of_kinds(rows: Iterable[Row]) -> Chosen:
+    """Return for each cell the method of each kind whose error in training is smallest."""
+    chosen: Chosen = {}
+    for row in sorted(rows, key=lambda row: row['training']):
+        errors = chosen.setdefault(Cell(*(row[name] for name in Cell._fields)), {})
+        errors.setdefault(METHODS[row['method']].kind, row['error'])
+    return chosen
+
+
+def ratios(chosen: Chosen, kind: str, about: Callable[[Cell], bool]) -> list[float]:
+    """Return the errors of d over those of the best linear filter, of the cells with both."""
+    both = [errors for cell, errors in chosen.items() if about(cell) and kind in errors]
+    return [errors[kind] / errors[LINEAR] for errors in both]
+
+
+def texts(rows: Iterable[Row]) -> dict[str, str]:
+    """Return the part of the page: ratios by kind and group, and how often a kind is the best."""
+    chosen, lines = best_of_kinds(rows), []
+    for kind in method.KINDS:
+        parts = [
+            ratios(chosen, kind, lambda c, group=group: (c.noise > 0.0, c.jumps) == group)
+            for group in GROUPS.values()
+        ]
+        best = sum(
+            kind in errors and errors[kind] <= (1.0 + CLOSE) * min(errors.values())
+            for errors in chosen.values()
+        )
+        shown = ['1' if kind == LINEAR else _spread(part) for part in parts]
+        lines.append([kind, *shown, f'{best} of {len(chosen)}'])
+    head = ['', *GROUPS, f'at most {100.0 * CLOSE:g} % behind the best']
+    return {'summary': markdown(head, lines)}
+
+
+def _spread(values: list[float]) -> str:
+    """Return a geometric mean and the largest value."""
+    return f'{number(mean(values))} ({number(max(values))})' if values else ''
+
+
+def number(x: float) -> str:
+    """Return a number as text."""
+    if not x < 1e6:
+        return '∞'
+    if x >= 100.0:
+        return f'{x:.3g}' if x < 1e4 else f'{x:.0e}'
+    return f'{x:.2g}' if x < 0.1 else f'{x:.2f}'
+
+
+def draw(chosen: Chosen, jumps: bool) -> Figure:
+    """Draw each kind's error over that of the best linear filter, for d with or without jumps."""
+    groups: dict[str, dict[str, list[Cell]]] = {case.text: {} for case in PLANTS.values()}
+    for cell in sorted(chosen, key=_order):
+        if cell.jumps == jumps:
+            groups[PLANTS[cell.plant].text].setdefault(_text(cell), []).append(cell)
+    panels = {
+        plant: {
+            text: {
+                kind: mean(values)
+                for kind in STYLES
+                if (values := ratios(chosen, kind, cells.__contains__))
+            }
+            for text, cells in rows.items()
+        }
+        for plant, rows in groups.items()
+        if rows
+    }
+    with_jumps = 'with' if jumps else 'without'
+    text = f'd {with_jumps} jumps: error of d over that of the best linear filter'
+    return evidence.draw_ratios(panels, STYLES, text)
+
+
+def _order(cell: Cell) -> tuple[bool, str, float, float]:
+    return cell.timing != 'even', cell.timing, -cell.rate, cell.noise
+
+
+def _text(cell: Cell) -> str:
+    rate = '1 kHz' if cell.rate == 1000.0 else f'{cell.rate:g} Hz'
+    timing = '' if cell.timing == 'even' else f', {cell.timing}'
+    return f'{rate}{timing}, {f"noise {cell.noise:g}" if cell.noise else "no noise"}'
 
 
 def measure(arguments: argparse.Namespace, results: Results) -> Found:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of the comparison: plant, disturbance, noise, rate, timing; and their recordings."""
+"""The cells of the comparison: plant, d, noise, rate, timing; their recordings, and errors."""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -12,7 +12,8 @@ from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import Family, FAMILY_PARAMETERS, Recording, SHAPES
 from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
-from studies.comparison.methods.method import Setting
+from studies.comparison.methods import METHODS
+from studies.comparison.methods.method import mean, objective, Setting, tune, Tuned
 from studies.harness import Floats
 from studies.waves import wave
 
@@ -43,11 +44,6 @@ class Disturbance(NamedTuple):
     """Shape that judges: one of the family's, or of waves.py, which no tuning sees."""
     band: tuple[float, float] = (0.5, 8.0)
     """rad/s."""
-
-    @property
-    def jumps(self) -> bool:
-        """True for a d that jumps."""
-        return self.judged in JUMPS
 
 
 class PlantCase(NamedTuple):
@@ -116,7 +112,7 @@ class Sensor(NamedTuple):
 
     def setting(self) -> Setting:
         """Return what a user knows before tuning."""
-        values = load(model_file(self.case.file), 'plant', PLANT_PARAMETERS)
+        values = load(shipped(f'config/models/{self.case.file}.yaml'), 'plant', PLANT_PARAMETERS)
         model = TriangularModel.of(PLANT_PARAMETERS.complete(values))
         # An encoder's rounding is spread evenly over a quantum.
         rounding = values.get('quantisation', 0.0) / math.sqrt(12.0)
@@ -168,17 +164,12 @@ class Sensor(NamedTuple):
         }  # fmt: skip
 
 
-def model_file(name: str) -> Any:
-    """Return the path of a plant in config/models."""
-    return shipped(f'config/models/{name}.yaml')
-
-
 @lru_cache
 def family_values(plant: str) -> dict[str, Any]:
     """Return the parameters of a plant's family that do not depend on the sensor."""
     case = PLANTS[plant]
     sizes = {'rms_of_d': case.rms_of_d, 'rms_of_u': case.rms_of_u, 'integration_step': STEP}
-    return load(model_file(case.file), 'plant', FAMILY_PARAMETERS) | sizes
+    return load(shipped(f'config/models/{case.file}.yaml'), 'plant', FAMILY_PARAMETERS) | sizes
 
 
 @lru_cache
@@ -210,3 +201,20 @@ def sensors(quick: bool = False) -> list[Sensor]:
     for timing in ('jitter', 'dropouts', 'outliers'):
         chosen += [Sensor('paper', (name,), 1e-3, 1000.0, timing) for name in ('mix', 'steps')]
     return chosen
+
+
+def evaluate(sensor: Sensor, name: str, training: int, trials: int) -> tuple[Tuned, list[float]]:
+    """Tune a method for a sensor and return its error for each of the sensor's disturbances."""
+    method, setting = METHODS[name], sensor.setting()
+    tuned = tune(method, setting, sensor.training(training), trials, seed=1)
+    run = method.prepare(setting, tuned.values)
+    return tuned, [
+        mean(objective(r, run(r)[tuned.readout]) for r in sensor.held_out(disturbance))
+        for disturbance in sensor.disturbances
+    ]
+
+
+def methods_for(sensor: Sensor) -> list[str]:
+    """Return the methods that are compared for a sensor."""
+    quiet = sensor.setting().noise == 0.0
+    return [name for name, method in METHODS.items() if not (quiet and method.needs_noise)]

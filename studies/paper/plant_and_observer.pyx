@@ -12,7 +12,7 @@ from libc.string cimport memcpy, memset
 from fhaosmo_ros.core.model.prediction cimport (
     CLASSICAL, Dynamics, MOST_LEVELS, Method, take_step
 )
-from fhaosmo_ros.core.observer.sliding_mode cimport SlidingMode
+from fhaosmo_ros.core.observer.sliding_mode cimport Gains, SlidingMode
 from fhaosmo_ros.core.observer.structure cimport Level, MOST_INPUTS
 from fhaosmo_ros.core.simulation.system cimport System
 
@@ -28,26 +28,16 @@ from fhaosmo_ros.core.simulation.system import Wave
 import numpy as np
 
 
-class Solver(NamedTuple):
-    """How plant and observer are integrated."""
-
-    # Euler ('ode1'), Bogacki-Shampine ('ode3') or classical Runge-Kutta ('ode4').
-    method: str
-    # True if sign(eps_i) is taken at the first stage of a step and held for its other stages, as
-    # simulators with zero-crossing detection do with their sign block. All else, |eps_i| included,
-    # follows every stage. For the variants with sign; a fuzzy curve is not held.
-    holds_sign: bool = False
-
-
-SOLVERS = {name: Solver(name) for name in ('ode1', 'ode3', 'ode4')}
-SOLVERS['ode4 held'] = Solver('ode4', holds_sign=True)
-"""What a fixed-step simulation offers, by its usual names."""
 cdef Method EULER = Method(1, [0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0])
 # Bogacki and Shampine 1989, doi:10.1016/0893-9659(89)90079-7.
 cdef Method BOGACKI_SHAMPINE = Method(
     3, [0.0, 0.5, 0.75, 0.0], [2.0 / 9.0, 1.0 / 3.0, 4.0 / 9.0, 0.0]
 )
-METHODS = {'ode1': EULER, 'ode3': BOGACKI_SHAMPINE, 'ode4': CLASSICAL}
+# What a fixed-step simulation offers, by its usual names. HELD takes sign(eps_i) at the first
+# stage of a step and holds it for the others, as simulators with zero-crossing detection do with
+# their sign block. All else, |eps_i| included, follows every stage; a fuzzy curve is not held.
+HELD = 'ode4 held'
+SOLVERS = {'ode1': EULER, 'ode3': BOGACKI_SHAMPINE, 'ode4': CLASSICAL, HELD: CLASSICAL}
 
 
 class JointRun(NamedTuple):
@@ -69,15 +59,11 @@ cdef struct State:
 
 
 cdef class Joint(Dynamics):
-    """
-    A plant, and an observer of the explicit scheme, from their initial states; u = 0.
-
-    Signs are held for a whole step if `holds_sign`; see `Solver`.
-    """
+    """A plant, and an observer of the explicit scheme, from their initial states; u = 0."""
 
     cdef System plant
     cdef SlidingMode observer
-    cdef SlidingMode free  # the same without injections
+    cdef Gains gains[MOST_LEVELS]  # of the observer, as it was made
     cdef bint holds_sign  # sign(eps_i) is held for a whole step
     cdef double sign[MOST_LEVELS]  # sign(eps_i) at the beginning of a step
     cdef double u[MOST_INPUTS]  # known inputs: 0
@@ -85,9 +71,8 @@ cdef class Joint(Dynamics):
 
     def __init__(self, System plant not None, configuration, bint holds_sign):
         cdef SlidingMode observer = make_structure(configuration)
-        cdef SlidingMode free = make_structure(configuration)
         cdef int i
-        self.plant, self.observer, self.free = plant, observer, free
+        self.plant, self.observer, self.gains = plant, observer, observer.gains
         if plant.phi.inputs > MOST_INPUTS:
             raise ConfigurationError(f'plant: expected at most {MOST_INPUTS} known inputs')
         self.holds_sign = holds_sign
@@ -100,62 +85,41 @@ cdef class Joint(Dynamics):
         if observer.from_measurement:
             self.state.level[0].z_hat = self.state.z[0]
         self.state.gamma = observer.memory.gamma
-        for i in range(free.levels):
-            free.gains[i].lambda_ = free.gains[i].alpha = 0.0
 
     cdef void rates(self, int stage, double t, const double* x, double* slope) noexcept nogil:
         """Write the rates of plant, levels and gamma."""
         cdef const State* now = <const State*>x
         cdef State* rate = <State*>slope
+        cdef Level* after
+        cdef int i
         memset(rate, 0, self.size * sizeof(double))
         self.plant.rates(stage, t, now.z, rate.z)
-        self.observer_rates(self.observer, now, rate)
         if self.holds_sign:
-            self.hold_signs(now, rate, stage == 0)
-        if self.observer.adaptive:
-            rate.gamma = self.gamma_rate(self.observer, now.gamma)
-
-    cdef void observer_rates(
-        self, SlidingMode observer, const State* now, State* rate
-    ) noexcept nogil:
-        """Write the rates of the levels: a forward Euler step of length 1 moves them by these."""
-        cdef int i
-        cdef Level* after
-        memcpy(observer.trial, now.level, observer.levels * sizeof(Level))
-        observer.memory.gamma, observer.memory.y = now.gamma, now.z[0]
-        observer.follow(now.z[0], 1.0, self.u)
-        for i in range(observer.levels):
-            after = &observer.trial[i]
+            self.hold_signs(now, stage == 0)
+        # A forward Euler step of length 1 moves the levels by their rates.
+        memcpy(self.observer.trial, now.level, self.observer.levels * sizeof(Level))
+        self.observer.memory.gamma, self.observer.memory.y = now.gamma, now.z[0]
+        self.observer.follow(now.z[0], 1.0, self.u)
+        for i in range(self.observer.levels):
+            after = &self.observer.trial[i]
             rate.level[i].z_hat = after.z_hat - now.level[i].z_hat
             rate.level[i].z_tilde = after.z_tilde - now.level[i].z_tilde
             rate.level[i].p = after.p - now.level[i].p
             rate.level[i].q = after.q - now.level[i].q
+        if self.observer.adaptive:
+            rate.gamma = self.gamma_rate(self.observer, now.gamma)
 
-    cdef void hold_signs(self, const State* now, State* rate, bint first) noexcept nogil:
-        """Remember the signs of the innovations, or replace those behind the rates by them."""
-        cdef State free
-        cdef bint known = False
-        cdef double eps, sign, factor
-        cdef Level* one
+    cdef void hold_signs(self, const State* now, bint first) noexcept nogil:
+        """Remember the signs of the innovations, or turn the gains where they are others now."""
+        cdef double eps, sign
         cdef int i
         for i in range(self.observer.levels):
-            if i == 0:
-                eps = now.z[0] - now.level[0].z_hat
-            else:
-                eps = now.level[i - 1].z_tilde - now.level[i].z_hat
+            eps = (now.level[i - 1].z_tilde if i > 0 else now.z[0]) - now.level[i].z_hat
             sign = (eps > 0.0) - (eps < 0.0)
             if first:
                 self.sign[i] = sign
-            elif self.sign[i] != sign:
-                if not known:
-                    self.observer_rates(self.free, now, &free)
-                    known = True
-                factor, one = self.sign[i] * sign, &rate.level[i]
-                # What the injections add has the other sign.
-                one.z_hat = free.level[i].z_hat + factor * (one.z_hat - free.level[i].z_hat)
-                one.z_tilde = (
-                    free.level[i].z_tilde + factor * (one.z_tilde - free.level[i].z_tilde)
-                )
+            self.observer.gains[i].lambda_ = self.sign[i] * sign * self.gains[i].lambda_
+            self.observer.gains[i].alpha = self.sign[i] * sign * self.gains[i].alpha
 
     cdef double gamma_rate(self, SlidingMode law, double gamma) noexcept nogil:
         """Return the rate of gamma by the law of D 7 and D 8, for the latest L."""
@@ -172,9 +136,9 @@ cdef class Joint(Dynamics):
         if law.adaptive:
             self.state.gamma = fmin(fmax(self.state.gamma, law.gamma_min), law.gamma_max)
 
-    def run(self, str method, double h, Py_ssize_t count, int every):
+    def run(self, str solver, double h, Py_ssize_t count, int every):
         """Integrate and return `count` states, every `every`-th one, from the first one on."""
-        cdef Method used = METHODS[method]
+        cdef Method used = SOLVERS[solver]
         cdef int n = self.plant.size, levels = self.observer.levels, i, _
         cdef Py_ssize_t row, step = 0
         cdef double[:, ::1] z = np.empty((count, n))
@@ -208,11 +172,11 @@ def simulate(observer, plant, solver='ode3', step=1e-3, duration=20.0, every=1):
     own = {'scheme': 'explicit', 'noise_size': 0.0}  # a solver has no scheme of its own
     configuration = ObserverConfiguration(OBSERVER_PARAMETERS.complete(observer).changed(own))
     p = PLANT_PARAMETERS.complete(plant)
-    (method, holds), model, d = SOLVERS[solver], TriangularModel.of(p), Wave(p)
+    model, d = TriangularModel.of(p), Wave(p)
     z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], model.order)
     system = System(model.expressions, d, step, z)
-    joint = Joint(system, configuration, holds and configuration.is_sign)
+    joint = Joint(system, configuration, solver == HELD and configuration.is_sign)
     rows = round(duration / step) // every + 1
-    found = joint.run(method, step, rows, every)
+    found = joint.run(solver, step, rows, every)
     t = np.arange(rows, dtype=np.float64) * (every * step)
     return JointRun(t=t, unknown_input=d.along(t), **found)

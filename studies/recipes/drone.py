@@ -7,14 +7,13 @@ heading that has none.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from scipy.spatial.transform import Rotation
 from studies.harness import Floats
-from studies.recipes import judging, peers
+from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
 RATE = 100.0
@@ -121,13 +120,13 @@ def wind_flight(seed: int) -> list[Recorded]:
         Recorded(
             f'{kind} {seed}, {name}', found['t'], found['position'][:, axis],
             found['thrust'][:, axis : axis + 1], k * found['wind'][:, axis],
-            found['t'] > WIND_SETTLED,
+            WIND_SETTLED,
         )
         for axis, name in enumerate('xy')
     ]  # fmt: skip
 
 
-def winds(_: object) -> dict[str, list[Fold]]:
+def winds(_: None) -> dict[str, list[Fold]]:
     """Return the flights with turbulence and those with steps, tuned on both."""
     flights = [wind_flight(seed) for seed in range(6)]
     training = [r for both in flights[:2] for r in both]
@@ -138,14 +137,12 @@ def winds(_: object) -> dict[str, list[Fold]]:
 
 WIND = Recipe(
     {
-        DIFFERENCE: Method(peers.disturbance_observer, WIND_BANDWIDTHS),
-        'Kalman filter, wind a random walk': Method(peers.kalman_filter, WIND_BANDWIDTHS),
+        DIFFERENCE: Method(judging.disturbance_observer, WIND_BANDWIDTHS),
+        'Kalman filter, wind a random walk': Method(judging.kalman_filter, WIND_BANDWIDTHS),
         FIXED: Method(judging.fixed, WIND_BANDWIDTHS),
         OURS: Method(judging.self_tuning),
     },
-    winds,
-    partial(judging.simulated, 'wind', 100.0, 3.5e-3, (1.5, 1.0), [(0.0, 1.0)], WIND_SETTLED),
-    'wind along the axis [m/s]', (DIFFERENCE, OURS), (3.0, 23.0), scale=2.237,
+    winds, 'wind along the axis [m/s]', (DIFFERENCE, OURS), (3.0, 23.0), scale=2.237,
 )  # fmt: skip
 
 
@@ -165,7 +162,7 @@ def bias_flight(seed: int) -> Recorded:
     found = fly(BIAS_DURATION, seed, gusts(seed, steps=False), GYROSCOPE | bias)
     roll, pitch, yaw = Rotation.from_quat(found['attitude']).as_euler('xyz').T
     t, u = found['t'], np.column_stack([found['rate'][:, 1:], roll, pitch])
-    return Recorded(f'flight {seed}', t, np.unwrap(yaw), u, -found['bias'][:, 2], t > BIAS_SETTLED)
+    return Recorded(f'flight {seed}', t, np.unwrap(yaw), u, -found['bias'][:, 2], BIAS_SETTLED)
 
 
 def with_outliers(r: Recorded, seed: int) -> Recorded:
@@ -175,7 +172,7 @@ def with_outliers(r: Recorded, seed: int) -> Recorded:
     return r._replace(y=r.y + wrong * JUMP * rng.standard_normal(len(r.t)))
 
 
-def biases(_: object) -> dict[str, list[Fold]]:
+def biases(_: None) -> dict[str, list[Fold]]:
     """Return the flights as simulated, and with outliers."""
     clean = [bias_flight(seed) for seed in range(5)]
     spoilt = [with_outliers(r, seed) for seed, r in enumerate(clean)]
@@ -183,14 +180,11 @@ def biases(_: object) -> dict[str, list[Fold]]:
     return {name: [Fold(p, rs[:2], rs[2:])] for name, rs in both.items()}
 
 
-INPUTS = (0.0, 0.3), (0.0, 0.5), (0.0, 0.2), (0.0, 0.2)
 BIAS = Recipe(
     {
-        'complementary filter': Method(peers.complementary_filter, BIAS_BANDWIDTHS),
-        'Kalman filter, bias a random walk': Method(peers.kalman_filter, BIAS_BANDWIDTHS),
+        'complementary filter': Method(judging.complementary_filter, BIAS_BANDWIDTHS),
+        'Kalman filter, bias a random walk': Method(judging.kalman_filter, BIAS_BANDWIDTHS),
         OURS: Method(judging.self_tuning),
     },
-    biases,
-    partial(judging.simulated, 'sensor_bias', 100.0, 3.5e-3, (0.05, 0.2), INPUTS, 2.0),
-    'bias [rad/s]', ('complementary filter', OURS), (0.0, 60.0), scale=-1.0,
+    biases, 'bias [rad/s]', ('complementary filter', OURS), (0.0, 60.0), scale=-1.0,
 )  # fmt: skip

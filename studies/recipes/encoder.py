@@ -9,7 +9,7 @@ from fhaosmo_ros.core import Family
 import numpy as np
 from scipy.signal import lfilter, savgol_coeffs
 from studies.harness import Floats, SELF_TUNING
-from studies.recipes import judging, peers
+from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
 ACCELERATION, VELOCITY = 'acceleration', 'velocity'
@@ -29,7 +29,7 @@ WINDOWS = [float(window) for window in range(11, 202, 10)]
 def difference(_: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
     """Return differences behind a first-order low pass; of the velocity for the acceleration."""
     order = 1 if r.quantity == VELOCITY else 2
-    return peers.low_passed(r.y, bandwidth, r.period, order, order)
+    return judging.low_passed(r.y, bandwidth, r.period, order, order)
 
 
 def savitzky_golay(degree: int, _: Mapping[str, Any], r: Recorded, window: float) -> Floats:
@@ -46,31 +46,22 @@ def this_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats
     return found.z[:, 1] if r.quantity == VELOCITY else found.unknown_input
 
 
-def recorded(count: int, **changes: float) -> dict[str, list[Fold]]:
+def conditions(_: None) -> dict[str, list[Fold]]:
     """Return a fold for each quantity and kind of acceleration; peers are tuned on both kinds."""
-    found, p = Family(JOINT | changes).recordings(2 * count), judging.model('encoder')
+    found, p = Family(JOINT).recordings(2 * RECORDINGS), judging.model('encoder')
     folds = {}
     for quantity in (ACCELERATION, VELOCITY):
         rs = [
             Recorded(
                 f'simulated {n}', r.t, r.y, np.zeros((len(r.t), 0)),
-                r.d if quantity == ACCELERATION else r.z[:, 1], r.t > SETTLED, quantity,
+                r.d if quantity == ACCELERATION else r.z[:, 1], SETTLED, quantity,
             )
             for n, r in enumerate(found, 1)
         ]  # fmt: skip
         for k, kind in enumerate(KINDS):
-            folds[f'{quantity}, {kind}'] = [Fold(p, rs[:count], rs[count + k :: len(KINDS)])]
+            judged = rs[RECORDINGS + k :: len(KINDS)]
+            folds[f'{quantity}, {kind}'] = [Fold(p, rs[:RECORDINGS], judged)]
     return folds
-
-
-def conditions(_: object) -> dict[str, list[Fold]]:
-    """Return all folds."""
-    return recorded(RECORDINGS)
-
-
-def short() -> dict[str, list[Fold]]:
-    """Return a fold of four short recordings."""
-    return {'simulated': recorded(2, duration=3.0)[f'{ACCELERATION}, {KINDS[0]}']}
 
 
 RECIPE = Recipe(
@@ -81,6 +72,6 @@ RECIPE = Recipe(
         OURS: Method(this_observer),
         FIXED: Method(this_observer, BANDWIDTHS),
     },
-    conditions, short, 'acceleration [rad/s²]', ('Savitzky-Golay, causal, degree 3', OURS),
-    (2.0, 4.0), band=False,
+    conditions, 'acceleration [rad/s²]', ('Savitzky-Golay, causal, degree 3', OURS), (2.0, 4.0),
+    band=False,
 )  # fmt: skip

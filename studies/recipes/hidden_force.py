@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from studies.harness import Floats, SELF_TUNING
-from studies.recipes import judging, peers
+from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
 PERIOD = 2**14 / 1e7
@@ -75,7 +75,7 @@ def described(found: list[float]) -> dict[str, Any]:
     return {'order': 2, 'phi': ['0', phi]}
 
 
-def conditions(data: Path | None) -> dict[str, list[Fold]]:
+def conditions(data: Path) -> dict[str, list[Fold]]:
     """Return model and peers from one half of the multisines, judged on the other."""
     force, y = np.genfromtxt(data, delimiter=',', skip_header=1, max_rows=END)[:, :2].T
     found = identify(y[MULTISINES:HALF], force[MULTISINES:HALF])
@@ -91,23 +91,17 @@ def recorded(name: str, y: Floats, d: Floats) -> Recorded:
     """Return a recording whose truth is that of `LAG` samples before."""
     t = np.arange(len(y)) * PERIOD
     late = np.concatenate([np.repeat(d[0], LAG), d[:-LAG]])
-    return Recorded(name, t, y, np.zeros((len(y), 0)), late, t > SETTLED)
-
-
-def short() -> judging.Folds:
-    """Return a fold of two short simulations of the file's own oscillator."""
-    found = judging.simulated('hidden_force', 1 / PERIOD, 1e-5, (4000.0, 200.0), seconds=1.5)
-    return judging.changed(found, lambda _, r: recorded(r.name, r.y, r.d))
+    return Recorded(name, t, y, np.zeros((len(y), 0)), late, SETTLED)
 
 
 RECIPE = Recipe(
     {
-        'disturbance observer': Method(peers.disturbance_observer, BANDWIDTHS),
-        'Kalman filter, d a random walk': Method(peers.kalman_filter, BANDWIDTHS),
+        'disturbance observer': Method(judging.disturbance_observer, BANDWIDTHS),
+        'Kalman filter, d a random walk': Method(judging.kalman_filter, BANDWIDTHS),
         FIXED: Method(fixed, BANDWIDTHS),
         OURS: Method(judging.self_tuning),
         LAGGING: Method(lagging),
     },
-    conditions, short, 'V1 [V]', ('disturbance observer', LAGGING), (5.0, 5.12),
+    conditions, 'V1 [V]', ('disturbance observer', LAGGING), (5.0, 5.12),
     scale=1.0 / 186_024.0, band=False, data='SNLS80mV.csv of Silverbox',
 )  # fmt: skip

@@ -10,8 +10,17 @@ from fhaosmo_ros.tools.bags.reader import BagReader
 import numpy as np
 from scipy.signal import butter, filtfilt, savgol_filter
 from studies.harness import Floats
-from studies.recipes import judging, peers
-from studies.recipes.judging import Estimate, FIXED, Fold, Method, OURS, Recipe, Recorded
+from studies.recipes import judging
+from studies.recipes.judging import (
+    Estimate,
+    FIXED,
+    Fold,
+    kalman_filter,
+    Method,
+    OURS,
+    Recipe,
+    Recorded,
+)
 
 JOINTS, WRENCH = '/pndbt/joint_states', '/pndbt/netft_data'
 RATE = 200.0
@@ -38,7 +47,7 @@ def read(path: Path) -> Recorded:
     low_pass = butter(2, CUTOFF, fs=len(wrench) / np.ptp(measured))
     shoulder = np.interp(t, measured, filtfilt(*low_pass, wrench))
     u = np.column_stack([angle, np.unwrap(elbow), elbow_speed])
-    return Recorded(path.stem, t - t[0], speed, u, shoulder, t > t[0] + SETTLED)
+    return Recorded(path.stem, t - t[0], speed, u, shoulder, SETTLED)
 
 
 def identify(r: Recorded) -> tuple[dict[str, float], float]:
@@ -108,37 +117,26 @@ def momentum_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Fl
     return found
 
 
-def conditions(data: Path | None) -> dict[str, list[Fold]]:
+def conditions(data: Path) -> dict[str, list[Fold]]:
     """Return model and peers from the first half of the bag, judged on the second."""
-    assert data is not None
     whole = read(data)
     half = len(whole.t) // 2
-    first, second = (cut(whole, part) for part in (slice(half), slice(half, None)))
+    first, second = (
+        whole._replace(**{name: getattr(whole, name)[part] for name in ('t', 'y', 'u', 'd')})
+        for part in (slice(half), slice(half, None))
+    )
     constants, offset = identify(first)
     first, second = (r._replace(d=r.d - offset) for r in (first, second))
     return {'second half': [Fold(judging.model('joint_torque', constants), [first], [second])]}
 
 
-def cut(r: Recorded, part: slice) -> Recorded:
-    """Return a part of a recording."""
-    t = r.t[part]
-    return Recorded(r.name, t, r.y[part], r.u[part], r.d[part], t > t[0] + SETTLED)
-
-
-def short() -> judging.Folds:
-    """Return a fold of two short simulations of the shoulder, below an elbow that is moved."""
-    inputs, d = [(-1.57, 0.1), (0.0, 0.1), (0.0, 0.5)], (20.0, 6.0)
-    found = judging.simulated('joint_torque', RATE, 0.02, d, inputs, SETTLED, 4.0)
-    return judging.changed(found, lambda p, r: r._replace(d=r.d * inertia(p, r)))
-
-
 RECIPE = Recipe(
     {
         'momentum observer': Method(momentum_observer, BANDWIDTHS),
-        'Kalman filter, d a random walk': Method(partial(torque, peers.kalman_filter), BANDWIDTHS),
+        'Kalman filter, d a random walk': Method(partial(torque, kalman_filter), BANDWIDTHS),
         FIXED: Method(partial(torque, judging.fixed), BANDWIDTHS),
         OURS: Method(partial(torque, judging.self_tuning)),
     },
-    conditions, short, 'torque at the shoulder [N m]', ('momentum observer', FIXED, OURS),
+    conditions, 'torque at the shoulder [N m]', ('momentum observer', FIXED, OURS),
     (0.5, 4.7), band=False, data='bag of the pendubot',
 )  # fmt: skip

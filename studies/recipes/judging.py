@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings with their truth, methods that have one number to choose, and who is better."""
+"""
+Recordings with their truth, methods, and who is better.
+
+Methods have one number to choose: those that people use today its bandwidth (rad/s).
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -8,12 +12,11 @@ from typing import Any, NamedTuple
 from fhaosmo_ros.core import Trajectory, TriangularModel
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.core.simulation.plant import respond
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import bilinear, lfilter
 from studies.evidence import Row
 from studies.harness import Floats, model_alone, observed, SELF_TUNING
-from studies.waves import wave
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'recipes'
 OURS, FIXED = 'this observer, self-tuning', 'this observer, fixed gains'
@@ -34,9 +37,14 @@ class Recorded(NamedTuple):
     """(N, m): known inputs, that of the interval which ends at each sample."""
     d: Floats
     """The true unknown input, or the `quantity` that methods return in its place."""
-    judged: NDArray[np.bool_]
-    """Samples that count."""
+    settled: float
+    """Seconds after which errors count."""
     quantity: str = 'd'
+
+    @property
+    def judged(self) -> NDArray[np.bool_]:
+        """Samples that count."""
+        return self.t - self.t[0] > self.settled
 
     @property
     def period(self) -> float:
@@ -74,10 +82,8 @@ class Recipe(NamedTuple):
     """What is measured and how it is shown."""
 
     methods: dict[str, Method]
-    conditions: Callable[[Path | None], Folds]
-    """From the recordings' place."""
-    short: Callable[[], Folds]
-    """The same from short simulations of the model alone."""
+    conditions: Callable[[Any], Folds]
+    """From the recordings' path, None where the recipe needs no recordings."""
     quantity: str
     """What the figure shows, with its unit."""
     drawn: Sequence[str]
@@ -132,6 +138,91 @@ def fixed(parameters: Mapping[str, Any], r: Recorded, bandwidth: float) -> Float
     return run(dict(parameters) | gains, r).unknown_input
 
 
+def low_passed(x: Floats, bandwidth: float, period: float, order: int, derivative: int) -> Floats:
+    """Return a derivative of x behind (s / bandwidth + 1)^-order, from rest at the first value."""
+    numerator = [1.0] + [0.0] * derivative
+    denominator = np.poly([-bandwidth] * order) / bandwidth**order
+    b, a = bilinear(numerator, denominator, 1.0 / period)
+    first = x[0]
+    filtered = lfilter(b, a, x - first)
+    return filtered + (first if derivative == 0 else 0.0)
+
+
+def inputs_of(r: Recorded) -> Floats:
+    """Return the known inputs, one that is 0 where there are none."""
+    return r.u if r.u.size else np.zeros((len(r.y), 1))
+
+
+def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
+    """
+    Return d = Q(s) (s² y - Phi_2), Q = (s / bandwidth + 1)^-2, for a model of order 2.
+
+    The low-passed second derivative less what the model explains (Chen et al. 2016,
+    doi:10.1109/TIE.2015.2478397).
+    """
+    model, h = plant_of(p), r.period
+    velocity = low_passed(r.y, bandwidth, h, 2, 1)
+    samples = zip(np.column_stack([r.y, velocity]), inputs_of(r), strict=True)
+    explained = np.array([model.evaluate(z, u)[1] for z, u in samples])
+    acceleration = low_passed(r.y, bandwidth, h, 2, 2)
+    return acceleration - low_passed(explained, bandwidth, h, 2, 0)
+
+
+def kalman_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
+    """
+    Return d of an extended Kalman filter whose model of d is a random walk.
+
+    Only the ratio of the two noises matters; it is given as the bandwidth of the steady filter of
+    the chain of integrators: q = bandwidth^(2N) noise² h, N = n + 1.
+    """
+    model = plant_of(p)
+    n, h = model.order, r.period
+    q = bandwidth ** (2 * n + 2) * h
+    x = np.zeros(n + 1)
+    x[0] = r.y[0]
+    covariance = np.diag([(3.0 * bandwidth) ** (2 * k) for k in range(n + 1)])
+    chain, found, inputs = np.eye(n + 1, k=1), np.zeros(len(r.y)), inputs_of(r)
+    for k in range(1, len(r.y)):
+        dt, u = r.t[k] - r.t[k - 1], inputs[k]
+        rates = [np.zeros(n + 1)]
+        for share in (0.0, 0.5, 0.5, 1.0):
+            point = x + share * dt * rates[-1]
+            rate = chain @ point
+            rate[:n] += model.evaluate(point[:n], u)
+            rates.append(rate)
+        x = x + dt / 6.0 * (rates[1] + 2.0 * rates[2] + 2.0 * rates[3] + rates[4])
+        slopes = chain.copy()
+        slopes[:n, :n] += model.jacobian(x[:n], u)
+        a = last = np.eye(n + 1)
+        for power in range(1, 5):
+            last = last @ slopes * (dt / power)
+            a = a + last
+        covariance = a @ covariance @ a.T
+        covariance[n, n] += q * dt
+        gain = covariance[:, 0] / (covariance[0, 0] + 1.0)
+        x = x + gain * (r.y[k] - x[0])
+        covariance = covariance - np.outer(gain, covariance[0])
+        found[k] = x[n]
+    return found
+
+
+def complementary_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
+    """
+    Return d of z1' = Phi(u) + d + 2 w e, d' = w² e with e = y - z1 and w = `bandwidth`.
+
+    In one dimension this is the filter of Mahony et al. (2008, doi:10.1109/TAC.2008.923738)
+    with its estimate of the bias.
+    """
+    model, angle, bias, found = plant_of(p), float(r.y[0]), 0.0, np.zeros(len(r.y))
+    for k in range(1, len(r.y)):
+        dt, rate = r.t[k] - r.t[k - 1], model.evaluate(r.y[k : k + 1], r.u[k])[0]
+        wrong = r.y[k] - angle - dt * (rate + bias)
+        angle += dt * (rate + bias + 2.0 * bandwidth * wrong)
+        bias += dt * bandwidth**2 * wrong
+        found[k] = bias
+    return found
+
+
 def error(pairs: Iterable[tuple[Recorded, Floats]]) -> float:
     """Return the RMS error of estimates over the RMS of the truth, all recordings as one."""
     both = [((found - r.d)[r.judged], r.d[r.judged]) for r, found in pairs]
@@ -158,37 +249,3 @@ def judge(method: Method, folds: Sequence[Fold]) -> Row:
         pairs += [(r, method.estimate(p, r, best)) for r in judged]
     wrong, unit = float(f'{error(pairs):.4g}'), method.unit if chosen else ''
     return {'error': wrong, 'chosen': ' '.join(f'{x:g}' for x in chosen), 'unit': unit}
-
-
-def simulated(
-    name: str, rate: float, noise: float, d: tuple[float, float],
-    inputs: Sequence[tuple[float, float]] = (), settled: float = 1.0, seconds: float = 8.0,
-) -> dict[str, list[Fold]]:  # fmt: skip
-    """
-    Return a fold of two simulations of a recipe's model, for a run without foreign data.
-
-    `d` has the RMS of the unknown input and its speed (rad/s), `inputs` mean and RMS of each
-    known one; what is judged begins `settled` seconds after the start.
-    """
-    parameters, found = model(name), []
-    plant = plant_of(parameters)
-    t = np.arange(0.0, seconds, 1.0 / rate)
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        force = d[0] * wave('sine', t, d[1], rng)
-        u = np.zeros((len(t), max(1, len(inputs))))
-        for column, (mean, size) in zip(u.T, inputs, strict=False):
-            column[:] = mean + size * wave('sine', t, 2.0, rng)
-        z, truth = respond(plant, 0.0, t, force, 1.0 / rate, u, step=0.5 / rate)
-        y = z[:, 0] + noise * rng.standard_normal(len(t))
-        known = u[:, : len(inputs)]
-        found.append(Recorded(f'simulated {seed + 1}', t, y, known, truth, t > settled))
-    return {'simulated': [Fold(parameters, found[:1], found[1:])]}
-
-
-def changed(folds: Folds, change: Callable[[dict[str, Any], Recorded], Recorded]) -> Folds:
-    """Return folds with each recording changed, by their parameters and itself."""
-    return {
-        name: [Fold(p, *([change(p, r) for r in rs] for rs in parts)) for p, *parts in these]
-        for name, these in folds.items()
-    }

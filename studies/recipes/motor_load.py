@@ -2,14 +2,13 @@
 """Load torque of a servo: recordings of BAM (Rhoban), whose load is a mass on a lever."""
 
 from collections.abc import Sequence
-from functools import partial
 import json
 from pathlib import Path
 
 import numpy as np
 from scipy.signal import savgol_filter
 from studies.harness import Floats
-from studies.recipes import judging, peers
+from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
 INERTIA = 0.00732
@@ -31,7 +30,7 @@ def read(path: Path) -> Recorded:
     )
     duty = np.where(load > 2**15, load - 2**16, load) / FULL_DUTY
     u = np.column_stack([duty * volt, powered])
-    return Recorded(path.stem, t, y, u, np.zeros_like(t), t > t[0] + SETTLED)
+    return Recorded(path.stem, t, y, u, np.zeros_like(t), SETTLED)
 
 
 def identify(recordings: Sequence[Recorded]) -> tuple[dict[str, float], Floats]:
@@ -53,9 +52,8 @@ def identify(recordings: Sequence[Recorded]) -> tuple[dict[str, float], Floats]:
     return dict(zip('abc', found[:3].tolist(), strict=True)), found[3:]
 
 
-def conditions(data: Path | None) -> dict[str, list[Fold]]:
+def conditions(data: Path) -> dict[str, list[Fold]]:
     """Return folds whose peers are tuned on the other recordings, for two models."""
-    assert data is not None
     recordings = [read(path) for path in sorted(data.glob('*.json'))]
     everything = identify(recordings)
 
@@ -76,16 +74,14 @@ def conditions(data: Path | None) -> dict[str, list[Fold]]:
     }
 
 
-INPUTS = (0.0, 2.0), (1.0, 0.0)
 RECIPE = Recipe(
     {
-        'disturbance observer': Method(peers.disturbance_observer, BANDWIDTHS),
-        'Kalman filter, d a random walk': Method(peers.kalman_filter, BANDWIDTHS),
+        'disturbance observer': Method(judging.disturbance_observer, BANDWIDTHS),
+        'Kalman filter, d a random walk': Method(judging.kalman_filter, BANDWIDTHS),
         FIXED: Method(judging.fixed, BANDWIDTHS),
         OURS: Method(judging.self_tuning),
     },
-    conditions,
-    partial(judging.simulated, 'motor_load', 190.0, 4e-4, (25.0, 6.0), INPUTS, SETTLED, 4.0),
-    'load torque [N m]', ('disturbance observer', OURS), (0.5, 6.0), scale=INERTIA, fold=3,
+    conditions, 'load torque [N m]', ('disturbance observer', OURS), (0.5, 6.0), scale=INERTIA,
+    fold=3,
     data='folder with the JSON files of one XL330 of BAM',
 )  # fmt: skip

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The loop over samples of the filters that bend or adapt; see adaptive.py.
+The loop over samples of the filters that bend or adapt; see kalman.py.
 
 They predict by Runge-Kutta steps of the whole (nonlinear) model, so they know Phi exactly as ours
 does, and correct by y. Each estimate uses the sample of its own time. Covariances are of scaled

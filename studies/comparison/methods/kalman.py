@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The Kalman filters, with the same model and Phi as ours: steady ones, and ones that adapt.
+
+    z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d
+    d' = d_1 - decay d, d_1' = d_2 - decay d_1, ..., d_{m-1}' = -decay d_{m-1} + white noise
+    x(t_k) = prediction(t_k) + K (y_k - prediction_1(t_k))
+
+For a linear Phi the prediction equals the zero-order-hold discretisation, up to an error that
+decreases with the longest step. The others have one recursion, with covariances relative to the
+tuned noise; between samples the covariance takes as many steps as there are periods.
+
+Huber: an innovation e beyond `huber` standard deviations sqrt(S) counts as if its noise were
+larger, so that its influence is bounded. Noise: R <- R + share (max(e^2 - P_11, R_0 / 10^4) - R),
+the recursive form of innovation-based adaptive estimation (A. H. Mohamed and K. P. Schwarz,
+Journal of Geodesy 73, 1999, doi:10.1007/s001900050236). Several models: the interacting multiple
+model filter (H. A. P. Blom and Y. Bar-Shalom, IEEE Transactions on Automatic Control 33(8), 1988,
+doi:10.1109/9.1299).
+"""
+
+from collections.abc import Sequence
+from functools import partial
+import math
+from types import SimpleNamespace
+
+from fhaosmo_ros.core.model.inputs import known_inputs
+from fhaosmo_ros.core.model.prediction import Prediction
+from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core.observer.kalman import innovations
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.tools.tuning.likelihood import Samples
+from fhaosmo_ros.tools.tuning.search import Dimension, minimise
+import numpy as np
+from scipy.linalg import expm, solve_discrete_are
+from studies.comparison.methods.filters import several_models
+from studies.comparison.methods.method import (
+    Estimates,
+    LINEAR,
+    Method,
+    ROBUST,
+    Run,
+    Search,
+    Setting,
+    USUAL,
+    Values,
+)
+from studies.harness import Floats
+
+LINEAR_LIMIT = 'Kalman, Matern'
+"""Our observer equals this filter for small innovations."""
+HUBER, NOISE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'
+REACH = 10.0
+"""How far a search for the bandwidth goes, as a factor to both sides."""
+LONGEST, LONGEST_STEP = 1.5, 1.0
+"""Steps of a prediction: nominal periods; seconds, for a model without dynamics of its own."""
+DERIVATIVES = (0, 1, 2, 3)
+"""Of d, that are tried."""
+
+
+class SampledModel:
+    """
+    The model, linearised at rest and extended by a chain of integrators that makes d.
+
+    States are scaled by powers of the period, because the Riccati equation is badly conditioned
+    otherwise.
+
+    Parameters
+    ----------
+    model : TriangularModel
+    period : float
+        Sampling period in seconds.
+    chain : int
+        Integrators that model d: with 1 the white noise drives d itself, with 2 its derivative.
+    decay : float
+        Rate (1/s) at which all states of the chain decay, so that d is a Matern process.
+
+    """
+
+    def __init__(
+        self, model: TriangularModel, period: float, chain: int = 1, decay: float = 0.0
+    ) -> None:
+        n, self.size, self.period = model.order, model.order + chain, period
+        self.scale = period ** np.arange(self.size)
+        """Powers of the period: scaled states are x_i * period^(i - 1)."""
+        self._rates = np.eye(self.size, k=1)
+        self._rates[range(n, self.size), range(n, self.size)] = -decay
+        jacobian = model.jacobian(np.zeros(n))
+        fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(n, k=1))))
+        self.resolution = min(0.03 / max(float(fastest), 1e-9), LONGEST_STEP)
+        """
+        Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
+        0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as dry
+        friction, needs shorter ones.
+        """
+        self._rates[:n, :n] += jacobian
+        self.a = self._scaled(expm(self._rates * period))
+        """(N, N): transition over a period, in scaled states."""
+
+    def _scaled(self, matrix: Floats) -> Floats:
+        return matrix * self.scale[:, None] / self.scale[None, :]
+
+    def kalman(self, intensity: float) -> Floats:
+        """
+        Return the steady-state Kalman gain for noise of variance 1 on y.
+
+        It is for a filter that predicts to t_k and then corrects with y_k itself; white noise of
+        the intensity drives the last state of the chain.
+        """
+        noise = self.process_noise(intensity)
+        try:
+            with np.errstate(invalid='ignore'):  # the result is checked below
+                p = solve_discrete_are(self.a.T, np.eye(self.size)[:1].T, noise, np.eye(1))
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
+        gain = p[:, 0] / (p[0, 0] + 1.0) / self.scale
+        if not np.isfinite(gain).all():
+            raise ConfigurationError(f'Kalman gain: expected finite numbers, got {gain}')
+        return gain
+
+    def process_noise(self, intensity: float) -> Floats:
+        """
+        Return what such noise adds to the scaled covariance over a period.
+
+        By C. F. Van Loan, IEEE Transactions on Automatic Control 23(3), 1978,
+        doi:10.1109/TAC.1978.1101743.
+        """
+        n, rates, drive = self.size, self._scaled(self._rates) * self.period, np.zeros(self.size)
+        drive[-1] = 1.0
+        block = np.zeros((2 * n, 2 * n))
+        block[:n, :n], block[:n, n:], block[n:, n:] = -rates, np.diag(drive), rates.T
+        exponential = expm(block)
+        largest = intensity * self.scale[-1] ** 2 * self.period
+        covariance = largest * exponential[n:, n:].T @ exponential[:n, n:]
+        return 0.5 * (covariance + covariance.T)
+
+
+def samples_of(r: Recording, model: TriangularModel) -> Samples:
+    """Return the samples of a recording, as if each came one period after the one before."""
+    count = len(r.y)
+    periods, used = np.ones(count, np.int64), np.ones(count, np.bool_)
+    periods[0] = 0  # there a filter begins
+    u = known_inputs(r.u, model.inputs, count)
+    return Samples(np.diff(r.t, prepend=r.t[0]), periods, np.ascontiguousarray(r.y), u, used)
+
+
+def estimates(
+    model: TriangularModel, gain: Floats, decay: float, r: Recording, longest: float
+) -> Floats:
+    """
+    Return the estimates of z, d, d_1, .. of a recording, a row for each sample, by the gain K.
+
+    `decay` is 0 for a random walk; intervals beyond `longest` (s) take several steps. This is a
+    Kalman filter whose covariance P is as it has to be for K from the beginning, and stays.
+    """
+    expressions, size = model.with_unknown_input(decay, len(gain) - model.order - 1), len(gain)
+    fresh = np.zeros((size, size))
+    fresh[:, 0] = gain  # K = P_1 / (P_11 + variance)
+    steady = SimpleNamespace(
+        a=np.eye(size), q=np.zeros((size, size)), fresh=fresh, variance=1.0 - gain[0],
+        clip=math.inf, settled=0,
+    )  # fmt: skip
+    _, _, found = innovations(Prediction(expressions, longest), samples_of(r, model), steady)
+    return np.asarray(found)
+
+
+def _prepare(setting: Setting, values: Values) -> Run:
+    """Return a run of the filter whose speed is about `bandwidth`."""
+    model, decay = setting.model, values.get('decay', 0.0)
+    chain = 1 + int(values.get('derivatives', 0))
+    sampled = SampledModel(model, setting.period, chain, decay)
+    gain = sampled.kalman(setting.period * values['bandwidth'] ** (2 * sampled.size))
+    n, longest = model.order, min(LONGEST * setting.period, sampled.resolution)
+
+    def estimate(r: Recording) -> dict[str, Estimates]:
+        out = estimates(model, gain, decay, r, longest)
+        return {'filtered': Estimates(out[:, :n], out[:, n])}
+
+    return estimate
+
+
+def _one_bandwidth(setting: Setting) -> tuple[Dimension, ...]:
+    """Return a range in rad/s, from far below any d to where the observer is deadbeat."""
+    return (Dimension('bandwidth', 0.05, 5.0 / setting.period, setting.speed),)
+
+
+def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...]:
+    """Return bandwidth and decay of a filter whose d is a Matern process."""
+    speed, fastest = setting.balance(derivatives), 5.0 / setting.period
+    return (
+        Dimension('bandwidth', speed / REACH, min(speed * REACH, fastest), speed),
+        Dimension('decay', 0.03, 30.0, 1.0),
+    )
+
+
+def each_order(search: Search, more: Sequence[Dimension] = ()) -> Values:
+    """Search bandwidth, decay and `more` with each number of derivatives of d."""
+    best: tuple[float, Values] = (float('inf'), {})
+    for k in DERIVATIVES:
+        fixed = {'derivatives': float(k)}
+        found = minimise(
+            lambda v, fixed=fixed: search.judged(fixed | v),
+            (*matern_space(search.setting, k), *more),
+            max(1, search.trials // len(DERIVATIVES)),
+            search.seed,
+        )
+        if not best[1] or found.value < best[0]:
+            best = found.value, fixed | found.best
+    return best[1]
+
+
+FILTERS = (
+    Method('Kalman', USUAL, _one_bandwidth, _prepare),  # d a random walk
+    Method('Kalman, decaying', LINEAR, matern_space, _prepare),  # a random walk that decays
+    Method(LINEAR_LIMIT, LINEAR, matern_space, _prepare, each_order),
+)
+"""Steady-state Kalman filters by their d."""
+
+
+def _prepare_adaptive(setting: Setting, values: Values) -> Run:
+    model, h, derivatives = setting.model, setting.period, int(values.get('derivatives', 0))
+    sampled = SampledModel(model, h, derivatives + 1, values['decay'])
+    size, spread = sampled.size, values.get('spread', 1.0)
+    factors = (1.0,) if spread == 1.0 else (1.0 / spread, 1.0, spread)
+    bandwidths = [factor * values['bandwidth'] for factor in factors]
+    q = np.array([sampled.process_noise(h * bandwidth ** (2 * size)) for bandwidth in bandwidths])
+    scale = h ** np.arange(size) / setting.noise
+    about = setting.balance(derivatives) ** np.arange(1.0 + derivatives)
+    sizes = np.concatenate([np.ones(model.order), setting.size * about])
+    sizes[0] = setting.noise
+    bank = SimpleNamespace(
+        a=sampled.a, q=q, fresh=np.diag((scale * sizes) ** 2), scale=scale, period=h,
+        huber=values.get('huber', math.inf), memory=h / values.get('memory', math.inf),
+        switch=h / values.get('stay', 1.0),
+    )  # fmt: skip
+    longest = min(LONGEST * h, sampled.resolution)
+    prediction = Prediction(model.with_unknown_input(values['decay'], derivatives), longest)
+
+    def estimate(r: Recording) -> dict[str, Estimates]:
+        out = several_models(prediction, samples_of(r, model), bank)
+        return {'filtered': Estimates(out[:, : model.order], out[:, model.order])}
+
+    return estimate
+
+
+def _adaptive(name: str, *options: Dimension) -> Method:
+    def space(setting: Setting) -> tuple[Dimension, ...]:
+        return (*matern_space(setting), *options)
+
+    tune = partial(each_order, more=options)
+    return Method(name, ROBUST, space, _prepare_adaptive, tune, needs_noise=True)
+
+
+ADAPTIVE = (
+    _adaptive(HUBER, Dimension('huber', 1.0, 10.0, 2.5)),
+    _adaptive(NOISE, Dimension('memory', 0.1, 100.0, 3.0)),
+    _adaptive(IMM, Dimension('spread', 1.2, 10.0, 2.0), Dimension('stay', 0.1, 100.0, 3.0)),
+)
+"""All take d for a Matern process."""
