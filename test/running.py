@@ -397,10 +397,8 @@ class Estimator(Rig):
             )  # fmt: skip
         return self._estimates
 
-    def wait_estimate(self, condition, what: str, timeout: float = DEADLINE) -> Estimate:
-        return self.user.wait(
-            lambda: [e for e in self.estimates[-50:] if condition(e)], what, timeout
-        )[-1]
+    def wait_estimate(self, condition, what: str) -> Estimate:
+        return self.user.wait(lambda: [e for e in self.estimates[-50:] if condition(e)], what)[-1]
 
 
 def told_parameters(user, node: str):

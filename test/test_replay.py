@@ -19,17 +19,11 @@ from rosbags.highlevel import AnyReader
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def expected(stamps, y, parameters=None, u=None):
+def expected(stamps, y, parameters=None):
     """What a node would estimate: one sample after the other."""
     estimator = OnlineEstimator(parameters)
-    rows = []
-    for k, (stamp, sample) in enumerate(zip(stamps.tolist(), y.tolist(), strict=True)):
-        if u is not None:
-            estimator.set_input(u[k])
-        e = estimator.update(stamp, sample)
-        if not e.status.rejected:
-            rows.append([*e.z, e.unknown_input, e.gamma])
-    return np.array(rows)
+    found = [estimator.update(*row) for row in zip(stamps.tolist(), y.tolist(), strict=True)]
+    return np.array([[*e.z, e.unknown_input, e.gamma] for e in found if not e.status.rejected])
 
 
 def table(path):
