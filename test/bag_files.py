@@ -70,35 +70,18 @@ def write_preset(path, messages, preset, published=None, parts=1):
 
     `published` are the publish times, by default the stamps.
     """
-    path.mkdir()
+    write(path, messages)  # for its metadata
+    (path / f'{path.name}.mcap').unlink()
     published = [m[2] for m in messages] if published is None else published
     share = -(-len(messages) // parts)
     names = [f'{path.name}_{k}.mcap' for k in range(parts)]
     for k, name in enumerate(names):
         part = slice(k * share, (k + 1) * share)
         _write_file(path / name, messages[part], published[part], PRESETS[preset])
-    topics = sorted({m[:2] for m in messages})
-    information = {
-        'version': 9, 'storage_identifier': 'mcap', 'message_count': len(messages),
-        'starting_time': {'nanoseconds_since_epoch': int(messages[0][2])},
-        'duration': {'nanoseconds': int(messages[-1][2] - messages[0][2])},
-        'topics_with_message_count': [
-            {
-                'topic_metadata': {
-                    'name': topic, 'type': kind, 'serialization_format': 'cdr',
-                    'offered_qos_profiles': [],
-                    'type_description_hash': TYPES.hash_rihs01(kind),
-                },
-                'message_count': sum(m[0] == topic for m in messages),
-            }
-            for topic, kind in topics
-        ],
-        'compression_format': '', 'compression_mode': '', 'relative_file_paths': names,
-        'files': [], 'custom_data': None, 'ros_distro': 'jazzy',
-    }  # fmt: skip
-    (path / 'metadata.yaml').write_text(
-        yaml.safe_dump({'rosbag2_bagfile_information': information})
-    )
+    text = (path / 'metadata.yaml').read_text()
+    information = yaml.safe_load(text)
+    information['rosbag2_bagfile_information'] |= {'relative_file_paths': names, 'files': []}
+    (path / 'metadata.yaml').write_text(yaml.safe_dump(information))
     return path
 
 

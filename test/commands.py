@@ -15,11 +15,11 @@ def environment(**changes):
     return {**os.environ, 'PYTHONPATH': path, **changes}
 
 
-def start(*arguments, **options):
-    """Start a command in a session of its own: no Ctrl-C for the tests reaches it."""
+def start(*arguments, command=COMMAND, **options):
+    """Start a command, or Python, in a session of its own: no Ctrl-C for the tests reaches it."""
     options = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE} | options
     return subprocess.Popen(
-        [*COMMAND, *map(str, arguments)], text=True, start_new_session=True,
+        [*command, *map(str, arguments)], text=True, start_new_session=True,
         **{'env': environment()} | options,
     )  # fmt: skip
 

@@ -11,6 +11,8 @@ from domains import take_domain
 from hypothesis import settings
 import pytest
 
+pytest.register_assert_rewrite('running')
+
 # Before numpy is imported: on small matrices, the threads of OpenBLAS only wait for each other.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observers and samples that several tests share."""
 
+import math
+
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.signal import lfilter
 
 # Every number that a test relies on; the defaults may change.
 SMALL = {'order': 2, 'phi': ['0', '-z2*z2*z1 + u'], 'lambda': 3.0, 'alpha': 4.0}
@@ -54,6 +57,14 @@ def states_of(rates, d, start=0.0, period=1e-3):
     for k in range(1, len(d)):
         z[k] = step[:n, :n] @ z[k - 1] + step[:n, n] * d[k - 1]
     return z
+
+
+def matern(count, rate, derivatives, rng, early=4000):
+    """Return a d of size 1 at 1 kHz with so many derivatives, its corner at `rate` (rad/s)."""
+    d = rng.standard_normal(count + early)
+    for _ in range(derivatives + 1):
+        d = lfilter([1.0], [1.0, -math.exp(-rate * 1e-3)], d)
+    return d[early:] / d[early:].std()
 
 
 def concatenated(runs):

@@ -9,13 +9,13 @@ import subprocess
 import sys
 import time
 
+import commands
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stopped
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 import pytest
 from waiting import wait_until
 
-ROOT = Path(__file__).resolve().parents[1]
 PARSER = argparse.ArgumentParser(prog='try')
 BUSY = """
 import argparse, os, signal, sys, time
@@ -144,13 +144,7 @@ def begin():
             signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.default_int_handler)
             signal.signal(signal.SIGHUP, signal.SIG_DFL)  # these tests under nohup ignore it
 
-        started.append(
-            subprocess.Popen(
-                [sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                text=True, start_new_session=True, preexec_fn=disposition,
-                env={**os.environ, 'PYTHONPATH': os.pathsep.join([str(ROOT), *sys.path])},
-            )
-        )  # fmt: skip
+        started.append(commands.start(*words, command=[sys.executable], preexec_fn=disposition))
         return started[-1]
 
     yield begin
@@ -242,4 +236,4 @@ assert not stop.is_set()
 
 @pytest.mark.signals
 def test_what_nohup_started_goes_on():
-    subprocess.run([sys.executable, '-c', NOHUP], check=True, cwd=ROOT)
+    subprocess.run([sys.executable, '-c', NOHUP], check=True, cwd=commands.ROOT)

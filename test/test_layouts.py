@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layouts for PlotJuggler and Foxglove are well formed and name what the nodes publish."""
+"""Layouts for PlotJuggler and Foxglove name what the nodes publish; the site has no lost link."""
 
 import json
 from pathlib import Path
 import re
+import subprocess
+import sys
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 from fhaosmo_ros.topics import ARRAY, estimates_of, FLOAT, TRUTH, TYPED_ESTIMATES
 import pytest
 
-LAYOUTS = Path(__file__).resolve().parents[1] / 'config' / 'layouts'
+ROOT = Path(__file__).resolve().parents[1]
+LAYOUTS = ROOT / 'config' / 'layouts'
 TYPES = {'/y': FLOAT}
 TYPES |= {f'/estimator/{name}': kind for name, kind in estimates_of({'gains': 'fixed'}).items()}
 TYPES |= {f'/plant/{name}': kind for name, kind in TRUTH.items()}
@@ -55,3 +59,30 @@ def test_paths_of_foxglove(path):
         for curve in layout['configById'][panel]['paths']:
             topic, _, field = curve['value'].partition('.')
             known(topic, field, rf'({"|".join(JOINTS)})\[\d\]')
+
+
+# The site
+
+
+def test_site_builds_and_its_links_lead_somewhere(tmp_path):
+    """Without a warning."""
+    pytest.importorskip('myst_parser', reason='sphinx is not installed: extra docs')
+    command = [sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-q', '-d', tmp_path / 'made']
+    done = subprocess.run(
+        [*command, ROOT / 'docs', tmp_path / 'site'], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    pages = {path: path.read_text() for path in (tmp_path / 'site').glob('*.html')}
+    assert len(pages) > 10
+    places = {path.name: set(re.findall(r'id="([^"]+)"', text)) for path, text in pages.items()}
+    lost = []
+    for path, text in pages.items():
+        for link in re.findall(r'(?:href|src)="([^"]+)"', text):
+            if re.match(r'[a-z]+:|//', link):
+                continue
+            name, _, place = unquote(link).partition('#')
+            target = path.parent / name.partition('?')[0] if name else path
+            if not target.exists() or (place and place not in places.get(target.name, {place})):
+                lost.append((path.name, link))
+    assert not lost
+    assert 'Observer.smooth' in (tmp_path / 'site' / 'offline.html').read_text()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 COUNT = 4000
+STAMPS, Y = files.signal(COUNT)
 PARAMETERS = {'variant': 'fuzzy_adaptive', 'epsilon': 3.0}
 OPTIONS = ['-p', 'variant:=fuzzy_adaptive']
 ARRAY, EVENT = 'std_msgs/msg/Float64MultiArray', 'rcl_interfaces/msg/ParameterEvent'
@@ -27,12 +28,14 @@ class Live:
         self.messages, self.rows = [], {}
         self._begins = True
 
-    def run(self, stamps, y, begin, end):
+    def run(self, begin, end, late=0):
+        """Take samples whose stamps are `late` by so many nanoseconds."""
         for k in range(begin, end):
-            estimate = self.estimator.update(int(stamps[k]), float(y[k]))
+            stamp = int(STAMPS[k]) + late
+            estimate = self.estimator.update(stamp, float(Y[k]))
             if estimate.status.rejected:
                 continue
-            self.rows[int(stamps[k])] = [*estimate.z, estimate.unknown_input, estimate.gamma]
+            self.rows[stamp] = [*estimate.z, estimate.unknown_input, estimate.gamma]
             if self._begins or k % 500 == 499:
                 self._tell(Flag.STARTED if self._begins else Flag(0), 90_000)
                 self._begins = False
@@ -80,10 +83,11 @@ class Live:
         self._tell(Flag.CHANGED, 100_100)
 
 
-def write(path, stamps, y, *lives, begin=0):
-    """Write what a recorder gets that comes at sample `begin`."""
-    messages = files.floats(stamps, y) + [m for live in lives for m in live.messages]
-    messages = [m for m in messages if m[2] >= stamps[begin]]
+def write(path, keep, *lives, begin=0):
+    """Write what a recorder gets of samples, or of so many, that comes at sample `begin`."""
+    keep = slice(keep) if isinstance(keep, int) else keep
+    messages = files.floats(STAMPS[keep], Y[keep]) + [m for live in lives for m in live.messages]
+    messages = [m for m in messages if m[2] >= STAMPS[begin]]
     return files.write(path, sorted(messages, key=lambda m: m[2]))
 
 
@@ -110,21 +114,20 @@ def rows(path):
 
 @pytest.mark.parametrize('begin', [0, 700, 2600])
 def test_every_live_estimate_comes_again(begin, tmp_path, capsys):
-    stamps, y = files.signal(COUNT)
     live = Live()
-    live.run(stamps, y, 123, 1000)  # it discovered y later than the recorder
-    live.change(stamps[999], 'epsilon', 1e-6)
-    live.run(stamps, y, 1000, 2000)
+    live.run(123, 1000)  # it discovered y later than the recorder
+    live.change(STAMPS[999], 'epsilon', 1e-6)
+    live.run(1000, 2000)
     live.reset()
-    live.run(stamps, y, 2000, 2300)
-    live.change(stamps[2299], 'gamma_rate', 0.02)
-    live.change(stamps[2299], 'epsilon', 2.0)
-    live.run(stamps, y, 2300, 2700)
+    live.run(2000, 2300)
+    live.change(STAMPS[2299], 'gamma_rate', 0.02)
+    live.change(STAMPS[2299], 'epsilon', 2.0)
+    live.run(2300, 2700)
     live.freeze(True)
-    live.run(stamps, y, 2700, 3400)
+    live.run(2700, 3400)
     live.freeze(False)
-    live.run(stamps, y, 3400, COUNT)
-    bag = write(tmp_path / 'bag', stamps, y, live, begin=begin)
+    live.run(3400, COUNT)
+    bag = write(tmp_path / 'bag', COUNT, live, begin=begin)
     parameters = ['-p', 'epsilon:=3.0'] if begin == 0 else []
     (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
     if begin == 2600:  # whoever records later has to know the parameters
@@ -135,7 +138,7 @@ def test_every_live_estimate_comes_again(begin, tmp_path, capsys):
     # The first snapshot after the begin is that of sample 123, 999 or 2699.
     expect(found, live, {0: 0, 700: 1000 - 123, 2600: 2700 - 123}[begin])
     assert 'followed /estimator' in text
-    count = sum(m[0].endswith('snapshot') and m[2] >= stamps[begin] for m in live.messages)
+    count = sum(m[0].endswith('snapshot') and m[2] >= STAMPS[begin] for m in live.messages)
     count -= begin > 0  # where it begins there is nothing to compare
     assert f'{count} of {count} snapshots are the same' in text
 
@@ -143,14 +146,13 @@ def test_every_live_estimate_comes_again(begin, tmp_path, capsys):
 @pytest.mark.parametrize('begin', [0, 1200])
 def test_parameters_come_from_the_bag(begin, tmp_path, capsys):
     """From the publisher's latest message, which a late recorder gets first."""
-    stamps, y = files.signal(2000)
     live = Live('/rig/estimator', {'variant': 'fuzzy', 'epsilon': 3.0})
-    live.tell_parameters(stamps[0], variant='fuzzy', epsilon=3.0, publish_rate=50.0)
-    live.run(stamps, y, 0, 1000)
-    live.change(stamps[999], 'epsilon', 1e-6)
-    live.tell_parameters(stamps[1200 if begin else 999] + 200_000, variant='fuzzy', epsilon=1e-6)
-    live.run(stamps, y, 1000, 2000)
-    bag = write(tmp_path / 'bag', stamps, y, live, begin=begin)
+    live.tell_parameters(STAMPS[0], variant='fuzzy', epsilon=3.0, publish_rate=50.0)
+    live.run(0, 1000)
+    live.change(STAMPS[999], 'epsilon', 1e-6)
+    live.tell_parameters(STAMPS[1200 if begin else 999] + 200_000, variant='fuzzy', epsilon=1e-6)
+    live.run(1000, 2000)
+    bag = write(tmp_path / 'bag', 2000, live, begin=begin)
     text, found = run(capsys, bag)
     assert 'parameters: /rig/estimator/parameters in the bag\n' in text
     assert 'parameters differ' not in text
@@ -158,10 +160,9 @@ def test_parameters_come_from_the_bag(begin, tmp_path, capsys):
 
 
 def test_parameters_of_the_bag_make_way(tmp_path, capsys):
-    stamps, y = files.signal(600)
-    live = Live().run(stamps, y, 0, 600)
-    live.tell_parameters(stamps[0], variant='sign', epsilon=1.0)
-    bag = write(tmp_path / 'bag', stamps, y, live)
+    live = Live().run(0, 600)
+    live.tell_parameters(STAMPS[0], variant='sign', epsilon=1.0)
+    bag = write(tmp_path / 'bag', 600, live)
     text, found = run(capsys, bag, *OPTIONS, '-p', 'epsilon:=3.0')
     assert 'in the bag, with variant, epsilon of the command line' in text
     expect(found, live)
@@ -173,10 +174,9 @@ def test_parameters_of_the_bag_make_way(tmp_path, capsys):
 
 
 def test_parameters_of_another_version_are_said(tmp_path, capsys):
-    stamps, y = files.signal(300)
-    live = Live().run(stamps, y, 0, 300)
-    live.tell_parameters(stamps[0], epsilom=1.0)
-    bag = write(tmp_path / 'bag', stamps, y, live)
+    live = Live().run(0, 300)
+    live.tell_parameters(STAMPS[0], epsilom=1.0)
+    bag = write(tmp_path / 'bag', 300, live)
     error = run(capsys, bag, code=2)
     for word in ("'/estimator/parameters'", 'epsilom', '--params-file'):
         assert word in error
@@ -185,31 +185,28 @@ def test_parameters_of_another_version_are_said(tmp_path, capsys):
 @pytest.mark.parametrize('begin', [0, 700])
 def test_input_that_came_before_the_recording_holds(begin, tmp_path, capsys):
     """Such as a set-point that is published once: only the live estimator knows it."""
-    stamps, y = files.signal(COUNT)
     live = Live(parameters={'phi': ['0', '0', 'u - z3'], 'gains': 'fixed'})
     live.estimator.set_input(0.7)
-    live.run(stamps, y, 0, 3000)
+    live.run(0, 3000)
     live.estimator.set_input(-0.4)
-    live.messages += files.floats(stamps[3000:3001] - 1, np.array([-0.4]), '/u')
-    live.run(stamps, y, 3000, COUNT)
-    bag = write(tmp_path / 'bag', stamps, y, live, begin=begin)
+    live.messages += files.floats(STAMPS[3000:3001] - 1, np.array([-0.4]), '/u')
+    live.run(3000, COUNT)
+    bag = write(tmp_path / 'bag', COUNT, live, begin=begin)
     _, found = run(capsys, bag, '-p', "phi:=['0', '0', 'u - z3']", '-p', 'gains:=fixed')
     expect(found, live, 1000 if begin else 0)
 
 
 def test_afresh_begins_at_the_first_sample(tmp_path, capsys):
-    stamps, y = files.signal(1000)
-    live = Live().run(stamps, y, 300, 1000)
-    bag = write(tmp_path / 'bag', stamps, y, live)
+    live = Live().run(300, 1000)
+    bag = write(tmp_path / 'bag', 1000, live)
     text, found = run(capsys, bag, *OPTIONS, '--afresh')
-    assert list(found) == stamps.tolist()
+    assert list(found) == STAMPS[:1000].tolist()
     assert 'followed' not in text
 
 
 def test_observer_of_another_size_begins_afresh(tmp_path, capsys):
-    stamps, y = files.signal(1500)
-    live = Live().run(stamps, y, 0, 1500)
-    bag = write(tmp_path / 'bag', stamps, y, live, begin=600)
+    live = Live().run(0, 1500)
+    bag = write(tmp_path / 'bag', 1500, live, begin=600)
     out = tmp_path / 'o.csv'
     options = ['-p', 'order:=2', '-p', "phi:=['0','0']"]
     assert replay.main([str(bag), '-o', str(out), *options]) == 0
@@ -218,30 +215,27 @@ def test_observer_of_another_size_begins_afresh(tmp_path, capsys):
 
 def test_samples_of_another_clock_are_not_followed(tmp_path, capsys):
     """As with sampling: clock, whose stamps no bag keeps."""
-    stamps, y = files.signal(1500)
-    live = Live().run(stamps + 17, y, 0, 1500)
-    bag = write(tmp_path / 'bag', stamps, y, live)
+    live = Live().run(0, 1500, late=17)
+    bag = write(tmp_path / 'bag', 1500, live)
     text, found = run(capsys, bag, *OPTIONS)
     assert '/estimator not followed' in text
-    assert list(found) == stamps.tolist()
+    assert list(found) == STAMPS[:1500].tolist()
 
 
 def test_sample_that_the_bag_lacks_does_not_stop_the_following(tmp_path, capsys):
-    stamps, y = files.signal(2000)
-    live = Live().run(stamps, y, 0, 1000)
+    live = Live().run(0, 1000)
     live.reset()
-    live.run(stamps, y, 1000, 2000)
-    keep = np.arange(2000) != 1000  # the one from which it started again
-    bag = write(tmp_path / 'bag', stamps[keep], y[keep], live)
+    live.run(1000, 2000)
+    keep = np.delete(np.arange(2000), 1000)  # the one from which it started again
+    bag = write(tmp_path / 'bag', keep, live)
     _, got = run(capsys, bag, *OPTIONS, '-p', 'epsilon:=3.0')
-    np.testing.assert_array_equal(got[int(stamps[999])], live.rows[int(stamps[999])])
-    assert got[int(stamps[1001])][4] == live.rows[int(stamps[1000])][4]  # gamma began afresh too
+    np.testing.assert_array_equal(got[int(STAMPS[999])], live.rows[int(STAMPS[999])])
+    assert got[int(STAMPS[1001])][4] == live.rows[int(STAMPS[1000])][4]  # gamma began afresh too
 
 
 def test_which_estimator_to_follow(tmp_path, capsys):
-    stamps, y = files.signal(1200)
-    lives = [Live('/left').run(stamps, y, 0, 1200), Live('/right').run(stamps, y, 500, 1200)]
-    bag = write(tmp_path / 'bag', stamps, y, *lives)
+    lives = [Live('/left').run(0, 1200), Live('/right').run(500, 1200)]
+    bag = write(tmp_path / 'bag', 1200, *lives)
     error = run(capsys, bag, code=2)
     assert '/left, /right' in error
     assert '--afresh' in error
@@ -251,16 +245,15 @@ def test_which_estimator_to_follow(tmp_path, capsys):
 
 
 def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
-    stamps, y = files.signal(1500)
     lives = [Live(f'/estimator/{name}', node='/estimator') for name in ('hip', 'knee')]
     for k, live in enumerate(lives):
-        live.run(stamps, y, 0, 700)
-        live.change(stamps[699], 'epsilon', [1e-6, 0.5][k])
-        live.run(stamps, y, 700, 1500)
-    bag = write(tmp_path / 'bag', stamps, y, *lives)
+        live.run(0, 700)
+        live.change(STAMPS[699], 'epsilon', [1e-6, 0.5][k])
+        live.run(700, 1500)
+    bag = write(tmp_path / 'bag', 1500, *lives)
     own = {'hip.epsilon': 3.0, 'knee.epsilon': 3.0, 'channels': ['hip', 'knee']}
-    lives[0].tell_parameters(stamps[0], variant='fuzzy_adaptive', epsilon=7.0, **own)
-    told = write(tmp_path / 'told', stamps, y, *lives)
+    lives[0].tell_parameters(STAMPS[0], variant='fuzzy_adaptive', epsilon=7.0, **own)
+    told = write(tmp_path / 'told', 1500, *lives)
     (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
     file = ['--params-file', tmp_path / 'p.yaml', *OPTIONS]
     for live, (source, options) in product(lives, [(bag, file), (told, [])]):
@@ -271,27 +264,24 @@ def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
 
 @pytest.mark.parametrize('labels', [['a', 'b'], ['version', 'z_hat1'], ['flags', 'm1']])
 def test_snapshot_of_another_version_is_said_and_not_followed(labels, tmp_path, capsys):
-    stamps, y = files.signal(50)
     data = labelled_array(labels, np.array([3.0, 1.0]))
-    messages = [*files.floats(stamps, y), ('/e/snapshot', ARRAY, int(stamps[-1]), data)]
+    messages = [*files.floats(STAMPS[:50], Y[:50]), ('/e/snapshot', ARRAY, int(STAMPS[49]), data)]
     bag = files.write(tmp_path / 'bag', messages)
     code = replay.main([str(bag), '-o', str(tmp_path / 'o.npz')])
     error = capsys.readouterr().err
     assert code == 0
     assert error.count("'/e/snapshot'") == 1
     assert 'begins at the first sample' in error
-    assert list(rows(tmp_path / 'o.npz')) == stamps.tolist()
+    assert list(rows(tmp_path / 'o.npz')) == STAMPS[:50].tolist()
 
 
 def test_channel_says_whom_to_follow(tmp_path, capsys):
-    stamps, y = files.signal(1200)
     lives = [
-        Live(f'/estimator/{name}', node='/estimator').run(stamps, y, 0, 1200)
-        for name in ('hip', 'knee')
+        Live(f'/estimator/{name}', node='/estimator').run(0, 1200) for name in ('hip', 'knee')
     ]
     own = {'variant': 'fuzzy_adaptive', 'epsilon': 3.0, 'channels': ['hip', 'knee']}
-    lives[0].tell_parameters(stamps[0], **own)
-    bag = write(tmp_path / 'bag', stamps, y, *lives)
+    lives[0].tell_parameters(STAMPS[0], **own)
+    bag = write(tmp_path / 'bag', 1200, *lives)
     text, found = run(capsys, bag, '--channel', 'knee')
     assert 'followed /estimator/knee' in text
     expect(found, lives[1])

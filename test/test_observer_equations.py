@@ -2,12 +2,13 @@
 """
 The compiled recursion against the paper's equations, written down a second time.
 
-The reference below is plain Python on dual numbers (value and derivative to gamma), made from the
-paper and from design.md, not from the kernels: scipy's brentq solves the implicit equations, and
-the sensitivities come out of the arithmetic instead of out of variational equations.
+The reference below is plain Python, made from the paper and from docs/mathematics.md, not from the
+kernels: scipy's brentq solves the implicit equations. Its numbers are complex: the imaginary part
+is STEP times the derivative to gamma, so that the sensitivities come out of the arithmetic instead
+of out of variational equations (complex-step derivatives; Squire and Trapp 1998).
 """
 
-from dataclasses import dataclass
+import cmath
 import math
 
 from fhaosmo_ros.core import Observer
@@ -17,54 +18,12 @@ from observer_cases import VARIANTS
 import pytest
 from scipy.optimize import brentq
 
-
-@dataclass(frozen=True)
-class Dual:
-    """A number that knows its derivative to gamma."""
-
-    value: float
-    slope: float = 0.0
-
-    def __add__(self, other):
-        other = dual(other)
-        return Dual(self.value + other.value, self.slope + other.slope)
-
-    def __mul__(self, other):
-        other = dual(other)
-        slope = self.slope * other.value + self.value * other.slope
-        return Dual(self.value * other.value, slope)
-
-    def __neg__(self):
-        return Dual(-self.value, -self.slope)
-
-    def __sub__(self, other):
-        return self + -dual(other)
-
-    def __rsub__(self, other):
-        return dual(other) - self
-
-    __radd__ = __add__
-    __rmul__ = __mul__
+STEP = 1e-30
+"""Its square is 0 beside any number here, so that derivatives are exact."""
 
 
-def dual(x):
-    return x if isinstance(x, Dual) else Dual(x)
-
-
-def sin(x):
-    return Dual(math.sin(x.value), math.cos(x.value) * x.slope)
-
-
-def tanh(x):
-    return Dual(math.tanh(x.value), x.slope / math.cosh(x.value) ** 2)
-
-
-def abs_power(x, gamma):
-    """Return |x|^gamma, x != 0."""
-    a = abs(x.value)
-    value = a**gamma.value
-    to_x = gamma.value * a ** (gamma.value - 1.0) * math.copysign(1.0, x.value)
-    return Dual(value, value * math.log(a) * gamma.slope + to_x * x.slope)
+def slope(x):
+    return x.imag / STEP
 
 
 # Expressions for the observer, and the same functions for the reference.
@@ -72,23 +31,23 @@ PHI = {
     1: (['-0.5*z1 + u'], [lambda z, u: -0.5 * z[0] + u]),
     2: (
         ['sin(z1)', '-z2*z2*z1 - 0.3*u'],
-        [lambda z, u: sin(z[0]), lambda z, u: -z[1] * z[1] * z[0] - 0.3 * u],
+        [lambda z, u: cmath.sin(z[0]), lambda z, u: -z[1] * z[1] * z[0] - 0.3 * u],
     ),
     3: (
         ['0', 'u*sin(z2)', '-z3 - z1*tanh(z3)'],
         [
-            lambda z, u: Dual(0.0),
-            lambda z, u: u * sin(z[1]),
-            lambda z, u: -z[2] - z[0] * tanh(z[2]),
+            lambda z, u: 0.0,
+            lambda z, u: u * cmath.sin(z[1]),
+            lambda z, u: -z[2] - z[0] * cmath.tanh(z[2]),
         ],
     ),
     4: (
         ['0.1*z1', '0', '-0.2*z1*z3', 'tanh(z4)*z2 - u*z3'],
         [
             lambda z, u: 0.1 * z[0],
-            lambda z, u: Dual(0.0),
+            lambda z, u: 0.0,
             lambda z, u: -0.2 * z[0] * z[2],
-            lambda z, u: tanh(z[3]) * z[1] - u * z[2],
+            lambda z, u: cmath.tanh(z[3]) * z[1] - u * z[2],
         ],
     ),
 }
@@ -105,33 +64,33 @@ class Reference:
         # z_{n+1}' = -kappa z_{n+1} + eta
         self.phi = [*phi, lambda z, u: -kappa * z[p['order']]]
         self.decay = [kappa if i == p['order'] - 1 else 0.0 for i in range(p['order'] + 1)]
-        self.hat = [Dual(v) for v in p['initial_estimate']]
-        self.tilde = [Dual(v) for v in p['initial_internal']]  # tilde[i] is z_tilde_{i+2}
+        self.hat = [complex(v) for v in p['initial_estimate']]
+        self.tilde = [complex(v) for v in p['initial_internal']]  # tilde[i] is z_tilde_{i+2}
         if p['start_from_measurement']:
-            self.hat[0] = Dual(y)
+            self.hat[0] = complex(y)
         self.gamma = p['gamma_initial'] if p['variant'].endswith('_adaptive') else 0.5
         self.y = y
         self.curves = curves(p, self.N)
 
     def psi(self, i, x):
         if self.sign:
-            return Dual(float(np.sign(x.value)))
+            return complex(np.sign(x.real))
         widths = self.p['fuzzy_widths']
         width = widths[min(i, len(widths) - 1)]
         grid = np.linspace(0.0, width, len(self.curves[i]))
-        a = abs(x.value)
-        value = math.copysign(np.interp(a, grid, self.curves[i]), x.value)
+        a = abs(x.real)
+        value = math.copysign(np.interp(a, grid, self.curves[i]), x.real)
         if a >= width:
-            return Dual(value)
+            return complex(value)
         k = int(np.searchsorted(grid, a, side='right')) - 1
         rise = (self.curves[i][k + 1] - self.curves[i][k]) / (grid[k + 1] - grid[k])
-        return Dual(value, rise * x.slope)
+        return complex(value, rise * x.imag)
 
     def injection(self, i, eps, gamma):
         """Return |eps|^gamma psi(eps), 0 at 0."""
-        if eps.value == 0.0:
-            return Dual(0.0)
-        return abs_power(eps, gamma) * self.psi(i, eps)
+        if eps.real == 0.0:
+            return 0j
+        return (eps * math.copysign(1.0, eps.real)) ** gamma * self.psi(i, eps)
 
     def step(self, y, h, u):
         getattr(self, self.p['scheme'])(y, h, u)
@@ -139,12 +98,12 @@ class Reference:
 
     def explicit(self, y, h, u):
         """Forward Euler: everything at the interval's beginning, y of the sample before."""
-        p, gamma = self.p, Dual(self.gamma, 1.0)
-        m = [Dual(self.y), *self.tilde[: self.N - 1]]
+        p, gamma = self.p, complex(self.gamma, STEP)
+        m = [complex(self.y), *self.tilde[: self.N - 1]]
         eps = [m[i] - self.hat[i] for i in range(self.N)]
         hat, tilde = list(self.hat), list(self.tilde)
         for i in range(self.N):
-            if any(abs(e.value) > p['epsilon'] for e in eps[:i]):
+            if any(abs(e.real) > p['epsilon'] for e in eps[:i]):
                 continue
             rate = self.tilde[i] + p['lambda'][i] * self.injection(i, eps[i], gamma)
             hat[i] = self.hat[i] + h * (rate + self.phi[i](m[: i + 1], u))
@@ -155,11 +114,11 @@ class Reference:
 
     def implicit(self, y, h, u):
         """Backward Euler: level after level, everything at the interval's end."""
-        p, gamma = self.p, Dual(self.gamma, 1.0)
+        p, gamma = self.p, complex(self.gamma, STEP)
         eps, m = [], []
         for i in range(self.N):
-            m.append(Dual(y) if i == 0 else self.tilde[i - 1])
-            if any(abs(e.value) > p['epsilon'] for e in eps):
+            m.append(complex(y) if i == 0 else self.tilde[i - 1])
+            if any(abs(e.real) > p['epsilon'] for e in eps):
                 eps.append(m[i] - self.hat[i])
                 continue
             kept = 1.0 / (1.0 + h * self.decay[i])
@@ -172,8 +131,8 @@ class Reference:
 
     def solve(self, i, b, h, gamma):
         stiffness = h * h * self.p['alpha'][i] / (1.0 + h * self.decay[i])
-        if self.sign and abs(b.value) <= stiffness:
-            return Dual(0.0), b * (1.0 / stiffness)
+        if self.sign and abs(b.real) <= stiffness:
+            return 0j, b / stiffness
 
         def balance(e, gamma, b):
             injection = h * self.p['lambda'][i] * self.injection(i, e, gamma)
@@ -181,34 +140,34 @@ class Reference:
 
         # To the last bit: what is left must not grow to the tolerance within the run.
         a = brentq(
-            lambda a: balance(math.copysign(1.0, b.value) * Dual(a), gamma, b).value,
+            lambda a: balance(complex(math.copysign(a, b.real)), gamma, b).real,
             1e-300 if self.sign else 0.0,
-            abs(b.value),
+            abs(b.real),
             xtol=1e-300,
             rtol=4 * np.finfo(float).eps,
         )
-        e = math.copysign(a, b.value)
-        to_e = balance(Dual(e, 1.0), Dual(self.gamma), Dual(b.value)).slope
-        to_gamma = balance(Dual(e), gamma, b).slope
-        eps = Dual(e, -to_gamma / to_e)  # implicit function theorem
+        e = math.copysign(a, b.real)
+        to_e = slope(balance(complex(e, STEP), self.gamma, b.real))
+        to_gamma = slope(balance(complex(e), gamma, b))
+        eps = complex(e, -STEP * to_gamma / to_e)  # implicit function theorem
         return eps, self.psi(i, eps)
 
     def adapt(self, eps, h):
         p = self.p
         if not p['variant'].endswith('_adaptive'):
             return
-        loss = sum((e * e for e in eps), Dual(0.0))
+        loss = sum(e * e for e in eps)
         gamma = self.gamma
-        rests = loss.value <= p['gamma_dead_zone'] ** 2
+        rests = loss.real <= p['gamma_dead_zone'] ** 2
         if rests or p['gamma_dead_zone'] == 0.0:
             gamma -= h * p['gamma_leakage'] * (gamma - p['gamma_initial'])
         if not rests:
-            gamma -= h * p['gamma_rate'] * loss.slope
+            gamma -= h * p['gamma_rate'] * slope(loss)
         self.gamma = min(max(gamma, p['gamma_min']), p['gamma_max'])
 
     def open(self):
-        m = [self.y, *(v.value for v in self.tilde[: self.N - 1])]
-        closed = [abs(m[i] - self.hat[i].value) > self.p['epsilon'] for i in range(self.N - 1)]
+        m = [self.y, *(v.real for v in self.tilde[: self.N - 1])]
+        closed = [abs(m[i] - self.hat[i].real) > self.p['epsilon'] for i in range(self.N - 1)]
         return 1 + next((i for i, c in enumerate(closed) if c), self.N - 1)
 
 
@@ -253,8 +212,8 @@ def compare(p, rtol=1e-9):
     for k in range(len(t)):
         if k > 0:
             reference.step(y[k], t[k] - t[k - 1], u[k])
-        hat.append([v.value for v in reference.hat])
-        tilde.append([v.value for v in reference.tilde])
+        hat.append([v.real for v in reference.hat])
+        tilde.append([v.real for v in reference.tilde])
         gamma.append(reference.gamma)
         opened.append(reference.open())
     np.testing.assert_allclose(result.z_hat, hat, rtol=rtol, atol=rtol)

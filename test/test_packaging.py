@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What colcon and pip install, what the launch files start, which environment make chooses."""
 
+from functools import partial
 import importlib.util
 import os
 from pathlib import Path
@@ -8,7 +9,7 @@ import runpy
 import shutil
 import subprocess
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from xml.etree import ElementTree
 
 import fhaosmo_ros
@@ -239,52 +240,36 @@ def test_package_xml():
 # launch
 
 
-class Recorded:
-    """Stands for any class of the launch packages: keeps what it was made with."""
-
-    given: dict[str, str]
-
-    def __init__(self, *args, **kwargs):
-        self.args, self.kwargs = args, kwargs
-
-    def add_action(self, action):
-        self.args[0].append(action)
-
-    def perform(self, context):
-        return self.given[self.args[0]]
-
-
-class Stub(ModuleType):
-    """A module of any classes; PyPI has no `launch` to test with."""
-
-    __path__ = ()
-
-    def __getattr__(self, name):
-        return type(name, (Recorded,), {})
-
-
 @pytest.fixture
 def started(monkeypatch):
     """Return a function that gives the nodes of a launch file with some arguments."""
+    given: dict[str, str] = {}
+
+    def make(kind, *args, **kwargs):
+        """Stand for any class of the launch packages, which are not on PyPI."""
+        return SimpleNamespace(
+            kind=kind, args=args, kwargs=kwargs, perform=lambda context: given[args[0]],
+            add_action=lambda action: args[0].append(action),
+        )  # fmt: skip
+
     for name in ('launch', 'launch_ros'):
         for part in ('', '.actions', '.substitutions', '.conditions'):
-            monkeypatch.setitem(sys.modules, name + part, Stub(name + part))
+            module = ModuleType(name + part)
+            module.__getattr__ = lambda kind: partial(make, kind)
+            monkeypatch.setitem(sys.modules, name + part, module)
 
-    def start(name: str, **given: str) -> list[dict]:
+    def start(name: str, **arguments: str) -> list[dict]:
         path = ROOT / 'launch' / f'{name}.launch.py'
         (entities,) = runpy.run_path(str(path))['generate_launch_description']().args
-        nodes, defaults = [], {}
-        for entity in entities:
-            match type(entity).__name__:
-                case 'DeclareLaunchArgument':
-                    defaults[entity.args[0]] = entity.kwargs['default_value']
-                case 'Node':
-                    nodes.append(entity)
-                case 'OpaqueFunction':
-                    start = entity.kwargs['function']
-        assert set(given) <= set(defaults)
-        monkeypatch.setattr(Recorded, 'given', defaults | given, raising=False)
-        return [node.kwargs for node in [*start(None), *nodes]]
+        declared, functions, nodes = (
+            [entity for entity in entities if entity.kind == kind]
+            for kind in ('DeclareLaunchArgument', 'OpaqueFunction', 'Node')
+        )
+        given.update({entity.args[0]: entity.kwargs['default_value'] for entity in declared})
+        assert set(arguments) <= {entity.args[0] for entity in declared}
+        given.update(arguments)
+        (function,) = functions
+        return [node.kwargs for node in [*function.kwargs['function'](None), *nodes]]
 
     return start
 
@@ -295,7 +280,7 @@ def test_launch_files_start_their_nodes_with_files_that_are_there(started, tmp_p
     expected = [str(ROOT / 'config/demo.yaml'), {'use_sim_time': True}]
     for node in (plant, estimator):
         assert (node['parameters'], node['namespace']) == (expected, '/rig')
-        assert type(node['on_exit']).__name__ == 'Shutdown'
+        assert node['on_exit'].kind == 'Shutdown'
     for name, file, executable in (
         ('arm', 'arm', 'arm'), ('joint_estimator', 'joint_states', 'estimator'),
     ):  # fmt: skip

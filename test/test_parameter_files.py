@@ -1,10 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter files: which sections serve which node, and what is refused."""
+"""Parameter files: which sections serve which node, and what is refused; YAML from anybody."""
+
+import time
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.files import dumps, load, loads
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
+from fhaosmo_ros.core.parameters.yaml_text import MAX_DEPTH, MAX_LENGTH, parse
+from fhaosmo_ros.tools.cli.options import assigned
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
 import pytest
+from yaml_texts import ANY_TEXT, HOSTILE, LAUGHS
 
 
 @pytest.fixture
@@ -122,3 +129,115 @@ def test_file_that_is_not_text(path):
     with open(path, 'wb') as file:
         file.write(b'\xff\xfe\x00\x80')
     assert 'expected YAML' in error_of(path, 'estimator')
+
+
+# YAML from anybody
+
+
+LISTS = ('lambda', 'phi', 'channels')
+
+
+def refusal_of(function, *arguments):
+    """Return the one line with which a call is refused, None if it is not."""
+    start, message = time.process_time(), None
+    try:
+        repr(function(*arguments))
+    except ConfigurationError as error:
+        message = str(error)
+        assert message.isprintable()
+        assert len(message) < 600
+    assert time.process_time() - start < 5.0
+    return message
+
+
+@pytest.mark.parametrize('text', HOSTILE.values(), ids=HOSTILE.keys())
+def test_hostile_text_is_content_or_one_line(text):
+    refusal_of(parse, text)
+    for name in LISTS:
+        assert refusal_of(ESTIMATOR_PARAMETERS[name].coerce, text) or name != 'lambda'
+    refusal_of(assigned, [f'lambda:={text}'], ESTIMATOR_PARAMETERS)
+    section = f'/**: {{ros__parameters: {{lambda: {text}}}}}'
+    for whole in (text, section):
+        assert refusal_of(loads, whole, 'estimator', ESTIMATOR_PARAMETERS)
+
+
+PIECES = [
+    '[', ']', '{', '}', '? ', ': ', ', ', '- ', '&a ', '*a ', '!!float ', '!!int ', '!!bool ',
+    '!!timestamp ', '!!binary ', '!!set ', '!!null ', '!<x> ', '2020-99-99', '0b_', '0x_', '._',
+    '1:2:3', '1e5', '9' * 500, '"', "'", '|', '>', '\n', '  ', '\t', '#', '%YAML 1.1\n', '---\n',
+    '...', '<<', '=', '~', 'null', 'yes', '.nan', '-.inf', 'a', 'é', '\x00', '\ud800', '\u2028',
+    '\ufeff', '@', '`', '!', '\\x', '\r', '\x85', '0o7', '1_0', '+', '-', '.', '_', '0',
+]  # fmt: skip
+TEXTS = st.one_of(
+    ANY_TEXT,
+    st.lists(st.sampled_from(PIECES), max_size=30).map(''.join),
+    st.text('[]{}?:,-&*!ab01. \n"\'|>#%@`', max_size=60),
+)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(TEXTS)
+def test_any_text_is_content_or_one_line(text):
+    refusal_of(parse, text)
+    for name in LISTS:
+        refusal_of(ESTIMATOR_PARAMETERS[name].coerce, text)
+
+
+@pytest.mark.parametrize(
+    ('text', 'content'),
+    [
+        ('', None),
+        ('[2001-02-30, 2001-02-03 04:05:06]', ['2001-02-30', '2001-02-03 04:05:06']),
+        ('{<<: {a: =}}', {'<<': {'a': '='}}),
+        ('[!!float 3, !!str 3]', [3.0, '3']),
+        ('[1, 0x10, 1e-3, .inf, yes, ~, a]', [1, 16, 0.001, float('inf'), True, None, 'a']),
+        ('a: &anchor [1]', {'a': [1]}),
+        ('1' * 300, int('1' * 300)),
+    ],
+)
+def test_content(text, content):
+    assert parse(text) == content
+    parse('[' * MAX_DEPTH + ']' * MAX_DEPTH)
+
+
+@pytest.mark.parametrize(
+    ('text', 'reason'),
+    [
+        ('a:\n  b: 1\n  b: 2', "the key 'b' twice (line 3)"),
+        ('a: &x [1]\nb: *x', 'the alias *x, which ROS does not read either (line 2)'),
+        (LAUGHS, 'the alias *a'),
+        ('[' * (MAX_DEPTH + 2), f'nested deeper than {MAX_DEPTH}'),
+        ('[' + '1,' * 100_000 + ']', 'more than 50000 values'),
+        ('1' * 400, 'an integer of more than 1024 bits'),
+        ('1' * 5000, 'which is no int'),
+        ('a' * (MAX_LENGTH + 1), f'{MAX_LENGTH + 1} characters, at most {MAX_LENGTH}'),
+        ('!!bool x', "'x', which is no bool"),
+        ('!!timestamp 2001-01-01', "the tag 'tag:yaml.org,2002:timestamp'"),
+        ('{[a]: 1}', 'a key that is no plain text'),
+        ('a: 1\n---\nb: 2', 'a second document (line 2)'),
+    ],
+)
+def test_refusal_gives_reason_and_line(text, reason):
+    message = refusal_of(parse, text)
+    assert message.startswith('expected YAML, got: ')
+    assert reason in message
+
+
+def test_section_or_parameter_given_twice_is_refused():
+    """Rcl merges them; a YAML library keeps the last one: nobody can rely on either."""
+    twice = '/**:\n  ros__parameters: {epsilon: 1.0}\n' * 2
+    message = refusal_of(loads, twice, 'estimator', ESTIMATOR_PARAMETERS)
+    assert message == "expected YAML, got: the key '/**' twice (line 3)"
+    nested = '/**: {ros__parameters: {channels: [a], a.epsilon: 1.0, a: {epsilon: 2.0}}}'
+    message = refusal_of(loads, nested, 'estimator', ESTIMATOR_PARAMETERS)
+    assert message == "section '/**': 'a.epsilon' is set twice"
+
+
+def test_written_file_has_no_alias_and_is_read_up_to_a_bound(tmp_path):
+    gains = [1.0, 2.0]
+    text = dumps({'lambda': gains, 'alpha': gains})
+    assert loads(text, 'estimator', ESTIMATOR_PARAMETERS) == {'lambda': gains, 'alpha': gains}
+    path = tmp_path / 'zero.yaml'
+    path.write_text('#' * (3 * MAX_LENGTH))
+    assert f'at most {MAX_LENGTH} are read' in refusal_of(load, path, 'estimator')
+    assert 'a longer integer' in refusal_of(ESTIMATOR_PARAMETERS['epsilon'].coerce, 10**5000)

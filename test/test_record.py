@@ -2,7 +2,6 @@
 """Recorded beside a live estimator: complete bags, the live estimates replayed, kills survived."""
 
 import contextlib
-import os
 import re
 import shlex
 import signal
@@ -20,18 +19,13 @@ from fhaosmo_ros.tools.bags.topics import read_ticks
 from fhaosmo_ros.topics import ESTIMATES, EVENT, PARAMETERS, SNAPSHOT
 from mcap.reader import NonSeekingReader
 import numpy as np
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.parameter import Parameter
-from rclpy.parameter_client import AsyncParameterClient
 from rosbags.highlevel import AnyReader
+from running import Parameters, User
 from std_srvs.srv import Trigger
 from waiting import wait_until
 import yaml
 
 pytestmark = pytest.mark.ros
-DOMAIN = os.environ['ROS_DOMAIN_ID']
 APART = str(take_domain())
 """A domain without the plant that the other tests share."""
 NODES = ['--ros-args', '--params-file', str(ROOT / 'config' / 'demo.yaml')]
@@ -130,48 +124,19 @@ def test_replay_follows_a_run_that_began_before_the_recording(live, tmp_path):
 def record_changes(bag):
     process = start('record', '-o', bag)
     wait_until(lambda: size(bag) > 800_000, 'messages', 90.0, process)
-    with hand() as (change, reset):
-        change(epsilon=0.05, gamma_rate=0.008, unknown_input_decay=0.5)
+    with contextlib.closing(User('hand')) as hand:
+        parameters = Parameters(hand, '/estimator')
+        parameters.set(epsilon=0.05, gamma_rate=0.008, unknown_input_decay=0.5)
         wait_for_more(bag, 100_000, process)  # half a second of messages to compare
-        reset()
+        assert hand.call('/estimator/reset', Trigger, Trigger.Request()).success
         wait_for_more(bag, 100_000, process)
-        change(epsilon=0.3)
+        parameters.set(epsilon=0.3)
         wait_for_more(bag, 200_000, process)
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=60)
-        change(epsilon=40.0, gamma_rate=0.004, unknown_input_decay=0.0)
+        parameters.set(epsilon=40.0, gamma_rate=0.004, unknown_input_decay=0.0)
     assert process.returncode == 0, error
     return error
-
-
-@contextlib.contextmanager
-def hand():
-    """Yield functions that set parameters of the estimator, and that reset it."""
-    context = Context()
-    rclpy.init(context=context, domain_id=int(DOMAIN))
-    node = rclpy.create_node('hand', context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    client = AsyncParameterClient(node, '/estimator')
-    trigger = node.create_client(Trigger, '/estimator/reset')
-    assert client.wait_for_services(90)
-    assert trigger.wait_for_service(90)
-
-    def result(future):
-        executor.spin_until_future_complete(future, 90)
-        return future.result()
-
-    def change(**values):
-        parameters = [Parameter(name, value=value) for name, value in values.items()]
-        assert all(r.successful for r in result(client.set_parameters(parameters)).results)
-
-    def reset():
-        assert result(trigger.call_async(Trigger.Request())).success
-
-    yield change, reset
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
 
 
 def compare(out, fewest=150):

@@ -17,6 +17,7 @@ from fhaosmo_ros.core.parameters.tables import (
     PLANT_PARAMETERS,
 )
 from fhaosmo_ros.core.simulation.plant import Plant
+from fhaosmo_ros.tools.tuning.objective import stamps_of
 import numpy as np
 from observer_cases import remembered
 import pytest
@@ -33,29 +34,39 @@ HIT, BACK, SOON = 6 * RATE, 13 * RATE // 2, RATE
 """Samples: when it happens, when it is over, and when the error is usual again after that."""
 
 
+def errors(parameters, t, y, d, bare=False):
+    """Return |error of d| of the node's estimator, or of the observer alone."""
+    if bare:
+        values = {k: v for k, v in parameters.items() if k in OBSERVER_PARAMETERS}
+        found = Observer(values).run(t, y, 0.0)
+    else:
+        found = OnlineEstimator(parameters).run(stamps_of(t), y, np.zeros(len(y)))
+    return np.abs(found.unknown_input - d)
+
+
 class Case:
     """A parameter file, and samples of its own plant with the noise that it is for."""
 
-    def __init__(self, path, rate=RATE):
+    def __init__(self, path):
         self.parameters = load(path, 'estimator', ONLINE_PARAMETERS)
         plant = {k: v for k, v in load(path, 'plant').items() if k in PLANT_PARAMETERS}
         if not plant.get('quantisation'):
             plant['noise_std'] = self.parameters['noise_size']
-        self.t = np.arange(12 * rate) / rate
+        self.t = np.arange(12 * RATE) / RATE
         truth = Plant(plant).simulate(self.t)
         self.y, self.d, self.z = truth.y, truth.unknown_input, truth.z
         self.largest = np.abs(self.d).max()
         self.usual = self.errors(self.y, self.d)[len(self.t) // 4 :].max()
+        self.settled = max(1.5 * self.usual, 0.1 * self.largest)
 
-    def errors(self, y, d, bare=False):
-        """Return |error of d|."""
-        if bare:
-            values = {k: v for k, v in self.parameters.items() if k in OBSERVER_PARAMETERS}
-            found = Observer(values).run(self.t[: len(y)], y, 0.0)
-        else:
-            stamps = 10**9 + np.round(self.t[: len(y)] * 1e9).astype(np.int64)
-            found = OnlineEstimator(self.parameters).run(stamps, y, np.zeros(len(y)))
-        return np.abs(found.unknown_input - d)
+    def errors(self, y, d, bare=False, **changes):
+        return errors({**self.parameters, **changes}, self.t[: len(y)], y, d, bare)
+
+    def shifted(self, begin, end, offset):
+        """Return y with an offset between two samples."""
+        y = self.y.copy()
+        y[begin:end] += offset
+        return y
 
 
 case_of = cache(Case)
@@ -66,40 +77,41 @@ def case(request):
     return case_of(request.param)
 
 
-@pytest.mark.parametrize('bare', [False, True], ids=['node', 'bare'])
+@pytest.fixture(scope='module')
+def pendulum():
+    return case_of(CONFIG / 'models' / 'pendulum.yaml')
+
+
+bare_too = pytest.mark.parametrize('bare', [False, True], ids=['node', 'bare'])
+
+
+@bare_too
 def test_start(case, bare):
     wrong = case.errors(case.y, case.d, bare)
     assert wrong.max() < 1.5 * case.largest
-    assert wrong[SOON:].max() < max(1.5 * case.usual, 0.1 * case.largest)
+    assert wrong[SOON:].max() < case.settled
 
 
-@pytest.mark.parametrize('bare', [False, True], ids=['node', 'bare'])
+@bare_too
 @pytest.mark.parametrize('offset', [0.1, 1.0, -10.0, 1000.0])
 def test_sensor_that_is_wrong_for_half_a_second(case, offset, bare):
-    y = case.y.copy()
-    y[HIT:BACK] += offset
-    wrong = case.errors(y, case.d, bare)
+    wrong = case.errors(case.shifted(HIT, BACK, offset), case.d, bare)
     assert wrong.max() < 2.0 * case.largest
-    assert wrong[BACK + SOON :].max() < max(1.5 * case.usual, 0.1 * case.largest)
+    assert wrong[BACK + SOON :].max() < case.settled
 
 
-@pytest.mark.parametrize('bare', [False, True], ids=['node', 'bare'])
+@bare_too
 @pytest.mark.parametrize(('name', 'factor'), [
     ('state_sizes', 0.1), ('state_sizes', 10.0), ('unknown_input_size', 1 / 3),
     ('unknown_input_size', 3.0), ('noise_size', 1 / 3), ('noise_size', 3.0),
 ])  # fmt: skip
 def test_start_with_sizes_that_are_wrong(case, name, factor, bare):
     right = case.parameters[name]
-    wrong = [factor * x for x in right] if isinstance(right, list) else factor * right
-    case.parameters[name] = wrong
-    try:
-        peak = case.errors(case.y, case.d, bare).max()
-    finally:
-        case.parameters[name] = right
-    assert peak < 1.5 * case.largest
+    size = [factor * x for x in right] if isinstance(right, list) else factor * right
+    assert case.errors(case.y, case.d, bare, **{name: size}).max() < 1.5 * case.largest
 
 
-@pytest.mark.parametrize('bare', [False, True], ids=['node', 'bare'])
+@bare_too
 @pytest.mark.parametrize('earlier', [1, 3, 5])
 def test_plant_that_goes_back_in_its_motion(case, earlier, bare):
     """As a simulator that is reset, or a bag that begins again; all states jump."""
@@ -107,59 +119,52 @@ def test_plant_that_goes_back_in_its_motion(case, earlier, bare):
     order = order[: len(case.t)]
     wrong = case.errors(case.y[order], case.d[order], bare)
     assert wrong[HIT:].max() < 2.0 * case.largest
-    assert wrong[HIT + SOON :].max() < max(1.5 * case.usual, 0.1 * case.largest)
+    assert wrong[HIT + SOON :].max() < case.settled
 
 
 # jumps of y alone (D 23)
 
 
-def pendulum(t, y):
+def observed(t, y):
+    """Return what the observer for the pendulum estimates, and that observer."""
     values = load(CONFIG / 'models' / 'pendulum.yaml', 'estimator', OBSERVER_PARAMETERS)
     observer = Observer(values)
     return observer.run(t, y), observer
 
 
-def test_offset_that_the_model_contradicts_is_taken_off_and_forgotten():
-    case = case_of(CONFIG / 'models' / 'pendulum.yaml')
-    y = case.y.copy()
-    y[HIT:] += 1.0
+def test_offset_that_the_model_contradicts_is_taken_off_and_forgotten(pendulum):
     end = HIT + 5 * RATE
-    found, observer = pendulum(case.t[:end], y[:end])
+    found, observer = observed(pendulum.t[:end], pendulum.shifted(HIT, None, 1.0)[:end])
     assert observer.structure.memory['offset'] == pytest.approx(1.0, abs=0.01)
-    np.testing.assert_allclose(found.z[HIT + RATE :, 0], case.z[HIT + RATE : end, 0], atol=0.01)
-    observer.run(case.t[end:], case.y[end:])
+    settled = slice(HIT + RATE, end)
+    np.testing.assert_allclose(found.z[settled, 0], pendulum.z[settled, 0], atol=0.01)
+    observer.run(pendulum.t[end:], pendulum.y[end:])
     assert observer.structure.memory['offset'] == 0.0
 
 
-def test_jumps_are_counted_and_a_snapshot_goes_on_from_them():
-    case = case_of(CONFIG / 'models' / 'pendulum.yaml')
-    y, stamps = case.y.copy(), 10**9 + np.round(case.t * 1e9).astype(np.int64)
-    y[HIT:BACK] += 1.0
-    whole, middle = OnlineEstimator(case.parameters), HIT + RATE // 4
-    expected = whole.run(stamps, y, np.zeros(len(y)))
+def test_jumps_are_counted_and_a_snapshot_goes_on_from_them(pendulum):
+    stamps, u = stamps_of(pendulum.t), np.zeros(len(pendulum.t))
+    y, middle = pendulum.shifted(HIT, BACK, 1.0), HIT + RATE // 4
+    whole, one, other = (OnlineEstimator(pendulum.parameters) for _ in range(3))
+    expected = whole.run(stamps, y, u)
     assert (whole.counters.jumps, whole.counters.divergences) == (2, 0)
-    one, other = OnlineEstimator(case.parameters), OnlineEstimator(case.parameters)
-    one.run(stamps[:middle], y[:middle], np.zeros(middle))
+    one.run(stamps[:middle], y[:middle], u[:middle])
     assert one.offset == pytest.approx(1.0, abs=0.01)
     other.load_state_dict(one.state_dict())
-    found = other.run(stamps[middle:], y[middle:], np.zeros(len(y) - middle))
+    found = other.run(stamps[middle:], y[middle:], u[middle:])
     np.testing.assert_array_equal(found.unknown_input, expected.unknown_input[middle:])
 
 
-def test_sensor_that_is_put_right_is_believed():
+def test_sensor_that_is_put_right_is_believed(pendulum):
     """As a zero that is found after the start: the wrong one had needed a large d."""
-    case = case_of(CONFIG / 'models' / 'pendulum.yaml')
-    y = case.y.copy()
-    y[:HIT] += 1.0
-    found, observer = pendulum(case.t, y)
+    found, observer = observed(pendulum.t, pendulum.shifted(None, HIT, 1.0))
     assert observer.structure.memory['offset'] == 0.0
-    wrong = np.abs(found.unknown_input - case.d)[HIT + SOON :]
-    assert wrong.max() < max(1.5 * case.usual, 0.1 * case.largest)
+    wrong = np.abs(found.unknown_input - pendulum.d)[HIT + SOON :]
+    assert wrong.max() < pendulum.settled
 
 
 def test_jump_of_y_leaves_all_but_z1_of_a_plant_without_z1_in_its_model(case):
-    y = case.y.copy()
-    y[HIT:] += 1000.0 * case.parameters['noise_size']
+    y = case.shifted(HIT, None, 1000.0 * case.parameters['noise_size'])
     values = {k: v for k, v in case.parameters.items() if k in OBSERVER_PARAMETERS}
     observer = Observer(values)
     found = observer.run(case.t, y, 0.0)
@@ -191,10 +196,8 @@ def test_after_a_jump_of_y_the_next_sample_gives_the_time_of_the_estimate():
 
 def test_jump_of_a_few_counts_of_an_encoder():
     """Some of its samples lie within 6 standard deviations, some beyond."""
-    case = Case(CONFIG / 'models' / 'dc_motor.yaml')
-    y, end = case.y.copy(), HIT + 5 * RATE
-    y[HIT:end] += 10.0 * case.parameters['noise_size']
-    wrong = case.errors(y, case.d)
+    case, end = case_of(CONFIG / 'models' / 'dc_motor.yaml'), HIT + 5 * RATE
+    wrong = case.errors(case.shifted(HIT, end, 10.0 * case.parameters['noise_size']), case.d)
     assert wrong[HIT:].max() < 0.1 * case.largest
     for moment in (HIT, end):
         assert wrong[moment + 3 * RATE // 10 : moment + RATE].max() < 1.5 * case.usual
@@ -213,23 +216,18 @@ def test_outliers_and_bursts_are_passed_over(case):
 def test_another_rate(case, part):
     """The error is that of fewer samples, not that of wrong gains."""
     wrong = case.errors(case.y, case.d)[3 * RATE :]
-    t, y, d = case.t[::part], case.y[::part], case.d[::part]
-    stamps = 10**9 + np.round(t * 1e9).astype(np.int64)
-    found = OnlineEstimator(case.parameters).run(stamps, y, np.zeros(len(y))).unknown_input
-    slow = np.abs(found - d)[3 * RATE // part :]
+    slow = errors(case.parameters, case.t[::part], case.y[::part], case.d[::part])
+    slow = slow[3 * RATE // part :]
     assert np.sqrt(np.mean(slow**2)) < 4.0 * np.sqrt(np.mean(wrong**2))
 
 
 def test_another_rate_without_the_sizes():
     """correction_period follows the mean interval, where nothing says how sure the observer is."""
-    path = CONFIG / 'noise_1e-4.yaml'
-    case = Case(path)
-    parameters = dict(case.parameters) | {'noise_size': 0.0}
+    case = case_of(CONFIG / 'noise_1e-4.yaml')
+    parameters = {**case.parameters, 'noise_size': 0.0}
     for part in (2, 10):
-        t, y, d = case.t[::part], case.y[::part], case.d[::part]
-        stamps = 10**9 + np.round(t * 1e9).astype(np.int64)
-        found = OnlineEstimator(parameters).run(stamps, y, np.zeros(len(y))).unknown_input
-        assert np.abs(found - d)[8 * RATE // part :].max() < 3.0 * case.largest
+        wrong = errors(parameters, case.t[::part], case.y[::part], case.d[::part])
+        assert wrong[8 * RATE // part :].max() < 3.0 * case.largest
 
 
 @pytest.mark.parametrize('offset', [1.0, -10.0])
@@ -240,9 +238,7 @@ def test_papers_gains_find_y_again(offset):
     truth = Plant({'noise_std': 0.0}).simulate(t)
     y = truth.y.copy()
     y[HIT:BACK] += offset
-    stamps = 10**9 + np.round(t * 1e9).astype(np.int64)
-    found = OnlineEstimator(parameters).run(stamps, y, np.zeros(len(y))).unknown_input
-    wrong = np.abs(found - truth.unknown_input)
+    wrong = errors(parameters, t, y, truth.unknown_input)
     assert wrong[14 * RATE :].max() < 3.0 * wrong[4 * RATE : HIT].max()
     assert wrong.max() < 40.0 * np.abs(truth.unknown_input).max()  # these gains have such peaks
 
@@ -250,19 +246,18 @@ def test_papers_gains_find_y_again(offset):
 @pytest.mark.parametrize('unit', [1e6, 1e-6])
 def test_units_do_not_matter(unit):
     """The motor's angle in microradians: lambda_6 is 1e13, the largest state 1e15."""
-    case = Case(CONFIG / 'models' / 'dc_motor.yaml')
-    p, y = dict(case.parameters), case.y.copy()
-    y[HIT:BACK] += 1.0
+    case = case_of(CONFIG / 'models' / 'dc_motor.yaml')
+    p, y = case.parameters, case.shifted(HIT, BACK, 1.0)
     expected = case.errors(y, case.d)
     levels = len(p['lambda'])
     powers = 2.0 * p['gamma_initial'] * (levels - 1 - np.arange(levels)) / levels
-    case.parameters |= {
+    changes = {
         'phi': ['0', f'{500.0 * unit}*u - 25*z2'],
         'lambda': (np.array(p['lambda']) * unit ** (1.0 - powers)).tolist(),
         **{name: unit * p[name] for name in ('noise_size', 'unknown_input_size')},
         **{name: [unit * x for x in p[name]] for name in ('state_sizes', 'fuzzy_widths')},
     }  # fmt: skip
-    found = case.errors(unit * y, unit * case.d)
+    found = case.errors(unit * y, unit * case.d, **changes)
     np.testing.assert_allclose(found / unit, expected, atol=1e-9 * case.largest)
 
 

@@ -17,19 +17,19 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 ROOT = Path(__file__).resolve().parents[1]
+STAMPS, Y = files.signal(3000)
 
 
-def expected(stamps, y, parameters=None, u=None):
+@pytest.fixture(name='bag')
+def _bag(tmp_path):
+    return files.write(tmp_path / 'bag', files.floats(STAMPS, Y))
+
+
+def expected(stamps, y, parameters=None):
     """What a node would estimate: one sample after the other."""
     estimator = OnlineEstimator(parameters)
-    rows = []
-    for k, (stamp, sample) in enumerate(zip(stamps.tolist(), y.tolist(), strict=True)):
-        if u is not None:
-            estimator.set_input(u[k])
-        e = estimator.update(stamp, sample)
-        if not e.status.rejected:
-            rows.append([*e.z, e.unknown_input, e.gamma])
-    return np.array(rows)
+    found = [estimator.update(*row) for row in zip(stamps.tolist(), y.tolist(), strict=True)]
+    return np.array([[*e.z, e.unknown_input, e.gamma] for e in found if not e.status.rejected])
 
 
 def table(path):
@@ -42,47 +42,41 @@ def run(*arguments):
     return replay.main([str(a) for a in arguments])
 
 
-def test_output_bag_holds_the_estimators_topics(tmp_path):
-    stamps, y = files.signal(300)
-    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+def test_output_bag_holds_the_estimators_topics(bag, tmp_path):
     out = tmp_path / 'out'
     model = ['-p', 'order:=2', '-p', 'phi:=["0","0"]', '-p', 'gains:=fixed']
     assert run(bag, '-o', out, *model) == 0
-    rows = expected(stamps, y, {'order': 2, 'phi': ['0', '0'], 'gains': 'fixed'})
+    rows = expected(STAMPS, Y, {'order': 2, 'phi': ['0', '0'], 'gains': 'fixed'})
     state = series(out, '/estimator/state')
     np.testing.assert_array_equal(state.values, rows[:, :2])
     assert state.labels == ['z1', 'z2']
-    np.testing.assert_array_equal(state.stamps, stamps)
+    np.testing.assert_array_equal(state.stamps, STAMPS)
     np.testing.assert_array_equal(series(out, '/estimator/unknown_input').values, rows[:, 2])
     np.testing.assert_array_equal(series(out, '/estimator/gamma').values, rows[:, 3])
-    np.testing.assert_array_equal(series(out, '/estimator/stamp').values, stamps)
+    np.testing.assert_array_equal(series(out, '/estimator/stamp').values, STAMPS)
     assert series(out, '/estimator/innovation').labels == ['eps1', 'eps2', 'eps3']
     with AnyReader([out]) as reader:
         assert all(c.digest.startswith('RIHS01_') for c in reader.connections)
         counts = {c.topic: c.msgcount for c in reader.connections}
         assert counts.pop('/estimator/parameters') == 1
-        assert set(counts.values()) == {300}
+        assert set(counts.values()) == {len(STAMPS)}
     # A bag that has estimates gets the replayed ones beside them.
     again = tmp_path / 'again'
     assert run(out, '-o', again) == 0
-    assert len(series(again, '/replay/estimator/state').stamps) == 300
-    assert len(series(again, '/estimator/state').stamps) == 300
+    assert len(series(again, '/replay/estimator/state').stamps) == len(STAMPS)
+    assert len(series(again, '/estimator/state').stamps) == len(STAMPS)
 
 
-def test_csv_reads_back_as_the_same_numbers(tmp_path):
-    stamps, y = files.signal(200)
-    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+def test_csv_reads_back_as_the_same_numbers(bag, tmp_path):
     assert run(bag, '-o', tmp_path / 'out.csv') == 0
     rows = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)
     with (tmp_path / 'out.csv').open() as file:
-        assert [int(row['stamp_ns']) for row in csv.DictReader(file)] == stamps.tolist()
+        assert [int(row['stamp_ns']) for row in csv.DictReader(file)] == STAMPS.tolist()
     got = np.column_stack([rows[n] for n in ('z1', 'z2', 'z3', 'unknown_input', 'gamma')])
-    np.testing.assert_array_equal(got, expected(stamps, y))
+    np.testing.assert_array_equal(got, expected(STAMPS, Y))
 
 
-def test_parameters_of_file_and_command_line(tmp_path, capsys):
-    stamps, y = files.signal(300)
-    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+def test_parameters_of_file_and_command_line(bag, tmp_path, capsys):
     (tmp_path / 'p.yaml').write_text(
         '/**: {ros__parameters: {variant: sign, alpha: 30, lambda: 15, publish_rate: 50.0}}'
     )
@@ -92,12 +86,10 @@ def test_parameters_of_file_and_command_line(tmp_path, capsys):
     assert run(bag, '-o', tmp_path / 'default.npz') == 0
     assert 'replay: warning: the bag has no ~/parameters' in capsys.readouterr().err
     values = {'variant': 'sign', 'alpha': 30, 'lambda': [20, 15.5, 15, 10]}
-    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y, values))
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(STAMPS, Y, values))
 
 
-def test_parameters_for_a_named_node(tmp_path):
-    stamps, y = files.signal(100)
-    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
+def test_parameters_for_a_named_node(bag, tmp_path):
     (tmp_path / 'p.yaml').write_text(
         'rig: {left: {ros__parameters: {epsilon: 3.0}}}\nestimator: {ros__parameters: {}}'
     )
@@ -105,7 +97,7 @@ def test_parameters_for_a_named_node(tmp_path):
     arguments = ['--params-file', tmp_path / 'p.yaml', *rules, '--node', '/rig/left']
     assert run(bag, '-o', tmp_path / 'o.npz', *arguments) == 0
     values = {'variant': 'sign', 'alpha': 30, 'epsilon': 3.0}
-    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y, values))
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(STAMPS, Y, values))
 
 
 @pytest.mark.parametrize(
@@ -236,12 +228,6 @@ def test_types_of_a_sourced_workspace_go_into_the_bag(tmp_path, monkeypatch):
 # Wrong input
 
 
-@pytest.fixture(name='bag')
-def _bag(tmp_path):
-    stamps, y = files.signal(3000)
-    return files.write(tmp_path / 'bag', files.floats(stamps, y))
-
-
 def cut(bag):
     path = next(bag.glob('*.mcap'))
     path.write_bytes(path.read_bytes()[:-2000])
@@ -331,7 +317,7 @@ def test_output_without_a_name_is_refused(name, bag, capsys):
 
 @pytest.mark.parametrize('way', [['--smooth'], ['-p', 'smoothing_lag:=0.2']])
 def test_smoothed_estimates_are_the_librarys(way, tmp_path, capsys):
-    stamps, y = files.signal(3000)
+    stamps, y = STAMPS, Y.copy()
     y[500:503] = np.nan
     bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
     lag = way != ['--smooth']

@@ -7,8 +7,9 @@ from fhaosmo_ros.core import Observer, OnlineEstimator, Plant, Status
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.self_tuning.intervals import within
 from fhaosmo_ros.core.simulation.metrics import rms
+from fhaosmo_ros.tools.tuning.objective import stamps_of
 import numpy as np
-from observer_cases import states_of
+from observer_cases import matern, states_of
 import pytest
 from scipy.linalg import expm
 from scipy.stats import norm, truncnorm
@@ -18,7 +19,6 @@ from studies.self_tuning import estimate as plain_estimate
 
 LEAST_CHANCE = -6.0
 """Of quantised samples (D 31)."""
-
 
 PERIOD = 1e-3
 SELF_TUNING = {'gains': 'self_tuning'}
@@ -32,26 +32,12 @@ def study(plant, condition=AS_TUNED, kind='sine', seconds=20.0, seed=31):
     return recording(plant, condition, kind, seconds, seed), values
 
 
-def stamps_of(t):
-    return 10**9 + np.round(t * 1e9).astype(np.int64)
-
-
-def matern(size, rate, count, rng):
-    """Return a d of two derivatives whose corner frequency is `rate` (rad/s)."""
-    d = rng.standard_normal(count + 4000)
-    share = math.exp(-rate * PERIOD)
-    for _ in range(3):
-        for k in range(1, len(d)):
-            d[k] += share * d[k - 1]
-    return size * d[4000:] / d[4000:].std()
-
-
 @pytest.fixture(scope='module')
 def case():
     """Return times, z, d of the paper's plant for 20 s, and unit noise."""
     rng = np.random.default_rng(4)
     count = 30_000
-    d = matern(0.07, 1.5, count, rng)
+    d = 0.07 * matern(count, 1.5, 2, rng)
     rates = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     z = states_of(rates, d, [0.2, 0.2, 0.2])
     noise = rng.standard_normal(count)
@@ -199,7 +185,7 @@ def test_known_input_is_used():
     rng = np.random.default_rng(5)
     count = 10_000
     t = np.arange(count) * PERIOD
-    d, u = matern(0.5, 1.5, count, rng), np.sign(np.sin(3.0 * t))
+    d, u = 0.5 * matern(count, 1.5, 2, rng), np.sign(np.sin(3.0 * t))
     rates = np.array([[0.0, 1.0], [0.0, -2.0]])
     z = states_of(rates, d + 5.0 * np.append(u[1:], 0.0), [0.0, 0.0])  # u: during the interval
     y = z[:, 0] + 1e-4 * rng.standard_normal(count)

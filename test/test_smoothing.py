@@ -10,8 +10,9 @@ from fhaosmo_ros.core.observer.smoothing import BEGINS, MEASURED, Rows
 from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.metrics import rms
+from fhaosmo_ros.tools.tuning.objective import stamps_of
 import numpy as np
-from observer_cases import states_of
+from observer_cases import matern, states_of
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov
 
@@ -36,10 +37,6 @@ def online(gains='fixed', **changes):
     return OnlineEstimator({**own, **changes})
 
 
-def stamps_of(t):
-    return np.round(t * 1e9).astype(np.int64) + MS
-
-
 def in_parts(estimator, stamps, y, size):
     """Return what an estimator smooths of a recording that it gets in parts, and its rows."""
     estimator.smooth()
@@ -48,16 +45,11 @@ def in_parts(estimator, stamps, y, size):
     return np.concatenate([row.unknown_input for row in rows]), rows
 
 
-def matern(seconds, noise=1e-3, bandwidth=4.0, seed=1):
+def of_matern(seconds, noise=1e-3, bandwidth=4.0, seed=1):
     """Return t, y and the truth of d, a Matern process with a derivative."""
     rng = np.random.default_rng(seed)
     count = round(seconds * 1e3)
-    d = rng.standard_normal(count + 5000)
-    share = math.exp(-bandwidth * 1e-3)
-    for _ in range(2):
-        for k in range(1, len(d)):
-            d[k] += share * d[k - 1]
-    d = d[5000:] / d[5000:].std()
+    d = matern(count, bandwidth, 1, rng, 5000)
     y = states_of(RATES, d)[:, 0] + noise * rng.standard_normal(count)
     return np.arange(count) * 1e-3, y, d
 
@@ -159,7 +151,7 @@ def test_it_is_the_smoother_of_rauch_tung_and_striebel(steps):
 
 def test_it_is_that_smoother_with_self_tuning_gains():
     """A recording that ends before the observer is believed has one model, that of its end."""
-    t, y, _ = matern(0.9, noise=0.0)
+    t, y, _ = of_matern(0.9, noise=0.0)
     y = y + 1e-3 * np.random.default_rng(2).uniform(-1.7, 1.7, len(t))
     found = Observer(SELF_TUNING).smooth(t, y)
     (means, deviations), _ = book_of_self_tuning(found, y)
@@ -191,7 +183,7 @@ def test_it_is_better_than_the_filter_and_the_longer_lag_than_the_shorter():
 def test_more_of_the_future_is_better_and_the_band_holds():
     errors, inside = [], []
     for seed in range(2):
-        t, y, d = matern(10.0, seed=seed)
+        t, y, d = of_matern(10.0, seed=seed)
         judged, stamps = slice(3000, 9000), stamps_of(t)
         found = [online('self').run(stamps, y)]
         for lag in (0.05, 0.3):
@@ -214,7 +206,7 @@ def test_more_of_the_future_is_better_and_the_band_holds():
 
 @pytest.mark.parametrize('gains', ['fixed', 'self'])
 def test_a_recording_in_parts_is_the_same(gains, monkeypatch):
-    t, y, _ = recording(12.0) if gains == 'fixed' else matern(12.0)
+    t, y, _ = recording(12.0) if gains == 'fixed' else of_matern(12.0)
     observer = Observer(SELF_TUNING) if gains == 'self' else Observer.from_yaml(CONFIG)
     whole, rough = observer.smooth(t, y), 1e-5 if gains == 'self' else 0.0
     monkeypatch.setattr(smoother, 'BLOCK', 1500)
@@ -229,7 +221,7 @@ def test_a_recording_in_parts_is_the_same(gains, monkeypatch):
 
 @pytest.mark.parametrize('gains', ['fixed', 'self'])
 def test_one_by_one_is_the_same_as_a_run(gains):
-    t, y, _ = recording(2.0) if gains == 'fixed' else matern(3.0)
+    t, y, _ = recording(2.0) if gains == 'fixed' else of_matern(3.0)
     y[1100:1110] = np.nan
     y[1250] += 1.0
     stamps = stamps_of(t)

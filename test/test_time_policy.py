@@ -117,36 +117,33 @@ def test_two_far_stamps_that_do_not_fit_each_other_restart_from_the_second():
     same(estimator, fresh)
 
 
-def test_one_stamp_ahead_by_less_than_max_gap_ends_a_gap_and_time_goes_on_from_it():
+@pytest.mark.parametrize(('behind', 'rejected', 'counted'), [
+    # One stamp is ahead by less than max_gap: it ends a gap, and time goes on from it.
+    ([30, *range(1, 40)], [False] + [True] * 30 + [False] * 9,
+     {'backward_stamps': 29, 'duplicate_stamps': 1, 'gaps': 1, 'sub_steps': 30}),
+    # A clock is set back a little.
+    (range(-99, 50), [True] * 100 + [False] * 49, {'backward_stamps': 99, 'duplicate_stamps': 1}),
+], ids=['one stamp ahead', 'clock set back'])  # fmt: skip
+def test_samples_are_held_until_time_has_caught_up(behind, rejected, counted):
     estimator = OnlineEstimator()
     last = run(estimator)
-    assert estimator.update(last + 30 * MS, 0.23).status & Status.GAP
-    words = [estimator.update(last + k * MS, 0.2).word for k in range(1, 40)]
-    assert [bool(w & REJECTED) for w in words] == [True] * 30 + [False] * 9
-    only(estimator, backward_stamps=29, duplicate_stamps=1, gaps=1, sub_steps=30)
+    words = [estimator.update(last + k * MS, 0.2).word for k in behind]
+    assert [bool(w & REJECTED) for w in words] == rejected
+    assert bool(words[0] & Status.GAP) == ('gaps' in counted)
+    only(estimator, **counted)
 
 
-def test_clock_set_back_a_little_holds_until_it_has_caught_up():
-    estimator = OnlineEstimator()
-    last = run(estimator)
-    words = [estimator.update(last - 100 * MS + k * MS, 0.2).word for k in range(1, 150)]
-    assert [bool(w & REJECTED) for w in words] == [True] * 100 + [False] * 49
-    only(estimator, backward_stamps=99, duplicate_stamps=1)
-
-
-def test_bag_loop_restarts_once_a_round():
-    estimator = OnlineEstimator()
-    for _ in range(4):
-        run(estimator, 2000)
-    only(estimator, far_stamps=3, restarts_backward=3)
-
-
-def test_bag_that_loops_within_max_gap_is_followed_after_so_many_late_samples():
-    """Time does not catch up then; each of its samples was rejected, for ever."""
-    estimator = OnlineEstimator({'max_gap': 5.0})
-    for _ in range(3):
-        run(estimator, 400)
-    only(estimator, backward_stamps=500, duplicate_stamps=1, restarts_backward=1)
+@pytest.mark.parametrize(('parameters', 'length', 'rounds', 'counted'), [
+    ({}, 2000, 4, {'far_stamps': 3, 'restarts_backward': 3}),
+    # Within max_gap time does not catch up: followed after so many late samples.
+    ({'max_gap': 5.0}, 400, 3,
+     {'backward_stamps': 500, 'duplicate_stamps': 1, 'restarts_backward': 1}),
+], ids=['once a round', 'within max_gap'])  # fmt: skip
+def test_bag_that_loops_restarts(parameters, length, rounds, counted):
+    estimator = OnlineEstimator(parameters)
+    for _ in range(rounds):
+        run(estimator, length)
+    only(estimator, **counted)
 
 
 # Gaps

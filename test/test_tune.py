@@ -18,7 +18,7 @@ from fhaosmo_ros.core.simulation.recordings import FAMILY_PARAMETERS
 from fhaosmo_ros.tools.tuning import report
 from fhaosmo_ros.tools.tuning.command import main, read_parameters
 from fhaosmo_ros.tools.tuning.linear_gains import kalman_gains, SCHEME
-from fhaosmo_ros.tools.tuning.objective import Objective, TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.objective import Objective, stamps_of, TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def row(report_, name):
 def online(values, r):
     """Return what the node's estimator makes of a recording."""
     estimator = OnlineEstimator(ESTIMATOR_PARAMETERS.complete(values))
-    return estimator.run(np.round(r.t * 1e9).astype(np.int64) + 10**9, r.y, r.u)
+    return estimator.run(stamps_of(r.t), r.y, r.u)
 
 
 # the objective

@@ -7,7 +7,6 @@ from pathlib import Path
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
 
-pytest.register_assert_rewrite('running')
 try:
     from running import arguments, Estimator, FED, LAX, Parameters, Process, User
 except ModuleNotFoundError:  # no ROS 2 in this Python

@@ -49,7 +49,7 @@ def limb(launch, user):
     )  # fmt: skip
 
     def said(text):
-        user.wait(lambda: text in process.output, f'line with {text!r} in the log')
+        user.wait(lambda: text in process.output(), f'line with {text!r} in the log')
 
     def send(k, push=0.0, names=JOINTS, **changes):
         """Send the k-th sample of the motion, a millisecond after the one before."""
@@ -211,16 +211,16 @@ def test_a_wrong_setting_is_said_once_and_the_estimates_stop(launch, user, tmp_p
     first = len(torques)
     for k in range(len(MOTION[0])):
         send(k)
-        if k % 20 == 19 and text not in process.output:
+        if k % 20 == 19 and text not in process.output():
             user.wait(
-                lambda n=first + k: text in process.output or len(torques) >= n, f'estimate {k}'
+                lambda n=first + k: text in process.output() or len(torques) >= n, f'estimate {k}'
             )
     user.wait(lambda: any(
         text in s.message for r in user.reports['wrong/arm'] for s in r.statuses.values()
     ), 'report')  # fmt: skip
     assert len(torques) < first + len(MOTION[0]) - 200
     lines = 1 + (time.monotonic() - begin) / 5.0  # once in five seconds
-    assert 1 <= process.output.count(text) <= lines
+    assert 1 <= process.output().count(text) <= lines
 
 
 def test_a_bag_that_begins_again_and_silence_are_said(limb, user):
@@ -259,5 +259,5 @@ def test_bad_parameters_end_the_node_in_one_line(launch, tmp_path, values, text)
     urdf.write_text(URDF)
     process = launch('arm', **{'robot_description_file': urdf, **values})
     assert process.wait() == 2
-    assert text in process.output
-    assert process.output.count('\n') == 1
+    assert text in process.output()
+    assert process.output().count('\n') == 1

@@ -9,7 +9,17 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.per_channel import of_channel, with_channels
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
-from running import Estimator, FED, joint_state, nanoseconds, OK, SECOND, told_parameters
+from running import (
+    Estimator,
+    FED,
+    joint_state,
+    nanoseconds,
+    OK,
+    Rig,
+    SECOND,
+    told_parameters,
+    WARN,
+)  # fmt: skip
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -111,11 +121,11 @@ def test_bad_set_names_the_channel_and_changes_nothing(parameters):
 COUNT = itertools.count()
 
 
-class Arm:
+class Arm(Rig):
     """An estimator of whatever joints come, fed and heard."""
 
     def __init__(self, user, process, namespace):
-        self.user, self.process, self.name = user, process, f'{namespace}/estimator'
+        super().__init__(user, process, f'{namespace}/estimator')
         self.publisher = user.publisher(f'{namespace}/joint_states', JointState)
         self.out = user.record(f'{self.name}/joint_states', JointState)
         self.stamp, self.sent = SECOND, []
@@ -143,16 +153,6 @@ class Arm:
             lambda: nanoseconds(self.out[-1].message.header.stamp) == stamp, 'estimates'
         )
 
-    def wait_report(self, words: str) -> None:
-        reports = self.user.reports[self.name[1:]]
-        self.user.wait(
-            lambda: any(words in r.statuses['state'].message for r in reports[-20:]),
-            f'report of {words}',
-        )
-
-    def said(self, words: str) -> list[str]:
-        return [line for line in self.process.output.splitlines() if words in line]
-
 
 @pytest.fixture
 def arm(user, launch):
@@ -163,7 +163,7 @@ def arm(user, launch):
 
 
 def test_each_joint_is_a_channel_whatever_the_order_of_the_names(user, arm):
-    user.wait(lambda: arm.said('waiting for the first message'), 'start')
+    arm.wait_said('waiting for the first message')
     orders = [('shoulder', 'elbow', 'wrist'), ('wrist', 'shoulder', 'elbow'), ('elbow', 'wrist')]
     arm.answer(shoulder=0.1, elbow=0.2, wrist=0.3)
     for k in range(24):
@@ -197,7 +197,7 @@ def test_names_that_no_topic_can_have_are_left_out(arm):
     assert "4 joints 'aaaa" in line
     assert "'constants', '', 'left/wrist' can't be the name of a channel" in line
     assert len(line) < 600
-    arm.wait_report("left out: 4 joints 'aaaa")
+    arm.wait_status('state', WARN, "left out: 4 joints 'aaaa")
 
 
 def test_names_that_come_later_are_one_line(arm):
@@ -206,8 +206,8 @@ def test_names_that_come_later_are_one_line(arm):
         arm.send(hip=0.1, **{f'late{k}_{i}': 0.1 for i in range(10)})
     arm.answer(hip=0.1)
     assert len(arm.said('late0_0')) == 1
-    assert len(arm.process.output.splitlines()) < 20
-    arm.wait_report("joints 'late0_0', 'late0_1'")
+    assert len(arm.process.output().splitlines()) < 20
+    arm.wait_status('state', WARN, "joints 'late0_0', 'late0_1'")
 
 
 def test_names_beyond_max_channels_are_left_out(arm):
@@ -215,4 +215,4 @@ def test_names_beyond_max_channels_are_left_out(arm):
     assert arm.answer(**many).name == list(many)[:64]
     (line,) = arm.said('max_channels')
     assert "left out: 436 joints 'j64', 'j65'" in line
-    arm.wait_report("left out: 436 joints 'j64'")
+    arm.wait_status('state', WARN, "left out: 436 joints 'j64'")

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reports on /diagnostics: their values, and what makes them WARN, ERROR and STALE; QoS."""
 
+from functools import partial
+import itertools
 import math
 
 from builtin_interfaces.msg import Time
@@ -9,30 +11,27 @@ import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from running import as_time, ERROR, FED, joint_state, LATCHED, LAX, OK, Parameters, STALE, WARN
+from running import (
+    as_time,
+    ERROR,
+    FED,
+    joint_state,
+    LATCHED,
+    LAX,
+    OK,
+    Parameters,
+    STALE,
+    values_of,
+    WARN,
+)  # fmt: skip
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Int64
 
 RATE = 200.0
 """Of the pair's plant."""
+TICK = 25_000_000
+"""Nanoseconds of a clock at 40 Hz."""
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-
-def numbers(status) -> dict[str, str]:
-    return {pair.key: pair.value for pair in status.values}
-
-
-def wait_values(rig, task: str, condition, what: str) -> dict[str, str]:
-    """Return the values of the first report from now on for which a condition holds."""
-    since, found = len(rig.reports), []
-
-    def look() -> bool:
-        found[:] = [numbers(report.statuses[task]) for report in rig.reports[since:]]
-        found[:] = [values for values in found if condition(values)]
-        return bool(found)
-
-    rig.user.wait(look, what)
-    return found[0]
 
 
 def test_values_of_the_input(pair):
@@ -42,7 +41,7 @@ def test_values_of_the_input(pair):
             and values['publishers'] == '/pair/plant'
         )
 
-    values = wait_values(pair, 'input', as_sampled, 'rate and name of the plant')
+    values = pair.wait_values('input', as_sampled, 'rate and name of the plant')
     assert values['topic'] == '/pair/y'
     assert float(values['jitter (std / mean of the period)']) >= 0.0
     mean = 1.0 / float(values['sample rate [Hz]'])
@@ -52,11 +51,11 @@ def test_values_of_the_input(pair):
     accepted = int(values['samples accepted'])
     assert accepted > 0
     assert int(values['samples lost']) >= 0
-    wait_values(pair, 'input', lambda v: int(v['samples accepted']) > accepted, 'more samples')
+    pair.wait_values('input', lambda v: int(v['samples accepted']) > accepted, 'more samples')
 
 
 def test_values_of_the_observer(pair):
-    values = numbers(pair.wait_status('observer', OK, 'OK'))
+    values = values_of(pair.wait_status('observer', OK, 'OK'))
     assert set(pair.reports[-1].statuses) == {'state', 'input', 'observer'}
     assert {status.hardware_id for status in pair.reports[-1].statuses.values()} == {'none'}
     assert values['open levels'] == '4 of 4'
@@ -103,7 +102,7 @@ def test_hardware_id_and_period_are_live(pair):
 def test_what_holds_gamma_is_said(fed):
     def wait_word(word: str) -> None:
         fed.feed(0.2)
-        wait_values(fed, 'observer', lambda v: v['gamma at'].startswith(word), f'gamma at {word}')
+        fed.wait_values('observer', lambda v: v['gamma at'].startswith(word), f'gamma at {word}')
 
     wait_word('neither bound')
     fed.parameters.set(gamma_min=0.3, gamma_initial=0.3, gamma_max=0.3)
@@ -117,18 +116,14 @@ def test_a_clock_that_is_slower_than_the_samples_is_said(user, estimator):
     rig = estimator('/slow', **FED | LAX, use_sim_time=True, sampling='clock')
     clock = user.publisher('/clock', Clock)
     rig.listen()
-    since, tick = len(rig.reports), 100
+    ticks = itertools.count(100 * TICK, TICK)
 
-    def said() -> bool:
-        nonlocal tick
-        tick += 1
-        clock.publish(Clock(clock=as_time(tick * 25_000_000)))
+    def send() -> None:
+        clock.publish(Clock(clock=as_time(next(ticks))))
         for _ in range(25):
             rig.send(0.2)
-        statuses = [report.statuses['input'] for report in rig.reports[since:]]
-        return any(s.level == WARN and 'ticks once for' in s.message for s in statuses)
 
-    user.wait(said, 'slow clock')
+    rig.wait_status('input', WARN, 'ticks once for', doing=send)
     user.node.destroy_publisher(clock)
 
 
@@ -153,14 +148,7 @@ def test_what_no_longer_fits_is_said(user, estimator):
     def wait_said(words: str, fresh: bool = True, **samples) -> None:
         if fresh:
             assert rig.reset().success
-        since = len(rig.reports)
-
-        def said() -> bool:
-            send(**samples)
-            statuses = [report.statuses['observer'] for report in rig.reports[since:]]
-            return any(s.level == WARN and words in s.message for s in statuses)
-
-        user.wait(said, words)
+        rig.wait_status('observer', WARN, words, doing=partial(send, **samples))
 
     for _ in range(10):
         send()
@@ -188,7 +176,7 @@ def test_publishers_are_named(user, estimator, stranger):
     rig = estimator('/heard', **FED)
     rig.wait_status('input', STALE, 'no usable sample yet', 'no publisher of /heard/y')
     rig.wait_said('still waiting', 'no publisher of /heard/y')
-    assert numbers(rig.reports[-1].statuses['input'])['publishers'] == 'none'
+    assert values_of(rig.reports[-1].statuses['input'])['publishers'] == 'none'
 
     unheard = stranger.create_publisher(Float64, '/heard/y', BEST_EFFORT)
     words = ('/stranger', 'best effort publisher and reliable subscription', 'input_reliability')
@@ -203,7 +191,7 @@ def test_publishers_are_named(user, estimator, stranger):
     stranger.destroy_publisher(unheard)
 
     first = stranger.create_publisher(Float64, '/heard/y', 10_000)
-    wait_values(rig, 'input', lambda v: v['publishers'] == '/stranger', 'name of the publisher')
+    rig.wait_values('input', lambda v: v['publishers'] == '/stranger', 'name of the publisher')
     rig.listen()
     rig.wait_status('input', STALE, '2 publishers')
     rig.wait_said('2 publishers of')
@@ -217,7 +205,7 @@ def test_publishers_are_named(user, estimator, stranger):
     rig.wait_count('samples accepted', 30)
     assert rig.count('samples lost') == 0
     stranger.destroy_publisher(first)
-    wait_values(rig, 'input', lambda v: v['publishers'] == '/user', 'name of the other one')
+    rig.wait_values('input', lambda v: v['publishers'] == '/user', 'name of the other one')
     assert rig.said('the publisher of /heard/y changed: now /user')
 
 
@@ -262,7 +250,7 @@ def test_policies_of_estimates(user, launch):
 
     def used() -> bool:
         y.publish(Float64(data=0.5))
-        values = numbers(reports[-1].statuses['input']) if reports else {}
+        values = values_of(reports[-1].statuses['input']) if reports else {}
         return int(values.get('samples accepted', 0)) > 0
 
     user.wait(used, 'accepted samples')

@@ -38,14 +38,8 @@ def test_bad_samples_are_rejected_and_counted(fed):
 
 
 def test_share_of_bad_samples_makes_an_error(fed):
-    since = len(fed.reports)
-
-    def said() -> bool:
-        fed.send(math.nan)  # until a report has no good sample of before
-        statuses = [report.statuses['input'] for report in fed.reports[since:]]
-        return any(s.level == ERROR and 'rejected measurements' in s.message for s in statuses)
-
-    fed.user.wait(said, 'error')
+    # Until a report has no good sample of before.
+    fed.wait_status('input', ERROR, 'rejected measurements', doing=lambda: fed.send(math.nan))
 
 
 def test_freeze_holds_gamma_and_lets_it_go(fed):
@@ -171,7 +165,7 @@ def test_node_clock_sampling_follows_simulated_time(clock, estimator):
 def test_negative_time_on_clock_is_rejected(clock, user, launch, node):
     given = {'sampling': 'nominal'} if node == 'estimator' else {}
     process = launch(node, namespace='/negative', use_sim_time=True, **given)
-    clock(-5 * SECOND, lambda: 'expected seconds >= 0, got -5' in process.output)
+    clock(-5 * SECOND, lambda: 'expected seconds >= 0, got -5' in process.output())
     assert process.poll() is None
     # What is given stays as it is in simulated time.
     assert Parameters(user, f'/negative/{node}').all(given) == given

@@ -101,7 +101,7 @@ def test_parameters_that_do_not_fit_fail_the_transition_and_say_why(user, unconf
     assert not unconfigured.change('configure')
     assert unconfigured.state() == 'unconfigured'
     words = "transition configure failed: parameter 'phi': expected 4 expressions"
-    assert words in process.output
+    assert words in process.output()
     result = parameters.try_to_set('order', 0)  # a value wrong by itself is refused at once
     assert not result.successful
     assert 'order' in result.reason
@@ -113,7 +113,7 @@ def test_parameters_that_do_not_fit_fail_the_transition_and_say_why(user, unconf
 def test_a_transition_that_is_not_possible_is_refused(unconfigured, process, transition):
     assert not unconfigured.change(transition)
     assert unconfigured.state() == 'unconfigured'
-    assert f'transition {transition} is not possible while unconfigured' in process.output
+    assert f'transition {transition} is not possible while unconfigured' in process.output()
     assert unconfigured.change('configure')
     assert not unconfigured.change('configure')
     assert unconfigured.state() == 'inactive'

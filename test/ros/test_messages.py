@@ -33,7 +33,7 @@ def recorder(launch, user, tmp_path):
 
     def record(node: str):
         process = launch('record', '--', '-o', tmp_path / 'bag', '--names', node, f'{node}_plant')
-        user.wait(lambda: 'recording to' in process.output, 'recorder')
+        user.wait(lambda: 'recording to' in process.output(), 'recorder')
         return process
 
     return record
@@ -171,11 +171,8 @@ def test_yaw_is_continuous_and_the_outputs_are_typed(user, estimator):
         ('unknown input [rad/s^2]', e.unknown_input),
         ('unknown input, scaled [N m]', 3.0 * e.unknown_input),
     ):
-
-        def reported(key=key, number=number) -> bool:
-            return float(rig.value(key) or 'nan') == pytest.approx(number, rel=1e-4)
-
-        user.wait(reported, key)
+        near = pytest.approx(number, rel=1e-4)
+        user.wait(lambda key=key, near=near: float(rig.value(key) or 'nan') == near, key)
     described = rig.parameters.describe('spike_gate')['spike_gate']
     assert 'unit of y: rad' in described.additional_constraints
 

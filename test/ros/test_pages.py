@@ -4,8 +4,8 @@
 import re
 import signal
 import subprocess
-import sys
 
+from commands import start
 import numpy as np
 from running import DEADLINE, ROOT
 from waiting import wait_until
@@ -33,11 +33,7 @@ def test_commands_of_the_first_pages_run_one_after_the_other(launch, tmp_path):
     launch('estimator')
     assert commands[0].startswith('record')
     for command in commands:
-        process = subprocess.Popen(
-            [sys.executable, '-m', 'fhaosmo_ros', *command.split()], cwd=tmp_path,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        )  # fmt: skip
-        with process:
+        with start(*command.split(), stderr=subprocess.STDOUT, cwd=tmp_path) as process:
             if command.startswith('record'):
                 wait_until(recorded, 'samples in the bag', process=process)
                 process.send_signal(signal.SIGINT)

@@ -8,22 +8,22 @@ import time
 from fhaosmo_ros.core.simulation.plant import Plant
 import numpy as np
 import pytest
-from running import Parameters, SECOND
+from running import Parameters, Rig, SECOND
 from std_msgs.msg import Float64, Float64MultiArray
 
 AMPLITUDE = 2.0
 OF_STATE = 'qos_overrides./stable/plant/state.publisher.depth'
 
 
-class PlantRig:
+class PlantRig(Rig):
     """A running plant, heard."""
 
     def __init__(self, user, process, namespace):
-        self.user, self.process = user, process
+        super().__init__(user, process, f'{namespace}/plant')
         self.y = user.record(f'{namespace}/y', Float64)
         self.state = user.record(f'{namespace}/plant/state', Float64MultiArray)
         self.d = user.record(f'{namespace}/plant/unknown_input', Float64)
-        self.parameters = Parameters(user, f'{namespace}/plant')
+        self.parameters = Parameters(user, self.name)
         user.wait(lambda: self.y and self.state and self.d, 'samples')
 
     def ticks(self, messages: list, count: int) -> list:
@@ -118,7 +118,7 @@ def test_known_input_comes_from_its_topic(plant, user):
 
         user.wait(follows, f'y = {expected}')
     u.publish(Float64(data=float('nan')))
-    user.wait(lambda: 'rejected u = nan' in rig.process.output, 'complaint about u')
+    rig.wait_said('rejected u = nan')
     _, y, _ = rig.fresh(20)
     np.testing.assert_allclose(y, -1.5, rtol=0.0, atol=1e-3)
 
@@ -127,11 +127,11 @@ def test_unstable_plant_says_so_once_and_publishes_nothing_more(user, launch):
     y = user.record('/unstable/y', Float64)
     process = launch('plant', namespace='/unstable', order=1, phi=['2000.0*z1 + 1.0'])
     words = 'has left the finite numbers'
-    user.wait(lambda: words in process.output, 'error')
-    said = re.search(rf'\[(\d+)\.(\d{{9}})\].*{words}', process.output)
+    user.wait(lambda: words in process.output(), 'error')
+    said = re.search(rf'\[(\d+)\.(\d{{9}})\].*{words}', process.output())
     error = int(said[1] + said[2])  # ns
     user.wait(lambda: time.time_ns() > error + SECOND // 3, 'some hundred periods')
-    assert process.output.count(words) == 1
+    assert process.output().count(words) == 1
     for stamp, message in y:
         assert stamp <= error
         assert np.isfinite(message.data)

@@ -15,9 +15,9 @@ GRACE = 30.0
 
 
 def ends_well(process) -> None:
-    assert process.wait(GRACE) == 0, process.output
+    assert process.wait(GRACE) == 0, process.output()
     for word in ('Traceback', 'Exception', 'Error', 'error', 'terminate called'):
-        assert word not in process.output, process.output
+        assert word not in process.output(), process.output()
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_signal_while_it_starts(launch, name, delay):
     process.send_signal(signal.SIGINT)
     code = process.wait(GRACE)
     # Python itself dies of a signal before it has begun with our code.
-    assert code in (0, -signal.SIGTERM, -signal.SIGINT), process.output
+    assert code in (0, -signal.SIGTERM, -signal.SIGINT), process.output()
 
 
 STUCK = """
@@ -100,10 +100,10 @@ sys.exit(main(sys.argv[1:]))
 
 def test_a_callback_that_does_not_end_does_not_hold_the_node(user, launch):
     process = launch(STUCK)
-    user.wait(lambda: 'asleep' in process.output, 'callback')
+    user.wait(lambda: 'asleep' in process.output(), 'callback')
     process.send_signal(signal.SIGINT)
     ends_well(process)
-    assert 'ended while a callback was running' in process.output
+    assert 'ended while a callback was running' in process.output()
 
 
 # What they are made of.

@@ -4,14 +4,13 @@
 import gc
 from pathlib import Path
 import signal
-import subprocess
-import sys
 from threading import Timer
 
+from commands import run
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
-from running import DEADLINE, Estimator, Parameters, ROOT
+from running import DEADLINE, Estimator, Parameters
 from yaml_texts import HOSTILE
 
 
@@ -131,10 +130,7 @@ def test_one_line_says_what_is_wrong(node, words, expected, tmp_path, capfd):
 
 @pytest.mark.parametrize('node', ['estimator', 'plant'])
 def test_process_ends_with_one_line(node):
-    done = subprocess.run(
-        [sys.executable, '-m', 'fhaosmo_ros', node, *rules('phi:=[]')],
-        cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE,
-    )  # fmt: skip
+    done = run(node, *rules('phi:=[]'))
     assert "'phi'" in check_refusal(node, done.returncode, done.stdout, done.stderr)
 
 
@@ -175,7 +171,7 @@ def test_files_and_rules_reach_the_node_for_which_they_are(user, launch, tmp_pat
     }  # fmt: skip
     assert parameters.all(expected) == expected
     assert 'noise_std' not in parameters.names()
-    (line,) = [x for x in process.output.splitlines() if '[WARN]' in x]
+    (line,) = [x for x in process.output().splitlines() if '[WARN]' in x]
     assert line.endswith(f'{files[3]}: sets nothing for node /rig/lead')
 
 

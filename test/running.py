@@ -5,8 +5,6 @@ from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
 import signal
-import subprocess
-import sys
 import threading
 import time
 from typing import NamedTuple
@@ -18,6 +16,7 @@ from fhaosmo_ros.core.parameters.files import loads
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
 from fhaosmo_ros.nodes.recording import PrivateNode
+from fhaosmo_ros.tools.cli.processes import Child
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
 from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python
@@ -57,6 +56,11 @@ def as_time(stamp: int) -> Time:
     return Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
 
 
+def values_of(status) -> dict[str, str]:
+    """Return the values of a diagnostic status."""
+    return {pair.key: pair.value for pair in status.values}
+
+
 def joint_state(stamp: int, names: Iterable[str], positions: Iterable[float]) -> JointState:
     header = Header(stamp=as_time(stamp))
     return JointState(header=header, name=list(names), position=map(float, positions))
@@ -70,23 +74,14 @@ def arguments(*words: object, namespace: str = '', **values: object) -> list[obj
     return ['--ros-args', *words, *(part for rule in rules for part in ('-p', rule))]
 
 
-class Process(subprocess.Popen):
-    """Python with its output in a file."""
+class Process(Child):
+    """A node, which is to end when it is told to, and no sooner."""
 
-    def __init__(self, path: Path, *words: object) -> None:
-        self._path = path
+    def __init__(self, log: Path, *words: object) -> None:
         self._may_end = False
-        with path.open('wb') as out:
-            super().__init__(
-                [sys.executable, *map(str, words)],
-                cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=out,
-                # A test under nohup ignores SIGHUP, and so would the node.
-                preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
-            )  # fmt: skip
-
-    @property
-    def output(self) -> str:
-        return self._path.read_text(errors='replace')
+        # A test under nohup ignores SIGHUP, and so would the node.
+        heard = {'preexec_fn': lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)}
+        super().__init__(log, *map(str, words), cwd=ROOT, **heard)
 
     def wait(self, timeout: float = DEADLINE) -> int:
         """Return the exit code of a process that is to end."""
@@ -96,14 +91,14 @@ class Process(subprocess.Popen):
     def interrupt(self) -> None:
         """Send SIGINT to a process that has to be running, if nobody has ended it."""
         if not self._may_end:
-            assert self.poll() is None, f'it has ended by itself:\n{self.output}'
-            self.send_signal(signal.SIGINT)
+            assert self.poll() is None, f'it has ended by itself:\n{self.output()}'
+            super().interrupt()
 
     def check_end(self) -> None:
         """Wait for the end after `interrupt`: a good one, with nothing terrible said."""
         awaited = self._may_end
-        assert self.wait() == 0 or awaited, self.output
-        assert 'Traceback' not in self.output, self.output
+        assert self.wait() == 0 or awaited, self.output()
+        assert 'Traceback' not in self.output(), self.output()
 
 
 class Published(NamedTuple):
@@ -172,15 +167,16 @@ class User:
         self.wait(lambda: publisher.get_subscription_count() >= heard, f'subscription of {topic}')
         return publisher
 
-    def wait(self, condition, what: str, timeout: float = DEADLINE) -> None:
-        """Wait until `condition` holds; it is looked at on every message, and now and then."""
+    def wait(self, condition, what: str, timeout: float = DEADLINE):
+        """Return what `condition` gives once that is true; looked at on every message, and now."""
         end = time.monotonic() + timeout
         # Without the lock: a condition that calls a service needs the thread that receives.
-        while not condition():
+        while not (found := condition()):
             if time.monotonic() > end:
                 raise TimeoutError(f'no {what} within {timeout} s')
             with self._changed:
                 self._changed.wait(0.05)
+        return found
 
     def client(self, service: str, kind: type):
         """Return the client of a service that is there."""
@@ -283,20 +279,76 @@ class Manager:
         return answer.success or (before != goal and self.state() == goal)
 
 
-class Estimator:
-    """A running estimator: what it publishes, what it says and what it can be asked."""
+class Rig:
+    """A running node: what it says in its log and in its reports."""
+
+    def __init__(self, user: User, process: Process, node: str) -> None:
+        self.user, self.process, self.name = user, process, node
+        self.reports = user.reports[node.lstrip('/')]
+
+    def said(self, *words: str) -> list[str]:
+        """Return the lines of its log that have these words."""
+        lines = self.process.output().splitlines()
+        return [line for line in lines if all(word in line for word in words)]
+
+    def wait_said(self, *words: str) -> None:
+        self.user.wait(lambda: self.said(*words), f'{words} in the log')
+
+    def value(self, key: str) -> str | None:
+        """Return a value of the latest report that has it."""
+        for report in reversed(self.reports):
+            for status in report.statuses.values():
+                if key in (found := values_of(status)):
+                    return found[key]
+        return None
+
+    def count(self, key: str) -> int:
+        return int(self.value(key) or 0)
+
+    def wait_count(self, key: str, value: int) -> None:
+        self.user.wait(lambda: self.count(key) >= value, f'{key!r} of {value} in diagnostics')
+
+    def wait_report(self, task: str, condition, what: str, doing=lambda: None):
+        """
+        Return the latest status of a task, of those that come from now on, that is as wanted.
+
+        What is to make it so is done again and again meanwhile.
+        """
+        since = len(self.reports)
+
+        def look() -> list:
+            doing()
+            statuses = [r.statuses[task] for r in self.reports[since:] if task in r.statuses]
+            return [status for status in statuses if condition(status)]
+
+        return self.user.wait(look, what)[-1]
+
+    def wait_status(self, task: str, level: bytes, *words: str, doing=lambda: None):
+        """Return a status of a task with this level and these words; see `wait_report`."""
+
+        def as_wanted(status) -> bool:
+            return status.level == level and all(word in status.message for word in words)
+
+        return self.wait_report(task, as_wanted, f'{task} with level {level} and {words}', doing)
+
+    def wait_values(self, task: str, condition, what: str) -> dict[str, str]:
+        """Return values of the latest report from now on for which a condition holds."""
+        return values_of(self.wait_report(task, lambda s: condition(values_of(s)), what))
+
+
+class Estimator(Rig):
+    """A running estimator: what it publishes too, and what it can be asked."""
 
     def __init__(
         self, user: User, process: Process, namespace: str, channel: str = '', gamma: bool = True
     ) -> None:
-        self.user, self.process = user, process
         node, part = f'{namespace}/estimator', f'/{channel}' if channel else ''
+        super().__init__(user, process, node)
         self.name = node + part
         self.topics = {
             topic: user.record(f'{self.name}/{topic}', kind)
             for topic, kind in ESTIMATES.items() if gamma or topic != 'gamma'
         }  # fmt: skip
-        self.reports = user.reports[node.lstrip('/')]
         self._topic = f'{namespace}{part}/y'
         self.y = user.record(self._topic, Float64)
         self._estimates: list[Estimate] = []
@@ -345,60 +397,8 @@ class Estimator:
             )  # fmt: skip
         return self._estimates
 
-    def wait_estimate(self, condition, what: str, timeout: float = DEADLINE) -> Estimate:
-        found: list[Estimate] = []
-
-        def look() -> bool:
-            found[:] = [e for e in self.estimates[-50:] if condition(e)]
-            return bool(found)
-
-        self.user.wait(look, what, timeout)
-        return found[-1]
-
-    # What it says.
-
-    def said(self, *words: str) -> list[str]:
-        """Return the lines of its log that have these words."""
-        lines = self.process.output.splitlines()
-        return [line for line in lines if all(word in line for word in words)]
-
-    def wait_said(self, *words: str) -> None:
-        self.user.wait(lambda: self.said(*words), f'{words} in the log')
-
-    def value(self, key: str) -> str | None:
-        """Return a value of the latest report that has it."""
-        for report in reversed(self.reports):
-            for status in report.statuses.values():
-                for pair in status.values:
-                    if pair.key == key:
-                        return pair.value
-        return None
-
-    def count(self, key: str) -> int:
-        return int(self.value(key) or 0)
-
-    def wait_count(self, key: str, value: int) -> None:
-        self.user.wait(lambda: self.count(key) >= value, f'{key!r} of {value} in diagnostics')
-
-    def wait_status(self, task: str, level: bytes, *words: str, since: int | None = None):
-        """
-        Return a status of a task with this level and these words in its message.
-
-        Of those that come from now on, or from the `since`-th report on.
-        """
-        since = len(self.reports) if since is None else since
-        found = []
-
-        def look() -> bool:
-            found[:] = [
-                status for report in self.reports[since:] for name, status in
-                report.statuses.items() if name == task and status.level == level
-                and all(word in status.message for word in words)
-            ]  # fmt: skip
-            return bool(found)
-
-        self.user.wait(look, f'{task} with level {level} and {words}')
-        return found[-1]
+    def wait_estimate(self, condition, what: str) -> Estimate:
+        return self.user.wait(lambda: [e for e in self.estimates[-50:] if condition(e)], what)[-1]
 
 
 def told_parameters(user, node: str):
@@ -406,14 +406,11 @@ def told_parameters(user, node: str):
     messages = user.record(f'{node}/parameters', String, LATCHED)
 
     def wait(condition=lambda values: True) -> dict:
-        found = []
-
-        def look() -> bool:
+        def told() -> list[dict]:
             texts = [published.message.data for published in messages[-1:]]
-            found[:] = [loads(text, node, ESTIMATOR_PARAMETERS) for text in texts]
-            return bool(found) and condition(found[0])
+            found = [loads(text, node, ESTIMATOR_PARAMETERS) for text in texts]
+            return [values for values in found if condition(values)]
 
-        user.wait(look, 'parameters on their topic')
-        return found[0]
+        return user.wait(told, 'parameters on their topic')[0]
 
     return wait
