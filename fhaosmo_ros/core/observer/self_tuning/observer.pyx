@@ -14,8 +14,8 @@ from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
     samples_since_jump, shift, watch
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    BANDS, COLOURS, COUNT, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, IN_BAND, KINDS, Line,
-    MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
+    BANDS, COLOURS, COUNT, DECAY, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, Line, MOST_ORDER,
+    MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     CALM_SAMPLES, EXACT, ROUNDED, STEADY, fill_noise, find_knowing, follow_differences,
@@ -328,9 +328,7 @@ cdef class SelfTuning(Structure):
         cdef bint changed
         if not same:
             for g in range(HALF):  # kappa does not depend on k
-                m.decayed[g] = (
-                    m.decayed[g - KINDS] if GRID.order[g] > 0 else exp(-m.kappa[g] * h)
-                )
+                m.decayed[g] = m.decayed[g - 1] if GRID.order[g] > 0 else exp(-m.kappa[g] * h)
             for c in range(COLOURS):
                 of_colours[c] = exp(-h / m.tau[GRID.first[c]]) if c > 0 else 0.0
             for g in range(HALF, COUNT):
@@ -354,9 +352,9 @@ cdef class SelfTuning(Structure):
                 slowed, pow(shared.first_noise / m.used_noise[c], 0.5 / (self.order + 1))
             )
         for c in range(BANDS):
-            g = HALF + c * IN_BAND
-            if m.kappa[g] / GRID.ratio[g] * slowed * shared.unsettled < LONG:
-                moving += IN_BAND
+            g = HALF + c * ORDERS
+            if m.kappa[g] / DECAY * slowed * shared.unsettled < LONG:
+                moving += ORDERS
         shared.moving = min((moving + EVEN - 1) // EVEN * EVEN, HALF)
 
     cdef void carry_flow(self, double h, const double* u, bint same) noexcept nogil:
