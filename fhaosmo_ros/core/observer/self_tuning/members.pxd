@@ -4,10 +4,11 @@
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 
 cdef enum:
-    ORDERS = 4  # members have k = 0, 1, 2, 3 derivatives of d
-    BANDS = 30  # bandwidths omega of the members of each k
+    ORDERS = 4  # d and its derivatives, of the members that have them
+    IN_BAND = 3  # members of each bandwidth: k = 0, 1, 3
+    BANDS = 40  # bandwidths omega of the members of each k
     COLOURS = 4  # colours of the noise; the first is white
-    HALF = BANDS * ORDERS  # members with white noise, and with coloured noise
+    HALF = BANDS * IN_BAND  # members with white noise, and with coloured noise
     COUNT = 2 * HALF
     MOST_ORDER = 12
     MOST_STATES = MOST_ORDER + ORDERS

@@ -14,8 +14,8 @@ from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
     samples_since_jump, shift, watch
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    BANDS, COLOURS, COUNT, DECAY, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, Line, MOST_ORDER,
-    MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
+    BANDS, COLOURS, COUNT, DECAY, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, IN_BAND, Line,
+    MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     CALM_SAMPLES, EXACT, ROUNDED, STEADY, fill_noise, find_knowing, follow_differences,
@@ -352,9 +352,9 @@ cdef class SelfTuning(Structure):
                 slowed, pow(shared.first_noise / m.used_noise[c], 0.5 / (self.order + 1))
             )
         for c in range(BANDS):
-            g = HALF + c * ORDERS
+            g = HALF + c * IN_BAND
             if m.kappa[g] / DECAY * slowed * shared.unsettled < LONG:
-                moving += ORDERS
+                moving += IN_BAND
         shared.moving = min((moving + EVEN - 1) // EVEN * EVEN, HALF)
 
     cdef void carry_flow(self, double h, const double* u, bint same) noexcept nogil:

@@ -5,7 +5,7 @@ from libc.math cimport M_PI, NAN, cos, exp, floor as floor_of, fmin, isfinite, l
 
 from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    BANDS, BAND_STEP, COLOURS, COUNT, GRID, HALF, Members, ORDERS, Shared, Work, entry, fill,
+    BANDS, BAND_STEP, COLOURS, COUNT, GRID, HALF, IN_BAND, Members, ORDERS, Shared, Work, entry, fill,
     largest, power
 )
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
@@ -100,7 +100,7 @@ cdef void shift(const double* weight, double slider, double* shown) noexcept nog
     for g in range(COUNT):
         shown[g] = 0.0
     for g in range(COUNT):
-        band, quicker = GRID.band[g], -ORDERS if g < HALF else ORDERS
+        band, quicker = GRID.band[g], -IN_BAND if g < HALF else IN_BAND
         for j in range(2):
             shown[g + (min(max(band + whole + j, 0), BANDS - 1) - band) * quicker] += (
                 weight[g] * (part if j else 1.0 - part)
