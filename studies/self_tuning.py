@@ -22,12 +22,12 @@ import numpy as np
 from scipy.linalg import expm
 from studies.harness import Floats, Found, Results, run_study
 
-BANDWIDTHS = np.geomspace(6e-4, 3.0, 15)
+BANDWIDTHS = np.geomspace(6e-4, 3.0, 40)
 """How fast the d of a member is, rad a sample."""
-DERIVATIVES = (0, 1, 2, 3)
+DERIVATIVES = (0, 1, 3)
 """How smooth: d is white noise, integrated so many times and once more."""
-DECAYS = (0.1, 0.6), (0.1, 1.5)
-"""How soon it forgets, as parts of the bandwidth: of every second one, and of those between."""
+DECAY = 0.1
+"""How soon it forgets, as a part of the bandwidth."""
 FIRST = 50
 """Samples that tell the noise before the filters begin."""
 MEMORY, NOISE_MEMORY = 8000.0, 1000
@@ -48,7 +48,7 @@ class Estimates(NamedTuple):
     d: Floats
     deviation: Floats  # standard deviation of the error of d
     noise: Floats  # standard deviation of the noise on y
-    weights: Floats  # (K, 15) of the members of each bandwidth
+    weights: Floats  # (K, 40) of the members of each bandwidth
 
 
 def estimate(model: Floats, y: Floats, period: float) -> Estimates:
@@ -65,10 +65,7 @@ def estimate(model: Floats, y: Floats, period: float) -> Estimates:
 
     """
     first_noise = noise_of(y[:FIRST], len(model) + 1)
-    members = [
-        (omega / period, share * omega / period, k)
-        for j, omega in enumerate(BANDWIDTHS) for k in DERIVATIVES for share in DECAYS[j % 2]
-    ]  # fmt: skip
+    members = [(omega / period, k) for omega in BANDWIDTHS for k in DERIVATIVES]
     steps = [member(model, period, first_noise**2, *values) for values in members]
     transition, driven, covariance = (np.array(parts) for parts in zip(*steps, strict=True))
     n, d = len(model), len(model)  # d is the state behind z
@@ -109,16 +106,16 @@ def estimate(model: Floats, y: Floats, period: float) -> Estimates:
 
 
 def member(
-    model: Floats, period: float, noise: float, omega: float, kappa: float, k: int
+    model: Floats, period: float, noise: float, omega: float, k: int
 ) -> tuple[Floats, Floats, Floats]:
     """
     Return transition, covariance of what drives it over one period, and first covariance.
 
-    (D + kappa)^(k + 1) d is white noise, as intense as makes omega the filter's bandwidth. States
+    (D + kappa)^(k + 1) d is white noise, kappa = DECAY omega, as intense as makes omega the filter's bandwidth. States
     are z, d, (D + kappa) d, .., with zeros behind the last one that the member has. The first
     covariance of d is its stationary one. By Van Loan (1978), doi:10.1109/TAC.1978.1101743.
     """
-    n, size = len(model), len(model) + max(DERIVATIVES) + 1
+    n, size, kappa = len(model), len(model) + max(DERIVATIVES) + 1, DECAY * omega
     a, q = np.zeros((size, size)), np.zeros((size, size))
     a[:n, :n] = model
     a[n - 1, n] = 1.0

@@ -66,7 +66,7 @@ def damaged(change):
     ('regular', -1), ('frozen', 2), ('latest', 2**63), ('latest', 0.5), ('latest', 'x'),
     ('mean_interval', -1.0), ('mean_interval', np.nan), ('held_y', np.inf), ('z_hat', np.zeros(3)),
     ('z_hat', np.full(4, np.nan)), ('past_pieces', np.full((512, 2), np.inf)), ('u', np.zeros(2)),
-    ('past_latest', None), ('version', 3), ('spread', 0.0),
+    ('past_latest', None), ('version', 2), ('spread', 0.0),
 ])  # fmt: skip
 def test_a_number_that_can_not_be_is_refused_and_changes_nothing(name, number):
     estimator = OnlineEstimator(LATE)

@@ -4,11 +4,10 @@
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 
 cdef enum:
-    ORDERS = 4  # members have k = 0, 1, 2, 3 derivatives of d
-    BANDS = 15  # bandwidths omega of the members of each k
+    ORDERS = 4  # d and its derivatives, of the members that have them
+    IN_BAND = 3  # members of each bandwidth: k = 0, 1, 3
+    BANDS = 40  # bandwidths omega of the members of each k
     COLOURS = 4  # colours of the noise; the first is white
-    KINDS = 2  # members of each bandwidth and k in each half: kappa differs, or the colour
-    IN_BAND = ORDERS * KINDS
     HALF = BANDS * IN_BAND  # members with white noise, and with coloured noise
     COUNT = 2 * HALF
     MOST_ORDER = 12
@@ -26,7 +25,6 @@ cdef struct Grid:
     int band[COUNT]  # number of the bandwidth, from the slowest
     double bandwidth[COUNT]  # omega (rad a sample)
     int order[COUNT]  # k
-    double ratio[COUNT]  # kappa / omega
     int colour[COUNT]  # of the noise, 0: white
     int white[COUNT]  # the first member with white noise of the same bandwidth and k
     int first[COLOURS]  # first member of each colour
@@ -155,6 +153,7 @@ cdef struct Members:
 
 
 cdef Grid GRID
+cdef double DECAY  # kappa / omega
 cdef double BAND_STEP  # omega of a band over that of the next slower one
 
 cdef inline int pair(int i, int j) noexcept nogil:

@@ -2,7 +2,7 @@
 """
 The members of the self-tuning observer: which they are, and what they remember (D 26).
 
-A member is an observer with its own model of d (D 17: k = 0 to 3 derivatives, intensity q,
+A member is an observer with its own model of d (D 17: k = 0, 1 or 3 derivatives, intensity q,
 decay kappa) and of the noise (white, or coloured: v_j = a v_{j-1} + w_j). All have n + 4 states,
 of which those of derivatives that a model does not have stay 0. Each quantity is a line of one
 number a member, so that a step of all members is a few long loops that the compiler turns into
@@ -18,11 +18,10 @@ from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 import numpy as np
 
 SLOWEST, QUICKEST = 6e-4, 3.0  # range of the bandwidths (rad a sample)
-# kappa / omega of the members of every second bandwidth, and of the others; with coloured noise it
-# is the first of two.
-DECAYS = [[0.1, 0.6], [0.1, 1.5]]
+DERIVATIVES = [0, 1, ORDERS - 1]  # k of the members of each bandwidth
+cdef double DECAY = 0.1
 CORRELATIONS = [0.0, 0.75, 0.92, 0.98]  # a of the colours of the noise
-COLOURED = [[1, 3], [1, 2]]  # colours of the members, by bandwidths as `DECAYS`
+COLOURED = [1, 3, 1, 2]  # of the members of four bandwidths in turn
 cdef enum:
     LANES = 24  # numbers that are compared side by side
 
@@ -30,17 +29,15 @@ cdef enum:
 def fill_grid():
     """Write which the members are."""
     global BAND_STEP
-    cdef int g, band, kind
+    cdef int g, band
     BAND_STEP = (QUICKEST / SLOWEST) ** (1.0 / (BANDS - 1))
     bandwidths = np.geomspace(SLOWEST, QUICKEST, BANDS)
     for g in range(COUNT - 1, -1, -1):
-        band, kind = g // IN_BAND, g % KINDS
-        band = BANDS - 1 - band if g < HALF else band - BANDS
+        band = BANDS - 1 - g // IN_BAND if g < HALF else g // IN_BAND - BANDS
         GRID.band[g], GRID.bandwidth[g] = band, bandwidths[band]
-        GRID.order[g] = g // KINDS % ORDERS
-        GRID.white[g] = HALF - IN_BAND * (1 + band) + KINDS * GRID.order[g]
-        GRID.colour[g] = 0 if g < HALF else COLOURED[band % 2][kind]
-        GRID.ratio[g] = DECAYS[band % 2][kind if g < HALF else 0]
+        GRID.order[g] = DERIVATIVES[g % IN_BAND]
+        GRID.white[g] = HALF - IN_BAND * (1 + band) + g % IN_BAND
+        GRID.colour[g] = 0 if g < HALF else COLOURED[band % 4]
         GRID.first[GRID.colour[g]] = g
     for g in range(COLOURS):
         GRID.correlation[g] = CORRELATIONS[g]
@@ -55,10 +52,10 @@ cdef VECTORISED fill(double* values, const double* of_colours) noexcept nogil:
     cdef double white = of_colours[0]
     for g in range(HALF):
         values[g] = white
-    for g in range(HALF, HALF + 2 * IN_BAND):
+    for g in range(HALF, HALF + 4 * IN_BAND):
         values[g] = of_colours[GRID.colour[g]]
-    for g in range(HALF + 2 * IN_BAND, COUNT):  # the colours are those of two bands before
-        values[g] = values[g - 2 * IN_BAND]
+    for g in range(HALF + 4 * IN_BAND, COUNT):  # the colours are those of four bands before
+        values[g] = values[g - 4 * IN_BAND]
 
 
 cdef double largest(const double* values, Py_ssize_t count) noexcept nogil:
@@ -127,4 +124,4 @@ cdef void find_tuning(Members* m, double* found) noexcept nogil:
         bands += w * GRID.band[g]
         found[3 + GRID.order[g]] += w
     found[0], found[1] = sqrt(variance), correlation
-    found[2] = m.kappa[HALF] / GRID.ratio[HALF] * exp(bands * log(BAND_STEP))
+    found[2] = m.kappa[HALF] / DECAY * exp(bands * log(BAND_STEP))

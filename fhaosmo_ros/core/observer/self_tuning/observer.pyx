@@ -14,7 +14,7 @@ from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
     samples_since_jump, shift, watch
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    BANDS, COLOURS, COUNT, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, IN_BAND, KINDS, Line,
+    BANDS, COLOURS, COUNT, DECAY, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, IN_BAND, Line,
     MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
@@ -328,9 +328,7 @@ cdef class SelfTuning(Structure):
         cdef bint changed
         if not same:
             for g in range(HALF):  # kappa does not depend on k
-                m.decayed[g] = (
-                    m.decayed[g - KINDS] if GRID.order[g] > 0 else exp(-m.kappa[g] * h)
-                )
+                m.decayed[g] = m.decayed[g - 1] if GRID.order[g] > 0 else exp(-m.kappa[g] * h)
             for c in range(COLOURS):
                 of_colours[c] = exp(-h / m.tau[GRID.first[c]]) if c > 0 else 0.0
             for g in range(HALF, COUNT):
@@ -355,7 +353,7 @@ cdef class SelfTuning(Structure):
             )
         for c in range(BANDS):
             g = HALF + c * IN_BAND
-            if m.kappa[g] / GRID.ratio[g] * slowed * shared.unsettled < LONG:
+            if m.kappa[g] / DECAY * slowed * shared.unsettled < LONG:
                 moving += IN_BAND
         shared.moving = min((moving + EVEN - 1) // EVEN * EVEN, HALF)
 

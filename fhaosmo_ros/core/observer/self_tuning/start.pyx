@@ -6,8 +6,8 @@ from libc.string cimport memset
 
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    COLOURS, COUNT, DIFFERENCES, Estimates, FIRST_SAMPLES, GRID, HALF, Line, Members, ORDERS,
-    Shared, factorial, pair, power
+    COLOURS, COUNT, DECAY, DIFFERENCES, Estimates, FIRST_SAMPLES, GRID, HALF, Line, Members,
+    ORDERS, Shared, factorial, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
     CALM_SAMPLES, EXACT, LATTICE_SHARE, ROUNDED, follow_differences, is_multiple
@@ -191,7 +191,7 @@ cdef void begin(Members* m, double noise) noexcept nogil:
         m.used_noise[c] = noise * noise
     for g in range(COUNT):
         c, omega = GRID.colour[g], GRID.bandwidth[g] / period
-        m.kappa[g], m.correlation[g] = GRID.ratio[g] * omega, GRID.correlation[c]
+        m.kappa[g], m.correlation[g] = DECAY * omega, GRID.correlation[c]
         m.tau[g] = -period / log(GRID.correlation[c]) if c > 0 else 0.0
     memset(m.difference, 0, sizeof(m.difference))
     shared.roughness, shared.calm = 1.0, CALM_SAMPLES + 1.0
