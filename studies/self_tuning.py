@@ -111,9 +111,10 @@ def member(
     """
     Return transition, covariance of what drives it over one period, and first covariance.
 
-    (D + kappa)^(k + 1) d is white noise, kappa = DECAY omega, as intense as makes omega the filter's bandwidth. States
-    are z, d, (D + kappa) d, .., with zeros behind the last one that the member has. The first
-    covariance of d is its stationary one. By Van Loan (1978), doi:10.1109/TAC.1978.1101743.
+    (D + kappa)^(k + 1) d is white noise, kappa = DECAY omega, as intense as makes omega the
+    filter's bandwidth. States are z, d, (D + kappa) d, .., with zeros behind the last one that the
+    member has. The first covariance of d is its stationary one. By Van Loan (1978),
+    doi:10.1109/TAC.1978.1101743.
     """
     n, size, kappa = len(model), len(model) + max(DERIVATIVES) + 1, DECAY * omega
     a, q = np.zeros((size, size)), np.zeros((size, size))

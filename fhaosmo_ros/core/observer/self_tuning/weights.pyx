@@ -5,8 +5,8 @@ from libc.math cimport M_PI, NAN, cos, exp, floor as floor_of, fmin, isfinite, l
 
 from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    BANDS, BAND_STEP, COLOURS, COUNT, GRID, HALF, IN_BAND, Members, ORDERS, Shared, Work, entry, fill,
-    largest, power
+    BANDS, BAND_STEP, COLOURS, COUNT, GRID, HALF, IN_BAND, Members, ORDERS, Shared, Work, entry,
+    fill, largest, power
 )
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 from fhaosmo_ros.core.observer.structure cimport GATE
