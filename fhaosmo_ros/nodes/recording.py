@@ -76,11 +76,6 @@ class PrivateNode:
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
-    def check(self) -> None:
-        """Raise what a callback has raised: nothing else happens since."""
-        if self._spinner.error is not None:
-            raise self._spinner.error
-
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
         """Ask another node to change parameters; what it answers is not waited for."""
         changes = [Parameter(name, value=value) for name, value in values.items()]
@@ -164,13 +159,28 @@ class TopicRecorder(PrivateNode):
         self._topics = {resolved(name) for name in [*topics, *(OF_NODES if nodes else ())]}
         self._begin = time_ns()
         self._seen: set[str] = set()
+        self._failed: OSError | None = None
 
     def __enter__(self) -> 'TopicRecorder':
         self._discover()
         self.node.create_timer(DISCOVERY_PERIOD, self._discover)
-        self.node.create_timer(FLUSH_PERIOD, self._bag.flush)
+        self.node.create_timer(FLUSH_PERIOD, lambda: self._write(self._bag.flush))
         super().__enter__()
         return self
+
+    def check(self) -> None:
+        """Raise what ended the recording: of the system, such as a full disk, or of a callback."""
+        if error := self._failed or self._spinner.error:
+            raise error
+
+    def _write(self, write: Callable[..., Any], *arguments: Any) -> Any:
+        """Write until that fails: rclpy would print the stack of what a callback raises."""
+        if self._failed is None:
+            try:
+                return write(*arguments)
+            except OSError as error:
+                self._failed = error
+        return None
 
     def _discover(self) -> None:
         inputs = self._inputs()
@@ -192,7 +202,7 @@ class TopicRecorder(PrivateNode):
                 continue
             offered = [_plain(p) for p in profiles]
             different = [qos for k, qos in enumerate(offered) if qos not in offered[:k]]
-            if not self._bag.add(topic, types[0], qos=different):
+            if self._write(self._bag.add, topic, types[0], different) is False:
                 self.problems.append(f'{topic}: the bag will lack the definition of its type')
             self._subscribe(topic, kind, profiles, measured=topic in inputs)
 
@@ -230,7 +240,8 @@ class TopicRecorder(PrivateNode):
                 number = 2**63
             latest = max(latest, number)
             stamp = info['source_timestamp'] or info['received_timestamp']
-            self._bag.write(topic, stamp if stamp >= earliest else self._begin, data)
+            stamp = stamp if stamp >= earliest else self._begin
+            self._write(self._bag.write, topic, stamp, data)
             self.counts[topic] += 1
 
         subscribe_with_info(self.node, kind, topic, receive, qos, raw=True)

@@ -76,8 +76,8 @@ class BagWriter:
         self,
         topic: str,
         message_type: str,
-        types: Any = TYPES,
         qos: Sequence[dict[str, Any]] = (OFFERED_QOS,),
+        types: Any = TYPES,
         digest: str = '',
     ) -> bool:
         """Add a topic if the bag lacks it; return False if its type has no definition here."""
@@ -169,7 +169,7 @@ class BagWriter:
         """Copy every topic as it is."""
         for c in reader.connections:
             qos = dump_qos_v9(c.ext.offered_qos_profiles)
-            self.add(c.topic, c.msgtype, reader.types, qos, c.digest)
+            self.add(c.topic, c.msgtype, qos, reader.types, c.digest)
         for topic, stamp, data, published in reader.messages():
             self.write(topic, stamp, data, published)
 
