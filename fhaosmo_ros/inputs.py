@@ -48,9 +48,15 @@ def with_joints(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def measured_output(values: Mapping[str, Any], channel: str = '') -> Input:
     """
-    Return what y is by the parameters of a channel, with defaults for those that are absent.
+    Return what y is.
 
-    `channel` is its name, '' without named channels.
+    Parameters
+    ----------
+    values : mapping
+        Parameters of the channel; defaults for those that are absent.
+    channel : str
+        Its name, '' without named channels.
+
     """
     topic, kind, field, stamp = (
         _value(values, f'input_{part}') for part in ('topic', 'type', 'field', 'stamp')
@@ -66,9 +72,19 @@ def known_inputs(
     """
     Return what the known inputs are, by their names in the model.
 
-    `names` are those that it uses, such as ``['u']``; the rest is as for `measured_output`. Raises
-    ConfigurationError for a list with neither one entry nor one for each known input, and for
-    inputs by their header's stamp where y is not.
+    Parameters
+    ----------
+    values, channel
+        As for `measured_output`.
+    names : sequence of str
+        Of the known inputs that the model uses, such as ``['u']``.
+
+    Raises
+    ------
+    ConfigurationError
+        A list with neither one entry nor one for each known input, or inputs by their header's
+        stamp where y is not.
+
     """
     stamps, by = CHANNEL_PARAMETERS['known_input_stamps'], _value(values, 'input_stamp')
     given = _value(values, stamps.name)
@@ -92,8 +108,17 @@ def make_pairing(
     """
     Return what pairs known inputs with samples by their headers' stamps; None without such inputs.
 
-    `values` are parameters of the channel, `names` all known inputs of the model, `known` those
-    that it uses, and `held` what they all are before the first ones come.
+    Parameters
+    ----------
+    values : mapping
+        Parameters of the channel.
+    names : sequence of str
+        All known inputs of the model.
+    known : mapping of str to Input
+        Those that it uses.
+    held : sequence of float
+        What they are before the first ones come.
+
     """
     by_stamp = [name in known and known[name].stamp == 'header' for name in names]
     if not any(by_stamp):

@@ -100,7 +100,11 @@ class PrivateNode:
         """
         Return a function that publishes messages in CDR.
 
-        Raises LookupError if the message type is not installed here.
+        Raises
+        ------
+        LookupError
+            The message type is not installed here.
+
         """
         qos = QoSProfile(depth=PLAYED_DEPTH)
         if transient_local:

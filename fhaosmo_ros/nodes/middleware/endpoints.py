@@ -66,8 +66,14 @@ def check_overrides(node: Node, given: Mapping[str, Any], topics: Iterable[str])
     """
     Raise for QoS overrides that rclpy would ignore, or refuse with an unclear message.
 
-    `given` is all that files and the command line set, `topics` are all that the node makes by
-    `create_publisher`.
+    Parameters
+    ----------
+    node : Node
+    given : mapping
+        All that files and the command line set.
+    topics : iterable of str
+        All topics that the node makes by `create_publisher`.
+
     """
     names = [full_name(node, topic) for topic in topics]
     policies = {policy.name.lower(): allowed for policy, allowed in POLICIES.items()}

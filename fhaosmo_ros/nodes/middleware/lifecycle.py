@@ -20,8 +20,13 @@ class ManagedNode(LifecycleNode, TimedNode):
 
     A transition fails if `configure`, `activate` or `deactivate` of a subclass raises. All
     publishers, subscriptions, services and timers that were made since `configure` began are
-    destroyed by the transition cleanup, and if `configure` fails. `state` is unconfigured,
-    inactive, active or finalized.
+    destroyed by the transition cleanup, and if `configure` fails.
+
+    Attributes
+    ----------
+    state : str
+        unconfigured, inactive, active or finalized.
+
     """
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -53,7 +58,15 @@ class ManagedNode(LifecycleNode, TimedNode):
                 destroy(entity)
 
     def start(self) -> None:
-        """Configure and activate at once; raise what one of them raised."""
+        """
+        Configure and activate at once.
+
+        Raises
+        ------
+        Exception
+            What `configure` or `activate` raised.
+
+        """
         for transition in (self.trigger_configure, self.trigger_activate):
             if transition() != SUCCESS:
                 assert self._error is not None

@@ -116,9 +116,21 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
     rclpy's own signal handlers are off: SIGINT would come out of the events executor as a
     RuntimeError, and a second Ctrl-C would cut the clean-up short.
 
-    `factory` makes the node, called `name`, out of the parameters that are given; `argv` are the
-    arguments of the process by default. Returns the exit code: 0 after a signal, 1 if a callback
-    failed, 2 for a bad configuration (said in one line on stderr).
+    Parameters
+    ----------
+    name : str
+        estimator or plant.
+    factory : callable
+        Makes the node out of the parameters that are given.
+    argv : list of str or None
+        None for the arguments of the process.
+
+    Returns
+    -------
+    int
+        Exit code: 0 after a signal, 1 if a callback failed, 2 for a bad configuration (said in
+        one line on stderr).
+
     """
     argv = sys.argv[1:] if argv is None else argv
     if text := help_of(name, argv):

@@ -27,9 +27,20 @@ def recorded_parameters(reader: BagReader, name: str | None = None) -> Recorded 
     """
     Return an estimator's parameters at the begin of the bag, or None if the bag lacks them.
 
-    Later live changes are not among them. `name` is the node's, followed by the channel's if it
-    has channels; by default, it is the only node in the bag that has published its parameters, if
-    it has no channels. Raises ConfigurationError if they are not parameters of this version.
+    Later live changes are not among them.
+
+    Parameters
+    ----------
+    reader : BagReader
+    name : str, optional
+        Name of the estimator: its node's, followed by the channel's if it has channels. Default:
+        the only node in the bag that has published its parameters, if it has no channels.
+
+    Raises
+    ------
+    ConfigurationError
+        They are not parameters of this version.
+
     """
     topics = {
         c.topic

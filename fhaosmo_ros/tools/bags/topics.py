@@ -41,7 +41,11 @@ def series(path: Path, topic: str) -> Series:
     """
     Read a topic of numbers; empty arrays if it has no message.
 
-    Raises ConfigurationError if its messages have lists of different lengths.
+    Raises
+    ------
+    ConfigurationError
+        Its messages have lists of different lengths.
+
     """
     stamps, values = [np.zeros(0, np.int64)], []
     labels: list[str] = []
@@ -72,8 +76,17 @@ def read_ticks(path: Path, name: str, parts: Sequence[str]) -> dict[str, NDArray
     """
     Return the values of an estimator's topics, a row for each tick that all of them have.
 
-    A tick is what the estimator publishes for one sample: a message on each topic, `parts` below
-    its name, of which the last one is published last.
+    A tick is what the estimator publishes for one sample: a message on each topic.
+
+    Parameters
+    ----------
+    path : path
+        A bag.
+    name : str
+        Name of the estimator.
+    parts : sequence of str
+        Topics below it; the last one is published last.
+
     """
     ticks = series(path, f'{name}/{parts[-1]}').stamps
     whole = np.ones(len(ticks), bool)
@@ -108,9 +121,22 @@ def truth_at(bag: Path, plant: str, when: NDArray[np.int64]) -> Series | None:
     Return the truth that belongs to samples of y.
 
     The plant publishes y, then its states, then d. So the truth of a sample is the first message
-    after it, unless that comes so late that it is another sample's. `plant` is the node's full
-    name, `when` has the (K,) stamps of the samples (ns). The result is z_1 .. z_n and d at `when`,
-    a row of NaN where the bag lacks them; None if it has no message of one of the topics.
+    after it, unless that comes so late that it is another sample's.
+
+    Parameters
+    ----------
+    bag : Path
+    plant : str
+        Full name of the node.
+    when : (K,) array
+        Stamps of the samples in nanoseconds.
+
+    Returns
+    -------
+    Series or None
+        z_1 .. z_n and d at `when`; a row of NaN where the bag lacks them. None if it has no
+        message of one of the topics.
+
     """
     columns = []
     labels: list[str] = []

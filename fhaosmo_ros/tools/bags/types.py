@@ -47,9 +47,14 @@ def serialise(message_type: str, **fields: Any) -> bytes:
 
 def with_numbers(message: bytes, numbers: NDArray[Any]) -> NDArray[np.uint8]:
     """
-    Return a message for each row of numbers, (K,) or (K, m), all at once: bytes, (K, size).
+    Return a message for each row of numbers, (K, size), all at once.
 
-    `message` is one in CDR; it ends with numbers of the same type, which those of a row replace.
+    Parameters
+    ----------
+    message : bytes
+        In CDR; it ends with the numbers, of the same type, which those of a row replace.
+    numbers : (K,) or (K, m) array
+
     """
     rows = np.ascontiguousarray(numbers).reshape(len(numbers), -1)
     ends = rows.view(np.uint8).reshape(len(rows), -1)

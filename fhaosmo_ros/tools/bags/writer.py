@@ -111,9 +111,17 @@ class BagWriter:
 
     def write(self, topic: str, stamp: int, data: bytes, published: int | None = None) -> None:
         """
-        Append one message in CDR, with its stamp in nanoseconds.
+        Append one message in CDR.
 
-        Its publish time, which mcap keeps beside, is the stamp unless it is given.
+        Parameters
+        ----------
+        topic : str
+        stamp : int
+            In nanoseconds.
+        data : bytes
+        published : int, optional
+            Publish time, which mcap keeps beside the stamp; default: the stamp.
+
         """
         channel, sent = self._channels[topic], stamp if published is None else published
         self._rows.append((channel, stamp, len(self._data)))
@@ -129,8 +137,13 @@ class BagWriter:
         """
         Append a message of each topic at each time, all at once.
 
-        `times` are K stamps in nanoseconds, `columns` topics with the bytes of their messages in
-        CDR, (K, size).
+        Parameters
+        ----------
+        times : (K,) array of int
+            In nanoseconds.
+        columns : sequence of (str, (K, size) array)
+            Topics, and the bytes of their messages in CDR.
+
         """
         self.flush()
         stamps = times.astype('<i8').view(np.uint8).reshape(len(times), -1)

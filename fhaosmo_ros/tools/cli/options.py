@@ -61,10 +61,19 @@ def channel_parameters(
     arguments: argparse.Namespace, recorded: Recorded | None = None
 ) -> dict[str, Any]:
     """
-    Return the parameters of a channel from the options: what files and -p change in `recorded`.
+    Return the parameters of a channel from the options.
 
-    Raises ConfigurationError for a file or a value that can't be used, by itself or together with
-    the others.
+    Parameters
+    ----------
+    arguments : Namespace
+    recorded : Recorded, optional
+        What files and -p change.
+
+    Raises
+    ------
+    ConfigurationError
+        A file or a value that can't be used, by itself or together with the others.
+
     """
     values: dict[str, Any] = {}
     origins: dict[str, Path | str | None] = {}
@@ -106,7 +115,11 @@ def assigned(rules: Sequence[str], table: ParameterTable) -> dict[str, Any]:
     """
     Return the values that NAME:=VALUE rules set, checked by a table.
 
-    Raises ConfigurationError for a rule that is none, an unknown name, or a bad value.
+    Raises
+    ------
+    ConfigurationError
+        A rule that is none, an unknown name, or a bad value.
+
     """
     values = dict(_rules(rules))
     for name in values:

@@ -56,8 +56,13 @@ def read_run(bag: Path) -> Run:
     Read the bag of a demonstration.
 
     Each estimate is compared with the truth of the sample behind it (``~/stamp``), not with that
-    of the moment at which it was published. Raises ConfigurationError if the bag holds no estimate
-    with its truth.
+    of the moment at which it was published.
+
+    Raises
+    ------
+    ConfigurationError
+        The bag holds no estimate with its truth.
+
     """
     y = series(bag, '/y')
     with BagReader(bag) as reader:

@@ -45,7 +45,11 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
     """
     Read the estimates of some estimators, or of all that a bag holds.
 
-    Raises ConfigurationError if it is not a bag, or holds no estimates.
+    Raises
+    ------
+    ConfigurationError
+        It is not a bag, or it holds no estimates.
+
     """
     with BagReader(path) as reader:
         topics = {c.topic for c in reader.connections if c.msgcount}

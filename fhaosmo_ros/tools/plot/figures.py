@@ -48,7 +48,14 @@ def save_curves(curves: list[Curves], path: Path) -> None:
     Write a figure of several estimates laid one over another.
 
     From top to bottom: a row for each state, for d, for gamma if an estimate has it, and for the
-    innovations of the first estimate. The suffix of the path names the format.
+    innovations of the first estimate.
+
+    Parameters
+    ----------
+    curves : list of Curves
+    path : path
+        Its suffix names the format.
+
     """
     first, names = curves[0], max((c.names for c in curves), key=len)
     gamma = ['gamma'] if any(c.gamma is not None for c in curves) else []

@@ -44,8 +44,13 @@ def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> st
     """
     Return the name of the estimator to follow: the one given, or the only one in the bag.
 
-    Where several channels have snapshots, `channel` chooses. Raises ConfigurationError if the one
-    given has no snapshots in the bag, or if none is given and there are several.
+    Where several channels have snapshots, `channel` chooses.
+
+    Raises
+    ------
+    ConfigurationError
+        The one given has no snapshots in the bag, or none is given and there are several.
+
     """
     found = sorted(
         c.topic.removesuffix(f'/{SNAPSHOT}')
@@ -71,9 +76,19 @@ def read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[Ev
     """
     Return the events of a live estimator in order.
 
-    `name` is the node's full name, followed by the channel's if it has channels; `fixed` are
-    parameters whose live changes are not repeated. Raises UnknownSnapshot if a snapshot is of
-    another version, or damaged.
+    Parameters
+    ----------
+    reader : BagReader
+    name : str
+        Name of the estimator: the node's full name, followed by the channel's if it has channels.
+    fixed : collection of str
+        Parameters whose live changes are not repeated.
+
+    Raises
+    ------
+    UnknownSnapshot
+        A snapshot is of another version, or damaged.
+
     """
     events: list[Event] = []
     changes: dict[str, Any] = {}
@@ -104,8 +119,19 @@ class LiveRun:
     """
     Repeats at an estimator what was done to a live one, at the same samples.
 
-    `name` and `events` are the live one's. `left_out` samples are before the first one that can be
-    followed.
+    Parameters
+    ----------
+    name : str
+        The live estimator's.
+    events : list of Event
+    estimator : OnlineEstimator
+        The one that follows the live one.
+
+    Attributes
+    ----------
+    left_out : int
+        Samples before the first one that can be followed.
+
     """
 
     def __init__(self, name: str, events: list[Event], estimator: OnlineEstimator) -> None:

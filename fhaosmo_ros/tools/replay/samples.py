@@ -23,10 +23,29 @@ class Samples:
     """
     The samples of a bag, and their estimates block by block.
 
-    `live` is what to follow, if anything; `whole` smooths over the whole recording; `watch` is as
-    for `BagReader.samples`. `span` has the seconds from the first sample to the latest, `stamps`
-    where the stamps came from, in words. Raises ConfigurationError if the bag lacks a topic or a
-    field, or has no samples.
+    Parameters
+    ----------
+    estimator : OnlineEstimator
+    live : LiveRun or None
+        The live estimator to follow.
+    inputs : BagInputs
+    whole : bool
+        Smooth over the whole recording.
+    watch : callable
+        See `BagReader.samples`.
+
+    Attributes
+    ----------
+    span : float
+        Seconds from the first sample to the latest.
+    stamps : str
+        Where the stamps came from, in words.
+
+    Raises
+    ------
+    ConfigurationError
+        The bag lacks a topic or a field, or has no samples.
+
     """
 
     def __init__(

@@ -97,8 +97,18 @@ class BagSink:
     The estimator's topics in an open bag: a message on each for every sample.
 
     All messages of a topic have the same length. So they are made a block at a time: the bytes of
-    one, and behind them each sample's numbers. The topics go below `name`; there are `order`
-    states and `levels` innovations; `parameters` are written once, as the node publishes them.
+    one, and behind them each sample's numbers.
+
+    Parameters
+    ----------
+    bag : BagWriter
+    name : str
+        Name below which the topics go.
+    order, levels : int
+        Numbers of states and of innovations.
+    parameters : mapping
+        Parameters of the estimates; written once, as the node publishes them.
+
     """
 
     def __init__(

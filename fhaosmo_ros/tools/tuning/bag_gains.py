@@ -55,8 +55,13 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
     """
     Return the gains of the steady Kalman filter of what was found (D 17 to D 19).
 
-    Raises NothingToFind if there can be no gains, or if the estimate of d would tell nothing;
-    ConfigurationError if there is no such filter in floating-point numbers.
+    Raises
+    ------
+    NothingToFind
+        There can be no gains, or the estimate of d would tell nothing.
+    ConfigurationError
+        There is no such filter in floating-point numbers.
+
     """
     _refuse(found)
     likelihood, design = found.likelihood, found.best.design

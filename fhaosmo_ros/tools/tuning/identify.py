@@ -102,9 +102,21 @@ def identify_input(
     """
     Find the likeliest noise and model of d.
 
-    `given` are those `values` of the estimator that the user set: `noise_size`,
-    `unknown_input_derivatives` and `unknown_input_decay` are not estimated then. Raises
-    NothingToFind if there are no gains for this y.
+    Parameters
+    ----------
+    data : RecordedOutput
+    model : TriangularModel
+    values : Parameters
+        Of the estimator, complete.
+    given : mapping
+        Those of them that the user set: `noise_size`, `unknown_input_derivatives` and
+        `unknown_input_decay` are not estimated then.
+
+    Raises
+    ------
+    NothingToFind
+        There are no gains for this y.
+
     """
     likelihood = _prepared(data, model, values, given)
     decay, orders = given.get('unknown_input_decay') or None, DERIVATIVES

@@ -44,19 +44,33 @@ TUNE_PARAMETERS = ParameterTable(MODEL, SENSOR, SHARED, FAMILY, TUNING)
 class Evaluation(NamedTuple):
     """How good one set of parameters is."""
 
-    # Weighted RMS error relative to the RMS of the truth; geometric mean over the recordings, so
-    # that an error smaller by a tenth counts the same on an easy recording and on a hard one.
     error: float
-    errors: Floats  # (R, n + 1) RMS errors of z_1 .. z_n and d of each recording
+    """
+    Weighted RMS error relative to the RMS of the truth; geometric mean over the recordings, so
+    that an error smaller by a tenth counts the same on an easy recording and on a hard one.
+    """
+    errors: Floats
+    """(R, n + 1) RMS errors of z_1 .. z_n and d of each recording."""
 
 
 class Objective:
     """
     Evaluates parameters of the estimator on recordings, by the node's code.
 
-    The recordings are longer than `settled`; `tuning` are all values of `TUNING`. `scale` has the
-    RMS values that errors are divided by, by default those of the truth of these recordings.
-    Raises ConfigurationError for a recording that is too short, or weights that do not fit.
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Each longer than `settled`.
+    tuning : mapping
+        Of `TUNING`, complete.
+    scale : array, optional
+        RMS values that errors are divided by; by default those of the truth of these recordings.
+
+    Raises
+    ------
+    ConfigurationError
+        A recording that is too short, or weights that do not fit.
+
     """
 
     def __init__(
@@ -86,8 +100,11 @@ class Objective:
         """
         Evaluate parameters of the estimator.
 
-        Raises ConfigurationError as `OnlineEstimator` does, and for parameters of another model
-        than that of the recordings.
+        Raises
+        ------
+        ConfigurationError
+            As `OnlineEstimator`, or parameters of another model than that of the recordings.
+
         """
         estimator = OnlineEstimator(ONLINE_PARAMETERS.part_of(parameters))
         order, states = estimator.observer.order, len(self.scale) - 1

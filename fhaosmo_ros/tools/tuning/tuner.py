@@ -64,9 +64,21 @@ class Tuner:
     """
     A search: where it begins, what is tried, and what comes of it.
 
-    It trains on some recordings, and is judged by those held out. `estimator` is what the user set
-    for the estimator, `tuning` all values of `TUNE_PARAMETERS`. Raises ConfigurationError for
-    parameters that do not fit together, or recordings that do not fit them.
+    Parameters
+    ----------
+    training, held_out : list of Recording
+        To train on, and to judge by.
+    estimator : mapping
+        What the user set for the estimator.
+    tuning : mapping
+        Of `TUNE_PARAMETERS`, complete.
+    seed : int
+
+    Raises
+    ------
+    ConfigurationError
+        Parameters that do not fit together, or recordings that do not fit them.
+
     """
 
     space: list[Dimension]
@@ -139,7 +151,11 @@ class Tuner:
         """
         Return the parameters of the estimator at a point of the space.
 
-        Raises ConfigurationError for values that are out of their bounds, or do not fit together.
+        Raises
+        ------
+        ConfigurationError
+            Values that are out of their bounds, or do not fit together.
+
         """
         changes = _changes(values)
         found = self._fixed | changes
