@@ -83,7 +83,7 @@ class ArmNode(TimedNode):
         self._values = values
         self._arm: Arm | None = None
         self._description = ''
-        self._problem = ''
+        self._problems: dict[str, str] = {}  # of each kind the last one, since the last report
         self._logged: dict[str, float] = {}  # when each kind of problem was, by perf_counter
         self._order: dict[tuple[str, ...], NDArray[np.int64] | None] = {}
         self._counted: dict[str, int] = {}
@@ -138,7 +138,7 @@ class ArmNode(TimedNode):
             self._use(message.data)
         except ConfigurationError as error:
             self._arm = None
-            self._problem = str(error)
+            self._problems['robot'] = str(error)
             self.get_logger().error(str(error))
 
     def _on_sample(self, message: JointState) -> None:
@@ -266,15 +266,16 @@ class ArmNode(TimedNode):
         if now - self._logged.get(kind, -np.inf) > QUIET:
             if len(self._logged) > 100:  # names that change all the time
                 self._logged.clear()
+                self._problems.clear()
             self._logged[kind] = now
             self.get_logger().warning(text)
-        self._problem = text
+        self._problems[kind] = text
 
     def _reports(self) -> list[Report]:
         report = Report('arm')
-        if self._problem:
-            report.find(WARN, self._problem)
-            self._problem = ''
+        for problem in self._problems.values():
+            report.find(WARN, problem)
+        self._problems.clear()
         if self._arm is None:
             report.find(ERROR, f'no robot yet on {self._topic}')
             return [report]
