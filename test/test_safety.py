@@ -187,6 +187,27 @@ def refused(estimator):
     return False
 
 
+@pytest.mark.parametrize('call', [
+    lambda e: e.policy.advance(10**10, 0.1, np.zeros(0)),
+    lambda e: e.policy.advance(10**10, 0.1, np.zeros(3)),
+    lambda e: e.policy.run(STAMPS[:2], Y, np.zeros((len(Y), 1)), False),
+    lambda e: e.policy.run(STAMPS, Y, np.zeros((2, 1)), False),
+    lambda e: e.policy.run(STAMPS, Y, np.zeros((len(Y), 2)), False),
+    lambda e: e.observer.structure.seed([0.1, 0.2]),
+    lambda e: e.policy.configure(
+        Observer({'inputs': ['a', 'b']}).structure, e._settings(e.parameters)
+    ),
+])  # fmt: skip
+@kinds
+def test_compiled_code_takes_no_arrays_of_other_sizes(kind, call):
+    """It reads arrays without looking at their ends: who calls it from Python is refused."""
+    estimator = running(KINDS[kind], 50, 5)
+    before = estimator.state_dict()
+    with pytest.raises(ValueError, match=r'expected|arrays'):
+        call(estimator)
+    np.testing.assert_equal(estimator.state_dict(), before)
+
+
 def test_flags_of_compiled_code_are_those_of_status():
     text = (ROOT / 'fhaosmo_ros' / 'core' / 'observer' / 'status.pxd').read_text()
     found = {name: eval(value) for name, value in re.findall(r'(\w+) = ([\d +]+)', text)}  # noqa: S307

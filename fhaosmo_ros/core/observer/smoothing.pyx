@@ -111,6 +111,8 @@ cdef class Rows:
         """Go on with other parameters of the same model from the next row on."""
         cdef LinearModel linear
         p, n, model = configuration.parameters, configuration.levels, configuration.model
+        if (n, model.order, len(model.inputs)) != (self.n, self.order, self.inputs):
+            raise ValueError('smoothing: the parameters are those of another model')
         if self.tunes:
             linear = LinearModel(model.slopes_at_rest + np.eye(self.order, k=1), 0.0)
         elif p['noise_size'] > 0.0 and p['unknown_input']:
@@ -392,6 +394,8 @@ cdef class Rows:
         cdef bint whole = lag is None
         cdef long long age = 0 if whole else lag
         cdef double[:, :, ::1] out
+        if not first <= end <= self.count:
+            raise ValueError(f'smooth: expected {first} to {self.count}, got {end}')
         out = np.empty((end - first, 1 + self.tunes, self.n))
         for k in range(self.count - 1 if whole else self.new, self.count):
             while due < min(end, k + 1) and (
@@ -428,6 +432,10 @@ cdef class Rows:
     def __setstate__(self, state):
         self.rows, self.done, self.began, self.new, self.memory.spread = state
         self.point, self.count = self.rows, len(self.rows)
+        last = self.rows['last']
+        if not (0 <= self.done <= self.count and self.new >= 0 and (last >= self.order).all()
+                and (last < self.n).all()):
+            raise ValueError('smoothing: numbers of rows or levels that can not be')
 
 
 cdef double usual(const Point* now, int i, int j) noexcept nogil:

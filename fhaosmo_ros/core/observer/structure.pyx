@@ -344,6 +344,8 @@ cdef class Structure:
         """
         cdef int i
         self.enter()
+        if len(values) != self.order + 1:
+            raise ValueError(f'seed: expected {self.order + 1} values, got {len(values)}')
         memset(self.level, 0, sizeof(self.level))
         for i in range(min(self.order + 1, self.levels)):  # derivatives of d, behind it, are 0
             self.level[i].z_hat = values[i]

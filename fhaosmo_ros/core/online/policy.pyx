@@ -63,9 +63,12 @@ cdef class Policy:
 
     def configure(self, Structure structure not None, dict settings):
         """Go on with an observer that has taken over, and with these settings."""
+        cdef Settings new = settings
+        if structure.inputs != self.past.inputs or (new.lag > 0) != self.past.is_late:
+            raise ValueError('policy: expected an observer and a past of the same known inputs')
         if self.structure is not None:
             self.structure.enter()
-        self.structure, self.settings = structure, settings
+        self.structure, self.settings = structure, new
         self.tuner = structure if isinstance(structure, SelfTuning) else None
 
     # One sample
@@ -408,8 +411,14 @@ cdef class Policy:
 
     def advance(self, long long stamp, double y, const double[::1] u):
         """Take a sample with its known inputs, all finite; return the status word."""
-        self.structure.enter()
+        self.check(u.shape[0])
         return self.take(stamp, y, &u[0])
+
+    cdef void check(self, Py_ssize_t inputs) except *:
+        """Raise where another thread runs this, or where there are other known inputs."""
+        self.structure.enter()
+        if inputs != self.structure.inputs:
+            raise ValueError(f'expected {self.structure.inputs} known inputs, got {inputs}')
 
     def run(
         self, const long long[::1] stamps, const double[::1] y, const double[:, ::1] u,
@@ -430,7 +439,9 @@ cdef class Policy:
         cdef long long[::1] times = np.empty(count * watched, dtype=np.int64)
         cdef double[:, ::1] acting = np.empty((count * watched, m))
         cdef const double* inputs
-        structure.enter()
+        self.check(u.shape[1])
+        if not stamps.shape[0] == u.shape[0] == count:
+            raise ValueError('run: arrays of different lengths')
         structure.busy = True
         try:
             with nogil:
