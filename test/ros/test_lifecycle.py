@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimator as a managed node, driven through its services as `ros2 lifecycle` does."""
 
+from fhaosmo_ros.nodes.estimator.node import EstimatorNode
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.signals import SignalHandlerOptions
 from running import ESTIMATES, Estimator, FED, Manager, OK, Parameters, STALE
 from std_srvs.srv import Trigger
 
@@ -37,6 +41,16 @@ def topics(user) -> int:
 def listeners(user) -> list[str]:
     found = user.node.get_subscriptions_info_by_topic('/managed/y')
     return [info.node_name for info in found if info.node_name != 'user']
+
+
+def test_a_destroyed_node_leaves_the_graph_while_its_process_goes_on(user):
+    name, context = ('estimator', '/destroyed'), Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node = EstimatorNode(context=context, namespace=name[1])
+    user.wait(lambda: name in user.node.get_node_names_and_namespaces(), 'node')
+    node.destroy_node()
+    user.wait(lambda: name not in user.node.get_node_names_and_namespaces(), 'end of the node')
+    rclpy.try_shutdown(context=context)
 
 
 def test_life_of_a_node(user, unconfigured, process):

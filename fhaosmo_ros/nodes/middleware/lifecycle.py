@@ -38,6 +38,16 @@ class ManagedNode(LifecycleNode, TimedNode):
         service = next(s for s in self.services if s.service_name.endswith('/change_state'))
         service.callback = self._guarded(service.callback)
 
+    def destroy_node(self) -> None:
+        """
+        Destroy the node, and its state machine, which rclpy 7.1 leaves.
+
+        It would keep the node, and all that the middleware has for it, until the process ends;
+        there Fast DDS may wait for ever.
+        """
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     @abstractmethod
     def configure(self) -> None:
         """Make what the node needs; raise if it is not possible."""
