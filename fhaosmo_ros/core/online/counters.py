@@ -8,7 +8,7 @@ class Counters(NamedTuple):
     """
     Numbers since the estimator was made; a snapshot. A reset does not clear them.
 
-    The policy counts into a struct with these names (samples.pxd).
+    The policy counts into a struct with these names (policy.pyx).
     """
 
     accepted: int = 0

@@ -2,10 +2,10 @@
 """
 The policy of time and of bad data: one function for node, replay and trials.
 
-What it does, case by case, is in docs/node.md; its memory is described in samples.pxd.
+What it does, case by case, is in docs/node.md. Times are in nanoseconds.
 """
 
-from libc.math cimport fabs, fmin, isfinite, isnan
+from libc.math cimport fabs, fmax, fmin, isfinite, isnan, rint
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
@@ -17,10 +17,6 @@ from fhaosmo_ros.core.observer.status cimport (
 )
 from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, Structure
 from fhaosmo_ros.core.online.delay cimport NANOSECONDS, PastInputs
-from fhaosmo_ros.core.online.samples cimport (
-    FAR, WINDOW, Clock, Counters, Course, Sensor, Settings, clock_time, difference, is_held,
-    is_spike, is_stuck, may_have_noise, repeats_noise
-)
 
 import numpy as np
 
@@ -33,6 +29,104 @@ MOST_SUB_STEPS = MOST_STEPS
 # is none to compare it with.
 cdef double MOST_INTERVALS = 500.0, FIRST_GAP = 3.6e12
 GAP_SAMPLES = MOST_INTERVALS
+# Stands for every difference (ns) that an integer may not hold.
+cdef long long FAR = 4_000_000_000_000_000_000
+# A tick is on time if it is off by at most so many intervals of the samples; times follow it by
+# one part in so many, and an interval is the mean of so many ticks.
+cdef double OFF_TICK = 2.0, PULL = 64.0
+cdef long long KNOWN_TICKS = 16, MOST_TICKS = 500
+# A step of y is a multiple of another one up to this, and up to rounding of y to 32 bits.
+cdef double MULTIPLE = 1e-4, SINGLE = 6e-7
+# After so many regular changes y's sensor holds its values; so many are remembered.
+cdef int ENOUGH_REGULAR = 4, MOST_REGULAR = 12
+# A y with noise may repeat itself so often in a row by chance, if it is a float of 32 bits.
+cdef int CHANCE_REPEATS = 2
+# Of late, less than this share of so many of its values were repeated, but for one: at the end of
+# a range it is always the same one.
+cdef double RARELY = 0.05, CHANGES = 50.0
+# So many samples in a row may be rejected by spike_gate.
+cdef int MOST_SPIKES = 5
+
+
+cdef enum:
+    WINDOW = 32  # intervals that a running mean remembers
+
+
+cdef struct Settings:
+    bint nominal  # dt is `period`, whatever the stamps say
+    bint by_clock  # stamps are the node clock's at reception
+    bint to_now  # estimates are carried over the delay
+    long long period  # nominal one
+    long long max_gap  # 0: MOST_INTERVALS usual ones
+    long long stuck_time  # 0: off
+    long long divergence_time  # 0: off
+    long long delay  # of y
+    long long lag  # how much later than the inputs y is known: measurement_delay - input_delay
+    double gate  # a spike is further from its prediction (unit of y); 0: off
+    double limit  # larger samples are rejected, larger states are lost
+    double epsilon  # y is lost while |eps_1| is larger (unit of y)
+
+
+cdef struct Counters:
+    # One for each case of docs/node.md; counters.py says what they mean.
+    long long accepted, rejected_measurements, rejected_spikes, rejected_stuck, rejected_steps
+    long long duplicate_stamps, backward_stamps, zero_stamps, far_stamps, rejected_inputs
+    long long gaps, sub_steps, spread_stamps, bursts, spikes_believed, stuck
+    long long restarts_forward, restarts_backward, divergences, jumps
+
+
+cdef struct Course:
+    # Where the estimator is in the course of the samples.
+    bint frozen  # gamma is held
+    bint valid  # there is an estimate, of the time `stamp`
+    bint timed  # False: the next sample's stamp is of another clock
+    bint held  # a sample far away waits for the next one's word
+    bint lost  # eps_1 is above epsilon, or steps fail
+    long long stamp  # of the latest sample that was used
+    long long latest  # time up to which the observer has been stepped
+    long long now  # the clock that counts nominal periods
+    long long held_stamp
+    long long late_count  # samples in a row that lie before `latest`
+    long long lost_since
+    long long spikes  # rejected by the gate, in a row
+    long long intervals  # number of intervals in the mean
+    double held_y
+    double mean_interval  # running mean of dt (ns)
+    double mean_jitter  # running mean of its deviation (ns)
+    double usual_interval  # longest mean_interval of late; a restart does not forget it (ns)
+
+
+cdef struct Clock:
+    # A clock that may stand still between its ticks.
+    long long tick  # latest reading
+    long long tick_length  # time from the reading before it
+    long long tick_count  # samples at it
+    long long steady  # ticks in a row between which samples came evenly
+    long long placed  # where the latest sample was put
+    double spacing  # of samples at one reading; 0: not known yet
+
+
+cdef struct Sensor:
+    # Whether y's sensor is stuck, or holds its values.
+    bint stuck
+    bint holds  # it holds each value for several samples
+    long long seen  # time of the latest sample, used or not
+    long long changed  # since when y is what it is
+    long long repeats  # samples in a row that repeat the one before
+    long long held_for  # how many of them there usually are
+    long long regular  # evidence that it holds each value for so long
+    double sample  # the latest y, used or not
+    double change  # by what it last differed from the one before
+    double repeated  # the y that has repeated itself last
+    double elsewhere  # share of values of late that repeat themselves, another one each
+
+
+cdef long long difference(long long a, long long b) noexcept nogil:
+    """Return a - b, or +-FAR where that would overflow."""
+    cdef double rough = <double>a - <double>b
+    if rough > FAR:
+        return FAR
+    return -FAR if rough < -FAR else a - b
 
 
 cdef class Policy:
@@ -96,7 +190,7 @@ cdef class Policy:
             course.now += self.settings.period
             now = course.now
         elif self.settings.by_clock:
-            now = clock_time(&self.clock, stamp, self.max_gap(), counters)
+            now = self.clock_time(stamp)
         word = self.judge(stamp, now, y)
         if not word and not isnan(memory.y):
             elapsed = self.since_latest(now, y, &word)
@@ -138,27 +232,148 @@ cdef class Policy:
     cdef int judge(self, long long stamp, long long now, double y) noexcept nogil:
         """Return the flag that says why a sample is not used, whatever the observer is like."""
         cdef Memory* memory = &self.structure.memory
-        cdef bint held, held_before = self.sensor.holds, noisy
+        cdef bint held, held_before = self.sensor.holds
         if not fabs(y) <= self.settings.limit:  # also NaN
             self.counters.rejected_measurements += 1
             return REJECTED_MEASUREMENT
         if stamp == 0 and not self.settings.nominal:
             self.counters.zero_stamps += 1
             return REJECTED_PERIOD
-        if self.settings.stuck_time and is_stuck(
-            &self.sensor, &self.settings, &self.counters, memory.y, y - memory.offset, now,
-            self.max_gap(),
-        ):
+        if self.settings.stuck_time and self.is_stuck(y - memory.offset, now):
             return REJECTED_STUCK
         if self.tuner is None:
             return 0
-        held = is_held(&self.sensor, self.max_gap(), &self.course, y, now)
+        held = self.is_held(y, now)
         if self.sensor.holds and not held_before:
             self.tuner.begin_afresh()  # with the sensor's own period
         if held:
             return REPEATED
-        noisy = may_have_noise(&self.sensor) and self.tuner.is_noisy(self.sensor.sample)
-        return REJECTED_STUCK * repeats_noise(&self.sensor, &self.counters, y, noisy)
+        return REJECTED_STUCK * self.repeats_noise(y)
+
+    # What a sample tells by itself: its time, and whether y can be true
+
+    cdef long long clock_time(self, long long stamp) noexcept nogil:
+        """
+        Return the time of a sample that came when the clock read `stamp`.
+
+        A clock that stands still between its ticks gives many samples one reading. They are spread
+        evenly, and end short of the next tick that is expected. While they come evenly, a tick, or
+        a sample, that comes late moves the times by little.
+        """
+        cdef Clock* clock = &self.clock
+        cdef long long count = clock.tick_count, length = difference(stamp, clock.tick), end
+        cdef double mean, off
+        if length == 0:
+            clock.tick_count += 1
+            end = stamp + clock.tick_length
+            if clock.steady > 0:
+                end += <long long>(OFF_TICK * clock.spacing)
+            end = min(<long long>clock.spacing, (end - clock.placed) // 2)
+            if end > 0:
+                clock.placed += end
+                self.counters.spread_stamps += 1
+            return clock.placed
+        clock.tick, clock.tick_count = stamp, 1
+        if count == 0 or not 0 < length <= self.max_gap():
+            clock.steady, clock.placed = 0, stamp
+            return stamp
+        clock.tick_length = length
+        mean, off = <double>length / count, difference(stamp, clock.placed) - clock.spacing
+        if count == 1 or not fabs(off) <= OFF_TICK * mean:
+            if clock.steady < KNOWN_TICKS:  # else it is a gap: samples come as before, but later
+                clock.spacing = mean
+            clock.steady = 0
+            # A tick that came early finds samples ahead of it: time goes on at half its speed.
+            clock.placed = max(stamp, clock.placed + <long long>(clock.spacing / 2.0))
+            return clock.placed
+        clock.steady = min(clock.steady + 1, MOST_TICKS)
+        clock.spacing += (mean - clock.spacing) / clock.steady
+        clock.placed += <long long>(clock.spacing + fmax(off / PULL, -clock.spacing / 2.0))
+        return clock.placed
+
+    cdef bint is_stuck(self, double y, long long now) noexcept nogil:
+        """Return True, and count it, if y has been seen unchanged for longer than stuck_time."""
+        cdef Sensor* sensor = &self.sensor
+        cdef long long silence = abs(difference(now, sensor.seen))
+        sensor.seen = now
+        if y != self.structure.memory.y or silence > self.max_gap():
+            sensor.changed, sensor.stuck = now, False
+            return False
+        if difference(now, sensor.changed) <= self.settings.stuck_time:
+            return False
+        self.counters.stuck += not sensor.stuck
+        sensor.stuck = True
+        self.counters.rejected_stuck += 1
+        return True
+
+    cdef bint is_held(self, double y, long long now) noexcept nogil:
+        """
+        Return True if y repeats a value because its sensor holds it, being slower than the topic.
+
+        Only for self-tuning, which would take every change after it for one of d. A sensor holds
+        values if they change after as many samples as before, about, and not by multiples, as an
+        encoder's counts do. y may also really stand still: then it repeats itself for longer. What
+        is counted here serves `repeats_noise`, too.
+        """
+        cdef Sensor* sensor = &self.sensor
+        cdef long long elapsed = difference(now, self.course.latest), usual = sensor.held_for
+        cdef double before = sensor.sample, change = y - before, low, high, others, elsewhere
+        if self.course.timed and elapsed <= 0:
+            return False  # a sample that comes twice is no repetition
+        sensor.sample = y
+        if change == 0.0:
+            sensor.repeats += 1
+            if sensor.repeats > 2 * usual + 1 or 2 * abs(elapsed) >= self.max_gap():
+                return False
+            return sensor.holds
+        low = fmin(fabs(change), fabs(sensor.change))
+        high = fmax(fabs(change), fabs(sensor.change))
+        others = high / low if low > 0.0 else 0.0
+        sensor.stuck, elsewhere = False, 0.0
+        if sensor.repeats > 0 and before != sensor.repeated:
+            elsewhere, sensor.repeated = 1.0, before
+        sensor.elsewhere += (elsewhere - sensor.elsewhere) / CHANGES
+        if sensor.repeats == 0 or 4 * abs(sensor.repeats - usual) > max(usual, 4):
+            sensor.regular = max(sensor.regular - 2, 0)
+        elif low > 0.0 and fabs(others - rint(others)) > MULTIPLE + SINGLE * fabs(y) / low:
+            sensor.regular = min(sensor.regular + 1, MOST_REGULAR)
+        if sensor.regular == 0:
+            sensor.held_for, sensor.holds = sensor.repeats, False
+        elif sensor.regular >= ENOUGH_REGULAR:
+            sensor.holds = True
+        sensor.repeats, sensor.change = 0, change
+        return False
+
+    cdef bint repeats_noise(self, double y) noexcept nogil:
+        """
+        Return True, and count it, if y repeats itself although it has noise; after `is_held`.
+
+        The sensor is stuck then, or at the end of its range: that y stands still is no motion.
+        Only for self-tuning, which knows whether y has noise, and is not quantised.
+        """
+        cdef Sensor* sensor = &self.sensor
+        if sensor.repeats <= CHANCE_REPEATS or y != sensor.sample:
+            return False  # also of another y whose stamp is not later: `is_held` leaves that alone
+        if sensor.repeats == CHANCE_REPEATS + 1 and not sensor.stuck and (
+            sensor.elsewhere < RARELY and self.tuner.is_noisy(sensor.sample)
+        ):
+            sensor.stuck = True
+            self.counters.stuck += 1
+        self.counters.rejected_stuck += sensor.stuck
+        return sensor.stuck
+
+    cdef bint is_spike(self, double innovation) noexcept nogil:
+        """Return True, and count it, if y is too far from its prediction to be believed yet."""
+        cdef bint too_far = not fabs(innovation) <= self.settings.gate
+        self.course.spikes = self.course.spikes + 1 if too_far else 0
+        if self.course.spikes > MOST_SPIKES:
+            self.course.spikes = 0
+            self.counters.spikes_believed += 1
+            return False
+        self.counters.rejected_spikes += too_far
+        return too_far
+
+    # Time
 
     cdef long long since_latest(self, long long now, double y, int* word) noexcept nogil:
         """Return the time since the latest sample, 0 where there is none; add flags to `word`."""
@@ -326,9 +541,7 @@ cdef class Policy:
             modelled = fabs(end) <= self.settings.limit  # False for NaN
             if not modelled:
                 end = memory.y
-            if self.settings.gate > 0.0 and is_spike(
-                &self.course, &self.settings, counters, corrected - end
-            ):
+            if self.settings.gate > 0.0 and self.is_spike(corrected - end):
                 return REJECTED_SPIKE
             bend = (corrected - end) / count
             self.structure.begin_at_estimates()
