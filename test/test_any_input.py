@@ -105,7 +105,7 @@ def test_nothing_raises_and_everything_shown_is_finite(events, seed):
                 'reset': estimator.reset,
                 'freeze': lambda: estimator.freeze(True),
                 'thaw': lambda: estimator.freeze(False),
-                'forget': estimator.forget_stamp,
+                'forget': lambda: estimator.policy.change(timed=False, tick_count=0),
             }[first]()
         if estimator.estimate is not None:
             assert finite(estimator.estimate)

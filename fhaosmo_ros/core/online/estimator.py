@@ -63,6 +63,8 @@ class OnlineEstimator:
         To read parameters, sizes and state from; samples go through this class.
     policy : Policy
         What decides about samples; compiled functions step by it.
+    smoothing : Smoother or None
+        It has the estimates, where these are of the past.
     events : EventDetector
         Judges each estimate of d, as it is before any smoothing; `events.taken()` returns what has
         begun or ended since it was called last.
@@ -76,16 +78,15 @@ class OnlineEstimator:
 
     def __init__(self, parameters: Mapping[str, Any] | None = None, /, **named: Any) -> None:
         given = ESTIMATOR_PARAMETERS.complete(parameters, named)
-        self._parameters = ONLINE_PARAMETERS.complete(given)
-        self.observer = Observer(self._parameters)
-        p = self._parameters
+        p = self._parameters = ONLINE_PARAMETERS.complete(given)
+        self.observer = Observer(p)
         if p['input_delay'] > p['measurement_delay']:
             raise ConfigurationError(
                 "parameters 'input_delay', 'measurement_delay': expected each at most the next "
                 f'one, got {p["input_delay"]} and {p["measurement_delay"]}'
             )
         check_events(p)
-        self._smoothing: Smoother | None = None
+        self.smoothing: Smoother | None = None
         if p['smoothing_lag'] > 0.0:
             self.smooth(p['smoothing_lag'])
         self._u = np.zeros(len(self.observer.inputs))
@@ -106,11 +107,6 @@ class OnlineEstimator:
         return make_from_file(cls, path, node, channel)
 
     @property
-    def smooths(self) -> bool:
-        """True if estimates are of the past."""
-        return self._smoothing is not None
-
-    @property
     def parameters(self) -> dict[str, Any]:
         """All parameters with their present values; a copy."""
         return dict(self._parameters)
@@ -128,8 +124,8 @@ class OnlineEstimator:
         The stamp of its sample, less `measurement_delay` unless the estimate is carried over it.
         With `smoothing_lag` its sample is the one that is so old.
         """
-        if self._smoothing is not None:
-            return self._smoothing.stamp if self._smoothing.estimate else None
+        if self.smoothing is not None:
+            return self.smoothing.stamp if self.smoothing.estimate else None
         course = self.policy.course
         return course['stamp'] - self._behind if course['valid'] else None
 
@@ -150,11 +146,6 @@ class OnlineEstimator:
         return float(self.policy.course['mean_jitter'] * NANOSECONDS)
 
     @property
-    def spread(self) -> float:
-        """Size of the innovations over that expected from noise_size, at least 1 (D 21)."""
-        return float(self.observer.structure.memory['spread'])
-
-    @property
     def offset(self) -> float:
         """What y is taken to be too large by, since a jump that the model contradicts (D 23)."""
         return float(self.observer.structure.memory['offset'])
@@ -164,7 +155,7 @@ class OnlineEstimator:
         parameters = self._parameters.changed_live(changes, 'observer')
         configuration = ObserverConfiguration(parameters)
         check_events(parameters)
-        if self._smoothing is not None:
+        if self.smoothing is not None:
             _check_smoothing(parameters, configuration)
         return Change(parameters, configuration)
 
@@ -174,11 +165,11 @@ class OnlineEstimator:
         self.observer.adopt(change.configuration)
         self.policy.configure(self.observer.structure, self._settings(change.parameters))
         self._parameters = change.parameters
-        if self._smoothing is not None:
-            self._smoothing.configure()
+        if self.smoothing is not None:
+            self.smoothing.configure()
         self.events.configure(change.parameters)
-        if change.parameters['sampling'] != before:
-            self.forget_stamp()
+        if change.parameters['sampling'] != before:  # stamps of another clock
+            self.policy.change(timed=False, tick_count=0)
 
     def configure(self, changes: Mapping[str, Any]) -> None:
         """
@@ -234,20 +225,15 @@ class OnlineEstimator:
 
         """
         _check_smoothing(self._parameters, self.observer.configuration)
-        self._smoothing = Smoother(
+        self.smoothing = Smoother(
             self.observer, None if lag is None else round(lag / NANOSECONDS)
         )
 
-    @property
-    def due(self) -> NDArray[np.int64]:
-        """Which samples, counted from 0, the rows are of that `run` or `finish` returned last."""
-        return np.zeros(0, dtype=np.int64) if self._smoothing is None else self._smoothing.numbers
-
     def finish(self) -> Trajectory:
         """Return the smoothed estimates that still wait: nothing comes after them."""
-        if self._smoothing is None:
+        if self.smoothing is None:
             raise ConfigurationError('finish: expected smoothing_lag > 0, or a call of `smooth`')
-        found = self._smoothing.finish()
+        found = self.smoothing.finish()
         self.observer.check_functions()
         return found
 
@@ -302,8 +288,8 @@ class OnlineEstimator:
 
     def _cut(self) -> None:
         """Smooth nothing across what has happened."""
-        if self._smoothing is not None:
-            self._smoothing.cut()
+        if self.smoothing is not None:
+            self.smoothing.cut()
 
     def seed(self, z: ArrayLike, unknown_input: float) -> None:
         """
@@ -343,10 +329,6 @@ class OnlineEstimator:
     def frozen(self) -> bool:
         """True while gamma is held."""
         return bool(self.policy.course['frozen'])
-
-    def forget_stamp(self) -> None:
-        """Expect stamps of another clock: the next sample takes the usual period."""
-        self.policy.change(timed=False, tick_count=0)
 
     @property
     def inputs(self) -> tuple[float, ...]:
@@ -405,12 +387,12 @@ class OnlineEstimator:
         """
         self.advance(operator.index(stamp), y)
         self.observer.check_functions()
-        return self.policy.report() if self._smoothing is None else self.estimate
+        return self.policy.report() if self.smoothing is None else self.estimate
 
     def advance(self, stamp: int, y: float) -> int:
         """Do what `update` does and return only the status word; see `estimate`."""
         stamp = min(max(stamp, -LARGEST_STAMP), LARGEST_STAMP)
-        if self._smoothing is None and not self.events.on:
+        if self.smoothing is None and not self.events.on:
             return self.policy.advance(stamp, y, self._u)  # type: ignore[no-any-return]
         self._run(np.array([stamp]), np.array([y], dtype=np.float64), self._u[np.newaxis])
         return self.observer.structure.word  # type: ignore[no-any-return]
@@ -463,7 +445,7 @@ class OnlineEstimator:
 
     def _run(self, stamps: Ints, y: NDArray[np.float64], u: NDArray[np.float64]) -> Trajectory:
         """Take samples with their known inputs, and look at them for events and for smoothing."""
-        watched = self.events.on or self._smoothing is not None
+        watched = self.events.on or self.smoothing is not None
         record, present, times, acting = self.policy.run(stamps, y, u, watched)
         found = Trajectory(stamps - self._behind, **record.columns)
         if self.events.on:
@@ -471,8 +453,8 @@ class OnlineEstimator:
             self.events.take(found.t, found.unknown_input, deviations, times, found.status)
         if len(present):
             found = found._replace(z=present[:, :-1], unknown_input=present[:, -1])
-        if self._smoothing is not None:
-            return self._smoothing.take(found, times, acting)
+        if self.smoothing is not None:
+            return self.smoothing.take(found, times, acting)
         return found
 
     @property
@@ -483,8 +465,8 @@ class OnlineEstimator:
         None before the first sample (that is `smoothing_lag` old), and from a jump of y, which z_1
         follows at once, until the next sample that is used.
         """
-        if self._smoothing is not None:
-            return self._smoothing.estimate
+        if self.smoothing is not None:
+            return self.smoothing.estimate
         return self.policy.report() if self.policy.course['valid'] else None
 
     @property
@@ -494,15 +476,15 @@ class OnlineEstimator:
 
         As a self-tuning observer expects them; NaN with fixed gains.
         """
-        if self._smoothing is not None:
-            return self._smoothing.standard_deviation
+        if self.smoothing is not None:
+            return self.smoothing.standard_deviation
         return self.observer.standard_deviation
 
     @property
     def tuning(self) -> Tuning:
         """What a self-tuning observer had found at the sample of `estimate`."""
-        if self._smoothing is not None:
-            return Tuning.of(self._smoothing.tuning)
+        if self.smoothing is not None:
+            return Tuning.of(self.smoothing.tuning)
         return self.observer.tuning
 
 

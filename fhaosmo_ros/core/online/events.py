@@ -201,7 +201,7 @@ class EventDetector:
         self._time = now
         if restarted:
             self.reset()
-        elif not 0 <= elapsed <= self._max_gap:  # stamps of another clock: see forget_stamp
+        elif not 0 <= elapsed <= self._max_gap:  # stamps of another clock: see `adopt`
             self._since = max(self._since + elapsed, EARLIEST)
             elapsed = 0
         if self._doing == LOST:

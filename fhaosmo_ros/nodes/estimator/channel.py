@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One channel of an estimator node: y (and u) in, one observer, estimates out."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from math import isfinite, isnan
 from time import perf_counter, time_ns
@@ -12,14 +12,14 @@ from builtin_interfaces.msg import Time
 from fhaosmo_ros.core.observer.status import AFRESH, JUMPED, REJECTED, Status, UNUSED
 from fhaosmo_ros.core.online.estimator import Change, OnlineEstimator
 from fhaosmo_ros.core.online.events import described
+from fhaosmo_ros.core.online.snapshots import Flag
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.inputs import known_inputs, make_pairing, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
-from fhaosmo_ros.nodes.estimator.outputs import Outputs, SnapshotOutput
-from fhaosmo_ros.nodes.estimator.sources import Listener, Sources
-from fhaosmo_ros.nodes.estimator.typed_outputs import Output
-from fhaosmo_ros.nodes.middleware.diagnostics import array_of, ERROR, OK, Report, WARN
+from fhaosmo_ros.nodes.estimator.outputs import Output, Outputs, TypedOutputs
+from fhaosmo_ros.nodes.estimator.sources import Sources
+from fhaosmo_ros.nodes.middleware.diagnostics import array_of, OK, Report, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import create_publisher
 from fhaosmo_ros.nodes.middleware.messages import message_class, time_message
 from fhaosmo_ros.topics import DIAGNOSTICS, EVENT
@@ -32,13 +32,6 @@ QUIET = 5.0
 """Seconds between two warnings of one kind."""
 TOLD_AFTER = 5
 """Reports on /diagnostics without any sample, until the log says why there is no estimate."""
-UNPAIRED = {
-    'late': 'late inputs, which came after their sample had been used: raise known_input_wait, or '
-    'their header stamps are of another clock',
-    'ahead': 'samples before any input, whose stamps are all later: are the header stamps of one '
-    'clock?',
-}
-"""What is said of known inputs and samples that do not find each other."""
 
 
 class Channel:
@@ -46,8 +39,7 @@ class Channel:
     Takes y and the known inputs out of messages, steps the observer, publishes the estimates.
 
     A new channel is inactive: its topics and services exist, but samples are dropped and nothing
-    is published. `estimated` is called with the channel for each sample that was used; `name` is
-    in its topics, services, reports and log, '' without names.
+    is published. `name` is in its topics, services, reports and log, '' without names.
     """
 
     def __init__(
@@ -56,17 +48,15 @@ class Channel:
         values: Parameters,
         estimator: OnlineEstimator,
         sources: Sources,
-        estimated: Callable[['Channel'], None],
+        typed: TypedOutputs,
         name: str = '',
     ) -> None:
-        self._node, self._estimated = node, estimated
-        self.name = name
+        self._node, self._typed, self.name = node, typed, name
         self._clock = node.get_clock()
         self._logger = node.get_logger().get_child(name) if name else node.get_logger()
         self.estimator = estimator
         self._values = values
         self._active = False
-        self._unpaired: dict[str, int] = {}
         self._forget()
         observer = estimator.observer
         prefix = f'~/{name}/' if name else '~/'
@@ -74,25 +64,23 @@ class Channel:
         self._events = create_publisher(
             node, message_class(DIAGNOSTICS), prefix + EVENT, latched=True
         )
-        self._snapshots = SnapshotOutput(node, prefix, estimator)
         wanted = measured_output(values, name)
         self._y = sources.of(wanted).add(wanted, self._on_sample)
-        simulated = node.get_parameter('use_sim_time').value
-        self._health = Health(estimator, values, self._y, simulated)
         known = known_inputs(values, observer.used_inputs, name)
         self._pairing = make_pairing(values, observer.inputs, known, estimator.inputs)
-        self._u: dict[str, Listener] = {}
+        us = {}
         for u, its in known.items():
             take = partial(self._on_input, observer.inputs.index(u), u)
-            self._u[u] = sources.of(its).add(its, take, first=True)
+            us[u] = sources.of(its).add(its, take, first=True)
+        simulated = node.get_parameter('use_sim_time').value
+        self._health = Health(estimator, values, self._y, us, self._pairing, simulated)
         if name:  # those without a name are the node's
             node.create_service(Trigger, prefix + 'reset', self.reset)
             node.create_service(SetBool, prefix + 'freeze', self.freeze)
 
     def activate(self) -> None:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
-        self.estimator.reset()
-        self._snapshots.reset()
+        self._reset()
         self._forget()
         if self._pairing is not None:
             self._pairing.forget_samples()
@@ -114,7 +102,7 @@ class Channel:
         """Go on with other live parameters, which the estimator has prepared."""
         found = self.estimator.events.on
         self.estimator.adopt(change)
-        self._snapshots.changed()
+        self._outputs.snapshot(Flag.CHANGED)
         self._values = self._health.limits = values
         if self._active and found != self.estimator.events.on:
             self._say('events are switched off' if found else 'no event yet')
@@ -122,27 +110,12 @@ class Channel:
     def reports(self) -> list[Report]:
         """Return the reports for /diagnostics, on the time since the last ones."""
         reports = self._health.reports(self._stale, f'{self.name} ' if self.name else '')
-        for name, u in self._u.items():
-            for text in [u.error] if u.error else u.source.unheard.values():
-                reports[0].find(ERROR if u.error else WARN, text)
-            nobody = not u.source.heard and not u.source.unheard
-            reports[0].find(WARN, f'no publisher of {name}', nobody)
-        if self._pairing is not None:
-            self._report_pairing(reports[0])
         if self._active and isnan(self._health.latest):
             self._without_sample += 1
             # What is wrong with y itself has been logged already.
             if self._without_sample == TOLD_AFTER and not self._y.error:
                 self._logger.warning(f'still waiting: {reports[0].text}')
         return reports
-
-    def _report_pairing(self, report: Report) -> None:
-        for name, text in UNPAIRED.items():
-            count = getattr(self._pairing, name)
-            report.values[text.partition(',')[0]] = count
-            news = count - self._unpaired.get(name, 0)
-            self._unpaired[name] = count
-            report.find(WARN, f'{news} {text}', news)
 
     def _forget(self) -> None:
         self._arrived = False
@@ -192,7 +165,7 @@ class Channel:
         used = not word & UNUSED
         if used:
             self._arrived = True
-            self._snapshots.accepted(stamp)
+            self._outputs.sample_used(stamp)
             health.latest = now
             health.stamps.append(stamp)
             health.unknown_inputs.append(estimator.observer.estimate.unknown_input)
@@ -200,8 +173,8 @@ class Channel:
             self._tell(word, stamp, y)
         if estimator.events.waiting:
             self._tell_events()
-        if used:
-            self._estimated(self)
+        if used and self._values['publish_on'] == 'sample':
+            self._publish()
 
     def _tell_events(self) -> None:
         """Publish, and log, the events that have begun or ended."""
@@ -280,17 +253,16 @@ class Channel:
                 throttle_duration_sec=QUIET,
             )
 
-    def publish(self) -> Output | None:
-        """Publish the numbers of the latest estimate; return it for the typed messages."""
+    def _publish(self) -> None:
+        """Publish the latest estimate, in the typed messages together with other channels'."""
         estimate, stamp = self.estimator.estimate, self.estimator.stamp
-        if estimate is None:
-            return None
-        self._outputs.publish(estimate, stamp)
-        joint = self._y.field.key if self._y.field else ''
-        return Output(self.name or joint or 'y', stamp, estimate, self._values)
+        if estimate is not None:
+            self._outputs.publish(estimate, stamp)
+            joint = self._y.field.key if self._y.field else ''
+            self._typed.add(Output(self.name or joint or 'y', stamp, estimate, self._values))
 
-    def is_stale(self) -> bool:
-        """Return True while y is silent, and log it once."""
+    def tick(self) -> None:
+        """Publish at the node's rate, if it is to; log once that y is silent."""
         if self._arrived:
             self._arrived = self._stale = False
             self._silent_since = None
@@ -305,18 +277,22 @@ class Channel:
                     'publishing until one comes',
                     throttle_duration_sec=QUIET,
                 )
-        return self._stale
+        if not self._stale and self._values['publish_on'] != 'sample':
+            self._publish()
 
     def reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Start the observer afresh with the next sample."""
-        self.estimator.reset()
-        self._snapshots.reset()
+        self._reset()
         return self._done(response, 'reset: the observer starts afresh with the next sample')
+
+    def _reset(self) -> None:
+        self.estimator.reset()
+        self._outputs.snapshot(Flag.RESET)
 
     def freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         """Hold gamma, or let it adapt again."""
         self.estimator.freeze(request.data)
-        self._snapshots.changed()
+        self._outputs.snapshot(Flag.CHANGED)
         text = 'gamma is held' if request.data else 'gamma adapts again'
         return self._done(response, f'freeze: {text}')
 

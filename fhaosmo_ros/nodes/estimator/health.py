@@ -15,6 +15,7 @@ from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
 from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
+from fhaosmo_ros.pairing import StampPairing
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,6 +38,13 @@ def _words(name: str) -> str:
     return name.replace('_', ' ')
 
 
+UNPAIRED = {
+    'late inputs': ', which came after their sample had been used: raise known_input_wait, or '
+    'their header stamps are of another clock',
+    'samples before any input': ', whose stamps are all later: are the header stamps of one '
+    'clock?',
+}
+"""What is said of known inputs and samples that do not find each other."""
 UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
 """Counters of samples that the observer has not taken."""
 
@@ -48,15 +56,20 @@ class Health:
     Appended to on each sample: `stamps` (ns), `delays` from the source stamp to the callback (ns),
     `durations` of the callback (s), `unknown_inputs`. `latest` is the time of the last sample on
     `perf_counter`, `offset` from its stamp to the publication of its message (ns). `limits` are
-    the channel's parameters, warn_* and error_* among them; `simulated`: stamps are in simulated
-    time.
+    the channel's parameters, warn_* among them; `simulated`: stamps are in simulated time.
     """
 
     def __init__(
-        self, estimator: OnlineEstimator, limits: Parameters, y: Listener, simulated: bool
+        self,
+        estimator: OnlineEstimator,
+        limits: Parameters,
+        y: Listener,
+        u: Mapping[str, Listener],
+        pairing: StampPairing | None,
+        simulated: bool,
     ) -> None:
-        self._estimator, self._y, self._simulated = estimator, y, simulated
-        self.limits = limits
+        self._estimator, self._y, self._u = estimator, y, u
+        self._pairing, self._simulated, self.limits = pairing, simulated, limits
         self.stamps: deque[int] = deque(maxlen=LIMIT)
         self.delays: deque[int] = deque(maxlen=LIMIT)
         self.durations: deque[float] = deque(maxlen=LIMIT)
@@ -154,23 +167,33 @@ class Health:
             "host's, or an old measurement; dt is not affected",
             y.stamps == 'header' and not self._simulated and abs(offset) > latest,
         )
+        for name, u in self._u.items():
+            for text in [u.error] if u.error else u.source.unheard.values():
+                report.find(ERROR if u.error else WARN, text)
+            nobody = not u.source.heard and not u.source.unheard
+            report.find(WARN, f'no publisher of {name}', nobody)
+        for key, text in UNPAIRED.items():
+            report.find(WARN, f'{news.get(key, 0)} {key}{text}', news.get(key, 0))
 
     def _observer(self, report: Report, mean: float, news: Mapping[str, int], stale: bool) -> None:
         estimator, limits = self._estimator, self.limits
         observer, estimate, offset = estimator.observer, estimator.estimate, estimator.offset
         unit = derivative_unit(limits['measurement_unit'], observer.order)
         d_now = estimate.unknown_input if estimate else nan
+        spread = observer.structure.memory['spread']
         d, durations = np.array(self.unknown_inputs), np.array(self.durations)
         chatter = high_passed(d, WINDOW)
         deviation = float(np.std(d)) if len(d) else nan
         overruns = int(np.sum(durations > mean))
-        away = self._gamma_away()
+        away = 0.0
+        if estimate and observer.configuration.adaptive and not observer.self_tuning:
+            away = estimate.gamma - observer.parameters['gamma_initial']
         report.values = {
             'open levels': f'{estimate.open_levels if estimate else 0} of {observer.levels}',
             'gamma': estimate.gamma if estimate else nan,
             'gamma away from gamma_initial': away,
             'gamma at': self._bound(estimate.status if estimate else Status.OK),
-            'innovations over those expected': estimator.spread,
+            'innovations over those expected': spread,
             'y over z1, since it jumped': offset,
             titled('unknown input', unit): d_now,
             'chatter of the unknown input': chatter,
@@ -207,7 +230,6 @@ class Health:
         if tuned and mean > 0.0 and observer.parameters['scheme'] == 'predict_correct':
             rates = f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / mean:.4g} Hz'
             report.find(WARN, rates, not tuned / RATE_RATIO < mean < tuned * RATE_RATIO)
-        spread = estimator.spread
         wide = f'innovations are {spread:.3g} times as large as noise_size says'
         report.find(WARN, wide, spread > SPREAD)
         report.find(WARN, f'{overruns} steps took longer than the sampling period', overruns)
@@ -230,7 +252,7 @@ class Health:
             report.find(WARN, f'{news} events, the last one {text}')
 
     def _counts(self) -> dict[str, int]:
-        counters, source = self._estimator.counters, self._y.source
+        counters, source, pairing = self._estimator.counters, self._y.source, self._pairing
         return {
             'samples accepted': counters.accepted,
             'samples lost': source.lost - self._lost_before,
@@ -239,17 +261,14 @@ class Health:
             'samples rejected': counters.rejected,
             **{_words(name): n for name, n in counters._asdict().items() if name != 'accepted'},
             'restarts': counters.restarts,
-        }
-
-    def _gamma_away(self) -> float:
-        observer, estimate = self._estimator.observer, self._estimator.estimate
-        adaptive = observer.parameters['variant'].endswith('_adaptive')
-        if estimate is None or observer.self_tuning or not adaptive:
-            return 0.0
-        return float(estimate.gamma - observer.parameters['gamma_initial'])
+        } | (
+            {'late inputs': pairing.late, 'samples before any input': pairing.ahead}
+            if pairing
+            else {}
+        )
 
     def _bound(self, status: Status) -> str:
-        if not self._estimator.observer.parameters['variant'].endswith('_adaptive'):
+        if not self._estimator.observer.configuration.adaptive:
             return 'a fixed value'
         if self._estimator.frozen:
             return 'the value that ~/freeze holds'

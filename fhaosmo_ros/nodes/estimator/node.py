@@ -22,9 +22,8 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
 from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.joints import Joints
-from fhaosmo_ros.nodes.estimator.outputs import parameter_text
+from fhaosmo_ros.nodes.estimator.outputs import check_axes, parameter_text, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
-from fhaosmo_ros.nodes.estimator.typed_outputs import check_axes, Output, TypedOutputs
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, input_qos, set_period
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
@@ -71,8 +70,6 @@ class EstimatorNode(ManagedNode):
         """Parameters of channels that do not change along with the common ones."""
         self._asked: set[str] = set()
         self._channels: list[Channel] = []  # none before the names of the joints are known
-        self._outputs: dict[str, Output] = {}
-        """Estimates that have been published, but not yet in the typed messages."""
         self._parameters_topic: Any = None
         self._clock_watch = ClockWatch(self)
         self._node_parameters = NodeParameters(
@@ -142,12 +139,10 @@ class EstimatorNode(ManagedNode):
         self._timer.cancel()
         self._typed = TypedOutputs(self, values)
         self._channels = [
-            Channel(
-                self, of_channel(values, name), estimator, self._sources, self._estimated, name
-            )
+            Channel(self, of_channel(values, name), estimator, self._sources, self._typed, name)
             for name, estimator in estimators.items()
         ]
-        self._sources.after_message = self._publish_typed
+        self._sources.after_message = self._typed.publish
         self.create_service(Trigger, '~/reset', partial(self._each_answers, 'reset'))
         self.create_service(SetBool, '~/freeze', partial(self._each_answers, 'freeze'))
         self._sources.open()
@@ -171,8 +166,8 @@ class EstimatorNode(ManagedNode):
         """Make the channels from the first names; later, report those that are new."""
         new = self._joints.new(names)
         if self._names != FROM_JOINTS:
-            if new:
-                self._joints.refuse(new)
+            why = 'has come after the first message; start the node again to take it'
+            self._joints.leave_out(new, why, throttle_duration_sec=5.0)
             return
         fit = self._joints.choose(new, self._node_parameters.values['max_channels'])
         if not fit:
@@ -218,33 +213,12 @@ class EstimatorNode(ManagedNode):
         super().cleanup()
         self._channels, self._parameters_topic = [], None
 
-    @property
-    def _publishes_each(self) -> bool:
-        return bool(self._node_parameters.values['publish_on'] == 'sample')
-
     def _tick(self) -> None:
         for channel in self._channels:
             channel.end_waiting()
         for channel in self._channels:
-            if not channel.is_stale() and not self._publishes_each:
-                self._publish(channel)
-        self._publish_typed()
-
-    def _estimated(self, channel: Channel) -> None:
-        if self._publishes_each:
-            self._publish(channel)
-
-    def _publish(self, channel: Channel) -> None:
-        if channel.name in self._outputs:  # several samples had waited for their known inputs
-            self._publish_typed()
-        output = channel.publish()
-        if output is not None:
-            self._outputs[channel.name] = output
-
-    def _publish_typed(self) -> None:
-        if self._outputs:
-            self._typed.publish(list(self._outputs.values()))
-            self._outputs.clear()
+            channel.tick()
+        self._typed.publish()
 
     def _each_answers(self, name: str, request: Any, response: Any) -> Any:
         for channel in self._channels:

@@ -1,25 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a channel publishes, and the text with the parameters of its node."""
+"""What channels publish, alone and together, and the text with the parameters of their node."""
 
+from collections.abc import Mapping, Sequence
+from math import nan
 from time import monotonic
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.estimates import Estimate, TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
 from fhaosmo_ros.core.parameters.declaration import Parameters
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.per_channel import CHANNELS, differing, of_channel
 from fhaosmo_ros.inputs import Input, known_inputs, measured_output
-from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, has_listeners, LATCHED
+from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, DEPTH, has_listeners, LATCHED
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
-from fhaosmo_ros.topics import (
-    ARRAY,
-    estimates_of,
-    SNAPSHOT,
-    STANDARD_DEVIATION,
-)
+from fhaosmo_ros.topics import ARRAY, estimates_of, SNAPSHOT, STANDARD_DEVIATION, TYPED_ESTIMATES
+from geometry_msgs.msg import AccelStamped, WrenchStamped
 from rclpy.node import Node
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 PERIOD, PERIOD_OF_SELF_TUNING = 1.0, 30.0
@@ -28,9 +29,10 @@ PERIOD, PERIOD_OF_SELF_TUNING = 1.0, 30.0
 
 class Outputs:
     """
-    Publishers of the estimates, each with ROS' parameters qos_overrides./TOPIC.publisher.POLICY.
+    Publishers of one channel's estimates and of its snapshots, by which a replay follows it.
 
-    What nobody listens to is not made: a message costs as much as a step with fixed gains.
+    Those of the estimates have ROS' parameters qos_overrides./TOPIC.publisher.POLICY. What nobody
+    listens to is not made: a message costs as much as a step with fixed gains.
     """
 
     def __init__(self, node: Node, prefix: str, estimator: OnlineEstimator) -> None:
@@ -44,6 +46,10 @@ class Outputs:
         self._state, self._tuning = labelled(states), labelled(TUNING)
         self._deviation = labelled([*states, 'd'])
         self._innovation = labelled([f'eps{i + 1}' for i in range(observer.levels)])
+        self._period = PERIOD_OF_SELF_TUNING if observer.self_tuning else PERIOD
+        self._first, self._published = True, 0.0
+        self._labels: list[str] = []
+        self._snapshots = node.create_publisher(message_class(ARRAY), prefix + SNAPSHOT, LATCHED)
 
     def publish(self, estimate: Estimate, stamp: int) -> None:
         """Publish an estimate and, last, the stamp of its sample in nanoseconds."""
@@ -61,45 +67,111 @@ class Outputs:
             if has_listeners(publisher):
                 publisher.publish(messages[name]())
 
-
-class SnapshotOutput:
-    """
-    Publisher of an estimator's memory, so that a replay can follow a live run exactly.
-
-    Once a second, after the first sample, and after each live change and reset.
-    """
-
-    def __init__(self, node: Node, prefix: str, estimator: OnlineEstimator) -> None:
-        self._estimator = estimator
-        self._period = PERIOD_OF_SELF_TUNING if estimator.observer.self_tuning else PERIOD
-        self._first, self._published = True, 0.0
-        self._labels: list[str] = []
-        self._publisher = node.create_publisher(message_class(ARRAY), prefix + SNAPSHOT, LATCHED)
-
-    def accepted(self, stamp: int) -> None:
-        """Publish if it is time to; to be called for each sample that was accepted."""
+    def sample_used(self, stamp: int) -> None:
+        """Publish a snapshot after the first sample, and if it is time to."""
         if self._first or monotonic() - self._published >= self._period:
             # Where samples wait in a queue, the observer may be ahead of this one.
             begins = self._first and stamp == self._estimator.latest
-            self._publish(Flag.STARTED if begins else Flag(0))
+            self.snapshot(Flag.STARTED if begins else Flag(0))
 
-    def changed(self) -> None:
-        """Publish that parameters or `freeze` have changed after the latest sample."""
-        self._publish(Flag.CHANGED)
-
-    def reset(self) -> None:
-        """Publish that the estimator was reset after the latest sample."""
-        self._publish(Flag.RESET)
-        self._first = True
-
-    def _publish(self, flags: Flag) -> None:
+    def snapshot(self, flags: Flag) -> None:
+        """Publish what the estimator remembers, and what has happened at the latest sample."""
         stamp = self._estimator.latest
         if stamp is not None:
             labels, vector = pack(Snapshot(stamp, flags, self._estimator.state_dict()))
             if labels != self._labels:  # a state before a gap is there only after one
                 self._labels, self._message = labels, labelled(labels)
-            self._publisher.publish(self._message(vector))
-            self._first, self._published = False, monotonic()
+            self._snapshots.publish(self._message(vector))
+            self._first, self._published = flags == Flag.RESET, monotonic()
+
+
+class Output(NamedTuple):
+    """The latest estimate of a channel, with its parameters and the stamp of its sample (ns)."""
+
+    name: str
+    stamp: int
+    estimate: Estimate
+    values: Mapping[str, Any]
+
+    @property
+    def effort(self) -> float:
+        """The unknown input in the user's unit."""
+        return float(self.estimate.unknown_input * self.values['unknown_input_scale'])
+
+
+class TypedOutputs:
+    """Publishers of the messages that ``typed_outputs`` asks for, each for all channels."""
+
+    def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
+        self._frame: str = values['frame_id']
+        self._waiting: dict[str, Output] = {}
+        self._publishers = {
+            name: node.create_publisher(message_class(TYPED_ESTIMATES[name]), f'~/{name}', DEPTH)
+            for name in dict.fromkeys(values['typed_outputs'])
+            if name != 'none'
+        }
+
+    def add(self, output: Output) -> None:
+        """Let an estimate wait for those of other channels."""
+        if output.name in self._waiting:  # several samples had waited for their known inputs
+            self.publish()
+        self._waiting[output.name] = output
+
+    def publish(self) -> None:
+        """Publish the estimates that wait, with the latest of their stamps."""
+        outputs = list(self._waiting.values())
+        for name, publisher in self._publishers.items() if outputs else ():
+            if has_listeners(publisher):
+                message = MAKERS[name](outputs)
+                message.header.frame_id = self._frame
+                message.header.stamp = time_message(max(o.stamp for o in outputs))
+                publisher.publish(message)
+        self._waiting.clear()
+
+
+def _joint_states(outputs: Sequence[Output]) -> JointState:
+    states = [output.estimate.z for output in outputs]
+    return JointState(
+        name=[output.name for output in outputs],
+        position=[float(z[0]) for z in states],
+        velocity=[float(z[1]) if len(z) > 1 else nan for z in states],
+        effort=[output.effort for output in outputs],
+    )
+
+
+def _wrench(outputs: Sequence[Output]) -> WrenchStamped:
+    message = WrenchStamped()
+    vectors = {'linear': message.wrench.force, 'angular': message.wrench.torque}
+    for output in outputs:
+        vector, axis = output.values['output_axis'].split('.')
+        setattr(vectors[vector], axis, output.effort)
+    return message
+
+
+def _accel(outputs: Sequence[Output]) -> AccelStamped:
+    message = AccelStamped()
+    for output in outputs:
+        vector, axis = output.values['output_axis'].split('.')
+        setattr(getattr(message.accel, vector), axis, float(output.estimate.unknown_input))
+    return message
+
+
+MAKERS = {'joint_states': _joint_states, 'wrench': _wrench, 'accel': _accel}
+
+
+def check_axes(typed_outputs: Sequence[str], channels: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raise ConfigurationError if two channels would write to the same axis of a message."""
+    if not {'wrench', 'accel'} & set(typed_outputs):
+        return
+    taken: dict[str, str] = {}
+    for name, values in channels.items():
+        axis = values['output_axis']
+        if axis in taken:
+            raise ConfigurationError(
+                f"parameter 'output_axis': expected another axis for each channel, got {axis!r} "
+                f'for {taken[axis]} and for {name}'
+            )
+        taken[axis] = name
 
 
 def parameter_text(node: Node, values: Parameters) -> str:

@@ -139,7 +139,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     )
     for why, count in reader.lacking.items():
         print(f'{count} messages left out: {why}')
-    if estimator.smooths:
+    if estimator.smoothing is not None:
         lag = estimator.parameters['smoothing_lag']
         later = 'and after' if arguments.smooth else f'and until {lag:g} s after'
         print(f'smoothed: each estimate by the samples before {later} it')

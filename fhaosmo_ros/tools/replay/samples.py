@@ -94,7 +94,7 @@ class Samples:
             self._active = int(event.begins)
             active[event.sample :] = self._active
             self._found.append((int(times[event.sample]), event))
-        if self.estimator.smooths:
+        if self.estimator.smoothing is not None:
             yield from self._due(estimates)
             return
         keep = np.flatnonzero((estimates.status & UNUSED) == 0)
@@ -111,7 +111,8 @@ class Samples:
 
     def _due(self, estimates: Trajectory) -> Iterator[Rows]:
         """Yield the rows whose smoothed estimates are final."""
-        numbers = self.estimator.due
-        if len(numbers):
+        smoothing = self.estimator.smoothing
+        if smoothing is not None and len(smoothing.numbers):
+            numbers = smoothing.numbers
             times, _, y = self._samples
             yield Rows(times[numbers], y[numbers], estimates, NONE, self._events())
