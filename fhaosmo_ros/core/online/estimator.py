@@ -225,9 +225,7 @@ class OnlineEstimator:
 
         """
         _check_smoothing(self._parameters, self.observer.configuration)
-        self.smoothing = Smoother(
-            self.observer, None if lag is None else round(lag / NANOSECONDS)
-        )
+        self.smoothing = Smoother(self.observer, None if lag is None else round(lag / NANOSECONDS))
 
     def finish(self) -> Trajectory:
         """Return the smoothed estimates that still wait: nothing comes after them."""

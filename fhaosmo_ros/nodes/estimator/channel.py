@@ -149,13 +149,6 @@ class Channel:
                 self.estimator.set_input(u, index)
             self._take(stamp, y)
 
-    def end_waiting(self) -> None:
-        """Step to samples that wait for known inputs although no sample has followed for long."""
-        if self._pairing is not None:
-            waited = perf_counter() - self._waits_since
-            if waited > self._values['known_input_wait']:
-                self._take_paired(at_once=True)
-
     def _take(self, stamp: int, y: float) -> None:
         """Step the observer to a sample."""
         begin, estimator, health = perf_counter(), self.estimator, self._health
@@ -263,6 +256,10 @@ class Channel:
 
     def tick(self) -> None:
         """Publish at the node's rate, if it is to; log once that y is silent."""
+        if self._pairing is not None:  # samples may wait for inputs, and no sample follows
+            waited = perf_counter() - self._waits_since
+            if waited > self._values['known_input_wait']:
+                self._take_paired(at_once=True)
         if self._arrived:
             self._arrived = self._stale = False
             self._silent_since = None

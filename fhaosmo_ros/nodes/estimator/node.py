@@ -215,8 +215,6 @@ class EstimatorNode(ManagedNode):
 
     def _tick(self) -> None:
         for channel in self._channels:
-            channel.end_waiting()
-        for channel in self._channels:
             channel.tick()
         self._typed.publish()
 

@@ -23,6 +23,7 @@ from rclpy.serialization import deserialize_message
 DISCOVERY_PERIOD = 0.2
 MOST_WHYS = 3
 """Different reasons that are told, of a publisher that always has another one."""
+STAMPS = {'source': 'source_timestamp', 'reception': 'received_timestamp'}
 UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """The name of a node that has been discovered later than its publisher, or is none of ROS."""
 Gid = tuple[int, ...]
@@ -73,13 +74,8 @@ class Listener:
                 return False
         if self._unwrap:
             value = self._unwrap(value)
-        source: int = info['source_timestamp']
-        if self.stamps == 'header':
-            self._take(header, value, source)
-        elif self.stamps == 'source':
-            self._take(source, value, source)
-        else:
-            self._take(info['received_timestamp'], value, source)
+        stamp = header if self.stamps == 'header' else info[STAMPS[self.stamps]]
+        self._take(stamp, value, info['source_timestamp'])
         return True
 
 
@@ -110,15 +106,6 @@ class Source:
         self._nameless: set[Gid] = set()
         self._told = ''
         self._timer: Any = None
-
-    def expect_type(self, message_type: str) -> None:
-        """Take a type that was given, '' for any; raise ConfigurationError for a second one."""
-        if message_type and self.message_type not in ('', message_type):
-            raise ConfigurationError(
-                f'topic {self.topic}: expected one message type for all inputs from it, got '
-                f'{self.message_type} and {message_type}'
-            )
-        self.message_type = self.message_type or message_type
 
     def add(self, wanted: Input, take: Take, first: bool = False) -> Listener:
         """Add a listener; a `first` one hears a message before those that are not."""
@@ -179,10 +166,8 @@ class Source:
         if verdict != QoSCompatibility.ERROR:
             return ''
         clashes = [part.removeprefix('ERROR: ') for part in reason.split(';') if 'ERROR' in part]
-        return (
-            f'{", ".join(clashes).lower()}; change input_reliability or input_durability, or its '
-            'own QoS'
-        )
+        hint = 'change input_reliability or input_durability, or its own QoS'
+        return f'{", ".join(clashes).lower()}; {hint}'
 
     def _discover(self) -> None:
         """Take the type of the topic's publishers; say once why if that is not possible."""
@@ -217,8 +202,10 @@ class Source:
 
     def _on_message(self, data: bytes, info: Mapping[str, Any]) -> None:
         sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
-        if sequence != self._sequence + 1:
-            self._count_lost(sequence)
+        if 0 < sequence <= self._sequence:  # another publisher's
+            self._mixed = True  # until `look` has seen how many there are
+        elif sequence and self._sequence and not self._mixed:
+            self.lost += sequence - self._sequence - 1
         self._sequence = sequence
         message, header = None, 0
         try:
@@ -232,24 +219,12 @@ class Source:
             if self._served and self._served[0].field.header:  # type: ignore[union-attr]
                 header = self._served[0].field.stamp(message)  # type: ignore[union-attr]
         lacking = [li for li in self._served if not li.hear(message, header, info)]
-        if lacking and len(self._whys) < MOST_WHYS:
-            self._tell_lacking(lacking)
-        self._sources.after_message()
-
-    def _tell_lacking(self, lacking: list[Listener]) -> None:
-        """Tell why a message lacks the field of some listeners, in one line, once a reason."""
-        why = str(lacking[0].why)
-        if why not in self._whys:  # two publishers may alternate
+        why = str(lacking[0].why) if lacking and len(self._whys) < MOST_WHYS else ''
+        if why and why not in self._whys:  # two publishers may alternate
             self._whys.add(why)
             more = f' (and {len(lacking) - 1} more like it)' if lacking[1:] else ''
             self._logger.warning(f'a message on {self.topic} is left out: {why}{more}')
-
-    def _count_lost(self, sequence: int) -> None:
-        """Count the messages between the publisher's last sequence number and this one."""
-        if 0 < sequence <= self._sequence:  # another publisher's
-            self._mixed = True  # until `look` has seen how many there are
-        elif sequence and self._sequence and not self._mixed:
-            self.lost += sequence - self._sequence - 1
+        self._sources.after_message()
 
 
 class Sources:
@@ -266,10 +241,19 @@ class Sources:
         self.after_message: Callable[[], None] = lambda: None
 
     def of(self, wanted: Input) -> Source:
-        """Return the source that an input is read from; new ones are not open yet."""
-        topic = self._node.resolve_topic_name(wanted.topic)
+        """
+        Return the source that an input is read from; new ones are not open yet.
+
+        Raises ConfigurationError for a second type of its messages.
+        """
+        topic, kind = self._node.resolve_topic_name(wanted.topic), wanted.message_type
         source = self._by_topic.setdefault(topic, Source(self._node, self, topic))
-        source.expect_type(wanted.message_type)
+        if kind and source.message_type not in ('', kind):
+            raise ConfigurationError(
+                f'topic {topic}: expected one message type for all inputs from it, got '
+                f'{source.message_type} and {kind}'
+            )
+        source.message_type = source.message_type or kind
         return source
 
     def open(self) -> None:

@@ -2,7 +2,7 @@
 """A managed node whose transitions may fail but never end the process."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 import traceback
 from typing import Any
 
@@ -22,21 +22,20 @@ class ManagedNode(LifecycleNode, TimedNode):
     publishers, subscriptions, services and timers that were made since `configure` began are
     destroyed by the transition cleanup, and if `configure` fails.
 
-    Attributes
-    ----------
-    state : str
-        unconfigured, inactive, active or finalized.
-
     """
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
-        self.state = 'unconfigured'
         self._error: Exception | None = None
         self._lasting: set[Any] = set()
         # In rclpy 7.1 a transition that the state does not allow raises, and ends the spinning.
         service = next(s for s in self.services if s.service_name.endswith('/change_state'))
         service.callback = self._guarded(service.callback)
+
+    @property
+    def state(self) -> str:
+        """One of unconfigured, inactive, active and finalized, and between two of them another."""
+        return self._state_machine.current_state[1]  # type: ignore[no-any-return]
 
     def destroy_node(self) -> None:
         """
@@ -63,20 +62,12 @@ class ManagedNode(LifecycleNode, TimedNode):
     def cleanup(self) -> None:
         """Stop working and destroy what was made since `configure` began, all or part of it."""
         self.deactivate()
-        for entity, destroy in list(self._entities()):
+        for entity, destroy in self._entities().items():
             if entity not in self._lasting:
                 destroy(entity)
 
     def start(self) -> None:
-        """
-        Configure and activate at once.
-
-        Raises
-        ------
-        Exception
-            What `configure` or `activate` raised.
-
-        """
+        """Configure and activate at once; raise what `configure` or `activate` raised."""
         for transition in (self.trigger_configure, self.trigger_activate):
             if transition() != SUCCESS:
                 assert self._error is not None
@@ -87,53 +78,49 @@ class ManagedNode(LifecycleNode, TimedNode):
         if self.state != 'finalized':
             self.trigger_shutdown()
 
-    def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
+    def on_configure(self, before: LifecycleState) -> TransitionCallbackReturn:
         """Unconfigured to inactive."""
-        self._lasting = {entity for entity, _ in self._entities()}
-        return self._attempt(self.configure, 'inactive', undo=self.cleanup)
+        self._lasting = set(self._entities())
+        return self._attempt(self.configure, undo=self.cleanup)
 
-    def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
+    def on_activate(self, before: LifecycleState) -> TransitionCallbackReturn:
         """Inactive to active."""
-        return self._attempt(self.activate, 'active', undo=self.deactivate)
+        return self._attempt(self.activate, undo=self.deactivate)
 
-    def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
+    def on_deactivate(self, before: LifecycleState) -> TransitionCallbackReturn:
         """Active to inactive."""
-        return self._attempt(self.deactivate, 'inactive')
+        return self._attempt(self.deactivate)
 
-    def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
+    def on_cleanup(self, before: LifecycleState) -> TransitionCallbackReturn:
         """Inactive to unconfigured."""
-        return self._attempt(self.cleanup, 'unconfigured')
+        return self._attempt(self.cleanup)
 
-    def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
+    def on_shutdown(self, before: LifecycleState) -> TransitionCallbackReturn:
         """Any state to finalized."""
-        return self._attempt(
-            self.deactivate if self.state == 'unconfigured' else self.cleanup, 'finalized'
-        )
+        unconfigured = before.label == 'unconfigured'
+        return self._attempt(self.deactivate if unconfigured else self.cleanup)
 
     def _attempt(
-        self, action: Callable[[], None], goal: str, undo: Callable[[], None] | None = None
+        self, action: Callable[[], None], undo: Callable[[], None] = lambda: None
     ) -> TransitionCallbackReturn:
         try:
             action()
         except Exception as error:
             self._error = error
-            if undo is not None:
-                undo()
+            undo()
             return FAILURE
-        self.state = goal
         return SUCCESS
 
-    def _entities(self) -> Iterator[tuple[Any, Callable[[Any], object]]]:
-        """Yield what the node has in ROS, each with what destroys it."""
+    def _entities(self) -> dict[Any, Callable[[Any], object]]:
+        """Return what the node has in ROS, each with what destroys it."""
         clock = self.resolve_topic_name('/clock')  # rclpy's own, also made later
-        others = [s for s in self.subscriptions if s.topic_name != clock]
-        for entities, destroy in (
-            (self.publishers, self.destroy_publisher),
-            (others, self.destroy_subscription),
-            (self.services, self.destroy_service),
-            (self.timers, self.destroy_timer),
-        ):
-            yield from ((entity, destroy) for entity in entities)
+        subscriptions = [s for s in self.subscriptions if s.topic_name != clock]
+        return {
+            **dict.fromkeys(self.publishers, self.destroy_publisher),
+            **dict.fromkeys(subscriptions, self.destroy_subscription),
+            **dict.fromkeys(self.services, self.destroy_service),
+            **dict.fromkeys(self.timers, self.destroy_timer),
+        }
 
     def _guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         def change_state(

@@ -5,13 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from typing import Any
 
-from fhaosmo_ros.core.parameters.declaration import (
-    Parameter,
-    Parameters,
-    shown,
-    suggestion,
-    Value,
-)
+from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown, suggestion, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import is_built_in
 from fhaosmo_ros.core.parameters.per_channel import split
@@ -85,8 +79,8 @@ class NodeParameters:
     The parameters of a node: declared in ROS, and changed by its services.
 
     ROS has a copy of the values for its services; the node reads these ones. A live change is
-    coerced once, when it comes in (pre-set callback); prepared as a set, and refused or accepted,
-    before ROS takes it (on-set callback); and adopted afterwards (post-set callback).
+    coerced and prepared as a set when it comes in (pre-set callback), refused or accepted before
+    ROS takes it (on-set callback), and adopted afterwards (post-set callback).
 
     Parameters
     ----------
@@ -120,12 +114,9 @@ class NodeParameters:
         self._prepare, self._adopt_change, self._followers = prepare, adopt, followers
         not_live = (name for name, parameter in values.table.items() if not parameter.live)
         self._read_only = set(not_live if fixed is None else fixed)
-        self._coerced: dict[str, Value] = {}
         self._refused: ConfigurationError | None = None
-        self._next: Parameters = values
-        self._prepared: Any = None
         self.extend(values)
-        node.add_pre_set_parameters_callback(self._coerce)
+        node.add_pre_set_parameters_callback(self._look_at)
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._adopt)
 
@@ -137,44 +128,35 @@ class NodeParameters:
                 self._node.declare_parameter(name, value, declared, ignore_override=True)
         self.values = values
 
-    def _coerce(self, parameters: list[RosParameter]) -> list[RosParameter]:
-        """Return the parameters, and those that follow, in their declared types if they fit."""
-        table = self.values.table
-        self._coerced, self._refused = {}, None
-        converted = {}
-        for p in parameters:
-            name = p.name
+    def _look_at(self, parameters: list[RosParameter]) -> list[RosParameter]:
+        """Coerce and prepare a set; return it, and those that follow, in the declared types."""
+        table, found = self.values.table, {p.name: p for p in parameters}
+        for name in found:
             if not self._node.has_parameter(name):  # rclpy 7.1 refuses it too, without the name
                 raise ParameterNotDeclaredException(f"'{name}'{suggestion(name, table)}")
-            converted[name] = p
-            if name in table:
-                try:
-                    value = self._coerced[name] = table[name].coerce(_read(p.value, table[name]))
-                    converted[name] = RosParameter(name, TYPES[table[name].kind], value)
-                except ConfigurationError:
-                    self._refused = self._refused or table[name].error(p.value)
-        if self._refused is None:
-            for name, leader in self._followers(list(converted)).items():
-                p = converted[leader]
+        self._refused, ours = None, [name for name in found if name in table]
+        try:
+            self._coerced = {name: _coerced(table[name], found[name].value) for name in ours}
+            for name, leader in self._followers(list(found)).items():
                 self._coerced[name] = self._coerced[leader]
-                converted[name] = RosParameter(name, p.type_, p.value)
-        return list(converted.values())
+            if ours:
+                self._next = Parameters(table, {**self.values, **self._coerced})
+                self._prepared = self._prepare(self._next, self._coerced)
+        except ConfigurationError as error:
+            self._refused = error
+            return parameters
+        for name, value in self._coerced.items():
+            found[name] = RosParameter(name, TYPES[table[name].kind], value)
+        return list(found.values())
 
     def _check(self, parameters: list[RosParameter]) -> SetParametersResult:
         ours = [p.name for p in parameters if p.name in self.values.table]
-        try:
-            if ours and self._refused is not None:
-                raise self._refused
-            if ours:
-                self._next = Parameters(self.values.table, {**self.values, **self._coerced})
-                self._prepared = self._prepare(self._next, self._coerced)
-        except ConfigurationError as error:
-            self._node.get_logger().warning(f'rejected: {error}')
-            for name in ours:  # rclpy has already put the rejected type there
-                kind = self.values.table[name].kind
-                self._node.describe_parameter(name).type = TYPES[kind].value
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
+        if not ours or self._refused is None:
+            return SetParametersResult(successful=True)
+        self._node.get_logger().warning(f'rejected: {self._refused}')
+        for name in ours:  # rclpy has already put the rejected type there
+            self._node.describe_parameter(name).type = TYPES[self.values.table[name].kind].value
+        return SetParametersResult(successful=False, reason=str(self._refused))
 
     def _adopt(self, parameters: list[RosParameter]) -> None:
         if any(p.name in self.values.table for p in parameters):
@@ -184,9 +166,13 @@ class NodeParameters:
             self._node.get_logger().info(f'set {text}')
 
 
-def _read(value: Any, declared: Parameter) -> Any:
-    """Return the number in a text: `ros2 param set` sends 1e-3 as one."""
+def _coerced(declared: Parameter, value: Any) -> Value:
+    """Return a value in the declared type; `ros2 param set` sends 1e-3 as a text."""
+    read = value
     if isinstance(value, str) and declared.kind == 'double':
         with suppress(ConfigurationError):
-            return parse(value)
-    return value
+            read = parse(value)
+    try:
+        return declared.coerce(read)
+    except ConfigurationError:
+        raise declared.error(value) from None

@@ -47,11 +47,8 @@ class ClockWatch:
     """Finds that a node's simulated time has not begun, or does not go on."""
 
     def __init__(self, node: Node) -> None:
-        self._node = node
-        self._topic = node.resolve_topic_name('/clock')
-        self._time = 0
-        self._since = monotonic()
-        self._told = False
+        self._node, self._topic = node, node.resolve_topic_name('/clock')
+        self._time, self._since, self._told = 0, monotonic(), False
 
     def look(self, report: Report) -> None:
         """Add what is wrong to a report; log it once."""
