@@ -39,7 +39,7 @@ SHARED = ('/parameter_events', '/rosout', '/diagnostics', '/tf', '/tf_static')
 """Topics of many publishers: the sequence numbers of their messages say nothing."""
 
 
-class PrivateNode:
+class PrivateNode(Spinner):
     """
     A `node` in a context of its own, without signal handlers; spun while open.
 
@@ -66,13 +66,10 @@ class PrivateNode:
             self.node = Node(name, context=self._context)
         except RuntimeError as error:
             raise ConfigurationError(f'ROS arguments {shlex.join(acting)}: {error}') from None
-
-    def __enter__(self) -> 'PrivateNode':
-        self._spinner = Spinner(self.node, grace=self.grace).__enter__()
-        return self
+        super().__init__(self.node, grace=self.grace)
 
     def __exit__(self, *error: object) -> None:
-        self._spinner.__exit__(*error)
+        super().__exit__(*error)
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
@@ -174,7 +171,7 @@ class TopicRecorder(PrivateNode):
 
     def check(self) -> None:
         """Raise what ended the recording: of the system, such as a full disk, or of a callback."""
-        if error := self._failed or self._spinner.error:
+        if error := self._failed or self.error:
             raise error
 
     def _write(self, write: Callable[..., Any], *arguments: Any) -> Any:
@@ -187,7 +184,12 @@ class TopicRecorder(PrivateNode):
         return None
 
     def _discover(self) -> None:
-        inputs = self._inputs()
+        inputs = set()  # what the nodes listen to
+        for full_name in self._nodes:
+            space, _, name = full_name.rpartition('/')
+            with suppress(NodeNameNonExistentError):  # not there yet
+                heard = self.node.get_subscriber_names_and_types_by_node(name, space or '/')
+                inputs |= {topic for topic, _ in heard}
         wanted = inputs | self._topics
         below = tuple(f'{name}/' for name in self._nodes)
         for topic, types in self.node.get_topic_names_and_types():
@@ -209,16 +211,6 @@ class TopicRecorder(PrivateNode):
             if self._write(self._bag.add, topic, types[0], different) is False:
                 self.problems.append(f'{topic}: the bag will lack the definition of its type')
             self._subscribe(topic, kind, profiles, measured=topic in inputs)
-
-    def _inputs(self) -> set[str]:
-        """Return the topics that the nodes listen to."""
-        found = set()
-        for full_name in self._nodes:
-            space, _, name = full_name.rpartition('/')
-            with suppress(NodeNameNonExistentError):  # not there yet
-                topics = self.node.get_subscriber_names_and_types_by_node(name, space or '/')
-                found |= {topic for topic, _ in topics}
-        return found
 
     def _subscribe(
         self, topic: str, kind: Any, profiles: Sequence[QoSProfile], measured: bool

@@ -474,9 +474,7 @@ class OnlineEstimator:
 
         As a self-tuning observer expects them; NaN with fixed gains.
         """
-        if self.smoothing is not None:
-            return self.smoothing.standard_deviation
-        return self.observer.standard_deviation
+        return (self.smoothing or self.observer).standard_deviation
 
     @property
     def tuning(self) -> Tuning:

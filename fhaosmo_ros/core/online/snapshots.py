@@ -10,7 +10,6 @@ into a double: each has two entries, its upper and its lower half.
 from collections.abc import Mapping, Sequence
 from enum import IntFlag
 from functools import lru_cache
-import math
 from numbers import Integral
 import re
 from typing import Any, NamedTuple
@@ -24,7 +23,8 @@ VERSION = 4
 HEAD = ['version', 'flags', 'sec', 'nanosec']
 HALF = 2**32
 SECOND = 1_000_000_000
-INDEX = re.compile(r'(.*?)(\d{1,6}(?:_\d{1,6})*)')
+HALVES = ['_upper', '_lower']
+LABEL = re.compile(r'(.*?)(_upper|_lower|\d+(?:_\d+)*|)', re.DOTALL)
 
 
 class Flag(IntFlag):
@@ -61,22 +61,24 @@ def pack(snapshot: Snapshot) -> tuple[list[str], NDArray[np.float64]]:
     """Return a snapshot as labels and a vector; the first entry is the version."""
     values = {name: value for name, value in snapshot.values.items() if name != 'version'}
     head = [VERSION, int(snapshot.flags), *divmod(snapshot.stamp, SECOND)]
-    whole = [isinstance(value, Integral) for value in values.values()]
     parts = [
-        np.ravel(divmod(int(value), HALF) if is_whole else value)
-        for value, is_whole in zip(values.values(), whole, strict=True)
+        np.ravel(divmod(int(value), HALF) if isinstance(value, Integral) else value)
+        for value in values.values()
     ]
-    shapes = tuple(zip(values, map(np.shape, values.values()), whole, strict=True))
-    return _labels(shapes), np.concatenate([head, *parts], dtype=np.float64)
+    return HEAD + _labels(values), np.concatenate([head, *parts], dtype=np.float64)
+
+
+def _labels(values: Mapping[str, Any]) -> list[str]:
+    """Return a label for each entry of named numbers."""
+    return _labels_of(tuple((k, np.shape(v), isinstance(v, Integral)) for k, v in values.items()))
 
 
 @lru_cache(maxsize=64)
-def _labels(shapes: tuple[tuple[str, tuple[int, ...], bool], ...]) -> list[str]:
-    """Return a label for each entry of numbers with these names and shapes, integers or not."""
-    labels = list(HEAD)
+def _labels_of(shapes: tuple[tuple[str, tuple[int, ...], bool], ...]) -> list[str]:
+    labels = []
     for name, shape, whole in shapes:
         ends = ('_'.join(str(k + 1) for k in index) for index in np.ndindex(shape))
-        labels += [name + end for end in (('_upper', '_lower') if whole else ends)]
+        labels += [name + end for end in (HALVES if whole else ends)]
     return labels
 
 
@@ -102,30 +104,25 @@ def unpack(vector: ArrayLike, labels: Sequence[str]) -> Snapshot:
             f'snapshot: expected version {VERSION}, and a stamp, got version {version:g}'
         )
     flags, second, nanosecond = map(int, head)
-    values = {'version': VERSION, **_values(entries)}
-    return Snapshot(second * SECOND + nanosecond, Flag(flags & 7), values)
-
-
-def _values(entries: Mapping[str, float]) -> dict[str, Any]:
-    """Return numbers and arrays by name."""
-    values: dict[str, Any] = {}
-    parts: dict[str, dict[tuple[int, ...], float]] = {}
+    parts: dict[str, dict[str, float]] = {}
     for label, number in entries.items():
-        name, _, half = label.rpartition('_')
-        match = INDEX.fullmatch(label)
-        if half in ('upper', 'lower') and {f'{name}_upper', f'{name}_lower'} <= entries.keys():
-            upper, lower = entries[f'{name}_upper'], entries[f'{name}_lower']
-            if not (abs(upper) <= HALF and 0.0 <= lower < HALF):
-                raise ConfigurationError(f"snapshot: '{name}': expected an integer")
-            values[name] = int(upper) * HALF + int(lower)
-        elif match is None:
-            values[label] = number
-        else:
-            place = tuple(int(k) - 1 for k in match[2].split('_'))
-            parts.setdefault(match[1], {})[place] = number
-    for name, part in parts.items():
-        shape = tuple(1 + max(places) for places in zip(*part, strict=False))
-        if math.prod(shape) != len(part) or sorted(part) != list(np.ndindex(shape)):
-            raise ConfigurationError(f"snapshot: '{name}': expected all entries of an array")
-        values[name] = np.array([part[place] for place in sorted(part)]).reshape(shape)
-    return values
+        name, end = LABEL.fullmatch(label).groups()  # type: ignore[union-attr]  # all match
+        parts.setdefault(name, {})[end] = number
+    try:
+        values = {name: _value(list(part), list(part.values())) for name, part in parts.items()}
+    except (OverflowError, ValueError) as error:
+        raise ConfigurationError(
+            f'snapshot: expected numbers and whole arrays ({error})'
+        ) from None
+    if _labels(values) != list(entries):
+        raise ConfigurationError('snapshot: expected all entries of each array, in their order')
+    return Snapshot(second * SECOND + nanosecond, Flag(flags & 7), {'version': VERSION, **values})
+
+
+def _value(ends: list[str], numbers: list[float]) -> Any:
+    """Return what the entries of one name are, by the ends of their labels."""
+    if ends == ['']:
+        return numbers[0]
+    if ends == HALVES:
+        return int(numbers[0]) * HALF + int(numbers[1])
+    return np.reshape(numbers, [int(k) for k in ends[-1].split('_')])

@@ -19,6 +19,7 @@ from fhaosmo_ros.nodes.middleware.endpoints import create_publisher, DEPTH, has_
 from fhaosmo_ros.nodes.middleware.messages import labelled, message_class, time_message
 from fhaosmo_ros.topics import ARRAY, estimates_of, SNAPSHOT, STANDARD_DEVIATION, TYPED_ESTIMATES
 from geometry_msgs.msg import AccelStamped, WrenchStamped
+import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
@@ -57,7 +58,7 @@ class Outputs:
         messages = {
             'gamma': lambda: Float64(data=estimate.gamma),
             STANDARD_DEVIATION: lambda: self._deviation(estimator.standard_deviation),
-            'tuning': lambda: self._tuning(estimator.observer.structure.found),
+            'tuning': lambda: self._tuning(np.hstack(estimator.tuning)),
             'state': lambda: self._state(estimate.z),
             'unknown_input': lambda: Float64(data=estimate.unknown_input),
             'innovation': lambda: self._innovation(estimate.innovation),

@@ -9,6 +9,7 @@ import re
 import sys
 import threading
 import traceback
+from typing import TypeVar
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import with_origin
@@ -27,6 +28,7 @@ try:
 except ImportError:  # an older rclpy
     EventsExecutor = None
 
+Self = TypeVar('Self', bound='Spinner')
 GRACE = 0.5
 """Seconds that a callback has to end after a signal."""
 PATIENCE = 20.0
@@ -67,7 +69,7 @@ class Spinner:
         self._stop = Future()
         self._thread = threading.Thread(target=self._spin, name='executor', daemon=True)
 
-    def __enter__(self) -> 'Spinner':
+    def __enter__(self: Self) -> Self:
         # What there is now lives to the end, so garbage collections need not look at it. One that
         # does takes 70 ms, in which the middleware waits for Python and drops messages.
         gc.collect()
