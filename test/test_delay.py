@@ -2,7 +2,7 @@
 """A known delay of y: the inputs that acted then, the estimate's time, and the present."""
 
 from fhaosmo_ros.core import ConfigurationError, Family, OnlineEstimator
-from fhaosmo_ros.core.online.delay import PIECES
+from fhaosmo_ros.core.online.policy import PIECES
 from fhaosmo_ros.core.simulation.plant import respond
 from fhaosmo_ros.tools.tuning.objective import Objective, TUNE_PARAMETERS
 from hypothesis import given

@@ -265,7 +265,7 @@ class OnlineEstimator:
         version = checked(values, {'version': VERSION})['version']
         if version != VERSION:
             raise ConfigurationError(f'snapshot: expected version {VERSION}, got {version}')
-        if np.size(values.get('past_pieces', ())) != self.policy.past.pieces.size:
+        if np.size(values.get('past_pieces', ())) != self.policy.pieces.size:
             raise ConfigurationError(
                 'snapshot: expected that of an estimator with the same measurement_delay'
             )
@@ -281,8 +281,10 @@ class OnlineEstimator:
     @property
     def _arrays(self) -> dict[str, NDArray[np.float64]]:
         """What is remembered of the known inputs."""
-        past = self.policy.past
-        return {'u': self._u, 'past_latest': past.latest, 'past_pieces': past.pieces}
+        policy = self.policy
+        return {
+            'u': self._u, 'past_latest': policy.latest_inputs, 'past_pieces': policy.pieces,
+        }  # fmt: skip
 
     def _cut(self) -> None:
         """Smooth nothing across what has happened."""

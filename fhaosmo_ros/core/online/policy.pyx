@@ -3,6 +3,10 @@
 The policy of time and of bad data: one function for node, replay and trials.
 
 What it does, case by case, is in docs/node.md. Times are in nanoseconds.
+
+A sample that arrives at t tells of the plant at t - `measurement_delay`; its stamp remains t for
+the rules of time. A known input that arrives at t acted at t - `input_delay`. So the step to a
+sample needs the inputs that arrived a lag of measurement_delay - input_delay before it.
 """
 
 from libc.math cimport fabs, fmax, fmin, isfinite, isnan, rint
@@ -15,8 +19,7 @@ from fhaosmo_ros.core.observer.status cimport (
     DIVERGED, FLAGS_MASK, GAP, HELD, JUMPED, REJECTED, REJECTED_MEASUREMENT, REJECTED_PERIOD,
     REJECTED_SPIKE, REJECTED_STEP, REJECTED_STUCK, REPEATED, RESTARTED, UNUSED
 )
-from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, Structure
-from fhaosmo_ros.core.online.delay cimport NANOSECONDS, PastInputs
+from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, MOST_INPUTS, Structure
 
 import numpy as np
 
@@ -29,6 +32,10 @@ MOST_SUB_STEPS = MOST_STEPS
 # is none to compare it with.
 cdef double MOST_INTERVALS = 500.0, FIRST_GAP = 3.6e12
 GAP_SAMPLES = MOST_INTERVALS
+cdef double NANOSECONDS = 1e-9
+cdef int MOST_PIECES = 512
+PIECES = MOST_PIECES
+"""Room for so many different values of the inputs within the delay; older ones are forgotten."""
 # Stands for every difference (ns) that an integer may not hold.
 cdef long long FAR = 4_000_000_000_000_000_000
 # A tick is on time if it is off by at most so many intervals of the samples; times follow it by
@@ -121,6 +128,12 @@ cdef struct Sensor:
     double elsewhere  # share of values of late that repeat themselves, another one each
 
 
+cdef struct Ring:
+    # Pieces of time with the same known inputs.
+    int past_place  # of the latest piece
+    int past_count  # of pieces
+
+
 cdef long long difference(long long a, long long b) noexcept nogil:
     """Return a - b, or +-FAR where that would overflow."""
     cdef double rough = <double>a - <double>b
@@ -149,16 +162,28 @@ cdef class Policy:
     cdef readonly Course course
     cdef Clock clock
     cdef Sensor sensor
-    cdef readonly PastInputs past
+    # The known inputs of late.
+    cdef readonly object latest_inputs  # (m,) array: at the latest sample that was used
+    cdef double* present  # its numbers
+    cdef double acting[MOST_INPUTS]  # a mean: in the latest step, where y is known later
+    cdef readonly object pieces  # (MOST_PIECES, 1 + m) array of a ring: durations (ns), inputs
+    cdef double* first  # the first piece
+    cdef Ring ring
 
     def __cinit__(self, Structure structure not None, dict settings):
-        self.past = PastInputs(structure.inputs, settings['lag'] > 0)
+        cdef bint late = settings['lag'] > 0
+        cdef double[::1] latest = np.zeros(structure.inputs)
+        cdef double[:, ::1] pieces = np.zeros((MOST_PIECES * late, 1 + structure.inputs))
+        self.latest_inputs, self.present = np.asarray(latest), &latest[0]
+        self.pieces = np.asarray(pieces)
+        if late:
+            self.first = &pieces[0, 0]
         self.configure(structure, settings)
 
     def configure(self, Structure structure not None, dict settings):
         """Go on with an observer that has taken over, and with these settings."""
         cdef Settings new = settings
-        if structure.inputs != self.past.inputs or (new.lag > 0) != self.past.is_late:
+        if self.pieces.shape != (MOST_PIECES * (new.lag > 0), 1 + structure.inputs):
             raise ValueError('policy: expected an observer and a past of the same known inputs')
         if self.structure is not None:
             self.structure.enter()
@@ -216,7 +241,7 @@ cdef class Policy:
         elif not word & REJECTED:
             counters.accepted += 1
             course.valid = True
-            memcpy(self.past.present, u, self.structure.inputs * sizeof(double))
+            memcpy(self.present, u, self.structure.inputs * sizeof(double))
             course.stamp = stamp if self.settings.nominal else now
         elif word & REJECTED_STEP:
             counters.rejected_steps += 1
@@ -467,7 +492,7 @@ cdef class Policy:
     cdef int begin_again(self, long long* counter) noexcept nogil:
         """Make a fresh observer, and count it; return flags."""
         self.refresh()
-        self.past.ring.past_count = 0
+        self.ring.past_count = 0
         counter[0] += 1
         return RESTARTED
 
@@ -495,7 +520,7 @@ cdef class Policy:
     cdef void forget_samples(self) noexcept nogil:
         """Start afresh: the next sample is the first. Counters go on."""
         self.refresh()
-        self.past.ring.past_count = 0
+        self.ring.past_count = 0
         self.course.valid = False
         self.clock.tick_count = self.clock.spacing = 0
 
@@ -506,11 +531,69 @@ cdef class Policy:
         cdef int word
         if self.settings.lag == 0:
             return self.step_over(elapsed, y, u)
-        self.past.note(elapsed, u)
-        word = self.step_over(elapsed, y, self.past.before(self.settings.lag, elapsed, u))
+        self.note(elapsed, u)
+        self.find_acting(elapsed, u)
+        word = self.step_over(elapsed, y, self.acting)
         if word & REJECTED_SPIKE:
-            self.past.withdraw(elapsed)
+            self.withdraw(elapsed)
         return word
+
+    cdef double* piece(self, int back) noexcept nogil:
+        """Return a piece, by its number from the latest one back."""
+        cdef int place = (self.ring.past_place + MOST_PIECES - back) % MOST_PIECES
+        return self.first + place * (1 + self.structure.inputs)
+
+    cdef void note(self, long long elapsed, const double* u) noexcept nogil:
+        """Append that the inputs have been `u` for the latest `elapsed` nanoseconds."""
+        cdef double* latest = self.piece(0)
+        cdef bint same = self.ring.past_count > 0
+        cdef int j
+        for j in range(self.structure.inputs):
+            same = same and latest[1 + j] == u[j]
+        if not same:
+            self.ring.past_place = (self.ring.past_place + 1) % MOST_PIECES
+            self.ring.past_count = min(self.ring.past_count + 1, MOST_PIECES)
+            latest = self.piece(0)
+            latest[0] = 0.0
+            memcpy(latest + 1, u, self.structure.inputs * sizeof(double))
+        latest[0] += elapsed
+
+    cdef void withdraw(self, long long elapsed) noexcept nogil:
+        """Take back what `note` has appended last."""
+        self.piece(0)[0] -= elapsed
+        if self.piece(0)[0] <= 0.0:
+            self.ring.past_place = (self.ring.past_place + MOST_PIECES - 1) % MOST_PIECES
+            self.ring.past_count -= 1
+
+    cdef void find_acting(self, long long elapsed, const double* u) noexcept nogil:
+        """
+        Write the mean of the inputs over `elapsed` nanoseconds that ended the lag before now.
+
+        They are `u` where nothing is known of the past.
+        """
+        cdef long long lag = self.settings.lag
+        cdef long long covered = 0, end = 0, begin, share  # end of a piece, before now
+        cdef int k, j
+        cdef double part
+        cdef const double* piece
+        memcpy(self.acting, u, self.structure.inputs * sizeof(double))
+        for k in range(self.ring.past_count):
+            piece = self.piece(k)
+            begin = end + <long long>piece[0]
+            share = min(begin, lag + elapsed) - max(end, lag)
+            if k == self.ring.past_count - 1:  # the oldest one known stands for all before it
+                share = elapsed - covered
+            if share > 0:
+                covered += share
+                part = <double>share / covered
+                for j in range(self.structure.inputs):
+                    if part == 1.0:
+                        self.acting[j] = piece[1 + j]
+                    else:
+                        self.acting[j] += part * (piece[1 + j] - self.acting[j])
+            if covered >= elapsed:
+                return
+            end = begin
 
     cdef int step_over(self, long long elapsed, double y, const double* u) noexcept nogil:
         """
@@ -614,11 +697,33 @@ cdef class Policy:
         for i in range(self.structure.prediction.n):
             z[i], self.structure.prediction.dz[i] = self.structure.estimate(i), 0.0
         memcpy(out, z, (n + 1) * sizeof(double))
-        self.past.carry(self.structure.prediction, self.settings.lag, self.settings.delay)
+        self.predict_delay()
         for i in range(n + 1):
             finite = finite and isfinite(z[i])
         if finite:  # else the model has left the finite numbers, and the estimates stay
             memcpy(out, z, (n + 1) * sizeof(double))
+
+    cdef void predict_delay(self) noexcept nogil:
+        """Follow the model over the delay, by the inputs that have acted since."""
+        cdef int known = 0, count = self.ring.past_count
+        cdef long long lag = self.settings.lag, delay = self.settings.delay
+        cdef long long age = 0, left = lag  # until now: from the end of a piece; to be predicted
+        if lag > 0 and count > 0:
+            while known + 1 < count and age + <long long>self.piece(known)[0] < lag:
+                age += <long long>self.piece(known)[0]
+                known += 1
+            while known >= 0:  # from the oldest piece within the lag to the latest one
+                if left > age:
+                    self.structure.prediction.over(
+                        (left - age) * NANOSECONDS, self.piece(known) + 1
+                    )
+                left = age
+                known -= 1
+                if known >= 0:
+                    age -= <long long>self.piece(known)[0]
+            delay -= lag
+        if delay > 0:
+            self.structure.prediction.over(delay * NANOSECONDS, self.present)
 
     # What Python calls
 
@@ -644,7 +749,6 @@ cdef class Policy:
         observer, and the inputs that acted until then. Else they have no rows.
         """
         cdef Structure structure = self.structure
-        cdef PastInputs past = self.past
         cdef Py_ssize_t k, count = y.shape[0], m = structure.inputs
         cdef Record record = Record(structure, count)
         cdef bint carried = self.settings.to_now and self.settings.delay > 0
@@ -666,7 +770,7 @@ cdef class Policy:
                         times[k] = self.course.latest
                         inputs = &u[k, 0]
                         if self.settings.lag > 0:
-                            inputs = past.acting
+                            inputs = self.acting
                         memcpy(&acting[k, 0], inputs, m * sizeof(double))
         finally:
             structure.busy = False
@@ -692,19 +796,18 @@ cdef class Policy:
     def memory(self):
         """What it remembers: the members of `Course`, `Clock`, `Sensor` and `Ring` by name."""
         cdef dict course = self.course, clock = self.clock, sensor = self.sensor
-        return course | clock | sensor | self.past.ring
+        return course | clock | sensor | self.ring
 
     def change(self, **numbers):
         """Remember other numbers: members of `memory` by name."""
         cdef dict memory = self.memory | numbers
         self.structure.enter()
-        self.past.ring = memory
-        self.course, self.clock, self.sensor = memory, memory, memory
+        self.course, self.clock, self.sensor, self.ring = memory, memory, memory, memory
 
     def __reduce__(self):
-        state = self.memory, self.counters, self.past.latest, self.past.pieces
+        state = self.memory, self.counters, self.latest_inputs, self.pieces
         return Policy, (self.structure, self.settings), state
 
     def __setstate__(self, state):
-        memory, self.counters, self.past.latest[:], self.past.pieces[:] = state
+        memory, self.counters, self.latest_inputs[:], self.pieces[:] = state
         self.change(**memory)
