@@ -30,6 +30,21 @@ NEWS = AFRESH | JUMPED
 """Flags of a step that are logged beside those of a rejected sample."""
 QUIET = 5.0
 """Seconds between two warnings of one kind."""
+TOLD = {
+    Status.RESTARTED: 'the stamps jumped by more than max_gap, ahead or back: restarted from the '
+    'new one ({restarts} restarts so far); where y always comes so slowly, set max_gap to several '
+    'of its periods',
+    Status.DIVERGED: 'the observer had lost y and started again from it; its gains do not fit '
+    '({divergences} divergences so far)',
+    Status.JUMPED: 'y jumped; {jumped} ({jumps} jumps so far)',
+    Status.HELD: 'its stamp lies more than max_gap from the one before; the next one decides',
+    Status.REJECTED_PERIOD: '{late}',
+    Status.REJECTED_SPIKE: 'y = {y} is too far from its prediction',
+    Status.REJECTED_STUCK: 'y = {y} repeats itself: its sensor is stuck',
+    Status.REJECTED_MEASUREMENT: 'expected a finite y of at most divergence_limit, got {y}',
+    REJECTED: 'y = {y} would have made the estimate infinite',
+}
+"""What is logged of a sample, by the first of these flags that it has."""
 TOLD_AFTER = 5
 """Reports on /diagnostics without any sample, until the log says why there is no estimate."""
 
@@ -199,33 +214,10 @@ class Channel:
         jumped = 'z1 follows it, the other estimates go on'
         if offset:
             jumped = f'the model contradicts it: y is taken as {offset:.4g} too large'
-        restarts = counters.restarts_forward + counters.restarts_backward
-        flag, text = next((flag, text) for flag, text in (
-            (
-                Status.RESTARTED,
-                'the stamps jumped by more than max_gap, ahead or back: restarted from the new '
-                f'one ({restarts} restarts so far); where y always comes so slowly, set max_gap '
-                'to several of its periods',
-            ),
-            (
-                Status.DIVERGED,
-                'the observer had lost y and started again from it; its gains do not fit '
-                f'({counters.divergences} divergences so far)',
-            ),
-            (Status.JUMPED, f'y jumped; {jumped} ({counters.jumps} jumps so far)'),
-            (
-                Status.HELD,
-                'its stamp lies more than max_gap from the one before; the next one decides',
-            ),
-            (Status.REJECTED_PERIOD, late),
-            (Status.REJECTED_SPIKE, f'y = {y} is too far from its prediction'),
-            (Status.REJECTED_STUCK, f'y = {y} repeats itself: its sensor is stuck'),
-            (
-                Status.REJECTED_MEASUREMENT,
-                f'expected a finite y of at most divergence_limit, got {y}',
-            ),
-            (REJECTED, f'y = {y} would have made the estimate infinite'),
-        ) if word & flag)  # fmt: skip
+        flag = next(flag for flag in TOLD if word & flag)
+        text = TOLD[flag].format(
+            y=y, late=late, jumped=jumped, restarts=counters.restarts, **counters._asdict()
+        )
         if not flag & NEWS:
             text = f'rejected a sample: {text} ({counters.rejected} rejected so far)'
         now = perf_counter()
