@@ -18,7 +18,7 @@ from fhaosmo_ros.core.parameters.units import derivative_unit
 from fhaosmo_ros.inputs import known_inputs, make_pairing, measured_output
 from fhaosmo_ros.nodes.estimator.health import Health
 from fhaosmo_ros.nodes.estimator.outputs import Output, Outputs, TypedOutputs
-from fhaosmo_ros.nodes.estimator.sources import Sources
+from fhaosmo_ros.nodes.estimator.sources import Listener, Sources
 from fhaosmo_ros.nodes.middleware.diagnostics import array_of, OK, Report, WARN
 from fhaosmo_ros.nodes.middleware.endpoints import create_publisher
 from fhaosmo_ros.nodes.middleware.messages import message_class, time_message
@@ -70,7 +70,7 @@ class Channel:
         self._clock = node.get_clock()
         self._logger = node.get_logger().get_child(name) if name else node.get_logger()
         self.estimator = estimator
-        self._values = values
+        self.values = values
         self._active = False
         self._forget()
         observer = estimator.observer
@@ -80,15 +80,15 @@ class Channel:
             node, message_class(DIAGNOSTICS), prefix + EVENT, latched=True
         )
         wanted = measured_output(values, name)
-        self._y = sources.of(wanted).add(wanted, self._on_sample)
+        self.y = sources.of(wanted).add(wanted, self._on_sample)
         known = known_inputs(values, observer.used_inputs, name)
-        self._pairing = make_pairing(values, observer.inputs, known, estimator.inputs)
-        us = {}
+        self.pairing = make_pairing(values, observer.inputs, known, estimator.inputs)
+        self.u: dict[str, Listener] = {}
         for u, its in known.items():
             take = partial(self._on_input, observer.inputs.index(u), u)
-            us[u] = sources.of(its).add(its, take, first=True)
-        simulated = node.get_parameter('use_sim_time').value
-        self._health = Health(estimator, values, self._y, us, self._pairing, simulated)
+            self.u[u] = sources.of(its).add(its, take, first=True)
+        self.simulated = node.get_parameter('use_sim_time').value
+        self._health = Health(self)
         if name:  # those without a name are the node's
             node.create_service(Trigger, prefix + 'reset', self.reset)
             node.create_service(SetBool, prefix + 'freeze', self.freeze)
@@ -97,8 +97,8 @@ class Channel:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
         self._reset()
         self._forget()
-        if self._pairing is not None:
-            self._pairing.forget_samples()
+        if self.pairing is not None:
+            self.pairing.forget_samples()
         self._health.begin()
         self._active = True
         if self.estimator.events.on:
@@ -106,7 +106,7 @@ class Channel:
         observer = self.estimator.observer
         self._logger.info(
             f'estimating {observer.order} states and the unknown input from '
-            f'{self._y.source.topic} ({observer.description})'
+            f'{self.y.source.topic} ({observer.description})'
         )
 
     def deactivate(self) -> None:
@@ -118,17 +118,17 @@ class Channel:
         found = self.estimator.events.on
         self.estimator.adopt(change)
         self._outputs.snapshot(Flag.CHANGED)
-        self._values = self._health.limits = values
+        self.values = values
         if self._active and found != self.estimator.events.on:
             self._say('events are switched off' if found else 'no event yet')
 
     def reports(self) -> list[Report]:
         """Return the reports for /diagnostics, on the time since the last ones."""
-        reports = self._health.reports(self._stale, f'{self.name} ' if self.name else '')
+        reports = self._health.reports(self._stale)
         if self._active and isnan(self._health.latest):
             self._without_sample += 1
             # What is wrong with y itself has been logged already.
-            if self._without_sample == TOLD_AFTER and not self._y.error:
+            if self._without_sample == TOLD_AFTER and not self.y.error:
                 self._logger.warning(f'still waiting: {reports[0].text}')
         return reports
 
@@ -148,18 +148,18 @@ class Channel:
         health.delays.append(time_ns() - source)
         health.offset = source - stamp if stamp else 0
         measured = stamp
-        if self._values['sampling'] == 'clock':
+        if self.values['sampling'] == 'clock':
             stamp = self._clock.now().nanoseconds
-        if self._pairing is None:
+        if self.pairing is None:
             self._take(stamp, y)
         else:
-            self._pairing.take_sample(measured, (stamp, y))
+            self.pairing.take_sample(measured, (stamp, y))
             self._waits_since = perf_counter()
             self._take_paired()
 
     def _take_paired(self, at_once: bool = False) -> None:
         """Step to the samples whose known inputs are there."""
-        for (stamp, y), inputs in self._pairing.released(at_once):
+        for (stamp, y), inputs in self.pairing.released(at_once):
             for index, u in enumerate(inputs):
                 self.estimator.set_input(u, index)
             self._take(stamp, y)
@@ -181,12 +181,12 @@ class Channel:
             self._tell(word, stamp, y)
         if estimator.events.waiting:
             self._tell_events()
-        if used and self._values['publish_on'] == 'sample':
+        if used and self.values['publish_on'] == 'sample':
             self._publish()
 
     def _tell_events(self) -> None:
         """Publish, and log, the events that have begun or ended."""
-        unit = derivative_unit(self._values['measurement_unit'], self.estimator.observer.order)
+        unit = derivative_unit(self.values['measurement_unit'], self.estimator.observer.order)
         for event in self.estimator.events.taken():
             text, values = described(event, unit)
             self._say(text, time_message(event.stamp), WARN if event.begins else OK, values)
@@ -202,15 +202,15 @@ class Channel:
         report.find(level, text)
         report.values |= values
         stamp = stamp or self._clock.now().to_msg()
-        self._events.publish(array_of(self._node, stamp, [report], self._values['hardware_id']))
+        self._events.publish(array_of(self._node, stamp, [report], self.values['hardware_id']))
 
     def _tell(self, word: int, stamp: int, y: float) -> None:
         """Log what became of a sample, each kind at most every `QUIET` seconds."""
         counters, offset = self.estimator.counters, self.estimator.offset
         late = 'expected a stamp later than the one before'
-        if not stamp and self._values['sampling'] != 'clock':
-            hint = '; input_stamp: source does without it' if self._y.stamps == 'header' else ''
-            late = f'its {self._y.stamps} stamp is 0: nobody fills it{hint}'
+        if not stamp and self.values['sampling'] != 'clock':
+            hint = '; input_stamp: source does without it' if self.y.stamps == 'header' else ''
+            late = f'its {self.y.stamps} stamp is 0: nobody fills it{hint}'
         jumped = 'z1 follows it, the other estimates go on'
         if offset:
             jumped = f'the model contradicts it: y is taken as {offset:.4g} too large'
@@ -229,8 +229,8 @@ class Channel:
                 self._logger.warning(text)
 
     def _on_input(self, index: int, name: str, stamp: int, u: float, _: int) -> None:
-        if self._pairing is not None and isfinite(u):
-            self._pairing.take_input(index, stamp, u)
+        if self.pairing is not None and isfinite(u):
+            self.pairing.take_input(index, stamp, u)
             self._take_paired()
         elif not self.estimator.set_input(u, index):
             self._logger.warning(
@@ -243,14 +243,14 @@ class Channel:
         estimate, stamp = self.estimator.estimate, self.estimator.stamp
         if estimate is not None:
             self._outputs.publish(estimate, stamp)
-            joint = self._y.field.key if self._y.field else ''
-            self._typed.add(Output(self.name or joint or 'y', stamp, estimate, self._values))
+            joint = self.y.field.key if self.y.field else ''
+            self._typed.add(Output(self.name or joint or 'y', stamp, estimate, self.values))
 
     def tick(self) -> None:
         """Publish at the node's rate, if it is to; log once that y is silent."""
-        if self._pairing is not None:  # samples may wait for inputs, and no sample follows
+        if self.pairing is not None:  # samples may wait for inputs, and no sample follows
             waited = perf_counter() - self._waits_since
-            if waited > self._values['known_input_wait']:
+            if waited > self.values['known_input_wait']:
                 self._take_paired(at_once=True)
         if self._arrived:
             self._arrived = self._stale = False
@@ -262,11 +262,11 @@ class Channel:
             elif not 0 <= now - self._silent_since <= longest * 1e9:  # or it jumped back
                 self._stale = True
                 self._logger.warning(
-                    f'no usable sample on {self._y.source.topic} for {longest:.3g} s: not '
+                    f'no usable sample on {self.y.source.topic} for {longest:.3g} s: not '
                     'publishing until one comes',
                     throttle_duration_sec=QUIET,
                 )
-        if not self._stale and self._values['publish_on'] != 'sample':
+        if not self._stale and self.values['publish_on'] != 'sample':
             self._publish()
 
     def reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

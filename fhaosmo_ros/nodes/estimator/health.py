@@ -5,19 +5,19 @@ from collections import deque
 from collections.abc import Mapping
 from math import nan
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.counters import UNUSED_SAMPLES
-from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described
-from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
-from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
-from fhaosmo_ros.pairing import StampPairing
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from fhaosmo_ros.nodes.estimator.channel import Channel
 
 LIMIT = 20_000
 """Number of latest samples that are remembered for one report."""
@@ -55,21 +55,11 @@ class Health:
 
     Appended to on each sample: `stamps` (ns), `delays` from the source stamp to the callback (ns),
     `durations` of the callback (s), `unknown_inputs`. `latest` is the time of the last sample on
-    `perf_counter`, `offset` from its stamp to the publication of its message (ns). `limits` are
-    the channel's parameters, warn_* among them; `simulated`: stamps are in simulated time.
+    `perf_counter`, `offset` from its stamp to the publication of its message (ns).
     """
 
-    def __init__(
-        self,
-        estimator: OnlineEstimator,
-        limits: Parameters,
-        y: Listener,
-        u: Mapping[str, Listener],
-        pairing: StampPairing | None,
-        simulated: bool,
-    ) -> None:
-        self._estimator, self._y, self._u = estimator, y, u
-        self._pairing, self._simulated, self.limits = pairing, simulated, limits
+    def __init__(self, channel: 'Channel') -> None:
+        self._channel = channel
         self.stamps: deque[int] = deque(maxlen=LIMIT)
         self.delays: deque[int] = deque(maxlen=LIMIT)
         self.durations: deque[float] = deque(maxlen=LIMIT)
@@ -81,17 +71,18 @@ class Health:
 
     def begin(self) -> None:
         """Begin to count: what was lost before does not matter."""
-        self._lost_before = self._y.source.lost
+        self._lost_before = self._channel.y.source.lost
         self._before = self._counts()
 
-    def reports(self, stale: bool, name: str) -> list[Report]:
-        """Return the reports on the time since the last ones, titled by the channel's `name`."""
+    def reports(self, stale: bool) -> list[Report]:
+        """Return the reports on the time since the last ones."""
         counts = self._counts()
         news = {key: count - self._before[key] for key, count in counts.items()}
         self._before = counts
         periods = np.diff(np.array(self.stamps, dtype=np.int64)) * NANOSECONDS
         mean = float(np.mean(periods)) if len(periods) else nan
-        reports = [Report(f'{name}input'), Report(f'{name}observer')]
+        title = f'{self._channel.name} '.lstrip()
+        reports = [Report(f'{title}input'), Report(f'{title}observer')]
         self._input(reports[0], periods, mean, news, stale)
         self._observer(reports[1], mean, news, stale)
         for column in (self.stamps, self.delays, self.durations, self.unknown_inputs):
@@ -107,7 +98,8 @@ class Health:
         stale: bool,
     ) -> None:
         """Report on the samples; `news`: by how much the counters have grown."""
-        y, source, limits, heard = self._y, self._y.source, self.limits, self._y.source.heard
+        channel, y, limits = self._channel, self._channel.y, self._channel.values
+        source, heard = y.source, y.source.heard
         rate = 1.0 / mean if mean > 0.0 else nan
         jitter = float(np.std(periods)) * rate if len(periods) else nan
         delay = max(self.delays) * NANOSECONDS if self.delays else nan
@@ -165,9 +157,9 @@ class Health:
             WARN,
             f'header stamps lie {abs(offset):.3g} s {side} publication: another clock than the '
             "host's, or an old measurement; dt is not affected",
-            y.stamps == 'header' and not self._simulated and abs(offset) > latest,
+            y.stamps == 'header' and not channel.simulated and abs(offset) > latest,
         )
-        for name, u in self._u.items():
+        for name, u in channel.u.items():
             for text in [u.error] if u.error else u.source.unheard.values():
                 report.find(ERROR if u.error else WARN, text)
             nobody = not u.source.heard and not u.source.unheard
@@ -176,7 +168,7 @@ class Health:
             report.find(WARN, f'{news.get(key, 0)} {key}{text}', news.get(key, 0))
 
     def _observer(self, report: Report, mean: float, news: Mapping[str, int], stale: bool) -> None:
-        estimator, limits = self._estimator, self.limits
+        estimator, limits = self._channel.estimator, self._channel.values
         observer, estimate, offset = estimator.observer, estimator.estimate, estimator.offset
         unit = derivative_unit(limits['measurement_unit'], observer.order)
         d_now = estimate.unknown_input if estimate else nan
@@ -236,7 +228,8 @@ class Health:
 
     def _find_events(self, report: Report, unit: str) -> None:
         """Tell of the event that lasts, or of those since the last report."""
-        events = self._estimator.events
+        estimator = self._channel.estimator
+        events = estimator.events
         news, self._events_before = events.count - self._events_before, events.count
         if not events.on:
             return
@@ -246,18 +239,19 @@ class Health:
             return
         text, _ = described(latest, unit)
         if events.active and latest.begins:
-            seconds = (self._estimator.latest - latest.since) * NANOSECONDS
+            seconds = (estimator.latest - latest.since) * NANOSECONDS
             report.find(WARN, f'event: {text}; it has lasted for {seconds:.3g} s')
         elif news:
             report.find(WARN, f'{news} events, the last one {text}')
 
     def _counts(self) -> dict[str, int]:
-        counters, source, pairing = self._estimator.counters, self._y.source, self._pairing
+        channel, y = self._channel, self._channel.y
+        counters, source, pairing = channel.estimator.counters, y.source, channel.pairing
         return {
             'samples accepted': counters.accepted,
             'samples lost': source.lost - self._lost_before,
             'damaged messages': source.damaged,
-            'messages without y': self._y.lacking,
+            'messages without y': y.lacking,
             'samples rejected': counters.rejected,
             **{_words(name): n for name, n in counters._asdict().items() if name != 'accepted'},
             'restarts': counters.restarts,
@@ -268,9 +262,10 @@ class Health:
         )
 
     def _bound(self, status: Status) -> str:
-        if not self._estimator.observer.configuration.adaptive:
+        estimator = self._channel.estimator
+        if not estimator.observer.configuration.adaptive:
             return 'a fixed value'
-        if self._estimator.frozen:
+        if estimator.frozen:
             return 'the value that ~/freeze holds'
         if status & Status.GAMMA_AT_MIN:
             return 'gamma_min'

@@ -24,11 +24,17 @@ from fhaosmo_ros.nodes.estimator.channel import Channel
 from fhaosmo_ros.nodes.estimator.joints import Joints
 from fhaosmo_ros.nodes.estimator.outputs import check_axes, parameter_text, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
-from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, OK, Report, STALE, WARN
+from fhaosmo_ros.nodes.middleware.diagnostics import (
+    DiagnosticsPublisher,
+    ERROR,
+    OK,
+    Report,
+    STALE,
+    WARN,
+)
 from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, input_qos, set_period
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
-from fhaosmo_ros.nodes.middleware.simulated_time import ClockWatch
 from fhaosmo_ros.nodes.middleware.spin import run_node
 from fhaosmo_ros.topics import estimates_of, EVENT, PARAMETERS
 from rclpy.parameter import Parameter as RosParameter
@@ -71,7 +77,6 @@ class EstimatorNode(ManagedNode):
         self._asked: set[str] = set()
         self._channels: list[Channel] = []  # none before the names of the joints are known
         self._parameters_topic: Any = None
-        self._clock_watch = ClockWatch(self)
         self._node_parameters = NodeParameters(
             self, values, self._prepare, self._adopt, self._followers, ['autostart', CHANNELS]
         )
@@ -264,7 +269,11 @@ class EstimatorNode(ManagedNode):
         state = Report('state')
         active = self.state == 'active'
         state.find(OK if active else STALE, self.state)
-        self._clock_watch.look(state)
+        timeless = (
+            self.get_parameter('use_sim_time').value and not self.get_clock().now().nanoseconds
+        )
+        clock = self.resolve_topic_name('/clock')
+        state.find(ERROR, f'use_sim_time, but nothing on {clock} yet', timeless)
         waits = active and not self._channels
         state.find(STALE, 'no message with the names of the joints yet', waits)
         state.find(WARN, self._joints.problem, self._joints.problem)

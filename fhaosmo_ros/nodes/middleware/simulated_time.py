@@ -1,17 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time from /clock: a node survives whatever is published there, and says what is wrong."""
+"""Time from /clock: a node survives whatever is published there."""
 
 from collections.abc import Callable
 from functools import partial
-from time import monotonic
 from typing import Any
 
-from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, WARN
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
-
-PATIENCE = 2.0
-"""Seconds of the host for which simulated time may stand still."""
 
 
 class TimedNode(Node):
@@ -41,33 +36,3 @@ class TimedNode(Node):
             f'({self._rejected} rejected so far)',
             throttle_duration_sec=5.0,
         )
-
-
-class ClockWatch:
-    """Finds that a node's simulated time has not begun, or does not go on."""
-
-    def __init__(self, node: Node) -> None:
-        self._node, self._topic = node, node.resolve_topic_name('/clock')
-        self._time, self._since, self._told = 0, monotonic(), False
-
-    def look(self, report: Report) -> None:
-        """Add what is wrong to a report; log it once."""
-        node = self._node
-        if not node.get_parameter('use_sim_time').value:
-            return
-        time, now = node.get_clock().now().nanoseconds, monotonic()
-        if time == 0:
-            report.find(ERROR, f'use_sim_time, but nothing on {self._topic} yet')
-            return
-        if time != self._time:
-            self._time, self._since, self._told = time, now, False
-        still = now - self._since
-        if still < PATIENCE:
-            return
-        gone = not node.count_publishers(self._topic)
-        reason = 'nobody publishes it any more' if gone else 'paused, or its publisher hangs'
-        text = f'the time on {self._topic} stands still for {still:.0f} s: {reason}'
-        if not self._told:
-            self._told = True
-            node.get_logger().warning(text)
-        report.find(ERROR if gone else WARN, text)
