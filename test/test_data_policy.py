@@ -3,12 +3,11 @@
 
 import math
 
-from fhaosmo_ros.core import ConfigurationError
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 import numpy as np
-from observer_cases import laws, levels_of
+from observer_cases import laws, levels_of, place
 import pytest
 
 MS = 1_000_000
@@ -92,7 +91,7 @@ def test_real_step_of_y_is_believed_after_five_samples_in_a_row():
 def test_gate_is_around_the_prediction_not_around_the_last_sample():
     # 10 units a second: after 100 ms of silence y is 1 further, and no spike.
     feed = Feed(spike_gate=0.05, phi=['0', '0', '0'])
-    feed.estimator.seed([0.0, 10.0, 0.0], 0.0)
+    place(feed.estimator, 0.0, 10.0, 0.0, 0.0)
     assert not any(w.rejected for w in feed(*[0.01 * k for k in range(100)]))
     feed.count += 100
     (word,) = feed(0.01 * feed.count)
@@ -169,7 +168,7 @@ def test_wild_sample_does_not_spoil_the_rest(law):
 def test_state_beyond_the_limit_starts_afresh_at_once():
     feed = Feed(divergence_limit=100.0, epsilon=200.0)
     feed.sine(10)
-    feed.estimator.seed([0.2, 99.99999, 99.99999], 99.99999)
+    place(feed.estimator, 0.2, 99.99999, 99.99999, 99.99999)
     words = feed.sine(20)
     assert sum(bool(w & Status.DIVERGED) for w in words) == 1
     assert feed.events == {'divergences': 1}
@@ -224,48 +223,8 @@ def test_frozen_gamma_stays_and_the_rest_goes_on():
     assert feed.estimator.estimate.gamma != gamma
 
 
-@pytest.mark.parametrize('structure', ['cascade', 'levant'])
-def test_seed_in_the_middle_takes_derivatives_of_the_unknown_input_for_zero(structure):
-    feed = Feed(unknown_input_derivatives=2, structure=structure)
-    feed.sine(100)
-    feed.estimator.seed([0.2, 1.0, 2.0], 3.0)
-    assert feed.numbers == [0.2, 1.0, 2.0, 3.0]
-    values = feed.estimator.observer.structure.state_dict()
-    np.testing.assert_array_equal(values['z_hat'], [0.2, 1.0, 2.0, 3.0, 0.0, 0.0])
-    np.testing.assert_array_equal(values['z_tilde'], [1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
-    assert not any(w.rejected for w in feed.sine(10))
-
-
-@pytest.mark.parametrize('estimate_from', ['internal', 'filtered'])
-@pytest.mark.parametrize('unknown_input', [True, False])
 @pytest.mark.parametrize('from_measurement', [True, False])
-def test_seed_is_where_an_observer_starts(estimate_from, unknown_input, from_measurement):
-    feed = Feed(
-        estimate_from=estimate_from, unknown_input=unknown_input,
-        start_from_measurement=from_measurement,
-    )  # fmt: skip
-    for _ in range(2):
-        feed.estimator.seed([0.1, 1.0, 2.0], 3.0)
-        feed(0.2)
-        assert feed.numbers == [0.2 if from_measurement else 0.1, 1.0, 2.0, 3.0]
-        feed.sine(100)
-        feed.estimator.reset()
-
-
-@pytest.mark.parametrize(
-    ('z', 'd'), [([0.1], 0.0), ([0.1] * 4, 0.0), ([0.1, math.nan, 0.0], 0.0), ([0.1] * 3, 1e101)]
-)
-def test_seed_that_does_not_fit_is_refused(z, d):
-    feed = Feed()
-    feed.sine(10)
-    before = levels_of(feed.estimator.observer)
-    with pytest.raises(ConfigurationError, match='seed: expected 3 states'):
-        feed.estimator.seed(z, d)
-    np.testing.assert_array_equal(levels_of(feed.estimator.observer), before)
-
-
-@pytest.mark.parametrize('from_measurement', [True, False])
-def test_parameters_and_a_reset_seed_the_start(from_measurement):
+def test_parameters_and_a_reset_give_the_start(from_measurement):
     feed = Feed()
     feed.sine(100)
     feed.estimator.configure({

@@ -144,7 +144,6 @@ def test_hostile_calls(kind):
         lambda: estimator.update(stamp(), wild()),
         lambda: estimator.set_input(wild(), wild()),
         lambda: estimator.run([stamp()] * 3, [wild(), wild(), 0.1]),
-        lambda: estimator.seed([wild()] * int(rng.integers(0, 5)), wild()),
         lambda: observer.step(wild(), wild(), wild()),
         lambda: observer.run([0.0, 1e-3, 2e-3], [wild(), 0.1, wild()], wild()),
         lambda: observer.start(wild()),
@@ -193,7 +192,6 @@ def refused(estimator):
     lambda e: e.policy.run(STAMPS[:2], Y, np.zeros((len(Y), 1)), False),
     lambda e: e.policy.run(STAMPS, Y, np.zeros((2, 1)), False),
     lambda e: e.policy.run(STAMPS, Y, np.zeros((len(Y), 2)), False),
-    lambda e: e.observer.structure.seed([0.1, 0.2]),
     lambda e: e.policy.configure(
         Observer({'inputs': ['a', 'b']}).structure, e._settings(e.parameters)
     ),

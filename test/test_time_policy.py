@@ -9,7 +9,7 @@ from fhaosmo_ros.core.observer.status import REJECTED, Status
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.policy import MOST_SUB_STEPS
 import numpy as np
-from observer_cases import levels_of
+from observer_cases import levels_of, place
 import pytest
 from scipy.integrate import solve_ivp
 
@@ -177,7 +177,7 @@ def test_prediction_is_the_plant_to_fourth_order(decay):
         })  # fmt: skip
         estimator.set_input(u)
         estimator.update(START, 0.0)
-        estimator.seed(start, d)
+        place(estimator, *start, d)
         return estimator.estimate.z[0]
 
     errors = [abs(predicted(n) - truth) for n in (10, 20, 40)]
@@ -194,13 +194,13 @@ def test_slow_sensor_is_not_cut_up_and_a_fast_one_is():
         assert estimator.jitter == 0.0
 
 
-def bridged(law, y, seed=None):
+def bridged(law, y, d=None):
     """Return an estimator after 33 equal samples at 100 Hz and `y` four periods later."""
     estimator = OnlineEstimator(law)
     for k in range(33):
         estimator.update(START + k * 10 * MS, 0.5)
-    if seed:
-        estimator.seed([0.5], seed)
+    if d:
+        place(estimator, 0.5, d)
     return estimator, estimator.update(START + 360 * MS, y).status
 
 
@@ -217,9 +217,9 @@ def test_bridge_ends_where_steps_at_the_predicted_samples_end():
 
 def test_model_that_has_no_prediction_is_bridged_in_a_straight_line():
     law = {'order': 1, 'phi': ['log(z1)*0'], 'scheme': 'explicit', 'variant': 'fuzzy'}
-    estimator, status = bridged(law, 0.9, seed=-1e9)  # drives z1 out of the logarithm's domain
+    estimator, status = bridged(law, 0.9, d=-1e9)  # drives z1 out of the logarithm's domain
     assert status == Status.GAP
-    assert estimator.estimate.z[0] == pytest.approx(-4e7, rel=0.1)  # what the seed leads to
+    assert estimator.estimate.z[0] == pytest.approx(-4e7, rel=0.1)  # what that d leads to
 
 
 def test_step_that_fails_within_a_bridge_leaves_numbers_finite():

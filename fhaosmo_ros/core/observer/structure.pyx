@@ -332,28 +332,6 @@ cdef class Structure:
         self.tell(model, tuning)
         return np.array([tuning[i] for i in range(7)])
 
-    def seed(self, values):
-        """
-        Put the estimate there at once, as if the observer had converged; time and gamma go on.
-
-        Parameters
-        ----------
-        values : (n + 1,) array
-            z_1 .. z_n and d.
-
-        """
-        cdef int i
-        self.enter()
-        if len(values) != self.order + 1:
-            raise ValueError(f'seed: expected {self.order + 1} values, got {len(values)}')
-        memset(self.level, 0, sizeof(self.level))
-        for i in range(min(self.order + 1, self.levels)):  # derivatives of d, behind it, are 0
-            self.level[i].z_hat = values[i]
-        for i in range(self.order):
-            self.level[i].z_tilde = values[i + 1]
-        self.memory.settled = 1.0
-        self.measure(self.memory.y)
-
     # Snapshots and copies
 
     def state_dict(self):

@@ -291,36 +291,6 @@ class OnlineEstimator:
         if self.smoothing is not None:
             self.smoothing.cut()
 
-    def seed(self, z: ArrayLike, unknown_input: float) -> None:
-        """
-        Put the estimate there at once, as if the observer had converged; time and gamma go on.
-
-        Before the first sample, or after `reset`, it is where the observer starts from; with
-        start_from_measurement the first sample still sets z_1.
-
-        Parameters
-        ----------
-        z : (n,) array
-            States z_1 .. z_n.
-        unknown_input : float
-            d.
-
-        Raises
-        ------
-        ConfigurationError
-            A wrong number of values, or one that is not finite or beyond divergence_limit.
-
-        """
-        n, limit = self.observer.order, self._parameters['divergence_limit']
-        values = np.append(np.asarray(z, dtype=np.float64), unknown_input)
-        if values.shape != (n + 1,) or not (np.abs(values) <= limit).all():
-            raise ConfigurationError(
-                f'seed: expected {n} states and an unknown input, finite and of at most '
-                f'{limit:g} (divergence_limit), got {z!r} and {unknown_input!r}'
-            )
-        self.observer.structure.seed(values)
-        self._cut()
-
     def freeze(self, held: bool) -> None:
         """Hold gamma where it is, or let it adapt again; no parameter changes."""
         self.policy.change(frozen=held)

@@ -517,13 +517,6 @@ cdef class Policy:
         course.spikes = course.intervals = 0
         course.mean_interval = course.mean_jitter = 0.0
 
-    cdef void forget_samples(self) noexcept nogil:
-        """Start afresh: the next sample is the first. Counters go on."""
-        self.refresh()
-        self.ring.past_count = 0
-        self.course.valid = False
-        self.clock.tick_count = self.clock.spacing = 0
-
     # Steps
 
     cdef int step_to(self, long long elapsed, double y, const double* u) noexcept nogil:
@@ -790,7 +783,11 @@ cdef class Policy:
     def reset(self):
         """Start afresh: the next sample is the first. Counters go on."""
         self.structure.enter()
-        self.forget_samples()
+        self.refresh()
+        self.ring.past_count = 0
+        self.course.valid = False
+        self.clock.tick_count = 0
+        self.clock.spacing = 0.0
 
     @property
     def memory(self):
