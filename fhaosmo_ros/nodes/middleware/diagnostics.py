@@ -24,15 +24,14 @@ class Report:
     """One status of /diagnostics, 'node: task': values, findings, and the worst level of these."""
 
     def __init__(self, task: str) -> None:
-        self._task = task
+        self.task, self.level = task, OK
         self.values: dict[str, Any] = {}
-        self._level = OK
         self._findings: list[str] = []
 
     def find(self, level: bytes, text: str, when: object = True) -> None:
         """Add a finding where `when` is true; the status gets the worst level and all texts."""
         if when:
-            self._level = max(self._level, level)
+            self.level = max(self.level, level)
             self._findings.append(text)
 
     @property
@@ -40,27 +39,22 @@ class Report:
         """All findings in a line."""
         return '; '.join(self._findings) or 'OK'
 
-    def message(self, node: str, hardware_id: str) -> DiagnosticStatus:
-        """Return the status message."""
-        return DiagnosticStatus(
-            level=self._level,
-            name=f'{node}: {self._task}',
-            message=self.text,
-            hardware_id=hardware_id,
-            values=[
-                KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else str(value))
-                for key, value in self.values.items()
-            ],
-        )
-
 
 def array_of(
     node: Node, stamp: Time, reports: Iterable[Report], hardware_id: str
 ) -> DiagnosticArray:
     """Return reports of a node as one message."""
-    name = node.get_fully_qualified_name().lstrip('/')
-    message = DiagnosticArray(status=[r.message(name, hardware_id) for r in reports])
+    name, message = node.get_fully_qualified_name().lstrip('/'), DiagnosticArray()
     message.header.stamp = stamp
+    for report in reports:
+        values = [
+            KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else str(value))
+            for key, value in report.values.items()
+        ]
+        message.status.append(DiagnosticStatus(
+            level=report.level, name=f'{name}: {report.task}', message=report.text,
+            hardware_id=hardware_id, values=values,
+        ))  # fmt: skip
     return message
 
 
