@@ -39,11 +39,13 @@ class ManagedNode(LifecycleNode, TimedNode):
 
     def destroy_node(self) -> None:
         """
-        Destroy the node, and its state machine, which rclpy 7.1 leaves.
+        Finalize and destroy the node, and its state machine, which rclpy 7.1 leaves.
 
-        It would keep the node, and all that the middleware has for it, until the process ends;
+        That would keep the node, and all that the middleware has for it, until the process ends;
         there Fast DDS may wait for ever.
         """
+        if self.state != 'finalized':
+            self.trigger_shutdown()
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
 
@@ -72,11 +74,6 @@ class ManagedNode(LifecycleNode, TimedNode):
             if transition() != SUCCESS:
                 assert self._error is not None
                 raise self._error
-
-    def stop(self) -> None:
-        """Finalize from whatever state."""
-        if self.state != 'finalized':
-            self.trigger_shutdown()
 
     def on_configure(self, before: LifecycleState) -> TransitionCallbackReturn:
         """Unconfigured to inactive."""

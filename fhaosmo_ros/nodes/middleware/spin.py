@@ -14,7 +14,6 @@ from typing import TypeVar
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import with_origin
 from fhaosmo_ros.nodes.middleware.arguments import help_of, read_arguments
-from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.stop_signals import stop_on_signals, Stopped
 import rclpy
 from rclpy.exceptions import InvalidHandle
@@ -167,8 +166,6 @@ def run_node(name: str, factory: Callable[..., Node], argv: list[str] | None) ->
         return 2
     finally:
         if node is not None:
-            if isinstance(node, ManagedNode):
-                node.stop()
             node.destroy_node()
         rclpy.try_shutdown()
         faulthandler.cancel_dump_traceback_later()
