@@ -11,8 +11,14 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
-from fhaosmo_ros.tools.bags.topics import messages, read_ticks, series, truth_at
+from fhaosmo_ros.tools.bags.topics import (
+    messages,
+    read_ticks,
+    Recorded,
+    recorded_parameters,
+    series,
+    truth_at,
+)
 from fhaosmo_ros.topics import ESTIMATES, EVENT, STANDARD_DEVIATION
 import numpy as np
 from numpy.typing import NDArray
