@@ -29,10 +29,6 @@ NOISY_FROM = 2.0 / 3.0
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; a run that Ctrl-C ends after the first estimate is reported, too."""
-    return run_command(_parser(), argv, _demo)
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='demo', description='Run plant and estimator, record, report, draw a figure.'
     )
@@ -53,7 +49,7 @@ def _parser() -> argparse.ArgumentParser:
         '--self-tuning', action='store_true',
         help="the second engine instead of the paper's observer (config/self_tuning.yaml)",
     )  # fmt: skip
-    return parser
+    return run_command(parser, argv, _demo)
 
 
 def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
@@ -95,50 +91,39 @@ def _record(
     folder: Path, parameters: Path, duration: float, noisy: bool, stop: Stop
 ) -> list[tuple[int, str]]:
     """Record a run; return when the plant changed (ns), and how."""
+    compared = ['/y', *(f'/plant/{name}' for name in TRUTH), '/estimator/state']
     with (
         BagWriter(folder / 'bag') as bag,
         TopicRecorder(bag, ['/estimator', '/plant']) as recorder,
         Children(folder) as nodes,
     ):
-        options = ('--ros-args', '--params-file', str(parameters))
         # Together: Fast DDS finds a node that starts half a second after another one 3 s late.
-        nodes.start_node('estimator', *options)
-        nodes.start_node('plant', *options)
-        compared = ['/y', *(f'/plant/{name}' for name in TRUTH), '/estimator/state']
-
-        def ready() -> bool:
-            heard = all(recorder.counts[topic] for topic in compared)
-            return heard and (not noisy or recorder.can_set_parameters('/plant'))
+        for name in ('estimator', 'plant'):
+            nodes.start_node(name, '--ros-args', '--params-file', str(parameters))
 
         def check() -> None:
             nodes.check()
             recorder.check()
-            _check_alone(recorder)
+            for topic in ('/y', '/estimator/state'):
+                if recorder.node.count_publishers(topic) > 1:  # the bag would hold a mixture
+                    raise ConfigurationError(
+                        f'expected one publisher of {topic}, got another one on this host with '
+                        f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}; set another ROS_DOMAIN_ID'
+                    )
 
-        _wait(ready, check, stop)
+        deadline = time.monotonic() + START_DEADLINE
+        print('waiting for the first estimate ...', flush=True)
+        while not all(recorder.counts[topic] for topic in compared) or (
+            noisy and not recorder.can_set_parameters('/plant')
+        ):
+            check()
+            if stop.wait(0.02):
+                raise Stopped('before the first estimate, nothing written')
+            if time.monotonic() > deadline:
+                raise ConfigurationError(
+                    f'waited {START_DEADLINE:g} s for the first estimate in vain'
+                )
         return _watch(recorder, check, duration, noisy, stop)
-
-
-def _check_alone(recorder: TopicRecorder) -> None:
-    """Raise if another node publishes what is recorded: the bag would hold a mixture."""
-    for topic in ('/y', '/estimator/state'):
-        if recorder.node.count_publishers(topic) > 1:
-            raise ConfigurationError(
-                f'expected one publisher of {topic}, got another one on this host with '
-                f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}; set another ROS_DOMAIN_ID'
-            )
-
-
-def _wait(ready: Callable[[], bool], check: Callable[[], None], stop: Stop) -> None:
-    """Wait for the first estimate."""
-    deadline = time.monotonic() + START_DEADLINE
-    print('waiting for the first estimate ...', flush=True)
-    while not ready():
-        check()
-        if stop.wait(0.02):
-            raise Stopped('before the first estimate, nothing written')
-        if time.monotonic() > deadline:
-            raise ConfigurationError(f'waited {START_DEADLINE:g} s for the first estimate in vain')
 
 
 def _watch(

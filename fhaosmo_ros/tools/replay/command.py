@@ -29,12 +29,7 @@ from fhaosmo_ros.tools.cli.options import (
     channel_parameters,
     named,
 )
-from fhaosmo_ros.tools.replay.live_run import (
-    find_estimator,
-    LiveRun,
-    read_events,
-    UnknownSnapshot,
-)
+from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun, UnknownSnapshot
 from fhaosmo_ros.tools.replay.sinks import bag_sink, Rows, TABLES
 from fhaosmo_ros.topics import ESTIMATES
 import numpy as np
@@ -47,10 +42,6 @@ NONE = np.zeros(0, dtype=np.int64)
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0 if the output is complete, else there is none."""
-    return run_command(_parser(), argv, _replay)
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='replay',
         description='Estimate offline from a recorded bag, with the result of the live node.',
@@ -88,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
         'where the bag already holds estimates)',
     )  # fmt: skip
     add_parameter_options(parser)
-    return parser
+    return run_command(parser, argv, _replay)
 
 
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
@@ -124,8 +115,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             estimator.smooth()
         if followed is not None:
             try:
-                events = read_events(reader, followed, named(arguments))
-                live = LiveRun(followed, events, estimator)
+                live = LiveRun(reader, followed, estimator, named(arguments))
             except UnknownSnapshot as error:
                 _warn(f'{error}; {followed} is not followed, this begins at the first sample')
         namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]

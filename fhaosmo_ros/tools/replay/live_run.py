@@ -72,17 +72,24 @@ def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> st
     return wanted[0] if wanted else None
 
 
-def read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[Event]:
+class LiveRun:
     """
-    Return the events of a live estimator in order.
+    Repeats at an estimator what was done to a live one, at the same samples.
 
     Parameters
     ----------
     reader : BagReader
     name : str
-        Name of the estimator: the node's full name, followed by the channel's if it has channels.
+        Of the live one: the node's full name, followed by the channel's if it has channels.
+    estimator : OnlineEstimator
+        The one that follows the live one.
     fixed : collection of str
         Parameters whose live changes are not repeated.
+
+    Attributes
+    ----------
+    left_out : int
+        Samples before the first one that can be followed.
 
     Raises
     ------
@@ -90,52 +97,12 @@ def read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[Ev
         A snapshot is of another version, or damaged.
 
     """
-    events: list[Event] = []
-    changes: dict[str, Any] = {}
-    topics = {f'{name}/{SNAPSHOT}', EVENTS} & {c.topic for c in reader.connections}
-    for topic, _, message in reader.read_all(topics):
-        if topic == EVENTS:
-            node, channel = message.node, name.removeprefix(message.node).strip('/')
-            if name == node or name.startswith(f'{node}/'):
-                for parameter in message.changed_parameters:
-                    of_channel, key = split(parameter.name)
-                    if of_channel == channel and key in ONLINE_PARAMETERS and key not in fixed:
-                        value = getattr(parameter.value, VALUE_FIELDS[parameter.value.type])
-                        changes[key] = ONLINE_PARAMETERS[key].coerce(value)
-            continue
-        try:
-            snapshot = unpack(message.data, message.layout.dim[0].label.split(','))
-        except (IndexError, ConfigurationError) as error:
-            raise UnknownSnapshot(f'topic {topic!r}: {error}') from None
-        # The node publishes the change first, then the snapshot.
-        took_them = not events or snapshot.flags & (Flag.CHANGED | Flag.STARTED)
-        events.append(Event(snapshot, changes if took_them else {}))
-        if took_them:
-            changes = {}
-    return events
 
-
-class LiveRun:
-    """
-    Repeats at an estimator what was done to a live one, at the same samples.
-
-    Parameters
-    ----------
-    name : str
-        The live estimator's.
-    events : list of Event
-    estimator : OnlineEstimator
-        The one that follows the live one.
-
-    Attributes
-    ----------
-    left_out : int
-        Samples before the first one that can be followed.
-
-    """
-
-    def __init__(self, name: str, events: list[Event], estimator: OnlineEstimator) -> None:
-        self._name, self._events, self._estimator = name, events, estimator
+    def __init__(
+        self, reader: BagReader, name: str, estimator: OnlineEstimator, fixed: Collection[str]
+    ) -> None:
+        self._name, self._estimator = name, estimator
+        self._events = _read_events(reader, name, fixed)
         self.left_out = 0
         self._followed = self._resumed = False
         self._unfit = ''
@@ -242,3 +209,30 @@ def _find(stamps: NDArray[np.int64], position: int, stamp: int) -> tuple[int, bo
             if wanted.any():
                 return begin + int(wanted.argmax()), found
     return len(stamps), False
+
+
+def _read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[Event]:
+    """Return the events of a live estimator in order."""
+    events: list[Event] = []
+    changes: dict[str, Any] = {}
+    topics = {f'{name}/{SNAPSHOT}', EVENTS} & {c.topic for c in reader.connections}
+    for topic, _, message in reader.read_all(topics):
+        if topic == EVENTS:
+            node, channel = message.node, name.removeprefix(message.node).strip('/')
+            if name == node or name.startswith(f'{node}/'):
+                for parameter in message.changed_parameters:
+                    of_channel, key = split(parameter.name)
+                    if of_channel == channel and key in ONLINE_PARAMETERS and key not in fixed:
+                        value = getattr(parameter.value, VALUE_FIELDS[parameter.value.type])
+                        changes[key] = ONLINE_PARAMETERS[key].coerce(value)
+            continue
+        try:
+            snapshot = unpack(message.data, message.layout.dim[0].label.split(','))
+        except (IndexError, ConfigurationError) as error:
+            raise UnknownSnapshot(f'topic {topic!r}: {error}') from None
+        # The node publishes the change first, then the snapshot.
+        took_them = not events or snapshot.flags & (Flag.CHANGED | Flag.STARTED)
+        events.append(Event(snapshot, changes if took_them else {}))
+        if took_them:
+            changes = {}
+    return events

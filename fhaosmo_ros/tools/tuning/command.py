@@ -39,10 +39,6 @@ BOTH = ParameterTable(
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; a search that Ctrl-C ends after the first trial is written, too."""
-    return run_command(_parser(), argv, _tune)
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='tune',
         description=__doc__,
@@ -76,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         '--bag', type=Path,
         help='find the gains that are likeliest for its y (of input_topic, input_field)',
     )  # fmt: skip
-    return parser
+    return run_command(parser, argv, _tune)
 
 
 def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
