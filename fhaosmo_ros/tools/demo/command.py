@@ -15,8 +15,8 @@ from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command, shipped
 from fhaosmo_ros.tools.cli.processes import Children
-from fhaosmo_ros.tools.demo.figure import save_figure
 from fhaosmo_ros.tools.demo.report import others, read_run, table
+from fhaosmo_ros.tools.plot.figures import save_curves
 from fhaosmo_ros.topics import TRUTH
 
 START_DEADLINE = 60.0
@@ -79,7 +79,10 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
             print('stopped early: reporting what has been recorded')
         run = read_run(folder / 'bag')
         compared = others(run, estimator)
-        save_figure(run, compared, marks, folder / 'demo.png')
+        errors = {name: estimate - run.truth[:, -1] for name, estimate in compared.items()}
+        if errors:
+            errors['live'] = run.errors[:, -1]
+        save_curves([run.curves], folder / 'demo.png', errors, marks)
         text = table(run, compared, marks)
         (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
         print(f'\n{text}\n')

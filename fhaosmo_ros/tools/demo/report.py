@@ -11,6 +11,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import messages, read_ticks, Series, series, truth_at
+from fhaosmo_ros.tools.plot.curves import Curves
 from fhaosmo_ros.topics import ESTIMATES, OF_GAINS, STANDARD_DEVIATION
 import numpy as np
 from numpy.typing import NDArray
@@ -41,14 +42,22 @@ the model alone.
 class Run(NamedTuple):
     """Estimates beside the truth at the time of the sample that each was computed from, K rows."""
 
-    t: Floats  # (K,) seconds since the first estimate
-    names: list[str]  # z1 .. zn and d
-    truth: Floats  # (K, n + 1) states, and d as the last column
-    estimate: Floats  # (K, n + 1) likewise
-    of_gains: dict[str, Floats]  # gamma; or standard_deviation and tuning
+    curves: Curves
+    truth: Floats  # (K, n + 1) of the curves
+    tuning: Floats | None  # (K, m) what a self-tuning estimator has found
     y: Series  # all samples
     rows: NDArray[np.int64]  # (K,) the sample behind each estimate
     counters: dict[str, str]  # of the estimator's last diagnostics
+
+    @property
+    def t(self) -> Floats:
+        """Seconds since the first estimate."""
+        return np.asarray((self.curves.stamps - self.curves.stamps[0]) * 1e-9)
+
+    @property
+    def errors(self) -> Floats:
+        """Errors of states and d, (K, n + 1)."""
+        return self.curves.estimate - self.truth
 
 
 def read_run(bag: Path) -> Run:
@@ -73,24 +82,27 @@ def read_run(bag: Path) -> Run:
     ticks = read_ticks(bag, '/estimator', [*found, *ESTIMATES])
     when = ticks['stamp'].astype(np.int64)
     truth = truth_at(bag, '/plant', when) if len(when) else None
-    known = None if truth is None else np.isfinite(truth.values).all(axis=1)
-    if known is None or not known.any():
+    known = np.isfinite(truth.values).all(axis=1) if truth else np.zeros(0, bool)
+    if not truth or not known.any():
         raise ConfigurationError('the run ended before an estimate arrived beside its truth')
     counters: dict[str, str] = {}
     for _, message in messages(bag, '/diagnostics'):
         for status in message.status:
             if 'estimator' in status.name:
                 counters |= {pair.key: pair.value for pair in status.values}
-    return Run(
-        (when[known] - when[known][0]) * 1e-9,
+    columns = {topic: values[known] for topic, values in ticks.items()}
+    curves = Curves(
+        'estimated live',
+        when[known],
         [*truth.labels, 'd'],
+        np.column_stack([columns['state'], columns['unknown_input']]),
+        columns['innovation'],
+        columns.get('gamma'),
+        columns.get(STANDARD_DEVIATION),
         truth.values[known],
-        np.column_stack([ticks['state'], ticks['unknown_input']])[known],
-        {topic: ticks[topic][known] for topic in found},
-        y,
-        np.searchsorted(y.stamps, when[known]).clip(max=len(y.stamps) - 1),
-        counters,
     )
+    rows = np.searchsorted(y.stamps, when[known]).clip(max=len(y.stamps) - 1)
+    return Run(curves, truth.values[known], columns.get('tuning'), y, rows, counters)
 
 
 def others(run: Run, parameters: Mapping[str, Any]) -> dict[str, Floats]:
@@ -118,7 +130,7 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
         if (part := (run.t >= begin) & (run.t < end)).any()
     ] or [(0.0, run.t >= 0.0)]  # fmt: skip
     d = run.truth[:, -1]
-    estimates = {'this estimator, live': run.estimate[:, -1], **compared}
+    estimates = {'this estimator, live': run.curves.estimate[:, -1], **compared}
     width = max(map(len, estimates))
     head = ''.join(f'{f"from {begin:.0f} s":>20}' for begin, _ in parts)
     lines = [
@@ -134,16 +146,15 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
     lines.append(f'{"RMS of d itself":{width}}{sizes}'.rstrip())
     late = run.t >= parts[0][0]
     if compared:
-        live, held = (rms((e - d)[late]) for e in (run.estimate[:, -1], compared[HELD]))
+        live, held = rms(run.errors[late, -1]), rms((compared[HELD] - d)[late])
         lines.append(WORDS.rstrip())
         lines.append(f'The power that adapts changed the error by {live / held - 1.0:+.1%}.')
     errors = [
-        f'{name} {rms((run.estimate - run.truth)[late, k]):.2g}'
-        for k, name in enumerate(run.names[:-1])
+        f'{name} {rms(run.errors[late, k]):.2g}' for k, name in enumerate(run.curves.names[:-1])
     ]
     lines += ['', f'RMS errors of the states from {parts[0][0]:.0f} s on: {", ".join(errors)}']
-    if STANDARD_DEVIATION in run.of_gains:
-        lines.append(_found(run))
+    if run.curves.deviation is not None and run.tuning is not None:
+        lines.append(_found(run, run.curves.deviation[:, -1], run.tuning[-1]))
     span = (run.y.stamps[-1] - run.y.stamps[0]) * 1e-9
     counts = [run.counters.get(f'samples {n}', '?') for n in ('accepted', 'lost', 'rejected')]
     lines.append(
@@ -153,14 +164,13 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
     return '\n'.join(lines)
 
 
-def _found(run: Run) -> str:
+def _found(run: Run, deviation: Floats, tuning: Floats) -> str:
     """Return what a self-tuning estimator has found, in words."""
-    deviation = run.of_gains[STANDARD_DEVIATION][:, -1]
     known = np.isfinite(deviation) & (run.t > START)
     if not known.any():
         return 'the run was too short for the estimator to find the noise'
-    error = np.abs(run.estimate[:, -1] - run.truth[:, -1])[known]
-    noise, _, bandwidth, *_ = run.of_gains['tuning'][-1]
+    error = np.abs(run.errors[known, -1])
+    noise, _, bandwidth, *_ = tuning
     return (
         'd lay within two standard deviations of its estimate for '
         f'{np.mean(error <= 2.0 * deviation[known]):.0%} of the time\n'
