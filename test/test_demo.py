@@ -76,7 +76,7 @@ def test_shipped_demonstration_changes_the_plant(tmp_path):
     end = run_.t > run_.t[-1] - 0.5
     true = np.median(true_noise(run_)[end])
     assert true > 0.8e-4
-    found = np.median(run_.tuning[end, 0])
+    found = np.median(run_.curves.tuning[end, 0])
     assert found > 0.5 * true  # jitter of a busy machine adds to it
 
 

@@ -10,9 +10,9 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import messages, read_ticks, Series, series, truth_at
-from fhaosmo_ros.tools.plot.curves import Curves
-from fhaosmo_ros.topics import ESTIMATES, OF_GAINS, STANDARD_DEVIATION
+from fhaosmo_ros.tools.bags.topics import messages, Series, series
+from fhaosmo_ros.tools.plot.curves import Curves, read_curves
+from fhaosmo_ros.topics import ESTIMATES
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,7 +44,6 @@ class Run(NamedTuple):
 
     curves: Curves
     truth: Floats  # (K, n + 1) of the curves
-    tuning: Floats | None  # (K, m) what a self-tuning estimator has found
     y: Series  # all samples
     rows: NDArray[np.int64]  # (K,) the sample behind each estimate
     counters: dict[str, str]  # of the estimator's last diagnostics
@@ -75,34 +74,18 @@ def read_run(bag: Path) -> Run:
     """
     y = series(bag, '/y')
     with BagReader(bag) as reader:
-        found = [
-            topic for topics in OF_GAINS.values() for topic in topics
-            if reader.count(f'/estimator/{topic}')
-        ]  # fmt: skip
-    ticks = read_ticks(bag, '/estimator', [*found, *ESTIMATES])
-    when = ticks['stamp'].astype(np.int64)
-    truth = truth_at(bag, '/plant', when) if len(when) else None
-    known = np.isfinite(truth.values).all(axis=1) if truth else np.zeros(0, bool)
-    if not truth or not known.any():
+        begun = all(reader.count(f'/estimator/{topic}') for topic in ESTIMATES)
+    live = read_curves(bag, ['/estimator'], '/plant')[0] if begun else None
+    if not live or live.truth is None or not np.isfinite(live.truth).all(axis=1).any():
         raise ConfigurationError('the run ended before an estimate arrived beside its truth')
+    curves = live.part(np.isfinite(live.truth).all(axis=1))._replace(label='estimated live')
     counters: dict[str, str] = {}
     for _, message in messages(bag, '/diagnostics'):
         for status in message.status:
             if 'estimator' in status.name:
                 counters |= {pair.key: pair.value for pair in status.values}
-    columns = {topic: values[known] for topic, values in ticks.items()}
-    curves = Curves(
-        'estimated live',
-        when[known],
-        [*truth.labels, 'd'],
-        np.column_stack([columns['state'], columns['unknown_input']]),
-        columns['innovation'],
-        columns.get('gamma'),
-        columns.get(STANDARD_DEVIATION),
-        truth.values[known],
-    )
-    rows = np.searchsorted(y.stamps, when[known]).clip(max=len(y.stamps) - 1)
-    return Run(curves, truth.values[known], columns.get('tuning'), y, rows, counters)
+    rows = np.searchsorted(y.stamps, curves.stamps).clip(max=len(y.stamps) - 1)
+    return Run(curves, np.asarray(curves.truth), y, rows, counters)
 
 
 def others(run: Run, parameters: Mapping[str, Any]) -> dict[str, Floats]:
@@ -153,8 +136,8 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
         f'{name} {rms(run.errors[late, k]):.2g}' for k, name in enumerate(run.curves.names[:-1])
     ]
     lines += ['', f'RMS errors of the states from {parts[0][0]:.0f} s on: {", ".join(errors)}']
-    if run.curves.deviation is not None and run.tuning is not None:
-        lines.append(_found(run, run.curves.deviation[:, -1], run.tuning[-1]))
+    if run.curves.deviation is not None and run.curves.tuning is not None:
+        lines.append(_found(run, run.curves.deviation[:, -1], run.curves.tuning[-1]))
     span = (run.y.stamps[-1] - run.y.stamps[0]) * 1e-9
     counts = [run.counters.get(f'samples {n}', '?') for n in ('accepted', 'lost', 'rejected')]
     lines.append(

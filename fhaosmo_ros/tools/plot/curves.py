@@ -19,7 +19,7 @@ from fhaosmo_ros.tools.bags.topics import (
     series,
     truth_at,
 )
-from fhaosmo_ros.topics import ESTIMATES, EVENT, STANDARD_DEVIATION
+from fhaosmo_ros.topics import ESTIMATES, EVENT, OF_GAINS, STANDARD_DEVIATION
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +36,7 @@ class Curves(NamedTuple):
     innovation: Floats  # (K, N)
     gamma: Floats | None = None  # (K,); None of a self-tuning estimator, which has no power
     deviation: Floats | None = None  # (K, n + 1) standard deviations, of a self-tuning estimator
+    tuning: Floats | None = None  # (K, m) what that one has found
     truth: Floats | None = None  # (K, n + 1); NaN where the bag lacks it
     epsilon: float | None = None  # of its gates, if it has gates and the bag has its parameters
     unit: str = ''  # of y, '' if the bag does not say it
@@ -45,6 +46,12 @@ class Curves(NamedTuple):
         """Return one of `names` with its unit, which follows from that of y."""
         unit = derivative_unit(self.unit, self.names.index(name))
         return titled('unknown\ninput d' if name == 'd' else name, unit)
+
+    def part(self, rows: NDArray[np.bool_]) -> 'Curves':
+        """Return some of the rows."""
+        columns = ('stamps', 'estimate', 'innovation', 'gamma', 'deviation', 'tuning', 'truth')
+        found = {name: getattr(self, name) for name in columns}
+        return self._replace(**{k: None if x is None else x[rows] for k, x in found.items()})
 
 
 def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]:
@@ -86,7 +93,7 @@ def _curves(
         unit = values['measurement_unit']
         if values['structure'] == 'cascade' and values['gains'] == 'fixed':
             epsilon = values['epsilon']
-    of_gains = [p for p in ('gamma', STANDARD_DEVIATION) if f'{name}/{p}' in topics]
+    of_gains = [p for of in OF_GAINS.values() for p in of if f'{name}/{p}' in topics]
     ticks = read_ticks(path, name, [*of_gains, *ESTIMATES])
     when = ticks['stamp']
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
@@ -102,6 +109,7 @@ def _curves(
         ticks['innovation'],
         ticks.get('gamma'),
         ticks.get(STANDARD_DEVIATION),
+        ticks.get('tuning'),
         truth.values if truth else None,
         epsilon,
         unit,
