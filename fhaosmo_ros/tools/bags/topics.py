@@ -15,14 +15,12 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import loads
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.topics import PARAMETERS, TEXT, TRUTH
+from fhaosmo_ros.topics import PARAMETERS, TEXT
 import numpy as np
 from numpy.typing import NDArray
 
 BLOCK = 16_384
 """Messages that are made arrays of at a time."""
-LATE = 0.75
-"""Periods of the plant by which the truth may follow its sample of y."""
 
 
 class Series(NamedTuple):
@@ -116,45 +114,6 @@ def _rows_of_ticks(times: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArra
     lead = np.median((ticks - times[before])[early]) if early.any() else np.inf
     lag = np.median(times[after[late]] - ticks[late]) if late.any() else np.inf
     return np.where(early, before, -1) if lead <= lag else np.where(late, after, -1)
-
-
-def truth_at(bag: Path, plant: str, when: NDArray[np.int64]) -> Series | None:
-    """
-    Return the truth that belongs to samples of y.
-
-    The plant publishes y, then its states, then d. So the truth of a sample is the first message
-    after it, unless that comes so late that it is another sample's.
-
-    Parameters
-    ----------
-    bag : Path
-    plant : str
-        Full name of the node.
-    when : (K,) array
-        Stamps of the samples in nanoseconds.
-
-    Returns
-    -------
-    Series or None
-        z_1 .. z_n and d at `when`; a row of NaN where the bag lacks them. None if it has no
-        message of one of the topics.
-
-    """
-    columns = []
-    labels: list[str] = []
-    for part in TRUTH:
-        found = series(bag, f'{plant}/{part}')
-        if not len(found.stamps):
-            return None
-        row = np.searchsorted(found.stamps, when)
-        its_own = row < len(found.stamps)
-        row = row.clip(max=len(found.stamps) - 1)
-        if len(found.stamps) > 1:
-            its_own &= found.stamps[row] - when <= LATE * np.median(np.diff(found.stamps))
-        values = found.values[row].astype(np.float64).reshape(len(row), -1)
-        columns.append(np.where(its_own[:, None], values, np.nan))
-        labels = labels or found.labels
-    return Series(when, np.column_stack(columns), labels)
 
 
 class Recorded(NamedTuple):

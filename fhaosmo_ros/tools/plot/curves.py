@@ -17,13 +17,14 @@ from fhaosmo_ros.tools.bags.topics import (
     Recorded,
     recorded_parameters,
     series,
-    truth_at,
 )
-from fhaosmo_ros.topics import ESTIMATES, EVENT, OF_GAINS, STANDARD_DEVIATION
+from fhaosmo_ros.topics import ESTIMATES, EVENT, OF_GAINS, STANDARD_DEVIATION, TRUTH
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+LATE = 0.75
+"""Periods of the plant by which the truth may follow its sample of y."""
 
 
 class Curves(NamedTuple):
@@ -97,8 +98,8 @@ def _curves(
     ticks = read_ticks(path, name, [*of_gains, *ESTIMATES])
     when = ticks['stamp']
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
-    truth = truth_at(path, plant, when)
-    if truth is not None and truth.values.shape != estimate.shape:
+    truth = _truth_at(path, plant, when)
+    if truth is not None and truth.shape != estimate.shape:
         truth = None  # of another model
     labels = series(path, f'{name}/state').labels
     return Curves(
@@ -110,11 +111,33 @@ def _curves(
         ticks.get('gamma'),
         ticks.get(STANDARD_DEVIATION),
         ticks.get('tuning'),
-        truth.values if truth else None,
+        truth,
         epsilon,
         unit,
         _events(path, f'{name}/{EVENT}', int(when[-1])) if f'{name}/{EVENT}' in topics else (),
     )
+
+
+def _truth_at(path: Path, plant: str, when: NDArray[np.int64]) -> Floats | None:
+    """
+    Return z_1 .. z_n and d at stamps of samples; NaN where the bag lacks them, None without any.
+
+    The plant publishes y, then its states, then d. So the truth of a sample is the first message
+    after it, unless that comes so late that it is another sample's.
+    """
+    columns = []
+    for part in TRUTH:
+        found = series(path, f'{plant}/{part}')
+        if not len(found.stamps):
+            return None
+        row = np.searchsorted(found.stamps, when)
+        its_own = row < len(found.stamps)
+        row = row.clip(max=len(found.stamps) - 1)
+        if len(found.stamps) > 1:
+            its_own &= found.stamps[row] - when <= LATE * np.median(np.diff(found.stamps))
+        values = found.values[row].astype(np.float64).reshape(len(row), -1)
+        columns.append(np.where(its_own[:, None], values, np.nan))
+    return np.column_stack(columns)
 
 
 def _events(path: Path, topic: str, end: int) -> list[tuple[int, int]]:
