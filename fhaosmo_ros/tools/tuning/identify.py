@@ -177,26 +177,25 @@ def identify_input(
     return found
 
 
-def _refuse(found: Identified, silent: float) -> None:
-    """Raise NothingToFind where there can be no gains; d = 0 is less likely by `silent`."""
+def _refuse(found: Identified, fall: float) -> None:
+    """Raise NothingToFind where there are no gains; `fall`: of the log-likelihood if d were 0."""
     likelihood, y, noise = found.likelihood, found.likelihood.samples.y, found.best.noise
     period, bandwidth = likelihood.period, found.best.design.bandwidth
-    if likelihood.fixed:
-        pass
-    elif noise < NO_NOISE * float(np.std(y)) and not found.quantum:
+    silent = noise < NO_NOISE * float(np.std(y)) and not found.quantum
+    if silent and not likelihood.fixed:
         raise NothingToFind(
             f'y: expected noise, got none that shows ({noise:.1e} in a y of '
             f'{np.std(y):.3g}), as in a simulation without noise: the less noise, the larger the '
             'gains, without limit. Say what the sensor will have: -p noise_size:=...'
         )
-    elif bandwidth > 0.9 * QUICKEST / period:
+    if bandwidth > 0.9 * QUICKEST / period and not likelihood.fixed:
         raise NothingToFind(
             f'y: the likeliest filter follows every sample ({bandwidth:.3g} rad/s at '
             f'{1.0 / period:.4g} Hz). Either y has no noise that shows, or it moves in a way that '
             'the model cannot: it jumps, or order or phi are wrong. Say what noise the sensor '
             'has (-p noise_size:=...), sample faster, or correct the model'
         )
-    if silent < SURE:
+    if fall < SURE:
         raise NothingToFind(
             f'd: expected a y that d moves, got one that the model explains with d = 0 (noise '
             f'{noise:.3g}). Record while the unknown input acts, and longer'
