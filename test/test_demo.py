@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 from commands import ROOT, run, start
-from fhaosmo_ros.tools.demo.report import OTHERS, read_run, true_noise
+from fhaosmo_ros.tools.demo import OTHERS, read_run, true_noise
 from fhaosmo_ros.topics import ESTIMATES, PARAMETERS, SNAPSHOT
 from rosbags.highlevel import AnyReader
 from waiting import wait_until

@@ -4,7 +4,7 @@
 import bag_files as files
 from fhaosmo_ros.core import ConfigurationError, OnlineEstimator
 from fhaosmo_ros.tools.bags.types import labelled_array
-from fhaosmo_ros.tools.demo.report import OTHERS, others, read_run, START, table
+from fhaosmo_ros.tools.demo import OTHERS, others, read_run, START, table
 from fhaosmo_ros.topics import ARRAY, estimates_of, FLOAT, TIME
 import numpy as np
 import pytest
