@@ -24,6 +24,11 @@ CHECK = ['hypothesis', 'pytest', 'pytest-xdist']
 TUNE = ['cmaes', 'optuna>=4,<6']
 ARM = ['pin>=3,<5']
 DOCS = ['myst-parser', 'sphinx', 'sphinx-rtd-theme']
+ROS = (
+    'builtin-interfaces', 'diagnostic-msgs', 'geometry-msgs', 'lifecycle-msgs', 'rcl-interfaces',
+    'rclpy', 'rmw-fastrtps-cpp', 'rosgraph-msgs', 'sensor-msgs', 'std-msgs', 'std-srvs',
+)  # fmt: skip
+"""What the nodes need of a ROS distribution."""
 
 
 def extensions():
@@ -109,16 +114,6 @@ class BuildExtensions(build_ext):
         mark.write_text(made_with)
 
 
-def wheels(distribution):
-    """Return what the nodes need of a ROS distribution, as wheels."""
-    packages = (
-        'builtin-interfaces', 'diagnostic-msgs', 'geometry-msgs', 'lifecycle-msgs',
-        'rcl-interfaces', 'rclpy', 'rmw-fastrtps-cpp', 'rosgraph-msgs', 'sensor-msgs',
-        'std-msgs', 'std-srvs',
-    )  # fmt: skip
-    return [f'ros-{distribution}-{package}' for package in packages]
-
-
 def files(*patterns):
     """List the files of this folder that match, grouped under share/ as they lie here."""
     groups = {}
@@ -143,13 +138,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        *files(
-            'config/**/*.*',
-            'launch/*.py',
-            'docs/*.md',
-            'docs/**/*.png',
-            'docs/*.svg',
-        ),
+        *files('config/**/*.*', 'launch/*.py', 'docs/*.md', 'docs/**/*.png', 'docs/*.svg'),
     ],
     zip_safe=False,
     install_requires=[
@@ -173,7 +162,7 @@ setup(
         'docs': DOCS,
         'recipes': ['rotorpy>=3,<4'],  # a simulator of drones, for studies/recipes
         # Community builds, for machines without ROS. Never beside an installed ROS.
-        **{f'ros-{distribution}': wheels(distribution) for distribution in ('jazzy', 'kilted')},
+        **{f'ros-{name}': [f'ros-{name}-{p}' for p in ROS] for name in ('jazzy', 'kilted')},
         'tune': TUNE,
         'compare': TUNE,
         'check': CHECK,

@@ -25,7 +25,7 @@ COMMANDS = {
     ),
     'plant': ('fhaosmo_ros.nodes.plant', 'node: simulate a plant and publish y and the truth'),
     'demo': (
-        'fhaosmo_ros.tools.demo.command',
+        'fhaosmo_ros.tools.demo',
         'run plant and estimator, record, report, draw a figure',
     ),
     'record': ('fhaosmo_ros.tools.record', "record y and the estimator's topics to a bag"),

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 from commands import ROOT, run, start
-from fhaosmo_ros.tools.demo.report import OTHERS, read_run, true_noise
+from fhaosmo_ros.tools.demo import OTHERS, read_run, true_noise
 from fhaosmo_ros.topics import ESTIMATES, PARAMETERS, SNAPSHOT
 from rosbags.highlevel import AnyReader
 from waiting import wait_until
@@ -58,7 +58,7 @@ def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(parameters):
     run_ = read_run(folder / 'bag')
     late = run_.t > 3.0
     assert late.any()
-    error = np.median(np.abs(run_.estimate[late] - run_.truth[late]), axis=0)
+    error = np.median(np.abs(run_.errors[late]), axis=0)
     # Not d: other tests load the machine meanwhile, and its stamps jitter in bursts then.
     assert (error[:2] < 0.05 * np.abs(run_.truth[late][:, :2]).max(axis=0)).all()
     assert np.isfinite(error).all()
@@ -72,11 +72,11 @@ def test_shipped_demonstration_changes_the_plant(tmp_path):
     assert 'now with noise of 1e-4 on y' in result.stdout
     assert 'd lay within two standard deviations' in result.stdout
     run_ = read_run(folder / 'bag')
-    assert 'gamma' not in run_.of_gains  # there is no power
+    assert run_.curves.gamma is None  # there is no power
     end = run_.t > run_.t[-1] - 0.5
     true = np.median(true_noise(run_)[end])
     assert true > 0.8e-4
-    found = np.median(run_.of_gains['tuning'][end, 0])
+    found = np.median(run_.curves.tuning[end, 0])
     assert found > 0.5 * true  # jitter of a busy machine adds to it
 
 

@@ -4,7 +4,7 @@
 import bag_files as files
 from fhaosmo_ros.core import ConfigurationError, OnlineEstimator
 from fhaosmo_ros.tools.bags.types import labelled_array
-from fhaosmo_ros.tools.demo.report import OTHERS, others, read_run, START, table
+from fhaosmo_ros.tools.demo import OTHERS, others, read_run, START, table
 from fhaosmo_ros.topics import ARRAY, estimates_of, FLOAT, TIME
 import numpy as np
 import pytest
@@ -87,9 +87,9 @@ def expected(late):
 
 def test_table_says_the_errors_that_are_in_the_bag(tmp_path):
     run = read_run(record(tmp_path / 'bag'))
-    assert run.names == NAMES
+    assert run.curves.names == NAMES
     np.testing.assert_allclose(run.truth, TRUTH, rtol=0.0, atol=1e-15)
-    np.testing.assert_allclose(run.estimate, ESTIMATE, rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(run.curves.estimate, ESTIMATE, rtol=0.0, atol=1e-15)
     np.testing.assert_allclose(run.t, T, rtol=0.0, atol=1e-12)
     text = table(run, {}, [])
     assert errors_of(text) == pytest.approx(expected(run.t >= START), rel=0.05)

@@ -8,13 +8,14 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.bags.types import serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
-from fhaosmo_ros.tools.tuning.bag_gains import make_gains, run
 from fhaosmo_ros.tools.tuning.command import main
 from fhaosmo_ros.tools.tuning.identify import (
     identify_input,
+    make_gains,
     NothingToFind,
     quantum,
     RecordedOutput,
+    run,
     size_of_input,
     usable,
 )

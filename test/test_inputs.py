@@ -2,9 +2,8 @@
 """Fields in messages of any type, of rosbags and rclpy; known inputs paired with y by stamps."""
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.inputs import known_inputs
+from fhaosmo_ros.inputs import known_inputs, MOST, StampPairing
 from fhaosmo_ros.messages.fields import find_field, MissingElementError
-from fhaosmo_ros.pairing import MOST, StampPairing
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np

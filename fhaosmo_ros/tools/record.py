@@ -18,10 +18,6 @@ from tqdm import tqdm
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0 if there is a valid bag, 2 also if nothing was recorded."""
-    return run_command(_parser(), argv, _record)
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='record',
         description="Record y, the estimator's and the plant's topics to a bag until Ctrl-C.",
@@ -36,7 +32,7 @@ def _parser() -> argparse.ArgumentParser:
         help='nodes whose topics, in and out, to record (default: /estimator /plant)',
     )  # fmt: skip
     add('--duration', type=float, metavar='SECONDS', help='stop by itself')
-    return parser
+    return run_command(parser, argv, _record)
 
 
 def _record(arguments: argparse.Namespace, stop: Stop) -> None:
@@ -55,8 +51,8 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     bag = BagWriter(path)
     recorder = TopicRecorder(
         bag,
-        [] if arguments.topics else [_full(name) for name in arguments.names],
-        [_full(topic) for topic in arguments.topics or []],
+        [] if arguments.topics else [f'/{name.strip("/")}' for name in arguments.names],
+        [f'/{topic.strip("/")}' for topic in arguments.topics or []],
         arguments.all,
         arguments.ros_arguments,
     )
@@ -81,10 +77,6 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
             file=sys.stderr,
         )
     print(f'{recorder.counts.total()} messages: {path}')
-
-
-def _full(name: str) -> str:
-    return f'/{name.strip("/")}'
 
 
 def _watch(recorder: Any, duration: float | None, stop: Stop) -> None:

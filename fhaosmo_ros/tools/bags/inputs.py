@@ -7,9 +7,14 @@ from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.inputs import Input, known_inputs, make_pairing, measured_output
+from fhaosmo_ros.inputs import (
+    Input,
+    known_inputs,
+    make_pairing,
+    measured_output,
+    StampPairing,
+)
 from fhaosmo_ros.messages.fields import Field
-from fhaosmo_ros.pairing import StampPairing
 from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples, Watch
 import numpy as np
 from numpy.typing import NDArray

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Topics of a bag as arrays, and which messages of several topics belong together.
+What nodes published into a bag: arrays, messages that belong together, and parameters.
 
 Messages of two topics are never paired by counting: a recording may lack some of them, most often
 at its begin and at its end. What was published together is found by its stamps in the bag.
@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core.parameters.files import loads
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.topics import TRUTH
+from fhaosmo_ros.topics import PARAMETERS, TEXT
 import numpy as np
 from numpy.typing import NDArray
 
 BLOCK = 16_384
 """Messages that are made arrays of at a time."""
-LATE = 0.75
-"""Periods of the plant by which the truth may follow its sample of y."""
 
 
 class Series(NamedTuple):
@@ -116,40 +116,56 @@ def _rows_of_ticks(times: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArra
     return np.where(early, before, -1) if lead <= lag else np.where(late, after, -1)
 
 
-def truth_at(bag: Path, plant: str, when: NDArray[np.int64]) -> Series | None:
-    """
-    Return the truth that belongs to samples of y.
+class Recorded(NamedTuple):
+    """Parameters of a node, as its first message in the bag has them."""
 
-    The plant publishes y, then its states, then d. So the truth of a sample is the first message
-    after it, unless that comes so late that it is another sample's.
+    topic: str
+    values: dict[str, Any]  # checked, in their own types; those of channels with channels' names
+    channel: str  # the one that was asked for, '' if the node has no named channels
+
+    @property
+    def namespace(self) -> str:
+        """Namespace of the node: '/rig' of /rig/estimator/parameters."""
+        return self.topic.rsplit('/', 2)[0]
+
+
+def recorded_parameters(reader: BagReader, name: str | None = None) -> Recorded | None:
+    """
+    Return an estimator's parameters at the begin of the bag, or None if the bag lacks them.
+
+    Later live changes are not among them.
 
     Parameters
     ----------
-    bag : Path
-    plant : str
-        Full name of the node.
-    when : (K,) array
-        Stamps of the samples in nanoseconds.
+    reader : BagReader
+    name : str, optional
+        Name of the estimator: its node's, followed by the channel's if it has channels. Default:
+        the only node in the bag that has published its parameters, if it has no channels.
 
-    Returns
-    -------
-    Series or None
-        z_1 .. z_n and d at `when`; a row of NaN where the bag lacks them. None if it has no
-        message of one of the topics.
+    Raises
+    ------
+    ConfigurationError
+        They are not parameters of this version.
 
     """
-    columns = []
-    labels: list[str] = []
-    for part in TRUTH:
-        found = series(bag, f'{plant}/{part}')
-        if not len(found.stamps):
+    topics = {
+        c.topic
+        for c in reader.connections
+        if c.topic.endswith(f'/{PARAMETERS}') and c.msgtype == TEXT and c.msgcount
+    }
+    if name is None:
+        if len(topics) != 1:
             return None
-        row = np.searchsorted(found.stamps, when)
-        its_own = row < len(found.stamps)
-        row = row.clip(max=len(found.stamps) - 1)
-        if len(found.stamps) > 1:
-            its_own &= found.stamps[row] - when <= LATE * np.median(np.diff(found.stamps))
-        values = found.values[row].astype(np.float64).reshape(len(row), -1)
-        columns.append(np.where(its_own[:, None], values, np.nan))
-        labels = labels or found.labels
-    return Series(when, np.column_stack(columns), labels)
+        name = min(topics).removesuffix(f'/{PARAMETERS}')
+    for node in (name, name.rpartition('/')[0]):
+        topic = f'{node}/{PARAMETERS}'
+        if topic in topics:
+            _, _, message = reader.read_all({topic})[0]
+            try:
+                values = loads(message.data, node, ESTIMATOR_PARAMETERS)
+            except ConfigurationError as error:
+                raise ConfigurationError(
+                    f'topic {topic!r}: {error}; --params-file does without it'
+                ) from None
+            return Recorded(topic, values, name.removeprefix(node).strip('/'))
+    return None

@@ -60,12 +60,14 @@ def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, bod
     try:
         return body(arguments, stop) or 0
     except ConfigurationError as error:
-        return _say(parser, f'error: {error}', 2)
+        text, code = f'error: {error}', 2
     except OSError as error:
         place = f': {error.filename}' if error.filename else ''
-        return _say(parser, f'error: {error.strerror or error}{place}', 2)
+        text, code = f'error: {error.strerror or error}{place}', 2
     except Stopped as error:
-        return _say(parser, f'interrupted{f", {error}" if str(error) else ""}', 130)
+        text, code = f'interrupted{f", {error}" if str(error) else ""}', 130
+    print(f'{parser.prog}: {without_password(text)}', file=sys.stderr)
+    return code
 
 
 def without_password(text: str) -> str:
@@ -86,11 +88,6 @@ def split_ros_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:
         else:
             target.append(word)
     return own, of_ros
-
-
-def _say(parser: argparse.ArgumentParser, text: str, code: int) -> int:
-    print(f'{parser.prog}: {without_password(text)}', file=sys.stderr)
-    return code
 
 
 class Output:

@@ -27,7 +27,7 @@ from fhaosmo_ros.core.parameters.tables import (
 )
 from fhaosmo_ros.core.parameters.yaml_text import parse
 from fhaosmo_ros.inputs import with_joints
-from fhaosmo_ros.tools.bags.recorded_parameters import Recorded
+from fhaosmo_ros.tools.bags.topics import Recorded
 
 
 def add_value_options(parser: argparse.ArgumentParser, which: str, over: str = 'file') -> None:

@@ -29,9 +29,6 @@ class Child(subprocess.Popen[bytes]):
 
     """
 
-    failure: ClassVar[type[Exception]] = ConfigurationError
-    """What `check` raises."""
-
     def __init__(self, log: Path, *arguments: str, **options: Any) -> None:
         self._log = log
         with log.open('wb') as output:
@@ -48,7 +45,7 @@ class Child(subprocess.Popen[bytes]):
         """Raise, with the end of its output, if the child has ended."""
         if self.poll() is not None:
             last = ' / '.join(self.output().splitlines()[-2:])
-            raise self.failure(
+            raise ConfigurationError(
                 f'{self._log.stem} ended with exit code {self.returncode}: '
                 f'{last or "without a word"}'
             )

@@ -15,10 +15,6 @@ SUFFIXES = ('.png', '.svg', '.pdf')
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0 if there is a figure, else none is written."""
-    return run_command(_parser(), argv, _plot)
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='plot',
         description='Draw the estimates in bags, live and replayed, one over another.',
@@ -32,7 +28,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--force', action='store_true', help='replace an output that exists')
     add('--names', nargs='+', metavar='NAME', help='estimators (default: all in the bags)')
     add('--plant', default='/plant', help='whose topics are the truth (default: %(default)s)')
-    return parser
+    return run_command(parser, argv, _plot)
 
 
 def _plot(arguments: argparse.Namespace, stop: Stop) -> None:

@@ -11,13 +11,20 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
-from fhaosmo_ros.tools.bags.topics import messages, read_ticks, series, truth_at
-from fhaosmo_ros.topics import ESTIMATES, EVENT, STANDARD_DEVIATION
+from fhaosmo_ros.tools.bags.topics import (
+    messages,
+    read_ticks,
+    Recorded,
+    recorded_parameters,
+    series,
+)
+from fhaosmo_ros.topics import ESTIMATES, EVENT, OF_GAINS, STANDARD_DEVIATION, TRUTH
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+LATE = 0.75
+"""Periods of the plant by which the truth may follow its sample of y."""
 
 
 class Curves(NamedTuple):
@@ -30,6 +37,7 @@ class Curves(NamedTuple):
     innovation: Floats  # (K, N)
     gamma: Floats | None = None  # (K,); None of a self-tuning estimator, which has no power
     deviation: Floats | None = None  # (K, n + 1) standard deviations, of a self-tuning estimator
+    tuning: Floats | None = None  # (K, m) what that one has found
     truth: Floats | None = None  # (K, n + 1); NaN where the bag lacks it
     epsilon: float | None = None  # of its gates, if it has gates and the bag has its parameters
     unit: str = ''  # of y, '' if the bag does not say it
@@ -39,6 +47,12 @@ class Curves(NamedTuple):
         """Return one of `names` with its unit, which follows from that of y."""
         unit = derivative_unit(self.unit, self.names.index(name))
         return titled('unknown\ninput d' if name == 'd' else name, unit)
+
+    def part(self, rows: NDArray[np.bool_]) -> 'Curves':
+        """Return some of the rows."""
+        columns = ('stamps', 'estimate', 'innovation', 'gamma', 'deviation', 'tuning', 'truth')
+        found = {name: getattr(self, name) for name in columns}
+        return self._replace(**{k: None if x is None else x[rows] for k, x in found.items()})
 
 
 def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]:
@@ -80,12 +94,12 @@ def _curves(
         unit = values['measurement_unit']
         if values['structure'] == 'cascade' and values['gains'] == 'fixed':
             epsilon = values['epsilon']
-    of_gains = [p for p in ('gamma', STANDARD_DEVIATION) if f'{name}/{p}' in topics]
+    of_gains = [p for of in OF_GAINS.values() for p in of if f'{name}/{p}' in topics]
     ticks = read_ticks(path, name, [*of_gains, *ESTIMATES])
     when = ticks['stamp']
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
-    truth = truth_at(path, plant, when)
-    if truth is not None and truth.values.shape != estimate.shape:
+    truth = _truth_at(path, plant, when)
+    if truth is not None and truth.shape != estimate.shape:
         truth = None  # of another model
     labels = series(path, f'{name}/state').labels
     return Curves(
@@ -96,11 +110,34 @@ def _curves(
         ticks['innovation'],
         ticks.get('gamma'),
         ticks.get(STANDARD_DEVIATION),
-        truth.values if truth else None,
+        ticks.get('tuning'),
+        truth,
         epsilon,
         unit,
         _events(path, f'{name}/{EVENT}', int(when[-1])) if f'{name}/{EVENT}' in topics else (),
     )
+
+
+def _truth_at(path: Path, plant: str, when: NDArray[np.int64]) -> Floats | None:
+    """
+    Return z_1 .. z_n and d at stamps of samples; NaN where the bag lacks them, None without any.
+
+    The plant publishes y, then its states, then d. So the truth of a sample is the first message
+    after it, unless that comes so late that it is another sample's.
+    """
+    columns = []
+    for part in TRUTH:
+        found = series(path, f'{plant}/{part}')
+        if not len(found.stamps):
+            return None
+        row = np.searchsorted(found.stamps, when)
+        its_own = row < len(found.stamps)
+        row = row.clip(max=len(found.stamps) - 1)
+        if len(found.stamps) > 1:
+            its_own &= found.stamps[row] - when <= LATE * np.median(np.diff(found.stamps))
+        values = found.values[row].astype(np.float64).reshape(len(row), -1)
+        columns.append(np.where(its_own[:, None], values, np.nan))
+    return np.column_stack(columns)
 
 
 def _events(path: Path, topic: str, end: int) -> list[tuple[int, int]]:

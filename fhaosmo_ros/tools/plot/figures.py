@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of runs and of estimates in bags."""
 
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -43,23 +44,32 @@ def envelope(t: NDArray[Any], x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[An
     return t[rows], x[rows]
 
 
-def save_curves(curves: list[Curves], path: Path) -> None:
+def save_curves(
+    curves: list[Curves],
+    path: Path,
+    errors: Mapping[str, NDArray[np.float64]] | None = None,
+    marks: Sequence[tuple[int, str]] = (),
+) -> None:
     """
     Write a figure of several estimates laid one over another.
 
-    From top to bottom: a row for each state, for d, for gamma if an estimate has it, and for the
-    innovations of the first estimate.
+    From top to bottom: a row for each state, for d, for errors of d if there are some, for gamma
+    if an estimate has it, and for the innovations of the first estimate.
 
     Parameters
     ----------
     curves : list of Curves
     path : path
         Its suffix names the format.
+    errors : mapping of str to (K,) array, optional
+        Of d, at the stamps of the first estimate, by what makes them.
+    marks : sequence of (int, str)
+        Times in nanoseconds at which something changed, and what.
 
     """
     first, names = curves[0], max((c.names for c in curves), key=len)
     gamma = ['gamma'] if any(c.gamma is not None for c in curves) else []
-    rows = [*names, *gamma, 'innovation']
+    rows = [*names, *(['error of d'] if errors else []), *gamma, 'innovation']
     figure = Figure(figsize=(8.5, 1.45 * len(rows) + 0.9), layout='constrained')
     axes = dict(zip(rows, figure.subplots(len(rows), 1, sharex=True), strict=True))
     origin = min(c.stamps[0] for c in curves)
@@ -90,6 +100,18 @@ def save_curves(curves: list[Curves], path: Path) -> None:
     t = (first.stamps - origin) * 1e-9
     _draw_innovations(axes['innovation'], t, first.innovation, first.epsilon)
     axes['innovation'].set_ylabel('|innovation|' + ('\n(first)' if len(curves) > 1 else ''))
+    if errors:
+        row = axes['error of d']
+        for name, error in errors.items():
+            row.plot(*envelope(t, error), linewidth=0.8, label=name)
+        size = 1.5 * float(np.nanmax(np.abs(first.estimate[:, -1])))
+        row.set_ylim(-size, size)  # what is beyond leaves the picture
+        row.set_ylabel('error of d')
+        row.legend(loc='upper right', ncols=len(errors), fontsize='x-small')
+    for stamp, words in marks:
+        for row in axes.values():
+            row.axvline((stamp - origin) * 1e-9, color='black', linewidth=0.8, linestyle=':')
+        axes['d'].set_title(words, fontsize='small', loc='right')
     for row in axes.values():
         row.grid(alpha=0.3)
     axes[rows[-1]].set_xlabel('time since the first estimate [s]')

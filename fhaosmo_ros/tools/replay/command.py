@@ -2,48 +2,46 @@
 """Replay a recorded y through the node's update path, as fast as the machine allows."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 import sys
 from tempfile import TemporaryDirectory
 from time import perf_counter
-from typing import Any
 
+from fhaosmo_ros.core.observer.estimates import Trajectory
+from fhaosmo_ros.core.observer.status import UNUSED
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.online.events import Event
 from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import INPUT, ONLINE_PARAMETERS
+from fhaosmo_ros.messages.fields import Unwrapper
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
-from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.recorded_parameters import Recorded, recorded_parameters
+from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
 from fhaosmo_ros.tools.bags.table import bag_of_table
-from fhaosmo_ros.tools.bags.writer import BagWriter
+from fhaosmo_ros.tools.bags.topics import Recorded, recorded_parameters
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 from fhaosmo_ros.tools.cli.options import (
     add_parameter_options,
     channel_parameters,
     named,
 )
-from fhaosmo_ros.tools.replay.live_run import (
-    find_estimator,
-    LiveRun,
-    read_events,
-    UnknownSnapshot,
-)
-from fhaosmo_ros.tools.replay.samples import Samples
-from fhaosmo_ros.tools.replay.sinks import BagSink, Sink, TABLES
+from fhaosmo_ros.tools.replay.live_run import find_estimator, LiveRun, UnknownSnapshot
+from fhaosmo_ros.tools.replay.sinks import bag_sink, Rows, TABLES
 from fhaosmo_ros.topics import ESTIMATES
+import numpy as np
+from numpy.typing import NDArray
+
+BLOCK = 16_384
+"""Samples that are estimated, and written, at a time."""
+NONE = np.zeros(0, dtype=np.int64)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; return 0 if the output is complete, else there is none."""
-    return run_command(_parser(), argv, _replay)
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='replay',
         description='Estimate offline from a recorded bag, with the result of the live node.',
@@ -81,20 +79,23 @@ def _parser() -> argparse.ArgumentParser:
         'where the bag already holds estimates)',
     )  # fmt: skip
     add_parameter_options(parser)
-    return parser
+    return run_command(parser, argv, _replay)
 
 
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     is_table = arguments.bag.suffix == '.csv'
     if arguments.columns and not is_table:
         raise ConfigurationError(f'--columns: expected a .csv file, got {arguments.bag}')
-    name = arguments.bag.resolve().name.removesuffix('.csv' if is_table else '.mcap')
+    bag_name = arguments.bag.resolve().name.removesuffix('.csv' if is_table else '.mcap')
     begin = perf_counter()
     with ExitStack() as stack:
         path = arguments.bag
         if is_table:
             path = Path(stack.enter_context(TemporaryDirectory()), 'table')
-            _write_bag_of_table(arguments, path)
+            own = channel_parameters(arguments)
+            used = OnlineEstimator(ONLINE_PARAMETERS.part_of(own)).observer.used_inputs
+            titles = [title.strip() for title in arguments.columns.split(',') if title.strip()]
+            bag_of_table(arguments.bag, titles, used, path)
         reader = stack.enter_context(BagReader(path))
         followed = recorded = live = None
         if not arguments.afresh:
@@ -114,28 +115,52 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             estimator.smooth()
         if followed is not None:
             try:
-                events = read_events(reader, followed, named(arguments))
-                live = LiveRun(followed, events, estimator)
+                live = LiveRun(reader, followed, estimator, named(arguments))
             except UnknownSnapshot as error:
                 _warn(f'{error}; {followed} is not followed, this begins at the first sample')
         namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
-        present = {c.topic for c in reader.connections}
-        model = estimator.observer.model
-        inputs = BagInputs(reader, own, model, namespace, arguments.channel)
-        finals = arguments.output or [Path(f'{name}_replayed')]
+        inputs = BagInputs(reader, own, estimator.observer.model, namespace, arguments.channel)
+        finals = arguments.output or [Path(f'{bag_name}_replayed')]
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
-        name = _name(present, arguments.name)
-        with stop.raising():
+        name = _name({c.topic for c in reader.connections}, arguments.name)
+        with stop.raising(), ExitStack() as files:
             count = reader.count(inputs.y.topic)
             bar = partial(progress, total=count, unit='sample', unit_scale=True, desc='replay')
-            samples = Samples(estimator, live, inputs, arguments.smooth, bar)
-            _write(reader, samples, outputs, name, ONLINE_PARAMETERS.defaults() | own)
+            samples, field = inputs.samples(bar)
+            span = float(samples.stamps[-1] - samples.stamps[0]) * 1e-9
+            stamps = 'source (publish times of the bag)'
+            if np.array_equal(samples.stamps, samples.times):
+                stamps = 'bag'
+            elif field.header and inputs.y.stamp != 'source':
+                stamps = 'header of the messages'
+            if live:
+                samples = live.begin(samples)
+            if field.wraps:
+                unwrap = Unwrapper()
+                if estimator.latest is not None:
+                    unwrap.begin_near(estimator.state_dict()['y'] + estimator.offset)
+                samples = samples.unwrapped(unwrap)
+            u = None
+            if estimator.observer.uses_input:
+                u = inputs.at(samples, estimator.inputs, estimator.reject_inputs)
+            parameters = ONLINE_PARAMETERS.defaults() | own
+            sinks = [
+                files.enter_context(
+                    TABLES[o.path.suffix](o.path)
+                    if o.path.suffix in TABLES
+                    else bag_sink(o.path, reader, name, estimator.observer, parameters)
+                )
+                for o in outputs
+            ]
+            for rows in _estimates(estimator, live, samples, u, arguments.smooth):
+                for sink in sinks:
+                    sink(rows)
         finals = [output.keep() for output in outputs]
     seconds = perf_counter() - begin
     c = estimator.counters
     print(
         f'{c.accepted} samples used, {c.rejected} rejected, {c.restarts} restarts; '
-        f'{samples.span:.1f} s of data in {seconds:.2f} s'
+        f'{span:.1f} s of data in {seconds:.2f} s'
     )
     for why, count in reader.lacking.items():
         print(f'{count} messages left out: {why}')
@@ -143,7 +168,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         lag = estimator.parameters['smoothing_lag']
         later = 'and after' if arguments.smooth else f'and until {lag:g} s after'
         print(f'smoothed: each estimate by the samples before {later} it')
-    print(f'stamps: {samples.stamps}')
+    print(f'stamps: {stamps}')
     print(f'parameters: {_origin(arguments, recorded)}')
     if not arguments.params_file and not recorded:
         _warn(
@@ -159,11 +184,45 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         print(f'output: {final}{where}')
 
 
-def _write_bag_of_table(arguments: argparse.Namespace, bag: Path) -> None:
-    own = channel_parameters(arguments)
-    used = OnlineEstimator(ONLINE_PARAMETERS.part_of(own)).observer.used_inputs
-    titles = [title.strip() for title in arguments.columns.split(',') if title.strip()]
-    bag_of_table(arguments.bag, titles, used, bag)
+def _estimates(
+    estimator: OnlineEstimator,
+    live: LiveRun | None,
+    samples: FieldSamples,
+    u: NDArray[np.float64] | None,
+    whole: bool,
+) -> Iterator[Rows]:
+    """Yield estimates block by block; `whole`: smoothed over the whole recording."""
+    events: list[tuple[int, Event]] = []
+    lasting = 0  # 1 while an event lasts
+
+    def due(found: Trajectory) -> Rows:
+        """Return the rows whose smoothed estimates are final."""
+        smoothing = estimator.smoothing
+        numbers = np.zeros(0, dtype=np.int64) if smoothing is None else smoothing.numbers
+        return Rows(samples.times[numbers], samples.values[numbers], found, NONE, events)
+
+    parts = live.parts(samples.stamps) if live else [slice(0, len(samples.stamps))]
+    for part in parts:
+        for begin in range(part.start, part.stop, BLOCK):
+            block = slice(begin, min(begin + BLOCK, part.stop))
+            times, stamps, y = samples.part(block)
+            found = estimator.run(stamps, y, None if u is None else u[block])
+            active = lasting + np.zeros(len(times), dtype=np.int64)
+            for event in estimator.events.taken():
+                lasting = int(event.begins)
+                active[event.sample :] = lasting
+                events.append((int(times[event.sample]), event))
+            if estimator.smoothing is not None:
+                rows = due(found)
+            else:
+                keep = np.flatnonzero((found.status & UNUSED) == 0)
+                active = active[keep] if estimator.events.on else NONE
+                rows = Rows(times[keep], y[keep], found.rows(keep), active, events)
+            if len(rows.times):
+                yield rows
+                events = []
+    if whole and len((rows := due(estimator.finish())).times):
+        yield rows
 
 
 def _warn(text: str) -> None:
@@ -188,25 +247,3 @@ def _name(present: set[str], name: str | None) -> str:
         if not taken:
             return candidate
     raise ConfigurationError(f'--name: expected topics that the bag lacks, got {min(taken)!r}')
-
-
-def _write(
-    reader: BagReader,
-    samples: Samples,
-    outputs: list[Output],
-    name: str,
-    parameters: Mapping[str, Any],
-) -> None:
-    observer = samples.estimator.observer
-    with ExitStack() as stack:
-        sinks: list[Sink] = []
-        for output in outputs:
-            if output.path.suffix in TABLES:
-                sinks.append(stack.enter_context(TABLES[output.path.suffix](output.path)))
-                continue
-            bag = stack.enter_context(BagWriter(output.path))
-            sinks.append(BagSink(bag, name, observer.order, observer.levels, parameters).write)
-            bag.copy(reader)
-        for rows in samples:
-            for sink in sinks:
-                sink(rows)

@@ -72,17 +72,24 @@ def find_estimator(reader: BagReader, name: str | None, channel: str = '') -> st
     return wanted[0] if wanted else None
 
 
-def read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[Event]:
+class LiveRun:
     """
-    Return the events of a live estimator in order.
+    Repeats at an estimator what was done to a live one, at the same samples.
 
     Parameters
     ----------
     reader : BagReader
     name : str
-        Name of the estimator: the node's full name, followed by the channel's if it has channels.
+        Of the live one: the node's full name, followed by the channel's if it has channels.
+    estimator : OnlineEstimator
+        The one that follows the live one.
     fixed : collection of str
         Parameters whose live changes are not repeated.
+
+    Attributes
+    ----------
+    left_out : int
+        Samples before the first one that can be followed.
 
     Raises
     ------
@@ -90,52 +97,12 @@ def read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[Ev
         A snapshot is of another version, or damaged.
 
     """
-    events: list[Event] = []
-    changes: dict[str, Any] = {}
-    topics = {f'{name}/{SNAPSHOT}', EVENTS} & {c.topic for c in reader.connections}
-    for topic, _, message in reader.read_all(topics):
-        if topic == EVENTS:
-            node, channel = message.node, name.removeprefix(message.node).strip('/')
-            if name == node or name.startswith(f'{node}/'):
-                for parameter in message.changed_parameters:
-                    of_channel, key = split(parameter.name)
-                    if of_channel == channel and key in ONLINE_PARAMETERS and key not in fixed:
-                        value = getattr(parameter.value, VALUE_FIELDS[parameter.value.type])
-                        changes[key] = ONLINE_PARAMETERS[key].coerce(value)
-            continue
-        try:
-            snapshot = unpack(message.data, message.layout.dim[0].label.split(','))
-        except (IndexError, ConfigurationError) as error:
-            raise UnknownSnapshot(f'topic {topic!r}: {error}') from None
-        # The node publishes the change first, then the snapshot.
-        took_them = not events or snapshot.flags & (Flag.CHANGED | Flag.STARTED)
-        events.append(Event(snapshot, changes if took_them else {}))
-        if took_them:
-            changes = {}
-    return events
 
-
-class LiveRun:
-    """
-    Repeats at an estimator what was done to a live one, at the same samples.
-
-    Parameters
-    ----------
-    name : str
-        The live estimator's.
-    events : list of Event
-    estimator : OnlineEstimator
-        The one that follows the live one.
-
-    Attributes
-    ----------
-    left_out : int
-        Samples before the first one that can be followed.
-
-    """
-
-    def __init__(self, name: str, events: list[Event], estimator: OnlineEstimator) -> None:
-        self._name, self._events, self._estimator = name, events, estimator
+    def __init__(
+        self, reader: BagReader, name: str, estimator: OnlineEstimator, fixed: Collection[str]
+    ) -> None:
+        self._name, self._estimator = name, estimator
+        self._events = _read_events(reader, name, fixed)
         self.left_out = 0
         self._followed = self._resumed = False
         self._unfit = ''
@@ -144,34 +111,30 @@ class LiveRun:
     def begin(self, samples: FieldSamples) -> FieldSamples:
         """Return the samples from the first one at which a snapshot tells the live state."""
         changes: dict[str, Any] = {}
-        for number, event in enumerate(self._events):
+        while self._events:
+            event = self._events.pop(0)
+            stamp, flags, values = event.snapshot
             changes |= event.changes
-            found = np.flatnonzero(samples.stamps == event.snapshot.stamp)
-            if len(found):
-                self._events = [event._replace(changes=changes), *self._events[number + 1 :]]
-                self.left_out = int(found[0]) + self._adopt(self._events[0])
-                self._followed = True
-                return samples.part(slice(self.left_out, None))
-        self._events = []
+            found = np.flatnonzero(samples.stamps == stamp)
+            if not len(found):
+                continue
+            self._followed, self.left_out = True, int(found[0])
+            if flags & Flag.STARTED:
+                # First sample of the live estimator, or first after a restart: it may hold inputs.
+                held = np.ravel(values.get('u', ()))
+                for index, u in enumerate(held[: len(self._estimator.inputs)].tolist()):
+                    self._estimator.set_input(u, index)
+                self._events.insert(0, event._replace(changes=changes))
+            else:
+                self._configure(changes)
+                try:
+                    self._estimator.load_state_dict(values)
+                    self._resumed = True
+                    self.left_out += 1  # the snapshot is what it was after this one
+                except ConfigurationError as error:  # as of an observer of another size
+                    self._unfit = f'; its state does not fit ({error})'
+            return samples.part(slice(self.left_out, None))
         return samples
-
-    def _adopt(self, event: Event) -> bool:
-        """Take the memory after the event's sample; return True if the run goes on behind it."""
-        if event.snapshot.flags & Flag.STARTED:
-            # First sample of the live estimator, or first after a restart: it may hold inputs.
-            held = np.ravel(event.snapshot.values.get('u', ()))
-            for index, u in enumerate(held[: len(self._estimator.inputs)].tolist()):
-                self._estimator.set_input(u, index)
-            return False
-        self._configure(event)
-        self._events.pop(0)
-        try:
-            self._estimator.load_state_dict(event.snapshot.values)
-        except ConfigurationError as error:  # as of an observer of another size
-            self._unfit = f'; its state does not fit ({error})'
-            return False
-        self._resumed = True
-        return True
 
     def parts(self, stamps: NDArray[np.int64]) -> Iterator[slice]:
         """
@@ -179,40 +142,35 @@ class LiveRun:
 
         A part may be empty.
         """
-        position = 0
+        position, estimator = 0, self._estimator
         for event in self._events:
-            stamp, flags, _ = event.snapshot
+            stamp, flags, values = event.snapshot
             # If the bag lacks that sample, the event takes place before the next one.
             at, found = _find(stamps, position, stamp)
             if flags & Flag.STARTED:
                 yield slice(position, at)
                 position = at
-                self._configure(event)
-                self._estimator.reset()
+                self._configure(event.changes)
+                estimator.reset()
             yield slice(position, at + found)
             position = at + found
-            self._repeat(event)
-            if found or self._estimator.latest == stamp:
+            if not flags & Flag.STARTED:
+                self._configure(event.changes)
+            if flags & Flag.RESET:
+                estimator.reset()
+            estimator.freeze(bool(np.any(values.get('frozen', False))))
+            if found or estimator.latest == stamp:
                 self._compare(event.snapshot)
         yield slice(position, len(stamps))
 
-    def _repeat(self, event: Event) -> None:
-        """Do what was done to the live estimator after the event's sample."""
-        _, flags, values = event.snapshot
-        if not flags & Flag.STARTED:
-            self._configure(event)
-        if flags & Flag.RESET:
-            self._estimator.reset()
-        self._estimator.freeze(bool(np.any(values.get('frozen', False))))
-
-    def _configure(self, event: Event) -> None:
-        if not event.changes:
+    def _configure(self, changes: dict[str, Any]) -> None:
+        if not changes:
             return
         try:
-            self._estimator.configure(event.changes)
+            self._estimator.configure(changes)
         except ConfigurationError as error:
             raise ConfigurationError(
-                f'live change of {", ".join(event.changes)}: {error}; -p keeps a parameter fixed, '
+                f'live change of {", ".join(changes)}: {error}; -p keeps a parameter fixed, '
                 '--afresh repeats no changes'
             ) from None
 
@@ -251,3 +209,30 @@ def _find(stamps: NDArray[np.int64], position: int, stamp: int) -> tuple[int, bo
             if wanted.any():
                 return begin + int(wanted.argmax()), found
     return len(stamps), False
+
+
+def _read_events(reader: BagReader, name: str, fixed: Collection[str]) -> list[Event]:
+    """Return the events of a live estimator in order."""
+    events: list[Event] = []
+    changes: dict[str, Any] = {}
+    topics = {f'{name}/{SNAPSHOT}', EVENTS} & {c.topic for c in reader.connections}
+    for topic, _, message in reader.read_all(topics):
+        if topic == EVENTS:
+            node, channel = message.node, name.removeprefix(message.node).strip('/')
+            if name == node or name.startswith(f'{node}/'):
+                for parameter in message.changed_parameters:
+                    of_channel, key = split(parameter.name)
+                    if of_channel == channel and key in ONLINE_PARAMETERS and key not in fixed:
+                        value = getattr(parameter.value, VALUE_FIELDS[parameter.value.type])
+                        changes[key] = ONLINE_PARAMETERS[key].coerce(value)
+            continue
+        try:
+            snapshot = unpack(message.data, message.layout.dim[0].label.split(','))
+        except (IndexError, ConfigurationError) as error:
+            raise UnknownSnapshot(f'topic {topic!r}: {error}') from None
+        # The node publishes the change first, then the snapshot.
+        took_them = not events or snapshot.flags & (Flag.CHANGED | Flag.STARTED)
+        events.append(Event(snapshot, changes if took_them else {}))
+        if took_them:
+            changes = {}
+    return events

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.observer.estimates import Trajectory, TUNING
+from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.online.events import described, Event
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.units import derivative_unit
+from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.types import (
     diagnostics,
     labelled_array,
@@ -92,70 +94,66 @@ TABLES = {'.csv': csv_sink, '.npz': npz_sink}
 """Sinks that open a file, by its suffix."""
 
 
-class BagSink:
+@contextmanager
+def bag_sink(
+    path: Path, reader: BagReader, name: str, observer: Observer, parameters: Mapping[str, Any]
+) -> Iterator[Sink]:
     """
-    The estimator's topics in an open bag: a message on each for every sample.
+    Write a bag: a copy of another one, and the estimator's topics with a message for every sample.
 
     All messages of a topic have the same length. So they are made a block at a time: the bytes of
     one, and behind them each sample's numbers.
 
     Parameters
     ----------
-    bag : BagWriter
+    path : path
+    reader : BagReader
+        What is copied.
     name : str
-        Name below which the topics go.
-    order, levels : int
-        Numbers of states and of innovations.
+        Name below which the topics of the estimates go.
+    observer : Observer
     parameters : mapping
         Parameters of the estimates; written once, as the node publishes them.
 
     """
-
-    def __init__(
-        self, bag: BagWriter, name: str, order: int, levels: int, parameters: Mapping[str, Any]
-    ) -> None:
-        self._bag, self._name, self._order = bag, name, order
-        self._parameters = dumps(parameters, name)
-        self._has_parameters = False
-        self._unit = derivative_unit(parameters.get('measurement_unit', ''), order)
-        state = [f'z{i + 1}' for i in range(order)]
-        labels = {
-            'state': state, 'innovation': [f'eps{i + 1}' for i in range(levels)],
-            STANDARD_DEVIATION: [*state, 'd'], 'tuning': TUNING,
-        }  # fmt: skip
-        empty = {
-            FLOAT: lambda _: serialise(FLOAT, data=0.0),
-            TIME: lambda _: serialise(TIME, sec=0, nanosec=0),
-            ARRAY: lambda topic: labelled_array(labels[topic], np.zeros(len(labels[topic]))),
-        }
+    text, has_parameters = serialise(TEXT, data=dumps(parameters, name)), False
+    unit = derivative_unit(parameters.get('measurement_unit', ''), observer.order)
+    state = [f'z{i + 1}' for i in range(observer.order)]
+    labels = {
+        'state': state, 'innovation': [f'eps{i + 1}' for i in range(observer.levels)],
+        STANDARD_DEVIATION: [*state, 'd'], 'tuning': TUNING,
+    }  # fmt: skip
+    empty = {
+        FLOAT: serialise(FLOAT, data=0.0), TIME: serialise(TIME, sec=0, nanosec=0),
+        **{of: labelled_array(names, np.zeros(len(names))) for of, names in labels.items()},
+    }  # fmt: skip
+    with BagWriter(path) as bag:
         bag.add(f'{name}/{PARAMETERS}', TEXT, qos=[LATCHED_QOS])
         topics = estimates_of(parameters)
         for topic, kind in topics.items():
             bag.add(f'{name}/{topic}', kind)
-        self._messages = {topic: empty[kind](topic) for topic, kind in topics.items()}
+        bag.copy(reader)
 
-    def write(self, rows: Rows) -> None:
-        """Append the messages of each sample, and those of events."""
-        if not self._has_parameters:
-            text = serialise(TEXT, data=self._parameters)
-            self._bag.write(f'{self._name}/{PARAMETERS}', int(rows.times[0]), text)
-            self._has_parameters = True
-        e = rows.estimates
-        stamp = np.column_stack(np.divmod(e.t, 1_000_000_000)).astype('<i4')
-        numbers = {
-            'gamma': e.gamma, STANDARD_DEVIATION: e.standard_deviation, 'tuning': e.tuning,
-            'state': e.z, 'unknown_input': e.unknown_input, 'innovation': e.innovation,
-            'stamp': stamp,
-        }  # fmt: skip
-        columns = [
-            (f'{self._name}/{topic}', with_numbers(message, numbers[topic]))
-            for topic, message in self._messages.items()
-        ]
-        self._bag.write_columns(rows.times, columns)
-        for time, event in rows.events:
-            topic = f'{self._name}/{EVENT}'
-            self._bag.add(topic, DIAGNOSTICS, qos=[LATCHED_QOS])
-            text, values = described(event, self._unit)
-            name = f'{self._name.lstrip("/")}: event'
-            message = diagnostics(event.stamp, event.begins, name, text, values)
-            self._bag.write(topic, time, message)
+        def write(rows: Rows) -> None:
+            nonlocal has_parameters
+            if not has_parameters:
+                bag.write(f'{name}/{PARAMETERS}', int(rows.times[0]), text)
+                has_parameters = True
+            e = rows.estimates
+            found = {
+                'gamma': e.gamma, STANDARD_DEVIATION: e.standard_deviation, 'tuning': e.tuning,
+                'state': e.z, 'unknown_input': e.unknown_input, 'innovation': e.innovation,
+                'stamp': np.column_stack(np.divmod(e.t, 1_000_000_000)).astype('<i4'),
+            }  # fmt: skip
+            columns = []
+            for topic, kind in topics.items():
+                message = empty[topic if kind == ARRAY else kind]
+                columns.append((f'{name}/{topic}', with_numbers(message, found[topic])))
+            bag.write_columns(rows.times, columns)
+            for time, event in rows.events:
+                bag.add(f'{name}/{EVENT}', DIAGNOSTICS, qos=[LATCHED_QOS])
+                status = f'{name.lstrip("/")}: event'
+                message = diagnostics(event.stamp, event.begins, status, *described(event, unit))
+                bag.write(f'{name}/{EVENT}', time, message)
+
+        yield write

@@ -13,17 +13,23 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.recordings import SENSOR
+from fhaosmo_ros.messages.fields import Unwrapper
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import Output, run_command
 from fhaosmo_ros.tools.cli.options import add_value_options, assigned
 from fhaosmo_ros.tools.tuning import report
-from fhaosmo_ros.tools.tuning.bag_gains import make_gains, run
-from fhaosmo_ros.tools.tuning.identify import identify_input, recorded
+from fhaosmo_ros.tools.tuning.identify import (
+    identify_input,
+    make_gains,
+    RecordedOutput,
+    run,
+)
 from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
 from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
+import numpy as np
 
 TRIALS = 1000
 BOTH = ParameterTable(
@@ -33,10 +39,6 @@ BOTH = ParameterTable(
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command; a search that Ctrl-C ends after the first trial is written, too."""
-    return run_command(_parser(), argv, _tune)
-
-
-def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='tune',
         description=__doc__,
@@ -70,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         '--bag', type=Path,
         help='find the gains that are likeliest for its y (of input_topic, input_field)',
     )  # fmt: skip
-    return parser
+    return run_command(parser, argv, _tune)
 
 
 def _tune(arguments: argparse.Namespace, stop: Stop) -> None:
@@ -104,23 +106,6 @@ def _search(
     return report.of_search(tuner, result)
 
 
-def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what files and rules set for the estimator, and for the tuning."""
-    estimator: dict[str, Any] = {}
-    tuning: dict[str, Any] = {}
-    for path in files:
-        found = load(path, 'estimator')
-        estimator |= found
-        # Where only the estimator has a model, the plant has the same one; and so the sensor.
-        tuning |= ParameterTable(MODEL, SENSOR).part_of(found)
-        tuning |= load(path, 'plant', TUNE_PARAMETERS) | load(path, 'tune', TUNE_PARAMETERS)
-    for name, value in assigned(rules, BOTH).items():
-        for table, values in ((ESTIMATOR_PARAMETERS, estimator), (TUNE_PARAMETERS, tuning)):
-            if name in table:
-                values[name] = value
-    return estimator, tuning
-
-
 def _identify(
     arguments: argparse.Namespace, estimator: dict[str, Any], tuning: dict[str, Any], stop: Stop
 ) -> report.Report:
@@ -138,11 +123,35 @@ def _identify(
     model = TriangularModel.of(values)
     with stop.raising():
         with BagReader(arguments.bag) as reader:
-            data = recorded(BagInputs(reader, estimator, model), model)
-        found = identify_input(data, model, values, given)
+            inputs = BagInputs(reader, estimator, model)
+            samples, field = inputs.samples()
+            if field.wraps:
+                samples = samples.unwrapped(Unwrapper())
+            u = np.zeros((len(samples.values), len(model.inputs)))
+            if model.uses_input:
+                u = inputs.at(samples)
+        t = (samples.stamps - samples.stamps[0]) * 1e-9
+        found = identify_input(RecordedOutput(t, samples.values, u), model, values, given)
         made = make_gains(found, given)
         along = run(found, made)
     return report.of_bag(found, made, along, arguments.bag.resolve().name)
+
+
+def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what files and rules set for the estimator, and for the tuning."""
+    estimator: dict[str, Any] = {}
+    tuning: dict[str, Any] = {}
+    for path in files:
+        found = load(path, 'estimator')
+        estimator |= found
+        # Where only the estimator has a model, the plant has the same one; and so the sensor.
+        tuning |= ParameterTable(MODEL, SENSOR).part_of(found)
+        tuning |= load(path, 'plant', TUNE_PARAMETERS) | load(path, 'tune', TUNE_PARAMETERS)
+    for name, value in assigned(rules, BOTH).items():
+        for table, values in ((ESTIMATOR_PARAMETERS, estimator), (TUNE_PARAMETERS, tuning)):
+            if name in table:
+                values[name] = value
+    return estimator, tuning
 
 
 if __name__ == '__main__':

@@ -1,20 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The likeliest model of d and of the noise for a recorded y (D 30)."""
+"""From a recorded y to the likeliest model of d and of the noise (D 30), and to gains for them."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 import math
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.configuration import usual_step
+from fhaosmo_ros.core.online.counters import Counters
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.policy import GAP_SAMPLES
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.messages.fields import Unwrapper
-from fhaosmo_ros.tools.bags.inputs import BagInputs
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
 from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.tuning.likelihood import CLIP, Design, Evaluation, Likelihood, Samples
-from fhaosmo_ros.tools.tuning.linear_gains import matern
+from fhaosmo_ros.tools.tuning.linear_gains import (
+    GAMMA,
+    kalman_gains,
+    matern,
+    rounded,
+    SCHEME,
+    WIDTH,
+)
+from fhaosmo_ros.tools.tuning.objective import stamps_of
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_opening
@@ -24,9 +33,8 @@ from scipy.stats import chi2, median_abs_deviation
 Floats = NDArray[np.float64]
 Evaluate = Callable[[Design], Evaluation]
 DERIVATIVES = (0, 1, 2)
-BANDWIDTHS = tuple(float(w) for w in np.geomspace(2e-4, 2.0, 15))
-"""First bandwidths, in rad a sample; at the first number of derivatives and ratio below."""
-FIRST_DERIVATIVES, FIRST_RATIO = 1, 0.5
+FIRST = [Design(1, float(w), 0.5) for w in np.geomspace(2e-4, 2.0, 15)]
+"""Where the search begins: at the likeliest of these, with bandwidths in rad a sample."""
 SLOWEST, QUICKEST = 1e-5, 3.0
 """Bandwidths of the filters, in rad a sample."""
 STEPS = np.array([0.3, 0.5])
@@ -50,6 +58,14 @@ FEWEST_STEPS = 20
 """Changes of y that say a quantum."""
 ON_GRID = 0.02
 """Values count as quantised if they are this close to multiples of the quantum, relatively."""
+SIZE_OF_USUAL = 0.9616
+"""RMS of a standard normal number among the 99 % that are nearest to 0."""
+UNSEEN = 0.97
+"""Expected error of d over its size from which on an estimate tells nothing."""
+NO_NOISE = 1e-7
+"""Noise over the size of y below which y is a simulated one without noise."""
+BEGIN = 0.1
+"""Part of the bag in which the estimates may still be settling."""
 
 
 class NothingToFind(ConfigurationError):
@@ -69,7 +85,6 @@ class Identified(NamedTuple):
 
     likelihood: Likelihood
     best: Evaluation  # of the likeliest design
-    silent: float  # fall of the log-likelihood if d were 0
     outliers: int  # samples that were left out
     quantum: float  # of y; 0 for none that shows
 
@@ -80,20 +95,33 @@ class Identified(NamedTuple):
         return size_of_input(design, self.likelihood.intensity(design, self.best.noise))
 
 
+class Gains(NamedTuple):
+    """Parameters of the estimator, and what is to be expected if the model holds."""
+
+    parameters: dict[str, Any]
+    expected: Floats  # (n + 1,) standard deviations of the errors of z and d
+    innovation: float  # standard deviation of the innovations
+    share: float  # part of an innovation that is left after the correction, 1 - K_1
+
+
+class Run(NamedTuple):
+    """The estimator with these gains along the bag."""
+
+    unknown_input: Floats  # (K,)
+    size: float  # RMS innovation over the expected one, without the largest hundredth
+    correlations: Floats  # (LAGS,) autocorrelations of the innovations
+    probability: float  # of so large ones, were innovations white (Ljung and Box 1978)
+    counters: Counters
+
+    @property
+    def lag(self) -> int:
+        """Index of the largest of `correlations`."""
+        return int(np.abs(self.correlations).argmax())
+
+
 def size_of_input(design: Design, intensity: float) -> float:
     """Return D of D 17 for a model of d whose last derivative has this intensity."""
     return math.sqrt(intensity / matern(design.decay, design.derivatives))
-
-
-def recorded(inputs: BagInputs, model: TriangularModel) -> RecordedOutput:
-    """Return the y of a bag, and the known inputs of a model."""
-    samples, field = inputs.samples()
-    if field.wraps:
-        samples = samples.unwrapped(Unwrapper())
-    u = np.zeros((len(samples.values), len(model.inputs)))
-    if model.uses_input:
-        u = inputs.at(samples)
-    return RecordedOutput((samples.stamps - samples.stamps[0]) * 1e-9, samples.values, u)
 
 
 def identify_input(
@@ -130,10 +158,13 @@ def identify_input(
 
         start = _start(likelihood, evaluate)
         outliers = _leave_out_outliers(likelihood, start)
-        best = _simplest(
-            _fit(evaluate, start.design._replace(derivatives=k), likelihood.period, decay)
-            for k in orders
-        )
+        best: Evaluation | None = None
+        for k in orders:
+            design = start.design._replace(derivatives=k)
+            richer = _fit(evaluate, design, likelihood.period, decay)
+            if not best or richer.log_likelihood > best.log_likelihood + WORTH:
+                best = richer
+        assert best
         if not math.isfinite(best.log_likelihood):
             raise NothingToFind(
                 f'y: expected samples that the model can predict, got none that phi = '
@@ -141,8 +172,103 @@ def identify_input(
             )
         still = STILL / float(likelihood.samples.h.sum())
         without = evaluate(best.design._replace(bandwidth=still))
-    silent = best.log_likelihood - without.log_likelihood
-    return Identified(likelihood, best, silent, outliers, quantum(likelihood.samples.y))
+    found = Identified(likelihood, best, outliers, quantum(likelihood.samples.y))
+    _refuse(found, best.log_likelihood - without.log_likelihood)
+    return found
+
+
+def _refuse(found: Identified, fall: float) -> None:
+    """Raise NothingToFind where there are no gains; `fall`: of the log-likelihood if d were 0."""
+    likelihood, y, noise = found.likelihood, found.likelihood.samples.y, found.best.noise
+    period, bandwidth = likelihood.period, found.best.design.bandwidth
+    silent = noise < NO_NOISE * float(np.std(y)) and not found.quantum
+    if silent and not likelihood.fixed:
+        raise NothingToFind(
+            f'y: expected noise, got none that shows ({noise:.1e} in a y of '
+            f'{np.std(y):.3g}), as in a simulation without noise: the less noise, the larger the '
+            'gains, without limit. Say what the sensor will have: -p noise_size:=...'
+        )
+    if bandwidth > 0.9 * QUICKEST / period and not likelihood.fixed:
+        raise NothingToFind(
+            f'y: the likeliest filter follows every sample ({bandwidth:.3g} rad/s at '
+            f'{1.0 / period:.4g} Hz). Either y has no noise that shows, or it moves in a way that '
+            'the model cannot: it jumps, or order or phi are wrong. Say what noise the sensor '
+            'has (-p noise_size:=...), sample faster, or correct the model'
+        )
+    if fall < SURE:
+        raise NothingToFind(
+            f'd: expected a y that d moves, got one that the model explains with d = 0 (noise '
+            f'{noise:.3g}). Record while the unknown input acts, and longer'
+        )
+
+
+def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
+    """
+    Return the gains of the steady Kalman filter of what was found (D 17 to D 19).
+
+    Raises
+    ------
+    NothingToFind
+        The estimate of d would tell nothing.
+    ConfigurationError
+        There is no such filter in floating-point numbers.
+
+    """
+    likelihood, design = found.likelihood, found.best.design
+    order, period = likelihood.model.order, rounded(likelihood.period)
+    noise, begin = rounded(found.best.noise), int(BEGIN * len(likelihood.samples.y))
+    states = found.best.estimates[begin:, :order]
+    sizes = np.maximum(np.sqrt(np.nanmean(np.square(states), axis=0)), noise)
+    values = {
+        **SCHEME,
+        'correction_period': period,
+        'noise_size': noise,
+        'state_sizes': [rounded(x) for x in sizes],
+        'unknown_input_size': rounded(found.size_of_input),
+        'unknown_input_derivatives': design.derivatives,
+        'unknown_input_decay': rounded(design.decay),
+        'fuzzy_widths': [rounded(WIDTH * noise)],
+        'gamma_initial': GAMMA,
+        **given,
+    }
+    checked = OBSERVER_PARAMETERS.complete(OBSERVER_PARAMETERS.part_of(values))
+    lambdas, k, p, variance = kalman_gains(checked, period)
+    values['lambda'] = [rounded(x) for x in lambdas]
+    errors = np.sqrt(np.maximum(np.diag(p) - k**2 * variance, 0.0))
+    share = errors[order] / found.size_of_input
+    if share > UNSEEN:
+        raise NothingToFind(
+            f'd: it changes too fast to be seen through this noise: the expected error is '
+            f'{min(share, 1.0):.2f} of its size, and an estimate of 0 has 1.00. Does y drift or '
+            'jump by itself, is its noise correlated from sample to sample (`gains: self_tuning` '
+            f'follows that), or is the order ({order}) too high by one? Else a '
+            'sensor with less noise, or a higher rate, is needed'
+        )
+    return Gains(values, errors[: order + 1], math.sqrt(variance), 1.0 - float(k[0]))
+
+
+def run(found: Identified, gains: Gains) -> Run:
+    """Let the estimator run over the bag, as the node would, and judge its innovations."""
+    samples = found.likelihood.samples
+    t, begin = np.cumsum(samples.h), int(BEGIN * len(samples.y))
+    estimator = OnlineEstimator(ESTIMATOR_PARAMETERS.complete(gains.parameters))
+    u = samples.u if estimator.observer.uses_input else None
+    trajectory = estimator.run(stamps_of(t), samples.y, u)
+    r = trajectory.innovation[:, 0] / (gains.share * gains.innovation)
+    r = r[np.isfinite(r) & samples.used & (np.arange(len(r)) >= begin)]
+    usual = r[np.abs(r) <= np.quantile(np.abs(r), 0.99)]
+    size = float(np.sqrt(np.mean(usual**2))) / SIZE_OF_USUAL
+    return Run(trajectory.unknown_input, size, *_whiteness(r), estimator.counters)
+
+
+def _whiteness(r: Floats) -> tuple[Floats, float]:
+    """Return autocorrelations, and their probability for white noise (Ljung and Box 1978)."""
+    r = np.clip(r, -CLIP, CLIP)
+    r = r - r.mean()
+    count, power, lags = len(r), float(r @ r), range(1, LAGS + 1)
+    found = np.array([r[:-j] @ r[j:] / power for j in lags])
+    statistic = count * (count + 2.0) * np.sum(found**2 / (count - np.array(lags)))
+    return found, float(chi2.sf(statistic, LAGS))
 
 
 def _prepared(
@@ -214,18 +340,9 @@ def _leave_out_outliers(likelihood: Likelihood, start: Evaluation) -> int:
     return int(far.sum())
 
 
-def _simplest(tried: Iterable[Evaluation]) -> Evaluation:
-    """Return the first one; one that follows must be likelier by `WORTH`."""
-    chosen, *others = tried
-    for richer in others:
-        if richer.log_likelihood > chosen.log_likelihood + WORTH:
-            chosen = richer
-    return chosen
-
-
 def _start(likelihood: Likelihood, evaluate: Evaluate) -> Evaluation:
     """Scan bandwidths, and bring the scale of clipping and the sizes about."""
-    designs = (Design(FIRST_DERIVATIVES, w / likelihood.period, FIRST_RATIO) for w in BANDWIDTHS)
+    designs = (d._replace(bandwidth=d.bandwidth / likelihood.period) for d in FIRST)
     best = max(map(evaluate, designs), key=lambda e: e.log_likelihood)
     likelihood.clip = CLIP
     for _ in range(2):
@@ -261,12 +378,3 @@ def _fit(evaluate: Evaluate, design: Design, period: float, decay: float | None)
         },
     )  # fmt: skip
     return at(found.x)
-
-
-def ljung_box(r: Floats, lags: int = LAGS) -> tuple[Floats, float]:
-    """Return autocorrelations of `r`, and their probability for white noise (Ljung, Box 1978)."""
-    r = r - r.mean()
-    count, power = len(r), float(r @ r)
-    found = np.array([r[:-j] @ r[j:] / power for j in range(1, lags + 1)])
-    statistic = count * (count + 2.0) * np.sum(found**2 / (count - np.arange(1, lags + 1)))
-    return found, float(chi2.sf(statistic, lags))

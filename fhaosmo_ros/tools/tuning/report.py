@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a tuning says: gains.yaml, which the estimator loads, and report.md with notes."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,9 +9,7 @@ from typing import Any, NamedTuple
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.tools.tuning.bag_gains import Gains, Run
-from fhaosmo_ros.tools.tuning.identify import Identified, LAGS, SURE
-from fhaosmo_ros.tools.tuning.objective import Evaluation
+from fhaosmo_ros.tools.tuning.identify import Gains, Identified, LAGS, Run, SURE
 from fhaosmo_ros.tools.tuning.search import Result
 from fhaosmo_ros.tools.tuning.tuner import Tuner
 import numpy as np
@@ -54,13 +52,18 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def of_search(tuner: Tuner, result: Result) -> Report:
     """Report the gains for a simulated family."""
-    begin, best = {d.name: d.start for d in tuner.space}, result.best
-    found = {
-        f'{title}, {data}': objective(tuner.parameters(values))
-        for title, values in (('given' if tuner.given else 'start', begin), ('tuned', best))
-        for data, objective in (('training', tuner.training), ('held out', tuner.held_out))
-    }
-    training, held_out = (found[f'tuned, {data}'].error for data in ('training', 'held out'))
+    best, begin = result.best, {d.name: d.start for d in tuner.space}
+    columns, found = [''], []
+    for title, values in (('given' if tuner.given else 'start', begin), ('tuned', best)):
+        for data, objective in (('training', tuner.training), ('held out', tuner.held_out)):
+            columns.append(f'{title}, {data}')
+            found.append(objective(tuner.parameters(values)))
+    errors = np.sqrt([np.mean(np.square(e.errors), axis=0) for e in found]).T
+    names = [*(f'z{k}' for k in range(1, len(errors))), 'd']
+    rows = [['error, relative to the truth', *(f'{e.error:.4f}' for e in found)]]
+    for name, of_name in zip(names, errors, strict=True):
+        rows.append([f'RMS error of {name}', *(f'{error:.3g}' for error in of_name)])
+    training, held_out = (e.error for e in found[2:])
     p = tuner.tuning
     summary = [
         f'{result.trials} trials for a simulated family: noise of y {p["noise_std"]:.3g}, '
@@ -70,30 +73,13 @@ def of_search(tuner: Tuner, result: Result) -> Report:
         f'({len(tuner.training.recordings)} recordings), {held_out:.3f} on '
         f'{len(tuner.held_out.recordings)} that took no part in the search.',
     ]
-    searched = table(
-        ['parameter', 'from', 'to', 'start', 'tuned'],
-        [
-            [d.name, *(f'{x:.4g}' for x in (d.low, d.high, d.start, best[d.name]))]
-            for d in tuner.space
-        ],
-    )
-    main = '\n\n'.join([_evaluations(found), *warnings(training, held_out)])
-    return Report(tuner.parameters(best), summary, main, searched)
-
-
-def _evaluations(columns: Mapping[str, Evaluation]) -> str:
-    """Return a table of evaluations, a column each."""
-    found = columns.values()
-    errors = np.sqrt([np.mean(np.square(e.errors), axis=0) for e in found]).T
-    names = [*(f'z{k}' for k in range(1, len(errors))), 'd']
-    rows = [
-        ['error, relative to the truth', *(f'{e.error:.4f}' for e in found)],
-        *(
-            [f'RMS error of {name}', *(f'{error:.3g}' for error in of_name)]
-            for name, of_name in zip(names, errors, strict=True)
-        ),
+    searched = [
+        [d.name, *(f'{x:.4g}' for x in (d.low, d.high, d.start, best[d.name]))]
+        for d in tuner.space
     ]
-    return table(['', *columns], rows)
+    main = '\n\n'.join([table(columns, rows), *warnings(training, held_out)])
+    more = table(['parameter', 'from', 'to', 'start', 'tuned'], searched)
+    return Report(tuner.parameters(best), summary, main, more)
 
 
 def warnings(training: float, held_out: float) -> list[str]:
@@ -127,44 +113,43 @@ def of_bag(found: Identified, gains: Gains, run: Run, bag: str) -> Report:
         f'its expected error is {gains.expected[-1]:.3g}.',
         *told,
     ]
-    names = [*(f'z{i + 1}' for i in range(len(gains.expected) - 1)), 'd']
-    given = ' (given)' if likelihood.fixed else ''
     rows = [
-        ('noise of y (standard deviation)', f'{best.noise:.4g}{given}'),
+        (
+            'noise of y (standard deviation)',
+            f'{best.noise:.4g}' + (' (given)' if likelihood.fixed else ''),
+        ),
         ('size of d (RMS)', f'{size:.4g}'),
         ('time in which d changes (1/kappa), s', f'{1.0 / best.design.decay:.4g}'),
         ('derivatives of d that are followed', f'{best.design.derivatives}'),
         ('bandwidth of the filter, rad/s', f'{best.design.bandwidth:.3g}'),
-        *(
-            (f'expected error of {name}', f'{e:.3g}')
-            for name, e in zip(names, gains.expected, strict=True)
+    ]
+    names = [*(f'z{i + 1}' for i in range(likelihood.model.order)), 'd']
+    for name, error in zip(names, gains.expected, strict=True):
+        rows.append((f'expected error of {name}', f'{error:.3g}'))
+    chance = 2.0 / math.sqrt(len(run.unknown_input))
+    along = [
+        (
+            'innovations, measured / expected',
+            f'{run.size:.2f} (expected {gains.innovation:.3g})',
+        ),
+        (
+            f'their largest correlation within {LAGS} samples',
+            f'{run.correlations[run.lag]:+.3f} over {run.lag + 1}; chance explains {chance:.3f}',
+        ),
+        ('probability of that if they are white (Ljung-Box)', f'{run.probability:.2g}'),
+        (
+            'samples rejected, times begun afresh',
+            f'{run.counters.rejected}, {run.counters.divergences}',
         ),
     ]
     main = '\n\n'.join([
         table(['found in y', ''], rows),
         f'The error of d is expected to be {gains.expected[-1] / size:.2f} of its size.',
-        _along(run, gains.innovation),
+        table(['the estimator along the bag', ''], along),
         *told,
     ])  # fmt: skip
     more = 'This is what y shows in this bag: where d will be quicker or larger, record it so.'
     return Report(ESTIMATOR_PARAMETERS.part_of(gains.parameters), summary, main, more)
-
-
-def _along(run: Run, innovation: float) -> str:
-    """Return the table of what the estimator does with y."""
-    largest = int(np.abs(run.correlations).argmax())
-    counts = run.counters
-    rows = [
-        ('innovations, measured / expected', f'{run.size:.2f} (expected {innovation:.3g})'),
-        (
-            f'their largest correlation within {LAGS} samples',
-            f'{run.correlations[largest]:+.3f} over {largest + 1}; chance explains '
-            f'{2.0 / math.sqrt(len(run.unknown_input)):.3f}',
-        ),
-        ('probability of that if they are white (Ljung-Box)', f'{run.probability:.2g}'),
-        ('samples rejected, times begun afresh', f'{counts.rejected}, {counts.divergences}'),
-    ]
-    return table(['the estimator along the bag', ''], rows)
 
 
 def notes(found: Identified, run: Run) -> Iterator[str]:
@@ -202,11 +187,11 @@ def notes(found: Identified, run: Run) -> Iterator[str]:
             f'Innovations have {run.size:.2f} times the expected size: the model or the noise '
             'are not what they are taken for, and so are the standard deviations.'
         )
-    lag = int(np.abs(run.correlations).argmax())
-    if run.probability < UNLIKELY and abs(run.correlations[lag]) > SMALL_CORRELATION:
+    correlation = run.correlations[run.lag]
+    if run.probability < UNLIKELY and abs(correlation) > SMALL_CORRELATION:
         yield (
-            f'Innovations are not white: they correlate by {run.correlations[lag]:+.2f} with '
-            f'those {lag + 1} before them. The model of the plant, of d or of the noise does not '
+            f'Innovations are not white: they correlate by {correlation:+.2f} with those '
+            f'{run.lag + 1} before them. The model of the plant, of d or of the noise does not '
             'quite fit; the gains are the best of their kind, but standard deviations are too '
             'small. `gains: self_tuning` follows noise that is coloured.'
         )

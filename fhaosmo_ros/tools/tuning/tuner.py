@@ -201,19 +201,24 @@ class Tuner:
 
 
 def _make_space(names: Sequence[str], observer: Observer) -> list[Dimension]:
-    """Return the dimensions of a search."""
+    """Return the dimensions of a search: in powers of ten, where a parameter's scale is open."""
     space: list[Dimension] = []
     start = observer.parameters
     for name in names:
-        values, labels = [start[name]], [name]
+        declared, values, labels = OBSERVER_PARAMETERS[name], [start[name]], [name]
         if isinstance(start[name], list):
             values = [start[name][min(k, len(start[name]) - 1)] for k in range(observer.levels)]
             labels = [f'{name}[{k}]' for k in range(observer.levels)]
         for label, value in zip(labels, values, strict=True):
-            low, high = _bounds(name, value, start)
+            middle = value or 1.0  # such as unknown_input_decay, which may be 0
+            low = max(middle / 10.0**DECADES, declared.lower or 0.0)
+            high = min(middle * 10.0**DECADES, declared.upper or 1.0)
+            if name == 'gamma_initial':
+                low, high = start['gamma_min'], start['gamma_max']
             log = 0.0 < 10.0 * low < high
-            begin = 1.0 if log and value == 0.0 else value
-            space.append(Dimension(label, low, high, min(max(begin, low), high), log))
+            space.append(
+                Dimension(label, low, high, min(max(middle if log else value, low), high), log)
+            )
     if not space:
         raise ConfigurationError(
             f'expected one of {", ".join(MODEL_OF_D)} to search, got both set'
@@ -243,12 +248,3 @@ def _gains(start: Mapping[str, Any]) -> list[str]:
     if start['variant'].endswith('_adaptive'):
         names.append('gamma_initial')
     return names
-
-
-def _bounds(name: str, value: float, start: Mapping[str, Any]) -> tuple[float, float]:
-    """Return the bounds of a search: in powers of ten, where the scale of a parameter is open."""
-    if name == 'gamma_initial':
-        return start['gamma_min'], start['gamma_max']
-    lower, upper = OBSERVER_PARAMETERS[name].lower or 0.0, OBSERVER_PARAMETERS[name].upper or 1.0
-    middle = value or 1.0  # such as unknown_input_decay, which may be 0
-    return max(middle / 10.0**DECADES, lower), min(middle * 10.0**DECADES, upper)
