@@ -52,11 +52,12 @@ cdef class Bank:
     cdef readonly object covariance  # (n, n) of d, if the likelier of both is right
     cdef readonly object weights  # (m + 1,), the first of free motion
     cdef double decay, begin, end, change, onset, since
-    cdef double[::1] free, scales, w, mixed, share, likelihood, average, off, innovation
+    cdef double[::1] free, scales, w, mixed, share, likelihood, average
+    cdef double[::1] off, innovation, measured
     # Of each filter: Y of all joints, p of all, d of all, and their covariance; now and before.
     cdef double[:, ::1] x, x0
     cdef double[:, :, ::1] p, p0
-    cdef double[:, ::1] s, gain, spread
+    cdef double[:, ::1] s, gain, spread, noise
 
     def __init__(
         self, free_intensity, double decay, scales, double begin, double end, double change,
@@ -72,24 +73,14 @@ cdef class Bank:
         self.p, self.p0 = np.zeros((m, 3 * n, 3 * n)), np.zeros((m, 3 * n, 3 * n))
         self.s, self.gain = np.zeros((n, n)), np.zeros((n, 3 * n))
         self.off, self.innovation = np.zeros(3 * n), np.zeros(n)
+        self.measured, self.noise = np.zeros(n), np.zeros((n, n))
         self.weights, self.mean, self.covariance = np.zeros(m), np.zeros((3, n)), np.zeros((n, n))
         self.w, self.average, self.spread = self.weights, self.mean.reshape(-1), self.covariance
         self.mixed, self.share, self.likelihood = np.zeros(m), np.zeros(m), np.zeros(m)
         self.start(np.zeros(n), np.zeros((n, n)), np.zeros(n))
 
     def start(self, momentum, momentum_covariance, torque_variance):
-        """
-        Begin in free motion.
-
-        Parameters
-        ----------
-        momentum : (n,) array
-            p = M qd.
-        momentum_covariance : (n, n) array
-        torque_variance : (n,) array
-            Of d at the start.
-
-        """
+        """Begin in free motion with p = M qd (n,), its covariance, and the variance of d (n,)."""
         cdef int n = self.joints
         x, p = np.asarray(self.x), np.asarray(self.p)
         x[...], p[...] = 0.0, 0.0
@@ -108,8 +99,9 @@ cdef class Bank:
         self.mean[2] -= torque
 
     def step(
-        self, double h, const double[::1] measured, const double[::1] drive,
-        const double[:, ::1] noise, const double[::1] torque_variance, const double[:, ::1] shape,
+        self, double h, const double[:, ::1] mass, const double[::1] change,
+        const double[::1] variance, double vague, const double[::1] drive,
+        const double[::1] torque_variance, const double[:, ::1] shape,
     ):
         """
         Go on to the next sample.
@@ -118,12 +110,16 @@ cdef class Bank:
         ----------
         h : float
             Time since the one before, s.
-        measured : (n,) array
-            M (q - q before), the increment of Y; or p.
+        mass : (n, n) array
+            M.
+        change : (n,) array
+            q - q before, so that Y has changed by M times that; or qd, where p is measured.
+        variance : (n,) array
+            Of the noise of `change`.
+        vague : float
+            Share of `change` that is not known, the same for all joints.
         drive : (n,) array
             u: torque + C^T qd - g.
-        noise : (n, n) array
-            Covariance of the error of Y; or of p.
         torque_variance : (n,) array
             Of u, from sample to sample.
         shape : (n, n) array
@@ -132,8 +128,8 @@ cdef class Bank:
         """
         cdef int n = self.joints
         sizes = {
-            measured.shape[0], drive.shape[0], torque_variance.shape[0],
-            noise.shape[0], noise.shape[1], shape.shape[0], shape.shape[1],
+            mass.shape[0], mass.shape[1], change.shape[0], variance.shape[0], drive.shape[0],
+            torque_variance.shape[0], shape.shape[0], shape.shape[1],
         }  # fmt: skip
         if sizes != {n}:
             raise ValueError(f'expected arrays of {n} joints, got sizes {sorted(sizes)}')
@@ -141,7 +137,8 @@ cdef class Bank:
         with nogil:
             self.mix(h, shape)
             self.predict(h, drive, torque_variance, shape)
-            self.correct(measured, noise)
+            self.measure(mass, change, variance, vague)
+            self.correct()
             self.combine()
 
     cdef double transition(self, int i, int j, double h) noexcept nogil:
@@ -231,7 +228,23 @@ cdef class Bank:
                 self.s[i, i] += self.free[i]
             diffuse(p, h, 1.0, self.s)
 
-    cdef void correct(self, const double[::1] measured, const double[:, ::1] noise) noexcept nogil:
+    cdef void measure(
+        self, const double[:, ::1] mass, const double[::1] change, const double[::1] variance,
+        double vague,
+    ) noexcept nogil:
+        """Write M v and the covariance of its error, M S M' + (vague M v)(vague M v)'."""
+        cdef int i, j, k, n = self.joints
+        for i in range(n):
+            self.measured[i] = 0.0
+            for k in range(n):
+                self.measured[i] += mass[i, k] * change[k]
+        for i in range(n):
+            for j in range(n):
+                self.noise[i, j] = vague * self.measured[i] * vague * self.measured[j]
+                for k in range(n):
+                    self.noise[i, j] += mass[i, k] * variance[k] * mass[j, k]
+
+    cdef void correct(self) noexcept nogil:
         """Correct all filters by the sample, and weigh them by how likely it was to each."""
         cdef int j, i, k, o, n = self.joints
         cdef int own = 0 if self.of_position else n  # where the measured part of the state is
@@ -241,9 +254,9 @@ cdef class Bank:
         for j in range(self.filters):
             p = self.p[j]
             for i in range(n):
-                self.innovation[i] = measured[i] - self.x[j, own + i]
+                self.innovation[i] = self.measured[i] - self.x[j, own + i]
                 for k in range(n):
-                    self.s[i, k] = p[own + i, own + k] + noise[i, k]
+                    self.s[i, k] = p[own + i, own + k] + self.noise[i, k]
                 for k in range(3 * n):
                     self.gain[i, k] = p[own + i, k]
             # Cholesky: s = L L^T; gain and innovation become L^-1 times themselves.
@@ -277,7 +290,7 @@ cdef class Bank:
                     p[k, i] = row[k]
             # Y begins anew at each sample, of positions with what it is more than measured.
             for i in range(n):
-                self.x[j, i] = self.x[j, i] - measured[i] if self.of_position else 0.0
+                self.x[j, i] = self.x[j, i] - self.measured[i] if self.of_position else 0.0
             if not self.of_position:
                 p[:n, :] = 0.0
                 p[:, :n] = 0.0
