@@ -45,10 +45,9 @@ SILENT = 0.5
 QUIET = 5.0
 """Seconds between two lines of the log about one problem."""
 TOPICS = {
-    '~/external_torque': JointState, '~/standard_deviation': JointState,
-    '~/joint_states': JointState, '~/external_wrench': WrenchStamped,
+    'external_torque': JointState, 'standard_deviation': JointState, 'joint_states': JointState,
+    'external_wrench': WrenchStamped, 'event': DiagnosticArray,
 }  # fmt: skip
-EVENT = '~/event'
 SERVICES = {
     'reset': 'the estimates begin anew with the next sample',
     'tare': 'the present external torque counts as zero',
@@ -84,7 +83,7 @@ class ArmNode(TimedNode):
         super().__init__(
             'arm', parameter_overrides=built_in(given), enable_logger_service=True, **options
         )
-        check_overrides(self, given, [*TOPICS, EVENT])
+        check_overrides(self, given, [f'~/{topic}' for topic in TOPICS])
         self._values = values
         self._arm: Arm | None = None
         self._description = ''
@@ -95,11 +94,10 @@ class ArmNode(TimedNode):
         self._near = False
         self._estimate: ArmEstimate | None = None
         self._outputs = {
-            topic.removeprefix('~/'): create_publisher(self, kind, topic)
+            topic: create_publisher(self, kind, f'~/{topic}', latched=topic == 'event')
             for topic, kind in TOPICS.items()
-            if topic != '~/external_wrench' or values['wrench_frame']
+            if topic != 'external_wrench' or values['wrench_frame']
         }
-        self._events = create_publisher(self, DiagnosticArray, EVENT, latched=True)
         NodeParameters(self, values, self._prepare, self._adopt)
         path = values['robot_description_file']
         if path:
@@ -116,15 +114,13 @@ class ArmNode(TimedNode):
     def _use(self, urdf: str) -> None:
         """Begin to estimate for this robot."""
         values = self._values
-        self._arm = Arm(urdf, values)
-        frame = values['wrench_frame']
-        if frame:
-            rest = np.zeros(len(self._arm.joints))
-            self._arm.model.frame_jacobian(rest, frame)  # raises for an unknown one
+        self._arm = arm = Arm(urdf, values)
+        if values['wrench_frame']:  # raises for an unknown one
+            arm.model.frame_jacobian(np.zeros(len(arm.joints)), values['wrench_frame'])
         self._description = urdf
         self._say_event(0, OK, 'no contact yet', {})
         self.get_logger().info(
-            f'estimating the external torques of {", ".join(self._arm.joints)} from '
+            f'estimating the external torques of {", ".join(arm.joints)} from '
             f'{self.resolve_topic_name(values["input_topic"])} '
             f'({values["measurement"]}, effort: {values["effort"]})'
         )
@@ -146,9 +142,7 @@ class ArmNode(TimedNode):
     def _on_sample(self, message: JointState) -> None:
         """Take a message, if it is of this arm."""
         arm = self._arm
-        if arm is None:
-            return
-        if self._estimate is not None and not {*arm.joints} & {*message.name}:
+        if arm is None or (self._estimate and not {*arm.joints} & {*message.name}):
             return  # of another robot
         try:
             with_velocity = self._values['measurement'] == 'velocity'
@@ -215,7 +209,8 @@ class ArmNode(TimedNode):
         report.find(level, text)
         report.values = values
         when = time_message(stamp) if stamp else self.get_clock().now().to_msg()
-        self._events.publish(array_of(self, when, [report], self._values['hardware_id']))
+        message = array_of(self, when, [report], self._values['hardware_id'])
+        self._outputs['event'].publish(message)
 
     def _warn(self, text: str, kind: str = '') -> None:
         """Log a problem, each kind at most every `QUIET` seconds, and report it."""

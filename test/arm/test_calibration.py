@@ -140,7 +140,7 @@ def test_the_file_gives_back_what_was_written_and_others_are_refused(found):
     assert again.coulomb.shape == (3, len(WIDTHS))
     for old, new, expected in (
         ('offset:', 'ofset:', 'missing or unknown are offset, ofset'),
-        ('  - elbow\n', '', 'expected shape'),
+        ('  - elbow\n', '', 'numbers of shape'),
         (f'- {found.calibration.offset[0].item()}', '- .nan', 'offset: expected finite numbers'),
     ):
         assert old in text

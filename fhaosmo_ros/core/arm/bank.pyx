@@ -26,20 +26,17 @@ cdef class Bank:
     Parameters
     ----------
     free_intensity : (n,) array
-        W of free motion on its diagonal, of each joint: torque^2 / s.
+        W of free motion on its diagonal: torque^2 / s.
     decay : float
         Of d in free motion, 1/s; in contact d does not decay.
     scales : (m,) array
-        Intensities of the contact filters: their W is scale^2 times `shape` of `step`, and that of
-        free motion.
+        Of the contact filters: W is scale^2 times `shape` of `step`, and that of free motion.
     begin, end, change : float
         Rates (1/s) at which contact begins and ends, and at which its intensity changes.
-    onset : float
-        Seconds of W by which d may have jumped where contact begins: a force that is there at once
-        would else be taken for one that still grows, and its estimate overshoots.
-    since : float
-        Seconds for which it may not have been seen: what it has done to Y and p until then would
-        else be taken for more force.
+    onset, since : float
+        Where contact begins, d may have jumped by so many seconds of W, at any time within the
+        last `since` seconds: else a force that is there at once would be taken for one that still
+        grows, and what it has done to Y and p until it is seen for more force.
     of_position : bool
         True if Y is measured, False if p is.
 

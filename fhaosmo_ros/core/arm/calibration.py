@@ -91,28 +91,23 @@ class Calibration:
 
         """
         try:
-            given = yaml.safe_load(text)['arm_calibration']
-            names = tuple(str(name) for name in given['joints'])
-            known = {f.name for f in fields(cls)}
-            if set(given) != known:
-                wrong = ', '.join(sorted(set(given) ^ known))
-                raise ConfigurationError(f'calibration: missing or unknown are {wrong}')
-            n, values = len(names), {}
-            for name in sorted(known - {'joints', 'log_odds'}):
-                array = values[name] = np.array(given[name], dtype=np.float64)
-                shape = {'inertial': (n, 10), 'coulomb': (n, len(WIDTHS))}.get(name, (n,))
-                if array.shape != shape:
-                    raise ConfigurationError(
-                        f'calibration: {name}: expected shape {shape}, got {array.shape}'
-                    )
-                if not np.isfinite(array).all():
-                    raise ConfigurationError(
-                        f'calibration: {name}: expected finite numbers, got others'
-                    )
-            return cls(joints=names, log_odds=float(given['log_odds']), **values)
+            given = dict(yaml.safe_load(text)['arm_calibration'])
+            joints = tuple(map(str, given.pop('joints', ())))
+            arrays = {name: np.array(v, dtype=np.float64) for name, v in given.items()}
         except (yaml.YAMLError, TypeError, KeyError, ValueError) as error:
-            if isinstance(error, ConfigurationError):
-                raise
             raise ConfigurationError(
                 f'calibration: expected a file of `calibrate`, got {text[:40]!r} ({error})'
             ) from None
+        n, known = len(joints), {f.name for f in fields(cls)} - {'joints'}
+        if set(arrays) != known:
+            wrong = ', '.join(sorted(set(arrays) ^ known))
+            raise ConfigurationError(f'calibration: missing or unknown are {wrong}')
+        shapes = {'inertial': (n, 10), 'coulomb': (n, len(WIDTHS)), 'log_odds': ()}
+        for name, array in arrays.items():
+            shape = shapes.get(name, (n,))
+            if array.shape != shape or not np.isfinite(array).all():
+                raise ConfigurationError(
+                    f'calibration: {name}: expected finite numbers of shape {shape}, got '
+                    f'{array.shape if array.shape != shape else "others"}'
+                )
+        return cls(joints, log_odds=float(arrays.pop('log_odds')), **arrays)

@@ -213,9 +213,8 @@ class _Regression:
             [regressors, *(np.eye(n) * c[:, np.newaxis] for c in own)], axis=2
         )
         mass, spread = model.inertial[:, 0], np.abs(model.inertial[:, [4, 6, 9]]).max(axis=1)
-        inertial = np.column_stack([
-            mass, *[mass * LEVER] * 3, *[spread + mass * LEVER**2] * 6
-        ])  # fmt: skip
+        second = spread + mass * LEVER**2
+        inertial = np.column_stack([mass, *[mass * LEVER] * 3, *[second] * 6])
         level = np.maximum(_rms(self.torque), 1e-9)
         fastest = np.maximum(np.abs(acceleration).max(axis=0), 1e-3)
         self._scale = np.concatenate([
@@ -228,12 +227,17 @@ class _Regression:
     ) -> Floats:
         """Return torque constants by the URDF; where it does not tell, those of the others."""
         names = self._model.joints
-        found = np.array([
-            _constant(by_model[:, j], effort[:, j], own[..., j].T) for j in unknown
-        ])  # fmt: skip
-        constants, explained, size = found.T
-        told = (explained > TOLD) & (size > WEAK * by_model.std(axis=0).max())
-        told &= constants > 0.0
+        constants, told = np.zeros(len(unknown)), np.zeros(len(unknown), dtype=bool)
+        for k, j in enumerate(unknown):
+            # The effort is fitted by the torque, not the torque by the effort: what else is in the
+            # effort would make the constant too small. Friction and rotor are taken from both.
+            both, others = np.column_stack([by_model[:, j], effort[:, j]]), own[..., j].T
+            x, y = (both - others @ np.linalg.lstsq(others, both, rcond=None)[0]).T
+            common, power = x @ y, x @ x
+            if common > 0.0:
+                explained, size = common**2 / (power * (y @ y)), np.sqrt(power / len(x))
+                told[k] = explained > TOLD and size > WEAK * by_model.std(axis=0).max()
+                constants[k] = power / common
         if not told.any():
             raise ConfigurationError(
                 'torque_constants: expected them as a parameter, because this motion does not '
@@ -280,10 +284,8 @@ class _Regression:
         n = len(self.size)
         links = self._model.unloaded
         unit = np.sqrt(np.maximum(links[:, :1], 1e-3)) * np.array([LEVER, LEVER, LEVER, 1.0])
-        shape = (
-            self._model.pseudo_inertias()
-            / (unit[:, :, np.newaxis] * unit[:, np.newaxis, :])[..., np.newaxis]
-        )
+        units = unit[:, :, np.newaxis] * unit[:, np.newaxis, :]
+        shape = self._model.pseudo_inertias() / units[..., np.newaxis]
         map_ = np.zeros((17 * n, len(right)))
         for i in range(n):
             own = slice(10 * i, 10 * i + 10)
@@ -298,9 +300,8 @@ class _Regression:
             x = inverse @ (right + rate * map_.T @ (near - start - dual))
             there = start + map_ @ x + dual
             values, vectors = np.linalg.eigh(there[: 16 * n].reshape(n, 4, 4))
-            clipped = (vectors * np.maximum(values, LEAST_SHARE)[:, np.newaxis]) @ np.swapaxes(
-                vectors, 1, 2
-            )
+            clipped = vectors * np.maximum(values, LEAST_SHARE)[:, np.newaxis]
+            clipped = clipped @ vectors.transpose(0, 2, 1)
             near = np.concatenate([clipped.ravel(), np.maximum(there[16 * n :], 0.0)])
             dual = there - near
         bodies, others = slice(0, 11 * n), slice(11 * n, None)
@@ -313,21 +314,6 @@ class _Regression:
     def left(self, x: Floats) -> Floats:
         """Return the torque that is left unexplained, (K, n)."""
         return np.asarray(self.unexplained - self.columns @ x)
-
-
-def _constant(torque: Floats, effort: Floats, others: Floats) -> tuple[float, float, float]:
-    """
-    Return the torque for a unit of effort by the URDF, how much that explains, and its size.
-
-    The effort is fitted by the torque, not the torque by the effort: what else is in the effort
-    would make the constant too small. Friction and the rotor, which the URDF lacks, are `others`.
-    """
-    both = np.column_stack([torque, effort])
-    torque, effort = (both - others @ np.linalg.lstsq(others, both, rcond=None)[0]).T
-    common, power = float(torque @ effort), float(torque @ torque)
-    explained = common**2 / max(power * float(effort @ effort), 1e-300)
-    size = float(np.sqrt(power / len(torque)))
-    return (power / common if common else 0.0), explained, size
 
 
 def _notes(joints: tuple[str, ...], velocity: Floats) -> list[str]:

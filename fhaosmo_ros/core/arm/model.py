@@ -92,7 +92,7 @@ class ArmModel:
         self.gravity = model.gravity.linear = np.array(gravity, dtype=np.float64)
         self.joints, n = tuple(model.names[1:]), model.nv
         bodies = [f for f in model.frames if f.type == pin.FrameType.BODY]
-        self.frames = tuple(f.name for f in bodies)
+        self.frames = tuple(str(f.name) for f in bodies)
         first = {f.parentJoint: str(f.name) for f in reversed(bodies)}
         self.links = tuple(first.get(k, name) for k, name in enumerate(self.joints, 1))
         self.continuous = np.array([size == 2 for size in list(model.nqs)[1:]])
