@@ -3,12 +3,11 @@
 
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from fhaosmo_ros.core.arm.arm import Arm, ArmEstimate, payload_of
+from fhaosmo_ros.core.arm.arm import Arm, ArmEstimate, payload_of, text_of
 from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
@@ -99,9 +98,8 @@ class ArmNode(TimedNode):
             if topic != 'external_wrench' or values['wrench_frame']
         }
         NodeParameters(self, values, self._prepare, self._adopt)
-        path = values['robot_description_file']
-        if path:
-            self._use(_text_of(path))
+        if values['robot_description_file']:
+            self._use(text_of(values, 'robot_description_file', 'a URDF'))
         else:
             self._topic = self.resolve_topic_name('robot_description')
             self.create_subscription(String, 'robot_description', self._on_description, LATCHED)
@@ -266,15 +264,6 @@ class ArmNode(TimedNode):
             getattr(self._arm, name)()
         self.get_logger().info(f'{name}: {response.message}')
         return response
-
-
-def _text_of(path: str) -> str:
-    try:
-        return Path(path).expanduser().read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(
-            f"parameter 'robot_description_file': expected a URDF, got {path} ({error})"
-        ) from None
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -160,7 +160,9 @@ class Arm:
     ) -> None:
         p = self.parameters = ARM_PARAMETERS.complete(parameters, named)
         if calibration is None and p['calibration_file']:
-            calibration = _read(p['calibration_file'])
+            calibration = Calibration.loads(
+                text_of(p, 'calibration_file', 'a file of `calibrate`')
+            )
         if len(p['gravity']) != 3:
             raise ARM_PARAMETERS['gravity'].error(p['gravity'], 'three numbers')
         chosen = [name for name in p['joints'] if name]
@@ -468,11 +470,12 @@ def payload_of(p: Parameters) -> Payload:
     return Payload(mass, tuple(center))
 
 
-def _read(path: str) -> Calibration:
+def text_of(parameters: Parameters, name: str, expected: str) -> str:
+    """Return the text of the file that a parameter names; raise ConfigurationError without it."""
+    path = parameters[name]
     try:
-        return Calibration.loads(Path(path).read_text(encoding='utf-8'))
-    except OSError as error:
+        return Path(path).expanduser().read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(
-            f"parameter 'calibration_file': expected a file of `calibrate`, got {path} "
-            f'({error.strerror})'
+            f"parameter '{name}': expected {expected}, got {path} ({error})"
         ) from None

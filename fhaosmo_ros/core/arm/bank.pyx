@@ -341,12 +341,12 @@ cdef void diffuse(
     double[:, ::1] p, double t, double intensity, const double[:, ::1] shape
 ) noexcept nogil:
     """Add the covariance of Y, p and d that white noise of d' makes within t seconds."""
-    cdef int a, b, i, k, n = shape.shape[0]
+    cdef int a, b, i, k, _, n = shape.shape[0]
     cdef double c
     for a in range(3):
         for b in range(3):
             c = intensity / ((5 - a - b) * (2 if a == 0 else 1) * (2 if b == 0 else 1))
-            for i in range(5 - a - b):
+            for _ in range(5 - a - b):
                 c *= t
             for i in range(n):
                 for k in range(n):

@@ -121,13 +121,8 @@ class ArmModel:
 
         `motor_inertia` (n,) is that of rotors as joints see it, kg m^2, and part of `Terms.mass`.
         """
-        n = len(self.joints)
-        self._model.armature = np.broadcast_to(motor_inertia, n)
+        self._model.armature = np.broadcast_to(motor_inertia, len(self.joints))
         self.unloaded = np.array(inertial, dtype=np.float64)
-        if self.unloaded.shape != (n, 10):
-            raise ConfigurationError(
-                f'inertial: expected an array of shape {(n, 10)}, got {self.unloaded.shape}'
-            )
         self.set_payload(Payload())
 
     def set_payload(self, payload: Payload) -> None:
