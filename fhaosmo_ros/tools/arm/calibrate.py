@@ -54,13 +54,14 @@ def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
         )
     with stop.raising(), BagReader(arguments.bag) as reader:
         urdf = description(reader, arguments)
-        arm = Arm(urdf, values if arguments.payload else {**values, 'calibration_file': ''})
+        unknown = {'payload': [0.0] * 4} if arguments.payload else {'calibration_file': ''}
+        arm = Arm(urdf, values | unknown)
         model, parameters = arm.model, arm.parameters
         stamps, rows = zip(*joint_samples(reader, arguments.topic, arm.joints, False), strict=True)
         when, samples = np.array(stamps), np.array(rows)
         newest = np.maximum.accumulate(np.concatenate([[0], when[:-1]]))
         good = np.isfinite(samples).all(axis=(1, 2)) & (when > newest)
-        t, q, effort = (when[good] - when[good][0]) * 1e-9, samples[good, 0], samples[good, 1]
+        t, q, effort = (when[good] - when[good][:1]) * 1e-9, samples[good, 0], samples[good, 1]
         torque = effort
         if parameters['effort'] == 'gravity_compensated':
             rest = np.zeros(len(arm.joints))
