@@ -22,7 +22,7 @@ NAME = 'fhaosmo_ros'
 FOR_ROS2_RUN = bool({'install', 'develop'} & set(sys.argv))
 CHECK = ['hypothesis', 'pytest', 'pytest-xdist']
 TUNE = ['cmaes', 'optuna>=4,<6']
-ARM = ['pin>=3,<5']
+ARM = ['pin>=3.3,<5']
 DOCS = ['myst-parser', 'sphinx', 'sphinx-rtd-theme']
 ROS = (
     'builtin-interfaces', 'diagnostic-msgs', 'geometry-msgs', 'lifecycle-msgs', 'rcl-interfaces',

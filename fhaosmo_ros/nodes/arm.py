@@ -2,16 +2,17 @@
 """The arm node: external torques and contacts out of /joint_states and a URDF."""
 
 from collections.abc import Mapping
-from pathlib import Path
+from functools import partial
 from time import perf_counter
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from fhaosmo_ros.core.arm.arm import Arm, ArmEstimate, payload_of
-from fhaosmo_ros.core.parameters.declaration import Parameters, suggestion, Value
+from fhaosmo_ros.core.arm.arm import Arm, ArmEstimate, payload_of, text_of
+from fhaosmo_ros.core.parameters.declaration import Parameters, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.tables import ARM_NODE_PARAMETERS
+from fhaosmo_ros.messages.joints import joint_sample
 from fhaosmo_ros.nodes.middleware.diagnostics import (
     array_of,
     DiagnosticsPublisher,
@@ -32,9 +33,8 @@ from fhaosmo_ros.nodes.middleware.messages import time_message
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
 from fhaosmo_ros.nodes.middleware.simulated_time import TimedNode
 from fhaosmo_ros.nodes.middleware.spin import run_node
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import Vector3, WrenchStamped
 import numpy as np
-from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -44,10 +44,13 @@ SILENT = 0.5
 QUIET = 5.0
 """Seconds between two lines of the log about one problem."""
 TOPICS = {
-    '~/external_torque': JointState, '~/standard_deviation': JointState,
-    '~/joint_states': JointState, '~/external_wrench': WrenchStamped,
+    'external_torque': JointState, 'standard_deviation': JointState, 'joint_states': JointState,
+    'external_wrench': WrenchStamped, 'event': DiagnosticArray,
 }  # fmt: skip
-EVENT = '~/event'
+SERVICES = {
+    'reset': 'the estimates begin anew with the next sample',
+    'tare': 'the present external torque counts as zero',
+}
 MEANT = {
     'beyond limits': 'positions lie beyond the limits of the URDF: are they in degrees, or is it '
     'another robot?',
@@ -79,50 +82,43 @@ class ArmNode(TimedNode):
         super().__init__(
             'arm', parameter_overrides=built_in(given), enable_logger_service=True, **options
         )
-        check_overrides(self, given, [*TOPICS, EVENT])
+        check_overrides(self, given, [f'~/{topic}' for topic in TOPICS])
         self._values = values
         self._arm: Arm | None = None
         self._description = ''
         self._problems: dict[str, str] = {}  # of each kind the last one, since the last report
         self._logged: dict[str, float] = {}  # when each kind of problem was, by perf_counter
-        self._order: dict[tuple[str, ...], NDArray[np.int64] | None] = {}
-        self._counted: dict[str, int] = {}
         self._published, self._latest = -np.inf, -np.inf
         self._contact: bool | None = False  # None: not known
         self._near = False
         self._estimate: ArmEstimate | None = None
         self._outputs = {
-            topic.removeprefix('~/'): create_publisher(self, kind, topic)
+            topic: create_publisher(self, kind, f'~/{topic}', latched=topic == 'event')
             for topic, kind in TOPICS.items()
-            if topic != '~/external_wrench' or values['wrench_frame']
+            if topic != 'external_wrench' or values['wrench_frame']
         }
-        self._events = create_publisher(self, DiagnosticArray, EVENT, latched=True)
         NodeParameters(self, values, self._prepare, self._adopt)
-        path = values['robot_description_file']
-        if path:
-            self._use(_text_of(path))
+        if values['robot_description_file']:
+            self._use(text_of(values, 'robot_description_file', 'a URDF'))
         else:
             self._topic = self.resolve_topic_name('robot_description')
             self.create_subscription(String, 'robot_description', self._on_description, LATCHED)
             self.get_logger().info(f'waiting for the robot on {self._topic}')
         self.create_subscription(JointState, values['input_topic'], self._on_sample, SENSOR_QOS)
-        self.create_service(Trigger, '~/reset', self._reset)
-        self.create_service(Trigger, '~/tare', self._tare)
+        for name, text in SERVICES.items():
+            self.create_service(Trigger, f'~/{name}', partial(self._serve, name, text))
         self._diagnostics = DiagnosticsPublisher(self, self._reports, values)
 
     def _use(self, urdf: str) -> None:
         """Begin to estimate for this robot."""
         values = self._values
-        self._arm = Arm(urdf, values)
-        frame = values['wrench_frame']
-        if frame:
-            rest = np.zeros(len(self._arm.joints))
-            self._arm.model.frame_jacobian(rest, frame)  # raises for an unknown one
+        self._arm = arm = Arm(urdf, values)
+        if values['wrench_frame']:  # raises for an unknown one
+            arm.model.frame_jacobian(np.zeros(len(arm.joints)), values['wrench_frame'])
         self._description = urdf
-        self._order.clear()
         self._say_event(0, OK, 'no contact yet', {})
         self.get_logger().info(
-            f'estimating the external torques of {", ".join(self._arm.joints)} from '
+            f'estimating the external torques of {", ".join(arm.joints)} from '
             f'{self.resolve_topic_name(values["input_topic"])} '
             f'({values["measurement"]}, effort: {values["effort"]})'
         )
@@ -144,121 +140,75 @@ class ArmNode(TimedNode):
     def _on_sample(self, message: JointState) -> None:
         """Take a message, if it is of this arm."""
         arm = self._arm
-        if arm is None:
+        if arm is None or (self._estimate and not {*arm.joints} & {*message.name}):
+            return  # of another robot
+        try:
+            with_velocity = self._values['measurement'] == 'velocity'
+            stamp, arrays = joint_sample(message, arm.joints, with_velocity)
+        except ConfigurationError as error:
+            self._warn(f'{error}: no estimate from it')
             return
-        names = tuple(message.name)
-        if names not in self._order:
-            self._learn(names)
-        order = self._order[names]
-        if order is None:
-            return
-        stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-        parts = [message.position, message.effort]
-        if self._values['measurement'] == 'velocity':
-            parts.append(message.velocity)
-        arrays = [np.asarray(part, dtype=np.float64) for part in parts]
-        for what, array in zip(('position', 'effort', 'velocity'), arrays, strict=False):
-            if len(array) != len(names):
-                self._warn(
-                    f'{what}: expected {len(names)} numbers, one for each name, got {len(array)}: '
-                    'no estimate without them'
-                )
-                return
-        if stamp == 0:
-            self._warn('the header stamp is 0: nobody fills it, and no time is known without it')
-            return
-        estimate = arm.take(stamp, *(array[order] for array in arrays))
-        for what, count in arm.counters.items():
-            if what in MEANT and count != self._counted.get(what, 0):
-                self._counted[what] = count
-                self._warn(f'{MEANT[what]} ({count} so far)', what)
+        estimate = arm.take(stamp, *arrays)
+        if arm.problem in MEANT:
+            count = arm.counters[arm.problem]
+            self._warn(f'{MEANT[arm.problem]} ({count} so far)', arm.problem)
         if arm.doubts.text:
             self._warn(arm.doubts.text, 'payload' if arm.doubts.payload else 'doubt')
         if estimate is not None:
             self._latest = perf_counter()
             self._estimate = estimate
-            self._publish(estimate)
+            self._tell(arm, estimate)
+            self._publish(arm, estimate)
 
-    def _learn(self, names: tuple[str, ...]) -> None:
-        """Remember where the arm's joints are in messages with these names."""
-        assert self._arm is not None
-        wanted = self._arm.joints
-        missing = [name for name in wanted if name not in names]
-        self._order[names] = None
-        if len(self._order) > 100:  # names that change all the time
-            self._order = {names: None}
-        if not missing:
-            self._order[names] = np.array([names.index(name) for name in wanted])
-        elif len(missing) < len(wanted) or not any(v is not None for v in self._order.values()):
-            self._warn(
-                f'a message lacks {", ".join(missing)}{suggestion(missing[0], names)}: no '
-                'estimate from it'
-            )
-
-    def _publish(self, estimate: ArmEstimate) -> None:
-        self._tell(estimate)
+    def _publish(self, arm: Arm, estimate: ArmEstimate) -> None:
         period = 1e9 / self._values['publish_rate']
         # Half a sample early rather than one late: rates that divide each other stay as they are.
         if 0.0 <= estimate.stamp - self._published < 0.9 * period:
             return
         self._published = estimate.stamp
-        assert self._arm is not None
-        names, stamp = list(self._arm.joints), time_message(estimate.stamp)
-        parts = {
-            'external_torque': lambda: {'effort': estimate.external_torque},
-            'standard_deviation': lambda: {'effort': estimate.standard_deviation},
-            'joint_states': lambda: {
-                'position': estimate.position, 'velocity': estimate.velocity,
-            },
-        }  # fmt: skip
-        for topic, arrays in parts.items():
-            publisher = self._outputs[topic]
-            if has_listeners(publisher):
-                message = JointState(name=names)
+        stamp = time_message(estimate.stamp)
+        for topic, arrays in {
+            'external_torque': {'effort': estimate.external_torque},
+            'standard_deviation': {'effort': estimate.standard_deviation},
+            'joint_states': {'position': estimate.position, 'velocity': estimate.velocity},
+        }.items():
+            if has_listeners(self._outputs[topic]):
+                lists = {name: array.tolist() for name, array in arrays.items()}
+                message = JointState(name=list(arm.joints), **lists)
                 message.header.stamp = stamp
-                for name, array in arrays().items():
-                    setattr(message, name, array.tolist())
-                publisher.publish(message)
+                self._outputs[topic].publish(message)
         frame = self._values['wrench_frame']
         if frame and has_listeners(self._outputs['external_wrench']):
-            wrench = self._arm.wrench(estimate, frame)
+            wrench, message = arm.wrench(estimate, frame), WrenchStamped()
             self._near = wrench.near_singular
-            wrenched = WrenchStamped()
-            wrenched.header.stamp, wrenched.header.frame_id = stamp, frame
-            for part, values in (
-                (wrenched.wrench.force, wrench.force), (wrenched.wrench.torque, wrench.torque),
-            ):  # fmt: skip
-                part.x, part.y, part.z = values.tolist()
-            self._outputs['external_wrench'].publish(wrenched)
+            message.header.stamp, message.header.frame_id = stamp, frame
+            message.wrench.force, message.wrench.torque = (
+                Vector3(x=x, y=y, z=z) for x, y, z in (wrench.force, wrench.torque)
+            )
+            self._outputs['external_wrench'].publish(message)
 
-    def _tell(self, estimate: ArmEstimate) -> None:
+    def _tell(self, arm: Arm, estimate: ArmEstimate) -> None:
         """Publish that a contact has begun or ended."""
         if estimate.contact == self._contact:
             return
         self._contact = estimate.contact
-        assert self._arm is not None
-        values = {
-            'link': estimate.link, 'log odds': f'{estimate.log_odds:.3g}',
-            **{
-                f'external torque {name}': f'{torque:.4g}'
-                for name, torque in zip(self._arm.joints, estimate.external_torque, strict=True)
-            },
-        }  # fmt: skip
+        at, values = estimate.link, {'link': estimate.link, 'log odds': f'{estimate.log_odds:.3g}'}
+        for name, torque in zip(arm.joints, estimate.external_torque, strict=True):
+            values[f'external torque {name}'] = f'{torque:.4g}'
         if estimate.contact:
-            text = f'contact, most likely at {estimate.link}'
-            self._say_event(estimate.stamp, WARN, text, values)
+            text = f'contact, most likely at {at}'
             self.get_logger().warning(f'event: {text}', throttle_duration_sec=QUIET)
         else:
-            at = f', most likely it was at {estimate.link}' if estimate.link else ''
-            text = f'contact has ended{at}'
-            self._say_event(estimate.stamp, OK, text, values)
+            text = f'contact has ended{at and f", most likely it was at {at}"}'
+        self._say_event(estimate.stamp, WARN if estimate.contact else OK, text, values)
 
     def _say_event(self, stamp: int, level: bytes, text: str, values: dict[str, str]) -> None:
         report = Report('contact')
         report.find(level, text)
         report.values = values
         when = time_message(stamp) if stamp else self.get_clock().now().to_msg()
-        self._events.publish(array_of(self, when, [report], self._values['hardware_id']))
+        message = array_of(self, when, [report], self._values['hardware_id'])
+        self._outputs['event'].publish(message)
 
     def _warn(self, text: str, kind: str = '') -> None:
         """Log a problem, each kind at most every `QUIET` seconds, and report it."""
@@ -305,28 +255,15 @@ class ArmNode(TimedNode):
             self._arm.adopt(values)
         self._diagnostics.adopt(values)
 
-    def _reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._served(response, 'reset', 'the estimates begin anew with the next sample')
-
-    def _tare(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._served(response, 'tare', 'the present external torque counts as zero')
-
-    def _served(self, response: Any, name: str, text: str) -> Any:
-        response.success = self._arm is not None and self._estimate is not None
+    def _serve(
+        self, name: str, text: str, _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        response.success = self._estimate is not None
         response.message = text if response.success else 'there is no estimate yet'
         if response.success:
             getattr(self._arm, name)()
         self.get_logger().info(f'{name}: {response.message}')
         return response
-
-
-def _text_of(path: str) -> str:
-    try:
-        return Path(path).expanduser().read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(
-            f"parameter 'robot_description_file': expected a URDF, got {path} ({error})"
-        ) from None
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -22,7 +22,8 @@ OFFSET = np.array([0.5, -0.3, 0.2])
 def real_arm():
     """Return an arm that is heavier than its URDF."""
     model = ArmModel(URDF)
-    return ArmModel(URDF, inertial=model.inertial * np.array([1.1, 1.2, 0.8])[:, np.newaxis])
+    model.set_inertial(model.inertial * np.array([1.1, 1.2, 0.8])[:, np.newaxis])
+    return model
 
 
 def recorded(seed=1, duration=40.0, noise=0.05):
@@ -42,8 +43,9 @@ def found():
 def test_what_the_urdf_leaves_is_explained_also_in_another_motion(found):
     assert np.all(found.after < 0.05 * found.before)
     other = recorded(seed=5, duration=20.0)
-    _, before, _ = payload_of_motion(ArmModel(URDF), *other, Calibration.none(JOINTS))
-    _, after, _ = payload_of_motion(ArmModel(URDF), *other, found.calibration)
+    model = ArmModel(URDF)
+    _, before, _ = payload_of_motion(model, *other, Calibration.of_urdf(model))
+    _, after, _ = payload_of_motion(model, *other, found.calibration)
     assert np.all(after < 0.1 * before)
     assert not found.notes
 
@@ -72,12 +74,13 @@ def test_a_joint_that_rests_keeps_its_urdf_and_is_named():
 
 
 def test_links_that_cannot_exist_are_not_found():
-    model = ArmModel(URDF, payload=Payload(0.5, (0.0, 0.0, 0.4)))
+    model = ArmModel(URDF)
+    model.set_payload(Payload(0.5, (0.0, 0.0, 0.4)))
     t, q, torque = recorded(
         duration=12.0, noise=3.0
     )  # so much noise that plain fits leave physics
     inertial = identify(model, t, q, torque - 5.0 * np.gradient(q, t, axis=0)).calibration.inertial
-    ArmModel(URDF, inertial=inertial)  # without payload, and without what rotors add
+    model.set_inertial(inertial)  # without payload, and without what rotors add
     for mass, x, y, z, xx, xy, yy, xz, yz, zz in inertial:
         turning = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         pseudo = np.zeros((4, 4))
@@ -137,7 +140,7 @@ def test_the_file_gives_back_what_was_written_and_others_are_refused(found):
     assert again.coulomb.shape == (3, len(WIDTHS))
     for old, new, expected in (
         ('offset:', 'ofset:', 'missing or unknown are offset, ofset'),
-        ('  - elbow\n', '', 'expected shape'),
+        ('  - elbow\n', '', 'numbers of shape'),
         (f'- {found.calibration.offset[0].item()}', '- .nan', 'offset: expected finite numbers'),
     ):
         assert old in text

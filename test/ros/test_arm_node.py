@@ -236,11 +236,7 @@ def test_a_bag_that_begins_again_and_silence_are_said(limb, user):
         'estimate after the restart',
     )  # fmt: skip
     limb.said('older than before: the estimates began anew')
-    limb.stamp = stamp
-
-
-def test_silence_is_an_error_in_diagnostics(limb, user):
-    since = len(user.reports['limb/arm'])
+    limb.stamp, since = stamp, len(user.reports['limb/arm'])
     user.wait(
         lambda: any(
             s.level == ERROR and 'no usable sample on /limb/joint_states for' in s.message

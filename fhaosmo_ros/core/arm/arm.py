@@ -11,7 +11,7 @@ from fhaosmo_ros.core.arm.bank import Bank
 from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.doubts import Doubts
 from fhaosmo_ros.core.arm.model import ArmModel, Payload, Terms
-from fhaosmo_ros.core.arm.samples import Clock, Limits, momentum_of, Noise
+from fhaosmo_ros.core.arm.samples import Clock, Noise
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -53,6 +53,8 @@ LOOK = 0.005
 """s between two estimates that count for the link: neighbours say nearly the same."""
 SLIDING = 0.005
 """s: memory of the differences of positions that friction is computed from."""
+FAULTS = ('too strong', 'beyond limits', 'too fast')
+"""What an effort, a position and a velocity can be that no arm has."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +106,10 @@ class ArmEstimates(NamedTuple):
 
 
 class Wrench(NamedTuple):
-    """Force (3,) in N and torque (3,) in N m along the axes of a frame, and how sure they are."""
+    """Force (3,) in N and torque (3,) in N m along the axes of a frame."""
 
     force: Floats
     torque: Floats
-    covariance: Floats  # (6, 6)
     near_singular: bool  # part of it cannot be seen in this posture
 
 
@@ -129,9 +130,15 @@ class Arm:
 
     Attributes
     ----------
+    parameters : Parameters
+        All, with their present values.
     model : ArmModel
+    calibration : Calibration
+        What is known of this arm.
     counters : Counter
         Samples by what became of them.
+    problem : str
+        Which of these happened to the latest sample, if that was not used.
     doubts : Doubts
         Says which setting seems to be wrong. Unless it is a payload, there is no estimate then.
 
@@ -151,97 +158,91 @@ class Arm:
         calibration: Calibration | None = None,
         **named: Any,
     ) -> None:
-        p = self._parameters = ARM_PARAMETERS.complete(parameters, named)
+        p = self.parameters = ARM_PARAMETERS.complete(parameters, named)
         if calibration is None and p['calibration_file']:
-            calibration = _read(p['calibration_file'])
-        chosen = [name for name in p['joints'] if name]
+            calibration = Calibration.loads(
+                text_of(p, 'calibration_file', 'a file of `calibrate`')
+            )
         if len(p['gravity']) != 3:
             raise ARM_PARAMETERS['gravity'].error(p['gravity'], 'three numbers')
-        model = ArmModel(urdf, joints=chosen, gravity=p['gravity'])
-        known = (calibration or Calibration.none(model.joints)).of(model.joints)
-        own = known.inertial if len(known.inertial) else model.unloaded
-        model.set_inertial(own, known.motor_inertia)
-        self.model, self.joints, self._known = model, model.joints, known
-        self._turns = bool(model.continuous.any())
+        chosen = [name for name in p['joints'] if name]
+        self.model = model = ArmModel(urdf, joints=chosen, gravity=p['gravity'])
+        self.joints = model.joints
         self._calibrated = calibration is not None
-        self.set_payload(payload_of(p))
+        known = self.calibration = calibration or Calibration.of_urdf(model)
+        if known.joints != model.joints:
+            raise ConfigurationError(
+                f'calibration: expected the joints {", ".join(model.joints)} in this order, got '
+                f'{", ".join(known.joints)}'
+            )
+        model.set_inertial(known.inertial, known.motor_inertia)
+        self.adopt(p)
         self._of_position = p['measurement'] == 'position'
-        spread = self._size('position_noise')
-        size = spread if self._of_position else self._values('velocity_noise')
-        self._noise = Noise(size, size, np.ones(len(size), dtype=bool))
+        self._measured = 1 if self._of_position else 2  # row of a sample
+        self._turns, self._rest = bool(model.continuous.any()), np.zeros(len(model.joints))
+        self._with_gravity = p['effort'] != 'gravity_compensated'
+        self._delay = int(p['torque_delay'] * 1e9)
+        given = self._values('torque_constants')
+        self._constants = np.where(given == 1.0, known.torque_constants, given)
         scale = model.torque_of_weight()
         scale = np.maximum(scale, LEAST * np.max(scale))
-        told = self._size('torque_noise')
-        size = np.where(told > 0.0, told, TORQUE_NOISE * scale)
-        self._torques = Noise(size, LEAST_FOUND * size, told == 0.0)
         self._model_variance = self._size('model_error', MODEL_ERROR * scale) ** 2
-        constants = self._values('torque_constants')
-        self._constants = np.where(constants == 1.0, known.torque_constants, constants)
-        scales = np.array(INTENSITIES) * model.weight
-        free = 2.0 * DECAY * self._model_variance
-        since = SINCE if self._of_position else 0.0
-        self._bank = Bank(free, DECAY, scales, BEGIN, END, CHANGE, ONSET, since, self._of_position)
-        finite = np.where(np.isfinite(model.effort_limits), model.effort_limits, 0.0)
-        strong = np.maximum(finite, scale)
-        self._limits = Limits(
-            model.lowest - FURTHER, model.highest + FURTHER, FASTER * model.velocity_limits,
-            STRONGER * strong, ENCODER * spread,
-        )  # fmt: skip
+        told, position = self._size('torque_noise'), self._size('position_noise')
+        torque = np.where(told > 0.0, told, TORQUE_NOISE * scale)
+        strong = np.fmax(np.where(model.effort_limits < np.inf, model.effort_limits, 0.0), scale)
         self._stopping = STOPPING * strong
-        self._waiting: deque[tuple[int, Floats, Floats | None]] = deque()
-        self.doubts = Doubts(
-            model, p['effort'] != 'gravity_compensated', np.sqrt(self._model_variance)
-        )
+        # Of efforts, positions and velocities.
+        size = np.array([torque, position, self._values('velocity_noise')])
+        least, most = size.copy(), np.full_like(size, np.inf)
+        least[0, told == 0.0] *= LEAST_FOUND
+        most[0, told > 0.0] = told[told > 0.0]
+        self._noise = Noise(size, least, most)
+        self._noisy, self._fastest = ENCODER * position, FASTER * model.velocity_limits
+        self._lowest = np.array([-STRONGER * strong, model.lowest - FURTHER, -self._fastest])
+        self._highest = np.array([STRONGER * strong, model.highest + FURTHER, self._fastest])
+        self._bank = Bank(
+            2.0 * DECAY * self._model_variance, DECAY, np.array(INTENSITIES) * model.weight,
+            BEGIN, END, CHANGE, ONSET, SINCE if self._of_position else 0.0, self._of_position,
+        )  # fmt: skip
+        self._clock = Clock()
+        self.doubts = Doubts(model, self._with_gravity, np.sqrt(self._model_variance))
         self._tare = np.zeros(len(self.joints))
         self.counters: Counter[str] = Counter()
-        self._clock = Clock()
+        self.problem = ''
+        self._newest: int | None = None  # stamp
         self.reset()
 
     def _values(self, name: str) -> Floats:
         """Return a parameter that has one value, or one for each joint."""
-        given, n = self._parameters[name], len(self.joints)
+        given, n = self.parameters[name], len(self.joints)
         if len(given) not in (1, n):
             raise ARM_PARAMETERS[name].error(given, f'1 or {n} numbers')
         return np.broadcast_to(np.array(given), n).copy()
 
     def _size(self, name: str, otherwise: Floats | float = 0.0) -> Floats:
         """Return the size of a noise: by calibration, else by the parameter, else `otherwise`."""
-        given, found = self._values(name), getattr(self._known, name)
+        given, found = self._values(name), getattr(self.calibration, name)
         return np.where(found > 0.0, found, np.where(given > 0.0, given, otherwise))
 
     def reset(self) -> None:
         """Begin anew with the next sample."""
+        # Of the latest sample that was used: stamp, position, terms and drive.
         self._last: tuple[int, Floats, Terms, Floats] | None = None
-        self._started, self._velocity = False, np.zeros(len(self.joints))
-        self._still, self._momentum = False, np.zeros(len(self.joints))
-        self._contact, self._evidence = False, np.zeros(len(self.joints))
-        self._looked = 0  # when evidence was taken
+        self._waiting: deque[tuple[int, Floats]] = deque()
+        self._velocity: Floats | None = None  # estimated
+        self._momentum = np.zeros(len(self.joints))  # measured
+        self._still = self._contact = False
+        self._looked, self._evidence = 0, np.zeros(len(self.joints))  # when, and for each link
         self.doubts.reset()
         self._clock.reset()
-        self._torques.reset()
         self._noise.reset()
-        self._waiting.clear()
-
-    @property
-    def parameters(self) -> Parameters:
-        """All parameters with their present values."""
-        return self._parameters
-
-    @property
-    def threshold(self) -> float:
-        """Logarithm of the odds above which contact is reported."""
-        rare = np.log(self._parameters['false_alarms_per_minute'])
-        return float((self._known.log_odds or ODDS) - rare)
 
     def adopt(self, parameters: Parameters) -> None:
         """Go on with other live parameters; raise ConfigurationError for a bad payload."""
-        payload = payload_of(parameters)
-        self._parameters = ARM_PARAMETERS.complete(parameters)
-        self.set_payload(payload)
-
-    def set_payload(self, payload: Payload) -> None:
-        """Carry another payload from now on."""
-        self.model.set_payload(payload)
+        self.model.set_payload(payload_of(parameters))
+        self.parameters = ARM_PARAMETERS.complete(parameters)
+        rare = np.log(parameters['false_alarms_per_minute'])
+        self._threshold = (self.calibration.log_odds or ODDS) - rare
 
     def tare(self) -> None:
         """Take the present external torque for zero from now on."""
@@ -267,142 +268,124 @@ class Arm:
         Returns
         -------
         ArmEstimate or None
-            None where there is none yet, or the sample was not used; `counters` say why.
+            None where there is none yet, or the sample was not used; `problem` says why.
 
         """
-        given = (q, effort) if self._of_position else (q, effort, velocity)
+        given = effort, q, self._rest if self._of_position else velocity
+        self.problem = ''
         try:
-            arrays = [np.asarray(part, dtype=np.float64) for part in given]
+            sample = np.array(given, dtype=np.float64)
         except (TypeError, ValueError):
-            arrays = [np.empty(0)]  # no numbers
-        if any(a.shape != self._constants.shape for a in arrays):
-            self.counters['wrong size'] += 1
-            return None
-        torque = arrays[1] * self._constants
-        wrong = self._limits.fault(arrays[0], torque, None if self._of_position else arrays[2])
-        wrong = wrong or self._too_old(stamp)
-        if wrong:
-            self.counters[wrong] += 1
-            return None
-        delay = int(self._parameters['torque_delay'] * 1e9)
-        if delay:
-            found = self._at(stamp - delay, stamp, arrays)
-            if found is None:
-                return None
-            stamp, arrays = stamp - delay, found
-        return self._go_on(stamp, arrays[0], torque, None if self._of_position else arrays[-1])
+            return self._refuse('wrong size')  # or no numbers
+        if sample.shape != self._lowest.shape:
+            return self._refuse('wrong size')
+        sample[0] *= self._constants
+        inside = (self._lowest < sample) & (sample < self._highest)
+        if not inside.all():
+            kind = FAULTS[int(np.argmin(inside.all(axis=1)))]
+            return self._refuse(kind if np.isfinite(sample).all() else 'not finite')
+        if self._newest is not None and stamp <= self._newest:
+            if stamp > self._newest - MAX_GAP * 1e9:
+                return self._refuse('not newer')
+            self.reset()
+            self._refuse('clock set back')
+        self._newest = stamp
+        return (self._go_on_late if self._delay else self._go_on)(stamp, sample)
 
-    def _too_old(self, stamp: int) -> str:
-        """Return why a stamp can't be used; nothing if it can. A clock set back begins anew."""
-        newest = self._waiting[-1][0] if self._waiting else self._last[0] if self._last else None
-        if newest is None or stamp > newest:
-            return ''
-        if stamp > newest - MAX_GAP * 1e9:
-            return 'not newer'
-        self.counters['clock set back'] += 1
-        self.reset()
-        return ''
+    def _refuse(self, problem: str) -> ArmEstimate | None:
+        """Count a sample that is not used."""
+        self.problem = problem
+        self.counters[problem] += 1
+        return None
 
-    def _at(self, stamp: int, now: int, arrays: list[Floats]) -> list[Floats] | None:
-        """Return the sample at an earlier time, between those that were kept."""
-        kept = self._waiting
-        kept.append((now, arrays[0], None if self._of_position else arrays[-1]))
-        while len(kept) > 2 and kept[1][0] <= stamp:
+    def _go_on_late(self, stamp: int, sample: Floats) -> ArmEstimate | None:
+        """Go on to an earlier time: the effort is as old as that, and the rest was kept."""
+        kept, then = self._waiting, stamp - self._delay
+        kept.append((stamp, sample))
+        while len(kept) > 2 and kept[1][0] <= then:
             kept.popleft()
-        if len(kept) < 2 or not kept[0][0] <= stamp <= kept[1][0]:
+        if len(kept) < 2 or not kept[0][0] <= then <= kept[1][0]:
             return None
-        (t0, q0, v0), (t1, q1, v1) = kept[0], kept[1]
-        share = (stamp - t0) / (t1 - t0)
-        found = [q0 + share * self._moved(q0, q1), arrays[1]]
-        if v0 is not None and v1 is not None:
-            found.append(v0 + share * (v1 - v0))
-        return found
+        (t0, before), (t1, after) = kept[0], kept[1]
+        share = (then - t0) / (t1 - t0)
+        between = before + share * (after - before)
+        between[0], between[1] = sample[0], before[1] + share * self._moved(before[1], after[1])
+        return self._go_on(then, between)
 
     def _moved(self, before: Floats, q: Floats) -> Floats:
         """Return q - before; of continuous joints the shorter way."""
-        moved = q - before
-        if not self._turns:
-            return moved
-        around = np.remainder(moved + np.pi, 2.0 * np.pi) - np.pi
-        return np.where(self.model.continuous, around, moved)
+        moved, turns = q - before, self.model.continuous
+        if self._turns:
+            moved[turns] = np.remainder(moved[turns] + np.pi, 2.0 * np.pi) - np.pi
+        return moved
 
-    def _go_on(
-        self, stamp: int, q: Floats, torque: Floats, velocity: Floats | None
-    ) -> ArmEstimate | None:
+    def _go_on(self, stamp: int, sample: Floats) -> ArmEstimate | None:
         """Bring the bank to a sample that can be used."""
-        if self._stands_still(stamp, q, velocity):
-            self.counters['standing still'] += 1
-            return None
-        if self._last is not None and (stamp - self._last[0]) * 1e-9 > MAX_GAP:
-            self.counters['restarts'] += 1
-            self.reset()
+        torque, q, velocity = sample
+        if self._last is not None:
+            before, old, terms, drive = self._last
+            moved, h = self._moved(old, q), (stamp - before) * 1e-9
+            if self._stands_still(moved, h):
+                return self._refuse('standing still')
+            if h > MAX_GAP:
+                self.reset()
+                self._refuse('restarts')
         if self._last is None:
-            rest = np.zeros(len(q)) if velocity is None else velocity
-            self._last = stamp, q, *self._drive(q, rest, torque, rest)
+            self._last = stamp, q, *self._drive(q, velocity, torque, velocity)
             return None
-        before, old, terms, drive = self._last
-        moved = self._moved(old, q)
-        h = self._clock.interval((stamp - before) * 1e-9, moved)
-        if self._limits.jumped(moved, h):
-            self.counters['jumped'] += 1
+        h = self._clock.interval(h, moved)
+        if (np.abs(moved) > self._fastest * h + self._noisy).any():
             self.reset()
-            return None
-        self._torques.take(torque)
-        self._noise.take(q if velocity is None else velocity)
-        if not self._started:
-            speed = moved / h if velocity is None else velocity
-            variance = 2.0 * self._noise.variance / (h * h if velocity is None else 1.0)
-            spread = terms.mass * variance
-            self._bank.start(terms.mass @ speed, spread @ terms.mass.T, self._model_variance)
-            self._started = True
+            return self._refuse('jumped')
+        self._noise.take(sample)
+        torque_variance, variance = self._noise.variance[0], self._noise.variance[self._measured]
+        bank, speed = self._bank, moved / h if self._of_position else velocity
+        if self._velocity is None:
+            wide = 2.0 * variance / (h * h if self._of_position else 1.0)
+            spread = (terms.mass * wide) @ terms.mass.T
+            bank.start(terms.mass @ speed, spread, self._model_variance)
             self._velocity = self._sliding = speed
-        if velocity is None:
+        if self._of_position:
             if self._calibrated:
                 share = -np.expm1(-h / SLIDING)
-                self._sliding = self._sliding + share * (moved / h - self._sliding)
+                self._sliding = self._sliding + share * (speed - self._sliding)
             new, drives = self._drive(q, self._velocity, torque, self._sliding)
-            # p times what is not known of the interval is noise, too.
-            vague = self._clock.apart / h
-            measured, noise = momentum_of(terms.mass, new.mass, moved, self._noise.variance, vague)
+            mass, change = 0.5 * (terms.mass + new.mass), moved
+            vague = self._clock.apart / h  # of the interval, and so of what has moved
         else:
             new, drives = self._drive(q, velocity, torque, velocity)
-            measured, noise = momentum_of(new.mass, new.mass, velocity, self._noise.variance, 0.0)
-        drive += drives
-        drive *= 0.5
-        self._bank.step(h, measured, drive, noise, self._torques.variance, new.reach)
-        self._last = stamp, q, new, drives
-        self._momentum = measured / h if velocity is None else measured
-        bank = self._bank
+            mass, change, vague = new.mass, velocity, 0.0
+        drive = 0.5 * (drive + drives)
+        bank.step(h, mass, change, variance, vague, drive, torque_variance, new.reach)
+        self._last, self._momentum = (stamp, q, new, drives), mass @ speed
         self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
-            self.counters['doubted'] += 1
-            return None
+            return self._refuse('doubted')
         self.counters['used'] += 1
+        return self._estimate(stamp, q)
+
+    def _stands_still(self, moved: Floats, h: float) -> bool:
+        """Return True if all joints stand at once, to the bit, though the arm was in motion."""
+        if moved.any():
+            self._still = False
+        elif not self._still:
+            self._still = bool(np.any(np.abs(self._momentum) > self._stopping * h))
+        return self._still
+
+    def _estimate(self, stamp: int, q: Floats) -> ArmEstimate:
+        """Return what the bank says, and the likeliest link by all that it said in a contact."""
+        bank, touched = self._bank, self._contact
         odds, torques, covariance = bank.log_odds, bank.mean[2].copy(), bank.covariance.copy()
-        touched = self._contact
-        self._contact = odds > (0.0 if touched else self.threshold)
+        self._velocity = self.model.velocity_of(bank.mean[1])
+        self._contact = odds > (0.0 if touched else self._threshold)
         if self._contact and not (touched and stamp - self._looked < LOOK * 1e9):
             own = self._likelihoods(torques, covariance, q)
             self._evidence = self._evidence + own if touched else own
             self._looked = stamp
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
-        self._velocity = self.model.velocity_of(bank.mean[1])
         return ArmEstimate(
-            stamp, q, self._velocity, torques, covariance, odds,
-            self._contact, link,
-        )  # fmt: skip
-
-    def _stands_still(self, stamp: int, q: Floats, velocity: Floats | None) -> bool:
-        """Return True if all joints stand at once, to the bit, though the arm was in motion."""
-        if self._last is None:
-            return False
-        before, old, terms, _ = self._last
-        momentum = self._momentum if velocity is None else terms.mass @ velocity
-        most = self._stopping * (stamp - before) * 1e-9
-        self._still = np.array_equal(q, old) and (
-            self._still or bool(np.any(np.abs(momentum) > most))
+            stamp, q, self._velocity, torques, covariance, odds, self._contact, link
         )
-        return self._still
 
     def _drive(
         self, q: Floats, velocity: Floats, torque: Floats, sliding: Floats
@@ -417,8 +400,8 @@ class Arm:
         drive = terms.coriolis + torque
         drive += self._tare
         if self._calibrated:
-            drive -= self._known.friction(sliding)
-        if self._parameters['effort'] != 'gravity_compensated':
+            drive -= self.calibration.friction(sliding)
+        if self._with_gravity:
             drive -= terms.gravity
         return terms, drive
 
@@ -443,23 +426,24 @@ class Arm:
 
         """
         stamps = np.round(np.asarray(t, dtype=np.float64) * 1e9).astype(np.int64)
-        q, effort = np.asarray(q, dtype=np.float64), np.asarray(effort, dtype=np.float64)
         k, n = len(stamps), len(self.joints)
-        v = None if velocity is None else np.asarray(velocity, dtype=np.float64)
-        for name, array in (('q', q), ('effort', effort), ('velocity', v)):
-            if array is not None and array.shape != (k, n):
+        given = {'q': q, 'effort': effort, 'velocity': velocity}
+        arrays = {
+            name: np.asarray(a, dtype=np.float64) for name, a in given.items() if a is not None
+        }
+        for name, array in arrays.items():
+            if array.shape != (k, n):
                 raise ConfigurationError(
                     f'run: {name}: expected shape {(k, n)}, got {array.shape}'
                 )
-        velocities, torques, deviations = (np.full((k, n), np.nan) for _ in range(3))
-        odds, contact, links = np.full(k, np.nan), np.zeros(k, dtype=bool), [''] * k
-        for i in range(k):
-            found = self.take(int(stamps[i]), q[i], effort[i], None if v is None else v[i])
-            if found is not None:
-                velocities[i], torques[i] = found.velocity, found.external_torque
-                deviations[i], odds[i] = found.standard_deviation, found.log_odds
-                contact[i], links[i] = found.contact, found.link
-        return ArmEstimates(velocities, torques, deviations, odds, contact, links)
+        none = np.full((n, n), np.nan)
+        unused = ArmEstimate(0, none[0], none[0], none[0], none, np.nan, False, '')
+        found = [
+            self.take(int(stamp), *row) or unused
+            for stamp, *row in zip(stamps, *arrays.values(), strict=True)
+        ]
+        *columns, links = ([getattr(e, name) for e in found] for name in ArmEstimates._fields)
+        return ArmEstimates._make([*map(np.array, columns), links])
 
     def wrench(self, estimate: ArmEstimate, frame: str) -> Wrench:
         """
@@ -475,8 +459,7 @@ class Arm:
         prior = DAMPING**2 / np.mean(np.diag(estimate.covariance)) * np.eye(6)
         covariance = np.linalg.inv(weighted.T @ weighted + prior)
         found = covariance @ weighted.T @ np.linalg.solve(root, estimate.external_torque)
-        near = len(values) < 6 or values[-1] < DAMPING
-        return Wrench(found[:3], found[3:], covariance, bool(near))
+        return Wrench(found[:3], found[3:], bool(len(values) < 6 or values[-1] < DAMPING))
 
 
 def payload_of(p: Parameters) -> Payload:
@@ -487,11 +470,12 @@ def payload_of(p: Parameters) -> Payload:
     return Payload(mass, tuple(center))
 
 
-def _read(path: str) -> Calibration:
+def text_of(parameters: Parameters, name: str, expected: str) -> str:
+    """Return the text of the file that a parameter names; raise ConfigurationError without it."""
+    path = parameters[name]
     try:
-        return Calibration.loads(Path(path).read_text(encoding='utf-8'))
-    except OSError as error:
+        return Path(path).expanduser().read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(
-            f"parameter 'calibration_file': expected a file of `calibrate`, got {path} "
-            f'({error.strerror})'
+            f"parameter '{name}': expected {expected}, got {path} ({error})"
         ) from None

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `calibrate` finds about one arm, and its file."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from dataclasses import asdict, dataclass, fields
 
+from fhaosmo_ros.core.arm.model import ArmModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 import yaml
 
 Floats = NDArray[np.float64]
@@ -23,8 +22,8 @@ class Calibration:
     Attributes
     ----------
     joints : (n,) names
-    inertial : (n, 10) array, or empty
-        Of each link in Pinocchio's order, without payload; empty for the URDF's.
+    inertial : (n, 10) array
+        Of each link in Pinocchio's order, without payload.
     motor_inertia : (n,) array
         Of rotors, as joints see it, kg m^2.
     offset : (n,) array
@@ -55,18 +54,14 @@ class Calibration:
     log_odds: float = 0.0
 
     @classmethod
-    def none(cls, joints: Sequence[str]) -> 'Calibration':
+    def of_urdf(cls, model: ArmModel) -> 'Calibration':
         """Return that of an arm of which only the URDF is known."""
-        n = len(joints)
+        n = len(model.joints)
         zeros = np.zeros(n)
         return cls(
-            tuple(joints), np.zeros((0, 10)), zeros, zeros, zeros, np.zeros((n, len(WIDTHS))),
+            model.joints, model.unloaded, zeros, zeros, zeros, np.zeros((n, len(WIDTHS))),
             np.ones(n), zeros, zeros, zeros,
         )  # fmt: skip
-
-    def changed(self, **values: Any) -> 'Calibration':
-        """Return these values with some changed."""
-        return replace(self, **values)
 
     def friction(self, velocity: Floats) -> Floats:
         """Return friction and offset at velocities (..., n), in N m."""
@@ -96,61 +91,23 @@ class Calibration:
 
         """
         try:
-            given = yaml.safe_load(text)['arm_calibration']
-            names = tuple(str(name) for name in given['joints'])
-            known = {f.name for f in fields(cls)}
-            if set(given) != known:
-                wrong = ', '.join(sorted(set(given) ^ known))
-                raise ConfigurationError(f'calibration: missing or unknown are {wrong}')
-            sizes = cls.none(names)
-            values: dict[str, Any] = {'log_odds': float(given['log_odds'])}
-            for f in fields(cls)[1:-1]:
-                array = _finite(f.name, given[f.name])
-                shape = getattr(sizes, f.name).shape
-                if f.name == 'inertial':
-                    array, shape = array.reshape(-1, 10), (len(array), 10)
-                    if len(array) not in (0, len(names)):
-                        shape = (len(names), 10)
-                if array.shape != shape:
-                    raise ConfigurationError(
-                        f'calibration: {f.name}: expected shape {shape}, got {array.shape}'
-                    )
-                values[f.name] = array
+            given = dict(yaml.safe_load(text)['arm_calibration'])
+            joints = tuple(map(str, given.pop('joints', ())))
+            arrays = {name: np.array(v, dtype=np.float64) for name, v in given.items()}
         except (yaml.YAMLError, TypeError, KeyError, ValueError) as error:
-            if isinstance(error, ConfigurationError):
-                raise
             raise ConfigurationError(
                 f'calibration: expected a file of `calibrate`, got {text[:40]!r} ({error})'
             ) from None
-        return cls(joints=names, **values)
-
-    def of(self, joints: Sequence[str]) -> 'Calibration':
-        """
-        Return the same for the joints in this order.
-
-        Raises
-        ------
-        ConfigurationError
-            They are not those of the file.
-
-        """
-        if set(joints) != set(self.joints):
-            raise ConfigurationError(
-                f'calibration: expected the joints {", ".join(joints)}, '
-                f'got {", ".join(self.joints)}'
-            )
-        if len(self.inertial) and tuple(joints) != self.joints:
-            raise ConfigurationError('calibration: expected the joints in the order of the URDF')
-        order = [self.joints.index(name) for name in joints]
-        arrays = {
-            f.name: getattr(self, f.name)[order]
-            for f in fields(self)[2:-1]
-        }  # fmt: skip
-        return replace(self, joints=tuple(joints), **arrays)
-
-
-def _finite(name: str, value: ArrayLike) -> Floats:
-    array = np.array(value, dtype=np.float64)
-    if not np.isfinite(array).all():
-        raise ConfigurationError(f'calibration: {name}: expected finite numbers, got others')
-    return array
+        n, known = len(joints), {f.name for f in fields(cls)} - {'joints'}
+        if set(arrays) != known:
+            wrong = ', '.join(sorted(set(arrays) ^ known))
+            raise ConfigurationError(f'calibration: missing or unknown are {wrong}')
+        shapes = {'inertial': (n, 10), 'coulomb': (n, len(WIDTHS)), 'log_odds': ()}
+        for name, array in arrays.items():
+            shape = shapes.get(name, (n,))
+            if array.shape != shape or not np.isfinite(array).all():
+                raise ConfigurationError(
+                    f'calibration: {name}: expected finite numbers of shape {shape}, got '
+                    f'{array.shape if array.shape != shape else "others"}'
+                )
+        return cls(joints, log_odds=float(arrays.pop('log_odds')), **arrays)

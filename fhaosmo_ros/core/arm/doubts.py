@@ -5,6 +5,8 @@ What explains an external torque that does not go away: a setting that is wrong,
 One regression, with slow forgetting, of the external torque on what each mistake would make of it.
 """
 
+from typing import Any
+
 from fhaosmo_ros.core.arm.model import ArmModel, Floats
 import numpy as np
 
@@ -28,14 +30,7 @@ class Doubts:
     """
     Looks for mistakes in what the external torques of an arm have in common.
 
-    Parameters
-    ----------
-    model : ArmModel
-    with_gravity : bool
-        True if the torques are said to contain gravity.
-    error : (n,) array
-        Standard deviation of the model's error, N m.
-
+    `with_gravity`: torques are said to contain it. `error` (n,): of the model, N m.
     """
 
     def __init__(self, model: ArmModel, with_gravity: bool, error: Floats) -> None:
@@ -44,14 +39,9 @@ class Doubts:
 
     def reset(self) -> None:
         """Forget everything."""
-        n, self._time, self._seconds = len(self._error), 0.0, 0.0
+        self._time = 0.0
         self.text, self.payload = '', False
-        self._squares = np.zeros(n)  # of the torque, in the model's error
-        self._weight = 0.0
-        self._postures = np.zeros((n, 2))  # positions, and their squares
-        self._own = np.zeros((n, 2))  # effort times torque, and its square, by joint
-        self._normal = [np.zeros((k, k)) for k in (3, 4)]  # of gravity's vector, and a payload
-        self._seen = [np.zeros(k) for k in (3, 4)]
+        self._sums: list[Any] = [0.0] * 8
 
     def take(self, h: float, q: Floats, effort: Floats, torque: Floats) -> None:
         """Look at a sample, `h` seconds after the one before; `torque` is the external one."""
@@ -59,43 +49,44 @@ class Doubts:
         if self._time < EVERY:
             return
         keep, self._time = np.exp(-self._time / MEMORY), 0.0
-        rest = np.zeros(len(q))
-        last = 10 * (len(q) - 1)
-        payload = -self._model.regressor(q, rest, rest)[:, last : last + 4]
-        columns = (self._model.gravity_columns(q), payload)
-        scaled = torque / self._error
-        self._seconds = self._seconds * keep + EVERY
-        self._weight = self._weight * keep + 1.0
-        self._squares = self._squares * keep + scaled**2
-        self._postures = self._postures * keep + np.column_stack([q, q**2])
-        self._own = self._own * keep + np.column_stack([effort * torque, effort**2])
-        for k, column in enumerate(columns):
-            a = column / self._error[:, np.newaxis]
-            self._normal[k] = self._normal[k] * keep + a.T @ a
-            self._seen[k] = self._seen[k] * keep + a.T @ scaled
-        if self._seconds > LEAST:
+        rest, last = np.zeros(len(q)), 10 * (len(q) - 1)
+        payload = self._model.regressor(q, rest, rest)[:, last : last + 4]
+        columns = np.column_stack([self._model.gravity_columns(q), -payload])
+        a, scaled = columns / self._error[:, np.newaxis], torque / self._error
+        news = (
+            1.0, q, q**2, effort * torque, effort**2, scaled**2, a.T @ a, a.T @ scaled
+        )  # fmt: skip
+        self._sums = [keep * old + new for old, new in zip(self._sums, news, strict=True)]
+        if EVERY * self._sums[0] > LEAST:
             self._judge()
 
     def _judge(self) -> None:
         """Choose what explains the torque, if something does."""
         self.text, self.payload = '', False
-        total, count = float(np.sum(self._squares)), len(self._squares)
-        mean, square = self._postures.T / self._weight
-        moved = float(np.max(square - mean**2)) > MOVED**2
-        if not moved or total < LARGE**2 * self._weight * count:
+        count, mean, square, both, own, squares, normal, seen = self._sums
+        moved = np.max(square / count - (mean / count) ** 2) > MOVED**2
+        if not moved or np.mean(squares) < LARGE**2 * count:
             return
-        slopes = self._own[:, 0] / np.maximum(self._own[:, 1], 1e-12)
-        explained = self._own[:, 0] * slopes / self._error**2
-        signs = (
-            (np.abs(slopes + 2.0) < 0.5) & (explained > EXPLAINED * self._squares)
-            & (self._squares > LARGE**2 * self._weight)
+        slopes = both / np.maximum(own, 1e-12)
+        wrong = (
+            (np.abs(slopes + 2.0) < 0.5) & (squares > LARGE**2 * count)
+            & (both * slopes / self._error**2 > EXPLAINED * squares)
         )  # fmt: skip
-        gravity, payload = (self._fit(k, total) for k in (0, 1))
-        names = [n for n, wrong in zip(self._model.joints, signs, strict=True) if wrong]
+
+        def fit(part: slice, least: float) -> Floats | None:
+            """Return the factors of a mistake that explains the torque, None if it does not."""
+            values = np.linalg.eigvalsh(normal[part, part])
+            if not values[0] > least * values[-1]:
+                return None
+            factors = np.asarray(np.linalg.solve(normal[part, part], seen[part]))
+            return factors if seen[part] @ factors > EXPLAINED * np.sum(squares) else None
+
+        gravity, payload = fit(slice(0, 3), SEEN[0]), fit(slice(3, 7), SEEN[1])
         if gravity is not None:
             self.text = self._of_gravity(gravity)
-        if not self.text and names:
-            self.text = f'the effort of {", ".join(names)} has the wrong sign'
+        if not self.text and wrong.any():
+            names = ', '.join(np.array(self._model.joints)[wrong])
+            self.text = f'the effort of {names} has the wrong sign'
         if not self.text and payload is not None and payload[0] > 0.0:
             numbers = ', '.join(f'{x:.3g}' for x in (payload[0], *(payload[1:] / payload[0])))
             self.text = (
@@ -103,14 +94,6 @@ class Doubts:
                 f'carries something, set the parameter payload to [{numbers}]'
             )
             self.payload = True
-
-    def _fit(self, k: int, total: float) -> Floats | None:
-        """Return the factors of a mistake that explains the torque, None if it does not."""
-        values = np.linalg.eigvalsh(self._normal[k])
-        if not values[0] > SEEN[k] * values[-1]:
-            return None
-        factors = np.asarray(np.linalg.solve(self._normal[k], self._seen[k]), dtype=np.float64)
-        return factors if self._seen[k] @ factors > EXPLAINED * total else None
 
     def _of_gravity(self, factors: Floats) -> str:
         """Return what a change of gravity's vector means."""

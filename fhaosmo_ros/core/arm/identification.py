@@ -48,24 +48,6 @@ rotor leave, and is no less than this share of the largest joint's.
 """
 
 
-def _pseudo_inertia() -> Floats:
-    """Return the 4 x 4 pseudo-inertia for a unit of each inertial parameter, (4, 4, 10)."""
-    out = np.zeros((4, 4, 10))
-    out[3, 3, 0] = 1.0
-    for axis in range(3):
-        out[axis, 3, 1 + axis] = out[3, axis, 1 + axis] = 1.0
-    for k, (a, b) in enumerate(((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)), start=4):
-        if a == b:  # half the trace of the inertia, less the inertia
-            out[[0, 1, 2], [0, 1, 2], k] = 0.5
-            out[a, a, k] = -0.5
-        else:
-            out[a, b, k] = out[b, a, k] = -1.0
-    return out
-
-
-_PSEUDO = _pseudo_inertia()
-
-
 class Identified(NamedTuple):
     """What was found; torques are low-passed, K rows."""
 
@@ -78,46 +60,6 @@ class Identified(NamedTuple):
     by_urdf: Floats  # (K, n)
     by_calibration: Floats  # (K, n)
     held_out: NDArray[np.bool_]  # (K,)
-
-
-class Motion(NamedTuple):
-    """Filtered samples, K rows."""
-
-    t: Floats  # (K,) s
-    q: Floats  # (K, n)
-    velocity: Floats
-    acceleration: Floats
-    torque: Floats
-    rubbing: Floats  # (K, n, k) tanh(velocity / width) of each of `WIDTHS`
-
-    @classmethod
-    def of(cls, model: ArmModel, t: Floats, q: Floats, torque: Floats) -> 'Motion':
-        """
-        Low-pass positions, torques and friction alike, forwards and backwards.
-
-        Friction changes within milliseconds where a joint turns round. So it is computed from a
-        velocity that is hardly filtered, and then filtered as the torque is.
-        """
-        period = float(np.median(np.diff(t)))
-        even = np.arange(t[0], t[-1], period)
-
-        def low(array: Floats, cutoff: float) -> Floats:
-            sos = butter(2, min(cutoff * period * 2.0, 0.5), output='sos')
-            return np.asarray(sosfiltfilt(sos, array, axis=0))
-
-        raw, effort = (
-            np.column_stack([np.interp(even, t, column) for column in array.T])
-            for array in (np.where(model.continuous, np.unwrap(q, axis=0), q), torque)
-        )
-        quick = np.gradient(low(raw, QUICK), period, axis=0)
-        rubbing = low(np.tanh(quick[..., np.newaxis] / np.array(WIDTHS)), CUTOFF)
-        smooth = low(raw, CUTOFF)
-        velocity = np.gradient(smooth, period, axis=0)
-        acceleration = np.gradient(velocity, period, axis=0)
-        edge, every = int(0.5 / period), max(1, round(1.0 / (ROWS * period)))
-        kept = slice(edge, len(even) - edge, every)
-        parts = (even, smooth, velocity, acceleration, low(effort, CUTOFF), rubbing)
-        return cls(*(part[kept] for part in parts))
 
 
 def noise_of(samples: ArrayLike) -> Floats:
@@ -173,24 +115,22 @@ def identify(
             f'identify: expected at least {SHORTEST:g} s of samples with increasing times, got '
             f'{len(t)} samples'
         )
-    motion = Motion.of(model, t, q, effort)
-    problem = _Problem(model, motion, torque_constants)
-    held = ((motion.t - motion.t[0]) // BLOCK).astype(int) % HELD_OUT == HELD_OUT - 1
+    problem = _Regression(model, t, q, effort, Calibration.of_urdf(model), torque_constants)
+    held = ((problem.t - problem.t[0]) // BLOCK).astype(int) % HELD_OUT == HELD_OUT - 1
     found = [problem.solve(~held, draw) for draw in DRAWS]
     errors = [np.sum((problem.left(x)[held] / problem.size) ** 2) for x in found]
     x = problem.solve(~held, DRAWS[int(np.argmin(errors))], possible=True)
     left = problem.left(x)
-    calibration = problem.calibration(x)
-    calibration = calibration.changed(
-        position_noise=np.maximum(noise_of(q), 1e-9),
-        torque_noise=noise_of(effort) * np.abs(calibration.torque_constants),
-        model_error=np.maximum(_rms(left[held]), 1e-9),
-    )
-    notes = problem.notes + _notes(model.joints, motion.velocity)
-    torque = motion.torque * calibration.torque_constants
+    motor_inertia, offset, viscous, *coulomb = x[10 * n :].reshape(-1, n)
+    calibration = Calibration(
+        model.joints, model.unloaded + x[: 10 * n].reshape(n, 10), motor_inertia, offset, viscous,
+        np.column_stack(coulomb), problem.constants, np.maximum(noise_of(q), 1e-9),
+        noise_of(effort) * np.abs(problem.constants), np.maximum(_rms(left[held]), 1e-9),
+    )  # fmt: skip
     return Identified(
-        calibration, _rms(problem.unexplained[held]), _rms(left[held]), notes, motion.t,
-        torque, problem.by_urdf, torque - left, held,
+        calibration, _rms(problem.unexplained[held]), _rms(left[held]),
+        problem.notes + _notes(model.joints, problem.velocity), problem.t, problem.torque,
+        problem.torque - problem.unexplained, problem.torque - left, held,
     )  # fmt: skip
 
 
@@ -203,8 +143,7 @@ def payload_of_motion(
     Everything else is taken from `calibration`, of the arm without payload.
     """
     t, q, effort = (np.asarray(a, dtype=np.float64) for a in (t, q, effort))
-    motion = Motion.of(model, t, q, effort)
-    problem = _Problem(model, motion, calibration.torque_constants, calibration)
+    problem = _Regression(model, t, q, effort, calibration, calibration.torque_constants)
     last = 10 * (len(model.joints) - 1)
     moving = problem.columns[..., last : last + 4]
     turning = problem.columns[..., last + 4 : last + 10]
@@ -220,68 +159,85 @@ def payload_of_motion(
     return payload, _rms(problem.unexplained), _rms(problem.unexplained - explained)
 
 
-class _Problem:
+class _Regression:
     """
-    The regression: what the URDF leaves unexplained, as a sum of columns.
+    What is left unexplained of a torque, as a sum of columns; K rows, low-passed.
 
     Columns, by joint: changes of the ten inertial parameters, motor inertia, offset, viscous
-    friction, and dry friction of each width.
+    friction, and dry friction of each width. Positions, torques and friction are filtered alike,
+    forwards and backwards. Friction changes within milliseconds where a joint turns round. So it
+    is computed from a velocity that is hardly filtered, and then filtered as the torque is.
     """
 
     def __init__(
-        self,
-        model: ArmModel,
-        motion: Motion,
+        self, model: ArmModel, t: Floats, q: Floats, effort: Floats, known: Calibration,
         torque_constants: ArrayLike,
-        known: Calibration | None = None,
-    ) -> None:
-        self._model, self._motion = model, motion
-        n, k = len(model.joints), len(motion.t)
-        known = known or Calibration.none(model.joints)
-        own = model.inertial if len(known.inertial) == 0 else known.inertial
+    ) -> None:  # fmt: skip
+        n = len(model.joints)
+        self._model = model
+        period = float(np.median(np.diff(t)))
+        even = np.arange(t[0], t[-1], period)
+
+        def low(array: Floats, cutoff: float) -> Floats:
+            sos = butter(2, min(cutoff * period * 2.0, 0.5), output='sos')
+            return np.asarray(sosfiltfilt(sos, array, axis=0))
+
+        raw, effort = (
+            np.column_stack([np.interp(even, t, column) for column in array.T])
+            for array in (np.where(model.continuous, np.unwrap(q, axis=0), q), effort)
+        )
+        quick = np.gradient(low(raw, QUICK), period, axis=0)
+        rubbing = [low(np.tanh(quick / width), CUTOFF) for width in WIDTHS]
+        smooth = low(raw, CUTOFF)
+        velocity = np.gradient(smooth, period, axis=0)
+        acceleration = np.gradient(velocity, period, axis=0)
+        edge, every = int(0.5 / period), max(1, round(1.0 / (ROWS * period)))
+        kept = slice(edge, len(even) - edge, every)
+        self.t, smooth, effort = even[kept], smooth[kept], low(effort, CUTOFF)[kept]
+        own = np.array([acceleration, np.ones_like(velocity), velocity, *rubbing])[:, kept]
+        acceleration, _, self.velocity = own[:3]
         regressors = np.array([
-            model.regressor(*row)
-            for row in zip(motion.q, motion.velocity, motion.acceleration, strict=True)
+            model.regressor(*row) for row in zip(smooth, self.velocity, acceleration, strict=True)
         ])  # fmt: skip
-        self.by_urdf = regressors @ own.ravel()
-        self.by_urdf += known.offset + known.viscous * motion.velocity
-        self.by_urdf += np.sum(known.coulomb * motion.rubbing, axis=-1)
-        self.by_urdf += known.motor_inertia * motion.acceleration
-        ones = np.ones((k, n))
-        rubbing = list(np.moveaxis(motion.rubbing, -1, 0))
-        own_columns: list[Floats] = [motion.acceleration, ones, motion.velocity, *rubbing]
-        constants = np.broadcast_to(np.asarray(torque_constants, dtype=np.float64), n).copy()
+        factors = np.array([known.motor_inertia, known.offset, known.viscous, *known.coulomb.T])
+        by_model = regressors @ (known.inertial + model.inertial - model.unloaded).ravel()
+        by_model += np.einsum('cj,ckj->kj', factors, own)
         self.notes: list[str] = []
-        unknown = np.flatnonzero(constants == 0.0)
+        self.constants = np.broadcast_to(np.asarray(torque_constants, dtype=np.float64), n).copy()
+        unknown = np.flatnonzero(self.constants == 0.0)
         if len(unknown):
-            constants[unknown] = self._told(unknown, own_columns)
-        self._constants = constants
-        measured = motion.torque * constants
-        self.unexplained = measured - self.by_urdf
-        diagonal = [np.eye(n) * column[:, np.newaxis, :] for column in own_columns]
-        self.columns = np.concatenate([regressors, *diagonal], axis=2)
+            self.constants[unknown] = self._told(unknown, by_model, effort, own)
+        self.torque = effort * self.constants
+        self.unexplained = self.torque - by_model
+        self.columns = np.concatenate(
+            [regressors, *(np.eye(n) * c[:, np.newaxis] for c in own)], axis=2
+        )
         mass, spread = model.inertial[:, 0], np.abs(model.inertial[:, [4, 6, 9]]).max(axis=1)
-        inertial = np.column_stack([
-            mass, *[mass * LEVER] * 3, *[spread + mass * LEVER**2] * 6
-        ])  # fmt: skip
-        level = np.maximum(_rms(measured), 1e-9)
-        fastest = np.maximum(np.abs(motion.acceleration).max(axis=0), 1e-3)
-        sizes = [level / fastest, *[level] * (2 + len(WIDTHS))]
+        second = spread + mass * LEVER**2
+        inertial = np.column_stack([mass, *[mass * LEVER] * 3, *[second] * 6])
+        level = np.maximum(_rms(self.torque), 1e-9)
+        fastest = np.maximum(np.abs(acceleration).max(axis=0), 1e-3)
         self._scale = np.concatenate([
-            np.maximum(SHARE * inertial, 1e-9).ravel(), *sizes
+            np.maximum(SHARE * inertial, 1e-9).ravel(), level / fastest, *[level] * (len(own) - 1)
         ])  # fmt: skip
         self.size = np.maximum(_rms(self.unexplained), 1e-9)
 
-    def _told(self, unknown: NDArray[np.intp], columns: list[Floats]) -> Floats:
+    def _told(
+        self, unknown: NDArray[np.intp], by_model: Floats, effort: Floats, own: Floats
+    ) -> Floats:
         """Return torque constants by the URDF; where it does not tell, those of the others."""
-        names, effort = self._model.joints, self._motion.torque
-        found = np.array([
-            _constant(self.by_urdf[:, j], effort[:, j], [column[:, j] for column in columns])
-            for j in unknown
-        ])  # fmt: skip
-        constants, explained, size = found.T
-        told = (explained > TOLD) & (size > WEAK * self.by_urdf.std(axis=0).max())
-        told &= constants > 0.0
+        names = self._model.joints
+        constants, told = np.zeros(len(unknown)), np.zeros(len(unknown), dtype=bool)
+        for k, j in enumerate(unknown):
+            # The effort is fitted by the torque, not the torque by the effort: what else is in the
+            # effort would make the constant too small. Friction and rotor are taken from both.
+            both, others = np.column_stack([by_model[:, j], effort[:, j]]), own[..., j].T
+            x, y = (both - others @ np.linalg.lstsq(others, both, rcond=None)[0]).T
+            common, power = x @ y, x @ x
+            if common > 0.0:
+                explained, size = common**2 / (power * (y @ y)), np.sqrt(power / len(x))
+                told[k] = explained > TOLD and size > WEAK * by_model.std(axis=0).max()
+                constants[k] = power / common
         if not told.any():
             raise ConfigurationError(
                 'torque_constants: expected them as a parameter, because this motion does not '
@@ -328,7 +284,8 @@ class _Problem:
         n = len(self.size)
         links = self._model.unloaded
         unit = np.sqrt(np.maximum(links[:, :1], 1e-3)) * np.array([LEVER, LEVER, LEVER, 1.0])
-        shape = _PSEUDO / (unit[:, :, np.newaxis] * unit[:, np.newaxis, :])[..., np.newaxis]
+        units = unit[:, :, np.newaxis] * unit[:, np.newaxis, :]
+        shape = self._model.pseudo_inertias() / units[..., np.newaxis]
         map_ = np.zeros((17 * n, len(right)))
         for i in range(n):
             own = slice(10 * i, 10 * i + 10)
@@ -343,9 +300,8 @@ class _Problem:
             x = inverse @ (right + rate * map_.T @ (near - start - dual))
             there = start + map_ @ x + dual
             values, vectors = np.linalg.eigh(there[: 16 * n].reshape(n, 4, 4))
-            clipped = (vectors * np.maximum(values, LEAST_SHARE)[:, np.newaxis]) @ np.swapaxes(
-                vectors, 1, 2
-            )
+            clipped = vectors * np.maximum(values, LEAST_SHARE)[:, np.newaxis]
+            clipped = clipped @ vectors.transpose(0, 2, 1)
             near = np.concatenate([clipped.ravel(), np.maximum(there[16 * n :], 0.0)])
             dual = there - near
         bodies, others = slice(0, 11 * n), slice(11 * n, None)
@@ -358,32 +314,6 @@ class _Problem:
     def left(self, x: Floats) -> Floats:
         """Return the torque that is left unexplained, (K, n)."""
         return np.asarray(self.unexplained - self.columns @ x)
-
-    def calibration(self, x: Floats) -> Calibration:
-        """Return what the factors mean."""
-        n, w = len(self._model.joints), len(WIDTHS)
-        own = x[10 * n :].reshape(-1, n)
-        return Calibration.none(self._model.joints).changed(
-            inertial=self._model.unloaded + x[: 10 * n].reshape(n, 10),
-            motor_inertia=own[0], offset=own[1], viscous=own[2], coulomb=own[3 : 3 + w].T.copy(),
-            torque_constants=self._constants,
-        )  # fmt: skip
-
-
-def _constant(torque: Floats, effort: Floats, others: list[Floats]) -> tuple[float, float, float]:
-    """
-    Return the torque for a unit of effort by the URDF, how much that explains, and its size.
-
-    The effort is fitted by the torque, not the torque by the effort: what else is in the effort
-    would make the constant too small. Friction and the rotor, which the URDF lacks, are `others`.
-    """
-    columns = np.column_stack(others)
-    both = np.column_stack([torque, effort])
-    torque, effort = (both - columns @ np.linalg.lstsq(columns, both, rcond=None)[0]).T
-    common, power = float(torque @ effort), float(torque @ torque)
-    explained = common**2 / max(power * float(effort @ effort), 1e-300)
-    size = float(np.sqrt(power / len(torque)))
-    return (power / common if common else 0.0), explained, size
 
 
 def _notes(joints: tuple[str, ...], velocity: Floats) -> list[str]:

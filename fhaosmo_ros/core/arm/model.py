@@ -10,10 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
-CROSS = np.array([
-    [0, 0, 0, 0, 0, 1, 0, -1, 0], [0, 0, -1, 0, 0, 0, 1, 0, 0], [0, 1, 0, -1, 0, 0, 0, 0, 0]
-], dtype=np.float64)  # fmt: skip
-"""(r @ CROSS) as rows of a matrix (3, 3) times w is the cross product w x r."""
 MOVING = ('revolute', 'continuous', 'prismatic')
 """Types of URDF joints that can be estimated."""
 GRIPPER = ('finger', 'gripper', 'knuckle')
@@ -52,10 +48,6 @@ class ArmModel:
         mimic joints and those of a gripper (a name with finger, gripper or knuckle in it).
     gravity : (3,) array
         In the base's frame, m/s^2.
-    payload : Payload
-    inertial : (n, 10) array, optional
-        Of each link with all that is fixed to it, instead of the URDF's: mass, mass times centre,
-        inertia about the joint (xx, xy, yy, xz, yz, zz).
 
     Attributes
     ----------
@@ -79,13 +71,7 @@ class ArmModel:
     """
 
     def __init__(
-        self,
-        urdf: str,
-        *,
-        joints: Sequence[str] = (),
-        gravity: ArrayLike = GRAVITY,
-        payload: Payload = Payload(),  # noqa: B008 - immutable
-        inertial: ArrayLike | None = None,
+        self, urdf: str, *, joints: Sequence[str] = (), gravity: ArrayLike = GRAVITY
     ) -> None:
         self._pin = pin = _pinocchio()
         moving = _moving_joints(urdf)
@@ -101,46 +87,33 @@ class ArmModel:
             raise ConfigurationError('robot description: expected a joint that moves, got none')
         whole = pin.buildModelFromXML(urdf)
         others = [whole.getJointId(name) for name in whole.names[1:] if name not in chosen]
-        self._model = pin.buildReducedModel(whole, others, pin.neutral(whole))
-        self.gravity = np.array(gravity, dtype=np.float64)
-        self._model.gravity.linear = self.gravity
-        self._data = self._model.createData()
-        self._even = pin.Model(self._model)  # links of 1 kg, see `set_payload`
-        self._even_data = self._even.createData()
-        self.joints = tuple(self._model.names[1:])
-        self.links = tuple(self._link_of(i) for i in range(1, self._model.njoints))
-        self.frames = tuple(f.name for f in self._model.frames if f.type == pin.FrameType.BODY)
-        n = len(self.joints)
-        self.continuous = np.array([self._model.nqs[i] == 2 for i in range(1, n + 1)])
-        self._at = np.array(self._model.idx_qs[1:])
+        self._model = model = pin.buildReducedModel(whole, others, pin.neutral(whole))
+        self._data = model.createData()
+        self.gravity = model.gravity.linear = np.array(gravity, dtype=np.float64)
+        self.joints, n = tuple(model.names[1:]), model.nv
+        bodies = [f for f in model.frames if f.type == pin.FrameType.BODY]
+        self.frames = tuple(str(f.name) for f in bodies)
+        first = {f.parentJoint: str(f.name) for f in reversed(bodies)}
+        self.links = tuple(first.get(k, name) for k, name in enumerate(self.joints, 1))
+        self.continuous = np.array([size == 2 for size in list(model.nqs)[1:]])
+        self._zero = pin.neutral(model)
         # A URDF that says nothing of a limit, or zero, means none.
-        turns = self.continuous | ~(
-            self._model.lowerPositionLimit[self._at] < self._model.upperPositionLimit[self._at]
-        )
-        self.lowest = np.where(turns, -np.inf, self._model.lowerPositionLimit[self._at])
-        self.highest = np.where(turns, np.inf, self._model.upperPositionLimit[self._at])
-        self.velocity_limits, self.effort_limits = (
-            np.where(limit > 0.0, limit, np.inf)
-            for limit in (self._model.velocityLimit, self._model.effortLimit)
-        )
-        moves = [[j in self._model.supports[i] for j in range(1, n + 1)] for i in range(1, n + 1)]
-        self._moves = np.array(moves, dtype=np.float64)[:, np.newaxis, :]
-        if inertial is None:
-            inertial = np.array(
-                [
-                    i.toDynamicParameters() if i.mass > 0.0 else np.zeros(10)
-                    for i in self._model.inertias[1:]
-                ]
-            )
-        self.set_inertial(inertial)
-        self.set_payload(payload)
-
-    def _link_of(self, joint: int) -> str:
-        names = [
-            f.name for f in self._model.frames
-            if f.type == self._pin.FrameType.BODY and f.parentJoint == joint
-        ]  # fmt: skip
-        return str(names[0] if names else self._model.names[joint])
+        at = np.array(model.idx_qs[1:])
+        lowest, highest = model.lowerPositionLimit[at], model.upperPositionLimit[at]
+        ends = ~self.continuous & (lowest < highest)
+        self.lowest, self.highest = np.where(ends, [lowest, highest], [[-np.inf], [np.inf]])
+        limits = np.array([model.velocityLimit, model.effortLimit])
+        self.velocity_limits, self.effort_limits = np.where(limits > 0.0, limits, np.inf)
+        # Arms whose only mass is 1 kg of one link, for each; and of all links. See `set_payload`.
+        self._even = [pin.Model(model) for _ in range(n + 1)]
+        for even in self._even:
+            for k in range(1, n + 1):
+                even.inertias[k] = pin.Inertia.Zero()
+        self._even_data = [even.createData() for even in self._even]
+        self.set_inertial([
+            own.toDynamicParameters() if own.mass > 0.0 else np.zeros(10)
+            for own in model.inertias[1:]
+        ])  # fmt: skip
 
     def set_inertial(self, inertial: ArrayLike, motor_inertia: ArrayLike = 0.0) -> None:
         """
@@ -150,11 +123,6 @@ class ArmModel:
         """
         self._model.armature = np.broadcast_to(motor_inertia, len(self.joints))
         self.unloaded = np.array(inertial, dtype=np.float64)
-        n = len(self.joints)
-        if self.unloaded.shape != (n, 10):
-            raise ConfigurationError(
-                f'inertial: expected an array of shape {(n, 10)}, got {self.unloaded.shape}'
-            )
         self.set_payload(Payload())
 
     def set_payload(self, payload: Payload) -> None:
@@ -169,21 +137,19 @@ class ArmModel:
         """
         inertial = self.inertial = self.unloaded.copy()
         inertial[-1] += self.inertial_of(payload)
-        for name, link, values in zip(self.joints, self.links, inertial, strict=True):
+        for k, values in enumerate(inertial, 1):
             if not (np.isfinite(values).all() and values[0] > 0.0):
-                raise ConfigurationError(f'link {link}: expected a mass > 0, got {values[0]:g}')
-            index = self._model.getJointId(name)
-            self._model.inertias[index] = self._pin.Inertia.FromDynamicParameters(values)
-        # A force of any direction at the place r from the centre has the moment r x force. Over
-        # places spread as the mass is, each component has 2/3 of their mean square distance, which
-        # is half the trace of the inertia over the mass. So the sum of J^T J is the mass matrix of
-        # an arm with links of 1 kg and of an inertia of that mean square.
-        own = list(self._model.inertias[1:])
-        self._levers = [np.array(i.lever) for i in own]
-        squares = np.array([max(np.trace(i.inertia), 0.0) / (3.0 * i.mass) for i in own])
-        self._radii = np.sqrt(squares)[:, np.newaxis, np.newaxis]
-        for k, (lever, square) in enumerate(zip(self._levers, squares, strict=True), 1):
-            self._even.inertias[k] = self._pin.Inertia(1.0, lever, square * np.eye(3))
+                raise ConfigurationError(
+                    f'link {self.links[k - 1]}: expected a mass > 0, got {values[0]:g}'
+                )
+            own = self._model.inertias[k] = self._pin.Inertia.FromDynamicParameters(values)
+            # A force of any direction at the place r from the centre has the moment r x force.
+            # Over places spread as the mass is, each component has 2/3 of their mean square
+            # distance, which is half the trace of the inertia over the mass. So J^T J of a link is
+            # the mass matrix of an arm that has 1 kg there, of an inertia of that mean square.
+            square = max(np.trace(own.inertia), 0.0) / (3.0 * own.mass)
+            place = self._pin.Inertia(1.0, own.lever, square * np.eye(3))
+            self._even[k - 1].inertias[k] = self._even[-1].inertias[k] = place
         mass = self.terms(np.zeros(len(self.joints)), np.zeros(len(self.joints))).mass
         if not np.all(np.linalg.eigvalsh(mass) > 0.0):
             raise ConfigurationError(
@@ -198,13 +164,8 @@ class ArmModel:
 
     def _configuration(self, q: ArrayLike) -> Floats:
         """Return q as Pinocchio has it: cosine and sine of a continuous joint's angle."""
-        q = np.asarray(q, dtype=np.float64)
-        if not self.continuous.any():
-            return q
-        out = np.empty(self._model.nq)
-        out[self._at] = np.where(self.continuous, np.cos(q), q)
-        out[self._at[self.continuous] + 1] = np.sin(q[self.continuous])
-        return out
+        moved = np.asarray(q, dtype=np.float64)
+        return np.asarray(self._pin.integrate(self._model, self._zero, moved))
 
     def terms(self, q: ArrayLike, velocity: ArrayLike) -> Terms:
         """Return the terms at q (n,) and its velocity (n,)."""
@@ -213,7 +174,7 @@ class ArmModel:
         coriolis = pin.computeCoriolisMatrix(model, data, configuration, velocity).T @ velocity
         gravity = pin.computeGeneralizedGravity(model, data, configuration).copy()
         mass = pin.crba(model, data, configuration).copy()
-        reach = pin.crba(self._even, self._even_data, configuration).copy()
+        reach = pin.crba(self._even[-1], self._even_data[-1], configuration).copy()
         return Terms(mass, coriolis, gravity, reach)
 
     def velocity_of(self, momentum: Floats) -> Floats:
@@ -223,17 +184,11 @@ class ArmModel:
 
     def reach_of_links(self, q: ArrayLike) -> Floats:
         """Return J^T J of each link, the mean over the places of its mass, (n, n, n), m^2."""
-        pin, data = self._pin, self._data
-        columns = pin.computeJointJacobians(self._model, data, self._configuration(q))
-        centers = np.array([
-            place.act(lever) for place, lever in zip(data.oMi[1:], self._levers, strict=True)
-        ])  # fmt: skip
-        turning = columns[3:]  # of spatial velocities at the base's origin, by joint
-        links = np.empty((len(centers), 6, len(centers)))
-        links[:, :3] = columns[:3] + (centers @ CROSS).reshape(-1, 3, 3) @ turning
-        links[:, 3:] = turning * self._radii
-        links *= self._moves
-        return np.asarray(links.transpose(0, 2, 1) @ links)
+        configuration, links = (
+            self._configuration(q),
+            zip(self._even, self._even_data, strict=True),
+        )
+        return np.array([self._pin.crba(*link, configuration) for link in links][:-1])
 
     def gravity_columns(self, q: ArrayLike) -> Floats:
         """Return the matrix (n, 3) whose product with a vector of gravity is g(q)."""
@@ -252,9 +207,8 @@ class ArmModel:
 
         """
         if not self._model.existFrame(frame):
-            raise ConfigurationError(
-                f'frame: expected one of {", ".join(self.frames)}, got {frame!r}'
-            )
+            known = ', '.join(self.frames)
+            raise ConfigurationError(f'frame: expected one of {known}, got {frame!r}')
         configuration, index = self._configuration(q), self._model.getFrameId(frame)
         return np.asarray(self._pin.computeFrameJacobian(
             self._model, self._data, configuration, index, self._pin.ReferenceFrame.LOCAL
@@ -262,12 +216,15 @@ class ArmModel:
 
     def regressor(self, q: ArrayLike, velocity: ArrayLike, acceleration: ArrayLike) -> Floats:
         """Return the matrix (n, 10 n) whose product with `inertial`, as one row, is the torque."""
-        return np.array(
-            self._pin.computeJointTorqueRegressor(
-                self._model, self._data, self._configuration(q),
-                np.asarray(velocity, dtype=np.float64), np.asarray(acceleration, dtype=np.float64),
-            )
-        )  # fmt: skip
+        arrays = (np.asarray(a, dtype=np.float64) for a in (velocity, acceleration))
+        return np.array(self._pin.computeJointTorqueRegressor(
+            self._model, self._data, self._configuration(q), *arrays
+        ))  # fmt: skip
+
+    def pseudo_inertias(self) -> Floats:
+        """Return the pseudo-inertia for a unit of each of the ten parameters, (4, 4, 10)."""
+        of = self._pin.PseudoInertia.FromDynamicParameters
+        return np.stack([of(unit).toMatrix() for unit in np.eye(10)], axis=-1)
 
     def torque_of_weight(self) -> Floats:
         """
@@ -278,10 +235,9 @@ class ArmModel:
         """
         random = np.random.default_rng(0)
         weight = self.inertial[:, 0] * np.linalg.norm(self.gravity)
-        squares = []
-        for _ in range(POSTURES):
-            reach = self.reach_of_links(random.uniform(-np.pi, np.pi, len(weight)))
-            squares.append(weight**2 @ np.diagonal(reach, axis1=1, axis2=2) / 3.0)
+        postures = random.uniform(-np.pi, np.pi, (POSTURES, len(weight)))
+        reaches = np.array([self.reach_of_links(q) for q in postures])
+        squares = np.einsum('l,pljj->pj', weight**2, reaches) / 3.0
         return np.asarray(np.sqrt(np.mean(squares, axis=0)))
 
     @property
@@ -305,13 +261,11 @@ def _moving_joints(urdf: str) -> dict[str, bool]:
     try:
         robot = ElementTree.fromstring(urdf)
     except ElementTree.ParseError as error:
-        raise ConfigurationError(
-            f'robot description: expected the XML of a URDF, got {urdf[:40]!r} ({error})'
-        ) from None
+        problem = f'the XML of a URDF, got {urdf[:40]!r} ({error})'
+        raise ConfigurationError(f'robot description: expected {problem}') from None
     if robot.tag != 'robot':
-        raise ConfigurationError(
-            f'robot description: expected a URDF (<robot ...>), got <{robot.tag} ...>'
-        )
+        problem = f'a URDF (<robot ...>), got <{robot.tag} ...>'
+        raise ConfigurationError(f'robot description: expected {problem}')
     found = {}
     for joint in robot.findall('joint'):
         name, kind = joint.get('name', ''), joint.get('type', '')

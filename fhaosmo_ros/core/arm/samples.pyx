@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-What samples of an arm say by themselves: whether they can be true, their time, their noise.
+"""What samples of an arm say by themselves: their noise, and their time."""
 
-All arrays have one number for each joint.
-"""
-
-from libc.math cimport fabs, fmax, fmin, isfinite
+from libc.math cimport fabs, fmax, fmin
 
 import numpy as np
 
@@ -27,105 +23,52 @@ cdef int FIRST_LEARNT = 10, LONGEST_LEARNT = 1000
 cdef double LARGEST = 9.0
 
 
-cdef class Limits:
-    """
-    What an arm cannot have sent.
-
-    Parameters
-    ----------
-    lowest, highest : (n,) array
-        Positions, rad (m).
-    fastest : (n,) array
-        Velocity, rad/s (m/s).
-    strongest : (n,) array
-        Torque, N m (N).
-    noise : (n,) array
-        What noise may add to the difference of two positions, rad (m).
-
-    """
-
-    cdef double[::1] lowest, highest, fastest, strongest, noise
-
-    def __init__(self, lowest, highest, fastest, strongest, noise):
-        self.lowest, self.highest, self.fastest = lowest, highest, fastest
-        self.strongest, self.noise = strongest, noise
-
-    def fault(
-        self, const double[::1] q, const double[::1] torque, const double[::1] velocity=None
-    ):
-        """Return why a sample can't be true, as a counter's name; nothing if it can."""
-        cdef int k, n = self.lowest.shape[0]
-        cdef bint moves = velocity is not None
-        for k in range(n):
-            if not (isfinite(q[k]) and isfinite(torque[k]) and (
-                not moves or isfinite(velocity[k])
-            )):
-                return 'not finite'
-        for k in range(n):
-            if not self.lowest[k] <= q[k] <= self.highest[k]:
-                return 'beyond limits'
-            if not fabs(torque[k]) < self.strongest[k]:
-                return 'too strong'
-            if moves and not fabs(velocity[k]) < self.fastest[k]:
-                return 'too fast'
-        return ''
-
-    def jumped(self, const double[::1] moved, double h):
-        """Return True if no joint of this arm can have moved so far within h seconds."""
-        cdef int k
-        for k in range(moved.shape[0]):
-            if fabs(moved[k]) > self.fastest[k] * h + self.noise[k]:
-                return True
-        return False
-
-
 cdef class Noise:
     """
     The variance of the noise of samples, followed by their third differences.
 
     Parameters
     ----------
-    size : (n,) array
-        Standard deviation, to begin with.
-    least : (n,) array
-        The smallest that it can become.
-    follows : (n,) array of bool
-        Where it is followed, and not as it was told.
+    size : (r, n) array
+        Standard deviation of r kinds of samples, to begin with.
+    least, most : (r, n) array
+        The smallest and the largest that it can become.
 
     """
 
-    cdef readonly object variance  # (n,)
-    cdef double[::1] now, least
-    cdef double[:, ::1] before  # the three samples before
-    cdef list follows
+    cdef readonly object variance  # (r, n)
+    cdef double[:, ::1] now, least, most
+    cdef double[:, :, ::1] before  # the three samples before
     cdef int seen, count
 
-    def __init__(self, size, least, follows):
-        self.variance = np.asarray(size, dtype=np.float64) ** 2
-        self.now, self.least = self.variance, np.asarray(least, dtype=np.float64) ** 2
-        self.before, self.follows = np.zeros((3, len(size))), list(follows)
+    def __init__(self, size, least, most):
+        self.now, self.least, self.most = np.square(size), np.square(least), np.square(most)
+        self.variance = np.asarray(self.now)
+        self.before = np.zeros((3, *self.variance.shape))
         self.seen, self.count = 0, FIRST_LEARNT
 
     def reset(self):
         """Take the next sample as the first one."""
         self.seen = 0
 
-    def take(self, const double[::1] sample):
-        """Take a sample."""
-        cdef double[:, ::1] b = self.before
-        cdef double change, square
-        cdef int k
+    def take(self, const double[:, ::1] sample):
+        """Take a sample, (r, n)."""
+        cdef double[:, :, ::1] b = self.before
+        cdef double change, square, found
+        cdef int i, k, rows = self.now.shape[0], n = self.now.shape[1]
         cdef bint known = self.seen >= 3
+        if sample.shape[0] != rows or sample.shape[1] != n:
+            raise ValueError(f'expected a sample of shape {(rows, n)}')
         if known:
             self.count = min(self.count + 1, LONGEST_LEARNT)
-        for k in range(b.shape[1]):
-            if known and self.follows[k]:
-                change = sample[k] - 3.0 * (b[2, k] - b[1, k]) - b[0, k]
-                square = fmin(change * change / 20.0, LARGEST * self.now[k])  # 1 + 9 + 9 + 1
-                self.now[k] = fmax(
-                    self.now[k] + (square - self.now[k]) / self.count, self.least[k]
-                )
-            b[0, k], b[1, k], b[2, k] = b[1, k], b[2, k], sample[k]
+        for i in range(rows):
+            for k in range(n):
+                if known:
+                    change = sample[i, k] - 3.0 * (b[2, i, k] - b[1, i, k]) - b[0, i, k]
+                    square = fmin(change * change / 20.0, LARGEST * self.now[i, k])  # 1+9+9+1
+                    found = self.now[i, k] + (square - self.now[i, k]) / self.count
+                    self.now[i, k] = fmin(fmax(found, self.least[i, k]), self.most[i, k])
+                b[0, i, k], b[1, i, k], b[2, i, k] = b[1, i, k], b[2, i, k], sample[i, k]
         self.seen = min(self.seen + 1, 3)
 
 
@@ -203,38 +146,3 @@ cdef class Clock:
         self.phase = even - since
         self.period += 6.0 / (n * (n + 1.0)) * off / steps
         return even
-
-
-def momentum_of(
-    const double[:, ::1] before, const double[:, ::1] after, const double[::1] velocity,
-    const double[::1] variance, double vague,
-):
-    """
-    Return M v, and the covariance of its error: M S M' + (vague M v)(vague M v)'.
-
-    Parameters
-    ----------
-    before, after : (n, n) array
-        M is their mean.
-    velocity : (n,) array
-        v; or by how much positions have changed.
-    variance : (n,) array
-        The diagonal of S.
-    vague : float
-        Share of v that is not known.
-
-    """
-    cdef int i, j, k, n = velocity.shape[0]
-    momentum, covariance, mean = np.zeros(n), np.zeros((n, n)), np.empty((n, n))
-    cdef double[::1] p = momentum
-    cdef double[:, ::1] r = covariance, mass = mean
-    for i in range(n):
-        for k in range(n):
-            mass[i, k] = 0.5 * (before[i, k] + after[i, k])
-            p[i] += mass[i, k] * velocity[k]
-    for i in range(n):
-        for j in range(n):
-            r[i, j] = vague * p[i] * vague * p[j]
-            for k in range(n):
-                r[i, j] += mass[i, k] * variance[k] * mass[j, k]
-    return momentum, covariance

@@ -2,14 +2,13 @@
 """Find what the URDF of an arm does not say, from a recording of free motion."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fhaosmo_ros.core.arm.arm import Arm, payload_of
-from fhaosmo_ros.core.arm.calibration import Calibration
+from fhaosmo_ros.core.arm.arm import Arm
 from fhaosmo_ros.core.arm.identification import Identified, identify, payload_of_motion
 from fhaosmo_ros.core.arm.model import ArmModel
-from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.arm.figure import torque_figure
@@ -17,11 +16,10 @@ from fhaosmo_ros.tools.arm.recording import (
     add_arm_options,
     arm_parameters,
     description,
-    read_joints,
-    Recorded,
+    joint_samples,
 )
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.cli.command import Output, progress, run_command
+from fhaosmo_ros.tools.cli.command import Output, run_command
 import numpy as np
 
 LEAST = 1.0
@@ -50,68 +48,55 @@ def main(argv: list[str] | None = None) -> int:
 
 def _calibrate(arguments: argparse.Namespace, stop: Stop) -> None:
     values = arm_parameters(arguments)
-    parameters = ARM_PARAMETERS.complete(values)
+    if arguments.payload and not values.get('calibration_file'):
+        raise ConfigurationError(
+            '--payload: expected -p calibration_file:=FILE of the arm without payload, got none'
+        )
     with stop.raising(), BagReader(arguments.bag) as reader:
         urdf = description(reader, arguments)
-        model = ArmModel(
-            urdf, joints=[n for n in parameters['joints'] if n], gravity=parameters['gravity'],
-            payload=payload_of(parameters),
-        )  # fmt: skip
-        recorded = read_joints(reader, arguments.topic, model, with_velocity=False)
-        effort = recorded.effort
+        unknown = {'payload': [0.0] * 4} if arguments.payload else {'calibration_file': ''}
+        arm = Arm(urdf, values | unknown)
+        model, parameters = arm.model, arm.parameters
+        stamps, rows = zip(*joint_samples(reader, arguments.topic, arm.joints, False), strict=True)
+        when, samples = np.array(stamps), np.array(rows)
+        newest = np.maximum.accumulate(np.concatenate([[0], when[:-1]]))
+        good = np.isfinite(samples).all(axis=(1, 2)) & (when > newest)
+        t, q, effort = (when[good] - when[good][:1]) * 1e-9, samples[good, 0], samples[good, 1]
+        torque = effort
         if parameters['effort'] == 'gravity_compensated':
-            rest = np.zeros(len(model.joints))
-            effort = effort + np.array([model.terms(q, rest).gravity for q in recorded.q])
+            rest = np.zeros(len(arm.joints))
+            torque = effort + np.array([model.terms(row, rest).gravity for row in q])
         if arguments.payload:
-            _payload(model, recorded, effort, values)
+            _payload(arm, t, q, torque)
             return
         constants: Any = 1.0
         if parameters['effort'] == 'current':
             given = np.array(parameters['torque_constants'])
             constants = np.where(given == 1.0, 0.0, given)
-        found = identify(model, recorded.t, recorded.q, effort, torque_constants=constants)
-        calibration = found.calibration.changed(
-            log_odds=_level(urdf, values, found.calibration, recorded)
-        )
+        found = identify(model, t, q, torque, torque_constants=constants)
+        # The log-odds of contact that this free motion reaches once a minute.
+        free = Arm(urdf, {**values, 'measurement': 'position'}, calibration=found.calibration)
+        odds = np.nan_to_num(free.run(t, q, effort).log_odds, nan=-np.inf)
+        seconds = t.astype(int)
+        peaks = np.sort([np.max(odds[seconds == s]) for s in np.unique(seconds)])[::-1]
+        level = float(max(peaks[min(int(len(peaks) / 60.0), len(peaks) - 1)], LEAST))
     print(_report(model, found))
     with Output(arguments.output, arguments.force) as output:
-        output.path.write_text(calibration.dumps(), encoding='utf-8')
+        text = replace(found.calibration, log_odds=level).dumps()
+        output.path.write_text(text, encoding='utf-8')
         print(f'\ncalibration: {output.keep()}')
     with Output(arguments.output.with_suffix('.png'), arguments.force) as output:
         torque_figure(model, found).savefig(output.path, dpi=110)
         print(f'figure:      {output.keep()}')
 
 
-def _level(
-    urdf: str, values: dict[str, Any], calibration: Calibration, recorded: Recorded
-) -> float:
-    """Return the log-odds of contact that this free motion reaches once a minute."""
-    arm = Arm(urdf, {**values, 'measurement': 'position'}, calibration=calibration)
-    odds = []
-    for row in progress(
-        zip(recorded.stamps, recorded.q, recorded.effort, strict=True),
-        total=len(recorded.q), unit='sample', desc='false alarms',
-    ):  # fmt: skip
-        estimate = arm.take(int(row[0]), row[1], row[2])
-        odds.append(-np.inf if estimate is None else estimate.log_odds)
-    seconds = recorded.t.astype(int)
-    peaks = np.sort([np.max(np.array(odds)[seconds == s]) for s in np.unique(seconds)])[::-1]
-    return float(max(peaks[min(int(len(peaks) / 60.0), len(peaks) - 1)], LEAST))
-
-
-def _payload(model: ArmModel, recorded: Recorded, effort: Any, values: dict[str, Any]) -> None:
+def _payload(arm: Arm, t: Any, q: Any, torque: Any) -> None:
     """Print the payload as a parameter."""
-    if not values.get('calibration_file'):
-        raise ConfigurationError(
-            '--payload: expected -p calibration_file:=FILE of the arm without payload, got none'
-        )
-    path = Path(values['calibration_file'])
-    calibration = Calibration.loads(path.read_text(encoding='utf-8')).of(model.joints)
-    payload, before, after = payload_of_motion(model, recorded.t, recorded.q, effort, calibration)
+    payload, before, after = payload_of_motion(arm.model, t, q, torque, arm.calibration)
     numbers = ', '.join(f'{x:.4g}' for x in (payload.mass, *payload.center))
-    for name, b, a in zip(model.joints, before, after, strict=True):
+    for name, b, a in zip(arm.joints, before, after, strict=True):
         print(f'{name}: unexplained {b:.3g} N m without, {a:.3g} N m with the payload')
-    print(f'\npayload: [{numbers}]    # kg and m, in the frame of {model.joints[-1]}')
+    print(f'\npayload: [{numbers}]    # kg and m, in the frame of {arm.joints[-1]}')
 
 
 def _report(model: ArmModel, found: Identified) -> str:

@@ -1,37 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint states and the robot's description out of a bag or a table, as arrays."""
+"""Joint states and the robot's description out of a bag."""
 
 import argparse
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from fhaosmo_ros.core.arm.model import ArmModel
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
-from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.messages.joints import joint_sample
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import progress
 from fhaosmo_ros.tools.cli.options import add_value_options, assigned
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
 JOINT_STATES, DESCRIPTION = '/joint_states', '/robot_description'
-
-
-class Recorded(NamedTuple):
-    """Joint states in the order of the arm's joints, K rows."""
-
-    stamps: NDArray[np.int64]  # (K,) ns
-    q: Floats  # (K, n)
-    effort: Floats  # (K, n)
-    velocity: Floats | None  # (K, n)
-
-    @property
-    def t(self) -> Floats:
-        """Seconds since the first sample."""
-        return np.asarray((self.stamps - self.stamps[0]) * 1e-9)
 
 
 def add_arm_options(parser: argparse.ArgumentParser) -> None:
@@ -68,9 +53,11 @@ def description(reader: BagReader, arguments: argparse.Namespace) -> str:
     return str(found.pop())
 
 
-def read_joints(reader: BagReader, topic: str, model: ArmModel, with_velocity: bool) -> Recorded:
+def joint_samples(
+    reader: BagReader, topic: str, joints: Sequence[str], with_velocity: bool
+) -> Iterator[tuple[int, list[NDArray[np.float64]]]]:
     """
-    Return the samples that hold all joints of the arm.
+    Yield the samples that hold all joints; see `joint_sample`.
 
     Raises
     ------
@@ -80,36 +67,17 @@ def read_joints(reader: BagReader, topic: str, model: ArmModel, with_velocity: b
     """
     if not reader.count(topic):
         raise ConfigurationError(f'{reader.path}: expected messages on {topic}, got none')
-    stamps, rows, names = [], [], ()
-    order: list[int] | None = None
-    lacking = ''
+    found, problem = False, ''
     for _, _, message, _ in progress(
         reader.objects([topic]), total=reader.count(topic), unit='message', desc='read'
     ):
-        if tuple(message.name) != names:
-            names = tuple(message.name)
-            missing = [name for name in model.joints if name not in names]
-            order = None if missing else [names.index(name) for name in model.joints]
-            if missing:
-                lacking = f'without {missing[0]}{suggestion(missing[0], names)}'
-        if order is None:
+        try:
+            sample = joint_sample(message, joints, with_velocity)
+        except ConfigurationError as error:
+            problem = str(error)
             continue
-        parts = [message.position, message.effort, *[message.velocity] * with_velocity]
-        if any(len(part) != len(names) for part in parts):
-            lacking = 'without a position, effort or velocity for each name'
-            continue
-        header = message.header.stamp
-        stamps.append(header.sec * 1_000_000_000 + header.nanosec)
-        rows.append([part[order] for part in parts])
-    if not rows:
-        raise ConfigurationError(
-            f'{reader.path}: expected joint states of {", ".join(model.joints)} on {topic}, got '
-            f'messages {lacking}'
-        )
-    when, samples = np.array(stamps), np.array(rows, dtype=np.float64)
-    good = np.isfinite(samples).all(axis=(1, 2)) & (when > np.maximum.accumulate(
-        np.concatenate([[0], when[:-1]])
-    ))  # fmt: skip
-    when, samples = when[good], samples[good]
-    velocity = samples[:, 2] if with_velocity else None
-    return Recorded(when, samples[:, 0], samples[:, 1], velocity)
+        found = True
+        yield sample
+    if not found:
+        expected = f'joint states of {", ".join(joints)} on {topic}'
+        raise ConfigurationError(f'{reader.path}: expected {expected}, got: {problem}')

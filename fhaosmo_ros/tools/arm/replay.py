@@ -4,6 +4,7 @@
 import argparse
 import csv
 from pathlib import Path
+from typing import IO
 
 from fhaosmo_ros.core.arm.arm import Arm
 from fhaosmo_ros.stop_signals import Stop
@@ -11,10 +12,10 @@ from fhaosmo_ros.tools.arm.recording import (
     add_arm_options,
     arm_parameters,
     description,
-    read_joints,
+    joint_samples,
 )
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.cli.command import Output, progress, run_command
+from fhaosmo_ros.tools.cli.command import Output, run_command
 import numpy as np
 
 
@@ -36,30 +37,24 @@ def main(argv: list[str] | None = None) -> int:
 def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
     with stop.raising(), BagReader(arguments.bag) as reader:
         arm = Arm(description(reader, arguments), arm_parameters(arguments))
-        with_velocity = arm.parameters['measurement'] == 'velocity'
-        recorded = read_joints(reader, arguments.topic, arm.model, with_velocity)
         with Output(arguments.output, arguments.force) as output:
             with output.path.open('w', newline='', encoding='utf-8') as file:
-                contacts = _write(arm, recorded, file)
+                contacts = _write(arm, reader, arguments.topic, file)
             print(f'{arm.counters["used"]} samples used, {contacts} contacts: {output.keep()}')
     for what, count in arm.counters.items():
         if what != 'used':
             print(f'{what}: {count} samples')
 
 
-def _write(arm, recorded, file) -> int:
+def _write(arm: Arm, reader: BagReader, topic: str, file: IO[str]) -> int:
     """Write a line for each estimate; return how many contacts began."""
-    table, contacts, touched = csv.writer(file), 0, False
-    names = arm.joints
+    table, contacts, touched, names = csv.writer(file), 0, False, arm.joints
     table.writerow([
         'stamp_ns', *names, *(f'{name}_deviation' for name in names), 'log_odds', 'link',
     ])  # fmt: skip
-    velocities = recorded.velocity if recorded.velocity is not None else recorded.q
-    for stamp, q, effort, velocity in progress(
-        zip(recorded.stamps, recorded.q, recorded.effort, velocities, strict=True),
-        total=len(recorded.q), unit='sample', desc='replay',
-    ):  # fmt: skip
-        found = arm.take(int(stamp), q, effort, velocity)
+    with_velocity = arm.parameters['measurement'] == 'velocity'
+    for stamp, arrays in joint_samples(reader, topic, names, with_velocity):
+        found = arm.take(stamp, *arrays)
         if found is None:
             continue
         contacts += found.contact and not touched
