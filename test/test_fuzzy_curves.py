@@ -199,13 +199,6 @@ def test_any_system_is_refused_or_keeps_the_promise(text):
     assert np.all(np.diff(values) >= 0.0)
 
 
-@pytest.mark.parametrize(('terms', 'end'), [(5, 5.0 / 6.0), (7, 8.0 / 9.0)])
-def test_centroid_alone_falls_short_of_1(terms, end):
-    # The centroid of the outermost half triangle, a third of its base away from 1.
-    system = read_system(f'terms {terms}')
-    np.testing.assert_allclose(infer(np.ones(1), system), end, atol=1e-6)
-
-
 @even
 def test_shipped_curve_is_the_inferred_one(terms, shape):
     """Else `python -m studies.fuzzy_curves` writes the file anew."""
@@ -239,32 +232,6 @@ def test_psi_is_bounded_monotone_and_continuous(law, level, a, b):
     # Lipschitz: the steepest piece of the curve is less than 5 times steeper than the diagonal.
     steepest = 5.0 / law.configuration.widths[level]
     assert psi(law, level, high) - psi(law, level, low) <= steepest * (high - low) + 1e-12
-
-
-@given(any_law, levels, st.floats(1e-6, 2.0))
-def test_slope_is_that_of_psi(law, level, share):
-    width = law.configuration.widths[level]
-    position = share * (KNOTS - 1)
-    if abs(position - round(position)) < 1e-3:
-        return  # two pieces meet
-    a, step = share * width, 1e-6 * width
-    _, slope = law.curve(level, a)
-    rise = psi(law, level, a + step) - psi(law, level, a - step)
-    np.testing.assert_allclose(slope, rise / (2.0 * step), rtol=1e-6, atol=1e-6 / width)
-
-
-@given(st.sampled_from(list(LAWS)), levels, st.floats(0.0, 2.0), st.floats(1e-9, 1e9))
-def test_width_scales_the_input(shape, level, share, width):
-    scaled, unit = (law((w,), fuzzy_systems=[f'terms {shape} 5']) for w in (width, 1.0))
-    expected = psi(unit, level, share)
-    np.testing.assert_allclose(psi(scaled, level, share * width), expected, atol=1e-13)
-
-
-@given(levels, st.floats(1e-300))
-def test_sign_is_the_limit_of_a_narrow_psi(level, a):
-    assert law(variant='sign').curve(level, a) == (1.0, 0.0)
-    if a >= 1e-12:
-        np.testing.assert_allclose(psi(law((1e-12,)), level, a), 1.0, rtol=1e-12)
 
 
 def test_systems_in_the_documents_are_accepted():

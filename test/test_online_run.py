@@ -13,40 +13,20 @@ PERIODS = [MS, MS, MS, MS, 2 * MS, 0, -MS, 499 * MS, 501 * MS, -700 * MS]
 VALUES = [0.0, 0.1, 0.1, 0.2, -0.3, float('nan'), float('inf'), 1e300]
 
 
-def live(parameters, stamps, y, u):
-    estimator = OnlineEstimator(parameters)
-    rows, words = [], []
+NAMES = ('z', 'unknown_input', 'gamma', 'innovation', 'status', 'open_levels')
+
+
+def one_by_one(estimator, stamps, y, u):
+    """Yield what an estimator shows after each sample, in the order of `NAMES`."""
     for stamp, sample, known in zip(stamps.tolist(), y.tolist(), u.tolist(), strict=True):
-        estimator.set_input(known)
+        for j, value in enumerate(known):
+            estimator.set_input(value, j)
         e = estimator.update(stamp, sample)
-        rows.append([*e.z, e.unknown_input, e.gamma, *e.innovation])
-        words.append((int(e.status), e.open_levels))
-    return estimator, np.array(rows), np.array(words)
+        yield [*e.z, e.unknown_input, e.gamma, *e.innovation, int(e.status), e.open_levels]
 
 
-def batch(parameters, stamps, y, u, size):
-    estimator = OnlineEstimator(parameters)
-    rows, words = [], []
-    for k in range(0, len(y), size):
-        p = estimator.run(stamps[k : k + size], y[k : k + size], u[k : k + size])
-        rows.append(np.column_stack([p.z, p.unknown_input, p.gamma, p.innovation]))
-        words.append(np.column_stack([p.status, p.open_levels]))
-    return estimator, np.concatenate(rows), np.concatenate(words)
-
-
-def assert_same(parameters, stamps, y, u, size):
-    one, rows, words = live(parameters, stamps, y, u)
-    other, rows_, words_ = batch(parameters, stamps, y, u, size)
-    np.testing.assert_array_equal(rows_, rows)  # bit for bit
-    np.testing.assert_array_equal(words_, words)
-    assert other.counters == one.counters
-    assert (other.period, other.jitter) == (one.period, one.jitter)
-    assert other.stamp == one.stamp
-    last = one.update(int(stamps[-1]) + 3 * MS, 0.05)
-    np.testing.assert_array_equal(other.update(int(stamps[-1]) + 3 * MS, 0.05).z, last.z)
-    if one.estimate is not None:
-        np.testing.assert_array_equal(other.estimate.z, one.estimate.z)
-        np.testing.assert_array_equal(other.estimate.innovation, one.estimate.innovation)
+def table(run):
+    return np.column_stack([getattr(run, name) for name in NAMES])
 
 
 LEVANT = {
@@ -88,19 +68,12 @@ def test_one_by_one_at_once_and_resumed_are_the_same(case):
     parameters = CASES[case] | {'spike_gate': 1.0, 'max_gap': 0.5}
     stamps, y, u = disturbed()
     one, many, resumed = (OnlineEstimator(parameters) for _ in range(3))
-    inputs = len(one.inputs)
-    u = u[:, :inputs]
-    found = many.run(stamps, y, u)
+    u = u[:, : len(one.inputs)]
+    found = table(many.run(stamps, y, u))
     assert many.counters.rejected_spikes >= 1
     assert many.counters.restarts == 1
-    for k in range(len(y)):
-        for j in range(inputs):
-            one.set_input(u[k, j], j)
-        e = one.update(int(stamps[k]), y[k])
-        now = [*e.z, e.unknown_input, e.gamma, *e.innovation, int(e.status)]
-        then = [*found.z[k], found.unknown_input[k], found.gamma[k], *found.innovation[k]]
-        assert now == [*then, found.status[k]], k
-        one.set_input(-3.0)  # not yet: the next sample has another one
+    for k, now in enumerate(one_by_one(one, stamps, y, u)):
+        np.testing.assert_array_equal(now, found[k])
         if k == 699:
             labels, vector = pack(Snapshot(one.latest, Flag.CHANGED, one.state_dict()))
             snapshot = unpack(vector.tolist(), labels)
@@ -108,25 +81,23 @@ def test_one_by_one_at_once_and_resumed_are_the_same(case):
             resumed.run(stamps[:50], y[:50])  # whatever it was before
             resumed.load_state_dict(snapshot.values)
             resumed.events.taken()
-            assert resumed.inputs == one.inputs
-            assert resumed.stamp == one.stamp
-    rest = resumed.run(stamps[700:], y[700:], u[700:])
-    for name in ('z', 'unknown_input', 'gamma', 'innovation', 'status'):
-        np.testing.assert_array_equal(getattr(rest, name), getattr(found, name)[700:])
-    events = [e._replace(sample=0) for e in many.events.taken()]
+            assert (resumed.inputs, resumed.stamp) == (one.inputs, one.stamp)
+        one.set_input(-3.0)  # not yet: the next sample has another one
+    rest = table(resumed.run(stamps[700:], y[700:], u[700:]))
+    np.testing.assert_array_equal(rest, found[700:])
+    events, of_one, of_resumed = (
+        [e._replace(sample=0) for e in estimator.events.taken()]
+        for estimator in (many, one, resumed)
+    )
     assert bool(events) == many.events.on
-    assert [e._replace(sample=0) for e in one.events.taken()] == events
-    left = [e for e in events if e.stamp > stamps[699]]
-    assert [e._replace(sample=0) for e in resumed.events.taken()] == left
+    assert of_one == events
+    assert of_resumed == [e for e in events if e.stamp > stamps[699]]
 
 
 SETTINGS = [
-    {},
-    {'spike_gate': 0.05},
-    {'stuck_time': 2.5e-3},
-    {'epsilon': 0.02, 'divergence_time': 3e-3},
+    {}, {'spike_gate': 0.05}, {'stuck_time': 2.5e-3}, {'epsilon': 0.02, 'divergence_time': 3e-3},
     {'divergence_limit': 10.0, 'scheme': 'explicit'},
-]
+]  # fmt: skip
 
 
 @given(
@@ -142,4 +113,13 @@ def test_gaps_jumps_and_bad_samples_are_the_same(samples, sampling, settings, si
     y = np.array([value for _, value in samples])
     u = np.where(np.arange(len(y)) % 5 == 4, np.nan, 0.1)
     parameters = {'sampling': sampling, 'phi': ['0', '0', 'u - z3']} | settings
-    assert_same(parameters, stamps, y, u, size)
+    one, other = OnlineEstimator(parameters), OnlineEstimator(parameters)
+    rows = list(one_by_one(one, stamps, y, u[:, np.newaxis]))
+    parts = [
+        table(other.run(stamps[k : k + size], y[k : k + size], u[k : k + size]))
+        for k in range(0, len(y), size)
+    ]
+    np.testing.assert_array_equal(np.concatenate(parts), rows)  # bit for bit
+    for name in ('counters', 'period', 'jitter', 'stamp', 'inputs'):
+        assert getattr(one, name) == getattr(other, name)
+    np.testing.assert_equal(other.state_dict(), one.state_dict())
