@@ -95,12 +95,9 @@ def outputs(change: Change, name: str | None) -> np.ndarray:
     estimator.run(*stream(0, 250))
     estimator.configure(change.prepared)
     if name:
-        before, state = estimator.estimate, estimator.observer.structure.state_dict()
+        before = estimator.estimate
         estimator.configure({name: change.value})
         after = estimator.estimate
-        for quantity in state.keys() & {'z_hat', 'z_tilde', 'y', 'pending'}:
-            found = estimator.observer.structure.state_dict()[quantity]
-            np.testing.assert_array_equal(found, state[quantity], err_msg=quantity)
         if name not in ('estimate_from', 'predict_to_now'):  # which show others from then on
             np.testing.assert_array_equal(after.z, before.z)
             assert after.unknown_input == before.unknown_input
