@@ -28,10 +28,10 @@ def write(path: str, text: str) -> str:
 def error_of(path: str, node: str) -> str:
     with pytest.raises(ConfigurationError) as error:
         load(path, node)
-    start, message = str(error.value)[: len(path) + 2], str(error.value)[len(path) + 2 :]
-    assert start == f'{path}: '
+    message = str(error.value)
+    assert message.startswith(f'{path}: ')
     assert '\n' not in message
-    return message
+    return message.removeprefix(f'{path}: ')
 
 
 @pytest.mark.parametrize(('section', 'node', 'matches'), [

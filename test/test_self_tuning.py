@@ -92,8 +92,8 @@ def test_it_follows_the_noise(case, correlation, factor):
     error = observer.run(t, z[:, 0] + sizes * coloured).unknown_input - d
     assert rms(error[5000:]) < rms(d)
     assert np.abs(error).max() < 1.5 * np.abs(d).max()
-    assert observer.tuning.noise == pytest.approx(factor * 1e-4, rel=0.2)
-    assert observer.tuning.correlation == pytest.approx(correlation, abs=0.1)
+    assert observer.tuning.noise == pytest.approx(factor * 1e-4, rel=0.2 if correlation else 0.15)
+    assert observer.tuning.correlation == pytest.approx(correlation, abs=0.05)
 
 
 def test_outliers_and_jumps_of_y(case):
@@ -109,7 +109,9 @@ def test_outliers_and_jumps_of_y(case):
         assert np.abs(error).max() < 2.0 * np.abs(d).max()
 
 
-@pytest.mark.parametrize(('size', 'seconds'), [(0.05, 5.0), (1.0, 0.05), (-2.0, 0.5)])
+@pytest.mark.parametrize(('size', 'seconds'), [
+    (0.05, 0.5), (0.05, 5.0), (1.0, 0.05), (-2.0, 0.5), (-2.0, 5.0),
+])  # fmt: skip
 def test_a_wrong_angle_is_no_wrong_gravity(size, seconds):
     """Believed, it would be a d of up to 19.6: y less its offset is used instead (D 23)."""
     r, values = study('pendulum', seed=5)
@@ -133,9 +135,9 @@ def test_a_plant_that_is_elsewhere_is_no_jump_of_y():
     assert rms(wrong[13_000:]) < 0.05 * rms(d)
 
 
-@pytest.mark.parametrize(
-    ('sigmas', 'seconds'), [(3.5, 0.02), (3.5, 0.5), (-5.0, 0.5), (8.0, 0.02)]
-)
+@pytest.mark.parametrize(('sigmas', 'seconds'), [
+    (3.5, 0.02), (3.5, 0.5), (5.0, 0.02), (-5.0, 0.5), (6.5, 0.5), (8.0, 0.02),
+])  # fmt: skip
 def test_an_offset_of_y_is_not_taken_for_d(case, sigmas, seconds):
     """Just within, and just beyond what counts as lost; before D 35 d was off by 100s of times."""
     t, z, d, noise = case
@@ -223,7 +225,7 @@ def late_by(t, size, random):
     return np.maximum.accumulate(late) + 1e-8 * np.arange(len(t))
 
 
-@pytest.mark.parametrize('seed', [0, 2])
+@pytest.mark.parametrize('seed', [0, 2, 4])
 def test_a_host_that_stamps_later_for_dozens_of_samples(seed):
     """By 10 us, and it wakes unevenly by 25: that is y without noise, and no d."""
     random, count = np.random.default_rng(seed), 20_000
@@ -292,7 +294,7 @@ def test_how_sure_it_is_of_a_quantised_y(plant):
 
 
 @pytest.mark.parametrize('quantum', [2.0, 10.0])
-@pytest.mark.parametrize('part', [0.03, 0.3, 0.5])
+@pytest.mark.parametrize('part', [0.03, 0.1, 0.3, 0.5])
 def test_noise_on_a_quantised_y(quantum, part):
     """y goes to a neighbouring count and back: by noise, which is no motion of d."""
     r, values = study("paper's plant")
@@ -346,7 +348,7 @@ def test_a_simulated_y_without_noise_that_comes_to_rest_is_not_stuck(late):
 
 
 @plants
-@pytest.mark.parametrize(('samples', 'noise'), [(5, 1.0), (10, 0.0), (20, 1.0)])
+@pytest.mark.parametrize(('samples', 'noise'), [(5, 1.0), (10, 1.0), (10, 0.0), (20, 1.0)])
 def test_a_sensor_that_is_slower_than_its_topic(plant, samples, noise):
     """It repeats each value; believed, that would be a d that jumps with each new one."""
     r, values = study(plant)
@@ -386,7 +388,8 @@ def test_slider(case):
 
 @pytest.mark.parametrize(('name', 'kind', 'seed', 'seconds'), [
     ("paper's plant", 'sine', 20, 8.0), ('motor', 'ou', 14, 8.0), ('motor', 'ou', 10, 8.0),
-    ('pendulum', 'square', 3, 8.0), ('motor', 'chirp', 13, 20.0), ('motor', 'ou', 1, 20.0),
+    ('pendulum', 'square', 3, 8.0), ('motor', 'sine', 0, 20.0), ('motor', 'chirp', 13, 20.0),
+    ('motor', 'ou', 1, 20.0), ('motor', 'ou', 7, 20.0),
 ])  # fmt: skip
 def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, kind, seed, seconds):
     """A hundredfold noise has samples farther and farther off by chance (D 33)."""
@@ -470,10 +473,8 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
         assert not ours[:, size:].any()
 
 
-@pytest.mark.parametrize(
-    ('shape', 'omega', 'noise'),
-    [('sine', 1.0, 1e-4), ('sine', 4.0, 1e-3), ('square', 1.0, 1e-4), ('square', 1.0, 1e-3)],
-)
+@pytest.mark.parametrize('noise', [1e-4, 1e-3])
+@pytest.mark.parametrize(('shape', 'omega'), [('sine', 1.0), ('sine', 4.0), ('square', 1.0)])
 def test_it_does_what_the_plain_version_does(shape, omega, noise):
     """Where noise is white and stamps are even, the idea is all that acts."""
     t = 2e-3 * np.arange(5000)
