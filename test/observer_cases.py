@@ -67,6 +67,11 @@ def matern(count, rate, derivatives, rng, early=4000):
     return d[early:] / d[early:].std()
 
 
+def powers(low, high):
+    """Return a strategy for numbers that are spread evenly over their orders of magnitude."""
+    return st.floats(low, high).map(lambda x: 10.0**x)
+
+
 def concatenated(runs):
     return [np.concatenate(parts) for parts in zip(*runs, strict=True)]
 

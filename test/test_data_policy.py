@@ -22,16 +22,13 @@ class Feed:
         self.count = 0
 
     def __call__(self, *values: float) -> list[Status]:
-        result = []
-        for y in values:
-            result.append(self.estimator.update(START + self.count * MS, y).status)
-            self.count += 1
-        return result
+        begin, self.count = self.count, self.count + len(values)
+        stamps = range(START + begin * MS, START + self.count * MS, MS)
+        return [self.estimator.update(*one).status for one in zip(stamps, values, strict=True)]
 
     def sine(self, count: int) -> list[Status]:
-        return self(
-            *(0.2 + 0.1 * math.sin(1e-3 * k) for k in range(self.count, self.count + count))
-        )
+        k = range(self.count, self.count + count)
+        return self(*(0.2 + 0.1 * math.sin(1e-3 * j) for j in k))
 
     @property
     def events(self) -> dict[str, int]:
@@ -68,12 +65,9 @@ def test_bad_value_is_rejected_and_as_if_it_had_not_come(bad, gate):
 
 def test_bad_input_is_not_held():
     estimator = OnlineEstimator({'phi': ['0', '0', 'u']})
-    assert estimator.set_input(2.0)
-    assert not estimator.set_input(math.nan)
-    assert not estimator.set_input(-math.inf)
+    assert [estimator.set_input(u) for u in (2.0, math.nan, -math.inf)] == [True, False, False]
     assert estimator.inputs == (2.0,)
-    assert estimator.counters.rejected_inputs == 2
-    assert estimator.counters.rejected == 0
+    assert (estimator.counters.rejected_inputs, estimator.counters.rejected) == (2, 0)
 
 
 def test_real_step_of_y_is_believed_after_five_samples_in_a_row():
@@ -109,26 +103,14 @@ def test_stuck_sensor_is_rejected_until_it_moves():
     assert [w.rejected for w in words] == [False] * 101 + [True] * 199
     assert words[-1] == Status.REJECTED_STUCK
     assert feed.estimator.stamp == START + 200 * MS
-    (word,) = feed(0.26)
-    assert word & Status.GAP
+    assert feed(0.26)[0] & Status.GAP
     assert feed.events == {'stuck': 1, 'rejected_stuck': 199}
-
-
-def test_sensor_stuck_for_longer_than_max_gap_restarts_the_observer():
-    feed = Feed(stuck_time=0.1)
-    feed.sine(100)
-    feed(*[0.25] * 800)
+    feed(*[0.25] * 3000)  # for longer than max_gap
     feed.sine(10)
-    assert feed.events['stuck'] == feed.events['restarts_forward'] == 1
-    feed(*[0.25] * 150)
-    assert feed.events['stuck'] == 2
-
-
-def test_silence_is_not_a_stuck_sensor():
-    feed = Feed(stuck_time=1.0)
-    feed(0.2, 0.2)
-    feed.count += 5000
-    assert not any(w & Status.REJECTED_STUCK for w in feed(0.2, 0.2, 0.2))
+    assert (feed.events['stuck'], feed.events['restarts_forward']) == (2, 1)
+    feed(0.2)
+    feed.count += 20_000  # silence is no stuck sensor
+    assert not any(w & Status.REJECTED_STUCK for w in feed(*[0.2] * 50))
 
 
 # Divergence
@@ -139,15 +121,13 @@ BAD_GAINS |= {'gamma_min': 1.0, 'gamma_initial': 1.0}
 
 
 def test_bad_live_gains_are_noticed_and_survived():
-    good = {k: ONLINE_PARAMETERS[k].default for k in BAD_GAINS}
     feed = Feed(epsilon=0.5, divergence_time=0.05)
     feed.sine(1000)
     before = feed.numbers
     feed.estimator.configure(BAD_GAINS)
-    words = feed.sine(1000)
-    assert any(w & Status.DIVERGED for w in words)
+    assert any(w & Status.DIVERGED for w in feed.sine(1000))
     assert np.isfinite([*feed.numbers, *feed.estimator.estimate.innovation]).all()
-    feed.estimator.configure(good)
+    feed.estimator.configure({k: ONLINE_PARAMETERS[k].default for k in BAD_GAINS})
     seen = feed.estimator.counters.divergences
     feed.sine(3000)
     assert feed.estimator.counters.divergences <= seen + 1
@@ -195,7 +175,7 @@ def test_spikes_beyond_epsilon_are_no_divergence_while_y_is_found_again():
 
 def test_divergence_time_zero_never_starts_afresh():
     feed = Feed(divergence_time=0.0, epsilon=1e-9)
-    feed.sine(3000)
+    feed.sine(2000)
     assert feed.events == {}
 
 
@@ -242,9 +222,8 @@ def test_reset_keeps_counters_and_forgets_the_rest():
     feed.sine(100)
     feed(math.nan)
     feed.estimator.reset()
-    assert feed.estimator.estimate is None
-    assert feed.estimator.stamp is None
-    assert feed.estimator.period == 0.0
+    e = feed.estimator
+    assert (e.estimate, e.stamp, e.period) == (None, None, 0.0)
     fresh.count = feed.count = 7  # stamps before those of the time before
     for f in (feed, fresh):
         f.sine(50)

@@ -4,7 +4,7 @@
 import bag_files as files
 from fhaosmo_ros.core import ConfigurationError, EventDetector, OnlineEstimator
 from fhaosmo_ros.core.observer.estimates import TUNING
-from fhaosmo_ros.core.observer.status import REJECTED, Status
+from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.tools.bags.topics import messages, series
 from fhaosmo_ros.tools.plot import command as plot
@@ -150,20 +150,18 @@ CASES = {
     'change': MODEL | FIXED | {'event_threshold': 0.4, 'event_change_time': 2.0},
     'self-tuning': MODEL | {'gains': 'self_tuning', 'event_deviations': 5.0},
 }
+TOLD = CASES['self-tuning']
 
 
 @pytest.fixture(scope='module')
 def samples():
     """y of z1' = -z1 + d at 100 Hz with jitter, outliers and a gap, d = 1 from 10 s to 16 s."""
-    rng = np.random.default_rng(4)
-    count = 2400
+    rng, count = np.random.default_rng(4), 2400
     t = 0.01 * np.arange(count) + 1e-3 * rng.uniform(-1, 1, count)
     t[2000:] += 0.7
-    d = (t > 10.0) & (t < 16.0)
-    z = 0.0
-    y = np.empty(count)
+    z, y = 0.0, np.empty(count)
     for k, h in enumerate(np.diff(t, prepend=t[0])):
-        z = np.exp(-h) * z + (1.0 - np.exp(-h)) * d[k]
+        z = np.exp(-h) * z + (1.0 - np.exp(-h)) * (10.0 < t[k] < 16.0)
         y[k] = z + 1e-3 * rng.standard_normal()
     y[[400, 1250, 1251]] += 5.0
     y[700] = np.nan
@@ -208,96 +206,57 @@ def test_standard_deviations_that_nobody_knows_are_refused():
 # Of a replay: events, standard deviations and tuning in bags, in tables and in figures
 
 
-FIRST_SAMPLES = 50
-"""Samples from which a self-tuning estimator begins, at most."""
-TOLD = {'order': 1, 'phi': ['-z1'], 'gains': 'self_tuning', 'event_deviations': 5.0}
-OPTIONS = [word for name, value in TOLD.items() for word in ('-p', f'{name}:={value}')]
-
-
 @pytest.fixture(scope='module')
-def recorded(tmp_path_factory):
-    """A bag of 16 s at 100 Hz of z1' = -z1 + d, d = 1 from 10 s to 14 s, and its samples."""
-    stamps = files.ORIGIN + 10_000_000 * np.arange(1600)
-    d = (np.arange(1600) > 1000) & (np.arange(1600) < 1400)
-    z = np.zeros(1600)
-    for k in range(1599):
-        z[k + 1] = 0.99 * z[k] + 0.01 * d[k]
-    y = z + 1e-3 * np.random.default_rng(2).standard_normal(1600)
+def recorded(samples, tmp_path_factory):
+    """A bag, its replay in three forms, and what a node's estimator finds of its samples."""
+    stamps, y = (values[:1900] for values in samples)
     folder = tmp_path_factory.mktemp('events')
     bag = files.write(folder / 'bag', files.floats(stamps, y))
     outputs = [folder / name for name in ('out', 'out.csv', 'out.npz')]
     words = [word for output in outputs for word in ('-o', str(output))]
-    assert replay.main([str(bag), *words, *OPTIONS]) == 0
-    estimator = OnlineEstimator(TOLD)
-    rows = estimator.run(stamps, y)
-    used = (rows.status & REJECTED) == 0
-    lasts = np.zeros(len(y), dtype=int)
-    events = estimator.events.taken()
-    for event in events:
-        lasts[event.sample :] = event.begins
-    return outputs, rows.standard_deviation[used], lasts[used], events
-
-
-@pytest.fixture(scope='module')
-def tuning(recorded):
-    """What a node's estimator has found after each sample that it uses, one by one."""
-    (bag, *_), *_ = recorded
+    words += [word for name, value in TOLD.items() for word in ('-p', f'{name}:={value}')]
+    assert replay.main([str(bag), *words]) == 0
     estimator, found = OnlineEstimator(TOLD), []
-    y = series(bag, '/y')
-    for stamp, value in zip(y.stamps.tolist(), y.values.tolist(), strict=True):
+    for stamp, value in zip(stamps.tolist(), y.tolist(), strict=True):
         if not estimator.update(stamp, value).status.rejected:
             noise, correlation, bandwidth, shares = estimator.observer.tuning
-            found.append([noise, correlation, bandwidth, *shares])
-    return np.array(found)
+            tuning = [noise, correlation, bandwidth, *shares]
+            found.append([*tuning, estimator.events.active, *estimator.standard_deviation])
+    return outputs, np.array(found), estimator.events.taken()
 
 
-def test_tuning_is_the_nodes_to_the_last_bit(recorded, tuning):
-    (bag, csv, npz), *_ = recorded
+def test_bag_and_tables_have_what_the_node_finds_to_the_last_bit(recorded):
+    (bag, csv, npz), found, events = recorded
     of_bag = series(bag, '/estimator/tuning')
     assert of_bag.labels == TUNING
-    np.testing.assert_array_equal(of_bag.values, tuning)
-    known = np.isfinite(tuning).all(axis=1)
-    assert 0 < np.argmax(known) <= FIRST_SAMPLES
-    assert known[FIRST_SAMPLES:].all()
-    np.testing.assert_allclose(tuning[known, 3:].sum(axis=1), 1.0, rtol=1e-12)
-    assert tuning[-1, 0] == pytest.approx(1e-3, rel=0.15)
+    np.testing.assert_array_equal(of_bag.values, found[:, :7])
+    known = np.isfinite(found[:, :7]).all(axis=1)
+    assert 0 < np.argmax(known) <= 50  # a self-tuning estimator begins by then
+    np.testing.assert_allclose(found[known, 3:7].sum(axis=1), 1.0, rtol=1e-12)
+    assert found[-1, 0] == pytest.approx(1e-3, rel=0.15)
     of_csv = np.genfromtxt(csv, delimiter=',', names=True)
+    names = [*(f'tuning_{name}' for name in TUNING), 'event', 'std_z1', 'std_unknown_input']
     with np.load(npz) as of_npz:
-        for name, column in zip(TUNING, tuning.T, strict=True):
-            np.testing.assert_array_equal(of_npz[f'tuning_{name}'], column)
-            np.testing.assert_array_equal(of_csv[f'tuning_{name}'], column)
-
-
-def test_the_bag_has_what_the_library_finds(recorded):
-    (bag, *_), deviation, _, events = recorded
+        for name, column in zip(names, found.T, strict=True):
+            np.testing.assert_array_equal(of_npz[name], column)
+            np.testing.assert_array_equal(of_csv[name], column)
     assert [e.begins for e in events[:2]] == [True, False]
-    found = [
+    told = [
         (m.header.stamp.sec * 10**9 + m.header.stamp.nanosec, bool(m.status[0].level))
         for _, m in messages(bag, '/estimator/event')
     ]
-    assert found == [(e.stamp, e.begins) for e in events]
+    assert told == [(e.stamp, e.begins) for e in events]
     (curves,) = read_curves(bag, None, '/plant')
-    np.testing.assert_array_equal(curves.deviation, deviation)
+    np.testing.assert_array_equal(curves.deviation, found[:, 8:])
     assert curves.events[0] == (events[0].since, events[1].stamp)
 
 
-def test_tables_say_at_each_sample_whether_an_event_lasts(recorded):
-    (_, csv, npz), deviation, lasts, _ = recorded
-    with np.load(npz) as found:
-        of_npz = {name: found[name] for name in found.files}
-    np.testing.assert_array_equal(of_npz['event'], lasts)
-    np.testing.assert_array_equal(of_npz['std_unknown_input'], deviation[:, 1])
-    of_csv = np.genfromtxt(csv, delimiter=',', names=True)
-    np.testing.assert_array_equal(of_csv['event'], lasts)
-    np.testing.assert_array_equal(of_csv['std_z1'], deviation[:, 0])
-
-
 def test_the_figure_shows_band_and_events(recorded, tmp_path, monkeypatch):
-    (bag, *_), _, _, events = recorded
+    (bag, *_), _, events = recorded
     bands, shaded = [], []
     monkeypatch.setattr('matplotlib.axes.Axes.fill_between', lambda *a, **_: bands.append(a))
     monkeypatch.setattr('matplotlib.axes.Axes.axvspan', lambda *a, **_: shaded.append(a[1:]))
     assert plot.main([str(bag), '-o', str(tmp_path / 'figure.svg')]) == 0
     assert len(bands) == 2  # of z1 and of d
-    first = (events[0].since - files.ORIGIN) * 1e-9
+    first = (events[0].since - BEGIN) * 1e-9
     assert min(begin for begin, _ in shaded) == pytest.approx(first, abs=0.02)

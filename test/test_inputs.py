@@ -20,13 +20,10 @@ for name, text in (('Inner', INNER), ('Outer', OUTER)):
     STORE.register(get_types_from_msg(text, f'rig/msg/{name}'))
 
 
-@pytest.mark.parametrize(
-    ('path', 'number'),
-    [
-        ('count', -7.0), ('three[2]', 2.5), ('parts[1].force', 1.5), ('parts[0].on[1]', 1.0),
-        ('parts[2].force', None), ('parts[1].on[0]', None), ('header.stamp.sec', 1.0),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(('path', 'number'), [
+    ('count', -7.0), ('three[2]', 2.5), ('parts[1].force', 1.5), ('parts[0].on[1]', 1.0),
+    ('parts[2].force', None), ('parts[1].on[0]', None), ('header.stamp.sec', 1.0),
+])  # fmt: skip
 def test_numbers_at_any_depth(path, number):
     """None: this message's lists are too short, others' may be longer."""
     inner, outer = (STORE.types[f'rig/msg/{name}'] for name in ('Inner', 'Outer'))
@@ -51,16 +48,12 @@ def joints(names, positions):
     return STORE.types[JOINTS](header=header, name=names, **lists)
 
 
-@pytest.mark.parametrize(
-    ('text', 'names', 'positions', 'problem'),
-    [
-        ('position[elbow]', ['hip', 'elbow'], [1.0, 2.0], ''),
-        ('position[1]', [], [1.0, 2.0], ''),
-        ('position[1]', [], [1.0], '1 in one message, got 1'),
-        ('position[elbow]', ['hip', 'elbw'], [1.0, 2.0], "did you mean 'elbw'"),
-        ('position[elbow]', ['hip', 'elbow'], [1.0], "none for 'elbow'"),
-    ],
-)
+@pytest.mark.parametrize(('text', 'names', 'positions', 'problem'), [
+    ('position[elbow]', ['hip', 'elbow'], [1.0, 2.0], ''), ('position[1]', [], [1.0, 2.0], ''),
+    ('position[1]', [], [1.0], '1 in one message, got 1'),
+    ('position[elbow]', ['hip', 'elbw'], [1.0, 2.0], "did you mean 'elbw'"),
+    ('position[elbow]', ['hip', 'elbow'], [1.0], "none for 'elbow'"),
+])  # fmt: skip
 def test_element_of_a_list_by_index_and_by_name(text, names, positions, problem):
     field = find_field(STORE.fielddefs, JOINTS, text)
     message = joints(names, positions)
@@ -98,9 +91,9 @@ def fed(pairing, events):
     return found + list(pairing.released(at_once=True))
 
 
-def newest(stamps, values, at, before=0.0):
-    """The zero-order hold that is meant: the newest value not stamped after each time."""
-    return np.concatenate([[before], values])[np.searchsorted(stamps, at, side='right')]
+def newest(stamps, values, at):
+    """The zero-order hold that is meant: the newest value not stamped after each time, or 0."""
+    return np.concatenate([[0.0], values])[np.searchsorted(stamps, at, side='right')]
 
 
 @settings(max_examples=60, deadline=None)
@@ -114,16 +107,13 @@ def test_order_of_arrival_within_the_wait_changes_nothing(seed, spacing, latest)
     def arriving(stamps):  # a topic keeps its own order
         return np.maximum.accumulate(stamps + rng.integers(0, latest * MS + 1, len(stamps)))
 
-    events = [
-        (at, 'y', stamp, k) for k, (at, stamp) in enumerate(zip(arriving(y), y, strict=True))
-    ]
+    events = list(zip(arriving(y), ['y'] * 40, y, range(40), strict=True))
     for j in range(2):
         events += zip(arriving(u[j]), [j] * 60, u[j], values[j], strict=True)
     pairing = StampPairing([True, True], (2 * latest + 20) * MS, GAP, [0.0, 0.0])
     found = fed(pairing, events)
-    assert [sample for sample, _ in found] == list(range(40))
     expected = np.column_stack([newest(u[j], values[j], y) for j in range(2)])
-    np.testing.assert_array_equal([row for _, row in found], expected)
+    assert found == [(k, row) for k, row in enumerate(expected.tolist())]
 
 
 def test_without_a_wait_the_newest_that_is_there_acts_and_late_ones_are_counted():

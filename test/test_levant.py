@@ -17,7 +17,7 @@ from fhaosmo_ros.core.simulation.metrics import rms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
-from observer_cases import VARIANTS
+from observer_cases import powers, VARIANTS
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -28,15 +28,16 @@ PHI = {
     3: (
         ['sin(z1)', 'u*z2', '-z3 - z1*tanh(z3)'],
         [
-            lambda z, u: math.sin(z[0]),
-            lambda z, u: u * z[1],
+            lambda z, u: math.sin(z[0]), lambda z, u: u * z[1],
             lambda z, u: -z[2] - z[0] * math.tanh(z[2]),
         ],
     ),
-}
+}  # fmt: skip
+INTEGRATORS = {'structure': 'levant', 'order': 3, 'phi': ['0'] * 3, 'variant': 'sign'}
 # Levant's gains for a last derivative bounded by L: lambda_i = C_i L^(i / N).
-COEFFICIENTS = {2: (1.5, 1.1), 4: (3.0, 4.16, 3.06, 1.1)}
-COEFFICIENTS[6] = (7.0, 23.72, 32.24, 20.26, 6.75, 1.1)
+COEFFICIENTS = {
+    2: (1.5, 1.1), 4: (3.0, 4.16, 3.06, 1.1), 6: (7.0, 23.72, 32.24, 20.26, 6.75, 1.1),
+}  # fmt: skip
 SCHEMES = ['implicit', 'predict_correct']
 WIDTHS = [0.3, 0.05]
 
@@ -47,11 +48,12 @@ def gains(levels, bound):
 
 def parameters(n, derivatives=0, **others):
     levels = n + 1 + derivatives
-    p = {'structure': 'levant', 'order': n, 'phi': PHI[n][0], 'lambda': gains(levels, 3.0)}
-    p |= {'unknown_input_derivatives': derivatives}
-    p |= {'fuzzy_widths': WIDTHS, 'gamma_initial': 0.7, 'gamma_rate': 0.0, 'gamma_leakage': 0.0}
-    p |= {'initial_estimate': list(np.linspace(0.1, -0.2, levels))}
-    return p | {'start_from_measurement': False, 'unknown_input_decay': 0.0} | others
+    return {
+        'structure': 'levant', 'order': n, 'phi': PHI[n][0], 'lambda': gains(levels, 3.0),
+        'unknown_input_derivatives': derivatives, 'unknown_input_decay': 0.0,
+        'fuzzy_widths': WIDTHS, 'gamma_initial': 0.7, 'gamma_rate': 10.0, 'gamma_leakage': 1.0,
+        'initial_estimate': list(np.linspace(0.1, -0.2, levels)), 'start_from_measurement': False,
+    } | others  # fmt: skip
 
 
 def signals(steps=100):
@@ -86,8 +88,7 @@ class Reference:
         return np.array([g * abs(e) ** p * self.psi(i, e) for i, (g, p) in enumerate(terms)])
 
     def known(self, y, u):
-        point = [y, *self.z[1:]]
-        return self.model(np.array(point), u)
+        return self.model(np.array([y, *self.z[1:]]), u)
 
     def model(self, point, u):
         return np.array([*(f(point, u) for f in self.phi), *(-self.decay * point[self.n :])])
@@ -155,6 +156,7 @@ def test_run_follows_the_equations(scheme, variant, n, decay, derivatives):
     np.testing.assert_array_equal(result.unknown_input, result.z_hat[:, n])
     np.testing.assert_allclose(result.innovation[:, 0], y - result.z_hat[:, 0])
     np.testing.assert_array_equal(result.innovation[1:, 1:], 0.0)
+    np.testing.assert_array_equal(result.gamma, reference.gamma)  # nothing moves it here
 
 
 def test_two_levels_are_the_super_twisting_pair():
@@ -172,8 +174,7 @@ def test_two_levels_are_the_super_twisting_pair():
 )
 def test_polynomial_of_the_observers_degree_is_followed_exactly(scheme, h):
     """Its fourth derivative is 0, which is less than any bound L > 0: nothing is left."""
-    p = {'structure': 'levant', 'order': 3, 'phi': ['0'] * 3, 'variant': 'sign'}
-    p |= {'scheme': scheme, 'lambda': gains(4, 1.0), 'prediction_step': h}
+    p = INTEGRATORS | {'scheme': scheme, 'lambda': gains(4, 1.0), 'prediction_step': h}
     t = np.arange(round(20.0 / h)) * h
     polynomial = np.polynomial.Polynomial([0.5, -0.3, 0.04, 0.005])
     run, late = Observer(p).run(t, polynomial(t)), t > 15.0
@@ -216,36 +217,28 @@ def test_prediction_step_divides_a_long_interval(variant):
 
 
 @pytest.mark.parametrize('scheme', SCHEMES)
-@pytest.mark.parametrize('level', [0, 1, 2, 3])
-def test_errors_shrink_with_the_step_as_levants_theorem_says(scheme, level):
+def test_errors_shrink_with_the_step_as_levants_theorem_says(scheme):
     """|error of z_i| <= mu_i L^(..) h^(N - i + 1); here at least order 1."""
-    p = {'structure': 'levant', 'order': 3, 'phi': ['0'] * 3, 'variant': 'sign'}
     steps, errors = [8e-3, 4e-3, 2e-3], []
     for h in steps:
         t = np.arange(round(20.0 / h)) * h
-        run = Observer(p | {'scheme': scheme, 'lambda': gains(4, 1.5)}).run(t, np.sin(t))
-        truth = np.array([np.sin, np.cos, lambda t: -np.sin(t), lambda t: -np.cos(t)][level](t))
-        errors.append(rms((run.z_hat[:, level] - truth)[t > 10.0]))
-    if max(errors) > 1e-12:
-        slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
-        assert slope > 0.8
+        run = Observer(INTEGRATORS | {'scheme': scheme, 'lambda': gains(4, 1.5)}).run(t, np.sin(t))
+        truth = np.stack([np.sin(t), np.cos(t), -np.sin(t), -np.cos(t)], axis=1)
+        errors.append([rms(e) for e in (run.z_hat - truth)[t > 10.0].T])
+    for error in np.transpose(errors):
+        assert max(error) < 1e-12 or np.polyfit(np.log(steps), np.log(error), 1)[0] > 0.8
 
 
 @settings(max_examples=40)
 @given(st.floats(1e-3, 1e3), st.sampled_from(SCHEMES))
 def test_sign_is_homogeneous(scale, scheme):
     """Time scaled by k, y by k^N: z_hat_i scales by k^(N - i + 1) (degree -1)."""
-    p = {'structure': 'levant', 'order': 3, 'phi': ['0'] * 3, 'scheme': scheme}
-    p |= {'variant': 'sign', 'lambda': gains(4, 3.0)}
+    p = INTEGRATORS | {'scheme': scheme, 'lambda': gains(4, 3.0)}
     t, y, _ = signals(50)
     one = Observer(p).run(t, y).z_hat
     other = Observer(p).run(scale * t, scale**4 * y).z_hat
     weights = scale ** np.arange(4.0, 0.0, -1.0)
     np.testing.assert_allclose(other / weights, one, rtol=1e-6, atol=1e-6 * np.abs(one).max())
-
-
-def powers(low, high):
-    return st.floats(low, high).map(lambda x: 10.0**x)
 
 
 @settings(max_examples=400)
@@ -260,17 +253,16 @@ def test_root(variant, b, h, gamma, lambdas, width):
     weights = np.array(lambdas) * h ** np.arange(1, 5)
     eps, w, top = levant.solve(weights, b, gamma)
     s = np.array([levant.curve(i, eps)[0] for i in range(4)]) if eps > 0.0 else np.zeros(4)
-    if eps > 0.0:
-        assert s[3] == top
-        if eps > 1e-299:
-            np.testing.assert_allclose(w, eps ** (gamma / 2.0), rtol=1e-12)
+    assert eps == 0.0 or s[3] == top
+    if eps > 1e-299:
+        np.testing.assert_allclose(w, eps ** (gamma / 2.0), rtol=1e-12)
     s[3] = top
     assert np.all((s >= 0.0) & (s <= 1.0))
     terms = np.append(weights * w ** np.arange(3, -1, -1) * s, eps)
     np.testing.assert_allclose(terms.sum(), b, rtol=1e-11)
 
 
-@pytest.mark.parametrize('scheme', ['implicit', 'predict_correct'])
+@pytest.mark.parametrize('scheme', SCHEMES)
 def test_gamma_of_next_to_nothing_is_the_limit_of_small_ones(scheme):
     p = {'structure': 'levant', 'scheme': scheme, 'variant': 'fuzzy_adaptive', 'gamma_rate': 0.0}
     p |= {'lambda': [39.75, 276.3, 1498.0, 3260.0], 'fuzzy_widths': 4.0}
@@ -283,25 +275,3 @@ def test_gamma_of_next_to_nothing_is_the_limit_of_small_ones(scheme):
     assert 0.0 < error < 1e-2
     for z_hat in rest:
         np.testing.assert_allclose(z_hat, smaller, rtol=0.0, atol=2e-3 * error)
-
-
-def test_more_levels_follow_a_smooth_unknown_input_closer():
-    t = np.arange(4000) * 5e-3
-    p = {'structure': 'levant', 'order': 1, 'phi': ['0'], 'variant': 'sign'}
-    p |= {'scheme': 'predict_correct'}
-    errors = []
-    for k in (0, 2):
-        q = p | {'unknown_input_derivatives': k, 'lambda': gains(2 + k, 1.5)}
-        run = Observer(q).run(t, np.sin(t))
-        errors.append(rms((run.unknown_input - np.cos(t))[t > 10.0]))
-    assert errors[1] < 0.05 * errors[0]
-
-
-@pytest.mark.parametrize('scheme', SCHEMES)
-def test_gamma_is_held(scheme):
-    t, y, u = signals()
-    p = parameters(3, scheme=scheme, variant='fuzzy_adaptive')
-    held = Observer(p).run(t, y, u)
-    learning = Observer(p | {'gamma_rate': 10.0, 'gamma_leakage': 1.0}).run(t, y, u)
-    np.testing.assert_array_equal(held.z_hat, learning.z_hat)
-    np.testing.assert_array_equal(learning.gamma, 0.7)

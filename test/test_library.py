@@ -17,51 +17,40 @@ T = np.arange(50) * 1e-3
 Y = 0.1 * np.sin(T)
 
 
-@pytest.fixture
-def gains(tmp_path):
+kinds = pytest.mark.parametrize('kind', [Observer, OnlineEstimator])
+
+
+@kinds
+def test_file_of_parameters(kind, tmp_path):
     path = tmp_path / 'gains.yaml'
     path.write_text(dumps(GAINS, 'estimator'))
-    return path
+    found = kind.from_yaml(path).parameters
+    assert found == kind(GAINS).parameters  # also what is not the observer's
+    assert all(found[name] == GAINS[name] for name in found.keys() & GAINS.keys())
+    assert ('divergence_time' in found) == (kind is OnlineEstimator)
+    for changes, said in (
+        ({'gamma_min': 0.97}, 'gamma_min'), ({'lamda': 1.0}, "'lambda'"),
+        ({'phi': ['0', 'b']}, 'b'),
+    ):  # fmt: skip
+        path.write_text(dumps(GAINS | changes, 'estimator'))
+        with pytest.raises(ConfigurationError, match=said) as error:
+            kind.from_yaml(path)
+        assert str(error.value).startswith(f'{path}: ')
+        assert str(error.value).count(str(path)) == 1
 
 
-@pytest.mark.parametrize('kind', [Observer, OnlineEstimator])
-def test_file_of_parameters(kind, gains):
-    found = kind.from_yaml(gains)
-    for name, value in GAINS.items():
-        if name in found.parameters:
-            assert found.parameters[name] == value
-    assert found.parameters == kind(GAINS).parameters  # also what is not the observer's
-    assert ('divergence_time' in found.parameters) == (kind is OnlineEstimator)
-
-
-@pytest.mark.parametrize('kind', [Observer, OnlineEstimator])
+@kinds
 def test_channel_of_a_node(kind, tmp_path):
-    path = tmp_path / 'rig.yaml'
+    path, node = tmp_path / 'rig.yaml', '/rig/observer'
     own = {'channels': ['hip', 'knee'], 'knee.constants.k': 3.0, 'knee.lambda': [1.0, 2.0, 3.0]}
-    path.write_text(dumps(GAINS | own, '/rig/observer'))
-    hip, knee = (
-        kind.from_yaml(path, '/rig/observer', name).parameters for name in ('hip', 'knee')
-    )
+    path.write_text(dumps(GAINS | own, node))
+    hip, knee = (kind.from_yaml(path, node, name).parameters for name in ('hip', 'knee'))
     assert (hip['constants.k'], hip['lambda']) == (2.0, [3.0, 4.0, 5.0])
     assert (knee['constants.k'], knee['lambda']) == (3.0, [1.0, 2.0, 3.0])
     with pytest.raises(ConfigurationError, match=r'rig\.yaml: .*hip or knee, got none'):
-        kind.from_yaml(path, '/rig/observer')
+        kind.from_yaml(path, node)
     with pytest.raises(ConfigurationError, match=r"rig\.yaml: expected a section 'estimator'"):
         kind.from_yaml(path)
-
-
-@pytest.mark.parametrize('kind', [Observer, OnlineEstimator])
-def test_error_begins_with_the_path(kind, gains):
-    for changes, said in (
-        ({'gamma_min': 0.97}, 'gamma_min'),
-        ({'lamda': 1.0}, "'lambda'"),
-        ({'phi': ['0', 'b']}, 'b'),
-    ):
-        gains.write_text(dumps(GAINS | changes, 'estimator'))
-        with pytest.raises(ConfigurationError, match=said) as error:
-            kind.from_yaml(gains)
-        assert str(error.value).startswith(f'{gains}: ')
-        assert str(error.value).count(str(gains)) == 1
 
 
 def test_without_u_the_inputs_that_are_held_go_on():
@@ -102,10 +91,9 @@ def test_columns_of_a_table_are_taken():
 def test_input_that_phi_uses_must_be_given():
     observer = Observer(OSCILLATOR)
     for call in (
-        lambda: observer.run(T, Y),
-        lambda: observer.smooth(T, Y),
+        lambda: observer.run(T, Y), lambda: observer.smooth(T, Y),
         lambda: observer.step(0.1, 1e-3),
-    ):
+    ):  # fmt: skip
         with pytest.raises(ConfigurationError, match='expected values of u'):
             call()
     assert not observer.started

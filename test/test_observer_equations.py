@@ -14,7 +14,7 @@ import math
 from fhaosmo_ros.core import Observer
 from fhaosmo_ros.core.observer.fuzzy import curves
 import numpy as np
-from observer_cases import VARIANTS
+from observer_cases import levels_of, VARIANTS
 import pytest
 from scipy.optimize import brentq
 
@@ -33,19 +33,11 @@ PHI = {
         ['sin(z1)', '-z2*z2*z1 - 0.3*u'],
         [lambda z, u: cmath.sin(z[0]), lambda z, u: -z[1] * z[1] * z[0] - 0.3 * u],
     ),
-    3: (
-        ['0', 'u*sin(z2)', '-z3 - z1*tanh(z3)'],
-        [
-            lambda z, u: 0.0,
-            lambda z, u: u * cmath.sin(z[1]),
-            lambda z, u: -z[2] - z[0] * cmath.tanh(z[2]),
-        ],
-    ),
     4: (
-        ['0.1*z1', '0', '-0.2*z1*z3', 'tanh(z4)*z2 - u*z3'],
+        ['0.1*z1', 'u*sin(z2)', '-0.2*z1*z3', 'tanh(z4)*z2 - u*z3'],
         [
             lambda z, u: 0.1 * z[0],
-            lambda z, u: 0.0,
+            lambda z, u: u * cmath.sin(z[1]),
             lambda z, u: -0.2 * z[0] * z[2],
             lambda z, u: cmath.tanh(z[3]) * z[1] - u * z[2],
         ],
@@ -175,25 +167,17 @@ def parameters(n, extra, **others):
     rng = np.random.default_rng(n)
     levels = n + extra
     return {
-        'order': n,
-        'phi': PHI[n][0],
-        'unknown_input': extra,
-        'unknown_input_decay': 0.0,
+        'order': n, 'phi': PHI[n][0], 'unknown_input': extra, 'unknown_input_decay': 0.0,
         'lambda': list(3.0 + 2.0 * rng.random(levels)),
         'alpha': list(4.0 + 3.0 * rng.random(levels)),
-        'epsilon': 0.2,
-        'fuzzy_widths': [0.05, 0.3][:levels],
-        'fuzzy_systems': ['terms 5', 'terms 7'],
-        'gamma_initial': 0.5,
+        'epsilon': 0.2, 'fuzzy_widths': [0.05, 0.3][:levels],
+        'fuzzy_systems': ['terms 5', 'terms 7'], 'gamma_initial': 0.5,
         'gamma_rate': 0.5,  # fast, so that gamma matters within the horizon
-        'gamma_min': 0.2,
-        'gamma_max': 0.9,
-        'gamma_dead_zone': 0.0,
-        'gamma_leakage': 0.0,
+        'gamma_min': 0.2, 'gamma_max': 0.9, 'gamma_dead_zone': 0.0, 'gamma_leakage': 0.0,
         'initial_estimate': list(rng.uniform(-0.2, 0.2, levels)),
         'initial_internal': list(rng.uniform(-0.2, 0.2, levels)),
         'start_from_measurement': False,
-    } | others
+    } | others  # fmt: skip
 
 
 def signals(steps=300):
@@ -206,25 +190,23 @@ def signals(steps=300):
 
 def compare(p, rtol=1e-9):
     t, y, u = signals()
-    result = Observer(p).run(t, y, u)
-    reference = Reference(p, PHI[p['order']][1], y[0])
-    hat, tilde, gamma, opened = [], [], [], []
+    observer, reference = Observer(p), Reference(p, PHI[p['order']][1], y[0])
+    result = observer.run(t, y, u)
+    rows = []
     for k in range(len(t)):
         if k > 0:
             reference.step(y[k], t[k] - t[k - 1], u[k])
-        hat.append([v.real for v in reference.hat])
-        tilde.append([v.real for v in reference.tilde])
-        gamma.append(reference.gamma)
-        opened.append(reference.open())
-    np.testing.assert_allclose(result.z_hat, hat, rtol=rtol, atol=rtol)
-    np.testing.assert_allclose(result.z_tilde, tilde, rtol=rtol, atol=rtol)
-    np.testing.assert_allclose(result.gamma, gamma, rtol=rtol)
-    np.testing.assert_array_equal(result.open_levels, opened)
+        rows.append([*reference.hat, *reference.tilde, reference.gamma, reference.open()])
+    found = [result.z_hat, result.z_tilde, result.gamma[:, None], result.open_levels[:, None]]
+    np.testing.assert_allclose(np.hstack(found), np.real(rows), rtol=rtol, atol=rtol)
+    if p['variant'].endswith('_adaptive') and p['gamma_rate'] > 0.0:
+        sensitivities = [[slope(v) for v in row] for row in (reference.hat, reference.tilde)]
+        np.testing.assert_allclose(levels_of(observer)[2:], sensitivities, rtol=rtol, atol=rtol)
     return result
 
 
 @pytest.mark.parametrize('extra', [False, True], ids=['N=n', 'N=n+1'])
-@pytest.mark.parametrize('n', [1, 2, 3, 4])
+@pytest.mark.parametrize('n', [1, 2, 4])
 @pytest.mark.parametrize('variant', VARIANTS)
 @pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
 def test_run_follows_the_equations(scheme, variant, n, extra):
@@ -238,23 +220,17 @@ def test_run_follows_the_equations(scheme, variant, n, extra):
 
 
 @pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
-@pytest.mark.parametrize(
-    'options',
-    [
-        {'gamma_rate': 0.0, 'gamma_initial': 0.7},
-        {'gamma_leakage': 2.0},
-        {'gamma_dead_zone': 0.1},
-        {'gamma_dead_zone': 0.1, 'gamma_leakage': 3.0},
-        {'gamma_min': 0.499, 'gamma_max': 0.501},
-        {'gamma_rate': 0.0, 'gamma_leakage': 5.0, 'gamma_initial': 0.31, 'gamma_min': 0.3},
-        {'fuzzy_systems': ['terms gaussian 5', 'terms trapezoid 7']},
-        {'start_from_measurement': True, 'fuzzy_widths': [0.02]},
-        {'epsilon': 1e3},
-        {'unknown_input_decay': 5.0},
-        {'unknown_input_decay': 5.0, 'unknown_input': False, 'epsilon': 1e3},
-    ],
-    ids=lambda options: '-'.join(options),
-)
+@pytest.mark.parametrize('options', [
+    {'gamma_rate': 0.0, 'gamma_initial': 0.7},
+    {'gamma_leakage': 2.0},
+    {'gamma_dead_zone': 0.1, 'gamma_leakage': 3.0},
+    {'gamma_min': 0.499, 'gamma_max': 0.501},
+    {'gamma_rate': 0.0, 'gamma_leakage': 5.0, 'gamma_initial': 0.31, 'gamma_min': 0.3},
+    {'fuzzy_systems': ['terms gaussian 5', 'terms trapezoid 7']},
+    {'start_from_measurement': True, 'fuzzy_widths': [0.02]},
+    {'epsilon': 1e3, 'unknown_input_decay': 5.0},
+    {'epsilon': 1e3, 'unknown_input_decay': 5.0, 'unknown_input': False},
+], ids='-'.join)  # fmt: skip
 def test_options_follow_the_equations(scheme, options):
     extra = options.get('unknown_input', True)
-    compare(parameters(3, extra, scheme=scheme, variant='fuzzy_adaptive') | options)
+    compare(parameters(2, extra, scheme=scheme, variant='fuzzy_adaptive') | options)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What holds for every observer: splits, snapshots, symmetry, what an estimate is."""
+"""What holds for every observer: splits, snapshots, times, symmetry, what an estimate is."""
 
-from fhaosmo_ros.core import Observer
+from fhaosmo_ros.core import ConfigurationError, Observer
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -14,7 +14,7 @@ from observer_cases import (
     samples,
     SMALL,
     state_of,
-)
+)  # fmt: skip
 import pytest
 
 
@@ -34,20 +34,15 @@ def test_split_run_equals_whole_run(law, a, b):
 def test_steps_equal_a_run(law):
     t, y, u = samples()
     expected = Observer(SMALL | law).run(t, y, u)
-    observer = Observer(SMALL | law)
-    latest = t[0]
+    observer, latest = Observer(SMALL | law), t[0]
     for k in range(len(t)):
         if observer.started:
             estimate = observer.step(y[k], t[k] - latest, u[k])
         else:
             estimate = observer.start(y[k])
         latest = max(latest, t[k])
-        np.testing.assert_array_equal(estimate.z, expected.z[k])
-        assert estimate.unknown_input == expected.unknown_input[k]
-        assert estimate.gamma == expected.gamma[k]
-        np.testing.assert_array_equal(estimate.innovation, expected.innovation[k])
-        assert estimate.status == expected.status[k]
-        assert estimate.open_levels == expected.open_levels[k]
+        for name in ('z', 'unknown_input', 'gamma', 'innovation', 'status', 'open_levels'):
+            np.testing.assert_array_equal(getattr(estimate, name), getattr(expected, name)[k])
 
 
 def test_snapshot_is_a_copy():
@@ -57,20 +52,17 @@ def test_snapshot_is_a_copy():
     snapshot['z_hat'][:] = 7.0
     assert not np.any(remembered(observer, 'z_hat') == 7.0)
     estimate = observer.step(0.1, 1e-3, 0.0)
-    z, innovation = estimate.z.copy(), estimate.innovation.copy()
+    values = [*estimate.z, *estimate.innovation]
     observer.step(5.0, 1e-3, 0.0)
-    np.testing.assert_array_equal(estimate.z, z)
-    np.testing.assert_array_equal(estimate.innovation, innovation)
+    assert [*estimate.z, *estimate.innovation] == values
 
 
 def test_snapshot_of_another_variant_gives_a_power_that_fits():
     adaptive = Observer(SMALL | {'variant': 'fuzzy_adaptive', 'gamma_initial': 0.7})
-    sign = Observer(SMALL | {'variant': 'sign'})
-    sign.structure.load_state_dict(state_of(adaptive))
-    assert remembered(sign, 'gamma') == 0.5
-    narrow = Observer(SMALL | {'variant': 'fuzzy_adaptive', 'gamma_max': 0.6})
-    narrow.structure.load_state_dict(state_of(adaptive))
-    assert remembered(narrow, 'gamma') == 0.6
+    for other, power in ({'variant': 'sign'}, 0.5), ({'gamma_max': 0.6}, 0.6):
+        observer = Observer(SMALL | {'variant': 'fuzzy_adaptive'} | other)
+        observer.structure.load_state_dict(state_of(adaptive))
+        assert remembered(observer, 'gamma') == power
 
 
 def test_reset_equals_a_new_observer():
@@ -94,9 +86,6 @@ def test_every_kth_row_is_the_row_of_the_full_run(law, every):
     np.testing.assert_array_equal(thin.status, np.bitwise_or.reduce(groups, axis=1))
 
 
-# Symmetry
-
-
 @laws
 @pytest.mark.parametrize('phi', [['0', '0', '-z3'], ['sin(z1)', 'z2**3 - z1', 'tanh(z3) + u']])
 def test_odd_model_gives_an_odd_estimate(law, phi):
@@ -107,9 +96,6 @@ def test_odd_model_gives_an_odd_estimate(law, phi):
         np.testing.assert_array_equal(getattr(other, name), -getattr(one, name), err_msg=name)
     np.testing.assert_array_equal(other.gamma, one.gamma)
     np.testing.assert_array_equal(other.open_levels, one.open_levels)
-
-
-# Estimates
 
 
 def test_one_value_serves_every_level():
@@ -133,3 +119,60 @@ def test_estimates_are_the_internal_or_the_filtered_states():
         # Without its own level the unknown input is theta, which has no filtered version.
         d = hat[:, 2] if extra else tilde[:, 1]
         np.testing.assert_array_equal(filtered.unknown_input, d)
+
+
+# Times of the samples: order, units, resolution, shapes
+
+
+@pytest.mark.parametrize('bad', [0.001, 0.0005, -1.0, np.nan, np.inf, -np.inf])
+def test_times_that_do_not_increase_are_refused(bad):
+    observer = Observer(SMALL)
+    observer.run([0.0, 0.001], [0.1, 0.1], 0.0)
+    before = state_of(observer)
+    for t in ([0.002, bad, 0.003], [bad, 0.002, 0.003]):
+        with pytest.raises(ConfigurationError, match=r'increase, got t\[[01]\] = '):
+            observer.run(t, [0.1, 0.2, 0.3], 0.0)
+    assert_same_state(state_of(observer), before)
+
+
+@laws
+def test_nanoseconds_equal_seconds(law):
+    nanoseconds = np.cumsum(np.random.default_rng(2).integers(500_000, 2_000_000, 300))
+    y = np.sin(3e-9 * nanoseconds)
+    one = Observer(SMALL | law).run(nanoseconds, y, 0.0)
+    other = Observer(SMALL | law).run(nanoseconds * 1e-9, y, 0.0)
+    # Rounding of t only; sign's chatter would amplify it, explicitly.
+    tolerance = 1e-6 if law['scheme'] == 'explicit' else 1e-9
+    np.testing.assert_allclose(one.z, other.z, atol=tolerance)
+    np.testing.assert_array_equal(one.t, nanoseconds)
+
+
+@laws
+@pytest.mark.parametrize('kind', [np.int64, np.uint64])
+def test_nanoseconds_stay_exact_at_a_large_epoch(law, kind):
+    steps = np.cumsum(np.random.default_rng(2).integers(500_000, 2_000_000, 300))
+    y, stamps = np.sin(3e-9 * steps), steps.astype(kind) + kind(1_799_999_999_999_999_999)
+    near, observer = Observer(SMALL | law).run(steps, y, 0.0), Observer(SMALL | law)
+    far = [observer.run(stamps[part], y[part], 0.0).z for part in (np.s_[:150], np.s_[150:])]
+    np.testing.assert_array_equal(np.concatenate(far), near.z)
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    observer = Observer(SMALL)
+    before = state_of(observer)
+    for arguments in (
+        ([0.0, 1.0], [0.0]), ([[0.0, 1.0]], [[0.0, 1.0]]),
+        ([0.0, 1.0], [0.0, 1.0], [0.0, 1.0, 2.0]), ([0.0, 1.0], [0.0, 1.0], 0.0, 0),
+    ):  # fmt: skip
+        with pytest.raises(ConfigurationError, match='expected'):
+            observer.run(*arguments)
+    assert_same_state(state_of(observer), before)
+
+
+def test_empty_run_changes_nothing():
+    observer = Observer(SMALL)
+    assert observer.run([], [], 0.0).z.shape == (0, 2)
+    observer.run(*samples())
+    before = state_of(observer)
+    assert observer.run([], [], 0.0).z.shape == (0, 2)
+    assert_same_state(state_of(observer), before)

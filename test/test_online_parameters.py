@@ -1,37 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every live parameter of the update path changes what it does, and none moves the estimate."""
 
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import Observer, OnlineEstimator
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
 import numpy as np
-from observer_cases import LAWS, samples, state_of
+from observer_cases import laws, samples, state_of
 import pytest
 
 START = 1_700_000_000 * 10**9
 LIVE = [name for name, parameter in ONLINE_PARAMETERS.items() if parameter.live]
 
 
-@dataclass(frozen=True)
-class Change:
-    """A change of one parameter, and what has to be so before for it to matter."""
+class Change(NamedTuple):
+    """A change of one parameter, what has to be so before for it to matter, and from half on."""
 
     value: Any
-    base: dict[str, Any] = field(default_factory=dict)
-    prepared: dict[str, Any] = field(default_factory=dict)
-    """Set after the first half."""
+    base: dict[str, Any] = {}  # noqa: RUF012
+    prepared: dict[str, Any] = {}  # noqa: RUF012
     reset: bool = False
 
 
 SEED = [0.0, 1.0, 2.0, 3.0]
-PREDICTING = {'structure': 'levant', 'scheme': 'predict_correct'}
-PREDICTING |= {'lambda': [8.0, 20.0, 30.0, 16.0], 'fuzzy_widths': [1.0]}
+PREDICTING = {
+    'structure': 'levant', 'scheme': 'predict_correct', 'lambda': [8.0, 20.0, 30.0, 16.0],
+    'fuzzy_widths': [1.0],
+}  # fmt: skip
 SCHEDULED = PREDICTING | {'noise_size': 0.01, 'correction_period': 1e-3}
 SELF_TUNING = {'gains': 'self_tuning'}
-EVENTS = {'event_threshold': 2.0, 'lambda': [740.0], 'alpha': [155.0], 'epsilon': 80.0}
-EVENTS |= {'fuzzy_widths': [0.1, 1.4], 'gamma_initial': 0.67}
+EVENTS = {
+    'event_threshold': 2.0, 'lambda': [740.0], 'alpha': [155.0], 'epsilon': 80.0,
+    'fuzzy_widths': [0.1, 1.4], 'gamma_initial': 0.67,
+}  # fmt: skip
 CHANGES = {
     'unknown_input_decay': Change(50.0),
     'bandwidth': Change(3.0, SELF_TUNING),
@@ -94,12 +95,9 @@ def outputs(change: Change, name: str | None) -> np.ndarray:
     estimator.run(*stream(0, 250))
     estimator.configure(change.prepared)
     if name:
-        before, state = estimator.estimate, estimator.observer.structure.state_dict()
+        before = estimator.estimate
         estimator.configure({name: change.value})
         after = estimator.estimate
-        for quantity in state.keys() & {'z_hat', 'z_tilde', 'y', 'pending'}:
-            found = estimator.observer.structure.state_dict()[quantity]
-            np.testing.assert_array_equal(found, state[quantity], err_msg=quantity)
         if name not in ('estimate_from', 'predict_to_now'):  # which show others from then on
             np.testing.assert_array_equal(after.z, before.z)
             assert after.unknown_input == before.unknown_input
@@ -131,29 +129,25 @@ def test_live_change_has_an_effect_and_makes_no_jump(name):
 MODEL = {'phi': ['0', 'sin(z1)', '-z2*z3 + u'], 'gamma_initial': 0.65, 'gamma_rate': 0.004}
 
 
-@pytest.mark.parametrize('law', LAWS, ids=lambda law: '-'.join(law.values()))
+@laws
 def test_live_change_does_not_move_the_state(law):
     for name in LIVE:
         value = CHANGES[name].value
-        refused = law['structure'] == 'levant' and value == 'explicit'
-        if name in OBSERVER_PARAMETERS and not refused:
-            change_a_running_observer(MODEL | law, {name: value})
-
-
-def change_a_running_observer(parameters, changes):
-    observer = Observer(parameters)
-    observer.run(*samples())
-    before = state_of(observer)
-    observer.configure(changes)
-    after = state_of(observer)
-    for quantity in before.keys() - {'p', 'q', 'gamma'}:
-        found, wanted = after[quantity], before[quantity]
-        np.testing.assert_array_equal(found, wanted, err_msg=f'{quantity} after {changes}')
-    # A fresh observer in the same state goes on in the same way: nothing else is remembered.
-    fresh = Observer(observer.parameters)
-    fresh.structure.load_state_dict(after)
-    for k in range(20):
-        one, other = (o.step(0.01 * k, 1e-3, 0.0) for o in (observer, fresh))
-        assert not one.status.rejected
-        np.testing.assert_array_equal(one.z, other.z, err_msg=f'after {changes}')
-        assert one.gamma == other.gamma
+        if name not in OBSERVER_PARAMETERS or (law['structure'], value) == ('levant', 'explicit'):
+            continue
+        observer = Observer(MODEL | law)
+        observer.run(*samples())
+        before = state_of(observer)
+        observer.configure({name: value})
+        after = state_of(observer)
+        for quantity in before.keys() - {'p', 'q', 'gamma'}:
+            found = after[quantity]
+            np.testing.assert_array_equal(found, before[quantity], err_msg=f'{quantity}, {name}')
+        # A fresh observer in the same state goes on in the same way: nothing else is remembered.
+        fresh = Observer(observer.parameters)
+        fresh.structure.load_state_dict(after)
+        for k in range(20):
+            one, other = (o.step(0.01 * k, 1e-3, 0.0) for o in (observer, fresh))
+            assert not one.status.rejected
+            np.testing.assert_array_equal(one.z, other.z, err_msg=f'after {name}')
+            assert one.gamma == other.gamma

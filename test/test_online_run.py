@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The batch path of a replay is the live path, bit for bit, whatever the samples."""
+"""A node, a replay and one that goes on from a snapshot do the same, bit for bit."""
 
-from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core import ConfigurationError, OnlineEstimator
 from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot, unpack
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,40 +13,20 @@ PERIODS = [MS, MS, MS, MS, 2 * MS, 0, -MS, 499 * MS, 501 * MS, -700 * MS]
 VALUES = [0.0, 0.1, 0.1, 0.2, -0.3, float('nan'), float('inf'), 1e300]
 
 
-def live(parameters, stamps, y, u):
-    estimator = OnlineEstimator(parameters)
-    rows, words = [], []
+NAMES = ('z', 'unknown_input', 'gamma', 'innovation', 'status', 'open_levels')
+
+
+def one_by_one(estimator, stamps, y, u):
+    """Yield what an estimator shows after each sample, in the order of `NAMES`."""
     for stamp, sample, known in zip(stamps.tolist(), y.tolist(), u.tolist(), strict=True):
-        estimator.set_input(known)
+        for j, value in enumerate(known):
+            estimator.set_input(value, j)
         e = estimator.update(stamp, sample)
-        rows.append([*e.z, e.unknown_input, e.gamma, *e.innovation])
-        words.append((int(e.status), e.open_levels))
-    return estimator, np.array(rows), np.array(words)
+        yield [*e.z, e.unknown_input, e.gamma, *e.innovation, int(e.status), e.open_levels]
 
 
-def batch(parameters, stamps, y, u, size):
-    estimator = OnlineEstimator(parameters)
-    rows, words = [], []
-    for k in range(0, len(y), size):
-        p = estimator.run(stamps[k : k + size], y[k : k + size], u[k : k + size])
-        rows.append(np.column_stack([p.z, p.unknown_input, p.gamma, p.innovation]))
-        words.append(np.column_stack([p.status, p.open_levels]))
-    return estimator, np.concatenate(rows), np.concatenate(words)
-
-
-def assert_same(parameters, stamps, y, u, size):
-    one, rows, words = live(parameters, stamps, y, u)
-    other, rows_, words_ = batch(parameters, stamps, y, u, size)
-    np.testing.assert_array_equal(rows_, rows)  # bit for bit
-    np.testing.assert_array_equal(words_, words)
-    assert other.counters == one.counters
-    assert (other.period, other.jitter) == (one.period, one.jitter)
-    assert other.stamp == one.stamp
-    last = one.update(int(stamps[-1]) + 3 * MS, 0.05)
-    np.testing.assert_array_equal(other.update(int(stamps[-1]) + 3 * MS, 0.05).z, last.z)
-    if one.estimate is not None:
-        np.testing.assert_array_equal(other.estimate.z, one.estimate.z)
-        np.testing.assert_array_equal(other.estimate.innovation, one.estimate.innovation)
+def table(run):
+    return np.column_stack([getattr(run, name) for name in NAMES])
 
 
 LEVANT = {
@@ -88,19 +68,12 @@ def test_one_by_one_at_once_and_resumed_are_the_same(case):
     parameters = CASES[case] | {'spike_gate': 1.0, 'max_gap': 0.5}
     stamps, y, u = disturbed()
     one, many, resumed = (OnlineEstimator(parameters) for _ in range(3))
-    inputs = len(one.inputs)
-    u = u[:, :inputs]
-    found = many.run(stamps, y, u)
+    u = u[:, : len(one.inputs)]
+    found = table(many.run(stamps, y, u))
     assert many.counters.rejected_spikes >= 1
     assert many.counters.restarts == 1
-    for k in range(len(y)):
-        for j in range(inputs):
-            one.set_input(u[k, j], j)
-        e = one.update(int(stamps[k]), y[k])
-        now = [*e.z, e.unknown_input, e.gamma, *e.innovation, int(e.status)]
-        then = [*found.z[k], found.unknown_input[k], found.gamma[k], *found.innovation[k]]
-        assert now == [*then, found.status[k]], k
-        one.set_input(-3.0)  # not yet: the next sample has another one
+    for k, now in enumerate(one_by_one(one, stamps, y, u)):
+        np.testing.assert_array_equal(now, found[k])
         if k == 699:
             labels, vector = pack(Snapshot(one.latest, Flag.CHANGED, one.state_dict()))
             snapshot = unpack(vector.tolist(), labels)
@@ -108,25 +81,23 @@ def test_one_by_one_at_once_and_resumed_are_the_same(case):
             resumed.run(stamps[:50], y[:50])  # whatever it was before
             resumed.load_state_dict(snapshot.values)
             resumed.events.taken()
-            assert resumed.inputs == one.inputs
-            assert resumed.stamp == one.stamp
-    rest = resumed.run(stamps[700:], y[700:], u[700:])
-    for name in ('z', 'unknown_input', 'gamma', 'innovation', 'status'):
-        np.testing.assert_array_equal(getattr(rest, name), getattr(found, name)[700:])
-    events = [e._replace(sample=0) for e in many.events.taken()]
+            assert (resumed.inputs, resumed.stamp) == (one.inputs, one.stamp)
+        one.set_input(-3.0)  # not yet: the next sample has another one
+    rest = table(resumed.run(stamps[700:], y[700:], u[700:]))
+    np.testing.assert_array_equal(rest, found[700:])
+    events, of_one, of_resumed = (
+        [e._replace(sample=0) for e in estimator.events.taken()]
+        for estimator in (many, one, resumed)
+    )
     assert bool(events) == many.events.on
-    assert [e._replace(sample=0) for e in one.events.taken()] == events
-    left = [e for e in events if e.stamp > stamps[699]]
-    assert [e._replace(sample=0) for e in resumed.events.taken()] == left
+    assert of_one == events
+    assert of_resumed == [e for e in events if e.stamp > stamps[699]]
 
 
 SETTINGS = [
-    {},
-    {'spike_gate': 0.05},
-    {'stuck_time': 2.5e-3},
-    {'epsilon': 0.02, 'divergence_time': 3e-3},
+    {}, {'spike_gate': 0.05}, {'stuck_time': 2.5e-3}, {'epsilon': 0.02, 'divergence_time': 3e-3},
     {'divergence_limit': 10.0, 'scheme': 'explicit'},
-]
+]  # fmt: skip
 
 
 @given(
@@ -142,4 +113,99 @@ def test_gaps_jumps_and_bad_samples_are_the_same(samples, sampling, settings, si
     y = np.array([value for _, value in samples])
     u = np.where(np.arange(len(y)) % 5 == 4, np.nan, 0.1)
     parameters = {'sampling': sampling, 'phi': ['0', '0', 'u - z3']} | settings
-    assert_same(parameters, stamps, y, u, size)
+    one, other = OnlineEstimator(parameters), OnlineEstimator(parameters)
+    rows = list(one_by_one(one, stamps, y, u[:, np.newaxis]))
+    parts = [
+        table(other.run(stamps[k : k + size], y[k : k + size], u[k : k + size]))
+        for k in range(0, len(y), size)
+    ]
+    np.testing.assert_array_equal(np.concatenate(parts), rows)  # bit for bit
+    for name in ('counters', 'period', 'jitter', 'stamp', 'inputs'):
+        assert getattr(one, name) == getattr(other, name)
+    np.testing.assert_equal(other.state_dict(), one.state_dict())
+
+
+# Snapshots
+
+
+ORIGIN = 1_700_000_000_123_456_789
+
+
+def fed(count, **parameters):
+    """Return an estimator that has taken samples with jitter."""
+    estimator, rng = OnlineEstimator(parameters), np.random.default_rng(3)
+    k = np.arange(count)
+    stamps = ORIGIN + k * 1_000_000 + rng.integers(-200_000, 200_000, count)
+    estimator.run(stamps, 0.2 + 0.1 * np.sin(3e-3 * k))
+    return estimator
+
+
+def test_labels_name_what_stands_there():
+    estimator = fed(700)
+    labels, vector = pack(Snapshot(estimator.latest, Flag(0), estimator.state_dict()))
+    entries = dict(zip(labels, vector.tolist(), strict=True))
+    assert len(entries) == len(vector)  # no name twice
+    assert labels[0] == 'version'
+    state = estimator.observer.structure.state_dict()
+    assert entries['z_hat2'] == state['z_hat'][1]
+    assert entries['z_tilde1'] == state['z_tilde'][0]
+    assert entries['gamma'] == estimator.estimate.gamma
+    assert entries['y'] == state['y']
+    assert int(entries['stamp_upper']) * 2**32 + int(entries['stamp_lower']) == estimator.stamp
+    assert int(entries['sec']) * 10**9 + int(entries['nanosec']) == estimator.stamp
+
+
+@pytest.mark.parametrize('integer', [0, 1, -1, 2**63 - 1, -(2**63), 1_700_000_000_123_456_789])
+def test_integers_come_back_exactly(integer):
+    times = ('stamp', 'latest', 'now', 'held_stamp', 'seen', 'tick', 'placed', 'event_since')
+    values = OnlineEstimator().state_dict() | dict.fromkeys(times, integer)
+    labels, vector = pack(Snapshot(5, Flag(0), values))
+    back = unpack(vector, labels).values
+    assert [back[name] for name in times] == [integer] * len(times)
+    estimator = OnlineEstimator()
+    estimator.load_state_dict(back)
+    assert estimator.state_dict()['latest'] == integer
+
+
+LATE = {'gains': 'fixed', 'measurement_delay': 0.1, 'phi': ['u', '0', '0']}
+
+
+@pytest.mark.parametrize(('name', 'number'), [
+    ('past_place', -1), ('past_place', 512), ('past_count', 513), ('event', 6), ('intervals', 33),
+    ('regular', -1), ('frozen', 2), ('latest', 2**63), ('latest', 0.5), ('latest', 'x'),
+    ('mean_interval', -1.0), ('mean_interval', np.nan), ('held_y', np.inf), ('z_hat', np.zeros(3)),
+    ('z_hat', np.full(4, np.nan)), ('past_pieces', np.full((512, 2), np.inf)), ('u', np.zeros(2)),
+    ('past_latest', None), ('version', 2), ('spread', 0.0),
+])  # fmt: skip
+def test_a_number_that_can_not_be_is_refused_and_changes_nothing(name, number):
+    estimator, good = fed(50, **LATE), fed(100, **LATE).state_dict()
+    before = estimator.state_dict()
+    for values in (good | {name: number}, {k: v for k, v in good.items() if k != name}):
+        with pytest.raises(ConfigurationError, match='snapshot'):
+            estimator.load_state_dict(values)
+        np.testing.assert_equal(estimator.state_dict(), before)
+
+
+def test_vector_of_other_entries_is_refused():
+    labels, vector = pack(Snapshot(5, Flag(0), OnlineEstimator().state_dict()))
+    with pytest.raises(ConfigurationError, match='entries'):
+        unpack(np.zeros(8), labels)
+    with pytest.raises(ConfigurationError, match='entries'):
+        unpack(vector, [*labels[:-1], labels[0]])
+    for names in ([], ['flags'], labels[4:]):
+        with pytest.raises(ConfigurationError, match='version'):
+            unpack(np.zeros(len(names)), names)
+    for name in ('z_hat9999999', 'z_hat6', 'z_hat0', 'covariance1', 'z_hat1_1'):
+        with pytest.raises(ConfigurationError, match='snapshot'):
+            unpack([*vector, 0.0], [*labels, name])
+
+
+def test_state_of_another_size_is_refused():
+    two = OnlineEstimator({'order': 2, 'phi': ['0', 'a - b'], 'inputs': ['a', 'b']}).state_dict()
+    for other, said in (
+        ({'order': 2, 'phi': ['0', 'u']}, 'expected finite numbers of shape'),
+        ({'order': 1, 'phi': ['0*a*b'], 'inputs': ['a', 'b']}, r'\(2,\)'),
+        (LATE, 'measurement_delay'),
+    ):
+        with pytest.raises(ConfigurationError, match=said):
+            OnlineEstimator(other).load_state_dict(two)

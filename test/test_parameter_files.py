@@ -34,41 +34,24 @@ def error_of(path: str, node: str) -> str:
     return message.removeprefix(f'{path}: ')
 
 
-@pytest.mark.parametrize(
-    ('section', 'node', 'matches'),
-    [
-        ('estimator', 'estimator', True),
-        ('/estimator', 'estimator', True),
-        ('/**', 'estimator', True),
-        ('/**', '/rig/arm/estimator', True),
-        ('/*', 'estimator', True),
-        ('/*', '/rig/estimator', False),
-        ('/rig/estimator', '/rig/estimator', True),
-        ('/rig/*', '/rig/estimator', True),
-        ('/rig/**', '/rig/arm/estimator', True),
-        ('/**/estimator', '/rig/arm/estimator', True),
-        ('/*/estimator', '/rig/arm/estimator', False),
-        ('estimator', '/rig/estimator', False),
-        ('/rig/estimator', 'estimator', False),
-        ('plant', 'estimator', False),
-        ('estimator2', 'estimator', False),
-    ],
-)
+@pytest.mark.parametrize(('section', 'node', 'matches'), [
+    ('estimator', 'estimator', True), ('/estimator', 'estimator', True),
+    ('/**', 'estimator', True), ('/**', '/rig/arm/estimator', True), ('/*', 'estimator', True),
+    ('/*', '/rig/estimator', False), ('/rig/estimator', '/rig/estimator', True),
+    ('/rig/*', '/rig/estimator', True), ('/rig/**', '/rig/arm/estimator', True),
+    ('/**/estimator', '/rig/arm/estimator', True), ('/*/estimator', '/rig/arm/estimator', False),
+    ('estimator', '/rig/estimator', False), ('/rig/estimator', 'estimator', False),
+    ('plant', 'estimator', False), ('estimator2', 'estimator', False),
+])  # fmt: skip
 def test_sections(path, section, node, matches):
     write(path, f"'{section}': {{ros__parameters: {{epsilon: 0.3}}}}")
     assert load(path, node) == ({'epsilon': 0.3} if matches else {})
 
 
-@pytest.mark.parametrize(
-    ('section', 'node'),
-    [
-        ('estimater', 'estimator'),
-        ('/Estimator', 'estimator'),
-        ('estimators', '/rig/estimator'),
-        ('/rig/estimatr', '/rig/estimator'),
-        ('plan', 'plant'),
-    ],
-)
+@pytest.mark.parametrize(('section', 'node'), [
+    ('estimater', 'estimator'), ('/Estimator', 'estimator'), ('estimators', '/rig/estimator'),
+    ('/rig/estimatr', '/rig/estimator'), ('plan', 'plant'),
+])  # fmt: skip
 def test_misspelt_section_is_refused(path, section, node):
     write(path, f"'{section}': {{ros__parameters: {{epsilon: 0.3}}}}")
     problem = f"no section is that of node '{node}', got '{section.lstrip('/')}'"
@@ -86,41 +69,28 @@ LATER = (
 )
 
 
-@pytest.mark.parametrize(
-    ('text', 'node', 'values'),
-    [
-        (NESTED, '/rig/arm/estimator', {'epsilon': 0.3}),
-        (LATER, 'estimator', {'epsilon': 0.4, 'max_gap': 2.0}),
-        (BOTH, 'estimator', {'order': 2, 'epsilon': 0.3}),
-        (BOTH, 'plant', {'order': 2, 'noise_std': 0.1}),
-        *(
-            (f'/**: {{ros__parameters: {{max_gap: {text}}}}}', 'estimator', {'max_gap': value})
-            for text, value in (
-                ('1e-1', 0.1), ('1E2', 100.0), ('.5e0', 0.5), ('1.5e1', 15.0), ('4', 4.0),
-                ('+3', 3.0),
-            )
-        ),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(('text', 'node', 'values'), [
+    (NESTED, '/rig/arm/estimator', {'epsilon': 0.3}),
+    (LATER, 'estimator', {'epsilon': 0.4, 'max_gap': 2.0}),
+    (BOTH, 'estimator', {'order': 2, 'epsilon': 0.3}),
+    (BOTH, 'plant', {'order': 2, 'noise_std': 0.1}),
+    *((f'/**: {{ros__parameters: {{max_gap: {text}}}}}', 'estimator', {'max_gap': float(text)})
+      for text in ('1e-1', '1E2', '.5e0', '1.5e1', '4', '+3')),
+])  # fmt: skip
 def test_values(path, text, node, values):
     assert load(write(path, text), node) == values
 
 
-@pytest.mark.parametrize(
-    ('text', 'words'),
-    [
-        ('/**: {ros__parameters: {noise_sd: 0.1}}', "'noise_sd'; did you mean 'noise_std'?"),
-        ('/**: {ros__parameters: {gamma: {min: 0.1}}}', "unknown parameter 'gamma.min'"),
-        ('/**: {ros__parameters: {qqq: 1}}', f'; known are {", ".join(ESTIMATOR_PARAMETERS)}, '),
-        ('- a\n- b', ''),
-        ('estimator: 3', ''),
-        ('estimator: {ros__parameters: 3}', ''),
-        ('estimator: {ros_parameters: {epsilon: 0.3}}', ''),
-        ('a: 1\n---\nb: 2', ''),
-        ('\ttab: 1', ''),
-        ('a: !!python/object/apply:os.system [true]', ''),
-    ],
-)
+@pytest.mark.parametrize(('text', 'words'), [
+    ('/**: {ros__parameters: {noise_sd: 0.1}}', "'noise_sd'; did you mean 'noise_std'?"),
+    ('/**: {ros__parameters: {gamma: {min: 0.1}}}', "unknown parameter 'gamma.min'"),
+    ('/**: {ros__parameters: {qqq: 1}}', f'; known are {", ".join(ESTIMATOR_PARAMETERS)}, '),
+    *((text, '') for text in (
+        '- a\n- b', 'estimator: 3', 'estimator: {ros__parameters: 3}',
+        'estimator: {ros_parameters: {epsilon: 0.3}}', 'a: 1\n---\nb: 2', '\ttab: 1',
+        'a: !!python/object/apply:os.system [true]',
+    )),
+])  # fmt: skip
 def test_bad_file_is_one_line_with_its_name(path, text, words):
     assert words in error_of(write(path, text), 'estimator')
 
@@ -183,40 +153,28 @@ def test_any_text_is_content_or_one_line(text):
         refusal_of(ESTIMATOR_PARAMETERS[name].coerce, text)
 
 
-@pytest.mark.parametrize(
-    ('text', 'content'),
-    [
-        ('', None),
-        ('[2001-02-30, 2001-02-03 04:05:06]', ['2001-02-30', '2001-02-03 04:05:06']),
-        ('{<<: {a: =}}', {'<<': {'a': '='}}),
-        ('[!!float 3, !!str 3]', [3.0, '3']),
-        ('[1, 0x10, 1e-3, .inf, yes, ~, a]', [1, 16, 0.001, float('inf'), True, None, 'a']),
-        ('a: &anchor [1]', {'a': [1]}),
-        ('1' * 300, int('1' * 300)),
-    ],
-)
+@pytest.mark.parametrize(('text', 'content'), [
+    ('', None), ('{<<: {a: =}}', {'<<': {'a': '='}}), ('[!!float 3, !!str 3]', [3.0, '3']),
+    ('[2001-02-30, 2001-02-03 04:05:06]', ['2001-02-30', '2001-02-03 04:05:06']),
+    ('[1, 0x10, 1e-3, .inf, yes, ~, a]', [1, 16, 0.001, float('inf'), True, None, 'a']),
+    ('a: &anchor [1]', {'a': [1]}), ('1' * 300, int('1' * 300)),
+])  # fmt: skip
 def test_content(text, content):
     assert parse(text) == content
     parse('[' * MAX_DEPTH + ']' * MAX_DEPTH)
 
 
-@pytest.mark.parametrize(
-    ('text', 'reason'),
-    [
-        ('a:\n  b: 1\n  b: 2', "the key 'b' twice (line 3)"),
-        ('a: &x [1]\nb: *x', 'the alias *x, which ROS does not read either (line 2)'),
-        (LAUGHS, 'the alias *a'),
-        ('[' * (MAX_DEPTH + 2), f'nested deeper than {MAX_DEPTH}'),
-        ('[' + '1,' * 100_000 + ']', 'more than 50000 values'),
-        ('1' * 400, 'an integer of more than 1024 bits'),
-        ('1' * 5000, 'which is no int'),
-        ('a' * (MAX_LENGTH + 1), f'{MAX_LENGTH + 1} characters, at most {MAX_LENGTH}'),
-        ('!!bool x', "'x', which is no bool"),
-        ('!!timestamp 2001-01-01', "the tag 'tag:yaml.org,2002:timestamp'"),
-        ('{[a]: 1}', 'a key that is no plain text'),
-        ('a: 1\n---\nb: 2', 'a second document (line 2)'),
-    ],
-)
+@pytest.mark.parametrize(('text', 'reason'), [
+    ('a:\n  b: 1\n  b: 2', "the key 'b' twice (line 3)"),
+    ('a: &x [1]\nb: *x', 'the alias *x, which ROS does not read either (line 2)'),
+    (LAUGHS, 'the alias *a'), ('[' * (MAX_DEPTH + 2), f'nested deeper than {MAX_DEPTH}'),
+    ('[' + '1,' * 100_000 + ']', 'more than 50000 values'),
+    ('1' * 400, 'an integer of more than 1024 bits'), ('1' * 5000, 'which is no int'),
+    ('a' * (MAX_LENGTH + 1), f'{MAX_LENGTH + 1} characters, at most {MAX_LENGTH}'),
+    ('!!bool x', "'x', which is no bool"), ('{[a]: 1}', 'a key that is no plain text'),
+    ('!!timestamp 2001-01-01', "the tag 'tag:yaml.org,2002:timestamp'"),
+    ('a: 1\n---\nb: 2', 'a second document (line 2)'),
+], ids=lambda text: ascii(text[:30]))  # fmt: skip
 def test_refusal_gives_reason_and_line(text, reason):
     message = refusal_of(parse, text)
     assert message.startswith('expected YAML, got: ')

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated plant: each disturbance against its formula, noise, the known input, bad input."""
+"""The simulated plant: disturbances by their formulas, noise, inputs; families of recordings."""
 
-from fhaosmo_ros.core import ConfigurationError, Plant
-from fhaosmo_ros.core.simulation.plant import quantised
+from fhaosmo_ros.core import ConfigurationError, Family, Plant, TriangularModel
+from fhaosmo_ros.core.simulation.plant import quantised, respond
 from fhaosmo_ros.core.simulation.system import KINDS
 import numpy as np
 import pytest
@@ -17,10 +17,8 @@ REST = {'order': 1, 'phi': ['0'], 'disturbance': 'none'}
 
 def chirp(t):
     """Return the sine of the integral of an angular frequency that rises, then stays."""
-    rate = (20.0 - 2.0) / 20.0
-    rising = 2.0 * t + rate * t**2 / 2.0
-    at_end = 2.0 * 20.0 + rate * 20.0**2 / 2.0
-    return np.sin(np.where(t < 20.0, rising, at_end + 20.0 * (t - 20.0)))
+    rising = np.minimum(t, 20.0)
+    return np.sin(2.0 * rising + 0.45 * rising**2 + 20.0 * (t - rising))
 
 
 FORMULAS = {
@@ -34,15 +32,14 @@ FORMULAS = {
 
 @pytest.mark.parametrize('kind', KINDS)
 def test_disturbance_follows_its_formula_and_drives_the_last_state(kind):
-    plant = Plant(WAVE | {'disturbance': kind})
-    np.testing.assert_allclose(plant.simulate(T).unknown_input, FORMULAS[kind](T), atol=1e-12)
-    p = {'order': 1, 'phi': ['0'], 'initial_state': 1.5, 'integration_step': 1e-3}
+    p = REST | WAVE | {'disturbance': kind, 'initial_state': 1.5, 'integration_step': 1e-3}
     t = np.linspace(0.0, 24.0, 24001)
-    z = Plant(WAVE | p | {'disturbance': kind}).simulate(t).z[:, 0]
-    d = FORMULAS[kind](t)
+    truth, d = Plant(p).simulate(t), FORMULAS[kind](t)
+    np.testing.assert_allclose(truth.unknown_input, d, atol=1e-12)
     integral = 1.5 + np.concatenate([[0.0], np.cumsum(0.5e-3 * (d[1:] + d[:-1]))])
     # Each jump of d falls within one step: less than step * amplitude.
-    np.testing.assert_allclose(z, integral, atol=1e-5 if kind in ('sine', 'chirp') else 5e-3)
+    close = 1e-5 if kind in ('sine', 'chirp') else 5e-3
+    np.testing.assert_allclose(truth.z[:, 0], integral, atol=close)
 
 
 def test_noise_is_seeded_white_and_of_the_right_size():
@@ -76,9 +73,8 @@ def test_samples_equal_a_simulation():
     t = np.cumsum(np.random.default_rng(1).uniform(1e-5, 5e-3, 300))
     whole, plant = Plant(p).simulate(t), Plant(p)
     rows = [plant.sample(at) for at in t]  # each a copy
-    np.testing.assert_array_equal([row.y for row in rows], whole.y)
-    np.testing.assert_array_equal([row.unknown_input for row in rows], whole.unknown_input)
-    np.testing.assert_array_equal([row.z for row in rows], whole.z)
+    for found, wanted in zip(zip(*rows, strict=True), whole, strict=True):
+        np.testing.assert_array_equal(found, wanted)
 
 
 def test_known_input_acts_during_the_interval_that_ends_at_its_time():
@@ -105,25 +101,18 @@ def test_setting_the_seed_starts_the_noise_again():
     np.testing.assert_array_equal([plant.sample(t).y for t in (0.4, 0.5, 0.6)], first)
 
 
-def test_list_of_the_wrong_length_is_refused():
-    with pytest.raises(ConfigurationError, match=r"'initial_state'.*1 or 3 values.*\[1.0, 2.0\]"):
-        Plant({'initial_state': [1.0, 2.0]})
-
-
-@pytest.mark.parametrize(
-    ('changes', 'reason'),
-    [
-        ({'noise_std': -1.0}, '>= 0'),
-        ({'initial_state': [9.0]}, "can't change in a running plant"),
-        ({'nois_std': 1.0}, "did you mean 'noise_std'"),
-    ],
-)
+@pytest.mark.parametrize(('changes', 'reason'), [
+    ({'noise_std': -1.0}, '>= 0'), ({'initial_state': [9.0]}, "can't change in a running plant"),
+    ({'nois_std': 1.0}, "did you mean 'noise_std'"),
+])  # fmt: skip
 def test_refused_change_changes_nothing(changes, reason):
     plant = Plant()
     before = plant.parameters
     with pytest.raises(ConfigurationError, match=reason):
         plant.configure({'disturbance_amplitude': 9.0} | changes)
     assert plant.parameters == before
+    with pytest.raises(ConfigurationError, match=r"'initial_state'.*1 or 3 values.*\[1.0, 2.0\]"):
+        Plant({'initial_state': [1.0, 2.0]})
     assert plant.sample(np.pi / 2.0).unknown_input == Plant().sample(np.pi / 2.0).unknown_input
 
 
@@ -133,3 +122,80 @@ def test_time_that_is_not_finite_is_refused(t):
     for call in (plant.advance, plant.sample, lambda t: plant.simulate([0.0, t])):
         with pytest.raises(ConfigurationError, match=r'expected (a )?finite time'):
             call(t)
+
+
+# Training recordings: seeded, true to their parameters, and solved accurately
+
+
+SHORT = {'duration': 4.0, 'integration_step': 1e-3}
+
+
+def test_recording_is_a_function_of_parameters_number_and_seed():
+    several = Family(SHORT).recordings(4, seed=7)
+    for ours, again in zip(several[2], Family(SHORT).recording(2, seed=7), strict=True):
+        np.testing.assert_array_equal(ours, again)
+    for family, seed in (Family(SHORT), 8), (Family(SHORT | {'noise_seed': 2}), 7):
+        assert not np.array_equal(family.recording(2, seed).d, several[2].d)
+    assert [r.shape for r in several] == ['sines', 'steps', 'chirp', 'sines']
+
+
+@pytest.mark.parametrize('shape', ['sines', 'steps', 'chirp'])
+def test_d_has_its_size_stays_in_its_band_and_is_not_one_sine(shape):
+    d = Family({
+        'rms_of_d': 0.3, 'band_of_d': [2.0, 6.0], 'disturbances': [shape], 'duration': 60.0,
+        'integration_step': 1e-3, 'sample_rate': 100.0,
+    }).recording(0).d  # fmt: skip
+    np.testing.assert_allclose(np.sqrt(np.mean(d**2)), 0.3, rtol=0.05)
+    power = np.abs(np.fft.rfft(d * np.hanning(len(d)))) ** 2
+    omega = 2.0 * np.pi * np.fft.rfftfreq(len(d), 0.01)
+    parts, _ = np.histogram(omega, [1.7, 2.9, 4.2, 6.5], weights=power)
+    if shape != 'steps':
+        assert parts.sum() > 0.99 * power.sum()
+        assert parts.min() > 0.02 * power.sum()
+
+
+def test_response_is_that_of_the_plant():
+    """Between the table's points d is a line: its error is (omega spacing)^2 / 8 of d."""
+    t = np.arange(0.0, 5.0, 1e-3)
+    table = 0.1 * np.sin(3.0 * np.arange(0.0, 5.1, 1e-4))
+    model = TriangularModel(['0', '0', '-z3'])
+    z, d = respond(model, [0.2, 0.2, 0.2], t, table, 1e-4)
+    truth = Plant({'disturbance_omega': 3.0, 'initial_state': 0.2}).simulate(t)
+    np.testing.assert_allclose(z, truth.z, atol=1e-7)
+    np.testing.assert_allclose(d, truth.unknown_input, atol=1e-8)
+
+
+def test_known_input_is_held_during_the_interval_that_ends_at_its_sample():
+    t = np.array([0.0, 0.25, 0.4, 1.0])
+    u = np.array([9.0, 1.0, -2.0, 0.5])
+    z, _ = respond(TriangularModel(['u']), [0.0], t, [0.0, 0.0], 1.0, u)
+    np.testing.assert_allclose(z[:, 0], np.cumsum(u * np.diff(t, prepend=0.0)), atol=1e-12)
+
+
+def test_noise_quantisation_jitter_and_dropouts_are_as_asked():
+    family = Family(
+        {'noise_std': 2e-3, 'period_jitter': 1e-4, 'stamp_jitter': 2e-4, 'dropout': 0.2,
+         'dropout_length': 5.0, 'integration_step': 1e-3, 'duration': 60.0}
+    )  # fmt: skip
+    r = family.recording(0)
+    assert (np.diff(r.t) > 0.0).all()
+    np.testing.assert_allclose(np.std(r.y - r.z[:, 0]), 2e-3, rtol=0.05)
+    np.testing.assert_allclose(len(r.t) / 60_001, 0.8, rtol=0.05)
+    runs = np.diff(r.t)[np.diff(r.t) > 2.5e-3] / 1e-3
+    assert 3.0 < np.mean(runs) < 9.0
+    off = r.t - np.round(r.t / 1e-3) * 1e-3
+    np.testing.assert_allclose(np.std(off), np.hypot(1e-4, 2e-4), rtol=0.1)
+    y = Family(SHORT | {'quantisation': 0.01}).recording(0).y
+    np.testing.assert_allclose(y / 0.01, np.round(y / 0.01), atol=1e-9)
+
+
+@pytest.mark.parametrize(('parameters', 'message'), [
+    ({'band_of_d': [3.0, 1.0]}, 'band_of_d.*lower one first'), ({'band_of_d': [3.0]}, 'band_of_d'),
+    ({'disturbances': ['sine']}, "disturbances.*did you mean 'sines'|disturbances.*sines"),
+    ({'noise': 1.0}, 'noise'),
+    (SHORT | {'phi': ['0', '0', 'z3**3'], 'rms_of_d': 100.0}, 'stay finite'),
+])  # fmt: skip
+def test_bad_family_is_one_line(parameters, message):
+    with pytest.raises(ConfigurationError, match=message) as error:
+        Family(parameters).recording(0)
+    assert '\n' not in str(error.value)

@@ -91,8 +91,7 @@ def assert_finite(estimator):
 
 
 def same(one, other):
-    for name, value in one._asdict().items():
-        np.testing.assert_array_equal(value, getattr(other, name))
+    np.testing.assert_equal(one._asdict(), other._asdict())
 
 
 @pytest.mark.parametrize('duplicate', [
@@ -168,22 +167,21 @@ def test_two_threads_on_one_estimator_get_an_error(kind):
                 estimator.run(stamps + k * 20 * 10**9, np.zeros(len(stamps)))
             k += 1
 
+    def refused():
+        try:
+            estimator.update(1, 0.0)
+        except RuntimeError as error:
+            return 'another thread' in str(error)
+        return False
+
     thread = threading.Thread(target=run)
     thread.start()
     try:
-        wait_until(lambda: refused(estimator), 'error', 60.0)
+        wait_until(refused, 'error', 60.0)
     finally:
         seen.set()
         thread.join()
     assert np.isfinite(estimator.observer.estimate.z).all()
-
-
-def refused(estimator):
-    try:
-        estimator.update(1, 0.0)
-    except RuntimeError as error:
-        return 'another thread' in str(error)
-    return False
 
 
 @pytest.mark.parametrize('call', [

@@ -40,23 +40,27 @@ def estimates(found, a, b, order):
     return np.hstack([z / sizes, found.standard_deviation / sizes])
 
 
+def in_units(a, b, order):
+    """Return estimates in units of a and b, and those in units of 1."""
+    t, y = samples(order)
+    return [
+        estimates(Observer(model(a, b, order)).run(b * t, a * y), a, b, order)
+        for a, b in ((a, b), (1.0, 1.0))
+    ]
+
+
 @pytest.mark.parametrize('order', [1, 2, 4])
 @pytest.mark.parametrize(('a', 'b'), [
     (2.0**20, 1.0), (2.0**-20, 1.0), (1.0, 2.0**20), (1.0, 2.0**-20), (2.0**-15, 2.0**9),
 ])  # fmt: skip
 def test_powers_of_two_change_no_bit(order, a, b):
-    t, y = samples(order)
-    wanted = estimates(Observer(model(1.0, 1.0, order)).run(t, y), 1.0, 1.0, order)
-    found = estimates(Observer(model(a, b, order)).run(b * t, a * y), a, b, order)
-    np.testing.assert_array_equal(found, wanted)
+    np.testing.assert_array_equal(*in_units(a, b, order))
 
 
 @pytest.mark.parametrize('a', [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize('b', [1e-6, 1.0, 1e6])
 def test_other_units_change_no_more_than_rounding_does(a, b):
-    t, y = samples(2)
-    wanted = estimates(Observer(model(1.0, 1.0, 2)).run(t, y), 1.0, 1.0, 2)
-    found = estimates(Observer(model(a, b, 2)).run(b * t, a * y), a, b, 2)
+    found, wanted = in_units(a, b, 2)
     known = np.isfinite(wanted).all(axis=1)
     np.testing.assert_array_equal(np.isfinite(found).all(axis=1), known)
     size = np.sqrt(np.mean(wanted[known] ** 2, axis=0))

@@ -23,8 +23,8 @@ RANGES: dict[str, tuple[float, float]] = {
     **dict.fromkeys(('saturated', 'narrowed'), NOT_NEGATIVE),
     **dict.fromkeys(('spread', 'scale'), AT_LEAST_1),
     **dict.fromkeys(('spikes', 'tick_count', 'repeats', 'held_for'), COUNTS),
-    **dict.fromkeys(('mean_interval', 'mean_jitter', 'usual_interval', 'spacing'), COUNTS),
-    'intervals': (0, 32), 'regular': (0, 12), 'steady': (0, 500), 'elsewhere': (0.0, 1.0),
+    **dict.fromkeys(('mean_interval', 'mean_jitter', 'usual_interval'), COUNTS),
+    'intervals': (0, 32), 'regular': (0, 12), 'ticks': (-5000, 2**17), 'elsewhere': (0.0, 1.0),
     'event': (0, 5), 'event_deviation': (0.0, math.inf), 'past_place': (0, 511),
     'past_count': (0, 512),
 }  # fmt: skip

@@ -36,12 +36,6 @@ cdef double NANOSECONDS = 1e-9
 cdef int MOST_PIECES = 512
 PIECES = MOST_PIECES
 """Room for so many different values of the inputs within the delay; older ones are forgotten."""
-# Stands for every difference (ns) that an integer may not hold.
-cdef long long FAR = 4_000_000_000_000_000_000
-# A tick is on time if it is off by at most so many intervals of the samples; times follow it by
-# one part in so many, and an interval is the mean of so many ticks.
-cdef double OFF_TICK = 2.0, PULL = 64.0
-cdef long long KNOWN_TICKS = 16, MOST_TICKS = 500
 # A step of y is a multiple of another one up to this, and up to rounding of y to 32 bits.
 cdef double MULTIPLE = 1e-4, SINGLE = 6e-7
 # After so many regular changes y's sensor holds its values; so many are remembered.
@@ -53,10 +47,6 @@ cdef int CHANCE_REPEATS = 2
 cdef double RARELY = 0.05, CHANGES = 50.0
 # So many samples in a row may be rejected by spike_gate.
 cdef int MOST_SPIKES = 5
-
-
-cdef enum:
-    WINDOW = 32  # intervals that a running mean remembers
 
 
 cdef struct Settings:
@@ -103,16 +93,6 @@ cdef struct Course:
     double usual_interval  # longest mean_interval of late; a restart does not forget it (ns)
 
 
-cdef struct Clock:
-    # A clock that may stand still between its ticks.
-    long long tick  # latest reading
-    long long tick_length  # time from the reading before it
-    long long tick_count  # samples at it
-    long long steady  # ticks in a row between which samples came evenly
-    long long placed  # where the latest sample was put
-    double spacing  # of samples at one reading; 0: not known yet
-
-
 cdef struct Sensor:
     # Whether y's sensor is stuck, or holds its values.
     bint stuck
@@ -132,14 +112,6 @@ cdef struct Ring:
     # Pieces of time with the same known inputs.
     int past_place  # of the latest piece
     int past_count  # of pieces
-
-
-cdef long long difference(long long a, long long b) noexcept nogil:
-    """Return a - b, or +-FAR where that would overflow."""
-    cdef double rough = <double>a - <double>b
-    if rough > FAR:
-        return FAR
-    return -FAR if rough < -FAR else a - b
 
 
 cdef class Policy:
@@ -215,7 +187,7 @@ cdef class Policy:
             course.now += self.settings.period
             now = course.now
         elif self.settings.by_clock:
-            now = self.clock_time(stamp)
+            now = clock_time(&self.clock, stamp, self.max_gap(), &counters.spread_stamps)
         word = self.judge(stamp, now, y)
         if not word and not isnan(memory.y):
             elapsed = self.since_latest(now, y, &word)
@@ -276,45 +248,6 @@ cdef class Policy:
         return REJECTED_STUCK * self.repeats_noise(y)
 
     # What a sample tells by itself: its time, and whether y can be true
-
-    cdef long long clock_time(self, long long stamp) noexcept nogil:
-        """
-        Return the time of a sample that came when the clock read `stamp`.
-
-        A clock that stands still between its ticks gives many samples one reading. They are spread
-        evenly, and end short of the next tick that is expected. While they come evenly, a tick, or
-        a sample, that comes late moves the times by little.
-        """
-        cdef Clock* clock = &self.clock
-        cdef long long count = clock.tick_count, length = difference(stamp, clock.tick), end
-        cdef double mean, off
-        if length == 0:
-            clock.tick_count += 1
-            end = stamp + clock.tick_length
-            if clock.steady > 0:
-                end += <long long>(OFF_TICK * clock.spacing)
-            end = min(<long long>clock.spacing, (end - clock.placed) // 2)
-            if end > 0:
-                clock.placed += end
-                self.counters.spread_stamps += 1
-            return clock.placed
-        clock.tick, clock.tick_count = stamp, 1
-        if count == 0 or not 0 < length <= self.max_gap():
-            clock.steady, clock.placed = 0, stamp
-            return stamp
-        clock.tick_length = length
-        mean, off = <double>length / count, difference(stamp, clock.placed) - clock.spacing
-        if count == 1 or not fabs(off) <= OFF_TICK * mean:
-            if clock.steady < KNOWN_TICKS:  # else it is a gap: samples come as before, but later
-                clock.spacing = mean
-            clock.steady = 0
-            # A tick that came early finds samples ahead of it: time goes on at half its speed.
-            clock.placed = max(stamp, clock.placed + <long long>(clock.spacing / 2.0))
-            return clock.placed
-        clock.steady = min(clock.steady + 1, MOST_TICKS)
-        clock.spacing += (mean - clock.spacing) / clock.steady
-        clock.placed += <long long>(clock.spacing + fmax(off / PULL, -clock.spacing / 2.0))
-        return clock.placed
 
     cdef bint is_stuck(self, double y, long long now) noexcept nogil:
         """Return True, and count it, if y has been seen unchanged for longer than stuck_time."""
@@ -786,8 +719,7 @@ cdef class Policy:
         self.refresh()
         self.ring.past_count = 0
         self.course.valid = False
-        self.clock.tick_count = 0
-        self.clock.spacing = 0.0
+        self.clock.tick_count = self.clock.spacing = 0
 
     @property
     def memory(self):
