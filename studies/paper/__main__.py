@@ -5,15 +5,7 @@ import argparse
 from collections.abc import Sequence
 import sys
 
-from fhaosmo_ros.core.observer.fuzzy import (
-    curve,
-    memberships,
-    NAMES,
-    of_level,
-    read_system,
-    SINGLETON,
-    Terms,
-)
+from fhaosmo_ros.core.observer.fuzzy import curve, memberships, of_level
 from fhaosmo_ros.tools.plot.figures import COLOURS, envelope, TRUTH
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -25,6 +17,11 @@ from studies.paper.cases import FREQUENCIES, LONG, SAMPLED
 from studies.paper.plant_and_observer import JointRun, SOLVERS
 
 NAME = 'paper'
+NAMES = {
+    5: ('NB', 'NS', 'ZR', 'PS', 'PB'),
+    7: ('NBB', 'NB', 'NS', 'ZR', 'PS', 'PB', 'PBB'),
+}
+"""Names of terms by their number."""
 QUICK_WIDTHS, QUICK_LONG = 6, 200.0
 DRAWN = (cases.FINE, cases.COARSE, cases.FUZZY, cases.ADAPTIVE)
 # Estimates that chatter are solid and below; the truth lies on top, dashed so that both are seen.
@@ -150,9 +147,9 @@ def fuzzy_systems() -> Figure:
     figure = Figure(figsize=(9.0, 0.6 + 2.0 * len(levels)), layout='constrained')
     for k, (left, middle, right) in enumerate(figure.subplots(len(levels), 3)):
         text, width = of_level(preset['fuzzy_systems'], k), of_level(preset['fuzzy_widths'], k)
-        system, half = read_system(text), curve(text)
-        _draw_terms(left, system.inputs, width)
-        _draw_terms(middle, system.outputs, 1.0)
+        half, count = curve(text), int(text.removeprefix('terms '))
+        _draw_terms(left, count, width)
+        _draw_terms(middle, count, 1.0)
         grid = np.linspace(0.0, width, len(half))
         right.plot([-width, 0, 0, width], [-1, -1, 1, 1], color='#999999', linestyle=':')
         right.plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')
@@ -166,15 +163,13 @@ def fuzzy_systems() -> Figure:
     return figure
 
 
-def _draw_terms(axes: Axes, terms: Terms, scale: float) -> None:
-    """Draw membership functions over [-scale, scale], and their names above them."""
-    x = np.linspace(-1.0, 1.0, 1001)
-    for k, (name, peak) in enumerate(zip(NAMES[len(terms.peaks)], terms.peaks, strict=True)):
+def _draw_terms(axes: Axes, count: int, scale: float) -> None:
+    """Draw triangles over [-scale, scale], and their names above them."""
+    x, peaks = np.linspace(-1.0, 1.0, 1001), np.linspace(-1.0, 1.0, count)
+    rows = memberships(x, 'triangle', count)
+    for k, (name, peak, row) in enumerate(zip(NAMES[count], peaks, rows, strict=True)):
         style = {'color': COLOURS[k % 2], 'linestyle': '--' if k % 2 else '-'}
-        if terms.shape == SINGLETON:
-            axes.plot([scale * peak] * 2, [0.0, 1.0], marker='o', markevery=[1], **style)
-        else:
-            axes.plot(scale * x, memberships(x, terms)[k], **style)
+        axes.plot(scale * x, row, **style)
         axes.text(scale * peak, 1.05, name, ha='center', fontsize=6)
     axes.set_xlim(-1.05 * scale, 1.05 * scale)
     axes.set_ylim(0.0, 1.18)

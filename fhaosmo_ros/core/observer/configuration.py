@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.observer.fuzzy import curves, of_level, read_system
+from fhaosmo_ros.core.observer.fuzzy import curves, of_level
 from fhaosmo_ros.core.observer.kalman import LinearModel, Uncertainty
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -134,12 +134,8 @@ class ObserverConfiguration:
             if len(p[name]) > levels and p[name] != declared.default:
                 raise declared.error(p[name], f'1 to {levels} values (N = {levels} levels)')
         self.widths = np.array([of_level(p['fuzzy_widths'], i) for i in range(levels)])
-        if self.is_sign:  # no curve is read
-            for text in p['fuzzy_systems']:
-                read_system(text)
-            self.curves = np.ones((levels, 2))
-        else:
-            self.curves = curves(p, levels)
+        psi = curves(p, levels)
+        self.curves = np.ones((levels, 2)) if self.is_sign else psi
         self.lambdas, self.alphas = self._per_level('lambda'), self._per_level('alpha')
         self.decays = np.zeros(levels)  # D 17: of d, d', .. but not of theta
         self.decays[n - 1 : -1 if p['unknown_input'] else None] = p['unknown_input_decay']

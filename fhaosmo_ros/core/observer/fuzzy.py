@@ -1,45 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-From fuzzy systems, the paper's or the user's, to curves psi that a step reads in constant time.
+Curves psi that a step reads in constant time, of the paper's fuzzy systems or by their samples.
 
-A system is one text of `fuzzy_systems`, a level each (`read_system`). The default is the paper's:
-psi_1 has 5 terms (NB NS ZR PS PB), psi_2 and psi_3 have 7 (NBB .. PBB); rule k maps term k of the
-input to term k of the output (paper, section 3). scikit-fuzzy defuzzifies; this is the only module
-that imports it. It brings scipy along, half a second and 40 MB, so the curves of the default
-systems are read from fuzzy_curves.csv, and scikit-fuzzy is imported when another one is first
-wanted. Input and output universes are [-1, 1]; a half-width scales the input, so that a width can
-change without a new inference.
+A text of `fuzzy_systems`, for each level, says which. The default is the paper's: psi_1 has 5
+terms, psi_2 and psi_3 have 7, evenly over [-1, 1]; rule k maps term k of the input to term k of
+the output (paper, section 3). A half-width scales the input, so that it can change without a new
+inference.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-import csv
-from functools import cache, lru_cache
-from itertools import pairwise
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import shown
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import NDArray
 
-NAMES = {
-    3: ('N', 'ZR', 'P'),
-    5: ('NB', 'NS', 'ZR', 'PS', 'PB'),
-    7: ('NBB', 'NB', 'NS', 'ZR', 'PS', 'PB', 'PBB'),
-}
-"""Names of terms by their number; those of the paper for 5 and 7."""
-SHAPES: dict[str, Callable[[Any], Any]] = {
-    'triangle': lambda off: np.clip(1.0 - off, 0.0, 1.0),
-    'trapezoid': lambda off: np.clip(1.5 - 2.0 * off, 0.0, 1.0),
-    'gaussian': lambda off: 0.5 ** np.square(2.0 * off),
-}
-"""Membership by the distance from a term's peak, in parts of that to its neighbour's."""
-SINGLETON = 'singleton'
-"""Terms of the output may also be points."""
+SHAPES = {'triangle': (1.0, 0.0), 'trapezoid': (0.75, 0.25), 'gaussian': (0.5, 0.0)}
+"""Where membership is 0 and 1 (a bell's: 1/2 and 1), in parts of the way to the next peak."""
 MOST_TERMS = 99
-LEAST_GAP = 0.001
-"""Between two peaks; about the spacing of the output universe."""
 KNOTS = 193
 """Samples of a curve on [0, 1]: halves, thirds and quarters, where it has corners, are knots."""
 UNIVERSE = np.linspace(-1.0, 1.0, 2049)
@@ -47,206 +27,42 @@ UNIVERSE = np.linspace(-1.0, 1.0, 2049)
 SMALL = 1e-6
 """The grid of the output universe can not tell less; a smaller psi(1) is 0."""
 
-DEFAULT_CURVES = Path(__file__).with_name('fuzzy_curves.csv')
-"""A column for each default system and shape, a row for each knot; see studies/fuzzy_curves.py."""
-
 Curve = NDArray[np.float64]
 
 
-class Terms(NamedTuple):
+def memberships(universe: Curve, shape: str, count: int) -> Curve:
     """
-    Membership functions on [-1, 1], from the most negative term to the most positive one.
-
-    Attributes
-    ----------
-    shape : str
-        One of `SHAPES`, or `SINGLETON`.
-    peaks : tuple of float
-        Ascending.
-
-    """
-
-    shape: str
-    peaks: tuple[float, ...]
-
-
-class FuzzySystem(NamedTuple):
-    """
-    A fuzzy inference system with one input and one output.
-
-    Attributes
-    ----------
-    inputs, outputs : Terms
-    rules : tuple of int
-        Rule k maps input term k to output term rules[k]; both count from 0.
-
-    """
-
-    inputs: Terms
-    outputs: Terms
-    rules: tuple[int, ...]
-
-
-def read_system(text: str) -> FuzzySystem | Curve:
-    """
-    Read the text of a system: clauses with ``;`` between them, each a word and its values.
-
-    ==================== ==========================================================================
-    ``terms [S] P``      membership functions of input and output
-    ``input [S] P``      those of the input alone
-    ``output [S] P``     those of the output alone
-    ``rules k1 k2 ..``   output term of each input term, counted from 1; default: 1 2 3 ..
-    ``curve 0 v1 v2 ..`` instead of all these: evenly spaced samples of psi over [0, 1]
-    ==================== ==========================================================================
-
-    S is a shape, triangle where it is left out. P is the number of terms that divide [-1, 1]
-    evenly, or their peaks. Peaks and rules are their own mirror images: psi is odd.
-
-    Returns
-    -------
-    FuzzySystem, or array
-        Of the samples.
-
-    Raises
-    ------
-    ConfigurationError
-        The text is no system.
-
-    """
-    clauses: dict[str, list[str]] = {}
-    for clause in text.split(';'):
-        name, *values = clause.replace(',', ' ').split() or ['']
-        if name not in CLAUSES or name in clauses:
-            raise _refused(text, f'clauses {", ".join(CLAUSES)}, each once', repr(name))
-        clauses[name] = values
-    if 'curve' in clauses:
-        if len(clauses) > 1:
-            raise _refused(text, 'curve by itself', ', '.join(clauses))
-        samples = np.array(_numbers(text, clauses['curve']))
-        if len(samples) < 2 or samples[0] != 0.0:
-            raise _refused(text, '2 samples or more, the first one 0', shown(samples))
-        return samples
-    if 'terms' in clauses and {'input', 'output'} <= clauses.keys():
-        raise _refused(text, 'terms, or input and output', ', '.join(clauses))
-    common = clauses.get('terms')
-    sides = [clauses.get(side, common) for side in ('input', 'output')]
-    if sides[0] is None:
-        raise _refused(text, 'terms, input or curve', ', '.join(clauses))
-    inputs = _terms(text, sides[0], [*SHAPES])
-    outputs = _terms(text, sides[1] or sides[0], (*SHAPES, SINGLETON))
-    count, most = len(inputs.peaks), len(outputs.peaks)
-    numbers: Sequence[float] = range(1, count + 1)
-    if 'rules' in clauses:
-        numbers = _numbers(text, clauses['rules'])
-    elif count != most:
-        allowed = 'rules where input and output have not the same number of terms'
-        raise _refused(text, allowed, f'{count} and {most} terms')
-    if len(numbers) != count or not all(k in range(1, most + 1) for k in numbers):
-        allowed = f'{count} rules, each an output term from 1 to {most}'
-        raise _refused(text, allowed, shown(numbers))
-    rules = tuple(int(k) - 1 for k in numbers)
-    for what, row in ('peaks', inputs.peaks), ('peaks', outputs.peaks), ('rules', numbers):
-        sums = np.add(row, row[::-1])
-        if np.any(sums != (most + 1 if row is numbers else 0.0)):
-            raise _refused(text, f'an odd curve, from {what} that are mirrored', shown(row))
-    return FuzzySystem(inputs, outputs, rules)
-
-
-CLAUSES = ('terms', 'input', 'output', 'rules', 'curve')
-
-
-def _refused(text: str, allowed: str, got: str) -> ConfigurationError:
-    return ConfigurationError(
-        f"parameter 'fuzzy_systems': expected {allowed}, got {got} in {shown(text)}"
-    )
-
-
-def _numbers(text: str, words: Sequence[str]) -> list[float]:
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = []
-    if not numbers or not np.all(np.isfinite(numbers)):
-        raise _refused(text, 'numbers', shown(' '.join(words)))
-    return numbers
-
-
-def _terms(text: str, words: Sequence[str], shapes: Sequence[str]) -> Terms:
-    shape = shapes[0]
-    if words and words[0][:1].isalpha():
-        shape, *words = words
-    if shape not in shapes:
-        raise _refused(text, f'a shape of {", ".join(shapes)}', repr(shape))
-    numbers = _numbers(text, words)
-    if len(numbers) == 1:
-        count = numbers[0]
-        if count not in range(3, MOST_TERMS + 1, 2):
-            raise _refused(text, f'an odd number of terms, 3 to {MOST_TERMS}', f'{count:g}')
-        half = np.linspace(0.0, 1.0, (int(count) + 1) // 2).tolist()
-        return Terms(shape, (*(-c for c in half[:0:-1]), *half))
-    apart = min(high - low for low, high in pairwise(numbers))
-    within = -1.0 <= numbers[0] <= numbers[-1] <= 1.0
-    if not (apart >= LEAST_GAP and within and len(numbers) <= MOST_TERMS):
-        allowed = (
-            f'2 to {MOST_TERMS} peaks within [-1, 1], each {LEAST_GAP} or more above the last'
-        )
-        raise _refused(text, allowed, shown(numbers))
-    return Terms(shape, tuple(numbers))
-
-
-def memberships(universe: Curve, terms: Terms) -> Curve:
-    """
-    Return the membership functions of terms.
+    Return the membership functions of terms that divide [-1, 1] evenly, a row for each.
 
     A triangle reaches 0 at its neighbours' peaks; a trapezoid is 1 over half of that; trapezoids
-    and bells cross their neighbours at 1/2. The outermost terms are 1 beyond their peaks.
-
-    Parameters
-    ----------
-    universe : (K,) array
-        Where to evaluate them, within [-1, 1].
-    terms : Terms
-        No singletons.
-
-    Returns
-    -------
-    (terms, K) array
-        One row a term.
-
+    and bells cross their neighbours at 1/2.
     """
-    peaks = np.array(terms.peaks)[:, np.newaxis]
-    gaps, off = np.diff(peaks, axis=0), universe - peaks
-    left, right = np.vstack([gaps[:1], gaps]), np.vstack([gaps, gaps[-1:]])
-    rows: Curve = SHAPES[terms.shape](np.abs(off) / np.where(off < 0.0, left, right))
-    rows[0][universe < peaks[0]] = 1.0
-    rows[-1][universe > peaks[-1]] = 1.0
-    return rows
+    peaks = np.linspace(-1.0, 1.0, count)[:, np.newaxis]
+    gap, off = peaks[1] - peaks[0], universe - peaks
+    if shape == 'gaussian':
+        sigma = gap / (2.0 * np.sqrt(2.0 * np.log(2.0)))
+        return np.asarray(np.exp(-(off**2) / (2.0 * sigma**2)))
+    foot, shoulder = (peaks + part * np.copysign(gap, off) for part in SHAPES[shape])
+    return np.asarray(np.clip((universe - foot) / (shoulder - foot), 0.0, 1.0))
 
 
-def infer(x: Curve, system: FuzzySystem) -> Curve:
-    """
-    Mamdani inference: minimum, maximum, centroid; singletons: their weighted mean.
+def infer(x: Curve, shape: str, count: int) -> Curve:
+    """Mamdani inference for inputs (K,) in [-1, 1]: minimum, maximum, centroid."""
+    outputs = memberships(UNIVERSE, shape, count)
+    activations = memberships(x, shape, count).T
+    return np.array([_centroid(np.minimum(a[:, None], outputs).max(axis=0)) for a in activations])
 
-    Parameters
-    ----------
-    x : (K,) array
-        Inputs within [-1, 1].
 
-    Returns
-    -------
-    (K,) array
-        The crisp outputs, not normalised.
-
-    """
-    import skfuzzy
-
-    activations, rules = memberships(x, system.inputs), list(system.rules)
-    if system.outputs.shape == SINGLETON:
-        peaks = np.array(system.outputs.peaks)[rules]
-        return np.asarray(peaks @ activations / activations.sum(axis=0))
-    outputs = memberships(UNIVERSE, system.outputs)[rules]
-    regions = (np.minimum(a[:, None], outputs).max(axis=0) for a in activations.T)
-    return np.array([skfuzzy.defuzz(UNIVERSE, r, 'centroid') for r in regions])
+def _centroid(y: Curve) -> Any:
+    """Return the centroid of the region below a line through points over `UNIVERSE`."""
+    begin, step, left, right = UNIVERSE[:-1], np.diff(UNIVERSE), y[:-1], y[1:]
+    with np.errstate(invalid='ignore'):  # 0 / 0 where the region has no height
+        middle = 2.0 / 3.0 * step * (right + 0.5 * left) / (left + right) + begin
+    cases = [left == right, left == 0.0, right == 0.0]
+    exact = [0.5 * (begin + UNIVERSE[1:]), 2.0 / 3.0 * step + begin, 1.0 / 3.0 * step + begin]
+    middle = np.select(cases, exact, middle)
+    area = np.where(left == right, step * left, 0.5 * step * (left + right))
+    return np.cumsum(middle * area)[-1] / np.cumsum(area)[-1]
 
 
 @lru_cache(maxsize=32)
@@ -257,7 +73,8 @@ def curve(text: str) -> Curve:
     Parameters
     ----------
     text : str
-        See `read_system`.
+        ``terms [SHAPE] P`` for P terms, as a triangle where no shape of `SHAPES` is named, or
+        ``curve 0 v1 v2 ..`` for evenly spaced samples of psi over [0, 1].
 
     Returns
     -------
@@ -268,19 +85,45 @@ def curve(text: str) -> Curve:
     Raises
     ------
     ConfigurationError
-        The text is no system, or its curve falls, stays 0, or leaves [-1, 1].
+        The text is neither, or its curve falls, stays 0, or leaves [-1, 1].
 
     """
-    system = read_system(text)
-    if isinstance(system, FuzzySystem):
-        shipped = default_curves().get(system)
-        psi = inferred(system) if shipped is None else shipped.copy()
+    grid = np.linspace(0.0, 1.0, KNOTS)
+    kind, *words = text.replace(',', ' ').split() or ['']
+    shape = words.pop(0) if kind == 'terms' and words and words[0][0].isalpha() else 'triangle'
+    if kind not in ('terms', 'curve'):
+        raise _refused(text, f'terms [{"|".join(SHAPES)}] P, or curve 0 v1 v2 ..', repr(kind))
+    if shape not in SHAPES:
+        raise _refused(text, f'a shape of {", ".join(SHAPES)}', repr(shape))
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if not numbers or not np.isfinite(numbers).all():
+        raise _refused(text, 'numbers', shown(' '.join(words)))
+    if kind == 'curve':
+        if len(numbers) < 2 or numbers[0] != 0.0:
+            raise _refused(text, '2 samples or more, the first one 0', shown(numbers))
+        psi = np.interp(grid, np.linspace(0.0, 1.0, len(numbers)), numbers)
+    elif len(numbers) > 1 or numbers[0] not in range(3, MOST_TERMS + 1, 2):
+        got = ' '.join(f'{number:g}' for number in numbers)
+        raise _refused(text, f'an odd number of terms, 3 to {MOST_TERMS}', shown(got))
     else:
-        psi = np.interp(np.linspace(0.0, 1.0, KNOTS), np.linspace(0.0, 1.0, len(system)), system)
-    _expect_rising(text, psi)
+        psi = infer(grid, shape, int(numbers[0]))
+        psi[0] = 0.0  # an odd curve is 0 there; the inference leaves rounding errors
+        # What falls by less than the grid of the output universe can tell does not fall.
+        level = np.maximum.accumulate(psi)
+        psi = np.where(level - psi < SMALL, level, psi)
+    k = int(np.diff(psi).argmin())
+    if psi[k + 1] < psi[k]:
+        where = [f'psi({j / (KNOTS - 1):.3g}) = {psi[j]:.4g}' for j in (k, k + 1)]
+        raise _refused(text, 'a curve that does not fall', ', '.join(where))
+    if not SMALL < psi[-1] <= 1.0:
+        got = f'psi(1) = {psi[-1]:.4g}'
+        raise _refused(text, 'a curve that ends above 0 and at most at 1', got)
     psi /= psi[-1]
     psi.flags.writeable = False
-    return psi
+    return np.asarray(psi)
 
 
 def curves(parameters: Mapping[str, Any], levels: int) -> Curve:
@@ -294,32 +137,7 @@ def of_level(values: Sequence[Any], level: int) -> Any:
     return values[min(level, len(values) - 1)]
 
 
-@cache
-def default_curves() -> dict[FuzzySystem, Curve]:
-    """Return the curves of the default systems, not normalised, as `inferred` made them."""
-    with DEFAULT_CURVES.open(newline='') as file:
-        header, *rows = csv.reader(file)
-    columns = np.array(rows, dtype=float).T
-    systems = (read_system(text) for text in header)
-    return {s: c for s, c in zip(systems, columns, strict=True) if isinstance(s, FuzzySystem)}
-
-
-def inferred(system: FuzzySystem) -> Curve:
-    """Return psi of a system at the knots, not normalised."""
-    psi = infer(np.linspace(0.0, 1.0, KNOTS), system)
-    psi[0] = 0.0  # an odd curve is 0 there; the inference leaves rounding errors
-    # What falls by less than the grid of the output universe can tell does not fall.
-    level = np.maximum.accumulate(psi)
-    return np.where(level - psi < SMALL, level, psi)
-
-
-def _expect_rising(text: str, psi: Curve) -> None:
-    """Raise unless psi is 0 at 0, does not fall, ends above 0, and is at most 1."""
-    k = int(np.diff(psi).argmin())
-    where = f'psi({k / (KNOTS - 1):.3g}) = {psi[k]:.4g}, psi({(k + 1) / (KNOTS - 1):.3g}) = '
-    if psi[k + 1] < psi[k]:
-        raise _refused(text, 'a curve that does not fall', f'{where}{psi[k + 1]:.4g}')
-    if not SMALL < psi[-1] <= 1.0:
-        raise _refused(
-            text, 'a curve that ends above 0 and at most at 1', f'psi(1) = {psi[-1]:.4g}'
-        )
+def _refused(text: str, allowed: str, got: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"parameter 'fuzzy_systems': expected {allowed}, got {got} in {shown(text)}"
+    )
