@@ -6,7 +6,6 @@ from array import array
 import warnings
 
 from fhaosmo_ros.core import ConfigurationError, Observer
-from fhaosmo_ros.core.parameters import files
 from fhaosmo_ros.core.parameters.declaration import KINDS, Parameter
 from fhaosmo_ros.core.parameters.files import load, select
 from fhaosmo_ros.core.parameters.per_channel import (
@@ -15,7 +14,6 @@ from fhaosmo_ros.core.parameters.per_channel import (
     UNNAMED,
     with_channels,
 )
-from fhaosmo_ros.core.parameters.removed import REMOVED
 from fhaosmo_ros.core.parameters.tables import (
     CHANNEL_PARAMETERS,
     ESTIMATOR_PARAMETERS,
@@ -200,15 +198,6 @@ def test_default_gains_with_the_plant_of_a_user_are_warned_of():
         for fine in ({}, {'phi': ['0', '0', '-z3']}, model | {'lambda': 3.0},
                      model | {'gains': 'self_tuning'}):  # fmt: skip
             Observer(fine)
-
-
-def test_parameter_of_an_older_version_names_its_successor():
-    for name, successor in REMOVED.items():
-        for wrong, values in ((name, {}), (f'hip.{name}', {'channels': ['hip']})):
-            with pytest.raises(ConfigurationError) as error:
-                files.complete(values | {wrong: 1.0}, ESTIMATOR_PARAMETERS)
-            assert str(error.value) == f"parameter '{wrong}' is gone: {successor}"
-        assert not any(name in table for table in files.NODE_TABLES.values())
 
 
 # Of many channels: common values, and a channel's own in their place

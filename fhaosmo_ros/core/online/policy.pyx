@@ -9,13 +9,12 @@ from libc.math cimport fabs, fmin, isfinite, isnan
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
-from fhaosmo_ros.core.observer.record cimport Record
 from fhaosmo_ros.core.observer.self_tuning.observer cimport SelfTuning
 from fhaosmo_ros.core.observer.status cimport (
     DIVERGED, FLAGS_MASK, GAP, HELD, JUMPED, REJECTED, REJECTED_MEASUREMENT, REJECTED_PERIOD,
     REJECTED_SPIKE, REJECTED_STEP, REJECTED_STUCK, REPEATED, RESTARTED, UNUSED
 )
-from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, Structure
+from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, Record, Structure
 from fhaosmo_ros.core.online.delay cimport NANOSECONDS, PastInputs
 from fhaosmo_ros.core.online.samples cimport (
     FAR, WINDOW, Clock, Counters, Course, Sensor, Settings, clock_time, difference, is_held,
