@@ -103,8 +103,8 @@ OBSERVER = (
               'half-width psi is +-1. Unit of eps_i; levant: of y.', lower=1e-12, upper=1e12,
               lengths='1 to N; the last one serves later levels'),
     Parameter('fuzzy_systems', ['terms 5', 'terms 7'],
-              'The fuzzy systems of levels 1, 2, ...: membership functions and '
-              'rules, or a sampled curve (docs/mathematics.md, Fuzzy curves).',
+              'The fuzzy systems of levels 1, 2, ...: shape and number of terms, or a sampled '
+              'curve (docs/mathematics.md, Fuzzy curves).',
               lengths='1 to N; the last one serves later levels'),
     Parameter('gamma_initial', 0.95, 'Power gamma at the start of an adaptive variant.', lower=0.0,
               lower_open=True, upper=1.0),
