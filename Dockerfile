@@ -13,10 +13,10 @@ RUN apt-get update \
 WORKDIR /ws
 COPY . src/fhaosmo_ros
 
-# scikit-fuzzy has no rosdep key, and rosdep would install rosbags by a pip that Ubuntu refuses.
+# rosdep would install rosbags by a pip that Ubuntu refuses.
 RUN python3 -m venv --system-site-packages venv \
     && touch venv/COLCON_IGNORE \
-    && venv/bin/pip install --no-cache-dir 'rosbags>=0.11.9,<0.12' 'scikit-fuzzy==0.5.0'
+    && venv/bin/pip install --no-cache-dir 'rosbags>=0.11.9,<0.12'
 
 # hadolint ignore=SC1091
 RUN . venv/bin/activate \

@@ -132,7 +132,7 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={'': ['*.csv', '*.pxd', '*.pyi']},
+    package_data={'': ['*.pxd', '*.pyi']},
     ext_modules=extensions(),
     cmdclass={'build_ext': BuildExtensions},
     data_files=[
@@ -144,12 +144,9 @@ setup(
     install_requires=[
         'matplotlib',
         'mcap>=1.6,<1.7',  # tools/bags uses two attributes of its Writer
-        'networkx',  # this, packaging and scipy: scikit-fuzzy imports them but declares nothing
         'numpy',
-        'packaging',
         'pyyaml',
         'rosbags>=0.11.9,<0.12',  # tools/bags uses its internals
-        'scikit-fuzzy',
         'scipy',
         'tqdm',
         'zstandard',
@@ -176,7 +173,10 @@ setup(
             'import-linter',
             'mcap-ros2-support',
             'mypy',
+            'networkx',  # this and packaging: scikit-fuzzy imports them but declares nothing
+            'packaging',
             'ruff',
+            'scikit-fuzzy',
             'setuptools>=68,<80',  # from 80 on, colcon build --symlink-install silently copies
             'sympy',
             'types-PyYAML',

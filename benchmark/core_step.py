@@ -16,8 +16,8 @@ from fhaosmo_ros.core import Plant
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.fuzzy import KNOTS
 from fhaosmo_ros.core.observer.observer import Observer
-from fhaosmo_ros.core.observer.record import run as run_structure
 from fhaosmo_ros.core.observer.status import LEVEL_SHIFT
+from fhaosmo_ros.core.observer.structure import run as run_structure
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 import numpy as np

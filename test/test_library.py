@@ -1,10 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the library offers beside ROS: parameter files, and what `tune` has written."""
 
-import copy
-import pickle
-
-from fhaosmo_ros.core import ConfigurationError, Function, Observer, OnlineEstimator, Plant
+from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Plant
 from fhaosmo_ros.core.parameters.files import dumps
 import numpy as np
 import pytest
@@ -105,49 +102,3 @@ def test_seconds_are_no_stamps():
         estimator.update(0.001, 0.1)
     with pytest.raises(ConfigurationError, match='nanoseconds'):
         estimator.run(T, Y)
-
-
-def swing(z, u):
-    return -3.0 * np.sin(z[0]) - z[1] * u[0]
-
-
-def gradient(z, u):
-    return [-3.0 * np.cos(z[0]), -u[0]]
-
-
-@pytest.mark.parametrize('gains', ['fixed', 'self_tuning'])
-@pytest.mark.parametrize(('slopes', 'tolerance'), [(gradient, 1e-12), (None, 1e-6)])
-def test_python_function_is_as_its_expression(gains, slopes, tolerance):
-    u = np.cos(T)
-    wanted = Observer(OSCILLATOR, gains=gains).run(T, Y, u)
-    observer = Observer(OSCILLATOR, gains=gains, phi=['0', Function(swing, slopes)])
-    for found in observer.run(T, Y, u), copy.deepcopy(observer).run(T + 1.0, Y, u):
-        assert np.isfinite(found.z).all()
-    np.testing.assert_allclose(
-        Observer(observer.parameters).run(T, Y, u).z, wanted.z, rtol=tolerance, atol=tolerance
-    )
-    assert pickle.loads(pickle.dumps(Function(swing))).function is swing  # noqa: S301
-
-
-def test_exception_of_a_python_function_comes_out():
-    def spring(z, u):
-        if z[0] > 0.004:
-            raise ArithmeticError
-        return -z[0]
-
-    with pytest.raises(IndexError):
-        Observer(OSCILLATOR, phi=['0', Function(lambda z, u: z[2])])
-    model = OSCILLATOR | {'phi': ['0', Function(spring)], 'noise_size': 1e-3}
-    observer, online = Observer(model), OnlineEstimator(model)
-    whole = OnlineEstimator(model)
-    whole.smooth()
-    stamps = np.round(T * 1e9).astype(np.int64) + 1
-    for call in (
-        lambda: observer.run(T, Y, 0.0), lambda: observer.smooth(T, Y, 0.0),
-        lambda: [observer.step(y, 1e-3, 0.0) for y in Y],
-        lambda: online.run(stamps, Y, 0.0),
-        lambda: [online.update(*sample) for sample in zip(stamps + stamps[-1], Y, strict=True)],
-        lambda: (whole.run(stamps, Y, 0.0), whole.finish()),
-    ):  # fmt: skip
-        with pytest.raises(ArithmeticError):
-            call()

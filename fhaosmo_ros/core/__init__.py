@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The observer as a plain Python library: no middleware, no bag reader, no plotting."""
 
-from fhaosmo_ros.core.model.function import Function
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory
 from fhaosmo_ros.core.observer.observer import Observer
@@ -20,7 +19,6 @@ __all__ = [
     'Event',
     'EventDetector',
     'Family',
-    'Function',
     'Observer',
     'OnlineEstimator',
     'Plant',

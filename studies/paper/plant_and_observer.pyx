@@ -24,7 +24,7 @@ from fhaosmo_ros.core.observer.configuration import ObserverConfiguration, per_l
 from fhaosmo_ros.core.observer.observer import make_structure
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
-from fhaosmo_ros.core.simulation.system import Wave
+from fhaosmo_ros.core.simulation.system import Disturbance
 import numpy as np
 
 
@@ -172,7 +172,7 @@ def simulate(observer, plant, solver='ode3', step=1e-3, duration=20.0, every=1):
     own = {'scheme': 'explicit', 'noise_size': 0.0}  # a solver has no scheme of its own
     configuration = ObserverConfiguration(OBSERVER_PARAMETERS.complete(observer).changed(own))
     p = PLANT_PARAMETERS.complete(plant)
-    model, d = TriangularModel.of(p), Wave(p)
+    model, d = TriangularModel.of(p), Disturbance(p)
     z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], model.order)
     system = System(model.expressions, d, step, z)
     joint = Joint(system, configuration, solver == HELD and configuration.is_sign)

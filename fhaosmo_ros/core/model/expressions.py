@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import keyword
 import math
 import re
-from types import MappingProxyType
+import sys
 from typing import NamedTuple
 import warnings
 
@@ -54,61 +54,27 @@ class Instruction(NamedTuple):
     operand: float = 0.0
 
 
-class Names(NamedTuple):
+def check_names(inputs: Sequence[str], constants: Mapping[str, float]) -> None:
+    """Raise ConfigurationError for a name that an expression could not use."""
+    taken = [*inputs, *constants]
+    for parameter, names in ('inputs', inputs), ('constants', constants):
+        for name in names:
+            problem = ''
+            if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name) or keyword.iskeyword(name):
+                problem = 'expected a letter, then letters, digits and _'
+            elif re.fullmatch('z[0-9]+', name) or name in KNOWN:
+                problem = 'expected a name that is not yet taken'
+            elif taken.count(name) > 1:
+                problem = 'expected every name once'
+            if problem:
+                raise ConfigurationError(f"parameter '{parameter}': {problem}, got {name!r}")
+
+
+def parse(
+    text: str, level: int, inputs: Sequence[str] = ('u',), constants: Mapping[str, float] = {}
+) -> list[Instruction]:
     """
-    Names that expressions may use beside those of the states.
-
-    Attributes
-    ----------
-    inputs : sequence of str
-        Known inputs, in the order of their values in u.
-    constants : mapping
-        Numbers by name.
-
-    """
-
-    inputs: Sequence[str] = ('u',)
-    constants: Mapping[str, float] = MappingProxyType({})
-
-    def check(self) -> None:
-        """
-        Refuse names that an expression could not use.
-
-        Raises
-        ------
-        ConfigurationError
-            Says which, and why.
-
-        """
-        for parameter, names in ('inputs', list(self.inputs)), ('constants', [*self.constants]):
-            for name in names:
-                problem = ''
-                if not re.fullmatch('[A-Za-z][A-Za-z0-9_]*', name) or keyword.iskeyword(name):
-                    problem = 'expected a letter, then letters, digits and _'
-                elif re.fullmatch('z[0-9]+', name) or name in KNOWN:
-                    problem = 'expected a name that is not yet taken'
-                elif [*self.inputs, *self.constants].count(name) > 1:
-                    problem = 'expected every name once'
-                if problem:
-                    raise ConfigurationError(f"parameter '{parameter}': {problem}, got {name!r}")
-
-
-ONLY_U = Names()
-
-
-def parse(text: str, level: int, names: Names = ONLY_U) -> list[Instruction]:
-    """
-    Parse Phi_level.
-
-    Parameters
-    ----------
-    text : str
-        The expression; it may use z1 .. z<level>, `names`, numbers, + - * / **, `FUNCTIONS`,
-        `FUNCTIONS_OF_SEVERAL` and `NUMBERS`.
-    level : int
-        1-based index of Phi.
-    names : Names
-        Known inputs and constants.
+    Parse Phi_level, which may use z1 .. z<level>, known inputs and constants by their names.
 
     Returns
     -------
@@ -121,7 +87,7 @@ def parse(text: str, level: int, names: Names = ONLY_U) -> list[Instruction]:
         Anything that is not on the whitelist, or more work than the limits above allow.
 
     """
-    parser = _Parser(text, level, names)
+    parser = _Parser(text, level, inputs, constants)
     if len(text) > MAX_LENGTH:
         parser.text = text[:40] + '...'
         raise parser.error(f'{len(text)} characters, at most {MAX_LENGTH}')
@@ -141,13 +107,13 @@ def parse(text: str, level: int, names: Names = ONLY_U) -> list[Instruction]:
 
 
 class _Parser:
-    def __init__(self, text: str, level: int, names: Names) -> None:
-        self.text = text
-        self.level = level
-        self.others = [*names.inputs, *names.constants]
+    def __init__(
+        self, text: str, level: int, inputs: Sequence[str], constants: Mapping[str, float]
+    ) -> None:
+        self.text, self.level, self.others = text, level, [*inputs, *constants]
         self.names = {f'z{j + 1}': Instruction(phi.STATE, j) for j in range(level)}
-        self.names |= {n: Instruction(phi.INPUT, k) for k, n in enumerate(names.inputs)}
-        for name, number in (NUMBERS | dict(names.constants)).items():
+        self.names |= {name: Instruction(phi.INPUT, k) for k, name in enumerate(inputs)}
+        for name, number in (NUMBERS | dict(constants)).items():
             self.names[name] = Instruction(phi.CONST, number)
 
     def emit(self, node: ast.expr) -> list[Instruction]:
@@ -155,7 +121,9 @@ class _Parser:
             case ast.Constant(value=bool()):
                 raise self.error(f'{node.value!r} is not a number')
             case ast.Constant(value=int() | float() as number):
-                return [self.constant(number)]
+                if number > sys.float_info.max:
+                    raise self.error('a number is too large')
+                return [Instruction(phi.CONST, float(number))]
             case ast.Name(id=name):
                 return [self.name(name)]
             case ast.UnaryOp(op=ast.UAdd(), operand=operand):
@@ -173,27 +141,16 @@ class _Parser:
         raise self.error(f'{part[:60]!r} is not allowed')
 
     def call(self, name: str, arguments: list[list[Instruction]]) -> list[Instruction]:
-        several = name in FUNCTIONS_OF_SEVERAL
-        if not several and name not in FUNCTIONS:
-            known = [*FUNCTIONS, *FUNCTIONS_OF_SEVERAL]
+        known = FUNCTIONS | FUNCTIONS_OF_SEVERAL
+        if name not in known:
             raise self.error(f"unknown function '{name}'{suggestion(name, known)}")
-        if len(arguments) != 1 + several and not (name in ('min', 'max') and len(arguments) > 2):
-            raise self.error(f'{_needs(name)}, got {len(arguments)}')
+        count, several = len(arguments), name in FUNCTIONS_OF_SEVERAL
+        if count != 1 + several and not (name in ('min', 'max') and count > 2):
+            raise self.error(f'{_needs(name)}, got {count}')
         result, *rest = arguments
-        if not several:
-            return self.fold([*result, Instruction(FUNCTIONS[name])])
-        for argument in rest:
-            result = self.fold([*result, *argument, Instruction(FUNCTIONS_OF_SEVERAL[name])])
+        for argument in rest if several else [[]]:
+            result = self.fold([*result, *argument, Instruction(known[name])])
         return result
-
-    def constant(self, number: float) -> Instruction:
-        try:
-            value = float(number)
-        except OverflowError:
-            value = math.inf
-        if not math.isfinite(value):
-            raise self.error('a number is too large')
-        return Instruction(phi.CONST, value)
 
     def name(self, name: str) -> Instruction:
         if name in self.names:

@@ -5,7 +5,6 @@ cpdef enum:
     CONST, STATE, INPUT
     ADD, SUB, MUL, DIV, POW, ATAN2, MIN, MAX
     NEG, SIN, COS, TAN, EXP, LOG, SQRT, ABS, TANH, SIGN
-    CALL
 
 cdef enum:
     MOST_OPERANDS = 128  # on the stack of an expression; above `MAX_OPERATIONS` of expressions.py
@@ -30,9 +29,6 @@ cdef class Expressions:
     cdef Dual evaluate(
         self, int i, const double* z, const double* dz, const double* u
     ) noexcept nogil
-    cdef Dual call(
-        self, int i, const double* z, const double* dz, const double* u
-    ) noexcept with gil
 
 
 cdef inline Dual evaluate(

@@ -12,7 +12,6 @@ from libc.math cimport (
 )
 from libc.stdlib cimport free, malloc
 
-from fhaosmo_ros.core.model.function import Function
 import numpy as np
 
 
@@ -27,10 +26,9 @@ cdef class Expressions:
 
     Parameters
     ----------
-    source : sequence of sequences of (int, float), or of Function
+    source : sequence of sequences of (int, float)
         Each expression's operations in postfix order: `CONST` .. `SIGN`, and the constant, or the
-        index of the state or input, that belongs to it. An empty expression is the constant 0. A
-        `Function` is called instead.
+        index of the state or input, that belongs to it. An empty expression is the constant 0.
     states, inputs : int
         How many states and known inputs there are.
 
@@ -42,10 +40,7 @@ cdef class Expressions:
 
     def __cinit__(self, source, int states, int inputs):
         cdef int k = 0, i
-        self.source = tuple(
-            one if isinstance(one, Function) else tuple((int(c), float(x)) for c, x in one)
-            for one in source
-        )
+        self.source = tuple(tuple((int(c), float(x)) for c, x in one) for one in source)
         self.count, self.states, self.inputs = len(self.source), states, inputs
         self.code = <Instruction*>malloc(
             (1 + sum(map(len, self.source))) * sizeof(Instruction)
@@ -55,10 +50,6 @@ cdef class Expressions:
             raise MemoryError
         for i, expression in enumerate(self.source):
             self.offsets[i] = k
-            if isinstance(expression, Function):
-                self.code[k].code = CALL
-                k += 1
-                continue
             for code, operand in expression:
                 self.code[k].code = code
                 self.code[k].index = <int>operand if code in (STATE, INPUT) else 0
@@ -90,8 +81,6 @@ cdef class Expressions:
         instruction = self.code + self.offsets[i]
         if instruction == end:
             return Dual(0.0, 0.0)
-        if instruction.code == CALL:
-            return self.call(i, z, dz, u)
         top -= 1
         while instruction != end:
             code = instruction.code
@@ -160,18 +149,6 @@ cdef class Expressions:
                     top.value, top.slope = sign_of(a), 0.0
             instruction += 1
         return stack[0]
-
-    cdef Dual call(
-        self, int i, const double* z, const double* dz, const double* u
-    ) noexcept with gil:
-        """Do what `evaluate` does, where Phi_{i+1} is a Python function."""
-        cdef int k
-        cdef double value, slope
-        value, slope = self.source[i].along(
-            [z[k] for k in range(i + 1)], [dz[k] for k in range(i + 1)],
-            [u[k] for k in range(self.inputs)]
-        )
-        return Dual(value, slope)
 
     def along(self, z, dz, u):
         """

@@ -4,8 +4,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fhaosmo_ros.core.model.expressions import is_linear, Names, ONLY_U, parse
-from fhaosmo_ros.core.model.function import Function
+from fhaosmo_ros.core.model.expressions import check_names, is_linear, parse
 from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.model.phi import Expressions, INPUT
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -21,11 +20,13 @@ class TriangularModel:
     Parameters
     ----------
     phi : sequence of str
-        One expression, or `Function`, a state.
+        One expression a state.
     order : int, optional
         Number of states n, to be checked against ``len(phi)``.
-    names : Names, optional
-        Known inputs and constants; without it, one known input u.
+    inputs : sequence of str
+        Names of the known inputs, in the order of their values.
+    constants : mapping
+        Numbers by name.
 
     Attributes
     ----------
@@ -35,8 +36,11 @@ class TriangularModel:
         Phi_1 .. Phi_n.
     inputs : tuple of str
         Names of the known inputs u_1 .. u_m, in the order of their values.
-    functions : tuple of Function
-        Those of Phi that are Python functions.
+    uses_input : bool
+    used_inputs : tuple of str
+        Those of them that an expression of Phi uses.
+    is_linear : bool
+        Every Phi is a linear function of the states, whatever the known inputs.
 
     Raises
     ------
@@ -46,7 +50,11 @@ class TriangularModel:
     """
 
     def __init__(
-        self, phi: Sequence[str], order: int | None = None, names: Names = ONLY_U
+        self,
+        phi: Sequence[str],
+        order: int | None = None,
+        inputs: Sequence[str] = ('u',),
+        constants: Mapping[str, float] = {},
     ) -> None:
         if order is not None and len(phi) != order:
             raise ConfigurationError(
@@ -55,13 +63,13 @@ class TriangularModel:
             )
         self.phi = tuple(phi)
         self.order = len(self.phi)
-        names.check()
-        self.inputs = tuple(names.inputs)
-        self.functions = tuple(phi for phi in self.phi if isinstance(phi, Function))
-        self._parsed: list[Any] = [
-            text if isinstance(text, Function) else parse(text, i + 1, names)
-            for i, text in enumerate(self.phi)
-        ]
+        check_names(inputs, constants)
+        self.inputs = tuple(inputs)
+        self._parsed = [parse(text, i + 1, inputs, constants) for i, text in enumerate(self.phi)]
+        used = {index for tokens in self._parsed for code, index in tokens if code == INPUT}
+        self.uses_input = bool(used)
+        self.used_inputs = tuple(name for k, name in enumerate(self.inputs) if k in used)
+        self.is_linear = all(is_linear(tokens) for tokens in self._parsed)
         self.expressions = Expressions(self._parsed, self.order, len(self.inputs))
 
     @classmethod
@@ -72,25 +80,7 @@ class TriangularModel:
             for name, value in parameters.items()
             if name.startswith(CONSTANTS)
         }
-        names = Names(parameters['inputs'], constants)
-        return cls(parameters['phi'], parameters['order'], names)
-
-    @property
-    def used_inputs(self) -> tuple[str, ...]:
-        """Names of the known inputs that an expression of Phi uses."""
-        expressions = [tokens for tokens in self._parsed if not isinstance(tokens, Function)]
-        used = {index for tokens in expressions for code, index in tokens if code == INPUT}
-        return tuple(name for k, name in enumerate(self.inputs) if k in used)
-
-    @property
-    def uses_input(self) -> bool:
-        """True if a Phi uses a known input."""
-        return bool(self.used_inputs)
-
-    @property
-    def is_linear(self) -> bool:
-        """True if every Phi is a linear function of the states, whatever the known inputs."""
-        return not self.functions and all(is_linear(tokens) for tokens in self._parsed)
+        return cls(parameters['phi'], parameters['order'], parameters['inputs'], constants)
 
     def with_unknown_input(self, decay: float, derivatives: int) -> Expressions:
         """

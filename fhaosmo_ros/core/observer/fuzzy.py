@@ -4,18 +4,13 @@ From fuzzy systems, the paper's or the user's, to curves psi that a step reads i
 
 A system is one text of `fuzzy_systems`, a level each (`read_system`). The default is the paper's:
 psi_1 has 5 terms (NB NS ZR PS PB), psi_2 and psi_3 have 7 (NBB .. PBB); rule k maps term k of the
-input to term k of the output (paper, section 3). scikit-fuzzy defuzzifies; this is the only module
-that imports it. It brings scipy along, half a second and 40 MB, so the curves of the default
-systems are read from fuzzy_curves.csv, and scikit-fuzzy is imported when another one is first
-wanted. Input and output universes are [-1, 1]; a half-width scales the input, so that a width can
-change without a new inference.
+input to term k of the output (paper, section 3). Input and output universes are [-1, 1]; a
+half-width scales the input, so that a width can change without a new inference.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-import csv
-from functools import cache, lru_cache
+from functools import lru_cache
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.parameters.declaration import shown
@@ -46,9 +41,6 @@ UNIVERSE = np.linspace(-1.0, 1.0, 2049)
 """Output universe; its grid holds every peak of 5 terms, and 0 and +-1 of 7."""
 SMALL = 1e-6
 """The grid of the output universe can not tell less; a smaller psi(1) is 0."""
-
-DEFAULT_CURVES = Path(__file__).with_name('fuzzy_curves.csv')
-"""A column for each default system and shape, a row for each knot; see studies/fuzzy_curves.py."""
 
 Curve = NDArray[np.float64]
 
@@ -238,15 +230,25 @@ def infer(x: Curve, system: FuzzySystem) -> Curve:
         The crisp outputs, not normalised.
 
     """
-    import skfuzzy
-
     activations, rules = memberships(x, system.inputs), list(system.rules)
     if system.outputs.shape == SINGLETON:
         peaks = np.array(system.outputs.peaks)[rules]
         return np.asarray(peaks @ activations / activations.sum(axis=0))
     outputs = memberships(UNIVERSE, system.outputs)[rules]
     regions = (np.minimum(a[:, None], outputs).max(axis=0) for a in activations.T)
-    return np.array([skfuzzy.defuzz(UNIVERSE, r, 'centroid') for r in regions])
+    return np.array([_centroid(region) for region in regions])
+
+
+def _centroid(y: Curve) -> Any:
+    """Return the centroid of the region below a line through points over `UNIVERSE`."""
+    begin, step, left, right = UNIVERSE[:-1], np.diff(UNIVERSE), y[:-1], y[1:]
+    with np.errstate(invalid='ignore'):  # 0 / 0 where the region has no height
+        middle = 2.0 / 3.0 * step * (right + 0.5 * left) / (left + right) + begin
+    cases = [left == right, left == 0.0, right == 0.0]
+    exact = [0.5 * (begin + UNIVERSE[1:]), 2.0 / 3.0 * step + begin, 1.0 / 3.0 * step + begin]
+    middle = np.select(cases, exact, middle)
+    area = np.where(left == right, step * left, 0.5 * step * (left + right))
+    return np.cumsum(middle * area)[-1] / np.cumsum(area)[-1]
 
 
 @lru_cache(maxsize=32)
@@ -273,8 +275,7 @@ def curve(text: str) -> Curve:
     """
     system = read_system(text)
     if isinstance(system, FuzzySystem):
-        shipped = default_curves().get(system)
-        psi = inferred(system) if shipped is None else shipped.copy()
+        psi = inferred(system)
     else:
         psi = np.interp(np.linspace(0.0, 1.0, KNOTS), np.linspace(0.0, 1.0, len(system)), system)
     _expect_rising(text, psi)
@@ -292,16 +293,6 @@ def curves(parameters: Mapping[str, Any], levels: int) -> Curve:
 def of_level(values: Sequence[Any], level: int) -> Any:
     """Return what a list says for a level (0-based): its last value serves those that follow."""
     return values[min(level, len(values) - 1)]
-
-
-@cache
-def default_curves() -> dict[FuzzySystem, Curve]:
-    """Return the curves of the default systems, not normalised, as `inferred` made them."""
-    with DEFAULT_CURVES.open(newline='') as file:
-        header, *rows = csv.reader(file)
-    columns = np.array(rows, dtype=float).T
-    systems = (read_system(text) for text in header)
-    return {s: c for s, c in zip(systems, columns, strict=True) if isinstance(s, FuzzySystem)}
 
 
 def inferred(system: FuzzySystem) -> Curve:

@@ -14,7 +14,7 @@ from fhaosmo_ros.core.observer.cascade import Cascade
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, Tuning
 from fhaosmo_ros.core.observer.levant import Levant
-from fhaosmo_ros.core.observer.record import run
+from fhaosmo_ros.core.observer.structure import run
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import make_from_file
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
@@ -70,8 +70,7 @@ class Observer:
 
     def __init__(self, parameters: Mapping[str, Any] | None = None, /, **named: Any) -> None:
         given = ESTIMATOR_PARAMETERS.complete(parameters, named)
-        self._use(make_structure(ObserverConfiguration(given)))
-        self.check_functions()  # which have been called at rest
+        self.structure = make_structure(ObserverConfiguration(given))
         defaults = {name for name in DEFINING if self.parameters[name] == DEFAULTS[name]}
         if 'phi' not in defaults and {'gains', *OF_PAPER} <= defaults:
             warnings.warn(
@@ -206,7 +205,7 @@ class Observer:
         with suppress(ConfigurationError):  # where numbers have overflowed it begins afresh
             structure.load_state_dict(remembered)
         structure.word = self.structure.word
-        self._use(structure)
+        self.structure = structure
 
     def reset(self) -> None:
         """Go back to the initial state; the next sample is the first."""
@@ -249,10 +248,7 @@ class Observer:
             raise ConfigurationError(f'step: expected dt > 0 and finite, in seconds, got {dt}')
         if u is None:
             u = self._no_input()
-        estimate = self.structure.update(y, dt, u)
-        if self._functions:
-            self.check_functions()
-        return estimate
+        return self.structure.update(y, dt, u)
 
     @property
     def estimate(self) -> Estimate:
@@ -299,7 +295,6 @@ class Observer:
         if len(t):
             self._t = t[-1].item()
         record = run(self.structure, y, h, u, every)
-        self.check_functions()
         return Trajectory(t[every - 1 :: every], **record.columns)
 
     def smooth(self, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
@@ -330,25 +325,11 @@ class Observer:
         """
         from fhaosmo_ros.core.observer.smoother import smooth
 
-        found = smooth(Observer(self.configuration.parameters), t, y, u)
-        self.check_functions()
-        return found
-
-    def _use(self, structure: Any) -> None:
-        self.structure = structure
-        self._needs_input = self.uses_input
-        self._functions = self.model.functions
-
-    def check_functions(self) -> None:
-        """Raise what a Python function of phi has raised since this was called last."""
-        for function in self._functions:
-            if function.failed is not None:
-                error, function.failed = function.failed, None
-                raise error
+        return smooth(Observer(self.configuration.parameters), t, y, u)
 
     def _no_input(self) -> float:
         """Return what stands for known inputs that were not given, or raise where phi has one."""
-        if self._needs_input:
+        if self.structure.uses_input:
             raise ConfigurationError(
                 f'u: expected values of {", ".join(self.used_inputs)}, which phi uses, got none'
             )
@@ -357,20 +338,9 @@ class Observer:
 
 def intervals(t: NDArray[Any], start: float | int | None) -> NDArray[np.float64]:
     """
-    Return the time of each sample since the one before it, in seconds.
+    Return the time (s) of each sample since the one before it, or raise unless times increase.
 
-    Parameters
-    ----------
-    t : (K,) array
-        In seconds, or in nanoseconds if integers.
-    start : number or None
-        Time before the first one; None if there was none: then its interval is 0.
-
-    Raises
-    ------
-    ConfigurationError
-        Times that are not finite, or do not increase.
-
+    Times are as those of `run`; `start` is that before the first one, whose interval is 0 without.
     """
     before = np.concatenate([t[:1] if start is None else np.array([start], t.dtype), t[:-1]])
     h = t - before

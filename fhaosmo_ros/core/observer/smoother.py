@@ -6,9 +6,9 @@ from typing import Any
 from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.observer.configuration import DERIVATIVES, Floats
 from fhaosmo_ros.core.observer.estimates import Estimate, Trajectory, TUNING
-from fhaosmo_ros.core.observer.record import Record
 from fhaosmo_ros.core.observer.smoothing import BEGINS, JUMPS, MEASURED, Rows, UNMEASURED
 from fhaosmo_ros.core.observer.status import AFRESH, JUMPED, LEVEL_SHIFT, REJECTED, UNUSED
+from fhaosmo_ros.core.observer.structure import Record
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -27,17 +27,12 @@ class Status(IntFlag):
     GAMMA_AT_MAX = 32
     SENSITIVITY_RESET = 64  # the sensitivities grew beyond use and start again at 0
     REJECTED_SPIKE = 128  # y is too far from its prediction: spike_gate, or 6 usual deviations
-    REJECTED_STUCK = (
-        256  # y has not changed for stuck_time, or repeats itself although it has noise
-    )
+    REJECTED_STUCK = 256  # y is as before for stuck_time, or repeats itself although it has noise
     HELD = 512  # with REJECTED_PERIOD: a jump of the stamp; the next sample decides
     GAP = 1024  # a long interval was bridged in sub-steps
     RESTARTED = 2048  # started afresh after a gap or a jump of the clock
     DIVERGED = 4096  # the estimate had lost y and was restarted from it
-    JUMPED = (
-        8192  # y alone has jumped; the other estimates go on (at once, or with the next sample)
-    )
-
+    JUMPED = 8192  # y alone has jumped; the other estimates go on, now or with the next sample
     REPEATED = 16384  # y repeats a value that its sensor holds: nothing is learned from it
 
     @property

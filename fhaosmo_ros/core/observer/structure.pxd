@@ -55,6 +55,7 @@ cdef class Structure:
     cdef readonly int order  # n
     cdef readonly int levels  # N
     cdef readonly int inputs  # known inputs m
+    cdef readonly bint uses_input  # Phi uses one of them
     cdef readonly bint predicting  # it follows the model between samples, also through a gap
     cdef bint implicit  # a step uses the sample at its end
     cdef bint from_measurement  # z_1 begins at the first sample
@@ -95,6 +96,15 @@ cdef class Structure:
 
 
 cdef bint has_drifted(Memory* memory, double off) noexcept nogil
+
+
+cdef class Record:
+    # What a run records, a row for each recorded sample, as `Trajectory` says.
+    cdef readonly dict columns  # the same by name
+    cdef double[:, ::1] z, innovation, z_hat, z_tilde, standard_deviation, model, tuning
+    cdef double[::1] unknown_input, gamma
+    cdef long long[::1] status, open_levels
+    cdef void write(self, Structure structure, Py_ssize_t row, int word) noexcept nogil
 
 
 cdef class Estimate:

@@ -11,7 +11,7 @@ from libc.string cimport memset
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
 from fhaosmo_ros.core.observer.kalman cimport fill
 from fhaosmo_ros.core.observer.status cimport (
-    DIVERGED, JUMPED, LEVEL_SHIFT, REJECTED_INPUT, REJECTED_MEASUREMENT,
+    DIVERGED, FLAGS_MASK, JUMPED, LEVEL_SHIFT, REJECTED_INPUT, REJECTED_MEASUREMENT,
     REJECTED_PERIOD, REJECTED_SPIKE, REJECTED_STEP
 )
 
@@ -36,6 +36,10 @@ cdef double MOST_DRIFT = 35.0
 # If a jump of y would make |z_{i+1}| or |d| so much smaller, y was wrong before it (D 23).
 cdef double MUCH_SMALLER = 0.5
 OF_LEVELS = 'z_hat', 'z_tilde', 'p', 'q'
+COLUMNS = (
+    'z', 'innovation', 'z_hat', 'z_tilde', 'standard_deviation', 'model', 'tuning',
+    'unknown_input', 'gamma', 'status', 'open_levels',
+)
 
 
 cdef bint has_drifted(Memory* memory, double off) noexcept nogil:
@@ -69,6 +73,7 @@ cdef class Structure:
         self.configuration = configuration
         self.order, self.levels = configuration.model.order, configuration.levels
         self.inputs = len(configuration.model.inputs)
+        self.uses_input = configuration.model.uses_input
         if self.inputs > MOST_INPUTS:
             raise ConfigurationError(
                 f"parameter 'inputs': expected at most {MOST_INPUTS}, got {self.inputs}"
@@ -374,6 +379,77 @@ cdef class Structure:
     def __setstate__(self, values):
         self.load_state_dict(values)
         self.word = values['word']
+
+
+cdef class Record:
+    """What a run of a structure records: arrays of so many rows by the names of `Trajectory`."""
+
+    def __cinit__(self, Structure structure not None, Py_ssize_t rows):
+        cdef int n = structure.order, levels = structure.levels
+        own = (n + 1, 4, 7) if structure.configuration.self_tuning else (0, 0, 0)
+        found = [np.empty((rows, width)) for width in (n, levels, levels, levels, *own)]
+        found += [np.empty(rows, dtype=kind) for kind in (float, float, np.int64, np.int64)]
+        self.columns = dict(zip(COLUMNS, found, strict=True))
+        self.z, self.innovation, self.z_hat, self.z_tilde = found[:4]
+        self.standard_deviation, self.model, self.tuning = found[4:7]
+        self.unknown_input, self.gamma, self.status, self.open_levels = found[7:]
+
+    cdef void write(self, Structure structure, Py_ssize_t row, int word) noexcept nogil:
+        """Record what an observer knows."""
+        cdef int i
+        for i in range(structure.levels):
+            self.z_hat[row, i] = structure.level[i].z_hat
+            self.z_tilde[row, i] = structure.level[i].z_tilde
+            self.innovation[row, i] = structure.innovation[i]
+        for i in range(structure.order):
+            self.z[row, i] = structure.estimate(i)
+        for i in range(<int>self.standard_deviation.shape[1]):
+            self.standard_deviation[row, i] = sqrt(structure.variance(i))
+        if self.model.shape[1] > 0:
+            structure.tell(&self.model[row, 0], &self.tuning[row, 0])
+        self.unknown_input[row] = structure.estimate(structure.order)
+        self.gamma[row] = structure.memory.gamma
+        self.status[row], self.open_levels[row] = word & FLAGS_MASK, word >> LEVEL_SHIFT
+
+
+def run(
+    Structure structure not None, const double[::1] y, const double[::1] h,
+    const double[:, ::1] u, Py_ssize_t every
+):
+    """
+    Start with samples until one is good, step from the next one on; record every `every`-th one.
+
+    Row r of the record is the state after sample (r + 1) * every - 1; its flags are those of
+    all samples since the row before it.
+
+    Parameters
+    ----------
+    y, h : (K,) arrays
+        Samples, and the time (s) of the interval that ends at each.
+    u : (K, m) array
+        Known inputs of that interval.
+
+    """
+    cdef Record record = Record(structure, y.shape[0] // every)
+    cdef Py_ssize_t k
+    cdef int word, seen = 0
+    if not (h.shape[0] == u.shape[0] == y.shape[0] and u.shape[1] == structure.inputs):
+        raise ValueError('run: arrays of different lengths')
+    structure.enter()
+    structure.busy = True
+    with nogil:
+        for k in range(y.shape[0]):
+            if isnan(structure.memory.y):
+                word = structure.start(y[k])
+            else:
+                word = structure.step(y[k], h[k], &u[k, 0])
+            seen |= word & FLAGS_MASK
+            if (k + 1) % every == 0:
+                record.write(structure, k // every, (word & ~FLAGS_MASK) | seen)
+                seen = 0
+            structure.word = word
+    structure.busy = False
+    return record
 
 
 cdef class Estimate:

@@ -232,7 +232,6 @@ class OnlineEstimator:
         if self.smoothing is None:
             raise ConfigurationError('finish: expected smoothing_lag > 0, or a call of `smooth`')
         found = self.smoothing.finish()
-        self.observer.check_functions()
         return found
 
     @property
@@ -356,7 +355,6 @@ class OnlineEstimator:
 
         """
         self.advance(operator.index(stamp), y)
-        self.observer.check_functions()
         return self.policy.report() if self.smoothing is None else self.estimate
 
     def advance(self, stamp: int, y: float) -> int:
@@ -410,7 +408,6 @@ class OnlineEstimator:
         if count:
             self._u[:] = inputs[-1]
         found = self._run(stamps, y, inputs)
-        self.observer.check_functions()
         return found
 
     def _run(self, stamps: Ints, y: NDArray[np.float64], u: NDArray[np.float64]) -> Trajectory:

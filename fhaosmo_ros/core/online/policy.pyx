@@ -13,13 +13,13 @@ from libc.math cimport fabs, fmax, fmin, isfinite, isnan, rint
 from libc.string cimport memcpy
 
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS
-from fhaosmo_ros.core.observer.record cimport Record
 from fhaosmo_ros.core.observer.self_tuning.observer cimport SelfTuning
 from fhaosmo_ros.core.observer.status cimport (
     DIVERGED, FLAGS_MASK, GAP, HELD, JUMPED, REJECTED, REJECTED_MEASUREMENT, REJECTED_PERIOD,
     REJECTED_SPIKE, REJECTED_STEP, REJECTED_STUCK, REPEATED, RESTARTED, UNUSED
 )
-from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, MOST_INPUTS, Structure
+from fhaosmo_ros.core.observer.structure cimport Estimate, Memory, MOST_INPUTS, Record, Structure
+from fhaosmo_ros.core.online.clock cimport FAR, WINDOW, Clock, clock_time, difference
 
 import numpy as np
 

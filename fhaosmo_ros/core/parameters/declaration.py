@@ -257,7 +257,7 @@ class ParameterTable(Mapping[str, Parameter]):
         return {name: self[name].coerce(value) for name, value in flat.items()}
 
 
-class Parameters(Mapping[str, Any]):
+class Parameters(dict[str, Any]):
     """
     Values of all parameters of a table, checked once and each in its own type; not to be changed.
 
@@ -271,27 +271,15 @@ class Parameters(Mapping[str, Any]):
 
     """
 
-    def __init__(self, table: ParameterTable, checked: Mapping[str, Any]) -> None:
+    def __init__(self, table: ParameterTable, checked: dict[str, Any]) -> None:
+        super().__init__(table.defaults() | checked)
         self.table = table
-        self._values = table.defaults() | dict(checked)
-
-    def __getitem__(self, name: str) -> Any:
-        return self._values[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def __repr__(self) -> str:
-        return f'Parameters({self._values!r})'
 
     def changed(self, changes: Mapping[str, Any]) -> 'Parameters':
         """Return these values with some changed, which are checked as by `coerce`."""
         if isinstance(changes, Parameters):
             return self.table.complete(changes)
-        return Parameters(self.table, self._values | self.table.coerce(changes))
+        return Parameters(self.table, self | self.table.coerce(changes))
 
     def changed_live(self, changes: Mapping[str, Any], running: str) -> 'Parameters':
         """

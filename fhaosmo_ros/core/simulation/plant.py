@@ -10,7 +10,7 @@ from fhaosmo_ros.core.observer.configuration import per_level
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
-from fhaosmo_ros.core.simulation.system import System, Table, Wave
+from fhaosmo_ros.core.simulation.system import Disturbance, System
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -57,7 +57,7 @@ class Plant:
         p = self._parameters = PLANT_PARAMETERS.complete(parameters, named)
         self._model = TriangularModel.of(p)
         z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], self._model.order)
-        self._d = Wave(p)
+        self._d = Disturbance(p)
         self._system = System(self._model.expressions, self._d, p['integration_step'], z)
         self._random = np.random.default_rng(p['noise_seed'])
 
@@ -107,7 +107,7 @@ class Plant:
     def adopt(self, parameters: Parameters) -> None:
         """Go on with parameters that `prepare` has returned."""
         self._parameters = parameters
-        self._model, self._d = TriangularModel.of(parameters), Wave(parameters)
+        self._model, self._d = TriangularModel.of(parameters), Disturbance(parameters)
         self._system.change(self._model.expressions, self._d)
 
     def advance(self, t: float, u: ArrayLike = 0.0) -> None:
@@ -226,7 +226,7 @@ def respond(
         Longest step in seconds; each interval is divided evenly.
 
     """
-    t, d = np.ascontiguousarray(t, dtype=np.float64), Table(table, spacing)
+    t, d = np.ascontiguousarray(t, dtype=np.float64), Disturbance({}, table, spacing)
     z = np.broadcast_to(initial_state, model.order)
     system = System(model.expressions, d, step, z)
     inputs = known_inputs(u, model.inputs, len(t))

@@ -5,24 +5,19 @@ from fhaosmo_ros.core.model.phi cimport Expressions
 from fhaosmo_ros.core.model.prediction cimport Dynamics, MOST_LEVELS
 
 cdef enum Kind:
-    NONE, SINE, STEP, SQUARE, CHIRP
+    NONE, SINE, STEP, SQUARE, CHIRP, TABLE
 
 
 cdef class Disturbance:
-    cdef double at(self, double t) noexcept nogil
-
-
-cdef class Wave(Disturbance):
+    cdef object arguments  # it was made from
     cdef Kind kind
     cdef double amplitude  # of the wave, or height of the step (unit of d)
     cdef double omega  # angular frequency; a chirp's at t = 0 (rad/s)
     cdef double offset  # added to it (unit of d)
     cdef double start  # time of the step (s)
-
-
-cdef class Table(Disturbance):
-    cdef double spacing  # of its values (s)
-    cdef double[::1] values  # from t = 0 on, at least 2 (unit of d)
+    cdef double spacing  # of the values of a table (s)
+    cdef const double[::1] values  # from t = 0 on, at least 2 (unit of d)
+    cdef double at(self, double t) noexcept nogil
 
 
 cdef class System(Dynamics):
