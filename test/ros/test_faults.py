@@ -16,28 +16,16 @@ from std_srvs.srv import SetBool
 MS = 1_000_000
 
 
-def finite(e) -> bool:
-    return all(map(math.isfinite, [*e.z, e.unknown_input, e.gamma, *e.innovation]))
-
-
-def test_bad_samples_are_rejected_and_counted(fed):
+def test_bad_samples_are_rejected_and_counted_and_many_are_an_error(fed):
     rejected = fed.count('rejected measurements')
-    before = fed.feed(0.2)
+    fed.feed(0.2)
     stamps = [fed.send(y) for y in (math.nan, math.inf, -math.inf)]
     after = fed.feed(0.21)
     fed.wait_count('rejected measurements', rejected + 3)
     assert not {e.stamp for e in fed.estimates} & set(stamps)
-    assert finite(before)
-    assert finite(after)
+    assert all(map(math.isfinite, [*after.z, after.unknown_input, after.gamma]))
     assert abs(after.z[0] - 0.2) < 0.1
     assert fed.said('rejected a sample: expected a finite y of at most divergence_limit, got nan')
-    assert any(
-        'rejected measurements' in report.statuses['input'].message
-        and report.statuses['input'].level in (WARN, ERROR) for report in fed.reports
-    )  # fmt: skip
-
-
-def test_share_of_bad_samples_makes_an_error(fed):
     # Until a report has no good sample of before.
     fed.wait_status('input', ERROR, 'rejected measurements', doing=lambda: fed.send(math.nan))
 
