@@ -11,7 +11,7 @@ from rosbags.typesys import get_typestore, Stores
 import yaml
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
-FLOAT = 'std_msgs/msg/Float64'
+FLOAT, JOINTS = 'std_msgs/msg/Float64', 'sensor_msgs/msg/JointState'
 ORIGIN = 1_700_000_000_123_456_789
 PRESETS = {
     'plain': {'compression': CompressionType.NONE},
@@ -41,6 +41,14 @@ def float64(value):
 def floats(stamps, values, topic='/y'):
     rows = zip(stamps.tolist(), values.tolist(), strict=True)
     return [(topic, FLOAT, stamp, float64(value)) for stamp, value in rows]
+
+
+def joint_state(stamp, position):
+    """Return the CDR of joints a, b and c."""
+    return cdr(
+        JOINTS, header=header(stamp), name=['a', 'b', 'c'], position=np.array(position),
+        velocity=np.zeros(0), effort=np.zeros(0),
+    )  # fmt: skip
 
 
 def header(stamp, frame='base'):

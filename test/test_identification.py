@@ -278,12 +278,8 @@ def test_command_says_what_a_bag_shows(bag, tmp_path, capsys):
     assert 'noise_std' not in report
 
 
-@pytest.mark.parametrize(
-    ('given', 'message'),
-    [('structure:=cascade', 'got structure set'), ('noise_size:=1000.0', 'd = 0')],
-)
-def test_bag_that_can_give_no_gains(bag, tmp_path, capsys, given, message):
+def test_bag_that_can_give_no_gains(bag, tmp_path, capsys):
     out = tmp_path / 'out'
-    assert main(['--bag', str(bag), '-o', str(out), '-p', given]) == 2
-    assert message in capsys.readouterr().err
+    assert main(['--bag', str(bag), '-o', str(out), '-p', 'noise_size:=1000.0']) == 2
+    assert 'd = 0' in capsys.readouterr().err
     assert not out.exists()

@@ -71,24 +71,6 @@ def test_bag_takes_its_own_time_over_the_rate(bag):
     assert time.monotonic() - begin >= 2.49  # 1 s at half the speed, after the delay
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        (['/no/bag'], ['/no/bag', 'does not exist']),
-        (['BAG', '--rate', '0'], ['--rate', '0.001 to 1000', '0']),
-        (['BAG', '--delay', '-1'], ['--delay', '0 to 3600', '-1']),
-        (['BAG', '--topics', '/x'], ["'/x'", '/y']),
-        (['BAG', '--topics', '/clock'], ['expected a message to play']),
-    ],
-)
-def test_wrong_input_is_said_in_one_line(arguments, words, bag):
-    process = play('play', *[bag if a == 'BAG' else a for a in arguments])
-    out, _ = process.communicate(timeout=120)
-    assert process.returncode == 2
-    assert len(out.strip().splitlines()) == 1
-    assert all(word in out for word in words)
-
-
 def plant_package(folder, name):
     """Write a package of messages whose import leaves a file; return that file."""
     mark = folder / 'imported'

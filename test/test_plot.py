@@ -40,26 +40,6 @@ def test_formats_by_file_name(kind, bag, tmp_path, capsys):
     assert 'two /replay/estimator' in text
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        (['BAG', '-o', 'x.jpg'], ['.png, .svg, .pdf', 'x.jpg']),
-        (['BAG', '--names', '/no'], ['/estimator, /replay/estimator', "'/no'"]),
-        (['/no/bag'], ['/no/bag', 'does not exist']),
-        (['PLAIN'], ['topics of an estimator', '/y']),
-    ],
-)
-def test_wrong_input_is_said_in_one_line(arguments, words, bag, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    capsys.readouterr()
-    places = {'BAG': str(bag), 'PLAIN': str(tmp_path / 'bag')}
-    assert plot.main([places.get(a, a) for a in arguments]) == 2
-    error = capsys.readouterr().err.strip().splitlines()
-    assert len(error) == 1
-    assert all(word in error[0] for word in words)
-    assert not list(tmp_path.glob('*.png'))
-
-
 def test_thinned_curve_draws_the_same_pixels():
     rng = np.random.default_rng(3)
     t = np.sort(rng.uniform(0.0, 100.0, 200_000)) ** 2  # a rate that changes

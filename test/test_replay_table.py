@@ -59,8 +59,3 @@ def test_bad_table_is_said_in_one_line(tmp_path, capsys, text, columns, said):
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
     assert not (tmp_path / 'my.npz').exists()
-
-
-def test_columns_are_those_of_a_csv_file(tmp_path, capsys):
-    assert run(tmp_path / 'bag', '--columns', 't,y') == 2
-    assert '--columns: expected a .csv file, got' in capsys.readouterr().err

@@ -3,7 +3,6 @@
 
 from contextlib import closing
 from pathlib import Path
-import re
 import signal
 import sqlite3
 import subprocess
@@ -307,37 +306,6 @@ def test_interrupt_keeps_the_best_and_the_next_run_goes_on(tmp_path):
     assert main([*command, f'--trials={trials}']) == 0
     assert f'# {trials} trials' in (out / 'gains.yaml').read_text()
     assert finished(storage) == trials
-
-
-# wrong input
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'message'),
-    [
-        (['-pnoise:=1'], "unknown parameter 'noise'"),
-        (['-psearch:=[lambda]'], "'search'.*leave it out"),
-        (
-            [f'-p{p}' for p in ('scheme:=predict_correct', *MODEL_OF_D)],
-            'expected one of unknown_input_size, unknown_input_decay to search',
-        ),
-        (['-pweights:=[1.0, 2.0]'], 'weights.*1 or 4 numbers'),
-        (['-psettled:=4.0'], 'more than 4 s'),
-        (['--trials=0'], '--trials >= 1'),
-        (['--storage', 'nodb://x'], 'storage'),
-        (['--bag', 'nothing', '-pscheme:=predict_correct'], 'does not exist'),
-        (['--params-file', 'nothing.yaml'], 'nothing.yaml'),
-        (['-o', '/proc/no/out'], 'output'),
-    ],
-)
-def test_wrong_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, message):
-    monkeypatch.chdir(tmp_path)
-    assert main([*EXPLICIT, '-o', 'out', *arguments]) == 2
-    err = capsys.readouterr().err
-    lines = [line for line in err.splitlines() if line.startswith('tune: error')]
-    assert len(lines) == 1
-    assert re.search(message, lines[0]), lines[0]
-    assert list(tmp_path.iterdir()) == []
 
 
 # what is shipped

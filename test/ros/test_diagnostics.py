@@ -3,7 +3,6 @@
 
 from functools import partial
 import itertools
-import math
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.recording import PrivateNode

@@ -27,19 +27,16 @@ def truth(pair, user):
     return states, inputs
 
 
-def test_state_is_labelled_and_sized(pair, truth):
-    for messages in (pair.topics['state'], truth[0]):
+def test_arrays_are_labelled_and_the_stamp_is_a_samples_source_stamp(pair, truth):
+    of_levels = 'eps1,eps2,eps3,eps4'
+    for messages, label, count in (
+        (pair.topics['state'], 'z1,z2,z3', 3), (truth[0], 'z1,z2,z3', 3),
+        (pair.topics['innovation'], of_levels, 4),
+    ):  # fmt: skip
         message = messages[-1].message
         (dimension,) = message.layout.dim
-        assert (dimension.label, dimension.size, dimension.stride) == ('z1,z2,z3', 3, 3)
-        assert len(message.data) == 3
-        assert message.layout.data_offset == 0
-    innovation = pair.topics['innovation'][-1].message
-    assert innovation.layout.dim[0].label == 'eps1,eps2,eps3,eps4'
-    assert len(innovation.data) == 4
-
-
-def test_stamp_is_a_samples_source_stamp(pair, truth):
+        assert (dimension.label, dimension.size, dimension.stride) == (label, count, count)
+        assert len(message.data) == count
     ours = [m.stamp for m in list(pair.y)]
     stamps = [e.stamp for e in pair.estimates if ours[0] <= e.stamp <= ours[-1]]
     assert len(stamps) > RATE
