@@ -140,65 +140,51 @@ def commands():
     return found
 
 
+def own_command(words):
+    """Return name and arguments of a command of this package; ('', []) of another one."""
+    if words[:3] == ['ros2', 'run', PACKAGE] or words[:2] == ['-m', PACKAGE]:
+        words = words[words.index(PACKAGE) :]
+    elif words[0] != 'fhaosmo':
+        return '', []
+    _, name, *rest = [*words, ''] if len(words) == 1 else words
+    return (name, rest) if re.fullmatch(r'[a-z]+', name) else ('', [])  # X, an option, or dots
+
+
 def test_commands_exist_with_their_options(capsys):
     helps = {}
-    wrong = []
     for page, words in commands():
-        if words[:3] == ['ros2', 'run', 'fhaosmo_ros'] or words[:2] == ['-m', 'fhaosmo_ros']:
-            words = words[words.index('fhaosmo_ros') + 1 :]
-        elif words[0] == 'fhaosmo':
-            words = words[1:]
-        else:
+        name, rest = own_command(words)
+        if not name:
             continue
-        name, *rest = words or ['']
-        if not re.fullmatch(r'[a-z]+', name):
-            continue  # X, an option, or dots
-        if name not in COMMANDS:
-            wrong.append((page, name))
-            continue
+        assert name in COMMANDS, page
         module = COMMANDS[name][0]
         if name not in helps and not module.startswith('fhaosmo_ros.nodes'):
             with contextlib.suppress(SystemExit):
                 main([name, '--help'])
             helps[name] = capsys.readouterr().out
+        options = [word for word in rest if re.fullmatch(r'--?[a-z][a-z-]*', word)]
         if helps.get(name):  # without ROS some have none
-            wrong += [
-                (page, name, word) for word in rest
-                if re.fullmatch(r'--?[a-z][a-z-]*', word) and f'{word}' not in helps[name]
-            ]  # fmt: skip
-    assert not wrong
+            assert [word for word in options if word not in helps[name]] == [], (page, words)
 
 
 def test_parameters_and_files_of_commands_exist():
-    declared = {name for table in TABLES.values() for name in table}
-    wrong = []
+    declared = {name for table in TABLES.values() for name in table} | {'use_sim_time'}
+    makefile = (ROOT / 'Makefile').read_text()
     for page, words in commands():
         line = ' '.join(words)
-        wrong += [
-            (page, name) for name in re.findall(r'-p [\'"]?([a-z_]+):=', line)
-            if name not in declared and name != 'use_sim_time'
-        ]  # fmt: skip
+        assert set(re.findall(r'-p [\'"]?([a-z_]+):=', line)) <= declared, (page, line)
         if words[:3] == ['ros2', 'param', 'set'] and len(words) > 5:
             table, name = TABLES[words[3].strip('/')], words[4]
             value = yaml.safe_load(' '.join(words[5:]).strip('"'))
             if not name.startswith(('constants.', 'hip.')):
                 table[name].coerce(value)
-        if words[:3] == ['ros2', 'launch', 'fhaosmo_ros']:
-            files = ROOT / 'launch' / words[3], ROOT / 'fhaosmo_ros' / 'launching.py'
+        if words[:3] == ['ros2', 'launch', PACKAGE]:
+            files = ROOT / 'launch' / words[3], ROOT / PACKAGE / 'launching.py'
             text = ''.join(path.read_text() for path in files)
-            wrong += [
-                (page, word) for word in words[4:] if ':=' in word
-                and f"'{word.split(':=')[0]}'" not in text
-            ]  # fmt: skip
-        wrong += [
-            (page, path) for path in re.findall(r'\bconfig/[\w./-]+\.(?:yaml|xml|json)', line)
-            if not (ROOT / path).exists()
-        ]  # fmt: skip
-    assert not wrong
-
-
-def test_targets_of_make_exist():
-    makefile = (ROOT / 'Makefile').read_text()
+            names = [word.split(':=')[0] for word in words[4:] if ':=' in word]
+            assert [name for name in names if f"'{name}'" not in text] == [], (page, line)
+        for path in re.findall(r'\bconfig/[\w./-]+\.(?:yaml|xml|json)', line):
+            assert (ROOT / path).exists(), (page, line)
     for page, text in PAGES.items():
         for target in re.findall(r'(?:^ {4}|`)make ([a-z]+)', text, re.M):
             assert f'\n{target}:' in makefile, f'{page}: make {target}'
@@ -223,18 +209,14 @@ def test_python_runs(page, tmp_path):
         assert result.returncode == 0, result.stderr
 
 
-def test_links_of_the_documents_lead_somewhere():
+def test_links_and_paths_of_the_documents_lead_somewhere():
     for name, text in PAGES.items():
         folder = ROOT if name == 'README.md' else ROOT / 'docs'
         for target in re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', text):
             assert (folder / target).exists(), f'{name}: {target}'
-
-
-def test_paths_in_the_page_inside_exist():
+    bases = [ROOT / base for base in ('', PACKAGE, f'{PACKAGE}/core')]
     for path in re.findall(r'`([\w./]+(?:\.(?:py|pyx|pxd|xml)|/))`', PAGES['inside.md']):
-        assert any((ROOT / base / path).exists() for base in ('', PACKAGE, f'{PACKAGE}/core')), (
-            path
-        )
+        assert any((base / path).exists() for base in bases), path
 
 
 def test_each_equation_that_is_cited_is_in_the_page():

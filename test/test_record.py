@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded beside a live estimator: complete bags, the live estimates replayed, kills survived."""
 
-import contextlib
 import re
 import shlex
 import signal
@@ -12,12 +11,12 @@ import pytest
 
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
+from bag_files import stamps_in
 from commands import COMMAND, environment, ROOT, run, start
 from domains import take_domain
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import read_ticks
 from fhaosmo_ros.topics import ESTIMATES, EVENT, PARAMETERS, SNAPSHOT
-from mcap.reader import NonSeekingReader
 import numpy as np
 from rosbags.highlevel import AnyReader
 from running import Parameters, User
@@ -38,12 +37,7 @@ def size(folder):
 
 
 def stamps(folder, topic):
-    """Stamps of a topic in a storage file that is not complete: it grows, or was cut."""
-    found = []
-    with (folder / f'{folder.name}_0.mcap').open('rb') as file, contextlib.suppress(Exception):
-        for _, _, message in NonSeekingReader(file).iter_messages([topic], log_time_order=False):
-            found.append(message.log_time)
-    return found
+    return stamps_in(folder / f'{folder.name}_0.mcap', topic)
 
 
 def wait_for_more(bag, length, process):
@@ -68,33 +62,27 @@ def test_bag_is_complete_after_ctrl_c(live, tmp_path):
     bag = tmp_path / 'bag'
     process = start('record', '-o', bag)
     # Some six seconds; the estimator may be discovered later than the plant.
-    wait_until(
-        lambda: size(bag) > 1_200_000 and len(stamps(bag, '/estimator/stamp')) > 20,
-        'messages', 120.0, process,
-    )  # fmt: skip
+    wait_for_more(bag, 1_200_000, process)
+    wait_until(lambda: len(stamps(bag, '/estimator/stamp')) > 20, 'estimates', 90.0, process)
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=60)
     assert process.returncode == 0, error
     information = yaml.safe_load((bag / 'metadata.yaml').read_text())
     information = information['rosbag2_bagfile_information']
-    counts = {
-        t['topic_metadata']['name']: t['message_count']
-        for t in information['topics_with_message_count']
-    }
-    assert counts['/y'] > 1000
+    counts = {}
+    latched = ['/rosout', *(f'/estimator/{name}' for name in (EVENT, SNAPSHOT, PARAMETERS))]
+    for topic in information['topics_with_message_count']:
+        metadata = topic['topic_metadata']
+        counts[metadata['name']] = topic['message_count']
+        assert metadata['type_description_hash'].startswith('RIHS01_')
+        qos = metadata['offered_qos_profiles'][0]
+        assert qos['reliability'] == 'reliable'
+        assert (qos['durability'] == 'transient_local') == (metadata['name'] in latched)
+    assert min(counts['/y'], counts['/plant/state']) > 1000
     assert counts['/estimator/stamp'] > 20
-    assert counts['/plant/state'] > 1000
     assert information['message_count'] == sum(counts.values())
     assert str(information['message_count']) in out
     assert information['duration']['nanoseconds'] > 10**9
-    latched = [f'/estimator/{name}' for name in (EVENT, SNAPSHOT, PARAMETERS)]
-    for topic in information['topics_with_message_count']:
-        metadata = topic['topic_metadata']
-        assert metadata['type_description_hash'].startswith('RIHS01_')
-        assert metadata['offered_qos_profiles'][0]['reliability'] == 'reliable'
-        durability = metadata['offered_qos_profiles'][0]['durability']
-        expected = 'transient_local' if metadata['name'] in ('/rosout', *latched) else 'volatile'
-        assert durability == expected, metadata['name']
     with AnyReader([bag]) as reader:
         read = {c.topic: 0 for c in reader.connections}
         for connection, _, data in reader.messages():
@@ -124,7 +112,7 @@ def test_replay_follows_a_run_that_began_before_the_recording(live, tmp_path):
 def record_changes(bag):
     process = start('record', '-o', bag)
     wait_until(lambda: size(bag) > 800_000, 'messages', 90.0, process)
-    with contextlib.closing(User('hand')) as hand:
+    with User('hand') as hand:
         parameters = Parameters(hand, '/estimator')
         parameters.set(epsilon=0.05, gamma_rate=0.008, unknown_input_decay=0.5)
         wait_for_more(bag, 100_000, process)  # half a second of messages to compare
@@ -158,23 +146,16 @@ def compare(out, fewest=150):
 
 def test_kill_leaves_what_was_flushed(live, tmp_path):
     bag = tmp_path / 'bag'
-    process = start('record', '-o', bag, '--topics', '/y')
-    wait_until(lambda: size(bag) > 150_000, 'messages', 90.0, process)
+    process = start('record', '-o', bag, '--all', '--names', '/nobody')
+    wait_for_more(bag, 300_000, process)
+    wait_until(lambda: stamps(bag, '/estimator/gamma'), 'estimates', 90.0, process)
     killed = time.time_ns()
     process.kill()
     process.communicate(timeout=60)
     assert not (bag / 'metadata.yaml').exists()
     found = stamps(bag, '/y')
-    assert len(found) > 1000
+    assert len(found) > 500
     assert killed - found[-1] < 20e9  # a busy machine; else half a second
-
-
-def test_all_topics(live, tmp_path):
-    result = run('record', '-o', tmp_path / 'bag', '--all', '--duration', '5')
-    assert result.returncode == 0, result.stderr
-    with BagReader(tmp_path / 'bag') as reader:
-        topics = {c.topic for c in reader.connections}
-    assert {'/y', '/estimator/gamma', '/diagnostics', '/rosout'} <= topics
 
 
 def test_input_that_was_remapped_and_channels_are_recorded(tmp_path):

@@ -25,6 +25,7 @@ WRONG = {
     'replay empty': ["expected messages on topic '/y', got none"],
     'replay joints -p input_field:=position[3]': ['position[3]', '3 in one message'],
     'replay joints': ['position[i]'],
+    'replay sqlite -p input_stamp:=source': ['input_stamp source: expected an mcap bag'],
     'replay bag --columns t,y': ['--columns: expected a .csv file, got'],
     # Parameters.
     'replay bag -p input_topic:=/yy': ["'/yy'", '(/y)', "did you mean '/y'?"],
@@ -89,6 +90,7 @@ def place(tmp_path_factory):
     spoilt = data['spoilt'][:5000] + b'\xff' * 60 + data['spoilt'][5060:]  # longer than a record
     (bags['spoilt'] / 'spoilt.mcap').write_bytes(spoilt)
     (bags['nameless'] / 'metadata.yaml').unlink()
+    files.write(place / 'sqlite', rows, 'sqlite3')
     (place / 'old.bag').write_bytes(b'#ROSBAG V2.0')
     with files.Writer(place / 'empty', version=9) as writer:
         writer.add_connection('/y', files.FLOAT, typestore=files.TYPES)
