@@ -12,8 +12,6 @@ from typing import NamedTuple
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 import fhaosmo_ros
-from fhaosmo_ros.core.parameters.files import loads
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
 from fhaosmo_ros.nodes.recording import PrivateNode
 from fhaosmo_ros.tools.cli.processes import Child
@@ -389,18 +387,3 @@ class Estimator(Rig):
 
     def wait_estimate(self, condition, what: str) -> Estimate:
         return self.user.wait(lambda: [e for e in self.estimates[-50:] if condition(e)], what)[-1]
-
-
-def told_parameters(user, node: str):
-    """Return a function that waits for values on the topic of a node's parameters."""
-    messages = user.record(f'{node}/parameters', String, LATCHED)
-
-    def wait(condition=lambda values: True) -> dict:
-        def told() -> list[dict]:
-            texts = [published.message.data for published in messages[-1:]]
-            found = [loads(text, node, ESTIMATOR_PARAMETERS) for text in texts]
-            return [values for values in found if condition(values)]
-
-        return user.wait(told, 'parameters on their topic')[0]
-
-    return wait

@@ -224,18 +224,15 @@ def write_ticks(path, order, missing=()):
     return files.write(path, messages)
 
 
-@pytest.mark.parametrize(
-    ('order', 'missing'),
-    [
-        ('abc', ()),
-        ('abc', {(0, 'a'), (0, 'b')}),
-        ('abc', {(0, 'c'), (TICKS - 1, 'c'), (TICKS - 1, 'b')}),
-        ('abc', {(77, 'b'), (78, 'a'), (78, 'c')}),
-        ('cab', {(0, 'c'), (50, 'b')}),
-        ('bca', {(TICKS - 1, 'a')}),
-        ('abc', {(k, 'c') for k in range(TICKS)}),
-    ],
-)
+@pytest.mark.parametrize(('order', 'missing'), [
+    ('abc', ()),
+    ('abc', {(0, 'a'), (0, 'b')}),
+    ('abc', {(0, 'c'), (TICKS - 1, 'c'), (TICKS - 1, 'b')}),
+    ('abc', {(77, 'b'), (78, 'a'), (78, 'c')}),
+    ('cab', {(0, 'c'), (50, 'b')}),
+    ('bca', {(TICKS - 1, 'a')}),
+    ('abc', {(k, 'c') for k in range(TICKS)}),
+])  # fmt: skip
 def test_ticks_are_whole(order, missing, tmp_path):
     ticks = read_ticks(write_ticks(tmp_path / 'bag', order, missing), '/e', 'abc')
     np.testing.assert_array_equal(ticks['a'], ticks['c'])

@@ -43,16 +43,13 @@ if __name__ == '__main__':
 """
 
 
-@pytest.mark.parametrize(
-    ('error', 'code', 'said'),
-    [
-        (ConfigurationError('wrong'), 2, 'error: wrong\n'),
-        (FileNotFoundError(2, 'No such file', 'x'), 2, 'error: No such file: x\n'),
-        (ConfigurationError("'sql://u:p@ss@h/db': no"), 2, "error: 'sql://u:***@h/db': no\n"),
-        (Stopped('nothing written'), 130, 'interrupted, nothing written\n'),
-        (Stopped(), 130, 'interrupted\n'),
-    ],
-)
+@pytest.mark.parametrize(('error', 'code', 'said'), [
+    (ConfigurationError('wrong'), 2, 'error: wrong\n'),
+    (FileNotFoundError(2, 'No such file', 'x'), 2, 'error: No such file: x\n'),
+    (ConfigurationError("'sql://u:p@ss@h/db': no"), 2, "error: 'sql://u:***@h/db': no\n"),
+    (Stopped('nothing written'), 130, 'interrupted, nothing written\n'),
+    (Stopped(), 130, 'interrupted\n'),
+])  # fmt: skip
 def test_errors_are_one_line_and_have_their_exit_code(capsys, error, code, said):
     def body(arguments, stop):
         raise error
@@ -147,16 +144,13 @@ def begin():
 
 
 @pytest.mark.signals
-@pytest.mark.parametrize(
-    ('number', 'ignored', 'group'),
-    [
-        (signal.SIGINT, False, True),  # Ctrl-C in a terminal
-        (signal.SIGINT, True, False),  # kill -INT of a script's background job
-        (signal.SIGTERM, True, True),  # timeout(1)
-        (signal.SIGHUP, False, True),  # the terminal or the SSH connection closes
-        (signal.SIGKILL, False, False),
-    ],
-)
+@pytest.mark.parametrize(('number', 'ignored', 'group'), [
+    (signal.SIGINT, False, True),  # Ctrl-C in a terminal
+    (signal.SIGINT, True, False),  # kill -INT of a script's background job
+    (signal.SIGTERM, True, True),  # timeout(1)
+    (signal.SIGHUP, False, True),  # the terminal or the SSH connection closes
+    (signal.SIGKILL, False, False),
+])  # fmt: skip
 def test_signal_ends_command_and_workers(begin, tmp_path, number, ignored, group):
     (tmp_path / 'busy.py').write_text(BUSY)
     process = begin(tmp_path / 'busy.py', tmp_path, ignored=ignored)

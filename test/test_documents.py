@@ -78,15 +78,6 @@ def test_every_key_of_a_shipped_configuration_is_declared_and_used(path):
     Plant({k: v for k, v in plant.items() if k in PLANT_PARAMETERS})
 
 
-def test_paper_configuration_has_the_papers_numbers():
-    estimator = load(ROOT / 'config' / 'paper.yaml', 'estimator')
-    assert estimator['lambda'] == [15.0] * 4
-    assert estimator['alpha'] == [30.0] * 4
-    assert estimator['epsilon'] == 0.025
-    assert (estimator['gamma_rate'], estimator['gamma_initial']) == (0.004, 0.5)
-    assert load(ROOT / 'config' / 'paper.yaml', 'plant')['disturbance_amplitude'] == 0.1
-
-
 def test_topics_in_the_table_are_those_of_the_code():
     tables = NODE.split('## Topics')[1].split('## ')[0].split('Of the plant:')
     written = {
@@ -217,11 +208,3 @@ def test_links_and_paths_of_the_documents_lead_somewhere():
     bases = [ROOT / base for base in ('', PACKAGE, f'{PACKAGE}/core')]
     for path in re.findall(r'`([\w./]+(?:\.(?:py|pyx|pxd|xml)|/))`', PAGES['inside.md']):
         assert any((base / path).exists() for base in bases), path
-
-
-def test_each_equation_that_is_cited_is_in_the_page():
-    numbers = set(map(int, re.findall(r'\(D (\d+)\)', PAGES['mathematics.md'])))
-    assert numbers == set(range(1, 37)) - {13, 14}  # gone, and their numbers are not used again
-    files = [path for kind in ('py', 'pyx', 'pxd') for path in (ROOT / PACKAGE).rglob(f'*.{kind}')]
-    text = ''.join(path.read_text(encoding='utf-8') for path in files)
-    assert set(map(int, re.findall(r'\bD (\d+)\b', text))) <= numbers

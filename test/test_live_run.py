@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A replay begins, restarts and changes parameters where the live estimator in the bag did."""
 
-from itertools import product
-
 import bag_files as files
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
@@ -188,14 +186,11 @@ def test_input_that_came_before_the_recording_holds(begin, tmp_path, capsys):
     expect(found, live, 1000 if begin else 0)
 
 
-@pytest.mark.parametrize(
-    ('late', 'options', 'said'),
-    [
-        (0, ['--afresh'], 'stamps: bag'),
-        (17, [], '/estimator not followed'),  # as with sampling: clock, whose stamps no bag keeps
-        (0, ['-p', 'order:=2', '-p', "phi:=['0','0']"], 'afresh after 399 samples'),
-    ],
-)
+@pytest.mark.parametrize(('late', 'options', 'said'), [
+    (0, ['--afresh'], 'stamps: bag'),
+    (17, [], '/estimator not followed'),  # as with sampling: clock, whose stamps no bag keeps
+    (0, ['-p', 'order:=2', '-p', "phi:=['0','0']"], 'afresh after 399 samples'),
+])  # fmt: skip
 def test_what_cannot_be_followed_begins_afresh(late, options, said, tmp_path, capsys):
     bag = write(tmp_path / 'bag', 1500, Live().run(0, 1500, late), begin=600)
     out = tmp_path / 'out.npz'
@@ -239,10 +234,15 @@ def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
     told = write(tmp_path / 'told', 1500, *lives)
     (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
     file = ['--params-file', tmp_path / 'p.yaml', *OPTIONS]
-    for live, (source, options) in product(lives, [(bag, file), (told, [])]):
-        text, found = run(capsys, source, '--follow', live.name, *options)
-        assert 'parameters differ' not in text
-        expect(found, live)
+    for live in lives:
+        channel = live.name.removeprefix('/estimator/')
+        for arguments in ([bag, '--follow', live.name, *file], [told, '--channel', channel]):
+            text, found = run(capsys, *arguments)
+            assert f'followed {live.name}' in text
+            assert 'parameters differ' not in text
+            expect(found, live)
+    error = run(capsys, told, '--afresh', '--channel', 'hop', code=2)
+    assert '--channel: expected hip or knee, got hop' in error
 
 
 @pytest.mark.parametrize('labels', [['a', 'b'], ['version', 'z_hat1'], ['flags', 'm1']])
@@ -255,17 +255,3 @@ def test_snapshot_of_another_version_is_said_and_not_followed(labels, tmp_path, 
     assert error.count("'/e/snapshot'") == 1
     assert 'begins at the first sample' in error
     assert list(rows(tmp_path / 'o.npz')) == STAMPS[:50].tolist()
-
-
-def test_channel_says_whom_to_follow(tmp_path, capsys):
-    lives = [
-        Live(f'/estimator/{name}', node='/estimator').run(0, 1200) for name in ('hip', 'knee')
-    ]
-    own = {'variant': 'fuzzy_adaptive', 'epsilon': 3.0, 'channels': ['hip', 'knee']}
-    lives[0].tell_parameters(STAMPS[0], **own)
-    bag = write(tmp_path / 'bag', 1200, *lives)
-    text, found = run(capsys, bag, '--channel', 'knee')
-    assert 'followed /estimator/knee' in text
-    expect(found, lives[1])
-    error = run(capsys, bag, '--afresh', '--channel', 'hop', code=2)
-    assert '--channel: expected hip or knee, got hop' in error

@@ -2,22 +2,25 @@
 """The command `tune` on simulated recordings: its start, its output, its inputs, its ends."""
 
 from contextlib import closing
+import math
 from pathlib import Path
 import signal
 import sqlite3
 import subprocess
+import sys
 
 from commands import start
 from fhaosmo_ros.core import ConfigurationError, Family, Observer, TriangularModel
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, OBSERVER_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.core.simulation.recordings import FAMILY_PARAMETERS
 from fhaosmo_ros.tools.tuning import report
 from fhaosmo_ros.tools.tuning.command import main, read_parameters
-from fhaosmo_ros.tools.tuning.linear_gains import kalman_gains, SCHEME
+from fhaosmo_ros.tools.tuning.linear_gains import SCHEME
 from fhaosmo_ros.tools.tuning.objective import Objective, stamps_of, TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 import numpy as np
 import pytest
@@ -86,32 +89,6 @@ def test_infinite_estimate_is_the_worst_and_another_model_is_refused():
         objective({'order': 2, 'phi': ['0', '0']})
 
 
-# the Kalman filter inside (D 19)
-
-
-@pytest.mark.parametrize(('derivatives', 'decay'), [(0, 0.7), (1, 1.0), (2, 3.0)])
-def test_gains_of_a_kalman_filter_make_one(derivatives, decay):
-    """The wider the half-widths and the smaller gamma, the closer."""
-    period, model = 1e-3, TriangularModel(PHI, 3)
-    r = Family({'duration': 5.0, 'integration_step': 1e-3, 'noise_std': 1e-3}).recording(0)
-    apart = []
-    for width, gamma in ((10.0, 1e-2), (1e3, 1e-4)):
-        values = dict(SCHEME) | {
-            'order': 3, 'phi': PHI, 'noise_size': 1e-3, 'unknown_input_size': 0.07,
-            'unknown_input_derivatives': derivatives,
-            'unknown_input_decay': decay, 'fuzzy_widths': [width], 'gamma_initial': gamma,
-            'gamma_min': 1e-5, 'correction_period': period,
-        }  # fmt: skip
-        made = kalman_gains(OBSERVER_PARAMETERS.complete(values), period)
-        expected = estimates(model, made.gain, decay, r, 0.1)
-        values |= {'lambda': made.lambdas.tolist(), 'noise_size': 0.0}  # steady from the start
-        found = Observer(values).run(r.t, r.y, r.u).z_hat
-        error = np.sqrt(np.mean((found - expected) ** 2, axis=0))
-        apart.append(np.max(error / np.sqrt(np.mean(expected**2, axis=0))))
-    assert apart[0] < 5e-2
-    assert apart[1] < min(3e-3, 0.1 * apart[0])
-
-
 # the start
 
 
@@ -164,16 +141,6 @@ def test_what_the_user_sets_stays(given):
         assert (dict(SCHEME) | given).items() <= found.items()
         assert len(found['lambda']) == 4 + found['unknown_input_derivatives']
         assert {d.name for d in tuner.space}.isdisjoint(given)
-
-
-def test_start_without_noise_is_nearly_exact():
-    """And nothing is written that would say how sure the observer is."""
-    quiet = {'noise_std': 0.0, 'sample_rate': 1000.0, 'disturbances': ['sines'], 'duration': 6.0}
-    values = VALUES.changed(quiet | {'settled': 2.0})
-    tuner = Tuner(*simulated(values, 1), {}, values, 1)
-    start = tuner.parameters({d.name: d.start for d in tuner.space})
-    assert tuner.training(start).error < 0.1
-    assert {'noise_size', 'unknown_input_size'}.isdisjoint(start)
 
 
 # output
@@ -297,3 +264,82 @@ def test_presets_fit_the_noise_in_their_name(noise):
     demo = load(ROOT / 'config' / 'demo.yaml', 'estimator')
     error, other = (Objective(recordings, TUNE_PARAMETERS.defaults())(p) for p in (values, demo))
     assert error.error < min(0.95, 0.9 * other.error)
+
+
+# the search itself, on an objective whose minimum is known
+
+SPACE = [Dimension('a', 1e-3, 1e3, 1.0), Dimension('b', -5.0, 5.0, 0.0, log=False)]
+
+
+def bowl(values):
+    return math.log10(values['a'] / 30.0) ** 2 + (values['b'] - 2.0) ** 2
+
+
+def seen_by(**options):
+    """Return what the search tried, and its result."""
+    seen = []
+    result = minimise(lambda v: bowl(seen.append(v) or v), SPACE, **options)
+    return seen, result
+
+
+def test_minimum_is_found_from_the_start_on():
+    seen, result = seen_by(trials=250)
+    assert seen[0] == {'a': 1.0, 'b': 0.0}
+    assert len(seen) == result.trials == 250
+    assert result.value == bowl(result.best) == min(map(bowl, seen)) < 1e-2
+    runs = [seen_by(trials=20, seed=seed)[0] for seed in (3, 3, 4)]
+    assert runs[0] == runs[1] != runs[2]
+
+
+def test_values_that_are_not_finite_are_bad_not_fatal():
+    assert minimise(lambda v: float('nan'), SPACE, 5).value == BAD
+    result = minimise(lambda v: bowl(v) if v['b'] < 1.0 else math.inf, SPACE, 60)
+    assert result.value < bowl({'a': 1.0, 'b': 0.0})
+
+
+@pytest.mark.parametrize('jobs', [1, 2])
+def test_error_in_the_objective_ends_the_search(jobs):
+    with pytest.raises(ZeroDivisionError):
+        minimise(lambda v: 1 / 0, SPACE, 50, jobs=jobs)
+
+
+def test_threads_share_one_study_and_a_stop_keeps_what_there_is():
+    done = []
+    seen, result = seen_by(trials=1000, jobs=3, on_trial=lambda: len(done.append(0) or done) > 59)
+    assert len(seen) == result.trials
+    assert 60 <= result.trials <= 62
+
+
+def test_study_is_continued(tmp_path):
+    storage = f'sqlite:///{tmp_path}/study.db'
+    first = minimise(bowl, SPACE, 4, storage=storage)
+    seen, second = seen_by(trials=7, storage=storage)
+    assert (first.trials, len(seen), second.trials) == (4, 3, 7)
+    assert second.value <= first.value
+    # A study that is complete, and another name, which is another study.
+    assert minimise(bowl, SPACE, 5, storage=storage) == second
+    assert minimise(bowl, SPACE, 2, storage=storage, name='other').trials == 2
+
+
+@pytest.mark.parametrize('storage', ['study.log', 'nodb://x', 'sqlite:////no/x.db', 'fails'])
+def test_storage_that_fails_is_one_line(tmp_path, storage):
+    """At once, or in the middle."""
+    file, calls = tmp_path / 'fails.db', []
+
+    def fail_later(values):
+        calls.append(values)
+        if len(calls) == 5:
+            file.write_bytes(b'damaged\n' * 1000)
+        return bowl(values)
+
+    storage = f'sqlite:///{file}' if storage == 'fails' else storage
+    with pytest.raises(ConfigurationError, match=r'storage.*expected') as error:
+        minimise(fail_later, SPACE, 10_000, storage=storage)
+    assert '\n' not in str(error.value)
+    assert len(calls) <= 6
+
+
+def test_missing_package_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'optuna', None)
+    with pytest.raises(ConfigurationError, match=r"pip install 'optuna>=4,<6' cmaes"):
+        minimise(bowl, SPACE, 1)

@@ -6,21 +6,13 @@ import math
 import time
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
+from fhaosmo_ros.core.parameters.files import loads
 from fhaosmo_ros.core.parameters.per_channel import of_channel, with_channels
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
-from running import (
-    Estimator,
-    FED,
-    joint_state,
-    nanoseconds,
-    OK,
-    Rig,
-    SECOND,
-    told_parameters,
-    WARN,
-)  # fmt: skip
+from running import Estimator, FED, joint_state, LATCHED, nanoseconds, OK, Rig, WARN
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 OWN = {
@@ -77,7 +69,7 @@ def test_topics_reports_and_services_are_each_channels_own(rigs):
 
 def test_common_parameter_serves_channels_without_their_own(user, parameters):
     """What is whose is told on the topic of the parameters."""
-    wait = told_parameters(user, '/many/estimator')
+    told = user.record('/many/estimator/parameters', String, LATCHED)
     assert parameters.get('hip.epsilon') == 5.0
     parameters.set(epsilon=6.0, lambda_=[20.0])
     expected = {'hip.epsilon': 6.0, 'knee.epsilon': 6.0, 'hip.lambda': [15.0]}
@@ -85,7 +77,8 @@ def test_common_parameter_serves_channels_without_their_own(user, parameters):
     assert parameters.all(expected) == expected
     parameters.set(**{'knee.epsilon': 7.0, 'hip.gamma_rate': 0.5})
     parameters.set(epsilon=8.0)
-    values = wait(lambda v: v['epsilon'] == 8.0)
+    user.wait(lambda: told and 'epsilon: 8.0' in told[-1].message.data, 'told change')
+    values = loads(told[-1].message.data, '/many/estimator', ESTIMATOR_PARAMETERS)
     assert set(values) <= set(with_channels(ESTIMATOR_PARAMETERS, OWN))
     for channel, epsilon in (('hip', 8.0), ('knee', 7.0)):
         assert of_channel(values, channel)['epsilon'] == epsilon
@@ -120,7 +113,7 @@ class Arm(Rig):
         super().__init__(user, process, f'{namespace}/estimator')
         self.publisher = user.publisher(f'{namespace}/joint_states', JointState)
         self.out = user.record(f'{self.name}/joint_states', JointState)
-        self.stamp, self.sent = SECOND, []
+        self.stamp, self.sent = 10**9, []
 
     def send(self, **positions) -> int:
         self.stamp += 2_000_000

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rclpy.parameter import get_parameter_value
-from running import FED, OK, Parameters, told_parameters
+from running import FED, OK, Parameters
 from test_any_input import valid
 
 TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}
@@ -148,22 +148,19 @@ def test_constants_are_parameters_of_their_own(user, launch):
 # Refused.
 
 
-@pytest.mark.parametrize(
-    ('node', 'name', 'value', 'words'),
-    [
-        ('estimator', 'gamma_min', 0.97, ['gamma_initial', '0.97']),
-        ('estimator', 'epsilon', 'wide', ['a number', "'wide'"]),
-        ('estimator', 'variant', 'fuzy', ["'fuzy'", "did you mean 'fuzzy'?"]),
-        ('estimator', 'lambda', [15.0, 15.0], ['1 or 4', '[15.0, 15.0]']),
-        ('estimator', 'publish_rate', 1e6, ['0.1', '5000', '1000000.0']),
-        ('estimator', 'order', 2, ['cleanup', '2']),
-        ('estimator', 'event_deviations', 4.0, ["expected gains = 'self_tuning'"]),
-        ('estimator', 'lamda', 1.0, ["did you mean 'lambda'?"]),
-        ('plant', 'noise_seed', 1.5, ['an integer', '1.5']),
-        ('plant', 'disturbance', 'saw', ['none, sine, step, square, chirp', "'saw'"]),
-        ('plant', 'phi', ['0', '0', 'z1'], []),
-    ],
-)
+@pytest.mark.parametrize(('node', 'name', 'value', 'words'), [
+    ('estimator', 'gamma_min', 0.97, ['gamma_initial', '0.97']),
+    ('estimator', 'epsilon', 'wide', ['a number', "'wide'"]),
+    ('estimator', 'variant', 'fuzy', ["'fuzy'", "did you mean 'fuzzy'?"]),
+    ('estimator', 'lambda', [15.0, 15.0], ['1 or 4', '[15.0, 15.0]']),
+    ('estimator', 'publish_rate', 1e6, ['0.1', '5000', '1000000.0']),
+    ('estimator', 'order', 2, ['cleanup', '2']),
+    ('estimator', 'event_deviations', 4.0, ["expected gains = 'self_tuning'"]),
+    ('estimator', 'lamda', 1.0, ["did you mean 'lambda'?"]),
+    ('plant', 'noise_seed', 1.5, ['an integer', '1.5']),
+    ('plant', 'disturbance', 'saw', ['none, sine, step, square, chirp', "'saw'"]),
+    ('plant', 'phi', ['0', '0', 'z1'], []),
+])  # fmt: skip
 def test_bad_value_changes_nothing_and_says_why(nodes, node, name, value, words):
     parameters = nodes[node]
     before = parameters.messages(*TABLES[node])
@@ -191,20 +188,17 @@ def test_atomic_set_is_all_or_nothing(fed):
 # Texts, as `ros2 param set` sends them.
 
 
-@pytest.mark.parametrize(
-    ('name', 'text', 'value'),
-    [
-        ('epsilon', '4', 4.0),
-        ('epsilon', '1e-2', 0.01),
-        ('lambda', '[15, 15, 15, 15]', [15.0] * 4),
-        ('lambda', '[15, 1e1, 16.5, 17]', [15.0, 10.0, 16.5, 17.0]),
-        ('lambda', '14', [14.0]),
-        ('lambda', '14.5', [14.5]),
-        ('start_from_measurement', 'off', False),
-        ('variant', 'sign', 'sign'),
-        *(('lambda', text, None) for text in ('[]', '[a, 1]', '[[1, 2], [3, 4]]', '[1, 2', '')),
-    ],
-)
+@pytest.mark.parametrize(('name', 'text', 'value'), [
+    ('epsilon', '4', 4.0),
+    ('epsilon', '1e-2', 0.01),
+    ('lambda', '[15, 15, 15, 15]', [15.0] * 4),
+    ('lambda', '[15, 1e1, 16.5, 17]', [15.0, 10.0, 16.5, 17.0]),
+    ('lambda', '14', [14.0]),
+    ('lambda', '14.5', [14.5]),
+    ('start_from_measurement', 'off', False),
+    ('variant', 'sign', 'sign'),
+    *(('lambda', text, None) for text in ('[]', '[a, 1]', '[[1, 2], [3, 4]]', '[1, 2', '')),
+])  # fmt: skip
 def test_texts_of_ros2_param_set(fed, name, text, value):
     p = fed.parameters
     kind = p.messages(name)[0].type
@@ -256,18 +250,3 @@ def test_random_sets_hurt_nobody_and_each_refusal_has_its_reason(user, estimator
     for e in node.estimates:
         assert all(map(math.isfinite, [*e.z, e.unknown_input, e.gamma, *e.innovation])), e
         assert 0.0 < e.gamma <= 1.0
-
-
-# What the estimator is set to, on a latched topic: the text of a parameter file.
-
-
-def test_topic_tells_who_comes_late_and_every_change(user, fed):
-    changes = {'epsilon': 3.5, 'gamma_rate': 0.25}
-    fed.parameters.set(**changes)
-    wait = told_parameters(user, fed.name)
-    expected = ESTIMATOR_PARAMETERS.defaults() | FED | changes
-    assert wait(lambda v: v['gamma_rate'] == 0.25) == expected
-    assert not fed.parameters.try_to_set(gamma_rate=-1.0).successful
-    fed.parameters.set(epsilon=0.125, publish_rate=50.0)
-    values = wait(lambda v: v['epsilon'] != 3.5)
-    assert values == expected | {'epsilon': 0.125, 'publish_rate': 50.0}
