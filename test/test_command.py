@@ -121,6 +121,9 @@ def test_output_replaces_only_what_is_empty_or_forced_and_only_when_it_is_comple
     with pytest.raises(ConfigurationError, match='--force'), Output(final):
         pass
     assert [p.name for p in tmp_path.iterdir()] == ['out']
+    for name in ('.', '..', '/'):
+        with pytest.raises(ConfigurationError, match='a folder that is in use'):
+            Output(Path(name), force=True)
 
 
 @pytest.fixture

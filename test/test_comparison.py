@@ -8,14 +8,7 @@ import pytest
 from scipy.linalg import expm
 from studies import everywhere
 from studies.comparison.cells import PLANTS, sensors
-from studies.comparison.methods import METHODS
-from studies.comparison.methods.kalman import (
-    ADAPTIVE,
-    HUBER,
-    IMM,
-    LINEAR_LIMIT,
-    SampledModel,
-)
+from studies.comparison.methods import kalman, METHODS
 from studies.comparison.methods.method import Setting
 
 MODELS = {
@@ -52,7 +45,7 @@ def recording(model, t, z0, d, u=0.0):
 @pytest.mark.parametrize('name', MODELS)
 def test_kalman_gain_is_the_limit_of_the_riccati_recursion(name, chain, decay):
     model, period = MODELS[name], 1e-2
-    gain = SampledModel(model, period, chain, decay).kalman(5.0)
+    gain = kalman.SampledModel(model, period, chain, decay).kalman(5.0)
     a = rates(model, chain, decay)
     spectrum = np.diag([*[0.0] * (len(a) - 1), 5.0])
     # The noise's covariance by the midpoint rule, and the recursion itself.
@@ -66,7 +59,7 @@ def test_kalman_gain_is_the_limit_of_the_riccati_recursion(name, chain, decay):
     np.testing.assert_allclose(gain, k, rtol=1e-4)
 
 
-@pytest.mark.parametrize('name', ['Kalman', *(m.name for m in ADAPTIVE)])
+@pytest.mark.parametrize('name', ['Kalman', *(m.name for m in kalman.ADAPTIVE)])
 def test_peers_know_the_input_and_bridge_a_gap(name):
     """A constant d from a noise-free y with a known input."""
     model, method = MODELS['motor'], METHODS[name]
@@ -91,8 +84,8 @@ def test_peers_without_their_options_are_the_kalman_filter(derivatives, rate):
     setting = everywhere.setting_of(motor, condition)
     member = {'derivatives': derivatives, 'bandwidth': 15.0, 'decay': 4.5}
     values = everywhere.at(member, setting.model.order, rate)
-    [expected] = everywhere.errors_of(LINEAR_LIMIT, setting, values, [r])
-    for name, options in ((HUBER, {}), (IMM, {'spread': 1.0 + 1e-9, 'stay': 1.0})):
+    [expected] = everywhere.errors_of(kalman.LINEAR_LIMIT, setting, values, [r])
+    for name, options in ((kalman.HUBER, {}), (kalman.IMM, {'spread': 1.0 + 1e-9, 'stay': 1.0})):
         [found] = everywhere.errors_of(name, setting, values | options, [r])
         assert found == pytest.approx(expected, rel=1e-3)
 

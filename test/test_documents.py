@@ -7,27 +7,13 @@ import re
 import subprocess
 import sys
 
+from fhaosmo_ros import topics
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.commands import COMMANDS
 from fhaosmo_ros.core import Counters, Observer, OnlineEstimator, Plant
+from fhaosmo_ros.core.parameters import tables
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.core.parameters.tables import (
-    NODE_TABLES,
-    OBSERVER_PARAMETERS,
-    PLANT_PARAMETERS,
-)
 from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
-from fhaosmo_ros.topics import (
-    DIAGNOSTICS,
-    ESTIMATES,
-    EVENT,
-    OF_GAINS,
-    PARAMETERS,
-    SNAPSHOT,
-    TEXT,
-    TRUTH,
-    TYPED_ESTIMATES,
-)
 import numpy as np
 import pytest
 from studies.parameter_reference import markdown
@@ -41,7 +27,7 @@ PAGES = {
     for path in [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 }
 NODE = PAGES['node.md']
-TABLES = NODE_TABLES | {'tune': TUNE_PARAMETERS}
+TABLES = tables.NODE_TABLES | {'tune': TUNE_PARAMETERS}
 
 
 def blocks(page, language):
@@ -60,7 +46,7 @@ def names(text):
 
 def test_parameter_table_is_up_to_date():
     assert PAGES['parameters.md'] == markdown(), 'run python -m studies.parameter_reference'
-    for table in NODE_TABLES.values():
+    for table in tables.NODE_TABLES.values():
         assert [name for name in table if f'| `{name}` |' not in PAGES['parameters.md']] == []
 
 
@@ -74,35 +60,36 @@ def test_every_key_of_a_shipped_configuration_is_declared_and_used(path):
         for name in ([f'{key}.{k}' for k in value] if isinstance(value, dict) else [key])
     }
     assert keys in (set(estimator) | set(plant), set(arm))
-    Observer({k: v for k, v in estimator.items() if k in OBSERVER_PARAMETERS})
-    Plant({k: v for k, v in plant.items() if k in PLANT_PARAMETERS})
+    Observer({k: v for k, v in estimator.items() if k in tables.OBSERVER_PARAMETERS})
+    Plant({k: v for k, v in plant.items() if k in tables.PLANT_PARAMETERS})
 
 
 def test_topics_in_the_table_are_those_of_the_code():
-    tables = NODE.split('## Topics')[1].split('## ')[0].split('Of the plant:')
+    texts = NODE.split('## Topics')[1].split('## ')[0].split('Of the plant:')
     written = {
         (node, name): kind
-        for node, table in zip(('estimator', 'plant'), tables, strict=True)
+        for node, table in zip(('estimator', 'plant'), texts, strict=True)
         for row in cells(table)
         for name in names(row[0])
         for kind in row[1].split(', ')
         if not row[0].startswith('in:') and 'srvs' not in kind
     }
-    latched = {EVENT: DIAGNOSTICS, PARAMETERS: TEXT, SNAPSHOT: ESTIMATES['state']}
-    declared = ESTIMATES | TYPED_ESTIMATES | latched
-    for topics in OF_GAINS.values():
-        declared |= topics
+    said = topics.DIAGNOSTICS
+    latched = {topics.EVENT: said, topics.PARAMETERS: topics.TEXT, topics.SNAPSHOT: topics.ARRAY}
+    declared = topics.ESTIMATES | topics.TYPED_ESTIMATES | latched
+    for of_gains in topics.OF_GAINS.values():
+        declared |= of_gains
     expected = {('estimator', name): kind for name, kind in declared.items()}
-    expected |= {('estimator', 'diagnostics'): DIAGNOSTICS, ('plant', 'y'): 'std_msgs/msg/Float64'}
-    expected |= {('plant', name): kind for name, kind in TRUTH.items()}
+    expected |= {('estimator', 'diagnostics'): said, ('plant', 'y'): topics.FLOAT}
+    expected |= {('plant', name): kind for name, kind in topics.TRUTH.items()}
     del written[('estimator', 'change_state')]
     assert written == {key: kind.replace('/msg/', '/') for key, kind in expected.items()}
 
 
 def test_counters_in_the_tables_are_those_of_the_code():
     text = NODE.split('## Time')[1].split('## Faults')[0]
-    tables = [part for part in text.split('\n\n') if '| counter |' in part]
-    written = [name for part in tables for row in cells(part)[1:] for name in names(row[-1])]
+    parts = [part for part in text.split('\n\n') if '| counter |' in part]
+    written = [name for part in parts for row in cells(part)[1:] for name in names(row[-1])]
     assert set(written) == set(Counters._fields)
 
 

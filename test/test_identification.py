@@ -8,16 +8,9 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
 from fhaosmo_ros.tools.bags.types import serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
+from fhaosmo_ros.tools.tuning import identify
 from fhaosmo_ros.tools.tuning.bag_gains import make_gains, run
 from fhaosmo_ros.tools.tuning.command import main
-from fhaosmo_ros.tools.tuning.identify import (
-    identify_input,
-    NothingToFind,
-    quantum,
-    RecordedOutput,
-    size_of_input,
-    usable,
-)
 from fhaosmo_ros.tools.tuning.likelihood import Design
 from fhaosmo_ros.tools.tuning.report import notes
 import numpy as np
@@ -56,8 +49,8 @@ def found_in(y, phi=PHI, **given):
     given = {'order': len(phi), 'phi': list(phi)} | given
     values = ESTIMATOR_PARAMETERS.complete(given)
     model = TriangularModel.of(values)
-    data = RecordedOutput(T, y, np.zeros((K, 1)))
-    found = identify_input(data, model, values, given)
+    data = identify.RecordedOutput(T, y, np.zeros((K, 1)))
+    found = identify.identify_input(data, model, values, given)
     gains = make_gains(found, given)
     return found, gains, run(found, gains)
 
@@ -79,7 +72,7 @@ def test_truth_is_likelier_than_other_designs(plain):
     likelihood = plain[0].likelihood
     bandwidth = ((SIZE**2 * (2.0 * RATE) ** 3 / 2.0) / (NOISE**2 * H)) ** (1 / 8)
     truth = Design(1, bandwidth, RATE / bandwidth)
-    assert size_of_input(truth, likelihood.intensity(truth, NOISE)) == pytest.approx(SIZE)
+    assert identify.size_of_input(truth, likelihood.intensity(truth, NOISE)) == pytest.approx(SIZE)
     best = likelihood(truth).log_likelihood
     for change in ({'bandwidth': 1.5 * bandwidth}, {'ratio': 10.0 * truth.ratio}):
         assert likelihood(truth._replace(**change)).log_likelihood < best - 3.0
@@ -143,7 +136,7 @@ def test_given_values_stay():
 ])  # fmt: skip
 @pytest.mark.filterwarnings('error')
 def test_nothing_is_made_of_nothing(y, about):
-    with pytest.raises(NothingToFind, match=about):
+    with pytest.raises(identify.NothingToFind, match=about):
         found_in(y())
 
 
@@ -170,7 +163,7 @@ def test_model_that_does_not_fit_is_told_or_refused(y, phi, about):
     try:
         found, _, along = found_in(y(), phi=phi)
         told = ' '.join(notes(found, along))
-    except NothingToFind as error:
+    except identify.NothingToFind as error:
         told = str(error)
     assert about in told
 
@@ -182,12 +175,12 @@ def test_model_that_does_not_fit_is_told_or_refused(y, phi, about):
 ])  # fmt: skip
 def test_quantum_is_found(truth):
     r = Family({'duration': 30.0, 'integration_step': 1e-3} | truth).recording(0)
-    assert quantum(r.y) == pytest.approx(truth.get('quantisation', 0.0), rel=1e-3)
+    assert identify.quantum(r.y) == pytest.approx(truth.get('quantisation', 0.0), rel=1e-3)
 
 
 def test_bad_samples_are_left_out():
     t, y = np.array([0.0, 1.0, 1e6, 1.0, 2.0]), np.array([0.0, 1.0, np.nan, 2.0, 3.0])
-    kept = usable(RecordedOutput(t, y, np.zeros((5, 1))))
+    kept = identify.usable(identify.RecordedOutput(t, y, np.zeros((5, 1))))
     np.testing.assert_array_equal([kept.t, kept.y], [[0.0, 1.0, 2.0], [0.0, 1.0, 3.0]])
 
 

@@ -157,7 +157,7 @@ cdef class Numbers:
         return values[index]
 """,
     'fhaosmo_ros/taken.pyx': (
-        'from fhaosmo_ros.number cimport NUMBER\ndef number():\n    return NUMBER'
+        'from fhaosmo_ros.number cimport NUMBER\ndef number():\n    return NUMBER\n'
     ),
 }
 OUT_OF_BOUNDS = """
@@ -166,49 +166,44 @@ try:
     Numbers()[4]
 except IndexError:
     print('checked')
-else:
-    print('unchecked')
 """
 
 
-@pytest.fixture
-def small(tmp_path) -> Path:
-    """Return a package of two small extensions with this package's setup.py."""
+def test_only_what_has_changed_is_built(tmp_path):
+    """Of a package of two small extensions with this package's setup.py."""
+
+    def build(debug: int = 1) -> dict[str, int]:
+        """Return when each extension was compiled (ns); a debug build takes half the time."""
+        command = (sys.executable, 'setup.py', '-q', 'build_ext', '-i')
+        assert run(*command, cwd=tmp_path, FHAOSMO_DEBUG=debug) == ''
+        libraries = (tmp_path / 'build').glob('lib*/**/*.so')
+        return {path.name.split('.')[0]: path.stat().st_mtime_ns for path in libraries}
+
+    def change(name: str, old: str, new: str) -> None:
+        path = tmp_path / NAME / name
+        path.write_text(path.read_text().replace(old, new))
+
+    (tmp_path / NAME).mkdir()
     for name, text in SMALL.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
     for name in ('setup.py', 'setup.cfg'):
         shutil.copy(ROOT / name, tmp_path)
-    return tmp_path
-
-
-def build(folder: Path, debug: int = 1) -> dict[str, int]:
-    """Return when each extension was compiled (ns); a debug build takes half the time."""
-    command = (sys.executable, 'setup.py', '-q', 'build_ext', '-i')
-    assert run(*command, cwd=folder, FHAOSMO_DEBUG=debug) == ''
-    libraries = (folder / 'build').glob('lib*/**/*.so')
-    return {path.name.split('.')[0]: path.stat().st_mtime_ns for path in libraries}
-
-
-def test_only_what_has_changed_is_built(small):
-    first = build(small)
+    first = build()
     assert set(first) == {'number', 'taken'}
-    assert not list((small / NAME).rglob('*.c'))
-    assert build(small) == first
-    taken = small / NAME / 'taken.pyx'
-    taken.write_text(taken.read_text() + ' + 0')
-    second = build(small)
+    assert not list((tmp_path / NAME).rglob('*.c'))
+    assert build() == first
+    change('taken.pyx', 'return NUMBER', 'return NUMBER + 0')
+    second = build()
     assert second['number'] == first['number']
     assert second['taken'] > first['taken']
-    declarations = small / NAME / 'number.pxd'
-    declarations.write_text(declarations.read_text().replace('NUMBER = 3', 'NUMBER = 4'))
-    build(small)
+    change('number.pxd', 'NUMBER = 3', 'NUMBER = 4')
+    build()
     query = f'from {NAME}.taken import number; print(number())'
-    assert run(sys.executable, '-c', query, cwd=small) == '4\n'
+    assert run(sys.executable, '-c', query, cwd=tmp_path) == '4\n'
     # A debug build checks bounds, and is not taken for a normal one.
-    assert run(sys.executable, '-c', OUT_OF_BOUNDS, cwd=small) == 'checked\n'
-    build(small, debug=0)
-    assert run(sys.executable, '-c', OUT_OF_BOUNDS, cwd=small) == 'unchecked\n'
+    assert run(sys.executable, '-c', OUT_OF_BOUNDS, cwd=tmp_path) == 'checked\n'
+    build(debug=0)
+    assert run(sys.executable, '-c', OUT_OF_BOUNDS, cwd=tmp_path) == ''
 
 
 # package.xml

@@ -2,7 +2,6 @@
 """A live estimator in simulation time, and a recorder, against a recording that is played."""
 
 import os
-import signal
 import subprocess
 import time
 
@@ -12,7 +11,7 @@ from rosbags.typesys import get_types_from_msg
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 import bag_files as files
-from commands import start
+from commands import interrupted, start
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.tools.bags.reader import BagReader
 from waiting import wait_until
@@ -55,9 +54,7 @@ def test_estimator_restarts_where_the_loop_begins_again(bag, tmp_path):
         wait_until(lambda: recorded.exists() and recorded.stat().st_size > 20_000, 'messages')
     finally:
         for process in processes:
-            process.send_signal(signal.SIGINT)
-        said = [process.communicate(timeout=60)[0] for process in processes]
-    assert [process.returncode for process in processes] == [0, 0, 0], said
+            interrupted(process)
     with BagReader(tmp_path / 'out') as reader:
         assert reader.count('/rig/y') > 0
 

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 from bag_files import stamps_in
-from commands import COMMAND, environment, ROOT, run, start
+from commands import COMMAND, environment, interrupted, ROOT, run, start
 from domains import take_domain
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import read_ticks
@@ -53,9 +53,7 @@ def live():
     nodes = [start('estimator', *NODES), start('plant', *NODES)]
     yield nodes
     for node in nodes:
-        node.send_signal(signal.SIGINT)
-    for node in nodes:
-        node.communicate(timeout=60)
+        interrupted(node)
 
 
 def test_bag_is_complete_after_ctrl_c(live, tmp_path):
@@ -64,9 +62,7 @@ def test_bag_is_complete_after_ctrl_c(live, tmp_path):
     # Some six seconds; the estimator may be discovered later than the plant.
     wait_for_more(bag, 1_200_000, process)
     wait_until(lambda: len(stamps(bag, '/estimator/stamp')) > 20, 'estimates', 90.0, process)
-    process.send_signal(signal.SIGINT)
-    out, error = process.communicate(timeout=60)
-    assert process.returncode == 0, error
+    out, _ = interrupted(process)
     information = yaml.safe_load((bag / 'metadata.yaml').read_text())
     information = information['rosbag2_bagfile_information']
     counts = {}
@@ -120,10 +116,8 @@ def record_changes(bag):
         wait_for_more(bag, 100_000, process)
         parameters.set(epsilon=0.3)
         wait_for_more(bag, 200_000, process)
-        process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=60)
+        _, error = interrupted(process)
         parameters.set(epsilon=40.0, gamma_rate=0.004, unknown_input_decay=0.0)
-    assert process.returncode == 0, error
     return error
 
 
@@ -161,18 +155,18 @@ def test_kill_leaves_what_was_flushed(live, tmp_path):
 def test_input_that_was_remapped_and_channels_are_recorded(tmp_path):
     bag = tmp_path / 'bag'
     channels = ['--ros-args', '-p', 'channels:=[hip, knee]', '-r', 'hip/y:=/force']
+    apart = {'env': environment(ROS_DOMAIN_ID=APART)}
     processes = [
-        start('record', '-o', bag, '--names', '/estimator', env=environment(ROS_DOMAIN_ID=APART)),
-        start('estimator', *channels, env=environment(ROS_DOMAIN_ID=APART)),
-        start('plant', '--ros-args', '-r', '/y:=/force', env=environment(ROS_DOMAIN_ID=APART)),
+        start('record', '-o', bag, '--names', '/estimator', **apart),
+        start('estimator', *channels, **apart),
+        start('plant', '--ros-args', '-r', '/y:=/force', **apart),
     ]
     try:
         # It finds /force only as what the estimator listens to.
-        wait_until(lambda: size(bag) > 700_000, 'messages', 90.0, processes[0])
+        wait_for_more(bag, 700_000, processes[0])
     finally:
         for process in reversed(processes):
-            process.send_signal(signal.SIGINT)
-            process.communicate(timeout=60)
+            interrupted(process)
     with BagReader(bag) as reader:
         counts = {c.topic: c.msgcount for c in reader.connections}
     assert counts['/force'] > 1000

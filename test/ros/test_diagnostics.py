@@ -70,18 +70,6 @@ def test_hardware_id_and_period_are_live(pair):
     pair.parameters.set(hardware_id='none', diagnostics_period=LAX['diagnostics_period'])
 
 
-def test_what_holds_gamma_is_said(fed):
-    def wait_word(word: str) -> None:
-        fed.feed(0.2)
-        fed.wait_values('observer', lambda v: v['gamma at'].startswith(word), f'gamma at {word}')
-
-    wait_word('neither bound')
-    fed.parameters.set(gamma_min=0.3, gamma_initial=0.3, gamma_max=0.3)
-    wait_word('gamma_m')
-    fed.parameters.set(variant='sign')
-    wait_word('a fixed value')
-
-
 def test_a_clock_that_is_slower_than_the_samples_is_said(user, estimator):
     """What `ros2 bag play --clock` gives, at 40 Hz."""
     rig = estimator('/slow', **FED | LAX, use_sim_time=True, sampling='clock')

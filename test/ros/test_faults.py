@@ -30,23 +30,28 @@ def test_bad_samples_are_rejected_and_counted_and_many_are_an_error(fed):
     fed.wait_status('input', ERROR, 'rejected measurements', doing=lambda: fed.send(math.nan))
 
 
-def test_freeze_holds_gamma_and_lets_it_go(fed):
-    fed.parameters.set(gamma_rate=100.0, gamma_initial=0.6, gamma_dead_zone=0.0)
-    fed.reset()
+def test_what_holds_gamma_is_said_and_freeze_lets_it_go(fed):
+    def wait_word(word: str) -> None:
+        fed.feed(0.2)
+        fed.wait_values('observer', lambda v: v['gamma at'].startswith(word), f'gamma at {word}')
 
     def freeze(data: bool) -> str:
-        answer = fed.user.call(f'{fed.name}/freeze', SetBool, SetBool.Request(data=data))
-        assert answer.success
-        return answer.message
+        return fed.user.call(f'{fed.name}/freeze', SetBool, SetBool.Request(data=data)).message
 
-    for k in range(12):
-        before = fed.feed(0.2 + 0.1 * math.sin(k))
+    wait_word('neither bound')
+    fed.parameters.set(gamma_rate=100.0, gamma_initial=0.6, gamma_dead_zone=0.0)
+    fed.reset()
+    before = [fed.feed(0.2 + 0.1 * math.sin(k)) for k in range(12)][-1]
     assert freeze(True) == 'gamma is held'
     held = [fed.feed(0.2 + 0.1 * math.sin(k)).gamma for k in range(20)]
     assert held == [before.gamma] * 20
-    fed.user.wait(lambda: fed.value('gamma at') == 'the value that ~/freeze holds', 'report')
+    wait_word('the value that ~/freeze holds')
     assert freeze(False) == 'gamma adapts again'
     assert fed.feed(0.5).gamma != before.gamma
+    fed.parameters.set(gamma_min=0.3, gamma_initial=0.3, gamma_max=0.3)
+    wait_word('gamma_m')
+    fed.parameters.set(variant='sign')
+    wait_word('a fixed value')
 
 
 def test_gap_stops_the_output_and_restarts_the_observer(fed):
