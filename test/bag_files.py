@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags for tests, written by rosbags, and those of mcap's presets by the mcap package."""
 
+import contextlib
 import struct
 
+from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 import numpy as np
@@ -11,7 +13,7 @@ from rosbags.typesys import get_typestore, Stores
 import yaml
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
-FLOAT = 'std_msgs/msg/Float64'
+FLOAT, JOINTS = 'std_msgs/msg/Float64', 'sensor_msgs/msg/JointState'
 ORIGIN = 1_700_000_000_123_456_789
 PRESETS = {
     'plain': {'compression': CompressionType.NONE},
@@ -43,6 +45,14 @@ def floats(stamps, values, topic='/y'):
     return [(topic, FLOAT, stamp, float64(value)) for stamp, value in rows]
 
 
+def joint_state(stamp, position):
+    """Return the CDR of joints a, b and c."""
+    return cdr(
+        JOINTS, header=header(stamp), name=['a', 'b', 'c'], position=np.array(position),
+        velocity=np.zeros(0), effort=np.zeros(0),
+    )  # fmt: skip
+
+
 def header(stamp, frame='base'):
     types = TYPES.types
     time = types['builtin_interfaces/msg/Time'](
@@ -62,6 +72,15 @@ def write(path, messages, storage='mcap', compression='none', version=9):
                 connections[topic] = bag.add_connection(topic, message_type, typestore=TYPES)
             bag.write(connections[topic], int(stamp), data)
     return path
+
+
+def stamps_in(path, topic):
+    """Stamps of a topic in a storage file that is not complete: it grows, or was cut."""
+    found = []
+    with contextlib.suppress(Exception), path.open('rb') as file:
+        for _, _, message in NonSeekingReader(file).iter_messages([topic], log_time_order=False):
+            found.append(message.log_time)
+    return found
 
 
 def write_preset(path, messages, preset, published=None, parts=1):

@@ -3,6 +3,7 @@
 
 import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 
@@ -30,3 +31,11 @@ def run(*arguments):
         [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=400,
         env=environment(), check=False,
     )  # fmt: skip
+
+
+def interrupted(process):
+    """Press Ctrl-C, and return what the command, which has to end well, has said."""
+    process.send_signal(signal.SIGINT)
+    out, error = process.communicate(timeout=60)
+    assert process.returncode == 0, (out, error)
+    return out, error

@@ -31,7 +31,7 @@ settings.load_profile('fixed')
 @pytest.fixture(autouse=True)
 def _signals():
     """The commands set handlers for the process that they take for their own."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = [signal.getsignal(number) for number in numbers]
     yield
     for number, handler in zip(numbers, before, strict=True):

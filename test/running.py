@@ -12,14 +12,12 @@ from typing import NamedTuple
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 import fhaosmo_ros
-from fhaosmo_ros.core.parameters.files import loads
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
 from fhaosmo_ros.nodes.recording import PrivateNode
 from fhaosmo_ros.tools.cli.processes import Child
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
-from rclpy.parameter import get_parameter_value, Parameter, parameter_value_to_python
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
@@ -126,20 +124,15 @@ class Estimate(NamedTuple):
     innovation: list[float]
 
 
-class User:
+class User(PrivateNode):
     """A node of the tests' own, with a thread that receives."""
 
     def __init__(self, name: str = 'user') -> None:
-        self._private = PrivateNode(name)
-        self.node = self._private.node
+        super().__init__(name)
         self._changed = threading.Condition()
-        self._clients: dict[str, object] = {}
+        self._of_services: dict[str, object] = {}
         self.reports: dict[str, list[Report]] = defaultdict(list)
         self._listen('/diagnostics', DiagnosticArray, self._on_report)
-        self._private.__enter__()
-
-    def close(self) -> None:
-        self._private.__exit__()
 
     def _on_report(self, stamp: int, message: DiagnosticArray) -> None:
         node = message.status[0].name.partition(': ')[0]
@@ -180,10 +173,10 @@ class User:
 
     def client(self, service: str, kind: type):
         """Return the client of a service that is there."""
-        if service not in self._clients:
-            self._clients[service] = self.node.create_client(kind, service)
-        self.wait(self._clients[service].service_is_ready, f'service {service}')
-        return self._clients[service]
+        if service not in self._of_services:
+            self._of_services[service] = self.node.create_client(kind, service)
+        self.wait(self._of_services[service].service_is_ready, f'service {service}')
+        return self._of_services[service]
 
     def call(self, service: str, kind: type, request: object):
         """Return a service's answer."""
@@ -230,20 +223,16 @@ class Parameters:
     def get(self, name: str) -> object:
         return self.all([name])[name]
 
-    def try_to_set(self, name: str, value: object, text: bool = False):
-        """Return the result; a `text` is read as `ros2 param set` reads it."""
-        message = Parameter(name, value=value).to_parameter_msg()
-        if text:
-            message.value = get_parameter_value(value)
-        return self._answer(self.service.set_parameters, [message]).results[0]
-
-    def try_to_set_together(self, **values: object):
+    def try_to_set(self, **values: object):
+        """Return the result of setting one parameter, or several together."""
         # 'lambda' is a keyword in Python, so the tests write lambda_
         changes = [Parameter(name.rstrip('_'), value=value) for name, value in values.items()]
-        return self._answer(self.service.set_parameters_atomically, changes).result
+        if changes[1:]:
+            return self._answer(self.service.set_parameters_atomically, changes).result
+        return self._answer(self.service.set_parameters, changes).results[0]
 
     def set(self, **values: object) -> None:
-        result = self.try_to_set_together(**values)
+        result = self.try_to_set(**values)
         assert result.successful, result.reason
 
 
@@ -308,12 +297,7 @@ class Rig:
     def wait_count(self, key: str, value: int) -> None:
         self.user.wait(lambda: self.count(key) >= value, f'{key!r} of {value} in diagnostics')
 
-    def wait_report(self, task: str, condition, what: str, doing=lambda: None):
-        """
-        Return the latest status of a task, of those that come from now on, that is as wanted.
-
-        What is to make it so is done again and again meanwhile.
-        """
+    def _wait(self, task: str, condition, what: str, doing=lambda: None):
         since = len(self.reports)
 
         def look() -> list:
@@ -324,16 +308,20 @@ class Rig:
         return self.user.wait(look, what)[-1]
 
     def wait_status(self, task: str, level: bytes, *words: str, doing=lambda: None):
-        """Return a status of a task with this level and these words; see `wait_report`."""
+        """
+        Return the latest status of a task, from now on, with this level and these words.
+
+        What is to make it so is done again and again meanwhile.
+        """
 
         def as_wanted(status) -> bool:
             return status.level == level and all(word in status.message for word in words)
 
-        return self.wait_report(task, as_wanted, f'{task} with level {level} and {words}', doing)
+        return self._wait(task, as_wanted, f'{task} with level {level} and {words}', doing)
 
     def wait_values(self, task: str, condition, what: str) -> dict[str, str]:
         """Return values of the latest report from now on for which a condition holds."""
-        return values_of(self.wait_report(task, lambda s: condition(values_of(s)), what))
+        return values_of(self._wait(task, lambda s: condition(values_of(s)), what))
 
 
 class Estimator(Rig):
@@ -399,18 +387,3 @@ class Estimator(Rig):
 
     def wait_estimate(self, condition, what: str) -> Estimate:
         return self.user.wait(lambda: [e for e in self.estimates[-50:] if condition(e)], what)[-1]
-
-
-def told_parameters(user, node: str):
-    """Return a function that waits for values on the topic of a node's parameters."""
-    messages = user.record(f'{node}/parameters', String, LATCHED)
-
-    def wait(condition=lambda values: True) -> dict:
-        def told() -> list[dict]:
-            texts = [published.message.data for published in messages[-1:]]
-            found = [loads(text, node, ESTIMATOR_PARAMETERS) for text in texts]
-            return [values for values in found if condition(values)]
-
-        return user.wait(told, 'parameters on their topic')[0]
-
-    return wait

@@ -102,12 +102,10 @@ def test_nothing_raises_and_everything_shown_is_finite(events, seed):
             estimator.set_input(first)
         elif first in ('freeze', 'thaw'):
             estimator.freeze(first == 'freeze')
+        elif first == 'reset':
+            estimator.reset()
         else:
-            change = estimator.policy.change
-            {
-                'reset': estimator.reset,
-                'forget': lambda: change(timed=False, tick_count=0),
-            }[first]()
+            estimator.policy.change(timed=False, tick_count=0)
         if estimator.estimate is not None:
             assert finite(estimator.estimate)
         counters = estimator.counters

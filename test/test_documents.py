@@ -7,27 +7,13 @@ import re
 import subprocess
 import sys
 
+from fhaosmo_ros import topics
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.commands import COMMANDS
 from fhaosmo_ros.core import Counters, Observer, OnlineEstimator, Plant
+from fhaosmo_ros.core.parameters import tables
 from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.core.parameters.tables import (
-    NODE_TABLES,
-    OBSERVER_PARAMETERS,
-    PLANT_PARAMETERS,
-)
 from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
-from fhaosmo_ros.topics import (
-    DIAGNOSTICS,
-    ESTIMATES,
-    EVENT,
-    OF_GAINS,
-    PARAMETERS,
-    SNAPSHOT,
-    TEXT,
-    TRUTH,
-    TYPED_ESTIMATES,
-)
 import numpy as np
 import pytest
 from studies.parameter_reference import markdown
@@ -41,7 +27,7 @@ PAGES = {
     for path in [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
 }
 NODE = PAGES['node.md']
-TABLES = NODE_TABLES | {'tune': TUNE_PARAMETERS}
+TABLES = tables.NODE_TABLES | {'tune': TUNE_PARAMETERS}
 
 
 def blocks(page, language):
@@ -60,7 +46,7 @@ def names(text):
 
 def test_parameter_table_is_up_to_date():
     assert PAGES['parameters.md'] == markdown(), 'run python -m studies.parameter_reference'
-    for table in NODE_TABLES.values():
+    for table in tables.NODE_TABLES.values():
         assert [name for name in table if f'| `{name}` |' not in PAGES['parameters.md']] == []
 
 
@@ -74,44 +60,36 @@ def test_every_key_of_a_shipped_configuration_is_declared_and_used(path):
         for name in ([f'{key}.{k}' for k in value] if isinstance(value, dict) else [key])
     }
     assert keys in (set(estimator) | set(plant), set(arm))
-    Observer({k: v for k, v in estimator.items() if k in OBSERVER_PARAMETERS})
-    Plant({k: v for k, v in plant.items() if k in PLANT_PARAMETERS})
-
-
-def test_paper_configuration_has_the_papers_numbers():
-    estimator = load(ROOT / 'config' / 'paper.yaml', 'estimator')
-    assert estimator['lambda'] == [15.0] * 4
-    assert estimator['alpha'] == [30.0] * 4
-    assert estimator['epsilon'] == 0.025
-    assert (estimator['gamma_rate'], estimator['gamma_initial']) == (0.004, 0.5)
-    assert load(ROOT / 'config' / 'paper.yaml', 'plant')['disturbance_amplitude'] == 0.1
+    Observer({k: v for k, v in estimator.items() if k in tables.OBSERVER_PARAMETERS})
+    Plant({k: v for k, v in plant.items() if k in tables.PLANT_PARAMETERS})
 
 
 def test_topics_in_the_table_are_those_of_the_code():
-    tables = NODE.split('## Topics')[1].split('## ')[0].split('Of the plant:')
+    texts = NODE.split('## Topics')[1].split('## ')[0].split('Of the plant:')
     written = {
         (node, name): kind
-        for node, table in zip(('estimator', 'plant'), tables, strict=True)
+        for node, table in zip(('estimator', 'plant'), texts, strict=True)
         for row in cells(table)
         for name in names(row[0])
         for kind in row[1].split(', ')
         if not row[0].startswith('in:') and 'srvs' not in kind
     }
-    latched = {EVENT: DIAGNOSTICS, PARAMETERS: TEXT, SNAPSHOT: ESTIMATES['state']}
-    declared = ESTIMATES | TYPED_ESTIMATES | latched
-    for topics in OF_GAINS.values():
-        declared |= topics
+    said = topics.DIAGNOSTICS
+    latched = {topics.EVENT: said, topics.PARAMETERS: topics.TEXT, topics.SNAPSHOT: topics.ARRAY}
+    declared = topics.ESTIMATES | topics.TYPED_ESTIMATES | latched
+    for of_gains in topics.OF_GAINS.values():
+        declared |= of_gains
     expected = {('estimator', name): kind for name, kind in declared.items()}
-    expected |= {('estimator', 'diagnostics'): DIAGNOSTICS, ('plant', 'y'): 'std_msgs/msg/Float64'}
-    expected |= {('plant', name): kind for name, kind in TRUTH.items()}
+    expected |= {('estimator', 'diagnostics'): said, ('plant', 'y'): topics.FLOAT}
+    expected |= {('plant', name): kind for name, kind in topics.TRUTH.items()}
     del written[('estimator', 'change_state')]
     assert written == {key: kind.replace('/msg/', '/') for key, kind in expected.items()}
 
 
 def test_counters_in_the_tables_are_those_of_the_code():
     text = NODE.split('## Time')[1].split('## Faults')[0]
-    tables = [part for part in text.split('\n\n') if '| counter |' in part]
-    written = [name for part in tables for row in cells(part)[1:] for name in names(row[-1])]
+    parts = [part for part in text.split('\n\n') if '| counter |' in part]
+    written = [name for part in parts for row in cells(part)[1:] for name in names(row[-1])]
     assert set(written) == set(Counters._fields)
 
 
@@ -140,65 +118,51 @@ def commands():
     return found
 
 
+def own_command(words):
+    """Return name and arguments of a command of this package; ('', []) of another one."""
+    if words[:3] == ['ros2', 'run', PACKAGE] or words[:2] == ['-m', PACKAGE]:
+        words = words[words.index(PACKAGE) :]
+    elif words[0] != 'fhaosmo':
+        return '', []
+    _, name, *rest = [*words, ''] if len(words) == 1 else words
+    return (name, rest) if re.fullmatch(r'[a-z]+', name) else ('', [])  # X, an option, or dots
+
+
 def test_commands_exist_with_their_options(capsys):
     helps = {}
-    wrong = []
     for page, words in commands():
-        if words[:3] == ['ros2', 'run', 'fhaosmo_ros'] or words[:2] == ['-m', 'fhaosmo_ros']:
-            words = words[words.index('fhaosmo_ros') + 1 :]
-        elif words[0] == 'fhaosmo':
-            words = words[1:]
-        else:
+        name, rest = own_command(words)
+        if not name:
             continue
-        name, *rest = words or ['']
-        if not re.fullmatch(r'[a-z]+', name):
-            continue  # X, an option, or dots
-        if name not in COMMANDS:
-            wrong.append((page, name))
-            continue
+        assert name in COMMANDS, page
         module = COMMANDS[name][0]
         if name not in helps and not module.startswith('fhaosmo_ros.nodes'):
             with contextlib.suppress(SystemExit):
                 main([name, '--help'])
             helps[name] = capsys.readouterr().out
+        options = [word for word in rest if re.fullmatch(r'--?[a-z][a-z-]*', word)]
         if helps.get(name):  # without ROS some have none
-            wrong += [
-                (page, name, word) for word in rest
-                if re.fullmatch(r'--?[a-z][a-z-]*', word) and f'{word}' not in helps[name]
-            ]  # fmt: skip
-    assert not wrong
+            assert [word for word in options if word not in helps[name]] == [], (page, words)
 
 
 def test_parameters_and_files_of_commands_exist():
-    declared = {name for table in TABLES.values() for name in table}
-    wrong = []
+    declared = {name for table in TABLES.values() for name in table} | {'use_sim_time'}
+    makefile = (ROOT / 'Makefile').read_text()
     for page, words in commands():
         line = ' '.join(words)
-        wrong += [
-            (page, name) for name in re.findall(r'-p [\'"]?([a-z_]+):=', line)
-            if name not in declared and name != 'use_sim_time'
-        ]  # fmt: skip
+        assert set(re.findall(r'-p [\'"]?([a-z_]+):=', line)) <= declared, (page, line)
         if words[:3] == ['ros2', 'param', 'set'] and len(words) > 5:
             table, name = TABLES[words[3].strip('/')], words[4]
             value = yaml.safe_load(' '.join(words[5:]).strip('"'))
             if not name.startswith(('constants.', 'hip.')):
                 table[name].coerce(value)
-        if words[:3] == ['ros2', 'launch', 'fhaosmo_ros']:
-            files = ROOT / 'launch' / words[3], ROOT / 'fhaosmo_ros' / 'launching.py'
+        if words[:3] == ['ros2', 'launch', PACKAGE]:
+            files = ROOT / 'launch' / words[3], ROOT / PACKAGE / 'launching.py'
             text = ''.join(path.read_text() for path in files)
-            wrong += [
-                (page, word) for word in words[4:] if ':=' in word
-                and f"'{word.split(':=')[0]}'" not in text
-            ]  # fmt: skip
-        wrong += [
-            (page, path) for path in re.findall(r'\bconfig/[\w./-]+\.(?:yaml|xml|json)', line)
-            if not (ROOT / path).exists()
-        ]  # fmt: skip
-    assert not wrong
-
-
-def test_targets_of_make_exist():
-    makefile = (ROOT / 'Makefile').read_text()
+            names = [word.split(':=')[0] for word in words[4:] if ':=' in word]
+            assert [name for name in names if f"'{name}'" not in text] == [], (page, line)
+        for path in re.findall(r'\bconfig/[\w./-]+\.(?:yaml|xml|json)', line):
+            assert (ROOT / path).exists(), (page, line)
     for page, text in PAGES.items():
         for target in re.findall(r'(?:^ {4}|`)make ([a-z]+)', text, re.M):
             assert f'\n{target}:' in makefile, f'{page}: make {target}'
@@ -223,23 +187,11 @@ def test_python_runs(page, tmp_path):
         assert result.returncode == 0, result.stderr
 
 
-def test_links_of_the_documents_lead_somewhere():
+def test_links_and_paths_of_the_documents_lead_somewhere():
     for name, text in PAGES.items():
         folder = ROOT if name == 'README.md' else ROOT / 'docs'
         for target in re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', text):
             assert (folder / target).exists(), f'{name}: {target}'
-
-
-def test_paths_in_the_page_inside_exist():
+    bases = [ROOT / base for base in ('', PACKAGE, f'{PACKAGE}/core')]
     for path in re.findall(r'`([\w./]+(?:\.(?:py|pyx|pxd|xml)|/))`', PAGES['inside.md']):
-        assert any((ROOT / base / path).exists() for base in ('', PACKAGE, f'{PACKAGE}/core')), (
-            path
-        )
-
-
-def test_each_equation_that_is_cited_is_in_the_page():
-    numbers = set(map(int, re.findall(r'\(D (\d+)\)', PAGES['mathematics.md'])))
-    assert numbers == set(range(1, 37)) - {13, 14}  # gone, and their numbers are not used again
-    files = [path for kind in ('py', 'pyx', 'pxd') for path in (ROOT / PACKAGE).rglob(f'*.{kind}')]
-    text = ''.join(path.read_text(encoding='utf-8') for path in files)
-    assert set(map(int, re.findall(r'\bD (\d+)\b', text))) <= numbers
+        assert any((base / path).exists() for base in bases), path

@@ -7,9 +7,7 @@ from fhaosmo_ros.core import ConfigurationError
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.fuzzy import (
     curve,
-    default_curves,
     infer,
-    inferred,
     KNOTS,
     read_system,
     SHAPES,
@@ -197,14 +195,6 @@ def test_any_system_is_refused_or_keeps_the_promise(text):
         return
     assert (values.shape, values[0], values[-1]) == ((KNOTS,), 0.0, 1.0)
     assert np.all(np.diff(values) >= 0.0)
-
-
-@even
-def test_shipped_curve_is_the_inferred_one(terms, shape):
-    """Else `python -m studies.fuzzy_curves` writes the file anew."""
-    text = f'terms {shape} {terms}'
-    system = read_system(text)
-    np.testing.assert_allclose(default_curves()[system], inferred(system), atol=1e-14)
 
 
 def test_last_width_and_system_serve_the_levels_that_follow():

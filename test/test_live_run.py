@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A replay begins, restarts and changes parameters where the live estimator in the bag did."""
 
-from itertools import product
-
 import bag_files as files
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
@@ -64,20 +62,18 @@ class Live:
 
     def change(self, stamp, name, value):
         self.estimator.configure({name: value})
-        types, nothing = files.TYPES.types, np.zeros(0, np.int64)
-        parameter = types['rcl_interfaces/msg/Parameter'](
-            name=f'{self.name.removeprefix(self.node)}.{name}'.strip('/.'),
-            value=types['rcl_interfaces/msg/ParameterValue'](
-                type=3, bool_value=False, integer_value=0, double_value=value, string_value='',
-                byte_array_value=np.zeros(0, np.uint8), bool_array_value=np.zeros(0, np.bool_),
-                integer_array_value=nothing, double_array_value=np.zeros(0),
-                string_array_value=[],
-            ),
+        types = files.TYPES.types
+        lists = dict.fromkeys(('byte', 'bool', 'integer', 'double', 'string'), ())
+        of_lists = {f'{kind}_array_value': np.array(x) for kind, x in lists.items()}
+        given = types['rcl_interfaces/msg/ParameterValue'](
+            type=3, bool_value=False, integer_value=0, double_value=value, string_value='',
+            **of_lists | {'string_array_value': []},
         )  # fmt: skip
-        time = files.header(stamp).stamp
+        name = f'{self.name.removeprefix(self.node)}.{name}'.strip('/.')
+        parameter = types['rcl_interfaces/msg/Parameter'](name=name, value=given)
         data = files.cdr(
-            EVENT, stamp=time, node=self.node, new_parameters=[], changed_parameters=[parameter],
-            deleted_parameters=[],
+            EVENT, stamp=files.header(stamp).stamp, node=self.node, new_parameters=[],
+            changed_parameters=[parameter], deleted_parameters=[],
         )  # fmt: skip
         self.messages.append(('/parameter_events', EVENT, int(stamp) + 100_000, data))
         self._tell(Flag.CHANGED, 100_100)
@@ -128,12 +124,10 @@ def test_every_live_estimate_comes_again(begin, tmp_path, capsys):
     live.freeze(False)
     live.run(3400, COUNT)
     bag = write(tmp_path / 'bag', COUNT, live, begin=begin)
-    parameters = ['-p', 'epsilon:=3.0'] if begin == 0 else []
     (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
+    parameters = ['--params-file', tmp_path / 'p.yaml']
     if begin == 2600:  # whoever records later has to know the parameters
         parameters = ['-p', 'epsilon:=2.0', '-p', 'gamma_rate:=0.02']
-    elif begin == 700 or parameters:
-        parameters = ['--params-file', tmp_path / 'p.yaml']
     text, found = run(capsys, bag, *OPTIONS, *parameters)
     # The first snapshot after the begin is that of sample 123, 999 or 2699.
     expect(found, live, {0: 0, 700: 1000 - 123, 2600: 2700 - 123}[begin])
@@ -171,13 +165,9 @@ def test_parameters_of_the_bag_make_way(tmp_path, capsys):
     text, found = run(capsys, bag, '--params-file', path)
     assert f'parameters: {path}\n' in text
     expect(found, live)
-
-
-def test_parameters_of_another_version_are_said(tmp_path, capsys):
-    live = Live().run(0, 300)
-    live.tell_parameters(STAMPS[0], epsilom=1.0)
-    bag = write(tmp_path / 'bag', 300, live)
-    error = run(capsys, bag, code=2)
+    other = Live().run(0, 300)
+    other.tell_parameters(STAMPS[0], epsilom=1.0)  # as of another version
+    error = run(capsys, write(tmp_path / 'other', 300, other), code=2)
     for word in ("'/estimator/parameters'", 'epsilom', '--params-file'):
         assert word in error
 
@@ -196,30 +186,18 @@ def test_input_that_came_before_the_recording_holds(begin, tmp_path, capsys):
     expect(found, live, 1000 if begin else 0)
 
 
-def test_afresh_begins_at_the_first_sample(tmp_path, capsys):
-    live = Live().run(300, 1000)
-    bag = write(tmp_path / 'bag', 1000, live)
-    text, found = run(capsys, bag, *OPTIONS, '--afresh')
-    assert list(found) == STAMPS[:1000].tolist()
-    assert 'followed' not in text
-
-
-def test_observer_of_another_size_begins_afresh(tmp_path, capsys):
-    live = Live().run(0, 1500)
-    bag = write(tmp_path / 'bag', 1500, live, begin=600)
-    out = tmp_path / 'o.csv'
-    options = ['-p', 'order:=2', '-p', "phi:=['0','0']"]
-    assert replay.main([str(bag), '-o', str(out), *options]) == 0
-    assert 'afresh after 399 samples' in capsys.readouterr().out
-
-
-def test_samples_of_another_clock_are_not_followed(tmp_path, capsys):
-    """As with sampling: clock, whose stamps no bag keeps."""
-    live = Live().run(0, 1500, late=17)
-    bag = write(tmp_path / 'bag', 1500, live)
-    text, found = run(capsys, bag, *OPTIONS)
-    assert '/estimator not followed' in text
-    assert list(found) == STAMPS[:1500].tolist()
+@pytest.mark.parametrize(('late', 'options', 'said'), [
+    (0, ['--afresh'], 'stamps: bag'),
+    (17, [], '/estimator not followed'),  # as with sampling: clock, whose stamps no bag keeps
+    (0, ['-p', 'order:=2', '-p', "phi:=['0','0']"], 'afresh after 399 samples'),
+])  # fmt: skip
+def test_what_cannot_be_followed_begins_afresh(late, options, said, tmp_path, capsys):
+    bag = write(tmp_path / 'bag', 1500, Live().run(0, 1500, late), begin=600)
+    out = tmp_path / 'out.npz'
+    assert replay.main([str(bag), '-o', str(out), *OPTIONS, *options]) == 0
+    assert said in capsys.readouterr().out
+    with np.load(out) as found:
+        assert found['stamp_ns'].tolist() == STAMPS[999 if '399' in said else 600 : 1500].tolist()
 
 
 def test_sample_that_the_bag_lacks_does_not_stop_the_following(tmp_path, capsys):
@@ -256,34 +234,24 @@ def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
     told = write(tmp_path / 'told', 1500, *lives)
     (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
     file = ['--params-file', tmp_path / 'p.yaml', *OPTIONS]
-    for live, (source, options) in product(lives, [(bag, file), (told, [])]):
-        text, found = run(capsys, source, '--follow', live.name, *options)
-        assert 'parameters differ' not in text
-        expect(found, live)
+    for live in lives:
+        channel = live.name.removeprefix('/estimator/')
+        for arguments in ([bag, '--follow', live.name, *file], [told, '--channel', channel]):
+            text, found = run(capsys, *arguments)
+            assert f'followed {live.name}' in text
+            assert 'parameters differ' not in text
+            expect(found, live)
+    error = run(capsys, told, '--afresh', '--channel', 'hop', code=2)
+    assert '--channel: expected hip or knee, got hop' in error
 
 
 @pytest.mark.parametrize('labels', [['a', 'b'], ['version', 'z_hat1'], ['flags', 'm1']])
 def test_snapshot_of_another_version_is_said_and_not_followed(labels, tmp_path, capsys):
     data = labelled_array(labels, np.array([3.0, 1.0]))
-    messages = [*files.floats(STAMPS[:50], Y[:50]), ('/e/snapshot', ARRAY, int(STAMPS[49]), data)]
-    bag = files.write(tmp_path / 'bag', messages)
-    code = replay.main([str(bag), '-o', str(tmp_path / 'o.npz')])
+    snapshot = '/e/snapshot', ARRAY, int(STAMPS[49]), data
+    bag = files.write(tmp_path / 'bag', [*files.floats(STAMPS[:50], Y[:50]), snapshot])
+    assert replay.main([str(bag), '-o', str(tmp_path / 'o.npz')]) == 0
     error = capsys.readouterr().err
-    assert code == 0
     assert error.count("'/e/snapshot'") == 1
     assert 'begins at the first sample' in error
     assert list(rows(tmp_path / 'o.npz')) == STAMPS[:50].tolist()
-
-
-def test_channel_says_whom_to_follow(tmp_path, capsys):
-    lives = [
-        Live(f'/estimator/{name}', node='/estimator').run(0, 1200) for name in ('hip', 'knee')
-    ]
-    own = {'variant': 'fuzzy_adaptive', 'epsilon': 3.0, 'channels': ['hip', 'knee']}
-    lives[0].tell_parameters(STAMPS[0], **own)
-    bag = write(tmp_path / 'bag', 1200, *lives)
-    text, found = run(capsys, bag, '--channel', 'knee')
-    assert 'followed /estimator/knee' in text
-    expect(found, lives[1])
-    error = run(capsys, bag, '--afresh', '--channel', 'hop', code=2)
-    assert '--channel: expected hip or knee, got hop' in error

@@ -157,7 +157,7 @@ cdef class Numbers:
         return values[index]
 """,
     'fhaosmo_ros/taken.pyx': (
-        'from fhaosmo_ros.number cimport NUMBER\ndef number():\n    return NUMBER'
+        'from fhaosmo_ros.number cimport NUMBER\ndef number():\n    return NUMBER\n'
     ),
 }
 OUT_OF_BOUNDS = """
@@ -166,56 +166,44 @@ try:
     Numbers()[4]
 except IndexError:
     print('checked')
-else:
-    print('unchecked')
 """
 
 
-@pytest.fixture
-def small(tmp_path) -> Path:
-    """Return a package of two small extensions with this package's setup.py."""
+def test_only_what_has_changed_is_built(tmp_path):
+    """Of a package of two small extensions with this package's setup.py."""
+
+    def build(debug: int = 1) -> dict[str, int]:
+        """Return when each extension was compiled (ns); a debug build takes half the time."""
+        command = (sys.executable, 'setup.py', '-q', 'build_ext', '-i')
+        assert run(*command, cwd=tmp_path, FHAOSMO_DEBUG=debug) == ''
+        libraries = (tmp_path / 'build').glob('lib*/**/*.so')
+        return {path.name.split('.')[0]: path.stat().st_mtime_ns for path in libraries}
+
+    def change(name: str, old: str, new: str) -> None:
+        path = tmp_path / NAME / name
+        path.write_text(path.read_text().replace(old, new))
+
+    (tmp_path / NAME).mkdir()
     for name, text in SMALL.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
     for name in ('setup.py', 'setup.cfg'):
         shutil.copy(ROOT / name, tmp_path)
-    return tmp_path
-
-
-def build(folder: Path, debug: int = 1) -> dict[str, int]:
-    """Return when each extension was compiled (ns); a debug build takes half the time."""
-    command = (sys.executable, 'setup.py', '-q', 'build_ext', '-i')
-    assert run(*command, cwd=folder, FHAOSMO_DEBUG=debug) == ''
-    libraries = (folder / 'build').glob('lib*/**/*.so')
-    return {path.name.split('.')[0]: path.stat().st_mtime_ns for path in libraries}
-
-
-def test_only_what_has_changed_is_built(small):
-    first = build(small)
+    first = build()
     assert set(first) == {'number', 'taken'}
-    assert not list((small / NAME).rglob('*.c'))
-    assert build(small) == first
-    taken = small / NAME / 'taken.pyx'
-    taken.write_text(taken.read_text() + ' + 0')
-    second = build(small)
+    assert not list((tmp_path / NAME).rglob('*.c'))
+    assert build() == first
+    change('taken.pyx', 'return NUMBER', 'return NUMBER + 0')
+    second = build()
     assert second['number'] == first['number']
     assert second['taken'] > first['taken']
-    declarations = small / NAME / 'number.pxd'
-    declarations.write_text(declarations.read_text().replace('NUMBER = 3', 'NUMBER = 4'))
-    build(small)
+    change('number.pxd', 'NUMBER = 3', 'NUMBER = 4')
+    build()
     query = f'from {NAME}.taken import number; print(number())'
-    assert run(sys.executable, '-c', query, cwd=small) == '4\n'
+    assert run(sys.executable, '-c', query, cwd=tmp_path) == '4\n'
     # A debug build checks bounds, and is not taken for a normal one.
-    assert run(sys.executable, '-c', OUT_OF_BOUNDS, cwd=small) == 'checked\n'
-    build(small, debug=0)
-    assert run(sys.executable, '-c', OUT_OF_BOUNDS, cwd=small) == 'unchecked\n'
-
-
-def test_without_cython_the_build_says_so(small):
-    (small / 'Cython.py').write_text('raise ImportError')
-    done = attempt(sys.executable, 'setup.py', '-q', 'build_ext', cwd=small, PYTHONPATH=small)
-    assert done.returncode == 1
-    assert done.stderr == "error: Cython is needed to build: pip install 'Cython>=3'\n"
+    assert run(sys.executable, '-c', OUT_OF_BOUNDS, cwd=tmp_path) == 'checked\n'
+    build(debug=0)
+    assert run(sys.executable, '-c', OUT_OF_BOUNDS, cwd=tmp_path) == ''
 
 
 # package.xml
@@ -223,18 +211,15 @@ def test_without_cython_the_build_says_so(small):
 
 def test_package_xml():
     package = ElementTree.parse(ROOT / 'package.xml').getroot()
-    assert package.findtext('name') == NAME
-    assert package.findtext('version') == fhaosmo_ros.__version__
-    assert package.findtext('export/build_type') == 'ament_python'
+    found = [package.findtext(tag) for tag in ('name', 'version', 'export/build_type')]
+    assert found == [NAME, fhaosmo_ros.__version__, 'ament_python']
     needed = {tag.text for tag in package.findall('exec_depend')}
     assert {'rclpy', 'std_msgs', 'std_srvs', 'launch_ros', 'python3-numpy'} <= needed
     assert {'cython3', 'python3-dev'} <= {tag.text for tag in package.findall('build_depend')}
     catkin_pkg = pytest.importorskip('catkin_pkg.package', reason='catkin_pkg is not installed')
-    warnings: list[str] = []
-    catkin_pkg.parse_package(str(ROOT / 'package.xml'), warnings=warnings).validate(
-        warnings=warnings
-    )
-    assert warnings == []
+    said: list[str] = []
+    catkin_pkg.parse_package(str(ROOT / 'package.xml'), warnings=said).validate(warnings=said)
+    assert said == []
 
 
 # launch
@@ -319,19 +304,16 @@ FAKE = {
 ROS, JAZZY = 'venv: .venv-ros\nwheels: no\n', {'ROS_DISTRO': 'jazzy'}
 
 
-@pytest.mark.parametrize(
-    ('fake', 'environment', 'printed', 'said'),
-    [
-        (None, {}, 'venv: .venv\nwheels: jazzy\n', []),
-        (None, {'ROS_WHEELS': 'kilted'}, 'venv: .venv-kilted\nwheels: kilted\n', []),
-        (None, {'CC': sys.executable}, f'wheels: jazzy\ncompiler: {sys.executable}\n', []),
-        ('no compiler', {'PATH': '{}'}, 'wheels: jazzy\ncompiler: ziglang\n', []),
-        ('here', JAZZY, ROS, []),
-        ('here', {'ROS_DISTRO': 'rolling'}, ROS, ['only ROS 2 Jazzy and', 'sourced is rolling']),
-        ('broken', JAZZY | {'AMENT_PREFIX_PATH': '/opt'}, None, ['cannot import rclpy']),
-        ('old', {'PYTHON': '{}/python3'}, None, ['Python 3.10 or later', 'Python 3.9.1']),
-    ],
-)
+@pytest.mark.parametrize(('fake', 'environment', 'printed', 'said'), [
+    (None, {}, 'venv: .venv\nwheels: jazzy\n', []),
+    (None, {'ROS_WHEELS': 'kilted'}, 'venv: .venv-kilted\nwheels: kilted\n', []),
+    (None, {'CC': sys.executable}, f'wheels: jazzy\ncompiler: {sys.executable}\n', []),
+    ('no compiler', {'PATH': '{}'}, 'wheels: jazzy\ncompiler: ziglang\n', []),
+    ('here', JAZZY, ROS, []),
+    ('here', {'ROS_DISTRO': 'rolling'}, ROS, ['only ROS 2 Jazzy and', 'sourced is rolling']),
+    ('broken', JAZZY | {'AMENT_PREFIX_PATH': '/opt'}, None, ['cannot import rclpy']),
+    ('old', {'PYTHON': '{}/python3'}, None, ['Python 3.10 or later', 'Python 3.9.1']),
+])  # fmt: skip
 def test_plan_of_the_environment(fake, environment, printed, said, tmp_path):
     (tmp_path / 'dirname').symlink_to(shutil.which('dirname'))  # all that it needs of the system
     if fake:
@@ -350,10 +332,9 @@ def test_plan_of_the_environment(fake, environment, printed, said, tmp_path):
 def test_without_the_headers_of_python_nothing_is_begun(tmp_path):
     name, text = FAKE['no headers']
     (tmp_path / name).write_text(text)
-    (tmp_path / 'scripts').mkdir()
-    script = shutil.copy(ENVIRONMENT, tmp_path / 'scripts')
-    for folder in (NAME, 'studies'):
+    for folder in ('scripts', NAME, 'studies'):
         (tmp_path / folder).mkdir()
+    script = shutil.copy(ENVIRONMENT, tmp_path / 'scripts')
     (tmp_path / 'setup.py').touch()
     done = attempt('sh', script, PYTHON=sys.executable, PYTHONPATH=tmp_path)
     assert done.returncode == 1
@@ -366,33 +347,21 @@ def test_without_the_headers_of_python_nothing_is_begun(tmp_path):
 # python -m fhaosmo_ros
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'code', 'words'),
-    [
-        (['estimater'], 2, ["no command 'estimater'", "did you mean 'estimator'?", *COMMANDS]),
-        (['compare'], 2, ['make compare in a checkout']),
-        ([], 2, COMMANDS),
-        (['-h'], 0, COMMANDS),
-        (['--help'], 0, COMMANDS),
-        (['--version'], 0, [f'fhaosmo_ros {fhaosmo_ros.__version__}\n']),
-    ],
-)
-def test_what_the_package_itself_says(arguments, code, words, capsys):
+@pytest.mark.parametrize(('arguments', 'code', 'words'), [
+    (['estimater'], 2, ["no command 'estimater'", "did you mean 'estimator'?", *COMMANDS]),
+    (['compare'], 2, ['make compare in a checkout']),
+    ([], 2, COMMANDS),
+    (['--help'], 0, COMMANDS),
+    (['--version'], 0, [f'fhaosmo_ros {fhaosmo_ros.__version__}\n']),
+    (['fake'], 1, ["'no_such_module_here'"]),
+])  # fmt: skip
+def test_what_the_package_itself_says(arguments, code, words, capsys, monkeypatch):
+    monkeypatch.setitem(COMMANDS, 'fake', ('no_such_module_here', ''))
     assert main(arguments) == code
     out, error = capsys.readouterr()
     said, nothing = (error, out) if code else (out, error)
     assert nothing == ''
-    assert all(word in said for word in words)
-
-
-def test_command_gets_its_arguments_and_returns_its_code(monkeypatch, capsys):
-    fake = ModuleType('fake_command')
-    fake.main = len
-    monkeypatch.setitem(sys.modules, 'fake_command', fake)
-    monkeypatch.setitem(COMMANDS, 'fake', ('fake_command', ''))
+    assert all(word in said for word in words if word != 'fake')
+    # A command gets its arguments, and its code is returned.
+    monkeypatch.setitem(sys.modules, 'no_such_module_here', SimpleNamespace(main=len))
     assert main(['fake', 'one', '--two']) == 2
-    monkeypatch.setitem(COMMANDS, 'fake', ('no_such_module_here', ''))
-    assert main(['fake']) == 1
-    assert "'no_such_module_here'" in capsys.readouterr().err
-    done = attempt(sys.executable, '-m', NAME, 'nonsense', cwd=ROOT)
-    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, '', 1)

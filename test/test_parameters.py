@@ -6,6 +6,7 @@ from array import array
 import warnings
 
 from fhaosmo_ros.core import ConfigurationError, Observer
+from fhaosmo_ros.core.parameters import files
 from fhaosmo_ros.core.parameters.declaration import KINDS, Parameter
 from fhaosmo_ros.core.parameters.files import load, select
 from fhaosmo_ros.core.parameters.per_channel import channel_names, of_channel, with_channels

@@ -108,16 +108,3 @@ def test_the_file_of_the_page_finds_faults_and_nothing_else(tmp_path, factor):
     assert np.median(late) < 0.35
     quiet = begun[begun < r.faults[0]]
     assert not len(quiet[quiet > 10.0])
-
-
-def test_page_of_events_says_what_was_measured():
-    documented = evidence.read(events.NAME)
-    told, changed = events.FACTORS
-    for name in (events.FILTER, events.OURS):
-        point = events.best(events.points_of(documented, told, name))
-        [kept] = [
-            p for p in events.points_of(documented, changed, name)
-            if p.threshold == point.threshold
-        ]  # fmt: skip
-        assert f'{point.delay:.2f} s' in EVENTS
-        assert f'{kept.false:.1f}' in EVENTS or f'{kept.false:,.0f}' in EVENTS

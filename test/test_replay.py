@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag replayed is the observer's own result; input that is wrong is said in one line."""
+"""A bag, or a CSV file, replayed is the observer's own result."""
 
 import csv
 from pathlib import Path
@@ -100,38 +100,15 @@ def test_parameters_for_a_named_node(bag, tmp_path):
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(STAMPS, Y, values))
 
 
-@pytest.mark.parametrize(
-    ('text', 'words'),
-    [
-        ('estimater: {ros__parameters: {}}', ["'estimator' or '/**'", "mean 'estimater'"]),
-        ('estimator: {ros__parameters: {lambda: [1.0, 2.0]}}', ["'lambda'", '[1.0, 2.0]']),
-        ('estimator: {ros__parameters: {lamda: 1.0}}', ["'lamda'", "mean 'lambda'"]),
-    ],
-)
-def test_wrong_file_is_named(text, words, bag, tmp_path, capsys):
-    path = tmp_path / 'p.yaml'
-    path.write_text(text)
-    assert run(bag, '-o', tmp_path / 'o.npz', '--params-file', path) == 2
-    error = capsys.readouterr().err.strip()
-    assert error.startswith(f'replay: error: {path}: ')
-    assert all(word in error for word in words), error
+def third_joint(stamp, value):
+    return files.joint_state(stamp, [1.0, 2.0, value])
 
 
-def joint_state(stamp, value):
-    return files.cdr(
-        'sensor_msgs/msg/JointState', header=files.header(stamp), name=['a', 'bcd', 'e'],
-        position=np.array([1.0, 2.0, value]), velocity=np.zeros(0), effort=np.zeros(0),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ('kind', 'field', 'make', 'rounding'),
-    [
-        ('sensor_msgs/msg/JointState', 'position[2]', joint_state, np.float64),
-        ('std_msgs/msg/Float32', None,
-         lambda _, v: files.cdr('std_msgs/msg/Float32', data=v), np.float32),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(('kind', 'field', 'make', 'rounding'), [
+    (files.JOINTS, 'position[2]', third_joint, np.float64),
+    ('std_msgs/msg/Float32', '', lambda _, v: files.cdr('std_msgs/msg/Float32', data=v),
+     np.float32),
+])  # fmt: skip
 def test_any_number_of_any_type(kind, field, make, rounding, tmp_path):
     stamps, y = files.signal(400)
     late = stamps + 3_000_000  # the bag's own stamps, not those of the headers
@@ -140,14 +117,12 @@ def test_any_number_of_any_type(kind, field, make, rounding, tmp_path):
         for at, stamp, value in zip(late.tolist(), stamps.tolist(), y.tolist(), strict=True)
     ]
     bag = files.write(tmp_path / 'bag', messages)
-    choice = ['-p', 'input_topic:=/sensor', *(['-p', f'input_field:={field}'] if field else [])]
+    choice = ['-p', 'input_topic:=/sensor', '-p', f"input_field:='{field}'"]
     assert run(bag, *choice, '-o', tmp_path / 'o.npz') == 0
-    used = stamps if b'header' in repr(files.TYPES.fielddefs[kind]).encode() else late
+    used = stamps if kind == files.JOINTS else late
     y = y.astype(rounding).astype(np.float64)
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(used, y))
-    assert run(
-        bag, *choice, '-p', 'input_stamp:=reception', '-o', tmp_path / 'b.npz'
-    ) == 0  # fmt: skip
+    assert run(bag, *choice, '-p', 'input_stamp:=reception', '-o', tmp_path / 'b.npz') == 0
     np.testing.assert_array_equal(table(tmp_path / 'b.npz'), expected(late, y))
 
 
@@ -182,7 +157,7 @@ def test_stamps_that_go_back_are_rejected_as_live(tmp_path, capsys):
     shown = stamps.copy()
     shown[100] -= 5_000_000
     messages = [
-        ('/j', 'sensor_msgs/msg/JointState', at, joint_state(s, v))
+        ('/j', files.JOINTS, at, third_joint(s, v))
         for at, s, v in zip(stamps.tolist(), shown.tolist(), y.tolist(), strict=True)
     ]
     bag = files.write(tmp_path / 'bag', messages)
@@ -225,96 +200,6 @@ def test_types_of_a_sourced_workspace_go_into_the_bag(tmp_path, monkeypatch):
         assert reader.field('/rig', 'inner[1].force').steps == ['inner', 1, 'force']
 
 
-# Wrong input
-
-
-def cut(bag):
-    path = next(bag.glob('*.mcap'))
-    path.write_bytes(path.read_bytes()[:-2000])
-
-
-def spoil(bag):
-    path = next(bag.glob('*.mcap'))
-    data = bytearray(path.read_bytes())
-    data[5000:5060] = b'\xff' * 60  # longer than a record
-    path.write_bytes(data)
-
-
-def old(bag):
-    bag.with_name('old.bag').write_bytes(b'#ROSBAG V2.0')
-
-
-def with_empty_topic(bag):
-    with files.Writer(bag.with_name('empty'), version=9) as writer:
-        writer.add_connection('/y', files.FLOAT, typestore=files.TYPES)
-        x = writer.add_connection('/x', files.FLOAT, typestore=files.TYPES)
-        writer.write(x, 5, files.float64(1.0))
-
-
-def lose_metadata(bag):
-    (bag / 'metadata.yaml').unlink()
-
-
-@pytest.mark.parametrize(
-    ('harm', 'arguments', 'words'),
-    [
-        (None, ['/no/such/bag'], ['/no/such/bag', 'does not exist']),
-        (None, ['BAG', '-p', 'input_topic:=/yy'], ["'/yy'", '(/y)', "did you mean '/y'?"]),
-        (None, ['BAG', '-p', 'input_field:=date'], ["'date'", "did you mean 'data'?"]),
-        (None, ['BAG', '-p', 'input_field:=data..x'], ["'data..x'", 'one of data']),
-        (
-            None,
-            ['BAG', '-p', 'input_stamp:=header'],
-            ['input_stamp header', files.FLOAT],
-        ),
-        (None, ['BAG', '-p', 'order=3'], ['NAME:=VALUE', "'order=3'"]),
-        (None, ['BAG', '-p', 'lamda:=3'], ["'lamda'", "did you mean 'lambda'?"]),
-        (None, ['BAG', '-p', 'epsilon:=-3'], ["'epsilon'", '> 0', '-3']),
-        (None, ['BAG', '-p', "phi:=['0','0','u']"], ["'/u'", '(/y)']),
-        (old, ['old.bag'], ['ROS 1', 'rosbags-convert --src old.bag']),
-        (None, ['BAG', '--params-file', '/no.yaml'], ['/no.yaml', 'No such file']),
-        (cut, ['BAG'], ['whole bag', 'was cut', 'mcap recover']),
-        (spoil, ['BAG'], ['whole bag']),
-        (lose_metadata, ['BAG'], ['metadata.yaml', 'bag.mcap: name that file']),
-        (with_empty_topic, ['empty'], ["expected messages on topic '/y', got none"]),
-    ],
-)
-def test_wrong_input_is_said_in_one_line_and_leaves_nothing(
-    harm, arguments, words, bag, tmp_path, capsys, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    if harm:
-        harm(bag)
-    before = sorted(tmp_path.iterdir())
-    code = run(*[bag if a == 'BAG' else a for a in arguments], '-o', tmp_path / 'out')
-    error = capsys.readouterr().err
-    lines = [line for line in error.splitlines() if line.startswith('replay: error: ')]
-    assert code == 2
-    assert len(lines) == 1, error
-    assert 'Traceback' not in error
-    for word in words:
-        assert word in lines[0]
-    assert sorted(tmp_path.iterdir()) == before
-
-
-def test_list_that_is_too_short(tmp_path, capsys):
-    bag = files.write(
-        tmp_path / 'bag', [('/y', 'sensor_msgs/msg/JointState', 5, joint_state(5, 1.0))]
-    )
-    assert run(bag, '-p', 'input_field:=position[3]', '-o', tmp_path / 'o.npz') == 2
-    assert 'position[3]' in (error := capsys.readouterr().err)
-    assert '3 in one message' in error
-    assert run(bag, '-o', tmp_path / 'o.npz') == 2
-    assert 'position[i]' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize('name', ['.', '..', '/'])
-def test_output_without_a_name_is_refused(name, bag, capsys):
-    assert run(bag, '-o', name, '--force') == 2
-    error = capsys.readouterr().err.strip()
-    assert error == f'replay: error: output {name}: expected a name, got a folder that is in use'
-
-
 @pytest.mark.parametrize('way', [['--smooth'], ['-p', 'smoothing_lag:=0.2']])
 def test_smoothed_estimates_are_the_librarys(way, tmp_path, capsys):
     stamps, y = STAMPS, Y.copy()
@@ -340,6 +225,58 @@ def test_smoothed_estimates_are_the_librarys(way, tmp_path, capsys):
     assert 'smoothed: each estimate by the samples before' in capsys.readouterr().out
 
 
-def test_smoothing_without_a_size_of_the_noise_is_refused(bag, capsys):
-    assert run(bag, '--smooth') == 2
-    assert "expected 'noise_size' > 0" in capsys.readouterr().err
+# CSV files
+
+T = np.arange(300) * 1e-3
+SINE, U = 0.1 * np.sin(T), np.cos(9.0 * T)
+MODEL = {'order': 2, 'phi': ['0', '-z1 + torque'], 'inputs': ['torque']}
+OPTIONS = [f'{name}:={value}' for name, value in MODEL.items()]
+
+
+def run_table(path, *arguments):
+    given = [text for option in OPTIONS for text in ('-p', option)]
+    return run(path, *given, '-o', path.with_suffix('.npz'), *arguments)
+
+
+@pytest.mark.parametrize(('first', 'delimiter', 'arguments'), [
+    ('t,angle,torque', ',', []),
+    ('torque;x;"angle";t', ';', ['--columns', 't, angle, torque']),
+    ('# t angle torque', ' ', ['-p', 'input_topic:=/joint_states', '-p', 'input_field:=position']),
+    ('', '\t', ['--columns', '1,2,3']),
+])  # fmt: skip
+def test_csv_file_is_estimated_as_its_arrays(tmp_path, first, delimiter, arguments):
+    path, columns = tmp_path / 'my.csv', [T, SINE, U]
+    if first.startswith('torque'):
+        columns = [U, 0.0 * T, SINE, T]
+    lines = [delimiter.join(map(repr, map(float, row))) for row in zip(*columns, strict=True)]
+    path.write_text('\n'.join([first, *lines][not first :]))
+    assert run_table(path, *arguments) == 0
+    stamps = np.maximum(np.round(T * 1e9).astype(np.int64), 1)
+    expected = OnlineEstimator(MODEL).run(stamps, SINE, U)
+    found = np.load(tmp_path / 'my.npz')
+    np.testing.assert_array_equal(found['stamp_ns'], stamps)
+    np.testing.assert_array_equal(found['unknown_input'], expected.unknown_input)
+
+
+def test_empty_cell_is_a_missing_sample(tmp_path, capsys):
+    (tmp_path / 'my.csv').write_text('t,y,u\n0,0.1,0\n0.001,,0\n0.002,0.1,0\n')
+    assert run_table(tmp_path / 'my.csv') == 0
+    assert '2 samples used, 1 rejected' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(('text', 'columns', 'said'), [
+    ('t,y,u\n0,1,2\n0.001,x,3\n', '', 'my.csv: expected lines of numbers: could not convert str'),
+    ('t,y,u\n0,1\n', '', 'my.csv: expected lines of numbers: '),
+    ('t,y,u\n', '', 'my.csv: expected lines of numbers, got none'),
+    ('', '', '--columns: expected 3 titles, of the time, y, torque, got'),
+    ('t,angle,u\n0,1,2\n', 't,anlge,u', "t, angle, u, got 'anlge'; did you mean 'angle'?"),
+    ('t,y,u\n0,1,2\n', 't,y', '--columns: expected 3 titles, of the time, y, torque, got t, y'),
+    ('t,y,u\n-1,1,2\n', '', 'my.csv: expected times of 0 to 9.2e+09 s, got -1.0 in sample 0'),
+    ('t,y,u\nnan,1,2\n', '', 'my.csv: expected times of 0 to 9.2e+09 s, got nan in sample 0'),
+])  # fmt: skip
+def test_bad_table_is_said_in_one_line(tmp_path, capsys, text, columns, said):
+    (tmp_path / 'my.csv').write_text(text)
+    assert run_table(tmp_path / 'my.csv', '--columns', columns) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert not (tmp_path / 'my.npz').exists()

@@ -47,9 +47,8 @@ def _launcher(folders):
 @pytest.fixture(scope='session')
 def user():
     """Return a node that hears, publishes and asks."""
-    user = User()
-    yield user
-    user.close()
+    with User() as user:
+        yield user
 
 
 @pytest.fixture(scope='module')

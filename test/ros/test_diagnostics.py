@@ -3,7 +3,6 @@
 
 from functools import partial
 import itertools
-import math
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.recording import PrivateNode
@@ -11,61 +10,32 @@ import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from running import (
-    as_time,
-    ERROR,
-    FED,
-    joint_state,
-    LATCHED,
-    LAX,
-    OK,
-    Parameters,
-    STALE,
-    values_of,
-    WARN,
-)  # fmt: skip
+from running import ERROR, FED, joint_state, LATCHED, LAX, OK, Parameters, STALE, values_of, WARN
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Int64
 
 RATE = 200.0
 """Of the pair's plant."""
-TICK = 25_000_000
-"""Nanoseconds of a clock at 40 Hz."""
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def test_values_of_the_input(pair):
+def test_values_of_the_reports(pair):
     def as_sampled(values) -> bool:  # a loaded machine may stall, or not know a new node's name
-        return (
-            float(values['sample rate [Hz]']) == pytest.approx(RATE, rel=0.2)
-            and values['publishers'] == '/pair/plant'
-        )
+        near = float(values['sample rate [Hz]']) == pytest.approx(RATE, rel=0.2)
+        return near and values['publishers'] == '/pair/plant'
 
-    values = pair.wait_values('input', as_sampled, 'rate and name of the plant')
-    assert values['topic'] == '/pair/y'
-    assert float(values['jitter (std / mean of the period)']) >= 0.0
-    mean = 1.0 / float(values['sample rate [Hz]'])
-    assert float(values['longest period [s]']) >= 0.999 * mean
-    assert 0.0 < float(values['longest delay [s]']) < 60.0
-    assert 0.0 <= float(values['age of the last sample [s]']) < 60.0
-    accepted = int(values['samples accepted'])
-    assert accepted > 0
-    assert int(values['samples lost']) >= 0
+    found = pair.wait_values('input', as_sampled, 'rate and name of the plant')
+    observer = values_of(pair.wait_status('observer', OK, 'OK'))
+    assert not {'nan', 'inf'} & {*found.values(), *observer.values()}
+    assert (found['topic'], observer['open levels']) == ('/pair/y', '4 of 4')
+    assert float(found['longest period [s]']) >= 0.999 / float(found['sample rate [Hz]'])
+    assert 0.0 < float(found['longest delay [s]']) < 60.0
+    mean, longest = (float(observer[f'step time, {x} [us]']) for x in ('mean', 'longest'))
+    assert 0.0 < mean <= longest
+    assert 0.0 <= float(observer['chatter index (0 smooth, 1 nothing but chatter)']) <= 1.0
+    accepted = int(found['samples accepted'])
     pair.wait_values('input', lambda v: int(v['samples accepted']) > accepted, 'more samples')
-
-
-def test_values_of_the_observer(pair):
-    values = values_of(pair.wait_status('observer', OK, 'OK'))
     assert set(pair.reports[-1].statuses) == {'state', 'input', 'observer'}
-    assert {status.hardware_id for status in pair.reports[-1].statuses.values()} == {'none'}
-    assert values['open levels'] == '4 of 4'
-    assert 0.1 <= float(values['gamma']) <= 1.0
-    assert values['gamma at'] == 'neither bound'
-    assert math.isfinite(float(values['unknown input']))
-    assert float(values['chatter of the unknown input']) >= 0.0
-    assert 0.0 <= float(values['chatter index (0 smooth, 1 nothing but chatter)']) <= 1.0
-    assert 0.0 < float(values['step time, mean [us]']) <= float(values['step time, longest [us]'])
-    assert int(values['overruns']) >= 0
 
 
 @pytest.mark.parametrize(
@@ -87,6 +57,7 @@ def test_thresholds(pair, task, changes, words):
 
 
 def test_hardware_id_and_period_are_live(pair):
+    assert pair.reports[-1].statuses['state'].hardware_id == 'none'
     pair.parameters.set(hardware_id='encoder 7', diagnostics_period=1.0)
     since = len(pair.reports)
 
@@ -99,27 +70,16 @@ def test_hardware_id_and_period_are_live(pair):
     pair.parameters.set(hardware_id='none', diagnostics_period=LAX['diagnostics_period'])
 
 
-def test_what_holds_gamma_is_said(fed):
-    def wait_word(word: str) -> None:
-        fed.feed(0.2)
-        fed.wait_values('observer', lambda v: v['gamma at'].startswith(word), f'gamma at {word}')
-
-    wait_word('neither bound')
-    fed.parameters.set(gamma_min=0.3, gamma_initial=0.3, gamma_max=0.3)
-    wait_word('gamma_m')
-    fed.parameters.set(variant='sign')
-    wait_word('a fixed value')
-
-
 def test_a_clock_that_is_slower_than_the_samples_is_said(user, estimator):
     """What `ros2 bag play --clock` gives, at 40 Hz."""
     rig = estimator('/slow', **FED | LAX, use_sim_time=True, sampling='clock')
     clock = user.publisher('/clock', Clock)
     rig.listen()
-    ticks = itertools.count(100 * TICK, TICK)
+    ticks = itertools.count(100)
 
     def send() -> None:
-        clock.publish(Clock(clock=as_time(next(ticks))))
+        seconds, tick = divmod(next(ticks), 40)
+        clock.publish(Clock(clock=Time(sec=seconds, nanosec=25_000_000 * tick)))
         for _ in range(25):
             rig.send(0.2)
 
@@ -153,8 +113,7 @@ def test_what_no_longer_fits_is_said(user, estimator):
     for _ in range(10):
         send()
     said = ' '.join(report.statuses['observer'].message for report in rig.reports)
-    for words in ('jumped', 'as large as', 'gains are for'):
-        assert words not in said
+    assert not [words for words in ('jumped', 'as large as', 'gains are for') if words in said]
     wait_said('y jumped 1 times', fresh=False, offset=1.0)
     wait_said('times as large as noise_size says', noise=1e-2)
     wait_said('gains are for 1000 Hz, y comes at 500 Hz', period=2)
@@ -163,13 +122,13 @@ def test_what_no_longer_fits_is_said(user, estimator):
 # Publishers that can't be heard, or are too many.
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture
 def stranger():
     """A node beside the user, as another process would have."""
-    node = PrivateNode('stranger').node  # not spun: a destroyed publisher is gone at once
-    yield node
-    node.destroy_node()
-    node.context.try_shutdown()
+    private = PrivateNode('stranger')  # not spun: a destroyed publisher is gone at once
+    yield private.node
+    private.node.destroy_node()
+    private.node.context.try_shutdown()
 
 
 def test_publishers_are_named(user, estimator, stranger):
@@ -180,8 +139,8 @@ def test_publishers_are_named(user, estimator, stranger):
 
     unheard = stranger.create_publisher(Float64, '/heard/y', BEST_EFFORT)
     words = ('/stranger', 'best effort publisher and reliable subscription', 'input_reliability')
-    rig.wait_status('input', ERROR, *words)
-    rig.wait_status('input', ERROR, *words)
+    for _ in range(2):
+        rig.wait_status('input', ERROR, *words)
     assert len(rig.said('/stranger publishes /heard/y unheard')) == 1  # once, not with each report
     stranger.destroy_publisher(unheard)
     rig.wait_status('input', STALE, 'no publisher')
@@ -205,8 +164,7 @@ def test_publishers_are_named(user, estimator, stranger):
     rig.wait_count('samples accepted', 30)
     assert rig.count('samples lost') == 0
     stranger.destroy_publisher(first)
-    rig.wait_values('input', lambda v: v['publishers'] == '/user', 'name of the other one')
-    assert rig.said('the publisher of /heard/y changed: now /user')
+    rig.wait_said('the publisher of /heard/y changed: now /user')
 
 
 def test_what_was_published_before_is_heard_if_asked_for(estimator, stranger):
@@ -241,10 +199,11 @@ def test_policies_of_estimates(user, launch):
     assert parameters.get(f'{prefix}/standard_deviation.publisher.depth') == 7
     assert parameters.get(f'{prefix}/innovation.publisher.depth') == 1000
 
+    reliable, kept = (policies(user, f'{node}/{topic}') for topic in ('stamp', 'unknown_input'))
     assert policies(user, f'{node}/state').reliability == ReliabilityPolicy.BEST_EFFORT
-    assert policies(user, f'{node}/stamp').reliability == ReliabilityPolicy.RELIABLE
-    assert policies(user, f'{node}/unknown_input').durability == DurabilityPolicy.TRANSIENT_LOCAL
-    assert policies(user, f'{node}/stamp').durability == DurabilityPolicy.VOLATILE
+    assert reliable.reliability == ReliabilityPolicy.RELIABLE
+    assert reliable.durability == DurabilityPolicy.VOLATILE
+    assert kept.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
     y, reports = user.publisher('/out/y'), user.reports[node[1:]]
 

@@ -55,35 +55,29 @@ def test_a_destroyed_node_leaves_the_graph_while_its_process_goes_on(user):
 
 def test_life_of_a_node(user, unconfigured, process):
     node = unconfigured
-    user.wait(lambda: topics(user) == 0, 'end of the topics')
-    user.wait(lambda: not listeners(user), 'end of the subscription')
+    user.wait(lambda: topics(user) == 0 and not listeners(user), 'end of the topics')
     assert node.transitions() == {'configure', 'shutdown'}
     assert node.change(Transition.TRANSITION_CONFIGURE)
     assert node.state() == 'inactive'
-    rig = Estimator(user, process, '/managed')
-    rig.listen()
+    rig = Estimator(user, process, '/managed').listen()
     for _ in range(20):  # an inactive node takes no samples ...
         rig.send(0.2)
     for _ in range(2):
         rig.wait_status('state', STALE, 'inactive')
     assert not rig.estimates
-    assert node.change(Transition.TRANSITION_ACTIVATE)
-    assert node.state() == 'active'
-    assert rig.feed(3.0).z == [3.0, 0.0, 0.0]  # ... and an active one starts with its first
-    assert rig.feed(3.1).z != [3.0, 0.0, 0.0]
-    rig.wait_status('state', OK, 'active')
-    assert node.change(Transition.TRANSITION_DEACTIVATE)
-    assert node.state() == 'inactive'
-    rig.wait_status('state', STALE, 'inactive')  # what was on its way has come
-    ticks = len(rig.topics['stamp'])
-    rig.wait_status('state', STALE, 'inactive')
-    assert len(rig.topics['stamp']) == ticks
-    assert node.change(Transition.TRANSITION_ACTIVATE)
-    assert rig.feed(5.0).z == [5.0, 0.0, 0.0]
+    for y in (3.0, 5.0):
+        assert node.change(Transition.TRANSITION_ACTIVATE)
+        assert node.state() == 'active'
+        assert rig.feed(y).z == [y, 0.0, 0.0]  # ... and an active one starts with its first
+        assert rig.feed(y + 0.1).z != [y, 0.0, 0.0]
+        rig.wait_status('state', OK, 'active')
+        assert node.change(Transition.TRANSITION_DEACTIVATE)
+        rig.wait_status('state', STALE, 'inactive')  # what was on its way has come
+        ticks = len(rig.topics['stamp'])
+        rig.wait_status('state', STALE, 'inactive')
+        assert len(rig.topics['stamp']) == ticks
     assert rig.count('samples lost') == 0
-    assert node.change(Transition.TRANSITION_DEACTIVATE)
     assert node.change(Transition.TRANSITION_CLEANUP)
-    assert node.state() == 'unconfigured'
     user.wait(lambda: topics(user) == 0, 'end of the topics')
 
 
@@ -92,14 +86,12 @@ def test_the_model_is_read_when_it_is_configured(user, unconfigured, process):
     was = parameters.all(['order', 'phi'])
     # One after the other, as `ros2 param set` does: between the two they do not fit together.
     for name, value in (('order', 2), ('phi', ['0', '-z2'])):
-        result = parameters.try_to_set(name, value)
-        assert result.successful, result.reason
+        parameters.set(**{name: value})
     assert node.change('configure')
     for name, value in was.items():
-        result = parameters.try_to_set(name, value)
+        result = parameters.try_to_set(**{name: value})
         assert not result.successful
-        for word in (name, 'cleanup', 'got'):
-            assert word in result.reason
+        assert all(word in result.reason for word in (name, 'cleanup', 'got'))
         # Its own value is taken, as `ros2 param load` of its own file sets it.
         parameters.set(**{name: parameters.get(name)})
     assert node.change('activate')
@@ -116,9 +108,8 @@ def test_parameters_that_do_not_fit_fail_the_transition_and_say_why(user, unconf
     assert unconfigured.state() == 'unconfigured'
     words = "transition configure failed: parameter 'phi': expected 4 expressions"
     assert words in process.output()
-    result = parameters.try_to_set('order', 0)  # a value wrong by itself is refused at once
-    assert not result.successful
-    assert 'order' in result.reason
+    # A value wrong by itself is refused at once.
+    assert 'order' in parameters.try_to_set(order=0).reason
     parameters.set(order=3)
     assert unconfigured.change('configure')
 

@@ -1,78 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A plant and an estimator that hears it; estimates of a running node are those of a replay."""
+"""Estimates and events of a running node are those of a replay."""
 
-import bisect
 import itertools
 import math
 
 from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.core.observer.estimates import TUNING
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import numpy as np
 import pytest
 from running import FED, LATCHED, nanoseconds, OK, WARN
-from std_msgs.msg import Float64, Float64MultiArray
-
-RATE = 100.0
-
-
-@pytest.fixture(scope='module')
-def truth(pair, user):
-    """Return states and unknown inputs of the plant, and wait for some estimates."""
-    states = user.record('/pair/plant/state', Float64MultiArray)
-    inputs = user.record('/pair/plant/unknown_input', Float64)
-    user.wait(lambda: states and inputs, 'truth of the plant')
-    user.wait(lambda: len(pair.estimates) >= 2 * RATE, 'estimates')
-    return states, inputs
-
-
-def test_state_is_labelled_and_sized(pair, truth):
-    for messages in (pair.topics['state'], truth[0]):
-        message = messages[-1].message
-        (dimension,) = message.layout.dim
-        assert (dimension.label, dimension.size, dimension.stride) == ('z1,z2,z3', 3, 3)
-        assert len(message.data) == 3
-        assert message.layout.data_offset == 0
-    innovation = pair.topics['innovation'][-1].message
-    assert innovation.layout.dim[0].label == 'eps1,eps2,eps3,eps4'
-    assert len(innovation.data) == 4
-
-
-def test_stamp_is_a_samples_source_stamp(pair, truth):
-    ours = [m.stamp for m in list(pair.y)]
-    stamps = [e.stamp for e in pair.estimates if ours[0] <= e.stamp <= ours[-1]]
-    assert len(stamps) > RATE
-    assert set(stamps) <= set(ours)
-    assert stamps == sorted(stamps)
-
-
-def test_estimates_are_finite_and_close(pair, truth):
-    states, inputs = truth
-
-    def rms_of_a_second() -> np.ndarray:
-        last = pair.estimates[-int(RATE) :]
-        estimates = np.array([[*e.z, e.unknown_input] for e in last])
-        true = [[*nearest(states, e.stamp).data, nearest(inputs, e.stamp).data] for e in last]
-        return np.sqrt(np.mean((estimates - true) ** 2, axis=0))
-
-    # A machine that stalls makes a gap, and the observer starts afresh: then it has a second more.
-    pair.user.wait(
-        lambda: (rms_of_a_second() < [0.005, 0.05, 0.1, 0.05]).all(), 'estimates near the truth'
-    )
-    low, high = (ESTIMATOR_PARAMETERS[f'gamma_{bound}'].default for bound in ('min', 'max'))
-    for e in pair.estimates:
-        assert all(map(math.isfinite, [*e.z, e.unknown_input, *e.innovation]))
-        assert low <= e.gamma <= high
-
-
-def nearest(messages: list, stamp: int):
-    """Return the message that was published nearest to a time."""
-    after = bisect.bisect(messages, stamp, key=lambda m: m.stamp)
-    return min(messages[max(after - 1, 0) :][:2], key=lambda m: abs(m.stamp - stamp)).message
-
-
-# Live as in a replay.
+from std_msgs.msg import Float64MultiArray
 
 
 @pytest.mark.parametrize(
@@ -109,6 +47,8 @@ def test_equals_a_replay_of_the_same_samples(user, estimator, values, request):
     for e in rig.estimates:
         if e.stamp in expected:
             np.testing.assert_array_equal(e.z, expected[e.stamp].z)
+    innovation = rig.topics['innovation'][-1].message
+    assert innovation.layout.dim[0].label.startswith('eps1,eps2,eps3,eps4')
     if 'gains' in values:
         noise, correlation, bandwidth, shares = replay.observer.tuning
         assert bandwidth > 0.0

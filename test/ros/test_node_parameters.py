@@ -11,10 +11,9 @@ from fhaosmo_ros.core.parameters.tables import (
 )
 import numpy as np
 import pytest
-from rcl_interfaces.msg import LoggerLevel, Parameter, ParameterValue
-from rcl_interfaces.srv import SetLoggerLevels
-from running import FED, joint_state, Parameters, SECOND, told_parameters
-from sensor_msgs.msg import JointState
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rclpy.parameter import get_parameter_value
+from running import FED, OK, Parameters
 from test_any_input import valid
 
 TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}
@@ -89,12 +88,12 @@ def test_every_parameter_is_described_and_has_its_default(nodes, node):
         assert ('set it after cleanup' in d.additional_constraints) == fixed, name
 
 
-def test_every_live_parameter_of_the_plant_can_change(nodes):
+def test_every_live_parameter_of_the_plant_can_change(pair):
     for parameter in LIVE['plant']:
-        was, change = nodes['plant'].get(parameter.name), other('plant', parameter)
-        nodes['plant'].set(**change)
-        assert nodes['plant'].all(change) == change
-        nodes['plant'].set(**{parameter.name: was})
+        was, change = pair.plant.get(parameter.name), other('plant', parameter)
+        for changes in (change, {parameter.name: was}):
+            pair.plant.set(**changes)
+            assert pair.plant.all(changes) == changes
 
 
 @pytest.mark.parametrize('parameter', LIVE['estimator'], ids=lambda p: p.name)
@@ -142,35 +141,30 @@ def test_constants_are_parameters_of_their_own(user, launch):
         user.publisher(topic)
     node.set(**{'constants.k': 3})
     for name, value in (('constants.k', math.nan), ('constants.k', 'x'), ('constants.q', 1.0)):
-        result = node.try_to_set(name, value)
-        assert not result.successful
-        assert name in result.reason
+        assert name in node.try_to_set(**{name: value}).reason
     assert node.get('constants.k') == 3.0
 
 
 # Refused.
 
 
-@pytest.mark.parametrize(
-    ('node', 'name', 'value', 'words'),
-    [
-        ('estimator', 'gamma_min', 0.97, ['gamma_initial', '0.97']),
-        ('estimator', 'epsilon', 'wide', ['a number', "'wide'"]),
-        ('estimator', 'variant', 'fuzy', ["'fuzy'", "did you mean 'fuzzy'?"]),
-        ('estimator', 'lambda', [15.0, 15.0], ['1 or 4', '[15.0, 15.0]']),
-        ('estimator', 'publish_rate', 1e6, ['0.1', '5000', '1000000.0']),
-        ('estimator', 'order', 2, ['cleanup', '2']),
-        ('estimator', 'event_deviations', 4.0, ["expected gains = 'self_tuning'"]),
-        ('estimator', 'lamda', 1.0, ["did you mean 'lambda'?"]),
-        ('plant', 'noise_seed', 1.5, ['an integer', '1.5']),
-        ('plant', 'disturbance', 'saw', ['none, sine, step, square, chirp', "'saw'"]),
-        ('plant', 'phi', ['0', '0', 'z1'], []),
-    ],
-)
+@pytest.mark.parametrize(('node', 'name', 'value', 'words'), [
+    ('estimator', 'gamma_min', 0.97, ['gamma_initial', '0.97']),
+    ('estimator', 'epsilon', 'wide', ['a number', "'wide'"]),
+    ('estimator', 'variant', 'fuzy', ["'fuzy'", "did you mean 'fuzzy'?"]),
+    ('estimator', 'lambda', [15.0, 15.0], ['1 or 4', '[15.0, 15.0]']),
+    ('estimator', 'publish_rate', 1e6, ['0.1', '5000', '1000000.0']),
+    ('estimator', 'order', 2, ['cleanup', '2']),
+    ('estimator', 'event_deviations', 4.0, ["expected gains = 'self_tuning'"]),
+    ('estimator', 'lamda', 1.0, ["did you mean 'lambda'?"]),
+    ('plant', 'noise_seed', 1.5, ['an integer', '1.5']),
+    ('plant', 'disturbance', 'saw', ['none, sine, step, square, chirp', "'saw'"]),
+    ('plant', 'phi', ['0', '0', 'z1'], []),
+])  # fmt: skip
 def test_bad_value_changes_nothing_and_says_why(nodes, node, name, value, words):
     parameters = nodes[node]
     before = parameters.messages(*TABLES[node])
-    result = parameters.try_to_set(name, value)
+    result = parameters.try_to_set(**{name: value})
     assert not result.successful
     assert '\n' not in result.reason
     for word in [name, *words]:
@@ -178,17 +172,10 @@ def test_bad_value_changes_nothing_and_says_why(nodes, node, name, value, words)
     assert parameters.messages(*TABLES[node]) == before
 
 
-def test_a_parameter_cannot_be_deleted(fed, user):
-    nothing = Parameter(name='lambda', value=ParameterValue())
-    (result,) = user.answer(fed.parameters.service.set_parameters, [nothing]).results
-    assert not result.successful
-    assert fed.parameters.get('lambda') == ESTIMATOR_PARAMETERS['lambda'].default
-
-
 def test_atomic_set_is_all_or_nothing(fed):
     p = fed.parameters
     before = p.messages(*ESTIMATOR_PARAMETERS)
-    result = p.try_to_set_together(epsilon=0.04, lambda_=[1.0, 2.0])
+    result = p.try_to_set(epsilon=0.04, lambda_=[1.0, 2.0])
     assert not result.successful
     assert 'lambda' in result.reason
     assert p.messages(*ESTIMATOR_PARAMETERS) == before
@@ -201,99 +188,65 @@ def test_atomic_set_is_all_or_nothing(fed):
 # Texts, as `ros2 param set` sends them.
 
 
-@pytest.mark.parametrize(
-    ('name', 'text', 'value'),
-    [
-        ('epsilon', '4', 4.0),
-        ('epsilon', '1e-2', 0.01),
-        ('lambda', '[15, 15, 15, 15]', [15.0] * 4),
-        ('lambda', '[15, 1e1, 16.5, 17]', [15.0, 10.0, 16.5, 17.0]),
-        ('lambda', '14', [14.0]),
-        ('lambda', '14.5', [14.5]),
-        ('start_from_measurement', 'off', False),
-        ('variant', 'sign', 'sign'),
-        *(('lambda', text, None) for text in ('[]', '[a, 1]', '[[1, 2], [3, 4]]', '[1, 2', '')),
-    ],
-)
+@pytest.mark.parametrize(('name', 'text', 'value'), [
+    ('epsilon', '4', 4.0),
+    ('epsilon', '1e-2', 0.01),
+    ('lambda', '[15, 15, 15, 15]', [15.0] * 4),
+    ('lambda', '[15, 1e1, 16.5, 17]', [15.0, 10.0, 16.5, 17.0]),
+    ('lambda', '14', [14.0]),
+    ('lambda', '14.5', [14.5]),
+    ('start_from_measurement', 'off', False),
+    ('variant', 'sign', 'sign'),
+    *(('lambda', text, None) for text in ('[]', '[a, 1]', '[[1, 2], [3, 4]]', '[1, 2', '')),
+])  # fmt: skip
 def test_texts_of_ros2_param_set(fed, name, text, value):
     p = fed.parameters
     kind = p.messages(name)[0].type
-    result = p.try_to_set(name, text, text=True)
+    change = Parameter(name=name, value=get_parameter_value(text))
+    (result,) = fed.user.answer(p.service.set_parameters, [change]).results
     assert result.successful == (value is not None), result.reason
     if value is None:
         assert f"parameter '{name}': expected a list of numbers > 0" in result.reason
     else:
         assert p.get(name) == value
+    nothing = Parameter(name=name, value=ParameterValue())  # as `ros2 param delete`
+    assert not fed.user.answer(p.service.set_parameters, [nothing]).results[0].successful
     assert p.messages(name)[0].type == kind
 
 
 # Random sets.
 
-COUNT = 400
+COUNT = 300
 ODD = (
-    math.nan, math.inf, -math.inf, -1.0, 0.0, 1e308, -1e308, 5e-324, 2**62, -1, True, '', 'fuzzy',
-    '[1.0, 2.0]', '1e-3', "__import__('os').abort()", '!!python/name:os.abort', [1.0, math.nan],
-    [0.5] * 4, [0.5] * 13, ['0', '0'], [1, 2, 3, 4], [True], 'x' * 10_000,
+    math.nan, math.inf, -1.0, 0.0, 1e308, 5e-324, 2**62, True, '', '[1.0, 2.0]', '1e-3',
+    "__import__('os').abort()", [1.0, math.nan], [0.5] * 13, ['0', '0'], [True], 'x' * 10_000,
 )  # fmt: skip
 
 
 def test_random_sets_hurt_nobody_and_each_refusal_has_its_reason(user, estimator):
-    node = estimator('/random', input_topic='joints', input_field='position[a]', **FED)
-    joints = user.publisher('/random/joints', JointState)
-    rng = np.random.default_rng(5)
-    table = ESTIMATOR_PARAMETERS
+    node = estimator('/random', **FED | {'max_gap': 0.0}).listen()
+    rng, accepted, values = np.random.default_rng(5), 0, {}
     names = [name for name, p in ONLINE_PARAMETERS.items() if p.live or name == 'order']
-    stamp, accepted, values = SECOND, 0, node.parameters.messages(*table)
     for _ in range(COUNT):
         changes = {
             str(name): ODD[rng.integers(len(ODD))] if rng.random() < 0.15
-            else valid(table[name], rng)
+            else valid(ESTIMATOR_PARAMETERS[name], rng)
             for name in rng.choice(names, size=rng.integers(1, 4), replace=False)
         }  # fmt: skip
-        result = node.parameters.try_to_set_together(**changes)
-        before, values = values, node.parameters.messages(*table)
-        changed = {n for n, a, b in zip(table, before, values, strict=True) if a != b}
-        if result.successful:
-            accepted += 1
-            assert changed <= set(changes), changes
-        else:
-            assert not changed, changes
-            assert result.reason, changes
+        result = node.parameters.try_to_set(**changes)
+        before, values = values, dict(zip(names, node.parameters.messages(*names), strict=True))
+        changed = {n for n in before if before[n] != values[n]}
+        accepted += result.successful
+        assert changed <= (set(changes) if result.successful else set()), changes
+        if not result.successful:
             assert '\n' not in result.reason, result.reason
             assert any(name in result.reason for name in [*changes, 'gamma_']), (changes, result)
         for _ in range(2):
-            stamp += int(rng.choice([1_000, 1_000_000, 20_000_000]))
-            y = rng.normal() if rng.random() < 0.99 else rng.choice([math.nan, 1e300])
-            joints.publish(joint_state(stamp, ['a'], [y]))
+            node.send(rng.normal() if rng.random() < 0.99 else rng.choice([math.nan, 1e300]))
     assert COUNT // 10 < accepted < COUNT - COUNT // 10
     node.parameters.set(publish_on='sample', diagnostics_period=0.2)
-    node.wait_status('state', b'\0')  # whatever has been published before has come
+    node.wait_status('state', OK)  # whatever has been published before has come
     assert len(node.estimates) > COUNT // 2
     for e in node.estimates:
         assert all(map(math.isfinite, [*e.z, e.unknown_input, e.gamma, *e.innovation])), e
         assert 0.0 < e.gamma <= 1.0
-
-
-# What the estimator is set to, on a latched topic: the text of a parameter file.
-
-
-def test_topic_tells_who_comes_late_and_every_change(user, fed):
-    changes = {'epsilon': 3.5, 'gamma_rate': 0.25}
-    fed.parameters.set(**changes)
-    wait = told_parameters(user, fed.name)
-    expected = ESTIMATOR_PARAMETERS.defaults() | FED | changes
-    assert wait(lambda v: v['gamma_rate'] == 0.25) == expected
-    assert not fed.parameters.try_to_set('gamma_rate', -1.0).successful
-    fed.parameters.set(epsilon=0.125, publish_rate=50.0)
-    values = wait(lambda v: v['epsilon'] != 3.5)
-    assert values == expected | {'epsilon': 0.125, 'publish_rate': 50.0}
-
-
-def test_levels_of_the_log_can_be_set(user, fed):
-    for level, value in ((LoggerLevel.LOG_LEVEL_WARN, 0.5), (LoggerLevel.LOG_LEVEL_INFO, 0.25)):
-        request = SetLoggerLevels.Request(levels=[LoggerLevel(name='fed.estimator', level=level)])
-        (result,) = user.call(f'{fed.name}/set_logger_levels', SetLoggerLevels, request).results
-        assert result.successful
-        fed.parameters.set(epsilon=value)
-    fed.wait_said('set epsilon = 0.25')
-    assert not fed.said('set epsilon = 0.5')

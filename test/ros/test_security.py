@@ -35,23 +35,6 @@ def allowed(policy, enclave: str, kind: str, verb: str) -> list[str]:
     return [expand(item.text, profile) for item in items]
 
 
-def test_policy_has_the_form_that_sros2_reads(policy):
-    """Schema 0.2.0 of sros2, as far as the file uses it."""
-    assert (policy.tag, policy.attrib) == ('policy', {'version': '0.2.0'})
-    for path in ('enclaves', 'enclaves/enclave/profiles', 'enclaves/enclave/profiles/profile'):
-        parents = policy.findall(path.rpartition('/')[0] or '.')
-        assert [list(parent) for parent in parents] == [[x] for x in policy.findall(path)]
-    verbs = {'topics': ('publish', 'subscribe'), 'services': ('reply', 'request')}
-    for rules in policy.findall('enclaves/enclave/profiles/profile/*'):
-        ((verb, rule),) = rules.attrib.items()
-        assert verb in verbs[rules.tag]
-        assert rule == 'ALLOW'
-        assert len(rules)
-        for item in rules:
-            assert (item.tag, item.attrib) == (rules.tag[:-1], {})
-            assert item.text.strip() == item.text
-
-
 @pytest.mark.parametrize('name', NODES)
 def test_policy_allows_exactly_what_the_node_has(user, launch, policy, name):
     # In a namespace: other tests leave nodes of this name behind for a while.

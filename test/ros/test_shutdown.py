@@ -4,7 +4,6 @@
 import signal
 import time
 
-from fhaosmo_ros.stop_signals import Stop, Stopped
 import pytest
 from rclpy.parameter import Parameter
 from running import Manager, Parameters
@@ -16,8 +15,8 @@ GRACE = 30.0
 
 def ends_well(process) -> None:
     assert process.wait(GRACE) == 0, process.output()
-    for word in ('Traceback', 'Exception', 'Error', 'error', 'terminate called'):
-        assert word not in process.output(), process.output()
+    words = ('Traceback', 'Exception', 'Error', 'error', 'terminate called')
+    assert not [word for word in words if word in process.output()], process.output()
 
 
 @pytest.mark.parametrize(
@@ -43,16 +42,13 @@ def test_running_pair_ends(user, launch, signals):
     user.wait(lambda: user.node.count_publishers(topic) == 0, 'end of the publishers')
 
 
-@pytest.mark.parametrize(
-    'transitions', [[], ['configure'], ['shutdown']], ids=['unconfigured', 'inactive', 'finalized']
-)
-def test_a_signal_ends_it_in_every_state(user, launch, transitions, request):
-    namespace = f'/{request.node.callspec.id}'
+@pytest.mark.parametrize('transition', ['', 'configure', 'shutdown'])
+def test_a_signal_ends_it_in_every_state(user, launch, transition):
+    namespace = f'/after_{transition}'
     process = launch('estimator', namespace=namespace, autostart=False)
     manager = Manager(user, f'{namespace}/estimator')
-    for transition in transitions:
-        assert manager.change(transition)
-    assert manager.state() == namespace[1:]
+    assert manager.state() == 'unconfigured'
+    assert not transition or manager.change(transition)
     process.send_signal(signal.SIGINT)
     ends_well(process)
 
@@ -62,15 +58,14 @@ def test_signal_while_parameters_are_set(user, launch):
     process = launch('estimator', namespace='/set')
     parameters = Parameters(user, '/set/estimator')
     parameters.set(epsilon=4.0)
-    changes = {'fuzzy_systems': ['terms gaussian 5'], 'variant': 'fuzzy'}
     for _ in range(20):
-        parameters.service.set_parameters([Parameter(n, value=v) for n, v in changes.items()])
+        parameters.service.set_parameters([Parameter('variant', value='fuzzy')])
     process.send_signal(signal.SIGINT)
     ends_well(process)
 
 
 @pytest.mark.parametrize('name', ['estimator', 'plant'])
-@pytest.mark.parametrize('delay', [0.2, 0.5, 0.8, 1.1])
+@pytest.mark.parametrize('delay', [0.3, 0.7, 1.1])
 def test_signal_while_it_starts(launch, name, delay):
     """The delay is the test's subject: anywhere within the start, or just behind it."""
     process = launch(name, namespace='/early')
@@ -104,19 +99,3 @@ def test_a_callback_that_does_not_end_does_not_hold_the_node(user, launch):
     process.send_signal(signal.SIGINT)
     ends_well(process)
     assert 'ended while a callback was running' in process.output()
-
-
-# What they are made of.
-
-
-def test_a_signal_cuts_only_what_may_be_cut_and_only_once():
-    stop = Stop()
-    with pytest.raises(Stopped), stop.raising():
-        stop.signal()
-    stop.signal()  # in the clean-up
-    assert stop.is_set()
-    with pytest.raises(Stopped), stop.raising():
-        raise AssertionError('the signal came before')
-    quiet = Stop()
-    quiet.signal()
-    assert quiet.wait(0.0)

@@ -29,6 +29,10 @@ def rules(*words: str) -> list[str]:
 # Node, arguments, words of the message; an argument with an end of line is put in a file.
 E, P = 'estimator', 'plant'
 OF_PLANT = 'plant: {ros__parameters: {order: 2}}\n'
+HOSTILE_TEXTS = [
+    HOSTILE[name].strip()
+    for name in ('laughs', '50000 brackets', 'very long text', 'python', 'half a list')
+]
 REFUSED = [
     # Files.
     (E, set_in_file('lamda: [15.0]'), [".yaml: unknown parameter 'lamda'", "mean 'lambda'?"]),
@@ -82,30 +86,22 @@ REFUSED = [
      ['state.publisher.deadline', 'one of']),
     (P, rules('qos_overrides./yy.publisher.depth:=5'),
      ["'qos_overrides./yy.publisher.depth': expected TOPIC"]),
+    # Hostile texts; more of them in test_parameter_files.py.
+    *((E, rules(f'lambda:={text}'), ["'lambda'"]) for text in HOSTILE_TEXTS),
+    *((E, set_in_file(f'lambda: {text}'), ['.yaml']) for text in HOSTILE_TEXTS),
 ]  # fmt: skip
 
 
 def in_files(words: list[str], folder: Path) -> list[str]:
-    """Put arguments of several lines in files, and return them with the files' names."""
+    """Put arguments that end with a line in files, and return them with the files' names."""
     result = []
     for k, word in enumerate(words):
-        if '\n' in word:
+        if word.endswith('\n'):
             path = folder / f'{k}.yaml'
             path.write_text(word)
             word = str(path)
         result.append(word)
     return result
-
-
-def start(node: str, words: list[str]) -> int:
-    """Start a node in this process and return its exit code; it is not to run."""
-    watch = Timer(DEADLINE, signal.raise_signal, [signal.SIGTERM])
-    watch.start()
-    try:
-        return main([node, *words])
-    finally:
-        watch.cancel()
-        gc.collect()  # the node itself: two of one name in a process make rcl warn
 
 
 def check_refusal(node: str, code: int, out: str, err: str) -> str:
@@ -115,14 +111,22 @@ def check_refusal(node: str, code: int, out: str, err: str) -> str:
     (line,) = [x for x in err.splitlines() if 'Publisher already registered' not in x]
     assert line.startswith(f'{node}: error: ')
     assert line.isprintable()
+    assert len(line) < 600
     for noise in ('Traceback', '.c:', 'Error(', '/project/'):
         assert noise not in line
     return line
 
 
-@pytest.mark.parametrize(('node', 'words', 'expected'), REFUSED, ids=str)
+@pytest.mark.parametrize(('node', 'words', 'expected'), REFUSED)
 def test_one_line_says_what_is_wrong(node, words, expected, tmp_path, capfd):
-    code = start(node, in_files(words, tmp_path))
+    # In this process; it is not to run.
+    watch = Timer(DEADLINE, signal.raise_signal, [signal.SIGTERM])
+    watch.start()
+    try:
+        code = main([node, *in_files(words, tmp_path)])
+    finally:
+        watch.cancel()
+        gc.collect()  # the node itself: two of one name in a process make rcl warn
     line = check_refusal(node, code, *capfd.readouterr())
     for word in expected:
         assert word in line
@@ -132,19 +136,6 @@ def test_one_line_says_what_is_wrong(node, words, expected, tmp_path, capfd):
 def test_process_ends_with_one_line(node):
     done = run(node, *rules('phi:=[]'))
     assert "'phi'" in check_refusal(node, done.returncode, done.stdout, done.stderr)
-
-
-@pytest.mark.parametrize('text', HOSTILE.values(), ids=HOSTILE.keys())
-def test_hostile_text_gives_no_more_than_a_line(text, tmp_path, capfd):
-    path = tmp_path / 'file.yaml'
-    for words, content in (
-        (rules(f'lambda:={text}'), ''),
-        (['--ros-args', '--params-file', str(path)], text),
-        (['--ros-args', '--params-file', str(path)], section(f'lambda: {text}')),
-    ):
-        path.write_text(content)
-        code = start('estimator', words)
-        assert len(check_refusal('estimator', code, *capfd.readouterr())) < 600
 
 
 def test_files_and_rules_reach_the_node_for_which_they_are(user, launch, tmp_path):
@@ -173,36 +164,6 @@ def test_files_and_rules_reach_the_node_for_which_they_are(user, launch, tmp_pat
     assert 'noise_std' not in parameters.names()
     (line,) = [x for x in process.output().splitlines() if '[WARN]' in x]
     assert line.endswith(f'{files[3]}: sets nothing for node /rig/lead')
-
-
-def attacks(mark: Path) -> list[str]:
-    """Return texts that would make the file `mark` if anything ran them."""
-    touch = f'touch {mark}'
-    return [
-        f"__import__('os').system('{touch}')",
-        f"().__class__.__base__.__subclasses__()[0].__init__.__globals__['os'].system('{touch}')",
-        f"z1 if __import__('os').system('{touch}') else z1",
-        f"[__import__('os').system('{touch}') for _ in (1,)][0]",
-        f"(lambda: __import__('os').system('{touch}'))()",
-        f'f\'{{open({str(mark)!r}, "w")}}\'',
-        f"open('{mark}', 'w')",
-        f"eval('{touch}')",
-        f'$({touch})',
-        f'`{touch}`',
-        f'0; {touch}',
-        f'| {touch}',
-        f'!!python/object/apply:os.system ["{touch}"]',
-    ]
-
-
-def test_arguments_and_files_execute_nothing(tmp_path, capfd):
-    mark = tmp_path / 'mark'
-    for text in attacks(mark):
-        for words in (rules(f'epsilon:={text}'), set_in_file(f'epsilon: {text}'), [text],
-                      ['--ros-args', '--params-file', text]):  # fmt: skip
-            code = start('estimator', in_files(words, tmp_path))
-            check_refusal('estimator', code, *capfd.readouterr())
-    assert not mark.exists()
 
 
 WITHOUT_EVENTS = """
