@@ -2,6 +2,7 @@
 """The protocol of all commands: exit codes, one-line errors, signals, outputs, processes."""
 
 import argparse
+from concurrent.futures.process import BrokenProcessPool
 import os
 from pathlib import Path
 import signal
@@ -11,9 +12,10 @@ import time
 
 import commands
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.stop_signals import Stopped
+from fhaosmo_ros.stop_signals import Stop, Stopped
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 import pytest
+from studies.harness import called
 from waiting import wait_until
 
 PARSER = argparse.ArgumentParser(prog='try')
@@ -202,6 +204,18 @@ def test_workers_end_when_their_parent_is_killed(busy):
     process, pids = busy(False)
     process.kill()
     wait_for_end(pids)
+
+
+class Unloadable:
+    """Pickles, but no other process can load it."""
+
+    def __reduce__(self):
+        return int, ('no number',)
+
+
+def test_a_call_that_no_worker_can_load_ends_the_command():
+    with pytest.raises(BrokenProcessPool):
+        called({'': (len, Unloadable())}, 'broken', 1, Stop())
 
 
 SLOW = """
