@@ -7,28 +7,15 @@ Write fhaosmo_ros/core/observer/fuzzy_curves.csv: the curves psi of the default 
 
 import csv
 
-from fhaosmo_ros.core.observer.fuzzy import (
-    DEFAULT_CURVES,
-    FuzzySystem,
-    inferred,
-    read_system,
-    SHAPES,
-)
-
-TEXTS = [f'terms {shape} {terms}' for shape in SHAPES for terms in (5, 7)]
+from fhaosmo_ros.core.observer.fuzzy import DEFAULT_CURVES, inferred, read_system, SHAPES
 
 
 def main() -> None:
     """Infer the curves and write them, each number with all its digits."""
-    columns = []
-    for text in TEXTS:
-        system = read_system(text)
-        assert isinstance(system, FuzzySystem)
-        columns.append(inferred(system).tolist())
+    texts = [f'terms {shape} {terms}' for shape in SHAPES for terms in (5, 7)]
+    columns = [inferred(read_system(text)).tolist() for text in texts]
     with DEFAULT_CURVES.open('w', newline='') as file:
-        table = csv.writer(file, lineterminator='\n')
-        table.writerow(TEXTS)
-        table.writerows(zip(*columns, strict=True))
+        csv.writer(file, lineterminator='\n').writerows([texts, *zip(*columns, strict=True)])
 
 
 if __name__ == '__main__':

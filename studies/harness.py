@@ -25,11 +25,9 @@ from studies.evidence import DOCS, Row
 
 SELF_TUNING = {'gains': 'self_tuning'}
 MODEL = ('order', 'phi', 'inputs')
-POLL = 0.1
-"""Seconds between two looks at what has come."""
+POLL = 0.1  # seconds between two looks at what has come
 Floats = NDArray[np.float64]
-Call = tuple[Any, ...]
-"""A function of a module, and its arguments."""
+Call = tuple[Any, ...]  # A function of a module, and its arguments
 Results = Callable[[Mapping[Hashable, Call]], dict[Any, Any]]
 """Returns what calls return, by key: `called` for one study."""
 
@@ -52,21 +50,9 @@ def run_study(
     """
     Run the command of a study: measure, and write what was found into a folder.
 
-    Parameters
-    ----------
-    name, description : str
-    measure : callable
-        Gets the arguments, with the folder as `output`, and a function that computes calls in
-        several processes.
-    argv : list of str, optional
-    options : iterable
-        Arguments of the command beside those that all studies have.
-
-    Returns
-    -------
-    int
-        0; 2 for a bad argument or output; 130 if it was interrupted.
-
+    `measure` gets the arguments, with the folder as `output`, and a function that computes calls
+    in several processes; `options` are arguments beside those that all studies have. Return 0; 2
+    for a bad argument or output; 130 if it was interrupted.
     """
     parser = argparse.ArgumentParser(prog=name, description=description)
     add = parser.add_argument
@@ -85,8 +71,8 @@ def run_study(
     def body(arguments: argparse.Namespace, stop: Stop) -> None:
         if arguments.jobs < 1:
             raise ConfigurationError(f'--jobs: expected an integer >= 1, got {arguments.jobs}')
-        own = Path(f'{name}_output') if arguments.quick else DOCS
-        arguments.output = arguments.output or own
+        usual = Path(f'{name}_output') if arguments.quick else DOCS
+        arguments.output = arguments.output or usual
         found = measure(arguments, lambda calls: called(calls, name, arguments.jobs, stop))
         evidence.publish(arguments.output, *found)
 

@@ -8,15 +8,15 @@ import pytest
 from scipy.linalg import expm
 from studies import everywhere
 from studies.comparison.cells import PLANTS, sensors
-from studies.comparison.methods import METHODS
-from studies.comparison.methods.kalman import (
+from studies.comparison.methods import (
     ADAPTIVE,
     HUBER,
     IMM,
     LINEAR_LIMIT,
+    METHODS,
     SampledModel,
 )
-from studies.comparison.methods.method import Setting
+from studies.comparison.tuning import Setting
 
 MODELS = {
     'paper': TriangularModel(['0', '0', '-z3']),
@@ -75,10 +75,10 @@ def test_error_of_the_usual_kalman_filter_decays_exactly_to_zero(name, period):
     values = {d.name: d.start for d in method.space(setting)}
     t = np.arange(0.0, 15.0, period)
     r = recording(model, t, [0.3, -0.2, 0.1][: model.order], 0.8, u=0.02)
-    found = method.prepare(setting, values)(r)['filtered']
-    assert abs(found.d[0] - 0.8) > 0.5
-    assert abs(found.d[-1] - 0.8) < 1e-5
-    np.testing.assert_allclose(found.z[-1], r.z[-1], atol=1e-6)
+    [found] = method.prepare(setting, values)(r)
+    assert abs(found[0, -1] - 0.8) > 0.5
+    assert abs(found[-1, -1] - 0.8) < 1e-5
+    np.testing.assert_allclose(found[-1, :-1], r.z[-1], atol=1e-6)
 
 
 @pytest.mark.parametrize('name', ['Kalman', *(m.name for m in ADAPTIVE)])
@@ -89,10 +89,10 @@ def test_peers_know_the_input_and_bridge_a_gap(name):
     t = np.concatenate([np.arange(0.0, 5.0, 1e-2), np.arange(5.3, 8.0, 1e-2)])
     r = recording(model, t, [0.3, -0.2], 0.8, u=0.02)
     values = {d.name: d.start for d in method.space(setting)} | {'decay': 1e-6}
-    found = method.prepare(setting, values)(r)['filtered']
+    [found] = method.prepare(setting, values)(r)
     after = t > 4.0
-    np.testing.assert_allclose(found.d[after], 0.8, atol=1e-3)
-    np.testing.assert_allclose(found.z[after], r.z[after], atol=1e-3)
+    np.testing.assert_allclose(found[after, -1], 0.8, atol=1e-3)
+    np.testing.assert_allclose(found[after, :-1], r.z[after], atol=1e-3)
 
 
 @pytest.mark.parametrize('derivatives', [0, 2])
@@ -105,9 +105,9 @@ def test_peers_without_their_options_are_the_kalman_filter(derivatives, rate):
     setting = everywhere.setting_of(motor, condition)
     member = {'derivatives': derivatives, 'bandwidth': 15.0, 'decay': 4.5}
     values = everywhere.at(member, setting.model.order, rate)
-    [expected] = everywhere.errors_of(LINEAR_LIMIT, setting, values, [r])
+    expected = everywhere.error_of(LINEAR_LIMIT, setting, values, [r])
     for name, options in ((HUBER, {}), (IMM, {'spread': 1.0 + 1e-9, 'stay': 1.0})):
-        [found] = everywhere.errors_of(name, setting, values | options, [r])
+        found = everywhere.error_of(name, setting, values | options, [r])
         assert found == pytest.approx(expected, rel=1e-3)
 
 

@@ -53,7 +53,7 @@ def test_all_findings_come_out_with_the_shipped_half_widths(documented):
 def test_shipped_half_widths_lie_inside_the_region():
     rows = evidence.read('paper_half_widths')
     holds = {tuple(row.values())[:2] for row in rows if all(list(row.values())[2:])}
-    first, later = cases.preset().observer['fuzzy_widths'][:2]
+    first, later = cases.preset()[0]['fuzzy_widths'][:2]
     around = [cases.WIDTHS[i - 1 : i + 2] for i in map(cases.WIDTHS.index, (first, later))]
     assert {(a, b) for a in around[0] for b in around[1]} <= holds
 

@@ -23,20 +23,17 @@ from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 from fhaosmo_ros.tools.cli.processes import Children
 from matplotlib.figure import Figure
 import numpy as np
-from studies.arm.judging import rmse
 from studies.arm.peers import classical, momentum
-from studies.arm.world import Floats, simulate, Touched, urdf_of
+from studies.arm.world import rmse, simulate, Touched, urdf_of
+from studies.harness import Floats
 
 ROBOT, SEED, DURATION = 'iiwa', 10, 16.0
 BALLS, PUSH = (2.5, 13.0), 9.5
 """Seconds at which a ball is thrown, and at which the slow push begins."""
-GAIN = 50.0
-"""1/s, of the classical observer: a usual one."""
-FIRST = 10**9
-"""ns, stamp of the first sample."""
+GAIN = 50.0  # 1/s, of the classical observer: a usual one
+FIRST = 10**9  # ns, stamp of the first sample
 TORQUE, EVENT = '/arm/external_torque', '/arm/event'
-SHOWN = (0, 1, 3)
-"""Joints in the figure."""
+SHOWN = (0, 1, 3)  # joints in the figure
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -55,10 +52,7 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
     print(f'on this host only, ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}; simulating ...')
     urdf = urdf_of(ROBOT)
     model = ArmModel(urdf)
-    world = simulate(
-        urdf, model.joints, model.links, DURATION, SEED, weight=model.weight, wall=True,
-        balls=BALLS, push=PUSH,
-    )  # fmt: skip
+    world = simulate(urdf, model, DURATION, SEED, wall=True, balls=BALLS, push=PUSH)
     default = Path('demo_output') / time.strftime('%Y-%m-%d_%H-%M-%S')
     with Output(arguments.output or default, arguments.force) as output:
         folder = output.path
@@ -68,9 +62,9 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         _run(folder, stop)
         torque, events = _read(folder / 'bag', world)
         by_gain = classical(momentum(model, world, by_position=True), {'gain': GAIN})
-        text = _table(model, world, torque, by_gain, events)
+        text = _table(world, torque, by_gain, events)
         (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
-        _figure(model, world, torque, by_gain, events).savefig(folder / 'demo_arm.png', dpi=110)
+        _figure(world, torque, by_gain, events).savefig(folder / 'demo_arm.png', dpi=110)
         print(f'\n{text}\n\nfigure: {output.keep() / "demo_arm.png"}')
 
 
@@ -142,9 +136,8 @@ def _kind(moment: float) -> str:
 
 
 def _table(
-    model: ArmModel, world: Touched, torque: Floats, by_gain: Floats,
-    events: list[tuple[float, str]],
-) -> str:  # fmt: skip
+    world: Touched, torque: Floats, by_gain: Floats, events: list[tuple[float, str]]
+) -> str:
     """Return errors, and when each contact was told."""
     known = np.isfinite(torque).all(axis=1)
     lines = [f'samples estimated: {known.sum()} of {len(known) - 1}', '']
@@ -158,8 +151,7 @@ def _table(
         '',
         'contact      told after   most likely at',
     ]
-    for k in world.begins:
-        moment = world.t[k]
+    for moment in (world.t[k] for k, *_ in world.begins):
         later = [(t, link) for t, link in events if -0.01 <= t - moment < 1.0]
         said = f'{(later[0][0] - moment) * 1e3:7.0f} ms   {later[0][1]}' if later else 'not told'
         lines.append(f'{_kind(moment):12}{said}')
@@ -167,9 +159,8 @@ def _table(
 
 
 def _figure(
-    model: ArmModel, world: Touched, torque: Floats, by_gain: Floats,
-    events: list[tuple[float, str]],
-) -> Figure:  # fmt: skip
+    world: Touched, torque: Floats, by_gain: Floats, events: list[tuple[float, str]]
+) -> Figure:
     """Draw the external torque of some joints, and the contacts that were told."""
     figure = Figure((10.0, 7.0), layout='constrained')
     rows = figure.subplots(len(SHOWN), 1, sharex=True)
@@ -189,7 +180,7 @@ def _figure(
         axes.set_title(f'External torque of joint {j + 1}', fontsize='medium', loc='left')
         for t, _ in events:
             axes.axvline(t, color='tab:red', lw=0.8, ls=':')
-    for k in world.begins:
+    for k, *_ in world.begins:
         rows[0].annotate(
             _kind(world.t[k]), (world.t[k], 1.0), xycoords=('data', 'axes fraction'),
             xytext=(2, -12), textcoords='offset points', fontsize='small',

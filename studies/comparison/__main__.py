@@ -9,20 +9,28 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 from studies import evidence
 from studies.comparison.cells import evaluate, JUMPS, methods_for, PLANTS, sensors
-from studies.comparison.methods import method, METHODS
-from studies.comparison.methods.method import LINEAR, mean
+from studies.comparison.methods import (
+    KINDS,
+    LINEAR,
+    METHODS,
+    OURS,
+    PAPER,
+    ROBUST,
+    SELF_TUNING,
+    SLIDING,
+    USUAL,
+)
+from studies.comparison.tuning import mean
 from studies.evidence import markdown, Row
 from studies.harness import Found, Results, run_study
 
 NAME = 'comparison'
-FULL, QUICK = (4, 200), (1, 15)
-"""Recordings that tune a method, and trials."""
+FULL, QUICK = (4, 200), (1, 15)  # recordings that tune a method, and trials
 STYLES = {
-    method.USUAL: evidence.USUAL, method.ROBUST: evidence.ROBUST, method.SLIDING: evidence.OTHER,
-    method.PAPER: evidence.GREY, method.OURS: evidence.TUNED, method.SELF_TUNING: evidence.SELF,
+    USUAL: evidence.USUAL, ROBUST: evidence.ROBUST, SLIDING: evidence.OTHER, PAPER: evidence.GREY,
+    OURS: evidence.TUNED, SELF_TUNING: evidence.SELF,
 }  # fmt: skip
-CLOSE = 0.05
-"""Errors within this part of another one count as equal."""
+CLOSE = 0.05  # errors within this part of another one count as equal
 
 
 class Cell(NamedTuple):
@@ -40,8 +48,7 @@ class Cell(NamedTuple):
         return self.d in JUMPS
 
 
-Chosen = dict[Cell, dict[str, float]]
-"""Errors of d by cell and kind of method."""
+Chosen = dict[Cell, dict[str, float]]  # errors of d by cell and kind of method
 
 GROUPS = {
     'd without jumps': (True, False), 'd with jumps': (True, True),
@@ -68,7 +75,7 @@ def ratios(chosen: Chosen, kind: str, about: Callable[[Cell], bool]) -> list[flo
 def texts(rows: Iterable[Row]) -> dict[str, str]:
     """Return the part of the page: ratios by kind and group, and how often a kind is the best."""
     chosen, lines = best_of_kinds(rows), []
-    for kind in method.KINDS:
+    for kind in KINDS:
         parts = [
             ratios(chosen, kind, lambda c, group=group: (c.noise > 0.0, c.jumps) == group)
             for group in GROUPS.values()
@@ -141,7 +148,7 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     })  # fmt: skip
     rows = evidence.rounded(
         Cell(s.plant, d, s.noise, s.rate, s.timing)._asdict()
-        | {'method': name, 'training': tuned.training, 'error': error}
+        | {'method': name, 'training': tuned.value, 'error': error}
         for (s, name), (tuned, errors) in found.items()
         for d, error in zip(s.disturbances, errors, strict=True)
     )

@@ -6,14 +6,14 @@ from functools import lru_cache
 import math
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.model.triangular import TriangularModel
+from fhaosmo_ros.core import Family, Recording, TriangularModel
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
-from fhaosmo_ros.core.simulation.recordings import Family, FAMILY_PARAMETERS, Recording, SHAPES
+from fhaosmo_ros.core.simulation.recordings import FAMILY_PARAMETERS, SHAPES
 from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from studies.comparison.methods import METHODS
-from studies.comparison.methods.method import mean, objective, Setting, tune, Tuned
+from studies.comparison.tuning import mean, objective, Outcome, Setting, tune
 from studies.harness import Floats
 from studies.waves import wave
 
@@ -25,25 +25,20 @@ TIMINGS: dict[str, dict[str, float]] = {
     'outliers': {'outliers': 0.01, 'outlier_std': 50.0},  # in standard deviations of the noise
 }
 JUMPS = ('steps', 'sawtooth', 'impulses', 'stick-slip')
-STAND_IN = 'chirp'
-"""Shape that `Unseen` replaces."""
+STAND_IN = 'chirp'  # shape that `Unseen` replaces
 STEP = 5e-4
 """Of the simulations, in seconds: Runge-Kutta steps whose error is far below any estimate's."""
-TRAINING_SEED, HELD_OUT_SEED = 1, 1001
-HELD_OUT = 6
+TRAINING_SEED, HELD_OUT_SEED, HELD_OUT = 1, 1001, 6
 FEW_SAMPLES, MORE = 300.0, 3
 """Below this rate (Hz) the training has this many times the recordings."""
 
 
 class Disturbance(NamedTuple):
-    """A kind of d: its shape in the tuning, and on the recordings that judge."""
+    """A kind of d: its shape in the tuning, and on the recordings that judge; rad/s."""
 
     trained: str
-    """Shape that the tuning sees."""
-    judged: str
-    """Shape that judges: one of the family's, or of waves.py, which no tuning sees."""
+    judged: str  # of the family's, or of waves.py, which no tuning sees
     band: tuple[float, float] = (0.5, 8.0)
-    """rad/s."""
 
 
 class PlantCase(NamedTuple):
@@ -53,8 +48,7 @@ class PlantCase(NamedTuple):
     file: str
     rms_of_d: float
     rms_of_u: float
-    relative: bool
-    """Noise in units of y's amplitude instead of absolutely."""
+    relative: bool  # noise in units of y's amplitude instead of absolutely
     disturbances: dict[str, Disturbance]
 
 
@@ -94,30 +88,20 @@ class Unseen(Family):
 class Sensor(NamedTuple):
     """A plant, its kinds of d, and how y is sampled. Methods are tuned once for each sensor."""
 
-    plant: str
-    """Key of `PLANTS`."""
-    disturbances: tuple[str, ...]
-    """Keys of the plant's disturbances."""
-    noise: float
-    """Standard deviation on y; see `PlantCase.relative`."""
-    rate: float
-    """Samples a second."""
-    timing: str = 'even'
-    """Key of `TIMINGS`."""
-
-    @property
-    def case(self) -> PlantCase:
-        """Return the plant's entry."""
-        return PLANTS[self.plant]
+    plant: str  # key of `PLANTS`
+    disturbances: tuple[str, ...]  # keys of the plant's
+    noise: float  # standard deviation on y; see `PlantCase.relative`
+    rate: float  # Hz
+    timing: str = 'even'  # key of `TIMINGS`
 
     def setting(self) -> Setting:
         """Return what a user knows before tuning."""
-        values = load(shipped(f'config/models/{self.case.file}.yaml'), 'plant', PLANT_PARAMETERS)
+        case = PLANTS[self.plant]
+        values = load(shipped(f'config/models/{case.file}.yaml'), 'plant', PLANT_PARAMETERS)
         model = TriangularModel.of(PLANT_PARAMETERS.complete(values))
         # An encoder's rounding is spread evenly over a quantum.
-        rounding = values.get('quantisation', 0.0) / math.sqrt(12.0)
-        noise = math.hypot(self._noise(), rounding)
-        return Setting(model, 1.0 / self.rate, self.case.rms_of_d, noise)
+        noise = math.hypot(self._noise(), values.get('quantisation', 0.0) / math.sqrt(12.0))
+        return Setting(model, 1.0 / self.rate, case.rms_of_d, noise)
 
     @lru_cache(maxsize=2)  # noqa: B019  (a named tuple is its own key; few are kept)
     def training(self, count: int) -> list[Recording]:
@@ -126,40 +110,38 @@ class Sensor(NamedTuple):
 
         More of them where they have few samples, fewer where no noise has to be averaged.
         """
-        shapes = sorted({self.case.disturbances[name].trained for name in self.disturbances})
-        if self.rate < FEW_SAMPLES:
-            count *= MORE
+        kinds = PLANTS[self.plant].disturbances
+        shapes = sorted({kinds[name].trained for name in self.disturbances})
+        count *= MORE if self.rate < FEW_SAMPLES else 1
         if self.setting().noise == 0.0:
             count = max(1, count // 2)
-        values = self._family(shapes, self.disturbances[0])
-        return Family(values).recordings(count, TRAINING_SEED)
+        family = Family(self._family(shapes, kinds[self.disturbances[0]].band))
+        return family.recordings(count, TRAINING_SEED)
 
     @lru_cache(maxsize=6)  # noqa: B019
     def held_out(self, disturbance: str, count: int = HELD_OUT) -> list[Recording]:
         """Return the recordings that judge."""
-        _, judged, (low, high) = self.case.disturbances[disturbance]
+        _, judged, band = PLANTS[self.plant].disturbances[disturbance]
         if judged in SHAPES:
-            return Family(self._family((judged,), disturbance)).recordings(count, HELD_OUT_SEED)
-        omegas = low * (high / low) ** ((np.arange(count) + 0.5) / count)
-        values = self._family((STAND_IN,), disturbance)
+            return Family(self._family((judged,), band)).recordings(count, HELD_OUT_SEED)
+        omegas = band[0] * (band[1] / band[0]) ** ((np.arange(count) + 0.5) / count)
+        values = self._family((STAND_IN,), band)
         return [
-            Unseen(values, judged, float(omega)).recording(k, HELD_OUT_SEED)
-            for k, omega in enumerate(omegas)
+            Unseen(values, judged, omega).recording(k, HELD_OUT_SEED)
+            for k, omega in enumerate(omegas.tolist())
         ]
 
     def _noise(self) -> float:
-        return self.noise * (amplitude(self.plant) if self.case.relative else 1.0)
+        return self.noise * (amplitude(self.plant) if PLANTS[self.plant].relative else 1.0)
 
-    def _family(self, shapes: Sequence[str], disturbance: str) -> dict[str, Any]:
+    def _family(self, shapes: Sequence[str], band: tuple[float, float]) -> dict[str, Any]:
+        noise = self._noise()
         units = {
-            'period_jitter': 1.0 / self.rate, 'dropout_length': self.rate,
-            'outlier_std': self._noise(),
+            'period_jitter': 1.0 / self.rate, 'dropout_length': self.rate, 'outlier_std': noise,
         }  # fmt: skip
         timing = {k: v * units.get(k, 1.0) for k, v in TIMINGS[self.timing].items()}
         return family_values(self.plant) | timing | {
-            'disturbances': list(shapes),
-            'band_of_d': list(self.case.disturbances[disturbance].band),
-            'noise_std': self._noise(),
+            'disturbances': list(shapes), 'band_of_d': list(band), 'noise_std': noise,
             'sample_rate': self.rate,
         }  # fmt: skip
 
@@ -203,13 +185,13 @@ def sensors(quick: bool = False) -> list[Sensor]:
     return chosen
 
 
-def evaluate(sensor: Sensor, name: str, training: int, trials: int) -> tuple[Tuned, list[float]]:
+def evaluate(sensor: Sensor, name: str, count: int, trials: int) -> tuple[Outcome, list[float]]:
     """Tune a method for a sensor and return its error for each of the sensor's disturbances."""
     method, setting = METHODS[name], sensor.setting()
-    tuned = tune(method, setting, sensor.training(training), trials, seed=1)
+    tuned = tune(method, setting, sensor.training(count), trials, seed=1)
     run = method.prepare(setting, tuned.values)
     return tuned, [
-        mean(objective(r, run(r)[tuned.readout]) for r in sensor.held_out(disturbance))
+        mean(objective(r, run(r)[tuned.readout][:, -1]) for r in sensor.held_out(disturbance))
         for disturbance in sensor.disturbances
     ]
 

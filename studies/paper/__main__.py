@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from studies import evidence
-from studies.harness import Floats, Found, Results, run_study
+from studies.harness import Found, Results, run_study
 from studies.paper import cases
 from studies.paper.cases import FREQUENCIES, LONG, SAMPLED
 from studies.paper.plant_and_observer import JointRun, SOLVERS
@@ -30,9 +30,7 @@ DRAWN = (cases.FINE, cases.COARSE, cases.FUZZY, cases.ADAPTIVE)
 # Estimates that chatter are solid and below; the truth lies on top, dashed so that both are seen.
 RED = {'color': COLOURS[0], 'linewidth': 0.9, 'label': 'estimate'}
 BLUE = {'color': TRUTH['color'], 'linewidth': 1.7, 'linestyle': (0, (5, 2)), 'label': 'truth'}
-TIME = 'time [s]'
-ZOOM = 0.1
-"""Seconds that figure sim1 enlarges."""
+ZOOM = 0.1  # seconds that figure sim1 enlarges
 
 
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
@@ -60,93 +58,71 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
         'paper_sampled': [row for case in SAMPLED for row in found[('sampled', *case)]],
         'paper_long': [row for case in LONG for row in found[('long', *case)]],
     }
-    *fixed, adaptive = [[found[name, w] for w in FREQUENCIES] for name in DRAWN]
+    *fixed, adaptive = ([(name, w, found[name, w]) for w in FREQUENCIES] for name in DRAWN)
     drawn = {
-        'paper_sim1': sim1(found['sim1']),
-        'paper_fuzzysystems': fuzzy_systems(),
-        'paper_simz': simz(list(zip(DRAWN, fixed, strict=False))),
-        'paper_simu': simu(adaptive),
-    }
+        'paper_sim1': sim1(found['sim1']), 'paper_fuzzysystems': fuzzy_systems(),
+        'paper_simz': unknown_inputs(fixed), 'paper_simu': unknown_inputs([adaptive], gamma=True),
+    }  # fmt: skip
     return Found(tables, cases.texts(simulations), drawn)
-
-
-def draw_pair(axes: Axes, t: Floats, truth: Floats, estimate: Floats) -> None:
-    """Draw an estimate in red and the truth in blue."""
-    axes.plot(*envelope(t, estimate), **RED)
-    axes.plot(*envelope(t, truth), **BLUE)
-    axes.set_xlim(t[0], t[-1])
-    axes.grid(alpha=0.3)
 
 
 def sim1(run: JointRun) -> Figure:
     """Figure sim1: z1, z2, z3 and eta, and the last `ZOOM` seconds of each."""
     figure = Figure(figsize=(9.0, 8.0), layout='constrained')
     panels = figure.subplots(4, 2, width_ratios=(2, 1))
-    eta = run.unknown_input - run.z[:, 2]
-    truths = [*run.z.T, eta]
+    truths = [*run.z.T, run.unknown_input - run.z[:, 2]]
     estimates = [*run.z_hat.T, run.z_tilde[:, 2]]
-    labels = ('z₁', 'z₂', 'z₃', 'η')
     late = run.t >= run.t[-1] - ZOOM
     after = 1e3 * (run.t[late] - run.t[late][0])
     for (left, right), label, truth, estimate in zip(
-        panels, labels, truths, estimates, strict=True
+        panels, ('z₁', 'z₂', 'z₃', 'η'), truths, estimates, strict=True
     ):
-        draw_pair(left, run.t, truth, estimate)
-        left.set_ylabel(f'{label} [1]')
-        right.plot(after, estimate[late], **RED)
-        right.plot(after, truth[late], **BLUE)
+        for x, style in ((estimate, RED), (truth, BLUE)):
+            left.plot(*envelope(run.t, x), **style)
+            right.plot(after, x[late], **style)
+        left.set(ylabel=f'{label} [1]', xlim=(run.t[0], run.t[-1]))
         right.ticklabel_format(useOffset=False)
         right.margins(x=0.0)
-        right.grid(alpha=0.3)
     panels[0, 0].legend(loc='upper left', ncols=2)
     panels[0, 0].set_title('sign, n = 3, step 1e-5 s')
     panels[0, 1].set_title(f'zoom: the last {1e3 * ZOOM:g} ms')
-    panels[3, 0].set_xlabel(TIME)
+    panels[3, 0].set_xlabel('time [s]')
     panels[3, 1].set_xlabel(f'time after {run.t[late][0]:.2f} s [ms]')
+    for axes in panels.flat:
+        axes.grid(alpha=0.3)
     return figure
 
 
-def simz(rows: Sequence[tuple[str, Sequence[JointRun]]]) -> Figure:
-    """Figure simz: d and its estimate, a row an observer, a column a frequency."""
-    figure = Figure(figsize=(9.0, 7.0), layout='constrained')
-    panels = figure.subplots(len(rows), len(FREQUENCIES), sharex=True)
-    for line, (name, runs) in zip(panels, rows, strict=True):
-        for axes, run, omega in zip(line, runs, FREQUENCIES, strict=True):
-            _unknown_input(axes, run)
+def unknown_inputs(
+    rows: Sequence[Sequence[tuple[str, float, JointRun]]], gamma: bool = False
+) -> Figure:
+    """Figures simz and simu: d and its estimate, a column a frequency; gamma below."""
+    count = len(rows) + gamma
+    figure = Figure(figsize=(9.0, 0.7 + 2.1 * count), layout='constrained')
+    panels = figure.subplots(count, len(FREQUENCIES), sharex=True)
+    for line, runs in zip(panels, rows, strict=False):
+        for axes, (name, omega, run) in zip(line, runs, strict=True):
+            estimate, late = run.z_hat[:, -1], run.t >= 2.0  # the transient may leave the picture
+            axes.plot(*envelope(run.t, estimate), **RED)
+            axes.plot(*envelope(run.t, run.unknown_input), **BLUE)
+            reach = 1.15 * max(np.abs(estimate[late]).max(), np.abs(run.unknown_input).max())
+            axes.set(ylabel='d [1]', ylim=(-reach, reach), xlim=(run.t[0], run.t[-1]))
             axes.set_title(f'{name}, ω = {omega:g} rad/s', fontsize=10)
+    if gamma:
+        for axes, (_, _, run) in zip(panels[-1], rows[-1], strict=True):
+            axes.plot(*envelope(run.t, run.gamma), color='black', linewidth=1.2)
+            axes.set_ylabel('γ [1]')
+    for axes in panels.flat:
+        axes.grid(alpha=0.3)
     for axes in panels[-1]:
-        axes.set_xlabel(TIME)
+        axes.set_xlabel('time [s]')
     panels[0, 0].legend(loc='upper right', ncols=2)
     return figure
-
-
-def simu(runs: Sequence[JointRun]) -> Figure:
-    """Figure simu: d and its estimate on top, gamma below."""
-    figure = Figure(figsize=(9.0, 5.4), layout='constrained')
-    panels = figure.subplots(2, len(runs), sharex=True)
-    for column, (run, omega) in enumerate(zip(runs, FREQUENCIES, strict=True)):
-        _unknown_input(panels[0, column], run)
-        panels[0, column].set_title(f'fuzzy adaptive, 1e-3 s, ω = {omega:g} rad/s', fontsize=10)
-        panels[1, column].plot(*envelope(run.t, run.gamma), color='black', linewidth=1.2)
-        panels[1, column].set_ylabel('γ [1]')
-        panels[1, column].set_xlabel(TIME)
-        panels[1, column].grid(alpha=0.3)
-    panels[0, 0].legend(loc='upper right', ncols=2)
-    return figure
-
-
-def _unknown_input(axes: Axes, run: JointRun) -> None:
-    estimate = run.z_hat[:, -1]
-    draw_pair(axes, run.t, run.unknown_input, estimate)
-    axes.set_ylabel('d [1]')
-    late = run.t >= 2.0  # the transient may leave the picture
-    reach = 1.15 * max(np.abs(estimate[late]).max(), np.abs(run.unknown_input).max())
-    axes.set_ylim(-reach, reach)
 
 
 def fuzzy_systems() -> Figure:
     """Figure fuzzysystems: membership functions of input and output, and the curve, by level."""
-    preset, levels = cases.preset().observer, ('1', '2', '3, 4')
+    (preset, _), levels = cases.preset(), ('1', '2', '3, 4')
     figure = Figure(figsize=(9.0, 0.6 + 2.0 * len(levels)), layout='constrained')
     for k, (left, middle, right) in enumerate(figure.subplots(len(levels), 3)):
         text, width = of_level(preset['fuzzy_systems'], k), of_level(preset['fuzzy_widths'], k)
@@ -156,12 +132,12 @@ def fuzzy_systems() -> Figure:
         grid = np.linspace(0.0, width, len(half))
         right.plot([-width, 0, 0, width], [-1, -1, 1, 1], color='#999999', linestyle=':')
         right.plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')
-        right.locator_params(axis='x', nbins=4)
+        right.set(xlabel=f'ε of level {levels[k]} [its unit]', ylabel='ψ(ε) [1]')
         right.grid(alpha=0.3)
         left.set_xlabel(f'ε of level {levels[k]} [its unit]')
         middle.set_xlabel('ψ [1], before scaling to ±1')
-        right.set_xlabel(f'ε of level {levels[k]} [its unit]')
-        right.set_ylabel('ψ(ε) [1]')
+        for axes in (left, middle, right):
+            axes.locator_params(axis='x', nbins=4)
     figure.suptitle('membership functions of input and output, and the curve (dotted: sign)')
     return figure
 
@@ -176,10 +152,7 @@ def _draw_terms(axes: Axes, terms: Terms, scale: float) -> None:
         else:
             axes.plot(scale * x, memberships(x, terms)[k], **style)
         axes.text(scale * peak, 1.05, name, ha='center', fontsize=6)
-    axes.set_xlim(-1.05 * scale, 1.05 * scale)
-    axes.set_ylim(0.0, 1.18)
-    axes.set_ylabel('membership [1]')
-    axes.locator_params(axis='x', nbins=4)
+    axes.set(xlim=(-1.05 * scale, 1.05 * scale), ylim=(0.0, 1.18), ylabel='membership [1]')
 
 
 if __name__ == '__main__':

@@ -29,17 +29,14 @@ The one that reproduces the paper best. Its figures show sign at 1e-5 s chatteri
 truth: with this one the estimate of d is closest to it. Solvers that hold the sign are closer, but
 they are not methods for the equations of the paper: they stand beside them.
 """
-DURATION = 20.0
-CONVERGED = 10.0
-"""Errors and chatter are measured from here on, in seconds."""
+DURATION, CONVERGED = 20.0, 10.0
+"""Seconds of a simulation, and from where on errors and chatter are measured."""
 GRID = 1e-3
 """Seconds between two recorded samples; an observer with a longer step records each of its own."""
 HIGH_PASS = 0.05
 """Window of a moving average in seconds; the high-passed part is the signal minus that average."""
-Score = dict[str, float]
-"""Scores of a run by name; see `score`."""
-Scores = dict[tuple[str, float], Score]
-"""By observer and angular frequency."""
+Score = dict[str, float]  # scores of a run by name; see `score`
+Scores = dict[tuple[str, float], Score]  # by observer and angular frequency
 SAFE = {
     p.name: p.default
     for p in OBSERVER_PARAMETERS.values()
@@ -69,10 +66,8 @@ VISIBLE = 0.005
 """High-passed RMS of the estimate of d from which chatter is visible: 5 % of d's amplitude."""
 SMOOTH = 0.1
 """Fuzzy counts as free of chatter with at most this part of sign's high-passed RMS at 1e-5 s."""
-BADLY = 2.0
-"""Sign at 1e-3 s is bad if its RMS error is at least this many times that at 1e-5 s."""
-MOVED = 0.01
-"""Gamma counts as moving if it ends at least this far from where it began."""
+BADLY = 2.0  # sign at 1e-3 s is bad if its RMS error is at least this many times that at 1e-5 s
+MOVED = 0.01  # gamma counts as moving if it ends at least this far from where it began
 WIDTHS = (
     0.01, 0.015, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7,
     1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0,
@@ -105,45 +100,40 @@ LAWS: dict[str, dict[str, Any]] = {"the paper's": {}, 'default': SAFE}
 """Laws of gamma by name: what differs from config/paper.yaml."""
 
 
-class Preset(NamedTuple):
-    """Parameters of config/paper.yaml, with defaults for the rest."""
-
-    observer: Parameters
-    plant: Parameters
-
-
 @lru_cache
-def preset() -> Preset:
-    """Read the paper's numbers from the shipped configuration."""
+def preset() -> tuple[Parameters, Parameters]:
+    """Return the observer and the plant of config/paper.yaml, with defaults for the rest."""
     path = shipped('config/paper.yaml')
     tables = {'estimator': OBSERVER_PARAMETERS, 'plant': PLANT_PARAMETERS}
-    return Preset(*(table.complete(load(path, node, table)) for node, table in tables.items()))
+    observer, plant = (t.complete(load(path, node, t)) for node, t in tables.items())
+    return observer, plant
 
 
 def simulated(name: str, omega: float, solver: str = SOLVER, **changes: Any) -> JointRun:
     """Simulate one of `OBSERVERS` as the paper does: plant and observer together."""
     variant, step, own = OBSERVERS[name]
-    observer = preset().observer.changed({'variant': variant} | own | changes)
-    plant = preset().plant.changed({'disturbance_omega': omega})
+    observer, plant = preset()
+    observer = observer.changed({'variant': variant} | own | changes)
+    plant = plant.changed({'disturbance_omega': omega})
     return simulate(observer, plant, solver, step, DURATION, max(1, round(GRID / step)))
 
 
 def first_observer() -> JointRun:
     """Simulate figure sim1: sign, n = 3, no model of Phi_3, theta estimates eta = -z3 + d."""
-    observer = preset().observer
-    three = {k: observer[k][:3] for k in ('lambda', 'alpha')}
+    observer, plant = preset()
     observer = observer.changed({
         'variant': 'sign', 'unknown_input': False, 'phi': ['0', '0', '0'],
         'initial_estimate': [0.05, 0.0, 0.05], 'initial_internal': [0.05, 0.0, 0.05],
-    } | three)  # fmt: skip
-    return simulate(observer, preset().plant, SOLVER, 1e-5, DURATION, 5)
+        **{k: observer[k][:3] for k in ('lambda', 'alpha')},
+    })  # fmt: skip
+    return simulate(observer, plant, SOLVER, 1e-5, DURATION, 5)
 
 
 def truth_of(omega: float, step: float, noise: float, duration: float) -> tuple[Floats, Truth]:
     """Simulate the plant alone."""
     t = np.arange(round(duration / step) + 1) * step
     given = {'disturbance_omega': omega, 'noise_std': noise, 'integration_step': min(step, 1e-3)}
-    return t, Plant(preset().plant.changed(given)).simulate(t)
+    return t, Plant(preset()[1].changed(given)).simulate(t)
 
 
 def observe(
@@ -152,7 +142,7 @@ def observe(
     """Run an observer as a node does, one step a sample; record every `every`-th step."""
     t, truth = case
     given = {'variant': variant, 'scheme': scheme} | changes
-    run = Observer(preset().observer.changed(given)).run(t, truth.y, every=every)
+    run = Observer(preset()[0].changed(given)).run(t, truth.y, every=every)
     rows = slice(every - 1, None, every)
     z, d = truth.z[rows], truth.unknown_input[rows]
     return JointRun(run.t, z, d, run.z_hat, run.z_tilde, run.gamma)
@@ -162,13 +152,8 @@ def score(run: JointRun) -> Score:
     """
     Judge the filtered estimates (the paper's 'estimated state') from `CONVERGED` on.
 
-    Returns
-    -------
-    dict
-        rms_z1 .. rms_zn, rms_d: RMS errors. true_d: RMS of d. bias_d: mean error of d. variation:
-        total variation of the estimate of d over that of d. high_pass: RMS of its high-passed
-        part. gamma: the last.
-
+    RMS errors, `true_d`, the RMS of d, `bias_d`, the mean error of d, and of the estimate of d:
+    `variation`, its total variation over that of d, `high_pass`, the RMS of its high-passed part.
     """
     late = run.t >= CONVERGED
     n = run.z.shape[1]
@@ -200,33 +185,27 @@ def long_rows(
     """
     Adapt gamma by each of `LAWS` for a long time, from `CONVERGED` on.
 
-    Returns
-    -------
-    list of dict
-        gamma_first, gamma_last: at the end of the first and the last window; rms_d_first,
-        rms_d_last: error of d within it; rms_d_fixed: that of the last with gamma = 1/2.
-
+    `gamma_first` is at the end of the first window, `rms_d_first` the error of d within it, and so
+    on; `rms_d_fixed` is that of the last one with gamma = 1/2.
     """
     truth = truth_of(omega, 1e-3, noise, duration + CONVERGED)
     first, size = (round(seconds / (THINNED * 1e-3)) for seconds in (CONVERGED, WINDOW))
 
-    def windows(variant: str, changes: dict[str, Any]) -> tuple[Floats, Floats]:
+    def windows(variant: str, changes: dict[str, Any]) -> tuple[list[float], list[float]]:
         run = observe(truth, variant, scheme, THINNED, **changes)
         error = run.z_hat[:, -1] - run.unknown_input
         starts = range(first, len(error) - size + 1, size)
-        return (
-            np.array([rms(error[k : k + size]) for k in starts]),
-            np.array([run.gamma[k + size - 1] for k in starts]),
-        )
+        rms_d = [rms(error[k : k + size]) for k in starts]
+        return rms_d, [float(run.gamma[k + size - 1]) for k in starts]
 
-    fixed = float(windows('fuzzy', {})[0][-1])
+    fixed = windows('fuzzy', {})[0][-1]
     rows = []
     for law, changes in LAWS.items():
         rms_d, gamma = windows('fuzzy_adaptive', changes)
         rows.append({
-            'law': law, 'scheme': scheme, 'omega': omega, 'noise': noise,
-            'gamma_first': float(gamma[0]), 'gamma_last': float(gamma[-1]),
-            'rms_d_first': float(rms_d[0]), 'rms_d_last': float(rms_d[-1]), 'rms_d_fixed': fixed,
+            'law': law, 'scheme': scheme, 'omega': omega, 'noise': noise, 'gamma_first': gamma[0],
+            'gamma_last': gamma[-1], 'rms_d_first': rms_d[0], 'rms_d_last': rms_d[-1],
+            'rms_d_fixed': fixed,
         })  # fmt: skip
     return rows
 
@@ -237,8 +216,7 @@ class Verdict(NamedTuple):
     name: str
     claim: str
     holds: bool
-    numbers: str
-    """What decides."""
+    numbers: str  # what decides
     estimates: bool
     """False if every observer that is judged has a larger RMS error of d than the estimate 0."""
 

@@ -6,48 +6,30 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import math
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core import ConfigurationError, Recording, TriangularModel
 from fhaosmo_ros.core.simulation.metrics import rms
-from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.tuning.objective import SMALLEST
 from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
 import numpy as np
 from studies.harness import Floats
 
-JUDGED_FROM = 5.0
-"""Seconds of each recording that are the transient."""
-ROUNDING = 1e-15
-"""Noise of a y about 1."""
-DEADBEAT = 3.0
-"""Bandwidth times period of an observer that forgets all but the last few samples."""
+JUDGED_FROM = 5.0  # seconds of each recording that are the transient
+ROUNDING = 1e-15  # noise of a y about 1
+DEADBEAT = 3.0  # bandwidth times period of an observer that forgets all but the last few samples
 HOPELESS = 1.5
 """A trial this many times worse than the best one so far is not run on more recordings."""
-LINEAR, USUAL, ROBUST = 'linear filter', 'usual Kalman filter', 'adaptive filter'
-SLIDING, PAPER, OURS, SELF_TUNING = 'sliding mode', 'paper', 'ours, tuned', 'ours, self-tuning'
-KINDS = (LINEAR, USUAL, ROBUST, SLIDING, PAPER, OURS, SELF_TUNING)
-"""Kinds of methods; the usual Kalman filter, whose d is a random walk, is one of its own."""
-
-
-class Estimates(NamedTuple):
-    """Estimated states (K, n) and unknown input (K,), one row a sample."""
-
-    z: Floats
-    d: Floats
-
-
 Values = Mapping[str, Any]
-Run = Callable[[Recording], dict[str, Estimates]]
-"""Estimates by readout: one method may offer several (filtered and internal states)."""
+Run = Callable[[Recording], Sequence[Floats]]
+"""Estimates of z and d (K, n + 1) by readout: some have filtered states, and internal ones."""
 
 
-def objective(recording: Recording, estimates: Estimates, since: float = JUDGED_FROM) -> float:
+def objective(recording: Recording, d: Floats, since: float = JUDGED_FROM) -> float:
     """Return the RMS error of d over the RMS of d; tuning minimises its geometric mean."""
     late = recording.t >= since
-    d = recording.d[late]
+    truth = recording.d[late]
     with np.errstate(over='ignore', invalid='ignore'):
-        value = rms(estimates.d[late] - d) / rms(d)
-    return value if np.isfinite(value) else float('inf')
+        value = rms(d[late] - truth) / rms(truth)
+    return value if np.isfinite(value) else math.inf
 
 
 def mean(errors: Iterable[float]) -> float:
@@ -59,14 +41,15 @@ class Setting(NamedTuple):
     """What a user knows before tuning."""
 
     model: TriangularModel
-    period: float
-    """Nominal sampling period in seconds."""
-    size: float
-    """About how large d is."""
-    noise: float
-    """Standard deviation of the noise on y, in its unit, with that of its rounding."""
-    judged_from: float = JUDGED_FROM
-    """Seconds of each recording that are the transient."""
+    period: float  # nominal sampling period in seconds
+    size: float  # about how large d is
+    noise: float  # standard deviation of the noise on y, in its unit, with that of its rounding
+    judged_from: float = JUDGED_FROM  # seconds of each recording that are the transient
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """The model, as parameters of an estimator."""
+        return {'order': self.model.order, 'phi': list(self.model.phi)}
 
     @property
     def speed(self) -> float:
@@ -89,54 +72,34 @@ class Setting(NamedTuple):
 class Search(NamedTuple):
     """What a method is tuned with."""
 
-    judged: Callable[[Values], float]
-    """From values to the objective over all recordings."""
+    judged: Callable[[Values], float]  # from values to the objective over all recordings
     setting: Setting
     recordings: Sequence[Recording]
-    trials: int
-    """How often an objective may be evaluated."""
+    trials: int  # how often an objective may be evaluated
     seed: int
 
 
 class Method(NamedTuple):
     """A way to estimate z and d."""
 
-    name: str
-    """Key in results, and head of its column."""
-    kind: str
-    """One of `KINDS`."""
-    space: Callable[[Setting], tuple[Dimension, ...]]
-    """Parameters to tune for a setting; empty where none is."""
+    name: str  # key in results, and head of its column
+    kind: str  # one of `KINDS` in methods.py
     prepare: Callable[[Setting, Values], Run]
     """Raises ConfigurationError for values that make no observer."""
-    tune: Callable[[Search], Values] | None = None
-    """A search of its own."""
-    needs_noise: bool = False
-    """True for one that is about the noise, which there has to be."""
-
-
-def untuned(_: Setting) -> tuple[Dimension, ...]:
-    """Return the space of a method that has no parameters."""
-    return ()
-
-
-class Tuned(NamedTuple):
-    """A method's best values on the training recordings, and which of its readouts was best."""
-
-    values: dict[str, Any]
-    readout: str
-    training: float
+    space: Callable[[Setting], Sequence[Dimension]] = lambda _: ()
+    """Parameters to tune for a setting."""
+    tune: Callable[[Search], Values] | None = None  # A search of its own
+    needs_noise: bool = False  # true for one that is about the noise, which there has to be
 
 
 class Outcome(NamedTuple):
-    """What one set of values brings."""
+    """What a set of values brings."""
 
     value: float
     """Geometric mean of the objective over the recordings, guessed where not all were run."""
-    readout: str
-    """The best one, which this is about."""
-    averages: list[float]
-    """The same over the first recordings, so many as were run."""
+    readout: int  # the best one, which this is about
+    averages: list[float]  # the same over the first recordings, so many as were run
+    values: dict[str, Any]
 
 
 def trial(
@@ -149,17 +112,15 @@ def trial(
     It ends early where the average so far exceeds `HOPELESS` times that of the `rival`, the
     averages of the best set of values so far.
     """
+    best, averages, totals = 0, list[float](), defaultdict[int, float](float)
     try:
         run = method.prepare(setting, values)
     except ConfigurationError:  # values that make no observer, such as an unsolvable Riccati
-        return Outcome(float('inf'), '', [])
-    totals: dict[str, float] = defaultdict(float)
-    averages: list[float] = []
+        return Outcome(math.inf, best, averages, {})
     for count, recording in enumerate(recordings, 1):
-        for name, estimates in run(recording).items():
-            totals[name] += math.log(
-                max(objective(recording, estimates, setting.judged_from), SMALLEST)
-            )
+        for readout, found in enumerate(run(recording)):
+            error = objective(recording, found[:, -1], setting.judged_from)
+            totals[readout] += math.log(max(error, SMALLEST))
         best = min(totals, key=totals.__getitem__)
         averages.append(math.exp(totals[best] / count))
         if not averages[-1] <= (HOPELESS * rival[count - 1] if rival else BAD):
@@ -167,32 +128,31 @@ def trial(
     value = averages[-1]
     if rival and len(averages) < len(recordings):  # as much worse on the others, it is assumed
         value *= rival[-1] / rival[len(averages) - 1]
-    return Outcome(value, best, averages)
+    return Outcome(value, best, averages, dict(values))
 
 
 def tune(
     method: Method, setting: Setting, recordings: Sequence[Recording], trials: int, seed: int
-) -> Tuned:
+) -> Outcome:
     """Search a method's parameters; one without any is evaluated as it is."""
-    space = list(method.space(setting))
-    values: Values = {}
-    best = Outcome(float('inf'), '', [])
+    averages: Sequence[float] = ()
+    least = math.inf
 
     def judged(v: Values) -> float:
-        nonlocal best
-        found = trial(method, setting, v, recordings, best.averages)
-        if len(found.averages) == len(recordings):
-            best = min(best, found)
+        nonlocal averages, least
+        found = trial(method, setting, v, recordings, averages)
+        if len(found.averages) == len(recordings) and found.value < least:
+            averages, least = found.averages, found.value
         return found.value
 
+    space, values = method.space(setting), {}
     if method.tune is not None:
-        values = method.tune(Search(judged, setting, recordings, trials, seed))
+        values = dict(method.tune(Search(judged, setting, recordings, trials, seed)))
     elif len(space) == 1:
         values = _scan(judged, space[0], trials)
     elif space:
         values = minimise(judged, space, trials, seed).best
-    found = trial(method, setting, values, recordings)
-    return Tuned(dict(values), found.readout or 'filtered', found.value)
+    return trial(method, setting, values, recordings)
 
 
 def _scan(judged: Callable[[Values], float], d: Dimension, trials: int) -> dict[str, float]:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The Kalman filters, with the same model and Phi as ours: steady ones, and ones that adapt.
+The observers that are compared, all with the same model and Phi.
+
+Kalman filters, steady ones, and ones that adapt:
 
     z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d
     d' = d_1 - decay d, d_1' = d_2 - decay d_1, ..., d_{m-1}' = -decay d_{m-1} + white noise
@@ -16,46 +18,51 @@ the recursive form of innovation-based adaptive estimation (A. H. Mohamed and K.
 Journal of Geodesy 73, 1999, doi:10.1007/s001900050236). Several models: the interacting multiple
 model filter (H. A. P. Blom and Y. Bar-Shalom, IEEE Transactions on Automatic Control 33(8), 1988,
 doi:10.1109/9.1299).
+
+The sliding mode observers are the core's own. Levant's differentiator and its gains: A. Levant,
+International Journal of Control 76(9-10), 2003, doi:10.1080/0020717031000099029. Ours are as users
+get them: with the gains that `tune` finds by its search, or self-tuning, in the online estimator.
 """
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr
+from functools import lru_cache, partial
+from io import StringIO
 import math
 from types import SimpleNamespace
+from typing import Any
 
+from fhaosmo_ros.core import ConfigurationError, Observer, Recording, TriangularModel
 from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.model.prediction import Prediction
-from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.observer.kalman import innovations
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.simulation.recordings import Recording
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
+from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.tuning.likelihood import Samples
+from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise
+from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, Tuner
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
-from studies.comparison.methods.filters import several_models
-from studies.comparison.methods.method import (
-    Estimates,
-    LINEAR,
-    Method,
-    ROBUST,
-    Run,
-    Search,
-    Setting,
-    USUAL,
-    Values,
-)
+from studies import harness
+from studies.comparison.filters import several_models
+from studies.comparison.tuning import JUDGED_FROM, Method, Run, Search, Setting, Values
 from studies.harness import Floats
 
-LINEAR_LIMIT = 'Kalman, Matern'
-"""Our observer equals this filter for small innovations."""
+LINEAR, USUAL, ROBUST = 'linear filter', 'usual Kalman filter', 'adaptive filter'
+SLIDING, PAPER, OURS, SELF_TUNING = 'sliding mode', 'paper', 'ours, tuned', 'ours, self-tuning'
+KINDS = (LINEAR, USUAL, ROBUST, SLIDING, PAPER, OURS, SELF_TUNING)
+"""Kinds of methods; the usual Kalman filter, whose d is a random walk, is one of its own."""
+LINEAR_LIMIT = 'Kalman, Matern'  # our observer equals this filter for small innovations
 HUBER, NOISE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'
-REACH = 10.0
-"""How far a search for the bandwidth goes, as a factor to both sides."""
+REACH = 10.0  # how far a search for the bandwidth goes, as a factor to both sides
 LONGEST, LONGEST_STEP = 1.5, 1.0
 """Steps of a prediction: nominal periods; seconds, for a model without dynamics of its own."""
-DERIVATIVES = (0, 1, 2, 3)
-"""Of d, that are tried."""
+TRIED = (0, 1, 2, 3)  # derivatives of d
+RECURSIVE = (1.1, 1.5, 2.0, 3.0, 5.0, 7.0)
+"""Levant's lambda_0 .. lambda_5 of the recursive form, for a Lipschitz constant of 1."""
+GRID = len(DERIVATIVES) * len(RATES)  # trials that `tune` uses before its search
 
 
 class SampledModel:
@@ -87,7 +94,8 @@ class SampledModel:
         self._rates[range(n, self.size), range(n, self.size)] = -decay
         jacobian = model.jacobian(np.zeros(n))
         fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(n, k=1))))
-        self.resolution = min(0.03 / max(float(fastest), 1e-9), LONGEST_STEP)
+        resolution = min(0.03 / max(float(fastest), 1e-9), LONGEST_STEP)
+        self.longest = min(LONGEST * period, resolution)
         """
         Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
         0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as dry
@@ -125,11 +133,9 @@ class SampledModel:
         By C. F. Van Loan, IEEE Transactions on Automatic Control 23(3), 1978,
         doi:10.1109/TAC.1978.1101743.
         """
-        n, rates, drive = self.size, self._scaled(self._rates) * self.period, np.zeros(self.size)
-        drive[-1] = 1.0
-        block = np.zeros((2 * n, 2 * n))
-        block[:n, :n], block[:n, n:], block[n:, n:] = -rates, np.diag(drive), rates.T
-        exponential = expm(block)
+        n, rates = self.size, self._scaled(self._rates) * self.period
+        drive = np.diag(np.eye(n)[-1])
+        exponential = expm(np.block([[-rates, drive], [np.zeros((n, n)), rates.T]]))
         largest = intensity * self.scale[-1] ** 2 * self.period
         covariance = largest * exponential[n:, n:].T @ exponential[:n, n:]
         return 0.5 * (covariance + covariance.T)
@@ -164,19 +170,12 @@ def estimates(
     return np.asarray(found)
 
 
-def _prepare(setting: Setting, values: Values) -> Run:
+def _steady(setting: Setting, values: Values) -> Run:
     """Return a run of the filter whose speed is about `bandwidth`."""
     model, decay = setting.model, values.get('decay', 0.0)
-    chain = 1 + int(values.get('derivatives', 0))
-    sampled = SampledModel(model, setting.period, chain, decay)
+    sampled = SampledModel(model, setting.period, 1 + int(values.get('derivatives', 0)), decay)
     gain = sampled.kalman(setting.period * values['bandwidth'] ** (2 * sampled.size))
-    n, longest = model.order, min(LONGEST * setting.period, sampled.resolution)
-
-    def estimate(r: Recording) -> dict[str, Estimates]:
-        out = estimates(model, gain, decay, r, longest)
-        return {'filtered': Estimates(out[:, :n], out[:, n])}
-
-    return estimate
+    return lambda r: [estimates(model, gain, decay, r, sampled.longest)[:, : model.order + 1]]
 
 
 def _one_bandwidth(setting: Setting) -> tuple[Dimension, ...]:
@@ -195,13 +194,13 @@ def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...
 
 def each_order(search: Search, more: Sequence[Dimension] = ()) -> Values:
     """Search bandwidth, decay and `more` with each number of derivatives of d."""
-    best: tuple[float, Values] = (float('inf'), {})
-    for k in DERIVATIVES:
+    best: tuple[float, Values] = (math.inf, {})
+    for k in TRIED:
         fixed = {'derivatives': float(k)}
         found = minimise(
             lambda v, fixed=fixed: search.judged(fixed | v),
             (*matern_space(search.setting, k), *more),
-            max(1, search.trials // len(DERIVATIVES)),
+            max(1, search.trials // len(TRIED)),
             search.seed,
         )
         if not best[1] or found.value < best[0]:
@@ -209,22 +208,15 @@ def each_order(search: Search, more: Sequence[Dimension] = ()) -> Values:
     return best[1]
 
 
-FILTERS = (
-    Method('Kalman', USUAL, _one_bandwidth, _prepare),  # d a random walk
-    Method('Kalman, decaying', LINEAR, matern_space, _prepare),  # a random walk that decays
-    Method(LINEAR_LIMIT, LINEAR, matern_space, _prepare, each_order),
-)
-"""Steady-state Kalman filters by their d."""
-
-
-def _prepare_adaptive(setting: Setting, values: Values) -> Run:
+def _bending(setting: Setting, values: Values) -> Run:
+    """Return a run of the filters that bend or adapt."""
     model, h, derivatives = setting.model, setting.period, int(values.get('derivatives', 0))
     sampled = SampledModel(model, h, derivatives + 1, values['decay'])
     size, spread = sampled.size, values.get('spread', 1.0)
     factors = (1.0,) if spread == 1.0 else (1.0 / spread, 1.0, spread)
     bandwidths = [factor * values['bandwidth'] for factor in factors]
     q = np.array([sampled.process_noise(h * bandwidth ** (2 * size)) for bandwidth in bandwidths])
-    scale = h ** np.arange(size) / setting.noise
+    scale = sampled.scale / setting.noise
     about = setting.balance(derivatives) ** np.arange(1.0 + derivatives)
     sizes = np.concatenate([np.ones(model.order), setting.size * about])
     sizes[0] = setting.noise
@@ -233,27 +225,101 @@ def _prepare_adaptive(setting: Setting, values: Values) -> Run:
         huber=values.get('huber', math.inf), memory=h / values.get('memory', math.inf),
         switch=h / values.get('stay', 1.0),
     )  # fmt: skip
-    longest = min(LONGEST * h, sampled.resolution)
-    prediction = Prediction(model.with_unknown_input(values['decay'], derivatives), longest)
+    expressions = model.with_unknown_input(values['decay'], derivatives)
+    prediction = Prediction(expressions, sampled.longest)
+    return lambda r: [several_models(prediction, samples_of(r, model), bank)[:, : model.order + 1]]
 
-    def estimate(r: Recording) -> dict[str, Estimates]:
-        out = several_models(prediction, samples_of(r, model), bank)
-        return {'filtered': Estimates(out[:, : model.order], out[:, model.order])}
+
+def _adaptive(name: str, *options: Dimension) -> Method:
+    """Return a method that takes d for a Matern process."""
+    return Method(
+        name, ROBUST, _bending, lambda setting: (*matern_space(setting), *options),
+        partial(each_order, more=options), needs_noise=True,
+    )  # fmt: skip
+
+
+def _sliding(parameters: Callable[[Values], Mapping[str, Any]], s: Setting, values: Values) -> Run:
+    """Return a run of the core's Observer with these parameters."""
+    observer, n = Observer(s.told | dict(parameters(values))), s.model.order
+
+    def estimate(r: Recording) -> list[Floats]:
+        observer.reset()
+        found = observer.run(r.t, r.y, r.u)
+        internal = np.column_stack([found.z_hat[:, 0], found.z_tilde[:, :n]])
+        return [found.z_hat[:, : n + 1], internal]
 
     return estimate
 
 
-def _adaptive(name: str, *options: Dimension) -> Method:
-    def space(setting: Setting) -> tuple[Dimension, ...]:
-        return (*matern_space(setting), *options)
+@lru_cache
+def _paper() -> dict[str, Any]:
+    """Return the paper's numbers that fit any plant: all but the model and the initial values."""
+    values = load(shipped('config/paper.yaml'), 'estimator', OBSERVER_PARAMETERS)
+    left_out = ('order', 'phi', 'variant', 'initial_estimate', 'initial_internal')
+    kept = {k: v for k, v in values.items() if k not in left_out}
+    return kept | {name: kept[name][:1] for name in ('lambda', 'alpha')}
 
-    tune = partial(each_order, more=options)
-    return Method(name, ROBUST, space, _prepare_adaptive, tune, needs_noise=True)
+
+def _papers(variant: str, _: Values) -> Mapping[str, Any]:
+    return _paper() | {'variant': variant, 'start_from_measurement': True}
 
 
+def _levant(setting: Setting, values: Values) -> Run:
+    """Non-recursive form: kappa_i = lambda_i kappa_{i+1}^(i / (i+1)) L^((N-i) / N)."""
+    levels = setting.model.order + 1
+    gains, kappa = [], 1.0
+    for i in reversed(range(levels)):
+        kappa = RECURSIVE[i] * kappa ** (i / (i + 1))
+        gains.append(kappa * values['lipschitz'] ** ((levels - i) / levels))
+    own = {'structure': 'levant', 'variant': 'sign', 'scheme': 'implicit', 'lambda': gains}
+    return _sliding(lambda _: own, setting, values)
+
+
+def _levant_space(setting: Setting) -> tuple[Dimension, ...]:
+    size = setting.size
+    return (Dimension('lipschitz', 1e-4 * size, 1e8 * size, 10.0 * size),)
+
+
+def _online(own: Values, setting: Setting, values: Values) -> Run:
+    """Return a run of the online estimator with these parameters."""
+    parameters, known = setting.told | dict(values) | dict(own), setting.model.uses_input
+
+    def estimate(r: Recording) -> list[Floats]:
+        found = harness.observed(parameters, r.t, r.y, r.u if known else None)
+        return [np.column_stack([found.z, found.unknown_input])]
+
+    return estimate
+
+
+def _tune(search: Search) -> Values:
+    """Return the parameters of the estimator that `tune` writes; its grid uses trials, too."""
+    tuning = TUNE_PARAMETERS.complete(search.setting.told | {'settled': JUDGED_FROM})
+    recordings = list(search.recordings)
+    with redirect_stderr(StringIO()):  # its progress bars
+        tuner = Tuner(recordings, recordings[:1], {}, tuning, search.seed)
+        return tuner.parameters(tuner.search(max(1, search.trials - GRID)).best)
+
+
+PAPERS = {'sign': 'sign', 'fuzzy': 'fuzzy', 'adaptive': 'fuzzy_adaptive'}
 ADAPTIVE = (
     _adaptive(HUBER, Dimension('huber', 1.0, 10.0, 2.5)),
     _adaptive(NOISE, Dimension('memory', 0.1, 100.0, 3.0)),
     _adaptive(IMM, Dimension('spread', 1.2, 10.0, 2.0), Dimension('stay', 0.1, 100.0, 3.0)),
 )
-"""All take d for a Matern process."""
+METHODS = {
+    m.name: m
+    for m in (
+        Method('Kalman', USUAL, _steady, _one_bandwidth),  # d a random walk
+        Method('Kalman, decaying', LINEAR, _steady, matern_space),  # a random walk that decays
+        Method(LINEAR_LIMIT, LINEAR, _steady, matern_space, each_order),
+        *ADAPTIVE,
+        Method('Levant, implicit', SLIDING, _levant, _levant_space),
+        *(
+            Method(f'paper: {name}', PAPER, partial(_sliding, partial(_papers, own)))
+            for name, own in PAPERS.items()
+        ),
+        Method(OURS, OURS, partial(_online, {}), tune=_tune),  # levant, fuzzy, predict_correct
+        Method(SELF_TUNING, SELF_TUNING, partial(_online, harness.SELF_TUNING)),
+    )
+}
+"""The observers, by name."""
