@@ -75,12 +75,10 @@ class Run(NamedTuple):
     """What was seen in one run."""
 
     share: float  # CPU time of the estimator over wall time
-    ratio: float | None
-    """CPU over that of the empty node; None if one was starved, which then costs less."""
+    ratio: float | None  # over that of the empty node; None if one was starved: that costs less
     sent: int  # samples that were published
     lost: int  # samples that the estimator has not taken
-    latency: tuple[float, float]
-    """Seconds from a sample's publication to its first estimate: median and 99 %."""
+    latency: tuple[float, float]  # seconds from sample to its first estimate: median and 99 %
 
 
 def measure(quick: bool) -> list[Row]:
@@ -129,14 +127,10 @@ def observe(case: Case, seconds: float) -> Run:
     watched = [f'/{name}{joint}/stamp' for name in (ESTIMATOR, EMPTY)]
     with Children() as children, Watch(dict.fromkeys(watched, TIME)) as watch:
         ours = children.start_node(ESTIMATOR, *given)
-        empty, source = (
-            (name, __file__, name, str(rate), str(case.joints))
-            for name, rate in ((EMPTY, case.out), ('source', case.rate))
-        )
-        empty = children.start(*empty)
+        empty = children.start(EMPTY, __file__, EMPTY, str(case.out), str(case.joints))
         ours.wait_for('waiting' if case.joints else 'estimating')
         empty.wait_for('computing nothing')
-        source = children.start(*source)
+        source = children.start('source', __file__, 'source', str(case.rate), str(case.joints))
         source.wait_for('publishing')
         wait_until(lambda: all(map(watch.count, watched)), 'not all nodes published')
         sleep(WARM_UP)

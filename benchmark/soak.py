@@ -191,16 +191,13 @@ class Client(PrivateNode):
         if kind == 'reset':
             right = self._answer(self._reset.call_async(Trigger.Request())).success
         else:
-            accepted = self._set(SETS[kind][self.counts[kind] % len(SETS[kind])])
+            accepted = self.set(SETS[kind][self.counts[kind] % len(SETS[kind])])
             right = accepted == (kind == 'good parameters')
         self.counts[kind] += 1
         self.counts['wrong answers'] += not right
 
-    def restore(self) -> None:
-        """Put the parameters back."""
-        self.counts['wrong answers'] += not self._set(BASE)
-
-    def _set(self, values: Mapping[str, Any]) -> bool:
+    def set(self, values: Mapping[str, Any]) -> bool:
+        """Set parameters of the estimator; return whether it accepted them."""
         wait_until(self._parameters.services_are_ready, 'the estimator offers no parameters')
         parameters = [Parameter(name, value=value) for name, value in values.items()]
         answer = self._answer(self._parameters.set_parameters_atomically(parameters))
@@ -272,7 +269,7 @@ def soak(seed: int, minutes: float, output: Path) -> set[str]:
                     client.call(kind)
                     time, kind, _ = next(calls)
                 if phase >= RESTORE and restored <= cycle:
-                    client.restore()
+                    client.counts['wrong answers'] += not client.set(BASE)
                     restored += 1
                 if judging != (JUDGED[0] <= phase < JUDGED[1]):
                     judging = not judging

@@ -96,7 +96,8 @@ def publish(
     folder.mkdir(parents=True, exist_ok=True)
     for name, rows in tables.items():
         with (folder / f'{name}.csv').open('w', newline='', encoding='utf-8') as file:
-            table = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
+            columns = dict.fromkeys(column for row in rows for column in row)
+            table = csv.DictWriter(file, list(columns), lineterminator='\n')
             table.writeheader()
             for row in rows:
                 numbers = {k: f'{v:.6g}' for k, v in row.items() if isinstance(v, float | int)}

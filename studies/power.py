@@ -57,11 +57,7 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
         found[f'the same gains, it adapts by {rate:g}'] = judged(gains, law)
     found['it adapts, all gains searched with the law'] = best(True, gains, {})
     found['Kalman filter, one tuning'] = results({'': (kalman, trials)})['']
-    columns = dict.fromkeys(column for row in found.values() for column in row)
-    rows: list[Row] = [
-        {'observer': name, **{column: row.get(column) for column in columns}}
-        for name, row in found.items()
-    ]
+    rows: list[Row] = [{'observer': name, **row} for name, row in found.items()]
     table = markdown(
         ('observer', 'error in training', 'error judged', 'γ is'),
         [(r['observer'], f'{r["training"]:.3f}', f'{r["judged"]:.3f}', r['gamma']) for r in rows],

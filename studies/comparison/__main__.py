@@ -8,18 +8,9 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 from studies import evidence
+from studies.comparison import methods
 from studies.comparison.cells import evaluate, JUMPS, methods_for, PLANTS, sensors
-from studies.comparison.methods import (
-    KINDS,
-    LINEAR,
-    METHODS,
-    OURS,
-    PAPER,
-    ROBUST,
-    SELF_TUNING,
-    SLIDING,
-    USUAL,
-)
+from studies.comparison.methods import KINDS, LINEAR, METHODS
 from studies.comparison.tuning import mean
 from studies.evidence import markdown, Row
 from studies.harness import Found, Results, run_study
@@ -27,8 +18,9 @@ from studies.harness import Found, Results, run_study
 NAME = 'comparison'
 FULL, QUICK = (4, 200), (1, 15)  # recordings that tune a method, and trials
 STYLES = {
-    USUAL: evidence.USUAL, ROBUST: evidence.ROBUST, SLIDING: evidence.OTHER, PAPER: evidence.GREY,
-    OURS: evidence.TUNED, SELF_TUNING: evidence.SELF,
+    methods.USUAL: evidence.USUAL, methods.ROBUST: evidence.ROBUST,
+    methods.SLIDING: evidence.OTHER, methods.PAPER: evidence.GREY, methods.OURS: evidence.TUNED,
+    methods.SELF_TUNING: evidence.SELF,
 }  # fmt: skip
 CLOSE = 0.05  # errors within this part of another one count as equal
 
@@ -75,6 +67,10 @@ def ratios(chosen: Chosen, kind: str, about: Callable[[Cell], bool]) -> list[flo
 def texts(rows: Iterable[Row]) -> dict[str, str]:
     """Return the part of the page: ratios by kind and group, and how often a kind is the best."""
     chosen, lines = best_of_kinds(rows), []
+
+    def spread(values: list[float]) -> str:  # geometric mean, and the largest
+        return f'{number(mean(values))} ({number(max(values))})' if values else ''
+
     for kind in KINDS:
         parts = [
             ratios(chosen, kind, lambda c, group=group: (c.noise > 0.0, c.jumps) == group)
@@ -84,15 +80,10 @@ def texts(rows: Iterable[Row]) -> dict[str, str]:
             kind in errors and errors[kind] <= (1.0 + CLOSE) * min(errors.values())
             for errors in chosen.values()
         )
-        shown = ['1' if kind == LINEAR else _spread(part) for part in parts]
+        shown = ['1' if kind == LINEAR else spread(part) for part in parts]
         lines.append([kind, *shown, f'{best} of {len(chosen)}'])
     head = ['', *GROUPS, f'at most {100.0 * CLOSE:g} % behind the best']
     return {'summary': markdown(head, lines)}
-
-
-def _spread(values: list[float]) -> str:
-    """Return a geometric mean and the largest value."""
-    return f'{number(mean(values))} ({number(max(values))})' if values else ''
 
 
 def number(x: float) -> str:
@@ -107,9 +98,12 @@ def number(x: float) -> str:
 def draw(chosen: Chosen, jumps: bool) -> Figure:
     """Draw each kind's error over that of the best linear filter, for d with or without jumps."""
     groups: dict[str, dict[str, list[Cell]]] = {case.text: {} for case in PLANTS.values()}
-    for cell in sorted(chosen, key=_order):
-        if cell.jumps == jumps:
-            groups[PLANTS[cell.plant].text].setdefault(_text(cell), []).append(cell)
+    for c in sorted(chosen, key=lambda c: (c.timing != 'even', c.timing, -c.rate, c.noise)):
+        if c.jumps == jumps:
+            rate = '1 kHz' if c.rate == 1000.0 else f'{c.rate:g} Hz'
+            timing = '' if c.timing == 'even' else f', {c.timing}'
+            row = f'{rate}{timing}, {f"noise {c.noise:g}" if c.noise else "no noise"}'
+            groups[PLANTS[c.plant].text].setdefault(row, []).append(c)
     panels = {
         plant: {
             text: {
@@ -125,16 +119,6 @@ def draw(chosen: Chosen, jumps: bool) -> Figure:
     with_jumps = 'with' if jumps else 'without'
     text = f'd {with_jumps} jumps: error of d over that of the best linear filter'
     return evidence.draw_ratios(panels, STYLES, text)
-
-
-def _order(cell: Cell) -> tuple[bool, str, float, float]:
-    return cell.timing != 'even', cell.timing, -cell.rate, cell.noise
-
-
-def _text(cell: Cell) -> str:
-    rate = '1 kHz' if cell.rate == 1000.0 else f'{cell.rate:g} Hz'
-    timing = '' if cell.timing == 'even' else f', {cell.timing}'
-    return f'{rate}{timing}, {f"noise {cell.noise:g}" if cell.noise else "no noise"}'
 
 
 def measure(arguments: argparse.Namespace, results: Results) -> Found:

@@ -69,38 +69,25 @@ class SampledModel:
     """
     The model, linearised at rest and extended by a chain of integrators that makes d.
 
-    States are scaled by powers of the period, because the Riccati equation is badly conditioned
-    otherwise.
-
-    Parameters
-    ----------
-    model : TriangularModel
-    period : float
-        Sampling period in seconds.
-    chain : int
-        Integrators that model d: with 1 the white noise drives d itself, with 2 its derivative.
-    decay : float
-        Rate (1/s) at which all states of the chain decay, so that d is a Matern process.
-
+    States are scaled by powers of the period (s), because the Riccati equation is badly
+    conditioned otherwise. With a `chain` of 1 white noise drives d itself, with 2 its derivative.
+    All states of the chain decay at the rate `decay` (1/s), so that d is a Matern process.
     """
 
     def __init__(
         self, model: TriangularModel, period: float, chain: int = 1, decay: float = 0.0
     ) -> None:
         n, self.size, self.period = model.order, model.order + chain, period
-        self.scale = period ** np.arange(self.size)
-        """Powers of the period: scaled states are x_i * period^(i - 1)."""
+        self.scale = period ** np.arange(self.size)  # scaled states are x_i * period^(i - 1)
         self._rates = np.eye(self.size, k=1)
         self._rates[range(n, self.size), range(n, self.size)] = -decay
         jacobian = model.jacobian(np.zeros(n))
         fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(n, k=1))))
         resolution = min(0.03 / max(float(fastest), 1e-9), LONGEST_STEP)
+        # Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
+        # 0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as
+        # dry friction, needs shorter ones.
         self.longest = min(LONGEST * period, resolution)
-        """
-        Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
-        0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as dry
-        friction, needs shorter ones.
-        """
         self._rates[:n, :n] += jacobian
         self.a = self._scaled(expm(self._rates * period))
         """(N, N): transition over a period, in scaled states."""
@@ -176,11 +163,6 @@ def _steady(setting: Setting, values: Values) -> Run:
     sampled = SampledModel(model, setting.period, 1 + int(values.get('derivatives', 0)), decay)
     gain = sampled.kalman(setting.period * values['bandwidth'] ** (2 * sampled.size))
     return lambda r: [estimates(model, gain, decay, r, sampled.longest)[:, : model.order + 1]]
-
-
-def _one_bandwidth(setting: Setting) -> tuple[Dimension, ...]:
-    """Return a range in rad/s, from far below any d to where the observer is deadbeat."""
-    return (Dimension('bandwidth', 0.05, 5.0 / setting.period, setting.speed),)
 
 
 def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...]:
@@ -275,11 +257,6 @@ def _levant(setting: Setting, values: Values) -> Run:
     return _sliding(lambda _: own, setting, values)
 
 
-def _levant_space(setting: Setting) -> tuple[Dimension, ...]:
-    size = setting.size
-    return (Dimension('lipschitz', 1e-4 * size, 1e8 * size, 10.0 * size),)
-
-
 def _online(own: Values, setting: Setting, values: Values) -> Run:
     """Return a run of the online estimator with these parameters."""
     parameters, known = setting.told | dict(values) | dict(own), setting.model.uses_input
@@ -300,6 +277,15 @@ def _tune(search: Search) -> Values:
         return tuner.parameters(tuner.search(max(1, search.trials - GRID)).best)
 
 
+def _one_bandwidth(s: Setting) -> Sequence[Dimension]:
+    """Return a range in rad/s, from far below any d to where the observer is deadbeat."""
+    return [Dimension('bandwidth', 0.05, 5.0 / s.period, s.speed)]
+
+
+def _lipschitz(s: Setting) -> Sequence[Dimension]:
+    return [Dimension('lipschitz', 1e-4 * s.size, 1e8 * s.size, 10.0 * s.size)]
+
+
 PAPERS = {'sign': 'sign', 'fuzzy': 'fuzzy', 'adaptive': 'fuzzy_adaptive'}
 ADAPTIVE = (
     _adaptive(HUBER, Dimension('huber', 1.0, 10.0, 2.5)),
@@ -313,7 +299,7 @@ METHODS = {
         Method('Kalman, decaying', LINEAR, _steady, matern_space),  # a random walk that decays
         Method(LINEAR_LIMIT, LINEAR, _steady, matern_space, each_order),
         *ADAPTIVE,
-        Method('Levant, implicit', SLIDING, _levant, _levant_space),
+        Method('Levant, implicit', SLIDING, _levant, _lipschitz),
         *(
             Method(f'paper: {name}', PAPER, partial(_sliding, partial(_papers, own)))
             for name, own in PAPERS.items()

@@ -5,17 +5,7 @@ import argparse
 from collections.abc import Sequence
 import sys
 
-from fhaosmo_ros.core.observer.fuzzy import (
-    curve,
-    memberships,
-    NAMES,
-    of_level,
-    read_system,
-    SINGLETON,
-    Terms,
-)
 from fhaosmo_ros.tools.plot.figures import COLOURS, envelope, TRUTH
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from studies import evidence
@@ -60,8 +50,8 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     }
     *fixed, adaptive = ([(name, w, found[name, w]) for w in FREQUENCIES] for name in DRAWN)
     drawn = {
-        'paper_sim1': sim1(found['sim1']), 'paper_fuzzysystems': fuzzy_systems(),
-        'paper_simz': unknown_inputs(fixed), 'paper_simu': unknown_inputs([adaptive], gamma=True),
+        'paper_sim1': sim1(found['sim1']), 'paper_simz': unknown_inputs(fixed),
+        'paper_simu': unknown_inputs([adaptive], gamma=True),
     }  # fmt: skip
     return Found(tables, cases.texts(simulations), drawn)
 
@@ -118,41 +108,6 @@ def unknown_inputs(
         axes.set_xlabel('time [s]')
     panels[0, 0].legend(loc='upper right', ncols=2)
     return figure
-
-
-def fuzzy_systems() -> Figure:
-    """Figure fuzzysystems: membership functions of input and output, and the curve, by level."""
-    (preset, _), levels = cases.preset(), ('1', '2', '3, 4')
-    figure = Figure(figsize=(9.0, 0.6 + 2.0 * len(levels)), layout='constrained')
-    for k, (left, middle, right) in enumerate(figure.subplots(len(levels), 3)):
-        text, width = of_level(preset['fuzzy_systems'], k), of_level(preset['fuzzy_widths'], k)
-        system, half = read_system(text), curve(text)
-        _draw_terms(left, system.inputs, width)
-        _draw_terms(middle, system.outputs, 1.0)
-        grid = np.linspace(0.0, width, len(half))
-        right.plot([-width, 0, 0, width], [-1, -1, 1, 1], color='#999999', linestyle=':')
-        right.plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')
-        right.set(xlabel=f'ε of level {levels[k]} [its unit]', ylabel='ψ(ε) [1]')
-        right.grid(alpha=0.3)
-        left.set_xlabel(f'ε of level {levels[k]} [its unit]')
-        middle.set_xlabel('ψ [1], before scaling to ±1')
-        for axes in (left, middle, right):
-            axes.locator_params(axis='x', nbins=4)
-    figure.suptitle('membership functions of input and output, and the curve (dotted: sign)')
-    return figure
-
-
-def _draw_terms(axes: Axes, terms: Terms, scale: float) -> None:
-    """Draw membership functions over [-scale, scale], and their names above them."""
-    x = np.linspace(-1.0, 1.0, 1001)
-    for k, (name, peak) in enumerate(zip(NAMES[len(terms.peaks)], terms.peaks, strict=True)):
-        style = {'color': COLOURS[k % 2], 'linestyle': '--' if k % 2 else '-'}
-        if terms.shape == SINGLETON:
-            axes.plot([scale * peak] * 2, [0.0, 1.0], marker='o', markevery=[1], **style)
-        else:
-            axes.plot(scale * x, memberships(x, terms)[k], **style)
-        axes.text(scale * peak, 1.05, name, ha='center', fontsize=6)
-    axes.set(xlim=(-1.05 * scale, 1.05 * scale), ylim=(0.0, 1.18), ylabel='membership [1]')
 
 
 if __name__ == '__main__':

@@ -74,25 +74,17 @@ WIDTHS = (
 )  # fmt: skip
 """Half-widths of the map, on both axes."""
 VARIANTS = ('sign', 'fuzzy', 'fuzzy_adaptive', 'sign_adaptive')
+SCHEMES, STEPS = (
+    ('explicit', 'implicit'),
+    (('explicit', 1e-3), ('implicit', 1e-3), ('implicit', 1e-2)),
+)
 SAMPLED = (
-    *(
-        (scheme, step, omega, 0.0)
-        for scheme, step in (('explicit', 1e-3), ('implicit', 1e-3), ('implicit', 1e-2))
-        for omega in FREQUENCIES
-    ),
-    *(
-        (scheme, 1e-3, FREQUENCIES[0], noise)
-        for noise in (1e-4, 1e-3, 1e-2)  # the amplitude of z1 is of order 0.1 to 1
-        for scheme in ('explicit', 'implicit')
-    ),
+    *((scheme, step, omega, 0.0) for scheme, step in STEPS for omega in FREQUENCIES),
+    # The amplitude of z1 is of order 0.1 to 1.
+    *((s, 1e-3, FREQUENCIES[0], noise) for noise in (1e-4, 1e-3, 1e-2) for s in SCHEMES),
 )
 """As a node runs: scheme, step (s), angular frequency, standard deviation of the noise on y."""
-LONG = tuple(
-    (scheme, omega, noise)
-    for noise in (0.0, 1e-4)
-    for scheme in ('explicit', 'implicit')
-    for omega in FREQUENCIES
-)
+LONG = tuple((s, w, noise) for noise in (0.0, 1e-4) for s in SCHEMES for w in FREQUENCIES)
 """Long runs: scheme, angular frequency, noise on y."""
 LONG_DURATION, WINDOW, THINNED = 2000.0, 100.0, 10
 """Seconds of a long run, and of the windows that are judged; it records every 10th sample."""
@@ -217,14 +209,7 @@ class Verdict(NamedTuple):
     claim: str
     holds: bool
     numbers: str  # what decides
-    estimates: bool
-    """False if every observer that is judged has a larger RMS error of d than the estimate 0."""
-
-    @property
-    def words(self) -> str:
-        """Whether it holds, and what that is worth."""
-        text = 'yes' if self.holds else 'no'
-        return f'**{text}**' if self.estimates else f'{text}, but no estimate'
+    estimates: bool  # whether an observer that is judged has less RMS error of d than 0 has
 
 
 def simulation(solver: str, name: str, omega: float) -> Row:
@@ -240,45 +225,46 @@ def scores_of(rows: Iterable[Row], solver: str) -> Scores:
 
 def verdicts(s: Scores) -> list[Verdict]:
     """Judge the findings F1, F2, F3 from the scores of one solver."""
-    found = []
 
-    def judge(name: str, claim: str, holds: bool, numbers: str, *judged: Score) -> None:
+    def judge(name: str, claim: str, holds: bool, numbers: str, *judged: Score) -> Verdict:
         estimates = any(one['rms_d'] < one['true_d'] for one in judged)
-        found.append(Verdict(name, claim, holds, numbers, estimates))
+        return Verdict(name, claim, holds, numbers, estimates)
 
+    found = []
     for label, w in zip(('low', 'high'), FREQUENCIES, strict=True):
         fine, coarse, fuzzy, adaptive = (s[name, w] for name in (FINE, COARSE, FUZZY, ADAPTIVE))
         chatter, smooth = fine['high_pass'], fuzzy['high_pass']
-        judge(
-            f'F1a {label}', 'sign at 1e-5 s chatters visibly', chatter >= VISIBLE,
-            f'high-passed {chatter:.1e}; error {fine["rms_d"]:.3f}', fine,
-        )  # fmt: skip
-        judge(
-            f'F1b {label}', 'sign at 1e-3 s is bad', coarse['rms_d'] >= BADLY * fine['rms_d'],
-            f'error {coarse["rms_d"]:.3f}, at 1e-5 s {fine["rms_d"]:.3f}', coarse, fine,
-        )  # fmt: skip
-        judge(
-            f'F1c {label}', 'fuzzy at 1e-3 s does not chatter', smooth <= SMOOTH * chatter,
-            f'high-passed {smooth:.1e}, sign at 1e-5 s {chatter:.1e}', fuzzy, fine,
-        )  # fmt: skip
-        judge(
-            f'F3 {label}', 'adaptation improves fuzzy, and γ moves',
-            adaptive['rms_d'] < fuzzy['rms_d'] and abs(adaptive['gamma'] - 0.5) >= MOVED,
-            f'error {adaptive["rms_d"]:.4f}, without {fuzzy["rms_d"]:.4f}; γ ends at '
-            f'{adaptive["gamma"]:.3f}', adaptive, fuzzy,
-        )  # fmt: skip
-    judge(
-        'F2', 'at the high frequency fuzzy is worse than sign', fuzzy['rms_d'] > fine['rms_d'],
-        f'error {fuzzy["rms_d"]:.3f}, sign at 1e-5 s {fine["rms_d"]:.3f}', fuzzy, fine,
-    )  # fmt: skip
-    return sorted(found)
+        improved = adaptive['rms_d'] < fuzzy['rms_d']
+        found += [
+            judge(f'F1a {label}', 'sign at 1e-5 s chatters visibly', chatter >= VISIBLE,
+                  f'high-passed {chatter:.1e}; error {fine["rms_d"]:.3f}', fine),
+            judge(f'F1b {label}', 'sign at 1e-3 s is bad',
+                  coarse['rms_d'] >= BADLY * fine['rms_d'],
+                  f'error {coarse["rms_d"]:.3f}, at 1e-5 s {fine["rms_d"]:.3f}', coarse, fine),
+            judge(f'F1c {label}', 'fuzzy at 1e-3 s does not chatter', smooth <= SMOOTH * chatter,
+                  f'high-passed {smooth:.1e}, sign at 1e-5 s {chatter:.1e}', fuzzy, fine),
+            judge(f'F3 {label}', 'adaptation improves fuzzy, and γ moves',
+                  improved and abs(adaptive['gamma'] - 0.5) >= MOVED,
+                  f'error {adaptive["rms_d"]:.4f}, without {fuzzy["rms_d"]:.4f}; γ ends at '
+                  f'{adaptive["gamma"]:.3f}', adaptive, fuzzy),
+        ]  # fmt: skip
+    claim = 'at the high frequency fuzzy is worse than sign'
+    numbers = f'error {fuzzy["rms_d"]:.3f}, sign at 1e-5 s {fine["rms_d"]:.3f}'
+    return sorted(
+        [*found, judge('F2', claim, fuzzy['rms_d'] > fine['rms_d'], numbers, fuzzy, fine)]
+    )
 
 
 def texts(rows: Iterable[Row]) -> dict[str, str]:
     """Return the part of the page, from the table of simulations."""
-    found = verdicts(scores_of(rows, SOLVER))
+    lines = []
+    for name, claim, holds, numbers, estimates in verdicts(scores_of(rows, SOLVER)):
+        word = 'yes' if holds else 'no'
+        lines.append(
+            [name, claim, f'**{word}**' if estimates else f'{word}, but no estimate', numbers]
+        )
     head = ['finding', 'claim', 'holds', 'numbers (RMS error of d; high-passed estimate)']
-    return {'findings': markdown(head, [(v.name, v.claim, v.words, v.numbers) for v in found])}
+    return {'findings': markdown(head, lines)}
 
 
 def width_rows(first: float, widths: Sequence[float], signs: Scores) -> list[Row]:

@@ -11,16 +11,7 @@ import numpy as np
 from scipy.signal import butter, filtfilt, savgol_filter
 from studies.harness import Floats
 from studies.recipes import judging
-from studies.recipes.judging import (
-    Estimate,
-    FIXED,
-    Fold,
-    kalman_filter,
-    Method,
-    OURS,
-    Recipe,
-    Recorded,
-)
+from studies.recipes.judging import FIXED, Fold, kalman_filter, Method, OURS, Recipe, Recorded
 
 JOINTS, WRENCH = '/pndbt/joint_states', '/pndbt/netft_data'
 RATE = 200.0  # of the joint states (Hz)
@@ -83,7 +74,7 @@ def inertia(p: Mapping[str, Any], r: Recorded) -> Floats:
     return np.asarray(p['constants.p'] - p['constants.r'] * np.cos(r.u[:, 1]) ** 2)
 
 
-def torque(method: Estimate, p: Mapping[str, Any], r: Recorded, number: float) -> Floats:
+def torque(method: judging.Estimate, p: Mapping[str, Any], r: Recorded, number: float) -> Floats:
     """Return the torque by what a method says of d: d J(q2)."""
     return method(p, r, number) * inertia(p, r)
 

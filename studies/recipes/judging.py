@@ -42,6 +42,11 @@ class Recorded(NamedTuple):
         return self.t - self.t[0] > self.settled
 
     @property
+    def inputs(self) -> Floats:
+        """Known inputs, one that is 0 where there are none."""
+        return self.u if self.u.size else np.zeros((len(self.y), 1))
+
+    @property
     def period(self) -> float:
         """Median interval (s)."""
         return float(np.median(np.diff(self.t)))
@@ -129,11 +134,6 @@ def low_passed(x: Floats, bandwidth: float, period: float, order: int, derivativ
     return lfilter(b, a, x - x[0]) + (x[0] if derivative == 0 else 0.0)
 
 
-def inputs_of(r: Recorded) -> Floats:
-    """Return the known inputs, one that is 0 where there are none."""
-    return r.u if r.u.size else np.zeros((len(r.y), 1))
-
-
 def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
     """
     Return d = Q(s) (s² y - Phi_2), Q = (s / bandwidth + 1)^-2, for a model of order 2.
@@ -143,7 +143,7 @@ def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) ->
     """
     model, h = plant_of(p), r.period
     velocity = low_passed(r.y, bandwidth, h, 2, 1)
-    samples = zip(np.column_stack([r.y, velocity]), inputs_of(r), strict=True)
+    samples = zip(np.column_stack([r.y, velocity]), r.inputs, strict=True)
     explained = np.array([model.evaluate(z, u)[1] for z, u in samples])
     acceleration = low_passed(r.y, bandwidth, h, 2, 2)
     return acceleration - low_passed(explained, bandwidth, h, 2, 0)
@@ -162,7 +162,7 @@ def kalman_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats
     x = np.zeros(n + 1)
     x[0] = r.y[0]
     covariance = np.diag([(3.0 * bandwidth) ** (2 * k) for k in range(n + 1)])
-    chain, found, inputs = np.eye(n + 1, k=1), np.zeros(len(r.y)), inputs_of(r)
+    chain, found, inputs = np.eye(n + 1, k=1), np.zeros(len(r.y)), r.inputs
     for k in range(1, len(r.y)):
         dt, u = r.t[k] - r.t[k - 1], inputs[k]
         rates = [np.zeros(n + 1)]
