@@ -14,11 +14,10 @@ from fhaosmo_ros.core import Recording, TriangularModel
 import numpy as np
 from scipy.integrate import solve_ivp
 from studies import evidence
-from studies.comparison.methods import LINEAR_LIMIT, METHODS
-from studies.comparison.tuning import mean, Setting, tune
 from studies.everywhere import Plant, self_tuned
 from studies.evidence import markdown, Row
 from studies.harness import Floats, Found, Results, run_study
+from studies.methods import LINEAR_LIMIT, mean, METHODS, Setting, tune
 from studies.waves import wave
 
 NAME, SEED, SAMPLES = 'elsewhere', 7, 8000

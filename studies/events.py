@@ -23,9 +23,9 @@ from matplotlib.figure import Figure
 import numpy as np
 from scipy.signal import lfilter
 from studies import evidence
-from studies.comparison.methods import estimates, SampledModel
 from studies.evidence import Row
 from studies.harness import Floats, Found, Results, run_study, SELF_TUNING
+from studies.methods import estimates, SampledModel
 
 NAME = 'events'
 H, NOISE, LOAD, FAULT, LASTS, EVERY, SETTLED = 0.01, 1e-3, 0.05, 1.0, 2.0, 20.0, 60.0

@@ -19,10 +19,20 @@ from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from scipy.signal import lfilter
 from studies import evidence
-from studies.comparison.methods import HUBER, IMM, LINEAR_LIMIT, METHODS, NOISE
-from studies.comparison.tuning import mean, objective, Setting, tune, Values
 from studies.evidence import markdown, Row
 from studies.harness import Found, observed, Results, run_study, SELF_TUNING
+from studies.methods import (
+    HUBER,
+    IMM,
+    LINEAR_LIMIT,
+    mean,
+    METHODS,
+    NOISE,
+    objective,
+    Setting,
+    tune,
+    Values,
+)
 from studies.waves import wave
 
 NAME = 'everywhere'

@@ -20,10 +20,9 @@ from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise, Values
 import numpy as np
-from studies.comparison.methods import LINEAR_LIMIT, METHODS
-from studies.comparison.tuning import mean, objective, Setting, trial, tune
 from studies.evidence import markdown, Row
 from studies.harness import Found, Results, run_study
+from studies.methods import LINEAR_LIMIT, mean, METHODS, objective, Setting, trial, tune
 
 PERIOD, DURATION, NOISY_FROM, SETTLED = 1e-3, 20.0, 13.3, 2.0
 """Seconds: of the run, from when y has noise, from when errors count."""

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from studies import everywhere
-from studies.comparison.cells import PLANTS, sensors
-from studies.comparison.methods import (
+from studies.comparison import PLANTS, sensors
+from studies.methods import (
     ADAPTIVE,
     HUBER,
     IMM,
     LINEAR_LIMIT,
     METHODS,
     SampledModel,
+    Setting,
 )
-from studies.comparison.tuning import Setting
 
 MODELS = {
     'paper': TriangularModel(['0', '0', '-z3']),

@@ -7,9 +7,8 @@ from fhaosmo_ros.core import Observer
 from fhaosmo_ros.core.simulation.metrics import high_passed
 import numpy as np
 import pytest
-from studies import evidence
-from studies.paper import cases
-from studies.paper.plant_and_observer import HELD, simulate, SOLVERS
+from studies import evidence, paper
+from studies.plant_and_observer import HELD, simulate, SOLVERS
 
 REWRITE = 'run make paper'
 
@@ -17,7 +16,7 @@ REWRITE = 'run make paper'
 @pytest.fixture(scope='module')
 def documented():
     rows = evidence.read('paper')
-    return {solver: cases.scores_of(rows, solver) for solver in SOLVERS}
+    return {solver: paper.scores_of(rows, solver) for solver in SOLVERS}
 
 
 def check(new, old, sign):
@@ -28,24 +27,24 @@ def check(new, old, sign):
             assert 1 / factor < new[key] / old[key] < factor, f'{key}: {REWRITE}'
 
 
-@pytest.mark.parametrize('name', [name for name, c in cases.OBSERVERS.items() if c.step == 1e-3])
-@pytest.mark.parametrize('omega', cases.FREQUENCIES)
+@pytest.mark.parametrize('name', [name for name, c in paper.OBSERVERS.items() if c.step == 1e-3])
+@pytest.mark.parametrize('omega', paper.FREQUENCIES)
 def test_new_simulation_agrees_with_the_table(documented, name, omega):
-    for s in (cases.SOLVER, HELD):
+    for s in (paper.SOLVER, HELD):
         old = documented[s][name, omega]
-        check(cases.simulation(s, name, omega), old, name.startswith('sign'))
+        check(paper.simulation(s, name, omega), old, name.startswith('sign'))
 
 
 def test_best_solver_is_the_one_of_the_findings(documented):
     def error(solver):
-        return sum(documented[solver][cases.FINE, w]['rms_d'] for w in cases.FREQUENCIES)
+        return sum(documented[solver][paper.FINE, w]['rms_d'] for w in paper.FREQUENCIES)
 
-    assert min(set(SOLVERS) - {HELD}, key=error) == cases.SOLVER
+    assert min(set(SOLVERS) - {HELD}, key=error) == paper.SOLVER
 
 
 def test_all_findings_come_out_with_the_shipped_half_widths(documented):
-    for name in (cases.SOLVER, HELD):
-        found = cases.verdicts(documented[name])
+    for name in (paper.SOLVER, HELD):
+        found = paper.verdicts(documented[name])
         failed = [v.name for v in found if not v.holds]
         assert failed == (['F1b high'] if name == HELD else [])
 
@@ -53,8 +52,8 @@ def test_all_findings_come_out_with_the_shipped_half_widths(documented):
 def test_shipped_half_widths_lie_inside_the_region():
     rows = evidence.read('paper_half_widths')
     holds = {tuple(row.values())[:2] for row in rows if all(list(row.values())[2:])}
-    first, later = cases.preset()[0]['fuzzy_widths'][:2]
-    around = [cases.WIDTHS[i - 1 : i + 2] for i in map(cases.WIDTHS.index, (first, later))]
+    first, later = paper.preset()[0]['fuzzy_widths'][:2]
+    around = [paper.WIDTHS[i - 1 : i + 2] for i in map(paper.WIDTHS.index, (first, later))]
     assert {(a, b) for a in around[0] for b in around[1]} <= holds
 
 

@@ -22,7 +22,7 @@ from fhaosmo_ros.tools.tuning.objective import Objective, stamps_of, TUNE_PARAME
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 import numpy as np
 import pytest
-from studies.comparison.methods import estimates, SampledModel
+from studies.methods import estimates, SampledModel
 from waiting import wait_until
 
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of the comparison: plant, d, noise, rate, timing; their recordings, and errors."""
+"""Compare the observer with what people would use instead, all tuned by the same rules."""
 
-from collections.abc import Mapping, Sequence
+import argparse
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 import math
+import sys
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import Family, Recording, TriangularModel
@@ -11,10 +13,12 @@ from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.recordings import FAMILY_PARAMETERS, SHAPES
 from fhaosmo_ros.tools.cli.command import shipped
+from matplotlib.figure import Figure
 import numpy as np
-from studies.comparison.methods import METHODS
-from studies.comparison.tuning import mean, objective, Outcome, Setting, tune
-from studies.harness import Floats
+from studies import evidence, methods
+from studies.evidence import markdown, Row
+from studies.harness import Floats, Found, Results, run_study
+from studies.methods import KINDS, LINEAR, mean, METHODS, objective, Outcome, Setting, tune
 from studies.waves import wave
 
 NOISES, RATES = (0.0, 1e-4, 1e-3, 1e-2), (1000.0, 100.0)
@@ -200,3 +204,133 @@ def methods_for(sensor: Sensor) -> list[str]:
     """Return the methods that are compared for a sensor."""
     quiet = sensor.setting().noise == 0.0
     return [name for name, method in METHODS.items() if not (quiet and method.needs_noise)]
+
+
+NAME = 'comparison'
+FULL, QUICK = (4, 200), (1, 15)  # recordings that tune a method, and trials
+STYLES = {
+    methods.USUAL: evidence.USUAL, methods.ROBUST: evidence.ROBUST,
+    methods.SLIDING: evidence.OTHER, methods.PAPER: evidence.GREY, methods.OURS: evidence.TUNED,
+    methods.SELF_TUNING: evidence.SELF,
+}  # fmt: skip
+CLOSE = 0.05  # errors within this part of another one count as equal
+
+
+class Cell(NamedTuple):
+    """Plant, kind of d, standard deviation of the noise on y, samples a second, timing."""
+
+    plant: str
+    d: str
+    noise: float
+    rate: float
+    timing: str
+
+    @property
+    def jumps(self) -> bool:
+        """True for a d that jumps."""
+        return self.d in JUMPS
+
+
+Chosen = dict[Cell, dict[str, float]]  # errors of d by cell and kind of method
+
+GROUPS = {
+    'd without jumps': (True, False), 'd with jumps': (True, True),
+    'no noise, without jumps': (False, False), 'no noise, with jumps': (False, True),
+}  # fmt: skip
+"""Whether there is noise, and whether d jumps."""
+
+
+def best_of_kinds(rows: Iterable[Row]) -> Chosen:
+    """Return for each cell the method of each kind whose error in training is smallest."""
+    chosen: Chosen = {}
+    for row in sorted(rows, key=lambda row: row['training']):
+        errors = chosen.setdefault(Cell(*(row[name] for name in Cell._fields)), {})
+        errors.setdefault(METHODS[row['method']].kind, row['error'])
+    return chosen
+
+
+def ratios(chosen: Chosen, kind: str, about: Callable[[Cell], bool]) -> list[float]:
+    """Return the errors of d over those of the best linear filter, of the cells with both."""
+    both = [errors for cell, errors in chosen.items() if about(cell) and kind in errors]
+    return [errors[kind] / errors[LINEAR] for errors in both]
+
+
+def texts(rows: Iterable[Row]) -> dict[str, str]:
+    """Return the part of the page: ratios by kind and group, and how often a kind is the best."""
+    chosen, lines = best_of_kinds(rows), []
+
+    def spread(values: list[float]) -> str:  # geometric mean, and the largest
+        return f'{number(mean(values))} ({number(max(values))})' if values else ''
+
+    for kind in KINDS:
+        parts = [
+            ratios(chosen, kind, lambda c, group=group: (c.noise > 0.0, c.jumps) == group)
+            for group in GROUPS.values()
+        ]
+        best = sum(
+            kind in errors and errors[kind] <= (1.0 + CLOSE) * min(errors.values())
+            for errors in chosen.values()
+        )
+        shown = ['1' if kind == LINEAR else spread(part) for part in parts]
+        lines.append([kind, *shown, f'{best} of {len(chosen)}'])
+    head = ['', *GROUPS, f'at most {100.0 * CLOSE:g} % behind the best']
+    return {'summary': markdown(head, lines)}
+
+
+def number(x: float) -> str:
+    """Return a number as text."""
+    if not x < 1e6:
+        return '∞'
+    if x >= 100.0:
+        return f'{x:.3g}' if x < 1e4 else f'{x:.0e}'
+    return f'{x:.2g}' if x < 0.1 else f'{x:.2f}'
+
+
+def draw(chosen: Chosen, jumps: bool) -> Figure:
+    """Draw each kind's error over that of the best linear filter, for d with or without jumps."""
+    groups: dict[str, dict[str, list[Cell]]] = {case.text: {} for case in PLANTS.values()}
+    for c in sorted(chosen, key=lambda c: (c.timing != 'even', c.timing, -c.rate, c.noise)):
+        if c.jumps == jumps:
+            rate = '1 kHz' if c.rate == 1000.0 else f'{c.rate:g} Hz'
+            timing = '' if c.timing == 'even' else f', {c.timing}'
+            row = f'{rate}{timing}, {f"noise {c.noise:g}" if c.noise else "no noise"}'
+            groups[PLANTS[c.plant].text].setdefault(row, []).append(c)
+    panels = {
+        plant: {
+            text: {
+                kind: mean(values)
+                for kind in STYLES
+                if (values := ratios(chosen, kind, cells.__contains__))
+            }
+            for text, cells in rows.items()
+        }
+        for plant, rows in groups.items()
+        if rows
+    }
+    with_jumps = 'with' if jumps else 'without'
+    text = f'd {with_jumps} jumps: error of d over that of the best linear filter'
+    return evidence.draw_ratios(panels, STYLES, text)
+
+
+def measure(arguments: argparse.Namespace, results: Results) -> Found:
+    """Return a line for each cell and method."""
+    quick = arguments.quick
+    training, trials = QUICK if quick else FULL
+    found = results({
+        (sensor, name): (evaluate, sensor, name, training, trials)
+        for sensor in sensors(quick)
+        for name in methods_for(sensor)
+    })  # fmt: skip
+    rows = evidence.rounded(
+        Cell(s.plant, d, s.noise, s.rate, s.timing)._asdict()
+        | {'method': name, 'training': tuned.value, 'error': error}
+        for (s, name), (tuned, errors) in found.items()
+        for d, error in zip(s.disturbances, errors, strict=True)
+    )
+    chosen = best_of_kinds(rows)
+    drawn = {'comparison_smooth': draw(chosen, False), 'comparison_jumps': draw(chosen, True)}
+    return Found({NAME: rows}, texts(rows), drawn)
+
+
+if __name__ == '__main__':
+    sys.exit(run_study(NAME, __doc__, measure))
