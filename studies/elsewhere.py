@@ -26,7 +26,7 @@ NOISES = (0.3, 1.0, 3.0)  # factors on the noise of the plant
 PLANTS = {
     'drive, rigid': Plant(('0', '-0.8*z2'), 5.0, 3.0, 1e-4, 500.0),
     'drive, two masses': Plant(('0', '0', '0', '-40*z3 - 2*z4'), 50.0, 1.0, 1e-4, 500.0),
-    'Duffing': Plant(('0', '-0.2*z2 + z1 - z1*z1*z1'), 1.0, 2.0, 1e-3, 200.0),
+    'Duffing': Plant(('0', '-0.2*z2 + z1 - z1**3'), 1.0, 2.0, 1e-3, 200.0),
     "the paper's": Plant(('0', '0', '-z3'), 0.07, 1.0, 1e-4, 500.0),
     'tank at 10 Hz': Plant(('-0.3*sqrt(abs(z1) + 0.01)',), 0.2, 0.05, 5e-3, 10.0),
     'heater at 4 Hz': Plant(('-0.1*z1', '-0.02*z2'), 0.05, 0.02, 0.05, 4.0),
