@@ -27,7 +27,7 @@ SELF_TUNING = {'gains': 'self_tuning'}
 MODEL = ('order', 'phi', 'inputs')
 POLL = 0.1  # seconds between two looks at what has come
 Floats = NDArray[np.float64]
-Call = tuple[Any, ...]  # A function of a module, and its arguments
+Call = tuple[Any, ...]  # a function of a module, and its arguments
 Results = Callable[[Mapping[Hashable, Call]], dict[Any, Any]]
 """Returns what calls return, by key: `called` for one study."""
 

@@ -121,12 +121,12 @@ class Method(NamedTuple):
     """A way to estimate z and d."""
 
     name: str  # key in results, and head of its column
-    kind: str  # one of `KINDS` in methods.py
+    kind: str  # one of `KINDS`
     prepare: Callable[[Setting, Values], Run]
     """Raises ConfigurationError for values that make no observer."""
     space: Callable[[Setting], Sequence[Dimension]] = lambda _: ()
     """Parameters to tune for a setting."""
-    tune: Callable[[Search], Values] | None = None  # A search of its own
+    tune: Callable[[Search], Values] | None = None  # a search of its own
     needs_noise: bool = False  # true for one that is about the noise, which there has to be
 
 
