@@ -36,7 +36,7 @@ from tqdm import tqdm
 
 BAR, JOINT_BAR, START_BAR = 1.2, 1.5, 2.0
 WARM_UP = 1.5
-HELD = 0.97  # A run counts for the ratio if each node published at this part of the rate at least
+HELD = 0.97  # a run counts for the ratio if each node published at this part of the rate at least
 EMPTY, ESTIMATOR = 'empty_node', 'estimator'
 SUBSCRIBERS = 2
 SETTLE = 0.5

@@ -15,7 +15,7 @@ DOCS = Path(__file__).resolve().parents[1] / 'docs'
 PAGE, FOLDER = 'evidence.md', 'evidence'
 PART = '<!-- begin {0} -->\n{1}\n<!-- end {0} -->'
 PATTERN = re.compile(r'<!-- begin (?P<name>\S+) -->\n(?P<text>.*?)\n?<!-- end (?P=name) -->', re.S)
-Row = dict[str, Any]  # A line of a table, by column; numbers are floats
+Row = dict[str, Any]  # a line of a table, by column; numbers are floats
 SELF, TUNED, USUAL, ROBUST, OTHER, GREY = (
     ('#D55E00', '*', 90), ('#009E73', 's', 22), ('#0072B2', 'o', 24), ('#56B4E9', '^', 26),
     ('#CC79A7', 'D', 20), ('#999999', 'x', 26),
