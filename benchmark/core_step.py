@@ -12,14 +12,14 @@ from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
 from typing import Any
 
-from fhaosmo_ros.core import Plant
+from fhaosmo_ros.core import Observer, Plant
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.fuzzy import KNOTS
-from fhaosmo_ros.core.observer.observer import Observer
 from fhaosmo_ros.core.observer.status import LEVEL_SHIFT
 from fhaosmo_ros.core.observer.structure import run as run_structure
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import PLANT_PARAMETERS
+from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from results import Row
 from studies.harness import model_alone, observed, SELF_TUNING
@@ -31,43 +31,39 @@ BAR = 1.1
 CALLS = {'explicit': 0.6, 'implicit': None}
 """Microseconds of a call of `Observer.step`; the implicit scheme solves an equation a level."""
 VARIANTS, SCHEMES = ('sign', 'fuzzy', 'fuzzy_adaptive'), ('explicit', 'implicit')
-MODELS = Path(__file__).parents[1] / 'config' / 'models'
 SELF_TUNING_BARS = {'paper_plant': 12.0, 'dc_motor': 12.0, 'pendulum': 100.0}
-"""Microseconds a step, of files in `MODELS`."""
-LENGTH = 30
-"""Seconds of a run at 1 kHz."""
-NOISE = 1e-4
-"""Of y, where the file has no quantum."""
+"""Microseconds a step, of files in config/models."""
+NOISE = 1e-4  # of y, where the file has no quantum
 PARTS = ('z_hat', 'z_tilde', 'p', 'q', 'gamma', 'y', 'pending')
 """What a cascade remembers, in the order of the state of reference.c."""
 LAW = ('rate', 'min', 'max', 'dead_zone', 'leakage')
 """Parameters of gamma at the end of its law there."""
-Run = Callable[[], np.ndarray]
-"""Returns the last numbers of `PARTS`, the first four for each level."""
 
 
 def measure(quick: bool) -> list[Row]:
     """Return the ratio to C, and the time of a step of every variant and scheme."""
     samples, rounds, calls = (40_000, 5, 2_000) if quick else (400_000, 15, 20_000)
-    y = output(samples + 1)
+    y = Plant({'integration_step': PERIOD}).simulate(np.arange(samples + 1) * PERIOD).y
     rows = [_against_c(y, rounds)]
     for variant, scheme in product(VARIANTS, SCHEMES):
         step = in_core(CASE | {'variant': variant, 'scheme': scheme}, y)
         step()
         best = min(_seconds(step) for _ in range(3)) / samples
         rows.append(Row(f'core step, {variant}, {scheme}', best * 1e9, 'ns'))
-    rows += [_call(scheme, y[:calls], None if quick else bar) for scheme, bar in CALLS.items()]
+    few = y[:calls].tolist()
+    for scheme, bar in CALLS.items():
+        observer = Observer(CASE | {'scheme': scheme})
+        observer.step(few[0], PERIOD)
+        best = min(_seconds(lambda o=observer: [o.step(v, PERIOD) for v in few]) for _ in range(3))
+        name = f'Observer.step, one call, {scheme}'
+        bar = None if quick else bar
+        rows.append(Row(name, best / len(few) * 1e6, 'us', bar, 'fuzzy_adaptive'))
     for model, bar in SELF_TUNING_BARS.items():
-        rows.append(_self_tuning(model, None if quick else bar, 5 if quick else LENGTH))
+        rows.append(_self_tuning(model, None if quick else bar, 5 if quick else 30))
     return rows
 
 
-def output(count: int) -> np.ndarray:
-    """Return `count` samples of the paper's plant, without noise."""
-    return np.asarray(Plant({'integration_step': PERIOD}).simulate(np.arange(count) * PERIOD).y)
-
-
-def in_core(parameters: dict[str, Any], y: np.ndarray) -> Run:
+def in_core(parameters: dict[str, Any], y: np.ndarray) -> Callable[[], np.ndarray]:
     """Return a callable that steps through y[1:] by the loop behind `Observer.run`."""
     observer, rest = _started(parameters, y[0]), np.ascontiguousarray(y[1:])
     start, count = observer.structure.state_dict(), len(rest)
@@ -81,35 +77,29 @@ def in_core(parameters: dict[str, Any], y: np.ndarray) -> Run:
     return run
 
 
-def in_c(folder: Path, y: np.ndarray) -> Run:
-    """Return a callable that steps through y[1:] in C, for `CASE`."""
+def in_c(folder: Path, y: np.ndarray) -> Callable[[], np.ndarray]:
+    """Return a callable that steps through y[1:] in C, for `CASE`; compiled by $CC, else cc."""
     c = ObserverConfiguration(CASE)
     assert c.curves.shape == (4, KNOTS) == (4, 193), 'reference.c expects other curves'
     gains = np.concatenate([c.lambdas, c.alphas, 1.0 / c.widths, c.curves[:2].ravel()])
-    gamma = [c.gamma_initial, *(c.parameters[f'gamma_{name}'] for name in LAW)]
-    packed = np.array([*gains, c.epsilon, *gamma])
-    start, rest = _numbers(_started(CASE, y[0])), np.ascontiguousarray(y[1:])
-    function, eps = _compiled(folder), np.empty(4)
+    law = np.array(
+        [*gains, c.epsilon, c.gamma_initial, *(c.parameters[f'gamma_{n}'] for n in LAW)]
+    )
+    start, rest, eps = _numbers(_started(CASE, y[0])), np.ascontiguousarray(y[1:]), np.empty(4)
+    library = folder / 'reference.so'
+    options = ['-O3', '-shared', '-fPIC', f'-DLEVEL_SHIFT={LEVEL_SHIFT}', '-o', library]
+    command = [*shlex.split(os.environ.get('CC', 'cc')), *options]
+    subprocess.run([*command, Path(__file__).with_name('reference.c'), '-lm'], check=True)
+    function = ctypes.CDLL(str(library)).run
     period, count = ctypes.c_double(PERIOD), ctypes.c_long(len(rest))
 
     def run() -> np.ndarray:
         state = start.copy()
-        law, levels, samples, innovations = (
-            x.ctypes.data_as(ctypes.c_void_p) for x in (packed, state, rest, eps)
-        )
-        function(law, levels, samples, period, count, innovations)
+        at = [x.ctypes.data_as(ctypes.c_void_p) for x in (law, state, rest, eps)]
+        function(*at[:3], period, count, at[3])
         return state
 
     return run
-
-
-def _compiled(folder: Path) -> Any:
-    """Compile reference.c into a folder by $CC, else cc; return its function."""
-    command = shlex.split(os.environ.get('CC', 'cc'))
-    options = ['-O3', '-shared', '-fPIC', f'-DLEVEL_SHIFT={LEVEL_SHIFT}', '-o']
-    files = [folder / 'reference.so', Path(__file__).with_name('reference.c'), '-lm']
-    subprocess.run([*command, *options, *files], check=True)
-    return ctypes.CDLL(str(files[0])).run
 
 
 def _started(parameters: dict[str, Any], y: float) -> Observer:
@@ -120,43 +110,29 @@ def _started(parameters: dict[str, Any], y: float) -> Observer:
 
 
 def _numbers(observer: Observer) -> np.ndarray:
-    """Return the numbers of `PARTS`."""
+    """Return the numbers of `PARTS`, the first four for each level."""
     found = observer.structure.state_dict()
     return np.concatenate([np.atleast_1d(found[name]) for name in PARTS])
 
 
 def _against_c(y: np.ndarray, rounds: int) -> Row:
-    name, times = 'core step / same step in C (-O3)', np.empty((rounds, 2))
     with TemporaryDirectory() as folder:
         ours, c = in_core(CASE, y), in_c(Path(folder), y)
         np.testing.assert_allclose(ours(), c(), rtol=1e-6, atol=1e-9)
-        for k in range(rounds):
-            times[k] = _seconds(ours), _seconds(c)
+        times = np.array([(_seconds(ours), _seconds(c)) for _ in range(rounds)])
     times *= 1e9 / (len(y) - 1)
     median, best = np.median(times, axis=0), times.min(axis=0)
     note = (
         f'N = 4, fuzzy_adaptive, explicit: {median[0]:.1f} / {median[1]:.1f} ns median, '
         f'{best[0]:.1f} / {best[1]:.1f} ns min ({best[0] / best[1]:.2f})'
     )
-    return Row(name, float(np.median(times[:, 0] / times[:, 1])), bar=BAR, note=note)
-
-
-def _call(scheme: str, y: np.ndarray, bar: float | None) -> Row:
-    samples, observer = y.tolist(), Observer(CASE | {'scheme': scheme})
-    observer.step(samples[0], PERIOD)
-
-    def run() -> None:
-        for sample in samples:
-            observer.step(sample, PERIOD)
-
-    microseconds = min(_seconds(run) for _ in range(3)) / len(samples) * 1e6
-    name = f'Observer.step, one call, {scheme}'
-    return Row(name, microseconds, 'us', bar, 'fuzzy_adaptive')
+    ratio = float(np.median(times[:, 0] / times[:, 1]))
+    return Row('core step / same step in C (-O3)', ratio, bar=BAR, note=note)
 
 
 def _self_tuning(model: str, bar: float | None, length: int) -> Row:
-    """Return microseconds a step of a recording."""
-    path = MODELS / f'{model}.yaml'
+    """Return microseconds a step of a recording of `length` seconds."""
+    path = shipped(f'config/models/{model}.yaml')
     plant = load(path, 'plant', PLANT_PARAMETERS)
     noise = {} if plant.get('quantisation') else {'noise_std': NOISE}
     t = np.arange(round(length / PERIOD)) * PERIOD

@@ -21,8 +21,7 @@ import numpy as np
 from rclpy.qos import QoSProfile
 
 ROOT = Path(__file__).parents[1]
-PATIENCE = 60.0
-"""Seconds that anything may take that is waited for."""
+PATIENCE = 60.0  # seconds that anything may take that is waited for
 DIAGNOSTICS = '/diagnostics'
 
 # What is started here is kept away from other ROS systems; the tests use the domains from 20 on.
@@ -88,15 +87,9 @@ class Watch(PrivateNode):
     Listens to /diagnostics and to some topics (name and type of each) while it is open.
 
     All times are source time stamps of the middleware (ns), taken when a message was published, so
-    what the listener itself takes does not count.
-
-    Attributes
-    ----------
-    reports : dict
-        The last diagnostics of each node, with the time of the report in 'received'.
-    outputs, not_finite : int
-        Messages of the topics, and those among them with a NaN or an infinity.
-
+    what the listener itself takes does not count. `reports` has the last diagnostics of each node,
+    with the time of the report in 'received'; `outputs` and `not_finite` count messages of the
+    topics, and those among them with a NaN or an infinity.
     """
 
     def __init__(self, topics: Mapping[str, str]) -> None:
@@ -140,8 +133,8 @@ class Watch(PrivateNode):
     def series(self, topic: str) -> tuple[Any, Any]:
         """Return times and values since `forget`, in order, as arrays."""
         with self._lock:
-            pairs = sorted(self._series[topic])
-        return np.array([at for at, _ in pairs]), np.array([value for _, value in pairs])
+            at, values = zip(*sorted(self._series[topic]), strict=True)
+        return np.array(at), np.array(values)
 
     def reported(self, node: str, name: str) -> int:
         """Return a number of a node's last report; 0 where there is none."""

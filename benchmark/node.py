@@ -1,21 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CPU, lost samples and latency of an estimator beside a node that computes nothing; its start."""
+"""
+CPU, lost samples and latency of an estimator beside a node that computes nothing; its start.
 
+This file is also what stands around the estimator: `node.py source RATE JOINTS` publishes y at an
+exact rate; sample k comes k periods after the first one, and a late one does not delay those
+behind it. It begins once it has two subscribers, and says at its end how many it has published.
+
+`node.py empty_node RATE JOINTS` has the estimator's subscription, timer, publishers and executor.
+Its messages were made once, except for the stamp of the latest sample, from which latencies are
+measured. What an estimator costs more than this is ours; what this costs is the middleware's.
+"""
+
+import math
+import signal
+import sys
+import threading
 from time import monotonic, sleep, time_ns
 from typing import NamedTuple
 
+from builtin_interfaces.msg import Time
+from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, Report
+from fhaosmo_ros.nodes.middleware.endpoints import SENSOR_QOS, subscribe_with_info
+from fhaosmo_ros.nodes.middleware.messages import labelled
+from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.topics import TIME
 from live import Children, wait_until, Watch
 import numpy as np
+import rclpy
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from results import Row
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
 from tqdm import tqdm
 
 BAR, JOINT_BAR, START_BAR = 1.2, 1.5, 2.0
 WARM_UP = 1.5
-HELD = 0.97
-"""A run counts for the ratio if each node published at this part of the rate at least."""
-AROUND, EMPTY, ESTIMATOR = 'benchmark/around.py', 'empty_node', 'estimator'
-START = ('-m', 'fhaosmo_ros', 'estimator', '--ros-args', '-p')
+HELD = 0.97  # a run counts for the ratio if each node published at this part of the rate at least
+EMPTY, ESTIMATOR = 'empty_node', 'estimator'
+SUBSCRIBERS = 2
+SETTLE = 0.5
+"""Seconds between the match as seen from here and the first sample: the other side's match."""
 
 
 class Case(NamedTuple):
@@ -49,16 +74,11 @@ CASES = (
 class Run(NamedTuple):
     """What was seen in one run."""
 
-    share: float
-    """CPU time of the estimator over wall time."""
-    ratio: float | None
-    """CPU over that of the empty node; None if one was starved, which then costs less."""
-    sent: int
-    """Samples that were published."""
-    lost: int
-    """Samples that the estimator has not taken."""
-    latency: tuple[float, float]
-    """Seconds from a sample's publication to its first estimate: median and 99 %."""
+    share: float  # CPU time of the estimator over wall time
+    ratio: float | None  # over that of the empty node; None if one was starved: that costs less
+    sent: int  # samples that were published
+    lost: int  # samples that the estimator has not taken
+    latency: tuple[float, float]  # seconds from sample to its first estimate: median and 99 %
 
 
 def measure(quick: bool) -> list[Row]:
@@ -90,7 +110,7 @@ def startup(quick: bool) -> list[Row]:
         found = []
         for _ in range(1 if quick else 5):
             with Children() as children:
-                node = children.start(ESTIMATOR, *START, f'gains:={gains}')
+                node = children.start_node(ESTIMATOR, '--ros-args', '-p', f'gains:={gains}')
                 found.append((node.wait_for('estimating'), node.cpu_seconds()))
         wall, processor = np.median(found, axis=0).tolist()
         note = f'{processor:.2g} s of CPU; {", ".join(f"{w:.2f}" for w, _ in found)}'
@@ -100,17 +120,17 @@ def startup(quick: bool) -> list[Row]:
 
 def observe(case: Case, seconds: float) -> Run:
     """Start a source of y, an estimator and an empty node, both on the same samples."""
-    estimator = [*START, f'gains:={case.gains}']
-    estimator += ['-p', f'publish_rate:={case.out}' if case.out else 'publish_on:=sample']
-    estimator += ['-p', 'channels:=[from_joint_names]'] if case.joints else []
-    joints, joint = ('--joints', str(case.joints)), '/joint1' if case.joints else ''
+    given = ['--ros-args', '-p', f'gains:={case.gains}']
+    given += ['-p', f'publish_rate:={case.out}' if case.out else 'publish_on:=sample']
+    given += ['-p', 'channels:=[from_joint_names]'] if case.joints else []
+    joint = '/joint1' if case.joints else ''
     watched = [f'/{name}{joint}/stamp' for name in (ESTIMATOR, EMPTY)]
     with Children() as children, Watch(dict.fromkeys(watched, TIME)) as watch:
-        ours = children.start(ESTIMATOR, *estimator)
-        empty = children.start(EMPTY, AROUND, EMPTY, '--rate', str(case.out), *joints)
+        ours = children.start_node(ESTIMATOR, *given)
+        empty = children.start(EMPTY, __file__, EMPTY, str(case.out), str(case.joints))
         ours.wait_for('waiting' if case.joints else 'estimating')
         empty.wait_for('computing nothing')
-        source = children.start('source', AROUND, 'source', '--rate', str(case.rate), *joints)
+        source = children.start('source', __file__, 'source', str(case.rate), str(case.joints))
         source.wait_for('publishing')
         wait_until(lambda: all(map(watch.count, watched)), 'not all nodes published')
         sleep(WARM_UP)
@@ -131,3 +151,107 @@ def observe(case: Case, seconds: float) -> Run:
     ratio = float(cpu[0] / cpu[1]) if held else None
     share, lost = float(cpu[0]) / elapsed, sent - watch.taken(ESTIMATOR)
     return Run(share, ratio, sent, lost, (median, most))
+
+
+def joint_state(count: int) -> JointState:
+    """Return a message of so many joints with zeros."""
+    names, zeros = [f'joint{k + 1}' for k in range(count)], [0.0] * count
+    return JointState(name=names, position=zeros, velocity=zeros, effort=zeros)
+
+
+def publish_samples(rate: float, joints: int, ended: threading.Event) -> None:
+    """Publish y, or the positions of some joints, at a rate (Hz) until the end."""
+    node = Node('source', start_parameter_services=False)
+    message = joint_state(joints) if joints else Float64()
+    publisher = node.create_publisher(type(message), 'joint_states' if joints else 'y', 10)
+    while not ended.is_set() and publisher.get_subscription_count() < SUBSCRIBERS:
+        sleep(0.02)
+    sleep(SETTLE)
+    print('publishing', flush=True)
+    count, start = 0, monotonic()
+    while not ended.is_set():
+        sleep(max(0.0, start + count / rate - monotonic()))
+        y = 0.2 + 0.1 * math.sin(count / rate)
+        if joints:
+            message.position = [y] * joints
+            stamp = divmod(time_ns(), 1_000_000_000)
+            message.header.stamp.sec, message.header.stamp.nanosec = stamp
+        else:
+            message.data = y
+        publisher.publish(message)
+        count += 1
+    sleep(SETTLE)  # the last samples leave before their writer does
+    print('published', count, flush=True)
+    node.destroy_node()
+
+
+class EmptyNode(Node):
+    """Counts samples; publishes constants, and the stamp of the latest sample."""
+
+    def __init__(self, rate: float, joints: int) -> None:
+        super().__init__(EMPTY)
+        self._count = self._latest = 0
+        self._stamp, self._joint_states = Time(), joint_state(max(joints, 1))
+        outputs = [('~/joint_states', self._joint_states)]
+        for prefix in [f'~/joint{k + 1}/' for k in range(joints)] or ['~/']:
+            outputs += [
+                (f'{prefix}state', labelled(['z1', 'z2', 'z3'])(np.zeros(3))),
+                (f'{prefix}unknown_input', Float64()),
+                (f'{prefix}gamma', Float64()),
+                (f'{prefix}innovation', labelled(['eps1', 'eps2', 'eps3', 'eps4'])(np.zeros(4))),
+                (f'{prefix}stamp', self._stamp),
+            ]
+        self._outputs = [
+            (self.create_publisher(type(message), topic, 10).publish, message)
+            for topic, message in outputs
+        ]
+        self._diagnostics = DiagnosticsPublisher(
+            self, self._reports, {'diagnostics_period': 1.0, 'hardware_id': 'none'}
+        )
+        self._each = not rate
+        if rate:
+            self._timer = self.create_timer(1.0 / rate, self._publish)
+        kind, topic = (JointState, 'joint_states') if joints else (Float64, 'y')
+        self._y = subscribe_with_info(self, kind, topic, self._on_sample, SENSOR_QOS)
+        self.get_logger().info('computing nothing')
+
+    def _on_sample(self, message: Float64 | JointState, info: dict[str, int]) -> None:
+        self._count += 1
+        self._latest = info['source_timestamp']
+        if isinstance(message, JointState):
+            stamp = message.header.stamp
+            self._latest = stamp.sec * 1_000_000_000 + stamp.nanosec
+        if self._each:
+            self._publish()
+
+    def _publish(self) -> None:
+        if self._latest:
+            self._stamp.sec, self._stamp.nanosec = divmod(self._latest, 1_000_000_000)
+            self._joint_states.header.stamp = self._stamp
+            for publish, message in self._outputs:
+                publish(message)
+
+    def _reports(self) -> list[Report]:
+        """Return as many values as the estimator's reports have."""
+        report = Report('input')
+        report.values = {'samples accepted': self._count, **{f'value {k}': 0 for k in range(30)}}
+        return [report]
+
+
+def main(what: str, rate: str, joints: str) -> None:
+    """Run the source, or the empty node, until SIGINT."""
+    ended = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: ended.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    if what == 'source':
+        publish_samples(float(rate), int(joints), ended)
+    else:
+        node = EmptyNode(float(rate), int(joints))
+        with Spinner(node, on_end=ended.set):
+            ended.wait()
+        node.destroy_node()
+    rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])

@@ -29,13 +29,10 @@ class Row(NamedTuple):
     """One line of the result."""
 
     name: str
-    value: float | None
-    """None if it could not be measured; then a bar counts as missed."""
+    value: float | None  # none if it could not be measured; then a bar counts as missed
     unit: str = ''
-    bar: float | None = None
-    """Highest allowed value."""
-    note: str = ''
-    """The numbers behind the value."""
+    bar: float | None = None  # highest allowed value
+    note: str = ''  # the numbers behind the value
 
     @property
     def missed(self) -> bool:
@@ -43,26 +40,20 @@ class Row(NamedTuple):
         return self.bar is not None and (self.value is None or not self.value <= self.bar)
 
     @property
-    def cells(self) -> tuple[str, str]:
-        """Value and bar as a reader sees them."""
+    def cells(self) -> tuple[str, str, str]:
+        """Name, value and bar as a reader sees them."""
         value = '-'
         if self.value is not None:
             digits = '.0f' if abs(self.value) >= 100.0 else '.3g'
             value = f'{self.value:{digits}} {self.unit or ""}'.strip()
-        return value, '' if self.bar is None else f'<= {self.bar:g}'
+        return self.name, value, '' if self.bar is None else f'<= {self.bar:g}'
 
 
 def render(rows: Iterable[Row]) -> str:
-    """Return the rows as an aligned table."""
-    lines = [('', 'measured', 'allowed', '', '')]
-    for row in rows:
-        verdict = '' if row.bar is None else 'MISSED' if row.missed else 'pass'
-        lines.append((row.name, *row.cells, verdict, row.note))
-    name, value, bar, verdict, _ = (max(map(len, column)) for column in zip(*lines, strict=True))
-    return '\n'.join(
-        f'{a:<{name}}  {b:>{value}}  {c:<{bar}}  {d:<{verdict}}  {e}'.rstrip()
-        for a, b, c, d, e in lines
-    )
+    """Return the rows as a table."""
+    verdicts = ('', 'pass', 'MISSED')
+    lines = [(*r.cells, verdicts[(r.bar is not None) + r.missed], r.note) for r in rows]
+    return evidence.markdown(['', 'measured', 'allowed', '', ''], lines)
 
 
 def machine() -> str:
@@ -77,12 +68,5 @@ def machine() -> str:
 def texts(rows: Iterable[Mapping[str, Any]]) -> dict[str, str]:
     """Return the part of the page, from the table."""
     found = {row['name']: Row(*(row[k] for k in Row._fields)) for row in rows}
-    lines = [(name, *found[name].cells) for name in SHOWN]
+    lines = [found[name].cells for name in SHOWN]
     return {NAME: evidence.markdown(['', 'measured', 'allowed'], lines)}
-
-
-def publish(part: str, rows: Iterable[Row], where: str) -> None:
-    """Replace the lines of a part in the table, and the rows of the page."""
-    kept = [row for row in evidence.read(NAME) if row['part'] != part]
-    new = evidence.rounded({'part': part, **row._asdict(), 'machine': where} for row in rows)
-    evidence.publish(evidence.DOCS, {NAME: [*kept, *new]}, texts([*kept, *new]), {})

@@ -16,7 +16,8 @@ from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
 import node
 import replay
-from results import machine, publish, render, Row
+from results import machine, NAME, render, Row, texts
+from studies import evidence
 
 PARTS = {
     'core': core_step.measure, 'node': node.measure, 'startup': node.startup,
@@ -36,26 +37,25 @@ def main() -> int:
     def body(arguments: argparse.Namespace, stop: Stop) -> int:
         if arguments.page and arguments.quick:
             parser.error('--page shows full measurements: expected no --quick, got --quick')
+        rows: list[Row] = []
+        where = machine()
         with stop.raising():
-            return measure(arguments)
+            for part in [arguments.only] if arguments.only else PARTS:
+                found = PARTS[part](arguments.quick)
+                if arguments.page:
+                    publish(part, found, where)
+                rows += found
+        print(f'{where}\n\n{render(rows)}')
+        return 1 if any(row.missed for row in rows) and not arguments.quick else 0
 
     return run_command(parser, None, body)
 
 
-def measure(arguments: argparse.Namespace) -> int:
-    """Return 1 if a bar is missed."""
-    rows: list[Row] = []
-    where = machine()
-    for part in [arguments.only] if arguments.only else PARTS:
-        found = PARTS[part](arguments.quick)
-        if arguments.page:
-            publish(part, found, where)
-        rows += found
-    print(f'{where}\n\n{render(rows)}')
-    missed = [row.name for row in rows if row.missed]
-    if missed:
-        print(f'\n{len(missed)} of the bars missed: {"; ".join(missed)}')
-    return 1 if missed and not arguments.quick else 0
+def publish(part: str, rows: list[Row], where: str) -> None:
+    """Replace the lines of a part in the table, and the rows of the page."""
+    kept = [row for row in evidence.read(NAME) if row['part'] != part]
+    new = evidence.rounded({'part': part, **row._asdict(), 'machine': where} for row in rows)
+    evidence.publish(evidence.DOCS, {NAME: [*kept, *new]}, texts([*kept, *new]), {})
 
 
 if __name__ == '__main__':

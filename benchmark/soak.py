@@ -15,6 +15,7 @@ import argparse
 from collections import Counter
 from collections.abc import Iterator, Mapping
 import json
+import math
 import os
 from pathlib import Path
 import signal
@@ -53,37 +54,28 @@ TOPICS = {
     TRUTH: FLOAT, ESTIMATE: FLOAT, GAMMA: FLOAT, STAMP: TIME, '/estimator/state': ARRAY,
     '/estimator/innovation': ARRAY,
 }  # fmt: skip
-CYCLE = 20.0
-"""Seconds: faults, then rest. The first cycle has no faults: caches fill."""
-FAULTS = (0.5, 11.0)
-"""When in a cycle faults begin."""
-PAUSE = (0.2, 1.2)
-"""Shortest and longest time between two faults, in seconds."""
+CYCLE, FAULTS, RESTORE, JUDGED = 20.0, (0.5, 11.0), 12.0, (15.0, 19.5)
+"""
+Seconds of a cycle, and when in it faults begin, parameters are put back, and the estimate must be
+right. The first cycle has no faults: caches fill.
+"""
+PAUSE = (0.2, 1.2)  # shortest and longest time between two faults, in seconds
 STREAM = {
     'nan': (1, 20), 'infinity': (1, 20), 'spike': (1, 3), 'duplicate': (1, 50), 'stuck': (5, 100),
     'burst': (2, 40), 'short gap': (2, 100), 'long gap': (300, 600), 'publisher restart': (1, 1),
 }  # fmt: skip
 """Faults of y, with the smallest and largest number of samples that each concerns."""
-CALLS = ('good parameters', 'bad parameters', 'reset')
-"""What a client does meanwhile."""
-SPIKE = 1e3
-SETTLE = 0.5
-"""Seconds from the match of a new publisher, as seen from here, to its first sample."""
-RESTORE, JUDGED = 12.0, (15.0, 19.5)
-"""When in a cycle parameters are put back, and when the estimate must be right."""
-PAIRED = 5_000_000
-"""Nanoseconds within which the topics of one estimate are published."""
-LAST = 10.0
-"""Seconds that the last samples, and the report of them, may take on a busy machine."""
-MEMORY = 2.0
-"""MB that the estimator's memory may grow by over the run."""
+CALLS = ('good parameters', 'bad parameters', 'reset')  # what a client does meanwhile
+SETTLE = 0.5  # seconds from the match of a new publisher, as seen from here, to its first sample
+PAIRED = 5_000_000  # nanoseconds within which the topics of one estimate are published
+LAST = 10.0  # seconds that the last samples, and the report of them, may take on a busy machine
+MEMORY, DRIFT = 2.0, 0.02
+"""What the estimator's memory (MB) may grow by; gamma, from the first to the last third."""
 ERROR, ERROR_GROWTH, MANY = 0.05, 0.01, 15
 """
 Largest median error of d in any judged window (half of d's amplitude), what it may grow by between
 the first and the last third, and from how many windows on that is judged.
 """
-DRIFT = 0.02
-"""What gamma may move between the first and the last third."""
 LOST, GROWTH, WORST = (
     'samples lost, by sequence number', 'error of d, growth', 'error of d, worst window',
 )  # fmt: skip
@@ -95,7 +87,7 @@ SETS = {
         {'estimate_from': 'filtered'}, {'gamma_rate': 4.0, 'gamma_min': 0.4, 'gamma_max': 0.6},
     ),
     'bad parameters': (
-        {'variant': 'fuzy'}, {'lambda': [-1.0]}, {'alpha': [1.0, 2.0]}, {'epsilon': float('nan')},
+        {'variant': 'fuzy'}, {'lambda': [-1.0]}, {'alpha': [1.0, 2.0]}, {'epsilon': math.nan},
         {'gamma_min': 0.9, 'gamma_max': 0.2}, {'order': 7}, {'publish_rate': 0.0},
         {'no_such_parameter': 1.0},
     ),
@@ -163,12 +155,8 @@ class FaultyPlant(PlantNode):
         if self._take('short gap') or self._take('long gap'):
             return []
         self._last = y = self._last if self._take('stuck') else y
-        if self._take('nan'):
-            y = float('nan')
-        elif self._take('infinity'):
-            y = float('inf')
-        elif self._take('spike'):
-            y += SPIKE
+        for kind, value in (('nan', math.nan), ('infinity', math.inf), ('spike', y + 1e3)):
+            y = value if self._take(kind) else y
         if self._take('burst'):
             self._held.append(y)
             return []
@@ -188,11 +176,8 @@ class Client(PrivateNode):
     """
     Changes the estimator's parameters, well and badly, and resets it.
 
-    Attributes
-    ----------
-    counts : Counter
-        Calls by kind, and 'wrong answers': a bad set that was accepted, a good one refused.
-
+    `counts` has the calls by kind, and 'wrong answers': a bad set that was accepted, a good one
+    refused.
     """
 
     def __init__(self) -> None:
@@ -206,16 +191,13 @@ class Client(PrivateNode):
         if kind == 'reset':
             right = self._answer(self._reset.call_async(Trigger.Request())).success
         else:
-            accepted = self._set(SETS[kind][self.counts[kind] % len(SETS[kind])])
+            accepted = self.set(SETS[kind][self.counts[kind] % len(SETS[kind])])
             right = accepted == (kind == 'good parameters')
         self.counts[kind] += 1
         self.counts['wrong answers'] += not right
 
-    def restore(self) -> None:
-        """Put the parameters back."""
-        self.counts['wrong answers'] += not self._set(BASE)
-
-    def _set(self, values: Mapping[str, Any]) -> bool:
+    def set(self, values: Mapping[str, Any]) -> bool:
+        """Set parameters of the estimator; return whether it accepted them."""
         wait_until(self._parameters.services_are_ready, 'the estimator offers no parameters')
         parameters = [Parameter(name, value=value) for name, value in values.items()]
         answer = self._answer(self._parameters.set_parameters_atomically(parameters))
@@ -276,10 +258,10 @@ def soak(seed: int, minutes: float, output: Path) -> set[str]:
         estimator.wait_for('estimating')
         plant.wait_for('injecting')
         calls = (event for event in schedule(seed) if event[1] in CALLS)
-        time, kind, _ = next(calls)
-        restored, judging, start = 0, False, monotonic()
-        with tqdm(total=round(seconds), desc='soak', unit='s', mininterval=1.0) as progress:
-            while (now := monotonic() - start) < seconds:
+        (time, kind, _), start = next(calls), monotonic()
+        restored, judging = 0, False
+        for second in tqdm(range(round(seconds)), desc='soak', unit='s', mininterval=1.0):
+            while (now := monotonic() - start) < second + 1:
                 sleep(0.02)
                 children.check()
                 cycle, phase = divmod(now, CYCLE)
@@ -287,32 +269,28 @@ def soak(seed: int, minutes: float, output: Path) -> set[str]:
                     client.call(kind)
                     time, kind, _ = next(calls)
                 if phase >= RESTORE and restored <= cycle:
-                    client.restore()
+                    client.counts['wrong answers'] += not client.set(BASE)
                     restored += 1
                 if judging != (JUDGED[0] <= phase < JUDGED[1]):
                     judging = not judging
                     if judging:
                         watch.forget()
                     else:
-                        windows.append((now, *judged(watch)))
-                if now >= progress.n + 1:
-                    progress.update(int(now) - progress.n)
-                    if now > CYCLE:
-                        memory.append((now, estimator.resident_megabytes()))
+                        windows.append(judged(watch))
+            if now > CYCLE:
+                memory.append((now, estimator.resident_megabytes()))
         plant.interrupt()
         plant.wait_for('}')
         faults = Counter(json.loads(plant.output().splitlines()[-1]))
         deadline = monotonic() + LAST
         while unaccounted(faults, watch) and monotonic() < deadline:
             sleep(0.1)
-    course = np.array(windows)
-    rows = verdict(np.array(memory), course, faults, client.counts, watch)
+    rows = verdict(np.array(memory), np.array(windows), faults, client.counts, watch)
     said = ', '.join(f'{n:,} {k}' for k, n in sorted(faults.items()))
     load = f'{os.cpu_count()} cores, load {os.getloadavg()[1]:.1f}'
     text = f'{minutes:g} minutes, seed {seed}, {load}: {said}\n\n{render(rows)}\n'
     output.mkdir(parents=True, exist_ok=True)
     (output / 'soak.txt').write_text(text)
-    np.savetxt(output / 'windows.csv', course, delimiter=',', header='t,error,gamma')
     missed = [row.name for row in rows if row.missed]
     print(text, f'FAILED: {"; ".join(missed)}' if missed else 'passed', sep='\n')
     return set(missed)
@@ -331,7 +309,7 @@ def judged(watch: Watch) -> tuple[float, float]:
     Medians, because a busy machine delays single samples.
     """
     if not all(watch.count(topic) for topic in (TRUTH, ESTIMATE, GAMMA, STAMP)):
-        return float('nan'), float('nan')
+        return math.nan, math.nan
     (published, d), (times, stamps), (at, truth) = map(watch.series, (ESTIMATE, STAMP, TRUTH))
     after = np.minimum(np.searchsorted(times, published), len(times) - 1)
     paired = np.abs(times[after] - published) < PAIRED
@@ -346,15 +324,15 @@ def verdict(
     """
     Return one row for each thing that a soak may fail on.
 
-    `memory` has seconds and MB of the estimator; `windows` the end of each judged one (s), and
-    the medians of error of d and of gamma in it.
+    `memory` has seconds and MB of the estimator; `windows` what `judged` found in each.
     """
     t, used = memory[:: max(1, len(memory) // 300)].T
     growth = float(theilslopes(used, t).slope * (t[-1] - t[0]))  # the median of all slopes
-    _, error, gamma = windows.T
+    error, gamma = windows.T
     errors, gammas = _ends(error), _ends(gamma)
     taken, lost = watch.taken('estimator'), watch.reported('estimator', 'samples lost')
     made = ', '.join(f'{n} {kind}' for kind, n in calls.items() if kind != 'wrong answers')
+    allowed = ERROR_GROWTH if len(error) >= MANY else ERROR
     return [
         Row('memory of estimator, growth', growth, 'MB', MEMORY,
             f'{used[0]:.1f} to {used[-1]:.1f} MB after warm-up'),
@@ -362,7 +340,7 @@ def verdict(
             f'{faults["published"]:,} published, {taken:,} used or rejected'),
         Row(LOST, lost, '', 0.0),
         Row('outputs that are not finite', watch.not_finite, '', 0.0, f'of {watch.outputs:,}'),
-        Row(GROWTH, errors[1] - errors[0], '', ERROR_GROWTH if len(error) >= MANY else ERROR,
+        Row(GROWTH, errors[1] - errors[0], '', allowed,
             f'{errors[0]:.2g} to {errors[1]:.2g}, medians of the first and the last third'),
         Row(WORST, error.max(), '', ERROR, f'{len(error)} windows, median {np.median(error):.2g}'),
         Row('gamma, drift', abs(gammas[1] - gammas[0]), '', DRIFT,

@@ -15,23 +15,22 @@ from collections.abc import Sequence
 import sys
 from typing import Any, NamedTuple
 
+from fhaosmo_ros import core
 from fhaosmo_ros.core import EventDetector, Observer, TriangularModel
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.core.simulation import recordings
 from fhaosmo_ros.tools.plot.figures import COLOURS
 from matplotlib.figure import Figure
 import numpy as np
 from scipy.signal import lfilter
 from studies import evidence
-from studies.comparison.methods.kalman import estimates, SampledModel
 from studies.evidence import Row
 from studies.harness import Floats, Found, Results, run_study, SELF_TUNING
+from studies.methods import estimates, SampledModel
 
 NAME = 'events'
 H, NOISE, LOAD, FAULT, LASTS, EVERY, SETTLED = 0.01, 1e-3, 0.05, 1.0, 2.0, 20.0, 60.0
 HOURS, QUICK_HOURS = 10.0, 0.5
 MODEL: dict[str, Any] = {'order': 2, 'phi': ['0', '-z2']}
-SELF_TUNED = MODEL | SELF_TUNING
 THRESHOLDS = np.geomspace(0.08, 0.9, 14)
 DEVIATIONS, DURATION = 5.0, 0.03
 FACTORS, NEVER = (1.0, 3.0), 0.05
@@ -45,6 +44,9 @@ class Recording(NamedTuple):
     y: Floats
     d: Floats
     faults: Floats
+
+
+Estimate = tuple[Floats, Floats]  # d and its standard deviation
 
 
 def record(hours: float, seed: int, noise: float = NOISE, faults: bool = False) -> Recording:
@@ -66,22 +68,22 @@ def record(hours: float, seed: int, noise: float = NOISE, faults: bool = False) 
     return Recording(z1 + noise * rng.standard_normal(count), d, begins)
 
 
-def kalman(y: Floats, intensity: float) -> tuple[Floats, Floats]:
-    """Return d by the filter whose d is a random walk, and no standard deviation."""
+def kalman(y: Floats, intensity: float) -> Estimate:
+    """Return what the filter says whose d is a random walk; it has no standard deviation."""
     model = TriangularModel(MODEL['phi'])
     gain = SampledModel(model, H).kalman(intensity / NOISE**2)
     t, none = H * np.arange(len(y)), np.zeros(len(y))
-    samples = recordings.Recording(t, y, none, none[:, None], none, FILTER)
+    samples = core.Recording(t, y, none, none[:, None], none, FILTER)
     return estimates(model, gain, 0.0, samples, 1.5 * H)[:, model.order], none
 
 
-def self_tuning(y: Floats) -> tuple[Floats, Floats]:
-    """Return d and its standard deviation by an observer that is told the model and no more."""
-    observer, parts = Observer(SELF_TUNED), []
+def self_tuning(y: Floats) -> Estimate:
+    """Return what an observer says that is told the model and no more."""
+    observer, parts = Observer(MODEL | SELF_TUNING), []
     for part in np.array_split(np.arange(len(y)), max(1, len(y) // 100_000)):
         found = observer.run(np.round(part * H * 1e9).astype(np.int64), y[part])
         parts.append((found.unknown_input, found.standard_deviation[:, -1]))
-    d, deviation = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    d, deviation = map(np.concatenate, zip(*parts, strict=True))
     return d, deviation
 
 
@@ -150,9 +152,7 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     tried = results({q: (points, FILTER, q, 1.0, 11, few, few) for q in INTENSITIES.tolist()})
     intensity = min(tried, key=lambda q: best(tried[q]).delay)
     cells = [(factor, name) for factor in FACTORS for name in (FILTER, OURS)]
-    found = results({
-        (factor, name): (points, name, intensity, factor, 1, hours, few) for factor, name in cells
-    })  # fmt: skip
+    found = results({(f, name): (points, name, intensity, f, 1, hours, few) for f, name in cells})
     rows = evidence.rounded(
         {
             'noise': factor * NOISE, 'estimator': name,
@@ -178,19 +178,17 @@ def draw(rows: Sequence[Row]) -> Figure:
     figure = Figure(figsize=(9.5, 4.2), layout='constrained')
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     for factor, axes in zip(FACTORS, panels, strict=True):
-        for k, name in enumerate((FILTER, OURS)):
+        for colour, name in zip(COLOURS, (FILTER, OURS), strict=False):
             shown = [p for p in points_of(rows, factor, name) if p.found > 0.9]
-            axes.plot(
-                [max(p.false, NEVER) for p in shown], [p.delay for p in shown], 'o-',
-                color=COLOURS[k], markersize=4, label=name,
-            )  # fmt: skip
-        title = f'noise of {factor * NOISE:g} rad'
-        axes.set_title(title + (', nothing told' if factor > 1.0 else ''))
-        axes.set_xscale('log')
-        axes.set_xlabel(f'false alarms an hour (leftmost: none in {HOURS:g} hours)')
+            x, y = [max(p.false, NEVER) for p in shown], [p.delay for p in shown]
+            axes.plot(x, y, 'o-', color=colour, markersize=4, label=name)
+        told = ', nothing told' if factor > 1.0 else ''
+        axes.set(
+            title=f'noise of {factor * NOISE:g} rad{told}', xscale='log',
+            xlabel=f'false alarms an hour (leftmost: none in {HOURS:g} hours)',
+        )  # fmt: skip
         axes.grid(alpha=0.3)
-    panels[0].set_ylabel('median delay [s]')
-    panels[0].set_ylim(0.0, None)
+    panels[0].set(ylabel='median delay [s]', ylim=(0.0, None))
     panels[0].legend()
     return figure
 

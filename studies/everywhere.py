@@ -9,10 +9,9 @@ beside a Kalman filter that is tuned anew with the truth for each.
 import argparse
 import math
 import sys
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from fhaosmo_ros.core import Recording, TriangularModel
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core import ConfigurationError, Recording, TriangularModel
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 from fhaosmo_ros.core.simulation.plant import quantised, respond
@@ -20,20 +19,20 @@ from fhaosmo_ros.tools.cli.command import shipped
 import numpy as np
 from scipy.signal import lfilter
 from studies import evidence
-from studies.comparison.methods import METHODS
-from studies.comparison.methods.kalman import HUBER, IMM, LINEAR_LIMIT, NOISE
-from studies.comparison.methods.method import (
-    Estimates,
-    JUDGED_FROM,
+from studies.evidence import markdown, Row
+from studies.harness import Found, observed, Results, run_study, SELF_TUNING
+from studies.methods import (
+    HUBER,
+    IMM,
+    LINEAR_LIMIT,
     mean,
+    METHODS,
+    NOISE,
     objective,
     Setting,
     tune,
     Values,
 )
-from studies.comparison.methods.observers import model_of
-from studies.evidence import markdown, Row
-from studies.harness import Floats, Found, observed, Results, run_study, SELF_TUNING
 from studies.waves import wave
 
 NAME = 'everywhere'
@@ -41,28 +40,27 @@ STEP, RATE, SEED = 5e-4, 1000.0, 1
 
 
 class Plant(NamedTuple):
-    """A plant, its d and noise as tuned, and the shipped file for it."""
+    """A plant, its d and noise as tuned, and its sensor."""
 
     phi: tuple[str, ...]
-    start: tuple[float, ...]
-    size: float
-    """RMS of d."""
-    speed: float
-    """About how fast d moves, in rad/s."""
+    size: float  # RMS of d
+    speed: float  # about how fast d moves (rad/s)
     noise: float
-    file: str
+    rate: float = RATE  # Hz
+    start: tuple[float, ...] = ()
+    file: str = ''  # the shipped one
 
 
 PLANTS = {
     "paper's plant": Plant(
-        ('0', '0', '-z3'), (0.2, 0.2, 0.2), 0.07, 1.0, 1e-3, 'config/noise_1e-3.yaml',
+        ('0', '0', '-z3'), 0.07, 1.0, 1e-3, start=(0.2, 0.2, 0.2), file='config/noise_1e-3.yaml',
     ),
     'pendulum': Plant(
-        ('0', '-19.62*sin(z1) - 0.3*z2 - 0.5*tanh(z2/0.1)'), (0.5, 0.0), 2.8, 2.0, 5e-4,
-        'config/models/pendulum.yaml',
+        ('0', '-19.62*sin(z1) - 0.3*z2 - 0.5*tanh(z2/0.1)'), 2.8, 2.0, 5e-4, start=(0.5, 0.0),
+        file='config/models/pendulum.yaml',
     ),
     'motor': Plant(
-        ('0', '-25*z2'), (0.0, 0.0), 70.0, 3.0, 4.4e-4, 'config/models/dc_motor.yaml',
+        ('0', '-25*z2'), 70.0, 3.0, 4.4e-4, start=(0.0, 0.0), file='config/models/dc_motor.yaml',
     ),
 }  # fmt: skip
 
@@ -71,18 +69,17 @@ class Condition(NamedTuple):
     """What differs from the condition of the tuning; factors, but for `rate` and `kind`."""
 
     noise: float = 1.0
-    later: float = 1.0
-    """On the noise of the second half."""
+    later: float = 1.0  # on the noise of the second half
     rate: float = RATE
     speed: float = 1.0
     size: float = 1.0
-    phi: float = 1.0
-    """On the functions that the estimators are told; the plant stays."""
+    phi: float = 1.0  # on the functions that the estimators are told; the plant stays
     kind: str = 'white'
 
 
+TUNED = 'as tuned'
 CONDITIONS = {
-    'as tuned': Condition(),
+    TUNED: Condition(),
     'noise x 10': Condition(noise=10.0),
     'noise / 10': Condition(noise=0.1),
     'noise x 10 from the middle on': Condition(later=10.0),
@@ -102,7 +99,6 @@ CONDITIONS = {
     'noise AR(1), 0.9': Condition(kind='0.9'),
     'y off by 1 for 0.5 s': Condition(kind='off'),
 }
-TUNED = 'as tuned'
 SELF, ONCE, PRESET = 'self-tuning', 'Kalman, tuned once', 'shipped file'
 STYLES = {
     SELF: evidence.SELF, ONCE: evidence.USUAL, PRESET: evidence.TUNED, HUBER: evidence.ROBUST,
@@ -114,10 +110,11 @@ PEERS: dict[str, list[dict[str, float]]] = {
     IMM: [{'spread': f, 'stay': seconds} for f in (1.5, 2.0, 3.0) for seconds in (1.0, 10.0)],
 }
 """What the tuning chooses from, around the filter that it has found."""
-ANEW = 'tuned anew'
-"""Error of d of the Kalman filter tuned for the condition; all others are over this."""
-KNOWN = 'every z known'
-"""What a wrong Phi makes of d, whoever estimates it."""
+ANEW, KNOWN = 'tuned anew', 'every z known'
+"""
+Errors of d: of the Kalman filter tuned for the condition, all others are over this; and what a
+wrong Phi makes of d, whoever estimates it.
+"""
 Once = tuple[dict[str, float], dict[str, dict[str, float]]]
 """What the tuning has found with the truth: a filter for `RATE`, and one of each of `PEERS`."""
 
@@ -173,27 +170,41 @@ def setting_of(plant: Plant, c: Condition) -> Setting:
     return Setting(TriangularModel(told), 1.0 / c.rate, plant.size, plant.noise)
 
 
-def error(r: Recording, d: Floats) -> float:
-    """Return the RMS error of d over its RMS, after the transient."""
-    return objective(r, Estimates(r.z, d))
-
-
-def errors_of(
-    name: str, setting: Setting, values: Values, recordings: list[Recording]
-) -> list[float]:
-    """Return the errors of a method of the comparison; infinite where it does not exist."""
+def error_of(name: str, setting: Setting, values: Values, recordings: list[Recording]) -> float:
+    """Return the mean error of a method of the comparison; infinite where it does not exist."""
     try:
         run = METHODS[name].prepare(setting, values)
     except ConfigurationError:
-        return [math.inf] * len(recordings)
-    return [error(r, run(r)['filtered'].d) for r in recordings]
+        return math.inf
+    return mean(objective(r, run(r)[0][:, -1]) for r in recordings)
 
 
 def implied(plant: Plant, c: Condition, recordings: list[Recording]) -> float:
     """Return the error of the d that a wrong Phi implies, where every z is known exactly."""
     phi = TriangularModel(plant.phi)
     off = [(1.0 - c.phi) * np.array([phi.evaluate(z)[-1] for z in r.z]) for r in recordings]
-    return mean([error(r, r.d + e) for r, e in zip(recordings, off, strict=True)])
+    return mean(objective(r, r.d + e) for r, e in zip(recordings, off, strict=True))
+
+
+class SelfTuned(NamedTuple):
+    """How self-tuning does, by recording."""
+
+    errors: list[float]
+    inside: list[float]  # mean shares of d within 1 and 1.96 deviations
+    largest: float  # |d|, over the largest true one
+
+
+def self_tuned(setting: Setting, recordings: list[Recording]) -> SelfTuned:
+    """Run the self-tuning estimator, which is told only the model."""
+    errors, inside, largest, since = [], [], 0.0, setting.judged_from
+    for r in recordings:
+        found = observed(setting.told | SELF_TUNING, r.t, r.y)
+        d = found.unknown_input
+        errors.append(objective(r, d, since))
+        away = np.abs(d - r.d) / found.standard_deviation[:, -1]
+        inside.append([np.mean((away < k)[r.t >= since]) for k in (1.0, 1.96)])
+        largest = max(largest, np.abs(d).max() / np.abs(r.d).max())
+    return SelfTuned(errors, np.mean(inside, axis=0).tolist(), largest)
 
 
 def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row, Once]:
@@ -201,42 +212,29 @@ def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row,
     plant, c = PLANTS[name], CONDITIONS[condition]
     recordings = [recording(plant, c, kind, size.duration) for kind in size.kinds]
     setting = setting_of(plant, c)
-    n = setting.model.order
 
-    def errors(method: str, values: Values) -> float:
-        return mean(errors_of(method, setting, values, recordings))
+    def error(method: str, values: Values) -> float:
+        return error_of(method, setting, values, recordings)
 
     anew = tune(METHODS[LINEAR_LIMIT], setting, recordings, size.trials, SEED).values
     if once is None:
         best = {
-            peer: min(choices, key=lambda own, peer=peer: errors(peer, anew | own))
+            peer: min(choices, key=lambda own, peer=peer: error(peer, anew | own))
             for peer, choices in PEERS.items()
         }
         once = anew, best
-    values = at(once[0], n, c.rate)
-    preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | model_of(setting)
-    of_preset = [error(r, observed(preset, r.t, r.y).unknown_input) for r in recordings]
-    ours, inside = self_tuned(model_of(setting), recordings)
-    found = {SELF: mean(ours), ONCE: errors(LINEAR_LIMIT, values), PRESET: mean(of_preset)}
-    found |= {peer: errors(peer, values | own) for peer, own in once[1].items()}
-    yard = errors(LINEAR_LIMIT, anew)
+    values = at(once[0], setting.model.order, c.rate)
+    preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | setting.told
+    of_preset = (objective(r, observed(preset, r.t, r.y).unknown_input) for r in recordings)
+    ours = self_tuned(setting, recordings)
+    found = {SELF: mean(ours.errors), ONCE: error(LINEAR_LIMIT, values), PRESET: mean(of_preset)}
+    found |= {peer: error(peer, values | own) for peer, own in once[1].items()}
+    yard = error(LINEAR_LIMIT, anew)
     row: Row = {'plant': name, 'condition': condition, ANEW: yard}
     row |= {method: value / yard for method, value in found.items()}
-    known = implied(plant, c, recordings) / yard if c.phi != 1.0 else None
-    return row | {KNOWN: known, 'inside 1 σ': inside[0], 'inside 1.96 σ': inside[1]}, once
-
-
-def self_tuned(
-    model: dict[str, Any], recordings: list[Recording]
-) -> tuple[list[float], list[float]]:
-    """Return the errors of self-tuning, and the shares of d within 1 and 1.96 deviations."""
-    errors, inside = [], []
-    for r in recordings:
-        found = observed(model | SELF_TUNING, r.t, r.y)
-        errors.append(error(r, found.unknown_input))
-        away = np.abs(found.unknown_input - r.d) / found.standard_deviation[:, -1]
-        inside.append([np.mean((away < k)[r.t >= JUDGED_FROM]) for k in (1.0, 1.96)])
-    return errors, [round(float(x), 3) for x in np.mean(inside, axis=0)]
+    row[KNOWN] = implied(plant, c, recordings) / yard if c.phi != 1.0 else None
+    row['inside 1 σ'], row['inside 1.96 σ'] = (round(share, 3) for share in ours.inside)
+    return row, once
 
 
 def number(ratio: float) -> str:

@@ -9,21 +9,20 @@ from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from matplotlib.figure import Figure
+import numpy as np
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
 PAGE, FOLDER = 'evidence.md', 'evidence'
 PART = '<!-- begin {0} -->\n{1}\n<!-- end {0} -->'
 PATTERN = re.compile(r'<!-- begin (?P<name>\S+) -->\n(?P<text>.*?)\n?<!-- end (?P=name) -->', re.S)
-Row = dict[str, Any]
-"""A line of a table, by column; numbers are floats."""
+Row = dict[str, Any]  # a line of a table, by column; numbers are floats
 SELF, TUNED, USUAL, ROBUST, OTHER, GREY = (
     ('#D55E00', '*', 90), ('#009E73', 's', 22), ('#0072B2', 'o', 24), ('#56B4E9', '^', 26),
     ('#CC79A7', 'D', 20), ('#999999', 'x', 26),
 )  # fmt: skip
 """Okabe-Ito, and a grey; marker and its area."""
 TICKS = (0.1, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
-FLOOR, CEILING = 0.1, 10.0
-"""Smallest and largest ratio that is drawn."""
+FLOOR, CEILING = 0.1, 10.0  # smallest and largest ratio that is drawn
 
 
 def read(name: str, docs: Path = DOCS) -> list[Row]:
@@ -88,13 +87,8 @@ def publish(
     """
     Write tables and figures into the folder beside the page, and fill the page if it is there.
 
-    Parameters
-    ----------
-    docs : path
-        Folder of the page; made where there is none.
-    tables, texts, figures : mapping
-        Lines by name of the CSV, generated parts of the page, figures by name of the PNG.
-
+    `docs` is the folder of the page, made where there is none; tables are lines by name of the
+    CSV, `texts` are generated parts of the page, figures are by name of the PNG.
     """
     page, folder = docs / PAGE, docs / FOLDER
     if page.exists():
@@ -102,13 +96,12 @@ def publish(
     folder.mkdir(parents=True, exist_ok=True)
     for name, rows in tables.items():
         with (folder / f'{name}.csv').open('w', newline='', encoding='utf-8') as file:
-            table = csv.DictWriter(file, list(rows[0]), lineterminator='\n')
+            columns = dict.fromkeys(column for row in rows for column in row)
+            table = csv.DictWriter(file, list(columns), lineterminator='\n')
             table.writeheader()
             for row in rows:
-                table.writerow({
-                    k: f'{v:.6g}' if isinstance(v, float | int) else v or ''
-                    for k, v in row.items()
-                })  # fmt: skip
+                numbers = {k: f'{v:.6g}' for k, v in row.items() if isinstance(v, float | int)}
+                table.writerow(row | numbers)
     for name, figure in figures.items():
         figure.savefig(folder / f'{name}.png', dpi=110)
     print(f'{docs}: {", ".join([*tables, *figures])}')
@@ -124,29 +117,17 @@ def draw_ratios(
     """
     Draw ratios of errors, a panel a plant: for the comparison, and for use everywhere.
 
-    Parameters
-    ----------
-    panels : mapping
-        Ratios by title of the panel, row, and method.
-    styles : mapping
-        Colour, marker and area by method.
-    text : str
-        What the ratio is.
-
+    `panels` has them by title of the panel, row, and method; `styles` colour, marker and area by
+    method; `text` says what the ratio is.
     """
     rows = list(dict.fromkeys(row for panel in panels.values() for row in panel))
     figure = Figure(figsize=(11.0, 0.3 * len(rows) + 1.6), layout='constrained')
     every = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for (title, panel), axes in zip(panels.items(), every, strict=True):
         for name, (colour, marker, area) in styles.items():
-            points = [
-                (min(max(ratios[name], FLOOR), CEILING), rows.index(row))
-                for row, ratios in panel.items()
-                if name in ratios
-            ]
-            x, y = zip(*points, strict=True) if points else ((), ())
-            front = 4 if (colour, marker, area) == SELF else 3
-            axes.scatter(x, y, area, colour, marker=marker, label=name, zorder=front)
+            points = {rows.index(row): r[name] for row, r in panel.items() if name in r}
+            x, front = np.clip(list(points.values()), FLOOR, CEILING), 3 + (colour == SELF[0])
+            axes.scatter(x, list(points), area, colour, marker=marker, label=name, zorder=front)
         axes.axvline(1.0, color='#000000', linewidth=0.8)
         axes.set(xscale='log', xlim=(0.8 * FLOOR, 1.2 * CEILING), title=title)
         axes.set_yticks(range(len(rows)), rows)

@@ -3,6 +3,7 @@
 
 import argparse
 from collections.abc import Callable, Hashable, Iterable, Mapping
+from concurrent.futures import ProcessPoolExecutor, wait
 import multiprocessing
 from multiprocessing import resource_tracker
 import os
@@ -24,11 +25,9 @@ from studies.evidence import DOCS, Row
 
 SELF_TUNING = {'gains': 'self_tuning'}
 MODEL = ('order', 'phi', 'inputs')
-POLL = 0.1
-"""Seconds between two looks at what has come."""
+POLL = 0.1  # seconds between two looks at what has come
 Floats = NDArray[np.float64]
-Call = tuple[Any, ...]
-"""A function of a module, and its arguments."""
+Call = tuple[Any, ...]  # a function of a module, and its arguments
 Results = Callable[[Mapping[Hashable, Call]], dict[Any, Any]]
 """Returns what calls return, by key: `called` for one study."""
 
@@ -51,21 +50,9 @@ def run_study(
     """
     Run the command of a study: measure, and write what was found into a folder.
 
-    Parameters
-    ----------
-    name, description : str
-    measure : callable
-        Gets the arguments, with the folder as `output`, and a function that computes calls in
-        several processes.
-    argv : list of str, optional
-    options : iterable
-        Arguments of the command beside those that all studies have.
-
-    Returns
-    -------
-    int
-        0; 2 for a bad argument or output; 130 if it was interrupted.
-
+    `measure` gets the arguments, with the folder as `output`, and a function that computes calls
+    in several processes; `options` are arguments beside those that all studies have. Return 0; 2
+    for a bad argument or output; 130 if it was interrupted.
     """
     parser = argparse.ArgumentParser(prog=name, description=description)
     add = parser.add_argument
@@ -84,8 +71,8 @@ def run_study(
     def body(arguments: argparse.Namespace, stop: Stop) -> None:
         if arguments.jobs < 1:
             raise ConfigurationError(f'--jobs: expected an integer >= 1, got {arguments.jobs}')
-        own = Path(f'{name}_output') if arguments.quick else DOCS
-        arguments.output = arguments.output or own
+        usual = Path(f'{name}_output') if arguments.quick else DOCS
+        arguments.output = arguments.output or usual
         found = measure(arguments, lambda calls: called(calls, name, arguments.jobs, stop))
         evidence.publish(arguments.output, *found)
 
@@ -103,27 +90,36 @@ def called(calls: Mapping[Hashable, Call], name: str, jobs: int, stop: Stop) -> 
     ------
     Stopped
         `stop` is set; the processes have ended.
+    BrokenProcessPool
+        A process ended, or could not load its call.
 
     """
     for variable in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
         os.environ.setdefault(variable, '1')  # the processes already use all cores
-    found = {}
     # Inherited: only this process takes signals, and ends the others.
     signals = {signal.SIGINT, signal.SIGHUP}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     resource_tracker.ensure_running()  # which unblocks SIGINT (Python 3.11), so once more
     signal.pthread_sigmask(signal.SIG_BLOCK, signals)
-    with multiprocessing.get_context('spawn').Pool(jobs, _end_with_parent) as pool:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        waiting = {key: pool.apply_async(call[0], call[1:]) for key, call in calls.items()}
-        with progress(total=len(calls), unit='part', desc=name) as bar:
-            while waiting:
-                if stop.wait(POLL):
-                    raise Stopped
-                for key in [key for key, result in waiting.items() if result.ready()]:
-                    found[key] = waiting.pop(key).get()
-                    bar.update()
-    return {key: found[key] for key in calls}
+    spawn = multiprocessing.get_context('spawn')
+    with ProcessPoolExecutor(jobs, spawn, _end_with_parent) as pool:
+        try:
+            futures = {key: pool.submit(*call) for key, call in calls.items()}
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+            waiting = set(futures.values())
+            with progress(total=len(calls), unit='part', desc=name) as bar:
+                while waiting:
+                    if stop.wait(POLL):
+                        raise Stopped
+                    done, waiting = wait(waiting, timeout=0.0)
+                    for future in done:
+                        future.result()  # raises what the call has raised
+                        bar.update()
+        except BaseException:
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+    return {key: future.result() for key, future in futures.items()}
 
 
 def _end_with_parent() -> None:

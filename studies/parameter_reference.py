@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """`python -m studies.parameter_reference` writes docs/parameters.md."""
 
-from pathlib import Path
 import sys
 
 from fhaosmo_ros.core.parameters import arm, tables
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.simulation.recordings import FAMILY
 from fhaosmo_ros.tools.tuning.objective import TUNING
+from studies import evidence
 
 HEAD = """# Parameters
 
@@ -24,6 +24,7 @@ the plant, and `autostart`, read them at the start.
 `tune` reads its parameters from a section `tune` of the same files; of the plant's it uses
 `initial_state`, `integration_step`, `noise_std`, `noise_seed` and `sample_rate` (docs/offline.md).
 """
+COLUMNS = ('name', 'default', 'allowed', 'live', 'what it does')
 GROUPS = (
     ('Model (estimator and plant)', tables.MODEL),
     ('Observer (estimator)', tables.OBSERVER),
@@ -46,23 +47,21 @@ def markdown() -> str:
     """Return the text of docs/parameters.md."""
     parts = [HEAD, NOTE]
     for title, group in GROUPS:
-        parts.append(f'\n## {title}\n\n| name | default | allowed | live | what it does |\n')
-        parts.append('|---|---|---|---|---|\n')
-        parts += [_row(parameter) for parameter in group]
+        table = evidence.markdown(COLUMNS, map(_row, group)).replace('| --- ', '|---')
+        parts.append(f'\n## {title}\n\n{table}\n')
     return ''.join(parts)
 
 
-def _row(p: Parameter) -> str:
+def _row(p: Parameter) -> list[str]:
     default = str(p.default).lower() if isinstance(p.default, bool) else p.default
     allowed = p.allowed + (f'; length {p.lengths}' if p.lengths else '')
     cells = (f'`{p.name}`', f'`{default}`', allowed, 'yes' if p.live else 'no', p.text)
-    # A bar inside a cell would end it.
-    return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |\n'
+    return [cell.replace('|', '\\|') for cell in cells]  # a bar inside a cell would end it
 
 
 def main() -> int:
     """Write docs/parameters.md of this checkout."""
-    path = Path(__file__).resolve().parents[1] / 'docs' / 'parameters.md'
+    path = evidence.DOCS / 'parameters.md'
     path.write_text(markdown(), encoding='utf-8')
     print(path)
     return 0

@@ -14,35 +14,25 @@ from functools import cache
 import sys
 from typing import Any
 
-from fhaosmo_ros.core import Observer, Plant
-from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core import ConfigurationError, Observer, Plant, Recording, TriangularModel
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
-from fhaosmo_ros.core.simulation.metrics import rms
-from fhaosmo_ros.core.simulation.recordings import Recording
 from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.tuning.search import Dimension, minimise, Values
 import numpy as np
-from studies.comparison.methods import METHODS
-from studies.comparison.methods.kalman import LINEAR_LIMIT
-from studies.comparison.methods.method import Setting, trial, tune
 from studies.evidence import markdown, Row
 from studies.harness import Found, Results, run_study
+from studies.methods import LINEAR_LIMIT, mean, METHODS, objective, Setting, trial, tune
 
 PERIOD, DURATION, NOISY_FROM, SETTLED = 1e-3, 20.0, 13.3, 2.0
 """Seconds: of the run, from when y has noise, from when errors count."""
 NOISE = 1e-4
-TRAINED, JUDGED = (1, 2), (11, 12, 13, 14, 15)
-"""Seeds of noise and initial states."""
+TRAINED, JUDGED = (1, 2), (11, 12, 13, 14, 15)  # seeds of noise and initial states
 STARTS, TRIALS, QUICK = (1, 2, 3, 4), 3000, 20
-RATES = (1.0, 10.0, 100.0, 1000.0)
-"""Gamma in the law, D 7."""
-REACH = 1e3
-"""How far a search goes from the demonstration's gains, as a factor to both sides."""
+RATES = (1.0, 10.0, 100.0, 1000.0)  # gamma in the law, D 7
+REACH = 1e3  # how far a search goes from the demonstration's gains, as a factor to both sides
 HELD = {'gamma_rate': 0.0, 'gamma_leakage': 0.0}
-LISTS = {'lambda': 4, 'alpha': 3, 'fuzzy_widths': 4}
-"""How many entries of each list act."""
+LISTS = {'lambda': 4, 'alpha': 3, 'fuzzy_widths': 4}  # how many entries of each list act
 LAW = (
     Dimension('gamma_rate', 10.0, 1e6, 30.0),
     Dimension('gamma_leakage', 1e-4, 1e2, 0.3),
@@ -66,11 +56,7 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
         found[f'the same gains, it adapts by {rate:g}'] = judged(gains, law)
     found['it adapts, all gains searched with the law'] = best(True, gains, {})
     found['Kalman filter, one tuning'] = results({'': (kalman, trials)})['']
-    columns = dict.fromkeys(column for row in found.values() for column in row)
-    rows: list[Row] = [
-        {'observer': name, **{column: row.get(column) for column in columns}}
-        for name, row in found.items()
-    ]
+    rows: list[Row] = [{'observer': name, **row} for name, row in found.items()]
     table = markdown(
         ('observer', 'error in training', 'error judged', 'γ is'),
         [(r['observer'], f'{r["training"]:.3f}', f'{r["judged"]:.3f}', r['gamma']) for r in rows],
@@ -90,16 +76,6 @@ def recording(seed: int) -> Recording:
     return Recording(t, truth.y + noise, np.zeros(len(t)), truth.z, truth.unknown_input, 'chirp')
 
 
-def error(recordings: list[Recording], estimates: list[np.ndarray]) -> float:
-    """Return the RMS error of d over the RMS of d, geometric mean over recordings."""
-    errors = []
-    for r, estimate in zip(recordings, estimates, strict=True):
-        late = r.t >= SETTLED
-        with np.errstate(over='ignore', invalid='ignore'):
-            errors.append(rms(estimate[late] - r.d[late]) / rms(r.d[late]))
-    return float(np.exp(np.mean(np.log(errors))))
-
-
 @cache
 def demonstrated() -> dict[str, Any]:
     """Return the demonstration's parameters: a search asks for them thousands of times."""
@@ -117,8 +93,9 @@ def run(values: Values, law: Values, recordings: list[Recording]) -> tuple[float
     except ConfigurationError:
         return np.inf, ''
     late = found[0].gamma[recordings[0].t >= SETTLED]
-    moves = f'{late.min():.2f} .. {late.max():.2f}'
-    return error(recordings, [f.unknown_input for f in found]), moves
+    pairs = zip(recordings, found, strict=True)
+    error = mean(objective(r, f.unknown_input, SETTLED) for r, f in pairs)
+    return error, f'{late.min():.2f} .. {late.max():.2f}'
 
 
 def judged(values: Values, law: Values) -> dict[str, Any]:
@@ -150,10 +127,8 @@ def kalman(trials: int) -> dict[str, Any]:
     setting = Setting(TriangularModel(('0', '0', '-z3')), PERIOD, 0.1, NOISE, SETTLED)
     training, others = ([recording(k) for k in seeds] for seeds in (TRAINED, JUDGED))
     best = tune(method, setting, training, trials, 1)
-    return {
-        'training': best.training, 'judged': trial(method, setting, best.values, others).value,
-        'gamma': '', **best.values,
-    }  # fmt: skip
+    judged = trial(method, setting, best.values, others).value
+    return {'training': best.value, 'judged': judged, 'gamma': '', **best.values}
 
 
 if __name__ == '__main__':

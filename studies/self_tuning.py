@@ -22,24 +22,17 @@ import numpy as np
 from scipy.linalg import expm
 from studies.harness import Floats, Found, Results, run_study
 
-BANDWIDTHS = np.geomspace(6e-4, 3.0, 40)
-"""How fast the d of a member is, rad a sample."""
-DERIVATIVES = (0, 1, 3)
-"""How smooth: d is white noise, integrated so many times and once more."""
-DECAY = 0.1
-"""How soon it forgets, as a part of the bandwidth."""
-FIRST = 50
-"""Samples that tell the noise before the filters begin."""
+BANDWIDTHS = np.geomspace(6e-4, 3.0, 40)  # how fast the d of a member is, rad a sample
+DERIVATIVES = (0, 1, 3)  # how smooth: d is white noise, integrated so many times and once more
+DECAY = 0.1  # how soon it forgets, as a part of the bandwidth
+FIRST = 50  # samples that tell the noise before the filters begin
 MEMORY, NOISE_MEMORY = 8000.0, 1000
 """Samples for which likelihoods, and the size of the noise, are remembered."""
-FLOOR = 30.0
-"""No log-likelihood falls further below the best one: each member can come back soon."""
+FLOOR = 30.0  # no log-likelihood falls further below the best one: each member can come back soon
 INEXACT = 1e-10
 """Innovations are expected to be larger by so much, or rounding would make variances negative."""
-LIMIT = 3.0
-"""An innovation counts as so many standard deviations at most: outliers change little."""
-CLIPPED = 0.9733
-"""Mean of min(x^2, 9) for a normal x of variance 1."""
+LIMIT = 3.0  # an innovation counts as so many standard deviations at most: outliers change little
+CLIPPED = 0.9733  # mean of min(x^2, 9) for a normal x of variance 1
 
 
 class Estimates(NamedTuple):
@@ -158,24 +151,20 @@ def draw(t: Floats, d: Floats, noise: Floats, found: Estimates) -> Figure:
     """Draw d, the noise, and which members are believed."""
     figure = Figure(figsize=(9.5, 7.0), layout='constrained')
     top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=[2, 1, 1.6])
-    top.plot(t, d, **TRUTH)
-    top.plot(t, found.d, color=COLOURS[0], linewidth=1.0, label='estimated')
+    pairs = ((top, d, found.d, 'estimated'), (middle, noise, found.noise, 'found'))
+    for axes, truth, estimated, label in pairs:
+        axes.plot(t, truth, **TRUTH)
+        axes.plot(t, estimated, color=COLOURS[0], linewidth=1.0, label=label)
     draw_band(top, t, found.d, found.deviation)
-    top.set_ylim(1.5 * d.min(), 2.2 * d.max())
-    top.set_title('Unknown input')
-    top.legend(loc='upper left', ncols=3)
-    middle.plot(t, noise, **TRUTH)
-    middle.plot(t, found.noise, color=COLOURS[0], linewidth=1.0, label='found')
-    middle.set_ylim(0.0, 1.5 * noise.max())
-    middle.set_title('Standard deviation of the noise of y')
-    middle.legend(loc='upper left', ncols=2)
+    top.set(title='Unknown input', ylim=(1.5 * d.min(), 2.2 * d.max()))
+    middle.set(title='Standard deviation of the noise of y', ylim=(0.0, 1.5 * noise.max()))
+    for axes in (top, middle):
+        axes.legend(loc='upper left', ncols=3)
     shown = bottom.pcolormesh(
         t, BANDWIDTHS / (t[1] - t[0]), found.weights.T, cmap='Greys', vmin=0.0, vmax=1.0
     )
-    bottom.set_yscale('log')
-    bottom.set_ylabel('bandwidth [rad/s]')
-    bottom.set_title('How much the members of each bandwidth are believed')
-    bottom.set_xlabel('time [s]')
+    title = 'How much the members of each bandwidth are believed'
+    bottom.set(title=title, yscale='log', ylabel='bandwidth [rad/s]', xlabel='time [s]')
     figure.colorbar(shown, ax=bottom, pad=0.01)
     return figure
 

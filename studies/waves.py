@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter, sawtooth
 
 Floats = NDArray[np.float64]
-BREAK_AWAY, KINETIC = 0.8, 0.4
-"""Friction of `stick-slip`, relative to the force that drives it."""
-BLOW = 0.2
-"""Length of an impulse, in 1 / omega."""
+BREAK_AWAY, KINETIC = 0.8, 0.4  # friction of `stick-slip`, relative to the force that drives it
+BLOW = 0.2  # length of an impulse, in 1 / omega
 
 
 def wave(kind: str, t: Floats, omega: float, random: np.random.Generator) -> Floats:

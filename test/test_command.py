@@ -2,6 +2,7 @@
 """The protocol of all commands: exit codes, one-line errors, signals, outputs, processes."""
 
 import argparse
+from concurrent.futures.process import BrokenProcessPool
 import os
 from pathlib import Path
 import signal
@@ -14,6 +15,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals, Stopped
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 import pytest
+from studies.harness import called
 from waiting import wait_until
 
 PARSER = argparse.ArgumentParser(prog='try')
@@ -170,6 +172,18 @@ def test_signal_ends_command_and_workers(begin, tmp_path, number, ignored, group
         assert {p.name for p in tmp_path.iterdir()} == {'busy.py', *names}
     left = [Path('/proc', pid) for pid in pids()]
     wait_until(lambda: not any(map(Path.exists, left)), 'end of workers')
+
+
+class Unloadable:
+    """Pickles, but no other process can load it."""
+
+    def __reduce__(self):
+        return int, ('no number',)
+
+
+def test_a_call_that_no_worker_can_load_ends_the_command():
+    with pytest.raises(BrokenProcessPool):
+        called({'': (len, Unloadable())}, 'broken', 1, Stop())
 
 
 SLOW = """

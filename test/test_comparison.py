@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from studies import everywhere
-from studies.comparison.cells import PLANTS, sensors
-from studies.comparison.methods import kalman, METHODS
-from studies.comparison.methods.method import Setting
+from studies.comparison import PLANTS, sensors
+from studies.methods import (
+    ADAPTIVE,
+    HUBER,
+    IMM,
+    LINEAR_LIMIT,
+    METHODS,
+    SampledModel,
+    Setting,
+)
 
 MODELS = {
     'paper': TriangularModel(['0', '0', '-z3']),
@@ -45,7 +52,7 @@ def recording(model, t, z0, d, u=0.0):
 @pytest.mark.parametrize('name', MODELS)
 def test_kalman_gain_is_the_limit_of_the_riccati_recursion(name, chain, decay):
     model, period = MODELS[name], 1e-2
-    gain = kalman.SampledModel(model, period, chain, decay).kalman(5.0)
+    gain = SampledModel(model, period, chain, decay).kalman(5.0)
     a = rates(model, chain, decay)
     spectrum = np.diag([*[0.0] * (len(a) - 1), 5.0])
     # The noise's covariance by the midpoint rule, and the recursion itself.
@@ -59,7 +66,7 @@ def test_kalman_gain_is_the_limit_of_the_riccati_recursion(name, chain, decay):
     np.testing.assert_allclose(gain, k, rtol=1e-4)
 
 
-@pytest.mark.parametrize('name', ['Kalman', *(m.name for m in kalman.ADAPTIVE)])
+@pytest.mark.parametrize('name', ['Kalman', *(m.name for m in ADAPTIVE)])
 def test_peers_know_the_input_and_bridge_a_gap(name):
     """A constant d from a noise-free y with a known input."""
     model, method = MODELS['motor'], METHODS[name]
@@ -67,11 +74,11 @@ def test_peers_know_the_input_and_bridge_a_gap(name):
     t = np.concatenate([np.arange(0.0, 5.0, 1e-2), np.arange(5.3, 8.0, 1e-2)])
     r = recording(model, t, [0.3, -0.2], 0.8, u=0.02)
     values = {d.name: d.start for d in method.space(setting)} | {'decay': 1e-6}
-    found = method.prepare(setting, values)(r)['filtered']
-    assert abs(found.d[0] - 0.8) > 0.5
+    [found] = method.prepare(setting, values)(r)
+    assert abs(found[0, -1] - 0.8) > 0.5
     after = t > 4.0
-    np.testing.assert_allclose(found.d[after], 0.8, atol=1e-3)
-    np.testing.assert_allclose(found.z[after], r.z[after], atol=1e-3)
+    np.testing.assert_allclose(found[after, -1], 0.8, atol=1e-3)
+    np.testing.assert_allclose(found[after, :-1], r.z[after], atol=1e-3)
 
 
 @pytest.mark.parametrize('derivatives', [0, 2])
@@ -84,9 +91,9 @@ def test_peers_without_their_options_are_the_kalman_filter(derivatives, rate):
     setting = everywhere.setting_of(motor, condition)
     member = {'derivatives': derivatives, 'bandwidth': 15.0, 'decay': 4.5}
     values = everywhere.at(member, setting.model.order, rate)
-    [expected] = everywhere.errors_of(kalman.LINEAR_LIMIT, setting, values, [r])
-    for name, options in ((kalman.HUBER, {}), (kalman.IMM, {'spread': 1.0 + 1e-9, 'stay': 1.0})):
-        [found] = everywhere.errors_of(name, setting, values | options, [r])
+    expected = everywhere.error_of(LINEAR_LIMIT, setting, values, [r])
+    for name, options in ((HUBER, {}), (IMM, {'spread': 1.0 + 1e-9, 'stay': 1.0})):
+        found = everywhere.error_of(name, setting, values | options, [r])
         assert found == pytest.approx(expected, rel=1e-3)
 
 

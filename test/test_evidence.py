@@ -4,17 +4,15 @@
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import pytest
 import results
-from studies import everywhere, evidence
-from studies.comparison import __main__ as comparison
-from studies.comparison.cells import methods_for, sensors
-from studies.paper import cases
-from studies.paper.plant_and_observer import SOLVERS
+from studies import comparison, everywhere, evidence, paper
+from studies.comparison import methods_for, sensors
+from studies.plant_and_observer import SOLVERS
 
 PARTS = {
     'speed': results.texts,
     'comparison': comparison.texts,
     'everywhere': everywhere.texts,
-    'paper': cases.texts,
+    'paper': paper.texts,
 }
 """What makes the parts of the page, by the name of the table they are made from."""
 
@@ -38,7 +36,7 @@ def test_tables_are_about_all_cells():
     assert cells == {(p, c) for p in everywhere.PLANTS for c in everywhere.CONDITIONS}
     simulations = {tuple(row.values())[:3] for row in evidence.read('paper')}
     assert simulations == {
-        (s, name, w) for s in SOLVERS for name in cases.OBSERVERS for w in cases.FREQUENCIES
+        (s, name, w) for s in SOLVERS for name in paper.OBSERVERS for w in paper.FREQUENCIES
     }
 
 

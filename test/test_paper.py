@@ -2,9 +2,8 @@
 """The paper: tables beside docs/evidence.md, parts of them anew, and what they must show."""
 
 import pytest
-from studies import evidence
-from studies.paper import cases
-from studies.paper.plant_and_observer import HELD, SOLVERS
+from studies import evidence, paper
+from studies.plant_and_observer import HELD, SOLVERS
 
 REWRITE = 'run make paper'
 
@@ -12,7 +11,7 @@ REWRITE = 'run make paper'
 @pytest.fixture(scope='module')
 def documented():
     rows = evidence.read('paper')
-    return {solver: cases.scores_of(rows, solver) for solver in SOLVERS}
+    return {solver: paper.scores_of(rows, solver) for solver in SOLVERS}
 
 
 def check(new, old, sign):
@@ -23,29 +22,29 @@ def check(new, old, sign):
             assert 1 / factor < new[key] / old[key] < factor, f'{key}: {REWRITE}'
 
 
-@pytest.mark.parametrize('name', [name for name, c in cases.OBSERVERS.items() if c.step == 1e-3])
-@pytest.mark.parametrize('omega', cases.FREQUENCIES)
+@pytest.mark.parametrize('name', [name for name, c in paper.OBSERVERS.items() if c.step == 1e-3])
+@pytest.mark.parametrize('omega', paper.FREQUENCIES)
 def test_new_simulation_agrees_with_the_table(documented, name, omega):
-    for s in (cases.SOLVER, HELD):
+    for s in (paper.SOLVER, HELD):
         old = documented[s][name, omega]
-        check(cases.simulation(s, name, omega), old, name.startswith('sign'))
+        check(paper.simulation(s, name, omega), old, name.startswith('sign'))
 
 
 def test_best_solver_and_all_findings_come_out(documented):
     """With the shipped half-widths."""
 
     def error(solver):
-        return sum(documented[solver][cases.FINE, w]['rms_d'] for w in cases.FREQUENCIES)
+        return sum(documented[solver][paper.FINE, w]['rms_d'] for w in paper.FREQUENCIES)
 
-    assert min(set(SOLVERS) - {HELD}, key=error) == cases.SOLVER
-    for name in (cases.SOLVER, HELD):
-        failed = [v.name for v in cases.verdicts(documented[name]) if not v.holds]
+    assert min(set(SOLVERS) - {HELD}, key=error) == paper.SOLVER
+    for name in (paper.SOLVER, HELD):
+        failed = [v.name for v in paper.verdicts(documented[name]) if not v.holds]
         assert failed == (['F1b high'] if name == HELD else [])
 
 
 def test_shipped_half_widths_lie_inside_the_region():
     rows = evidence.read('paper_half_widths')
     holds = {tuple(row.values())[:2] for row in rows if all(list(row.values())[2:])}
-    first, later = cases.preset().observer['fuzzy_widths'][:2]
-    around = [cases.WIDTHS[i - 1 : i + 2] for i in map(cases.WIDTHS.index, (first, later))]
+    first, later = paper.preset()[0]['fuzzy_widths'][:2]
+    around = [paper.WIDTHS[i - 1 : i + 2] for i in map(paper.WIDTHS.index, (first, later))]
     assert {(a, b) for a in around[0] for b in around[1]} <= holds

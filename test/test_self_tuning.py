@@ -14,7 +14,7 @@ import pytest
 from scipy.linalg import block_diag, expm
 from scipy.signal import lfilter
 from scipy.stats import norm, truncnorm
-from studies.everywhere import Condition, CONDITIONS, model_of, PLANTS, recording, setting_of
+from studies.everywhere import Condition, CONDITIONS, PLANTS, recording, setting_of
 from studies.harness import observed
 from studies.self_tuning import estimate as plain_estimate
 
@@ -30,7 +30,7 @@ plants = pytest.mark.parametrize('plant', PLANTS)
 def study(plant, condition=AS_TUNED, kind='sine', seconds=20.0, seed=31):
     """Return a recording of one of the study's plants, and the parameters of its model."""
     plant = PLANTS[plant]
-    values = model_of(setting_of(plant, condition)) | SELF_TUNING
+    values = setting_of(plant, condition).told | SELF_TUNING
     return recording(plant, condition, kind, seconds, seed), values
 
 

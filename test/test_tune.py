@@ -24,7 +24,7 @@ from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 import numpy as np
 import pytest
-from studies.comparison.methods.kalman import estimates, SampledModel
+from studies.methods import estimates, SampledModel
 from waiting import wait_until
 
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')

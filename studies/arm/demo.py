@@ -23,20 +23,18 @@ from fhaosmo_ros.tools.cli.command import Output, progress, run_command
 from fhaosmo_ros.tools.cli.processes import Children
 from matplotlib.figure import Figure
 import numpy as np
-from studies.arm.judging import rmse
 from studies.arm.peers import classical, momentum
-from studies.arm.world import Floats, simulate, Touched, urdf_of
+from studies.arm.world import rmse, simulate, Touched, urdf_of
+from studies.harness import Floats
 
 ROBOT, SEED, DURATION = 'iiwa', 10, 16.0
 BALLS, PUSH = (2.5, 13.0), 9.5
 """Seconds at which a ball is thrown, and at which the slow push begins."""
-GAIN = 50.0
-"""1/s, of the classical observer: a usual one."""
-FIRST = 10**9
-"""ns, stamp of the first sample."""
+GAIN = 50.0  # 1/s, of the classical observer: a usual one
+FIRST = 10**9  # ns, stamp of the first sample
 TORQUE, EVENT = '/arm/external_torque', '/arm/event'
-SHOWN = (0, 1, 3)
-"""Joints in the figure."""
+Events = list[tuple[float, str]]  # seconds and link of contacts
+SHOWN = (0, 1, 3)  # joints in the figure
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -55,10 +53,7 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
     print(f'on this host only, ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}; simulating ...')
     urdf = urdf_of(ROBOT)
     model = ArmModel(urdf)
-    world = simulate(
-        urdf, model.joints, model.links, DURATION, SEED, weight=model.weight, wall=True,
-        balls=BALLS, push=PUSH,
-    )  # fmt: skip
+    world = simulate(urdf, model, DURATION, SEED, wall=True, balls=BALLS, push=PUSH)
     default = Path('demo_output') / time.strftime('%Y-%m-%d_%H-%M-%S')
     with Output(arguments.output or default, arguments.force) as output:
         folder = output.path
@@ -68,9 +63,9 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
         _run(folder, stop)
         torque, events = _read(folder / 'bag', world)
         by_gain = classical(momentum(model, world, by_position=True), {'gain': GAIN})
-        text = _table(model, world, torque, by_gain, events)
+        text = _table(world, torque, by_gain, events)
         (folder / 'report.txt').write_text(text + '\n', encoding='utf-8')
-        _figure(model, world, torque, by_gain, events).savefig(folder / 'demo_arm.png', dpi=110)
+        _figure(world, torque, by_gain, events).savefig(folder / 'demo_arm.png', dpi=110)
         print(f'\n{text}\n\nfigure: {output.keep() / "demo_arm.png"}')
 
 
@@ -116,7 +111,7 @@ def _run(folder: Path, stop: Stop) -> None:
                     raise Stopped
 
 
-def _read(path: Path, world: Touched) -> tuple[Floats, list[tuple[float, str]]]:
+def _read(path: Path, world: Touched) -> tuple[Floats, Events]:
     """Return the external torque at each sample (NaN where none came), and contacts that began."""
     torque, events = np.full(world.truth.shape, np.nan), []
     with BagReader(path) as reader:
@@ -141,35 +136,27 @@ def _kind(moment: float) -> str:
     return 'slow push' if 0.0 <= moment - PUSH < 1.5 else 'wall'
 
 
-def _table(
-    model: ArmModel, world: Touched, torque: Floats, by_gain: Floats,
-    events: list[tuple[float, str]],
-) -> str:  # fmt: skip
+def _table(world: Touched, torque: Floats, by_gain: Floats, events: Events) -> str:
     """Return errors, and when each contact was told."""
     known = np.isfinite(torque).all(axis=1)
-    lines = [f'samples estimated: {known.sum()} of {len(known) - 1}', '']
-    lines.append('error of the external torque, RMS, sum of all joints')
-    for name, estimate in (('arm', torque), (f'classical, {GAIN:g}/s', by_gain)):
+    lines = [
+        f'samples estimated: {known.sum()} of {len(known) - 1}', '',
+        'error of the external torque, RMS, sum of all joints',
+    ]  # fmt: skip
+    nothing = np.zeros_like(world.truth)
+    names = ('arm', f'classical, {GAIN:g}/s', '(no estimate)')
+    for name, estimate in zip(names, (torque, by_gain, nothing), strict=True):
         value = rmse(world, np.where(known[:, np.newaxis], estimate, world.truth))
         lines.append(f'  {name:18}{value:6.2f} N m')
-    size = rmse(world, np.zeros_like(world.truth))
-    lines += [
-        f'  {"(no estimate)":18}{size:6.2f} N m',
-        '',
-        'contact      told after   most likely at',
-    ]
-    for k in world.begins:
-        moment = world.t[k]
+    lines += ['', 'contact      told after   most likely at']
+    for moment in (world.t[k] for k, *_ in world.begins):
         later = [(t, link) for t, link in events if -0.01 <= t - moment < 1.0]
         said = f'{(later[0][0] - moment) * 1e3:7.0f} ms   {later[0][1]}' if later else 'not told'
         lines.append(f'{_kind(moment):12}{said}')
     return '\n'.join(lines)
 
 
-def _figure(
-    model: ArmModel, world: Touched, torque: Floats, by_gain: Floats,
-    events: list[tuple[float, str]],
-) -> Figure:  # fmt: skip
+def _figure(world: Touched, torque: Floats, by_gain: Floats, events: Events) -> Figure:
     """Draw the external torque of some joints, and the contacts that were told."""
     figure = Figure((10.0, 7.0), layout='constrained')
     rows = figure.subplots(len(SHOWN), 1, sharex=True)
@@ -179,22 +166,23 @@ def _figure(
             world.t, 0, 1, where=touched, transform=axes.get_xaxis_transform(), color='0.9',
             label='touched',
         )  # fmt: skip
-        axes.plot(world.t, by_gain[:, j], color='tab:blue', lw=0.6, label='classical observer')
-        axes.plot(world.t, world.truth[:, j], color='black', lw=1.6, label='truth')
-        axes.plot(world.t, torque[:, j], color='tab:orange', lw=1.0, label='arm')
+        for estimate, colour, width, label in (
+            (by_gain, 'tab:blue', 0.6, 'classical observer'),
+            (world.truth, 'black', 1.6, 'truth'), (torque, 'tab:orange', 1.0, 'arm'),
+        ):  # fmt: skip
+            axes.plot(world.t, estimate[:, j], color=colour, lw=width, label=label)
         low, high = world.truth[:, j].min(), world.truth[:, j].max()
         margin = 0.25 * (high - low)
-        axes.set_ylim(low - margin, high + margin)
-        axes.set_ylabel('N m')
+        axes.set(ylim=(low - margin, high + margin), ylabel='N m')
         axes.set_title(f'External torque of joint {j + 1}', fontsize='medium', loc='left')
-        for t, _ in events:
-            axes.axvline(t, color='tab:red', lw=0.8, ls=':')
-    for k in world.begins:
+        for k, (t, _) in enumerate(events):
+            label = '' if k else 'contact told'
+            axes.axvline(t, color='tab:red', lw=0.8, ls=':', label=label)
+    for k, *_ in world.begins:
         rows[0].annotate(
             _kind(world.t[k]), (world.t[k], 1.0), xycoords=('data', 'axes fraction'),
             xytext=(2, -12), textcoords='offset points', fontsize='small',
         )  # fmt: skip
-    rows[0].plot([], [], color='tab:red', lw=0.8, ls=':', label='contact told')
     figure.legend(*rows[0].get_legend_handles_labels(), ncols=5, loc='outside upper right')
     rows[-1].set_xlabel('time, s')
     return figure

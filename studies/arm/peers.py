@@ -9,6 +9,8 @@ Garofalo, N. Mansfeld, J. Jankowski, C. Ott, ICRA 2019, doi:10.1109/ICRA.2019.87
 """
 
 from collections.abc import Callable
+from functools import partial
+from math import factorial
 from typing import NamedTuple
 
 from fhaosmo_ros.core.arm.model import ArmModel
@@ -16,14 +18,15 @@ from fhaosmo_ros.tools.tuning.search import Dimension
 import numpy as np
 from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
-from studies.arm.world import Floats, PERIOD, Touched
+from studies.arm.world import PERIOD, Touched
+from studies.harness import Floats
 
 
 class Momentum(NamedTuple):
-    """What all of them take, K rows: p, increments of Y, and u."""
+    """What all of them take, K rows: p, its integral Y, and u."""
 
     p: Floats
-    moved: Floats
+    y: Floats
     drive: Floats
     size: Floats  # (n,) mean diagonal of M
 
@@ -32,16 +35,13 @@ def momentum(model: ArmModel, w: Touched, by_position: bool) -> Momentum:
     """Return p = M qd and u, with qd from differences of positions or from the sensor."""
     moved = np.diff(w.q, axis=0, prepend=w.q[:1])
     velocity = moved / PERIOD if by_position else w.velocity
-    p, y, u, size = np.zeros_like(w.q), np.zeros_like(w.q), np.zeros_like(w.q), 0.0
-    before = None
-    for k in range(len(w.q)):
-        terms = model.terms(w.q[k], velocity[k])
-        u[k] = w.torque[k] + terms.coriolis - terms.gravity
-        p[k] = terms.mass @ velocity[k]
-        y[k] = 0.5 * (terms.mass + (terms.mass if before is None else before)) @ moved[k]
-        before, size = terms.mass, size + np.diag(terms.mass) / len(w.q)
+    terms = [model.terms(q, v) for q, v in zip(w.q, velocity, strict=True)]
+    mass = np.array([x.mass for x in terms])
+    u = w.torque + [x.coriolis for x in terms] - np.array([x.gravity for x in terms])
     u[1:] = 0.5 * (u[1:] + u[:-1])
-    return Momentum(p, y, u, size)
+    between = 0.5 * (mass + np.concatenate([mass[:1], mass[:-1]]))
+    p, y = ((m @ x[..., None])[..., 0] for m, x in ((mass, velocity), (between, moved)))
+    return Momentum(p, np.cumsum(y, axis=0), u, np.diagonal(mass, axis1=1, axis2=2).mean(axis=0))
 
 
 def classical(m: Momentum, values: dict[str, float]) -> Floats:
@@ -51,44 +51,28 @@ def classical(m: Momentum, values: dict[str, float]) -> Floats:
     return np.asarray(lfilter([1.0 - keep], [1.0, -keep], rate, axis=0))
 
 
-def _filtered(a: Floats, b: Floats, gain: Floats, measured: Floats, drive: Floats) -> Floats:
-    """Return the states of an observer with constant gain, (K, n, states)."""
-    x, out = np.zeros((measured.shape[1], len(a))), []
-    closed = a - np.outer(gain, a[0])
-    pushed = b - gain * b[0]
-    for y, u in zip(measured, drive, strict=True):
-        x = x @ closed.T + np.outer(y, gain) + np.outer(u, pushed)
-        out.append(x)
-    return np.array(out)
-
-
-def _gain(a: Floats, noise: Floats) -> Floats:
-    h = np.zeros((1, len(a)))
-    h[0, 0] = 1.0
-    spread = solve_discrete_are(a.T, h.T, noise, np.eye(1))
-    return np.asarray((spread @ h.T / (h @ spread @ h.T + 1.0)).ravel())
-
-
-def kalman_p(m: Momentum, values: dict[str, float]) -> Floats:
-    """P' = u + d, d a random walk; `speed` is the bandwidth."""
-    h, a = PERIOD, np.array([[1.0, PERIOD], [0.0, 1.0]])
-    ratio = (values['speed'] * h) ** 4 / h**2
-    noise = ratio * np.array([[h * h / 3.0, h / 2.0], [h / 2.0, 1.0]])
-    noise[0, 0] += values['model'] ** 2
-    return _filtered(a, np.array([h, 0.0]), _gain(a, noise), m.p, m.drive)[..., 1]
-
-
-def kalman_y(m: Momentum, values: dict[str, float]) -> Floats:
-    """Y' = p, p' = u + d, d a random walk."""
-    h = PERIOD
-    a = np.array([[1.0, h, h * h / 2.0], [0.0, 1.0, h], [0.0, 0.0, 1.0]])
-    intensity = (values['speed'] * h) ** 6 / h**5
-    noise = intensity * np.array([
-        [h**5 / 20, h**4 / 8, h**3 / 6], [h**4 / 8, h**3 / 3, h * h / 2], [h**3 / 6, h * h / 2, h]
+def kalman(on_integral: bool, m: Momentum, values: dict[str, float]) -> Floats:
+    """P' = u + d, d a random walk, of bandwidth `speed`, and Y' = p if Y is what is known."""
+    h, size = PERIOD, 2 + on_integral
+    power = np.array([h**k / factorial(k) for k in range(size)])  # k integrations
+    a = sum(power[k] * np.eye(size, k=k) for k in range(size))
+    lower = size - 1 - np.arange(size)  # integrations between d and each state
+    noise = np.array([
+        [h ** (i + j + 1) / (factorial(i) * factorial(j) * (i + j + 1)) for j in lower]
+        for i in lower
     ])  # fmt: skip
-    noise[1, 1] += (values['model'] / h) ** 2
-    y = np.cumsum(m.moved, axis=0)
-    return _filtered(a, np.array([h * h / 2.0, h, 0.0]), _gain(a, noise), y, m.drive)[..., 2]
+    noise *= (values['speed'] * h) ** (2 * size) / h ** (2 * size - 1)
+    noise[-2, -2] += (values['model'] / h**on_integral) ** 2
+    first = np.eye(size)[:1]
+    p = solve_discrete_are(a.T, first.T, noise, np.eye(1))
+    gain = p[:, 0] / (p[0, 0] + 1.0)
+    b = np.append(power[:0:-1], 0.0)
+    closed, pushed = a - np.outer(gain, a[0]), b - gain * b[0]
+    x, found = np.zeros((m.p.shape[1], size)), []
+    for y, u in zip(m.y if on_integral else m.p, m.drive, strict=True):
+        x = x @ closed.T + np.outer(y, gain) + np.outer(u, pushed)
+        found.append(x[:, -1])
+    return np.array(found)
 
 
 def sliding(m: Momentum, values: dict[str, float]) -> Floats:
@@ -105,18 +89,15 @@ def sliding(m: Momentum, values: dict[str, float]) -> Floats:
     return out
 
 
-SPEED = Dimension('speed', 2.0, 900.0, 60.0)
-MODEL = Dimension('model', 1e-4, 10.0, 0.01)
+FILTERED = (Dimension('speed', 2.0, 900.0, 60.0), Dimension('model', 1e-4, 10.0, 0.01))
+TWISTED = (
+    Dimension('k1', 0.1, 300.0, 5.0), Dimension('k2', 1.0, 1e4, 100.0),
+    Dimension('layer', 1e-5, 1.0, 1e-2), Dimension('k0', 0.1, 900.0, 30.0),
+)  # fmt: skip
 Peer = Callable[[Momentum, dict[str, float]], Floats]
 PEERS: dict[str, tuple[Peer, tuple[Dimension, ...]]] = {
     'classical momentum observer': (classical, (Dimension('gain', 1.0, 900.0, 50.0),)),
-    'Kalman filter on p': (kalman_p, (SPEED, MODEL)),
-    'sliding mode on p': (
-        sliding,
-        (
-            Dimension('k1', 0.1, 300.0, 5.0), Dimension('k2', 1.0, 1e4, 100.0),
-            Dimension('layer', 1e-5, 1.0, 1e-2), Dimension('k0', 0.1, 900.0, 30.0),
-        ),
-    ),
-    'Kalman filter on Y': (kalman_y, (SPEED, MODEL)),
-}  # fmt: skip
+    'Kalman filter on p': (partial(kalman, False), FILTERED),
+    'sliding mode on p': (sliding, TWISTED),
+    'Kalman filter on Y': (partial(kalman, True), FILTERED),
+}

@@ -4,31 +4,29 @@
 from collections.abc import Callable
 from pathlib import Path
 import re
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from fhaosmo_ros.core.arm.model import ArmModel
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 import pinocchio
 import pybullet_data
+from studies.harness import Floats
 
-Floats = NDArray[np.float64]
-PERIOD, SUBSTEPS = 1e-3, 2
-"""Seconds between two samples, and steps of the simulation in it."""
+PERIOD, SUBSTEPS = 1e-3, 2  # seconds between two samples, and steps of the simulation in it
 ENCODER = 2.0 * np.pi / 2**17
 TORQUE_NOISE = 0.005
 """Of torque sensors, as a share of the mean torque of gravity at each joint, and N m at least."""
 LEAST_NOISE = 0.01
-STIFFNESS = 20.0
-"""Of the drives, N m/rad, at least."""
+STIFFNESS = 20.0  # of the drives, N m/rad, at least
+SETTLED = 0.5  # seconds from when errors count
 ROBOTS = {
     'iiwa': 'kuka_iiwa/model.urdf',
     'panda': 'franka_panda/panda.urdf',
     'ur5': 'ur_description/urdf/ur5_robot.urdf',
 }
 PUSHES = ('pulse', 'step', 'slow')
-UNSEEN = ('knock', 'ramp', 'rub')
-"""Kinds of contact on which nothing is tuned."""
+UNSEEN = ('knock', 'ramp', 'rub')  # kinds of contact on which nothing is tuned
 SHAPES: dict[str, tuple[tuple[float, float], Callable[[float], float]]] = {
     'pulse': ((20, 60), lambda share: np.sin(np.pi * share)),
     'step': ((400, 400), lambda share: 1.0),
@@ -38,27 +36,8 @@ SHAPES: dict[str, tuple[tuple[float, float], Callable[[float], float]]] = {
     'rub': ((600, 900), lambda share: 0.6 + 0.4 * np.sin(6.0 * np.pi * share)),
 }
 """Least and greatest length in samples, and force as a share of the largest, by kind."""
-
-
-class Errors(NamedTuple):
-    """How the real arm differs from its model, as shares."""
-
-    payload: float = 0.0  # of the arm's mass, at the last link
-    masses: float = 0.0
-    friction: float = 0.0  # of the mean torque of gravity, viscous and dry
-
-
-PERFECT = Errors()
-
-
-class Scene(NamedTuple):
-    """What touches the arm."""
-
-    contacts: dict[int, tuple[int, Floats, Floats]]  # body, place, force by sample
-    begins: list[tuple[int, int]]  # samples at which contacts begin, and bodies
-    throws: set[int]  # samples at which a ball is thrown
-    wall: bool
-    friction: float
+Forces = dict[int, tuple[int, Floats, Floats]]  # body, place on it and force (N) by sample
+Begins = list[tuple[int, str, int]]  # sample, kind and length (samples) of contacts
 
 
 class Touched(NamedTuple):
@@ -69,10 +48,13 @@ class Touched(NamedTuple):
     velocity: Floats  # (K, n) of a good sensor
     torque: Floats  # (K, n) of torque sensors
     truth: Floats  # (K, n) external torque
-    begins: NDArray[np.int64]  # samples at which contacts begin
-    links: list[str]  # touched in each
-    kinds: list[str]  # of each
-    lasts: NDArray[np.int64]  # samples
+    begins: Begins  # of contacts
+
+
+def rmse(w: Touched, estimate: Floats) -> float:
+    """Return the root mean square error, summed over joints."""
+    late = w.t > SETTLED
+    return float(np.sum(np.sqrt(np.mean((estimate[late] - w.truth[late]) ** 2, axis=0))))
 
 
 def urdf_of(robot: str) -> str:
@@ -86,71 +68,34 @@ def urdf_of(robot: str) -> str:
 
 
 def simulate(
-    urdf: str, joints: tuple[str, ...], links: tuple[str, ...], duration: float, seed: int,
-    kinds: tuple[str, ...] = PUSHES, errors: Errors = PERFECT, weight: float = 150.0,
-    wall: bool = False, balls: tuple[float, ...] = (), push: float | None = None,
+    urdf: str, arm: ArmModel, duration: float, seed: int, kinds: tuple[str, ...] = PUSHES,
+    payload: float = 0.0, wall: bool = False, balls: tuple[float, ...] = (),
+    push: float | None = None,
 ) -> Touched:  # fmt: skip
     """
     Let an arm follow sines and be touched every second and a half.
 
-    Forces of 5 to 40 % of `weight` (N) act in random directions at random places of random links.
-    With `wall` there is MuJoCo's own contact of the last link with a plane instead; with `balls`
-    that of the middle link with a ball, thrown at these times (s); and one slow push at `push`.
+    Forces of 5 to 40 % of its weight act in random directions at random places of random links.
+    The last link carries a `payload`, a share of the arm's mass. With `wall` there is MuJoCo's own
+    contact of the last link with a plane instead; with `balls` that of the middle link with a
+    ball, thrown at these times (s); and one slow push at `push`.
     """
     random = np.random.default_rng(seed)
-    spec = mujoco.MjSpec.from_string(urdf)
-    spec.option.timestep = PERIOD / SUBSTEPS
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.compiler.fusestatic = False
-    for coupling in list(spec.equalities):
-        spec.delete(coupling)
-    for joint in list(spec.joints):
-        if joint.name not in joints:
-            spec.delete(joint)
-    for body in spec.bodies[1:]:
-        if errors.masses:
-            body.mass *= 1.0 + errors.masses * random.uniform(-1.0, 1.0)
-    last = spec.body(links[-1])
-    if errors.payload:
-        total = sum(b.mass for b in spec.bodies[1:])
-        carried = last.add_body(pos=[0.0, 0.0, 0.08], explicitinertial=True)
-        carried.mass, carried.inertia = errors.payload * total, [errors.payload * total * 4e-4] * 3
-    if wall:
-        last.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.06, 0, 0], mass=0.0)
-        plane = spec.worldbody.add_geom(
-            name='wall', type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02, 3.0, 3.0], pos=[9.0, 0, 0.0]
-        )
-        plane.solref, plane.priority = [0.04, 1.0], 1
-        plane.solimp = [0.1, 0.4, 0.02, 0.5, 2.0]  # stiffer ones flutter
-    if balls:
-        padded = spec.body(links[len(links) // 2])
-        padded.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.08, 0, 0], mass=0.0)
-        ball = spec.worldbody.add_body(name='ball', pos=[0.0, 0.0, -5.0])
-        ball.add_freejoint()
-        ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.05, 0, 0], mass=0.4)
-    model = spec.compile()
-    model.opt.gravity[:] = (0.0, 0.0, -9.81)
-    model.dof_frictionloss[:] = 0.0
-    model.dof_damping[:] = 0.0
-    model.jnt_limited[:] = 0
+    model = _compiled(urdf, arm, payload, wall, bool(balls))
     data = mujoco.MjData(model)
-    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in joints]
-    at, dof = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
-    bodies = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in links]
-    contacts, begins, count = {}, [], round(duration / PERIOD)
+    joints = [model.joint(name) for name in arm.joints]
+    at, dof = (np.concatenate([getattr(j, a) for j in joints]) for a in ('qposadr', 'dofadr'))
+    bodies = [model.body(name).id for name in arm.links]
+    forces: Forces = {}
+    begins: Begins = []
+    n, count = len(at), round(duration / PERIOD)
     if push is not None:
         for i in range(1500):
-            force = 0.15 * weight * np.sin(np.pi * i / 1500) ** 2 * np.array([0.0, 1.0, 0.0])
-            contacts[round(push / PERIOD) + i] = bodies[-2], np.zeros(3), force
+            force = 0.15 * arm.weight * np.sin(np.pi * i / 1500) ** 2 * np.array([0.0, 1.0, 0.0])
+            forces[round(push / PERIOD) + i] = bodies[-2], np.zeros(3), force
     elif kinds and not wall:
-        contacts, begins = _contacts(random, count, kinds, bodies, weight)
+        forces, begins = _contacts(random, count, kinds, bodies, arm.weight)
     throws = {round(moment / PERIOD) for moment in balls}
-    scene = Scene(contacts, begins, throws, wall, errors.friction)
-    return _run(model, data, at, dof, bodies, random, count, scene, links)
-
-
-def _run(model, data, at, dof, bodies, random, count, scene, links) -> Touched:
-    n = len(at)
     swing = random.uniform(0.15, 0.5, (2, n)) * np.sign(random.uniform(-1.0, 1.0, (2, n)))
     speed = random.uniform(0.5, 2.5, (2, n))
     middle = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 1.2, 0.0])[:n] + random.uniform(-0.3, 0.3, n)
@@ -163,7 +108,7 @@ def _run(model, data, at, dof, bodies, random, count, scene, links) -> Touched:
             -np.sum(swing * speed**2 * np.sin(angle), axis=0),
         )
 
-    if scene.wall:
+    if wall:
         reached = []
         for t in np.arange(0.0, count * PERIOD, 0.05):
             data.qpos[at] = reference(t)[0]
@@ -174,66 +119,87 @@ def _run(model, data, at, dof, bodies, random, count, scene, links) -> Touched:
         model.geom_pos[model.geom('wall').id] = (face + 0.02, 0.0, 0.0)
     data.qpos[at], data.qvel[dof], _ = reference(0.0)
     mujoco.mj_forward(model, data)
-    size = np.abs(_gravity(model, at, dof)).mean(axis=0)
-    noise = np.maximum(TORQUE_NOISE * size, LEAST_NOISE)
-    friction = scene.friction * np.maximum(size, 0.1 * np.max(size))
-    rows = {name: np.zeros((count, n)) for name in ('q', 'velocity', 'torque', 'truth')}
+    noise = np.maximum(TORQUE_NOISE * _gravity(model, at, dof), LEAST_NOISE)
+    q, velocity, torque, truth = np.zeros((4, count, n))
     full, jacobian = np.zeros((model.nv, model.nv)), np.zeros((3, model.nv))
     for k in range(count):
         target = reference(k * PERIOD)
         mujoco.mj_fullM(model, data, full)
         mass = full[np.ix_(dof, dof)]
-        q, v = data.qpos[at].copy(), data.qvel[dof].copy()
+        angle, v = data.qpos[at].copy(), data.qvel[dof].copy()
         stiff = STIFFNESS + 100.0 * np.diag(mass)
-        torque = mass @ target[2] + data.qfrc_bias[dof] + stiff * (target[0] - q)
-        torque += 2.0 * np.sqrt(stiff * np.diag(mass)) * (target[1] - v)
-        rubbing = friction * (np.tanh(v / 0.02) + 0.5 * v)
+        drive = mass @ target[2] + data.qfrc_bias[dof] + stiff * (target[0] - angle)
+        drive += 2.0 * np.sqrt(stiff * np.diag(mass)) * (target[1] - v)
         data.qfrc_applied[:] = 0.0
-        touching = scene.contacts.get(k)
-        if k in scene.throws:
+        if k in throws:
             _throw(model, data, bodies[len(bodies) // 2])
-        truth = np.zeros(n)
-        if touching is not None:
-            body, place, force = touching
+        if k in forces:
+            body, place, force = forces[k]
             point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ place
             mujoco.mj_jac(model, data, jacobian, None, point, body)
-            truth = jacobian[:, dof].T @ force
-        rows['q'][k] = np.round(q / ENCODER) * ENCODER
-        rows['velocity'][k] = v + 1e-3 * random.standard_normal(n)
-        rows['torque'][k] = torque + rubbing + noise * random.standard_normal(n)
-        data.qfrc_applied[dof] = torque + truth
+            truth[k] = jacobian[:, dof].T @ force
+        q[k] = np.round(angle / ENCODER) * ENCODER
+        velocity[k] = v + 1e-3 * random.standard_normal(n)
+        torque[k] = drive + noise * random.standard_normal(n)
+        data.qfrc_applied[dof] = drive + truth[k]
         felt = np.zeros(n)
         for _ in range(SUBSTEPS):
             mujoco.mj_step(model, data)
             felt += data.qfrc_constraint[dof] / SUBSTEPS
-        rows['truth'][k] = truth + felt
+        truth[k] += felt
         mujoco.mj_forward(model, data)
-    begins = scene.begins
-    if scene.wall or scene.throws:
-        pressed = np.linalg.norm(rows['truth'], axis=1) > 0.0
-        begins = np.flatnonzero(np.diff(pressed.astype(int)) == 1)
-        begins = [(int(k) + 1, bodies[-1], 'wall', 0) for k in begins]
-    return Touched(
-        np.arange(count) * PERIOD, rows['q'], rows['velocity'], rows['torque'], rows['truth'],
-        np.array([k for k, *_ in begins], dtype=np.int64),
-        [links[bodies.index(body)] for _, body, *_ in begins], [kind for *_, kind, _ in begins],
-        np.array([length for *_, length in begins], dtype=np.int64),
-    )  # fmt: skip
+    if wall or throws:
+        pressed = np.linalg.norm(truth, axis=1) > 0.0
+        begins = [(k + 1, 'wall', 0) for k in np.flatnonzero(np.diff(pressed) & pressed[1:])]
+    return Touched(np.arange(count) * PERIOD, q, velocity, torque, truth, begins)
+
+
+def _compiled(urdf: str, arm: ArmModel, payload: float, wall: bool, ball: bool) -> Any:
+    """Return MuJoCo's model."""
+    spec, sphere = mujoco.MjSpec.from_string(urdf), mujoco.mjtGeom.mjGEOM_SPHERE
+    spec.option.timestep = PERIOD / SUBSTEPS
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.compiler.fusestatic = False
+    for extra in (*spec.equalities, *(j for j in spec.joints if j.name not in arm.joints)):
+        spec.delete(extra)
+    last = spec.body(arm.links[-1])
+    if payload:
+        mass = payload * sum(b.mass for b in spec.bodies[1:])
+        carried = last.add_body(pos=[0.0, 0.0, 0.08], explicitinertial=True)
+        carried.mass, carried.inertia = mass, [mass * 4e-4] * 3
+    if wall:
+        last.add_geom(type=sphere, size=[0.06, 0, 0], mass=0.0)
+        plane = spec.worldbody.add_geom(
+            name='wall', type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02, 3.0, 3.0], pos=[9.0, 0, 0.0]
+        )
+        plane.solref, plane.priority = [0.04, 1.0], 1
+        plane.solimp = [0.1, 0.4, 0.02, 0.5, 2.0]  # stiffer ones flutter
+    if ball:
+        padded = spec.body(arm.links[len(arm.links) // 2])
+        padded.add_geom(type=sphere, size=[0.08, 0, 0], mass=0.0)
+        body = spec.worldbody.add_body(name='ball', pos=[0.0, 0.0, -5.0])
+        body.add_freejoint()
+        body.add_geom(type=sphere, size=[0.05, 0, 0], mass=0.4)
+    model = spec.compile()
+    model.opt.gravity[:] = (0.0, 0.0, -9.81)
+    model.dof_frictionloss[:] = 0.0
+    model.dof_damping[:] = 0.0
+    model.jnt_limited[:] = 0
+    return model
 
 
 def _gravity(model, at, dof) -> Floats:
-    """Return torques of gravity in random postures."""
+    """Return the mean torques of gravity over random postures."""
     data, found, random = mujoco.MjData(model), [], np.random.default_rng(0)
     for _ in range(50):
         data.qpos[at] = random.uniform(-2.0, 2.0, len(at))
         mujoco.mj_forward(model, data)
         found.append(data.qfrc_bias[dof].copy())
-    return np.array(found)
+    return np.abs(found).mean(axis=0)
 
 
-def _contacts(random, count, kinds, bodies, weight) -> tuple[dict, list[tuple]]:
-    """Return body, place and force by sample; and begin, body, kind and length of contacts."""
-    contacts, begins, k = {}, [], 1000
+def _contacts(random, count, kinds, bodies, weight) -> tuple[Forces, Begins]:
+    forces, begins, k = {}, [], 1000
     while k < count - 1500:
         body = bodies[int(random.integers(2, len(bodies) - 1))]
         direction, place = random.standard_normal(3), random.uniform(-0.08, 0.08, 3)
@@ -243,10 +209,10 @@ def _contacts(random, count, kinds, bodies, weight) -> tuple[dict, list[tuple]]:
         bounds, shape = SHAPES[kind]
         length = int(random.uniform(*bounds))
         for i in range(length):
-            contacts[k + i] = body, place, force * shape(i / length)
-        begins.append((k, body, kind, length))
+            forces[k + i] = body, place, force * shape(i / length)
+        begins.append((k, kind, length))
         k += length + int(random.uniform(500, 1500))
-    return contacts, begins
+    return forces, begins
 
 
 def _throw(model, data, body) -> None:

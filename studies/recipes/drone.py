@@ -9,42 +9,27 @@ heading that has none.
 from collections.abc import Callable
 from typing import Any
 
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
+from fhaosmo_ros.core import ConfigurationError
 import numpy as np
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from studies.harness import Floats
 from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
-RATE = 100.0
-"""Of the simulation and of the sensors (Hz)."""
-NEEDED = "pip install '.[recipes]'"
+RATE = 100.0  # of the simulation and of the sensors (Hz)
 
 
 def fly(
     duration: float, seed: int, wind: Callable[[float], Floats], gyroscope: dict[str, Floats]
 ) -> dict[str, Floats]:
     """
-    Fly a circle in the wind and return what was measured, a row a sample, and the truth.
+    Fly a circle in a wind (m/s by time) and return what was measured, a row a sample.
 
-    Parameters
-    ----------
-    duration : float
-        Seconds.
-    seed : int
-        Of all noise.
-    wind : callable
-        Wind (m/s, three numbers) at a time (s).
-    gyroscope : dict
-        `initial_bias`, `noise_density`, `random_walk` of RotorPy's Imu.
-
-    Returns
-    -------
-    dict of arrays
-        `t`; `position` (N, 3) and `attitude` (N, 4) of motion capture; `thrust` (N, 3), commanded
-        thrust over mass in the world by that attitude (m/s²); `rate` (N, 3) of the gyroscope;
-        `wind` (N, 3), `bias` (N, 3): the truth.
-
+    `seed` is of all noise; `gyroscope` has `initial_bias`, `noise_density` and `random_walk` of
+    RotorPy's Imu. `position` (N, 3) and `attitude` (N, 4) are of motion capture; `thrust` (N, 3)
+    is commanded thrust over mass in the world by that attitude (m/s²); `rate` (N, 3) is of the
+    gyroscope; `wind` (N, 3) and `bias` (N, 3) are the truth.
     """
     try:
         from rotorpy.controllers.quadrotor_control import SE3Control
@@ -54,7 +39,8 @@ def fly(
         from rotorpy.vehicles.hummingbird_params import quad_params
         from rotorpy.vehicles.multirotor import Multirotor
     except ImportError as error:
-        raise ConfigurationError(f'RotorPy is not installed here: {NEEDED} ({error})') from None
+        needed = "pip install '.[recipes]'"
+        raise ConfigurationError(f'RotorPy is not installed here: {needed} ({error})') from None
     np.random.seed(seed)  # noqa: NPY002 (RotorPy draws from the global generator)
     vehicle, control = Multirotor(quad_params), SE3Control(quad_params)
     circle = ThreeDCircularTraj(freq=np.full(3, 0.1), yaw_bool=True)
@@ -93,16 +79,14 @@ def gusts(seed: int, steps: bool) -> Callable[[float], Floats]:
     step, size = 1.0 / RATE, 1.5
     keep = np.exp(-step / (10.0 / 4.0))
     moved = rng.standard_normal((12_000, 2)) * size * np.sqrt(1.0 - keep**2)
-    mean, turbulence = rng.uniform(-4.0, 4.0, 2), np.zeros((12_000, 2))
-    for k in range(1, 12_000):
-        turbulence[k] = keep * turbulence[k - 1] + moved[k]
+    mean, moved[0] = rng.uniform(-4.0, 4.0, 2), 0.0
+    turbulence = lfilter([1.0], [1.0, -keep], moved, axis=0)
     return lambda t: np.append(mean + turbulence[round(t / step)], 0.0)
 
 
 # Wind
 
-WIND_DURATION, WIND_SETTLED = 40.0, 3.0
-"""Of a flight (s)."""
+WIND_DURATION, WIND_SETTLED = 40.0, 3.0  # of a flight (s)
 QUIET = {
     'initial_bias': np.zeros(3), 'noise_density': np.full(3, 1e-4), 'random_walk': np.zeros(3),
 }  # fmt: skip
@@ -114,16 +98,12 @@ def wind_flight(seed: int) -> list[Recorded]:
     """Return both axes of a flight; d is k times the wind."""
     steps = bool(seed % 2)
     found = fly(WIND_DURATION, seed, gusts(seed, steps), QUIET)
-    k = judging.model('wind')['constants.k']
-    kind = 'steps' if steps else 'turbulence'
+    k, kind = judging.model('wind')['constants.k'], 'steps' if steps else 'turbulence'
+    of_axes = (found[name].T for name in ('position', 'thrust', 'wind'))
     return [
-        Recorded(
-            f'{kind} {seed}, {name}', found['t'], found['position'][:, axis],
-            found['thrust'][:, axis : axis + 1], k * found['wind'][:, axis],
-            WIND_SETTLED,
-        )
-        for axis, name in enumerate('xy')
-    ]  # fmt: skip
+        Recorded(f'{kind} {seed}, {name}', found['t'], y, u[:, None], k * wind, WIND_SETTLED)
+        for name, y, u, wind in zip('xy', *of_axes, strict=False)
+    ]
 
 
 def winds(_: None) -> dict[str, list[Fold]]:

@@ -13,15 +13,13 @@ from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
 ACCELERATION, VELOCITY = 'acceleration', 'velocity'
-KINDS = ('smooth', 'steps')
-"""Of acceleration, as `disturbances` below has them in turn."""
+KINDS = ('smooth', 'steps')  # of acceleration, as `disturbances` below has them in turn
 JOINT = {
     'order': 2, 'phi': ['0', '0'], 'duration': 8.0, 'sample_rate': 1000.0, 'initial_state': 0.0,
     'quantisation': 2 * np.pi / 4096, 'noise_std': 0.0, 'rms_of_d': 20.0, 'band_of_d': [2.0, 15.0],
     'disturbances': ['sines', 'steps'], 'step_interval': 0.5,
 }  # fmt: skip
-SETTLED, RECORDINGS = 1.0, 4
-"""s; recordings for tuning, and as many for judging."""
+SETTLED, RECORDINGS = 1.0, 4  # s; recordings for tuning, and as many for judging
 BANDWIDTHS = np.geomspace(10.0, 500.0, 25).tolist()
 WINDOWS = [float(window) for window in range(11, 202, 10)]
 

@@ -15,8 +15,7 @@ PERIOD = 2**14 / 1e7
 MULTISINES, HALF = 45_000, 65_000
 """Row from which on the input is a multisine; model and peers come from the rows up to `HALF`."""
 END = 85_000
-LAG = 1
-"""Samples: each method is judged by what it says of d that much later."""
+LAG = 1  # samples: each method is judged by what it says of d that much later
 LAGGING, SMOOTHING = f'{OURS}, smoothing_lag of one sample', 0.0016
 """The same with the estimates smoothed by that sample: the lag is a little less than a period."""
 SETTLED, WINDOW = 1.0, 300

@@ -11,22 +11,11 @@ import numpy as np
 from scipy.signal import butter, filtfilt, savgol_filter
 from studies.harness import Floats
 from studies.recipes import judging
-from studies.recipes.judging import (
-    Estimate,
-    FIXED,
-    Fold,
-    kalman_filter,
-    Method,
-    OURS,
-    Recipe,
-    Recorded,
-)
+from studies.recipes.judging import FIXED, Fold, kalman_filter, Method, OURS, Recipe, Recorded
 
 JOINTS, WRENCH = '/pndbt/joint_states', '/pndbt/netft_data'
-RATE = 200.0
-"""Of the joint states (Hz)."""
-CUTOFF = 15.0
-"""Of the zero-phase low pass of the measured torque (Hz), as its recorders used it."""
+RATE = 200.0  # of the joint states (Hz)
+CUTOFF = 15.0  # of the zero-phase low pass of the measured torque (Hz), as its recorders used it
 WINDOW, SLIDING, SETTLED = 31, 0.05, 0.5
 """Samples of the smoother that identifies the model, offline; rad/s; s."""
 BANDWIDTHS = np.geomspace(10.0, 300.0, 14).tolist()
@@ -60,27 +49,24 @@ def identify(r: Recorded) -> tuple[dict[str, float], float]:
         torque = p q1'' + h (cos q2 s'' - sin q2 s'²) + g1 cos q1 + v q1' + c sign q1' + offset
         s'' = -(h/i) (cos q2 q1'' + sin q2 q1'²) - k cos s - friction        (the elbow is free)
     """
-    h = 1.0 / RATE
-    t = np.arange(r.t[0], r.t[-1], h)
+    period = 1.0 / RATE
+    t = np.arange(r.t[0], r.t[-1], period)
     angle, elbow, torque = (np.interp(t, r.t, x) for x in (r.u[:, 0], r.u[:, 1], r.d))
-    speed, elbow_speed = (savgol_filter(x, WINDOW, 3, 1, h) for x in (angle, elbow))
-    acceleration = savgol_filter(angle, WINDOW, 3, 2, h)
-    absolute, turning = acceleration + savgol_filter(elbow, WINDOW, 3, 2, h), speed + elbow_speed
+    speed, elbow_speed = (savgol_filter(x, WINDOW, 3, 1, period) for x in (angle, elbow))
+    acceleration, of_elbow = (savgol_filter(x, WINDOW, 3, 2, period) for x in (angle, elbow))
+    absolute, turning = acceleration + of_elbow, speed + elbow_speed
     cos, sin = np.cos(elbow), np.sin(elbow)
     table = [
         acceleration, cos * absolute - sin * turning**2, np.cos(angle), speed,
         np.tanh(speed / SLIDING), np.ones_like(t),
     ]  # fmt: skip
-    p, coupling, g1, v, c, offset = np.linalg.lstsq(np.array(table).T, torque, rcond=None)[0]
+    p, h, g1, v, c, offset = np.linalg.lstsq(np.array(table).T, torque, rcond=None)[0].tolist()
     of_elbow = [
         -cos * acceleration - sin * speed**2, -np.cos(angle + elbow), elbow_speed,
         np.tanh(elbow_speed),
     ]  # fmt: skip
-    ratio, k = np.linalg.lstsq(np.array(of_elbow).T, absolute, rcond=None)[0][:2]
-    constants = {
-        'p': p, 'h': coupling, 'r': coupling * ratio, 'g1': g1, 'k': k, 'v': v, 'c': c,
-    }  # fmt: skip
-    return {name: float(x) for name, x in constants.items()}, float(offset)
+    ratio, k = np.linalg.lstsq(np.array(of_elbow).T, absolute, rcond=None)[0][:2].tolist()
+    return {'p': p, 'h': h, 'r': h * ratio, 'g1': g1, 'k': k, 'v': v, 'c': c}, offset
 
 
 def inertia(p: Mapping[str, Any], r: Recorded) -> Floats:
@@ -88,7 +74,7 @@ def inertia(p: Mapping[str, Any], r: Recorded) -> Floats:
     return np.asarray(p['constants.p'] - p['constants.r'] * np.cos(r.u[:, 1]) ** 2)
 
 
-def torque(method: Estimate, p: Mapping[str, Any], r: Recorded, number: float) -> Floats:
+def torque(method: judging.Estimate, p: Mapping[str, Any], r: Recorded, number: float) -> Floats:
     """Return the torque by what a method says of d: d J(q2)."""
     return method(p, r, number) * inertia(p, r)
 

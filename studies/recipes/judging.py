@@ -22,29 +22,29 @@ CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'recipes'
 OURS, FIXED = 'this observer, self-tuning', 'this observer, fixed gains'
 BUTTERWORTH = {2: (np.sqrt(2.0), 1.0), 3: (2.0, 2.0, 1.0)}
 """Coefficients of Butterworth polynomials of degree N, without the first one."""
-FAR = 1.0
-"""Half-width of psi; smaller innovations are corrected linearly."""
+FAR = 1.0  # half-width of psi; smaller innovations are corrected linearly
 
 
 class Recorded(NamedTuple):
     """A recording with its truth, (N,) arrays but for u."""
 
     name: str
-    t: Floats
-    """Seconds."""
+    t: Floats  # s
     y: Floats
-    u: Floats
-    """(N, m): known inputs, that of the interval which ends at each sample."""
-    d: Floats
-    """The true unknown input, or the `quantity` that methods return in its place."""
-    settled: float
-    """Seconds after which errors count."""
+    u: Floats  # (N, m): known inputs, that of the interval which ends at each sample
+    d: Floats  # the true unknown input, or the `quantity` that methods return in its place
+    settled: float  # seconds after which errors count
     quantity: str = 'd'
 
     @property
     def judged(self) -> NDArray[np.bool_]:
         """Samples that count."""
         return self.t - self.t[0] > self.settled
+
+    @property
+    def inputs(self) -> Floats:
+        """Known inputs, one that is 0 where there are none."""
+        return self.u if self.u.size else np.zeros((len(self.y), 1))
 
     @property
     def period(self) -> float:
@@ -72,32 +72,21 @@ class Method(NamedTuple):
     unit: str = 'rad/s'
 
 
-Folds = Mapping[str, Sequence[Fold]]
-"""By condition."""
-Judgements = Mapping[str, Mapping[str, Row]]
-"""Error, chosen numbers (one a fold) and their unit, by condition and method."""
+Folds = Mapping[str, Sequence[Fold]]  # by condition
 
 
 class Recipe(NamedTuple):
     """What is measured and how it is shown."""
 
     methods: dict[str, Method]
-    conditions: Callable[[Any], Folds]
-    """From the recordings' path, None where the recipe needs no recordings."""
-    quantity: str
-    """What the figure shows, with its unit."""
-    drawn: Sequence[str]
-    """Methods in the figure."""
-    shown: tuple[float, float]
-    """Seconds in the figure."""
-    scale: float = 1.0
-    """From d to the quantity."""
-    fold: int = 0
-    """The fold in the figure."""
-    band: bool = True
-    """Whether it has the standard deviations."""
-    data: str = ''
-    """The recordings that have to be given."""
+    conditions: Callable[[Any], Folds]  # from the path of recordings, None where none are needed
+    quantity: str  # in the figure, with its unit
+    drawn: Sequence[str]  # methods in the figure
+    shown: tuple[float, float]  # seconds in the figure
+    scale: float = 1.0  # from d to the quantity
+    fold: int = 0  # in the figure
+    band: bool = True  # whether the figure has the standard deviations
+    data: str = ''  # the recordings that have to be given
 
 
 def model(name: str, constants: Mapping[str, float] | None = None) -> dict[str, Any]:
@@ -140,17 +129,9 @@ def fixed(parameters: Mapping[str, Any], r: Recorded, bandwidth: float) -> Float
 
 def low_passed(x: Floats, bandwidth: float, period: float, order: int, derivative: int) -> Floats:
     """Return a derivative of x behind (s / bandwidth + 1)^-order, from rest at the first value."""
-    numerator = [1.0] + [0.0] * derivative
     denominator = np.poly([-bandwidth] * order) / bandwidth**order
-    b, a = bilinear(numerator, denominator, 1.0 / period)
-    first = x[0]
-    filtered = lfilter(b, a, x - first)
-    return filtered + (first if derivative == 0 else 0.0)
-
-
-def inputs_of(r: Recorded) -> Floats:
-    """Return the known inputs, one that is 0 where there are none."""
-    return r.u if r.u.size else np.zeros((len(r.y), 1))
+    b, a = bilinear([1.0] + [0.0] * derivative, denominator, 1.0 / period)
+    return lfilter(b, a, x - x[0]) + (x[0] if derivative == 0 else 0.0)
 
 
 def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
@@ -162,7 +143,7 @@ def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) ->
     """
     model, h = plant_of(p), r.period
     velocity = low_passed(r.y, bandwidth, h, 2, 1)
-    samples = zip(np.column_stack([r.y, velocity]), inputs_of(r), strict=True)
+    samples = zip(np.column_stack([r.y, velocity]), r.inputs, strict=True)
     explained = np.array([model.evaluate(z, u)[1] for z, u in samples])
     acceleration = low_passed(r.y, bandwidth, h, 2, 2)
     return acceleration - low_passed(explained, bandwidth, h, 2, 0)
@@ -181,7 +162,7 @@ def kalman_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats
     x = np.zeros(n + 1)
     x[0] = r.y[0]
     covariance = np.diag([(3.0 * bandwidth) ** (2 * k) for k in range(n + 1)])
-    chain, found, inputs = np.eye(n + 1, k=1), np.zeros(len(r.y)), inputs_of(r)
+    chain, found, inputs = np.eye(n + 1, k=1), np.zeros(len(r.y)), r.inputs
     for k in range(1, len(r.y)):
         dt, u = r.t[k] - r.t[k - 1], inputs[k]
         rates = [np.zeros(n + 1)]
@@ -240,12 +221,11 @@ def judge(method: Method, folds: Sequence[Fold]) -> Row:
     for p, training, judged in folds:
         best = method.numbers[0]
         if len(method.numbers) > 1:
-            scores = {
-                number: error([(r, method.estimate(p, r, number)) for r in training])
-                for number in method.numbers
-            }
-            best = min(scores, key=scores.__getitem__)
-            chosen.append(float(f'{best:.4g}'))
+            best = min(
+                method.numbers,
+                key=lambda x, p=p, rs=training: error((r, method.estimate(p, r, x)) for r in rs),
+            )
+            chosen.append(f'{float(f"{best:.4g}"):g}')
         pairs += [(r, method.estimate(p, r, best)) for r in judged]
     wrong, unit = float(f'{error(pairs):.4g}'), method.unit if chosen else ''
-    return {'error': wrong, 'chosen': ' '.join(f'{x:g}' for x in chosen), 'unit': unit}
+    return {'error': wrong, 'chosen': ' '.join(chosen), 'unit': unit}

@@ -11,13 +11,11 @@ from studies.harness import Floats
 from studies.recipes import judging
 from studies.recipes.judging import FIXED, Fold, Method, OURS, Recipe, Recorded
 
-INERTIA = 0.00732
-"""kg m²: mass * g * lever over the identified weight."""
+INERTIA = 0.00732  # kg m²: mass * g * lever over the identified weight
 FULL_DUTY, SLIDING = 885.0, 0.3
 """`load` of the servo at full voltage; speed (rad/s) over which Coulomb friction changes sign."""
 SETTLED = 0.5
-WINDOW = 15
-"""Samples of the smoother that identifies the model, offline."""
+WINDOW = 15  # samples of the smoother that identifies the model, offline
 BANDWIDTHS = np.geomspace(5.0, 200.0, 14).tolist()
 
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The loop over samples of the filters that bend or adapt; see kalman.py.
+The loop over samples of the filters that bend or adapt; see methods.py.
 
 They predict by Runge-Kutta steps of the whole (nonlinear) model, so they know Phi exactly as ours
 does, and correct by y. Each estimate uses the sample of its own time. Covariances are of scaled
@@ -92,26 +92,13 @@ cdef inline double chance(bint same, int count, double switch) noexcept nogil:
 
 def several_models(Prediction prediction, samples, bank):
     """
-    Run Kalman filters that bend or adapt, one for each model.
+    Run Kalman filters that bend or adapt, one for each model; return (K, N) estimates.
 
-    Parameters
-    ----------
-    prediction : Prediction
-        Of N states, with its longest step; a longer interval takes several.
-    samples
-        With `y`, `h` of shape (K,): samples, time since the one before (s), of which the first is
-        not used; `u` (K, m): known inputs.
-    bank
-        With `a`, `fresh` (N, N): transition of a period and covariance at the first sample; `q`
-        (M, N, N): what a period adds, by model; `scale` (N,): scaled states over states; `period`
-        (s); `huber`: standard deviations; `memory`: share of a sample in the variance of the
-        noise; `switch`: probability of another model.
-
-    Returns
-    -------
-    (K, N) array
-        Estimates of z, d, d', ..
-
+    `samples` is as for `core.observer.kalman.innovations`. `bank` has `a`, `fresh` (N, N):
+    transition of a period and covariance at the first sample; `q` (M, N, N): what a period adds,
+    by model; `scale` (N,): scaled states over states; `period` (s); `huber`: standard deviations;
+    `memory`: share of a sample in the variance of the noise; `switch`: probability of another
+    model.
     """
     cdef const double[::1] y = samples.y, h = samples.h
     cdef const double[:, ::1] u = samples.u

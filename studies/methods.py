@@ -1,0 +1,464 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The observers that are compared, all with the same model and Phi; how they are scored and tuned.
+
+Kalman filters, steady ones, and ones that adapt:
+
+    z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d
+    d' = d_1 - decay d, d_1' = d_2 - decay d_1, ..., d_{m-1}' = -decay d_{m-1} + white noise
+    x(t_k) = prediction(t_k) + K (y_k - prediction_1(t_k))
+
+For a linear Phi the prediction equals the zero-order-hold discretisation, up to an error that
+decreases with the longest step. The others have one recursion, with covariances relative to the
+tuned noise; between samples the covariance takes as many steps as there are periods.
+
+Huber: an innovation e beyond `huber` standard deviations sqrt(S) counts as if its noise were
+larger, so that its influence is bounded. Noise: R <- R + share (max(e^2 - P_11, R_0 / 10^4) - R),
+the recursive form of innovation-based adaptive estimation (A. H. Mohamed and K. P. Schwarz,
+Journal of Geodesy 73, 1999, doi:10.1007/s001900050236). Several models: the interacting multiple
+model filter (H. A. P. Blom and Y. Bar-Shalom, IEEE Transactions on Automatic Control 33(8), 1988,
+doi:10.1109/9.1299).
+
+The sliding mode observers are the core's own. Levant's differentiator and its gains: A. Levant,
+International Journal of Control 76(9-10), 2003, doi:10.1080/0020717031000099029. Ours are as users
+get them: with the gains that `tune` finds by its search, or self-tuning, in the online estimator.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import redirect_stderr
+from functools import lru_cache, partial
+from io import StringIO
+import math
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+from fhaosmo_ros.core import ConfigurationError, Observer, Recording, TriangularModel
+from fhaosmo_ros.core.model.inputs import known_inputs
+from fhaosmo_ros.core.model.prediction import Prediction
+from fhaosmo_ros.core.observer.kalman import innovations
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
+from fhaosmo_ros.core.simulation.metrics import rms
+from fhaosmo_ros.tools.cli.command import shipped
+from fhaosmo_ros.tools.tuning.likelihood import Samples
+from fhaosmo_ros.tools.tuning.objective import SMALLEST, TUNE_PARAMETERS
+from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
+from fhaosmo_ros.tools.tuning.tuner import DERIVATIVES, RATES, Tuner
+import numpy as np
+from scipy.linalg import expm, solve_discrete_are
+from studies import harness
+from studies.filters import several_models
+from studies.harness import Floats
+
+JUDGED_FROM = 5.0  # seconds of each recording that are the transient
+ROUNDING = 1e-15  # noise of a y about 1
+DEADBEAT = 3.0  # bandwidth times period of an observer that forgets all but the last few samples
+HOPELESS = 1.5
+"""A trial this many times worse than the best one so far is not run on more recordings."""
+Values = Mapping[str, Any]
+Run = Callable[[Recording], Sequence[Floats]]
+"""Estimates of z and d (K, n + 1) by readout: some have filtered states, and internal ones."""
+
+
+def objective(recording: Recording, d: Floats, since: float = JUDGED_FROM) -> float:
+    """Return the RMS error of d over the RMS of d; tuning minimises its geometric mean."""
+    late = recording.t >= since
+    truth = recording.d[late]
+    with np.errstate(over='ignore', invalid='ignore'):
+        value = rms(d[late] - truth) / rms(truth)
+    return value if np.isfinite(value) else math.inf
+
+
+def mean(errors: Iterable[float]) -> float:
+    """Return the geometric mean: a tenth less counts the same on an easy case and a hard one."""
+    return float(np.exp(np.mean(np.log(np.maximum(list(errors), SMALLEST)))))
+
+
+class Setting(NamedTuple):
+    """What a user knows before tuning."""
+
+    model: TriangularModel
+    period: float  # nominal sampling period in seconds
+    size: float  # about how large d is
+    noise: float  # standard deviation of the noise on y, in its unit, with that of its rounding
+    judged_from: float = JUDGED_FROM  # seconds of each recording that are the transient
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """The model, as parameters of an estimator."""
+        return {'order': self.model.order, 'phi': list(self.model.phi)}
+
+    @property
+    def speed(self) -> float:
+        """Where searches begin: the bandwidth (rad/s) at which noise weighs as much as d."""
+        fastest = 0.5 / self.period
+        return fastest if self.noise <= 0.0 else min(self.balance(0), fastest)
+
+    def balance(self, derivatives: int) -> float:
+        """
+        Return the bandwidth (rad/s) at which noise weighs as much as d, for N levels.
+
+        Noise of density noise^2 period leaves noise sqrt(period w^(2 N - 1)) in the N-th level.
+        Without any there is rounding.
+        """
+        levels = self.model.order + 1 + derivatives
+        ratio = self.size / (max(self.noise, ROUNDING) * self.period**0.5)
+        return float(min(ratio ** (1.0 / (levels - 0.5)), DEADBEAT / self.period))
+
+
+class Search(NamedTuple):
+    """What a method is tuned with."""
+
+    judged: Callable[[Values], float]  # from values to the objective over all recordings
+    setting: Setting
+    recordings: Sequence[Recording]
+    trials: int  # how often an objective may be evaluated
+    seed: int
+
+
+class Method(NamedTuple):
+    """A way to estimate z and d."""
+
+    name: str  # key in results, and head of its column
+    kind: str  # one of `KINDS`
+    prepare: Callable[[Setting, Values], Run]
+    """Raises ConfigurationError for values that make no observer."""
+    space: Callable[[Setting], Sequence[Dimension]] = lambda _: ()
+    """Parameters to tune for a setting."""
+    tune: Callable[[Search], Values] | None = None  # a search of its own
+    needs_noise: bool = False  # true for one that is about the noise, which there has to be
+
+
+class Outcome(NamedTuple):
+    """What a set of values brings."""
+
+    value: float
+    """Geometric mean of the objective over the recordings, guessed where not all were run."""
+    readout: int  # the best one, which this is about
+    averages: list[float]  # the same over the first recordings, so many as were run
+    values: dict[str, Any]
+
+
+def trial(
+    method: Method, setting: Setting, values: Values, recordings: Sequence[Recording],
+    rival: Sequence[float] = (),
+) -> Outcome:  # fmt: skip
+    """
+    Evaluate a set of values on all recordings.
+
+    It ends early where the average so far exceeds `HOPELESS` times that of the `rival`, the
+    averages of the best set of values so far.
+    """
+    best, averages, totals = 0, list[float](), defaultdict[int, float](float)
+    try:
+        run = method.prepare(setting, values)
+    except ConfigurationError:  # values that make no observer, such as an unsolvable Riccati
+        return Outcome(math.inf, best, averages, {})
+    for count, recording in enumerate(recordings, 1):
+        for readout, found in enumerate(run(recording)):
+            error = objective(recording, found[:, -1], setting.judged_from)
+            totals[readout] += math.log(max(error, SMALLEST))
+        best = min(totals, key=totals.__getitem__)
+        averages.append(math.exp(totals[best] / count))
+        if not averages[-1] <= (HOPELESS * rival[count - 1] if rival else BAD):
+            break
+    value = averages[-1]
+    if rival and len(averages) < len(recordings):  # as much worse on the others, it is assumed
+        value *= rival[-1] / rival[len(averages) - 1]
+    return Outcome(value, best, averages, dict(values))
+
+
+def tune(
+    method: Method, setting: Setting, recordings: Sequence[Recording], trials: int, seed: int
+) -> Outcome:
+    """Search a method's parameters; one without any is evaluated as it is."""
+    averages: Sequence[float] = ()
+    least = math.inf
+
+    def judged(v: Values) -> float:
+        nonlocal averages, least
+        found = trial(method, setting, v, recordings, averages)
+        if len(found.averages) == len(recordings) and found.value < least:
+            averages, least = found.averages, found.value
+        return found.value
+
+    space, values = method.space(setting), {}
+    if method.tune is not None:
+        values = dict(method.tune(Search(judged, setting, recordings, trials, seed)))
+    elif len(space) == 1:
+        values = _scan(judged, space[0], trials)
+    elif space:
+        values = minimise(judged, space, trials, seed).best
+    return trial(method, setting, values, recordings)
+
+
+def _scan(judged: Callable[[Values], float], d: Dimension, trials: int) -> dict[str, float]:
+    """Try points all over the range of the only parameter, then closer ones around the best."""
+    coarse = max(1, 2 * trials // 3)
+    points = [d.start, *np.geomspace(d.low, d.high, coarse)][:coarse]
+    best = min(points, key=lambda x: judged({d.name: x}))
+    step = (d.high / d.low) ** (1.0 / max(coarse - 1, 1))
+    closer = np.geomspace(max(best / step, d.low), min(best * step, d.high), trials - coarse)
+    return {d.name: float(min([best, *closer], key=lambda x: judged({d.name: x})))}
+
+
+LINEAR, USUAL, ROBUST = 'linear filter', 'usual Kalman filter', 'adaptive filter'
+SLIDING, PAPER, OURS, SELF_TUNING = 'sliding mode', 'paper', 'ours, tuned', 'ours, self-tuning'
+KINDS = (LINEAR, USUAL, ROBUST, SLIDING, PAPER, OURS, SELF_TUNING)
+"""Kinds of methods; the usual Kalman filter, whose d is a random walk, is one of its own."""
+LINEAR_LIMIT = 'Kalman, Matern'  # our observer equals this filter for small innovations
+HUBER, NOISE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'
+REACH = 10.0  # how far a search for the bandwidth goes, as a factor to both sides
+LONGEST, LONGEST_STEP = 1.5, 1.0
+"""Steps of a prediction: nominal periods; seconds, for a model without dynamics of its own."""
+TRIED = (0, 1, 2, 3)  # derivatives of d
+RECURSIVE = (1.1, 1.5, 2.0, 3.0, 5.0, 7.0)
+"""Levant's lambda_0 .. lambda_5 of the recursive form, for a Lipschitz constant of 1."""
+GRID = len(DERIVATIVES) * len(RATES)  # trials that `tune` uses before its search
+
+
+class SampledModel:
+    """
+    The model, linearised at rest and extended by a chain of integrators that makes d.
+
+    States are scaled by powers of the period (s), because the Riccati equation is badly
+    conditioned otherwise. With a `chain` of 1 white noise drives d itself, with 2 its derivative.
+    All states of the chain decay at the rate `decay` (1/s), so that d is a Matern process.
+    """
+
+    def __init__(
+        self, model: TriangularModel, period: float, chain: int = 1, decay: float = 0.0
+    ) -> None:
+        n, self.size, self.period = model.order, model.order + chain, period
+        self.scale = period ** np.arange(self.size)  # scaled states are x_i * period^(i - 1)
+        self._rates = np.eye(self.size, k=1)
+        self._rates[range(n, self.size), range(n, self.size)] = -decay
+        jacobian = model.jacobian(np.zeros(n))
+        fastest = np.max(np.abs(np.linalg.eigvals(jacobian + np.eye(n, k=1))))
+        resolution = min(0.03 / max(float(fastest), 1e-9), LONGEST_STEP)
+        # Runge-Kutta steps (s) up to this one have a negligible error. For a linear model steps of
+        # 0.1 / fastest rate would do; a nonlinearity that is crossed within a few steps, such as
+        # dry friction, needs shorter ones.
+        self.longest = min(LONGEST * period, resolution)
+        self._rates[:n, :n] += jacobian
+        self.a = self._scaled(expm(self._rates * period))
+        """(N, N): transition over a period, in scaled states."""
+
+    def _scaled(self, matrix: Floats) -> Floats:
+        return matrix * self.scale[:, None] / self.scale[None, :]
+
+    def kalman(self, intensity: float) -> Floats:
+        """
+        Return the steady-state Kalman gain for noise of variance 1 on y.
+
+        It is for a filter that predicts to t_k and then corrects with y_k itself; white noise of
+        the intensity drives the last state of the chain.
+        """
+        noise = self.process_noise(intensity)
+        try:
+            with np.errstate(invalid='ignore'):  # the result is checked below
+                p = solve_discrete_are(self.a.T, np.eye(self.size)[:1].T, noise, np.eye(1))
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
+        gain = p[:, 0] / (p[0, 0] + 1.0) / self.scale
+        if not np.isfinite(gain).all():
+            raise ConfigurationError(f'Kalman gain: expected finite numbers, got {gain}')
+        return gain
+
+    def process_noise(self, intensity: float) -> Floats:
+        """
+        Return what such noise adds to the scaled covariance over a period.
+
+        By C. F. Van Loan, IEEE Transactions on Automatic Control 23(3), 1978,
+        doi:10.1109/TAC.1978.1101743.
+        """
+        n, rates = self.size, self._scaled(self._rates) * self.period
+        drive = np.diag(np.eye(n)[-1])
+        exponential = expm(np.block([[-rates, drive], [np.zeros((n, n)), rates.T]]))
+        largest = intensity * self.scale[-1] ** 2 * self.period
+        covariance = largest * exponential[n:, n:].T @ exponential[:n, n:]
+        return 0.5 * (covariance + covariance.T)
+
+
+def samples_of(r: Recording, model: TriangularModel) -> Samples:
+    """Return the samples of a recording, as if each came one period after the one before."""
+    count = len(r.y)
+    periods, used = np.ones(count, np.int64), np.ones(count, np.bool_)
+    periods[0] = 0  # there a filter begins
+    u = known_inputs(r.u, model.inputs, count)
+    return Samples(np.diff(r.t, prepend=r.t[0]), periods, np.ascontiguousarray(r.y), u, used)
+
+
+def estimates(
+    model: TriangularModel, gain: Floats, decay: float, r: Recording, longest: float
+) -> Floats:
+    """
+    Return the estimates of z, d, d_1, .. of a recording, a row for each sample, by the gain K.
+
+    `decay` is 0 for a random walk; intervals beyond `longest` (s) take several steps. This is a
+    Kalman filter whose covariance P is as it has to be for K from the beginning, and stays.
+    """
+    expressions, size = model.with_unknown_input(decay, len(gain) - model.order - 1), len(gain)
+    fresh = np.zeros((size, size))
+    fresh[:, 0] = gain  # K = P_1 / (P_11 + variance)
+    steady = SimpleNamespace(
+        a=np.eye(size), q=np.zeros((size, size)), fresh=fresh, variance=1.0 - gain[0],
+        clip=math.inf, settled=0,
+    )  # fmt: skip
+    _, _, found = innovations(Prediction(expressions, longest), samples_of(r, model), steady)
+    return np.asarray(found)
+
+
+def _steady(setting: Setting, values: Values) -> Run:
+    """Return a run of the filter whose speed is about `bandwidth`."""
+    model, decay = setting.model, values.get('decay', 0.0)
+    sampled = SampledModel(model, setting.period, 1 + int(values.get('derivatives', 0)), decay)
+    gain = sampled.kalman(setting.period * values['bandwidth'] ** (2 * sampled.size))
+    return lambda r: [estimates(model, gain, decay, r, sampled.longest)[:, : model.order + 1]]
+
+
+def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...]:
+    """Return bandwidth and decay of a filter whose d is a Matern process."""
+    speed, fastest = setting.balance(derivatives), 5.0 / setting.period
+    return (
+        Dimension('bandwidth', speed / REACH, min(speed * REACH, fastest), speed),
+        Dimension('decay', 0.03, 30.0, 1.0),
+    )
+
+
+def each_order(search: Search, more: Sequence[Dimension] = ()) -> Values:
+    """Search bandwidth, decay and `more` with each number of derivatives of d."""
+    best: tuple[float, Values] = (math.inf, {})
+    for k in TRIED:
+        fixed = {'derivatives': float(k)}
+        found = minimise(
+            lambda v, fixed=fixed: search.judged(fixed | v),
+            (*matern_space(search.setting, k), *more),
+            max(1, search.trials // len(TRIED)),
+            search.seed,
+        )
+        if not best[1] or found.value < best[0]:
+            best = found.value, fixed | found.best
+    return best[1]
+
+
+def _bending(setting: Setting, values: Values) -> Run:
+    """Return a run of the filters that bend or adapt."""
+    model, h, derivatives = setting.model, setting.period, int(values.get('derivatives', 0))
+    sampled = SampledModel(model, h, derivatives + 1, values['decay'])
+    size, spread = sampled.size, values.get('spread', 1.0)
+    factors = (1.0,) if spread == 1.0 else (1.0 / spread, 1.0, spread)
+    bandwidths = [factor * values['bandwidth'] for factor in factors]
+    q = np.array([sampled.process_noise(h * bandwidth ** (2 * size)) for bandwidth in bandwidths])
+    scale = sampled.scale / setting.noise
+    about = setting.balance(derivatives) ** np.arange(1.0 + derivatives)
+    sizes = np.concatenate([np.ones(model.order), setting.size * about])
+    sizes[0] = setting.noise
+    bank = SimpleNamespace(
+        a=sampled.a, q=q, fresh=np.diag((scale * sizes) ** 2), scale=scale, period=h,
+        huber=values.get('huber', math.inf), memory=h / values.get('memory', math.inf),
+        switch=h / values.get('stay', 1.0),
+    )  # fmt: skip
+    expressions = model.with_unknown_input(values['decay'], derivatives)
+    prediction = Prediction(expressions, sampled.longest)
+    return lambda r: [several_models(prediction, samples_of(r, model), bank)[:, : model.order + 1]]
+
+
+def _adaptive(name: str, *options: Dimension) -> Method:
+    """Return a method that takes d for a Matern process."""
+    return Method(
+        name, ROBUST, _bending, lambda setting: (*matern_space(setting), *options),
+        partial(each_order, more=options), needs_noise=True,
+    )  # fmt: skip
+
+
+def _sliding(parameters: Callable[[Values], Mapping[str, Any]], s: Setting, values: Values) -> Run:
+    """Return a run of the core's Observer with these parameters."""
+    observer, n = Observer(s.told | dict(parameters(values))), s.model.order
+
+    def estimate(r: Recording) -> list[Floats]:
+        observer.reset()
+        found = observer.run(r.t, r.y, r.u)
+        internal = np.column_stack([found.z_hat[:, 0], found.z_tilde[:, :n]])
+        return [found.z_hat[:, : n + 1], internal]
+
+    return estimate
+
+
+@lru_cache
+def _paper() -> dict[str, Any]:
+    """Return the paper's numbers that fit any plant: all but the model and the initial values."""
+    values = load(shipped('config/paper.yaml'), 'estimator', OBSERVER_PARAMETERS)
+    left_out = ('order', 'phi', 'variant', 'initial_estimate', 'initial_internal')
+    kept = {k: v for k, v in values.items() if k not in left_out}
+    return kept | {name: kept[name][:1] for name in ('lambda', 'alpha')}
+
+
+def _papers(variant: str, _: Values) -> Mapping[str, Any]:
+    return _paper() | {'variant': variant, 'start_from_measurement': True}
+
+
+def _levant(setting: Setting, values: Values) -> Run:
+    """Non-recursive form: kappa_i = lambda_i kappa_{i+1}^(i / (i+1)) L^((N-i) / N)."""
+    levels = setting.model.order + 1
+    gains, kappa = [], 1.0
+    for i in reversed(range(levels)):
+        kappa = RECURSIVE[i] * kappa ** (i / (i + 1))
+        gains.append(kappa * values['lipschitz'] ** ((levels - i) / levels))
+    own = {'structure': 'levant', 'variant': 'sign', 'scheme': 'implicit', 'lambda': gains}
+    return _sliding(lambda _: own, setting, values)
+
+
+def _online(own: Values, setting: Setting, values: Values) -> Run:
+    """Return a run of the online estimator with these parameters."""
+    parameters, known = setting.told | dict(values) | dict(own), setting.model.uses_input
+
+    def estimate(r: Recording) -> list[Floats]:
+        found = harness.observed(parameters, r.t, r.y, r.u if known else None)
+        return [np.column_stack([found.z, found.unknown_input])]
+
+    return estimate
+
+
+def _tune(search: Search) -> Values:
+    """Return the parameters of the estimator that `tune` writes; its grid uses trials, too."""
+    tuning = TUNE_PARAMETERS.complete(search.setting.told | {'settled': JUDGED_FROM})
+    recordings = list(search.recordings)
+    with redirect_stderr(StringIO()):  # its progress bars
+        tuner = Tuner(recordings, recordings[:1], {}, tuning, search.seed)
+        return tuner.parameters(tuner.search(max(1, search.trials - GRID)).best)
+
+
+def _one_bandwidth(s: Setting) -> Sequence[Dimension]:
+    """Return a range in rad/s, from far below any d to where the observer is deadbeat."""
+    return [Dimension('bandwidth', 0.05, 5.0 / s.period, s.speed)]
+
+
+def _lipschitz(s: Setting) -> Sequence[Dimension]:
+    return [Dimension('lipschitz', 1e-4 * s.size, 1e8 * s.size, 10.0 * s.size)]
+
+
+PAPERS = {'sign': 'sign', 'fuzzy': 'fuzzy', 'adaptive': 'fuzzy_adaptive'}
+ADAPTIVE = (
+    _adaptive(HUBER, Dimension('huber', 1.0, 10.0, 2.5)),
+    _adaptive(NOISE, Dimension('memory', 0.1, 100.0, 3.0)),
+    _adaptive(IMM, Dimension('spread', 1.2, 10.0, 2.0), Dimension('stay', 0.1, 100.0, 3.0)),
+)
+METHODS = {
+    m.name: m
+    for m in (
+        Method('Kalman', USUAL, _steady, _one_bandwidth),  # d a random walk
+        Method('Kalman, decaying', LINEAR, _steady, matern_space),  # a random walk that decays
+        Method(LINEAR_LIMIT, LINEAR, _steady, matern_space, each_order),
+        *ADAPTIVE,
+        Method('Levant, implicit', SLIDING, _levant, _lipschitz),
+        *(
+            Method(f'paper: {name}', PAPER, partial(_sliding, partial(_papers, own)))
+            for name, own in PAPERS.items()
+        ),
+        Method(OURS, OURS, partial(_online, {}), tune=_tune),  # levant, fuzzy, predict_correct
+        Method(SELF_TUNING, SELF_TUNING, partial(_online, harness.SELF_TUNING)),
+    )
+}
+"""The observers, by name."""
