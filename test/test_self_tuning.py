@@ -267,6 +267,20 @@ def test_a_jump_of_d_is_followed_at_once():
     assert (off[jump + 25 : jump + 300] < 0.1).all()
 
 
+@pytest.mark.parametrize('seed', [0, 10, 16])
+def test_a_usual_jump_of_d_is_believed_at_the_second_sample_and_two_outliers_are_none(seed):
+    """With d = 0.2 at the start, too: what is usual is not known yet."""
+    t = np.arange(4000) / 10.0
+    d = 0.2 * np.sign(np.sin(0.1 * t + 0.01))
+    y = 0.1 * np.concatenate([[0.0], np.cumsum(d[:-1])])
+    y += 2e-3 * np.random.default_rng(seed).standard_normal(len(t))
+    y[3500:3502] += [3.0, 6.0]  # as a d of 30 would do it
+    wrong = np.abs(Observer(SELF_TUNING, order=1, phi=['0']).run(t, y).unknown_input - d)
+    for jump in np.flatnonzero(np.diff(d))[3:] + 1:  # 13 noises a sample
+        assert wrong[jump + 2 : jump + 200].max() < 0.1
+    assert wrong[3500:3550].max() < 0.1
+
+
 @pytest.mark.parametrize('counts', [1024, 4096, 65536])
 def test_slow_motion_over_an_encoder(counts):
     """It stands still for most of the time; a count that comes then is no jump of d."""

@@ -47,7 +47,7 @@ def in_parts(estimator, stamps, y, size):
 
 def smoothed(estimator, stamps, y, u=None):
     """Return the rows that an estimator smooths of a recording, and those that waited."""
-    if not estimator.smooths:
+    if estimator.smoothing is None:
         estimator.smooth()
     return [estimator.run(stamps, y, u), estimator.finish()]
 

@@ -374,7 +374,7 @@ cdef class Rows:
             memcpy(less, known, n * sizeof(Row))
             carry(n, now.p, less)
             for i in range(n):
-                out[n + i] = max(now.p[i][i] - less[i][i], ROUNDING * now.p[i][i])
+                out[n + i] = max(now.p[i][i] - less[i][i], ROUNDING * fabs(now.p[i][i]))
 
     def smooth(self, Py_ssize_t end, lag=None):
         """

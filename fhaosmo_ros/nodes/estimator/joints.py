@@ -3,7 +3,6 @@
 
 from collections.abc import Iterable
 from textwrap import shorten
-from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import channel_names, CHANNELS
@@ -14,6 +13,8 @@ from rclpy.node import Node
 
 MOST_KNOWN = 1000
 """After so many names, new ones are neither looked at nor told any more."""
+QUIET = 5.0
+"""Seconds between two lines about names that come late."""
 
 
 class Joints:
@@ -43,23 +44,31 @@ class Joints:
                 fit.append(name)
             except ConfigurationError as error:
                 bad[name] = shorten(str(error), 200)
-        self.leave_out(
+        self._leave_out(
             list(bad),
             f"can't be the name of a channel ({next(iter(bad.values()), '')}); name a channel and "
             'set its input_field to position[NAME]',
         )
-        self.leave_out(
+        self._leave_out(
             fit[most:],
             f'beyond max_channels ({most}); raise it, or name in channels those that are to be '
             'estimated',
         )
         return fit[:most]
 
-    def leave_out(self, names: list[str], why: str, **options: Any) -> None:
-        """Log why names do not become channels, if there are any."""
+    def refuse(self, names: list[str]) -> None:
+        """Tell that names have come too late to become channels, if there are any."""
         if names:
             self._left_out += names
-            self._node.get_logger().error(f'{_in_words(names)} {why}', **options)
+            why = 'has come after the first message; start the node again to take it'
+            text = f'{_in_words(names)} {why}'
+            self._node.get_logger().warning(text, throttle_duration_sec=QUIET)
+
+    def _leave_out(self, names: list[str], why: str) -> None:
+        """Log why names of the first message do not become channels, if there are any."""
+        if names:
+            self._left_out += names
+            self._node.get_logger().error(f'{_in_words(names)} {why}')
 
     @property
     def problem(self) -> str:

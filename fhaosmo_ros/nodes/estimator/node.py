@@ -171,8 +171,7 @@ class EstimatorNode(ManagedNode):
         """Make the channels from the first names; later, report those that are new."""
         new = self._joints.new(names)
         if self._names != FROM_JOINTS:
-            why = 'has come after the first message; start the node again to take it'
-            self._joints.leave_out(new, why, throttle_duration_sec=5.0)
+            self._joints.refuse(new)
             return
         fit = self._joints.choose(new, self._node_parameters.values['max_channels'])
         if not fit:

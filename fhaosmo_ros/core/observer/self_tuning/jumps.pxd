@@ -3,10 +3,8 @@
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
 
-cdef double GROWTHS
-
 cdef void begin_growth(Members* m) noexcept nogil
-cdef bint follow_growth(Members* m, double beyond) noexcept nogil
+cdef bint has_jumped(Members* m, double beyond) noexcept nogil
 cdef void watch(Members* m, int member) noexcept nogil
 cdef void follow_innovations(Members* m) noexcept nogil
 cdef int samples_since_jump(Members* m) noexcept nogil

@@ -8,23 +8,26 @@ larger by orders of magnitude. So the innovations of the member that was likely 
 mean (Willsky and Jones 1976).
 """
 
-from libc.math cimport INFINITY, fabs, fmax, log, sqrt
+from libc.math cimport INFINITY, fabs, fmax, fmin, log, pow, sqrt
 from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    COUNT, GRID, HALF, Line, MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW,
-    by_binomials, put, state
+    COUNT, GRID, HALF, Line, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW,
+    by_binomials, factorial, power, put, state
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport ROUGH
 from fhaosmo_ros.core.observer.structure cimport GATE, LOST_SAMPLES
 
-# If so many samples in a row are farther off than the first one, d has jumped (D 33).
-cdef double GROWTHS = 3.0
-# Farther means: so many times as far, and 3 sigma more; so much of what a jump of d makes of it;
-# and so many times the highest differences of y, which noise does not get to. Differences must not
-# have been larger than usual before, unless y is farther off by the last factor.
-cdef double FARTHER = 1.3, POWER = 0.7, SMOOTH = 5.0, SMOOTHEST = 30.0
+# Where unlikely samples are farther off than the first one, d may have jumped (D 33). Farther
+# means: so many times as far, and 3 sigma more; and so many times the highest differences of y,
+# which noise does not get to. Differences must not have been larger than usual before, unless y is
+# farther off by the last factor.
+cdef double FARTHER = 1.3, SMOOTH = 5.0, SMOOTHEST = 30.0
+# From one usual value to the opposite one d jumps by so many times its usual size.
+cdef double USUAL_JUMP = 2.0
+# A jump is taken to have begun while y was off by at most this part of what it is off now.
+cdef double HIDDEN_MOST = 0.9
 # By so much, in twice the log-likelihood, a jump has to explain the innovations better than
 # growing ones or more noise, and than any other member; and white noise to be likelier than
 # coloured noise.
@@ -37,63 +40,38 @@ cdef void begin_growth(Members* m) noexcept nogil:
     m.shared.uneven, m.shared.first_rough = m.work.sample.uneven, m.work.sample.roughness_before
 
 
-cdef double respond(Members* m, double* z) noexcept nogil:
-    """Carry what a jump of d by 1 has done to z to the next sample, in place; return z_1."""
-    cdef double before[MOST_ORDER]
-    cdef int n = m.n, i, j
-    memcpy(before, z, n * sizeof(double))
-    for i in range(n):
-        z[i] = m.flow[i][n]
-        for j in range(n):
-            z[i] += m.flow[i][j] * before[j]
-    return z[0]
-
-
-cdef double growth(Members* m, double hidden, int count) noexcept nogil:
-    """
-    Return how many times as far y is off, `count` samples later, because d has jumped.
-
-    It is the less, the longer ago d has jumped: so long that y was off by at most the part
-    `hidden` of what it is now in the sample before.
-    """
-    cdef double z[MOST_ORDER]
-    cdef double first, off
-    memset(z, 0, sizeof(z))
-    first = respond(m, z)
-    off = respond(m, z)
-    for _ in range(LOST_SAMPLES):  # after so many y would be lost
-        if first > hidden * off:
-            break
-        first, off = off, respond(m, z)
-    for _ in range(count - 1):
-        off = respond(m, z)
-    return off / first if first > 0.0 else 1.0
-
-
-cdef bint follow_growth(Members* m, double beyond) noexcept nogil:
+cdef bint has_jumped(Members* m, double beyond) noexcept nogil:
     """
     Return True if unlikely samples are farther and farther off, so that d has jumped (D 33).
 
-    `beyond` samples in a row before this one were unlikely.
+    `beyond` samples in a row before this one were unlikely. Two samples say how large the jump is;
+    each more that is as smooth speaks for it. Jumps of twice the size are four times as rare, so
+    that a larger one than usual takes more of them. In the sample, `since_jump` is the time since
+    then.
     """
     cdef Shared* shared = &m.shared
     cdef Sample* sample = &m.work.sample
-    cdef double off = fabs(sample.off), hidden = GATE * sqrt(sample.largest), least, uneven
-    cdef int count = <int>beyond if beyond < LOST_SAMPLES else LOST_SAMPLES
+    cdef double off = fabs(sample.off), uneven, hidden, jump
+    cdef int count = <int>fmin(beyond, LOST_SAMPLES)
     if count == 0:
         begin_growth(m)
     shared.uneven += (sample.uneven - shared.uneven) / (count + 1.0)
-    least = FARTHER * shared.first_off + HUBER * sqrt(m.work.now[0])
-    if count > 0:
-        least = fmax(
-            least, POWER * shared.first_off * growth(m, hidden / shared.first_off, count)
-        )
     uneven = sqrt(shared.uneven)
-    least = fmax(least, SMOOTH * uneven)
-    shared.growing = shared.growing + 1.0 if count > 0 and off > least else 0.0
-    return shared.growing >= GROWTHS and (
-        shared.first_rough < ROUGH or off > SMOOTHEST * uneven
-    )
+    if count > 0 and off > SMOOTH * uneven and (
+        off > FARTHER * shared.first_off + HUBER * sqrt(m.work.now[0])
+    ):
+        shared.growing += 1.0
+    else:
+        shared.growing = 0.0
+    if shared.growing == 0.0 or (
+        shared.first_rough >= ROUGH and off <= SMOOTHEST * uneven
+    ):
+        return False
+    hidden = fmin(GATE * sqrt(m.work.now[0]) / off, HIDDEN_MOST)
+    sample.since_jump = sample.h / (1.0 - pow(hidden, 1.0 / m.n))
+    jump = off * factorial(m.n) / power(sample.since_jump, m.n)
+    jump = log(jump / (USUAL_JUMP * sqrt(shared.size_of_d)))
+    return (shared.growing - 1.0) * log(off / uneven) > 2.0 * jump
 
 
 cdef void watch(Members* m, int member) noexcept nogil:

@@ -48,6 +48,7 @@ cdef struct Sample:
     double y  # less the offset (D 23)
     double before  # the sample before
     double h  # time since then (s)
+    double since_jump  # time since a jump of d (s), where `has_jumped` says that there was one
     double off  # by what it is off the prediction of the mean
     double quanta  # variance of the error of rounding; 0: y is not quantised (D 29)
     double roughness  # square of its difference over the usual one
@@ -112,6 +113,7 @@ cdef struct Shared:
     double goes_back  # of late, the share of the steps of y that go back at once
     double far_sign  # sign of the last innovation that was too far off for every member
     double growing  # unlikely samples in a row that are farther and farther off (D 33)
+    double size_of_d  # mean square of the estimates of d of late
     double first_off  # how far off the first of the unlikely samples in a row was
     double uneven  # mean square of the highest difference of y in these samples
     double first_rough  # what `roughness` was before the first of them

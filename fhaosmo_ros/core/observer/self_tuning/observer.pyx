@@ -10,8 +10,7 @@ from fhaosmo_ros.core.observer.self_tuning.filters cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.intervals cimport choose_members, take_interval
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
-    GROWTHS, begin_growth, follow_growth, follow_innovations, follow_jump,
-    samples_since_jump, shift, watch
+    begin_growth, follow_innovations, follow_jump, has_jumped, samples_since_jump, shift, watch
 )
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     BANDS, COLOURS, COUNT, DECAY, DIFFERENCES, FIRST_SAMPLES, GRID, HALF, IN_BAND, Line,
@@ -232,9 +231,9 @@ cdef class SelfTuning(Structure):
         cdef Sample* sample = &w.sample
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
-        cdef double expected, off, sign, turn = 0.0, tau = 0.0
+        cdef double expected, off, sign, turn = 0.0, since = 0.0
         cdef double speed
-        cdef bint growing, goes_on, likely, begins, jumped, doubted, rough, same
+        cdef bint goes_on, likely, begins, jumped, doubted, rough, same
         cdef int i, n = self.order, since_jump = 0
         sample.quanta = rounding(m)
         if choose_members(m, sample.quanta):
@@ -249,7 +248,7 @@ cdef class SelfTuning(Structure):
         fill_noise(m)
         self.follow_period(h, same)
         rough = sample.roughness > HUBER * HUBER
-        if shared.growing >= GROWTHS - 1.0 or shared.recent > 0.0 or sample.quanta > 0.0:
+        if memory.beyond > 0.0 or shared.recent > 0.0 or sample.quanta > 0.0:
             shared.moving = HALF
         if sample.quanta > 0.0:  # P depends on the samples
             shared.unsettled = 0.0
@@ -266,7 +265,7 @@ cdef class SelfTuning(Structure):
         sample.average = fmin(shared.samples, NOISE_SAMPLES)
         sample.kept = exp(-h / self.forgetting if self.forgetting > 0.0 else -1.0 / MEMORY)
         shared.samples = <int>sample.average + 1
-        growing = follow_growth(m, memory.beyond)
+        begins = has_jumped(m, memory.beyond)
         off, sign = fabs(sample.off), copysign(1.0, sample.off)
         goes_on = (
             memory.beyond > 0.0 and sign == shared.far_sign and not rough
@@ -274,7 +273,7 @@ cdef class SelfTuning(Structure):
         )
         likely = is_likely(m, HUBER if goes_on else GATE, False)
         shared.recent = fmax(shared.recent - 1.0, 0.0)
-        begins = growing and not likely
+        begins = begins and not likely
         jumped = begins or (shared.recent > 0.0 and not rough)
         if rough:
             turn = ROUGH_TURN
@@ -293,10 +292,9 @@ cdef class SelfTuning(Structure):
             memory.beyond = INFINITY
             return
         if jumped:
-            if begins:  # while it was within the gate, it could not be seen
-                tau = h / (1.0 - pow(fmin(GATE * sqrt(w.now[0]) / off, 0.9), 1.0 / n))
-                shared.recent = JUMP_SAMPLES
-            allow_jump(m, y, tau)
+            if begins:
+                since, shared.recent = sample.since_jump, JUMP_SAMPLES
+            allow_jump(m, y, since)
             memset(m.far, 0, sizeof(m.far))
             memcpy(w.believed, w.s, sizeof(Line))
             shared.unsettled = 0.0
@@ -311,6 +309,7 @@ cdef class SelfTuning(Structure):
         mix(m, self.slider, mean, self.trial_variances)
         for i in range(self.levels):
             self.trial[i].z_hat = mean[i]
+        shared.size_of_d += (mean[n] * mean[n] - shared.size_of_d) / sample.average
         tell_model(m, self.slider, jumped, &self.trial_model)
         for i in range(shared.active):
             if m.far[i] > LOST_SAMPLES:  # far off for long

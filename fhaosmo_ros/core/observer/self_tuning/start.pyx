@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The first samples, and members that begin with what these tell (D 26, D 28)."""
 
-from libc.math cimport INFINITY, fabs, fmax, fmin, log, sqrt
+from libc.math cimport INFINITY, exp, fabs, fmax, fmin, log, sqrt
 from libc.string cimport memset
 
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
@@ -181,7 +181,7 @@ cdef void begin(Members* m, double noise) noexcept nogil:
     """Let the members begin at the last sample (D 28)."""
     cdef Shared* shared = &m.shared
     cdef double y = m.first_y[shared.samples - 1], period = shared.steady_period
-    cdef double omega, kappa, intensity, size, least = INFINITY
+    cdef double omega, kappa, intensity, size, least = INFINITY, sizes = 0.0
     cdef int n = m.n, g, i, j, k, below, c
     find_sizes(m)
     shared.moving, shared.active = HALF, COUNT
@@ -218,6 +218,9 @@ cdef void begin(Members* m, double noise) noexcept nogil:
         size = log(m.p.dd[0][0][g] / m.p.dd[0][0][0])
         m.prior[g] = -0.5 * size
         least = fmin(least, size)
+        sizes += size
+    # Before samples have told: the geometric mean of what the members expect.
+    shared.size_of_d = m.p.dd[0][0][0] * exp(sizes / COUNT)
     for g in range(COUNT):
         m.prior[g] += 0.5 * least
         if shared.lattice > LATTICE_SHARE and GRID.bandwidth[g] > WITHIN_SAMPLES:
