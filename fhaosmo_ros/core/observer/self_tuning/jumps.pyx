@@ -142,7 +142,7 @@ cdef double otherwise(const double* r, int n) noexcept nogil:
     """
     cdef double middle = 0.5 * (WINDOW - 1), level = 0.0, slope = 0.0, size = 0.0, squares = 0.0
     cdef double most, along, shape
-    cdef int j, m, count, power
+    cdef int j, m, count, degree
     for j in range(WINDOW):
         level += r[j]
         slope += (j - middle) * r[j]
@@ -152,11 +152,11 @@ cdef double otherwise(const double* r, int n) noexcept nogil:
         count = WINDOW - m
         squares += r[m] * r[m]
         most = fmax(most, squares - count * (1.0 + log(fmax(squares / count, 1.0))))
-        for power in range(1, n + 1 if count > 1 else 1):
+        for degree in range(1, n + 1 if count > 1 else 1):
             along = size = 0.0
             for j in range(m, WINDOW):
                 shape = 1.0
-                for _ in range(power):
+                for _ in range(degree):
                     shape *= j - m + 1
                 along += shape * r[j]
                 size += shape * shape

@@ -231,7 +231,7 @@ cdef class SelfTuning(Structure):
         cdef Sample* sample = &w.sample
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
-        cdef double expected, off, sign, turn = 0.0, since = 0.0
+        cdef double expected, sign, turn = 0.0, since = 0.0
         cdef double speed
         cdef bint goes_on, likely, begins, jumped, doubted, rough, same
         cdef int i, n = self.order, since_jump = 0
@@ -266,7 +266,7 @@ cdef class SelfTuning(Structure):
         sample.kept = exp(-h / self.forgetting if self.forgetting > 0.0 else -1.0 / MEMORY)
         shared.samples = <int>sample.average + 1
         begins = has_jumped(m, memory.beyond)
-        off, sign = fabs(sample.off), copysign(1.0, sample.off)
+        sign = copysign(1.0, sample.off)
         goes_on = (
             memory.beyond > 0.0 and sign == shared.far_sign and not rough
             and shared.roughness < HUBER
