@@ -11,7 +11,6 @@ from fhaosmo_ros.core.parameters.declaration import (
     Parameters,
     ParameterTable,
     shown,
-    suggestion,
     unknown_parameter,
 )
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -126,7 +125,6 @@ def _of_node(text: str, node: str, strict: bool) -> dict[str, Any]:
     if strict and not ours:
         raise ConfigurationError(
             f"expected a section '{node}' or '/**', got {', '.join(names)}"
-            f'{suggestion(node, names)}'
         )
     misspelt = [name for name in names if _misspells(name, node)]
     if misspelt and not ours:

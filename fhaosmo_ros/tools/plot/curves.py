@@ -97,6 +97,8 @@ def _curves(
     of_gains = [p for of in OF_GAINS.values() for p in of if f'{name}/{p}' in topics]
     ticks = read_ticks(path, name, [*of_gains, *ESTIMATES])
     when = ticks['stamp']
+    if not len(when):
+        raise ConfigurationError(f'bag {path}: expected whole estimates of {name}, got none')
     estimate = np.column_stack([ticks['state'], ticks['unknown_input']])
     truth = _truth_at(path, plant, when)
     if truth is not None and truth.shape != estimate.shape:

@@ -98,8 +98,8 @@ cdef void follow_innovations(Members* m) noexcept nogil:
             m.window[j] = m.window[j + 1]
         m.window[WINDOW - 1] = m.work.b[g] / sqrt(m.work.s[g] * m.work.now[0])
     shared.since_mark += 1
-    if shared.since_mark >= WINDOW:
-        shared.since_mark = 0
+    if shared.since_mark % WINDOW == 0:
+        shared.since_mark = WINDOW
         memcpy(m.score_before[1], m.score_before[0], sizeof(Line))
         memcpy(m.score_before[0], m.score, sizeof(Line))
 
@@ -122,9 +122,11 @@ cdef int samples_since_jump(Members* m) noexcept nogil:
     g = shared.followed
     if best <= GATE * GATE or first < WINDOW // 2 or GRID.bandwidth[g] * WINDOW > 1.0:
         return 0
+    if shared.since_mark < WINDOW:  # too soon after a jump: rather d explains both
+        return 0
     if best <= otherwise(m.window, m.n) + SHAPE:
         return 0
-    before = &m.score_before[0 if shared.since_mark >= count else 1][0]
+    before = &m.score_before[0 if shared.since_mark % WINDOW >= count else 1][0]
     gained = m.score[g] - before[g]
     for j in range(HALF):
         most = fmax(most, 2.0 * (m.score[j] - before[j] - gained))

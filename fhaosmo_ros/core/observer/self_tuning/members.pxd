@@ -97,7 +97,7 @@ cdef struct Shared:
     int likeliest  # the likeliest member
     int told  # the member whose model a smoother goes by (D 34)
     int followed  # the member whose innovations are looked at for a jump of y (D 35)
-    int since_mark  # samples since `score_before[0]`
+    int since_mark  # samples since `score_before[0]`, and WINDOW more from the second one on
     double unsettled  # time since covariances began to move (s)
     double steady_period  # interval that they are those of (s)
     double flow_period  # interval that the flow is that of (s)

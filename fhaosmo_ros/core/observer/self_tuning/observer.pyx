@@ -60,7 +60,7 @@ cdef double LARGEST = 1e300  # no number of a snapshot is larger, nor is an erro
 # Ranges of the numbers of a snapshot; others are from 0 to LARGEST.
 RANGES = {'likeliest': (0, COUNT - 1), 'told': (0, COUNT - 1), 'followed': (0, COUNT - 1)}
 RANGES |= {'samples': (0, NOISE_SAMPLES + 1), 'moving': (0, HALF), 'active': (0, COUNT)}
-RANGES |= {'since_mark': (0, WINDOW - 1), 'far_sign': (-1, 1), 'correlation': (0, 1)}
+RANGES |= {'since_mark': (0, 2 * WINDOW - 1), 'far_sign': (-1, 1), 'correlation': (0, 1)}
 RANGES |= dict.fromkeys((
     'first_y', 'difference', 'flow', 'window', 'prior', 'score', 'log_variance', 'residual',
     'score_before', 'z', 'd', 'gain_z', 'gain_d', 'p_zz', 'p_zd', 'p_dd',
