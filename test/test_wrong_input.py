@@ -39,7 +39,7 @@ WRONG = {
     'replay bag --smooth': ["expected 'noise_size' > 0"],
     'replay bag --params-file /no.yaml': ['/no.yaml', 'No such file'],
     'replay bag --params-file lamda.yaml': ['error: lamda.yaml: ', "'lamda'", "mean 'lambda'"],
-    'replay bag --params-file node.yaml': ["'estimator' or '/**'", "mean 'estimater'"],
+    'replay bag --params-file node.yaml': ["'estimator' or '/**'", 'got estimater'],
     # plot
     'plot both -o x.jpg': ['.png, .svg, .pdf', 'x.jpg'],
     'plot both --names /no': ['/estimator', "'/no'"],

@@ -123,9 +123,7 @@ def _of_node(text: str, node: str, strict: bool) -> dict[str, Any]:
     ours = [section for section in sections if _matches(section, node)]
     names = [section.lstrip('/') for section in sections]
     if strict and not ours:
-        raise ConfigurationError(
-            f"expected a section '{node}' or '/**', got {', '.join(names)}"
-        )
+        raise ConfigurationError(f"expected a section '{node}' or '/**', got {', '.join(names)}")
     misspelt = [name for name in names if _misspells(name, node)]
     if misspelt and not ours:
         raise ConfigurationError(
