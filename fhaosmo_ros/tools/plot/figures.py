@@ -16,6 +16,8 @@ TRUTH = {'color': '#0072B2', 'linewidth': 2.2, 'label': 'true'}
 """Blue of the Okabe-Ito palette."""
 COLOURS = ('#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 """Okabe-Ito palette, without the blue of the truth; each curve also has its own dashes."""
+OTHERS = ('#bbbbbb', *COLOURS[1:])
+"""Of what the run is compared with: what chatters is grey."""
 DASHES = ('-', '--', '-.', ':')
 TINY = 1e-300
 """Added to what is drawn on a logarithmic scale, which has no place for zero."""
@@ -102,8 +104,9 @@ def save_curves(
     axes['innovation'].set_ylabel('|innovation|' + ('\n(first)' if len(curves) > 1 else ''))
     if errors:
         row = axes['error of d']
-        for name, error in errors.items():
-            row.plot(*envelope(t, error), linewidth=0.8, label=name)
+        for (name, error), colour in zip(errors.items(), OTHERS, strict=False):
+            row.plot(*envelope(t, error), linewidth=0.8, label=name, color=colour)
+        row.lines[-1].set(color=COLOURS[0], linestyle='--', linewidth=1.2)  # the run itself
         size = 1.5 * float(np.nanmax(np.abs(first.estimate[:, -1])))
         row.set_ylim(-size, size)  # what is beyond leaves the picture
         row.set_ylabel('error of d')
