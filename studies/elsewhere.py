@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-`python -m studies.elsewhere` measures self-tuning on plants that nothing was made with.
+`python -m studies.elsewhere` measures self-tuning on other plants than `everywhere`.
 
 Its rules for jumps of d and of y were chosen on these plants with other seeds, no other constant
 was; scipy integrates them, not our code. It is told the model. For each recording that judges, a

@@ -14,7 +14,7 @@ from rclpy.node import Node
 MOST_KNOWN = 1000
 """After so many names, new ones are neither looked at nor told any more."""
 QUIET = 5.0
-"""Seconds between two lines about names that come late."""
+"""Seconds between two warnings of joints that have come late."""
 
 
 class Joints:
@@ -22,6 +22,7 @@ class Joints:
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self._logger = node.get_logger()
         self._known: set[str] = set()
         self._left_out: list[str] = []
 
@@ -44,31 +45,24 @@ class Joints:
                 fit.append(name)
             except ConfigurationError as error:
                 bad[name] = shorten(str(error), 200)
-        self._leave_out(
-            list(bad),
-            f"can't be the name of a channel ({next(iter(bad.values()), '')}); name a channel and "
-            'set its input_field to position[NAME]',
-        )
-        self._leave_out(
-            fit[most:],
-            f'beyond max_channels ({most}); raise it, or name in channels those that are to be '
-            'estimated',
-        )
+        if bad:
+            why = f"can't be the name of a channel ({next(iter(bad.values()))})"
+            hint = 'name a channel and set its input_field to position[NAME]'
+            self._logger.error(f'{self._leave_out(list(bad))} {why}; {hint}')
+        if fit[most:]:
+            why = f'beyond max_channels ({most})'
+            hint = 'raise it, or name in channels those that are to be estimated'
+            self._logger.error(f'{self._leave_out(fit[most:])} {why}; {hint}')
         return fit[:most]
 
     def refuse(self, names: list[str]) -> None:
-        """Tell that names have come too late to become channels, if there are any."""
-        if names:
-            self._left_out += names
-            why = 'has come after the first message; start the node again to take it'
-            text = f'{_in_words(names)} {why}'
-            self._node.get_logger().warning(text, throttle_duration_sec=QUIET)
+        """Tell that names have come too late to become channels."""
+        why = 'has come after the first message; start the node again to take it'
+        self._logger.warning(f'{self._leave_out(names)} {why}', throttle_duration_sec=QUIET)
 
-    def _leave_out(self, names: list[str], why: str) -> None:
-        """Log why names of the first message do not become channels, if there are any."""
-        if names:
-            self._left_out += names
-            self._node.get_logger().error(f'{_in_words(names)} {why}')
+    def _leave_out(self, names: list[str]) -> str:
+        self._left_out += names
+        return _in_words(names)
 
     @property
     def problem(self) -> str:

@@ -171,7 +171,8 @@ class EstimatorNode(ManagedNode):
         """Make the channels from the first names; later, report those that are new."""
         new = self._joints.new(names)
         if self._names != FROM_JOINTS:
-            self._joints.refuse(new)
+            if new:
+                self._joints.refuse(new)
             return
         fit = self._joints.choose(new, self._node_parameters.values['max_channels'])
         if not fit:
