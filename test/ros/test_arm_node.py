@@ -185,9 +185,11 @@ def test_a_wrong_setting_is_said_once_and_the_estimates_stop(launch, user, tmp_p
         limb.send(k, effort=-MOTION[3][k])
         if k % 20 == 19:
             user.wait(lambda n=first + k: limb.said(text) or len(heard) >= n, f'estimate {k}')
-    user.wait(lambda: any(
-        text in r.statuses['arm'].message for r in limb.reports
-    ), 'report')  # fmt: skip
+    # A report has what went wrong since the one before: samples go on until one is heard.
+    user.wait(
+        lambda: any(text in r.statuses['arm'].message for r in limb.reports) or limb.send(k),
+        'report',
+    )
     assert len(heard) < first + count - 200
     lines = 1 + (time.monotonic() - begin) / 5.0  # once in five seconds
     assert 1 <= len(limb.said(text)) <= lines
