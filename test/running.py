@@ -37,10 +37,7 @@ ESTIMATES = {
     'state': Float64MultiArray, 'unknown_input': Float64, 'gamma': Float64,
     'innovation': Float64MultiArray, 'stamp': Time,
 }  # fmt: skip
-FED = {
-    'publish_on': 'sample', 'max_gap': 60.0, 'input_reliability': 'reliable',
-    'diagnostics_period': 0.2,
-}  # fmt: skip
+FED = {'publish_on': 'sample', 'max_gap': 60.0, 'diagnostics_period': 0.2}
 """For an estimator that a test feeds: each sample is answered at once, and no gap restarts it."""
 LAX = {'warn_jitter_above': 1e6, 'warn_delay_above': 1e6, 'diagnostics_period': 0.2}
 """A loaded machine is no reason for a warning here."""
@@ -64,8 +61,17 @@ def joint_state(stamp: int, names: Iterable[str], positions: Iterable[float]) ->
     return JointState(header=header, name=list(names), position=map(float, positions))
 
 
-def arguments(*words: object, namespace: str = '', **values: object) -> list[object]:
-    """Return ROS arguments: those given, a namespace, and parameters; `lambda_` sets lambda."""
+def arguments(
+    *words: object, namespace: str = '', inputs: Iterable[str] = (), **values: object
+) -> list[object]:
+    """
+    Return ROS arguments: those given, a namespace, and parameters; `lambda_` sets lambda.
+
+    `inputs` are topics in the namespace, or with full names, that an estimator hears reliably.
+    """
+    for topic in inputs:
+        name = topic if topic.startswith('/') else f'{namespace}/{topic}'
+        values[f'qos_overrides.{name}.subscription.reliability'] = 'reliable'
     if namespace:
         words = ('-r', f'__ns:={namespace}', *words)
     rules = [f'{name.rstrip("_")}:={value}' for name, value in values.items()]

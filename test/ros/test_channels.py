@@ -27,7 +27,8 @@ def rigs(user, launch):
     """Return what belongs to each channel, by its name."""
     own = {f'{name}.{key}': value for name, values in OWN.items() for key, value in values.items()}
     common = FED | COMMON | {'channels': list(OWN)}
-    process = launch('estimator', namespace='/many', **common, **own)
+    inputs = [f'{name}/y' for name in OWN]
+    process = launch('estimator', namespace='/many', inputs=inputs, **common, **own)
     return {name: Estimator(user, process, '/many', name).listen() for name in OWN}
 
 
@@ -144,7 +145,9 @@ def arm(user, launch):
     namespace = f'/arm{next(COUNT)}'
     own = ['-p', 'elbow.epsilon:=7.0', '-p', 'elbo.epsilon:=7.0']
     channels = FED | {'channels': ['from_joint_names']}
-    return Arm(user, launch('estimator', *own, namespace=namespace, **channels), namespace)
+    inputs = ['joint_states']
+    process = launch('estimator', *own, namespace=namespace, inputs=inputs, **channels)
+    return Arm(user, process, namespace)
 
 
 def test_each_joint_is_a_channel_whatever_the_order_of_the_names(user, arm):

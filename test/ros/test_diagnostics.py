@@ -90,7 +90,7 @@ def test_a_clock_that_is_slower_than_the_samples_is_said(user, estimator):
 def test_what_no_longer_fits_is_said(user, estimator):
     file = ['--params-file', 'config/noise_1e-3.yaml']
     options = LAX | {'publish_on': 'sample', 'max_gap': 60.0}
-    options |= {'input_topic': 'q', 'input_field': 'position[a]', 'input_reliability': 'reliable'}
+    options |= {'input_topic': 'q', 'input_field': 'position[a]', 'inputs': ['q']}
     rig = estimator('/fits', *file, **options)
     q = user.publisher('/fits/q', JointState)
     rng, stamp, sent = np.random.default_rng(1), 0, 0
@@ -138,7 +138,8 @@ def test_publishers_are_named(user, estimator, stranger):
     assert values_of(rig.reports[-1].statuses['input'])['publishers'] == 'none'
 
     unheard = stranger.create_publisher(Float64, '/heard/y', BEST_EFFORT)
-    words = ('/stranger', 'best effort publisher and reliable subscription', 'input_reliability')
+    policy = 'qos_overrides./heard/y.subscription'
+    words = ('/stranger', 'best effort publisher and reliable subscription', policy)
     for _ in range(2):
         rig.wait_status('input', ERROR, *words)
     assert len(rig.said('/stranger publishes /heard/y unheard')) == 1  # once, not with each report
@@ -170,12 +171,11 @@ def test_publishers_are_named(user, estimator, stranger):
 def test_what_was_published_before_is_heard_if_asked_for(estimator, stranger):
     before = stranger.create_publisher(Float64, '/latched/y', LATCHED)
     before.publish(Float64(data=2.5))
-    rig = estimator(
-        '/latched', **FED | {'publish_on': 'timer'}, input_durability='transient_local'
-    )
+    durability = {'qos_overrides./latched/y.subscription.durability': 'transient_local'}
+    rig = estimator('/latched', **FED | {'publish_on': 'timer'} | durability)
     assert rig.wait_estimate(lambda e: True, 'estimate of the latched sample').z[0] == 2.5
     stranger.create_publisher(Float64, '/latched/y', 10)
-    rig.wait_status('input', WARN, '/stranger', 'volatile', 'input_durability')
+    rig.wait_status('input', WARN, '/stranger', 'volatile', 'qos_overrides./latched/y')
 
 
 # Policies of what is published.
@@ -190,7 +190,7 @@ def test_policies_of_estimates(user, launch):
     """An estimate that nobody listens to is not made, unless its publisher keeps the last ones."""
     node = '/out/estimator'
     prefix = f'qos_overrides.{node}'
-    launch('estimator', namespace='/out', gains='self_tuning', **FED, **{
+    launch('estimator', namespace='/out', gains='self_tuning', inputs=['y'], **FED, **{
         f'{prefix}/state.publisher.reliability': 'best_effort',
         f'{prefix}/unknown_input.publisher.durability': 'transient_local',
         f'{prefix}/standard_deviation.publisher.depth': 7,

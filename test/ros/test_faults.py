@@ -91,7 +91,7 @@ def test_slow_sensor_does_not_flood_the_log(estimator):
 
 def test_bad_inputs_are_rejected_and_the_last_one_is_held(user, estimator):
     model = {'order': 2, 'phi': ['0', 'u - z2'], 'max_gap': 60.0}
-    rig = estimator('/bad_u', **FED | model)
+    rig = estimator('/bad_u', inputs=['y', 'u'], **FED | model)
     rig.wait_status('input', STALE, 'no publisher of u')
     rig.listen()
     u = user.publisher('/bad_u/u')

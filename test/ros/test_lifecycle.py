@@ -16,7 +16,7 @@ NODE = '/managed/estimator'
 
 @pytest.fixture(scope='module')
 def process(launch):
-    return launch('estimator', namespace='/managed', autostart=False, **FED)
+    return launch('estimator', namespace='/managed', inputs=['y'], autostart=False, **FED)
 
 
 @pytest.fixture(scope='module')

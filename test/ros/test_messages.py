@@ -51,7 +51,7 @@ def test_robot_is_estimated_live_as_in_a_replay(user, estimator, recorder, tmp_p
 
     typed = user.record('/robot/estimator/joint_states', JointState)
     rig = estimator(
-        '/robot', '--params-file', ROOT / 'config' / 'joint_states.yaml',
+        '/robot', '--params-file', ROOT / 'config' / 'joint_states.yaml', inputs=['joint_states'],
         **FED | {'channels': [''], 'input_field': 'position[shoulder]', 'max_gap': 0.0},
         unknown_input_scale=2.0,
     )  # fmt: skip
@@ -86,7 +86,9 @@ def test_robot_is_estimated_live_as_in_a_replay(user, estimator, recorder, tmp_p
 
 
 def test_bad_messages_are_told_counted_and_survived(user, estimator):
-    rig = estimator('/bad', input_topic='data', input_field='position[elbow]', **FED)
+    rig = estimator(
+        '/bad', inputs=['data'], input_topic='data', input_field='position[elbow]', **FED
+    )
     with User('other') as other:  # one participant has one type of a topic
         other.node.create_publisher(Float64, '/bad/data', 10)
         for _ in range(2):
@@ -134,7 +136,8 @@ def test_yaw_is_continuous_and_the_outputs_are_typed(user, estimator):
     wrench = user.record('/yaw/estimator/wrench', WrenchStamped)
     accel = user.record('/yaw/estimator/accel', AccelStamped)
     rig = estimator(
-        '/yaw', input_topic='pose', input_field='pose.orientation.yaw', **FED | model,
+        '/yaw', inputs=['pose'], input_topic='pose', input_field='pose.orientation.yaw',
+        **FED | model,
         typed_outputs=['wrench', 'accel'], output_axis='angular.z', unknown_input_scale=3.0,
         frame_id='base', measurement_unit='rad', unknown_input_unit="'N m'",
     )  # fmt: skip
@@ -171,7 +174,8 @@ def test_known_input_from_the_message_of_y(user, estimator):
     """u of a message is that of its own sample; whatever /clock does, dt is that of headers."""
     model = {'order': 1, 'phi': ['u'], 'lambda': [15.0, 5.0]}
     rig = estimator(
-        '/drive', input_topic='imu', input_field='angular_velocity.z', **FED | model,
+        '/drive', inputs=['imu'], input_topic='imu', input_field='angular_velocity.z',
+        **FED | model,
         known_input_topics=['imu'], known_input_fields=['linear_acceleration.x'],
         use_sim_time=True,
     )  # fmt: skip
@@ -200,8 +204,8 @@ def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(
     }  # fmt: skip
     process = recorder('/arm2/estimator')
     rig = estimator(
-        '/arm2', '-r', 'u:=/motor/state', input_topic='q', input_field='position[a]',
-        known_input_fields=['effort[a]'], **FED | model,
+        '/arm2', '-r', 'u:=/motor/state', inputs=['q', '/motor/state'], input_topic='q',
+        input_field='position[a]', known_input_fields=['effort[a]'], **FED | model,
     )  # fmt: skip
     y = user.publisher('/arm2/q', JointState, heard=2)
     u = user.publisher('/motor/state', JointState, heard=2)

@@ -85,7 +85,11 @@ REFUSED = [
     (E, rules('qos_overrides./estimator/state.publisher.deadline:=5'),
      ['state.publisher.deadline', 'one of']),
     (P, rules('qos_overrides./yy.publisher.depth:=5'),
-     ["'qos_overrides./yy.publisher.depth': expected TOPIC"]),
+     ["'qos_overrides./yy.publisher.depth': expected qos_overrides.ENDPOINT.POLICY", '/y.pub']),
+    (E, rules('qos_overrides./yy.subscription.depth:=5'),
+     ["'qos_overrides./yy.subscription.depth'", 'one of', '/y.subscription']),
+    (E, rules('qos_overrides./y.subscription.depth:=deep'), ['an integer', "'deep'"]),
+    (E, rules('input_depth:=10'), ["'input_depth'", 'qos_overrides./TOPIC.subscription.depth']),
     # Hostile texts; more of them in test_parameter_files.py.
     *((E, rules(f'lambda:={text}'), ["'lambda'"]) for text in HOSTILE_TEXTS),
     *((E, set_in_file(f'lambda: {text}'), ['.yaml']) for text in HOSTILE_TEXTS),
@@ -148,16 +152,20 @@ def test_files_and_rules_reach_the_node_for_which_they_are(user, launch, tmp_pat
         '    lambda: 12\n'
         '    max_gap: 2e0\n'
         '    noise_std: 0.1\n'
+        '    qos_overrides: {/rig/y: {subscription: {depth: 7}}}\n'
         'estimator: {ros__parameters: {epsilon: 0.9}}\n'
         '/rig/lead: {ros__parameters: {alpha: [7], spike_gate: 0.5}}\n'
     )
     files = in_files(['--params-file', text, '--params-file', OF_PLANT], tmp_path)
     own = ['lambda:=[12.0, 13.0, 14.0]', 'gamma_max:=0.97', 'plant:noise:=0.1']
+    own.append('qos_overrides./rig/y.subscription.reliability:=reliable')
     process = launch('estimator', '-r', '__node:=lead', '-r', '__ns:=/rig', *files, *rules(*own))
     parameters = Parameters(user, '/rig/lead')
     expected = {
         'order': 2, 'phi': ['0', '-z2'], 'lambda': [12.0, 13.0, 14.0], 'max_gap': 2.0,
         'alpha': [7.0], 'spike_gate': 0.5, 'gamma_max': 0.97,
+        'qos_overrides./rig/y.subscription.depth': 7,
+        'qos_overrides./rig/y.subscription.reliability': 'reliable',
         'epsilon': ESTIMATOR_PARAMETERS['epsilon'].default,
     }  # fmt: skip
     assert parameters.all(expected) == expected
@@ -175,9 +183,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_without_the_events_executor_it_works_too(user, launch):
-    process = launch(
-        WITHOUT_EVENTS, namespace='/older', max_gap=60.0, input_reliability='reliable'
-    )
+    process = launch(WITHOUT_EVENTS, namespace='/older', inputs=['y'], max_gap=60.0)
     rig = Estimator(user, process, '/older').listen()
     for y in (0.2, 0.21, 0.22):
         estimate = rig.feed(y)

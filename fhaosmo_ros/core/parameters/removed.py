@@ -14,6 +14,9 @@ REMOVED = {
     'chatter_weight': "leave it out: 'tune' counts the errors alone",
     'warn_chatter_above': 'leave it out: /diagnostics has the chatter of d as a number',
     'error_bad_share_above': 'leave it out: ERROR if more than half of the samples were unused',
+    'input_reliability': "set 'qos_overrides./TOPIC.subscription.reliability'",
+    'input_durability': "set 'qos_overrides./TOPIC.subscription.durability'",
+    'input_depth': "set 'qos_overrides./TOPIC.subscription.depth'",
     'search': "leave it out: 'tune' searches the model of d, or the gains where 'lambda' is set",
 }
 """What a message says of a name that was a parameter once."""

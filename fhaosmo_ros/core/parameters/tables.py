@@ -264,17 +264,6 @@ ESTIMATOR_NODE = (
               'channels: joint_states, wrench, accel (docs/node.md says what is in them); none.',
               choices=('none', 'joint_states', 'wrench', 'accel'), live=False, lengths='any'),
     Parameter('frame_id', '', 'frame_id of these messages.', live=False),
-    Parameter('input_reliability', 'best_effort',
-              'QoS of y and u. best_effort hears every publisher; reliable hears reliable ones '
-              'only, and has lost samples sent again.', choices=('best_effort', 'reliable'),
-              live=False),
-    Parameter('input_durability', 'volatile',
-              'QoS of y and u. transient_local also hears what was published before, of '
-              'transient_local publishers only.', choices=('volatile', 'transient_local'),
-              live=False),
-    Parameter('input_depth', 1000,
-              'Samples of y that wait while the node is busy; older ones are lost.', lower=1,
-              upper=100_000, live=False),
 )  # fmt: skip
 
 DIAGNOSTICS = (

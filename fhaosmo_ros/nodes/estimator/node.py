@@ -32,7 +32,7 @@ from fhaosmo_ros.nodes.middleware.diagnostics import (
     STALE,
     WARN,
 )
-from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, input_qos, set_period
+from fhaosmo_ros.nodes.middleware.endpoints import check_overrides, set_period
 from fhaosmo_ros.nodes.middleware.lifecycle import ManagedNode
 from fhaosmo_ros.nodes.middleware.parameters import built_in, NodeParameters
 from fhaosmo_ros.nodes.middleware.spin import run_node
@@ -99,17 +99,19 @@ class EstimatorNode(ManagedNode):
         if names == FROM_JOINTS:  # which joints there are is not known yet, but some may be named
             names = [*names, *with_own_parameters(names, values)]
         own = {name: of_channel(values, name) for name in names}
-        check_overrides(self, self._given, [
-            f'~/{name}/{topic}' if name else f'~/{topic}'
-            for name in names
-            for topic in [*estimates_of(own[name]), EVENT]
-        ])  # fmt: skip
-        estimators = {}
+        estimators, inputs = {}, []
         for name, mine in own.items():
             with naming_channel(name):
                 estimators[name] = OnlineEstimator(mine)
             known = known_inputs(mine, estimators[name].observer.used_inputs, name)
-            check_inputs(self, [measured_output(mine, name), *known.values()])
+            inputs += [measured_output(mine, name), *known.values()]
+        check_inputs(self, inputs)
+        estimates = [
+            f'~/{name}/{topic}' if name else f'~/{topic}'
+            for name in names
+            for topic in [*estimates_of(own[name]), EVENT]
+        ]
+        check_overrides(self, self._given, estimates, [wanted.topic for wanted in inputs])
         check_axes(values['typed_outputs'], {name: own[name] for name in self._names})
         return estimators
 
@@ -117,7 +119,7 @@ class EstimatorNode(ManagedNode):
         """Make the channel, or channels, from the present parameters."""
         values = self._node_parameters.values
         estimators = self._make_estimators()
-        self._sources = Sources(self, input_qos(values), self._found_type)
+        self._sources = Sources(self, self._found_type)
         latest = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._parameters_topic = self.create_publisher(String, f'~/{PARAMETERS}', latest)
         if self._from_joints:

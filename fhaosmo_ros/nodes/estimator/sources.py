@@ -7,17 +7,23 @@ publishes a type that has a wanted field.
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from copy import copy
 import math
 from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import Input
 from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError, Unwrapper
-from fhaosmo_ros.nodes.middleware.endpoints import full_name, subscribe_with_info
+from fhaosmo_ros.nodes.middleware.endpoints import (
+    full_name,
+    OVERRIDABLE,
+    SENSOR_QOS,
+    subscribe_with_info,
+)
 from fhaosmo_ros.nodes.middleware.messages import definitions, message_class
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import qos_check_compatible, QoSCompatibility, QoSProfile
+from rclpy.qos import qos_check_compatible, QoSCompatibility
 from rclpy.serialization import deserialize_message
 
 DISCOVERY_PERIOD = 0.2
@@ -162,11 +168,11 @@ class Source:
         """Return why a publisher can't be heard, '' if it can."""
         if endpoint.topic_type != self.message_type:
             return f'its type is {endpoint.topic_type}, expected {self.message_type}'
-        verdict, reason = qos_check_compatible(endpoint.qos_profile, self._sources.qos)
+        verdict, reason = qos_check_compatible(endpoint.qos_profile, self._qos)
         if verdict != QoSCompatibility.ERROR:
             return ''
         clashes = [part.removeprefix('ERROR: ') for part in reason.split(';') if 'ERROR' in part]
-        hint = 'change input_reliability or input_durability, or its own QoS'
+        hint = f'change qos_overrides.{self.topic}.subscription, or its own QoS'
         return f'{", ".join(clashes).lower()}; {hint}'
 
     def _discover(self) -> None:
@@ -197,8 +203,11 @@ class Source:
         self._served = [listener for listener in self.listeners if listener.field]
         if not self._subscribed and (self._served or self.on_names):
             self._class, self.message_type, self._subscribed = kind, message_type, True
-            qos = self._sources.qos
-            subscribe_with_info(self._node, kind, self.topic, self._on_message, qos, raw=True)
+            subscription = subscribe_with_info(
+                self._node, kind, self.topic, self._on_message, copy(SENSOR_QOS), raw=True,
+                qos_overriding_options=OVERRIDABLE,
+            )  # fmt: skip
+            self._qos = subscription.qos_profile
 
     def _on_message(self, data: bytes, info: Mapping[str, Any]) -> None:
         sequence = info['publication_sequence_number'] or 0  # 0: the middleware has none
@@ -229,14 +238,14 @@ class Source:
 
 class Sources:
     """
-    The sources of a node, one for each topic, all with one QoS.
+    The sources of a node, one for each topic.
 
     `on_type` is called when the type of a topic has become known, `after_message` after each
     message.
     """
 
-    def __init__(self, node: Node, qos: QoSProfile, on_type: Callable[[], None]) -> None:
-        self._node, self.qos, self.on_type = node, qos, on_type
+    def __init__(self, node: Node, on_type: Callable[[], None]) -> None:
+        self._node, self.on_type = node, on_type
         self._by_topic: dict[str, Source] = {}
         self.after_message: Callable[[], None] = lambda: None
 

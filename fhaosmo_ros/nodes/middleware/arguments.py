@@ -10,7 +10,7 @@ import textwrap
 from typing import Any, NamedTuple
 
 from fhaosmo_ros import __version__
-from fhaosmo_ros.core.parameters.declaration import Parameter, shown, suggestion
+from fhaosmo_ros.core.parameters.declaration import Parameter, shown, unknown_parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import check_one_type, is_built_in, read
 from fhaosmo_ros.core.parameters.tables import FIRST, NODE_TABLES
@@ -67,9 +67,7 @@ def read_arguments(name: str, argv: list[str]) -> Arguments:
         # A file may hold the parameters of another node of the package, too; a rule may not.
         table = NODE_TABLES[name]
         if not (is_built_in(parameter) or '.' in parameter or parameter in table):
-            raise ConfigurationError(
-                f"unknown parameter '{parameter}'{suggestion(parameter, table)}"
-            )
+            raise unknown_parameter(parameter, table)
         try:
             value = parse(text)
         except ConfigurationError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers with QoS that a user may override, subscriptions with stamps, periods of timers."""
+"""Publishers and subscriptions with QoS that a user may override; periods of timers."""
 
 from collections.abc import Callable, Iterable, Mapping
 import inspect
@@ -20,7 +20,7 @@ has joined; what the publisher still keeps then is sent again.
 """
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Who comes later still gets the latest messages."""
-SENSOR_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+SENSOR_QOS = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Best effort matches every publisher; the queue holds one second at 1 kHz."""
 POLICIES: dict[QoSPolicyKind, tuple[str, ...] | range] = {
     QoSPolicyKind.HISTORY: ('keep_last', 'keep_all'),
@@ -29,6 +29,7 @@ POLICIES: dict[QoSPolicyKind, tuple[str, ...] | range] = {
     QoSPolicyKind.DURABILITY: ('volatile', 'transient_local'),
 }
 """QoS policies that a user may override, with the values that each may have."""
+OVERRIDABLE = QoSOverridingOptions(POLICIES)
 OVERRIDES = 'qos_overrides.'
 OF_RCLPY = tuple(f'{OVERRIDES}{topic}.' for topic in ('/clock', '/parameter_events', '/rosout'))
 """Topics whose QoS can be overridden in every node of rclpy."""
@@ -41,7 +42,7 @@ def create_publisher(node: Node, kind: Any, topic: str, latched: bool = False) -
         kind,
         topic,
         QoSProfile(depth=LATCHED.depth if latched else DEPTH, durability=durability),
-        qos_overriding_options=QoSOverridingOptions(POLICIES),
+        qos_overriding_options=OVERRIDABLE,
     )
 
 
@@ -62,7 +63,12 @@ def full_name(node: Node, topic: str) -> str:
         ) from None
 
 
-def check_overrides(node: Node, given: Mapping[str, Any], topics: Iterable[str]) -> None:
+def check_overrides(
+    node: Node,
+    given: Mapping[str, Any],
+    published: Iterable[str],
+    subscribed: Iterable[str] = (),
+) -> None:
     """
     Raise for QoS overrides that rclpy would ignore, or refuse with an unclear message.
 
@@ -71,21 +77,24 @@ def check_overrides(node: Node, given: Mapping[str, Any], topics: Iterable[str])
     node : Node
     given : mapping
         All that files and the command line set.
-    topics : iterable of str
-        All topics that the node makes by `create_publisher`.
+    published, subscribed : iterable of str
+        All topics whose publishers and subscriptions the node makes `OVERRIDABLE`.
 
     """
-    names = [full_name(node, topic) for topic in topics]
+    endpoints = [
+        *(f'{full_name(node, topic)}.publisher' for topic in published),
+        *(f'{full_name(node, topic)}.subscription' for topic in dict.fromkeys(subscribed)),
+    ]
     policies = {policy.name.lower(): allowed for policy, allowed in POLICIES.items()}
     for name, value in given.items():
         if not name.startswith(OVERRIDES) or name.startswith(OF_RCLPY):
             continue
-        topic, _, policy = name.removeprefix(OVERRIDES).rpartition('.publisher.')
+        endpoint, _, policy = name.removeprefix(OVERRIDES).rpartition('.')
         allowed = policies.get(policy)
-        if topic not in names or allowed is None:
+        if endpoint not in endpoints or allowed is None:
             expected = (
-                f'TOPIC.publisher.POLICY with TOPIC one of {", ".join(names)} and POLICY one of '
-                f'{", ".join(policies)}'
+                f'{OVERRIDES}ENDPOINT.POLICY with ENDPOINT one of {", ".join(endpoints)} and '
+                f'POLICY one of {", ".join(policies)}'
             )
             raise ConfigurationError(f"parameter '{name}': expected {expected}")
         if value not in allowed:
@@ -94,25 +103,16 @@ def check_overrides(node: Node, given: Mapping[str, Any], topics: Iterable[str])
             raise ConfigurationError(f"parameter '{name}': expected {expected}, got {value!r}")
 
 
-def input_qos(values: Mapping[str, Any]) -> QoSProfile:
-    """Return the QoS that the parameters input_reliability, _durability and _depth ask for."""
-    return QoSProfile(
-        depth=values['input_depth'],
-        reliability=ReliabilityPolicy[values['input_reliability'].upper()],
-        durability=DurabilityPolicy[values['input_durability'].upper()],
-    )
-
-
 def subscribe_with_info(
     node: Node,
     message_type: Any,
     topic: str,
     callback: Callable[[Any, dict[str, int]], None],
     qos: QoSProfile,
-    raw: bool = False,
+    **options: Any,
 ) -> Any:
     """
-    Subscribe with a callback that takes the message, in CDR if `raw`, and its info.
+    Subscribe with a callback that takes the message and its info; `options` are those of rclpy.
 
     rclpy delivers the info if the callback's signature has two parameters. The events executor of
     rclpy 7.1 passes both as one tuple, the other executors as two arguments; the adapter takes
@@ -126,8 +126,8 @@ def subscribe_with_info(
 
     adapter.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
     return node.create_subscription(
-        message_type, topic, adapter, qos, raw=raw,
-        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+        message_type, topic, adapter, qos,
+        event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False), **options,
     )  # fmt: skip
 
 
