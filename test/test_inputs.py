@@ -2,7 +2,7 @@
 """Fields in messages of any type, of rosbags and rclpy; known inputs paired with y by stamps."""
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.inputs import known_inputs, MOST, StampPairing
+from fhaosmo_ros.inputs import Input, known_inputs, MOST, Pairing
 from fhaosmo_ros.messages.fields import find_field, MissingElementError
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -76,7 +76,14 @@ def test_angle_of_a_quaternion():
 
 
 MS = 1_000_000
-GAP = 500 * MS
+GAP = 0.5
+
+
+def pairing_of(stamps, wait, held):
+    """Return a pairing of known inputs with these kinds of stamps; `wait` in nanoseconds."""
+    known = {f'u{j}': Input('u', '', '', stamp, '') for j, stamp in enumerate(stamps)}
+    values = {'known_input_wait': wait * 1e-9, 'max_gap': GAP}
+    return Pairing(values, list(known), known, held)
 
 
 def fed(pairing, events):
@@ -110,14 +117,14 @@ def test_order_of_arrival_within_the_wait_changes_nothing(seed, spacing, latest)
     events = list(zip(arriving(y), ['y'] * 40, y, range(40), strict=True))
     for j in range(2):
         events += zip(arriving(u[j]), [j] * 60, u[j], values[j], strict=True)
-    pairing = StampPairing([True, True], (2 * latest + 20) * MS, GAP, [0.0, 0.0])
+    pairing = pairing_of(['header', 'header'], (2 * latest + 20) * MS, [0.0, 0.0])
     found = fed(pairing, events)
     expected = np.column_stack([newest(u[j], values[j], y) for j in range(2)])
     assert found == [(k, row) for k, row in enumerate(expected.tolist())]
 
 
 def test_without_a_wait_the_newest_that_is_there_acts_and_late_ones_are_counted():
-    pairing = StampPairing([True], 0, GAP, [7.0])
+    pairing = pairing_of(['header'], 0, [7.0])
     events = [
         (1, 0, 20 * MS, 2.0), (2, 'y', 10 * MS, 'a'), (3, 'y', 20 * MS, 'b'),
         (4, 'y', 30 * MS, 'c'), (5, 0, 30 * MS, 3.0), (6, 'y', 40 * MS, 'd'),
@@ -127,7 +134,7 @@ def test_without_a_wait_the_newest_that_is_there_acts_and_late_ones_are_counted(
 
 
 def test_input_without_stamp_or_by_reception_holds_from_its_arrival_on():
-    pairing = StampPairing([True, False], 100 * MS, GAP, [0.0, 0.0])
+    pairing = pairing_of(['header', 'reception'], 100 * MS, [0.0, 0.0])
     events = [
         (1, 1, 99 * MS, 5.0), (2, 'y', 10 * MS, 'a'), (3, 1, 1 * MS, 6.0), (4, 0, 10 * MS, 1.0),
         (5, 0, 0, 9.0), (6, 'y', 11 * MS, 'b'),
@@ -136,7 +143,7 @@ def test_input_without_stamp_or_by_reception_holds_from_its_arrival_on():
 
 
 def test_clock_that_jumps_back_and_silence_leave_nothing_behind():
-    pairing = StampPairing([True], 20 * MS, GAP, [0.0])
+    pairing = pairing_of(['header'], 20 * MS, [0.0])
     events, at = [], 0
     for begin in (5000, 0, 9000):  # a bag that is played in a loop, then a jump ahead
         for k in range(0, 100, 10):

@@ -15,7 +15,7 @@ from fhaosmo_ros.core.online.events import described
 from fhaosmo_ros.core.online.snapshots import Flag
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit
-from fhaosmo_ros.inputs import known_inputs, make_pairing, measured_output
+from fhaosmo_ros.inputs import known_inputs, measured_output, Pairing
 from fhaosmo_ros.nodes.estimator.health import Health
 from fhaosmo_ros.nodes.estimator.outputs import Output, Outputs, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import Listener, Sources
@@ -82,7 +82,7 @@ class Channel:
         wanted = measured_output(values, name)
         self.y = sources.of(wanted).add(wanted, self._on_sample)
         known = known_inputs(values, observer.used_inputs, name)
-        self.pairing = make_pairing(values, observer.inputs, known, estimator.inputs)
+        self.pairing = Pairing(values, observer.inputs, known, estimator.inputs)
         self.u: dict[str, Listener] = {}
         for u, its in known.items():
             take = partial(self._on_input, observer.inputs.index(u), u)
@@ -97,8 +97,7 @@ class Channel:
         """Take samples and publish from now on; the first sample starts the observer afresh."""
         self._reset()
         self._forget()
-        if self.pairing is not None:
-            self.pairing.forget_samples()
+        self.pairing.forget_samples()
         self._health.begin()
         self._active = True
         if self.estimator.events.on:
@@ -150,12 +149,9 @@ class Channel:
         measured = stamp
         if self.values['sampling'] == 'clock':
             stamp = self._clock.now().nanoseconds
-        if self.pairing is None:
-            self._take(stamp, y)
-        else:
-            self.pairing.take_sample(measured, (stamp, y))
-            self._waits_since = perf_counter()
-            self._take_paired()
+        self.pairing.take_sample(measured, (stamp, y))
+        self._waits_since = perf_counter()
+        self._take_paired()
 
     def _take_paired(self, at_once: bool = False) -> None:
         """Step to the samples whose known inputs are there."""
@@ -229,10 +225,11 @@ class Channel:
                 self._logger.warning(text)
 
     def _on_input(self, index: int, name: str, stamp: int, u: float, _: int) -> None:
-        if self.pairing is not None and isfinite(u):
+        if isfinite(u):
             self.pairing.take_input(index, stamp, u)
             self._take_paired()
-        elif not self.estimator.set_input(u, index):
+        else:
+            self.estimator.reject_inputs(1)
             self._logger.warning(
                 f'rejected {name} = {u}: expected a finite number; the last one is held',
                 throttle_duration_sec=QUIET,
@@ -248,10 +245,8 @@ class Channel:
 
     def tick(self) -> None:
         """Publish at the node's rate, if it is to; log once that y is silent."""
-        if self.pairing is not None:  # samples may wait for inputs, and no sample follows
-            waited = perf_counter() - self._waits_since
-            if waited > self.values['known_input_wait']:
-                self._take_paired(at_once=True)
+        if perf_counter() - self._waits_since > self.values['known_input_wait']:
+            self._take_paired(at_once=True)  # samples may wait for inputs, and no sample follows
         if self._arrived:
             self._arrived = self._stale = False
             self._silent_since = None

@@ -14,7 +14,7 @@ from fhaosmo_ros.core.online.events import described
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
-from fhaosmo_ros.inputs import StampPairing
+from fhaosmo_ros.inputs import Pairing
 from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
 import numpy as np
@@ -58,7 +58,7 @@ class Watched(Protocol):
     estimator: OnlineEstimator
     y: Listener
     u: Mapping[str, Listener]
-    pairing: StampPairing | None
+    pairing: Pairing
     simulated: bool
 
 
@@ -178,7 +178,7 @@ class Health:
             nobody = not u.source.heard and not u.source.unheard
             report.find(WARN, f'no publisher of {name}', nobody)
         for key, text in UNPAIRED.items():
-            report.find(WARN, f'{news.get(key, 0)} {key}{text}', news.get(key, 0))
+            report.find(WARN, f'{news[key]} {key}{text}', news[key])
 
     def _observer(self, report: Report, mean: float, news: Mapping[str, int], stale: bool) -> None:
         estimator, limits = self._channel.estimator, self._channel.values
@@ -268,11 +268,9 @@ class Health:
             'samples rejected': counters.rejected,
             **{_words(name): n for name, n in counters._asdict().items() if name != 'accepted'},
             'restarts': counters.restarts,
-        } | (
-            {'late inputs': pairing.late, 'samples before any input': pairing.ahead}
-            if pairing
-            else {}
-        )
+            'late inputs': pairing.late,
+            'samples before any input': pairing.ahead,
+        }
 
     def _bound(self, status: Status) -> str:
         estimator = self._channel.estimator

@@ -7,13 +7,7 @@ from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.inputs import (
-    Input,
-    known_inputs,
-    make_pairing,
-    measured_output,
-    StampPairing,
-)
+from fhaosmo_ros.inputs import Input, known_inputs, measured_output, Pairing
 from fhaosmo_ros.messages.fields import Field
 from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples, Watch
 import numpy as np
@@ -102,10 +96,7 @@ class BagInputs:
         """
         names, count = self._model.inputs, len(self._model.inputs)
         before = list(held or [0.0] * count)
-        # Without inputs by their headers' stamps, samples do not wait.
-        pairing = make_pairing(self._values, names, self._u, before) or StampPairing(
-            [False] * count, 0, 0, before
-        )
+        pairing = Pairing(self._values, names, self._u, before)
         arrivals = [_arrivals(samples, SAMPLE)]
         for name, its in self._u.items():
             field = self._reader.field(its.topic, its.field, its.name)
