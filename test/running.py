@@ -27,8 +27,8 @@ from std_srvs.srv import Trigger
 ROOT = Path(fhaosmo_ros.__file__).parents[1]
 DEADLINE = 60.0
 """Seconds for what takes one on a quiet machine."""
-TRIES = 20
-"""Of a call, which share the deadline: the middleware may lose the first one of a new client."""
+FIRST_TRY = 0.25
+"""Seconds until a call is made again, later twice as many: the middleware may lose the first."""
 SECOND = 1_000_000_000
 OK, WARN, ERROR, STALE = b'\0', b'\1', b'\2', b'\3'
 QOS = QoSProfile(depth=10_000)
@@ -37,9 +37,9 @@ ESTIMATES = {
     'state': Float64MultiArray, 'unknown_input': Float64, 'gamma': Float64,
     'innovation': Float64MultiArray, 'stamp': Time,
 }  # fmt: skip
-FED = {'publish_on': 'sample', 'max_gap': 60.0, 'diagnostics_period': 0.2}
+FED = {'publish_on': 'sample', 'max_gap': 60.0, 'diagnostics_period': 0.1}
 """For an estimator that a test feeds: each sample is answered at once, and no gap restarts it."""
-LAX = {'warn_jitter_above': 1e6, 'warn_delay_above': 1e6, 'diagnostics_period': 0.2}
+LAX = {'warn_jitter_above': 1e6, 'warn_delay_above': 1e6, 'diagnostics_period': 0.1}
 """A loaded machine is no reason for a warning here."""
 
 
@@ -62,14 +62,14 @@ def joint_state(stamp: int, names: Iterable[str], positions: Iterable[float]) ->
 
 
 def arguments(
-    *words: object, namespace: str = '', inputs: Iterable[str] = (), **values: object
+    *words: object, namespace: str = '', reliable: Iterable[str] = (), **values: object
 ) -> list[object]:
     """
     Return ROS arguments: those given, a namespace, and parameters; `lambda_` sets lambda.
 
-    `inputs` are topics in the namespace, or with full names, that an estimator hears reliably.
+    `reliable` are topics in the namespace, or with full names, that an estimator hears reliably.
     """
-    for topic in inputs:
+    for topic in reliable:
         name = topic if topic.startswith('/') else f'{namespace}/{topic}'
         values[f'qos_overrides.{name}.subscription.reliability'] = 'reliable'
     if namespace:
@@ -190,13 +190,13 @@ class User(PrivateNode):
 
     def answer(self, ask, *request: object):
         """Return the answer to a request, asked again where it gets lost."""
-        done = threading.Event()
-        futures = []
-        for _ in range(TRIES):
+        done, futures, patience = threading.Event(), [], FIRST_TRY
+        while patience < DEADLINE:
             futures.append(ask(*request))
             futures[-1].add_done_callback(lambda _: done.set())
-            if done.wait(DEADLINE / TRIES):
+            if done.wait(patience):
                 return next(future.result() for future in futures if future.done())
+            patience *= 2.0
         raise TimeoutError(f'no answer within {DEADLINE} s')
 
 

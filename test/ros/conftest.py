@@ -62,8 +62,8 @@ def launch(tmp_path_factory):
 def estimator(launch, user):
     """Return a function that starts an estimator and knows its topics."""
 
-    def start(namespace, *words, inputs=('y',), **values):
-        process = launch('estimator', *words, namespace=namespace, inputs=inputs, **values)
+    def start(namespace, *words, reliable=('y',), **values):
+        process = launch('estimator', *words, namespace=namespace, reliable=reliable, **values)
         return Estimator(user, process, namespace, gamma=values.get('gains') != 'self_tuning')
 
     return start
@@ -82,7 +82,7 @@ def pair(tmp_path_factory, user):
 @pytest.fixture(scope='session')
 def _fed(tmp_path_factory, user):
     with _launcher(tmp_path_factory) as launch:
-        process = launch('estimator', namespace='/fed', inputs=['y'], **FED)
+        process = launch('estimator', namespace='/fed', reliable=['y'], **FED)
         yield Estimator(user, process, '/fed').listen()
 
 

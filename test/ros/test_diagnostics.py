@@ -2,14 +2,12 @@
 """Reports on /diagnostics: their values, and what makes them WARN, ERROR and STALE; QoS."""
 
 from functools import partial
-import itertools
 
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.recording import PrivateNode
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosgraph_msgs.msg import Clock
 from running import ERROR, FED, joint_state, LATCHED, LAX, OK, Parameters, STALE, values_of, WARN
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Int64
@@ -58,39 +56,22 @@ def test_thresholds(pair, task, changes, words):
 
 def test_hardware_id_and_period_are_live(pair):
     assert pair.reports[-1].statuses['state'].hardware_id == 'none'
-    pair.parameters.set(hardware_id='encoder 7', diagnostics_period=1.0)
+    pair.parameters.set(hardware_id='encoder 7', diagnostics_period=0.5)
     since = len(pair.reports)
 
     def slow() -> bool:  # a report that comes late makes the time to the next one shorter
         stamps = [report.stamp for report in pair.reports[since:]]
-        return len(stamps) > 2 and stamps[-1] - stamps[-2] > 0.8e9
+        return len(stamps) > 2 and stamps[-1] - stamps[-2] > 0.4e9
 
-    pair.user.wait(slow, 'reports 1 s apart')
+    pair.user.wait(slow, 'reports 0.5 s apart')
     assert pair.reports[-1].statuses['state'].hardware_id == 'encoder 7'
     pair.parameters.set(hardware_id='none', diagnostics_period=LAX['diagnostics_period'])
-
-
-def test_a_clock_that_is_slower_than_the_samples_is_said(user, estimator):
-    """What `ros2 bag play --clock` gives, at 40 Hz."""
-    rig = estimator('/slow', **FED | LAX, use_sim_time=True, sampling='clock')
-    clock = user.publisher('/clock', Clock)
-    rig.listen()
-    ticks = itertools.count(100)
-
-    def send() -> None:
-        seconds, tick = divmod(next(ticks), 40)
-        clock.publish(Clock(clock=Time(sec=seconds, nanosec=25_000_000 * tick)))
-        for _ in range(25):
-            rig.send(0.2)
-
-    rig.wait_status('input', WARN, 'ticks once for', doing=send)
-    user.node.destroy_publisher(clock)
 
 
 def test_what_no_longer_fits_is_said(user, estimator):
     file = ['--params-file', 'config/noise_1e-3.yaml']
     options = LAX | {'publish_on': 'sample', 'max_gap': 60.0}
-    options |= {'input_topic': 'q', 'input_field': 'position[a]', 'inputs': ['q']}
+    options |= {'input_topic': 'q', 'input_field': 'position[a]', 'reliable': ['q']}
     rig = estimator('/fits', *file, **options)
     q = user.publisher('/fits/q', JointState)
     rng, stamp, sent = np.random.default_rng(1), 0, 0
@@ -190,7 +171,7 @@ def test_policies_of_estimates(user, launch):
     """An estimate that nobody listens to is not made, unless its publisher keeps the last ones."""
     node = '/out/estimator'
     prefix = f'qos_overrides.{node}'
-    launch('estimator', namespace='/out', gains='self_tuning', inputs=['y'], **FED, **{
+    launch('estimator', namespace='/out', gains='self_tuning', reliable=['y'], **FED, **{
         f'{prefix}/state.publisher.reliability': 'best_effort',
         f'{prefix}/unknown_input.publisher.durability': 'transient_local',
         f'{prefix}/standard_deviation.publisher.depth': 7,

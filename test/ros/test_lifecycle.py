@@ -16,7 +16,7 @@ NODE = '/managed/estimator'
 
 @pytest.fixture(scope='module')
 def process(launch):
-    return launch('estimator', namespace='/managed', inputs=['y'], autostart=False, **FED)
+    return launch('estimator', namespace='/managed', reliable=['y'], autostart=False, **FED)
 
 
 @pytest.fixture(scope='module')
@@ -46,7 +46,9 @@ def listeners(user) -> list[str]:
 def test_a_destroyed_node_leaves_the_graph_while_its_process_goes_on(user):
     name, context = ('estimator', '/destroyed'), Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    node = EstimatorNode(context=context, namespace=name[1])
+    given = {'use_sim_time': True, 'sampling': 'nominal'}
+    node = EstimatorNode(given, context=context, namespace=name[1])
+    assert node.get_parameter('sampling').value == 'nominal'  # simulated time chooses no other
     user.wait(lambda: name in user.node.get_node_names_and_namespaces(), 'node')
     node.destroy_node()
     user.wait(lambda: name not in user.node.get_node_names_and_namespaces(), 'end of the node')

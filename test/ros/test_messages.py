@@ -51,7 +51,8 @@ def test_robot_is_estimated_live_as_in_a_replay(user, estimator, recorder, tmp_p
 
     typed = user.record('/robot/estimator/joint_states', JointState)
     rig = estimator(
-        '/robot', '--params-file', ROOT / 'config' / 'joint_states.yaml', inputs=['joint_states'],
+        '/robot', '--params-file', ROOT / 'config' / 'joint_states.yaml',
+        reliable=['joint_states'],
         **FED | {'channels': [''], 'input_field': 'position[shoulder]', 'max_gap': 0.0},
         unknown_input_scale=2.0,
     )  # fmt: skip
@@ -87,7 +88,7 @@ def test_robot_is_estimated_live_as_in_a_replay(user, estimator, recorder, tmp_p
 
 def test_bad_messages_are_told_counted_and_survived(user, estimator):
     rig = estimator(
-        '/bad', inputs=['data'], input_topic='data', input_field='position[elbow]', **FED
+        '/bad', reliable=['data'], input_topic='data', input_field='position[elbow]', **FED
     )
     with User('other') as other:  # one participant has one type of a topic
         other.node.create_publisher(Float64, '/bad/data', 10)
@@ -136,7 +137,7 @@ def test_yaw_is_continuous_and_the_outputs_are_typed(user, estimator):
     wrench = user.record('/yaw/estimator/wrench', WrenchStamped)
     accel = user.record('/yaw/estimator/accel', AccelStamped)
     rig = estimator(
-        '/yaw', inputs=['pose'], input_topic='pose', input_field='pose.orientation.yaw',
+        '/yaw', reliable=['pose'], input_topic='pose', input_field='pose.orientation.yaw',
         **FED | model,
         typed_outputs=['wrench', 'accel'], output_axis='angular.z', unknown_input_scale=3.0,
         frame_id='base', measurement_unit='rad', unknown_input_unit="'N m'",
@@ -174,7 +175,7 @@ def test_known_input_from_the_message_of_y(user, estimator):
     """u of a message is that of its own sample; whatever /clock does, dt is that of headers."""
     model = {'order': 1, 'phi': ['u'], 'lambda': [15.0, 5.0]}
     rig = estimator(
-        '/drive', inputs=['imu'], input_topic='imu', input_field='angular_velocity.z',
+        '/drive', reliable=['imu'], input_topic='imu', input_field='angular_velocity.z',
         **FED | model,
         known_input_topics=['imu'], known_input_fields=['linear_acceleration.x'],
         use_sim_time=True,
@@ -204,7 +205,7 @@ def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(
     }  # fmt: skip
     process = recorder('/arm2/estimator')
     rig = estimator(
-        '/arm2', '-r', 'u:=/motor/state', inputs=['q', '/motor/state'], input_topic='q',
+        '/arm2', '-r', 'u:=/motor/state', reliable=['q', '/motor/state'], input_topic='q',
         input_field='position[a]', known_input_fields=['effort[a]'], **FED | model,
     )  # fmt: skip
     y = user.publisher('/arm2/q', JointState, heard=2)

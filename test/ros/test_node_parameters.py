@@ -27,6 +27,7 @@ OTHER = {
     'gamma_max': {'gamma_max': 0.97},
     'scheme': {'scheme': 'explicit'},
     'sampling': {'sampling': 'nominal'},
+    'diagnostics_period': {'diagnostics_period': 0.2},
     'fuzzy_systems': {'fuzzy_systems': ['curve 0 0.8 1']},
     # A deviation is known to self-tuning only: test_events.py.
     'event_deviations': {'gamma_rate': 0.01},
@@ -244,7 +245,7 @@ def test_random_sets_hurt_nobody_and_each_refusal_has_its_reason(user, estimator
         for _ in range(2):
             node.send(rng.normal() if rng.random() < 0.99 else rng.choice([math.nan, 1e300]))
     assert COUNT // 10 < accepted < COUNT - COUNT // 10
-    node.parameters.set(publish_on='sample', diagnostics_period=0.2)
+    node.parameters.set(publish_on='sample', diagnostics_period=0.1)
     node.wait_status('state', OK)  # whatever has been published before has come
     assert len(node.estimates) > COUNT // 2
     for e in node.estimates:

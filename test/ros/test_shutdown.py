@@ -42,15 +42,17 @@ def test_running_pair_ends(user, launch, signals):
     user.wait(lambda: user.node.count_publishers(topic) == 0, 'end of the publishers')
 
 
-@pytest.mark.parametrize('transition', ['', 'configure', 'shutdown'])
-def test_a_signal_ends_it_in_every_state(user, launch, transition):
-    namespace = f'/after_{transition}'
-    process = launch('estimator', namespace=namespace, autostart=False)
-    manager = Manager(user, f'{namespace}/estimator')
-    assert manager.state() == 'unconfigured'
-    assert not transition or manager.change(transition)
-    process.send_signal(signal.SIGINT)
-    ends_well(process)
+def test_a_signal_ends_it_in_every_state(user, launch):
+    nodes = {
+        transition: launch('estimator', namespace=f'/after_{transition}', autostart=False)
+        for transition in ('', 'configure', 'shutdown')
+    }
+    for transition, process in nodes.items():
+        manager = Manager(user, f'/after_{transition}/estimator')
+        assert manager.state() == 'unconfigured'
+        assert not transition or manager.change(transition)
+        process.send_signal(signal.SIGINT)
+        ends_well(process)
 
 
 def test_signal_while_parameters_are_set(user, launch):
@@ -64,17 +66,18 @@ def test_signal_while_parameters_are_set(user, launch):
     ends_well(process)
 
 
-@pytest.mark.parametrize('name', ['estimator', 'plant'])
 @pytest.mark.parametrize('delay', [0.3, 0.7, 1.1])
-def test_signal_while_it_starts(launch, name, delay):
+def test_signal_while_it_starts(launch, delay):
     """The delay is the test's subject: anywhere within the start, or just behind it."""
-    process = launch(name, namespace='/early')
+    nodes = [launch(name, namespace='/early') for name in ('estimator', 'plant')]
     time.sleep(delay)
-    process.send_signal(signal.SIGTERM)
-    process.send_signal(signal.SIGINT)
-    code = process.wait(GRACE)
-    # Python itself dies of a signal before it has begun with our code.
-    assert code in (0, -signal.SIGTERM, -signal.SIGINT), process.output()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        for process in nodes:
+            process.send_signal(number)
+    for process in nodes:
+        code = process.wait(GRACE)
+        # Python itself dies of a signal before it has begun with our code.
+        assert code in (0, -signal.SIGTERM, -signal.SIGINT), process.output()
 
 
 STUCK = """

@@ -183,7 +183,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_without_the_events_executor_it_works_too(user, launch):
-    process = launch(WITHOUT_EVENTS, namespace='/older', inputs=['y'], max_gap=60.0)
+    process = launch(WITHOUT_EVENTS, namespace='/older', reliable=['y'], max_gap=60.0)
     rig = Estimator(user, process, '/older').listen()
     for y in (0.2, 0.21, 0.22):
         estimate = rig.feed(y)
