@@ -146,7 +146,7 @@ def test_publishers_are_named(user, estimator, stranger):
     rig.wait_count('samples accepted', 30)
     assert rig.count('samples lost') == 0
     stranger.destroy_publisher(first)
-    rig.wait_said('the publisher of /heard/y changed: now /user')
+    rig.wait_values('input', lambda v: v['publishers'] == '/user', 'one publisher')
 
 
 def test_what_was_published_before_is_heard_if_asked_for(estimator, stranger):

@@ -5,17 +5,13 @@ from collections import deque
 from collections.abc import Mapping
 from math import nan
 from time import perf_counter
-from typing import Protocol
+from typing import Any
 
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.counters import UNUSED_SAMPLES
-from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described
-from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
-from fhaosmo_ros.inputs import Pairing
-from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
 import numpy as np
 from numpy.typing import NDArray
@@ -50,41 +46,29 @@ UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
 """Counters of samples that the observer has not taken."""
 
 
-class Watched(Protocol):
-    """What is reported on: a channel, with its parameters of now."""
-
-    name: str
-    values: Parameters
-    estimator: OnlineEstimator
-    y: Listener
-    u: Mapping[str, Listener]
-    pairing: Pairing
-    simulated: bool
-
-
 class Health:
     """
-    Remembers a few numbers of each sample, and makes two reports of them.
+    Remembers a few numbers of each sample of a channel, and makes two reports of them.
 
     Appended to on each sample: `stamps` (ns), `delays` from the source stamp to the callback (ns),
     `durations` of the callback (s), `unknown_inputs`. `latest` is the time of the last sample on
     `perf_counter`, `offset` from its stamp to the publication of its message (ns).
     """
 
-    def __init__(self, channel: Watched) -> None:
+    def __init__(self, channel: Any) -> None:
         self._channel = channel
         self.stamps: deque[int] = deque(maxlen=LIMIT)
         self.delays: deque[int] = deque(maxlen=LIMIT)
         self.durations: deque[float] = deque(maxlen=LIMIT)
         self.unknown_inputs: deque[float] = deque(maxlen=LIMIT)
-        self.offset = self._lost_before = 0
+        self.offset = 0
         self.latest = nan
         self._before = self._counts()
         self._events_before = 0
 
     def begin(self) -> None:
         """Begin to count: what was lost before does not matter."""
-        self._lost_before = self._channel.y.source.lost
+        self._channel.y.source.lost = 0
         self._before = self._counts()
 
     def reports(self, stale: bool) -> list[Report]:
@@ -139,13 +123,13 @@ class Health:
         silence = ERROR if source.unheard and not heard else STALE
         since = f'for {age:.3g} s' if age == age else 'yet'
         report.find(silence, f'no usable sample {since}', stale)
-        nobody = not heard and not y.error
-        report.find(silence, f'no publisher of {source.topic} that can be heard', nobody)
+        alone = f'no publisher of {source.topic} that can be heard'
+        report.find(silence, alone, not heard and not y.error)
         used, lacking, spread = (
             news[key] for key in ('samples accepted', 'messages without y', 'spread stamps')
         )
-        several = len(heard) > 1 and not lacking
-        report.find(WARN, f'{len(heard)} publishers, their samples mix', several)
+        several = f'{len(heard)} publishers, their samples mix'
+        report.find(WARN, several, len(heard) > 1 and not lacking)
         report.find(WARN, f'{lacking} messages without y: {y.why}', lacking and not used)
         bad = {key: news[key] for key in UNUSED if news[key]}
         share = sum(bad.values()) / max(1, sum(bad.values()) + used)
@@ -159,10 +143,8 @@ class Health:
         )
         for key in ('restarts', 'stuck'):
             report.find(WARN, f'{key} {news[key]}', news[key])
-        slow = rate < limits['warn_rate_below']
-        report.find(WARN, f'sample rate {rate:.4g} Hz', slow)
-        jitters = jitter > limits['warn_jitter_above']
-        report.find(WARN, f'jitter {jitter:.3g}', jitters)
+        report.find(WARN, f'sample rate {rate:.4g} Hz', rate < limits['warn_rate_below'])
+        report.find(WARN, f'jitter {jitter:.3g}', jitter > limits['warn_jitter_above'])
         latest = limits['warn_delay_above']
         report.find(WARN, f'samples arrive {delay:.3g} s after their stamps', delay > latest)
         side = 'before' if offset > 0.0 else 'after'
@@ -229,8 +211,8 @@ class Health:
         report.find(ERROR, f'diverged and started again from y, {diverged} times', diverged)
         report.find(WARN, f'y jumped {jumps} times', jumps)
         report.find(WARN, f'y is taken as {offset:.3g} too large since it jumped', offset)
-        moved = abs(away) > GAMMA_AWAY
-        report.find(WARN, f'gamma is {away:+.2g} away from gamma_initial', moved)
+        moved = f'gamma is {away:+.2g} away from gamma_initial'
+        report.find(WARN, moved, abs(away) > GAMMA_AWAY)
         tuned = observer.parameters['correction_period']
         if tuned and mean > 0.0 and observer.parameters['scheme'] == 'predict_correct':
             rates = f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / mean:.4g} Hz'
@@ -262,7 +244,7 @@ class Health:
         counters, source, pairing = channel.estimator.counters, y.source, channel.pairing
         return {
             'samples accepted': counters.accepted,
-            'samples lost': source.lost - self._lost_before,
+            'samples lost': source.lost,
             'damaged messages': source.damaged,
             'messages without y': y.lacking,
             'samples rejected': counters.rejected,

@@ -108,7 +108,6 @@ class Source:
         self._served: list[Listener] = []  # those with a field
         self._whys: set[str] = set()
         self._subscribed = False
-        self._last: dict[Gid, str] = {}  # the latest publishers that could be heard
         self._nameless: set[Gid] = set()
         self._told = ''
         self._timer: Any = None
@@ -138,7 +137,7 @@ class Source:
         """
         if not self._subscribed:
             return
-        told = self.unheard
+        before, told = self.heard, self.unheard
         self.heard, self.unheard = {}, {}
         for endpoint in self._node.get_publishers_info_by_topic(self.topic):
             gid = tuple(endpoint.endpoint_gid)
@@ -154,15 +153,11 @@ class Source:
             if told.get(gid) != self.unheard[gid]:
                 self._logger.error(self.unheard[gid])
         self._mixed = len(self.heard) > 1
-        if self.heard and self.heard.keys() != self._last.keys():
+        if self._mixed and self.heard.keys() != before.keys():
             names = ' and '.join(sorted(self.heard.values()))
-            if self._mixed:
-                self._logger.warning(
-                    f'{len(self.heard)} publishers of {self.topic}, their samples mix: {names}'
-                )
-            elif self._last:
-                self._logger.warning(f'the publisher of {self.topic} changed: now {names}')
-            self._last = self.heard
+            self._logger.warning(
+                f'{len(self.heard)} publishers of {self.topic}, their samples mix: {names}'
+            )
 
     def _mismatch(self, endpoint: Any) -> str:
         """Return why a publisher can't be heard, '' if it can."""

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A managed node whose transitions may fail but never end the process."""
 
-from abc import abstractmethod
 from collections.abc import Callable
 import traceback
 from typing import Any
@@ -18,10 +17,10 @@ class ManagedNode(LifecycleNode, TimedNode):
     """
     A managed node (ROS 2 lifecycle) that says why a transition failed.
 
-    A transition fails if `configure`, `activate` or `deactivate` of a subclass raises. All
-    publishers, subscriptions, services and timers that were made since `configure` began are
-    destroyed by the transition cleanup, and if `configure` fails.
-
+    A subclass has the methods `configure`, `activate` and `deactivate`, which is also called when
+    the node is not active; a transition fails if its method raises. All publishers, subscriptions,
+    services and timers that were made since `configure` began are destroyed by the transition
+    cleanup, and if `configure` fails.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -48,18 +47,6 @@ class ManagedNode(LifecycleNode, TimedNode):
             self.trigger_shutdown()
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
-
-    @abstractmethod
-    def configure(self) -> None:
-        """Make what the node needs; raise if it is not possible."""
-
-    @abstractmethod
-    def activate(self) -> None:
-        """Begin to work."""
-
-    @abstractmethod
-    def deactivate(self) -> None:
-        """Stop working; also called when the node is not active."""
 
     def cleanup(self) -> None:
         """Stop working and destroy what was made since `configure` began, all or part of it."""
