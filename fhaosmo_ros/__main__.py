@@ -17,7 +17,7 @@ import signal
 import sys
 
 from fhaosmo_ros import __version__
-from fhaosmo_ros.commands import COMMANDS, STUDIES
+from fhaosmo_ros.commands import COMMANDS
 from fhaosmo_ros.stop_signals import ending_signals
 
 
@@ -38,12 +38,6 @@ def main(argv: list[str] | None = None) -> int:
     if name in ('-h', '--help'):
         print(usage())
         return 0
-    if name in STUDIES:
-        print(
-            f'error: {name!r} is not an installed command: run make {name} in a checkout',
-            file=sys.stderr,
-        )
-        return 2
     if name == '--version':
         print(f'fhaosmo_ros {__version__}')
         return 0

@@ -37,5 +37,3 @@ COMMANDS = {
     'play': ('fhaosmo_ros.tools.play', "publish a bag's topics in its own time, with /clock"),
     'tune': ('fhaosmo_ros.tools.tuning.command', 'find gains that fit the sensor and the plant'),
 }
-STUDIES = ('compare', 'paper')
-"""Studies of the repository that are not installed: `make` runs them in a checkout."""

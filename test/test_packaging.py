@@ -349,7 +349,6 @@ def test_without_the_headers_of_python_nothing_is_begun(tmp_path):
 
 @pytest.mark.parametrize(('arguments', 'code', 'words'), [
     (['estimater'], 2, ["no command 'estimater'", "did you mean 'estimator'?", *COMMANDS]),
-    (['compare'], 2, ['make compare in a checkout']),
     ([], 2, COMMANDS),
     (['--help'], 0, COMMANDS),
     (['--version'], 0, [f'fhaosmo_ros {fhaosmo_ros.__version__}\n']),

@@ -2,6 +2,7 @@
 """Publishers and subscriptions with QoS that a user may override; periods of timers."""
 
 from collections.abc import Callable, Iterable, Mapping
+from copy import copy
 import inspect
 import re
 from typing import Any
@@ -37,13 +38,8 @@ OF_RCLPY = tuple(f'{OVERRIDES}{topic}.' for topic in ('/clock', '/parameter_even
 
 def create_publisher(node: Node, kind: Any, topic: str, latched: bool = False) -> Any:
     """Return a publisher, reliable unless the user wants another QoS; latched: transient-local."""
-    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-    return node.create_publisher(
-        kind,
-        topic,
-        QoSProfile(depth=LATCHED.depth if latched else DEPTH, durability=durability),
-        qos_overriding_options=OVERRIDABLE,
-    )
+    qos = copy(LATCHED) if latched else QoSProfile(depth=DEPTH)
+    return node.create_publisher(kind, topic, qos, qos_overriding_options=OVERRIDABLE)
 
 
 def has_listeners(publisher: Any) -> bool:

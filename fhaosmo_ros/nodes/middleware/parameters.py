@@ -8,7 +8,6 @@ from typing import Any
 from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown, suggestion, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import is_built_in
-from fhaosmo_ros.core.parameters.per_channel import split
 from fhaosmo_ros.core.parameters.yaml_text import parse
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -30,11 +29,9 @@ TYPES = {
 }
 
 
-def descriptor(
-    parameter: Parameter, read_only: bool, values: Mapping[str, Any]
-) -> ParameterDescriptor:
+def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     """
-    Return the ROS descriptor of a declared parameter; it says the unit of y where `values` do.
+    Return the ROS descriptor of a declared parameter.
 
     Typing is dynamic so that a wrong type reaches our own check, whose message names the
     parameter. Bounds are a ROS range only where a slider of rqt_reconfigure makes sense.
@@ -46,10 +43,6 @@ def descriptor(
         constraints.append('logarithmic scale: change it by a factor')
     if not parameter.live and not read_only:
         constraints.append('fixed while the node is configured: set it after cleanup')
-    channel, _ = split(parameter.name)
-    unit = values.get(f'{channel}.measurement_unit' if channel else 'measurement_unit', '')
-    if unit and 'unit of y' in parameter.text:
-        constraints.append(f'unit of y: {unit}')
     result = ParameterDescriptor(
         name=parameter.name,
         type=TYPES[parameter.kind].value,
@@ -124,7 +117,7 @@ class NodeParameters:
         """Go on with values, perhaps of a larger table: what is new is declared."""
         for name, value in values.items():
             if not self._node.has_parameter(name):
-                declared = descriptor(values.table[name], name in self._read_only, values)
+                declared = descriptor(values.table[name], name in self._read_only)
                 self._node.declare_parameter(name, value, declared, ignore_override=True)
         self.values = values
 
