@@ -29,6 +29,12 @@ ROS = (
     'rclpy', 'rmw-fastrtps-cpp', 'rosgraph-msgs', 'sensor-msgs', 'std-msgs', 'std-srvs',
 )  # fmt: skip
 """What the nodes need of a ROS distribution."""
+DEBUG = os.environ.get('FHAOSMO_DEBUG') == '1'
+DIRECTIVES = {
+    'language_level': 3, 'boundscheck': DEBUG, 'wraparound': False, 'initializedcheck': DEBUG,
+    'cdivision': True, 'show_performance_hints': False,
+}  # fmt: skip
+"""Of Cython, for all of the package."""
 
 
 def extensions():
@@ -42,33 +48,21 @@ def extensions():
     product and sum are contracted), and -O3 makes it no faster. Methods of studies/ are built in a
     checkout, never installed.
     """
-    debug = os.environ.get('FHAOSMO_DEBUG') == '1'
     sanitize = ['-fsanitize=address'] if os.environ.get('FHAOSMO_ASAN') == '1' else []
     found = []
     for path in sorted([*Path(NAME).rglob('*.pyx'), *Path('studies').rglob('*.pyx')]):
-        options = ['-O1', '-g'] if debug else ['-O2', '-g0']
+        options = ['-O1', '-g'] if DEBUG else ['-O2', '-g0']
         options += ['-fno-math-errno', *sanitize]
         if {'self_tuning', 'arm'} & set(path.parts):
             options += ['-fno-trapping-math', '-fno-signed-zeros', '-fassociative-math']
-            options += [] if debug else ['-O3']
+            options += [] if DEBUG else ['-O3']
         else:
             options.append('-ffp-contract=off')
-        extension = Extension(
-            '.'.join(path.with_suffix('').parts),
-            [str(path)],
-            libraries=['m'],
-            extra_compile_args=options,
+        name = '.'.join(path.with_suffix('').parts)
+        found.append(Extension(
+            name, [str(path)], libraries=['m'], extra_compile_args=options,
             extra_link_args=sanitize,
-        )
-        extension.cython_directives = {
-            'language_level': 3,
-            'boundscheck': debug,
-            'wraparound': False,
-            'initializedcheck': debug,
-            'cdivision': True,
-            'show_performance_hints': False,
-        }
-        found.append(extension)
+        ))  # fmt: skip
     return found
 
 
@@ -93,9 +87,9 @@ class BuildExtensions(build_ext):
             sys.exit("error: Cython is needed to build: pip install 'Cython>=3'")
         # The mark of scripts/environment.sh that what lies in the checkout is up to date.
         Path('build/in_place').unlink(missing_ok=True)
-        options = {(*e.extra_compile_args, *e.cython_directives.items()) for e in self.extensions}
+        options = sorted({tuple(extension.extra_compile_args) for extension in self.extensions})
         compiler = [os.environ.get(name) for name in ('CC', 'CFLAGS', 'LDFLAGS')]
-        made_with = repr((version, compiler, sorted(options, key=repr)))
+        made_with = repr((version, compiler, DIRECTIVES, options))
         mark = Path(self.build_temp, 'made_with')
         self.force = self.force or not mark.is_file() or mark.read_text() != made_with
         # Processes, not threads: Cython is Python. They must not run this file again.
@@ -106,7 +100,7 @@ class BuildExtensions(build_ext):
             quiet=True,
             force=self.force,
             build_dir=self.build_temp,
-            compiler_directives=self.extensions[0].cython_directives,
+            compiler_directives=DIRECTIVES,
         )
         for extension, c in zip(self.extensions, translated, strict=True):
             extension.sources = c.sources

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from functools import partial
 from math import isfinite, isnan
 from time import perf_counter, time_ns
-from types import MappingProxyType
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -191,12 +190,12 @@ class Channel:
 
     def _say(
         self, text: str, stamp: Time | None = None, level: bytes = OK,
-        values: Mapping[str, str] = MappingProxyType({}),
+        values: Mapping[str, str] | None = None,
     ) -> None:  # fmt: skip
         """Publish on the topic of events; without a stamp, with that of now."""
         report = Report(f'{self.name} event' if self.name else 'event')
         report.find(level, text)
-        report.values |= values
+        report.values |= values or {}
         stamp = stamp or self._clock.now().to_msg()
         self._events.publish(array_of(self._node, stamp, [report], self.values['hardware_id']))
 
