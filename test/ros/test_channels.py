@@ -124,11 +124,13 @@ class Arm(Rig):
 
     def answer(self, **positions):
         """Return the estimates of a message; it is sent again until they are heard."""
-        begin = self.stamp
+        begin, latest = self.stamp, -math.inf
 
         def answered() -> bool:
-            self.send(**positions)
-            time.sleep(0.2)
+            nonlocal latest
+            if time.monotonic() > latest + 0.2:
+                self.send(**positions)
+                latest = time.monotonic()
             return self.out and nanoseconds(self.out[-1].message.header.stamp) > begin
 
         self.user.wait(answered, f'estimates of {len(positions)} joints')
