@@ -21,7 +21,7 @@ from fhaosmo_ros.core.parameters.per_channel import (
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.inputs import known_inputs, measured_output, with_joints
 from fhaosmo_ros.nodes.estimator.channel import Channel
-from fhaosmo_ros.nodes.estimator.joints import Joints
+from fhaosmo_ros.nodes.estimator.joints import choose, left_out
 from fhaosmo_ros.nodes.estimator.outputs import check_axes, parameter_text, TypedOutputs
 from fhaosmo_ros.nodes.estimator.sources import check_inputs, Sources
 from fhaosmo_ros.nodes.middleware.diagnostics import (
@@ -70,8 +70,8 @@ class EstimatorNode(ManagedNode):
         )
         self._given = given
         self._names: list[str] = values[CHANNELS]
-        self._joints = Joints(self)
-        self._from_joints = self._names == FROM_JOINTS
+        self._joints: set[str] = set()  # of the message that the names come from
+        self._left_out = ''  # what is said of those that are no channels
         self._own = {name for name in given if split(name)[0]}
         """Parameters of channels that do not change along with the common ones."""
         self._asked: set[str] = set()
@@ -122,9 +122,8 @@ class EstimatorNode(ManagedNode):
         self._sources = Sources(self, self._found_type)
         latest = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._parameters_topic = self.create_publisher(String, f'~/{PARAMETERS}', latest)
-        if self._from_joints:
-            self._sources.of(measured_output(values)).on_names = self._take_joints
         if self._names == FROM_JOINTS:
+            self._sources.of(measured_output(values)).on_names = self._take_joints
             self._sources.open()
             self.get_logger().info(
                 'channels from_joint_names: waiting for the first message on '
@@ -170,16 +169,23 @@ class EstimatorNode(ManagedNode):
             )
 
     def _take_joints(self, names: list[str]) -> None:
-        """Make the channels from the first names; later, report those that are new."""
-        new = self._joints.new(names)
+        """Make the channels from the first names; later, report once those that are new."""
+        present = self._node_parameters.values
         if self._names != FROM_JOINTS:
-            if new:
-                self._joints.refuse(new)
+            late = [name for name in names if name not in self._joints]
+            if late:
+                self._sources.of(measured_output(present)).on_names = None
+                text = f'{left_out(late)} after the first message; start the node again to take it'
+                self._left_out = '; '.join(filter(None, [self._left_out, text]))
+                self.get_logger().warning(text)
             return
-        fit = self._joints.choose(new, self._node_parameters.values['max_channels'])
+        self._joints = set(names)
+        fit, others = choose(self, names, present['max_channels'])
+        if others not in ('', self._left_out):
+            self.get_logger().error(others, throttle_duration_sec=5.0)
+        self._left_out = others
         if not fit:
             return
-        present = self._node_parameters.values
         for name in set(with_own_parameters(present[CHANNELS], present)) - set(fit):
             self.get_logger().error(
                 f"parameters of '{name}' are not used: there is no such joint"
@@ -278,7 +284,7 @@ class EstimatorNode(ManagedNode):
         state.find(ERROR, f'use_sim_time, but nothing on {clock} yet', timeless)
         waits = active and not self._channels
         state.find(STALE, 'no message with the names of the joints yet', waits)
-        state.find(WARN, self._joints.problem, self._joints.problem)
+        state.find(WARN, self._left_out, self._left_out)
         if not active or waits:
             return [state]
         self._sources.look()
