@@ -213,6 +213,7 @@ STYLES = {
     methods.SLIDING: evidence.OTHER, methods.PAPER: evidence.GREY, methods.OURS: evidence.TUNED,
     methods.SELF_TUNING: evidence.SELF,
 }  # fmt: skip
+KEY = 6  # columns that say what was measured: a cell, and the method
 CLOSE = 0.05  # errors within this part of another one count as equal
 
 
@@ -313,13 +314,14 @@ def draw(chosen: Chosen, jumps: bool) -> Figure:
 
 
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
-    """Return a line for each cell and method."""
-    quick = arguments.quick
+    """Return a line for each cell and method; with `method` the others are those of the table."""
+    quick, only = arguments.quick, arguments.method
     training, trials = QUICK if quick else FULL
     found = results({
         (sensor, name): (evaluate, sensor, name, training, trials)
         for sensor in sensors(quick)
         for name in methods_for(sensor)
+        if only in (None, name)
     })  # fmt: skip
     rows = evidence.rounded(
         Cell(s.plant, d, s.noise, s.rate, s.timing)._asdict()
@@ -327,10 +329,15 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
         for (s, name), (tuned, errors) in found.items()
         for d, error in zip(s.disturbances, errors, strict=True)
     )
+    if only:
+        anew = {tuple(row.values())[:KEY]: row for row in rows}
+        before = evidence.read(NAME, arguments.output)
+        rows = [anew.get(tuple(row.values())[:KEY], row) for row in before]
     chosen = best_of_kinds(rows)
     drawn = {'comparison_smooth': draw(chosen, False), 'comparison_jumps': draw(chosen, True)}
     return Found({NAME: rows}, texts(rows), drawn)
 
 
 if __name__ == '__main__':
-    sys.exit(run_study(NAME, __doc__, measure))
+    only = {'choices': METHODS, 'metavar': 'NAME', 'help': 'what to measure anew (default: all)'}
+    sys.exit(run_study(NAME, __doc__, measure, options=[('--method', only)]))
