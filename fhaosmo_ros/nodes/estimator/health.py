@@ -5,13 +5,17 @@ from collections import deque
 from collections.abc import Mapping
 from math import nan
 from time import perf_counter
-from typing import Any
+from typing import Protocol
 
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.counters import UNUSED_SAMPLES
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described
+from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
+from fhaosmo_ros.inputs import Pairing
+from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +50,18 @@ UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
 """Counters of samples that the observer has not taken."""
 
 
+class Watched(Protocol):
+    """What is reported on: a channel, with its parameters of now."""
+
+    name: str
+    values: Parameters
+    estimator: OnlineEstimator
+    y: Listener
+    u: Mapping[str, Listener]
+    pairing: Pairing
+    simulated: bool
+
+
 class Health:
     """
     Remembers a few numbers of each sample of a channel, and makes two reports of them.
@@ -55,7 +71,7 @@ class Health:
     `perf_counter`, `offset` from its stamp to the publication of its message (ns).
     """
 
-    def __init__(self, channel: Any) -> None:
+    def __init__(self, channel: Watched) -> None:
         self._channel = channel
         self.stamps: deque[int] = deque(maxlen=LIMIT)
         self.delays: deque[int] = deque(maxlen=LIMIT)
