@@ -2,6 +2,7 @@
 """The command `tune` on simulated recordings: its start, its output, its inputs, its ends."""
 
 from contextlib import closing
+from itertools import product
 import math
 from pathlib import Path
 import signal
@@ -112,8 +113,9 @@ def test_start_is_nearly_as_good_as_the_best_kalman_filter(tuner):
     start = {d.name: d.start for d in tuner.space}
     assert tuner.training(tuner.parameters(start)).error < 1.03 * best
     assert [*start] == ['unknown_input_size', 'unknown_input_decay']
-    # Held-out recordings are others, and errors relative to the same scale.
-    assert not any(a is b for a in tuner.training.recordings for b in tuner.held_out.recordings)
+    # Held-out recordings have other seeds, and errors are relative to the same scale.
+    pairs = product(tuner.training.recordings, tuner.held_out.recordings)
+    assert not any(np.array_equal(a.y, b.y) or np.array_equal(a.d, b.d) for a, b in pairs)
     np.testing.assert_array_equal(tuner.held_out.scale, tuner.training.scale)
 
 
@@ -321,22 +323,11 @@ def test_study_is_continued(tmp_path):
     assert minimise(bowl, SPACE, 2, storage=storage, name='other').trials == 2
 
 
-@pytest.mark.parametrize('storage', ['study.log', 'nodb://x', 'sqlite:////no/x.db', 'fails'])
-def test_storage_that_fails_is_one_line(tmp_path, storage):
-    """At once, or in the middle."""
-    file, calls = tmp_path / 'fails.db', []
-
-    def fail_later(values):
-        calls.append(values)
-        if len(calls) == 5:
-            file.write_bytes(b'damaged\n' * 1000)
-        return bowl(values)
-
-    storage = f'sqlite:///{file}' if storage == 'fails' else storage
-    with pytest.raises(ConfigurationError, match=r'storage.*expected') as error:
-        minimise(fail_later, SPACE, 10_000, storage=storage)
+@pytest.mark.parametrize('storage', ['study.log', 'nodb://x', 'sqlite:////no/x.db'])
+def test_storage_that_optuna_refuses_is_one_line(storage):
+    with pytest.raises(ConfigurationError, match=r'storage.*cannot use it') as error:
+        minimise(bowl, SPACE, 10, storage=storage)
     assert '\n' not in str(error.value)
-    assert len(calls) <= 6
 
 
 def test_missing_package_is_named(monkeypatch):

@@ -19,8 +19,6 @@ BAD = 1e9
 """Stands for an objective that is not finite: larger than any, and the sampler accepts it."""
 SIGMA = 0.1
 """Standard deviation of the first proposals, as a share of each dimension's range."""
-LONGEST = 200
-"""Characters of another library's error that are shown."""
 
 
 class Dimension(NamedTuple):
@@ -66,8 +64,7 @@ def minimise(
     seed : int
         With one job and no storage, the result is a function of it.
     storage, name : str, optional
-        As for `optuna.create_study`; in memory by default. All processes and machines that name
-        the same storage and study search in one study.
+        As for `optuna.create_study`; in memory by default.
     jobs : int
         Threads: an objective should spend its time in compiled code without the GIL.
     on_trial : callable
@@ -76,7 +73,7 @@ def minimise(
     Raises
     ------
     ConfigurationError
-        A storage that can't be used, or Optuna is not installed.
+        Optuna cannot use the storage, or is not installed.
 
     """
     try:  # here, as only this search needs them: a robot may lack them
@@ -87,11 +84,9 @@ def minimise(
             f'{error.name} is not installed: make tune does it, or '
             "python3 -m pip install 'optuna>=4,<6' cmaes"
         ) from None
-    from optuna.study import MaxTrialsCallback
-    from optuna.trial import TrialState
-
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     start = {d.name: d.start for d in space}
+    finished = (optuna.trial.TrialState.COMPLETE,)
 
     def evaluate(trial: Any) -> float:
         values = {d.name: trial.suggest_float(d.name, d.low, d.high, log=d.log) for d in space}
@@ -113,28 +108,12 @@ def minimise(
             storage=storage, sampler=sampler, study_name=name, load_if_exists=True
         )
     except Exception as error:  # SQLAlchemy and each driver have exceptions of their own
-        raise _unusable(storage, error) from None
-    states = (TrialState.COMPLETE,)
-    try:
-        done = len(study.get_trials(deepcopy=False, states=states))
-        if not done:
-            study.enqueue_trial(start, skip_if_exists=True)
-        if done < trials:
-            callbacks = [after, MaxTrialsCallback(trials, states=states)]
-            study.optimize(evaluate, n_trials=trials - done, n_jobs=jobs, callbacks=callbacks)
-        count = len(study.get_trials(deepcopy=False, states=states))
-        return Result(dict(study.best_params), study.best_value, count)
-    except (optuna.exceptions.StorageInternalError, UnboundLocalError) as error:
-        if storage is None:  # else the second one: Optuna's loop raises it where a storage fails
-            raise
-        raise _unusable(storage, error) from None
-
-
-def _unusable(storage: str | None, error: BaseException) -> ConfigurationError:
-    """Return what a driver says in one line, without the advice that stands around its cause."""
-    while (before := error.__cause__ or error.__context__) is not None:
-        error = before
-    return ConfigurationError(
-        f'storage {storage!r}: expected what Optuna takes, such as sqlite:///study.db or '
-        f'postgresql+psycopg://user@host/name, got: {" ".join(str(error).split())[:LONGEST]}'
-    )
+        first = str(error).partition('\n')[0]
+        raise ConfigurationError(f'storage {storage!r}: Optuna cannot use it: {first}') from None
+    done = len(study.get_trials(deepcopy=False, states=finished))
+    if not done:
+        study.enqueue_trial(start, skip_if_exists=True)
+    enough = optuna.study.MaxTrialsCallback(trials, states=finished)  # of all processes
+    study.optimize(evaluate, max(trials - done, 0), n_jobs=jobs, callbacks=[after, enough])
+    count = len(study.get_trials(deepcopy=False, states=finished))
+    return Result(dict(study.best_params), study.best_value, count)
