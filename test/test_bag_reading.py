@@ -123,6 +123,17 @@ def test_damage_in_a_file_with_checksums_is_an_error(how, tmp_path):
     assert results.count(None) > 40
 
 
+def test_summary_that_differs_from_its_checksum_is_an_error(tmp_path):
+    """Such as another topic's name, which reads as well."""
+    file = storage_file(make(tmp_path / 'bag', 'ours'))
+    data = bytearray(file.read_bytes())
+    at = data.rindex(b'/y')
+    data[at : at + 2] = b'/z'
+    file.write_bytes(data)
+    with pytest.raises(ConfigurationError, match='summary does not agree with its CRC'):
+        BagReader(file)
+
+
 @pytest.mark.parametrize('share', [0.999, 0.99, 0.72, 0.3, 0.001])
 @pytest.mark.parametrize('how', ['ours', 'lz4', 'fastwrite', 'sqlite3'])
 def test_file_that_was_cut_is_an_error(how, share, tmp_path):
