@@ -42,10 +42,16 @@ def wait_until(condition: Callable[[], Any], complaint: str, poll: float = 0.02)
 class Child(processes.Child):
     """A child in a session of its own: Ctrl-C reaches only us, and we end the children."""
 
-    def __init__(self, log: Path, *arguments: str) -> None:
+    def __init__(self, name: str, *arguments: str) -> None:
         self.started = perf_counter()
+        self._folder = TemporaryDirectory()
+        log = Path(self._folder.name, f'{name}.log')
         environment = {**os.environ, 'PYTHONUNBUFFERED': '1'}
         super().__init__(log, *arguments, env=environment, start_new_session=True, cwd=ROOT)
+
+    def __exit__(self, *reason: Any) -> None:
+        super().__exit__(*reason)
+        self._folder.cleanup()
 
     def wait_for(self, text: str) -> float:
         """Wait until `text` is in the output; return the seconds since the start."""
@@ -68,18 +74,9 @@ class Child(processes.Child):
         return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
 
 
-class Children(processes.Children):
-    """Such children; what they say goes to a folder that goes with them."""
-
-    kind = Child
-
-    def __init__(self) -> None:
-        self._logs = TemporaryDirectory()
-        super().__init__(Path(self._logs.name))
-
-    def __exit__(self, *reason: Any) -> None:
-        super().__exit__(*reason)
-        self._logs.cleanup()
+def start_node(name: str, *arguments: str) -> Child:
+    """Start one of this package's nodes."""
+    return Child(name, '-m', 'fhaosmo_ros', name, *arguments)
 
 
 class Watch(PrivateNode):

@@ -11,6 +11,7 @@ Its messages were made once, except for the stamp of the latest sample, from whi
 measured. What an estimator costs more than this is ours; what this costs is the middleware's.
 """
 
+from contextlib import ExitStack
 import math
 import signal
 import sys
@@ -24,7 +25,7 @@ from fhaosmo_ros.nodes.middleware.endpoints import SENSOR_QOS, subscribe_with_in
 from fhaosmo_ros.nodes.middleware.messages import labelled
 from fhaosmo_ros.nodes.middleware.spin import Spinner
 from fhaosmo_ros.topics import TIME
-from live import Children, wait_until, Watch
+from live import Child, start_node, wait_until, Watch
 import numpy as np
 import rclpy
 from rclpy.node import Node
@@ -109,8 +110,7 @@ def startup(quick: bool) -> list[Row]:
     for gains in ('fixed', 'self_tuning'):
         found = []
         for _ in range(1 if quick else 5):
-            with Children() as children:
-                node = children.start_node(ESTIMATOR, '--ros-args', '-p', f'gains:={gains}')
+            with start_node(ESTIMATOR, '--ros-args', '-p', f'gains:={gains}') as node:
                 found.append((node.wait_for('estimating'), node.cpu_seconds()))
         wall, processor = np.median(found, axis=0).tolist()
         note = f'{processor:.2g} s of CPU; {", ".join(f"{w:.2f}" for w, _ in found)}'
@@ -125,12 +125,17 @@ def observe(case: Case, seconds: float) -> Run:
     given += ['-p', 'channels:=[from_joint_names]'] if case.joints else []
     joint = '/joint1' if case.joints else ''
     watched = [f'/{name}{joint}/stamp' for name in (ESTIMATOR, EMPTY)]
-    with Children() as children, Watch(dict.fromkeys(watched, TIME)) as watch:
-        ours = children.start_node(ESTIMATOR, *given)
-        empty = children.start(EMPTY, __file__, EMPTY, str(case.out), str(case.joints))
+    with (
+        Watch(dict.fromkeys(watched, TIME)) as watch,
+        start_node(ESTIMATOR, *given) as ours,
+        Child(EMPTY, __file__, EMPTY, str(case.out), str(case.joints)) as empty,
+        ExitStack() as later,
+    ):
         ours.wait_for('waiting' if case.joints else 'estimating')
         empty.wait_for('computing nothing')
-        source = children.start('source', __file__, 'source', str(case.rate), str(case.joints))
+        source = later.enter_context(
+            Child('source', __file__, 'source', str(case.rate), str(case.joints))
+        )
         source.wait_for('publishing')
         wait_until(lambda: all(map(watch.count, watched)), 'not all nodes published')
         sleep(WARM_UP)

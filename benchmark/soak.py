@@ -33,7 +33,7 @@ from fhaosmo_ros.nodes.recording import PrivateNode
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.cli.command import run_command
 from fhaosmo_ros.topics import ARRAY, FLOAT, TIME
-from live import Children, ROOT, wait_until, Watch
+from live import Child, ROOT, start_node, wait_until, Watch
 import numpy as np
 from numpy.typing import NDArray
 import rclpy
@@ -252,9 +252,12 @@ def run_plant(seed: str, *arguments: str) -> None:
 def soak(seed: int, minutes: float, output: Path) -> set[str]:
     """Run once, write and print the verdict; return the names of what was missed."""
     seconds, memory, windows = 60.0 * minutes, [], []
-    with Children() as children, Watch(TOPICS) as watch, Client() as client:
-        estimator = children.start_node('estimator', *PARAMETERS, '-r', 'y:=faulty_y')
-        plant = children.start('plant', 'benchmark/soak.py', 'plant', str(seed), *PARAMETERS)
+    with (
+        Watch(TOPICS) as watch,
+        Client() as client,
+        start_node('estimator', *PARAMETERS, '-r', 'y:=faulty_y') as estimator,
+        Child('plant', 'benchmark/soak.py', 'plant', str(seed), *PARAMETERS) as plant,
+    ):
         estimator.wait_for('estimating')
         plant.wait_for('injecting')
         calls = (event for event in schedule(seed) if event[1] in CALLS)
@@ -263,7 +266,8 @@ def soak(seed: int, minutes: float, output: Path) -> set[str]:
         for second in tqdm(range(round(seconds)), desc='soak', unit='s', mininterval=1.0):
             while (now := monotonic() - start) < second + 1:
                 sleep(0.02)
-                children.check()
+                estimator.check()
+                plant.check()
                 cycle, phase = divmod(now, CYCLE)
                 if time <= now:
                     client.call(kind)

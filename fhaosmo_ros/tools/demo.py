@@ -19,7 +19,7 @@ from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import messages, Series, series
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command, shipped
-from fhaosmo_ros.tools.cli.processes import Children
+from fhaosmo_ros.tools.cli.processes import start_node
 from fhaosmo_ros.tools.plot.curves import Curves, read_curves
 from fhaosmo_ros.tools.plot.figures import save_curves
 from fhaosmo_ros.topics import ESTIMATES, TRUTH
@@ -29,8 +29,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 START = 2.0
 """Seconds of the start that the table leaves out."""
-RECENT = 50
-"""Estimates over which the true noise is averaged."""
 SELF_TUNING, HELD = 'self-tuning', 'fuzzy, the power held'
 OTHERS: dict[str, dict[str, Any]] = {
     'sign, gains of the paper': {
@@ -126,17 +124,18 @@ def _record(
     from fhaosmo_ros.nodes.recording import TopicRecorder
 
     compared = ['/y', *(f'/plant/{name}' for name in TRUTH), '/estimator/state']
+    given = ('--ros-args', '--params-file', str(parameters))
     with (
         BagWriter(folder / 'bag') as bag,
         TopicRecorder(bag, ['/estimator', '/plant']) as recorder,
-        Children(folder) as nodes,
-    ):
         # Together: Fast DDS finds a node that starts half a second after another one 3 s late.
-        for name in ('estimator', 'plant'):
-            nodes.start_node(name, '--ros-args', '--params-file', str(parameters))
+        start_node(folder, 'estimator', *given) as estimator,
+        start_node(folder, 'plant', *given) as plant,
+    ):
 
         def check() -> None:
-            nodes.check()
+            estimator.check()
+            plant.check()
             recorder.check()
             for topic in ('/y', '/estimator/state'):
                 if recorder.node.count_publishers(topic) > 1:  # the bag would hold a mixture
@@ -282,8 +281,6 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
         f'{name} {rms(run.errors[late, k]):.2g}' for k, name in enumerate(run.curves.names[:-1])
     ]
     lines += ['', f'RMS errors of the states from {parts[0][0]:.0f} s on: {", ".join(errors)}']
-    if run.curves.deviation is not None and run.curves.tuning is not None:
-        lines.append(_found(run, run.curves.deviation[:, -1], run.curves.tuning[-1]))
     span = (run.y.stamps[-1] - run.y.stamps[0]) * 1e-9
     counts = [run.counters.get(f'samples {n}', '?') for n in ('accepted', 'lost', 'rejected')]
     lines.append(
@@ -291,25 +288,3 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
         f'{(len(run.y.stamps) - 1) / span if span > 0.0 else float("nan"):.1f} a second'
     )
     return '\n'.join(lines)
-
-
-def _found(run: Run, deviation: Floats, tuning: Floats) -> str:
-    """Return what a self-tuning estimator has found, in words."""
-    known = np.isfinite(deviation) & (run.t > START)
-    if not known.any():
-        return 'the run was too short for the estimator to find the noise'
-    error = np.abs(run.errors[known, -1])
-    noise, _, bandwidth, *_ = tuning
-    return (
-        'd lay within two standard deviations of its estimate for '
-        f'{np.mean(error <= 2.0 * deviation[known]):.0%} of the time\n'
-        f'noise on y at the end: found {noise:.2g}, true {true_noise(run)[-1]:.2g}; '
-        f'd is followed within {1.0 / bandwidth:.2g} s'
-    )
-
-
-def true_noise(run: Run) -> Floats:
-    """Return the standard deviation of the latest y minus z1 behind each estimate."""
-    wrong = run.y.values.ravel()[run.rows] - run.truth[:, 0]
-    mean = np.convolve(wrong**2, np.full(RECENT, 1.0 / RECENT))[: len(wrong)]
-    return np.asarray(np.sqrt(mean / np.minimum(1.0, np.arange(1, len(wrong) + 1) / RECENT)))

@@ -20,7 +20,7 @@ from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.types import header, serialise
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command
-from fhaosmo_ros.tools.cli.processes import Children
+from fhaosmo_ros.tools.cli.processes import Child, start_node
 from matplotlib.figure import Figure
 import numpy as np
 from studies.arm.peers import classical, momentum
@@ -87,14 +87,15 @@ def _run(folder: Path, stop: Stop) -> None:
     with (
         BagWriter(folder / 'bag') as bag,
         TopicRecorder(bag, topics=(TORQUE, EVENT)) as recorder,
-        Children(folder) as children,
-    ):
         # The encoders' steps, and what the torque sensors' data sheet would say.
-        node = children.start_node(
-            'arm', '--ros-args', '-p', f'robot_description_file:={folder / "robot.urdf"}',
+        start_node(
+            folder, 'arm', '--ros-args', '-p', f'robot_description_file:={folder / "robot.urdf"}',
             '-p', 'publish_rate:=1000.0',
-        )  # fmt: skip
-        robot = children.start('robot', '-m', 'fhaosmo_ros', 'play', str(folder / 'robot'))
+        ) as node,
+        Child(
+            folder / 'robot.log', '-m', 'fhaosmo_ros', 'play', str(folder / 'robot')
+        ) as robot,
+    ):  # fmt: skip
         begin, count = time.monotonic(), 0
         form = '{l_bar}{bar}| {n:.0f}/{total:.0f} s'
         with progress(total=DURATION, unit='s', bar_format=form) as bar:

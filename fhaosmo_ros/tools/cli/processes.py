@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Child processes that never outlive their parent's block."""
+"""Child processes that do not outlive the block which they are started for."""
 
 from pathlib import Path
 import signal
 import subprocess
 import sys
-from typing import Any, ClassVar
+from typing import Any
 
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 
@@ -15,7 +15,7 @@ GRACE = 5.0
 
 class Child(subprocess.Popen[bytes]):
     """
-    A Python process whose output goes to a file.
+    A Python process whose output goes to a file; it ends with its `with` block.
 
     Parameters
     ----------
@@ -62,45 +62,12 @@ class Child(subprocess.Popen[bytes]):
             self.kill()
             self.wait()
 
-
-class Children:
-    """
-    Children that all end with its block.
-
-    Parameters
-    ----------
-    folder : path
-        Each child's output goes to ``<name>.log`` there.
-
-    """
-
-    kind: ClassVar[type[Child]] = Child
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._children: list[Child] = []
-
-    def start(self, name: str, *arguments: str, **options: Any) -> Any:
-        """Start a child; see `Child`."""
-        child = self.kind(self._folder / f'{name}.log', *arguments, **options)
-        self._children.append(child)
-        return child
-
-    def start_node(self, name: str, *arguments: str) -> Child:
-        """Start one of this package's nodes."""
-        return self.start(name, '-m', 'fhaosmo_ros', name, *arguments)
-
-    def check(self) -> None:
-        """Raise if one of them has ended."""
-        for child in self._children:
-            child.check()
-
-    def __enter__(self) -> 'Children':
-        return self
-
     def __exit__(self, *_: object) -> None:
         # A second Ctrl-C does not cut this short: a command's handlers of signals raise nothing.
-        for child in self._children:
-            child.interrupt()
-        for child in self._children:
-            child.end()
+        self.interrupt()
+        self.end()
+
+
+def start_node(folder: Path, name: str, *arguments: str) -> Child:
+    """Start one of this package's nodes; its output goes to ``<name>.log`` in a folder."""
+    return Child(folder / f'{name}.log', '-m', 'fhaosmo_ros', name, *arguments)
