@@ -72,7 +72,7 @@ def test_truth_is_likelier_than_other_designs(plain):
     likelihood = plain[0].likelihood
     bandwidth = ((SIZE**2 * (2.0 * RATE) ** 3 / 2.0) / (NOISE**2 * H)) ** (1 / 8)
     truth = Design(1, bandwidth, RATE / bandwidth)
-    assert identify.size_of_input(truth, likelihood.intensity(truth, NOISE)) == pytest.approx(SIZE)
+    assert likelihood.size_of_input(truth, NOISE) == pytest.approx(SIZE)
     best = likelihood(truth).log_likelihood
     for change in ({'bandwidth': 1.5 * bandwidth}, {'ratio': 10.0 * truth.ratio}):
         assert likelihood(truth._replace(**change)).log_likelihood < best - 3.0

@@ -18,7 +18,6 @@ from fhaosmo_ros.tools.tuning.likelihood import CLIP, Design, Evaluation, Likeli
 from fhaosmo_ros.tools.tuning.linear_gains import (
     GAMMA,
     kalman_gains,
-    matern,
     rounded,
     SCHEME,
     WIDTH,
@@ -91,8 +90,7 @@ class Identified(NamedTuple):
     @property
     def size_of_input(self) -> float:
         """The RMS value D of the Matern process of d (D 17)."""
-        design = self.best.design
-        return size_of_input(design, self.likelihood.intensity(design, self.best.noise))
+        return self.likelihood.size_of_input(self.best.design, self.best.noise)
 
 
 class Gains(NamedTuple):
@@ -117,11 +115,6 @@ class Run(NamedTuple):
     def lag(self) -> int:
         """Index of the largest of `correlations`."""
         return int(np.abs(self.correlations).argmax())
-
-
-def size_of_input(design: Design, intensity: float) -> float:
-    """Return D of D 17 for a model of d whose last derivative has this intensity."""
-    return math.sqrt(intensity / matern(design.decay, design.derivatives))
 
 
 def identify_input(

@@ -77,6 +77,12 @@ class Likelihood:
         levels = self.model.order + 1 + design.derivatives
         return noise**2 * self.period * design.bandwidth ** (2 * levels)
 
+    def size_of_input(self, design: Design, noise: float) -> float:
+        """Return the RMS value of the Matern process of d."""
+        rate, k = design.decay, design.derivatives
+        of_unit = (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2 / math.factorial(2 * k)
+        return math.sqrt(self.intensity(design, noise) / of_unit)  # D 17
+
     def __call__(self, design: Design) -> Evaluation:
         """Evaluate a design."""
         model = self.model.with_unknown_input(design.decay, design.derivatives)

@@ -2,7 +2,6 @@
 """lambda with which the observer is a Kalman filter (D 17 to D 19)."""
 
 from collections.abc import Mapping
-import math
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
@@ -102,9 +101,3 @@ def kalman_gains(p: Mapping[str, Any], period: float) -> KalmanGains:
 def rounded(value: float) -> float:
     """Return a number as it is written to files, with four digits."""
     return float(f'{value:.4g}')
-
-
-def matern(rate: float, derivatives: int) -> float:
-    """Return the intensity of the white noise behind a Matern d of the RMS 1 (D 17)."""
-    k = derivatives
-    return (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2 / math.factorial(2 * k)
