@@ -146,9 +146,9 @@ def test_wild_sample_does_not_spoil_the_rest(law):
 
 
 def test_state_beyond_the_limit_starts_afresh_at_once():
-    feed = Feed(divergence_limit=100.0, epsilon=200.0)
+    feed = Feed(divergence_time=0.0)
     feed.sine(10)
-    place(feed.estimator, 0.2, 99.99999, 99.99999, 99.99999)
+    place(feed.estimator, 0.2, 1.1e60, 1.1e60, 1.1e60)
     words = feed.sine(20)
     assert sum(bool(w & Status.DIVERGED) for w in words) == 1
     assert feed.events == {'divergences': 1}

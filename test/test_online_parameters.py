@@ -66,7 +66,6 @@ CHANGES = {
     'spike_gate': Change(0.05),
     'stuck_time': Change(0.005),
     'divergence_time': Change(0.005, {'epsilon': 1e-4}),
-    'divergence_limit': Change(1.0),
     'predict_to_now': Change(True, {'measurement_delay': 0.02}),
     'event_threshold': Change(1e-3),
     'event_deviations': Change(0.1, SELF_TUNING | {'event_duration': 0.0}),

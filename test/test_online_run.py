@@ -96,7 +96,7 @@ def test_one_by_one_at_once_and_resumed_are_the_same(case):
 
 SETTINGS = [
     {}, {'spike_gate': 0.05}, {'stuck_time': 2.5e-3}, {'epsilon': 0.02, 'divergence_time': 3e-3},
-    {'divergence_limit': 10.0, 'scheme': 'explicit'},
+    {'scheme': 'explicit'},
 ]  # fmt: skip
 
 

@@ -15,7 +15,7 @@ class Counters(NamedTuple):
     """Samples used."""
 
     rejected_measurements: int = 0
-    """y was NaN, infinite or beyond divergence_limit."""
+    """y was NaN, infinite or beyond 1e60."""
     rejected_spikes: int = 0
     """y lay too far from its prediction: beyond spike_gate, or 6 usual deviations."""
     rejected_stuck: int = 0

@@ -196,7 +196,6 @@ class OnlineEstimator:
         return {name: round(seconds / NANOSECONDS) for name, seconds in times.items()} | {
             'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
             'to_now': p['predict_to_now'], 'gate': p['spike_gate'],
-            'limit': p['divergence_limit'],
             'epsilon': math.inf if knows_noise else p['epsilon'],
         }  # fmt: skip
 

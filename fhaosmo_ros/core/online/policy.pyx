@@ -45,6 +45,8 @@ cdef int CHANCE_REPEATS = 2
 # Of late, less than this share of so many of its values were repeated, but for one: at the end of
 # a range it is always the same one.
 cdef double RARELY = 0.05, CHANGES = 50.0
+# Larger samples are rejected, larger states are lost: products of several stay finite.
+cdef double LIMIT = 1e60
 # So many samples in a row may be rejected by spike_gate.
 cdef int MOST_SPIKES = 5
 
@@ -60,7 +62,6 @@ cdef struct Settings:
     long long delay  # of y
     long long lag  # how much later than the inputs y is known: measurement_delay - input_delay
     double gate  # a spike is further from its prediction (unit of y); 0: off
-    double limit  # larger samples are rejected, larger states are lost
     double epsilon  # y is lost while |eps_1| is larger (unit of y)
 
 
@@ -230,7 +231,7 @@ cdef class Policy:
         """Return the flag that says why a sample is not used, whatever the observer is like."""
         cdef Memory* memory = &self.structure.memory
         cdef bint held, held_before = self.sensor.holds
-        if not fabs(y) <= self.settings.limit:  # also NaN
+        if not fabs(y) <= LIMIT:  # also NaN
             self.counters.rejected_measurements += 1
             return REJECTED_MEASUREMENT
         if stamp == 0 and not self.settings.nominal:
@@ -547,7 +548,7 @@ cdef class Policy:
             for _ in range(count):
                 self.structure.prediction.step(h, u)
             end = self.structure.prediction.z[0]
-            modelled = fabs(end) <= self.settings.limit  # False for NaN
+            modelled = fabs(end) <= LIMIT  # False for NaN
             if not modelled:
                 end = memory.y
             if self.settings.gate > 0.0 and self.is_spike(corrected - end):
@@ -596,13 +597,12 @@ cdef class Policy:
             course.mean_jitter += (fabs(change) - course.mean_jitter) / course.intervals
 
     cdef bint has_diverged(self, bint failed, long long now) noexcept nogil:
-        """Return True if the state is beyond divergence_limit, or y lost for divergence_time."""
+        """Return True if the state is beyond all bounds, or y lost for divergence_time."""
         cdef Course* course = &self.course
-        cdef double limit = self.settings.limit
         cdef int i
         for i in range(self.structure.levels):
-            if not (fabs(self.structure.level[i].z_hat) <= limit
-                    and fabs(self.structure.level[i].z_tilde) <= limit):
+            if not (fabs(self.structure.level[i].z_hat) <= LIMIT
+                    and fabs(self.structure.level[i].z_tilde) <= LIMIT):
                 return True
         if not failed and fabs(self.structure.innovation[0]) <= self.settings.epsilon:
             course.lost = False

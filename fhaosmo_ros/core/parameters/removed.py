@@ -17,6 +17,7 @@ REMOVED = {
     'input_reliability': "set 'qos_overrides./TOPIC.subscription.reliability'",
     'input_durability': "set 'qos_overrides./TOPIC.subscription.durability'",
     'input_depth': "set 'qos_overrides./TOPIC.subscription.depth'",
+    'divergence_limit': 'leave it out: samples beyond 1e60 are rejected',
     'search': "leave it out: 'tune' searches the model of d, or the gains where 'lambda' is set",
 }
 """What a message says of a name that was a parameter once."""

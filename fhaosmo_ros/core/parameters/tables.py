@@ -154,9 +154,6 @@ SAMPLING = (
     Parameter('divergence_time', 1.0,
               '|eps_1| above epsilon, or steps that fail, for longer than this: y is lost, and '
               'the observer starts afresh. 0: never.', unit='s', lower=0.0, upper=3600.0),
-    Parameter('divergence_limit', 1e60,
-              'A larger sample is rejected, and an observer with a larger state starts afresh '
-              'from y.', lower=1.0, upper=1e100),
     Parameter('measurement_delay', 0.0,
               'How long before its stamp y was measured; estimates belong to the time stamp - '
               'measurement_delay.', unit='s', lower=0.0, upper=10.0, live=False),

@@ -40,7 +40,7 @@ TOLD = {
     Status.REJECTED_PERIOD: '{late}',
     Status.REJECTED_SPIKE: 'y = {y} is too far from its prediction',
     Status.REJECTED_STUCK: 'y = {y} repeats itself: its sensor is stuck',
-    Status.REJECTED_MEASUREMENT: 'expected a finite y of at most divergence_limit, got {y}',
+    Status.REJECTED_MEASUREMENT: 'expected a finite y of at most 1e60, got {y}',
     REJECTED: 'y = {y} would have made the estimate infinite',
 }
 """What is logged of a sample, by the first of these flags that it has."""
