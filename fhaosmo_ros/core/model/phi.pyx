@@ -68,20 +68,17 @@ cdef class Expressions:
         self, int i, const double* z, const double* dz, const double* u
     ) noexcept nogil:
         """
-        Return Phi_{i+1}(z, u) and its derivative along dz.
+        Return Phi_{i+1}(z, u) and its derivative along dz, for an expression that is not empty.
 
         Outside its domain an operation gives NaN or infinity.
         """
         cdef Dual stack[MOST_OPERANDS]
         cdef Instruction* instruction
         cdef Instruction* end = self.code + self.offsets[i + 1]
-        cdef Dual* top = stack
+        cdef Dual* top = stack - 1
         cdef int code
         cdef double a, da, b, db, v, d
         instruction = self.code + self.offsets[i]
-        if instruction == end:
-            return Dual(0.0, 0.0)
-        top -= 1
         while instruction != end:
             code = instruction.code
             if code <= INPUT:
@@ -179,6 +176,6 @@ cdef class Expressions:
         if min(states.shape[0], tangent.shape[0]) < self.states or inputs.shape[0] < self.inputs:
             raise ValueError(f'expected {self.states} states and {self.inputs} inputs')
         for i in range(self.count):
-            phi = self.evaluate(i, &states[0], &tangent[0], &inputs[0])
+            phi = evaluate(self, i, &states[0], &tangent[0], &inputs[0])
             found[0, i], found[1, i] = phi.value, phi.slope
         return np.asarray(found)

@@ -46,7 +46,6 @@ cdef class SlidingMode(Structure):
     cdef void follow(self, double y, double h, const double* u) noexcept nogil
     cdef int adapt(self, double h) noexcept nogil
     cdef void fit(self) noexcept
-    cdef void forget_sensitivities(self) noexcept
     cdef void predict_trial(self, double h, const double* u) noexcept nogil
     cdef double bandwidth(self, double h) noexcept nogil
     cdef void correct_trial(self, double doubt) noexcept nogil

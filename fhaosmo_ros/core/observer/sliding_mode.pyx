@@ -108,21 +108,17 @@ cdef class SlidingMode(Structure):
 
     cdef void fit(self) noexcept:
         """Bring gamma within its bounds, and forget what is not carried along."""
+        cdef int i
         if self.adaptive:
             self.memory.gamma = min(max(self.memory.gamma, self.gamma_min), self.gamma_max)
         else:
             self.memory.gamma = self.gamma_initial
         if not self.sensitive:
-            self.forget_sensitivities()
+            for i in range(self.levels):
+                self.level[i].p = self.level[i].q = 0.0
         if not self.scheduled and self.memory.offset != 0.0:
             self.memory.y += self.memory.offset
             self.memory.offset = self.memory.jumps = 0.0
-
-    cdef void forget_sensitivities(self) noexcept:
-        """Set the sensitivities to 0."""
-        cdef int i
-        for i in range(self.levels):
-            self.level[i].p = self.level[i].q = 0.0
 
     def curve(self, int level, double a):
         """Return psi of a level (0-based) at a >= 0, and its slope."""

@@ -8,6 +8,7 @@ Equations are cited as P (paper: label of the equation) and D (number in docs/ma
 from libc.math cimport INFINITY, NAN, fabs, isfinite, isnan, sqrt
 from libc.string cimport memset
 
+from fhaosmo_ros.core.model.phi cimport evaluate
 from fhaosmo_ros.core.model.prediction cimport MOST_LEVELS, Prediction
 from fhaosmo_ros.core.observer.kalman cimport fill
 from fhaosmo_ros.core.observer.status cimport (
@@ -267,9 +268,9 @@ cdef class Structure:
             z[i], still[i] = self.trial[i].z_hat, 0.0
         for i in range(self.levels):
             z[0] = self.trial[0].z_hat
-            change = self.prediction.phi.evaluate(i, z, still, u).value
+            change = evaluate(self.prediction.phi, i, z, still, u).value
             z[0] = self.trial[0].z_hat + offset
-            change -= self.prediction.phi.evaluate(i, z, still, u).value
+            change -= evaluate(self.prediction.phi, i, z, still, u).value
             if not fabs(change) <= self.most_change(i):
                 contradicted = True
                 behind = self.trial[i + 1].z_hat if i + 1 < self.levels else 0.0

@@ -230,8 +230,7 @@ class OnlineEstimator:
         """Return the smoothed estimates that still wait: nothing comes after them."""
         if self.smoothing is None:
             raise ConfigurationError('finish: expected smoothing_lag > 0, or a call of `smooth`')
-        found = self.smoothing.finish()
-        return found
+        return self.smoothing.finish()
 
     @property
     def latest(self) -> int | None:
@@ -406,8 +405,7 @@ class OnlineEstimator:
                 self.reject_inputs(1)
         if count:
             self._u[:] = inputs[-1]
-        found = self._run(stamps, y, inputs)
-        return found
+        return self._run(stamps, y, inputs)
 
     def _run(self, stamps: Ints, y: NDArray[np.float64], u: NDArray[np.float64]) -> Trajectory:
         """Take samples with their known inputs, and look at them for events and for smoothing."""

@@ -4,7 +4,7 @@
 from libc.math cimport ceil, fmax, fmin, sin
 from libc.string cimport memcpy
 
-from fhaosmo_ros.core.model.phi cimport Expressions
+from fhaosmo_ros.core.model.phi cimport Expressions, evaluate
 from fhaosmo_ros.core.model.prediction cimport CLASSICAL, MOST_LEVELS, take_step
 
 import numpy as np
@@ -133,7 +133,7 @@ cdef class System(Dynamics):
         cdef int i, last = self.size - 1
         for i in range(self.size):
             slope[i] = x[i + 1] if i < last else self.d.at(t)
-            slope[i] += self.phi.evaluate(i, x, STILL, self.u).value
+            slope[i] += evaluate(self.phi, i, x, STILL, self.u).value
 
     cdef void go_to(self, double t, const double* u) noexcept nogil:
         """
