@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a sensor_msgs/msg/JointState, live or of a bag, says of the joints of an arm."""
 
-from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import suggestion
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 
 def joint_sample(
-    message: Any, joints: Sequence[str], with_velocity: bool
+    message: Any, joints: tuple[str, ...], with_velocity: bool
 ) -> tuple[int, list[NDArray[np.float64]]]:
     """
     Return the stamp in ns, and position, effort and perhaps velocity in the order of `joints`.
@@ -22,21 +22,27 @@ def joint_sample(
         A joint, a number or the stamp is missing.
 
     """
-    names = message.name
+    names = tuple(message.name)
+    order, arrays = _order(names, joints), []
+    for what in ('position', 'effort', *['velocity'] * with_velocity):
+        numbers = getattr(message, what)
+        if len(numbers) != len(names):
+            raise ConfigurationError(
+                f'{what}: expected {len(names)} numbers, one for each name, got {len(numbers)}'
+            )
+        arrays.append(np.asarray(numbers, dtype=np.float64)[order])
+    stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+    if stamp == 0:
+        raise ConfigurationError('the header stamp is 0: nobody fills it')
+    return stamp, arrays
+
+
+@lru_cache(maxsize=16)  # messages of a driver have the same names
+def _order(names: tuple[str, ...], joints: tuple[str, ...]) -> NDArray[np.intp]:
+    """Return where each joint is among the names."""
     missing = [name for name in joints if name not in names]
     if missing:
         raise ConfigurationError(
             f'a message lacks {", ".join(missing)}{suggestion(missing[0], names)}'
         )
-    order, arrays = [names.index(name) for name in joints], []
-    for what in ('position', 'effort', *['velocity'] * with_velocity):
-        array = np.asarray(getattr(message, what), dtype=np.float64)
-        if len(array) != len(names):
-            raise ConfigurationError(
-                f'{what}: expected {len(names)} numbers, one for each name, got {len(array)}'
-            )
-        arrays.append(array[order])
-    stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-    if stamp == 0:
-        raise ConfigurationError('the header stamp is 0: nobody fills it')
-    return stamp, arrays
+    return np.array([names.index(name) for name in joints])

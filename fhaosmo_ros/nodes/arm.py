@@ -47,6 +47,12 @@ TOPICS = {
     'external_torque': JointState, 'standard_deviation': JointState, 'joint_states': JointState,
     'external_wrench': WrenchStamped, 'event': DiagnosticArray,
 }  # fmt: skip
+FIELDS = {
+    'external_torque': {'effort': 'external_torque'},
+    'standard_deviation': {'effort': 'standard_deviation'},
+    'joint_states': {'position': 'position', 'velocity': 'velocity'},
+}
+"""What the fields of a JointState are in `ArmEstimate`."""
 SERVICES = {
     'reset': 'the estimates begin anew with the next sample',
     'tare': 'the present external torque counts as zero',
@@ -116,6 +122,7 @@ class ArmNode(TimedNode):
         if values['wrench_frame']:  # raises for an unknown one
             arm.model.frame_jacobian(np.zeros(len(arm.joints)), values['wrench_frame'])
         self._description = urdf
+        self._messages = {topic: JointState(name=list(arm.joints)) for topic in FIELDS}
         self._say_event(0, OK, 'no contact yet', {})
         self.get_logger().info(
             f'estimating the external torques of {", ".join(arm.joints)} from '
@@ -167,15 +174,12 @@ class ArmNode(TimedNode):
             return
         self._published = estimate.stamp
         stamp = time_message(estimate.stamp)
-        for topic, arrays in {
-            'external_torque': {'effort': estimate.external_torque},
-            'standard_deviation': {'effort': estimate.standard_deviation},
-            'joint_states': {'position': estimate.position, 'velocity': estimate.velocity},
-        }.items():
+        for topic, fields in FIELDS.items():
             if has_listeners(self._outputs[topic]):
-                lists = {name: array.tolist() for name, array in arrays.items()}
-                message = JointState(name=list(arm.joints), **lists)
+                message = self._messages[topic]
                 message.header.stamp = stamp
+                for field, of_estimate in fields.items():
+                    setattr(message, field, getattr(estimate, of_estimate).tolist())
                 self._outputs[topic].publish(message)
         frame = self._values['wrench_frame']
         if frame and has_listeners(self._outputs['external_wrench']):

@@ -3,7 +3,6 @@
 
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +10,7 @@ from fhaosmo_ros.core.arm.bank import Bank
 from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.doubts import Doubts
 from fhaosmo_ros.core.arm.model import ArmModel, Payload, Terms
-from fhaosmo_ros.core.arm.samples import Clock, Noise
+from fhaosmo_ros.core.arm.samples import Clock, Noise, outside
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -57,8 +56,7 @@ FAULTS = ('too strong', 'beyond limits', 'too fast')
 """What an effort, a position and a velocity can be that no arm has."""
 
 
-@dataclass(frozen=True)
-class ArmEstimate:
+class ArmEstimate(NamedTuple):
     """
     What is estimated at one sample.
 
@@ -226,13 +224,14 @@ class Arm:
 
     def reset(self) -> None:
         """Begin anew with the next sample."""
+        n = len(self.joints)
         # Of the latest sample that was used: stamp, position, terms and drive.
         self._last: tuple[int, Floats, Terms, Floats] | None = None
         self._waiting: deque[tuple[int, Floats]] = deque()
         self._velocity: Floats | None = None  # estimated
-        self._momentum = np.zeros(len(self.joints))  # measured
+        self._motion = np.zeros((n, n)), np.zeros(n)  # M and velocity, measured
         self._still = self._contact = False
-        self._looked, self._evidence = 0, np.zeros(len(self.joints))  # when, and for each link
+        self._looked, self._evidence = 0, np.zeros(n)  # when, and for each link
         self.doubts.reset()
         self._clock.reset()
         self._noise.reset()
@@ -280,10 +279,9 @@ class Arm:
         if sample.shape != self._lowest.shape:
             return self._refuse('wrong size')
         sample[0] *= self._constants
-        inside = (self._lowest < sample) & (sample < self._highest)
-        if not inside.all():
-            kind = FAULTS[int(np.argmin(inside.all(axis=1)))]
-            return self._refuse(kind if np.isfinite(sample).all() else 'not finite')
+        kind = outside(sample, self._lowest, self._highest)
+        if kind >= 0:
+            return self._refuse(FAULTS[kind] if np.isfinite(sample).all() else 'not finite')
         if self._newest is not None and stamp <= self._newest:
             if stamp > self._newest - MAX_GAP * 1e9:
                 return self._refuse('not newer')
@@ -357,7 +355,7 @@ class Arm:
             mass, change, vague = new.mass, velocity, 0.0
         drive = 0.5 * (drive + drives)
         bank.step(h, mass, change, variance, vague, drive, torque_variance, new.reach)
-        self._last, self._momentum = (stamp, q, new, drives), mass @ speed
+        self._last, self._motion = (stamp, q, new, drives), (mass, speed)
         self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             return self._refuse('doubted')
@@ -369,7 +367,8 @@ class Arm:
         if moved.any():
             self._still = False
         elif not self._still:
-            self._still = bool(np.any(np.abs(self._momentum) > self._stopping * h))
+            mass, speed = self._motion
+            self._still = bool(np.any(np.abs(mass @ speed) > self._stopping * h))
         return self._still
 
     def _estimate(self, stamp: int, q: Floats) -> ArmEstimate:

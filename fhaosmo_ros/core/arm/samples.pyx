@@ -23,6 +23,18 @@ cdef int FIRST_LEARNT = 10, LONGEST_LEARNT = 1000
 cdef double LARGEST = 9.0
 
 
+def outside(
+    const double[:, ::1] sample, const double[:, ::1] lowest, const double[:, ::1] highest
+):
+    """Return the first row with a number that is not between its bounds, -1 if all are."""
+    cdef int i, k
+    for i in range(sample.shape[0]):
+        for k in range(sample.shape[1]):
+            if not lowest[i, k] < sample[i, k] < highest[i, k]:
+                return i
+    return -1
+
+
 cdef class Noise:
     """
     The variance of the noise of samples, followed by their third differences.

@@ -2,7 +2,7 @@
 """Joint states and the robot's description out of a bag."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +54,7 @@ def description(reader: BagReader, arguments: argparse.Namespace) -> str:
 
 
 def joint_samples(
-    reader: BagReader, topic: str, joints: Sequence[str], with_velocity: bool
+    reader: BagReader, topic: str, joints: tuple[str, ...], with_velocity: bool
 ) -> Iterator[tuple[int, list[NDArray[np.float64]]]]:
     """
     Yield the samples that hold all joints; see `joint_sample`.
