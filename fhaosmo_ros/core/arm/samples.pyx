@@ -26,7 +26,7 @@ cdef double LARGEST = 9.0
 def outside(
     const double[:, ::1] sample, const double[:, ::1] lowest, const double[:, ::1] highest
 ):
-    """Return the first row with a number that is not between its bounds, -1 if all are."""
+    """Return the first row with a number not between its bounds (of one size), -1 if all are."""
     cdef int i, k
     for i in range(sample.shape[0]):
         for k in range(sample.shape[1]):
@@ -64,13 +64,11 @@ cdef class Noise:
         self.seen = 0
 
     def take(self, const double[:, ::1] sample):
-        """Take a sample, (r, n)."""
+        """Take a sample, (r, n); its size is not checked."""
         cdef double[:, :, ::1] b = self.before
         cdef double change, square, found
         cdef int i, k, rows = self.now.shape[0], n = self.now.shape[1]
         cdef bint known = self.seen >= 3
-        if sample.shape[0] != rows or sample.shape[1] != n:
-            raise ValueError(f'expected a sample of shape {(rows, n)}')
         if known:
             self.count = min(self.count + 1, LONGEST_LEARNT)
         for i in range(rows):
