@@ -147,13 +147,14 @@ class ArmNode(TimedNode):
     def _on_sample(self, message: JointState) -> None:
         """Take a message, if it is of this arm."""
         arm = self._arm
-        if arm is None or (self._estimate and not {*arm.joints} & {*message.name}):
-            return  # of another robot
+        if arm is None:
+            return
         try:
             with_velocity = self._values['measurement'] == 'velocity'
             stamp, arrays = joint_sample(message, arm.joints, with_velocity)
         except ConfigurationError as error:
-            self._warn(f'{error}: no estimate from it')
+            if not self._estimate or {*arm.joints} & {*message.name}:  # else of another robot
+                self._warn(f'{error}: no estimate from it')
             return
         estimate = arm.take(stamp, *arrays)
         if arm.problem in MEANT:
