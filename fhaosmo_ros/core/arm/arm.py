@@ -10,7 +10,7 @@ from fhaosmo_ros.core.arm.bank import Bank
 from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.doubts import Doubts
 from fhaosmo_ros.core.arm.model import ArmModel, Payload, Terms
-from fhaosmo_ros.core.arm.samples import Clock, Noise, outside
+from fhaosmo_ros.core.arm.samples import Clock, farther, Noise, outside
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -332,7 +332,7 @@ class Arm:
             self._last = stamp, q, *self._drive(q, velocity, torque, velocity)
             return None
         h = self._clock.interval(h, moved)
-        if (np.abs(moved) > self._fastest * h + self._noisy).any():
+        if farther(moved, self._fastest, h, self._noisy):
             self.reset()
             return self._refuse('jumped')
         self._noise.take(sample)

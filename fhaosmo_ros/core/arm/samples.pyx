@@ -35,6 +35,17 @@ def outside(
     return -1
 
 
+def farther(
+    const double[::1] moved, const double[::1] fastest, double h, const double[::1] noisy
+):
+    """Return whether a joint has moved farther than is possible within h, and by noise."""
+    cdef int k
+    for k in range(moved.shape[0]):
+        if fabs(moved[k]) > fastest[k] * h + noisy[k]:
+            return True
+    return False
+
+
 cdef class Noise:
     """
     The variance of the noise of samples, followed by their third differences.
