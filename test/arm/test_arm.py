@@ -164,10 +164,12 @@ def test_a_force_that_is_there_at_once_is_not_taken_for_one_that_grows():
 
 def test_weights_are_probabilities(free, arm):
     run(arm, free, end=300)
-    bank = arm._bank
+    bank, one, square = arm._bank, np.ones(3), np.eye(3)
     assert np.isclose(bank.weights.sum(), 1.0)
     assert np.all(bank.weights > 0.0)
     np.testing.assert_array_equal(bank.covariance, bank.covariance.T)
+    with pytest.raises(ValueError, match='arrays of 3 joints'):
+        bank.step(1e-3, square, np.zeros(2), one, 0.0, one, one, square)
 
 
 @pytest.mark.parametrize('measurement', ['position', 'velocity'])

@@ -101,7 +101,7 @@ cdef class Bank:
         const double[::1] torque_variance, const double[:, ::1] shape,
     ):
         """
-        Go on to the next sample; sizes are not checked.
+        Go on to the next sample.
 
         Parameters
         ----------
@@ -123,6 +123,12 @@ cdef class Bank:
             Sum of J^T J over the links: how forces on the arm act on its joints.
 
         """
+        cdef int n = self.joints
+        if not (
+            n == mass.shape[0] == mass.shape[1] == change.shape[0] == variance.shape[0]
+            == drive.shape[0] == torque_variance.shape[0] == shape.shape[0] == shape.shape[1]
+        ):
+            raise ValueError(f'expected arrays of {n} joints')
         self.x, self.x0, self.p, self.p0 = self.x0, self.x, self.p0, self.p
         with nogil:
             self.mix(h, shape)

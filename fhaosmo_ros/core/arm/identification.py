@@ -100,11 +100,16 @@ def identify(
     Raises
     ------
     ConfigurationError
-        Too short a recording, or times that do not increase.
+        Too short a recording, or arrays that do not fit.
 
     """
     t, q, effort = (np.asarray(a, dtype=np.float64) for a in (t, q, effort))
     n = len(model.joints)
+    if t.ndim != 1 or q.shape != (len(t), n) or effort.shape != q.shape:
+        raise ConfigurationError(
+            f'identify: expected q and effort of shape {(len(t), n)}, got {q.shape} and '
+            f'{effort.shape}'
+        )
     if len(t) < LEAST_ROWS or not np.all(np.diff(t) > 0.0) or t[-1] - t[0] < SHORTEST:
         raise ConfigurationError(
             f'identify: expected at least {SHORTEST:g} s of samples with increasing times, got '

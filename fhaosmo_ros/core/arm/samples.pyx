@@ -26,8 +26,13 @@ cdef double LARGEST = 9.0
 def outside(
     const double[:, ::1] sample, const double[:, ::1] lowest, const double[:, ::1] highest
 ):
-    """Return the first row with a number not between its bounds (of one size), -1 if all are."""
+    """Return the first row with a number that is not between its bounds, -1 if all are."""
     cdef int i, k
+    if not (
+        sample.shape[0] == lowest.shape[0] == highest.shape[0]
+        and sample.shape[1] == lowest.shape[1] == highest.shape[1]
+    ):
+        raise ValueError('expected arrays of one shape')
     for i in range(sample.shape[0]):
         for k in range(sample.shape[1]):
             if not lowest[i, k] < sample[i, k] < highest[i, k]:
@@ -40,6 +45,8 @@ def farther(
 ):
     """Return whether a joint has moved farther than is possible within h, and by noise."""
     cdef int k
+    if not moved.shape[0] == fastest.shape[0] == noisy.shape[0]:
+        raise ValueError('expected arrays of one length')
     for k in range(moved.shape[0]):
         if fabs(moved[k]) > fastest[k] * h + noisy[k]:
             return True
@@ -75,11 +82,13 @@ cdef class Noise:
         self.seen = 0
 
     def take(self, const double[:, ::1] sample):
-        """Take a sample, (r, n); its size is not checked."""
+        """Take a sample, (r, n)."""
         cdef double[:, :, ::1] b = self.before
         cdef double change, square, found
         cdef int i, k, rows = self.now.shape[0], n = self.now.shape[1]
         cdef bint known = self.seen >= 3
+        if sample.shape[0] != rows or sample.shape[1] != n:
+            raise ValueError(f'expected a sample of shape {(rows, n)}')
         if known:
             self.count = min(self.count + 1, LONGEST_LEARNT)
         for i in range(rows):
