@@ -118,7 +118,6 @@ cdef struct Shared:
     double uneven  # mean square of the highest difference of y in these samples
     double first_rough  # what `roughness` was before the first of them
     double recent  # samples left that count as part of a jump of d (D 33)
-    double turns  # of late, the share of samples that were unlikely, on a new side, not rough
 
 
 cdef struct Members:

@@ -165,9 +165,9 @@ cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil:
     w.sample.largest = fmax(IGNORANT * least, own)
 
 
-cdef bint is_likely(Members* m, double gate, bint to_any) noexcept nogil:
+cdef bint is_likely(Members* m, double gate) noexcept nogil:
     """
-    Return True if a member that can judge the sample finds it likely (D 29), or any at all.
+    Return True if a member that can judge the sample finds it likely (D 29).
 
     A member that is unlikely itself would meet y by chance.
     """
@@ -176,8 +176,8 @@ cdef bint is_likely(Members* m, double gate, bint to_any) noexcept nogil:
     cdef int g
     for g in range(m.shared.active):
         variance = w.believed[g] * w.noise[g]
-        if w.b[g] * w.b[g] <= gate * gate * variance and (
-            to_any or (variance <= w.sample.largest and m.score[g] > -CLOSE)
+        if variance <= w.sample.largest and m.score[g] > -CLOSE and (
+            w.b[g] * w.b[g] <= gate * gate * variance
         ):
             return True
     return False

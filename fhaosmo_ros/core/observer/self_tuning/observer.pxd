@@ -27,8 +27,8 @@ cdef class SelfTuning(Structure):
     cdef void step_members(self, double y, double h, const double* u) noexcept nogil
     cdef void follow_period(self, double h, bint same) noexcept nogil
     cdef void carry_flow(self, double h, const double* u, bint same) noexcept nogil
-    cdef void pass_over(self, bint doubted) noexcept nogil
-    cdef void take_sample(self, bint doubted) noexcept nogil
+    cdef void pass_over(self) noexcept nogil
+    cdef void take_sample(self) noexcept nogil
     cdef bint has_begun(self) noexcept nogil
     # Snapshots.
     cdef dict places(self)

@@ -38,10 +38,6 @@ cdef double MEMORY = 8000.0
 cdef double NOISE_SAMPLES = 1000.0  # the noise is averaged over so many
 # What is beyond 3 sigma in so many samples after a jump of d is due to it, too.
 cdef double JUMP_SAMPLES = 10.0
-# If unlikely samples are on the other side than the last one in a larger share of CALM_SAMPLES,
-# and y itself moves as ever, members are judged by them too: those that were likely are wrong. A
-# sample whose difference is large counts as ROUGH_TURN of these: noise may have grown.
-cdef double OFTEN = 0.07, ROUGH_TURN = -0.5
 # P moves if the variance of the noise has changed by STEADY, or by so much if its colour is not
 # the likeliest one.
 cdef double FAR_OFF = 3.0
@@ -168,7 +164,7 @@ cdef class SelfTuning(Structure):
         cdef int n = self.order, i, j, g
         cdef double size, z, a
         memory.pending = memory.offset = memory.watched = memory.drift = memory.beyond = 0.0
-        shared.unsettled = shared.growing = shared.recent = shared.turns = 0.0
+        shared.unsettled = shared.growing = shared.recent = 0.0
         self.level[0].z_hat = memory.y = y
         if not self.has_begun():
             self.begin_afresh()
@@ -231,9 +227,8 @@ cdef class SelfTuning(Structure):
         cdef Sample* sample = &w.sample
         cdef Memory* memory = &self.memory
         cdef double mean[MOST_STATES]
-        cdef double expected, sign, turn = 0.0, since = 0.0
-        cdef double speed
-        cdef bint goes_on, likely, begins, jumped, doubted, rough, same
+        cdef double expected, since = 0.0, speed
+        cdef bint goes_on, likely, begins, jumped, rough, same
         cdef int i, n = self.order, since_jump = 0
         sample.quanta = rounding(m)
         if choose_members(m, sample.quanta):
@@ -266,23 +261,16 @@ cdef class SelfTuning(Structure):
         sample.kept = exp(-h / self.forgetting if self.forgetting > 0.0 else -1.0 / MEMORY)
         shared.samples = <int>sample.average + 1
         begins = has_jumped(m, memory.beyond)
-        sign = copysign(1.0, sample.off)
         goes_on = (
-            memory.beyond > 0.0 and sign == shared.far_sign and not rough
-            and shared.roughness < HUBER
+            memory.beyond > 0.0 and copysign(1.0, sample.off) == shared.far_sign
+            and not rough and shared.roughness < HUBER
         )
-        likely = is_likely(m, HUBER if goes_on else GATE, False)
+        likely = is_likely(m, HUBER if goes_on else GATE)
         shared.recent = fmax(shared.recent - 1.0, 0.0)
         begins = begins and not likely
         jumped = begins or (shared.recent > 0.0 and not rough)
-        if rough:
-            turn = ROUGH_TURN
-        elif not likely and sign != shared.far_sign:
-            turn = 1.0
-        shared.turns = fmax(shared.turns + (turn - shared.turns) / CALM_SAMPLES, 0.0)
-        doubted = shared.turns > OFTEN and shared.roughness < HUBER and sample.quanta == 0.0
         if not likely and not jumped:
-            self.pass_over(doubted)
+            self.pass_over()
             self.trial_variances[0] = expected
             return
         memory.beyond = 0.0
@@ -298,7 +286,7 @@ cdef class SelfTuning(Structure):
             memset(m.far, 0, sizeof(m.far))
             memcpy(w.believed, w.s, sizeof(Line))
             shared.unsettled = 0.0
-        self.take_sample(doubted)
+        self.take_sample()
         follow_quantum(m)
         if not jumped:
             since_jump = samples_since_jump(m)
@@ -370,7 +358,7 @@ cdef class SelfTuning(Structure):
         if not same:
             shared.flow_period = h
 
-    cdef void pass_over(self, bint doubted) noexcept nogil:
+    cdef void pass_over(self) noexcept nogil:
         """Count a sample that is not likely; where it may be noise that has grown, follow that."""
         cdef Members* m = self.members
         cdef Shared* shared = &m.shared
@@ -378,9 +366,6 @@ cdef class SelfTuning(Structure):
         cdef Memory* memory = &self.memory
         cdef double sign = copysign(1.0, sample.off)
         cdef bint other_side = memory.beyond > 0.0 and sign != shared.far_sign
-        if doubted and is_likely(m, HUBER, True):
-            judge(m, 1.0, sample.kept, True)
-            weigh(m, FLOOR)
         if other_side:
             begin_growth(m)
             memory.beyond = 0.0
@@ -394,7 +379,7 @@ cdef class SelfTuning(Structure):
             follow_noise(m)
         shared.far_sign = sign
 
-    cdef void take_sample(self, bint doubted) noexcept nogil:
+    cdef void take_sample(self) noexcept nogil:
         """Correct the members by a sample, and weigh them."""
         cdef Members* m = self.members
         cdef Shared* shared = &m.shared
@@ -403,7 +388,7 @@ cdef class SelfTuning(Structure):
         cdef double kept
         follow_noise(m)
         shared.calm = shared.calm + 1.0 if sample.grown <= STEADY else 0.0
-        calm = shared.calm > CALM_SAMPLES or doubted
+        calm = shared.calm > CALM_SAMPLES
         judged = (calm or sample.best_fit < HUBER * HUBER) and (
             sample.roughness <= HUBER * HUBER or quantised
         )
