@@ -28,10 +28,6 @@ cdef int CHANGING = 8
 cdef double ALL_BUT_ONE = 0.8
 # If a larger share of the first samples repeat the one before, y is quantised.
 cdef double REPEATED = 0.3
-# Members with a larger bandwidth (rad a sample) tell d from the last two or three samples. There
-# errors of rounding, which are not white, look like such a d: where y is quantised,
-# log-likelihoods of these members are smaller by MORE_REASON.
-cdef double WITHIN_SAMPLES = 1.0, MORE_REASON = 50.0
 
 
 cdef void gather(Members* m) noexcept nogil:
@@ -223,8 +219,6 @@ cdef void begin(Members* m, double noise) noexcept nogil:
     shared.size_of_d = m.p.dd[0][0][0] * exp(sizes / COUNT)
     for g in range(COUNT):
         m.prior[g] += 0.5 * least
-        if shared.lattice > LATTICE_SHARE and GRID.bandwidth[g] > WITHIN_SAMPLES:
-            m.prior[g] -= MORE_REASON
         m.score[g] = m.prior[g]
         m.variance[g] = m.short_mean[g] = 1.0
         m.log_variance[g] = m.residual[g] = m.far[g] = 0.0
