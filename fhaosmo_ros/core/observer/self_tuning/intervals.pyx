@@ -37,9 +37,6 @@ cdef double HALF_SURE = log(0.5)
 # first probability. So a sample that repeats the one before, and that a member expects with more
 # than the second one, tells it nothing: each such sample would narrow it again.
 cdef double EVENLY = log(0.917), KNOWN = log(0.88)
-# In models of more states a repeated sample narrows no member: many of them in a row would narrow
-# one whose z_1 is wrong, and one with a d that is thousands of times too large would be likelier.
-cdef int FEW_STATES = 3
 # In an interval of twice so few standard deviations the density is taken to be constant.
 cdef double HALF_NARROW = 0.015
 # Log-likelihood of members with coloured noise, which errors of rounding are not.
@@ -59,7 +56,6 @@ cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) n
     cdef double inverse, off, width, near, far, to_near, left, right, beyond, share, by_near
     cdef double center, less, square
     cdef double known = KNOWN if repeated else INFINITY, tail = GATE
-    cdef double narrowing = 0.0 if repeated and m.n > FEW_STATES else 1.0
     cdef Py_ssize_t g, active = m.shared.active
     for g in range(active):
         w.size[g] = sqrt(INEXACT * (w.p.zz[0][g] + least))
@@ -102,7 +98,7 @@ cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) n
         center = center if center < off else off
         w.b[g] = center * w.size[g] if w.chance[g] <= known else 0.0
         w.inverse[g] = 1.0 / (w.size[g] * w.size[g]) if w.chance[g] <= known else 0.0
-        w.taken[g] = w.lost[g] * w.inverse[g] * narrowing
+        w.taken[g] = w.lost[g] * w.inverse[g]
 
 
 cdef inline double passage(

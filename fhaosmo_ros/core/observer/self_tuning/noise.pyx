@@ -21,9 +21,8 @@ cdef double SHORT_SHARE = 0.05  # of the last sample in short means
 cdef double STEADY = 1.5, CALM_SAMPLES = 40.0
 # Averages that have to follow soon are over so many samples, or steps of y.
 cdef double QUICK_SAMPLES = 30.0
-# With a larger share of multiples of the quantum among the steps of y it is quantised; with a
-# smaller one than the second the quantum is none.
-cdef double LATTICE_SHARE = 0.9, NO_LATTICE = 0.5
+# With a larger share of multiples of the quantum among the steps of y it is quantised.
+cdef double LATTICE_SHARE = 0.9
 cdef double HIDDEN = 4.0  # noise of so many times the variance of rounding hides the quanta
 cdef double ROUGH_SAMPLES = 100.0  # squared differences of y are averaged over so many
 # y and its stamps are taken to be no more exact than this: in parts of what y moves between
@@ -53,7 +52,7 @@ cdef void follow_quantum(Members* m) noexcept nogil:
     Take a sample that is used: is the step to it a multiple of the quantum? (D 29).
 
     A step like the one before says nothing: so does y move at a constant speed. Another quantum is
-    believed where it divides this one, or where this one is none.
+    believed where it divides this one, or where y is not quantised by this one.
     """
     cdef Shared* shared = &m.shared
     cdef double y = m.work.sample.y, step = fabs(y - m.work.sample.before), change
@@ -65,7 +64,7 @@ cdef void follow_quantum(Members* m) noexcept nogil:
     fits = is_multiple(step, shared.quantum, y)
     if not fits:
         fits = is_multiple(shared.quantum, step, y)
-        if fits or shared.lattice < NO_LATTICE:
+        if fits or shared.lattice < LATTICE_SHARE:
             shared.quantum = step
     if not fits:
         shared.lattice -= shared.lattice / QUICK_SAMPLES
