@@ -32,7 +32,7 @@ FLOOR = 30.0  # no log-likelihood falls further below the best one: each member 
 INEXACT = 1e-10
 """Innovations are expected to be larger by so much, or rounding would make variances negative."""
 LIMIT = 3.0  # an innovation counts as so many standard deviations at most: outliers change little
-CLIPPED = 0.9733  # mean of min(x^2, 9) for a normal x of variance 1
+CLIPPED = 0.9733  # mean of x^2 where |x| < 3, for a normal x of variance 1
 
 
 class Estimates(NamedTuple):

@@ -4,7 +4,7 @@
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 
-cdef double HUBER, INEXACT
+cdef double EXACT, HUBER, INEXACT
 
 cdef VECTORISED predict_states(
     Members* m, double h, const double* mean, const double* predicted

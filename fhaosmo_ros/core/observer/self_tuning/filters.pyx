@@ -16,9 +16,12 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 
 cdef double HUBER = 3.0  # innovations of more standard deviations count as so many (Huber 1964)
+# y and its stamps are taken to be no more exact than this: in parts of what y moves between
+# samples (RMS), and of the period.
+cdef double EXACT = 1e-5
 # By this factor S is too large, so that P stays positive where y is by many orders of magnitude
 # more exact than its prediction: what is left of P then is more than what rounding makes of it.
-cdef double INEXACT = 1.0 + 1e-10
+cdef double INEXACT = 1.0 + EXACT * EXACT
 
 
 cdef VECTORISED predict_states(

@@ -7,7 +7,7 @@ the truncated one has (Curry, Vander Velde and Potter 1970, IEEE Transactions on
 16, 152-161).
 """
 
-from libc.math cimport INFINITY, M_2_PI, M_PI, copysign, exp, fabs, fmax, fmin, log, sqrt
+from libc.math cimport INFINITY, M_2_PI, M_PI, copysign, erf, exp, fabs, fmax, fmin, log, sqrt
 from libc.stdlib cimport calloc, free
 
 from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER, INEXACT
@@ -16,6 +16,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
 )
 from fhaosmo_ros.core.observer.self_tuning.normal cimport exponential, mills
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.observer.self_tuning.weights cimport QUANTISED_FLOOR
 from fhaosmo_ros.core.observer.structure cimport GATE
 
 cdef double ROOT = sqrt(2.0 * M_PI)
@@ -24,7 +25,7 @@ cdef double FARTHEST = 12.0  # standard deviations; numbers that are farther off
 cdef double VAGUE = 0.1
 # Logarithms of the least probability that a sample counts with, and of the least one with which
 # z_1 passes an edge at just this sample.
-cdef double LEAST_CHANCE = -6.0, LEAST_PASSAGE = -12.0
+cdef double LEAST_CHANCE = -6.0, LEAST_PASSAGE = 2.0 * LEAST_CHANCE
 # If more than one in so many of y's steps go back at once, noise of as much as VAGUE carries z_1
 # over edges. Innovations do not show noise that is far smaller than the quantum.
 cdef double OF_BACK = 3.0
@@ -36,11 +37,9 @@ cdef double HALF_SURE = log(0.5)
 # A normal number with the variance of an even distribution in the interval lies in it with the
 # first probability. So a sample that repeats the one before, and that a member expects with more
 # than the second one, tells it nothing: each such sample would narrow it again.
-cdef double EVENLY = log(0.917), KNOWN = log(0.88)
+cdef double EVENLY = log(erf(sqrt(1.5))), KNOWN = log(0.88)
 # In an interval of twice so few standard deviations the density is taken to be constant.
 cdef double HALF_NARROW = 0.015
-# Log-likelihood of members with coloured noise, which errors of rounding are not.
-cdef double UNUSED = -1e6
 
 
 cdef VECTORISED truncate(Members* m, double half, double least, bint repeated) noexcept nogil:
@@ -201,7 +200,7 @@ cdef bint choose_members(Members* m, double quanta) noexcept nogil:
     m.shared.active = HALF if quanta > 0.0 else COUNT
     if m.shared.active < before:
         for g in range(HALF, COUNT):
-            m.weight[g], m.score[g] = 0.0, UNUSED
+            m.weight[g], m.score[g] = 0.0, -QUANTISED_FLOOR
     elif m.shared.active > before:
         m.shared.unsettled = 0.0
         for i in range(COLOURS):

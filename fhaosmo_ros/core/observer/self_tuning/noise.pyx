@@ -1,20 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """The noise of y, its quantum, and whether a sample is likely (D 29)."""
 
-from libc.math cimport INFINITY, exp, fabs, fmax, fmin, round
+from libc.math cimport INFINITY, M_2_PI, erf, exp, fabs, fmax, fmin, round, sqrt
 
-from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
+from fhaosmo_ros.core.observer.self_tuning.filters cimport EXACT, HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     COLOURS, GRID, HALF, Members, Sample, Shared, Work, fill, largest
 )
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.observer.structure cimport LOST_SAMPLES
 
-cdef double IGNORANT = 3.0  # who expects S of so many times the smallest one does not judge y
-cdef double CLIPPED = 0.9733  # mean of min(x^2, 9) where x is normal with variance 1
-# Members whose log-likelihood is so far below the best one do not say whether a sample is likely,
-# and those so far below the best one of their colour do not tell the noise.
-cdef double CLOSE = 8.0
-cdef double SHORT_SHARE = 0.05  # of the last sample in short means
+# Variances of which one is so many times the other are different ones: who expects S of so many
+# times the smallest one does not judge y.
+cdef double APART = 3.0
+# Mean of x^2 within HUBER where x is normal with variance 1: 2 % less than that of the squares that
+# are bounded so, for the noise is rather found too large.
+cdef double CLIPPED = 1.0 - HUBER * sqrt(M_2_PI) * exp(-0.5 * HUBER * HUBER) / erf(
+    HUBER / sqrt(2.0)
+)
+# The exponential of minus this is nothing. Members whose log-likelihood is so far below the best
+# one do not say whether a sample is likely, and those so far below the best one of their colour do
+# not tell the noise. After so many time constants of a member its P is steady.
+cdef double FADED = 8.0
+cdef double SHORT_SHARE = 1.0 / LOST_SAMPLES  # of the last sample in short means
 # If squared innovations over S are larger of late for every member that can judge, and squared
 # differences of y are too, the noise has grown. It is averaged over QUICK_SAMPLES then. Until
 # CALM_SAMPLES later a sample judges the members only if one of them explains it.
@@ -25,17 +33,14 @@ cdef double QUICK_SAMPLES = 30.0
 cdef double LATTICE_SHARE = 0.9
 cdef double HIDDEN = 4.0  # noise of so many times the variance of rounding hides the quanta
 cdef double ROUGH_SAMPLES = 100.0  # squared differences of y are averaged over so many
-# y and its stamps are taken to be no more exact than this: in parts of what y moves between
-# samples (RMS), and of the period.
-cdef double EXACT = 1e-5
 # Where intervals are uneven by more than this part of the period, so are the stamps: a host stamps
 # a sample some microseconds late, by a little more or less for dozens of samples, and a y that is
 # taken to be free of that would make a d of it.
 cdef double PROMPT = 0.01
 # Where the highest differences of y are more than FLAT times those of the order below, as
-# variances of white noise, they are noise, of at least OF_FLAT times that variance: what is smooth
+# variances of white noise, they are noise, of at least FLAT^2 times that variance: what is smooth
 # has far smaller ones.
-cdef double FLAT = 0.5, OF_FLAT = 0.25
+cdef double FLAT = 0.5
 cdef double ROUNDED = 1e-12  # what is less than this part of a number may be an error of 64 bits
 cdef double ROUGH = 2.0  # the variance of the noise is at most so many times what they say
 
@@ -158,10 +163,10 @@ cdef VECTORISED find_knowing(Members* m, bint unlikely_before) noexcept nogil:
     cdef double least, own, most = 4.0 if unlikely_before else INFINITY
     for g in range(active):
         w.believed[g] = w.s[g] if w.s[g] < most * m.variance[g] else most * m.variance[g]
-        w.one[g] = -w.believed[g] * w.noise[g] if m.score[g] > -CLOSE else -INFINITY
+        w.one[g] = -w.believed[g] * w.noise[g] if m.score[g] > -FADED else -INFINITY
     least = -largest(w.one, active)
     own = w.believed[m.shared.likeliest] * w.noise[m.shared.likeliest]
-    w.sample.largest = fmax(IGNORANT * least, own)
+    w.sample.largest = fmax(APART * least, own)
 
 
 cdef bint is_likely(Members* m, double gate) noexcept nogil:
@@ -175,7 +180,7 @@ cdef bint is_likely(Members* m, double gate) noexcept nogil:
     cdef int g
     for g in range(m.shared.active):
         variance = w.believed[g] * w.noise[g]
-        if variance <= w.sample.largest and m.score[g] > -CLOSE and (
+        if variance <= w.sample.largest and m.score[g] > -FADED and (
             w.b[g] * w.b[g] <= gate * gate * variance
         ):
             return True
@@ -206,7 +211,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
         m.short_mean[g] += SHORT_SHARE * (ratio - m.short_mean[g])
         w.ratio[g] = ratio
         w.one[g] = -m.short_mean[g] if variance <= widest else -INFINITY
-        w.two[g] = -ratio if variance <= widest and m.score[g] > -CLOSE else -INFINITY
+        w.two[g] = -ratio if variance <= widest and m.score[g] > -FADED else -INFINITY
     least = fmin(m.shared.roughness, -largest(w.one, active))
     sample.grown, sample.best_fit = fmax(least, 1.0), -largest(w.two, active)
     for c in range(COLOURS):
@@ -218,7 +223,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
     for g in range(active):
         c = GRID.colour[g]
         off = m.score[g] - best[c]
-        if off > -CLOSE:
+        if off > -FADED:
             weight = exp(off) if off < 0.0 else 1.0
             weights[c] += weight
             squares[c] += weight * w.ratio[g]
@@ -235,5 +240,5 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
             most = fmin(most, m.rough[c][p])
         m.noise[c] = fmax(fmin(m.noise[c], ROUGH * most), sample.floor)
         if m.rough[c][m.n + 1] > FLAT * m.rough[c][m.n]:
-            m.noise[c] = fmax(m.noise[c], OF_FLAT * m.rough[c][m.n + 1])
+            m.noise[c] = fmax(m.noise[c], FLAT * FLAT * m.rough[c][m.n + 1])
     fill_noise(m)

@@ -6,7 +6,7 @@ from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy, memset
 
 from fhaosmo_ros.core.observer.self_tuning.filters cimport (
-    HUBER, allow_jump, correct, correct_states, expect, predict_states
+    EXACT, HUBER, allow_jump, correct, correct_states, expect, predict_states
 )
 from fhaosmo_ros.core.observer.self_tuning.intervals cimport choose_members, take_interval
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport (
@@ -17,7 +17,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    CALM_SAMPLES, EXACT, ROUNDED, STEADY, fill_noise, find_knowing, follow_differences,
+    APART, CALM_SAMPLES, FADED, ROUNDED, STEADY, fill_noise, find_knowing, follow_differences,
     follow_noise, follow_quantum, follow_stamps, is_likely, rounding
 )
 from fhaosmo_ros.core.observer.self_tuning.start cimport gather
@@ -38,20 +38,16 @@ cdef double MEMORY = 8000.0
 cdef double NOISE_SAMPLES = 1000.0  # the noise is averaged over so many
 # What is beyond 3 sigma in so many samples after a jump of d is due to it, too.
 cdef double JUMP_SAMPLES = 10.0
-# P moves if the variance of the noise has changed by STEADY, or by so much if its colour is not
-# the likeliest one.
-cdef double FAR_OFF = 3.0
 # Intervals that differ by this part are equal: seconds of a clock, as floats, are not exact.
 cdef double SAME = 1e-9
 # P is not the steady one if the mean interval has changed by more than the first part of it, nor
 # after an interval of GAP usual ones; after shorter ones nearly.
 cdef double NEAR = 0.25, GAP = 2.5
-cdef double LONG = 8.0  # time constants of a member after which its P is steady
 # Covariances of so many members, or of a multiple, move: whole vectors of the processor.
 cdef int EVEN = 16
-# A y has noise if its differences are all more than the first part of its first difference, RMS;
-# none if they are less than the second part of the noise at the start, as variances.
-cdef double LEAST_NOISE = 1e-3, NO_NOISE = 1e-9
+# A y has noise if its differences are all more than this part of its first difference, and of the
+# noise at the start, RMS.
+cdef double LEAST_NOISE = 1e-3
 cdef double LARGEST = 1e300  # no number of a snapshot is larger, nor is an error of a prediction
 # Ranges of the numbers of a snapshot; others are from 0 to LARGEST.
 RANGES = {'likeliest': (0, COUNT - 1), 'told': (0, COUNT - 1), 'followed': (0, COUNT - 1)}
@@ -116,12 +112,10 @@ cdef class SelfTuning(Structure):
     cdef bint is_noisy(self, double y) noexcept nogil:
         """Return True if all differences of y show noise, so that it does not repeat itself."""
         cdef double* rough = &self.members.rough[0][0]  # by white noise
-        cdef double least = fmax(
-            NO_NOISE * self.members.shared.first_noise, LEAST_NOISE * LEAST_NOISE * rough[1]
-        )
+        cdef double least = fmax(self.members.shared.first_noise, rough[1])
         cdef int p
         for p in range(1, self.order + 2):
-            if not rough[p] > fmax(least, ROUNDED * y * (ROUNDED * y)):
+            if not rough[p] > fmax(LEAST_NOISE * LEAST_NOISE * least, ROUNDED * y * (ROUNDED * y)):
                 return False
         return self.members.shared.active == COUNT  # else y is quantised, or none has begun
 
@@ -327,7 +321,7 @@ cdef class SelfTuning(Structure):
         )
         for c in range(COLOURS):
             ratio = m.work.now[c] / m.used_noise[c]
-            limit = STEADY if c == GRID.colour[shared.likeliest] else FAR_OFF
+            limit = STEADY if c == GRID.colour[shared.likeliest] else APART
             changed = changed or not 1.0 / limit < ratio < limit
         if changed:
             m.used_noise = m.work.now
@@ -340,7 +334,7 @@ cdef class SelfTuning(Structure):
             )
         for c in range(BANDS):
             g = HALF + c * IN_BAND
-            if m.kappa[g] / DECAY * slowed * shared.unsettled < LONG:
+            if m.kappa[g] / DECAY * slowed * shared.unsettled < FADED:
                 moving += IN_BAND
         shared.moving = min((moving + EVEN - 1) // EVEN * EVEN, HALF)
 

@@ -4,13 +4,14 @@
 from libc.math cimport INFINITY, exp, fabs, fmax, fmin, log, sqrt
 from libc.string cimport memset
 
+from fhaosmo_ros.core.observer.self_tuning.filters cimport EXACT
 from fhaosmo_ros.core.observer.self_tuning.jumps cimport watch
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     COLOURS, COUNT, DECAY, DIFFERENCES, Estimates, FIRST_SAMPLES, GRID, HALF, Line, Members,
     ORDERS, Shared, factorial, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    CALM_SAMPLES, EXACT, LATTICE_SHARE, ROUNDED, follow_differences, is_multiple
+    CALM_SAMPLES, LATTICE_SHARE, ROUNDED, follow_differences, is_multiple
 )
 from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, weigh
 
@@ -24,8 +25,6 @@ cdef double DOUBT = 10.0
 # y may be constant until its sensor is ready. So many samples from its first change on tell
 # whether it is quantised; if not, the first samples are those from there on.
 cdef int CHANGING = 8
-# Of so few steps: all are multiples of the smallest one, which does not count.
-cdef double ALL_BUT_ONE = 0.8
 # If a larger share of the first samples repeat the one before, y is quantised.
 cdef double REPEATED = 0.3
 
@@ -77,13 +76,12 @@ cdef bint on_lattice(const double* values) noexcept nogil:
         step = fabs(values[i + 1] - values[i])
         if step > 0.0:
             quantum = fmin(quantum, step)
-    return share_of_multiples(values, CHANGING + 1, quantum) > ALL_BUT_ONE
+    return share_of_multiples(values, CHANGING + 1, quantum) > LATTICE_SHARE
 
 
 cdef double share_of_multiples(const double* values, int count, double quantum) noexcept nogil:
     """Return the share of multiples of `quantum` among the steps; 1 if many samples repeat."""
-    cdef double steps = 0.0, repeated = 0.0, step
-    cdef double multiples = -1.0  # the smallest step is one in any case
+    cdef double steps = 0.0, repeated = 0.0, multiples = 0.0, step
     cdef int i
     for i in range(1, count):
         step = fabs(values[i] - values[i - 1])
