@@ -60,7 +60,6 @@ cdef struct Sample:
     double average  # number of samples to average the noise over
     double kept  # part of the log-likelihoods that is not forgotten
     double grown  # how much larger than expected innovations and differences are of late, >= 1
-    double best_fit  # least squared innovation, over its variance, of those who can judge
 
 
 cdef struct Work:
@@ -102,7 +101,6 @@ cdef struct Shared:
     double steady_period  # interval that they are those of (s)
     double flow_period  # interval that the flow is that of (s)
     double first_noise  # variance of the noise when the members began
-    double calm  # samples since the noise has grown
     double roughness  # short mean of the squared differences of y, over their usual size
     double interval  # last one between two samples, taken or not (s)
     double since  # time from the last sample taken to the last one (s)

@@ -4,7 +4,7 @@
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 
-cdef double APART, CALM_SAMPLES, FADED, LATTICE_SHARE, ROUGH, ROUNDED, STEADY
+cdef double APART, FADED, LATTICE_SHARE, ROUGH, ROUNDED, STEADY
 
 cdef bint is_multiple(double step, double quantum, double y) noexcept nogil
 cdef void follow_quantum(Members* m) noexcept nogil

@@ -13,8 +13,8 @@ from fhaosmo_ros.core.observer.structure cimport LOST_SAMPLES
 # Variances of which one is so many times the other are different ones: who expects S of so many
 # times the smallest one does not judge y.
 cdef double APART = 3.0
-# Mean of x^2 within HUBER where x is normal with variance 1: 2 % less than that of the squares that
-# are bounded so, for the noise is rather found too large.
+# Mean of x^2 within HUBER where x is normal with variance 1: 2 % less than that of squares bounded
+# so, for the noise is rather found too large.
 cdef double CLIPPED = 1.0 - HUBER * sqrt(M_2_PI) * exp(-0.5 * HUBER * HUBER) / erf(
     HUBER / sqrt(2.0)
 )
@@ -24,11 +24,9 @@ cdef double CLIPPED = 1.0 - HUBER * sqrt(M_2_PI) * exp(-0.5 * HUBER * HUBER) / e
 cdef double FADED = 8.0
 cdef double SHORT_SHARE = 1.0 / LOST_SAMPLES  # of the last sample in short means
 # If squared innovations over S are larger of late for every member that can judge, and squared
-# differences of y are too, the noise has grown. It is averaged over QUICK_SAMPLES then. Until
-# CALM_SAMPLES later a sample judges the members only if one of them explains it.
-cdef double STEADY = 1.5, CALM_SAMPLES = 40.0
-# Averages that have to follow soon are over so many samples, or steps of y.
-cdef double QUICK_SAMPLES = 30.0
+# differences of y are too, the noise has grown. It is averaged over QUICK_SAMPLES then, as are the
+# steps of y.
+cdef double STEADY = 1.5, QUICK_SAMPLES = 40.0
 # With a larger share of multiples of the quantum among the steps of y it is quantised.
 cdef double LATTICE_SHARE = 0.9
 cdef double HIDDEN = 4.0  # noise of so many times the variance of rounding hides the quanta
@@ -192,8 +190,7 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
     Follow the noise of y of each colour, by the innovations of its likeliest members (D 29).
 
     In the sample, `grown` is how much larger than expected squared innovations have been of late,
-    for every member, and squared differences too: more than 1 while the noise grows. `best_fit` is
-    the least squared innovation, over its variance, of the members that can judge.
+    for every member, and squared differences too: more than 1 while the noise grows.
     """
     cdef Work* w = &m.work
     cdef Sample* sample = &w.sample
@@ -211,9 +208,8 @@ cdef VECTORISED follow_noise(Members* m) noexcept nogil:
         m.short_mean[g] += SHORT_SHARE * (ratio - m.short_mean[g])
         w.ratio[g] = ratio
         w.one[g] = -m.short_mean[g] if variance <= widest else -INFINITY
-        w.two[g] = -ratio if variance <= widest and m.score[g] > -FADED else -INFINITY
     least = fmin(m.shared.roughness, -largest(w.one, active))
-    sample.grown, sample.best_fit = fmax(least, 1.0), -largest(w.two, active)
+    sample.grown = fmax(least, 1.0)
     for c in range(COLOURS):
         best[c], weights[c], squares[c] = -INFINITY, 0.0, 0.0
     best[0] = largest(m.score, HALF)

@@ -17,7 +17,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     MOST_ORDER, MOST_STATES, Members, ORDERS, Sample, Shared, WINDOW, Work, entry, find_tuning, put
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    APART, CALM_SAMPLES, FADED, ROUNDED, STEADY, fill_noise, find_knowing, follow_differences,
+    APART, FADED, ROUNDED, STEADY, fill_noise, find_knowing, follow_differences,
     follow_noise, follow_quantum, follow_stamps, is_likely, rounding
 )
 from fhaosmo_ros.core.observer.self_tuning.start cimport gather
@@ -376,23 +376,18 @@ cdef class SelfTuning(Structure):
     cdef void take_sample(self) noexcept nogil:
         """Correct the members by a sample, and weigh them."""
         cdef Members* m = self.members
-        cdef Shared* shared = &m.shared
         cdef Sample* sample = &m.work.sample
-        cdef bint quantised = sample.quanta > 0.0, calm, judged
-        cdef double kept
+        cdef bint quantised = sample.quanta > 0.0
+        cdef double kept = sample.kept
         follow_noise(m)
-        shared.calm = shared.calm + 1.0 if sample.grown <= STEADY else 0.0
-        calm = shared.calm > CALM_SAMPLES
-        judged = (calm or sample.best_fit < HUBER * HUBER) and (
-            sample.roughness <= HUBER * HUBER or quantised
-        )
-        kept = sample.kept if judged else -1.0
+        if sample.roughness > HUBER * HUBER and not quantised:
+            kept = -1.0  # it does not judge them
         follow_innovations(m)
         if quantised:
             take_interval(m, kept)
         correct(m, quantised)
         if not quantised:
-            judge(m, sample.grown, kept, calm)
+            judge(m, sample.grown, kept)
         correct_states(m, sample.y)
         weigh(m, QUANTISED_FLOOR if quantised else FLOOR)
 

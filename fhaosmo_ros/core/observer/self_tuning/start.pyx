@@ -11,7 +11,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     ORDERS, Shared, factorial, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    CALM_SAMPLES, LATTICE_SHARE, ROUNDED, follow_differences, is_multiple
+    LATTICE_SHARE, ROUNDED, follow_differences, is_multiple
 )
 from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, weigh
 
@@ -188,7 +188,7 @@ cdef void begin(Members* m, double noise) noexcept nogil:
         m.kappa[g], m.correlation[g] = DECAY * omega, GRID.correlation[c]
         m.tau[g] = -period / log(GRID.correlation[c]) if c > 0 else 0.0
     memset(m.difference, 0, sizeof(m.difference))
-    shared.roughness, shared.calm = 1.0, CALM_SAMPLES + 1.0
+    shared.roughness = 1.0
     for j in range(shared.samples):
         follow_differences(m, m.first_y[j])
     memset(&m.x, 0, sizeof(Estimates))

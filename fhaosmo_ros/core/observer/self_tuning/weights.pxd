@@ -15,7 +15,7 @@ cdef struct Model:
 
 cdef double FLOOR, QUANTISED_FLOOR
 
-cdef VECTORISED judge(Members* m, double grown, double kept, bint calm) noexcept nogil
+cdef VECTORISED judge(Members* m, double grown, double kept) noexcept nogil
 cdef VECTORISED weigh(Members* m, double floor) noexcept nogil
 cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) noexcept nogil
 cdef void tell_model(Members* m, double slider, bint jumped, Model* model) noexcept nogil

@@ -19,17 +19,16 @@ cdef double FLOOR = 30.0, QUANTISED_FLOOR = 100.0
 cdef double CLEARLY = 2.0
 
 
-cdef VECTORISED judge(Members* m, double grown, double kept, bint calm) noexcept nogil:
+cdef VECTORISED judge(Members* m, double grown, double kept) noexcept nogil:
     """
     Take a sample into the log-likelihoods, and bound the innovations (D 27, D 28), in place.
 
     `kept` is the part of the log-likelihoods that is not forgotten; negative to leave them as they
-    are. If the noise has been calm of late, samples in a row that are far off a member are not
-    outliers, but its fault.
+    are. Samples in a row that are far off a member are not outliers, but its fault.
     """
     cdef Work* w = &m.work
     cdef Py_ssize_t g, active = m.shared.active
-    cdef double slack = 1.0 if calm else 0.0, late, likelihood, most, limit
+    cdef double late, likelihood, most, limit
     cdef double logs[COLOURS]
     for g in range(active):
         w.ratio[g] = w.b[g] * w.b[g] / (w.s[g] * w.noise[g])
@@ -39,7 +38,7 @@ cdef VECTORISED judge(Members* m, double grown, double kept, bint calm) noexcept
             logs[g] = log(w.now[g] / m.shared.first_noise)
         fill(w.one, logs)
         for g in range(active):
-            late = slack * (m.far[g] - 1.0 if m.far[g] > 1.0 else 0.0)
+            late = m.far[g] - 1.0 if m.far[g] > 1.0 else 0.0
             most = HUBER * HUBER * (1.0 + late * late)
             likelihood = w.ratio[g] / grown
             likelihood = likelihood if likelihood < most else most
