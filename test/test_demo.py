@@ -75,7 +75,7 @@ def test_shipped_demonstration_changes_the_plant(tmp_path):
     assert run_.curves.gamma is None  # there is no power
     end = run_.t > run_.t[-1] - 0.5
     true = np.std((run_.y.values.ravel()[run_.rows] - run_.truth[:, 0])[end])
-    assert true > 0.8e-4
+    assert true > 0.5e-4  # of some 50 samples
     found = np.median(run_.curves.tuning[end, 0])
     assert found > 0.5 * true  # jitter of a busy machine adds to it
 
