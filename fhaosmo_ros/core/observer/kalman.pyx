@@ -168,6 +168,12 @@ cdef class LinearModel:
         return np.array(whole)[:n, :n].copy(), np.array(q)[:n, :n].copy()
 
 
+def matern(rate, derivatives):
+    """Return the intensity of the white noise behind a Matern d of the RMS 1 (D 17)."""
+    k = derivatives
+    return (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2 / math.factorial(2 * k)
+
+
 class Uncertainty:
     """
     What the covariance of an observer follows from, by parameters (D 20).
@@ -212,9 +218,8 @@ class Uncertainty:
         rates[:n, :n] += jacobian
         rates[range(n, levels), range(n, levels)] = -decay
         rate = decay or p['unknown_input_rate']
-        factor = (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2 / math.factorial(2 * k)
         self.rates = rates
-        self.variance, self.intensity = p['noise_size'] ** 2, size**2 * factor
+        self.variance, self.intensity = p['noise_size'] ** 2, size**2 * matern(rate, k)
         self.linear = LinearModel(rates, self.intensity)
         self.fresh = np.zeros((levels, levels))
         self.fresh[range(n), range(n)] = np.square(STATES_DOUBT * sizes)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.model.triangular import TriangularModel
-from fhaosmo_ros.core.observer.kalman import innovations, LinearModel, stationary
+from fhaosmo_ros.core.observer.kalman import innovations, LinearModel, matern, stationary
 import numpy as np
 from numpy.typing import NDArray
 
@@ -79,8 +79,7 @@ class Likelihood:
 
     def size_of_input(self, design: Design, noise: float) -> float:
         """Return the RMS value of the Matern process of d."""
-        rate, k = design.decay, design.derivatives
-        of_unit = (2.0 * rate) ** (2 * k + 1) * math.factorial(k) ** 2 / math.factorial(2 * k)
+        of_unit = matern(design.decay, design.derivatives)
         return math.sqrt(self.intensity(design, noise) / of_unit)  # D 17
 
     def __call__(self, design: Design) -> Evaluation:
