@@ -7,6 +7,7 @@ from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 cdef double APART, FADED, LATTICE_SHARE, ROUGH, ROUNDED, STEADY
 
 cdef bint is_multiple(double step, double quantum, double y) noexcept nogil
+cdef double divided(double quantum, double step, double y) noexcept nogil
 cdef void follow_quantum(Members* m) noexcept nogil
 cdef double rounding(Members* m) noexcept nogil
 cdef void follow_differences(Members* m, double y) noexcept nogil

@@ -50,6 +50,12 @@ cdef bint is_multiple(double step, double quantum, double y) noexcept nogil:
     return tolerance < 0.1 * quantum and fabs(off) <= tolerance
 
 
+cdef double divided(double quantum, double step, double y) noexcept nogil:
+    """Return what a step that is no multiple leaves of the quantum, if that divides it."""
+    cdef double left = fabs(step - round(step / quantum) * quantum)
+    return left if not is_multiple(step, quantum, y) and is_multiple(quantum, left, y) else quantum
+
+
 cdef void follow_quantum(Members* m) noexcept nogil:
     """
     Take a sample that is used: is the step to it a multiple of the quantum? (D 29).
@@ -58,7 +64,7 @@ cdef void follow_quantum(Members* m) noexcept nogil:
     believed where it divides this one, or where y is not quantised by this one.
     """
     cdef Shared* shared = &m.shared
-    cdef double y = m.work.sample.y, step = fabs(y - m.work.sample.before), change
+    cdef double y = m.work.sample.y, step = fabs(y - m.work.sample.before), change, smaller
     cdef bint fits
     if step <= ROUNDED * fabs(y):
         return
@@ -68,7 +74,8 @@ cdef void follow_quantum(Members* m) noexcept nogil:
     if not fits:
         fits = is_multiple(shared.quantum, step, y)
         if fits or shared.lattice < LATTICE_SHARE:
-            shared.quantum = step
+            smaller = divided(shared.quantum, step, y)
+            shared.quantum = smaller if smaller < shared.quantum else step
     if not fits:
         shared.lattice -= shared.lattice / QUICK_SAMPLES
     elif change > 0.5 * shared.quantum:

@@ -223,7 +223,7 @@ cdef class SelfTuning(Structure):
         cdef double mean[MOST_STATES]
         cdef double expected, since = 0.0, speed
         cdef bint goes_on, likely, begins, jumped, rough, same
-        cdef int i, n = self.order, since_jump = 0
+        cdef int i, since_jump = 0
         sample.quanta = rounding(m)
         if choose_members(m, sample.quanta):
             weigh(m, FLOOR)
@@ -291,7 +291,6 @@ cdef class SelfTuning(Structure):
         mix(m, self.slider, mean, self.trial_variances)
         for i in range(self.levels):
             self.trial[i].z_hat = mean[i]
-        shared.size_of_d += (mean[n] * mean[n] - shared.size_of_d) / sample.average
         tell_model(m, self.slider, jumped, &self.trial_model)
         for i in range(shared.active):
             if m.far[i] > LOST_SAMPLES:  # far off for long

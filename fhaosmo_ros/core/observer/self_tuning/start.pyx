@@ -11,7 +11,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     ORDERS, Shared, factorial, pair, power
 )
 from fhaosmo_ros.core.observer.self_tuning.noise cimport (
-    LATTICE_SHARE, ROUNDED, follow_differences, is_multiple
+    LATTICE_SHARE, ROUNDED, divided, follow_differences, is_multiple
 )
 from fhaosmo_ros.core.observer.self_tuning.weights cimport FLOOR, weigh
 
@@ -70,13 +70,27 @@ cdef void drop_first(Members* m, int dropped, int count) noexcept nogil:
 
 cdef bint on_lattice(const double* values) noexcept nogil:
     """Return True if `CHANGING` steps seem to be those of a quantised y."""
+    return share_of_multiples(
+        values, CHANGING + 1, find_quantum(values, CHANGING + 1, 0.0)
+    ) > LATTICE_SHARE
+
+
+cdef double find_quantum(const double* values, int count, double least) noexcept nogil:
+    """
+    Return the smallest step above `least`; INFINITY if none is.
+
+    Where others are no multiples, it may be one itself, of what they leave of it: 2 of 2, 3, 2, ..
+    """
     cdef double quantum = INFINITY, step
     cdef int i
-    for i in range(CHANGING):
-        step = fabs(values[i + 1] - values[i])
-        if step > 0.0:
+    for i in range(1, count):
+        step = fabs(values[i] - values[i - 1])
+        if step > least:
             quantum = fmin(quantum, step)
-    return share_of_multiples(values, CHANGING + 1, quantum) > LATTICE_SHARE
+    for i in range(1, count):
+        if share_of_multiples(values, count, quantum) < LATTICE_SHARE:
+            quantum = divided(quantum, fabs(values[i] - values[i - 1]), values[i])
+    return quantum
 
 
 cdef double share_of_multiples(const double* values, int count, double quantum) noexcept nogil:
@@ -117,7 +131,8 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
     cdef double differences[FIRST_SAMPLES]
     cdef double values[FIRST_SAMPLES]
     cdef double rough[DIFFERENCES]
-    cdef double noise = INFINITY, binomial = 1.0, quantum = INFINITY, size, period = 0.0
+    cdef double quantum = find_quantum(m.first_y, shared.samples, ROUNDED * largest)
+    cdef double noise = INFINITY, binomial = 1.0, size, period = 0.0
     cdef int count = shared.samples, order, i, c
     for i in range(count):
         differences[i] = m.first_y[i]
@@ -127,8 +142,6 @@ cdef double find_noise(Members* m, double least, double largest) noexcept nogil:
         for i in range(count - order):
             differences[i] = differences[i + 1] - differences[i]
             values[i] = fabs(differences[i])
-            if order == 1 and values[i] > ROUNDED * largest:
-                quantum = fmin(quantum, values[i])
         size = ranked(values, count - order, 0.5) / MEDIAN / sqrt(binomial)
         if size > 0.0:
             noise = fmin(noise, size)

@@ -5,8 +5,8 @@ from libc.math cimport M_PI, NAN, cos, exp, floor as floor_of, fmin, isfinite, l
 
 from fhaosmo_ros.core.observer.self_tuning.filters cimport HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
-    BANDS, BAND_STEP, COLOURS, COUNT, GRID, HALF, IN_BAND, Members, ORDERS, Shared, Work, entry,
-    fill, largest, power
+    BANDS, BAND_STEP, COLOURS, COUNT, FIRST_SAMPLES, GRID, HALF, IN_BAND, Members, ORDERS, Shared,
+    Work, entry, fill, largest, power
 )
 from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
 from fhaosmo_ros.core.observer.structure cimport GATE
@@ -110,6 +110,8 @@ cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) 
     """
     Write the mean of the members' estimates of z, d, d', .., and its variances (D 28).
 
+    Members do not know how large d usually is: where their estimates of it are vague, they are
+    drawn to 0, as for a d whose standard deviation is `HUBER` times its size of late.
     The first one is NaN if a member, or its weight, is lost: where Phi or P grows without a limit.
     """
     cdef Work* w = &m.work
@@ -143,5 +145,16 @@ cdef VECTORISED mix(Members* m, double slider, double* mean, double* variances) 
                 off = (p[g] if p[g] > 0.0 else 0.0) + off * off
                 total += weight[g] * off if weight[g] > 0.0 else 0.0
         variances[i] = total
+    total = m.shared.size_of_d + (
+        mean[n] * mean[n] - m.shared.size_of_d
+    ) / (w.sample.average - FIRST_SAMPLES)
+    m.shared.size_of_d = total
+    if total > 0.0:
+        c, total = HUBER * HUBER * total, 0.0
+        z, p = &w.d[0][0], &m.p.dd[0][0][0]
+        for g in range(active):
+            off = weight[g] * z[g] * (c / (c + (p[g] if p[g] > 0.0 else 0.0)))
+            total += off if weight[g] > 0.0 else 0.0
+        mean[n] = total
     if not isfinite(lost):
         mean[0] = NAN
