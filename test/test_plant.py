@@ -78,10 +78,11 @@ def test_samples_equal_a_simulation():
 
 
 def test_known_input_acts_during_the_interval_that_ends_at_its_time():
+    t, u = np.array([0.0, 0.25, 0.4, 1.0]), np.array([9.0, 1.0, -2.0, 0.5])
     plant = Plant(REST | {'phi': ['u'], 'initial_state': 0.0})
-    assert plant.model.uses_input
-    truth = plant.simulate([0.0, 0.5, 1.0], [99.0, 2.0, -6.0])
-    np.testing.assert_allclose(truth.z[:, 0], [0.0, 1.0, -2.0], atol=1e-12)
+    z, _ = respond(plant.model, [0.0], t, [0.0, 0.0], 1.0, u)
+    for found in z, plant.simulate(t, u).z:
+        np.testing.assert_allclose(found[:, 0], np.cumsum(u * np.diff(t, prepend=0)), atol=1e-12)
 
 
 def test_live_change_acts_from_now_on():
@@ -92,36 +93,29 @@ def test_live_change_acts_from_now_on():
     # A change may act from the last point of the grid on, one integration step earlier.
     np.testing.assert_allclose(truth.z, [2.0], atol=2.0 * plant.parameters['integration_step'])
     assert truth.unknown_input == 2.0
+    noise = Plant(REST | {'noise_std': 1.0})
+    first = [noise.sample(t).y for t in (0.1, 0.2, 0.3)]
+    noise.configure({'noise_seed': 1})  # begins the noise again
+    np.testing.assert_array_equal([noise.sample(t).y for t in (0.4, 0.5, 0.6)], first)
 
 
-def test_setting_the_seed_starts_the_noise_again():
-    plant = Plant(REST | {'noise_std': 1.0})
-    first = [plant.sample(t).y for t in (0.1, 0.2, 0.3)]
-    plant.configure({'noise_seed': 1})
-    np.testing.assert_array_equal([plant.sample(t).y for t in (0.4, 0.5, 0.6)], first)
-
-
-@pytest.mark.parametrize(('changes', 'reason'), [
-    ({'noise_std': -1.0}, '>= 0'), ({'initial_state': [9.0]}, "can't change in a running plant"),
-    ({'nois_std': 1.0}, "did you mean 'noise_std'"),
-])  # fmt: skip
-def test_refused_change_changes_nothing(changes, reason):
+def test_refused_change_or_time_changes_nothing():
     plant = Plant()
     before = plant.parameters
-    with pytest.raises(ConfigurationError, match=reason):
-        plant.configure({'disturbance_amplitude': 9.0} | changes)
+    for changes, reason in (
+        ({'noise_std': -1.0}, '>= 0'), ({'nois_std': 1.0}, "did you mean 'noise_std'"),
+        ({'initial_state': [9.0]}, "can't change in a running plant"),
+    ):  # fmt: skip
+        with pytest.raises(ConfigurationError, match=reason):
+            plant.configure({'disturbance_amplitude': 9.0} | changes)
+    for t in np.nan, np.inf, -np.inf:
+        for call in (plant.advance, plant.sample, lambda t: plant.simulate([0.0, t])):
+            with pytest.raises(ConfigurationError, match='expected finite time'):
+                call(t)
     assert plant.parameters == before
+    assert plant.sample(np.pi / 2.0).unknown_input == Plant().sample(np.pi / 2.0).unknown_input
     with pytest.raises(ConfigurationError, match=r"'initial_state'.*1 or 3 values.*\[1.0, 2.0\]"):
         Plant({'initial_state': [1.0, 2.0]})
-    assert plant.sample(np.pi / 2.0).unknown_input == Plant().sample(np.pi / 2.0).unknown_input
-
-
-@pytest.mark.parametrize('t', [np.nan, np.inf, -np.inf])
-def test_time_that_is_not_finite_is_refused(t):
-    plant = Plant()
-    for call in (plant.advance, plant.sample, lambda t: plant.simulate([0.0, t])):
-        with pytest.raises(ConfigurationError, match=r'expected (a )?finite time'):
-            call(t)
 
 
 # Training recordings: seeded, true to their parameters, and solved accurately
@@ -158,18 +152,10 @@ def test_response_is_that_of_the_plant():
     """Between the table's points d is a line: its error is (omega spacing)^2 / 8 of d."""
     t = np.arange(0.0, 5.0, 1e-3)
     table = 0.1 * np.sin(3.0 * np.arange(0.0, 5.1, 1e-4))
-    model = TriangularModel(['0', '0', '-z3'])
-    z, d = respond(model, [0.2, 0.2, 0.2], t, table, 1e-4)
+    z, d = respond(TriangularModel(['0', '0', '-z3']), [0.2, 0.2, 0.2], t, table, 1e-4)
     truth = Plant({'disturbance_omega': 3.0, 'initial_state': 0.2}).simulate(t)
     np.testing.assert_allclose(z, truth.z, atol=1e-7)
     np.testing.assert_allclose(d, truth.unknown_input, atol=1e-8)
-
-
-def test_known_input_is_held_during_the_interval_that_ends_at_its_sample():
-    t = np.array([0.0, 0.25, 0.4, 1.0])
-    u = np.array([9.0, 1.0, -2.0, 0.5])
-    z, _ = respond(TriangularModel(['u']), [0.0], t, [0.0, 0.0], 1.0, u)
-    np.testing.assert_allclose(z[:, 0], np.cumsum(u * np.diff(t, prepend=0.0)), atol=1e-12)
 
 
 def test_noise_quantisation_jitter_and_dropouts_are_as_asked():
