@@ -5,7 +5,7 @@ import ast
 import math
 
 from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, TriangularModel
-from fhaosmo_ros.core.model.expressions import FUNCTIONS, MAX_LENGTH, MAX_OPERATIONS, parse
+from fhaosmo_ros.core.model.expressions import MAX_LENGTH, MAX_OPERATIONS, parse
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,27 +13,20 @@ import numpy as np
 import pytest
 from yaml_texts import ANY_TEXT
 
-Z, U = np.array([0.7, -1.3, 2.1]), 0.4
-NAMES = {'z1': Z[0], 'z2': Z[1], 'z3': Z[2], 'u': U} | {
-    name: getattr(np, name) for name in FUNCTIONS
-}
-NAMES |= {'pi': math.pi, 'atan2': math.atan2, 'min': min, 'max': max}
-
+# How it is written; values of all functions are compared with sympy's in test_jacobian.py.
 ACCEPTED = [
-    '0', '-0', '1', '1.5e-3', '.5', '5.', '1_000', '0x10', '-z3', '+z1', 'u', '--z1', ' z1 ',
-    'z1 + z2 - z3*u', 'z1/z2/z3', 'z1 - z2 - z3', '-z1**2', '(-z1)**2', '2**3**0.5', 'z1**-2',
-    '-0.5*z2 - sin(z1)', 'sin(cos(tan(z1)))', 'exp(-z1**2)', 'log(abs(z2))', 'sqrt(z1**2 + 1)',
-    'tanh(u)*sign(z2)', '(z1 + z2)*(z1 - z2)', '(z1\n+ z2)', 'z1  # a comment', 'abs(-z1)',
-    '1/(1 + exp(-z3))', '3.7*sin(2*u) - 0.1*z3*abs(z3)', '*'.join(['z1'] * 40),
-    'pi', '2*pi*z1', 'atan2(z1, z2)', 'atan2(0*z1, -1)', 'min(z1, z2)', 'max(z1, 0)',
-    'max(min(z2, 1), -1)', 'min(z1, z2, z3, u)', 'max(1, 2, z1)', 'atan2(sin(z1), cos(z2))',
+    '0', '-0', '1.5e-3', '.5', '5.', '1_000', '0x10', '-z3', '+z1', 'u', '--z1', ' z1 ',
+    'z1/z2/z3', '-z1**2', '2**3**0.5', 'z1**-2', '(z1\n+ z2)', 'z1  # a comment',
+    '*'.join(['z1'] * 40), '2*pi*z1', 'min(z1, z2, z3, u)', 'max(1, 2, z1)',
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize('text', ACCEPTED)
-def test_value_is_that_of_python_and_numpy(text):
-    expected = eval(text.strip(), {'__builtins__': {}}, NAMES)  # noqa: S307  our own list
-    got = TriangularModel(['0', '0', text]).evaluate(Z, U)
+def test_value_is_that_of_python(text):
+    z, u = np.array([0.7, -1.3, 2.1]), 0.4
+    names = {'z1': z[0], 'z2': z[1], 'z3': z[2], 'u': u, 'pi': math.pi, 'min': min, 'max': max}
+    expected = eval(text.strip(), {'__builtins__': {}}, names)  # noqa: S307  our own list
+    got = TriangularModel(['0', '0', text]).evaluate(z, u)
     np.testing.assert_allclose(got, [0.0, 0.0, expected], rtol=1e-14)
 
 
@@ -41,22 +34,18 @@ REFUSED = [
     # code
     "__import__('os').system('true')", 'z1.__class__', 'z1' + '.a' * 240, 'eval(z1)', 'lambda: 1',
     '[z1 for z1 in (1, 2)]', "f'{z1}'", "'z1'", '(z1 := 2)', 'z1; z2', 'z1[0]', '[z1]',
-    'z1 if z2 else z3', 'z1 and z2', '~z1', 'z1 % z2', 'z1 << 2', '(yield z1)', '*z1',
-    # calls
-    'sin(z1, z2)', 'sin(x=z1)', 'sin(**z1)', 'sin', 'sin(z1)(z2)', 'sinh(z1)', 'atan2(z1, z2, z3)',
-    # names
-    'z0', 'z01', 'z', 'z4', 'x', 'pi(2)', 'max', '-False',
+    'z1 if z2 else z3', 'z1 and z2', '~z1', 'z1 % z2', '(yield z1)', '*z1',
+    # calls and names
+    'sin(z1, z2)', 'sin(x=z1)', 'sin(**z1)', 'sin', 'sin(z1)(z2)', 'atan2(z1, z2, z3)',
+    'z0', 'z01', 'z', 'x', 'pi(2)', 'max', '-False',
     # numbers
     '1j', 'inf', '1e999', '9' * 400, '9**9**9**9', '1/0', 'log(0)',
-    # text; Python reads full-width letters as z1
-    '', '# z1', 'z1 +', '2 z1', 'z1\0', 'z1\ud800', '\uff5a\uff11',
-    '\U0001d42c\U0001d422\U0001d427(z1)', 'z\u0663', '\u2212z1',
+    # text; Python reads full-width letters as z1, and warns of the last two
+    '', '# z1', 'z1 +', 'z1\0', 'z1\ud800', '\uff5a\uff11', 'z\u0663', '1if z1 else 2', '"\\d"',
     # size
     '0' + '+0' * MAX_LENGTH, 'z1+' * 1_000_000 + 'z1', '(' * 240 + 'z1' + ')' * 240,
     '+'.join(['z1'] * 120), '[' * 190 + ']' * 190, '(' * 50_000 + 'z1' + ')' * 50_000,
     '+'.join(['(' + '-' * 20 + 'z1)'] * 15), '+'.join(['tan(' * 16 + 'z1' + ')' * 16] * 6),
-    # what Python warns of
-    '1if z1 else 2', '"\\d"',
 ]  # fmt: skip
 
 
@@ -76,14 +65,12 @@ def test_anything_else_is_refused_in_one_line(text, recwarn):
 
 @pytest.mark.parametrize(('text', 'reason'), [
     ('z4 + z1', 'z4 comes after z3: the model would not be triangular'),
-    ('snh(z1)', "unknown function 'snh'; did you mean"),
+    ('snh(z1)', "unknown function 'snh'; did you mean"), ('z1^2', 'a power is written z1**2'),
     ('z1 + sin', 'sin needs one argument'), ('z1.real', "'z1.real' is not allowed"),
     ('True', 'True is not a number'), ('1e400', 'a number is too large'),
     ('z1/(1 - 1)*0 + 1/0', 'a constant part of it is not a finite number'),
     ('2 z1', 'this is not an arithmetic expression'),
     ('-' * (MAX_OPERATIONS + 1) + 'z1', f'101 operations, at most {MAX_OPERATIONS}'),
-    ('+'.join(['tan(z1)'] * 51), f'101 operations, at most {MAX_OPERATIONS}'),
-    ('+'.join(['(-z1-u-1)'] * 26), f'103 operations, at most {MAX_OPERATIONS}'),
     ('z1' * MAX_LENGTH, f'{2 * MAX_LENGTH} characters, at most {MAX_LENGTH}'),
 ])  # fmt: skip
 def test_message_gives_the_reason(text, reason):
@@ -92,17 +79,9 @@ def test_message_gives_the_reason(text, reason):
     assert reason in str(error.value)
 
 
-def test_what_is_just_within_the_limits_is_accepted():
+def test_limits_themselves_are_allowed():
     parse('-' * MAX_OPERATIONS + 'z1', 1)
     parse('z1' + ' ' * (MAX_LENGTH - 4) + '+1', 1)
-
-
-@pytest.mark.parametrize(('level', 'later'), [(1, 2), (1, 3), (2, 3), (1, 12)])
-def test_later_state_is_refused(level, later):
-    phi = ['0', '0', '0']
-    phi[level - 1] = f'z1 + z{later}'
-    with pytest.raises(ConfigurationError, match=f'Phi_{level} .*z{later} comes after z{level}'):
-        TriangularModel(phi)
 
 
 @pytest.mark.parametrize(('phi', 'order'), [(['0'], 2), (['0', '0', '0'], 2), ([], 1)])
@@ -125,18 +104,12 @@ def test_any_text_is_either_an_expression_or_an_error(text):
     assert all(math.isfinite(i.operand) for i in tape)
 
 
-@pytest.mark.parametrize(
-    ('phi', 'uses'), [(['0', 'sin(u)'], True), (['0', 'sin(z1)'], False), (['0'], False)]
-)
-def test_known_input_is_noticed(phi, uses):
-    assert TriangularModel(phi).uses_input == uses
-
-
 MOTOR = {'order': 2, 'phi': ['0', '(k*torque - b*z2 - m*9.81*sin(z1) + load)/m']}
 MOTOR |= {'inputs': ['torque', 'load'], 'constants.m': 2.0, 'constants.b': 0.5, 'constants.k': 3}
 
 
 def test_named_inputs_and_constants_stand_for_their_values():
+    assert not TriangularModel(['0', 'sin(z1)']).uses_input
     model = TriangularModel.of(OBSERVER_PARAMETERS.complete(MOTOR))
     assert model.inputs == model.used_inputs == ('torque', 'load')
     z, (torque, load) = np.array([0.3, -0.7]), (1.5, -0.2)
@@ -161,15 +134,13 @@ def test_named_model_is_the_same_as_one_with_numbers_and_a_constant_changes_live
 
 
 @pytest.mark.parametrize(('changes', 'said'), [
-    ({'phi': ['0', 'z1^2'], 'inputs': ['u']}, r'z1\*\*2'),
     ({'phi': ['0', 'torqe']}, "did you mean 'torque'"), ({'phi': ['0', 'g']}, "'constants.g'"),
     *(({'inputs': [name, 'torque', 'load']}, said) for name, said in (
         ('torque', 'once'), ('z1', 'taken'), ('pi', 'taken'), ('lambda', 'letter'),
         ('a b', 'letter'),
     )),
-    ({'constants.torque': 1.0}, 'once'), ({'constants.max': 1.0}, 'taken'),
-    ({'constants.': 1.0}, 'unknown parameter'), ({'constants.a.b': 1.0}, 'unknown parameter'),
-    ({'constants.m': np.inf}, 'constants.m'),
+    ({'constants.torque': 1.0}, 'once'), ({'constants.': 1.0}, 'unknown parameter'),
+    ({'constants.a.b': 1.0}, 'unknown parameter'), ({'constants.m': np.inf}, 'constants.m'),
 ])  # fmt: skip
 def test_bad_names_are_refused_in_words_that_help(changes, said):
     with pytest.raises(ConfigurationError, match=said):
