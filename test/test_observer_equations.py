@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The compiled recursion against the paper's equations, written down a second time.
+The compiled recursions against their equations, written down a second time.
 
-The reference below is plain Python, made from the paper and from docs/mathematics.md, not from the
-kernels: scipy's brentq solves the implicit equations. Its numbers are complex: the imaginary part
-is STEP times the derivative to gamma, so that the sensitivities come out of the arithmetic instead
-of out of variational equations (complex-step derivatives; Squire and Trapp 1998).
+The references below are plain Python, made from the paper and from docs/mathematics.md, not from
+the kernels: scipy's brentq solves the implicit equations, its solve_ivp follows the model. Numbers
+of the cascade are complex: the imaginary part is STEP times the derivative to gamma, so that the
+sensitivities come out of the arithmetic instead of out of variational equations (complex-step
+derivatives; Squire and Trapp 1998).
 """
 
 import cmath
@@ -16,6 +17,8 @@ from fhaosmo_ros.core.observer.fuzzy import curves
 import numpy as np
 from observer_cases import levels_of, VARIANTS
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 from scipy.optimize import brentq
 
 STEP = 1e-30
@@ -46,23 +49,13 @@ PHI = {
 
 
 class Reference:
-    """Plain recursion of design.md, section 2."""
+    """What the structures share: Phi, the power, and psi."""
 
-    def __init__(self, p, phi, y):
-        self.p, self.phi = p, phi
-        self.N = p['order'] + p['unknown_input']
+    def __init__(self, p, levels):
+        self.p, self.N, self.phi = p, levels, PHI[p['order']][1]
         self.sign = p['variant'].startswith('sign')
-        kappa = p['unknown_input_decay']
-        # z_{n+1}' = -kappa z_{n+1} + eta
-        self.phi = [*phi, lambda z, u: -kappa * z[p['order']]]
-        self.decay = [kappa if i == p['order'] - 1 else 0.0 for i in range(p['order'] + 1)]
-        self.hat = [complex(v) for v in p['initial_estimate']]
-        self.tilde = [complex(v) for v in p['initial_internal']]  # tilde[i] is z_tilde_{i+2}
-        if p['start_from_measurement']:
-            self.hat[0] = complex(y)
         self.gamma = p['gamma_initial'] if p['variant'].endswith('_adaptive') else 0.5
-        self.y = y
-        self.curves = curves(p, self.N)
+        self.curves = curves(p, levels)
 
     def psi(self, i, x):
         if self.sign:
@@ -77,6 +70,27 @@ class Reference:
         k = int(np.searchsorted(grid, a, side='right')) - 1
         rise = (self.curves[i][k + 1] - self.curves[i][k]) / (grid[k + 1] - grid[k])
         return complex(value, rise * x.imag)
+
+
+def root(function, low, high):
+    """Return it to the last bit: what is left must not grow to the tolerance within a run."""
+    return brentq(function, low, high, xtol=1e-300, rtol=4 * np.finfo(float).eps)
+
+
+class Cascade(Reference):
+    """Plain recursion of D 2 to D 10 and D 17."""
+
+    def __init__(self, p, y):
+        super().__init__(p, p['order'] + p['unknown_input'])
+        kappa = p['unknown_input_decay']
+        # z_{n+1}' = -kappa z_{n+1} + eta
+        self.phi = [*self.phi, lambda z, u: -kappa * z[p['order']]]
+        self.decay = [kappa if i == p['order'] - 1 else 0.0 for i in range(p['order'] + 1)]
+        self.hat = [complex(v) for v in p['initial_estimate']]
+        self.tilde = [complex(v) for v in p['initial_internal']]  # tilde[i] is z_tilde_{i+2}
+        if p['start_from_measurement']:
+            self.hat[0] = complex(y)
+        self.y = y
 
     def injection(self, i, eps, gamma):
         """Return |eps|^gamma psi(eps), 0 at 0."""
@@ -130,13 +144,10 @@ class Reference:
             injection = h * self.p['lambda'][i] * self.injection(i, e, gamma)
             return e + injection + stiffness * self.psi(i, e) - b
 
-        # To the last bit: what is left must not grow to the tolerance within the run.
-        a = brentq(
+        a = root(
             lambda a: balance(complex(math.copysign(a, b.real)), gamma, b).real,
             1e-300 if self.sign else 0.0,
             abs(b.real),
-            xtol=1e-300,
-            rtol=4 * np.finfo(float).eps,
         )
         e = math.copysign(a, b.real)
         to_e = slope(balance(complex(e, STEP), self.gamma, b.real))
@@ -161,6 +172,65 @@ class Reference:
         m = [self.y, *(v.real for v in self.tilde[: self.N - 1])]
         closed = [abs(m[i] - self.hat[i].real) > self.p['epsilon'] for i in range(self.N - 1)]
         return 1 + next((i for i, c in enumerate(closed) if c), self.N - 1)
+
+
+class Levant(Reference):
+    """z_hat_i' = z_hat_{i+1} + Phi_i + lambda_i |eps|^(2 gamma (N - i) / N) psi_i(eps)."""
+
+    def __init__(self, p):
+        super().__init__(p, p['order'] + 1 + p['unknown_input_derivatives'])
+        self.z = np.array(p['initial_estimate'])
+
+    def injections(self, e):
+        powers = [2.0 * self.gamma * (self.N - i) / self.N for i in range(1, self.N + 1)]
+        terms = zip(self.p['lambda'], powers, strict=True)
+        return np.array([g * abs(e) ** p * self.psi(i, e).real for i, (g, p) in enumerate(terms)])
+
+    def model(self, point, u):
+        decays = -self.p['unknown_input_decay'] * point[self.p['order'] :]
+        return np.array([*(f(point, u).real for f in self.phi), *decays])
+
+    def implicit(self, y, h, u):
+        """Solve (1 - h shift) z = old + h (Phi + injections(y - z_1)) for z."""
+        chain = np.eye(self.N) - h * np.eye(self.N, k=1)
+        drift = self.z + h * self.model(np.array([y, *self.z[1:]]), u)
+        self.correct(y, lambda v: np.linalg.solve(chain, drift + h * v), h**self.N)
+
+    def predict_correct(self, y, h, u):
+        """
+        Follow the model, then share each injection out like the correction of a deadbeat observer.
+
+        Ackermann's formula gives it for the shortest chain that the injection belongs to.
+        """
+
+        def rates(_, z):
+            return np.append(z[1:], 0.0) + self.model(z, u)
+
+        end = solve_ivp(rates, (0.0, h), self.z, 'DOP853', rtol=1e-13, atol=1e-13).y[:, -1]
+        held = np.zeros((self.N, self.N))
+        whole = expm(h * np.eye(self.N, k=1))
+        for j in range(1, self.N + 1):
+            step = whole[:j, :j]
+            seen = np.array([(step[:1] @ np.linalg.matrix_power(step, k))[0] for k in range(j)])
+            gain = np.linalg.matrix_power(step, j) @ np.linalg.solve(seen, np.eye(j)[-1])
+            held[:j, j - 1] = gain * h**j  # the first state takes all: gain[0] = 1
+        self.correct(y, lambda v: end + held @ v, h**self.N)
+
+    def correct(self, y, state, reach_of_last):
+        """Find the injections v for which y - state(v)_1 is the innovation that they belong to."""
+
+        def gap(e):  # decreases with e
+            return y - state(self.injections(e))[0] - e
+
+        b = y - state(np.zeros(self.N))[0]
+        gain = self.p['lambda'][-1]
+        last = np.eye(self.N)[-1] * gain
+        reach = y - state(last * np.sign(b))[0]
+        if self.sign and b * reach <= 0.0:  # the set-valued last sign can take it all
+            self.z = state(last * b / (gain * reach_of_last))
+            return
+        e = root(gap, math.copysign(1e-300, b), b)
+        self.z = state(self.injections(e))
 
 
 def parameters(n, extra, **others):
@@ -190,7 +260,7 @@ def signals(steps=300):
 
 def compare(p, rtol=1e-9):
     t, y, u = signals()
-    observer, reference = Observer(p), Reference(p, PHI[p['order']][1], y[0])
+    observer, reference = Observer(p), Cascade(p, y[0])
     result = observer.run(t, y, u)
     rows = []
     for k in range(len(t)):
@@ -209,7 +279,7 @@ def compare(p, rtol=1e-9):
 @pytest.mark.parametrize('n', [1, 2, 4])
 @pytest.mark.parametrize('variant', VARIANTS)
 @pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
-def test_run_follows_the_equations(scheme, variant, n, extra):
+def test_cascade_follows_the_equations(scheme, variant, n, extra):
     p = parameters(n, extra, scheme=scheme, variant=variant)
     result = compare(p)
     assert np.ptp(result.z_hat, axis=0).min() > 1e-3  # every level moved
@@ -231,6 +301,36 @@ def test_run_follows_the_equations(scheme, variant, n, extra):
     {'epsilon': 1e3, 'unknown_input_decay': 5.0},
     {'epsilon': 1e3, 'unknown_input_decay': 5.0, 'unknown_input': False},
 ], ids='-'.join)  # fmt: skip
-def test_options_follow_the_equations(scheme, options):
+def test_options_of_the_cascade_follow_the_equations(scheme, options):
     extra = options.get('unknown_input', True)
     compare(parameters(2, extra, scheme=scheme, variant='fuzzy_adaptive') | options)
+
+
+@pytest.mark.parametrize('derivatives', [0, 2])
+@pytest.mark.parametrize('decay', [0.0, 5.0])
+@pytest.mark.parametrize('n', [1, 2])
+@pytest.mark.parametrize('variant', VARIANTS)
+@pytest.mark.parametrize('scheme', ['implicit', 'predict_correct'])
+def test_levant_follows_the_equations(scheme, variant, n, decay, derivatives):
+    levels = n + 1 + derivatives
+    p = parameters(n, True, scheme=scheme, variant=variant, unknown_input_decay=decay) | {
+        'structure': 'levant', 'unknown_input_derivatives': derivatives, 'gamma_initial': 0.7,
+        'lambda': [2.0 * 3.0 ** (i + 1) for i in range(levels)],
+        'initial_estimate': list(np.linspace(0.1, -0.2, levels)), 'initial_internal': [0.0],
+        'alpha': [1.0],
+    }  # fmt: skip
+    t, y, u = signals(100)
+    y += 0.2 * np.sign(np.sin(9.0 * t))
+    result, reference = Observer(p).run(t, y, u), Levant(p)
+    z = [reference.z]
+    for k in range(1, len(t)):
+        getattr(reference, scheme)(y[k], t[k] - t[k - 1], u[k])
+        z.append(reference.z)
+    np.testing.assert_allclose(result.z_hat, z, rtol=1e-7, atol=1e-7)
+    assert np.ptp(result.z_hat, axis=0).min() > 0.1  # every level moved
+    np.testing.assert_array_equal(result.z_tilde[1:, :-1], result.z_hat[1:, 1:])
+    np.testing.assert_array_equal(result.z, result.z_hat[:, :n])
+    np.testing.assert_array_equal(result.unknown_input, result.z_hat[:, n])
+    np.testing.assert_allclose(result.innovation[:, 0], y - result.z_hat[:, 0])
+    np.testing.assert_array_equal(result.innovation[1:, 1:], 0.0)
+    np.testing.assert_array_equal(result.gamma, reference.gamma)  # nothing moves it here

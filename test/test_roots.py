@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cascade: the bounds of gamma, the root of an implicit level."""
+"""Both structures: the bounds of gamma, the roots of implicit equations."""
 
 from fhaosmo_ros.core import Observer, Status
 from fhaosmo_ros.core.observer.cascade import Cascade
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
+from fhaosmo_ros.core.observer.levant import Levant
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 import numpy as np
-from observer_cases import levels_of, powers, samples, SMALL
+from observer_cases import levels_of, powers, samples, SMALL, VARIANTS
 import pytest
 
 schemes = pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
@@ -113,3 +114,39 @@ def test_root_increases_with_the_right_side(b, factor, h, variant):
     assert s <= b / (30.0 * h * h) * (1.0 + 1e-12)
     assert more >= eps * (1.0 - 1e-12)
     assert t >= s * (1.0 - 1e-12)
+
+
+@settings(max_examples=400)
+@given(
+    st.sampled_from(VARIANTS), powers(-20.0, 6.0), powers(-6.0, 0.5),
+    powers(-3.0, 0.0) | st.sampled_from([1e-9, 1e-16, 1e-300]),
+    st.lists(powers(-6.0, 6.0), min_size=4, max_size=4), powers(-9.0, 6.0),
+)  # fmt: skip
+def test_root_of_levants_structure(variant, b, h, gamma, lambdas, width):
+    p = {'structure': 'levant', 'variant': variant, 'lambda': lambdas, 'fuzzy_widths': width}
+    levant = Levant(ObserverConfiguration(p))
+    weights = np.array(lambdas) * h ** np.arange(1, 5)
+    eps, w, top = levant.solve(weights, b, gamma)
+    s = np.array([levant.curve(i, eps)[0] for i in range(4)]) if eps > 0.0 else np.zeros(4)
+    assert eps == 0.0 or s[3] == top
+    if eps > 1e-299:
+        np.testing.assert_allclose(w, eps ** (gamma / 2.0), rtol=1e-12)
+    s[3] = top
+    assert np.all((s >= 0.0) & (s <= 1.0))
+    terms = np.append(weights * w ** np.arange(3, -1, -1) * s, eps)
+    np.testing.assert_allclose(terms.sum(), b, rtol=1e-11)
+
+
+@pytest.mark.parametrize('scheme', ['implicit', 'predict_correct'])
+def test_gamma_of_next_to_nothing_is_the_limit_of_small_ones(scheme):
+    p = {'structure': 'levant', 'scheme': scheme, 'variant': 'fuzzy_adaptive', 'gamma_rate': 0.0}
+    p |= {'lambda': [39.75, 276.3, 1498.0, 3260.0], 'fuzzy_widths': 4.0}
+    t = np.arange(0.0, 1.0, 1e-3)
+    small, smaller, *rest = (
+        Observer(p | {'gamma_min': gamma, 'gamma_initial': gamma}).run(t, np.sin(t)).z_hat
+        for gamma in (1e-6, 1e-9, 1e-12, 1e-15, 1e-18, 1e-300)
+    )
+    error = np.abs(small - smaller).max()
+    assert 0.0 < error < 1e-2
+    for z_hat in rest:
+        np.testing.assert_allclose(z_hat, smaller, rtol=0.0, atol=2e-3 * error)
