@@ -57,8 +57,7 @@ def test_powers_of_two_change_no_bit(order, a, b):
     np.testing.assert_array_equal(*in_units(a, b, order))
 
 
-@pytest.mark.parametrize('a', [1e-6, 1.0, 1e6])
-@pytest.mark.parametrize('b', [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize(('a', 'b'), [(1e-6, 1e6), (1e6, 1e-6), (1e6, 1e6), (1e-6, 1e-6)])
 def test_other_units_change_no_more_than_rounding_does(a, b):
     found, wanted = in_units(a, b, 2)
     known = np.isfinite(wanted).all(axis=1)
