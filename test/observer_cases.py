@@ -71,10 +71,6 @@ def powers(low, high):
     return st.floats(low, high).map(lambda x: 10.0**x)
 
 
-def concatenated(runs):
-    return [np.concatenate(parts) for parts in zip(*runs, strict=True)]
-
-
 def place(estimator, *values):
     """Put the estimates of z and d there, as if the observer had converged."""
     state, n = estimator.state_dict(), len(values) - 1

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/evidence.md says what its tables say; these have all cells and the findings of the paper."""
+"""docs/evidence.md says what its tables say; these have all cells and the paper's findings."""
 
-from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 import pytest
 import results
@@ -35,20 +34,6 @@ def test_tables_are_about_all_cells():
     assert simulations == {
         (s, name, w) for s in SOLVERS for name in paper.OBSERVERS for w in paper.FREQUENCIES
     }
-
-
-def test_a_table_is_read_as_it_was_written_and_the_page_is_filled(tmp_path):
-    page = tmp_path / evidence.PAGE
-    page.write_text('before\n<!-- begin a -->\nold\n<!-- end a -->\nafter\n')
-    rows = [{'name': 'x, y', 'value': 1.5, 'other': None}, {'name': 'z', 'value': 2e9, 'other': 0}]
-    evidence.publish(tmp_path, {'table': rows}, {'a': evidence.markdown(['h'], [['1']])}, {})
-    assert evidence.read('table', tmp_path) == rows
-    assert page.read_text() == (
-        'before\n<!-- begin a -->\n| h |\n| --- |\n| 1 |\n<!-- end a -->\nafter\n'
-    )
-    with pytest.raises(ConfigurationError, match='expected b, got a'):
-        evidence.publish(tmp_path, {'table': rows[:1]}, {'b': ''}, {})
-    assert evidence.read('table', tmp_path) == rows
 
 
 @pytest.fixture(scope='module')

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The curves psi against scikit-fuzzy's own control system, and what they promise."""
 
-from pathlib import Path
-
 from fhaosmo_ros.core import ConfigurationError
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
 from fhaosmo_ros.core.observer.fuzzy import curve, infer, KNOTS, read_system, SHAPES
@@ -162,11 +160,3 @@ def test_psi_is_bounded_monotone_and_continuous(law, level, a, b):
     # Lipschitz: the steepest piece of the curve is less than 5 times steeper than the diagonal.
     steepest = 5.0 / law.configuration.widths[level]
     assert high - low <= steepest * abs(b - a) + 1e-12
-
-
-def test_systems_in_the_documents_are_accepted():
-    page = Path(__file__).resolve().parents[1] / 'docs' / 'mathematics.md'
-    example = page.read_text().split('    fuzzy_systems:\n', 1)[1].split('\n\n', 1)[0]
-    systems = [line.strip().removeprefix('- ') for line in example.splitlines()]
-    assert len(systems) == 3
-    law(fuzzy_systems=systems)

@@ -11,10 +11,8 @@ import numpy as np
 from observer_cases import levels_of, powers, samples, SMALL, VARIANTS
 import pytest
 
-schemes = pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
 
-
-@schemes
+@pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
 def test_change_of_variant_starts_the_sensitivities_at_zero(scheme):
     observer = Observer(SMALL | {'scheme': scheme, 'variant': 'fuzzy_adaptive'})
     observer.run(*samples())
@@ -87,12 +85,15 @@ shapes = st.sampled_from(['triangle', 'gaussian'])
 @example(1e-12, 1.0, 0.01, 1e6, 1e-6, 1e-12, 'triangle', 0)
 @example(1e6, 1e-6, 1.0, 1e6, 1e6, 1e-12, 'triangle', 0)
 @example(1.0, 1.0, 0.01, 1e6, 1e6, 1e6, 'gaussian', 1)
+@example(5e-324, 1e-3, 0.5, 15.0, 30.0, 0.02, 'triangle', 0)
+@example(0.0, 1e-3, 0.5, 15.0, 30.0, 0.02, 'triangle', 0)
 def test_fuzzy_root(b, h, gamma, lambda_, alpha, width, shape, level):
     check(law('fuzzy_adaptive', lambda_, alpha, width, shape), b, h, gamma, level)
 
 
 @settings(max_examples=500)
 @given(sizes, periods, gains, gains)
+@example(1e-310, 1e-3, 15.0, 30.0)
 def test_sign_root(b, h, lambda_, alpha):
     eps, s = check(law('sign', lambda_, alpha, 1.0), b, h, 0.5, 0)  # no other power with sign
     stiffness = h * h * alpha
@@ -101,19 +102,6 @@ def test_sign_root(b, h, lambda_, alpha):
     elif b > stiffness * (1.0 + 1e-9):
         assert s == 1.0
         assert eps > 0.0
-
-
-@given(sizes, st.floats(1.0, 10.0), periods, st.sampled_from(['sign', 'fuzzy_adaptive']))
-@example(1e-310, 1.0, 1e-3, 'sign')
-@example(5e-324, 1.0, 1e-3, 'fuzzy_adaptive')
-@example(0.0, 1.0, 1e-3, 'fuzzy_adaptive')
-def test_root_increases_with_the_right_side(b, factor, h, variant):
-    cascade = law(variant, 15.0, 30.0, 0.02)
-    (eps, s), (more, t) = (cascade.solve(0, x, h, 0.5) for x in (b, b * factor))
-    assert 0.0 <= eps <= b
-    assert s <= b / (30.0 * h * h) * (1.0 + 1e-12)
-    assert more >= eps * (1.0 - 1e-12)
-    assert t >= s * (1.0 - 1e-12)
 
 
 @settings(max_examples=400)

@@ -90,10 +90,6 @@ def assert_finite(estimator):
         assert np.isfinite(numbers).all(), estimate
 
 
-def same(one, other):
-    np.testing.assert_equal(one._asdict(), other._asdict())
-
-
 @pytest.mark.parametrize('duplicate', [
     copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x)),  # noqa: S301
 ])  # fmt: skip
@@ -102,10 +98,11 @@ def test_a_copy_goes_on_by_itself(kind, duplicate):
     estimator = running(KINDS[kind], 300, 1)
     other = duplicate(running(KINDS[kind], 300, 1))  # what it was made from is gone
     found = other.run(STAMPS, Y)
-    same(found, estimator.run(STAMPS, Y))
+    np.testing.assert_equal(found._asdict(), estimator.run(STAMPS, Y)._asdict())
     third = duplicate(estimator)
     estimator.run(STAMPS + 10**9, -Y)
-    same(third.run(STAMPS + 2 * 10**8, Y), other.run(STAMPS + 2 * 10**8, Y))
+    later, wanted = (one.run(STAMPS + 2 * 10**8, Y) for one in (third, other))
+    np.testing.assert_equal(later._asdict(), wanted._asdict())
 
 
 @kinds
@@ -126,16 +123,12 @@ def test_hostile_calls(kind):
     """Call with numbers, and with what is no number, in any order."""
     rng = np.random.default_rng(4)
 
-    def wild():
-        choice = rng.random()
-        if choice < 0.1:
-            return NO_NUMBERS[rng.integers(len(NO_NUMBERS))]
-        return WILD[rng.integers(len(WILD))] if choice < 0.6 else float(rng.normal())
+    def wild(*others):
+        values = [*WILD, *NO_NUMBERS, *others, *rng.normal(size=20)]
+        return values[rng.integers(len(values))]
 
     def stamp():
-        if rng.random() < 0.3:
-            return WILD_STAMPS[rng.integers(len(WILD_STAMPS))]
-        return int(rng.integers(10**9, 2 * 10**9))
+        return wild(*WILD_STAMPS, *range(10**9, 2 * 10**9, 10**7))
 
     estimator, known = running(KINDS[kind], 50, 4), Observer().parameters
     observer = Observer({k: v for k, v in KINDS[kind].items() if k in known})
