@@ -273,12 +273,22 @@ def curve(text: str) -> Curve:
         The text is no system, or its curve falls, stays 0, or leaves [-1, 1].
 
     """
-    system = read_system(text)
+    x, system = np.linspace(0.0, 1.0, KNOTS), read_system(text)
     if isinstance(system, FuzzySystem):
-        psi = inferred(system)
+        psi = infer(x, system)
+        psi[0] = 0.0  # an odd curve is 0 there; the inference leaves rounding errors
+        # What falls by less than the grid of the output universe can tell does not fall.
+        level = np.maximum.accumulate(psi)
+        psi = np.where(level - psi < SMALL, level, psi)
     else:
-        psi = np.interp(np.linspace(0.0, 1.0, KNOTS), np.linspace(0.0, 1.0, len(system)), system)
-    _expect_rising(text, psi)
+        psi = np.interp(x, np.linspace(0.0, 1.0, len(system)), system)
+    k = int(np.diff(psi).argmin())
+    if psi[k + 1] < psi[k]:
+        got = f'psi({x[k]:.3g}) = {psi[k]:.4g}, psi({x[k + 1]:.3g}) = {psi[k + 1]:.4g}'
+        raise _refused(text, 'a curve that does not fall', got)
+    if not SMALL < psi[-1] <= 1.0:
+        got = f'psi(1) = {psi[-1]:.4g}'
+        raise _refused(text, 'a curve that ends above 0 and at most at 1', got)
     psi /= psi[-1]
     psi.flags.writeable = False
     return psi
@@ -293,24 +303,3 @@ def curves(parameters: Mapping[str, Any], levels: int) -> Curve:
 def of_level(values: Sequence[Any], level: int) -> Any:
     """Return what a list says for a level (0-based): its last value serves those that follow."""
     return values[min(level, len(values) - 1)]
-
-
-def inferred(system: FuzzySystem) -> Curve:
-    """Return psi of a system at the knots, not normalised."""
-    psi = infer(np.linspace(0.0, 1.0, KNOTS), system)
-    psi[0] = 0.0  # an odd curve is 0 there; the inference leaves rounding errors
-    # What falls by less than the grid of the output universe can tell does not fall.
-    level = np.maximum.accumulate(psi)
-    return np.where(level - psi < SMALL, level, psi)
-
-
-def _expect_rising(text: str, psi: Curve) -> None:
-    """Raise unless psi is 0 at 0, does not fall, ends above 0, and is at most 1."""
-    k = int(np.diff(psi).argmin())
-    where = f'psi({k / (KNOTS - 1):.3g}) = {psi[k]:.4g}, psi({(k + 1) / (KNOTS - 1):.3g}) = '
-    if psi[k + 1] < psi[k]:
-        raise _refused(text, 'a curve that does not fall', f'{where}{psi[k + 1]:.4g}')
-    if not SMALL < psi[-1] <= 1.0:
-        raise _refused(
-            text, 'a curve that ends above 0 and at most at 1', f'psi(1) = {psi[-1]:.4g}'
-        )
