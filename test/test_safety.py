@@ -19,7 +19,6 @@ from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator, Stat
 from fhaosmo_ros.core.observer.status import FLAGS_MASK, LEVEL_SHIFT, REJECTED, UNUSED
 import numpy as np
 import pytest
-from waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[1]
 HOSTILE = int(os.environ.get('HOSTILE', '0'))
@@ -151,29 +150,25 @@ def test_hostile_calls(kind):
 def test_two_threads_on_one_estimator_get_an_error(kind):
     estimator = running(KINDS[kind], 100, 1)
     stamps = 2 * 10**9 + np.arange(20_000) * 10**6
-    seen = threading.Event()
+    said, refused = [], threading.Event()
 
     def run():
         k = 0
-        while not seen.is_set():
-            with contextlib.suppress(RuntimeError):  # or this thread is the one that is refused
+        while not refused.is_set():
+            try:
                 estimator.run(stamps + k * 20 * 10**9, np.zeros(len(stamps)))
+            except RuntimeError as error:
+                said.append(str(error))
+                refused.set()
             k += 1
 
-    def refused():
-        try:
-            estimator.update(1, 0.0)
-        except RuntimeError as error:
-            return 'another thread' in str(error)
-        return False
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        wait_until(refused, 'error', 60.0)
-    finally:
-        seen.set()
+    threads = [threading.Thread(target=run) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    assert refused.wait(60.0)
+    for thread in threads:
         thread.join()
+    assert 'another thread' in said[0]
     assert np.isfinite(estimator.observer.estimate.z).all()
 
 
