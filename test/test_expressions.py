@@ -118,15 +118,10 @@ def test_named_inputs_and_constants_stand_for_their_values():
     np.testing.assert_allclose(model.jacobian(z, [torque, load])[1], [-9.81 * np.cos(0.3), -0.25])
 
 
-def test_named_model_is_the_same_as_one_with_numbers_and_a_constant_changes_live():
-    numbers = {'order': 2, 'phi': ['0', '(3.0*u - 0.9*z2 - 2.0*9.81*sin(z1) + v)/2.0']}
+def test_a_constant_changes_live():
     names = Observer(MOTOR | {'gains': 'fixed'})
     names.configure({'constants.b': 0.9})
-    numbers = Observer(numbers | {'inputs': ['u', 'v'], 'gains': 'fixed'})
-    rng = np.random.default_rng(1)
-    t, y, u = np.arange(300) * 1e-3, rng.standard_normal(300), rng.standard_normal((300, 2))
-    for mine, other in zip(names.run(t, y, u), numbers.run(t, y, u), strict=True):
-        np.testing.assert_array_equal(mine, other)
+    np.testing.assert_allclose(names.model.jacobian(np.zeros(2), [0.0, 0.0])[1], [-9.81, -0.45])
     for bad in ({'constants.m': np.nan}, {'constants.q': 1.0}, {'constants.b': 'x'}):
         with pytest.raises(ConfigurationError, match=next(iter(bad)).rpartition('.')[2]):
             names.configure(bad)
