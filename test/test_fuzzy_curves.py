@@ -42,16 +42,16 @@ def memberships(universe, shape, peaks):
     return rows
 
 
-def oracle(inputs, outputs, rules):
-    """Return psi by a control system of scikit-fuzzy; inputs, outputs: shape and peaks."""
+def oracle(system):
+    """Return psi of a system, not normalised, by a control system of scikit-fuzzy."""
     # The grid interpolates an input's memberships and holds the output's; its spacing must fit
     # the peaks of the terms, which lie at multiples of 1/2, 1/3 and 1/10.
     universe = np.linspace(-1.0, 1.0, 12001)
     eps, out = control.Antecedent(universe, 'eps'), control.Consequent(universe, 'psi')
-    for variable, terms in ((eps, inputs), (out, outputs)):
+    for variable, terms in ((eps, system.inputs), (out, system.outputs)):
         for k, row in enumerate(memberships(universe, *terms)):
             variable[f't{k + 1}'] = row
-    rules = [control.Rule(eps[f't{k + 1}'], out[f't{j}']) for k, j in enumerate(rules)]
+    rules = [control.Rule(eps[f't{k + 1}'], out[f't{j + 1}']) for k, j in enumerate(system.rules)]
     simulation = control.ControlSystemSimulation(control.ControlSystem(rules))
 
     def psi(x):
@@ -67,31 +67,28 @@ INPUTS = [0.0, 1 / 512, 0.1, 0.125, 0.2503, 1 / 3, 0.4, 0.5, 0.5001, 2 / 3, 0.77
 P5, P7 = '-1 -0.4 0 0.4 1', '-0.9 -0.6 -0.2 0 0.2 0.6 0.9'
 
 
-@pytest.mark.parametrize(('terms', 'rules', 'inferred', 'between_knots'), [
+def test_text_is_read_as_a_system():
+    found = read_system(f'input 3; output gaussian {P5}; rules 1 3 5')
+    peaks = (-1.0, -0.4, 0.0, 0.4, 1.0)
+    assert found == (('triangle', (-1.0, 0.0, 1.0)), ('gaussian', peaks), (0, 2, 4))
+
+
+@pytest.mark.parametrize(('text', 'inferred', 'between_knots'), [
     # Knots are h = 1/192 apart, and every corner of an even triangle's curve is one. A smooth
     # curve leaves the straight line between two of them by h^2 / 8 times its curvature, some 10,
     # hence 4e-5; triangles are steeper beside their peaks, trapezoids have corners between knots.
-    ('triangle 5', '', 2e-6, 1.2e-4), ('triangle 7', '', 2e-6, 1.2e-4),
-    ('gaussian 5', '', 2e-6, 1.2e-4), ('gaussian 7', '', 2e-6, 1.2e-4),
-    ('trapezoid 5', '', 2e-6, 1e-3), ('trapezoid 7', '', 2e-6, 1e-3),
+    ('terms triangle 5', 2e-6, 1.2e-4), ('terms triangle 7', 2e-6, 1.2e-4),
+    ('terms gaussian 5', 2e-6, 1.2e-4), ('terms gaussian 7', 2e-6, 1.2e-4),
+    ('terms trapezoid 5', 2e-6, 1e-3), ('terms trapezoid 7', 2e-6, 1e-3),
     # Corners of other peaks are cut.
-    (f'triangle {P5}; triangle {P7}', '1 3 4 5 7', 1e-5, 5e-3),
-    (f'gaussian {P5}; trapezoid {P7}', '1 2 4 6 7', 1e-5, 5e-3),
-    (f'triangle {P5}; gaussian {P7}', '1 2 4 6 7', 1e-5, 5e-3),
+    (f'input triangle {P5}; output triangle {P7}; rules 1 3 4 5 7', 1e-5, 5e-3),
+    (f'input gaussian {P5}; output trapezoid {P7}; rules 1 2 4 6 7', 1e-5, 5e-3),
+    (f'input triangle {P5}; output gaussian {P7}; rules 1 2 4 6 7', 1e-5, 5e-3),
 ])  # fmt: skip
-def test_system_agrees_with_a_control_system_of_scikit_fuzzy(
-    terms, rules, inferred, between_knots
-):
+def test_system_agrees_with_a_control_system_of_scikit_fuzzy(text, inferred, between_knots):
     """Where nothing is interpolated between knots, only the output grids differ."""
-    sides, text = [], f'terms {terms}'
-    if rules:
-        text = f'input {terms.replace("; ", "; output ")}; rules {rules}'
-    for side in terms.split('; '):
-        shape, *peaks = side.split()
-        even = np.linspace(-1.0, 1.0, int(peaks[0])) if len(peaks) == 1 else None
-        sides.append((shape, [float(c) for c in peaks] if even is None else even))
-    numbers = [int(k) for k in rules.split()] or range(1, len(sides[0][1]) + 1)
-    psi, system, x = oracle(sides[0], sides[-1], numbers), read_system(text), np.array(INPUTS)
+    system, x = read_system(text), np.array(INPUTS)
+    psi = oracle(system)
     expected = np.array([psi(v) for v in x])
     for sign, wanted in (1.0, expected), (-1.0, [psi(-v) for v in x]):
         np.testing.assert_allclose(infer(sign * x, system), wanted, atol=inferred)
