@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A known delay of y: the inputs that acted then, the estimate's time, and the present."""
 
-from fhaosmo_ros.core import ConfigurationError, Family, Observer, OnlineEstimator
+from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator
 from fhaosmo_ros.core.online.policy import PIECES
 from fhaosmo_ros.core.simulation.plant import respond
-from fhaosmo_ros.tools.tuning.objective import Objective, TUNE_PARAMETERS
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -37,25 +36,24 @@ def late(y):
     return np.concatenate([np.full(LATE, np.nan), y[:-LATE]])
 
 
+@pytest.mark.parametrize('inputs_too', [False, True])
 @pytest.mark.parametrize('law', [
     {'scheme': 'predict_correct'}, {'scheme': 'implicit'},
     {'scheme': 'explicit', 'structure': 'cascade'},
 ])  # fmt: skip
-def test_late_samples_give_the_estimates_of_punctual_ones(law):
-    y, u = truth()[0][:, 0], voltage()
+def test_late_samples_give_the_estimates_of_punctual_ones(law, inputs_too):
+    y, u, delay = truth()[0][:, 0], voltage(), DELAYED['measurement_delay']
     punctual = OnlineEstimator(MOTOR | law).run(STAMPS, y, u)
-    delayed = OnlineEstimator(DELAYED | law).run(STAMPS, late(y), u)
-    np.testing.assert_array_equal(delayed.t[LATE:], punctual.t[:-LATE])
-    np.testing.assert_array_equal(delayed.z[LATE:], punctual.z[:-LATE])
-    np.testing.assert_array_equal(delayed.unknown_input[LATE:], punctual.unknown_input[:-LATE])
-
-
-def test_inputs_that_come_as_late_as_y_belong_to_it():
-    y, u = truth()[0][:, 0], voltage()
-    same = OnlineEstimator(DELAYED | {'input_delay': DELAYED['measurement_delay']})
-    found, wanted = same.run(STAMPS, y, u), OnlineEstimator(MOTOR).run(STAMPS, y, u)
-    np.testing.assert_array_equal(found.z, wanted.z)
-    np.testing.assert_array_equal(found.t, wanted.t - LATE * PERIOD)
+    if inputs_too:  # then all is as late
+        delayed = OnlineEstimator(DELAYED | law | {'input_delay': delay}).run(STAMPS, y, u)
+        now, then = slice(None), slice(None)
+        np.testing.assert_array_equal(delayed.t, STAMPS - LATE * PERIOD)
+    else:
+        delayed = OnlineEstimator(DELAYED | law).run(STAMPS, late(y), u)
+        now, then = slice(LATE, None), slice(-LATE)
+        np.testing.assert_array_equal(delayed.t[now], STAMPS[then])
+    np.testing.assert_array_equal(delayed.z[now], punctual.z[then])
+    np.testing.assert_array_equal(delayed.unknown_input[now], punctual.unknown_input[then])
 
 
 @pytest.mark.parametrize('estimate_from', ['internal', 'filtered'])
@@ -132,22 +130,3 @@ def test_more_pieces_than_there_is_room_for_lose_the_oldest():
 def test_input_later_than_y_is_refused():
     with pytest.raises(ConfigurationError, match='input_delay'):
         OnlineEstimator(DELAYED | {'input_delay': 0.05})
-
-
-def test_tuning_knows_of_the_delay():
-    model = {'order': 2, 'phi': ['0', '8*u - 3*z2'], 'measurement_delay': 0.05}
-    family = Family(model | {'duration': 6.0, 'sample_rate': 200.0, 'rms_of_d': 2.0,
-                             'disturbances': ['sines'], 'band_of_d': [0.5, 3.0],
-                             'initial_state': 0.0, 'integration_step': 1e-3})  # fmt: skip
-    recordings = family.recordings(2)
-    gains = {key: MOTOR[key] for key in ('structure', 'scheme', 'variant', 'lambda')} | model
-    gains['fuzzy_widths'] = [0.5]
-
-    def error(changes):
-        tuning = TUNE_PARAMETERS.complete({'settled': 2.0})
-        return Objective(recordings, tuning)(gains | changes).errors.max(axis=0)
-
-    then, now = error({}), error({'predict_to_now': True})
-    unknown = error({'measurement_delay': 0.0})
-    assert (then < 0.2 * unknown).all()  # z1, z2, d
-    assert (now[:2] < 0.2 * unknown[:2]).all()

@@ -50,63 +50,50 @@ def case():
     return tuple(values[:20_000] for values in (np.arange(count) * PERIOD, z, d, noise))
 
 
-@pytest.mark.parametrize(
-    ('phi', 'linear'),
-    [
-        (['0', '0', '-z3'], True), (['0', 'u/2 - 3*z2 + sin(u)'], True),
-        (['z1*2 - z1', '0'], True),
-        (['0', 'u*z2'], False), (['0', 'sin(z1)'], False), (['0', 'z1*z2'], False),
-        (['0', '1/(1 + z2)'], False), (['0', 'min(z1, 1)'], False), (['0', 'z2**2'], False),
-    ],
-)  # fmt: skip
-def test_linear_models_are_known(phi, linear):
+@pytest.mark.parametrize('phi', [
+    ['0', '0', '-z3'], ['0', 'u/2 - 3*z2 + sin(u)'], ['z1*2 - z1', '0'],
+])  # fmt: skip
+def test_linear_models_are_known(phi):
     """Only those may keep their covariances once they are steady."""
     model = TriangularModel(phi)
-    assert model.is_linear == linear
-    if linear:
-        points = np.random.default_rng(0).normal(size=(5, len(phi)))
-        slopes = [model.jacobian(z, 0.7) for z in points]
-        assert np.ptp(slopes, axis=0).max() < 1e-12
+    assert model.is_linear
+    points = np.random.default_rng(0).normal(size=(5, len(phi)))
+    assert np.ptp([model.jacobian(z, 0.7) for z in points], axis=0).max() < 1e-12
+    for last in ('u*z2', 'sin(z1)', 'z1*z2', '1/(1 + z2)', 'min(z1, 1)', 'z2**2'):
+        assert not TriangularModel(['0', last]).is_linear
 
 
-def test_it_finds_noise_and_d(case):
-    """Error, noise and error bars without any parameter but the model, at two noise levels."""
-    t, z, d, noise = case
-    for size, bar in ((1e-4, 0.35), (1e-3, 0.8)):
-        run = Observer(SELF_TUNING).run(t, z[:, 0] + size * noise)
-        error = run.unknown_input - d
-        assert np.abs(error).max() < 1.5 * np.abs(d).max()  # from the first sample on
-        assert rms(error[5000:]) < bar * rms(d)
-        expected = run.standard_deviation[5000:, 3]
-        assert 0.5 < np.mean(np.abs(error[5000:]) < expected) < 0.86
-        assert np.mean(np.abs(error[5000:]) < 1.96 * expected) > 0.8
+LATER = np.arange(20_000) >= 15_000
+OUTLIERS = 50.0 * (np.random.default_rng(2).uniform(size=20_000) < 0.01)
+HEAVY = np.random.default_rng(3).standard_t(3.0, 20_000)
+NOISES = {
+    # noise on y by unit noise; bound of the error over d; size and correlation at the end
+    'little': (lambda n: 1e-4 * n, 0.2, 1e-4, 0.0),
+    'usual': (lambda n: 1e-3 * n, 0.35, 1e-3, 0.0),
+    '10 times as much later': (lambda n: 1e-4 * np.where(LATER, 10.0, 1.0) * n, 0.25, 1e-3, 0.0),
+    '100 times': (lambda n: 1e-4 * np.where(LATER, 100.0, 1.0) * n, 0.35, 1e-2, 0.0),
+    'coloured': (lambda n: 1e-3 * lfilter([math.sqrt(0.19)], [1.0, -0.9], n), 0.6, 1e-3, 0.9),
+    'outliers': (lambda n: 1e-3 * (1.0 + OUTLIERS) * n, 0.4, 1e-3, 0.0),
+    'heavy tails': (lambda _: 1e-3 * HEAVY, 0.4, 1.6e-3, 0.0),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(('correlation', 'factor'), [(0.0, 10.0), (0.0, 100.0), (0.9, 10.0)])
-def test_it_follows_the_noise(case, correlation, factor):
-    """From 15 s on white noise is larger; noise of another colour is not taken for d."""
-    t, z, d, noise = case
-    coloured = lfilter([math.sqrt(1.0 - correlation**2)], [1.0, -correlation], noise)
-    sizes = np.where((t < 15.0) & (correlation == 0.0), 1e-4, factor * 1e-4)
+@pytest.mark.parametrize('name', NOISES)
+def test_it_finds_noise_and_d(case, name):
+    """Error, error bars and noise without any parameter but the model, from the start on."""
+    (t, z, d, unit), (noise_of, bar, size, correlation) = case, NOISES[name]
     observer = Observer(SELF_TUNING)
-    error = observer.run(t, z[:, 0] + sizes * coloured).unknown_input - d
-    assert rms(error[5000:]) < rms(d)
-    assert np.abs(error).max() < 1.5 * np.abs(d).max()
-    assert observer.tuning.noise == pytest.approx(factor * 1e-4, rel=0.2 if correlation else 0.15)
+    run = observer.run(t, z[:, 0] + noise_of(unit))
+    error = np.abs(run.unknown_input - d)
+    assert rms(error[5000:]) < bar * rms(d)
+    assert error.max() < 1.5 * np.abs(d).max()
+    assert not (run.status & Status.JUMPED).any()
+    assert observer.tuning.noise == pytest.approx(size, rel=0.2)
     assert observer.tuning.correlation == pytest.approx(correlation, abs=0.05)
-
-
-def test_outliers_and_jumps_of_y(case):
-    """One sample in a hundred is 50 sigma off; y is 1 off for half a second."""
-    t, z, d, noise = case
-    clean = z[:, 0] + 1e-3 * noise
-    expected = rms((Observer(SELF_TUNING).run(t, clean).unknown_input - d)[5000:])
-    outliers = clean + 0.05 * noise * (np.random.default_rng(2).uniform(size=len(t)) < 0.01)
-    jump = clean + ((t > 15.0) & (t < 15.5))
-    for y in (outliers, jump):
-        error = Observer(SELF_TUNING).run(t, y).unknown_input - d
-        assert rms(error[5000:]) < 1.25 * expected
-        assert np.abs(error).max() < 2.0 * np.abs(d).max()
+    if name in ('little', 'usual'):
+        expected = run.standard_deviation[5000:, 3]
+        assert 0.5 < np.mean(error[5000:] < expected) < 0.86
+        assert np.mean(error[5000:] < 1.96 * expected) > 0.8
 
 
 @pytest.mark.parametrize(('size', 'seconds'), [
@@ -136,26 +123,18 @@ def test_a_plant_that_is_elsewhere_is_no_jump_of_y():
 
 
 @pytest.mark.parametrize(('sigmas', 'seconds'), [
-    (3.5, 0.02), (3.5, 0.5), (5.0, 0.02), (-5.0, 0.5), (6.5, 0.5), (8.0, 0.02),
+    (3.5, 0.02), (3.5, 0.5), (5.0, 0.02), (-5.0, 0.5), (6.5, 0.5), (8.0, 0.02), (1000.0, 0.5),
 ])  # fmt: skip
 def test_an_offset_of_y_is_not_taken_for_d(case, sigmas, seconds):
-    """Just within, and just beyond what counts as lost; before D 35 d was off by 100s of times."""
+    """Within, and just beyond what counts as lost; before D 35 d was off by 100s of times."""
     t, z, d, noise = case
     y = z[:, 0] + 1e-3 * noise + 1e-3 * sigmas * ((t > 15.0) & (t < 15.0 + seconds))
     run = Observer(SELF_TUNING).run(t, y)
     assert np.abs(run.unknown_input - d).max() < 1.5 * np.abs(d).max()
-    if abs(sigmas) < 4.0:  # larger ones are sometimes lost samples, and y begins afresh
+    if not 4.0 < abs(sigmas) < 10.0:  # those are sometimes lost samples, and y begins afresh
         jumps = t[(run.status & Status.JUMPED) > 0]
-        np.testing.assert_allclose(jumps, [15.0, 15.0 + seconds], atol=0.016)
-
-
-def test_d_and_noise_are_not_taken_for_jumps_of_y(case):
-    """A d that moves, larger noise, heavy tails."""
-    t, z, _, noise = case
-    loud = np.where(t < 15.0, 1e-3, 1e-2)
-    tails = np.random.default_rng(3).standard_t(3.0, len(t))
-    for y in (z[:, 0] + 1e-3 * noise, z[:, 0] + loud * noise, z[:, 0] + 1e-3 * tails):
-        assert not (Observer(SELF_TUNING).run(t, y).status & Status.JUMPED).any()
+        atol = 0.016 if abs(sigmas) < 4.0 else 0.022
+        np.testing.assert_allclose(jumps, [15.0, 15.0 + seconds], atol=atol)
 
 
 def test_another_rate_and_lost_samples(case):
@@ -170,27 +149,13 @@ def test_another_rate_and_lost_samples(case):
         assert rms(error[t[index] > 5.0]) < 0.6 * rms(d)
 
 
-def test_known_input_is_used():
-    """d is what the known input does not explain."""
-    rng = np.random.default_rng(5)
-    t = np.arange(10_000) * PERIOD
-    d, u = 0.5 * matern(len(t), 1.5, 2, rng), np.sign(np.sin(3.0 * t))
-    z = states_of([[0.0, 1.0], [0.0, -2.0]], d + 5.0 * np.append(u[1:], 0.0))
-    y = z[:, 0] + 1e-4 * rng.standard_normal(len(t))
-    run = Observer(SELF_TUNING, order=2, phi=['0', '5*u - 2*z2']).run(t, y, u)
-    assert rms((run.unknown_input - d)[3000:]) < 0.4 * rms(d)
-
-
 def test_y_that_says_nothing():
-    """A constant y, and one without noise: finite estimates, and no guess before y moves."""
-    t = np.arange(3000) * PERIOD
+    """Of a constant y nothing is guessed before it moves."""
     observer = Observer(SELF_TUNING)
-    run = observer.run(t, np.full(3000, 0.3))
+    run = observer.run(np.arange(3000) * PERIOD, np.full(3000, 0.3))
     assert (run.unknown_input == 0.0).all()
     assert np.isinf(run.standard_deviation[-1, -1])
     assert math.isnan(observer.tuning.noise)
-    run = Observer(SELF_TUNING).run(t, 0.2 + 0.05 * np.sin(t))
-    assert np.isfinite([*run.unknown_input, *run.z.ravel()]).all()
 
 
 def swept(rates, size, period, duration, shape):
@@ -219,12 +184,6 @@ def test_little_noise_or_none(noise, period):
             assert observer.tuning.noise == pytest.approx(noise, rel=0.3)
 
 
-def late_by(t, size, random):
-    """Return stamps that are late by a half-normal time, in order."""
-    late = t + size * np.abs(random.standard_normal(len(t)))
-    return np.maximum.accumulate(late) + 1e-8 * np.arange(len(t))
-
-
 @pytest.mark.parametrize('seed', [0, 2, 4])
 def test_a_host_that_stamps_later_for_dozens_of_samples(seed):
     """By 10 us, and it wakes unevenly by 25: that is y without noise, and no d."""
@@ -249,7 +208,8 @@ def test_stamps_are_the_only_noise(jitter):
     t = np.arange(8000) * 2e-3
     d = 50.0 * (np.sin(0.6 * t + 1.0) + np.sin(2.0 * t))
     y = states_of(rates, d, np.zeros(4), 2e-3)[:, 0]
-    late = late_by(t, jitter * 2e-3, random)
+    late = np.maximum.accumulate(t + jitter * 2e-3 * np.abs(random.standard_normal(len(t))))
+    late += 1e-8 * np.arange(len(t))
     late[30] += 1.5e-3  # before the members begin
     observer = Observer({**SELF_TUNING, 'order': 4, 'phi': ['0', '0', '0', '-40*z3 - 2*z4']})
     error = observer.run(late, y).unknown_input - d
@@ -332,18 +292,12 @@ def test_a_sensor_that_is_stuck_at_the_end_of_its_range_or_not_ready(plant):
         assert 0.6 * repeated <= estimator.counters.rejected_stuck
         assert rms((found - r.d)[late]) < 0.5 * rms(r.d)
         assert np.abs(found).max() < 50.0 * np.abs(r.d).max()
-
-
-def test_a_clock_that_jumps_back_while_the_sensor_is_stuck():
-    """As where a bag begins again: the next other y starts afresh, whatever its stamp."""
-    y = 0.01 * np.random.default_rng(3).standard_normal(4000)
-    y[3000:] = y[3000]
-    estimator = OnlineEstimator({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
-    stamps = 10**11 + 10**6 * np.arange(len(y))
-    estimator.run(stamps, y)
-    assert estimator.counters.rejected_stuck == 997
-    estimator.run(stamps[:3000] - 10**10, y[:3000])
-    assert estimator.counters.rejected_stuck == 997
+    # A bag that begins again while it is stuck: the next other y starts afresh.
+    estimator, stamps = OnlineEstimator(values), stamps_of(r.t) + 10**11
+    estimator.run(stamps[:8200], stuck[:8200])
+    rejected = estimator.counters.rejected_stuck
+    estimator.run(stamps[:7000] - 10**10, stuck[:7000])
+    assert estimator.counters.rejected_stuck == rejected > 150
     assert estimator.counters.restarts_backward == 1
 
 
@@ -412,14 +366,16 @@ def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, kind, seed, seconds
     assert np.abs(found - r.d).max() < 4.0 * np.abs(r.d).max()
 
 
-def test_a_constant_changes_live():
+def test_known_input_and_a_constant_that_changes_live():
     """Members of a linear model keep what it makes of them in a period: of the new one then."""
-    t, y, d = swept(np.array([[0.0, 1.0], [0.0, -5.0]]), 70.0, PERIOD, 20.0, np.sin)
-    y = y + 1e-4 * np.random.default_rng(8).standard_normal(len(t))
-    observer = Observer(SELF_TUNING, order=2, phi=['0', '-b*z2'], constants={'b': 25.0})
-    observer.run(t[:8000], y[:8000])
+    t = np.arange(20_000) * PERIOD
+    d, u = 70.0 * np.sin(3.0 * t), 50.0 * np.sign(np.sin(2.0 * t))
+    y = states_of(np.array([[0.0, 1.0], [0.0, -5.0]]), d + 5.0 * np.append(u[1:], 0.0))[:, 0]
+    y += 1e-4 * np.random.default_rng(8).standard_normal(len(t))
+    observer = Observer(SELF_TUNING, order=2, phi=['0', '5*u - b*z2'], constants={'b': 25.0})
+    observer.run(t[:8000], y[:8000], u[:8000])
     observer.configure({'constants.b': 5.0})
-    run = observer.run(t[8000:], y[8000:])
+    run = observer.run(t[8000:], y[8000:], u[8000:])
     flow = observer.structure.state_dict()['flow']
     assert flow[1, 1] == pytest.approx(math.exp(-5.0 * PERIOD), rel=1e-6)
     assert rms((run.unknown_input - d[8000:])[4000:]) < 0.02 * rms(d)
