@@ -336,15 +336,19 @@ def test_where_only_y_is_known_the_rest_is_unknown(lag):
     np.testing.assert_array_equal(rows[1].z[:, 0], 0.5)
 
 
-@lags
-def test_an_input_beyond_all_numbers_is_forgotten(lag):
+@both
+def test_an_input_beyond_all_numbers_is_forgotten(gains):
     """The observer rejects it or begins afresh; its own estimates stand where no number can."""
-    y, u = 1e-3 * np.random.default_rng(1).standard_normal(3000), np.zeros(3000)
+    y, u = NOISE * np.random.default_rng(1).standard_normal(3000), np.zeros(3000)
     u[2000:2005] = 1e308
-    estimator = online('self', phi=['0', 'u - 3*z2'], smoothing_lag=lag)
-    d = joined(smoothed(estimator, MS * np.arange(1, 3001), y, u))
-    assert len(d) > 2990
-    assert np.abs(d[-900:]).max() < 10.0
+    phi = ['0', 'u - 3*z2'] if gains == 'self' else ['0', '0', 'u - z3']
+    for lag in (0.0, 0.05):
+        estimator = online(gains, phi=phi, smoothing_lag=lag)
+        rows = smoothed(estimator, MS * np.arange(1, 3001), y, u)
+        assert len(joined(rows)) > 2990
+        assert rms(joined(rows, 'z')[-900:, 0]) < NOISE
+    found = Observer(estimator.observer.parameters).smooth(np.arange(3000) * 1e-3, y, u)
+    assert rms(found.z[-900:, 0]) < NOISE
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2, 13])

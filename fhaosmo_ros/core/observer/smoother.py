@@ -101,30 +101,25 @@ class Smoother:
             block = slice(begin, begin + BLOCK)
             if len(kept):
                 self._hold(found.rows(block), times[block], u[block], kinds[block])
-            smoothed.append(self._due())
+            end = self._rows.count
+            if self._lag is None:
+                end = self._rows.done
+                if self._rows.count - end >= self._wait:
+                    end = self._rows.settled()
+                    self._wait = self._rows.count - end + BLOCK
+            smoothed.append(self._rows.smooth(end, self._lag))
         self._found = Trajectory._make(map(np.concatenate, zip(self._found, found, strict=True)))
         self._numbers = np.concatenate([self._numbers, numbers])
         return self._handed_out(np.concatenate(smoothed))
 
-    def _due(self) -> Floats:
-        """Return the estimates that have become final since the last call."""
-        rows = self._rows
-        if self._lag is not None:
-            return rows.smooth(rows.count, self._lag)  # type: ignore[no-any-return]
-        end = rows.done
-        if rows.count - end >= self._wait:
-            end = rows.settled()
-            self._wait = rows.count - end + BLOCK
-        return rows.smooth(end)  # type: ignore[no-any-return]
-
     def finish(self) -> Trajectory:
         """Return the rows that still wait: nothing comes after them."""
         if self._held and not self._held[-1].any():  # the observer knows nothing but y
-            own, self._held = self._held[0], []
-            return self._handed_out(own)
-        if self._held:
+            smoothed, self._held = self._held[0], []
+        else:
             self._go()
-        return self._handed_out(self._rows.smooth(self._rows.count))
+            smoothed = self._rows.smooth(self._rows.count)
+        return self._handed_out(smoothed)
 
     def _kinds(self, status: Ints) -> Ints:
         """
@@ -164,10 +159,11 @@ class Smoother:
 
     def _go(self) -> None:
         """Go forward through the rows that are held."""
-        (own, *samples, models), self._held = self._held, []
-        if self._observer.self_tuning and len(models):
-            models = self._completed(own, models)
-        self._rows.append(own, *samples, models)
+        if self._held:
+            (own, *samples, models), self._held = self._held, []
+            if self._observer.self_tuning:
+                models = self._completed(own, models)
+            self._rows.append(own, *samples, models)
 
     def _completed(self, own: Floats, models: Floats) -> Floats:
         """Let what a self-tuning observer knows stand for what it did not know before (D 34)."""

@@ -88,7 +88,8 @@ class OnlineEstimator:
         check_events(p)
         self.smoothing: Smoother | None = None
         if p['smoothing_lag'] > 0.0:
-            self.smooth(p['smoothing_lag'])
+            _check_smoothing(p, self.observer.configuration)
+            self.smoothing = Smoother(self.observer, round(p['smoothing_lag'] / NANOSECONDS))
         self._u = np.zeros(len(self.observer.inputs))
         self.policy = Policy(self.observer.structure, self._settings(p))
         self.events = EventDetector(p)
@@ -210,12 +211,12 @@ class OnlineEstimator:
         self.events.reset()
         self._cut()
 
-    def smooth(self, lag: float | None = None) -> None:
+    def smooth(self) -> None:
         """
-        Let `run` return smoothed estimates, each `lag` seconds after its sample.
+        Let `run` return estimates by all samples, each once later ones do not matter to it.
 
-        Without a lag each comes once later samples no longer matter to it, and `finish` returns
-        the rest. To be called before the first sample. Memory stays bounded.
+        `finish` returns the rest. To be called before the first sample; a `smoothing_lag` is
+        forgotten. Memory stays bounded.
 
         Raises
         ------
@@ -224,7 +225,7 @@ class OnlineEstimator:
 
         """
         _check_smoothing(self._parameters, self.observer.configuration)
-        self.smoothing = Smoother(self.observer, None if lag is None else round(lag / NANOSECONDS))
+        self.smoothing = Smoother(self.observer)
 
     def finish(self) -> Trajectory:
         """Return the smoothed estimates that still wait: nothing comes after them."""

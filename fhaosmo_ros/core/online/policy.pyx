@@ -92,6 +92,8 @@ cdef struct Course:
     double mean_interval  # running mean of dt (ns)
     double mean_jitter  # running mean of its deviation (ns)
     double usual_interval  # longest mean_interval of late; a restart does not forget it (ns)
+    int past_place  # of the latest piece of time with the same known inputs, in a ring of them
+    int past_count  # of such pieces
 
 
 cdef struct Sensor:
@@ -107,12 +109,6 @@ cdef struct Sensor:
     double change  # by what it last differed from the one before
     double repeated  # the y that has repeated itself last
     double elsewhere  # share of values of late that repeat themselves, another one each
-
-
-cdef struct Ring:
-    # Pieces of time with the same known inputs.
-    int past_place  # of the latest piece
-    int past_count  # of pieces
 
 
 cdef class Policy:
@@ -141,7 +137,6 @@ cdef class Policy:
     cdef double acting[MOST_INPUTS]  # a mean: in the latest step, where y is known later
     cdef readonly object pieces  # (MOST_PIECES, 1 + m) array of a ring: durations (ns), inputs
     cdef double* first  # the first piece
-    cdef Ring ring
 
     def __cinit__(self, Structure structure not None, dict settings):
         cdef bint late = settings['lag'] > 0
@@ -426,7 +421,7 @@ cdef class Policy:
     cdef int begin_again(self, long long* counter) noexcept nogil:
         """Make a fresh observer, and count it; return flags."""
         self.refresh()
-        self.ring.past_count = 0
+        self.course.past_count = 0
         counter[0] += 1
         return RESTARTED
 
@@ -467,19 +462,19 @@ cdef class Policy:
 
     cdef double* piece(self, int back) noexcept nogil:
         """Return a piece, by its number from the latest one back."""
-        cdef int place = (self.ring.past_place + MOST_PIECES - back) % MOST_PIECES
+        cdef int place = (self.course.past_place + MOST_PIECES - back) % MOST_PIECES
         return self.first + place * (1 + self.structure.inputs)
 
     cdef void note(self, long long elapsed, const double* u) noexcept nogil:
         """Append that the inputs have been `u` for the latest `elapsed` nanoseconds."""
         cdef double* latest = self.piece(0)
-        cdef bint same = self.ring.past_count > 0
+        cdef bint same = self.course.past_count > 0
         cdef int j
         for j in range(self.structure.inputs):
             same = same and latest[1 + j] == u[j]
         if not same:
-            self.ring.past_place = (self.ring.past_place + 1) % MOST_PIECES
-            self.ring.past_count = min(self.ring.past_count + 1, MOST_PIECES)
+            self.course.past_place = (self.course.past_place + 1) % MOST_PIECES
+            self.course.past_count = min(self.course.past_count + 1, MOST_PIECES)
             latest = self.piece(0)
             latest[0] = 0.0
             memcpy(latest + 1, u, self.structure.inputs * sizeof(double))
@@ -489,8 +484,8 @@ cdef class Policy:
         """Take back what `note` has appended last."""
         self.piece(0)[0] -= elapsed
         if self.piece(0)[0] <= 0.0:
-            self.ring.past_place = (self.ring.past_place + MOST_PIECES - 1) % MOST_PIECES
-            self.ring.past_count -= 1
+            self.course.past_place = (self.course.past_place + MOST_PIECES - 1) % MOST_PIECES
+            self.course.past_count -= 1
 
     cdef void find_acting(self, long long elapsed, const double* u) noexcept nogil:
         """
@@ -504,11 +499,11 @@ cdef class Policy:
         cdef double part
         cdef const double* piece
         memcpy(self.acting, u, self.structure.inputs * sizeof(double))
-        for k in range(self.ring.past_count):
+        for k in range(self.course.past_count):
             piece = self.piece(k)
             begin = end + <long long>piece[0]
             share = min(begin, lag + elapsed) - max(end, lag)
-            if k == self.ring.past_count - 1:  # the oldest one known stands for all before it
+            if k == self.course.past_count - 1:  # the oldest one known stands for all before it
                 share = elapsed - covered
             if share > 0:
                 covered += share
@@ -631,7 +626,7 @@ cdef class Policy:
 
     cdef void predict_delay(self) noexcept nogil:
         """Follow the model over the delay, by the inputs that have acted since."""
-        cdef int known = 0, count = self.ring.past_count
+        cdef int known = 0, count = self.course.past_count
         cdef long long lag = self.settings.lag, delay = self.settings.delay
         cdef long long age = 0, left = lag  # until now: from the end of a piece; to be predicted
         if lag > 0 and count > 0:
@@ -717,21 +712,21 @@ cdef class Policy:
         """Start afresh: the next sample is the first. Counters go on."""
         self.structure.enter()
         self.refresh()
-        self.ring.past_count = 0
+        self.course.past_count = 0
         self.course.valid = False
         self.clock.tick_count = self.clock.spacing = 0
 
     @property
     def memory(self):
-        """What it remembers: the members of `Course`, `Clock`, `Sensor` and `Ring` by name."""
-        cdef dict course = self.course, clock = self.clock, sensor = self.sensor
-        return course | clock | sensor | self.ring
+        """What it remembers: the members of `Course`, `Clock` and `Sensor` by name."""
+        cdef dict course = self.course, clock = self.clock
+        return course | clock | self.sensor
 
     def change(self, **numbers):
         """Remember other numbers: members of `memory` by name."""
         cdef dict memory = self.memory | numbers
         self.structure.enter()
-        self.course, self.clock, self.sensor, self.ring = memory, memory, memory, memory
+        self.course, self.clock, self.sensor = memory, memory, memory
 
     def __reduce__(self):
         state = self.memory, self.counters, self.latest_inputs, self.pieces
