@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A known delay of y: the inputs that acted then, the estimate's time, and the present."""
 
-from fhaosmo_ros.core import ConfigurationError, Observer, OnlineEstimator
+from fhaosmo_ros.core import ConfigurationError, Family, Observer, OnlineEstimator
 from fhaosmo_ros.core.online.policy import PIECES
 from fhaosmo_ros.core.simulation.plant import respond
+from fhaosmo_ros.tools.tuning.objective import Objective, TUNE_PARAMETERS
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -130,3 +131,19 @@ def test_more_pieces_than_there_is_room_for_lose_the_oldest():
 def test_input_later_than_y_is_refused():
     with pytest.raises(ConfigurationError, match='input_delay'):
         OnlineEstimator(DELAYED | {'input_delay': 0.05})
+
+
+def test_tuning_knows_of_the_delay():
+    model = {'order': 2, 'phi': ['0', '8*u - 3*z2'], 'measurement_delay': 0.05}
+    signals = {'duration': 6.0, 'sample_rate': 200.0, 'rms_of_d': 2.0, 'disturbances': ['sines']}
+    signals |= {'band_of_d': [0.5, 3.0], 'initial_state': 0.0, 'integration_step': 1e-3}
+    recordings = Family(model | signals).recordings(2)
+    gains = MOTOR | model | {'fuzzy_widths': [0.5]}
+
+    def error(**changes):
+        tuning = TUNE_PARAMETERS.complete({'settled': 2.0})
+        return Objective(recordings, tuning)(gains | changes).errors.max(axis=0)
+
+    unknown = error(measurement_delay=0.0)
+    assert (error() < 0.2 * unknown).all()  # z1, z2, d
+    assert (error(predict_to_now=True)[:2] < 0.2 * unknown[:2]).all()

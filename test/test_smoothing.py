@@ -227,14 +227,18 @@ def test_one_by_one_is_the_same_as_a_run(gains):
     assert one.stamp == stamps[-1] - 100 * MS
 
 
-def test_nothing_is_smoothed_across_a_restart():
+@pytest.mark.parametrize('reset', [False, True])
+def test_nothing_is_smoothed_across_a_restart(reset):
     t, y, _ = recording(4.0)
-    stamps = stamps_of(t)
+    stamps, estimator = stamps_of(t), online()
     theirs = joined(smoothed(online(), stamps, y))
-    stamps, y = np.append(stamps, stamps + 10**10), np.append(y, 5.0 + y)
-    ours = joined(smoothed(online(), stamps, y))
+    estimator.smooth()
+    rows = [estimator.run(stamps, y)]
+    if reset:
+        estimator.reset()
+    ours = joined(rows + smoothed(estimator, stamps + 10**10, 5.0 + y))
     np.testing.assert_allclose(ours[: len(theirs)], theirs, rtol=0.0, atol=1e-9)
-    assert len(ours) == 2 * len(t) - 1  # the sample that announced the restart
+    assert len(ours) == 2 * len(t) - (not reset)  # the sample that announced the restart
 
 
 def test_outliers_count_as_little_as_in_the_observer():
