@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+FIRST = 10**18
 PERIOD, LATE = 2_000_000, 20
 """Nanoseconds, and periods by which y is late."""
 COUNT = 1500
-STAMPS = 10**18 + PERIOD * np.arange(COUNT)
+STAMPS = FIRST + PERIOD * np.arange(COUNT)
 MOTOR = {
     'order': 2, 'phi': ['0', '8*u - 3*z2 - 5*sin(z1)'], 'structure': 'levant', 'variant': 'sign',
     'scheme': 'predict_correct', 'lambda': [5.5, 16.0, 22.0],
@@ -77,11 +78,17 @@ def test_prediction_ends_at_the_present_state(share, estimate_from):
     assert np.abs(then.z[at_end, 1] - z[at_end, 1]).max() > 0.02  # so the delay matters
 
 
+def test_where_the_model_leaves_the_finite_numbers_the_estimate_of_then_stands():
+    late = {'order': 1, 'phi': ['z1**60'], 'measurement_delay': 1.0, 'predict_to_now': True}
+    estimator = OnlineEstimator(late | {'gains': 'fixed'})
+    estimator.update(FIRST, 5.0)
+    assert estimator.estimate.z == [5.0]
+
+
 TWO = {
     'order': 1, 'phi': ['0*a*b'], 'inputs': ['a', 'b'], 'gains': 'fixed', 'variant': 'sign',
     'spike_gate': 1.0,
 }  # fmt: skip
-FIRST = 10**18
 
 
 def acting(pieces, lag, elapsed, now, spikes=()):

@@ -95,6 +95,9 @@ FAULTS = {
         {}, [(600, 3.0), (5 * HOUR, 0.4), (5 * HOUR + 1, 0.4)], 'hr-',
         {'far_stamps': 1, 'restarts_forward': 1},
     ),
+    'a thousand times as slow from now on': (
+        {}, of(1000, 2000, 3000, 4000), 'hr--', {'far_stamps': 1, 'restarts_forward': 1}
+    ),
     'no y': (
         {}, [(1, NAN), (2, math.inf), (3, -math.inf), (4, 2e100), (5, -1.7e308), (6, 0.21)],
         'xxxxxg', {'rejected_measurements': 5, 'gaps': 1, 'sub_steps': 6},

@@ -190,8 +190,6 @@ class Uncertainty:
     ----------
     linear : LinearModel
         The model with D 17, linearised at rest.
-    rates : (N, N) array
-        Its A.
     variance, intensity : float
         Of the noise on y; of the white noise that drives the last level.
     fresh : (N, N) array
@@ -218,7 +216,6 @@ class Uncertainty:
         rates[:n, :n] += jacobian
         rates[range(n, levels), range(n, levels)] = -decay
         rate = decay or p['unknown_input_rate']
-        self.rates = rates
         self.variance, self.intensity = p['noise_size'] ** 2, size**2 * matern(rate, k)
         self.linear = LinearModel(rates, self.intensity)
         self.fresh = np.zeros((levels, levels))
@@ -256,7 +253,7 @@ class Uncertainty:
 
     def _doubled(self, period):
         """Return the covariance in the filter's own units, and the units."""
-        n = len(self.rates)
+        n = len(self.fresh)
         speed = (self.intensity / (self.variance * period)) ** (0.5 / n)
         unit = math.sqrt(self.variance) * speed ** np.arange(n)
         phi, q = self.linear.transition(period)
