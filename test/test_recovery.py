@@ -220,6 +220,14 @@ def test_papers_gains_find_y_again(offset):
     assert wrong.max() < 40.0 * np.abs(truth.unknown_input).max()  # these gains have such peaks
 
 
+def test_cascade_goes_on_from_its_start_as_a_kalman_filter():
+    """Its levels are put where they would be had they followed it; else they search for long."""
+    t = np.arange(3 * RATE) / RATE
+    truth = Plant(disturbance_omega=1.0).simulate(t)
+    found = Observer.from_yaml(CONFIG / 'demo.yaml').run(t, truth.y)
+    assert np.abs(found.unknown_input - truth.unknown_input).max() < 0.05
+
+
 # the covariance (D 20)
 
 
