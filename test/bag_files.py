@@ -25,9 +25,9 @@ PRESETS = {
 """Of Jazzy's mcap storage."""
 
 
-def signal(count, rng=None):
+def signal(count):
     """Stamps (ns) at 1 kHz with jitter, and a smooth y."""
-    rng = rng or np.random.default_rng(7)
+    rng = np.random.default_rng(7)
     stamps = ORIGIN + np.arange(count) * 1_000_000 + rng.integers(-200_000, 200_000, count)
     return stamps, 0.2 + 0.1 * np.sin(stamps % 10**12 * 1e-9)
 
@@ -92,28 +92,23 @@ def write_preset(path, messages, preset, published=None, parts=1):
     write(path, messages)  # for its metadata
     (path / f'{path.name}.mcap').unlink()
     published = [m[2] for m in messages] if published is None else published
-    share = -(-len(messages) // parts)
+    rows = list(zip(messages, published, strict=True))
+    share = -(-len(rows) // parts)
     names = [f'{path.name}_{k}.mcap' for k in range(parts)]
     for k, name in enumerate(names):
-        part = slice(k * share, (k + 1) * share)
-        _write_file(path / name, messages[part], published[part], PRESETS[preset])
-    text = (path / 'metadata.yaml').read_text()
-    information = yaml.safe_load(text)
+        with (path / name).open('wb') as stream:
+            writer = McapWriter(stream, chunk_size=20_000, **PRESETS[preset])
+            writer.start(profile='ros2', library='libmcap 1.3.1')
+            channels = {}
+            for (topic, kind, stamp, data), sent in rows[k * share : (k + 1) * share]:
+                if topic not in channels:
+                    text, _ = TYPES.generate_msgdef(kind, ros_version=2)
+                    schema = writer.register_schema(kind, 'ros2msg', text.encode())
+                    extra = {'offered_qos_profiles': '[]'}
+                    channels[topic] = writer.register_channel(topic, 'cdr', schema, extra)
+                writer.add_message(channels[topic], int(stamp), data, int(sent))
+            writer.finish()
+    information = yaml.safe_load((path / 'metadata.yaml').read_text())
     information['rosbag2_bagfile_information'] |= {'relative_file_paths': names, 'files': []}
     (path / 'metadata.yaml').write_text(yaml.safe_dump(information))
     return path
-
-
-def _write_file(path, messages, published, options):
-    with path.open('wb') as stream:
-        writer = McapWriter(stream, chunk_size=20_000, **options)
-        writer.start(profile='ros2', library='libmcap 1.3.1')
-        channels = {}
-        for (topic, kind, stamp, data), sent in zip(messages, published, strict=True):
-            if topic not in channels:
-                text, _ = TYPES.generate_msgdef(kind, ros_version=2)
-                schema = writer.register_schema(kind, 'ros2msg', text.encode())
-                extra = {'offered_qos_profiles': '[]'}
-                channels[topic] = writer.register_channel(topic, 'cdr', schema, extra)
-            writer.add_message(channels[topic], int(stamp), data, int(sent))
-        writer.finish()

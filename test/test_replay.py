@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag, or a CSV file, replayed is the observer's own result."""
 
-import csv
 from pathlib import Path
 import sqlite3
 
@@ -42,17 +41,11 @@ def run(*arguments):
     return replay.main([str(a) for a in arguments])
 
 
-@pytest.fixture(name='blocks')
-def _blocks(monkeypatch):
-    """Several blocks of estimates, also the last one not full."""
-    monkeypatch.setattr(replay, 'BLOCK', 700)
-
-
-@pytest.mark.usefixtures('blocks')
-def test_output_bag_holds_the_estimators_topics(bag, tmp_path):
-    out = tmp_path / 'out'
+def test_output_is_a_bag_with_the_estimators_topics_or_a_table(bag, tmp_path, monkeypatch):
+    monkeypatch.setattr(replay, 'BLOCK', 700)  # several blocks, the last one not full
+    out, text, arrays = (tmp_path / name for name in ('out', 'out.csv', 'out.npz'))
     model = ['-p', 'order:=2', '-p', 'phi:=["0","0"]', '-p', 'gains:=fixed']
-    assert run(bag, '-o', out, *model) == 0
+    assert run(bag, '-o', out, '-o', text, '-o', arrays, *model) == 0
     rows = expected(STAMPS, Y, {'order': 2, 'phi': ['0', '0'], 'gains': 'fixed'})
     state = series(out, '/estimator/state')
     np.testing.assert_array_equal(state.values, rows[:, :2])
@@ -67,6 +60,15 @@ def test_output_bag_holds_the_estimators_topics(bag, tmp_path):
         counts = {c.topic: c.msgcount for c in reader.connections}
         assert counts.pop('/estimator/parameters') == 1
         assert set(counts.values()) == {len(STAMPS)}
+    np.testing.assert_array_equal(table(arrays), rows)
+    # A CSV file reads back as the same numbers.
+    with text.open() as file, np.load(arrays) as found:
+        titles = file.readline().strip().split(',')
+        assert titles == list(found)
+        assert titles[:3] == ['stamp_ns', 'bag_time_ns', 'y']
+        columns = np.loadtxt(file, delimiter=',', dtype=object, converters=str).T
+        for title, column in zip(titles, columns, strict=True):
+            np.testing.assert_array_equal(column.astype(found[title].dtype), found[title])
     # A bag that has estimates gets the replayed ones beside them.
     again = tmp_path / 'again'
     assert run(out, '-o', again) == 0
@@ -74,43 +76,22 @@ def test_output_bag_holds_the_estimators_topics(bag, tmp_path):
     assert len(series(again, '/estimator/state').stamps) == len(STAMPS)
 
 
-@pytest.mark.usefixtures('blocks')
-def test_csv_reads_back_as_the_same_numbers(bag, tmp_path):
-    assert run(bag, '-o', tmp_path / 'out.csv') == 0
-    rows = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)
-    with (tmp_path / 'out.csv').open() as file:
-        titles, *lines = csv.reader(file)
-    assert titles == [
-        'stamp_ns', 'bag_time_ns', 'y', 'z1', 'z2', 'z3', 'unknown_input', 'gamma',
-        *(f'eps{k}' for k in (1, 2, 3, 4)), 'status', 'open_levels',
-    ]  # fmt: skip
-    assert [int(line[0]) for line in lines] == STAMPS.tolist()
-    got = np.column_stack([rows[n] for n in ('z1', 'z2', 'z3', 'unknown_input', 'gamma')])
-    np.testing.assert_array_equal(got, expected(STAMPS, Y))
-
-
-def test_parameters_of_file_and_command_line(bag, tmp_path, capsys):
+def test_parameters_of_a_named_node_by_file_and_command_line(bag, tmp_path, capsys):
     (tmp_path / 'p.yaml').write_text(
-        '/**: {ros__parameters: {variant: sign, alpha: 30, lambda: 15, publish_rate: 50.0}}'
+        'rig: {left: {ros__parameters: {epsilon: 3.0, lambda: 15, publish_rate: 50.0}}}\n'
+        'estimator: {ros__parameters: {}}'
     )
-    arguments = ['--params-file', tmp_path / 'p.yaml', '-p', 'lambda:=[20, 15.5, 15, 1e1]']
+    rules = ['plant:order:=7', 'rig/left:variant:=sign', '/rig/left:alpha:=30', 'gamma_rate:=0.1',
+             'lambda:=[20, 15.5, 15, 1e1]']  # fmt: skip
+    arguments = ['--params-file', tmp_path / 'p.yaml', '--node', '/rig/left']
+    arguments += [word for rule in rules for word in ('-p', rule)]
     assert run(bag, '-o', tmp_path / 'o.npz', *arguments) == 0
     assert 'warning' not in capsys.readouterr().err
+    values = {'variant': 'sign', 'alpha': 30, 'epsilon': 3.0, 'gamma_rate': 0.1}
+    values['lambda'] = [20, 15.5, 15, 10]
+    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(STAMPS, Y, values))
     assert run(bag, '-o', tmp_path / 'default.npz') == 0
     assert 'replay: warning: the bag has no ~/parameters' in capsys.readouterr().err
-    values = {'variant': 'sign', 'alpha': 30, 'lambda': [20, 15.5, 15, 10]}
-    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(STAMPS, Y, values))
-
-
-def test_parameters_for_a_named_node(bag, tmp_path):
-    (tmp_path / 'p.yaml').write_text(
-        'rig: {left: {ros__parameters: {epsilon: 3.0}}}\nestimator: {ros__parameters: {}}'
-    )
-    rules = ['-p', 'plant:order:=7', '-p', 'rig/left:variant:=sign', '-p', '/rig/left:alpha:=30']
-    arguments = ['--params-file', tmp_path / 'p.yaml', *rules, '--node', '/rig/left']
-    assert run(bag, '-o', tmp_path / 'o.npz', *arguments) == 0
-    values = {'variant': 'sign', 'alpha': 30, 'epsilon': 3.0}
-    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(STAMPS, Y, values))
 
 
 def third_joint(stamp, value):
@@ -122,17 +103,21 @@ def third_joint(stamp, value):
     ('std_msgs/msg/Float32', '', lambda _, v: files.cdr('std_msgs/msg/Float32', data=v),
      np.float32),
 ])  # fmt: skip
-def test_any_number_of_any_type(kind, field, make, rounding, tmp_path):
+def test_any_number_of_any_type(kind, field, make, rounding, tmp_path, capsys):
     stamps, y = files.signal(400)
     late = stamps + 3_000_000  # the bag's own stamps, not those of the headers
+    shown = stamps.copy()
+    shown[100] -= 5_000_000  # goes back: rejected, as live
     messages = [
         ('/sensor', kind, at, make(stamp, value))
-        for at, stamp, value in zip(late.tolist(), stamps.tolist(), y.tolist(), strict=True)
+        for at, stamp, value in zip(late.tolist(), shown.tolist(), y.tolist(), strict=True)
     ]
     bag = files.write(tmp_path / 'bag', messages)
     choice = ['-p', 'input_topic:=/sensor', '-p', f"input_field:='{field}'"]
     assert run(bag, *choice, '-o', tmp_path / 'o.npz') == 0
-    used = stamps if kind == files.JOINTS else late
+    has_header = kind == files.JOINTS
+    assert f'{int(has_header)} rejected' in capsys.readouterr().out
+    used = shown if has_header else late
     y = y.astype(rounding).astype(np.float64)
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(used, y))
     assert run(bag, *choice, '-p', 'input_stamp:=reception', '-o', tmp_path / 'b.npz') == 0
@@ -141,43 +126,31 @@ def test_any_number_of_any_type(kind, field, make, rounding, tmp_path):
 
 def test_several_known_inputs_are_held_each_by_itself(tmp_path, capsys):
     stamps, y = files.signal(600)
-    times = [stamps[100::250] + 1, stamps[50::100] + 1]
+    times = [stamps[100::250] + 1, stamps[50::100]]  # of one time: before the sample
     values = [np.array([0.5, -0.25]), np.linspace(-1.0, 1.0, 6)]
-    messages = files.floats(stamps, y) + files.floats(stamps[400:401], np.array([np.nan]), '/b')
+    messages = files.floats(stamps[400:401], np.array([np.nan]), '/b')
     for at, u, topic in zip(times, values, ('/left', '/b'), strict=True):
         messages += files.floats(at, u, topic)
+    messages += files.floats(stamps, y)
     bag = files.write(tmp_path / 'bag', sorted(messages, key=lambda m: m[2]))
     parameters = {'phi': ['0', '0', 'k*(a + 2*b) - z3'], 'inputs': ['a', 'unused', 'b']}
     parameters |= {'constants.k': 0.5}
     (tmp_path / 'p.yaml').write_text(dumps(parameters))
-    arguments = ['--params-file', tmp_path / 'p.yaml', '-o', tmp_path / 'o.npz']
-    topics = ['-p', 'known_input_topics:=[/left, /b]']
-    assert run(bag, *arguments, *topics) == 0
+    arguments = ['--params-file', tmp_path / 'p.yaml', '-o', tmp_path / 'o.npz', '--force']
+    assert run(bag, *arguments, '-p', 'known_input_topics:=[/left, /b]') == 0
     u = np.zeros((len(y), 3))
     for column, at, known in zip((0, 2), times, values, strict=True):
-        u[:, column] = np.concatenate([[0.0], known])[np.searchsorted(at, stamps)]
+        row = np.searchsorted(at, stamps, side='right')
+        u[:, column] = np.concatenate([[0.0], known])[row]
     estimates = OnlineEstimator(parameters).run(stamps, y, u)
     with np.load(tmp_path / 'o.npz') as found:
         np.testing.assert_array_equal(found['unknown_input'], estimates.unknown_input)
-    assert run(bag, *arguments, '--force', '-p', 'known_input_topics:=[/a, /b, /c]') != 0
-    assert 'each known input that phi uses (a, b)' in capsys.readouterr().err
-    assert run(bag, *arguments, '--force') != 0
-    assert "'/a'" in capsys.readouterr().err
-
-
-def test_stamps_that_go_back_are_rejected_as_live(tmp_path, capsys):
-    stamps, y = files.signal(200)
-    shown = stamps.copy()
-    shown[100] -= 5_000_000
-    messages = [
-        ('/j', files.JOINTS, at, third_joint(s, v))
-        for at, s, v in zip(stamps.tolist(), shown.tolist(), y.tolist(), strict=True)
-    ]
-    bag = files.write(tmp_path / 'bag', messages)
-    options = ['-p', 'input_topic:=/j', '-p', 'input_field:=position[2]']
-    assert run(bag, *options, '-o', tmp_path / 'o.npz') == 0
-    np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(shown, y))
-    assert '1 rejected' in capsys.readouterr().out
+    for options, said in (
+        (['-p', 'known_input_topics:=[/a, /b, /c]'], 'each known input that phi uses (a, b)'),
+        ([], "'/a'"),
+    ):
+        assert run(bag, *arguments, *options) == 2
+        assert said in capsys.readouterr().err
 
 
 def test_topic_of_an_unknown_type_is_copied(tmp_path):
@@ -191,9 +164,9 @@ def test_topic_of_an_unknown_type_is_copied(tmp_path):
         database.execute('UPDATE schema SET schema_version = 3')
     database.close()
     text = (bag / 'metadata.yaml').read_text()
-    at = text.index('name: /odd')
-    text = text[:at] + text[at:].replace(files.FLOAT, 'rig_msgs/msg/Odd', 1)
-    (bag / 'metadata.yaml').write_text(text)
+    before, odd, after = text.partition('name: /odd')
+    after = after.replace(files.FLOAT, 'rig_msgs/msg/Odd', 1)
+    (bag / 'metadata.yaml').write_text(before + odd + after)
     assert run(bag, '-o', tmp_path / 'o.npz', '-o', tmp_path / 'o') == 0
     np.testing.assert_array_equal(table(tmp_path / 'o.npz'), expected(stamps, y))
     with BagReader(tmp_path / 'o') as copied:
@@ -213,28 +186,27 @@ def test_types_of_a_sourced_workspace_go_into_the_bag(tmp_path, monkeypatch):
         assert reader.field('/rig', 'inner[1].force').steps == ['inner', 1, 'force']
 
 
-@pytest.mark.parametrize('way', [['--smooth'], ['-p', 'smoothing_lag:=0.2']])
-def test_smoothed_estimates_are_the_librarys(way, tmp_path, capsys):
-    stamps, y = STAMPS, Y.copy()
+@pytest.mark.parametrize('lag', [None, 0.2])
+def test_smoothed_estimates_are_the_librarys(lag, tmp_path, capsys):
+    y = Y.copy()
     y[500:503] = np.nan
-    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
-    lag = way != ['--smooth']
-    options = ['--params-file', ROOT / 'config' / 'demo.yaml']
-    assert run(bag, '-o', tmp_path / 'o.npz', *way, *options) == 0
-    estimator = OnlineEstimator.from_yaml(ROOT / 'config' / 'demo.yaml')
+    bag = files.write(tmp_path / 'bag', files.floats(STAMPS, y))
+    file = ROOT / 'config' / 'demo.yaml'
+    way = ['-p', f'smoothing_lag:={lag}'] if lag else ['--smooth']
+    assert run(bag, '-o', tmp_path / 'o.npz', *way, '--params-file', file) == 0
+    estimator = OnlineEstimator.from_yaml(file)
     if lag:
-        estimator = OnlineEstimator(estimator.parameters | {'smoothing_lag': 0.2})
+        estimator = OnlineEstimator(estimator.parameters | {'smoothing_lag': lag})
     else:
         estimator.smooth()
-    parts = [estimator.run(stamps, y), *([] if lag else [estimator.finish()])]
+    parts = [estimator.run(STAMPS, y), *([] if lag else [estimator.finish()])]
+    of_stamp = dict(zip(STAMPS.tolist(), y.tolist(), strict=True))
     with np.load(tmp_path / 'o.npz') as found:
-        columns = {name: found[name] for name in found.files}
-    for name, key in (('stamp_ns', 't'), ('unknown_input', 'unknown_input')):
-        ours = np.concatenate([getattr(part, key) for part in parts])
-        np.testing.assert_allclose(columns[name], ours, rtol=0.0, atol=1e-7)
-    np.testing.assert_array_equal(columns['bag_time_ns'], columns['stamp_ns'])
-    of_stamp = dict(zip(stamps.tolist(), y.tolist(), strict=True))
-    np.testing.assert_array_equal(columns['y'], [of_stamp[t] for t in columns['stamp_ns']])
+        for name, key in (('stamp_ns', 't'), ('unknown_input', 'unknown_input')):
+            ours = np.concatenate([getattr(part, key) for part in parts])
+            np.testing.assert_allclose(found[name], ours, rtol=0.0, atol=1e-7)
+        np.testing.assert_array_equal(found['bag_time_ns'], found['stamp_ns'])
+        np.testing.assert_array_equal(found['y'], [of_stamp[t] for t in found['stamp_ns']])
     assert 'smoothed: each estimate by the samples before' in capsys.readouterr().out
 
 
@@ -243,11 +215,10 @@ def test_smoothed_estimates_are_the_librarys(way, tmp_path, capsys):
 T = np.arange(300) * 1e-3
 SINE, U = 0.1 * np.sin(T), np.cos(9.0 * T)
 MODEL = {'order': 2, 'phi': ['0', '-z1 + torque'], 'inputs': ['torque']}
-OPTIONS = [f'{name}:={value}' for name, value in MODEL.items()]
 
 
 def run_table(path, *arguments):
-    given = [text for option in OPTIONS for text in ('-p', option)]
+    given = [text for name, value in MODEL.items() for text in ('-p', f'{name}:={value}')]
     return run(path, *given, '-o', path.with_suffix('.npz'), *arguments)
 
 
@@ -258,33 +229,26 @@ def run_table(path, *arguments):
     ('', '\t', ['--columns', '1,2,3']),
 ])  # fmt: skip
 def test_csv_file_is_estimated_as_its_arrays(tmp_path, first, delimiter, arguments):
-    path, columns = tmp_path / 'my.csv', [T, SINE, U]
-    if first.startswith('torque'):
-        columns = [U, 0.0 * T, SINE, T]
+    y = SINE.copy()
+    y[100] = SINE[100] if delimiter == ' ' else np.nan  # an empty cell is a missing sample
+    columns = [U, 0.0 * T, y, T] if first.startswith('torque') else [T, y, U]
     lines = [delimiter.join(map(repr, map(float, row))) for row in zip(*columns, strict=True)]
-    path.write_text('\n'.join([first, *lines][not first :]))
+    path = tmp_path / 'my.csv'
+    path.write_text('\n'.join([first, *lines][not first :]).replace('nan', ''))
     assert run_table(path, *arguments) == 0
     stamps = np.maximum(np.round(T * 1e9).astype(np.int64), 1)
-    expected = OnlineEstimator(MODEL).run(stamps, SINE, U)
-    found = np.load(tmp_path / 'my.npz')
-    np.testing.assert_array_equal(found['stamp_ns'], stamps)
-    np.testing.assert_array_equal(found['unknown_input'], expected.unknown_input)
-
-
-def test_empty_cell_is_a_missing_sample(tmp_path, capsys):
-    (tmp_path / 'my.csv').write_text('t,y,u\n0,0.1,0\n0.001,,0\n0.002,0.1,0\n')
-    assert run_table(tmp_path / 'my.csv') == 0
-    assert '2 samples used, 1 rejected' in capsys.readouterr().out
+    expected = OnlineEstimator(MODEL).run(stamps, y, U)
+    used = np.isfinite(y)
+    with np.load(tmp_path / 'my.npz') as found:
+        np.testing.assert_array_equal(found['stamp_ns'], stamps[used])
+        np.testing.assert_array_equal(found['unknown_input'], expected.unknown_input[used])
 
 
 @pytest.mark.parametrize(('text', 'columns', 'said'), [
     ('t,y,u\n0,1,2\n0.001,x,3\n', '', 'my.csv: expected lines of numbers: could not convert str'),
-    ('t,y,u\n0,1\n', '', 'my.csv: expected lines of numbers: '),
     ('t,y,u\n', '', 'my.csv: expected lines of numbers, got none'),
     ('', '', '--columns: expected 3 titles, of the time, y, torque, got'),
     ('t,angle,u\n0,1,2\n', 't,anlge,u', "t, angle, u, got 'anlge'; did you mean 'angle'?"),
-    ('t,y,u\n0,1,2\n', 't,y', '--columns: expected 3 titles, of the time, y, torque, got t, y'),
-    ('t,y,u\n-1,1,2\n', '', 'my.csv: expected times of 0 to 9.2e+09 s, got -1.0 in sample 0'),
     ('t,y,u\nnan,1,2\n', '', 'my.csv: expected times of 0 to 9.2e+09 s, got nan in sample 0'),
 ])  # fmt: skip
 def test_bad_table_is_said_in_one_line(tmp_path, capsys, text, columns, said):
@@ -292,4 +256,3 @@ def test_bad_table_is_said_in_one_line(tmp_path, capsys, text, columns, said):
     assert run_table(tmp_path / 'my.csv', '--columns', columns) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
-    assert not (tmp_path / 'my.npz').exists()
