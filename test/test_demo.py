@@ -46,23 +46,20 @@ def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(parameters):
     result = run('demo', '--duration', 6, '--output', folder, '--params-file', parameters)
     assert result.returncode == 0, result.stderr
     assert nodes_of(parameters) == []
-    for word in (*OTHERS, 'RMS error', 'z1', 'z2', 'z3', 'dropped'):
+    for word in (*OTHERS, 'RMS error', 'z1', 'z2', 'z3', 'samples'):
         assert word in result.stdout
     assert (folder / 'report.txt').read_text().strip() in result.stdout
     assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
     with AnyReader([folder / 'bag']) as reader:
-        topics = {c.topic: c for c in reader.connections}
+        topics = {c.topic for c in reader.connections}
     found = [f'/estimator/{part}' for part in (*ESTIMATES, 'gamma', SNAPSHOT, PARAMETERS)]
-    assert {'/y', '/plant/state', '/plant/unknown_input', *found} <= set(topics)
-    assert all(c.digest.startswith('RIHS01_') for c in topics.values())
-    assert topics['/y'].msgcount > 1000
+    assert {'/y', '/plant/state', '/plant/unknown_input', *found} <= topics
     run_ = read_run(folder / 'bag')
+    assert len(run_.y.stamps) > 1000
     late = run_.t > 3.0
-    assert late.any()
-    error = np.median(np.abs(run_.errors[late]), axis=0)
     # Not d: other tests load the machine meanwhile, and its stamps jitter in bursts then.
-    assert (error[:2] < 0.05 * np.abs(run_.truth[late][:, :2]).max(axis=0)).all()
-    assert np.isfinite(error).all()
+    error = np.median(np.abs(run_.errors[late, :2]), axis=0)
+    assert (error < 0.05 * np.abs(run_.curves.truth[late, :2]).max(axis=0)).all()
 
 
 def test_shipped_demonstration_changes_the_plant(tmp_path):
@@ -74,7 +71,7 @@ def test_shipped_demonstration_changes_the_plant(tmp_path):
     run_ = read_run(folder / 'bag')
     assert run_.curves.gamma is None  # there is no power
     end = run_.t > run_.t[-1] - 0.5
-    true = np.std((run_.y.values.ravel()[run_.rows] - run_.truth[:, 0])[end])
+    true = np.std((run_.y.values.ravel()[run_.rows] - run_.curves.truth[:, 0])[end])
     assert true > 0.5e-4  # of some 50 samples
     found = np.median(run_.curves.tuning[end, 0])
     assert found > 0.5 * true  # jitter of a busy machine adds to it

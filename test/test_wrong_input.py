@@ -14,28 +14,23 @@ TUNE = (
     'tune -o out -pscheme:=explicit -pduration:=4.0 -pintegration_step:=1e-3 -psample_rate:=200.0 '
     '-precordings:=1 -pheld_out:=1 -psettled:=1.0 '
 )
-OF_D = '-punknown_input_size:=1.0 -punknown_input_decay:=1.0'
 WRONG = {
     # Bags.
     'replay /no/bag': ['/no/bag', 'does not exist'],
     'replay old.bag': ['ROS 1', 'rosbags-convert --src old.bag'],
-    'replay cut': ['whole bag', 'was cut', 'mcap recover'],
-    'replay spoilt': ['whole bag'],
+    'replay spoilt': ['whole bag', 'mcap recover'],
     'replay nameless': ['metadata.yaml', 'nameless.mcap: name that file'],
     'replay empty': ["expected messages on topic '/y', got none"],
     'replay joints -p input_field:=position[3]': ['position[3]', '3 in one message'],
-    'replay joints': ['position[i]'],
     'replay sqlite -p input_stamp:=source': ['input_stamp source: expected an mcap bag'],
     'replay bag --columns t,y': ['--columns: expected a .csv file, got'],
     # Parameters.
     'replay bag -p input_topic:=/yy': ["'/yy'", '(/y)', "did you mean '/y'?"],
     'replay bag -p input_field:=date': ["'date'", "did you mean 'data'?"],
-    'replay bag -p input_field:=data..x': ["'data..x'", 'one of data'],
     'replay bag -p input_stamp:=header': ['input_stamp header', files.FLOAT],
     'replay bag -p order=3': ['NAME:=VALUE', "'order=3'"],
     'replay bag -p lamda:=3': ["'lamda'", "did you mean 'lambda'?"],
     'replay bag -p epsilon:=-3': ["'epsilon'", '> 0', '-3'],
-    "replay bag -p phi:=\"['0','0','u']\"": ["'/u'", '(/y)'],
     'replay bag --smooth': ["expected 'noise_size' > 0"],
     'replay bag --params-file /no.yaml': ['/no.yaml', 'No such file'],
     'replay bag --params-file lamda.yaml': ['error: lamda.yaml: ', "'lamda'", "mean 'lambda'"],
@@ -43,11 +38,8 @@ WRONG = {
     # plot
     'plot both -o x.jpg': ['.png, .svg, .pdf', 'x.jpg'],
     'plot both --names /no': ['/estimator', "'/no'"],
-    'plot /no/bag': ['/no/bag', 'does not exist'],
     'plot bag': ['topics of an estimator', '/y'],
     # play, record, demo
-    'play /no/bag': ['/no/bag', 'does not exist'],
-    'play bag --rate 0': ['--rate', '0.001 to 1000', '0'],
     'play bag --delay -1': ['--delay', '0 to 3600', '-1'],
     'play bag --topics /x': ["'/x'", '/y'],
     'play bag --topics /clock': ['expected a message to play'],
@@ -56,23 +48,17 @@ WRONG = {
     'record -o out --topics /nobody --duration 0.5': ['nothing was published'],
     'record -o bag': ['an existing folder'],
     'demo --output out --duration 0': ['--duration', '1 to 3600', '0'],
-    'demo --output out --params-file /no.yaml': ['/no.yaml', 'No such file'],
     'demo --output out --params-file phi.yaml': ["'phi': expected 3 expressions"],
     'demo --output bag': ['bag', '--force'],
     # tune
     f'{TUNE} -pnoise:=1': ["unknown parameter 'noise'"],
     f'{TUNE} -psearch:=[lambda]': ["'search'", 'leave it out'],
-    f'{TUNE} -pscheme:=predict_correct {OF_D}': [
-        'expected one of unknown_input_size, unknown_input_decay to search'
-    ],
     f'{TUNE} -pweights:=[1.0,2.0]': ['weights', '1 or 4 numbers'],
     f'{TUNE} -psettled:=4.0': ['more than 4 s'],
     f'{TUNE} --trials=0': ['--trials >= 1'],
     f'{TUNE} --storage nodb://x': ['storage'],
-    f'{TUNE} --params-file nothing.yaml': ['nothing.yaml'],
     f'{TUNE} -o /proc/no/out': ['output'],
     f'{TUNE} -o bag': ['expected a new name (or --force'],
-    'tune --bag nothing -pscheme:=predict_correct': ['does not exist'],
     'tune --bag bag -o out -p structure:=cascade': ['got structure set'],
 }
 """Words of the line, by the call."""
@@ -83,13 +69,13 @@ def place(tmp_path_factory):
     """Return a folder with whole bags and broken ones, and wrong parameter files."""
     place = tmp_path_factory.mktemp('place')
     rows = files.floats(*files.signal(1000))
-    bags = {name: files.write(place / name, rows) for name in ('bag', 'cut', 'spoilt', 'nameless')}
-    assert main(['replay', str(bags['bag']), '-o', str(place / 'both')]) == 0
-    data = {name: (bag / f'{name}.mcap').read_bytes() for name, bag in bags.items()}
-    (bags['cut'] / 'cut.mcap').write_bytes(data['cut'][:-2000])
-    spoilt = data['spoilt'][:5000] + b'\xff' * 60 + data['spoilt'][5060:]  # longer than a record
-    (bags['spoilt'] / 'spoilt.mcap').write_bytes(spoilt)
-    (bags['nameless'] / 'metadata.yaml').unlink()
+    for name in ('bag', 'spoilt', 'nameless'):
+        files.write(place / name, rows)
+    assert main(['replay', str(place / 'bag'), '-o', str(place / 'both')]) == 0
+    data = (place / 'spoilt' / 'spoilt.mcap').read_bytes()
+    data = data[:5000] + b'\xff' * 60 + data[5060:]  # longer than a record
+    (place / 'spoilt' / 'spoilt.mcap').write_bytes(data)
+    (place / 'nameless' / 'metadata.yaml').unlink()
     files.write(place / 'sqlite', rows, 'sqlite3')
     (place / 'old.bag').write_bytes(b'#ROSBAG V2.0')
     with files.Writer(place / 'empty', version=9) as writer:
@@ -109,7 +95,7 @@ def test_wrong_input_is_said_in_one_line_and_leaves_nothing(call, place, capfd, 
     command, *arguments = shlex.split(call)
     if command in NODES:
         pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
-    elif command == 'tune':
+    elif '--storage' in arguments:
         pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
     monkeypatch.chdir(place)
     before = sorted(place.rglob('*'))

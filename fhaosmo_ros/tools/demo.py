@@ -15,14 +15,13 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.stop_signals import Stop, Stopped
-from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import messages, Series, series
+from fhaosmo_ros.tools.bags.topics import Series, series
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import Output, progress, run_command, shipped
 from fhaosmo_ros.tools.cli.processes import start_node
 from fhaosmo_ros.tools.plot.curves import Curves, read_curves
 from fhaosmo_ros.tools.plot.figures import save_curves
-from fhaosmo_ros.topics import ESTIMATES, TRUTH
+from fhaosmo_ros.topics import TRUTH
 import numpy as np
 from numpy.typing import NDArray
 
@@ -105,7 +104,7 @@ def _demo(arguments: argparse.Namespace, stop: Stop) -> None:
             print('stopped early: reporting what has been recorded')
         run = read_run(folder / 'bag')
         compared = others(run, estimator)
-        errors = {name: estimate - run.truth[:, -1] for name, estimate in compared.items()}
+        errors = {name: estimate - run.curves.truth[:, -1] for name, estimate in compared.items()}
         if errors:
             errors['live'] = run.errors[:, -1]
         save_curves([run.curves], folder / 'demo.png', errors, marks)
@@ -185,13 +184,11 @@ def _watch(
 
 
 class Run(NamedTuple):
-    """Estimates beside the truth at the time of the sample that each was computed from, K rows."""
+    """A recorded run: estimates beside the truth at the sample that each was computed from."""
 
-    curves: Curves
-    truth: Floats  # (K, n + 1) of the curves
+    curves: Curves  # of K estimates whose truth is known
     y: Series  # all samples
     rows: NDArray[np.int64]  # (K,) the sample behind each estimate
-    counters: dict[str, str]  # of the estimator's last diagnostics
 
     @property
     def t(self) -> Floats:
@@ -201,7 +198,7 @@ class Run(NamedTuple):
     @property
     def errors(self) -> Floats:
         """Errors of states and d, (K, n + 1)."""
-        return self.curves.estimate - self.truth
+        return self.curves.estimate - self.curves.truth
 
 
 def read_run(bag: Path) -> Run:
@@ -217,20 +214,13 @@ def read_run(bag: Path) -> Run:
         The bag holds no estimate with its truth.
 
     """
-    y = series(bag, '/y')
-    with BagReader(bag) as reader:
-        begun = all(reader.count(f'/estimator/{topic}') for topic in ESTIMATES)
-    live = read_curves(bag, ['/estimator'], '/plant')[0] if begun else None
-    if not live or live.truth is None or not np.isfinite(live.truth).all(axis=1).any():
+    (curves,) = read_curves(bag, ['/estimator'], '/plant')
+    if curves.truth is None or not (known := np.isfinite(curves.truth).all(axis=1)).any():
         raise ConfigurationError('the run ended before an estimate arrived beside its truth')
-    curves = live.part(np.isfinite(live.truth).all(axis=1))._replace(label='estimated live')
-    counters: dict[str, str] = {}
-    for _, message in messages(bag, '/diagnostics'):
-        for status in message.status:
-            if 'estimator' in status.name:
-                counters |= {pair.key: pair.value for pair in status.values}
+    curves = curves.part(known)._replace(label='estimated live')
+    y = series(bag, '/y')
     rows = np.searchsorted(y.stamps, curves.stamps).clip(max=len(y.stamps) - 1)
-    return Run(curves, np.asarray(curves.truth), y, rows, counters)
+    return Run(curves, y, rows)
 
 
 def others(run: Run, parameters: Mapping[str, Any]) -> dict[str, Floats]:
@@ -257,7 +247,7 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
         (begin, part) for begin, end in pairwise(edges)
         if (part := (run.t >= begin) & (run.t < end)).any()
     ] or [(0.0, run.t >= 0.0)]  # fmt: skip
-    d = run.truth[:, -1]
+    d = run.curves.truth[:, -1]
     estimates = {'this estimator, live': run.curves.estimate[:, -1], **compared}
     width = max(map(len, estimates))
     head = ''.join(f'{f"from {begin:.0f} s":>20}' for begin, _ in parts)
@@ -281,10 +271,6 @@ def table(run: Run, compared: Mapping[str, Floats], marks: Sequence[tuple[int, s
         f'{name} {rms(run.errors[late, k]):.2g}' for k, name in enumerate(run.curves.names[:-1])
     ]
     lines += ['', f'RMS errors of the states from {parts[0][0]:.0f} s on: {", ".join(errors)}']
-    span = (run.y.stamps[-1] - run.y.stamps[0]) * 1e-9
-    counts = [run.counters.get(f'samples {n}', '?') for n in ('accepted', 'lost', 'rejected')]
-    lines.append(
-        f'samples: {counts[0]} used, {counts[1]} dropped, {counts[2]} rejected; '
-        f'{(len(run.y.stamps) - 1) / span if span > 0.0 else float("nan"):.1f} a second'
-    )
+    rate = 1e9 / np.mean(np.diff(run.y.stamps))
+    lines.append(f'samples: {len(run.y.stamps)}, {rate:.1f} a second')
     return '\n'.join(lines)

@@ -24,7 +24,6 @@ def main(argv: list[str] | None = None) -> int:
     add = parser.add_argument
     add('bag', type=Path)
     add('--topics', nargs='+', metavar='TOPIC', help='these only (default: all)')
-    add('--rate', type=float, default=1.0, help='times real time (default: %(default)g)')
     add('--loop', action='store_true', help='begin again at the end, until Ctrl-C')
     add(
         '--delay', type=float, default=4.0, metavar='SECONDS',
@@ -35,8 +34,6 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _play(arguments: argparse.Namespace, stop: Stop) -> None:
-    if not 1e-3 <= arguments.rate <= 1e3:
-        raise ConfigurationError(f'--rate: expected 0.001 to 1000, got {arguments.rate:g}')
     if not 0.0 <= arguments.delay <= 3600.0:
         raise ConfigurationError(f'--delay: expected 0 to 3600 s, got {arguments.delay:g}')
     # Here, so that --help needs no ROS.
@@ -53,7 +50,7 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
             if any(q.durability.name == 'TRANSIENT_LOCAL' for q in c.ext.offered_qos_profiles)
         }
         with PrivateNode('fhaosmo_player', arguments.ros_arguments) as node:
-            clock = node.publisher('/clock', CLOCK, False)
+            publish_clock = node.publisher('/clock', CLOCK, False)
             publish = {}
             for topic, kind in topics.items():
                 try:
@@ -64,22 +61,16 @@ def _play(arguments: argparse.Namespace, stop: Stop) -> None:
             if stop.wait(arguments.delay):
                 return
             while True:
-                now, begin = None, time.monotonic_ns()
+                now = None
                 for topic, stamp, data, _ in reader.messages(publish):
                     if now is None:
-                        first = now = stamp
-                        clock(_clock(now))
+                        now, ahead = stamp - 1, stamp - time.monotonic_ns()
                     while now < stamp:  # the clock goes on between the messages
-                        now = min(now + CLOCK_PERIOD * max(1, round(arguments.rate)), stamp)
-                        pause = (now - first) / arguments.rate - (time.monotonic_ns() - begin)
-                        if stop.wait(max(0.0, pause * 1e-9)):
+                        now = min(now + CLOCK_PERIOD, stamp)
+                        if stop.wait(max(0.0, (now - ahead - time.monotonic_ns()) * 1e-9)):
                             return
-                        clock(_clock(now))
+                        clock = TYPES.types[TIME](*divmod(now, 1_000_000_000))
+                        publish_clock(serialise(CLOCK, clock=clock))
                     publish[topic](data)
                 if not arguments.loop:
                     return
-
-
-def _clock(now: int) -> bytes:
-    """Return the message on /clock for a time in nanoseconds."""
-    return serialise(CLOCK, clock=TYPES.types[TIME](*divmod(now, 1_000_000_000)))

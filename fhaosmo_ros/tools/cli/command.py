@@ -3,13 +3,13 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+from functools import partial
 import os
 from pathlib import Path
 import re
 import shlex
 import shutil
 import sys
-from typing import Any
 
 from fhaosmo_ros import __version__
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -17,8 +17,8 @@ from fhaosmo_ros.stop_signals import Stop, stop_on_signals, Stopped
 from tqdm import tqdm
 
 Body = Callable[[argparse.Namespace, Stop], int | None]
-PERIOD = 30.0
-"""Seconds between two lines in a log; work that ends sooner leaves none."""
+progress = partial(tqdm, disable=None)
+"""A bar in a terminal, and nothing in a log."""
 
 
 def run_command(parser: argparse.ArgumentParser, argv: Sequence[str] | None, body: Body) -> int:
@@ -149,25 +149,6 @@ class Output:
 
     def __exit__(self, *_: object) -> None:
         shutil.rmtree(self._folder, ignore_errors=True)
-
-
-class _Lines:
-    """stderr, where each state of a bar is a line without what moves a terminal's cursor."""
-
-    def write(self, text: str) -> None:
-        if line := text.strip():
-            sys.stderr.write(f'{line}\n')
-
-    def flush(self) -> None:
-        sys.stderr.flush()
-
-
-def progress(*arguments: Any, **options: Any) -> Any:
-    """Return a `tqdm` with these arguments, fit for a terminal or for a log."""
-    if not sys.stderr.isatty():
-        period = {'mininterval': PERIOD, 'maxinterval': PERIOD, 'delay': PERIOD}
-        options |= {'file': _Lines(), **period}
-    return tqdm(*arguments, **options)
 
 
 def shipped(relative: str) -> Path:
