@@ -21,55 +21,42 @@ SEEN_QOS = LATCHED_QOS | {'history': 'unknown', 'depth': 0}
 """As the middleware tells of a publisher: it does not know history and depth."""
 
 
-def test_metadata(tmp_path):
-    """Every field that rosbag2's parser asks for in version 9, of its type; twice."""
+def test_metadata_is_as_rosbag2_writes_it(tmp_path):
+    """As that of rosbags; and again in the file, where the parser of the C++ reader looks."""
+    messages = [
+        ('/y', files.FLOAT, 5, files.float64(1.5)), ('/late', files.FLOAT, 7, files.float64(-2.5)),
+        ('/y', files.FLOAT, 9, files.float64(2.5)),
+    ]  # fmt: skip
+    text = (files.write(tmp_path / 'theirs', messages) / 'metadata.yaml').read_text()
+    text = text.replace('theirs.mcap', 'bag_0.mcap').replace('distro: rosbags', 'distro: jazzy')
+    expected = yaml.safe_load(text)
+    profiles = {'/y': [OFFERED_QOS], '/late': [SEEN_QOS]}
     with BagWriter(tmp_path / 'bag') as bag:
-        bag.add('/y', files.FLOAT)
-        bag.add('/late', files.FLOAT, qos=[SEEN_QOS])
-        bag.write('/y', 5, files.float64(1.5))
-        bag.write('/late', 7, files.float64(-2.5))
-        bag.write('/y', 9, files.float64(2.5))
-    span = {
-        'starting_time': {'nanoseconds_since_epoch': 5}, 'duration': {'nanoseconds': 4},
-        'message_count': 3,
-    }  # fmt: skip
-    profiles = {'/y': OFFERED_QOS, '/late': SEEN_QOS}
-    expected = {
-        'version': 9, 'storage_identifier': 'mcap', **span,
-        'topics_with_message_count': [
-            {
-                'message_count': count,
-                'topic_metadata': {
-                    'name': name, 'type': files.FLOAT, 'serialization_format': 'cdr',
-                    'offered_qos_profiles': [profiles[name]], 'type_description_hash': FLOAT_HASH,
-                },
-            }
-            for name, count in (('/y', 2), ('/late', 1))
-        ],
-        'compression_format': '', 'compression_mode': '', 'relative_file_paths': ['bag_0.mcap'],
-        'files': [{'path': 'bag_0.mcap', **span}],
-        'custom_data': None,  # how yaml-cpp writes an empty map
-        'ros_distro': 'jazzy',
-    }  # fmt: skip
-    text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
-    assert yaml.safe_load(text) == {'rosbag2_bagfile_information': expected}
+        for topic, qos in profiles.items():
+            bag.add(topic, files.FLOAT, qos)
+        for topic, _, stamp, data in messages:
+            bag.write(topic, stamp, data)
+    for topic in expected['rosbag2_bagfile_information']['topics_with_message_count']:
+        metadata = topic['topic_metadata']
+        metadata['offered_qos_profiles'] = profiles[metadata['name']]
+    assert yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text()) == expected
     with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        summary = reader.get_summary()
-        for channel in summary.channels.values():
-            qos, digest = map(channel.metadata.get, ('offered_qos_profiles', 'topic_type_hash'))
-            assert (channel.message_encoding, digest) == ('cdr', FLOAT_HASH)
-            assert yaml.safe_load(qos) == [profiles[channel.topic]]
-            schema = summary.schemas[channel.schema_id]
-            assert (schema.name, schema.encoding) == (files.FLOAT, 'ros2msg')
+        for channel in reader.get_summary().channels.values():
+            assert channel.metadata['topic_type_hash'] == FLOAT_HASH
+            qos = yaml.safe_load(channel.metadata['offered_qos_profiles'])
+            assert qos == profiles[channel.topic]
         (metadata,) = reader.iter_metadata()
-        assert metadata.name == 'rosbag2'
-        assert yaml.safe_load(metadata.metadata['serialized_metadata']) == expected
+        inside = yaml.safe_load(metadata.metadata['serialized_metadata'])
+        assert {'rosbag2_bagfile_information': inside} == expected
         got = [
-            (channel.topic, message.log_time, message.publish_time, decoded.data)
-            for _, channel, message, decoded in reader.iter_decoded_messages()
+            (channel.topic, schema.name, message.log_time, message.publish_time, decoded.data)
+            for schema, channel, message, decoded in reader.iter_decoded_messages()
         ]
-    assert got == [('/y', 5, 5, 1.5), ('/late', 7, 7, -2.5), ('/y', 9, 9, 2.5)]
+    assert got == [
+        ('/y', files.FLOAT, 5, 5, 1.5), ('/late', files.FLOAT, 7, 7, -2.5),
+        ('/y', files.FLOAT, 9, 9, 2.5),
+    ]  # fmt: skip
 
 
 def recorded(path):

@@ -20,56 +20,57 @@ for name, text in (('Inner', INNER), ('Outer', OUTER)):
     STORE.register(get_types_from_msg(text, f'rig/msg/{name}'))
 
 
-@pytest.mark.parametrize(('path', 'number'), [
-    ('count', -7.0), ('three[2]', 2.5), ('parts[1].force', 1.5), ('parts[0].on[1]', 1.0),
-    ('parts[2].force', None), ('parts[1].on[0]', None), ('header.stamp.sec', 1.0),
+def made(kind, **fields):
+    return STORE.types[kind](**fields)
+
+
+def header():
+    stamp = made('builtin_interfaces/msg/Time', sec=1, nanosec=2)
+    return made('std_msgs/msg/Header', stamp=stamp, frame_id='a')
+
+
+def outer():
+    inner = [
+        made('rig/msg/Inner', force=0.5, on=np.array([False, True])),
+        made('rig/msg/Inner', force=1.5, on=np.zeros(0, dtype=bool)),
+    ]
+    three = np.array([0.5, 1.5, 2.5], np.float32)
+    return made('rig/msg/Outer', header=header(), count=-7, three=three, parts=inner, words=['a'])
+
+
+def joints(names):
+    lists = {'velocity': np.zeros(0), 'effort': np.zeros(0)}
+    return made(JOINTS, header=header(), name=names, position=np.array([1.0, 2.0]), **lists)
+
+
+QUATERNION = made(
+    'geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=2.0 * np.sin(0.4), w=2.0 * np.cos(0.4)
+)
+
+
+@pytest.mark.parametrize(('message', 'path', 'expected'), [
+    (outer(), 'count', -7.0), (outer(), 'three[2]', 2.5), (outer(), 'parts[1].force', 1.5),
+    (outer(), 'parts[0].on[1]', 1.0), (outer(), 'header.stamp.sec', 1.0),
+    (joints([]), 'position[1]', 2.0), (joints(['hip', 'elbow']), 'position[elbow]', 2.0),
+    (QUATERNION, 'yaw', pytest.approx(0.8)),
+    # This message's lists are too short, others' may be longer.
+    (outer(), 'parts[2].force', 'index below the number'),
+    (outer(), 'parts[1].on[0]', 'index below the number'),
+    (joints([]), 'position[2]', '2 in one message, got 2'),
+    (joints(['hip', 'elbw']), 'position[elbow]', "did you mean 'elbw'"),
+    (joints(['a', 'b', 'elbow']), 'position[elbow]', "none for 'elbow'"),
 ])  # fmt: skip
-def test_numbers_at_any_depth(path, number):
-    """None: this message's lists are too short, others' may be longer."""
-    inner, outer = (STORE.types[f'rig/msg/{name}'] for name in ('Inner', 'Outer'))
-    parts = [inner(0.5, np.array([False, True])), inner(1.5, np.zeros(0, dtype=bool))]
-    header = joints([], []).header
-    message = outer(header, -7, np.array([0.5, 1.5, 2.5], np.float32), parts, ['count'])
-    data = STORE.serialize_cdr(message, 'rig/msg/Outer')
-    field = find_field(STORE.fielddefs, 'rig/msg/Outer', path)
-    assert field.header == 'header'
-    for same in (message, STORE.deserialize_cdr(data, 'rig/msg/Outer')):
-        if number is None:
-            with pytest.raises(MissingElementError, match='index below the number'):
+def test_number_at_any_depth_by_index_and_by_name(message, path, expected):
+    kind = message.__msgtype__
+    field = find_field(STORE.fielddefs, kind, path)
+    if field.header:
+        assert field.stamp(message) == 1_000_000_002
+    for same in (message, STORE.deserialize_cdr(STORE.serialize_cdr(message, kind), kind)):
+        if isinstance(expected, str):
+            with pytest.raises(MissingElementError, match=expected):
                 field.value(same)
         else:
-            assert field.value(same) == number
-
-
-def joints(names, positions):
-    stamp = STORE.types['builtin_interfaces/msg/Time'](sec=1, nanosec=2)
-    header = STORE.types['std_msgs/msg/Header'](stamp=stamp, frame_id='a')
-    lists = {'position': np.array(positions), 'velocity': np.zeros(0), 'effort': np.zeros(0)}
-    return STORE.types[JOINTS](header=header, name=names, **lists)
-
-
-@pytest.mark.parametrize(('text', 'names', 'positions', 'problem'), [
-    ('position[elbow]', ['hip', 'elbow'], [1.0, 2.0], ''), ('position[1]', [], [1.0, 2.0], ''),
-    ('position[1]', [], [1.0], '1 in one message, got 1'),
-    ('position[elbow]', ['hip', 'elbw'], [1.0, 2.0], "did you mean 'elbw'"),
-    ('position[elbow]', ['hip', 'elbow'], [1.0], "none for 'elbow'"),
-])  # fmt: skip
-def test_element_of_a_list_by_index_and_by_name(text, names, positions, problem):
-    field = find_field(STORE.fielddefs, JOINTS, text)
-    message = joints(names, positions)
-    assert field.stamp(message) == 1_000_000_002
-    if problem:
-        with pytest.raises(MissingElementError, match=problem):
-            field.value(message)
-    else:
-        assert field.value(message) == 2.0
-
-
-def test_angle_of_a_quaternion():
-    kind = 'geometry_msgs/msg/Quaternion'
-    message = STORE.types[kind](x=0.0, y=0.0, z=2.0 * np.sin(0.4), w=2.0 * np.cos(0.4))
-    field = find_field(STORE.fielddefs, kind, 'yaw')
-    assert field.value(message) == pytest.approx(0.8)
+            assert field.value(same) == expected
 
 
 # Known inputs paired with y by header stamps: whatever arrives first, the result is one

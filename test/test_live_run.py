@@ -7,22 +7,22 @@ from fhaosmo_ros.core.online.snapshots import Flag, pack, Snapshot
 from fhaosmo_ros.core.parameters.files import dumps
 from fhaosmo_ros.tools.bags.types import labelled_array
 from fhaosmo_ros.tools.replay import command as replay
+from fhaosmo_ros.topics import ARRAY, TEXT
 import numpy as np
 import pytest
 
 COUNT = 4000
 STAMPS, Y = files.signal(COUNT)
 PARAMETERS = {'variant': 'fuzzy_adaptive', 'epsilon': 3.0}
-OPTIONS = ['-p', 'variant:=fuzzy_adaptive']
-ARRAY, EVENT = 'std_msgs/msg/Float64MultiArray', 'rcl_interfaces/msg/ParameterEvent'
+EVENT = 'rcl_interfaces/msg/ParameterEvent'
 
 
 class Live:
     """What a node does and publishes, as messages of a bag."""
 
-    def __init__(self, name='/estimator', parameters=PARAMETERS, node=None):
+    def __init__(self, name='/estimator', node=None, **parameters):
         self.name, self.node = name, node or name
-        self.estimator = OnlineEstimator(parameters)
+        self.estimator = OnlineEstimator(PARAMETERS, **parameters)
         self.messages, self.rows = [], {}
         self._begins = True
 
@@ -31,8 +31,6 @@ class Live:
         for k in range(begin, end):
             stamp = int(STAMPS[k]) + late
             estimate = self.estimator.update(stamp, float(Y[k]))
-            if estimate.status.rejected:
-                continue
             self.rows[stamp] = [*estimate.z, estimate.unknown_input, estimate.gamma]
             if self._begins or k % 500 == 499:
                 self._tell(Flag.STARTED if self._begins else Flag(0), 90_000)
@@ -46,10 +44,9 @@ class Live:
         self.messages.append((f'{self.name}/snapshot', ARRAY, estimator.latest + delay, data))
 
     def tell_parameters(self, stamp, **values):
-        """Publish them, as all that the node is set to."""
-        text = dumps(values, self.node)
-        data = files.cdr('std_msgs/msg/String', data=text)
-        self.messages.append((f'{self.node}/parameters', 'std_msgs/msg/String', int(stamp), data))
+        """Publish all that the node is set to."""
+        data = files.cdr(TEXT, data=dumps(values, self.node))
+        self.messages.append((f'{self.node}/parameters', TEXT, int(stamp) + 200_000, data))
 
     def reset(self):
         self.estimator.reset()
@@ -109,7 +106,10 @@ def expect(found, live, first=0):
 
 @pytest.mark.parametrize('begin', [0, 700, 2600])
 def test_every_live_estimate_comes_again(begin, tmp_path, capsys):
-    live = Live()
+    """With known inputs that only the live estimator has seen, and parameters from the bag."""
+    model = {'phi': ['0', '0', 'u - z3'], 'gains': 'fixed'}
+    live = Live('/rig/estimator', **model)
+    live.estimator.set_input(0.7)  # a set-point that was published once
     live.run(123, 1000)  # it discovered y later than the recorder
     live.change(STAMPS[999], 'epsilon', 1e-6)
     live.run(1000, 2000)
@@ -119,65 +119,39 @@ def test_every_live_estimate_comes_again(begin, tmp_path, capsys):
     live.change(STAMPS[2299], 'epsilon', 2.0)
     live.run(2300, 2700)
     live.freeze(True)
-    live.run(2700, 3400)
+    live.run(2700, 3000)
+    live.estimator.set_input(-0.4)
+    live.messages += files.floats(STAMPS[3000:3001] - 1, np.array([-0.4]), '/rig/u')
+    live.run(3000, 3400)
     live.freeze(False)
     live.run(3400, COUNT)
+    # The publisher's latest message, which a late recorder gets first.
+    told = PARAMETERS | model | {'publish_rate': 50.0}
+    if begin == 2600:
+        told |= {'gamma_rate': 0.02, 'epsilon': 2.0}
+    live.tell_parameters(STAMPS[begin], **told)
     bag = write(tmp_path / 'bag', COUNT, live, begin=begin)
-    (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
-    parameters = ['--params-file', tmp_path / 'p.yaml']
-    if begin == 2600:  # whoever records later has to know the parameters
-        parameters = ['-p', 'epsilon:=2.0', '-p', 'gamma_rate:=0.02']
-    text, found = run(capsys, bag, *OPTIONS, *parameters)
+    text, found = run(capsys, bag)
     # The first snapshot after the begin is that of sample 123, 999 or 2699.
     expect(found, live, {0: 0, 700: 1000 - 123, 2600: 2700 - 123}[begin])
-    assert 'followed /estimator' in text
+    assert 'parameters: /rig/estimator/parameters in the bag\n' in text
+    assert 'followed /rig/estimator' in text
     count = sum(m[0].endswith('snapshot') and m[2] >= STAMPS[begin] for m in live.messages)
     count -= begin > 0  # where it begins there is nothing to compare
     assert f'{count} of {count} snapshots are the same' in text
-
-
-@pytest.mark.parametrize('begin', [0, 1200])
-def test_parameters_come_from_the_bag(begin, tmp_path, capsys):
-    """From the publisher's latest message, which a late recorder gets first."""
-    live = Live('/rig/estimator', {'variant': 'fuzzy', 'epsilon': 3.0})
-    live.tell_parameters(STAMPS[0], variant='fuzzy', epsilon=3.0, publish_rate=50.0)
-    live.run(0, 1000)
-    live.change(STAMPS[999], 'epsilon', 1e-6)
-    live.tell_parameters(STAMPS[1200 if begin else 999] + 200_000, variant='fuzzy', epsilon=1e-6)
-    live.run(1000, 2000)
-    bag = write(tmp_path / 'bag', 2000, live, begin=begin)
-    text, found = run(capsys, bag)
-    assert 'parameters: /rig/estimator/parameters in the bag\n' in text
-    assert 'parameters differ' not in text
-    expect(found, live, 1500 if begin else 0)
 
 
 def test_parameters_of_the_bag_make_way(tmp_path, capsys):
     live = Live().run(0, 600)
     live.tell_parameters(STAMPS[0], variant='sign', epsilon=1.0)
     bag = write(tmp_path / 'bag', 600, live)
-    text, found = run(capsys, bag, *OPTIONS, '-p', 'epsilon:=3.0')
+    text, found = run(capsys, bag, '-p', 'variant:=fuzzy_adaptive', '-p', 'epsilon:=3.0')
     assert 'in the bag, with variant, epsilon of the command line' in text
     expect(found, live)
-    other = Live().run(0, 300)
-    other.tell_parameters(STAMPS[0], epsilom=1.0)  # as of another version
-    error = run(capsys, write(tmp_path / 'other', 300, other), code=2)
+    live.tell_parameters(STAMPS[0] - 1, epsilom=1.0)  # as of another version
+    error = run(capsys, write(tmp_path / 'other', 600, live), code=2)
     for word in ("'/estimator/parameters'", 'epsilom', '--params-file'):
         assert word in error
-
-
-@pytest.mark.parametrize('begin', [0, 700])
-def test_input_that_came_before_the_recording_holds(begin, tmp_path, capsys):
-    """Such as a set-point that is published once: only the live estimator knows it."""
-    live = Live(parameters={'phi': ['0', '0', 'u - z3'], 'gains': 'fixed'})
-    live.estimator.set_input(0.7)
-    live.run(0, 3000)
-    live.estimator.set_input(-0.4)
-    live.messages += files.floats(STAMPS[3000:3001] - 1, np.array([-0.4]), '/u')
-    live.run(3000, COUNT)
-    bag = write(tmp_path / 'bag', COUNT, live, begin=begin)
-    _, found = run(capsys, bag, '-p', "phi:=['0', '0', 'u - z3']", '-p', 'gains:=fixed')
-    expect(found, live, 1000 if begin else 0)
 
 
 @pytest.mark.parametrize(('late', 'options', 'first', 'said'), [
@@ -188,7 +162,7 @@ def test_input_that_came_before_the_recording_holds(begin, tmp_path, capsys):
 ])  # fmt: skip
 def test_what_cannot_be_followed_begins_afresh(late, options, first, said, tmp_path, capsys):
     bag = write(tmp_path / 'bag', 1500, Live().run(0, 1500, late), begin=600)
-    text, found = run(capsys, bag, *OPTIONS, *options)
+    text, found = run(capsys, bag, *options)
     assert said in text
     assert list(found) == STAMPS[first:1500].tolist()
 
@@ -197,14 +171,15 @@ def test_sample_that_the_bag_lacks_does_not_stop_the_following(tmp_path, capsys)
     live = Live().run(0, 1000)
     live.reset()
     live.run(1000, 2000)
+    live.tell_parameters(STAMPS[0], **PARAMETERS)
     keep = np.delete(np.arange(2000), 1000)  # the one from which it started again
-    _, got = run(capsys, write(tmp_path / 'bag', keep, live), *OPTIONS, '-p', 'epsilon:=3.0')
+    _, got = run(capsys, write(tmp_path / 'bag', keep, live))
     assert got[int(STAMPS[999])] == live.rows[int(STAMPS[999])]
     assert got[int(STAMPS[1001])][4] == live.rows[int(STAMPS[1000])][4]  # gamma began afresh too
 
 
 def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
-    lives = [Live(f'/estimator/{name}', node='/estimator') for name in ('hip', 'knee')]
+    lives = [Live(f'/estimator/{name}', '/estimator') for name in ('hip', 'knee')]
     for live, epsilon in zip(lives, (1e-6, 0.5), strict=True):
         live.run(0, 700)
         live.change(STAMPS[699], 'epsilon', epsilon)
@@ -213,20 +188,21 @@ def test_changes_of_one_channel_are_its_own(tmp_path, capsys):
     own = {'hip.epsilon': 3.0, 'knee.epsilon': 3.0, 'channels': ['hip', 'knee']}
     lives[0].tell_parameters(STAMPS[0], variant='fuzzy_adaptive', epsilon=7.0, **own)
     told = write(tmp_path / 'told', 1500, *lives)
-    (tmp_path / 'p.yaml').write_text('/**: {ros__parameters: {epsilon: 3.0}}')
-    file = ['--params-file', tmp_path / 'p.yaml', *OPTIONS]
+    (tmp_path / 'p.yaml').write_text(dumps(PARAMETERS))
     for live in lives:
-        channel = live.name.removeprefix('/estimator/')
-        for arguments in ([bag, '--follow', live.name, *file], [told, '--channel', channel]):
+        follow = ['--follow', live.name, '--params-file', tmp_path / 'p.yaml']
+        channel = ['--channel', live.name.removeprefix('/estimator/')]
+        for arguments in ([bag, *follow], [told, *channel]):
             text, found = run(capsys, *arguments)
             assert f'followed {live.name}' in text
             assert 'parameters differ' not in text
             expect(found, live)
-    error = run(capsys, told, '--afresh', '--channel', 'hop', code=2)
-    assert '--channel: expected hip or knee, got hop' in error
-    error = run(capsys, bag, code=2)
-    assert '(/estimator/hip, /estimator/knee)' in error
-    assert "'/middle'" in run(capsys, bag, '--follow', '/middle', code=2)
+    for arguments, said in (
+        ([told, '--afresh', '--channel', 'hop'], '--channel: expected hip or knee, got hop'),
+        ([bag], '(/estimator/hip, /estimator/knee)'),
+        ([bag, '--follow', '/middle'], "'/middle'"),
+    ):
+        assert said in run(capsys, *arguments, code=2)
 
 
 @pytest.mark.parametrize('labels', [['a', 'b'], ['version', 'z_hat1'], ['flags', 'm1']])

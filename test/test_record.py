@@ -4,7 +4,6 @@
 from collections import Counter
 import re
 import shlex
-import signal
 import subprocess
 import time
 
@@ -186,27 +185,3 @@ def test_full_disk_leaves_what_was_recorded(live, tmp_path):
     assert 'File "' not in result.stderr  # a stack, by Python or by the middleware
     assert '`mcap recover` saves what was recorded' in result.stderr
     assert len(stamps(tmp_path / 'bag', '/y')) > 1500
-
-
-COMMAND_LINE = re.compile(r'^ +ros2 run fhaosmo_ros ((?:record|replay|plot) .*?)(?: +#.*)?$', re.M)
-
-
-def test_commands_of_the_first_pages_run_one_after_the_other(live, tmp_path):
-    """As they are written there."""
-    readme, page = ((ROOT / name).read_text() for name in ('README.md', 'docs/start.md'))
-    lines = COMMAND_LINE.findall(page)
-    assert set(COMMAND_LINE.findall(readme)) <= set(lines)
-    assert lines[0].startswith('record')
-    text = re.search(r'^```yaml\n(.*?)```', page, re.M | re.S)[1]
-    (tmp_path / 'pendulum.yaml').write_text(text)
-    t = np.arange(0.0, 2.0, 1e-3)
-    table = np.column_stack([t, 0.5 * np.cos(4.4 * t), np.zeros_like(t)])
-    np.savetxt(tmp_path / 'my.csv', table, delimiter=',', header='t,angle,tau', comments='')
-    for line in lines:
-        with start(*line.split(), stderr=subprocess.STDOUT, cwd=tmp_path) as process:
-            if line.startswith('record'):
-                wait_for_more(tmp_path / 'run', 200_000, process)
-                process.send_signal(signal.SIGINT)
-            output, _ = process.communicate(timeout=60)
-        assert process.returncode == 0, f'{line}: {output}'
-        assert (tmp_path / re.search(r' -o (\S+)', line)[1]).exists(), line
