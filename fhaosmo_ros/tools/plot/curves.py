@@ -18,7 +18,7 @@ from fhaosmo_ros.tools.bags.topics import (
     recorded_parameters,
     series,
 )
-from fhaosmo_ros.topics import ESTIMATES, EVENT, OF_GAINS, STANDARD_DEVIATION, TRUTH
+from fhaosmo_ros.topics import ESTIMATES, EVENT, STANDARD_DEVIATION, TRUTH
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,7 +37,6 @@ class Curves(NamedTuple):
     innovation: Floats  # (K, N)
     gamma: Floats | None = None  # (K,); None of a self-tuning estimator, which has no power
     deviation: Floats | None = None  # (K, n + 1) standard deviations, of a self-tuning estimator
-    tuning: Floats | None = None  # (K, m) what that one has found
     truth: Floats | None = None  # (K, n + 1); NaN where the bag lacks it
     epsilon: float | None = None  # of its gates, if it has gates and the bag has its parameters
     unit: str = ''  # of y, '' if the bag does not say it
@@ -50,7 +49,7 @@ class Curves(NamedTuple):
 
     def part(self, rows: NDArray[np.bool_]) -> 'Curves':
         """Return some of the rows."""
-        columns = ('stamps', 'estimate', 'innovation', 'gamma', 'deviation', 'tuning', 'truth')
+        columns = ('stamps', 'estimate', 'innovation', 'gamma', 'deviation', 'truth')
         found = {name: getattr(self, name) for name in columns}
         return self._replace(**{k: None if x is None else x[rows] for k, x in found.items()})
 
@@ -94,8 +93,8 @@ def _curves(
         unit = values['measurement_unit']
         if values['structure'] == 'cascade' and values['gains'] == 'fixed':
             epsilon = values['epsilon']
-    of_gains = [p for of in OF_GAINS.values() for p in of if f'{name}/{p}' in topics]
-    ticks = read_ticks(path, name, [*of_gains, *ESTIMATES])
+    optional = [p for p in ('gamma', STANDARD_DEVIATION) if f'{name}/{p}' in topics]
+    ticks = read_ticks(path, name, [*optional, *ESTIMATES])
     when = ticks['stamp']
     if not len(when):
         raise ConfigurationError(f'bag {path}: expected whole estimates of {name}, got none')
@@ -112,7 +111,6 @@ def _curves(
         ticks['innovation'],
         ticks.get('gamma'),
         ticks.get(STANDARD_DEVIATION),
-        ticks.get('tuning'),
         truth,
         epsilon,
         unit,

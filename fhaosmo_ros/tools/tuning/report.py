@@ -14,11 +14,7 @@ from fhaosmo_ros.tools.tuning.search import Result
 from fhaosmo_ros.tools.tuning.tuner import Tuner
 import numpy as np
 
-OVERFITTED = 1.25
-"""The report warns from this ratio of the held-out error to the training error on."""
 SMALL_CORRELATION, UNLIKELY = 0.05, 0.01
-NEAR = 1.2
-"""Sizes that differ by less than this factor are alike."""
 
 
 class Report(NamedTuple):
@@ -77,25 +73,8 @@ def of_search(tuner: Tuner, result: Result) -> Report:
         [d.name, *(f'{x:.4g}' for x in (d.low, d.high, d.start, best[d.name]))]
         for d in tuner.space
     ]
-    main = '\n\n'.join([table(columns, rows), *warnings(training, held_out)])
     more = table(['parameter', 'from', 'to', 'start', 'tuned'], searched)
-    return Report(tuner.parameters(best), summary, main, more)
-
-
-def warnings(training: float, held_out: float) -> list[str]:
-    """Return what a user should know before using gains of these errors."""
-    found = []
-    if held_out > OVERFITTED * training:
-        found.append(
-            f'Note: The error on held-out recordings is {held_out / training:.2f} times that of '
-            'the training: more recordings, or fewer parameters to search, would help.'
-        )
-    if held_out > 0.9:
-        found.append(
-            f'Note: An estimate that is always 0 has the error 1; this one {held_out:.2f}. Either '
-            'this sensor hardly shows this d, or more trials, or another start, are needed.'
-        )
-    return found
+    return Report(tuner.parameters(best), summary, table(columns, rows), more)
 
 
 # from a bag
@@ -176,16 +155,6 @@ def notes(found: Identified, run: Run) -> Iterator[str]:
             f'{samples.y.max():.3g} for {whole:.0f} s. If no controller holds this plant, then a '
             'sign in phi is wrong; if one does, its command should be a known input, or d '
             'contains it.'
-        )
-    if lost := run.counters.divergences:
-        yield (
-            f'With these gains the estimator lost y {lost} times in this bag and began afresh: '
-            'do not use them before the notes above are settled.'
-        )
-    if not 1.0 / NEAR < run.size < NEAR:
-        yield (
-            f'Innovations have {run.size:.2f} times the expected size: the model or the noise '
-            'are not what they are taken for, and so are the standard deviations.'
         )
     correlation = run.correlations[run.lag]
     if run.probability < UNLIKELY and abs(correlation) > SMALL_CORRELATION:
