@@ -46,7 +46,7 @@ WRONG = {
     'record -o out --duration 0': ['--duration', '> 0', '0'],
     "record -o out --topics 'a b'": ['--topics', "'a b'"],
     'record -o out --topics /nobody --duration 0.5': ['nothing was published'],
-    'record -o bag': ['an existing folder'],
+    'record -o bag': ['one that exists'],
     'demo --output out --duration 0': ['--duration', '1 to 3600', '0'],
     'demo --output out --params-file phi.yaml': ["'phi': expected 3 expressions"],
     'demo --output bag': ['bag', '--force'],

@@ -2,7 +2,7 @@
 """The demonstration: plant and estimator as two processes over DDS, recorded and compared."""
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 import os
 from pathlib import Path
@@ -154,32 +154,20 @@ def _record(
                 raise ConfigurationError(
                     f'waited {START_DEADLINE:g} s for the first estimate in vain'
                 )
-        return _watch(recorder, check, duration, noisy, stop)
-
-
-def _watch(
-    recorder: Any,
-    check: Callable[[], None],
-    duration: float,
-    noisy: bool,
-    stop: Stop,
-) -> list[tuple[int, str]]:
-    """Show a progress bar, and change the plant, until the time is over or the user stops it."""
-    words, values = NOISE
-    begin, elapsed = time.monotonic(), 0.0
-    marks: list[tuple[int, str]] = []
-    form = '{l_bar}{bar}| {n:.0f}/{total:.0f} s{postfix}'
-    with progress(total=duration, unit='s', bar_format=form) as bar:
-        while elapsed < duration and not stop.wait(0.1):
-            check()
-            elapsed = min(time.monotonic() - begin, duration)
-            bar.set_postfix_str(f'{recorder.counts["/y"]} samples', refresh=False)
-            bar.update(elapsed - bar.n)
-            if noisy and not marks and elapsed >= NOISY_FROM * duration:
-                bar.write(f'{elapsed:4.1f} s: {words}')
-                marks.append((time.time_ns(), words))
-                recorder.set_parameters('/plant', values)
-    return marks
+        words, values = NOISE
+        begin, elapsed = time.monotonic(), 0.0
+        marks: list[tuple[int, str]] = []
+        form = '{l_bar}{bar}| {n:.0f}/{total:.0f} s'
+        with progress(total=duration, bar_format=form) as bar:
+            while elapsed < duration and not stop.wait(0.1):
+                check()
+                elapsed = min(time.monotonic() - begin, duration)
+                bar.update(elapsed - bar.n)
+                if noisy and not marks and elapsed >= NOISY_FROM * duration:
+                    bar.write(f'{elapsed:4.1f} s: {words}')
+                    marks.append((time.time_ns(), words))
+                    recorder.set_parameters('/plant', values)
+        return marks
 
 
 class Run(NamedTuple):

@@ -2,6 +2,7 @@
 """Record y and the estimator's topics to a bag."""
 
 import argparse
+import math
 from pathlib import Path
 import re
 import shutil
@@ -13,7 +14,6 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.writer import BagWriter
 from fhaosmo_ros.tools.cli.command import progress, run_command
-from tqdm import tqdm
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -40,9 +40,9 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
         raise ConfigurationError(f'--duration: expected > 0 s, got {arguments.duration:g}')
     path = arguments.output or Path(time.strftime('bag_%Y-%m-%d_%H-%M-%S'))
     if path.exists():
-        kind = 'folder' if path.is_dir() else 'file'
-        raise ConfigurationError(f'output {path}: expected a new name, got an existing {kind}')
-    for topic in arguments.topics or []:
+        raise ConfigurationError(f'output {path}: expected a new name, got one that exists')
+    topics = arguments.topics or []
+    for topic in topics:
         if not re.fullmatch(r'/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', topic):
             raise ConfigurationError(f'--topics: expected a name such as /y, got {topic!r}')
     # Here, so that --help needs no ROS.
@@ -51,8 +51,8 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
     bag = BagWriter(path)
     recorder = TopicRecorder(
         bag,
-        [] if arguments.topics else [f'/{name.strip("/")}' for name in arguments.names],
-        [f'/{topic.strip("/")}' for topic in arguments.topics or []],
+        [] if topics else [f'/{name.strip("/")}' for name in arguments.names],
+        [f'/{topic.strip("/")}' for topic in topics],
         arguments.all,
         arguments.ros_arguments,
     )
@@ -81,14 +81,12 @@ def _record(arguments: argparse.Namespace, stop: Stop) -> None:
 
 def _watch(recorder: Any, duration: float | None, stop: Stop) -> None:
     """Show how many messages have come until the user or the time ends it."""
-    begin, ended = time.monotonic(), False
+    end, ended = math.inf if duration is None else time.monotonic() + duration, False
     bar_format = '{desc}: {n_fmt} messages, {elapsed}'
     with progress(desc='record', unit='message', bar_format=bar_format) as bar:
         while not ended:
-            ended = stop.wait(0.05) or (
-                duration is not None and time.monotonic() - begin >= duration
-            )
+            ended = stop.wait(0.05) or time.monotonic() >= end
             recorder.check()
             while recorder.problems:
-                tqdm.write(f'record: {recorder.problems.pop(0)}', file=sys.stderr)
+                bar.write(f'record: {recorder.problems.pop(0)}', file=sys.stderr)
             bar.update(recorder.counts.total() - bar.n)

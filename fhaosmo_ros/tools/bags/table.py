@@ -68,9 +68,11 @@ def _columns(path: Path, wanted: Sequence[str], names: Sequence[str]) -> NDArray
     with path.open(encoding='utf-8-sig') as file:
         lines = file.readlines() or ['']
     delimiter = next((mark for mark in DELIMITERS if mark in lines[0]), None)
-    cells = [cell.strip('# "\n') for cell in lines[0].split(delimiter)]
-    has_titles = not any(map(_is_number, cells))
-    titles = cells if has_titles else [str(k + 1) for k in range(len(cells))]
+    titles = [cell.strip('# "\n') for cell in lines[0].split(delimiter)]
+    try:  # a line of numbers has no titles
+        titles = [str(k + 1) for k, _ in enumerate(map(_number, titles))]
+    except ValueError:
+        del lines[0]
     wanted = wanted or titles[: len(names)]
     if len(wanted) != len(names):
         raise ConfigurationError(
@@ -83,7 +85,6 @@ def _columns(path: Path, wanted: Sequence[str], names: Sequence[str]) -> NDArray
                 f'--columns: expected titles of {path}, which are {", ".join(titles)}, '
                 f'got {title!r}{suggestion(title, titles)}'
             )
-    del lines[:has_titles]
     if not lines:
         raise ConfigurationError(f'{path}: expected lines of numbers, got none')
     places = [titles.index(title) for title in wanted]
@@ -95,11 +96,3 @@ def _columns(path: Path, wanted: Sequence[str], names: Sequence[str]) -> NDArray
 
 def _number(text: str) -> float:
     return float(text) if text.strip() else np.nan
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
