@@ -2,17 +2,13 @@
 """A figure and a table from the estimates in bags."""
 
 import bag_files as files
-from fhaosmo_ros.tools.bags.types import labelled_array
 from fhaosmo_ros.tools.plot import command as plot
-from fhaosmo_ros.tools.plot.curves import Curves, metrics, read_curves
-from fhaosmo_ros.tools.plot.figures import COLUMNS, envelope, save_curves
+from fhaosmo_ros.tools.plot.figures import COLUMNS, envelope
 from fhaosmo_ros.tools.replay import command as replay
-from fhaosmo_ros.topics import ARRAY
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
 import pytest
-from rosbags.highlevel import AnyReader
 
 
 @pytest.fixture(name='bag')
@@ -56,33 +52,3 @@ def test_thinned_curve_draws_the_same_pixels():
             canvas.draw()
             pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].mean(axis=2))
         assert np.mean(np.abs(pictures[0] - pictures[1]) > 100.0) < 2e-3
-
-
-def test_figure_of_many_estimates_is_thinned(tmp_path, monkeypatch):
-    """All samples of a million estimates took 460 MB more."""
-    count = 20_000
-    stamps, y = files.signal(count)
-    both = np.column_stack([y, y])
-    curves = Curves('run', stamps, ['z1', 'd'], both, both, y, truth=both, epsilon=1.0, unit='rad')
-    drawn = []
-    monkeypatch.setattr(Figure, 'savefig', lambda figure, *_, **__: drawn.extend(figure.axes))
-    save_curves([curves], tmp_path / 'f.png')
-    lengths = [len(line.get_xdata()) for axes in drawn for line in axes.lines]
-    assert len(lengths) == 7
-    assert max(lengths) <= 2 * COLUMNS + 2
-    assert [axes.get_ylabel() for axes in drawn[:2]] == ['z1 [rad]', 'unknown\ninput d [rad/s]']
-
-
-def test_truth_is_unknown_where_the_bag_lacks_it(bag, tmp_path):
-    """A recorder may hear the plant later than the estimator."""
-    stamps, y = files.signal(500)
-    data = labelled_array(['z1', 'z2', 'z3'], np.zeros(3))
-    late = [('/plant/state', ARRAY, int(stamp), data) for stamp in stamps[100:400]]
-    with AnyReader([tmp_path / 'one']) as reader:
-        all_ = [(c.topic, c.msgtype, s, bytes(d)) for c, s, d in reader.messages()]
-    all_ += [*late, *files.floats(stamps[50:450], y[50:450], '/plant/unknown_input')]
-    both = files.write(tmp_path / 'both', sorted(all_, key=lambda m: m[2]))
-    (curves,) = read_curves(both, None, '/plant')
-    known = np.isfinite(curves.truth)
-    assert known.all(axis=1).tolist() == [100 <= k < 400 for k in range(500)]
-    assert 'nan' not in metrics([curves])

@@ -266,11 +266,6 @@ def test_values_that_are_not_finite_are_bad_not_fatal():
     assert result.value < bowl({'a': 1.0, 'b': 0.0})
 
 
-def test_error_in_a_thread_ends_the_search():
-    with pytest.raises(ZeroDivisionError):
-        minimise(lambda v: 1 / 0, SPACE, 50, jobs=2)
-
-
 def test_missing_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, 'optuna', None)
     with pytest.raises(ConfigurationError, match=r"pip install 'optuna>=4,<6' cmaes"):
