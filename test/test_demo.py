@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demonstration as a newcomer meets it, in short."""
 
+import contextlib
 import os
-from pathlib import Path
 import signal
 import subprocess
 
@@ -22,34 +22,23 @@ from waiting import wait_until
 pytestmark = pytest.mark.ros
 
 
-def nodes_of(folder):
-    """List the processes whose command line mentions a folder."""
-    found = []
-    for entry in Path('/proc').glob('[0-9]*/cmdline'):
-        try:
-            if str(folder).encode() in entry.read_bytes():
-                found.append(entry.parent.name)
-        except OSError:
-            continue
-    return [pid for pid in found if int(pid) != os.getpid()]
+def leaves_no_process(demo):
+    """Return whether all processes of its session have ended."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(demo.pid, 0)
+        return False
+    return True
 
 
-@pytest.fixture(scope='module')
-def parameters(tmp_path_factory):
-    """A copy of the demo's parameters, so that its processes can be told by its path."""
-    path = tmp_path_factory.mktemp('demo') / 'demo.yaml'
-    path.write_text((ROOT / 'config' / 'demo.yaml').read_text())
-    return path
-
-
-def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(parameters):
-    folder = parameters.parent / 'out'
-    result = run('demo', '--duration', 6, '--output', folder, '--params-file', parameters)
-    assert result.returncode == 0, result.stderr
-    assert nodes_of(parameters) == []
+def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(tmp_path):
+    folder, file = tmp_path / 'out', ROOT / 'config' / 'demo.yaml'
+    demo = start('demo', '--duration', 6, '--output', folder, '--params-file', file)
+    out, err = demo.communicate(timeout=400)
+    assert demo.returncode == 0, err
+    assert leaves_no_process(demo)
     for word in (*OTHERS, 'RMS error', 'z1', 'z2', 'z3', 'samples'):
-        assert word in result.stdout
-    assert (folder / 'report.txt').read_text().strip() in result.stdout
+        assert word in out
+    assert (folder / 'report.txt').read_text().strip() in out
     assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
     with AnyReader([folder / 'bag']) as reader:
         topics = {c.topic for c in reader.connections}
@@ -78,10 +67,10 @@ def test_shipped_demonstration_changes_the_plant(tmp_path):
     assert found > 0.5 * true  # jitter of a busy machine adds to it
 
 
-def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(parameters):
-    folder = parameters.parent / 'interrupted'
-    process = start('demo', '--duration', 600, '--output', folder, '--params-file', parameters)
-    part = folder.with_name('.interrupted.part') / 'interrupted' / 'bag' / 'bag_0.mcap'
+def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(tmp_path):
+    folder = tmp_path / 'out'
+    process = start('demo', '--duration', 600, '--output', folder)
+    part = tmp_path / '.out.part' / 'out' / 'bag' / 'bag_0.mcap'
     wait_until(lambda: len(stamps_in(part, '/estimator/state')) > 100, 'estimates', 120.0, process)
     # As a terminal does: to the whole group; and twice, as an impatient user does.
     os.killpg(process.pid, signal.SIGINT)
@@ -91,7 +80,7 @@ def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(parameters):
     assert 'Traceback' not in err
     assert 'stopped early' in out
     assert (folder / 'demo.png').exists()
-    assert nodes_of(parameters) == []
+    assert leaves_no_process(process)
 
 
 def test_another_plant_in_the_same_domain_is_refused(tmp_path):
