@@ -84,14 +84,10 @@ def test_infinite_estimate_is_the_worst_and_another_model_is_refused():
 # the start
 
 
-@pytest.fixture(scope='module', name='tuner')
-def _tuner():
-    values = VALUES.changed({'duration': 6.0, 'settled': 2.0, 'recordings': 3})
-    return Tuner(*simulated(values, 1), {}, values, 1)
-
-
-def test_start_is_nearly_as_good_as_the_best_kalman_filter(tuner):
+def test_start_is_nearly_as_good_as_the_best_kalman_filter():
     """Of filters of d as a random walk, over two decades of bandwidths."""
+    values = VALUES.changed({'duration': 6.0, 'settled': 2.0, 'recordings': 3})
+    tuner = Tuner(*simulated(values, 1), {}, values, 1)
     best = np.inf
     for bandwidth in np.geomspace(2.0, 200.0, 25):
         model = SampledModel(TriangularModel(PHI, 3), 1.0 / 200.0)

@@ -9,7 +9,7 @@ from fhaosmo_ros.core.model.triangular import TriangularModel
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import Input, known_inputs, measured_output, Pairing
 from fhaosmo_ros.messages.fields import Field
-from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples, Watch
+from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,18 +63,17 @@ class BagInputs:
         if self.y.stamp == 'reception':
             self.y = self.y._replace(stamp='bag')
 
-    def samples(self, watch: Watch = iter) -> tuple[FieldSamples, Field]:
+    def samples(self) -> tuple[FieldSamples, Field]:
         """
         Return the samples of y, and the field that they were in.
 
-        `watch` is as for `BagReader.samples`. Raises ConfigurationError if the bag lacks the topic
-        or the field, or has no samples.
+        Raises ConfigurationError if the bag lacks the topic or the field, or has no samples.
         """
         y, stamp, reader = self.y, self.y.stamp, self._reader
         field = reader.field(y.topic, y.field, y.name)
         if stamp == 'auto' and not field.header and self._values.get('sampling') == 'clock':
             stamp = 'bag'  # such an estimator took a sample when it came, not when it was sent
-        samples = reader.samples(y.topic, field, stamp, watch)
+        samples = reader.samples(y.topic, field, stamp)
         if not len(samples.times):
             why = next(iter(reader.lacking), 'expected messages, read none')
             raise ConfigurationError(f'topic {y.topic!r}: {why}')

@@ -3,7 +3,7 @@
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, ExitStack
 from itertools import zip_longest
 from operator import itemgetter
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag2.storage_mcap import McapReader
+from tqdm import tqdm
 import zstandard
 
 ZSTD = b'\x28\xb5\x2f\xfd'
@@ -37,7 +38,6 @@ MESSAGE = struct.Struct('<HIQQ')
 """Of mcap: channel, sequence, log time and publish time, before a message in CDR."""
 FOOTER = struct.Struct('<BQQQI8s')
 """Of mcap: opcode, length, begin of the summary and of its offsets, CRC; then the magic number."""
-Watch = Callable[[Iterator[Any]], Iterable[Any]]
 Row = tuple[int, int, int, bytes]
 """Log time and publish time (ns), number of the connection, and message in CDR."""
 
@@ -230,11 +230,9 @@ class BagReader:
             raise ConfigurationError(f'bag {self.path}: expected a definition of {kind}, got none')
         return find_field(self.types.fielddefs, kind, text, name)
 
-    def samples(
-        self, topic: str, field: Field, stamp: str = 'bag', watch: Watch = iter
-    ) -> FieldSamples:
+    def samples(self, topic: str, field: Field, stamp: str = 'bag') -> FieldSamples:
         """
-        Return the samples of a field.
+        Return the samples of a field; a terminal shows how far it is.
 
         Messages whose lists are too short or lack the name are left out, as by the node.
 
@@ -246,8 +244,6 @@ class BagReader:
             'header': of the messages. 'source': the publish time, which only mcap has; `ros2 bag
             record` writes the publisher's source stamp there. 'bag': of the bag (mcap: log time),
             for `ros2 bag record` the time of reception. 'auto': the first of these that there is.
-        watch : callable
-            Passes the samples on, such as a progress bar.
 
         Raises
         ------
@@ -267,7 +263,9 @@ class BagReader:
         if stamp == 'auto':
             stamp = 'header' if field.header else 'source'
         kinds = [('time', np.int64), ('stamp', np.int64), ('value', np.float64)]
-        rows = np.fromiter(watch(self._samples(topic, field, stamp)), dtype=kinds)
+        found, count = self._samples(topic, field, stamp), self.count(topic)
+        bar = tqdm(found, topic, count, leave=False, unit='', unit_scale=True, disable=None)
+        rows = np.fromiter(bar, dtype=kinds)
         return FieldSamples(*(np.ascontiguousarray(rows[name]) for name, _ in kinds))
 
     def _samples(self, topic: str, field: Field, stamp: str) -> Iterator[tuple[int, int, float]]:

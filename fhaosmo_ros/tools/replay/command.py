@@ -4,7 +4,6 @@
 import argparse
 from collections.abc import Iterator
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 import sys
 from tempfile import TemporaryDirectory
@@ -23,7 +22,7 @@ from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
 from fhaosmo_ros.tools.bags.table import bag_of_table
 from fhaosmo_ros.tools.bags.topics import Recorded, recorded_parameters
-from fhaosmo_ros.tools.cli.command import Output, progress, run_command
+from fhaosmo_ros.tools.cli.command import Output, run_command
 from fhaosmo_ros.tools.cli.options import (
     add_parameter_options,
     channel_parameters,
@@ -124,9 +123,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
         name = _name({c.topic for c in reader.connections}, arguments.name)
         with stop.raising(), ExitStack() as files:
-            count = reader.count(inputs.y.topic)
-            bar = partial(progress, total=count, unit='sample', unit_scale=True, desc='replay')
-            samples, field = inputs.samples(bar)
+            samples, field = inputs.samples()
             span = float(samples.stamps[-1] - samples.stamps[0]) * 1e-9
             stamps = 'source (publish times of the bag)'
             if np.array_equal(samples.stamps, samples.times):
