@@ -1,34 +1,94 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A figure and a table from the estimates in bags."""
+"""Figures and tables of plot and demo, from a bag whose errors are known."""
 
 import bag_files as files
+from fhaosmo_ros.core import OnlineEstimator
+from fhaosmo_ros.tools.bags.types import labelled_array
+from fhaosmo_ros.tools.demo import OTHERS, others, read_run, START, table
 from fhaosmo_ros.tools.plot import command as plot
+from fhaosmo_ros.tools.plot.curves import read_curves
 from fhaosmo_ros.tools.plot.figures import COLUMNS, envelope
-from fhaosmo_ros.tools.replay import command as replay
+from fhaosmo_ros.topics import ARRAY, FLOAT, TIME
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
 import pytest
 
+COUNT, FIRST, PERIOD = 401, 50, 0.01
+KNOWN = range(70, 390)
+T = PERIOD * np.arange(COUNT)
+NAMES = ['z1', 'z2', 'z3', 'd']
+SIZES = np.array([1.0, 3.0, 0.2, 0.05])
+"""Amplitude of each state and of d."""
+TRUTH = SIZES * np.sin(0.5 * np.pi * T)[:, None]
+ERROR = np.select([T < 2.5, T < 3.5], [0.1, 0.01], 0.03)
+"""Relative to the amplitude; the sign alternates."""
+ESTIMATE = TRUTH + SIZES * (ERROR * (-1.0) ** np.arange(COUNT))[:, None]
 
-@pytest.fixture(name='bag')
-def _bag(tmp_path):
-    stamps, y = files.signal(500)
-    bag = files.write(tmp_path / 'bag', files.floats(stamps, y))
-    assert replay.main([str(bag), '-o', str(tmp_path / 'one')]) == 0
-    arguments = ['-o', str(tmp_path / 'two'), '-p', 'variant:=sign']
-    assert replay.main([str(tmp_path / 'one'), *arguments]) == 0
-    return tmp_path / 'two'
+
+@pytest.fixture(scope='module', name='bag')
+def _bag(tmp_path_factory):
+    """Write a run of which the recorder missed estimates before `FIRST`, and some of the truth."""
+    messages = []
+    for k in range(COUNT):
+        stamp = files.ORIGIN + round(k * PERIOD * 1e9)
+        rows = [('/y', FLOAT, 0, files.float64(TRUTH[k, 0]))]
+        if k in KNOWN:
+            rows += [
+                ('/plant/state', ARRAY, 20_000, labelled_array(NAMES[:3], TRUTH[k, :3])),
+                ('/plant/unknown_input', FLOAT, 40_000, files.float64(TRUTH[k, 3])),
+            ]
+        of_estimate = [
+            ('state', ARRAY, labelled_array(NAMES[:3], ESTIMATE[k, :3])),
+            ('unknown_input', FLOAT, files.float64(ESTIMATE[k, 3])),
+            ('innovation', ARRAY, labelled_array(['eps1'], np.zeros(1))),
+            ('stamp', TIME, files.cdr(TIME, sec=stamp // 10**9, nanosec=stamp % 10**9)),
+        ]
+        for number, (name, kind, data) in enumerate(of_estimate if k >= FIRST else ()):
+            rows.append((f'/estimator/{name}', kind, 10**6 + 10**4 * number, data))
+        messages += [(topic, kind, stamp + delay, data) for topic, kind, delay, data in rows]
+    return files.write(tmp_path_factory.mktemp('demo') / 'bag', messages)
 
 
-def test_formats_by_file_name(bag, tmp_path, capsys):
-    for kind, magic in {'png': b'\x89PNG\r\n\x1a\n', 'svg': b'<?xml', 'pdf': b'%PDF-'}.items():
-        out = tmp_path / f'figure.{kind}'
-        assert plot.main([str(bag), '-o', str(out)]) == 0
-        assert out.read_bytes().startswith(magic)
-    text = capsys.readouterr().out
-    assert 'two /estimator' in text
-    assert 'two /replay/estimator' in text
+def test_truth_is_unknown_where_the_bag_lacks_it(bag, tmp_path, capsys):
+    (curves,) = read_curves(bag, None, '/plant')
+    known = np.isfinite(curves.truth).all(axis=1)
+    assert known.tolist() == [k in KNOWN for k in range(FIRST, COUNT)]
+    assert plot.main([str(bag), '-o', str(tmp_path / 'figure.pdf')]) == 0
+    assert (tmp_path / 'figure.pdf').read_bytes().startswith(b'%PDF-')
+    said = capsys.readouterr().out
+    assert 'bag /estimator' in said
+    assert 'nan' not in said
+
+
+def test_table_says_the_errors_that_are_in_the_bag(bag):
+    run = read_run(bag)
+    assert run.curves.names == NAMES
+    np.testing.assert_allclose(run.curves.truth, TRUTH[KNOWN], rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(run.curves.estimate, ESTIMATE[KNOWN], rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(run.t, T[KNOWN] - T[KNOWN][0], rtol=0.0, atol=1e-12)
+    text = table(run, {}, [])
+    assert 'samples: 401, 100.0 a second' in text
+    (line,) = [line for line in text.splitlines() if line.startswith('this estimator, live')]
+    (states,) = [line for line in text.splitlines() if line.startswith('RMS errors of the states')]
+    of_states = [float(part.split()[1]) for part in states.split(': ')[1].split(', ')]
+    late = np.array(KNOWN)[run.t >= START]
+    rms = np.sqrt(np.mean((ESTIMATE - TRUTH)[late] ** 2, axis=0))
+    moved = [np.abs(np.diff(d[late, 3])).sum() for d in (ESTIMATE, TRUTH)]
+    expected = [rms[3], moved[0] / moved[1], *rms[:3]]
+    assert [*map(float, line.split()[-2:]), *of_states] == pytest.approx(expected, rel=0.05)
+
+
+def test_other_observers_go_through_the_same_samples(bag):
+    """What changes begins a column of the table."""
+    run = read_run(bag)
+    compared = others(run, {'gains': 'fixed'})
+    name, changes = [*OTHERS.items()][1]
+    alone = OnlineEstimator(changes).run(run.y.stamps, run.y.values.ravel())
+    np.testing.assert_array_equal(compared[name], alone.unknown_input[KNOWN])
+    text = table(run, compared, [(files.ORIGIN + 3 * 10**9, 'noise')])
+    assert 'from 2 s' in text
+    assert others(run, {'gains': 'self_tuning'}) == {}
 
 
 def test_thinned_curve_draws_the_same_pixels():
