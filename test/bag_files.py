@@ -4,15 +4,14 @@
 import contextlib
 import struct
 
+from fhaosmo_ros.tools.bags.types import header, serialise, TYPES
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import get_typestore, Stores
 import yaml
 
-TYPES = get_typestore(Stores.ROS2_JAZZY)
 FLOAT, JOINTS = 'std_msgs/msg/Float64', 'sensor_msgs/msg/JointState'
 ORIGIN = 1_700_000_000_123_456_789
 PRESETS = {
@@ -32,10 +31,6 @@ def signal(count):
     return stamps, 0.2 + 0.1 * np.sin(stamps % 10**12 * 1e-9)
 
 
-def cdr(message_type, **fields):
-    return bytes(TYPES.serialize_cdr(TYPES.types[message_type](**fields), message_type))
-
-
 def float64(value):
     return b'\0\1\0\0' + struct.pack('<d', value)
 
@@ -47,18 +42,10 @@ def floats(stamps, values, topic='/y'):
 
 def joint_state(stamp, position):
     """Return the CDR of joints a, b and c."""
-    return cdr(
+    return serialise(
         JOINTS, header=header(stamp), name=['a', 'b', 'c'], position=np.array(position),
         velocity=np.zeros(0), effort=np.zeros(0),
     )  # fmt: skip
-
-
-def header(stamp, frame='base'):
-    types = TYPES.types
-    time = types['builtin_interfaces/msg/Time'](
-        sec=int(stamp // 10**9), nanosec=int(stamp % 10**9)
-    )
-    return types['std_msgs/msg/Header'](stamp=time, frame_id=frame)
 
 
 def write(path, messages, storage='mcap', compression='none', version=9):

@@ -287,7 +287,7 @@ def recorded(path):
         bag.flush()
         bag.flush()
         bag.add('/description', 'std_msgs/msg/String', qos=[LATCHED_QOS])
-        bag.write('/description', 900, files.cdr('std_msgs/msg/String', data='<robot/>'))
+        bag.write('/description', 900, files.serialise('std_msgs/msg/String', data='<robot/>'))
         bag.write('/y', 70_000, files.float64(5.0))
 
 

@@ -45,7 +45,7 @@ class Live:
 
     def tell_parameters(self, stamp, **values):
         """Publish all that the node is set to."""
-        data = files.cdr(TEXT, data=dumps(values, self.node))
+        data = files.serialise(TEXT, data=dumps(values, self.node))
         self.messages.append((f'{self.node}/parameters', TEXT, int(stamp) + 200_000, data))
 
     def reset(self):
@@ -68,7 +68,7 @@ class Live:
         )  # fmt: skip
         name = f'{self.name.removeprefix(self.node)}.{name}'.strip('/.')
         parameter = types['rcl_interfaces/msg/Parameter'](name=name, value=given)
-        data = files.cdr(
+        data = files.serialise(
             EVENT, stamp=files.header(stamp).stamp, node=self.node, new_parameters=[],
             changed_parameters=[parameter], deleted_parameters=[],
         )  # fmt: skip

@@ -42,7 +42,7 @@ def _bag(tmp_path_factory):
             ('state', ARRAY, labelled_array(NAMES[:3], ESTIMATE[k, :3])),
             ('unknown_input', FLOAT, files.float64(ESTIMATE[k, 3])),
             ('innovation', ARRAY, labelled_array(['eps1'], np.zeros(1))),
-            ('stamp', TIME, files.cdr(TIME, sec=stamp // 10**9, nanosec=stamp % 10**9)),
+            ('stamp', TIME, files.serialise(TIME, sec=stamp // 10**9, nanosec=stamp % 10**9)),
         ]
         for number, (name, kind, data) in enumerate(of_estimate if k >= FIRST else ()):
             rows.append((f'/estimator/{name}', kind, 10**6 + 10**4 * number, data))
