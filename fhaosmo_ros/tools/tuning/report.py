@@ -23,7 +23,6 @@ class Report(NamedTuple):
     parameters: dict[str, Any]
     summary: list[str]  # lines at the head of both files
     main: str  # tables and notes, which are also printed
-    more: str
 
 
 def save(folder: Path, command: str, report: Report) -> None:
@@ -33,7 +32,7 @@ def save(folder: Path, command: str, report: Report) -> None:
     lines = ['Made by', f'    {made}', f'(fhaosmo_ros {__version__}).', *report.summary]
     head = ''.join(f'# {line}\n' for line in lines)
     (folder / 'gains.yaml').write_text(head + dumps(report.parameters), 'utf-8')
-    parts = ['# Tuning', f'    {made}', '\n'.join(report.summary), report.main, report.more]
+    parts = ['# Tuning', f'    {made}', '\n'.join(report.summary), report.main]
     (folder / 'report.md').write_text('\n\n'.join(parts) + '\n', 'utf-8')
 
 
@@ -73,8 +72,8 @@ def of_search(tuner: Tuner, result: Result) -> Report:
         [d.name, *(f'{x:.4g}' for x in (d.low, d.high, d.start, best[d.name]))]
         for d in tuner.space
     ]
-    more = table(['parameter', 'from', 'to', 'start', 'tuned'], searched)
-    return Report(tuner.parameters(best), summary, table(columns, rows), more)
+    main = [table(columns, rows), table(['parameter', 'from', 'to', 'start', 'tuned'], searched)]
+    return Report(tuner.parameters(best), summary, '\n\n'.join(main))
 
 
 # from a bag
@@ -92,11 +91,9 @@ def of_bag(found: Identified, gains: Gains, run: Run, bag: str) -> Report:
         f'its expected error is {gains.expected[-1]:.3g}.',
         *told,
     ]
+    given = ' (given)' if likelihood.fixed else ''
     rows = [
-        (
-            'noise of y (standard deviation)',
-            f'{best.noise:.4g}' + (' (given)' if likelihood.fixed else ''),
-        ),
+        ('noise of y (standard deviation)', f'{best.noise:.4g}{given}'),
         ('size of d (RMS)', f'{size:.4g}'),
         ('time in which d changes (1/kappa), s', f'{1.0 / best.design.decay:.4g}'),
         ('derivatives of d that are followed', f'{best.design.derivatives}'),
@@ -106,29 +103,24 @@ def of_bag(found: Identified, gains: Gains, run: Run, bag: str) -> Report:
     for name, error in zip(names, gains.expected, strict=True):
         rows.append((f'expected error of {name}', f'{error:.3g}'))
     chance = 2.0 / math.sqrt(len(run.unknown_input))
+    largest = f'{run.correlations[run.lag]:+.3f} over {run.lag + 1}'
     along = [
-        (
-            'innovations, measured / expected',
-            f'{run.size:.2f} (expected {gains.innovation:.3g})',
-        ),
-        (
-            f'their largest correlation within {LAGS} samples',
-            f'{run.correlations[run.lag]:+.3f} over {run.lag + 1}; chance explains {chance:.3f}',
-        ),
+        ('innovations, measured / expected', f'{run.size:.2f}'),
+        ('innovations, expected', f'{gains.innovation:.3g}'),
+        (f'their largest correlation within {LAGS} samples', largest),
+        ('what chance explains of it', f'{chance:.3f}'),
         ('probability of that if they are white (Ljung-Box)', f'{run.probability:.2g}'),
-        (
-            'samples rejected, times begun afresh',
-            f'{run.counters.rejected}, {run.counters.divergences}',
-        ),
+        ('samples rejected', f'{run.counters.rejected}'),
+        ('times begun afresh', f'{run.counters.divergences}'),
     ]
     main = '\n\n'.join([
         table(['found in y', ''], rows),
         f'The error of d is expected to be {gains.expected[-1] / size:.2f} of its size.',
         table(['the estimator along the bag', ''], along),
         *told,
+        'This is what y shows in this bag: where d will be quicker or larger, record it so.',
     ])  # fmt: skip
-    more = 'This is what y shows in this bag: where d will be quicker or larger, record it so.'
-    return Report(ESTIMATOR_PARAMETERS.part_of(gains.parameters), summary, main, more)
+    return Report(ESTIMATOR_PARAMETERS.part_of(gains.parameters), summary, main)
 
 
 def notes(found: Identified, run: Run) -> Iterator[str]:
