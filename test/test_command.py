@@ -81,18 +81,22 @@ def test_a_signal_cuts_only_what_may_be_cut_and_only_once(in_destructor, capsys)
         def __del__(self):
             signal.raise_signal(signal.SIGTERM)
 
+    cleaned = []
+
     def body(arguments, stop):
-        try:
-            with stop.raising():
+        with stop.raising():
+            try:
                 if in_destructor:
                     Collected()  # Python drops what a signal raises there
                 else:
                     signal.raise_signal(signal.SIGTERM)
                     pytest.fail('went on')
-        finally:
-            signal.raise_signal(signal.SIGTERM)  # in the clean-up
+            finally:
+                signal.raise_signal(signal.SIGTERM)
+                cleaned.append(True)
 
     assert run_command(PARSER, [], body) == 130
+    assert cleaned
     assert capsys.readouterr().err == 'try: interrupted\n'
     stop = Stop()
     stop.signal()
