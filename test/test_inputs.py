@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fields in messages of any type, of rosbags and rclpy; known inputs paired with y by stamps."""
 
+import bag_files as files
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.inputs import Input, known_inputs, MOST, Pairing
 from fhaosmo_ros.messages.fields import find_field, MissingElementError
@@ -8,64 +9,51 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
-JOINTS = 'sensor_msgs/msg/JointState'
-INNER = 'float32 force\nbool[] on\n'
-OUTER = (
-    'std_msgs/Header header\nint64 count\nfloat32[3] three\nrig/Inner[<=2] parts\nstring[] words\n'
-)
-for name, text in (('Inner', INNER), ('Outer', OUTER)):
-    STORE.register(get_types_from_msg(text, f'rig/msg/{name}'))
+NONE = np.zeros(0)
 
 
 def made(kind, **fields):
-    return STORE.types[kind](**fields)
-
-
-def header():
-    stamp = made('builtin_interfaces/msg/Time', sec=1, nanosec=2)
-    return made('std_msgs/msg/Header', stamp=stamp, frame_id='a')
-
-
-def outer():
-    inner = [
-        made('rig/msg/Inner', force=0.5, on=np.array([False, True])),
-        made('rig/msg/Inner', force=1.5, on=np.zeros(0, dtype=bool)),
-    ]
-    three = np.array([0.5, 1.5, 2.5], np.float32)
-    return made('rig/msg/Outer', header=header(), count=-7, three=three, parts=inner, words=['a'])
+    return files.TYPES.types[kind](**fields)
 
 
 def joints(names):
-    lists = {'velocity': np.zeros(0), 'effort': np.zeros(0)}
-    return made(JOINTS, header=header(), name=names, position=np.array([1.0, 2.0]), **lists)
+    lists = {'position': np.array([1.0, 2.0]), 'velocity': NONE, 'effort': NONE}
+    return made(files.JOINTS, header=files.header(1_000_000_002), name=names, **lists)
 
 
+POINT = made(
+    'trajectory_msgs/msg/JointTrajectoryPoint', positions=np.array([0.5, 1.5]), velocities=NONE,
+    accelerations=NONE, effort=NONE,
+    time_from_start=made('builtin_interfaces/msg/Duration', sec=-7, nanosec=0),
+)  # fmt: skip
+TRAJECTORY = made(
+    'trajectory_msgs/msg/JointTrajectory', header=files.header(1_000_000_002), joint_names=['a'],
+    points=[POINT],
+)  # fmt: skip
 QUATERNION = made(
     'geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=2.0 * np.sin(0.4), w=2.0 * np.cos(0.4)
 )
 
 
 @pytest.mark.parametrize(('message', 'path', 'expected'), [
-    (outer(), 'count', -7.0), (outer(), 'three[2]', 2.5), (outer(), 'parts[1].force', 1.5),
-    (outer(), 'parts[0].on[1]', 1.0), (outer(), 'header.stamp.sec', 1.0),
+    (TRAJECTORY, 'header.stamp.sec', 1.0), (TRAJECTORY, 'points[0].positions[1]', 1.5),
+    (TRAJECTORY, 'points[0].time_from_start.sec', -7.0),
     (joints([]), 'position[1]', 2.0), (joints(['hip', 'elbow']), 'position[elbow]', 2.0),
     (QUATERNION, 'yaw', pytest.approx(0.8)),
     # This message's lists are too short, others' may be longer.
-    (outer(), 'parts[2].force', 'index below the number'),
-    (outer(), 'parts[1].on[0]', 'index below the number'),
+    (TRAJECTORY, 'points[1].positions[0]', 'index below the number'),
+    (TRAJECTORY, 'points[0].effort[0]', 'index below the number'),
     (joints([]), 'position[2]', '2 in one message, got 2'),
     (joints(['hip', 'elbw']), 'position[elbow]', "did you mean 'elbw'"),
     (joints(['a', 'b', 'elbow']), 'position[elbow]', "none for 'elbow'"),
 ])  # fmt: skip
 def test_number_at_any_depth_by_index_and_by_name(message, path, expected):
-    kind = message.__msgtype__
-    field = find_field(STORE.fielddefs, kind, path)
+    types, kind = files.TYPES, message.__msgtype__
+    field = find_field(types.fielddefs, kind, path)
     if field.header:
         assert field.stamp(message) == 1_000_000_002
-    for same in (message, STORE.deserialize_cdr(STORE.serialize_cdr(message, kind), kind)):
+    for same in (message, types.deserialize_cdr(types.serialize_cdr(message, kind), kind)):
         if isinstance(expected, str):
             with pytest.raises(MissingElementError, match=expected):
                 field.value(same)
