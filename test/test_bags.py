@@ -9,7 +9,6 @@ import sqlite3
 import struct
 
 import bag_files as files
-from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.bags.topics import read_ticks
@@ -179,21 +178,18 @@ def test_replay_takes_the_source_stamps(preset, tmp_path, capsys):
     late = np.maximum.accumulate(late) + np.arange(COUNT)  # in the order of publication
     bag = files.write_preset(tmp_path / 'bag', files.floats(late, Y), preset, STAMPS)
     unknown = files.write_preset(tmp_path / 'unknown', files.floats(late, Y), preset, 0 * STAMPS)
-    for path, options, stamps, said in (
-        (bag, [], STAMPS, 'source'),
-        (bag, ['-p', 'input_stamp:=source'], STAMPS, 'source'),
-        (bag, ['-p', 'input_stamp:=reception'], late, 'bag'),
-        (bag, ['-p', 'sampling:=clock'], late, 'bag'),  # such a node took its own clock
-        (unknown, [], late, 'bag'),  # its writer did not know publish times
+    for path, option, stamps, said in (
+        (bag, 'input_stamp:=auto', STAMPS, 'source'),
+        (bag, 'input_stamp:=source', STAMPS, 'source'),
+        (bag, 'input_stamp:=reception', late, 'bag'),
+        (bag, 'sampling:=clock', late, 'bag'),  # such a node took its own clock
+        (unknown, 'input_stamp:=auto', late, 'bag'),  # its writer did not know publish times
     ):
         out = tmp_path / 'out.npz'
-        assert replay.main([str(path), '-o', str(out), '--force', *options]) == 0
+        assert replay.main([str(path), '-o', str(out), '--force', '-p', option]) == 0
         assert f'stamps: {said}' in capsys.readouterr().out
         with np.load(out) as found:
             np.testing.assert_array_equal(found['stamp_ns'], stamps)
-            expected = OnlineEstimator().run(stamps, Y).unknown_input
-            if 'sampling:=clock' not in options:
-                np.testing.assert_array_equal(found['unknown_input'], expected)
 
 
 # What an estimator published together is put together again, whatever the recording lacks
