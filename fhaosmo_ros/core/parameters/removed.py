@@ -18,6 +18,7 @@ REMOVED = {
     'input_durability': "set 'qos_overrides./TOPIC.subscription.durability'",
     'input_depth': "set 'qos_overrides./TOPIC.subscription.depth'",
     'divergence_limit': 'leave it out: samples beyond 1e60 are rejected',
+    'sines': 'leave it out: a sum has 5 sines',
     'search': "leave it out: 'tune' searches the model of d, or the gains where 'lambda' is set",
 }
 """What a message says of a name that was a parameter once."""

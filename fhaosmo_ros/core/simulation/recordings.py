@@ -36,6 +36,8 @@ SHORTEST = 1e-9
 """Stamps stay this far apart (s), as two integer nanoseconds do."""
 
 SHAPES = ('sines', 'steps', 'chirp')
+SINES = 5
+"""Number of sines in a sum."""
 
 SHARED = tuple(
     PLANT_NODE_PARAMETERS[name]
@@ -52,7 +54,7 @@ FAMILY = (
     Parameter('duration', 20.0, 'Length of a recording.', unit='s', lower=0.1, upper=1e5,
               live=False),
     Parameter('disturbances', ['sines', 'steps', 'chirp'],
-              'Shapes of d, taken in turn: sines (a sum with random frequencies in band_of_d, '
+              'Shapes of d, taken in turn: sines (five with random frequencies in band_of_d, '
               'phases and amplitudes), steps (random levels at random times), chirp (through '
               'band_of_d, upwards or downwards). Never one sine: gains tuned on it would '
               'resonate at it.', choices=SHAPES, live=False, lengths='1 or more'),
@@ -60,7 +62,6 @@ FAMILY = (
               upper=1e9, live=False),
     Parameter('band_of_d', [0.5, 8.0], 'Lowest and highest angular frequency of sines and chirp.',
               unit='rad/s', lower=0.0, lower_open=True, upper=1e5, live=False, lengths='2'),
-    Parameter('sines', 5, 'Number of sines in a sum.', lower=2, upper=1000, live=False),
     Parameter('step_interval', 3.0, 'Mean time between two steps, at least a third of it.',
               unit='s', lower=1e-3, upper=1e5, live=False),
     Parameter('rms_of_u', 1.0,
@@ -142,9 +143,9 @@ class Family:
                 p['band_of_d'], 'two angular frequencies, the lower one first'
             )
 
-    def recordings(self, count: int, seed: int = 0, first: int = 0) -> list[Recording]:
-        """Return recordings `first` .. `first + count - 1` of a seed; shapes take turns."""
-        return [self.recording(first + k, seed) for k in range(count)]
+    def recordings(self, count: int, seed: int = 0) -> list[Recording]:
+        """Return the first recordings of a seed; shapes take turns."""
+        return [self.recording(k, seed) for k in range(count)]
 
     def recording(self, number: int, seed: int = 0) -> Recording:
         """
@@ -204,19 +205,19 @@ class Family:
         p = self.parameters
         low, high = p['band_of_d']
         if shape == 'sines':
-            return _sines(t, low, high, p['sines'], random)
+            return _sines(t, low, high, random)
         if shape == 'chirp':
             return _chirp(t, low, high, random)
         return _steps(t, p['step_interval'], random)
 
 
-def _sines(t: Floats, low: float, high: float, count: int, random: Generator) -> Floats:
-    """One sine in each of `count` parts of the band, so that none is left out."""
-    share = (np.arange(count) + random.uniform(size=count)) / count
+def _sines(t: Floats, low: float, high: float, random: Generator) -> Floats:
+    """One sine in each of `SINES` parts of the band, so that none is left out."""
+    share = (np.arange(SINES) + random.uniform(size=SINES)) / SINES
     omega = low * (high / low) ** share
-    amplitude = random.uniform(0.5, 1.5, count)
+    amplitude = random.uniform(0.5, 1.5, SINES)
     amplitude *= np.sqrt(2.0 / np.sum(amplitude**2))
-    phase = random.uniform(0.0, 2.0 * np.pi, count)
+    phase = random.uniform(0.0, 2.0 * np.pi, SINES)
     wave = np.zeros_like(t)
     for a, w, start in zip(amplitude, omega, phase, strict=True):
         wave += a * np.sin(w * t + start)
