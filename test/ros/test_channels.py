@@ -32,44 +32,33 @@ def rigs(user, launch):
     return {name: Estimator(user, process, '/many', name).listen() for name in OWN}
 
 
-@pytest.fixture
-def parameters(rigs):
-    return rigs['hip'].parameters
-
-
-def test_each_channel_is_bit_for_bit_an_estimator_of_its_own(user, rigs, parameters):
-    """Also after a common parameter has changed, which serves knee only: hip has its own."""
+def test_each_channel_is_bit_for_bit_an_estimator_of_its_own(user, rigs):
+    """Also where hip alone is reset, and a common parameter changes that serves only knee."""
     assert user.call('/many/estimator/reset', Trigger, Trigger.Request()).success
     estimators = {name: OnlineEstimator(COMMON | own) for name, own in OWN.items()}
-    for part in range(2):
-        for k in range(30):
-            for name, rig in rigs.items():
-                if (k, name) == (10, 'hip'):
-                    estimators[name].update(rig.send(math.nan), math.nan)
-                    continue
-                found = rig.feed(math.sin(0.1 * k) + part + len(name))
-                expected = estimators[name].update(found.stamp, rig.y[-1].message.data)
-                assert found.z == list(expected.z)
-                assert found.unknown_input == expected.unknown_input
-        parameters.set(lambda_=[20.0])
-        estimators['knee'].configure({'lambda': [20.0]})
+    for k in range(50):
+        if k == 25:
+            rigs['hip'].parameters.set(lambda_=[20.0])
+            estimators['knee'].configure({'lambda': [20.0]})
+            assert rigs['hip'].reset().success
+            estimators['hip'].reset()
+        for name, rig in rigs.items():
+            if (k, name) == (10, 'hip'):
+                estimators[name].update(rig.send(math.nan), math.nan)
+                continue
+            found = rig.feed(math.sin(0.1 * k) + len(name))
+            expected = estimators[name].update(found.stamp, rig.y[-1].message.data)
+            assert found.z == list(expected.z)
+            assert found.unknown_input == expected.unknown_input
+    for name, labels in (('hip', 'z1,z2,z3'), ('knee', 'z1,z2')):
+        assert rigs[name].topics['state'][-1].message.layout.dim[0].label == labels
+        for task in ('input', 'observer'):
+            rigs[name].wait_status(f'{name} {task}', OK)
 
 
-def test_topics_reports_and_services_are_each_channels_own(rigs):
-    states = {name: rig.topics['state'][-1].message for name, rig in rigs.items()}
-    labels = {name: state.layout.dim[0].label for name, state in states.items()}
-    assert labels == {'hip': 'z1,z2,z3', 'knee': 'z1,z2'}
-    rigs['hip'].wait_status('state', OK)
-    tasks = {f'{name} {task}' for name in OWN for task in ('input', 'observer')}
-    assert set(rigs['hip'].reports[-1].statuses) == {'state', *tasks}
-    rigs['knee'].feed(1.0)
-    assert rigs['hip'].reset().success
-    assert rigs['hip'].feed(3.0).z == [3.0, 0.0, 0.0]
-    assert rigs['knee'].feed(1.1).z[1] != 0.0
-
-
-def test_common_parameter_serves_channels_without_their_own(user, parameters):
+def test_common_parameter_serves_channels_without_their_own(user, rigs):
     """What is whose is told on the topic of the parameters."""
+    parameters = rigs['hip'].parameters
     told = user.record('/many/estimator/parameters', String, LATCHED)
     assert parameters.get('hip.epsilon') == 5.0
     parameters.set(epsilon=6.0, lambda_=[20.0])
@@ -87,19 +76,19 @@ def test_common_parameter_serves_channels_without_their_own(user, parameters):
         assert (of_channel(values, channel)['gamma_rate'] == 0.5) == (channel == 'hip')
 
 
-def test_bad_set_names_the_channel_and_changes_nothing(parameters):
-    """Also a common value that one of its followers can't take is refused for all."""
-    for changes, channel, words in (
-        ({'knee.gamma_min': 0.9, 'knee.gamma_max': 0.2}, 'knee', 'expected each at most the next'),
-        ({'hip.gamma_max': 0.8, 'gamma_initial': 0.9}, 'hip', '0.9'),
-    ):
-        names = [*changes, 'knee.gamma_initial']
-        before = parameters.all(names)
-        answer = parameters.try_to_set(**changes)
-        assert not answer.successful
-        assert f"channel '{channel}'" in answer.reason
-        assert words in answer.reason
-        assert parameters.all(names) == before
+@pytest.mark.parametrize(('changes', 'channel', 'words'), [
+    ({'knee.gamma_min': 0.9, 'knee.gamma_max': 0.2}, 'knee', 'expected each at most the next'),
+    # A common value that one of its followers can't take is refused for all.
+    ({'hip.gamma_max': 0.8, 'gamma_initial': 0.9}, 'hip', '0.9'),
+])  # fmt: skip
+def test_bad_set_names_the_channel_and_changes_nothing(rigs, changes, channel, words):
+    parameters, names = rigs['hip'].parameters, [*changes, 'knee.gamma_initial']
+    before = parameters.all(names)
+    answer = parameters.try_to_set(**changes)
+    assert not answer.successful
+    assert f"channel '{channel}'" in answer.reason
+    assert words in answer.reason
+    assert parameters.all(names) == before
 
 
 # Channels from the names of joints.
@@ -136,11 +125,6 @@ class Arm(Rig):
         self.user.wait(answered, f'estimates of {len(positions)} joints')
         return self.out[-1].message
 
-    def wait(self, stamp: int) -> None:
-        self.user.wait(
-            lambda: nanoseconds(self.out[-1].message.header.stamp) == stamp, 'estimates'
-        )
-
 
 @pytest.fixture
 def arm(user, launch):
@@ -157,10 +141,14 @@ def test_each_joint_is_a_channel_whatever_the_order_of_the_names(user, arm):
     orders = [('shoulder', 'elbow', 'wrist'), ('wrist', 'shoulder', 'elbow'), ('elbow', 'wrist')]
     arm.answer(shoulder=0.1, elbow=0.2, wrist=0.3)
     for k in range(24):
-        arm.wait(arm.send(**{name: 0.1 * len(name) + 0.01 * k for name in orders[k % 3]}))
-    values = {name: {'max_gap': 60.0} for name in orders[0]}
-    values['elbow'] |= {'epsilon': 7.0}
-    estimators = {name: OnlineEstimator(own) for name, own in values.items()}
+        stamp = arm.send(**{name: 0.1 * len(name) + 0.01 * k for name in orders[k % 3]})
+        user.wait(
+            lambda stamp=stamp: nanoseconds(arm.out[-1].message.header.stamp) == stamp, 'estimates'
+        )
+    own = {'elbow': {'epsilon': 7.0}}
+    estimators = {
+        name: OnlineEstimator({'max_gap': 60.0} | own.get(name, {})) for name in orders[0]
+    }
     expected = {
         stamp: {name: estimators[name].update(stamp, y) for name, y in positions.items()}
         for stamp, positions in arm.sent

@@ -34,15 +34,6 @@ def unconfigured(manager):
     return manager
 
 
-def topics(user) -> int:
-    return sum(user.node.count_publishers(f'{NODE}/{t}') for t in ESTIMATES)
-
-
-def listeners(user) -> list[str]:
-    found = user.node.get_subscriptions_info_by_topic('/managed/y')
-    return [info.node_name for info in found if info.node_name != 'user']
-
-
 def test_a_destroyed_node_leaves_the_graph_while_its_process_goes_on(user):
     name, context = ('estimator', '/destroyed'), Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
@@ -57,8 +48,6 @@ def test_a_destroyed_node_leaves_the_graph_while_its_process_goes_on(user):
 
 def test_life_of_a_node(user, unconfigured, process):
     node = unconfigured
-    user.wait(lambda: topics(user) == 0 and not listeners(user), 'end of the topics')
-    assert node.transitions() == {'configure', 'shutdown'}
     assert node.change(Transition.TRANSITION_CONFIGURE)
     assert node.state() == 'inactive'
     rig = Estimator(user, process, '/managed').listen()
@@ -79,16 +68,35 @@ def test_life_of_a_node(user, unconfigured, process):
         rig.wait_status('state', STALE, 'inactive')
         assert len(rig.topics['stamp']) == ticks
     assert rig.count('samples lost') == 0
-    assert node.change(Transition.TRANSITION_CLEANUP)
-    user.wait(lambda: topics(user) == 0, 'end of the topics')
+
+
+def test_cleanup_leaves_nothing_behind(user, unconfigured):
+    def entities() -> tuple[int, int, int]:
+        heard = user.node.get_subscriptions_info_by_topic('/managed/y')
+        return (
+            sum(user.node.count_publishers(f'{NODE}/{topic}') for topic in ESTIMATES),
+            [info.node_name for info in heard].count('estimator'),
+            user.node.count_services(f'{NODE}/reset'),
+        )
+
+    for _ in range(5):
+        for transition in ('configure', 'activate', 'deactivate', 'cleanup'):
+            assert unconfigured.change(transition)
+    user.wait(lambda: entities() == (0, 0, 0), 'end of the topics')
+    assert unconfigured.change('configure')
+    user.wait(lambda: entities() == (len(ESTIMATES), 1, 1), 'one of each')
 
 
 def test_the_model_is_read_when_it_is_configured(user, unconfigured, process):
     node, parameters = unconfigured, Parameters(user, NODE)
     was = parameters.all(['order', 'phi'])
     # One after the other, as `ros2 param set` does: between the two they do not fit together.
-    for name, value in (('order', 2), ('phi', ['0', '-z2'])):
-        parameters.set(**{name: value})
+    parameters.set(order=2)
+    assert not node.change('configure')
+    assert node.state() == 'unconfigured'
+    words = "transition configure failed: parameter 'phi': expected 2 expressions"
+    assert words in process.output()
+    parameters.set(phi=['0', '-z2'])
     assert node.change('configure')
     for name, value in was.items():
         result = parameters.try_to_set(**{name: value})
@@ -103,38 +111,11 @@ def test_the_model_is_read_when_it_is_configured(user, unconfigured, process):
     parameters.set(**was)
 
 
-def test_parameters_that_do_not_fit_fail_the_transition_and_say_why(user, unconfigured, process):
-    parameters = Parameters(user, NODE)
-    parameters.set(order=4)
-    assert not unconfigured.change('configure')
-    assert unconfigured.state() == 'unconfigured'
-    words = "transition configure failed: parameter 'phi': expected 4 expressions"
-    assert words in process.output()
-    # A value wrong by itself is refused at once.
-    assert 'order' in parameters.try_to_set(order=0).reason
-    parameters.set(order=3)
-    assert unconfigured.change('configure')
-
-
-@pytest.mark.parametrize('transition', [Transition.TRANSITION_ACTIVATE, 99, 'activate', 'fly'])
+@pytest.mark.parametrize('transition', [Transition.TRANSITION_ACTIVATE, 99, 'fly'])
 def test_a_transition_that_is_not_possible_is_refused(unconfigured, process, transition):
     assert not unconfigured.change(transition)
     assert unconfigured.state() == 'unconfigured'
     assert f'transition {transition} is not possible while unconfigured' in process.output()
-    assert unconfigured.change('configure')
-    assert not unconfigured.change('configure')
-    assert unconfigured.state() == 'inactive'
-
-
-def test_cycles_leave_nothing_behind(user, unconfigured):
-    for _ in range(5):
-        for transition in ('configure', 'activate', 'deactivate', 'cleanup'):
-            assert unconfigured.change(transition)
-    for transition in ('configure', 'activate'):
-        assert unconfigured.change(transition)
-    user.wait(lambda: topics(user) == len(ESTIMATES), 'one publisher for each topic')
-    user.wait(lambda: listeners(user) == ['estimator'], 'one subscription')
-    user.wait(lambda: user.node.count_services(f'{NODE}/reset') == 1, 'one service')
 
 
 def test_reset_that_waits_during_cleanup_does_not_end_the_node(user, unconfigured, process):

@@ -15,55 +15,20 @@ from rcl_interfaces.msg import Parameter, ParameterValue
 from rclpy.parameter import get_parameter_value
 from running import FED, OK, Parameters
 from test_any_input import valid
+from test_online_parameters import CHANGES
 
 TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}
-LIVE = {node: [p for p in table.values() if p.live] for node, table in TABLES.items()}
 STARTED_WITH = {'estimator': FED, 'plant': {'sample_rate': 200.0}}
 READ_ONLY = {
     'estimator': ['autostart', 'channels'],  # the rest can be set while the node is unconfigured
     'plant': [p.name for p in PLANT_NODE_PARAMETERS.values() if not p.live],
 }
-OTHER = {
-    'gamma_max': {'gamma_max': 0.97},
-    'scheme': {'scheme': 'explicit'},
-    'sampling': {'sampling': 'nominal'},
-    'diagnostics_period': {'diagnostics_period': 0.2},
-    'fuzzy_systems': {'fuzzy_systems': ['curve 0 0.8 1']},
-    # A deviation is known to self-tuning only: test_events.py.
-    'event_deviations': {'gamma_rate': 0.01},
-}
-"""Changes where another value alone can't be."""
 
 
 @pytest.fixture
 def nodes(fed, pair):
     """Return the parameters of both nodes."""
     return {'estimator': fed.parameters, 'plant': pair.plant}
-
-
-def start_value(node, parameter):
-    return STARTED_WITH[node].get(parameter.name, parameter.default)
-
-
-def other(node, parameter) -> dict:
-    """Return a change of a parameter, and of what has to change with it."""
-    value = start_value(node, parameter)
-    if parameter.name in OTHER:
-        return OTHER[parameter.name]
-    if parameter.choices:
-        return {parameter.name: next(c for c in parameter.choices if c != value)}
-    match value:
-        case bool():
-            new = not value
-        case int():
-            new = value + 1
-        case float():
-            new = 0.9 * value or 0.01
-        case str():
-            new = 'other'
-        case list():
-            new = [0.9 * x or 0.01 for x in value]
-    return {parameter.name: new}
 
 
 @pytest.mark.parametrize('node', TABLES)
@@ -75,7 +40,8 @@ def test_every_parameter_is_described_and_has_its_default(nodes, node):
     types = [message.type for message in parameters.messages(*table)]
     values = parameters.all(table)
     for kind, (name, parameter) in zip(types, table.items(), strict=True):
-        d, value, expected = described[name], values[name], start_value(node, parameter)
+        d, value = described[name], values[name]
+        expected = STARTED_WITH[node].get(name, parameter.default)
         assert value == expected, name
         assert type(value) is type(expected), name
         assert len(d.description) > 10, name
@@ -89,31 +55,24 @@ def test_every_parameter_is_described_and_has_its_default(nodes, node):
         assert ('set it after cleanup' in d.additional_constraints) == fixed, name
 
 
-def test_every_live_parameter_of_the_plant_can_change(pair):
-    for parameter in LIVE['plant']:
-        was, change = pair.plant.get(parameter.name), other('plant', parameter)
-        for changes in (change, {parameter.name: was}):
-            pair.plant.set(**changes)
-            assert pair.plant.all(changes) == changes
-
-
-@pytest.mark.parametrize('parameter', LIVE['estimator'], ids=lambda p: p.name)
-def test_live_change_acts_on_the_next_sample_as_in_a_replay(fed, parameter):
-    replay = OnlineEstimator({name: v for name, v in FED.items() if name in ONLINE_PARAMETERS})
-    change = other('estimator', parameter)
-    was = fed.parameters.all(change)
-    for changes in (was, change, was):
-        fed.parameters.set(**changes)
-        assert fed.parameters.all(changes) == changes
-        replay.configure({name: v for name, v in changes.items() if name in ONLINE_PARAMETERS})
-        for k in range(4):
-            y = 0.2 + 0.01 * math.sin(0.7 * k)
-            replay.update(fed.send(y), y)
-        expected = replay.estimate
-        found = fed.wait_estimate(lambda e: e.stamp == replay.stamp, 'estimate')
-        assert found.z == list(expected.z)
-        assert found.innovation == list(expected.innovation)
-        assert (found.unknown_input, found.gamma) == (expected.unknown_input, expected.gamma)
+def test_live_changes_act_on_the_next_sample_as_in_a_replay(fed):
+    replay = OnlineEstimator({'max_gap': FED['max_gap']})
+    for name, (value, *_) in CHANGES.items():
+        if name in ('gamma_max', 'event_deviations'):  # which need others of the base
+            continue
+        was = fed.parameters.all([name])
+        for change in ({name: value}, was):
+            fed.parameters.set(**change)
+            replay.configure(change)
+            for k in range(4):
+                y = 0.2 + 0.01 * math.sin(0.7 * k)
+                replay.update(fed.send(y), y)
+            expected = replay.estimate
+            found = fed.wait_estimate(lambda e: e.stamp == replay.stamp, f'estimate, {name}')
+            assert found.z == list(expected.z), change
+            assert found.innovation == list(expected.innovation), change
+            assert (found.unknown_input, found.gamma) == (expected.unknown_input, expected.gamma)
+        assert fed.parameters.all([name]) == was
 
 
 def test_publish_rate_acts_on_the_wire(fed):
@@ -131,17 +90,14 @@ def test_publish_rate_acts_on_the_wire(fed):
 
 
 def test_constants_are_parameters_of_their_own(user, launch):
-    launch(
-        'estimator', namespace='/motor', order=2, phi=['0', 'k*a + b'], inputs=['a', 'b'],
-        **{'constants.k': 2.0},
-    )  # fmt: skip
+    model = {'order': 2, 'phi': ['0', 'k*a + b'], 'inputs': ['a', 'b'], 'constants.k': 2.0}
+    launch('estimator', namespace='/motor', **model)
     node = Parameters(user, '/motor/estimator')
-    assert node.get('constants.k') == 2.0
     assert 'Phi' in node.describe('constants.k')['constants.k'].description
     for topic in ('/motor/a', '/motor/b'):
         user.publisher(topic)
     node.set(**{'constants.k': 3})
-    for name, value in (('constants.k', math.nan), ('constants.k', 'x'), ('constants.q', 1.0)):
+    for name, value in (('constants.k', math.nan), ('constants.q', 1.0)):
         assert name in node.try_to_set(**{name: value}).reason
     assert node.get('constants.k') == 3.0
 
@@ -151,14 +107,10 @@ def test_constants_are_parameters_of_their_own(user, launch):
 
 @pytest.mark.parametrize(('node', 'name', 'value', 'words'), [
     ('estimator', 'gamma_min', 0.97, ['gamma_initial', '0.97']),
-    ('estimator', 'epsilon', 'wide', ['a number', "'wide'"]),
     ('estimator', 'variant', 'fuzy', ["'fuzy'", "did you mean 'fuzzy'?"]),
     ('estimator', 'lambda', [15.0, 15.0], ['1 or 4', '[15.0, 15.0]']),
-    ('estimator', 'publish_rate', 1e6, ['0.1', '5000', '1000000.0']),
     ('estimator', 'order', 2, ['cleanup', '2']),
-    ('estimator', 'event_deviations', 4.0, ["expected gains = 'self_tuning'"]),
     ('estimator', 'lamda', 1.0, ["did you mean 'lambda'?"]),
-    ('plant', 'noise_seed', 1.5, ['an integer', '1.5']),
     ('plant', 'disturbance', 'saw', ['none, sine, step, square, chirp', "'saw'"]),
     ('plant', 'phi', ['0', '0', 'z1'], []),
 ])  # fmt: skip
@@ -173,16 +125,9 @@ def test_bad_value_changes_nothing_and_says_why(nodes, node, name, value, words)
     assert parameters.messages(*TABLES[node]) == before
 
 
-def test_atomic_set_is_all_or_nothing(fed):
-    p = fed.parameters
-    before = p.messages(*ESTIMATOR_PARAMETERS)
-    result = p.try_to_set(epsilon=0.04, lambda_=[1.0, 2.0])
-    assert not result.successful
-    assert 'lambda' in result.reason
-    assert p.messages(*ESTIMATOR_PARAMETERS) == before
-    # Each would be refused alone, beside the other's old value.
-    p.set(gamma_min=0.85, gamma_max=0.95, gamma_initial=0.9)
-    assert (p.get('gamma_min'), p.get('gamma_max')) == (0.85, 0.95)
+def test_a_set_is_judged_as_a_whole(fed):
+    """Each of these would be refused alone, beside the other's old value."""
+    fed.parameters.set(gamma_min=0.85, gamma_max=0.95, gamma_initial=0.9)
     assert fed.feed(0.2).gamma >= 0.85
 
 
@@ -190,15 +135,12 @@ def test_atomic_set_is_all_or_nothing(fed):
 
 
 @pytest.mark.parametrize(('name', 'text', 'value'), [
-    ('epsilon', '4', 4.0),
     ('epsilon', '1e-2', 0.01),
     ('lambda', '[15, 15, 15, 15]', [15.0] * 4),
     ('lambda', '[15, 1e1, 16.5, 17]', [15.0, 10.0, 16.5, 17.0]),
-    ('lambda', '14', [14.0]),
     ('lambda', '14.5', [14.5]),
     ('start_from_measurement', 'off', False),
-    ('variant', 'sign', 'sign'),
-    *(('lambda', text, None) for text in ('[]', '[a, 1]', '[[1, 2], [3, 4]]', '[1, 2', '')),
+    *(('lambda', text, None) for text in ('[]', '[a, 1]', '[1, 2')),
 ])  # fmt: skip
 def test_texts_of_ros2_param_set(fed, name, text, value):
     p = fed.parameters

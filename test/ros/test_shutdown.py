@@ -25,7 +25,7 @@ def ends_well(process) -> None:
     ids=['SIGHUP', 'three'],
 )
 def test_running_pair_ends(user, launch, signals):
-    """Both at full rate, so that callbacks run when the signal comes."""
+    """At full rate, and with requests that wait, so that callbacks run when the signal comes."""
     namespace = f'/end{signals[0]}'
     d = user.record(f'{namespace}/estimator/unknown_input', Float64)
     nodes = [
@@ -33,6 +33,9 @@ def test_running_pair_ends(user, launch, signals):
         launch('estimator', namespace=namespace, publish_rate=1000.0),
     ]
     user.wait(lambda: len(d) > 10, 'estimates')
+    parameters = Parameters(user, f'{namespace}/estimator')
+    for _ in range(20):
+        parameters.service.set_parameters([Parameter('variant', value='fuzzy')])
     for number in signals:
         for node in nodes:
             node.send_signal(number)
@@ -55,25 +58,14 @@ def test_a_signal_ends_it_in_every_state(user, launch):
         ends_well(process)
 
 
-def test_signal_while_parameters_are_set(user, launch):
-    """A call that is being answered, or waits to be, when the signal comes."""
-    process = launch('estimator', namespace='/set')
-    parameters = Parameters(user, '/set/estimator')
-    parameters.set(epsilon=4.0)
-    for _ in range(20):
-        parameters.service.set_parameters([Parameter('variant', value='fuzzy')])
-    process.send_signal(signal.SIGINT)
-    ends_well(process)
-
-
 @pytest.mark.parametrize('delay', [0.3, 0.7, 1.1])
 def test_signal_while_it_starts(launch, delay):
     """The delay is the test's subject: anywhere within the start, or just behind it."""
     nodes = [launch(name, namespace='/early') for name in ('estimator', 'plant')]
     time.sleep(delay)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        for process in nodes:
-            process.send_signal(number)
+    for process in nodes:
+        process.send_signal(signal.SIGTERM)
+        process.send_signal(signal.SIGINT)
     for process in nodes:
         code = process.wait(GRACE)
         # Python itself dies of a signal before it has begun with our code.

@@ -6,7 +6,6 @@ from pathlib import Path
 import signal
 from threading import Timer
 
-from commands import run
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 import pytest
@@ -26,33 +25,24 @@ def rules(*words: str) -> list[str]:
     return ['--ros-args', *(part for word in words for part in ('-p', word))]
 
 
-# Node, arguments, words of the message; an argument with an end of line is put in a file.
+# Node, arguments, words of the message; an argument with an end of line is put in a file. What is
+# said of files and values as such: test_parameters.py, test_parameter_files.py.
 E, P = 'estimator', 'plant'
 OF_PLANT = 'plant: {ros__parameters: {order: 2}}\n'
-HOSTILE_TEXTS = [
-    HOSTILE[name].strip()
-    for name in ('laughs', '50000 brackets', 'very long text', 'python', 'half a list')
-]
 REFUSED = [
     # Files.
-    (E, set_in_file('lamda: [15.0]'), [".yaml: unknown parameter 'lamda'", "mean 'lambda'?"]),
+    (E, [*set_in_file('lamda: [1]'), *set_in_file('lamda: [2]')],
+     ["5.yaml: unknown parameter 'lamda'", "mean 'lambda'?"]),
     (E, [*set_in_file('lambda: [-3.0]'), '-p', 'lambda:=[-4.0]'],
      ["error: parameter 'lambda'", '> 0', '[-4.0]']),
-    (E, [*set_in_file('lamda: [1]'), *set_in_file('lamda: [2]')],
-     ["5.yaml: unknown parameter 'lamda'"]),
-    (E, set_in_file("phi: ['0', '0', '__import__(1)']"), ["'phi'", 'allowed', '__import__']),
-    (P, set_in_file("phi: ['0', '-z2']"), ["'phi'", '3 expressions', 'got 2']),
-    (E, ['--ros-args', '--params-file', 'a: b: c\n'], ['.yaml', 'expected YAML']),
-    (E, ['--ros-args', '--params-file', 'lambda: [15.0]\n'], ['.yaml', 'ros__parameters']),
     (P, ['--ros-args', '-r', '__node:=plans', '--params-file', OF_PLANT],
      ["got 'plant'; did you mean '/plans'"]),
-    (E, set_in_file('lambda: [15, 15.5, 16, 17]'), ["'lambda'", 'one type', '[15, 15.5, 16, 17]']),
     (P, ['--ros-args', '--params-file', '/nowhere/demo.yaml'],
      ['/nowhere/demo.yaml', 'expected a readable file', 'No such file']),
+    (E, set_in_file(f'lambda: {HOSTILE["laughs"].strip()}'), ['.yaml']),
     # Arguments.
-    (E, rules('lamda:=4'), ["'lamda'", "mean 'lambda'?"]),
+    (E, rules(f'lambda:={HOSTILE["50000 brackets"]}'), ["'lambda'"]),
     (E, rules('estimator:noise:=0.1'), ["'noise'"]),
-    (E, rules('max_gap:=soon'), ["'max_gap'", 'a number', "'soon'"]),
     (E, rules('epsilon'), ["'-p epsilon'"]),
     (E, ['--ros-args', '-p'], ['-p']),
     (P, ['fast'], ["'fast'", 'usage: plant']),
@@ -69,30 +59,18 @@ REFUSED = [
     (E, rules('input_type:=sensor_msgs/msg/JointState'), ['a field', 'position[i]']),
     (E, rules('input_type:=std_msgs/msg/Float64', 'input_stamp:=header'),
      ["'input_stamp'", 'messages with a header', 'std_msgs/msg/Float64']),
-    (E, rules('channels:=[a, b]', 'typed_outputs:=[wrench]'), ["'output_axis'", 'linear.x']),
     # Channels.
-    (E, rules('channels:=[hip]', 'hpi.epsilon:=3.0'),
-     ["unknown parameter 'hpi.epsilon'; did you mean 'hip.epsilon'?"]),
+    (E, rules('channels:=[a, b]', 'typed_outputs:=[wrench]'), ["'output_axis'", 'linear.x']),
     (E, rules('channels:=[hip]', 'hip.order:=2'),
      ["channel 'hip': parameter 'phi': expected 2 expressions"]),
-    (E, rules('hip.epsilon:=3.0'), ["parameter 'hip.epsilon'"]),
     # QoS.
     (E, rules('qos_overrides./estimator/state.publisher.reliability:=sometimes'),
      ['/estimator/state', 'sometimes']),
-    (E, rules('qos_overrides./estimator/state.publisher.depth:=-1'), ['/estimator/state', '-1']),
-    (E, rules('qos_overrides./estimator/stat.publisher.depth:=5'),
-     ["'qos_overrides./estimator/stat", 'one of']),
-    (E, rules('qos_overrides./estimator/state.publisher.deadline:=5'),
-     ['state.publisher.deadline', 'one of']),
     (P, rules('qos_overrides./yy.publisher.depth:=5'),
      ["'qos_overrides./yy.publisher.depth': expected qos_overrides.ENDPOINT.POLICY", '/y.pub']),
-    (E, rules('qos_overrides./yy.subscription.depth:=5'),
-     ["'qos_overrides./yy.subscription.depth'", 'one of', '/y.subscription']),
+    (E, rules('qos_overrides./y.subscription.deadline:=5'),
+     ['y.subscription.deadline', 'one of', '/y.subscription']),
     (E, rules('qos_overrides./y.subscription.depth:=deep'), ['an integer', "'deep'"]),
-    (E, rules('input_depth:=10'), ["'input_depth'", 'qos_overrides./TOPIC.subscription.depth']),
-    # Hostile texts; more of them in test_parameter_files.py.
-    *((E, rules(f'lambda:={text}'), ["'lambda'"]) for text in HOSTILE_TEXTS),
-    *((E, set_in_file(f'lambda: {text}'), ['.yaml']) for text in HOSTILE_TEXTS),
 ]  # fmt: skip
 
 
@@ -108,38 +86,26 @@ def in_files(words: list[str], folder: Path) -> list[str]:
     return result
 
 
-def check_refusal(node: str, code: int, out: str, err: str) -> str:
-    assert code == 2
-    assert out == ''
-    # rcl's own, where two nodes of a name are in one process
-    (line,) = [x for x in err.splitlines() if 'Publisher already registered' not in x]
-    assert line.startswith(f'{node}: error: ')
-    assert line.isprintable()
-    assert len(line) < 600
-    for noise in ('Traceback', '.c:', 'Error(', '/project/'):
-        assert noise not in line
-    return line
-
-
 @pytest.mark.parametrize(('node', 'words', 'expected'), REFUSED)
 def test_one_line_says_what_is_wrong(node, words, expected, tmp_path, capfd):
     # In this process; it is not to run.
     watch = Timer(DEADLINE, signal.raise_signal, [signal.SIGTERM])
     watch.start()
     try:
-        code = main([node, *in_files(words, tmp_path)])
+        assert main([node, *in_files(words, tmp_path)]) == 2
     finally:
         watch.cancel()
         gc.collect()  # the node itself: two of one name in a process make rcl warn
-    line = check_refusal(node, code, *capfd.readouterr())
+    out, err = capfd.readouterr()
+    # rcl's own, where two nodes of a name are in one process
+    (line,) = [x for x in err.splitlines() if 'Publisher already registered' not in x]
+    assert out == ''
+    assert line.startswith(f'{node}: error: ')
+    assert line.isprintable()
+    assert len(line) < 600
+    assert not [noise for noise in ('Traceback', '.c:', 'Error(') if noise in line]
     for word in expected:
         assert word in line
-
-
-@pytest.mark.parametrize('node', ['estimator', 'plant'])
-def test_process_ends_with_one_line(node):
-    done = run(node, *rules('phi:=[]'))
-    assert "'phi'" in check_refusal(node, done.returncode, done.stdout, done.stderr)
 
 
 def test_files_and_rules_reach_the_node_for_which_they_are(user, launch, tmp_path):
