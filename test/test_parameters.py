@@ -6,13 +6,11 @@ from array import array
 import warnings
 
 from fhaosmo_ros.core import ConfigurationError, Observer
-from fhaosmo_ros.core.parameters import files
 from fhaosmo_ros.core.parameters.declaration import KINDS, Parameter
-from fhaosmo_ros.core.parameters.files import load, select
+from fhaosmo_ros.core.parameters.files import complete, load, select
 from fhaosmo_ros.core.parameters.per_channel import channel_names, of_channel, with_channels
 from fhaosmo_ros.core.parameters.removed import REMOVED
 from fhaosmo_ros.core.parameters.tables import (
-    CHANNEL_PARAMETERS,
     ESTIMATOR_PARAMETERS,
     NODE_TABLES,
     PLANT_NODE_PARAMETERS,
@@ -22,142 +20,94 @@ import numpy as np
 import pytest
 
 ALL = {**ESTIMATOR_PARAMETERS, **PLANT_NODE_PARAMETERS}
-NUMBERS = [p for p in ALL.values() if p.kind in ('int', 'double', 'double_array')]
-DOUBLES = [p for p in NUMBERS if p.kind != 'int']
-
-
-def shaped(parameter, item):
-    return [item] if parameter.kind.endswith('array') else item
-
-
-def refused(parameter, value):
-    """Check the message for a refused value and return it."""
-    with pytest.raises(ConfigurationError) as error:
-        parameter.coerce(value)
-    message = str(error.value)
-    assert message.isprintable()
-    assert message.startswith(f"parameter '{parameter.name}': expected {parameter.allowed}, got ")
-    assert len(message) < 600
-    return message
 
 
 def test_declaration_is_complete():
     for name, parameter in ALL.items():
         assert parameter.kind in KINDS, name
         assert parameter.text.endswith('.'), name
-        assert parameter.name == name == name.lower()
         assert name.isidentifier()
+        assert name == name.lower()
         assert bool(parameter.lengths) == parameter.kind.endswith('array'), name
         got = parameter.coerce(parameter.default)
         assert (got, type(got)) == (parameter.default, type(parameter.default)), name
+        if parameter.kind in ('int', 'double', 'double_array'):
+            assert parameter.lower < parameter.upper, name
     ESTIMATOR_PARAMETERS.defaults()['phi'].append('0')  # a fresh copy
     assert len(ESTIMATOR_PARAMETERS['phi'].default) == ESTIMATOR_PARAMETERS['order'].default
 
 
-def test_bounds_hold_and_are_told():
-    for parameter in NUMBERS:
-        whole = int if parameter.kind == 'int' else float
-        sign = '>' if parameter.lower_open else '>='
-        assert parameter.lower < parameter.upper, parameter.name
-        assert f'{sign} {parameter.lower:g} and <= {parameter.upper:g}' in parameter.allowed
-        assert not parameter.unit or f'[{parameter.unit}]' in parameter.allowed
-        parameter.coerce(shaped(parameter, whole(parameter.upper)))
-        low = shaped(parameter, whole(parameter.lower))
-        if parameter.lower_open:
-            refused(parameter, low)
-        else:
-            parameter.coerce(low)
-        for beyond in (parameter.lower - 1, parameter.upper * 2 + 1):
-            assert repr(whole(beyond)) in refused(parameter, shaped(parameter, whole(beyond)))
+LIMITS = {'unit': 'm', 'lower': 0.0, 'upper': 2.0, 'lower_open': True}
+DECLARED = {
+    'bool': Parameter('p', True, 'A switch.'),
+    'int': Parameter('p', 2, 'A count.', lower=1, upper=9),
+    'double': Parameter('p', 0.5, 'A length.', **LIMITS),
+    'string': Parameter('p', 'sign', 'A choice.', choices=('sign', 'fuzzy')),
+    'double_array': Parameter('p', [0.5], 'Lengths.', **LIMITS),
+    'string_array': Parameter('p', ['0'], 'Expressions.'),
+}
 
 
-def test_any_number_is_accepted_where_one_is_meant():
-    tried = 0
-    for parameter in DOUBLES:
-        candidates = [1, 0, int(parameter.upper)]
-        for value in [v for v in candidates if parameter.lower < v <= parameter.upper][:1]:
-            tried += 1
-            given = [shaped(parameter, value), shaped(parameter, np.float64(value))]
-            wanted = shaped(parameter, float(value))
-            if parameter.kind == 'double_array':
-                given += [array('d', [value]), np.array([value]), (value,), value]
-                given += [f'[{value}]']  # as rclpy and a command line deliver it
-                assert parameter.coerce(f'[{value}, {value}.0]') == wanted * 2
-            for one in given:
-                got = parameter.coerce(one)
-                assert (got, type(got)) == (wanted, type(wanted)), parameter.name
-                assert isinstance(got[0] if isinstance(got, list) else got, float)
-    assert tried > len(DOUBLES) / 2
+@pytest.mark.parametrize(('kind', 'expected', 'values'), [
+    ('bool', False, [False, np.bool_(False)]),
+    ('int', 9, [9, np.int64(9)]),
+    ('double', 2.0, [2, 2.0, np.float64(2.0)]),
+    ('double_array', [2.0], [2, '2', [2], (2.0,), '[2]', np.array([2]), array('d', [2])]),
+    # As in C and rcl, unlike YAML 1.1.
+    ('double_array', [0.5, 1.0], [[0.5, 1], '[0.5, 1]', '[5e-1, .1E1]', '[5.e-1, +1e0]']),
+    ('string_array', ['0', '0.5', '-z3'], [[0, 0.5, '-z3'], '[0, 0.5, -z3]', ('0', '0.5', '-z3')]),
+])  # fmt: skip
+def test_what_is_meant_is_taken_in_the_declared_type(kind, expected, values):
+    for value in values:
+        got = DECLARED[kind].coerce(value)
+        assert (got, type(got)) == (expected, type(expected))
+        assert kind != 'double_array' or all(isinstance(item, float) for item in got)
 
 
-def test_value_of_another_kind_is_refused():
-    nothing = [None, {}, {'a': 1}, object, [], '', b'0', 1j, [None]]
-    kinds = {'bool': (0, 1, 'true', 'yes', 1.0), 'int': (1.0, 1.5, '1', True, [1])}
-    for parameter in ALL.values():
-        for value in (*nothing, *kinds.get(parameter.kind, ())):
-            if not (value == '' and parameter.kind == 'string' and not parameter.choices):
-                refused(parameter, value)
-        if parameter.kind == 'bool':
-            assert parameter.coerce(np.bool_(False)) is False
-        elif parameter.kind == 'int':
-            assert type(parameter.coerce(np.int64(2))) is int
-        elif parameter.kind.endswith('array'):
-            for text in ('[', '[1, 2', 'a: b', '{1: 2}', '[[1]]', '!!python/x', '[~]'):
-                refused(parameter, text)
-    for parameter in DOUBLES:
-        for item in (float('nan'), float('inf'), -float('inf'), True, None, '1', [1.0]):
-            assert repr(item) in refused(parameter, shaped(parameter, item))
-        refused(parameter, shaped(parameter, 10**400))
-
-
-def test_unknown_choice_gets_the_closest_one():
-    for parameter in (p for p in ALL.values() if p.choices):
-        choice = parameter.choices[-1]
-        for wrong in (choice + 'x', choice[:-1]):
-            assert f"did you mean '{choice}'?" in refused(parameter, wrong)
-        assert 'did you mean' not in refused(parameter, 'qqqqqq')
-
-
-def test_numbers_in_a_list_of_expressions_become_text():
-    phi = ALL['phi']
-    assert phi.coerce([0, 0.5, '-z3']) == phi.coerce('[0, 0.5, -z3]') == ['0', '0.5', '-z3']
-    assert phi.coerce(('0', 'u*z1')) == ['0', 'u*z1']
-    for value in (['0', True], ['0', None], ['0', ['z1']], 5, '[0, true]'):
-        refused(phi, value)
-    for number in ('1e-3', '1E3', '-2e+2', '.5e1', '1.e2'):  # as in C and rcl, unlike YAML 1.1
-        assert Parameter('p', [0.0], 'A list.').coerce(f'[{number}, 1]') == [float(number), 1.0]
+@pytest.mark.parametrize(('kind', 'allowed', 'values'), [
+    ('bool', 'true or false', [0, 1, 'true', 1.0]),
+    ('int', 'an integer >= 1 and <= 9', [0, 10, 1.0, '1', True, [1]]),
+    ('double', 'a number > 0 and <= 2 [m]',
+     [0, 2.1, float('nan'), float('inf'), True, '1', [1.0], 10**400]),
+    ('string', 'one of sign, fuzzy', ['fuzy', 'qqq', '', 1]),
+    ('double_array', 'a list of numbers > 0 and <= 2 [m]',
+     [[1.0, 0.0], [float('nan')], [True], ['1'], [[1.0]], [10**400],
+      '[', '[1, 2', 'a: b', '[[1]]', '!!python/x', '[~]']),
+    ('string_array', 'a list of strings', [['0', True], ['0', ['z1']], 5, '[0, true]']),
+])  # fmt: skip
+def test_all_else_is_refused_in_one_line(kind, allowed, values):
+    for value in [*values, None, {}, {'a': 1}, object, [], b'0', 1j, [None]]:
+        with pytest.raises(ConfigurationError) as error:
+            DECLARED[kind].coerce(value)
+        message = str(error.value)
+        assert message.isprintable()
+        assert len(message) < 600
+        assert message.startswith(f"parameter 'p': expected {allowed}, got ")
+        assert message.endswith("got 'fuzy'; did you mean 'fuzzy'?") == (value == 'fuzy')
 
 
 def test_unknown_and_old_names_are_told():
     for table in NODE_TABLES.values():
         for name in table:
-            wrong = name + 'x'
-            with pytest.raises(ConfigurationError, match=f"unknown parameter '{wrong}'.*{name}"):
-                table.coerce({wrong: 1.0})
-        with pytest.raises(ConfigurationError) as error:
-            table.coerce({'qqqq': 1})
-        assert all(name in str(error.value) for name in table)
+            with pytest.raises(ConfigurationError, match=f"unknown parameter '{name}x'.*{name}"):
+                table.coerce({name + 'x': 1.0})
         assert not REMOVED.keys() & table.keys()
     for name, successor in REMOVED.items():
         for wrong, values in ((name, {}), (f'hip.{name}', {'channels': ['hip']})):
             with pytest.raises(ConfigurationError) as error:
-                files.complete(values | {wrong: 1.0}, ESTIMATOR_PARAMETERS)
+                complete(values | {wrong: 1.0}, ESTIMATOR_PARAMETERS)
             assert str(error.value) == f"parameter '{wrong}' is gone: {successor}"
 
 
 @pytest.mark.parametrize(('name', 'value', 'allowed'), [
-    ('lambda', [1.0, 2.0], '1 or 4 values'), ('initial_estimate', [0.0] * 3, '1 or 4 values'),
-    ('initial_internal', [0.0] * 2, '1 or 4 values'), ('fuzzy_widths', [1.0] * 5, '1 to 4 values'),
-    ('phi', ['0', '0'], '3 expressions'),
+    ('lambda', [1.0, 2.0], '1 or 4 values, got [1.0, 2.0]'),
+    ('initial_internal', [0.0] * 3, '1 or 4 values'), ('fuzzy_widths', [1.0] * 5, '1 to 4 values'),
+    ('phi', ['0', '0'], '3 expressions (order = 3), got 2'),
 ])  # fmt: skip
 def test_list_of_the_wrong_length_is_refused(name, value, allowed):
-    for changes in ({name: value}, {name: str(value)}, {name: np.array(value)}):
-        with pytest.raises(ConfigurationError) as error:
-            Observer(changes)
-        message = str(error.value)
-        assert message.isprintable()
-        for part in (f"'{name}'", allowed, repr(value) if name != 'phi' else 'got 2'):
-            assert part in message
+    with pytest.raises(ConfigurationError) as error:
+        Observer({name: value})
+    assert f"'{name}': expected {allowed}" in str(error.value)
 
 
 @pytest.mark.parametrize(('values', 'reason'), [
@@ -192,9 +142,7 @@ NAMES = ['hip', 'knee_2']
 
 @pytest.mark.parametrize(('names', 'reason'), [
     (['hip', 'hip'], 'every name once'), ([], 'a list of strings'),
-    *(([*names], 'names of letters') for names in (
-        ('hip', ''), ('2hip',), ('hip/left',), ('a__b',), ('hip.left',),
-    )),
+    *(([*NAMES, name], 'names of letters') for name in ('', '2hip', 'hip/left', 'a__b', 'a.b')),
     (['lambda'], "names that no parameter has (there is one 'lambda')"),
 ])  # fmt: skip
 def test_bad_names_are_refused(names, reason):
@@ -209,23 +157,20 @@ def test_own_value_wins_and_the_common_one_serves_the_rest():
     hip, knee = (of_channel(values, name) for name in NAMES)
     assert (hip['epsilon'], knee['epsilon']) == (7.0, 5.0)
     assert (knee['lambda'], 'lambda' in hip) == ([3.0], False)
-
-
-def test_own_parameters_are_declared_and_checked_as_the_common_ones():
-    assert list(with_channels(ESTIMATOR_PARAMETERS, channel_names({}))) == [*ESTIMATOR_PARAMETERS]
     table = with_channels(ESTIMATOR_PARAMETERS, NAMES, {'epsilon': 9.0})
-    assert len(table) == len(ESTIMATOR_PARAMETERS) + 2 * len(CHANNEL_PARAMETERS)
-    with pytest.raises(ConfigurationError, match=r"'hip.epsilon': expected a number > 0 .*got -1"):
-        table.coerce({'hip.epsilon': -1})
     assert table['hip.order'].live == ESTIMATOR_PARAMETERS['order'].live
     assert table['hip.epsilon'].default == 9.0  # the common value
     assert table['hip.max_gap'].default == ESTIMATOR_PARAMETERS['max_gap'].default
 
 
-@pytest.mark.parametrize('name', ['hpi.lambda', 'hip.lamda', 'hip.publish_rate'])
-def test_unknown_names_are_told(name):
-    with pytest.raises(ConfigurationError, match=f"unknown parameter '{name}'"):
-        select({'channels': NAMES, name: 1.0}, ESTIMATOR_PARAMETERS)
+@pytest.mark.parametrize(('name', 'reason'), [
+    *((name, f"unknown parameter '{name}'") for name in
+      ('hpi.lambda', 'hip.lamda', 'hip.publish_rate')),
+    ('hip.epsilon', "parameter 'hip.epsilon': expected a number > 0"),
+])  # fmt: skip
+def test_own_parameters_are_checked_as_the_common_ones(name, reason):
+    with pytest.raises(ConfigurationError, match=reason):
+        select({'channels': NAMES, name: -1.0}, ESTIMATOR_PARAMETERS)
 
 
 def replayed(*words):
@@ -242,7 +187,7 @@ def test_one_file_serves_channels_and_plant_and_a_replay_takes_one_channel(tmp_p
     )
     channels = {'channels': ['hip', 'knee'], 'epsilon': 5.0, 'hip.epsilon': 7.0}
     assert load(rig, 'estimator') == channels
-    assert load(rig, 'plant', PLANT_NODE_PARAMETERS) == {'sample_rate': 50.0}
+    assert load(rig, 'plant') == {'sample_rate': 50.0}
     words = ['--params-file', str(rig), '-p', 'knee.lambda:=3']
     assert replayed(*words, '--channel', 'hip') == {'epsilon': 7.0}
     assert replayed(*words, '--channel', 'knee') == {'epsilon': 5.0, 'lambda': [3.0]}
