@@ -16,7 +16,7 @@ from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
 from fhaosmo_ros.nodes.recording import PrivateNode
 from fhaosmo_ros.tools.cli.processes import Child
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetAvailableTransitions, GetState
+from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -51,9 +51,10 @@ def as_time(stamp: int) -> Time:
     return Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
 
 
-def values_of(status) -> dict[str, str]:
-    """Return the values of a diagnostic status."""
-    return {pair.key: pair.value for pair in status.values}
+def values_of(status) -> dict[str, object]:
+    """Return the values of a diagnostic status, and its own level, message and hardware_id."""
+    own = {name: getattr(status, name) for name in ('level', 'message', 'hardware_id')}
+    return own | {pair.key: pair.value for pair in status.values}
 
 
 def joint_state(stamp: int, names: Iterable[str], positions: Iterable[float]) -> JointState:
@@ -115,7 +116,6 @@ class Published(NamedTuple):
 class Report(NamedTuple):
     """A message on /diagnostics: its own time in nanoseconds, and statuses by their tasks."""
 
-    stamp: int
     time: int
     statuses: dict
 
@@ -140,11 +140,10 @@ class User(PrivateNode):
         self.reports: dict[str, list[Report]] = defaultdict(list)
         self._listen('/diagnostics', DiagnosticArray, self._on_report)
 
-    def _on_report(self, stamp: int, message: DiagnosticArray) -> None:
+    def _on_report(self, _: int, message: DiagnosticArray) -> None:
         node = message.status[0].name.partition(': ')[0]
         statuses = {status.name.partition(': ')[2]: status for status in message.status}
-        time = nanoseconds(message.header.stamp)
-        self.reports[node].append(Report(stamp, time, statuses))
+        self.reports[node].append(Report(nanoseconds(message.header.stamp), statuses))
 
     def _listen(self, topic: str, kind: type, callback, qos: QoSProfile = QOS) -> None:
         def receive(message: object, info: dict) -> None:
@@ -211,9 +210,8 @@ class Parameters:
     def names(self) -> set[str]:
         return set(self._answer(self.service.list_parameters).result.names)
 
-    def describe(self, *names: str) -> dict:
-        answer = self._answer(self.service.describe_parameters, names)
-        return {d.name: d for d in answer.descriptors}
+    def describe(self, *names: str) -> list:
+        return list(self._answer(self.service.describe_parameters, names).descriptors)
 
     def messages(self, *names: str) -> list:
         return list(self._answer(self.service.get_parameters, names).values)
@@ -230,12 +228,9 @@ class Parameters:
         return self.all([name])[name]
 
     def try_to_set(self, **values: object):
-        """Return the result of setting one parameter, or several together."""
-        # 'lambda' is a keyword in Python, so the tests write lambda_
+        """Return the result of setting one parameter, or several together; `lambda_`: lambda."""
         changes = [Parameter(name.rstrip('_'), value=value) for name, value in values.items()]
-        if changes[1:]:
-            return self._answer(self.service.set_parameters_atomically, changes).result
-        return self._answer(self.service.set_parameters, changes).results[0]
+        return self._answer(self.service.set_parameters_atomically, changes).result
 
     def set(self, **values: object) -> None:
         result = self.try_to_set(**values)
@@ -260,10 +255,6 @@ class Manager:
 
     def state(self) -> str:
         return self._call('get_state', GetState).current_state.label
-
-    def transitions(self) -> set[str]:
-        answer = self._call('get_available_transitions', GetAvailableTransitions)
-        return {t.transition.label for t in answer.available_transitions}
 
     def change(self, transition: int | str) -> bool:
         by_label = isinstance(transition, str)
@@ -291,11 +282,8 @@ class Rig:
 
     def value(self, key: str) -> str | None:
         """Return a value of the latest report that has it."""
-        for report in reversed(self.reports):
-            for status in report.statuses.values():
-                if key in (found := values_of(status)):
-                    return found[key]
-        return None
+        latest = (values_of(s) for r in reversed(self.reports) for s in r.statuses.values())
+        return next((values[key] for values in latest if key in values), None)
 
     def count(self, key: str) -> int:
         return int(self.value(key) or 0)
@@ -303,31 +291,30 @@ class Rig:
     def wait_count(self, key: str, value: int) -> None:
         self.user.wait(lambda: self.count(key) >= value, f'{key!r} of {value} in diagnostics')
 
-    def _wait(self, task: str, condition, what: str, doing=lambda: None):
+    def wait_values(self, task: str, condition, what: str = '', doing=lambda: None):
+        """
+        Return values of the latest report from now on for which a condition on them holds.
+
+        What is to make it so is done again and again meanwhile.
+        """
         since = len(self.reports)
 
         def look() -> list:
             doing()
             statuses = [r.statuses[task] for r in self.reports[since:] if task in r.statuses]
-            return [status for status in statuses if condition(status)]
+            values = [values_of(status) for status in statuses]
+            return [found for found in values if condition(found)]
 
         return self.user.wait(look, what)[-1]
 
     def wait_status(self, task: str, level: bytes, *words: str, doing=lambda: None):
-        """
-        Return the latest status of a task, from now on, with this level and these words.
+        """Return values as `wait_values`, of a status with this level and these words."""
 
-        What is to make it so is done again and again meanwhile.
-        """
+        def as_wanted(values) -> bool:
+            text = values['message']
+            return values['level'] == level and all(word in text for word in words)
 
-        def as_wanted(status) -> bool:
-            return status.level == level and all(word in status.message for word in words)
-
-        return self._wait(task, as_wanted, f'{task} with level {level} and {words}', doing)
-
-    def wait_values(self, task: str, condition, what: str) -> dict[str, str]:
-        """Return values of the latest report from now on for which a condition holds."""
-        return values_of(self._wait(task, lambda s: condition(values_of(s)), what))
+        return self.wait_values(task, as_wanted, f'{task} with {level} and {words}', doing)
 
 
 class Estimator(Rig):

@@ -7,7 +7,7 @@ from fhaosmo_ros.nodes.recording import PrivateNode
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from running import ERROR, FED, joint_state, LATCHED, LAX, OK, STALE, values_of, WARN
+from running import ERROR, FED, joint_state, LATCHED, LAX, OK, STALE, WARN
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Int64
 
@@ -22,7 +22,7 @@ def test_values_of_the_reports(pair):
         return near and values['publishers'] == '/pair/plant'
 
     found = pair.wait_values('input', as_sampled, 'rate and name of the plant')
-    observer = values_of(pair.wait_status('observer', OK, 'OK'))
+    observer = pair.wait_status('observer', OK, 'OK')
     assert not {'nan', 'inf'} & {*found.values(), *observer.values()}
     assert (found['topic'], observer['open levels']) == ('/pair/y', '4 of 4')
     assert float(found['longest period [s]']) >= 0.999 / float(found['sample rate [Hz]'])
@@ -31,11 +31,9 @@ def test_values_of_the_reports(pair):
     assert 0.0 < mean <= longest
     accepted = int(found['samples accepted'])
     pair.wait_values('input', lambda v: int(v['samples accepted']) > accepted, 'more samples')
-    assert pair.reports[-1].statuses['state'].hardware_id == 'none'
-    pair.parameters.set(hardware_id='encoder 7')
-    pair.wait_status('state', OK)
-    assert pair.reports[-1].statuses['state'].hardware_id == 'encoder 7'
-    pair.parameters.set(hardware_id='none')
+    for name in ('encoder 7', 'none'):
+        pair.parameters.set(hardware_id=name)
+        pair.wait_values('state', lambda v, name=name: v['hardware_id'] == name, name)
 
 
 @pytest.mark.parametrize(('task', 'changes', 'words'), [
@@ -98,9 +96,9 @@ def stranger():
 
 def test_publishers_are_named(user, estimator, stranger):
     rig = estimator('/heard', **FED)
-    rig.wait_status('input', STALE, 'no usable sample yet', 'no publisher of /heard/y')
+    found = rig.wait_status('input', STALE, 'no usable sample yet', 'no publisher of /heard/y')
+    assert found['publishers'] == 'none'
     rig.wait_said('still waiting', 'no publisher of /heard/y')
-    assert values_of(rig.reports[-1].statuses['input'])['publishers'] == 'none'
 
     unheard = stranger.create_publisher(Float64, '/heard/y', BEST_EFFORT)
     policy = 'qos_overrides./heard/y.subscription'

@@ -36,23 +36,18 @@ def test_every_parameter_is_described_and_has_its_default(nodes, node):
     table, parameters = TABLES[node], nodes[node]
     extra = {n for n in parameters.names() - set(table) if not n.startswith('qos_overrides.')}
     assert extra <= {'use_sim_time', 'start_type_description_service'}
-    described = parameters.describe(*table)
+    assert parameters.all(table) == table.defaults() | STARTED_WITH[node]
     types = [message.type for message in parameters.messages(*table)]
-    values = parameters.all(table)
-    for kind, (name, parameter) in zip(types, table.items(), strict=True):
-        d, value = described[name], values[name]
-        expected = STARTED_WITH[node].get(name, parameter.default)
-        assert value == expected, name
-        assert type(value) is type(expected), name
-        assert len(d.description) > 10, name
-        assert d.type == kind, name
-        assert d.read_only == (name in READ_ONLY[node]), name
-        assert parameter.allowed in d.additional_constraints, name
+    for kind, d, p in zip(types, parameters.describe(*table), table.values(), strict=True):
+        assert d.name == p.name
+        assert (d.description, d.type) == (p.text, kind), p.name
+        assert d.read_only == (p.name in READ_ONLY[node]), p.name
+        assert p.allowed in d.additional_constraints, p.name
         for r in [*d.floating_point_range, *d.integer_range]:  # a slider
-            assert (r.from_value, r.to_value) == (parameter.lower, parameter.upper), name
-            assert (r.to_value - r.from_value) / 100 <= max(1.0, abs(parameter.default)), name
-        fixed = not parameter.live and not d.read_only
-        assert ('set it after cleanup' in d.additional_constraints) == fixed, name
+            assert (r.from_value, r.to_value) == (p.lower, p.upper), p.name
+            assert (r.to_value - r.from_value) / 100 <= max(1.0, abs(p.default)), p.name
+        fixed = not p.live and not d.read_only
+        assert ('set it after cleanup' in d.additional_constraints) == fixed, p.name
 
 
 def test_live_changes_act_on_the_next_sample_as_in_a_replay(fed):
@@ -93,7 +88,7 @@ def test_constants_are_parameters_of_their_own(user, launch):
     model = {'order': 2, 'phi': ['0', 'k*a + b'], 'inputs': ['a', 'b'], 'constants.k': 2.0}
     launch('estimator', namespace='/motor', **model)
     node = Parameters(user, '/motor/estimator')
-    assert 'Phi' in node.describe('constants.k')['constants.k'].description
+    assert 'Phi' in node.describe('constants.k')[0].description
     for topic in ('/motor/a', '/motor/b'):
         user.publisher(topic)
     node.set(**{'constants.k': 3})
@@ -181,15 +176,12 @@ def test_random_sets_hurt_nobody_and_each_refusal_has_its_reason(user, estimator
         changed = {n for n in before if before[n] != values[n]}
         accepted += result.successful
         assert changed <= (set(changes) if result.successful else set()), changes
-        if not result.successful:
-            assert '\n' not in result.reason, result.reason
-            assert any(name in result.reason for name in [*changes, 'gamma_']), (changes, result)
-        for _ in range(2):
-            node.send(rng.normal() if rng.random() < 0.99 else rng.choice([math.nan, 1e300]))
+        reasons = [name in result.reason for name in [*changes, 'gamma_']]
+        assert result.successful or (any(reasons) and '\n' not in result.reason), result
+        node.send(rng.normal() if rng.random() < 0.99 else rng.choice([math.nan, 1e300]))
     assert COUNT // 10 < accepted < COUNT - COUNT // 10
     node.parameters.set(publish_on='sample', diagnostics_period=0.1)
     node.wait_status('state', OK)  # whatever has been published before has come
     assert len(node.estimates) > COUNT // 2
     for e in node.estimates:
         assert all(map(math.isfinite, [*e.z, e.unknown_input, e.gamma, *e.innovation])), e
-        assert 0.0 < e.gamma <= 1.0
