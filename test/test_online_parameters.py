@@ -3,13 +3,14 @@
 
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core import Observer, OnlineEstimator
-from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, ONLINE_PARAMETERS
+from fhaosmo_ros.core import OnlineEstimator
+from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 import numpy as np
-from observer_cases import laws, samples, state_of
 import pytest
 
 START = 1_700_000_000 * 10**9
+OF_GAINS = ('gamma', 'p', 'q', 'settled')
+"""What an observer remembers of its gains: a change of these may change it."""
 LIVE = [name for name, parameter in ONLINE_PARAMETERS.items() if parameter.live]
 
 
@@ -75,7 +76,7 @@ CHANGES = {
 }
 
 
-def stream(first: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def stream(first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return samples at 1 kHz: jitter, a gap, a spike, a step, a dead stretch."""
     rng = np.random.default_rng(first)
     k = np.arange(first, first + count)
@@ -85,7 +86,7 @@ def stream(first: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     y[50] += 0.3
     y[150:] += 1.0
     y[180:200] = 1.2
-    return START + 3 * first * 10**6 + np.cumsum(steps), y, np.zeros(count)
+    return START + 3 * first * 10**6 + np.cumsum(steps), y
 
 
 def outputs(change: Change, name: str | None) -> np.ndarray:
@@ -94,14 +95,16 @@ def outputs(change: Change, name: str | None) -> np.ndarray:
     estimator.run(*stream(0, 250))
     estimator.configure(change.prepared)
     if name:
-        before = estimator.estimate
+        observer, before = estimator.observer, estimator.estimate
+        memory = observer.structure.state_dict()
         estimator.configure({name: change.value})
-        after = estimator.estimate
-        if name not in ('estimate_from', 'predict_to_now'):  # which show others from then on
-            np.testing.assert_array_equal(after.z, before.z)
-            assert after.unknown_input == before.unknown_input
-        np.testing.assert_array_equal(after.innovation, before.innovation)
         assert estimator.parameters[name] == ONLINE_PARAMETERS[name].coerce(change.value)
+        for quantity, value in observer.structure.state_dict().items():
+            if quantity not in OF_GAINS:
+                np.testing.assert_array_equal(value, memory[quantity], err_msg=quantity)
+        if name not in ('estimate_from', 'predict_to_now'):  # which show others from then on
+            np.testing.assert_array_equal(estimator.estimate.z, before.z)
+            assert estimator.estimate.unknown_input == before.unknown_input
     if change.reset:
         estimator.reset()
     estimator.events.taken()
@@ -118,35 +121,6 @@ def test_every_live_parameter_is_tried():
 
 @pytest.mark.parametrize('name', LIVE)
 def test_live_change_has_an_effect_and_makes_no_jump(name):
-    change = CHANGES[name]
-    one, other = outputs(change, None), outputs(change, name)
+    one, other = outputs(CHANGES[name], None), outputs(CHANGES[name], name)
     assert np.isfinite(other).all()
     assert not np.array_equal(one, other)
-    np.testing.assert_array_equal(one, outputs(change, None))  # nothing else differs
-
-
-MODEL = {'phi': ['0', 'sin(z1)', '-z2*z3 + u'], 'gamma_initial': 0.65, 'gamma_rate': 0.004}
-
-
-@laws
-def test_live_change_does_not_move_the_state(law):
-    for name in LIVE:
-        value = CHANGES[name].value
-        if name not in OBSERVER_PARAMETERS or (law['structure'], value) == ('levant', 'explicit'):
-            continue
-        observer = Observer(MODEL | law)
-        observer.run(*samples())
-        before = state_of(observer)
-        observer.configure({name: value})
-        after = state_of(observer)
-        for quantity in before.keys() - {'p', 'q', 'gamma'}:
-            found = after[quantity]
-            np.testing.assert_array_equal(found, before[quantity], err_msg=f'{quantity}, {name}')
-        # A fresh observer in the same state goes on in the same way: nothing else is remembered.
-        fresh = Observer(observer.parameters)
-        fresh.structure.load_state_dict(after)
-        for k in range(20):
-            one, other = (o.step(0.01 * k, 1e-3, 0.0) for o in (observer, fresh))
-            assert not one.status.rejected
-            np.testing.assert_array_equal(one.z, other.z, err_msg=f'after {name}')
-            assert one.gamma == other.gamma
