@@ -19,14 +19,10 @@ def process(launch):
     return launch('estimator', namespace='/managed', reliable=['y'], autostart=False, **FED)
 
 
-@pytest.fixture(scope='module')
-def manager(user, process):
-    return Manager(user, NODE)
-
-
 @pytest.fixture
-def unconfigured(manager):
-    """Return the node in the state in which it started."""
+def unconfigured(user, process):
+    """Return the manager of the node, in the state in which it started."""
+    manager = Manager(user, NODE)
     for state, transition in (('active', 'deactivate'), ('inactive', 'cleanup')):
         if manager.state() == state:
             assert manager.change(transition)
@@ -35,11 +31,9 @@ def unconfigured(manager):
 
 
 def test_a_destroyed_node_leaves_the_graph_while_its_process_goes_on(user):
-    name, context = ('estimator', '/destroyed'), Context()
+    context, name = Context(), ('estimator', '/destroyed')
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-    given = {'use_sim_time': True, 'sampling': 'nominal'}
-    node = EstimatorNode(given, context=context, namespace=name[1])
-    assert node.get_parameter('sampling').value == 'nominal'  # simulated time chooses no other
+    node = EstimatorNode({'sampling': 'nominal'}, context=context, namespace='/destroyed')
     user.wait(lambda: name in user.node.get_node_names_and_namespaces(), 'node')
     node.destroy_node()
     user.wait(lambda: name not in user.node.get_node_names_and_namespaces(), 'end of the node')

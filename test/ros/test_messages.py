@@ -14,7 +14,7 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from running import as_time, FED, joint_state, nanoseconds, ROOT, SECOND, STALE, User, WARN
 from sensor_msgs.msg import Imu, JointState
-from std_msgs.msg import Bool, ByteMultiArray, Float64, Header
+from std_msgs.msg import ByteMultiArray, Float64, Header
 
 STEP = 2_000_000
 """Nanoseconds between two header stamps."""
@@ -115,15 +115,15 @@ def test_bad_messages_are_told_counted_and_survived(user, estimator):
 # Other messages.
 
 
-@pytest.mark.parametrize(('message', 'field', 'number'), [
-    (DiagnosticArray(status=[DiagnosticStatus(level=b'\2')]), 'status[0].level', 2.0),
-    (Bool(data=True), '', 1.0),
-    (ByteMultiArray(data=[b'\1', b'\3']), 'data[1]', 3.0),
-])  # fmt: skip
-def test_numbers_of_any_kind(message, field, number):
-    kind = f'{type(message).__module__.partition(".")[0]}/msg/{type(message).__name__}'
-    read = deserialize_message(serialize_message(message), message_class(kind))
-    assert find_field(definitions(kind), kind, field).value(read) == pytest.approx(number)
+def test_bytes_are_numbers():
+    """They are numbers to rosbags, and bytes to rclpy."""
+    for message, field in (
+        (DiagnosticArray(status=[DiagnosticStatus(level=b'\2')]), 'status[0].level'),
+        (ByteMultiArray(data=[b'\1', b'\2']), 'data[1]'),
+    ):
+        kind = f'{type(message).__module__.partition(".")[0]}/msg/{type(message).__name__}'
+        read = deserialize_message(serialize_message(message), message_class(kind))
+        assert find_field(definitions(kind), kind, field).value(read) == 2.0
 
 
 def test_yaw_is_continuous_and_the_outputs_are_typed(user, estimator):

@@ -13,12 +13,8 @@ from running import DEADLINE, Estimator, Parameters
 from yaml_texts import HOSTILE
 
 
-def section(text: str) -> str:
-    return f'/**: {{ros__parameters: {{{text}}}}}\n'
-
-
 def set_in_file(text: str) -> list[str]:
-    return ['--ros-args', '--params-file', section(text)]
+    return ['--ros-args', '--params-file', f'/**: {{ros__parameters: {{{text}}}}}\n']
 
 
 def rules(*words: str) -> list[str]:
