@@ -82,8 +82,9 @@ def arguments(
 class Process(Child):
     """A node, which is to end when it is told to, and no sooner."""
 
+    _may_end = False
+
     def __init__(self, log: Path, *words: object) -> None:
-        self._may_end = False
         # A test under nohup ignores SIGHUP, and so would the node.
         heard = {'preexec_fn': lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)}
         super().__init__(log, *map(str, words), cwd=ROOT, **heard)
@@ -101,8 +102,7 @@ class Process(Child):
 
     def check_end(self) -> None:
         """Wait for the end after `interrupt`: a good one, with nothing terrible said."""
-        awaited = self._may_end
-        assert self.wait() == 0 or awaited, self.output()
+        assert self._may_end or self.wait() == 0, self.output()
         assert 'Traceback' not in self.output(), self.output()
 
 
@@ -237,32 +237,23 @@ class Parameters:
         assert result.successful, result.reason
 
 
-GOALS = {
-    'configure': 'inactive', 'activate': 'active', 'deactivate': 'inactive',
-    'cleanup': 'unconfigured', 'shutdown': 'finalized',
-}  # fmt: skip
-"""State that a transition leads to, where it succeeds."""
-
-
 class Manager:
     """Drives a managed node; what it answers is what a user of `ros2 lifecycle` sees."""
 
     def __init__(self, user: User, node: str) -> None:
         self._user, self._node = user, node
 
-    def _call(self, service: str, kind: type, **request: object):
-        return self._user.call(f'{self._node}/{service}', kind, kind.Request(**request))
-
     def state(self) -> str:
-        return self._call('get_state', GetState).current_state.label
+        answer = self._user.call(f'{self._node}/get_state', GetState, GetState.Request())
+        return answer.current_state.label
 
     def change(self, transition: int | str) -> bool:
         by_label = isinstance(transition, str)
         wanted = Transition(label=transition) if by_label else Transition(id=transition)
-        goal, before = GOALS.get(transition), self.state()
-        answer = self._call('change_state', ChangeState, transition=wanted)
+        before, request = self.state(), ChangeState.Request(transition=wanted)
+        answer = self._user.call(f'{self._node}/change_state', ChangeState, request)
         # Asked again after a lost answer, the node refuses a transition that it has made.
-        return answer.success or (before != goal and self.state() == goal)
+        return answer.success or before != self.state()
 
 
 class Rig:
