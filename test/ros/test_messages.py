@@ -182,7 +182,7 @@ def test_known_input_from_the_message_of_y(user, estimator):
         expected.set_input(float(k % 5))
         e = expected.update(stamp, 0.01 * k)
     found = rig.wait_estimate(lambda e: e.stamp == stamp, 'last estimate')
-    assert found.unknown_input == e.unknown_input
+    assert (found.z, found.unknown_input) == (list(e.z), e.unknown_input)
 
 
 def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(
@@ -216,7 +216,7 @@ def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(
         expected.set_input(float(k % 5))
         e = expected.update(stamp, 0.01 * k)
         user.wait(lambda k=k: len(rig.estimates) > k, 'estimate with its input')
-    assert rig.estimates[-1].unknown_input == e.unknown_input
+    assert rig.estimates[-1].z == list(e.z)
     assert rig.said('rejected u = nan: expected a finite number; the last one is held')
     y.publish(joint_state(stamps[-1], ['a'], [0.3]))  # its input never comes
     user.wait(lambda: len(rig.estimates) == len(stamps), 'end of the wait')
@@ -228,6 +228,4 @@ def test_known_input_of_another_topic_is_that_of_the_stamp_of_y(
     process.check_end()
     replayed = replay(tmp_path)
     assert replayed['stamp_ns'].tolist() == stamps
-    np.testing.assert_allclose(
-        replayed['unknown_input'], [e.unknown_input for e in rig.estimates], atol=1e-12
-    )
+    np.testing.assert_allclose(replayed['z1'], [e.z[0] for e in rig.estimates], atol=1e-12)
