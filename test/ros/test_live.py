@@ -32,15 +32,20 @@ def test_self_tuning_equals_a_replay_of_the_same_samples(user, estimator):
 
 
 def test_on_a_timer_every_sample_counts_whichever_estimates_are_published(fed):
-    fed.parameters.set(publish_on='timer', publish_rate=500.0)
-    replay = OnlineEstimator({'max_gap': 60.0})
-    expected = {}
-    for k in range(60):  # faster than any timer
+    fed.parameters.set(publish_on='timer', publish_rate=50.0)
+    replay, expected, first = OnlineEstimator({'max_gap': 60.0}), {}, len(fed.topics['stamp'])
+    for k in range(60):  # faster than the timer
         stamp = fed.send(math.sin(0.1 * k))
         expected[stamp] = list(replay.update(stamp, fed.y[-1].message.data).z)
     fed.wait_estimate(lambda e: e.stamp == stamp, 'estimate of the last sample')
     found = [e for e in fed.estimates if e.stamp in expected]
     assert [e.z for e in found] == [expected[e.stamp] for e in found]
+
+    def at_rate() -> bool:  # the latest estimate comes again where no sample does
+        periods = np.diff([message.stamp for message in fed.topics['stamp'][first:][-20:]])
+        return len(periods) > 18 and np.median(periods) == pytest.approx(20e6, rel=0.2)
+
+    fed.user.wait(at_rate, 'rate of 50 Hz')
 
 
 def test_estimates_of_the_past_are_those_of_a_replay(estimator):

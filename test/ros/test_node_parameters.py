@@ -70,20 +70,6 @@ def test_live_changes_act_on_the_next_sample_as_in_a_replay(fed):
         assert fed.parameters.all([name]) == was
 
 
-def test_publish_rate_acts_on_the_wire(fed):
-    stamps = fed.topics['stamp']
-    for rate in (20.0, 100.0):
-        fed.parameters.set(publish_on='timer', publish_rate=rate)
-        fed.send(0.2)
-        start = len(stamps)
-
-        def at_rate(rate=rate, start=start) -> bool:
-            periods = np.diff([m.stamp for m in stamps[start:][-20:]]) * 1e-9
-            return len(periods) > 18 and np.median(periods) == pytest.approx(1 / rate, rel=0.2)
-
-        fed.user.wait(at_rate, f'rate of {rate} Hz')
-
-
 def test_constants_are_parameters_of_their_own(user, launch):
     model = {'order': 2, 'phi': ['0', 'k*a + b'], 'inputs': ['a', 'b'], 'constants.k': 2.0}
     launch('estimator', namespace='/motor', **model)
