@@ -76,6 +76,7 @@ LATER = (
     (LATER, 'estimator', {'epsilon': 0.4, 'max_gap': 2.0}),
     (BOTH, 'estimator', {'order': 2, 'epsilon': 0.3}),
     (BOTH, 'plant', {'order': 2, 'noise_std': 0.1}),
+    (setting('phi: [0, -z2]'), 'plant', {'phi': ['0', '-z2']}),
     *((setting(f'max_gap: {text}'), 'estimator', {'max_gap': float(text)})
       for text in ('1E2', '.5e0', '4', '+3')),
 ])  # fmt: skip
@@ -87,7 +88,6 @@ def test_values(loaded, text, node, values):
     (setting('noise_sd: 0.1'), "'noise_sd'; did you mean 'noise_std'?"),
     (setting('gamma: {min: 0.1}'), "unknown parameter 'gamma.min'"),
     (setting('qqq: 1'), f'; known are {", ".join(ESTIMATOR_PARAMETERS)}, '),
-    (setting('lambda: [15, 15.5]'), 'expected a list of one type'),
     *((text, '') for text in ('- a\n- b', 'estimator: 3', 'estimator: {ros__parameters: 3}',
                               'estimator: {ros_parameters: {epsilon: 0.3}}', '\ttab: 1')),
 ])  # fmt: skip
