@@ -8,7 +8,7 @@ import warnings
 from fhaosmo_ros.core import ConfigurationError, Observer
 from fhaosmo_ros.core.parameters.declaration import KINDS, Parameter
 from fhaosmo_ros.core.parameters.files import complete, load, select
-from fhaosmo_ros.core.parameters.per_channel import channel_names, of_channel, with_channels
+from fhaosmo_ros.core.parameters.per_channel import of_channel, with_channels
 from fhaosmo_ros.core.parameters.removed import REMOVED
 from fhaosmo_ros.core.parameters.tables import (
     ESTIMATOR_PARAMETERS,
@@ -140,15 +140,18 @@ def test_default_gains_with_the_plant_of_a_user_are_warned_of():
 NAMES = ['hip', 'knee_2']
 
 
-@pytest.mark.parametrize(('names', 'reason'), [
-    (['hip', 'hip'], 'every name once'), ([], 'a list of strings'),
-    *(([*NAMES, name], 'names of letters') for name in ('', '2hip', 'hip/left', 'a__b', 'a.b')),
-    (['lambda'], "names that no parameter has (there is one 'lambda')"),
+@pytest.mark.parametrize(('values', 'reason'), [
+    ({'channels': ['hip', 'hip']}, 'every name once'), ({'channels': []}, 'a list of strings'),
+    *(({'channels': [*NAMES, name]}, 'names of letters')
+      for name in ('', '2hip', 'hip/left', 'a__b', 'a.b')),
+    ({'channels': ['lambda']}, r"names that no parameter has \(there is one 'lambda'\)"),
+    *(({'channels': NAMES, name: 1.0}, f"unknown parameter '{name}'")
+      for name in ('hpi.lambda', 'hip.lamda', 'hip.publish_rate')),
+    ({'channels': NAMES, 'hip.epsilon': -1}, "parameter 'hip.epsilon': expected a number > 0"),
 ])  # fmt: skip
-def test_bad_names_are_refused(names, reason):
-    with pytest.raises(ConfigurationError, match="parameter 'channels': expected ") as error:
-        channel_names({'channels': names})
-    assert reason in str(error.value)
+def test_bad_names_and_values_are_refused(values, reason):
+    with pytest.raises(ConfigurationError, match=reason):
+        select(values, ESTIMATOR_PARAMETERS)
 
 
 def test_own_value_wins_and_the_common_one_serves_the_rest():
@@ -161,16 +164,6 @@ def test_own_value_wins_and_the_common_one_serves_the_rest():
     assert table['hip.order'].live == ESTIMATOR_PARAMETERS['order'].live
     assert table['hip.epsilon'].default == 9.0  # the common value
     assert table['hip.max_gap'].default == ESTIMATOR_PARAMETERS['max_gap'].default
-
-
-@pytest.mark.parametrize(('name', 'reason'), [
-    *((name, f"unknown parameter '{name}'") for name in
-      ('hpi.lambda', 'hip.lamda', 'hip.publish_rate')),
-    ('hip.epsilon', "parameter 'hip.epsilon': expected a number > 0"),
-])  # fmt: skip
-def test_own_parameters_are_checked_as_the_common_ones(name, reason):
-    with pytest.raises(ConfigurationError, match=reason):
-        select({'channels': NAMES, name: -1.0}, ESTIMATOR_PARAMETERS)
 
 
 def replayed(*words):

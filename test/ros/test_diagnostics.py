@@ -68,18 +68,17 @@ def test_what_no_longer_fits_is_said(user, estimator):
         taken = ('samples accepted', 'samples rejected')
         user.wait(lambda: sum(map(rig.count, taken)) >= sent, 'use of all samples')
 
-    def wait_said(words: str, fresh: bool = True, **samples) -> None:
-        if fresh:
-            assert rig.reset().success
-        rig.wait_status('observer', WARN, words, doing=partial(send, **samples))
-
     for _ in range(10):
         send()
     said = ' '.join(report.statuses['observer'].message for report in rig.reports)
     assert not [words for words in ('jumped', 'as large as', 'gains are for') if words in said]
-    wait_said('y jumped 1 times', fresh=False, offset=1.0)
-    wait_said('times as large as noise_size says', noise=1e-2)
-    wait_said('gains are for 1000 Hz, y comes at 500 Hz', period=2)
+    for words, samples in (
+        ('y jumped 1 times', {'offset': 1.0}),
+        ('times as large as noise_size says', {'noise': 1e-2}),
+        ('gains are for 1000 Hz, y comes at 500 Hz', {'period': 2}),
+    ):
+        rig.wait_status('observer', WARN, words, doing=partial(send, **samples))
+        assert rig.reset().success
 
 
 # Publishers that can't be heard, or are too many.

@@ -131,7 +131,7 @@ def test_texts_as_ros2_param_set_sends_them(fed, name, text, value):
     else:
         assert p.get(name) == value
     assert not try_to_set(ParameterValue()).successful  # as `ros2 param delete`
-    assert p.messages(name)[0].type == kind
+    assert p.messages(name)[0].type == p.describe(name)[0].type == kind
 
 
 COUNT = 300

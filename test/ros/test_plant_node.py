@@ -58,11 +58,10 @@ def test_y_belongs_to_its_stamp(rig):
 
 def test_truth_is_labelled_and_y_is_its_first_state(rig):
     rig.user.wait(lambda: len(rig.state) > 60 and rig.y[-1].stamp > rig.state[59].stamp, 'samples')
-    samples, states = list(rig.y), rig.state[10:60]
+    stamps, states = [sample.stamp for sample in rig.y], rig.state[10:60]
     assert states[-1].message.layout.dim[0].label == 'z1,z2,z3'
-    stamps = [sample.stamp for sample in samples]
     for stamp, state in states:  # which the plant publishes behind the sample
-        assert state.data[0] == samples[bisect(stamps, stamp) - 1].message.data
+        assert state.data[0] == rig.y[bisect(stamps, stamp) - 1].message.data
     assert rig.parameters.get(OF_STATE) == 7
 
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import re
 from typing import Any, TypeVar
 
-from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, ParameterTable
+from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
 from fhaosmo_ros.core.parameters.tables import (
     CHANNEL_PARAMETERS,
     CONSTANTS,
@@ -73,7 +73,7 @@ def with_own_parameters(names: list[str], values: Iterable[str]) -> list[str]:
 
 
 def with_channels(
-    table: Mapping[str, Parameter], names: Iterable[str], values: Mapping[str, Any] | None = None
+    table: ParameterTable, names: Iterable[str], values: Mapping[str, Any] | None = None
 ) -> ParameterTable:
     """
     Return `table` and, for each named channel, a copy of the `CHANNEL_PARAMETERS` in it.
@@ -81,18 +81,16 @@ def with_channels(
     The copies default to the checked common `values`.
     """
     values = values or {}
-    declared = ParameterTable(table.values(), CHANNEL_PARAMETERS.families)
     common = [p for p in table.values() if p.name in CHANNEL_PARAMETERS]
-    common += [declared[name] for name in values if name.startswith(CONSTANTS)]
-    common += declared.families
+    common += [table[name] for name in values if name.startswith(CONSTANTS)]
+    common += table.families
     own = [
         replace(p, name=f'{name}.{p.name}', default=values.get(p.name, p.default))
         for name in names
         if name
         for p in common
     ]
-    families = table.families if isinstance(table, ParameterTable) else ()
-    return ParameterTable(table.values(), families, own)
+    return ParameterTable(table.values(), table.families, own)
 
 
 def of_channel(values: Values, name: str) -> Values:
