@@ -22,7 +22,7 @@ def rules(*words: str) -> list[str]:
 
 
 # Node, arguments, words of the message; an argument with an end of line is put in a file. What is
-# said of files and values as such: test_parameters.py, test_parameter_files.py.
+# said of files and values as such: test_parameters.py.
 E, P = 'estimator', 'plant'
 OF_PLANT = 'plant: {ros__parameters: {order: 2}}\n'
 REFUSED = [
