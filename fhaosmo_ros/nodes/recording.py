@@ -4,7 +4,6 @@
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from itertools import pairwise
 import shlex
 from time import time_ns
 from typing import Any
@@ -23,8 +22,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
 PLAYED_DEPTH, RECORDED_DEPTH = 1000, 5000
-ACTING = ('-r', '--remap', '-e', '--enclave')
-"""ROS arguments that act."""
 DISCOVERY_PERIOD = 0.2
 FLUSH_PERIOD = 0.5
 """Seconds between two flushes of a bag: a kill loses no more than that."""
@@ -47,8 +44,7 @@ class PrivateNode(Spinner):
     ----------
     name : str
     ros_arguments : sequence of str
-        What follows ``--ros-args``. Names and remappings (-r) and the enclave (-e) act; the rest,
-        parameters and log levels that launch gives to every node, does not concern this one.
+        What follows ``--ros-args``, as launch gives it to every node: names, remappings, enclave.
 
     """
 
@@ -57,15 +53,13 @@ class PrivateNode(Spinner):
     def __init__(self, name: str, ros_arguments: Sequence[str] = ()) -> None:
         self._context = Context()
         self._clients: dict[str, AsyncParameterClient] = {}
-        acting = ['--ros-args']
-        for pair in pairwise(ros_arguments):
-            acting += pair if pair[0] in ACTING else ()
+        given = ['--ros-args', *ros_arguments]
         no_handlers = SignalHandlerOptions.NO
         try:
-            rclpy.init(args=acting, context=self._context, signal_handler_options=no_handlers)
+            rclpy.init(args=given, context=self._context, signal_handler_options=no_handlers)
             self.node = Node(name, context=self._context)
         except RuntimeError as error:
-            raise ConfigurationError(f'ROS arguments {shlex.join(acting)}: {error}') from None
+            raise ConfigurationError(f'ROS arguments {shlex.join(given)}: {error}') from None
         super().__init__(self.node, grace=self.grace)
 
     def __exit__(self, *error: object) -> None:

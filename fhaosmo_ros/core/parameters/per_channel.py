@@ -6,7 +6,7 @@ A channel takes its own value where it has one, else the common value. The table
 the common table and m prefixed copies of it.
 """
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 import re
 from typing import Any, TypeVar
@@ -116,13 +116,7 @@ def differing(values: Parameters) -> dict[str, Any]:
     }
 
 
-def followers(name: str, names: Iterable[str], own: Collection[str]) -> list[str]:
-    """
-    Return the parameters of the channels `names` that follow the common one called `name`.
-
-    Those in `own` have been set themselves, and so do not follow.
-    """
-    if name not in CHANNEL_PARAMETERS:
-        return []
-    prefixed = [f'{channel}.{name}' for channel in names if channel]
-    return [parameter for parameter in prefixed if parameter not in own]
+def followers(name: str, channels: Iterable[str], values: Mapping[str, Any]) -> list[str]:
+    """Return the parameters of channels that follow the common one: those of the same value."""
+    prefixed = [f'{channel}.{name}' for channel in channels if channel]
+    return [own for own in prefixed if name in CHANNEL_PARAMETERS and values[own] == values[name]]

@@ -72,9 +72,6 @@ class EstimatorNode(ManagedNode):
         self._names: list[str] = values[CHANNELS]
         self._joints: set[str] = set()  # of the message that the names come from
         self._left_out = ''  # what is said of those that are no channels
-        self._own = {name for name in given if split(name)[0]}
-        """Parameters of channels that do not change along with the common ones."""
-        self._asked: set[str] = set()
         self._channels: list[Channel] = []  # none before the names of the joints are known
         self._parameters_topic: Any = None
         self._node_parameters = NodeParameters(
@@ -238,10 +235,11 @@ class EstimatorNode(ManagedNode):
 
     def _followers(self, names: Collection[str]) -> dict[str, str]:
         """Return the parameters of channels that change along with `names`, and with which."""
-        self._asked = {name for name in names if split(name)[0]}
-        own = self._own | self._asked
-        channels = with_own_parameters(self._names, self._node_parameters.values)
-        return {f: name for name in names for f in followers(name, channels, own)}
+        values = self._node_parameters.values
+        channels = with_own_parameters(self._names, values)
+        return {
+            f: name for name in names for f in followers(name, channels, values) if f not in names
+        }
 
     def _prepare(
         self, values: Parameters, changes: Mapping[str, Value]
@@ -265,7 +263,6 @@ class EstimatorNode(ManagedNode):
 
     def _adopt(self, prepared: list[tuple[Parameters, Change]]) -> None:
         values = self._node_parameters.values
-        self._own |= self._asked  # these no longer follow
         for channel, (own, change) in zip(self._channels, prepared, strict=True):
             channel.adopt(own, change)
         if self._channels:
