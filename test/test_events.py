@@ -40,33 +40,38 @@ def pulse(begin, end, count=1000, height=1.0):
     return d
 
 
-ONCE = [(350, True), (600, False)]
+def events_at(*samples):
+    return [(sample, k % 2 == 0) for k, sample in enumerate(samples)]
+
+
+ONE, ONCE = pulse(300, 600), events_at(350, 600)
 DENT = pulse(100, 500) - pulse(200, 210, height=0.6)
+SPIKES = pulse(400, 420, height=Status.REJECTED_SPIKE).astype(int)
+RESTART = SPIKES + pulse(500, 501, height=Status.RESTARTED).astype(int)
 
 
 @pytest.mark.parametrize(('d', 'own', 'events'), [
-    (-pulse(300, 600), {}, ONCE),
-    (pulse(300, 600), {'event_duration': 0.0}, [(300, True), (600, False)]),
-    (pulse(300, 600), {'event_threshold': 1.0}, []),  # not more than that
-    (pulse(300, 600), {'event_duration': 0.3}, []),
+    (-ONE, {}, ONCE),
+    (ONE, {'event_duration': 0.0}, events_at(300, 600)),
+    (ONE, {'event_threshold': 1.0}, []),  # not more than that
+    (ONE, {'event_duration': 0.3}, []),
     # What lasts for less counts from its own begin.
-    (pulse(100, 140) + pulse(141, 180) + pulse(200, 300), {}, [(250, True), (300, False)]),
+    (pulse(100, 140) + pulse(141, 180) + pulse(200, 300), {}, events_at(250, 300)),
     # Hysteresis keeps an event together.
-    (DENT, {'event_threshold': 0.8, 'event_release': 0.3}, [(150, True), (500, False)]),
-    (DENT, {'event_threshold': 0.8, 'event_release': 1.0},
-     [(150, True), (200, False), (260, True), (500, False)]),
+    (DENT, {'event_threshold': 0.8, 'event_release': 0.3}, events_at(150, 500)),
+    (DENT, {'event_threshold': 0.8, 'event_release': 1.0}, events_at(150, 200, 260, 500)),
+    # Rejected samples do not count, and a restart ends an event.
+    (ONE - pulse(400, 420), {'words': SPIKES}, ONCE),
+    (ONE - pulse(400, 420), {'words': RESTART}, events_at(350, 500, 551, 600)),
+    # Threshold and deviations both have to be exceeded.
+    *((ONE, {'deviations': np.full(1000, 0.1), 'event_deviations': k, 'event_threshold': limit},
+       events) for k, limit, events in ((4.0, 0.0, ONCE), (4.0, 1.1, []), (11.0, 0.1, []))),
+    # A deviation that is not known yet.
+    (ONE, {'deviations': 0.1 + pulse(0, 400, height=np.inf), 'event_deviations': 4.0},
+     events_at(450, 600)),
 ])  # fmt: skip
 def test_an_event_lasts_from_the_least_duration_to_the_release(d, own, events):
     assert found(d, **{'event_threshold': 0.5, **own}) == events
-
-
-def test_deviations_and_threshold_both_have_to_be_exceeded():
-    d, deviations = pulse(300, 600), np.full(1000, 0.1)
-    for k, threshold, events in ((4.0, 0.0, ONCE), (4.0, 1.1, []), (11.0, 0.1, [])):
-        own = {'event_deviations': k, 'event_threshold': threshold}
-        assert found(d, deviations, **own) == events
-    deviations[:400] = np.inf  # not known yet
-    assert found(d, deviations, event_deviations=4.0) == [(450, True), (600, False)]
 
 
 def test_a_standard_deviation_that_grows_with_the_event_does_not_hide_it():
@@ -93,15 +98,6 @@ def test_a_change_is_judged_against_the_running_mean():
     np.testing.assert_allclose([k for k, _ in events], expected, atol=60)
     # Nothing is judged before the mean is known.
     assert found(5.0 + pulse(0, 400), **own) == []
-
-
-def test_rejected_samples_do_not_count_and_a_restart_ends_an_event():
-    d, words = pulse(300, 600), np.zeros(1000, dtype=np.int64)
-    d[400:420], words[400:420] = 0.0, Status.REJECTED_SPIKE
-    assert found(d, words=words, event_threshold=0.5) == ONCE
-    words[500] = Status.RESTARTED
-    expected = [(350, True), (500, False), (551, True), (600, False)]
-    assert found(d, words=words, event_threshold=0.5) == expected
 
 
 @settings(max_examples=60, deadline=None)
