@@ -285,7 +285,7 @@ def test_node_clock_sampling_follows_simulated_time(clock, estimator):
     rig.wait_status('input', WARN, 'ticks once for', doing=send)
 
 
-def test_a_clock_that_does_not_run_is_said_and_negative_time_is_rejected(clock, estimator, launch):
+def test_clocks_that_stand_still_go_back_below_zero_or_jump(user, clock, estimator, launch):
     plant = launch('plant', namespace='/still', use_sim_time=True)
     rig = estimator('/still', use_sim_time=True, **LAX)
     assert rig.parameters.get('sampling') == 'clock'
@@ -293,3 +293,10 @@ def test_a_clock_that_does_not_run_is_said_and_negative_time_is_rejected(clock, 
         clock(-5 * SECOND, lambda process=process: 'seconds >= 0, got -5' in process.output())
     rig.wait_status('state', ERROR, 'nothing on /clock')
     clock(SECOND, lambda: rig.reports[-1].statuses['state'].message == 'active')
+    # The plant does not simulate through a jump.
+    for begin in (2 * SECOND, 10**6 * SECOND):
+        count, ticks = len(rig.y), itertools.count(begin, MS)
+        user.wait(
+            lambda count=count, ticks=ticks: clock(next(ticks)) or len(rig.y) > count + 5, 'y'
+        )
+    assert 'goes on from where it was' in plant.output()
