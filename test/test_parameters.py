@@ -56,7 +56,7 @@ DECLARED = {
 @pytest.mark.parametrize(('kind', 'expected', 'values'), [
     ('bool', False, [False, np.bool_(False)]),
     ('int', 9, [9, np.int64(9)]),
-    ('double', 2.0, [2, 2.0, np.float64(2.0)]),
+    ('double', 2.0, [2, 2.0, np.float64(2.0), '2e0']),
     ('double_array', [2.0], [2, '2', [2], (2.0,), '[2]', np.array([2]), array('d', [2])]),
     # As in C and rcl, unlike YAML 1.1.
     ('double_array', [0.5, 1.0], [[0.5, 1], '[0.5, 1]', '[5e-1, .1E1]', '[5.e-1, +1e0]']),
@@ -73,7 +73,7 @@ def test_what_is_meant_is_taken_in_the_declared_type(kind, expected, values):
     ('bool', 'true or false', [0, 1, 'true', 1.0]),
     ('int', 'an integer >= 1 and <= 9', [0, 10, 1.0, '1', True, [1]]),
     ('double', 'a number > 0 and <= 2 [m]',
-     [0, 2.1, float('nan'), float('inf'), True, '1', [1.0], 10**400]),
+     [0, 2.1, float('nan'), float('inf'), True, 'x', '[1]', [1.0], 10**400]),
     ('string', 'one of sign, fuzzy', ['fuzy', 'qqq', '', 1]),
     ('double_array', 'a list of numbers > 0 and <= 2 [m]',
      [[1.0, 0.0], [float('nan')], [True], ['1'], [[1.0]], [10**400],

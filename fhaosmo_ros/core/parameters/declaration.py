@@ -119,8 +119,8 @@ class Parameter:
         """
         Return `value` in the parameter's own type, or raise.
 
-        An integer is accepted where a number is meant, and so is a list that a command line
-        delivered as text because it mixes both (``"[15, 15.5]"``), and one number for a list.
+        An integer is accepted where a number is meant, one number for a list, and the text of a
+        number or a list: `ros2 param set` sends 1e-3 and ``[15, 15.5]`` as texts.
 
         Raises
         ------
@@ -130,7 +130,7 @@ class Parameter:
         """
         given, kind = value, self.kind
         is_list = kind.endswith('_array')
-        if is_list and isinstance(value, str):
+        if isinstance(value, str) and (is_list or kind == 'double'):
             try:
                 value = parse(value)
             except ConfigurationError:

@@ -2,13 +2,11 @@
 """From the declarations of the core to ROS parameters: descriptors, overrides, live changes."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from contextlib import suppress
 from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown, suggestion, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import is_built_in
-from fhaosmo_ros.core.parameters.yaml_text import parse
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -127,7 +125,7 @@ class NodeParameters:
                 raise ParameterNotDeclaredException(f"'{name}'{suggestion(name, table)}")
         self._refused, ours = None, [name for name in found if name in table]
         try:
-            self._coerced = {name: _coerced(table[name], found[name].value) for name in ours}
+            self._coerced = {name: table[name].coerce(found[name].value) for name in ours}
             for name, leader in self._followers(list(found)).items():
                 self._coerced[name] = self._coerced[leader]
             if ours:
@@ -155,15 +153,3 @@ class NodeParameters:
             self._adopt_change(self._prepared)
             text = ', '.join(f'{name} = {value}' for name, value in self._coerced.items())
             self._node.get_logger().info(f'set {text}')
-
-
-def _coerced(declared: Parameter, value: Any) -> Value:
-    """Return a value in the declared type; `ros2 param set` sends 1e-3 as a text."""
-    read = value
-    if isinstance(value, str) and declared.kind == 'double':
-        with suppress(ConfigurationError):
-            read = parse(value)
-    try:
-        return declared.coerce(read)
-    except ConfigurationError:
-        raise declared.error(value) from None
