@@ -116,7 +116,6 @@ def differing(values: Parameters) -> dict[str, Any]:
     }
 
 
-def followers(name: str, channels: Iterable[str], values: Mapping[str, Any]) -> list[str]:
-    """Return the parameters of channels that follow the common one: those of the same value."""
-    prefixed = [f'{channel}.{name}' for channel in channels if channel]
-    return [own for own in prefixed if name in CHANNEL_PARAMETERS and values[own] == values[name]]
+def followers(name: str, values: Mapping[str, Any]) -> list[str]:
+    """Return the channels' own parameters that follow the common one: those of the same value."""
+    return [own for own, v in values.items() if split(own)[1] == name != own and v == values[name]]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimator node: a managed node (ROS 2 lifecycle) of one channel or many."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -12,7 +12,6 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import complete
 from fhaosmo_ros.core.parameters.per_channel import (
     CHANNELS,
-    followers,
     FROM_JOINTS,
     of_channel,
     split,
@@ -75,7 +74,7 @@ class EstimatorNode(ManagedNode):
         self._channels: list[Channel] = []  # none before the names of the joints are known
         self._parameters_topic: Any = None
         self._node_parameters = NodeParameters(
-            self, values, self._prepare, self._adopt, self._followers, ['autostart', CHANNELS]
+            self, values, self._prepare, self._adopt, fixed=['autostart', CHANNELS]
         )
         self._diagnostics = DiagnosticsPublisher(self, self._reports, values)
         try:
@@ -232,14 +231,6 @@ class EstimatorNode(ManagedNode):
         for channel in self._channels:
             getattr(channel, name)(request, response)
         return response
-
-    def _followers(self, names: Collection[str]) -> dict[str, str]:
-        """Return the parameters of channels that change along with `names`, and with which."""
-        values = self._node_parameters.values
-        channels = with_own_parameters(self._names, values)
-        return {
-            f: name for name in names for f in followers(name, channels, values) if f not in names
-        }
 
     def _prepare(
         self, values: Parameters, changes: Mapping[str, Value]

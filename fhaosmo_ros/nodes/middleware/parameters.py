@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the declarations of the core to ROS parameters: descriptors, overrides, live changes."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from fhaosmo_ros.core.parameters.declaration import Parameter, Parameters, shown, suggestion, Value
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import is_built_in
+from fhaosmo_ros.core.parameters.per_channel import followers
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -81,9 +82,6 @@ class NodeParameters:
         ConfigurationError. Changes nothing.
     adopt : callable
         Gets what `prepare` has returned, once ROS has accepted the changes.
-    followers : callable
-        Gets the names that somebody sets; returns the parameters that change along, and which of
-        those names each of them follows.
     fixed : iterable of str, optional
         Parameters that can't change in any state of the node; without it, those that are not live.
 
@@ -95,12 +93,11 @@ class NodeParameters:
         values: Parameters,
         prepare: Callable[[Parameters, Mapping[str, Value]], Any],
         adopt: Callable[[Any], None],
-        followers: Callable[[Collection[str]], Mapping[str, str]] = lambda _: {},
         fixed: Iterable[str] | None = None,
     ) -> None:
         self.values = values
         self._node = node
-        self._prepare, self._adopt_change, self._followers = prepare, adopt, followers
+        self._prepare, self._adopt_change = prepare, adopt
         not_live = (name for name, parameter in values.table.items() if not parameter.live)
         self._read_only = set(not_live if fixed is None else fixed)
         self._refused: ConfigurationError | None = None
@@ -126,8 +123,9 @@ class NodeParameters:
         self._refused, ours = None, [name for name in found if name in table]
         try:
             self._coerced = {name: table[name].coerce(found[name].value) for name in ours}
-            for name, leader in self._followers(list(found)).items():
-                self._coerced[name] = self._coerced[leader]
+            for name in ours:
+                for own in followers(name, self.values):
+                    self._coerced.setdefault(own, self._coerced[name])
             if ours:
                 self._next = Parameters(table, {**self.values, **self._coerced})
                 self._prepared = self._prepare(self._next, self._coerced)
