@@ -3,6 +3,7 @@
 
 import itertools
 import math
+import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.core.observer.estimates import TUNING
@@ -203,11 +204,14 @@ class Arm(Rig):
         return self.stamp
 
     def answer(self, **positions):
-        """Return the estimates of a message; it is sent again until they are heard."""
-        begin = self.stamp
+        """Return the estimates of a message; it is sent again, five times a second, until then."""
+        begin, latest = self.stamp, -math.inf
 
         def answered() -> bool:
-            self.send(**positions)
+            nonlocal latest
+            if time.monotonic() > latest + 0.2:
+                self.send(**positions)
+                latest = time.monotonic()
             return self.out and nanoseconds(self.out[-1].message.header.stamp) > begin
 
         self.user.wait(answered, f'estimates of {len(positions)} joints')
