@@ -244,7 +244,18 @@ def _flat(values: Mapping[Any, Any], prefix: str = '') -> Iterator[tuple[str, An
         if isinstance(value, Mapping):
             yield from _flat(value, f'{prefix}{key}.')
         else:
+            check_one_type(f'{prefix}{key}', value)
             yield f'{prefix}{key}', value
+
+
+def check_one_type(name: str, value: Any) -> None:
+    """Refuse what rcl refuses, in words that help."""
+    if isinstance(value, list) and len({type(item) for item in value}) > 1:
+        kinds = ' and '.join(sorted({type(item).__name__ for item in value}))
+        raise ConfigurationError(
+            f"parameter '{name}': expected a list of one type (write 15.0, or quote '0'), "
+            f'got {kinds} mixed: {shown(value)}'
+        )
 
 
 def _misspells(section: str, node: str) -> bool:

@@ -7,6 +7,7 @@ from math import nan
 from time import perf_counter
 from typing import TYPE_CHECKING
 
+from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.counters import UNUSED_SAMPLES
 from fhaosmo_ros.core.online.events import described
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
@@ -173,7 +174,7 @@ class Health:
         report.values = {
             'open levels': f'{estimate.open_levels if estimate else 0} of {observer.levels}',
             'gamma': estimate.gamma if estimate else nan,
-            'gamma is held': estimator.frozen,
+            'gamma at': self._bound(estimate.status if estimate else Status.OK),
             'innovations over those expected': spread,
             'y over z1, since it jumped': offset,
             titled('unknown input', unit): d_now,
@@ -242,3 +243,13 @@ class Health:
             'late inputs': pairing.late,
             'samples before any input': pairing.ahead,
         }
+
+    def _bound(self, status: Status) -> str:
+        estimator = self._channel.estimator
+        if not estimator.observer.configuration.adaptive:
+            return 'a fixed value'
+        if estimator.frozen:
+            return 'the value that ~/freeze holds'
+        if status & Status.GAMMA_AT_MIN:
+            return 'gamma_min'
+        return 'gamma_max' if status & Status.GAMMA_AT_MAX else 'neither bound'

@@ -2,6 +2,7 @@
 """The command line of a node: its parameters, read once and by us, and its help."""
 
 import argparse
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 import os
 import re
@@ -9,10 +10,10 @@ import textwrap
 from typing import Any, NamedTuple
 
 from fhaosmo_ros import __version__
-from fhaosmo_ros.core.parameters.declaration import shown, unknown_parameter
+from fhaosmo_ros.core.parameters.declaration import Parameter, shown, unknown_parameter
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.files import is_built_in, read
-from fhaosmo_ros.core.parameters.tables import NODE_TABLES
+from fhaosmo_ros.core.parameters.files import check_one_type, is_built_in, read
+from fhaosmo_ros.core.parameters.tables import FIRST, NODE_TABLES
 from fhaosmo_ros.core.parameters.yaml_text import parse
 from rclpy.logging import get_logger
 from rclpy.utilities import remove_ros_args
@@ -71,6 +72,7 @@ def read_arguments(name: str, argv: list[str]) -> Arguments:
             value = parse(text)
         except ConfigurationError as error:
             raise ConfigurationError(f"parameter '{parameter}': {error}") from None
+        check_one_type(parameter, value)
         given[parameter], origins[parameter] = value, None
     others = remove_ros_args([name, *(rest if of_ros else argv)])[1:]
     if others:
@@ -92,15 +94,22 @@ def _full_name(name: str, arguments: list[str]) -> str:
 
 def help_of(name: str, argv: list[str]) -> str:
     """Return the help that a command line asks for, '' if it asks for none."""
-    if '--version' in argv:
-        return f'fhaosmo_ros {__version__}'
-    if not {'-h', '--help'} & set(argv):
-        return ''
-    lines = [f'usage: {name} {USAGE}', '', 'Parameters and their defaults (docs/parameters.md):']
     table = NODE_TABLES[name]
-    for p in (*table.values(), *table.families):
+    if '-h' in argv or '--help' in argv:
+        first = [p for p in table.values() if p.name in FIRST]
+        return '\n'.join([
+            f'usage: {name} {USAGE}', '',
+            'The parameters that matter first, and their defaults:', '', *_lines(first), '',
+            f'All of them: {name} --help-parameters; docs/parameters.md says more.',
+        ])  # fmt: skip
+    if '--help-parameters' in argv:
+        return '\n'.join(_lines([*table.values(), *table.families]))
+    return f'fhaosmo_ros {__version__}' if '--version' in argv else ''
+
+
+def _lines(parameters: Iterable[Parameter]) -> Iterator[str]:
+    for p in parameters:
+        yield f'{p.name}: {shown(p.default)}'
         indent = ' ' * 4
         text = f'{p.text} ({p.allowed})'
-        lines.append(f'{p.name}: {shown(p.default)}')
-        lines += textwrap.wrap(text, 99, initial_indent=indent, subsequent_indent=indent)
-    return '\n'.join(lines)
+        yield from textwrap.wrap(text, 99, initial_indent=indent, subsequent_indent=indent)

@@ -38,6 +38,8 @@ def descriptor(parameter: Parameter, read_only: bool) -> ParameterDescriptor:
     constraints = [parameter.allowed]
     if parameter.lengths:
         constraints.append(parameter.lengths)
+    if parameter.logarithmic:
+        constraints.append('logarithmic scale: change it by a factor')
     if not parameter.live and not read_only:
         constraints.append('fixed while the node is configured: set it after cleanup')
     result = ParameterDescriptor(
