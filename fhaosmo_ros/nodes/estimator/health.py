@@ -5,19 +5,20 @@ from collections import deque
 from collections.abc import Mapping
 from math import nan
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.counters import UNUSED_SAMPLES
+from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described
+from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
+from fhaosmo_ros.inputs import Pairing
+from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from fhaosmo_ros.nodes.estimator.channel import Channel
 
 LIMIT = 20_000
 """Number of latest samples that are remembered for one report."""
@@ -26,6 +27,8 @@ WINDOW = 5
 NANOSECONDS = 1e-9
 BAD_SHARE = 0.5
 """Share of samples lost or rejected that is an error; any at all deserves a warning."""
+GAMMA_AWAY = 0.2
+"""Distance of gamma from where it began that deserves a warning."""
 RATE_RATIO = 1.5
 """Factor between the rate of y and that of the gains that deserves one."""
 SPREAD = 3.0
@@ -47,6 +50,18 @@ UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
 """Counters of samples that the observer has not taken."""
 
 
+class Watched(Protocol):
+    """What is reported on: a channel, with its parameters of now."""
+
+    name: str
+    values: Parameters
+    estimator: OnlineEstimator
+    y: Listener
+    u: Mapping[str, Listener]
+    pairing: Pairing
+    simulated: bool
+
+
 class Health:
     """
     Remembers a few numbers of each sample of a channel, and makes two reports of them.
@@ -56,7 +71,7 @@ class Health:
     `perf_counter`, `offset` from its stamp to the publication of its message (ns).
     """
 
-    def __init__(self, channel: 'Channel') -> None:
+    def __init__(self, channel: Watched) -> None:
         self._channel = channel
         self.stamps: deque[int] = deque(maxlen=LIMIT)
         self.delays: deque[int] = deque(maxlen=LIMIT)
@@ -170,15 +185,24 @@ class Health:
         d_now = estimate.unknown_input if estimate else nan
         spread = observer.structure.memory['spread']
         d, durations = np.array(self.unknown_inputs), np.array(self.durations)
+        chatter = high_passed(d, WINDOW)
+        deviation = float(np.std(d)) if len(d) else nan
         overruns = int(np.sum(durations > mean))
+        away = 0.0
+        if estimate and observer.configuration.adaptive and not observer.self_tuning:
+            away = estimate.gamma - observer.parameters['gamma_initial']
         report.values = {
             'open levels': f'{estimate.open_levels if estimate else 0} of {observer.levels}',
             'gamma': estimate.gamma if estimate else nan,
+            'gamma away from gamma_initial': away,
             'gamma at': self._bound(estimate.status if estimate else Status.OK),
             'innovations over those expected': spread,
             'y over z1, since it jumped': offset,
             titled('unknown input', unit): d_now,
-            'chatter of the unknown input': high_passed(d, WINDOW),
+            'chatter of the unknown input': chatter,
+            'chatter index (0 smooth, 1 nothing but chatter)': (
+                min(1.0, chatter / deviation) if deviation > 0.0 else 0.0
+            ),
             'step time, mean [us]': 1e6 * float(np.mean(durations)) if len(durations) else 0.0,
             'step time, longest [us]': 1e6 * max(self.durations, default=0.0),
             'overruns': overruns,
@@ -203,6 +227,8 @@ class Health:
         report.find(ERROR, f'diverged and started again from y, {diverged} times', diverged)
         report.find(WARN, f'y jumped {jumps} times', jumps)
         report.find(WARN, f'y is taken as {offset:.3g} too large since it jumped', offset)
+        moved = f'gamma is {away:+.2g} away from gamma_initial'
+        report.find(WARN, moved, abs(away) > GAMMA_AWAY)
         tuned = observer.parameters['correction_period']
         if tuned and mean > 0.0 and observer.parameters['scheme'] == 'predict_correct':
             rates = f'gains are for {1.0 / tuned:.4g} Hz, y comes at {1.0 / mean:.4g} Hz'
