@@ -43,8 +43,8 @@ compare:
 	@$(call with,compare) && exec "$$python" -m studies.comparison $(ARGS)
 
 evidence: paper compare
-	@$(call with,compare) && "$$python" -m studies.everywhere && "$$python" -m studies.power && \
-	"$$python" -m studies.elsewhere && "$$python" -m studies.self_tuning && exec "$$python" -m studies.events
+	@$(call with,compare) && "$$python" -m studies.everywhere && "$$python" -m studies.elsewhere && \
+	exec "$$python" -m studies.self_tuning
 
 lint:
 	@$(call with,test) && set -x && \

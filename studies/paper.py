@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Reproduce all simulations of the paper, check its findings, and go beyond its limits.
+Reproduce the simulations of the paper, check its findings, and go beyond its limits.
 
-The findings are inequalities between numbers. Where the paper stops: the implicit scheme,
-measurement noise, 2,000 s of adaptation.
+The findings are inequalities between numbers. Where the paper stops: the implicit scheme, and
+measurement noise.
 """
 
 import argparse
@@ -13,19 +13,17 @@ import sys
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import Observer, Plant
-from fhaosmo_ros.core.observer.fuzzy import curve, memberships, NAMES, of_level, read_system
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import chatter, high_passed, rms
-from fhaosmo_ros.core.simulation.plant import Truth
 from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.plot.figures import COLOURS, envelope, TRUTH
 from matplotlib.figure import Figure
 import numpy as np
 from studies import evidence
 from studies.evidence import markdown, Row
-from studies.harness import Floats, Found, Results, run_study
+from studies.harness import Found, Results, run_study
 from studies.plant_and_observer import JointRun, simulate, SOLVERS
 
 FREQUENCIES = (1.0, 5.0)
@@ -75,11 +73,6 @@ SMOOTH = 0.1
 """Fuzzy counts as free of chatter with at most this part of sign's high-passed RMS at 1e-5 s."""
 BADLY = 2.0  # sign at 1e-3 s is bad if its RMS error is at least this many times that at 1e-5 s
 MOVED = 0.01  # gamma counts as moving if it ends at least this far from where it began
-WIDTHS = (
-    0.01, 0.015, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7,
-    1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0,
-)  # fmt: skip
-"""Half-widths of the map, on both axes."""
 VARIANTS = ('sign', 'fuzzy', 'fuzzy_adaptive', 'sign_adaptive')
 SCHEMES, STEPS = (
     ('explicit', 'implicit'),
@@ -91,12 +84,6 @@ SAMPLED = (
     *((s, 1e-3, FREQUENCIES[0], noise) for noise in (1e-4, 1e-3, 1e-2) for s in SCHEMES),
 )
 """As a node runs: scheme, step (s), angular frequency, standard deviation of the noise on y."""
-LONG = tuple((s, w, noise) for noise in (0.0, 1e-4) for s in SCHEMES for w in FREQUENCIES)
-"""Long runs: scheme, angular frequency, noise on y."""
-LONG_DURATION, WINDOW, THINNED = 2000.0, 100.0, 10
-"""Seconds of a long run, and of the windows that are judged; it records every 10th sample."""
-LAWS: dict[str, dict[str, Any]] = {"the paper's": {}, 'default': SAFE}
-"""Laws of gamma by name: what differs from config/paper.yaml."""
 
 
 @lru_cache
@@ -108,11 +95,11 @@ def preset() -> tuple[Parameters, Parameters]:
     return observer, plant
 
 
-def simulated(name: str, omega: float, solver: str = SOLVER, **changes: Any) -> JointRun:
+def simulated(name: str, omega: float, solver: str = SOLVER) -> JointRun:
     """Simulate one of `OBSERVERS` as the paper does: plant and observer together."""
     variant, step, own = OBSERVERS[name]
     observer, plant = preset()
-    observer = observer.changed({'variant': variant} | own | changes)
+    observer = observer.changed({'variant': variant} | own)
     plant = plant.changed({'disturbance_omega': omega})
     return simulate(observer, plant, solver, step, DURATION, max(1, round(GRID / step)))
 
@@ -126,25 +113,6 @@ def first_observer() -> JointRun:
         **{k: observer[k][:3] for k in ('lambda', 'alpha')},
     })  # fmt: skip
     return simulate(observer, plant, SOLVER, 1e-5, DURATION, 5)
-
-
-def truth_of(omega: float, step: float, noise: float, duration: float) -> tuple[Floats, Truth]:
-    """Simulate the plant alone."""
-    t = np.arange(round(duration / step) + 1) * step
-    given = {'disturbance_omega': omega, 'noise_std': noise, 'integration_step': min(step, 1e-3)}
-    return t, Plant(preset()[1].changed(given)).simulate(t)
-
-
-def observe(
-    case: tuple[Floats, Truth], variant: str, scheme: str, every: int = 1, **changes: Any
-) -> JointRun:
-    """Run an observer as a node does, one step a sample; record every `every`-th step."""
-    t, truth = case
-    given = {'variant': variant, 'scheme': scheme} | changes
-    run = Observer(preset()[0].changed(given)).run(t, truth.y, every=every)
-    rows = slice(every - 1, None, every)
-    z, d = truth.z[rows], truth.unknown_input[rows]
-    return JointRun(run.t, z, d, run.z_hat, run.z_tilde, run.gamma)
 
 
 def score(run: JointRun) -> Score:
@@ -170,42 +138,16 @@ def score(run: JointRun) -> Score:
 
 def sampled_rows(scheme: str, step: float, omega: float, noise: float) -> list[Row]:
     """Measure observers as a node runs them, a step a sample."""
-    truth = truth_of(omega, step, noise, DURATION)
-    return [
-        {'observer': variant, 'scheme': scheme, 'step': step, 'omega': omega, 'noise': noise}
-        | score(observe(truth, variant, scheme))
-        for variant in VARIANTS
-    ]
-
-
-def long_rows(
-    scheme: str, omega: float, noise: float, duration: float = LONG_DURATION
-) -> list[Row]:
-    """
-    Adapt gamma by each of `LAWS` for a long time, from `CONVERGED` on.
-
-    `gamma_first` is at the end of the first window, `rms_d_first` the error of d within it, and so
-    on; `rms_d_fixed` is that of the last one with gamma = 1/2.
-    """
-    truth = truth_of(omega, 1e-3, noise, duration + CONVERGED)
-    first, size = (round(seconds / (THINNED * 1e-3)) for seconds in (CONVERGED, WINDOW))
-
-    def windows(variant: str, changes: dict[str, Any]) -> tuple[list[float], list[float]]:
-        run = observe(truth, variant, scheme, THINNED, **changes)
-        error = run.z_hat[:, -1] - run.unknown_input
-        starts = range(first, len(error) - size + 1, size)
-        rms_d = [rms(error[k : k + size]) for k in starts]
-        return rms_d, [float(run.gamma[k + size - 1]) for k in starts]
-
-    fixed = windows('fuzzy', {})[0][-1]
-    rows = []
-    for law, changes in LAWS.items():
-        rms_d, gamma = windows('fuzzy_adaptive', changes)
-        rows.append({
-            'law': law, 'scheme': scheme, 'omega': omega, 'noise': noise, 'gamma_first': gamma[0],
-            'gamma_last': gamma[-1], 'rms_d_first': rms_d[0], 'rms_d_last': rms_d[-1],
-            'rms_d_fixed': fixed,
-        })  # fmt: skip
+    observer, plant = preset()
+    case: Row = {'scheme': scheme, 'step': step, 'omega': omega, 'noise': noise}
+    given = {'disturbance_omega': omega, 'noise_std': noise, 'integration_step': min(step, 1e-3)}
+    t, rows = np.arange(round(DURATION / step) + 1) * step, []
+    truth = Plant(plant.changed(given)).simulate(t)
+    for variant in VARIANTS:
+        found = Observer(observer.changed({'variant': variant, 'scheme': scheme})).run(t, truth.y)
+        estimates = found.z_hat, found.z_tilde, found.gamma
+        run = JointRun(t, truth.z, truth.unknown_input, *estimates)
+        rows.append({'observer': variant} | case | score(run))
     return rows
 
 
@@ -274,29 +216,7 @@ def texts(rows: Iterable[Row]) -> dict[str, str]:
     return {'findings': markdown(head, lines)}
 
 
-def width_rows(first: float, widths: Sequence[float], signs: Scores) -> list[Row]:
-    """
-    Judge F1c, F2 and F3 at one half-width of level 1 and several of the later levels.
-
-    `signs` are the scores of sign, which knows no half-widths.
-    """
-    rows = []
-    for later in widths:
-        s = dict(signs)
-        for w in FREQUENCIES:
-            for name in (FUZZY, ADAPTIVE):
-                s[name, w] = score(simulated(name, w, fuzzy_widths=[first, later]))
-        judged = verdicts(s)
-        holds = {
-            part: float(all(v.holds for v in judged if v.name.startswith(part)))
-            for part in ('F1c', 'F2', 'F3')
-        }
-        rows.append({'level 1': first, 'later levels': later} | holds)
-    return rows
-
-
 NAME = 'paper'
-QUICK_WIDTHS, QUICK_LONG = 6, 200.0
 DRAWN = (FINE, COARSE, FUZZY, ADAPTIVE)
 # Estimates that chatter are solid and below; the truth lies on top, dashed so that both are seen.
 RED = {'color': COLOURS[0], 'linewidth': 0.9, 'label': 'estimate'}
@@ -305,37 +225,23 @@ ZOOM = 0.1  # seconds that figure sim1 enlarges
 
 
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
-    """Return all tables: first the simulations, because the half-widths take scores of sign."""
-    quick = arguments.quick
-    widths = WIDTHS[:: QUICK_WIDTHS if quick else 1]
-    duration = QUICK_LONG if quick else LONG_DURATION
-    cells = [(s, name, w) for s in SOLVERS for name in OBSERVERS for w in FREQUENCIES]
+    """Return tables and figures; with `quick` of one solver alone."""
+    solvers = [SOLVER] if arguments.quick else list(SOLVERS)
+    cells = [(s, name, w) for s in solvers for name in OBSERVERS for w in FREQUENCIES]
     found = results(
-        {cell: (simulation, *cell) for cell in cells}
-        | {('long', *case): (long_rows, *case, duration) for case in LONG}
+        {'sim1': (first_observer,)}
+        | {cell: (simulation, *cell) for cell in cells}
         | {('sampled', *case): (sampled_rows, *case) for case in SAMPLED}
+        | {(name, w): (simulated, name, w) for name in DRAWN for w in FREQUENCIES}
     )
     simulations = evidence.rounded(found[cell] for cell in cells)
-    scores = scores_of(simulations, SOLVER)
-    signs = {key: score for key, score in scores.items() if key[0].startswith('sign')}
-    found |= results(
-        {'sim1': (first_observer,)}
-        | {(name, w): (simulated, name, w) for name in DRAWN for w in FREQUENCIES}
-        | {width: (width_rows, width, widths, signs) for width in widths}
-    )
-    tables = {
-        'paper': simulations,
-        'paper_half_widths': [row for width in widths for row in found[width]],
-        'paper_sampled': [row for case in SAMPLED for row in found[('sampled', *case)]],
-        'paper_long': [row for case in LONG for row in found[('long', *case)]],
-    }
+    sampled = [row for case in SAMPLED for row in found[('sampled', *case)]]
     *fixed, adaptive = ([(name, w, found[name, w]) for w in FREQUENCIES] for name in DRAWN)
     drawn = {
         'paper_sim1': sim1(found['sim1']), 'paper_simz': unknown_inputs(fixed),
         'paper_simu': unknown_inputs([adaptive], gamma=True),
-        'paper_fuzzysystems': fuzzy_systems(),
     }  # fmt: skip
-    return Found(tables, texts(simulations), drawn)
+    return Found({NAME: simulations, 'paper_sampled': sampled}, texts(simulations), drawn)
 
 
 def sim1(run: JointRun) -> Figure:
@@ -389,33 +295,6 @@ def unknown_inputs(
     for axes in panels[-1]:
         axes.set_xlabel('time [s]')
     panels[0, 0].legend(loc='upper right', ncols=2)
-    return figure
-
-
-def fuzzy_systems() -> Figure:
-    """Figure fuzzysystems: membership functions of input and output, and the curve, by level."""
-    observer, levels = preset()[0], ('1', '2', '3, 4')
-    figure = Figure(figsize=(9.0, 6.6), layout='constrained')
-    x = np.linspace(-1.0, 1.0, 1001)
-    for k, (left, middle, right) in enumerate(figure.subplots(len(levels), 3)):
-        text, width = of_level(observer['fuzzy_systems'], k), of_level(observer['fuzzy_widths'], k)
-        system, half = read_system(text), curve(text)
-        for axes, terms, scale in (left, system.inputs, width), (middle, system.outputs, 1.0):
-            rows = memberships(x, terms)
-            for j, (name, peak) in enumerate(zip(NAMES[len(rows)], terms.peaks, strict=True)):
-                axes.plot(scale * x, rows[j], color=COLOURS[j % 2], linestyle=('-', '--')[j % 2])
-                axes.text(scale * peak, 1.05, name, ha='center', fontsize=6)
-            axes.set(ylim=(0.0, 1.18), ylabel='membership [1]')
-        grid = width * np.linspace(0.0, 1.0, len(half))
-        right.plot([-width, 0, 0, width], [-1, -1, 1, 1], color='#999999', linestyle=':')
-        right.plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')
-        right.grid(alpha=0.3)
-        right.set_ylabel('ψ(ε) [1]')
-        middle.set_xlabel('ψ [1], before scaling to ±1')
-        for axes in left, right:
-            axes.locator_params(axis='x', nbins=4)
-            axes.set_xlabel(f'ε of level {levels[k]} [its unit]')
-    figure.suptitle('membership functions of input and output, and the curve (dotted: sign)')
     return figure
 
 
