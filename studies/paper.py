@@ -13,6 +13,7 @@ import sys
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import Observer, Plant
+from fhaosmo_ros.core.observer.fuzzy import curve, memberships, NAMES, of_level, read_system
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
@@ -240,6 +241,7 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     drawn = {
         'paper_sim1': sim1(found['sim1']), 'paper_simz': unknown_inputs(fixed),
         'paper_simu': unknown_inputs([adaptive], gamma=True),
+        'paper_fuzzysystems': fuzzy_systems(),
     }  # fmt: skip
     return Found({NAME: simulations, 'paper_sampled': sampled}, texts(simulations), drawn)
 
@@ -295,6 +297,33 @@ def unknown_inputs(
     for axes in panels[-1]:
         axes.set_xlabel('time [s]')
     panels[0, 0].legend(loc='upper right', ncols=2)
+    return figure
+
+
+def fuzzy_systems() -> Figure:
+    """Figure fuzzysystems: membership functions of input and output, and the curve, by level."""
+    observer, levels = preset()[0], ('1', '2', '3, 4')
+    figure = Figure(figsize=(9.0, 6.6), layout='constrained')
+    x = np.linspace(-1.0, 1.0, 1001)
+    for k, (left, middle, right) in enumerate(figure.subplots(len(levels), 3)):
+        text, width = of_level(observer['fuzzy_systems'], k), of_level(observer['fuzzy_widths'], k)
+        system, half = read_system(text), curve(text)
+        for axes, terms, scale in (left, system.inputs, width), (middle, system.outputs, 1.0):
+            rows = memberships(x, terms)
+            for j, (name, peak) in enumerate(zip(NAMES[len(rows)], terms.peaks, strict=True)):
+                axes.plot(scale * x, rows[j], color=COLOURS[j % 2], linestyle=('-', '--')[j % 2])
+                axes.text(scale * peak, 1.05, name, ha='center', fontsize=6)
+            axes.set(ylim=(0.0, 1.18), ylabel='membership [1]')
+        grid = width * np.linspace(0.0, 1.0, len(half))
+        right.plot([-width, 0, 0, width], [-1, -1, 1, 1], color='#999999', linestyle=':')
+        right.plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')
+        right.grid(alpha=0.3)
+        right.set_ylabel('ψ(ε) [1]')
+        middle.set_xlabel('ψ [1], before scaling to ±1')
+        for axes in left, right:
+            axes.locator_params(axis='x', nbins=4)
+            axes.set_xlabel(f'ε of level {levels[k]} [its unit]')
+    figure.suptitle('membership functions of input and output, and the curve (dotted: sign)')
     return figure
 
 
