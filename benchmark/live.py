@@ -1,28 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Processes whose start, CPU time and memory are measured, and what nodes say."""
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from functools import partial
 import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
-import threading
 from time import monotonic, perf_counter, sleep
 from typing import Any
 
-from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.nodes.middleware.endpoints import subscribe_with_info
-from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.nodes.recording import PrivateNode
 from fhaosmo_ros.tools.cli import processes
-from fhaosmo_ros.topics import OF_ALL_NODES
-import numpy as np
 from rclpy.qos import QoSProfile
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 60.0  # seconds that anything may take that is waited for
-DIAGNOSTICS = '/diagnostics'
 
 # What is started here is kept away from other ROS systems; the tests use the domains from 20 on.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -81,62 +77,35 @@ def start_node(name: str, *arguments: str) -> Child:
 
 class Watch(PrivateNode):
     """
-    Listens to /diagnostics and to some topics (name and type of each) while it is open.
+    Hears topics (the type of each), and the diagnostics of all nodes.
 
-    All times are source time stamps of the middleware (ns), taken when a message was published, so
-    what the listener itself takes does not count. `reports` has the last diagnostics of each node,
-    with the time of the report in 'received'; `outputs` and `not_finite` count messages of the
-    topics, and those among them with a NaN or an infinity.
+    `heard` has by topic what has come: each message behind its source time stamp (ns), taken when
+    it was published, so what the listener itself takes does not count. `reports` has the latest
+    values of each node, with the time of the report in 'received'.
     """
 
-    def __init__(self, topics: Mapping[str, str]) -> None:
+    def __init__(self, topics: Mapping[str, type]) -> None:
         super().__init__('watch')
-        self.reports: dict[str, dict[str, str]] = {}
-        self.outputs = self.not_finite = 0
-        self._series: dict[str, list[tuple[int, float]]] = {topic: [] for topic in topics}
-        self._lock = threading.Lock()
-        qos = QoSProfile(depth=5000)
-        for topic, kind in {**topics, DIAGNOSTICS: OF_ALL_NODES[DIAGNOSTICS]}.items():
-            take = self._report if topic == DIAGNOSTICS else partial(self._receive, topic)
-            subscribe_with_info(self.node, message_class(kind), topic, take, qos)
+        self.heard: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in topics}
+        self.reports: dict[str, dict[str, str]] = defaultdict(dict)
+        for topic, kind in {**topics, '/diagnostics': DiagnosticArray}.items():
+            take = partial(self._receive, topic) if topic in topics else self._report
+            subscribe_with_info(self.node, kind, topic, take, QoSProfile(depth=5000))
 
-    def _report(self, message: Any, info: Mapping[str, int]) -> None:
+    def _report(self, message: DiagnosticArray, info: Mapping[str, int]) -> None:
         for status in message.status:
             values = {item.key: item.value for item in status.values}
-            if 'samples accepted' in values:
-                node = status.name.partition(': ')[0]
-                self.reports[node] = values | {'received': str(info['source_timestamp'])}
+            values['received'] = str(info['source_timestamp'])
+            self.reports[status.name.partition(': ')[0]].update(values)
 
     def _receive(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
-        if isinstance(message, Time):
-            value = message.sec * 1_000_000_000 + message.nanosec
-        else:
-            value = float(np.sum(message.data))
-        self.outputs += 1
-        self.not_finite += not np.isfinite(value)
-        with self._lock:
-            self._series[topic].append((info['source_timestamp'], value))
+        self.heard[topic].append((info['source_timestamp'], message))
 
     def forget(self) -> None:
         """Keep what comes from now on."""
-        with self._lock:
-            for series in self._series.values():
-                series.clear()
+        for topic in self.heard:
+            self.heard[topic] = []
 
-    def count(self, topic: str) -> int:
-        """Return how many messages have come since `forget`."""
-        return len(self._series[topic])
-
-    def series(self, topic: str) -> tuple[Any, Any]:
-        """Return times and values since `forget`, in order, as arrays."""
-        with self._lock:
-            at, values = zip(*sorted(self._series[topic]), strict=True)
-        return np.array(at), np.array(values)
-
-    def reported(self, node: str, name: str) -> int:
-        """Return a number of a node's last report; 0 where there is none."""
-        return int(self.reports.get(node, {}).get(name, 0))
-
-    def taken(self, node: str) -> int:
-        """Return the samples of y that a node has used or rejected, by its last report."""
-        return self.reported(node, 'samples accepted') + self.reported(node, 'samples rejected')
+    def number(self, node: str, *names: str) -> int:
+        """Return a number of a node's latest report, or the sum of some; 0 before it has come."""
+        return sum(int(self.reports[node].get(name, 0)) for name in names)

@@ -6,9 +6,10 @@ This file is also what stands around the estimator: `node.py source RATE JOINTS`
 exact rate; sample k comes k periods after the first one, and a late one does not delay those
 behind it. It begins once it has two subscribers, and says at its end how many it has published.
 
-`node.py empty_node RATE JOINTS` has the estimator's subscription, timer, publishers and executor.
-Its messages were made once, except for the stamp of the latest sample, from which latencies are
-measured. What an estimator costs more than this is ours; what this costs is the middleware's.
+`node.py empty_node RATE JOINTS` has the estimator's subscription, timer and executor. It publishes
+messages that were made once, and the stamp of the latest sample, from which latencies are
+measured. What an estimator costs more than this is ours; what this costs is the middleware's. Of
+both the topics in `OUTPUTS` are heard: an estimator publishes nothing else then.
 """
 
 from contextlib import ExitStack
@@ -22,9 +23,7 @@ from typing import NamedTuple
 from builtin_interfaces.msg import Time
 from fhaosmo_ros.nodes.middleware.diagnostics import DiagnosticsPublisher, Report
 from fhaosmo_ros.nodes.middleware.endpoints import SENSOR_QOS, subscribe_with_info
-from fhaosmo_ros.nodes.middleware.messages import labelled
 from fhaosmo_ros.nodes.middleware.spin import Spinner
-from fhaosmo_ros.topics import TIME
 from live import Child, start_node, wait_until, Watch
 import numpy as np
 import rclpy
@@ -39,6 +38,7 @@ BAR, JOINT_BAR, START_BAR = 1.2, 1.5, 2.0
 WARM_UP = 1.5
 HELD = 0.97  # a run counts for the ratio if each node published at this part of the rate at least
 EMPTY, ESTIMATOR = 'empty_node', 'estimator'
+OUTPUTS = {'unknown_input': Float64, 'stamp': Time}
 SUBSCRIBERS = 2
 SETTLE = 0.5
 """Seconds between the match as seen from here and the first sample: the other side's match."""
@@ -123,10 +123,9 @@ def observe(case: Case, seconds: float) -> Run:
     given = ['--ros-args', '-p', f'gains:={case.gains}']
     given += ['-p', f'publish_rate:={case.out}' if case.out else 'publish_on:=sample']
     given += ['-p', 'channels:=[from_joint_names]'] if case.joints else []
-    joint = '/joint1' if case.joints else ''
-    watched = [f'/{name}{joint}/stamp' for name in (ESTIMATOR, EMPTY)]
+    stamps = [f'/{name}/{"joint1/" * bool(case.joints)}stamp' for name in (ESTIMATOR, EMPTY)]
     with (
-        Watch(dict.fromkeys(watched, TIME)) as watch,
+        Watch(topics(ESTIMATOR, case.joints) | topics(EMPTY, case.joints)) as watch,
         start_node(ESTIMATOR, *given) as ours,
         Child(EMPTY, __file__, EMPTY, str(case.out), str(case.joints)) as empty,
         ExitStack() as later,
@@ -137,7 +136,7 @@ def observe(case: Case, seconds: float) -> Run:
             Child('source', __file__, 'source', str(case.rate), str(case.joints))
         )
         source.wait_for('publishing')
-        wait_until(lambda: all(map(watch.count, watched)), 'not all nodes published')
+        wait_until(lambda: all(watch.heard[t] for t in stamps), 'not all nodes published')
         sleep(WARM_UP)
         watch.forget()
         before, start = np.array([ours.cpu_seconds(), empty.cpu_seconds()]), monotonic()
@@ -145,29 +144,31 @@ def observe(case: Case, seconds: float) -> Run:
         elapsed = monotonic() - start
         cpu = np.array([ours.cpu_seconds(), empty.cpu_seconds()]) - before
         asked = (case.out or case.rate) * elapsed
-        held = min(map(watch.count, watched)) >= HELD * asked
-        published, stamps = watch.series(watched[0])
+        held = min(len(watch.heard[t]) for t in stamps) >= HELD * asked
+        heard = [(at, m.sec * 1_000_000_000 + m.nanosec) for at, m in watch.heard[stamps[0]]]
         source.interrupt()
         source.end()
         sent, ended = int(source.output().split()[-1]), time_ns()
-        wait_until(lambda: watch.reported(ESTIMATOR, 'received') > ended, 'no report at the end')
-    _, first = np.unique(stamps, return_index=True)
-    median, most = np.quantile(1e-9 * np.abs(published - stamps)[first], [0.5, 0.99]).tolist()
+        wait_until(lambda: watch.number(ESTIMATOR, 'received') > ended, 'no report at the end')
+    published, measured = np.array(heard).T
+    _, first = np.unique(measured, return_index=True)
+    median, most = np.quantile(1e-9 * np.abs(published - measured)[first], [0.5, 0.99]).tolist()
     ratio = float(cpu[0] / cpu[1]) if held else None
-    share, lost = float(cpu[0]) / elapsed, sent - watch.taken(ESTIMATOR)
-    return Run(share, ratio, sent, lost, (median, most))
+    lost = sent - watch.number(ESTIMATOR, 'samples accepted', 'samples rejected')
+    return Run(float(cpu[0]) / elapsed, ratio, sent, lost, (median, most))
 
 
-def joint_state(count: int) -> JointState:
-    """Return a message of so many joints with zeros."""
-    names, zeros = [f'joint{k + 1}' for k in range(count)], [0.0] * count
-    return JointState(name=names, position=zeros, velocity=zeros, effort=zeros)
+def topics(node: str, joints: int) -> dict[str, type]:
+    """Return the topics that are heard of a node with one y, or with some joints."""
+    prefixes = [f'/{node}/joint{k + 1}' for k in range(joints)] or [f'/{node}']
+    return {f'{prefix}/{name}': kind for prefix in prefixes for name, kind in OUTPUTS.items()}
 
 
 def publish_samples(rate: float, joints: int, ended: threading.Event) -> None:
     """Publish y, or the positions of some joints, at a rate (Hz) until the end."""
     node = Node('source', start_parameter_services=False)
-    message = joint_state(joints) if joints else Float64()
+    names = [f'joint{k + 1}' for k in range(joints)]
+    message = JointState(name=names, velocity=[0.0] * joints) if joints else Float64()
     publisher = node.create_publisher(type(message), 'joint_states' if joints else 'y', 10)
     while not ended.is_set() and publisher.get_subscription_count() < SUBSCRIBERS:
         sleep(0.02)
@@ -191,24 +192,15 @@ def publish_samples(rate: float, joints: int, ended: threading.Event) -> None:
 
 
 class EmptyNode(Node):
-    """Counts samples; publishes constants, and the stamp of the latest sample."""
+    """Counts samples; publishes zeros, and the stamp of the latest sample."""
 
     def __init__(self, rate: float, joints: int) -> None:
         super().__init__(EMPTY)
         self._count = self._latest = 0
-        self._stamp, self._joint_states = Time(), joint_state(max(joints, 1))
-        outputs = [('~/joint_states', self._joint_states)]
-        for prefix in [f'~/joint{k + 1}/' for k in range(joints)] or ['~/']:
-            outputs += [
-                (f'{prefix}state', labelled(['z1', 'z2', 'z3'])(np.zeros(3))),
-                (f'{prefix}unknown_input', Float64()),
-                (f'{prefix}gamma', Float64()),
-                (f'{prefix}innovation', labelled(['eps1', 'eps2', 'eps3', 'eps4'])(np.zeros(4))),
-                (f'{prefix}stamp', self._stamp),
-            ]
+        self._stamp = Time()
         self._outputs = [
-            (self.create_publisher(type(message), topic, 10).publish, message)
-            for topic, message in outputs
+            (self.create_publisher(kind, t, 10).publish, self._stamp if kind is Time else kind())
+            for t, kind in topics(EMPTY, joints).items()
         ]
         self._diagnostics = DiagnosticsPublisher(
             self, self._reports, {'diagnostics_period': 1.0, 'hardware_id': 'none'}
@@ -232,7 +224,6 @@ class EmptyNode(Node):
     def _publish(self) -> None:
         if self._latest:
             self._stamp.sec, self._stamp.nanosec = divmod(self._latest, 1_000_000_000)
-            self._joint_states.header.stamp = self._stamp
             for publish, message in self._outputs:
                 publish(message)
 
