@@ -200,19 +200,16 @@ def evaluate(sensor: Sensor, name: str, count: int, trials: int) -> tuple[Outcom
     ]
 
 
-def methods_for(sensor: Sensor) -> list[str]:
-    """Return the methods that are compared for a sensor."""
-    quiet = sensor.setting().noise == 0.0
-    return [name for name, method in METHODS.items() if not (quiet and method.needs_noise)]
-
-
 NAME = 'comparison'
 FULL, QUICK = (4, 200), (1, 15)  # recordings that tune a method, and trials
 STYLES = {
-    methods.USUAL: evidence.USUAL, methods.ROBUST: evidence.ROBUST,
+    methods.USUAL: evidence.USUAL, methods.ADAPTIVE: evidence.ROBUST,
     methods.SLIDING: evidence.OTHER, methods.PAPER: evidence.GREY, methods.OURS: evidence.TUNED,
     methods.SELF_TUNING: evidence.SELF,
 }  # fmt: skip
+KIND = {name: method.kind for name, method in METHODS.items()} | dict.fromkeys(
+    methods.EARLIER, methods.ADAPTIVE
+)
 KEY = 6  # columns that say what was measured: a cell, and the method
 CLOSE = 0.05  # errors within this part of another one count as equal
 
@@ -246,7 +243,7 @@ def best_of_kinds(rows: Iterable[Row]) -> Chosen:
     chosen: Chosen = {}
     for row in sorted(rows, key=lambda row: row['training']):
         errors = chosen.setdefault(Cell(*(row[name] for name in Cell._fields)), {})
-        errors.setdefault(METHODS[row['method']].kind, row['error'])
+        errors.setdefault(KIND[row['method']], row['error'])
     return chosen
 
 
@@ -314,13 +311,13 @@ def draw(chosen: Chosen, jumps: bool) -> Figure:
 
 
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
-    """Return a line for each cell and method; with `method` the others are those of the table."""
+    """Return a line for each cell and method; what was not measured is as in the table before."""
     quick, only = arguments.quick, arguments.method
     training, trials = QUICK if quick else FULL
     found = results({
         (sensor, name): (evaluate, sensor, name, training, trials)
         for sensor in sensors(quick)
-        for name in methods_for(sensor)
+        for name in METHODS
         if only in (None, name)
     })  # fmt: skip
     rows = evidence.rounded(
@@ -329,10 +326,9 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
         for (s, name), (tuned, errors) in found.items()
         for d, error in zip(s.disturbances, errors, strict=True)
     )
-    if only:
-        anew = {tuple(row.values())[:KEY]: row for row in rows}
-        before = evidence.read(NAME, arguments.output)
-        rows = [anew.get(tuple(row.values())[:KEY], row) for row in before]
+    anew = {tuple(row.values())[:KEY]: row for row in rows}
+    before = evidence.read(NAME, arguments.output)
+    rows = [anew.pop(tuple(row.values())[:KEY], row) for row in before] + [*anew.values()]
     chosen = best_of_kinds(rows)
     drawn = {'comparison_smooth': draw(chosen, False), 'comparison_jumps': draw(chosen, True)}
     return Found({NAME: rows}, texts(rows), drawn)

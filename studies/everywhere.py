@@ -104,19 +104,11 @@ STYLES = {
     SELF: evidence.SELF, ONCE: evidence.USUAL, PRESET: evidence.TUNED, HUBER: evidence.ROBUST,
     NOISE: evidence.OTHER, IMM: evidence.GREY,
 }  # fmt: skip
-PEERS: dict[str, list[dict[str, float]]] = {
-    HUBER: [{'huber': limit} for limit in (1.5, 2.5, 4.0)],
-    NOISE: [{'memory': seconds} for seconds in (0.3, 1.0, 10.0)],
-    IMM: [{'spread': f, 'stay': seconds} for f in (1.5, 2.0, 3.0) for seconds in (1.0, 10.0)],
-}
-"""What the tuning chooses from, around the filter that it has found."""
 ANEW, KNOWN = 'tuned anew', 'every z known'
 """
 Errors of d: of the Kalman filter tuned for the condition, all others are over this; and what a
 wrong Phi makes of d, whoever estimates it.
 """
-Once = tuple[dict[str, float], dict[str, dict[str, float]]]
-"""What the tuning has found with the truth: a filter for `RATE`, and one of each of `PEERS`."""
 
 
 class Size(NamedTuple):
@@ -170,10 +162,10 @@ def setting_of(plant: Plant, c: Condition) -> Setting:
     return Setting(TriangularModel(told), 1.0 / c.rate, plant.size, plant.noise)
 
 
-def error_of(name: str, setting: Setting, values: Values, recordings: list[Recording]) -> float:
-    """Return the mean error of a method of the comparison; infinite where it does not exist."""
+def error_of(values: Values, setting: Setting, recordings: list[Recording]) -> float:
+    """Return the mean error of a Kalman filter; infinite where it does not exist."""
     try:
-        run = METHODS[name].prepare(setting, values)
+        run = METHODS[LINEAR_LIMIT].prepare(setting, values)
     except ConfigurationError:
         return math.inf
     return mean(objective(r, run(r)[0][:, -1]) for r in recordings)
@@ -207,29 +199,23 @@ def self_tuned(setting: Setting, recordings: list[Recording]) -> SelfTuned:
     return SelfTuned(errors, np.mean(inside, axis=0).tolist(), largest)
 
 
-def cell(name: str, condition: str, size: Size, once: Once | None) -> tuple[Row, Once]:
+def cell(name: str, condition: str, size: Size, once: Values | None) -> tuple[Row, Values]:
     """Return the errors of all methods in a condition; without `once` tune them here."""
     plant, c = PLANTS[name], CONDITIONS[condition]
     recordings = [recording(plant, c, kind, size.duration) for kind in size.kinds]
     setting = setting_of(plant, c)
-
-    def error(method: str, values: Values) -> float:
-        return error_of(method, setting, values, recordings)
-
     anew = tune(METHODS[LINEAR_LIMIT], setting, recordings, size.trials, SEED).values
-    if once is None:
-        best = {
-            peer: min(choices, key=lambda own, peer=peer: error(peer, anew | own))
-            for peer, choices in PEERS.items()
-        }
-        once = anew, best
-    values = at(once[0], setting.model.order, c.rate)
+    once = once or anew
+    values = at(once, setting.model.order, c.rate)
     preset = load(shipped(plant.file), 'estimator', ONLINE_PARAMETERS) | setting.told
     of_preset = (objective(r, observed(preset, r.t, r.y).unknown_input) for r in recordings)
     ours = self_tuned(setting, recordings)
-    found = {SELF: mean(ours.errors), ONCE: error(LINEAR_LIMIT, values), PRESET: mean(of_preset)}
-    found |= {peer: error(peer, values | own) for peer, own in once[1].items()}
-    yard = error(LINEAR_LIMIT, anew)
+    found = {
+        SELF: mean(ours.errors),
+        ONCE: error_of(values, setting, recordings),
+        PRESET: mean(of_preset),
+    }
+    yard = error_of(anew, setting, recordings)
     row: Row = {'plant': name, 'condition': condition, ANEW: yard}
     row |= {method: value / yard for method, value in found.items()}
     row[KNOWN] = implied(plant, c, recordings) / yard if c.phi != 1.0 else None
@@ -245,7 +231,7 @@ def number(ratio: float) -> str:
 def texts(cells: list[Row]) -> dict[str, str]:
     """Return the part of the page."""
     lines = []
-    for name in STYLES:
+    for name in [name for name in STYLES if name in cells[0]]:
         found = [c[name] for c in cells]
         worst = max(cells, key=lambda c, name=name: c[name])
         where = f'{number(max(found))} ({worst["plant"]}, {worst["condition"]})'
@@ -261,7 +247,10 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     found = results({(p, c): (cell, p, c, size, None) for p, c in keys if c == TUNED})
     once = {p: found[p, TUNED][1] for p in size.plants}
     found |= results({(p, c): (cell, p, c, size, once[p]) for p, c in keys if c != TUNED})
-    cells = evidence.rounded(found[key][0] for key in keys)
+    # What filters of earlier got is as in the table before.
+    table = evidence.read(NAME, arguments.output)
+    before = {(row['plant'], row['condition']): row for row in table}
+    cells = evidence.rounded(before.get(key, {}) | found[key][0] for key in keys)
     panels: dict[str, dict[str, Row]] = {p: {} for p in size.plants}
     for row in cells:
         panels[row['plant']][row['condition']] = row
