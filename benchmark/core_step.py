@@ -9,7 +9,8 @@ from pathlib import Path
 import shlex
 import subprocess
 from tempfile import TemporaryDirectory
-from time import perf_counter, process_time
+from time import process_time
+from timeit import repeat, timeit
 from typing import Any
 
 from fhaosmo_ros.core import Observer, Plant
@@ -27,9 +28,7 @@ from studies.harness import model_alone, observed, SELF_TUNING
 PERIOD = 1e-3
 CASE = {'variant': 'fuzzy_adaptive', 'scheme': 'explicit', 'fuzzy_widths': [0.1]}
 """Wide fuzzy sets: no chatter, so that rounding does not grow and both end at the same state."""
-BAR = 1.1
-CALLS = {'explicit': 0.6, 'implicit': None}
-"""Microseconds of a call of `Observer.step`; the implicit scheme solves an equation a level."""
+BAR, CALL_BAR = 1.1, 0.6  # times C; microseconds of a call of `Observer.step`
 VARIANTS, SCHEMES = ('sign', 'fuzzy', 'fuzzy_adaptive'), ('explicit', 'implicit')
 SELF_TUNING_BARS = {'paper_plant': 12.0, 'dc_motor': 12.0, 'pendulum': 100.0}
 """Microseconds a step, of files in config/models."""
@@ -47,20 +46,14 @@ def measure(quick: bool) -> list[Row]:
     rows = [_against_c(y, rounds)]
     for variant, scheme in product(VARIANTS, SCHEMES):
         step = in_core(CASE | {'variant': variant, 'scheme': scheme}, y)
-        step()
-        best = min(_seconds(step) for _ in range(3)) / samples
+        best = min(repeat(step, number=1, repeat=4)) / samples
         rows.append(Row(f'core step, {variant}, {scheme}', best * 1e9, 'ns'))
-    few = y[:calls].tolist()
-    for scheme, bar in CALLS.items():
-        observer = Observer(CASE | {'scheme': scheme})
-        observer.step(few[0], PERIOD)
-        best = min(_seconds(lambda o=observer: [o.step(v, PERIOD) for v in few]) for _ in range(3))
-        name = f'Observer.step, one call, {scheme}'
-        bar = None if quick else bar
-        rows.append(Row(name, best / len(few) * 1e6, 'us', bar, 'fuzzy_adaptive'))
-    for model, bar in SELF_TUNING_BARS.items():
-        rows.append(_self_tuning(model, None if quick else bar, 5 if quick else 30))
-    return rows
+    observer, few = _started(CASE, y[0]), y[:calls].tolist()
+    best = min(repeat(lambda: [observer.step(v, PERIOD) for v in few], number=1, repeat=3))
+    name = 'Observer.step, one call, explicit'
+    rows.append(Row(name, best / calls * 1e6, 'us', CALL_BAR, 'fuzzy_adaptive'))
+    models = SELF_TUNING_BARS.items()
+    return rows + [_self_tuning(model, bar, 5 if quick else 30) for model, bar in models]
 
 
 def in_core(parameters: dict[str, Any], y: np.ndarray) -> Callable[[], np.ndarray]:
@@ -119,7 +112,7 @@ def _against_c(y: np.ndarray, rounds: int) -> Row:
     with TemporaryDirectory() as folder:
         ours, c = in_core(CASE, y), in_c(Path(folder), y)
         np.testing.assert_allclose(ours(), c(), rtol=1e-6, atol=1e-9)
-        times = np.array([(_seconds(ours), _seconds(c)) for _ in range(rounds)])
+        times = np.array([[timeit(run, number=1) for run in (ours, c)] for _ in range(rounds)])
     times *= 1e9 / (len(y) - 1)
     median, best = np.median(times, axis=0), times.min(axis=0)
     note = (
@@ -130,7 +123,7 @@ def _against_c(y: np.ndarray, rounds: int) -> Row:
     return Row('core step / same step in C (-O3)', ratio, bar=BAR, note=note)
 
 
-def _self_tuning(model: str, bar: float | None, length: int) -> Row:
+def _self_tuning(model: str, bar: float, length: int) -> Row:
     """Return microseconds a step of a recording of `length` seconds."""
     path = shipped(f'config/models/{model}.yaml')
     plant = load(path, 'plant', PLANT_PARAMETERS)
@@ -138,14 +131,6 @@ def _self_tuning(model: str, bar: float | None, length: int) -> Row:
     t = np.arange(round(length / PERIOD)) * PERIOD
     y = Plant(plant | noise).simulate(t).y
     told = model_alone(load(path, 'estimator')) | SELF_TUNING
-    begin = process_time()
-    observed(told, t, y)
-    spent = 1e6 * (process_time() - begin) / len(y)
+    spent = timeit(lambda: observed(told, t, y), timer=process_time, number=1)
     note = f'{length} s at 1 kHz; {told["order"]} states'
-    return Row(f'step, self-tuning, {model}', spent, 'us', bar, note)
-
-
-def _seconds(run: Callable[[], object]) -> float:
-    start = perf_counter()
-    run()
-    return perf_counter() - start
+    return Row(f'step, self-tuning, {model}', 1e6 * spent / len(y), 'us', bar, note)
