@@ -195,7 +195,7 @@ def evaluate(sensor: Sensor, name: str, count: int, trials: int) -> tuple[Outcom
     tuned = tune(method, setting, sensor.training(count), trials, seed=1)
     run = method.prepare(setting, tuned.values)
     return tuned, [
-        mean(objective(r, run(r)[tuned.readout][:, -1]) for r in sensor.held_out(disturbance))
+        mean(objective(r, run(r)[:, -1]) for r in sensor.held_out(disturbance))
         for disturbance in sensor.disturbances
     ]
 
@@ -207,9 +207,7 @@ STYLES = {
     methods.SLIDING: evidence.OTHER, methods.PAPER: evidence.GREY, methods.OURS: evidence.TUNED,
     methods.SELF_TUNING: evidence.SELF,
 }  # fmt: skip
-KIND = {name: method.kind for name, method in METHODS.items()} | dict.fromkeys(
-    methods.EARLIER, methods.ADAPTIVE
-)
+KIND = {name: method.kind for name, method in METHODS.items()} | methods.EARLIER
 KEY = 6  # columns that say what was measured: a cell, and the method
 CLOSE = 0.05  # errors within this part of another one count as equal
 

@@ -168,7 +168,7 @@ def error_of(values: Values, setting: Setting, recordings: list[Recording]) -> f
         run = METHODS[LINEAR_LIMIT].prepare(setting, values)
     except ConfigurationError:
         return math.inf
-    return mean(objective(r, run(r)[0][:, -1]) for r in recordings)
+    return mean(objective(r, run(r)[:, -1]) for r in recordings)
 
 
 def implied(plant: Plant, c: Condition, recordings: list[Recording]) -> float:

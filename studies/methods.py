@@ -2,37 +2,30 @@
 """
 The observers that are compared, all with the same model and Phi; how they are scored and tuned.
 
-Steady Kalman filters:
+Kalman filters with a steady gain:
 
     z_i' = z_{i+1} + Phi_i(z, u),   z_n' = Phi_n(z, u) + d
     d' = d_1 - decay d, d_1' = d_2 - decay d_1, ..., d_{m-1}' = -decay d_{m-1} + white noise
     x(t_k) = prediction(t_k) + K (y_k - prediction_1(t_k))
 
 For a linear Phi the prediction equals the zero-order-hold discretisation, up to an error that
-decreases with the longest step.
-
-The sliding mode observers are the core's own. Levant's differentiator and its gains: A. Levant,
-International Journal of Control 76(9-10), 2003, doi:10.1080/0020717031000099029. Ours are as users
-get them: with the gains that `tune` finds by its search, or self-tuning, in the online estimator.
+decreases with the longest step. Ours are as users get them: with the gains that `tune` finds by
+its search, or self-tuning, in the online estimator.
 """
 
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import redirect_stderr
-from functools import lru_cache, partial
+from functools import partial
 from io import StringIO
 import math
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from fhaosmo_ros.core import ConfigurationError, Observer, Recording, TriangularModel
+from fhaosmo_ros.core import ConfigurationError, Recording, TriangularModel
 from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.observer.kalman import innovations
-from fhaosmo_ros.core.parameters.files import load
-from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
-from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.tuning.likelihood import Samples
 from fhaosmo_ros.tools.tuning.objective import SMALLEST, TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
@@ -48,8 +41,8 @@ DEADBEAT = 3.0  # bandwidth times period of an observer that forgets all but the
 HOPELESS = 1.5
 """A trial this many times worse than the best one so far is not run on more recordings."""
 Values = Mapping[str, Any]
-Run = Callable[[Recording], Sequence[Floats]]
-"""Estimates of z and d (K, n + 1) by readout: some have filtered states, and internal ones."""
+Run = Callable[[Recording], Floats]
+"""From a recording to estimates of z and d, (K, n + 1)."""
 
 
 def objective(recording: Recording, d: Floats, since: float = JUDGED_FROM) -> float:
@@ -125,7 +118,6 @@ class Outcome(NamedTuple):
 
     value: float
     """Geometric mean of the objective over the recordings, guessed where not all were run."""
-    readout: int  # the best one, which this is about
     averages: list[float]  # the same over the first recordings, so many as were run
     values: dict[str, Any]
 
@@ -140,23 +132,21 @@ def trial(
     It ends early where the average so far exceeds `HOPELESS` times that of the `rival`, the
     averages of the best set of values so far.
     """
-    best, averages, totals = 0, list[float](), defaultdict[int, float](float)
+    total, averages = 0.0, list[float]()
     try:
         run = method.prepare(setting, values)
     except ConfigurationError:  # values that make no observer, such as an unsolvable Riccati
-        return Outcome(math.inf, best, averages, {})
+        return Outcome(math.inf, averages, {})
     for count, recording in enumerate(recordings, 1):
-        for readout, found in enumerate(run(recording)):
-            error = objective(recording, found[:, -1], setting.judged_from)
-            totals[readout] += math.log(max(error, SMALLEST))
-        best = min(totals, key=totals.__getitem__)
-        averages.append(math.exp(totals[best] / count))
+        error = objective(recording, run(recording)[:, -1], setting.judged_from)
+        total += math.log(max(error, SMALLEST))
+        averages.append(math.exp(total / count))
         if not averages[-1] <= (HOPELESS * rival[count - 1] if rival else BAD):
             break
     value = averages[-1]
     if rival and len(averages) < len(recordings):  # as much worse on the others, it is assumed
         value *= rival[-1] / rival[len(averages) - 1]
-    return Outcome(value, best, averages, dict(values))
+    return Outcome(value, averages, dict(values))
 
 
 def tune(
@@ -198,18 +188,20 @@ SLIDING, PAPER, OURS, SELF_TUNING = 'sliding mode', 'paper', 'ours, tuned', 'our
 KINDS = (LINEAR, USUAL, ADAPTIVE, SLIDING, PAPER, OURS, SELF_TUNING)
 """Kinds of methods; the usual Kalman filter, whose d is a random walk, is one of its own."""
 HUBER, NOISE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'
-EARLIER = (HUBER, NOISE, IMM)
+EARLIER = {
+    HUBER: ADAPTIVE, NOISE: ADAPTIVE, IMM: ADAPTIVE, 'Levant, implicit': SLIDING,
+    'paper: sign': PAPER, 'paper: fuzzy': PAPER, 'paper: adaptive': PAPER,
+}  # fmt: skip
 """
-Adaptive filters. They and what they got are of commit 1657d61 (studies/filters.pyx); nothing of
-this package is in them, so their columns of the tables stay as they are.
+Methods of commit 1657d61 with their kinds: in our tables stays what they got. Levant's
+differentiator and the paper's observers had no gains but their own, and nothing of this package is
+in the others.
 """
 LINEAR_LIMIT = 'Kalman, Matern'  # our observer equals this filter for small innovations
 REACH = 10.0  # how far a search for the bandwidth goes, as a factor to both sides
 LONGEST, LONGEST_STEP = 1.5, 1.0
 """Steps of a prediction: nominal periods; seconds, for a model without dynamics of its own."""
 TRIED = (0, 1, 2, 3)  # derivatives of d
-RECURSIVE = (1.1, 1.5, 2.0, 3.0, 5.0, 7.0)
-"""Levant's lambda_0 .. lambda_5 of the recursive form, for a Lipschitz constant of 1."""
 GRID = len(DERIVATIVES) * len(RATES)  # trials that `tune` uses before its search
 
 
@@ -310,7 +302,7 @@ def _steady(setting: Setting, values: Values) -> Run:
     model, decay = setting.model, values.get('decay', 0.0)
     sampled = SampledModel(model, setting.period, 1 + int(values.get('derivatives', 0)), decay)
     gain = sampled.kalman(setting.period * values['bandwidth'] ** (2 * sampled.size))
-    return lambda r: [estimates(model, gain, decay, r, sampled.longest)[:, : model.order + 1]]
+    return lambda r: estimates(model, gain, decay, r, sampled.longest)[:, : model.order + 1]
 
 
 def matern_space(setting: Setting, derivatives: int = 0) -> tuple[Dimension, ...]:
@@ -338,50 +330,13 @@ def each_order(search: Search) -> Values:
     return best[1]
 
 
-def _sliding(parameters: Callable[[Values], Mapping[str, Any]], s: Setting, values: Values) -> Run:
-    """Return a run of the core's Observer with these parameters."""
-    observer, n = Observer(s.told | dict(parameters(values))), s.model.order
-
-    def estimate(r: Recording) -> list[Floats]:
-        observer.reset()
-        found = observer.run(r.t, r.y, r.u)
-        internal = np.column_stack([found.z_hat[:, 0], found.z_tilde[:, :n]])
-        return [found.z_hat[:, : n + 1], internal]
-
-    return estimate
-
-
-@lru_cache
-def _paper() -> dict[str, Any]:
-    """Return the paper's numbers that fit any plant: all but the model and the initial values."""
-    values = load(shipped('config/paper.yaml'), 'estimator', OBSERVER_PARAMETERS)
-    left_out = ('order', 'phi', 'variant', 'initial_estimate', 'initial_internal')
-    kept = {k: v for k, v in values.items() if k not in left_out}
-    return kept | {name: kept[name][:1] for name in ('lambda', 'alpha')}
-
-
-def _papers(variant: str, _: Values) -> Mapping[str, Any]:
-    return _paper() | {'variant': variant, 'start_from_measurement': True}
-
-
-def _levant(setting: Setting, values: Values) -> Run:
-    """Non-recursive form: kappa_i = lambda_i kappa_{i+1}^(i / (i+1)) L^((N-i) / N)."""
-    levels = setting.model.order + 1
-    gains, kappa = [], 1.0
-    for i in reversed(range(levels)):
-        kappa = RECURSIVE[i] * kappa ** (i / (i + 1))
-        gains.append(kappa * values['lipschitz'] ** ((levels - i) / levels))
-    own = {'structure': 'levant', 'variant': 'sign', 'scheme': 'implicit', 'lambda': gains}
-    return _sliding(lambda _: own, setting, values)
-
-
 def _online(own: Values, setting: Setting, values: Values) -> Run:
     """Return a run of the online estimator with these parameters."""
     parameters, known = setting.told | dict(values) | dict(own), setting.model.uses_input
 
-    def estimate(r: Recording) -> list[Floats]:
+    def estimate(r: Recording) -> Floats:
         found = harness.observed(parameters, r.t, r.y, r.u if known else None)
-        return [np.column_stack([found.z, found.unknown_input])]
+        return np.column_stack([found.z, found.unknown_input])
 
     return estimate
 
@@ -400,22 +355,12 @@ def _one_bandwidth(s: Setting) -> Sequence[Dimension]:
     return [Dimension('bandwidth', 0.05, 5.0 / s.period, s.speed)]
 
 
-def _lipschitz(s: Setting) -> Sequence[Dimension]:
-    return [Dimension('lipschitz', 1e-4 * s.size, 1e8 * s.size, 10.0 * s.size)]
-
-
-PAPERS = {'sign': 'sign', 'fuzzy': 'fuzzy', 'adaptive': 'fuzzy_adaptive'}
 METHODS = {
     m.name: m
     for m in (
         Method('Kalman', USUAL, _steady, _one_bandwidth),  # d a random walk
         Method('Kalman, decaying', LINEAR, _steady, matern_space),  # a random walk that decays
         Method(LINEAR_LIMIT, LINEAR, _steady, matern_space, each_order),
-        Method('Levant, implicit', SLIDING, _levant, _lipschitz),
-        *(
-            Method(f'paper: {name}', PAPER, partial(_sliding, partial(_papers, own)))
-            for name, own in PAPERS.items()
-        ),
         Method(OURS, OURS, partial(_online, {}), tune=_tune),  # levant, fuzzy, predict_correct
         Method(SELF_TUNING, SELF_TUNING, partial(_online, harness.SELF_TUNING)),
     )
