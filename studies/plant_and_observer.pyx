@@ -3,16 +3,15 @@
 Plant and observer as one system of differential equations, integrated with a fixed step.
 
 This is how the paper simulates: in continuous time, the observer sees y = z_1 at every stage of
-the solver. Its rates are those of its explicit scheme (D 2 to D 7 in docs/mathematics.md).
+the solver, which is called ode3 in fixed-step simulators. Its rates are those of its explicit
+scheme (D 2 to D 7 in docs/mathematics.md).
 """
 
 from libc.math cimport fmax, fmin
 from libc.string cimport memcpy, memset
 
-from fhaosmo_ros.core.model.prediction cimport (
-    CLASSICAL, Dynamics, MOST_LEVELS, Method, take_step
-)
-from fhaosmo_ros.core.observer.sliding_mode cimport Gains, SlidingMode
+from fhaosmo_ros.core.model.prediction cimport Dynamics, MOST_LEVELS, Method, take_step
+from fhaosmo_ros.core.observer.sliding_mode cimport SlidingMode
 from fhaosmo_ros.core.observer.structure cimport Level, MOST_INPUTS
 from fhaosmo_ros.core.simulation.system cimport System
 
@@ -28,16 +27,10 @@ from fhaosmo_ros.core.simulation.system import Disturbance
 import numpy as np
 
 
-cdef Method EULER = Method(1, [0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0])
 # Bogacki and Shampine 1989, doi:10.1016/0893-9659(89)90079-7.
 cdef Method BOGACKI_SHAMPINE = Method(
     3, [0.0, 0.5, 0.75, 0.0], [2.0 / 9.0, 1.0 / 3.0, 4.0 / 9.0, 0.0]
 )
-# What a fixed-step simulation offers, by its usual names. HELD takes sign(eps_i) at the first
-# stage of a step and holds it for the others, as simulators with zero-crossing detection do with
-# their sign block. All else, |eps_i| included, follows every stage; a fuzzy curve is not held.
-HELD = 'ode4 held'
-SOLVERS = {'ode1': EULER, 'ode3': BOGACKI_SHAMPINE, 'ode4': CLASSICAL, HELD: CLASSICAL}
 
 
 class JointRun(NamedTuple):
@@ -63,19 +56,15 @@ cdef class Joint(Dynamics):
 
     cdef System plant
     cdef SlidingMode observer
-    cdef Gains gains[MOST_LEVELS]  # of the observer, as it was made
-    cdef bint holds_sign  # sign(eps_i) is held for a whole step
-    cdef double sign[MOST_LEVELS]  # sign(eps_i) at the beginning of a step
     cdef double u[MOST_INPUTS]  # known inputs: 0
     cdef State state
 
-    def __init__(self, System plant not None, configuration, bint holds_sign):
+    def __init__(self, System plant not None, configuration):
         cdef SlidingMode observer = make_structure(configuration)
         cdef int i
-        self.plant, self.observer, self.gains = plant, observer, observer.gains
+        self.plant, self.observer = plant, observer
         if plant.phi.inputs > MOST_INPUTS:
             raise ConfigurationError(f'plant: expected at most {MOST_INPUTS} known inputs')
-        self.holds_sign = holds_sign
         plant.u = self.u
         self.size = (sizeof(State) - sizeof(self.state.level)) // sizeof(double)
         self.size += observer.levels * (sizeof(Level) // sizeof(double))
@@ -94,8 +83,6 @@ cdef class Joint(Dynamics):
         cdef int i
         memset(rate, 0, self.size * sizeof(double))
         self.plant.rates(stage, t, now.z, rate.z)
-        if self.holds_sign:
-            self.hold_signs(now, stage == 0)
         # A forward Euler step of length 1 moves the levels by their rates.
         memcpy(self.observer.trial, now.level, self.observer.levels * sizeof(Level))
         self.observer.memory.gamma, self.observer.memory.y = now.gamma, now.z[0]
@@ -109,18 +96,6 @@ cdef class Joint(Dynamics):
         if self.observer.adaptive:
             rate.gamma = self.gamma_rate(self.observer, now.gamma)
 
-    cdef void hold_signs(self, const State* now, bint first) noexcept nogil:
-        """Remember the signs of the innovations, or turn the gains where they are others now."""
-        cdef double eps, sign
-        cdef int i
-        for i in range(self.observer.levels):
-            eps = (now.level[i - 1].z_tilde if i > 0 else now.z[0]) - now.level[i].z_hat
-            sign = (eps > 0.0) - (eps < 0.0)
-            if first:
-                self.sign[i] = sign
-            self.observer.gains[i].lambda_ = self.sign[i] * sign * self.gains[i].lambda_
-            self.observer.gains[i].alpha = self.sign[i] * sign * self.gains[i].alpha
-
     cdef double gamma_rate(self, SlidingMode law, double gamma) noexcept nogil:
         """Return the rate of gamma by the law of D 7 and D 8, for the latest L."""
         cdef bint rests = law.loss <= law.dead_zone * law.dead_zone
@@ -131,14 +106,9 @@ cdef class Joint(Dynamics):
             rate -= law.gamma_rate * law.gradient  # P adaptationlawgamma
         return rate
 
-    cdef void project(self, SlidingMode law) noexcept nogil:
-        """Project gamma on its range (D 8)."""
-        if law.adaptive:
-            self.state.gamma = fmin(fmax(self.state.gamma, law.gamma_min), law.gamma_max)
-
-    def run(self, str solver, double h, Py_ssize_t count, int every):
+    def run(self, double h, Py_ssize_t count, int every):
         """Integrate and return `count` states, every `every`-th one, from the first one on."""
-        cdef Method used = SOLVERS[solver]
+        cdef SlidingMode law = self.observer
         cdef int n = self.plant.size, levels = self.observer.levels, i, _
         cdef Py_ssize_t row, step = 0
         cdef double[:, ::1] z = np.empty((count, n))
@@ -147,8 +117,10 @@ cdef class Joint(Dynamics):
         with nogil:
             for row in range(count):
                 for _ in range(every if row > 0 else 0):
-                    take_step(self, &used, step * h, h, <double*>&self.state)
-                    self.project(self.observer)
+                    take_step(self, &BOGACKI_SHAMPINE, step * h, h, <double*>&self.state)
+                    if law.adaptive:  # D 8
+                        self.state.gamma = fmin(fmax(self.state.gamma, law.gamma_min),
+                                                law.gamma_max)
                     step += 1
                 for i in range(n):
                     z[row, i] = self.state.z[i]
@@ -162,7 +134,7 @@ cdef class Joint(Dynamics):
         }
 
 
-def simulate(observer, plant, solver='ode3', step=1e-3, duration=20.0, every=1):
+def simulate(observer, plant, step=1e-3, duration=20.0, every=1):
     """
     Integrate plant and observer from their initial states over `duration` (s).
 
@@ -175,8 +147,7 @@ def simulate(observer, plant, solver='ode3', step=1e-3, duration=20.0, every=1):
     model, d = TriangularModel.of(p), Disturbance(p)
     z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], model.order)
     system = System(model.expressions, d, step, z)
-    joint = Joint(system, configuration, solver == HELD and configuration.is_sign)
     rows = round(duration / step) // every + 1
-    found = joint.run(solver, step, rows, every)
+    found = Joint(system, configuration).run(step, rows, every)
     t = np.arange(rows, dtype=np.float64) * (every * step)
     return JointRun(t=t, unknown_input=d.along(t), **found)
