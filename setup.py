@@ -151,7 +151,6 @@ setup(
         # Worlds and robots of studies/arm.
         'arm-study': [*ARM, *TUNE, 'example-robot-data', 'mujoco>=4,<5', 'pybullet'],
         'docs': DOCS,
-        'recipes': ['rotorpy>=3,<4'],  # a simulator of drones, for studies/recipes
         # Community builds, for machines without ROS. Never beside an installed ROS.
         **{f'ros-{name}': [f'ros-{name}-{p}' for p in ROS] for name in ('jazzy', 'kilted')},
         'tune': TUNE,

@@ -141,5 +141,6 @@ def observed(
     parameters: Mapping[str, Any], t: Floats, y: Floats, u: Floats | None = None
 ) -> Trajectory:
     """Return what the node would have estimated from samples, the first one at t[0]."""
+    estimator = OnlineEstimator(parameters)
     stamps = 10**9 + np.round((t - t[0]) * 1e9).astype(np.int64)
-    return OnlineEstimator(parameters).run(stamps, y, u)
+    return estimator.run(stamps, y, u if estimator.observer.uses_input else None)

@@ -332,10 +332,10 @@ def each_order(search: Search) -> Values:
 
 def _online(own: Values, setting: Setting, values: Values) -> Run:
     """Return a run of the online estimator with these parameters."""
-    parameters, known = setting.told | dict(values) | dict(own), setting.model.uses_input
+    parameters = setting.told | dict(values) | dict(own)
 
     def estimate(r: Recording) -> Floats:
-        found = harness.observed(parameters, r.t, r.y, r.u if known else None)
+        found = harness.observed(parameters, r.t, r.y, r.u)
         return np.column_stack([found.z, found.unknown_input])
 
     return estimate

@@ -15,14 +15,13 @@ import numpy as np
 from studies import evidence
 from studies.evidence import Row
 from studies.harness import Found, Results, run_study, SELF_TUNING
-from studies.recipes import drone, encoder, hidden_force, joint_torque, motor_load
+from studies.recipes import encoder, hidden_force, joint_torque, motor_load
 from studies.recipes.judging import Fold, Folds, judge, OURS, Recipe, run
 
 NAME = 'recipes'
 RECIPES: dict[str, Recipe] = {
-    'encoder': encoder.RECIPE, 'motor_load': motor_load.RECIPE, 'wind': drone.WIND,
-    'joint_torque': joint_torque.RECIPE, 'sensor_bias': drone.BIAS,
-    'hidden_force': hidden_force.RECIPE,
+    'encoder': encoder.RECIPE, 'motor_load': motor_load.RECIPE,
+    'joint_torque': joint_torque.RECIPE, 'hidden_force': hidden_force.RECIPE,
 }  # fmt: skip
 QUICK = 4  # with --quick the best is chosen from every fourth number
 NEEDS = '; '.join(f'{name}: {r.data}' for name, r in RECIPES.items() if r.data)

@@ -51,7 +51,7 @@ def conditions(_: None) -> dict[str, list[Fold]]:
     for quantity in (ACCELERATION, VELOCITY):
         rs = [
             Recorded(
-                f'simulated {n}', r.t, r.y, np.zeros((len(r.t), 0)),
+                f'simulated {n}', r.t, r.y, np.zeros((len(r.t), 1)),
                 r.d if quantity == ACCELERATION else r.z[:, 1], SETTLED, quantity,
             )
             for n, r in enumerate(found, 1)

@@ -90,7 +90,7 @@ def recorded(name: str, y: Floats, d: Floats) -> Recorded:
     """Return a recording whose truth is that of `LAG` samples before."""
     t = np.arange(len(y)) * PERIOD
     late = np.concatenate([np.repeat(d[0], LAG), d[:-LAG]])
-    return Recorded(name, t, y, np.zeros((len(y), 0)), late, SETTLED)
+    return Recorded(name, t, y, np.zeros((len(y), 1)), late, SETTLED)
 
 
 RECIPE = Recipe(

@@ -31,7 +31,7 @@ class Recorded(NamedTuple):
     name: str
     t: Floats  # s
     y: Floats
-    u: Floats  # (N, m): known inputs, that of the interval which ends at each sample
+    u: Floats  # (N, m): known inputs of the interval which ends at each sample; one of 0 for none
     d: Floats  # the true unknown input, or the `quantity` that methods return in its place
     settled: float  # seconds after which errors count
     quantity: str = 'd'
@@ -40,11 +40,6 @@ class Recorded(NamedTuple):
     def judged(self) -> NDArray[np.bool_]:
         """Samples that count."""
         return self.t - self.t[0] > self.settled
-
-    @property
-    def inputs(self) -> Floats:
-        """Known inputs, one that is 0 where there are none."""
-        return self.u if self.u.size else np.zeros((len(self.y), 1))
 
     @property
     def period(self) -> float:
@@ -102,7 +97,7 @@ def plant_of(parameters: Mapping[str, Any]) -> TriangularModel:
 
 def run(parameters: Mapping[str, Any], r: Recorded) -> Trajectory:
     """Return what the node would have estimated."""
-    return observed(parameters, r.t, r.y, r.u if r.u.size else None)
+    return observed(parameters, r.t, r.y, r.u)
 
 
 def self_tuning(parameters: Mapping[str, Any], r: Recorded, _: float = 0.0) -> Floats:
@@ -143,7 +138,7 @@ def disturbance_observer(p: Mapping[str, Any], r: Recorded, bandwidth: float) ->
     """
     model, h = plant_of(p), r.period
     velocity = low_passed(r.y, bandwidth, h, 2, 1)
-    samples = zip(np.column_stack([r.y, velocity]), r.inputs, strict=True)
+    samples = zip(np.column_stack([r.y, velocity]), r.u, strict=True)
     explained = np.array([model.evaluate(z, u)[1] for z, u in samples])
     acceleration = low_passed(r.y, bandwidth, h, 2, 2)
     return acceleration - low_passed(explained, bandwidth, h, 2, 0)
@@ -162,9 +157,9 @@ def kalman_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats
     x = np.zeros(n + 1)
     x[0] = r.y[0]
     covariance = np.diag([(3.0 * bandwidth) ** (2 * k) for k in range(n + 1)])
-    chain, found, inputs = np.eye(n + 1, k=1), np.zeros(len(r.y)), r.inputs
+    chain, found = np.eye(n + 1, k=1), np.zeros(len(r.y))
     for k in range(1, len(r.y)):
-        dt, u = r.t[k] - r.t[k - 1], inputs[k]
+        dt, u = r.t[k] - r.t[k - 1], r.u[k]
         rates = [np.zeros(n + 1)]
         for share in (0.0, 0.5, 0.5, 1.0):
             point = x + share * dt * rates[-1]
@@ -184,23 +179,6 @@ def kalman_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats
         x = x + gain * (r.y[k] - x[0])
         covariance = covariance - np.outer(gain, covariance[0])
         found[k] = x[n]
-    return found
-
-
-def complementary_filter(p: Mapping[str, Any], r: Recorded, bandwidth: float) -> Floats:
-    """
-    Return d of z1' = Phi(u) + d + 2 w e, d' = w² e with e = y - z1 and w = `bandwidth`.
-
-    In one dimension this is the filter of Mahony et al. (2008, doi:10.1109/TAC.2008.923738)
-    with its estimate of the bias.
-    """
-    model, angle, bias, found = plant_of(p), float(r.y[0]), 0.0, np.zeros(len(r.y))
-    for k in range(1, len(r.y)):
-        dt, rate = r.t[k] - r.t[k - 1], model.evaluate(r.y[k : k + 1], r.u[k])[0]
-        wrong = r.y[k] - angle - dt * (rate + bias)
-        angle += dt * (rate + bias + 2.0 * bandwidth * wrong)
-        bias += dt * bandwidth**2 * wrong
-        found[k] = bias
     return found
 
 
