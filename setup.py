@@ -45,8 +45,8 @@ def extensions():
     compiler's AddressSanitizer. Loops over the members of the self-tuning observer are sums that
     may be taken in any order, so that they become vector instructions; see
     core/observer/self_tuning/vectors.pxd. All else gives the same bits on each processor (no
-    product and sum are contracted), and -O3 makes it no faster. Methods of studies/ are built in a
-    checkout, never installed.
+    product and sum are contracted), and -O3 makes it no faster. What is compiled of studies/
+    is built in a checkout, never installed.
     """
     sanitize = ['-fsanitize=address'] if os.environ.get('FHAOSMO_ASAN') == '1' else []
     found = []

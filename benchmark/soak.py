@@ -15,7 +15,7 @@ import os
 from pathlib import Path
 import sys
 from time import monotonic, sleep, time_ns
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core import Plant
 from fhaosmo_ros.core.parameters.files import load
@@ -53,7 +53,7 @@ STREAM = {
     'burst': (2, 40), 'short gap': (2, 100), 'long gap': (300, 600), 'publisher restart': (1, 1),
 }  # fmt: skip
 """Faults of y, with the smallest and largest number of samples that each concerns."""
-GOOD, BAD, RESET = 'good parameters', 'bad parameters', 'reset'
+GOOD, BAD, BASE, RESET = 'good parameters', 'bad parameters', 'parameters put back', 'reset'
 SETS: dict[str, tuple[dict[str, Any], ...]] = {
     GOOD: (
         {'variant': 'sign'}, {'variant': 'fuzzy'}, {'scheme': 'explicit', 'variant': 'fuzzy'},
@@ -65,9 +65,7 @@ SETS: dict[str, tuple[dict[str, Any], ...]] = {
         {'gamma_min': 0.9, 'gamma_max': 0.2}, {'order': 7}, {'no_such_parameter': 1.0},
     ),
 }  # fmt: skip
-BASE = {name: PARAMETERS[name] for changes in SETS[GOOD] for name in changes}
-"""What is put back."""
-LAST = 10.0  # seconds that the report of the last samples may take on a busy machine
+SETS[BASE] = ({name: PARAMETERS[name] for changes in SETS[GOOD] for name in changes},)
 MEMORY, DRIFT, ERROR, GROWTH = 2.0, 0.02, 0.05, 0.01
 """
 What the estimator's memory may grow by (MB); gamma, from the first to the last third; the largest
@@ -85,12 +83,12 @@ def schedule(seed: int) -> Iterator[tuple[float, str, int]]:
     while start := start + CYCLE:
         time = start + FAULTS[0]
         while time < start + FAULTS[1]:
-            kinds = kinds or random.permutation([*STREAM, *SETS, RESET]).tolist()
+            kinds = kinds or random.permutation([*STREAM, GOOD, BAD, RESET]).tolist()
             kind = kinds.pop()
             low, high = STREAM.get(kind, (1, 1))
             yield time, kind, int(random.integers(low, high + 1))
             time += float(random.uniform(*PAUSE))
-        yield start + RESTORE, 'base', 1
+        yield start + RESTORE, BASE, 1
 
 
 class Feed:
@@ -154,8 +152,7 @@ class Feed:
             future = self._reset.call_async(Trigger.Request())
             self._calls.append((future, lambda answer: answer.success))
         else:
-            sets = SETS.get(kind, (BASE,))
-            values = sets[self.counts[kind] % len(sets)]
+            values = SETS[kind][self.counts[kind] % len(SETS[kind])]
             changes = [Parameter(name, value=value) for name, value in values.items()]
             future = self._parameters.set_parameters_atomically(changes)
             right = kind != BAD
@@ -167,34 +164,48 @@ class Feed:
         return sum(not (call.done() and right(call.result())) for call, right in self._calls)
 
 
-class Cycle(NamedTuple):
-    """What was seen in one."""
+class Seen:
+    """What was seen of the estimator, by cycle."""
 
-    error: float  # median of the absolute error of d, late in the cycle
-    gamma: float
-    memory: float  # of the estimator (MB)
-    not_finite: int  # estimates with a NaN or an infinity
+    def __init__(self, cycles: int) -> None:
+        self.errors: list[list[float]] = [[] for _ in range(cycles)]  # of d, late in each
+        self.gamma: list[float] = []
+        self.memory: list[float] = []  # MB
+        self.not_finite = 0  # estimates with a NaN or an infinity
+
+    def judge(self, watch: Watch, plant: Plant, begin: int) -> None:
+        """Judge the estimates that have come; on a busy machine those of the cycle before, too."""
+        heard = watch.heard[ESTIMATES]
+        watch.forget()
+        for _, m in heard:
+            self.not_finite += not np.isfinite([*m.position, *m.velocity, *m.effort]).all()
+            t = 1e-9 * (m.header.stamp.sec * 10**9 + m.header.stamp.nanosec - begin)
+            cycle, phase = divmod(t, CYCLE)
+            if phase >= JUDGED:
+                self.errors[int(cycle)].append(abs(m.effort[0] - plant.unknown_input(t)))
 
 
 def soak(seed: int, minutes: float, output: Path) -> bool:
     """Run once, write and print the verdict; return whether everything held."""
-    plant, cycles, given = Plant(OF_PLANT), list[Cycle](), ('--ros-args', '--params-file', FILE)
+    cycles, given = round(60.0 * minutes / CYCLE), ('--ros-args', '--params-file', FILE)
+    plant, seen = Plant(OF_PLANT), Seen(cycles)
     with Watch({ESTIMATES: JointState}) as watch, start_node('estimator', *given) as estimator:
         estimator.wait_for('estimating')
         feed = Feed(watch, seed)
         begin, start = time_ns(), monotonic()
-        for first in tqdm(np.arange(0.0, 60.0 * minutes, CYCLE), desc='soak', unit='cycle'):
-            for t in first + np.arange(round(CYCLE * RATE)) / RATE:
+        for cycle in tqdm(range(cycles), desc='soak', unit='cycle'):
+            for t in CYCLE * cycle + np.arange(round(CYCLE * RATE)) / RATE:
                 sleep(max(0.0, start + t - monotonic()))
                 feed.pass_on(t, begin + round(1e9 * t), plant.sample(t).y)
             estimator.check()
-            error, not_finite = judged(watch, plant, begin, first + JUDGED)
-            gamma = float(watch.reports['estimator']['gamma'])
-            cycles.append(Cycle(error, gamma, estimator.resident_megabytes(), not_finite))
-        deadline = monotonic() + LAST
+            seen.judge(watch, plant, begin)
+            seen.gamma.append(float(watch.reports['estimator']['gamma']))
+            seen.memory.append(estimator.resident_megabytes())
+        deadline = monotonic() + PATIENCE
         while unaccounted(feed, watch) and monotonic() < deadline:
             sleep(0.1)
-    rows = verdict(cycles, feed, watch)
+        seen.judge(watch, plant, begin)
+    rows = verdict(seen, feed, watch)
     said = ', '.join(f'{n:,} {k}' for k, n in sorted(feed.counts.items()))
     load = f'{os.cpu_count()} cores, load {os.getloadavg()[1]:.1f}'
     text = f'{minutes:g} minutes, seed {seed}, {load}: {said}\n\n{render(rows)}\n'
@@ -205,27 +216,16 @@ def soak(seed: int, minutes: float, output: Path) -> bool:
     return not missed
 
 
-def judged(watch: Watch, plant: Plant, begin: int, since: float) -> tuple[float, int]:
-    """Return the median error of d since a time, and how many estimates are not finite."""
-    errors, not_finite = [], 0
-    for _, m in watch.heard[ESTIMATES]:
-        not_finite += not np.isfinite([*m.position, *m.velocity, *m.effort]).all()
-        t = 1e-9 * (m.header.stamp.sec * 10**9 + m.header.stamp.nanosec - begin)
-        if t >= since:
-            errors.append(abs(m.effort[0] - plant.unknown_input(t)))
-    watch.forget()
-    return float(np.median(errors)), not_finite
-
-
 def unaccounted(feed: Feed, watch: Watch) -> int:
     """Return how many samples were published that the estimator has neither taken nor missed."""
     known = watch.number('estimator', 'samples accepted', 'samples rejected', 'samples lost')
     return abs(feed.counts['published'] - known)
 
 
-def verdict(cycles: list[Cycle], feed: Feed, watch: Watch) -> list[Row]:
+def verdict(seen: Seen, feed: Feed, watch: Watch) -> list[Row]:
     """Return one row for each thing that a soak may fail on; the first cycle is for warming up."""
-    error, gamma, memory, not_finite = np.array(cycles[1:]).T
+    error = np.array([np.median(errors) for errors in seen.errors[1:]])
+    gamma, memory = seen.gamma[1:], seen.memory[1:]
     growth = float(theilslopes(memory).slope * (len(memory) - 1))  # the median of all slopes
     thirds = [[np.median(x) for x in np.array_split(y, 3)] for y in (error, gamma)]
     lost, made = watch.number('estimator', 'samples lost'), feed.counts
@@ -236,14 +236,14 @@ def verdict(cycles: list[Cycle], feed: Feed, watch: Watch) -> list[Row]:
         Row('samples unaccounted for', unaccounted(feed, watch), '', 0.0,
             f'of {made["published"]:,}'),
         Row('samples lost, by sequence number', lost, '', 0.0),
-        Row('estimates that are not finite', not_finite.sum(), '', 0.0),
+        Row('estimates that are not finite', seen.not_finite, '', 0.0),
         *(
             Row(f'{name}, from the first to the last third', abs(y[-1] - y[0]), '', bar,
                 f'{y[0]:.2g} to {y[-1]:.4g}')
             for name, y, bar in zip(('error of d', 'gamma'), thirds, (GROWTH, DRIFT), strict=True)
         ),
         Row('error of d, worst cycle', error.max(), '', ERROR, f'median {np.median(error):.2g}'),
-        Row('wrong answers to calls', feed.wrong(), '', 0.0, f'{calls}, {made["base"]} put back'),
+        Row('wrong answers to calls', feed.wrong(), '', 0.0, calls),
     ]  # fmt: skip
 
 

@@ -229,8 +229,6 @@ class SampledModel:
         # dry friction, needs shorter ones.
         self.longest = min(LONGEST * period, resolution)
         self._rates[:n, :n] += jacobian
-        self.a = self._scaled(expm(self._rates * period))
-        """(N, N): transition over a period, in scaled states."""
 
     def _scaled(self, matrix: Floats) -> Floats:
         return matrix * self.scale[:, None] / self.scale[None, :]
@@ -240,32 +238,26 @@ class SampledModel:
         Return the steady-state Kalman gain for noise of variance 1 on y.
 
         It is for a filter that predicts to t_k and then corrects with y_k itself; white noise of
-        the intensity drives the last state of the chain.
+        the intensity drives the last state of the chain. What that adds to the scaled covariance
+        over a period is by C. F. Van Loan, IEEE Transactions on Automatic Control 23(3), 1978,
+        doi:10.1109/TAC.1978.1101743.
         """
-        noise = self.process_noise(intensity)
+        a = self._scaled(expm(self._rates * self.period))
+        n, rates = self.size, self._scaled(self._rates) * self.period
+        drive = np.diag(np.eye(n)[-1])
+        exponential = expm(np.block([[-rates, drive], [np.zeros((n, n)), rates.T]]))
+        largest = intensity * self.scale[-1] ** 2 * self.period
+        noise = largest * exponential[n:, n:].T @ exponential[:n, n:]
+        noise = 0.5 * (noise + noise.T)
         try:
             with np.errstate(invalid='ignore'):  # the result is checked below
-                p = solve_discrete_are(self.a.T, np.eye(self.size)[:1].T, noise, np.eye(1))
+                p = solve_discrete_are(a.T, np.eye(self.size)[:1].T, noise, np.eye(1))
         except (np.linalg.LinAlgError, ValueError) as error:
             raise ConfigurationError(f'Kalman gain: no solution ({error})') from None
         gain = p[:, 0] / (p[0, 0] + 1.0) / self.scale
         if not np.isfinite(gain).all():
             raise ConfigurationError(f'Kalman gain: expected finite numbers, got {gain}')
         return gain
-
-    def process_noise(self, intensity: float) -> Floats:
-        """
-        Return what such noise adds to the scaled covariance over a period.
-
-        By C. F. Van Loan, IEEE Transactions on Automatic Control 23(3), 1978,
-        doi:10.1109/TAC.1978.1101743.
-        """
-        n, rates = self.size, self._scaled(self._rates) * self.period
-        drive = np.diag(np.eye(n)[-1])
-        exponential = expm(np.block([[-rates, drive], [np.zeros((n, n)), rates.T]]))
-        largest = intensity * self.scale[-1] ** 2 * self.period
-        covariance = largest * exponential[n:, n:].T @ exponential[:n, n:]
-        return 0.5 * (covariance + covariance.T)
 
 
 def samples_of(r: Recording, model: TriangularModel) -> Samples:

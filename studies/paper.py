@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Reproduce the simulations of the paper, check its findings, and go beyond its limits.
+Reproduce the simulations of the paper with an estimate of d, check its findings, go beyond.
 
 The findings are inequalities between numbers. Where the paper stops: the implicit scheme, and
 measurement noise.
@@ -13,7 +13,6 @@ import sys
 from typing import Any, NamedTuple
 
 from fhaosmo_ros.core import Observer, Plant
-from fhaosmo_ros.core.observer.fuzzy import curve, memberships, NAMES, of_level, read_system
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS, PLANT_PARAMETERS
@@ -106,17 +105,6 @@ def simulated(name: str, omega: float) -> JointRun:
     return simulate(observer, plant, step, DURATION, max(1, round(GRID / step)))
 
 
-def first_observer() -> JointRun:
-    """Simulate figure sim1: sign, n = 3, no model of Phi_3, theta estimates eta = -z3 + d."""
-    observer, plant = preset()
-    observer = observer.changed({
-        'variant': 'sign', 'unknown_input': False, 'phi': ['0', '0', '0'],
-        'initial_estimate': [0.05, 0.0, 0.05], 'initial_internal': [0.05, 0.0, 0.05],
-        **{k: observer[k][:3] for k in ('lambda', 'alpha')},
-    })  # fmt: skip
-    return simulate(observer, plant, 1e-5, DURATION, 5)
-
-
 def score(run: JointRun) -> Score:
     """
     Judge the filtered estimates (the paper's 'estimated state') from `CONVERGED` on.
@@ -147,8 +135,7 @@ def sampled_rows(scheme: str, step: float, omega: float, noise: float) -> list[R
     truth = Plant(plant.changed(given)).simulate(t)
     for variant in VARIANTS:
         found = Observer(observer.changed({'variant': variant, 'scheme': scheme})).run(t, truth.y)
-        estimates = found.z_hat, found.z_tilde, found.gamma
-        run = JointRun(t, truth.z, truth.unknown_input, *estimates)
+        run = JointRun(t, truth.z, truth.unknown_input, found.z_hat, found.gamma)
         rows.append({'observer': variant} | case | score(run))
     return rows
 
@@ -218,7 +205,6 @@ DRAWN = (FINE, COARSE, FUZZY, ADAPTIVE)
 # Estimates that chatter are solid and below; the truth lies on top, dashed so that both are seen.
 RED = {'color': COLOURS[0], 'linewidth': 0.9, 'label': 'estimate'}
 BLUE = {'color': TRUTH['color'], 'linewidth': 1.7, 'linestyle': (0, (5, 2)), 'label': 'truth'}
-ZOOM = 0.1  # seconds that figure sim1 enlarges
 
 
 def measure(arguments: argparse.Namespace, results: Results) -> Found:
@@ -226,8 +212,7 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     cells = [(name, w) for name in OBSERVERS for w in FREQUENCIES]
     sampled = SAMPLED[:: SKIPPED if arguments.quick else 1]
     found = results(
-        {'sim1': (first_observer,)}
-        | {cell: (simulated, *cell) for cell in cells}
+        {cell: (simulated, *cell) for cell in cells}
         | {case: (sampled_rows, *case) for case in sampled}
     )
     before = [r for r in evidence.read(NAME, arguments.output) if r['solver'] in EARLIER]
@@ -237,40 +222,12 @@ def measure(arguments: argparse.Namespace, results: Results) -> Found:
     )
     *fixed, adaptive = ([(name, w, found[name, w]) for w in FREQUENCIES] for name in DRAWN)
     drawn = {
-        'paper_sim1': sim1(found['sim1']), 'paper_simz': unknown_inputs(fixed),
+        'paper_simz': unknown_inputs(fixed),
         'paper_simu': unknown_inputs([adaptive], gamma=True),
-        'paper_fuzzysystems': fuzzy_systems(),
-    }  # fmt: skip
+    }
     rows = sorted(before + simulations, key=lambda row: row['solver'])
     tables = {NAME: rows, 'paper_sampled': [row for case in sampled for row in found[case]]}
     return Found(tables, texts(simulations), drawn)
-
-
-def sim1(run: JointRun) -> Figure:
-    """Figure sim1: z1, z2, z3 and eta, and the last `ZOOM` seconds of each."""
-    figure = Figure(figsize=(9.0, 8.0), layout='constrained')
-    panels = figure.subplots(4, 2, width_ratios=(2, 1))
-    truths = [*run.z.T, run.unknown_input - run.z[:, 2]]
-    estimates = [*run.z_hat.T, run.z_tilde[:, 2]]
-    late = run.t >= run.t[-1] - ZOOM
-    after = 1e3 * (run.t[late] - run.t[late][0])
-    for (left, right), label, truth, estimate in zip(
-        panels, ('z₁', 'z₂', 'z₃', 'η'), truths, estimates, strict=True
-    ):
-        for x, style in ((estimate, RED), (truth, BLUE)):
-            left.plot(*envelope(run.t, x), **style)
-            right.plot(after, x[late], **style)
-        left.set(ylabel=f'{label} [1]', xlim=(run.t[0], run.t[-1]))
-        right.ticklabel_format(useOffset=False)
-        right.margins(x=0.0)
-    panels[0, 0].legend(loc='upper left', ncols=2)
-    panels[0, 0].set_title('sign, n = 3, step 1e-5 s')
-    panels[0, 1].set_title(f'zoom: the last {1e3 * ZOOM:g} ms')
-    panels[3, 0].set_xlabel('time [s]')
-    panels[3, 1].set_xlabel(f'time after {run.t[late][0]:.2f} s [ms]')
-    for axes in panels.flat:
-        axes.grid(alpha=0.3)
-    return figure
 
 
 def unknown_inputs(
@@ -297,33 +254,6 @@ def unknown_inputs(
     for axes in panels[-1]:
         axes.set_xlabel('time [s]')
     panels[0, 0].legend(loc='upper right', ncols=2)
-    return figure
-
-
-def fuzzy_systems() -> Figure:
-    """Figure fuzzysystems: membership functions of input and output, and the curve, by level."""
-    observer, levels = preset()[0], ('1', '2', '3, 4')
-    figure = Figure(figsize=(9.0, 6.6), layout='constrained')
-    x = np.linspace(-1.0, 1.0, 1001)
-    for k, (left, middle, right) in enumerate(figure.subplots(len(levels), 3)):
-        text, width = of_level(observer['fuzzy_systems'], k), of_level(observer['fuzzy_widths'], k)
-        system, half = read_system(text), curve(text)
-        for axes, terms, scale in (left, system.inputs, width), (middle, system.outputs, 1.0):
-            rows = memberships(x, terms)
-            for j, (name, peak) in enumerate(zip(NAMES[len(rows)], terms.peaks, strict=True)):
-                axes.plot(scale * x, rows[j], color=COLOURS[j % 2], linestyle=('-', '--')[j % 2])
-                axes.text(scale * peak, 1.05, name, ha='center', fontsize=6)
-            axes.set(ylim=(0.0, 1.18), ylabel='membership [1]')
-        grid = width * np.linspace(0.0, 1.0, len(half))
-        right.plot([-width, 0, 0, width], [-1, -1, 1, 1], color='#999999', linestyle=':')
-        right.plot(np.r_[-grid[::-1], grid], np.r_[-half[::-1], half], color='black')
-        right.grid(alpha=0.3)
-        right.set_ylabel('ψ(ε) [1]')
-        middle.set_xlabel('ψ [1], before scaling to ±1')
-        for axes in left, right:
-            axes.locator_params(axis='x', nbins=4)
-            axes.set_xlabel(f'ε of level {levels[k]} [its unit]')
-    figure.suptitle('membership functions of input and output, and the curve (dotted: sign)')
     return figure
 
 

@@ -40,7 +40,6 @@ class JointRun(NamedTuple):
     z: Floats  # states of the plant
     unknown_input: Floats  # d
     z_hat: Floats  # filtered states
-    z_tilde: Floats  # internal states; z_tilde[:, i] belongs to z_{i+2}
     gamma: Floats
 
 
@@ -112,7 +111,7 @@ cdef class Joint(Dynamics):
         cdef int n = self.plant.size, levels = self.observer.levels, i, _
         cdef Py_ssize_t row, step = 0
         cdef double[:, ::1] z = np.empty((count, n))
-        cdef double[:, ::1] z_hat = np.empty((count, levels)), z_tilde = np.empty((count, levels))
+        cdef double[:, ::1] z_hat = np.empty((count, levels))
         cdef double[::1] gamma = np.empty(count)
         with nogil:
             for row in range(count):
@@ -126,12 +125,8 @@ cdef class Joint(Dynamics):
                     z[row, i] = self.state.z[i]
                 for i in range(levels):
                     z_hat[row, i] = self.state.level[i].z_hat
-                    z_tilde[row, i] = self.state.level[i].z_tilde
                 gamma[row] = self.state.gamma
-        return {
-            'z': np.asarray(z), 'z_hat': np.asarray(z_hat), 'z_tilde': np.asarray(z_tilde),
-            'gamma': np.asarray(gamma),
-        }
+        return np.asarray(z), np.asarray(z_hat), np.asarray(gamma)
 
 
 def simulate(observer, plant, step=1e-3, duration=20.0, every=1):
@@ -148,6 +143,6 @@ def simulate(observer, plant, step=1e-3, duration=20.0, every=1):
     z = per_level(PLANT_PARAMETERS['initial_state'], p['initial_state'], model.order)
     system = System(model.expressions, d, step, z)
     rows = round(duration / step) // every + 1
-    found = Joint(system, configuration).run(step, rows, every)
+    z, z_hat, gamma = Joint(system, configuration).run(step, rows, every)
     t = np.arange(rows, dtype=np.float64) * (every * step)
-    return JointRun(t=t, unknown_input=d.along(t), **found)
+    return JointRun(t, z, d.along(t), z_hat, gamma)
