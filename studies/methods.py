@@ -25,7 +25,10 @@ from fhaosmo_ros.core import ConfigurationError, Recording, TriangularModel
 from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.model.prediction import Prediction
 from fhaosmo_ros.core.observer.kalman import innovations
+from fhaosmo_ros.core.parameters.files import load
+from fhaosmo_ros.core.parameters.tables import OBSERVER_PARAMETERS
 from fhaosmo_ros.core.simulation.metrics import rms
+from fhaosmo_ros.tools.cli.command import shipped
 from fhaosmo_ros.tools.tuning.likelihood import Samples
 from fhaosmo_ros.tools.tuning.objective import SMALLEST, TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.search import BAD, Dimension, minimise
@@ -188,15 +191,8 @@ SLIDING, PAPER, OURS, SELF_TUNING = 'sliding mode', 'paper', 'ours, tuned', 'our
 KINDS = (LINEAR, USUAL, ADAPTIVE, SLIDING, PAPER, OURS, SELF_TUNING)
 """Kinds of methods; the usual Kalman filter, whose d is a random walk, is one of its own."""
 HUBER, NOISE, IMM = 'Kalman, Huber', 'Kalman, adaptive noise', 'IMM of three bandwidths'
-EARLIER = {
-    HUBER: ADAPTIVE, NOISE: ADAPTIVE, IMM: ADAPTIVE, 'Levant, implicit': SLIDING,
-    'paper: sign': PAPER, 'paper: fuzzy': PAPER, 'paper: adaptive': PAPER,
-}  # fmt: skip
-"""
-Methods of commit 1657d61 with their kinds: in our tables stays what they got. Levant's
-differentiator and the paper's observers had no gains but their own, and nothing of this package is
-in the others.
-"""
+EARLIER = {HUBER: ADAPTIVE, NOISE: ADAPTIVE, IMM: ADAPTIVE, 'Levant, implicit': SLIDING}
+"""Methods of commit 1657d61 with their kinds: in our tables stays what they got."""
 LINEAR_LIMIT = 'Kalman, Matern'  # our observer equals this filter for small innovations
 REACH = 10.0  # how far a search for the bandwidth goes, as a factor to both sides
 LONGEST, LONGEST_STEP = 1.5, 1.0
@@ -333,6 +329,14 @@ def _online(own: Values, setting: Setting, values: Values) -> Run:
     return estimate
 
 
+def _papers(variant: str) -> dict[str, Any]:
+    """Return the paper's numbers that fit any plant: all but the model and the initial values."""
+    values = load(shipped('config/paper.yaml'), 'estimator', OBSERVER_PARAMETERS)
+    own = ('order', 'phi', 'initial_estimate', 'initial_internal', 'start_from_measurement')
+    kept = {name: values[name] for name in values if name not in own}
+    return kept | {name: kept[name][:1] for name in ('lambda', 'alpha')} | {'variant': variant}
+
+
 def _tune(search: Search) -> Values:
     """Return the parameters of the estimator that `tune` writes; its grid uses trials, too."""
     tuning = TUNE_PARAMETERS.complete(search.setting.told | {'settled': JUDGED_FROM})
@@ -347,12 +351,17 @@ def _one_bandwidth(s: Setting) -> Sequence[Dimension]:
     return [Dimension('bandwidth', 0.05, 5.0 / s.period, s.speed)]
 
 
+PAPERS = {'sign': 'sign', 'fuzzy': 'fuzzy', 'adaptive': 'fuzzy_adaptive'}
 METHODS = {
     m.name: m
     for m in (
         Method('Kalman', USUAL, _steady, _one_bandwidth),  # d a random walk
         Method('Kalman, decaying', LINEAR, _steady, matern_space),  # a random walk that decays
         Method(LINEAR_LIMIT, LINEAR, _steady, matern_space, each_order),
+        *(
+            Method(f'paper: {name}', PAPER, partial(_online, _papers(variant)))
+            for name, variant in PAPERS.items()
+        ),
         Method(OURS, OURS, partial(_online, {}), tune=_tune),  # levant, fuzzy, predict_correct
         Method(SELF_TUNING, SELF_TUNING, partial(_online, harness.SELF_TUNING)),
     )
