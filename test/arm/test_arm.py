@@ -329,11 +329,18 @@ def test_noise_of_torques_is_found_and_makes_no_contact(free, arm):
 
 def intervals(sampled, stamps):
     """Return the clock, and the intervals that it gives to sines sampled at these times."""
-    clock, q = Clock(), np.sin(np.outer(sampled, [1.0, 2.3]))
-    moved = np.diff(q, axis=0)
-    return clock, np.array([
-        clock.interval(h, m) for h, m in zip(np.diff(stamps), moved, strict=True)
-    ])  # fmt: skip
+    clock, speed, variance = Clock(), np.array([1.0, 2.3]), np.full(2, NOISE**2)
+    angle = np.outer(sampled, speed)
+    steps = zip(np.diff(stamps), np.diff(np.sin(angle), axis=0), np.cos(angle[:-1]), strict=True)
+    return clock, np.array([clock.interval(h, m, speed * v, variance) for h, m, v in steps])
+
+
+def hanging(t):
+    """Return stamps of a host that hangs for 8 samples, and at times drops one of them."""
+    stamps = t.copy()
+    for k in range(500, len(t) - 8, 97):
+        stamps[k : k + 8] = t[k + 8]
+    return np.maximum.accumulate(stamps) + 1e-9 * np.arange(len(t))
 
 
 @pytest.mark.parametrize('late', [0.05, 0.1, 0.2])
@@ -363,12 +370,23 @@ def test_missing_samples_and_another_rate_are_followed():
     np.testing.assert_allclose(found[late], np.diff(t)[late], atol=5e-6)
 
 
-def test_an_arm_feels_as_well_with_stamps_that_jitter(model):
+@pytest.mark.parametrize('lost', [0.0, 0.05])
+def test_stamps_of_a_host_that_hangs_are_known_by_the_motion(lost):
+    t = PERIOD * np.flatnonzero(np.random.default_rng(2).random(4000) >= lost)
+    stamps = hanging(t)
+    _, found = intervals(t, stamps)
+    assert np.diff(stamps).max() > 7.0 * PERIOD
+    np.testing.assert_allclose(found[100:], np.diff(t)[100:], rtol=0.02)
+
+
+@pytest.mark.parametrize('jitter', [0.0, 1e-4])
+@pytest.mark.parametrize('hangs', [False, True])
+def test_an_arm_feels_as_well_with_bad_stamps(model, jitter, hangs):
     t, q, _, torque = motion(model, 4.0)
-    error = {}
-    for late in (0.0, 1e-4):
-        stamps = 10.0 + t + late * np.random.default_rng(3).standard_normal(len(t))
-        estimates = Arm(URDF).run(stamps, q, torque)
-        error[late] = np.sqrt(np.nanmean(estimates.external_torque[1000:] ** 2))
+    stamps = 10.0 + t + jitter * np.random.default_rng(3).standard_normal(len(t))
+    error = []
+    for given in (t, hanging(stamps) if hangs else stamps):
+        estimates = Arm(URDF).run(given, q, torque)
+        error.append(np.sqrt(np.nanmean(estimates.external_torque[1000:] ** 2)))
         assert not estimates.contact[1000:].any()
-    assert error[1e-4] < error[0.0] + 0.02
+    assert error[1] < error[0] + 0.02

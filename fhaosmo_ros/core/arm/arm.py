@@ -331,7 +331,8 @@ class Arm:
         if self._last is None:
             self._last = stamp, q, *self._drive(q, velocity, torque, velocity)
             return None
-        h = self._clock.interval(h, moved)
+        known = self._rest if self._velocity is None else self._velocity
+        h = self._clock.interval(h, moved, known, self._noise.variance[1])
         if farther(moved, self._fastest, h, self._noisy):
             self.reset()
             return self._refuse('jumped')
@@ -349,7 +350,7 @@ class Arm:
                 self._sliding = self._sliding + share * (speed - self._sliding)
             new, drives = self._drive(q, self._velocity, torque, self._sliding)
             mass, change = 0.5 * (terms.mass + new.mass), moved
-            vague = self._clock.apart / h  # of the interval, and so of what has moved
+            vague = self._clock.vague
         else:
             new, drives = self._drive(q, velocity, torque, velocity)
             mass, change, vague = new.mass, velocity, 0.0

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What samples of an arm say by themselves: their noise, and their time."""
 
-from libc.math cimport fabs, fmax, fmin
+from libc.math cimport fabs, fmax, fmin, INFINITY, sqrt
 
 import numpy as np
 
@@ -10,13 +10,14 @@ import numpy as np
 # later.
 cdef int LONGEST = 200
 cdef double BETTER = 0.8, KEEP = 0.995
-# After so many stamps in a row that are off by half a period or more, the even clock starts from
-# there; after GONE of them, it begins anew.
-cdef int LATE = 5, GONE = 500
+# After so many stamps in a row that are off by half a period or more, the even clock begins anew.
+cdef int GONE = 500
 # The median of so many intervals is the period that the even clock begins with.
 cdef int LEARNT = 20
 # By such a share of a period a stamp has to be late until a sample is taken as missing.
 cdef double MISSING = 0.7
+# Square of the standard deviations by which joints may miss where their velocity would bring them.
+cdef double STRAIGHT = 100.0
 # Samples over which noise is averaged, at the start and later; an impact counts as three standard
 # deviations at most.
 cdef int FIRST_LEARNT = 10, LONGEST_LEARNT = 1000
@@ -111,10 +112,15 @@ cdef class Clock:
     So stamps are evened out, by the least squares of a line (constant period) over the last
     samples, written as an alpha-beta filter; whole periods may be missing. Intervals are those of
     the stamps or even ones, whichever make the smoother velocities.
+
+    A host that hangs stamps one sample late, and those after it at nearly the same time. Where
+    stamps and even clock do not agree to half a period, or samples seem to be missing, encoders
+    are the third clock: joints move on with their velocity, and how far they have moved tells the
+    time that has passed.
     """
 
     cdef readonly bint even  # even intervals are used
-    cdef readonly double apart  # by how much the two differ at the latest sample (s)
+    cdef readonly double vague  # share of what has moved at the latest sample that is not known
     cdef double phase  # of the even clock, from the latest stamp (s)
     cdef double period  # s
     cdef int count, off  # stamps evened out, and those in a row that say nothing
@@ -127,17 +133,42 @@ cdef class Clock:
 
     def reset(self):
         """Forget everything."""
-        self.even, self.apart, self.phase, self.period = False, 0.0, 0.0, 0.0
+        self.even, self.vague, self.phase, self.period = False, 0.0, 0.0, 0.0
         self.count = self.off = 0
         self.first, self.speeds = [], None
         self.rough_by_stamps = self.rough_by_even = 0.0
 
-    def interval(self, double h, const double[::1] moved):
-        """Return the time in which the joints have `moved`; `h` is that of the stamps (s)."""
-        cdef double even = self.evened(h), by_stamps = 0.0, by_even = 0.0, one, two
-        cdef bint begins = self.speeds is None
+    def interval(
+        self, double h, const double[::1] moved, const double[::1] velocity,
+        const double[::1] variance,
+    ):
+        """
+        Return the time in which the joints have `moved`; `h` is that of the stamps (s).
+
+        `velocity` is the one before, and `variance` that of the noise of positions.
+        """
+        cdef double by_stamps = 0.0, by_even = 0.0, total = 0.0, along = 0.0, square = 0.0
+        cdef double noise = 0.0, even, one, two
+        cdef double told = h, sure = INFINITY  # time by the motion, and how exact it is (s)
+        cdef bint begins
         cdef int k
-        self.apart = fabs(h - even)
+        for k in range(moved.shape[0]):
+            total += moved[k] * moved[k]
+            along += moved[k] * velocity[k]
+            square += velocity[k] * velocity[k]
+            noise += variance[k]
+        if square > 0.0:
+            told = along / square
+            if total - told * along <= STRAIGHT * noise:
+                sure = sqrt(LARGEST * noise / square)
+        even = self.evened(h, told, sure)
+        if fabs(h - even) > 0.5 * self.period:
+            self.speeds = None
+            if fabs(h - told) < fabs(even - told):
+                even = h
+            self.vague = fabs(even - told) / fmax(fabs(told), 1e-15)
+            return even
+        begins = self.speeds is None
         if begins:
             self.speeds = np.zeros((2, moved.shape[0]))
         for k in range(moved.shape[0]):
@@ -149,9 +180,11 @@ cdef class Clock:
             self.rough_by_stamps = KEEP * self.rough_by_stamps + by_stamps
             self.rough_by_even = KEEP * self.rough_by_even + by_even
         self.even = self.rough_by_even < BETTER * self.rough_by_stamps
-        return even if self.even else h
+        one = even if self.even else h
+        self.vague = fabs(h - even) / one
+        return one
 
-    cdef double evened(self, double h):
+    cdef double evened(self, double h, double told, double sure):
         """Go on by a stamp, `h` after the one before, and return the even interval."""
         cdef double since = h - self.phase, off, even
         cdef int steps, n
@@ -164,11 +197,17 @@ cdef class Clock:
             return h
         steps = max(1, int(since / self.period + 1.0 - MISSING))
         off = since - steps * self.period
+        if (
+            fabs(steps * self.period - told) > sure
+            and (fabs(off) > 0.5 * self.period or told < (0.5 * steps + 1.0) * self.period)
+        ):
+            steps = max(1, <int> (fmin(told, since) / self.period + 0.5))
+            off = since - steps * self.period
         if fabs(off) > 0.5 * self.period:  # a stamp that says nothing, unless it goes on
             self.off += 1
             if self.off > GONE:
                 self.count = self.off = 0
-            self.phase = 0.0 if self.off % LATE == 0 else -off
+            self.phase = 0.0 if fabs(h - steps * self.period) < 0.5 * self.period else -off
             return steps * self.period
         self.off = 0
         self.count = n = min(self.count + 1, LONGEST)
