@@ -35,12 +35,13 @@ URDF = ''.join([
 ])  # fmt: skip
 
 
-def motion(model, duration=10.0, seed=1, period=1e-3):
-    """Return times, and positions, velocities and torques of a free motion of sines."""
+def motion(model, duration=10.0, seed=1, period=1e-3, resting=()):
+    """Return times, positions, velocities and torques of free sines; some joints may rest."""
     random = np.random.default_rng(seed)
     t = np.arange(0.0, duration, period)
     n = len(model.joints)
     swing, speed = random.uniform(0.3, 0.8, (2, n)), random.uniform(0.7, 2.5, (2, n))
+    swing[:, list(resting)] = 0.0
     angle = speed[:, np.newaxis] * t[:, np.newaxis]
     q = 0.2 + np.sum(swing[:, np.newaxis] * np.sin(angle), axis=0)
     v = np.sum((swing * speed)[:, np.newaxis] * np.cos(angle), axis=0)

@@ -19,16 +19,12 @@ PERIOD = 0.004
 OFFSET = np.array([0.5, -0.3, 0.2])
 
 
-def real_arm():
-    """Return an arm that is heavier than its URDF."""
+def recorded(seed=1, duration=40.0, noise=0.05, payload=None):
+    """Return a free motion of an arm heavier than its URDF, with friction, an offset and noise."""
     model = ArmModel(URDF)
     model.set_inertial(model.inertial * np.array([1.1, 1.2, 0.8])[:, np.newaxis])
-    return model
-
-
-def recorded(seed=1, duration=40.0, noise=0.05):
-    """Return a free motion of that arm, with friction, an offset and noise."""
-    t, q, v, torque = motion(real_arm(), duration, seed, PERIOD)
+    model.set_payload(payload or Payload())
+    t, q, v, torque = motion(model, duration, seed, PERIOD)
     rubbing = np.array([1.0, 3.0, 2.0]) * np.tanh(v / 0.05) + np.array([0.2, 0.5, 0.3]) * v
     random = np.random.default_rng(seed)
     q = q + 1e-5 * random.standard_normal(q.shape)
@@ -60,13 +56,7 @@ def test_noise_is_found_and_stays_finite_for_a_quantised_encoder(found):
 
 def test_a_joint_that_rests_keeps_its_urdf_and_is_named():
     model = ArmModel(URDF)
-    t, q, v, torque = motion(model, 20.0, period=PERIOD)
-    q[:, 2] = 0.3
-    v[:, 2] = 0.0
-    a = np.gradient(v, PERIOD, axis=0)
-    torque = np.array([
-        model.regressor(*row) @ model.inertial.ravel() for row in zip(q, v, a, strict=True)
-    ])  # fmt: skip
+    t, q, _, torque = motion(model, 20.0, period=PERIOD, resting=[2])
     noisy = torque + 0.02 * np.random.default_rng(1).standard_normal(torque.shape)
     found = identify(model, t, q, noisy)
     assert [note.split()[0] for note in found.notes] == ['elbow']
@@ -76,9 +66,8 @@ def test_a_joint_that_rests_keeps_its_urdf_and_is_named():
 def test_links_that_cannot_exist_are_not_found():
     model = ArmModel(URDF)
     model.set_payload(Payload(0.5, (0.0, 0.0, 0.4)))
-    t, q, torque = recorded(
-        duration=12.0, noise=3.0
-    )  # so much noise that plain fits leave physics
+    # So much noise that plain fits leave physics.
+    t, q, torque = recorded(duration=12.0, noise=3.0)
     inertial = identify(model, t, q, torque - 5.0 * np.gradient(q, t, axis=0)).calibration.inertial
     model.set_inertial(inertial)  # without payload, and without what rotors add
     for mass, x, y, z, xx, xy, yy, xz, yz, zz in inertial:
@@ -119,16 +108,11 @@ def test_a_torque_constant_that_is_not_told_is_taken_from_other_joints():
 
 
 def test_a_payload_is_found(found):
-    carrying = real_arm()
-    carrying.set_payload(Payload(1.5, (0.02, 0.0, 0.35)))
-    torque = motion(carrying, 20.0, 7, PERIOD)[3]
-    plain = motion(real_arm(), 20.0, 7, PERIOD)[3]
-    t, q, measured = recorded(seed=7, duration=20.0)
-    payload, before, after = payload_of_motion(
-        ArmModel(URDF), t, q, measured + torque - plain, found.calibration
-    )
-    assert payload.mass == pytest.approx(1.5, rel=0.05)
-    np.testing.assert_allclose(payload.center, (0.02, 0.0, 0.35), atol=0.06)
+    carried = Payload(1.5, (0.02, 0.0, 0.35))
+    other = recorded(seed=7, duration=20.0, payload=carried)
+    payload, before, after = payload_of_motion(ArmModel(URDF), *other, found.calibration)
+    assert payload.mass == pytest.approx(carried.mass, rel=0.05)
+    np.testing.assert_allclose(payload.center, carried.center, atol=0.06)
     assert np.all(after <= before)
 
 
