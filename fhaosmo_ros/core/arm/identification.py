@@ -62,26 +62,21 @@ class Identified(NamedTuple):
     held_out: NDArray[np.bool_]  # (K,)
 
 
-def noise_of(samples: ArrayLike) -> Floats:
+def noise_of(samples: Floats) -> Floats:
     """
     Return the standard deviation of white noise on each column, from third differences.
 
     The root mean square within six times the 90 % quantile, so that gaps and shocks do not count
     but the rare steps of a resting encoder do.
     """
-    third = np.diff(np.asarray(samples, dtype=np.float64), n=3, axis=0)
+    third = np.diff(samples, n=3, axis=0)
     bound = 6.0 * np.quantile(np.abs(third), 0.9, axis=0)
     kept = np.where(np.abs(third) <= np.maximum(bound, 1e-300), third, 0.0)
     return np.asarray(np.sqrt(np.mean(kept**2, axis=0) / 20.0))  # 20 = 1 + 9 + 9 + 1
 
 
 def identify(
-    model: ArmModel,
-    t: ArrayLike,
-    q: ArrayLike,
-    effort: ArrayLike,
-    *,
-    torque_constants: ArrayLike = 1.0,
+    model: ArmModel, t: Floats, q: Floats, effort: Floats, *, torque_constants: ArrayLike = 1.0
 ) -> Identified:
     """
     Find what the torque of an arm in free motion says about it.
@@ -100,16 +95,10 @@ def identify(
     Raises
     ------
     ConfigurationError
-        Too short a recording, or arrays that do not fit.
+        Too short a recording.
 
     """
-    t, q, effort = (np.asarray(a, dtype=np.float64) for a in (t, q, effort))
     n = len(model.joints)
-    if t.ndim != 1 or q.shape != (len(t), n) or effort.shape != q.shape:
-        raise ConfigurationError(
-            f'identify: expected q and effort of shape {(len(t), n)}, got {q.shape} and '
-            f'{effort.shape}'
-        )
     if len(t) < LEAST_ROWS or not np.all(np.diff(t) > 0.0) or t[-1] - t[0] < SHORTEST:
         raise ConfigurationError(
             f'identify: expected at least {SHORTEST:g} s of samples with increasing times, got '
@@ -135,14 +124,13 @@ def identify(
 
 
 def payload_of_motion(
-    model: ArmModel, t: ArrayLike, q: ArrayLike, effort: ArrayLike, calibration: Calibration
+    model: ArmModel, t: Floats, q: Floats, effort: Floats, calibration: Calibration
 ) -> tuple[Payload, Floats, Floats]:
     """
     Return what the last link carries, and the RMS of the torque left without and with it, (n,).
 
     Everything else is taken from `calibration`, of the arm without payload.
     """
-    t, q, effort = (np.asarray(a, dtype=np.float64) for a in (t, q, effort))
     problem = _Regression(model, t, q, effort, calibration, calibration.torque_constants)
     last = 10 * (len(model.joints) - 1)
     moving = problem.columns[..., last : last + 4]

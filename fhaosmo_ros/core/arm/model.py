@@ -53,8 +53,6 @@ class ArmModel:
     ----------
     joints, links : tuple of str
         In the model's order; a link for each joint.
-    frames : tuple of str
-        All links, also those that are fixed to others.
     continuous : (n,) array of bool
         Joints whose angle has no end.
     lowest, highest, velocity_limits, effort_limits : (n,) array
@@ -92,7 +90,6 @@ class ArmModel:
         self.gravity = model.gravity.linear = np.array(gravity, dtype=np.float64)
         self.joints, n = tuple(model.names[1:]), model.nv
         bodies = [f for f in model.frames if f.type == pin.FrameType.BODY]
-        self.frames = tuple(str(f.name) for f in bodies)
         first = {f.parentJoint: str(f.name) for f in reversed(bodies)}
         self.links = tuple(first.get(k, name) for k, name in enumerate(self.joints, 1))
         self.continuous = np.array([size == 2 for size in list(model.nqs)[1:]])
@@ -207,7 +204,8 @@ class ArmModel:
 
         """
         if not self._model.existFrame(frame):
-            known = ', '.join(self.frames)
+            link = self._pin.FrameType.BODY
+            known = ', '.join(f.name for f in self._model.frames if f.type == link)
             raise ConfigurationError(f'frame: expected one of {known}, got {frame!r}')
         configuration, index = self._configuration(q), self._model.getFrameId(frame)
         return np.asarray(self._pin.computeFrameJacobian(
