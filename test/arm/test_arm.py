@@ -75,6 +75,8 @@ def test_a_payload_is_weight_at_its_place():
     rest = np.zeros(3)
     more = model.terms(q, rest).gravity - bare.terms(q, rest).gravity
     np.testing.assert_allclose(more, [0.0, -1.5 * 9.81 * 0.8, -1.5 * 9.81 * 0.4], atol=1e-9)
+    weight = np.array([1.5 * 9.81, 0.0, 0.0, 0.0, 0.0, 0.0])  # the tool's own x points downwards
+    np.testing.assert_allclose(model.frame_jacobian(q, 'tool').T @ weight, -more, atol=1e-9)
 
 
 @pytest.mark.parametrize(('urdf', 'options', 'text'), [
@@ -187,13 +189,15 @@ def test_tare_takes_the_present_torque_for_zero(free, arm):
     assert np.abs(after.external_torque[[0, -1]]).max() < 0.3  # at once, and later
 
 
-def test_gravity_compensated_effort_and_a_late_torque(free, model, arm):
+def test_currents_gravity_compensated_effort_and_a_late_torque(free, model, arm):
     t, q, v, torque = free
     gravity = np.array([model.terms(*row).gravity for row in zip(q, v, strict=True)])
+    expected = run(arm, free).external_torque
     other = Arm(URDF, effort='gravity_compensated')
-    np.testing.assert_allclose(
-        run(other, free, push=gravity).external_torque, run(arm, free).external_torque, atol=1e-6
-    )
+    np.testing.assert_allclose(run(other, free, push=gravity).external_torque, expected, atol=1e-6)
+    constants = [8.0, 4.0, 0.5]
+    other = Arm(URDF, effort='current', torque_constants=constants)
+    np.testing.assert_allclose(other.run(t, q, torque / constants).external_torque, expected)
     late = np.vstack([np.repeat(torque[:1], 5, axis=0), torque[:-5]])
     told = Arm(URDF, torque_delay=0.005).run(t, q, late)
     ignored = Arm(URDF).run(t, q, late)
@@ -378,12 +382,14 @@ def test_stamps_of_a_host_that_hangs_are_known_by_the_motion(lost):
 
 @pytest.mark.parametrize('jitter', [0.0, 1e-4])
 @pytest.mark.parametrize('hangs', [False, True])
-def test_an_arm_feels_as_well_with_bad_stamps(model, jitter, hangs):
+@pytest.mark.parametrize('delay', [0, 5])
+def test_an_arm_feels_as_well_with_bad_stamps(model, jitter, hangs, delay):
     t, q, _, torque = motion(model, 4.0)
+    torque = torque[np.maximum(np.arange(len(t)) - delay, 0)]
     stamps = 10.0 + t + jitter * np.random.default_rng(3).standard_normal(len(t))
     error = []
     for given in (t, hanging(stamps) if hangs else stamps):
-        estimates = Arm(URDF).run(given, q, torque)
+        estimates = Arm(URDF, torque_delay=delay * PERIOD).run(given, q, torque)
         error.append(np.sqrt(np.nanmean(estimates.external_torque[1000:] ** 2)))
         assert not estimates.contact[1000:].any()
     assert error[1] < error[0] + 0.02

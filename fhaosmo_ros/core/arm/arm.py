@@ -202,7 +202,8 @@ class Arm:
             2.0 * DECAY * self._model_variance, DECAY, np.array(INTENSITIES) * model.weight,
             BEGIN, END, CHANGE, ONSET, SINCE if self._of_position else 0.0, self._of_position,
         )  # fmt: skip
-        self._clock = Clock()
+        # Of the samples that the bank gets, and of those that wait until their effort has come.
+        self._clock, self._entrance = Clock(), Clock()
         self.doubts = Doubts(model, self._with_gravity, np.sqrt(self._model_variance))
         self._tare = np.zeros(len(self.joints))
         self.counters: Counter[str] = Counter()
@@ -225,15 +226,16 @@ class Arm:
     def reset(self) -> None:
         """Begin anew with the next sample."""
         n = len(self.joints)
-        # Of the latest sample that was used: stamp, position, terms and drive.
+        # Of the latest sample that was used: time, position, terms and drive.
         self._last: tuple[int, Floats, Terms, Floats] | None = None
-        self._waiting: deque[tuple[int, Floats]] = deque()
+        self._waiting: deque[tuple[int, int, Floats]] = deque()  # stamps, times and samples
         self._velocity: Floats | None = None  # estimated
         self._motion = np.zeros((n, n)), np.zeros(n)  # M and velocity, measured
         self._still = self._contact = False
         self._looked, self._evidence = 0, np.zeros(n)  # when, and for each link
         self.doubts.reset()
         self._clock.reset()
+        self._entrance.reset()
         self._noise.reset()
 
     def adopt(self, parameters: Parameters) -> None:
@@ -288,7 +290,9 @@ class Arm:
             self.reset()
             self._refuse('clock set back')
         self._newest = stamp
-        return (self._go_on_late if self._delay else self._go_on)(stamp, sample)
+        return (
+            self._go_on_late(stamp, sample) if self._delay else self._go_on(stamp, stamp, sample)
+        )
 
     def _refuse(self, problem: str) -> ArmEstimate | None:
         """Count a sample that is not used."""
@@ -298,17 +302,27 @@ class Arm:
 
     def _go_on_late(self, stamp: int, sample: Floats) -> ArmEstimate | None:
         """Go on to an earlier time: the effort is as old as that, and the rest was kept."""
-        kept, then = self._waiting, stamp - self._delay
-        kept.append((stamp, sample))
-        while len(kept) > 2 and kept[1][0] <= then:
+        kept, time = self._waiting, stamp
+        if kept:
+            newest, latest, before = kept[-1]
+            moved, h = self._moved(before[1], sample[1]), (stamp - newest) * 1e-9
+            time = latest + round(1e9 * self._interval(self._entrance, h, moved))
+        kept.append((stamp, time, sample))
+        then = time - self._delay
+        while len(kept) > 2 and kept[1][1] <= then:
             kept.popleft()
-        if len(kept) < 2 or not kept[0][0] <= then <= kept[1][0]:
+        if len(kept) < 2 or not kept[0][1] <= then <= kept[1][1]:
             return None
-        (t0, before), (t1, after) = kept[0], kept[1]
+        (_, t0, before), (_, t1, after) = kept[0], kept[1]
         share = (then - t0) / (t1 - t0)
         between = before + share * (after - before)
         between[0], between[1] = sample[0], before[1] + share * self._moved(before[1], after[1])
-        return self._go_on(then, between)
+        return self._go_on(stamp - self._delay, then, between)
+
+    def _interval(self, clock: Clock, h: float, moved: Floats) -> float:
+        """Return the time in which the joints have moved, `h` by the stamps."""
+        known = self._rest if self._velocity is None else self._velocity
+        return float(clock.interval(h, moved, known, self._noise.variance[1]))
 
     def _moved(self, before: Floats, q: Floats) -> Floats:
         """Return q - before; of continuous joints the shorter way."""
@@ -317,22 +331,21 @@ class Arm:
             moved[turns] = np.remainder(moved[turns] + np.pi, 2.0 * np.pi) - np.pi
         return moved
 
-    def _go_on(self, stamp: int, sample: Floats) -> ArmEstimate | None:
-        """Bring the bank to a sample that can be used."""
+    def _go_on(self, stamp: int, time: int, sample: Floats) -> ArmEstimate | None:
+        """Bring the bank to a sample that can be used; the estimate of this `time` has `stamp`."""
         torque, q, velocity = sample
         if self._last is not None:
             before, old, terms, drive = self._last
-            moved, h = self._moved(old, q), (stamp - before) * 1e-9
+            moved, h = self._moved(old, q), (time - before) * 1e-9
             if self._stands_still(moved, h):
                 return self._refuse('standing still')
             if h > MAX_GAP:
                 self.reset()
                 self._refuse('restarts')
         if self._last is None:
-            self._last = stamp, q, *self._drive(q, velocity, torque, velocity)
+            self._last = time, q, *self._drive(q, velocity, torque, velocity)
             return None
-        known = self._rest if self._velocity is None else self._velocity
-        h = self._clock.interval(h, moved, known, self._noise.variance[1])
+        h = self._interval(self._clock, h, moved)
         if farther(moved, self._fastest, h, self._noisy):
             self.reset()
             return self._refuse('jumped')
@@ -356,7 +369,7 @@ class Arm:
             mass, change, vague = new.mass, velocity, 0.0
         drive = 0.5 * (drive + drives)
         bank.step(h, mass, change, variance, vague, drive, torque_variance, new.reach)
-        self._last, self._motion = (stamp, q, new, drives), (mass, speed)
+        self._last, self._motion = (time, q, new, drives), (mass, speed)
         self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             return self._refuse('doubted')
