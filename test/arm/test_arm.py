@@ -380,6 +380,13 @@ def test_stamps_of_a_host_that_hangs_are_known_by_the_motion(lost):
     np.testing.assert_allclose(found[100:], np.diff(t)[100:], rtol=0.02)
 
 
+def test_a_clock_that_is_set_forward_does_not_begin_the_evening_anew():
+    t = PERIOD * np.arange(4000.0)
+    stamps = t + 0.1 * PERIOD * np.random.default_rng(1).standard_normal(4000)
+    stamps[2000:] += 0.02
+    np.testing.assert_allclose(intervals(t, stamps)[1][500:], PERIOD, rtol=0.03)
+
+
 @pytest.mark.parametrize('jitter', [0.0, 1e-4])
 @pytest.mark.parametrize('hangs', [False, True])
 @pytest.mark.parametrize('delay', [0, 5])
