@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The studies of other observers: peers are what they say."""
 
-from fhaosmo_ros.core import TriangularModel
+from fhaosmo_ros.core import Recording, TriangularModel
 import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
-from studies import everywhere
-from studies.methods import HUBER, IMM, LINEAR_LIMIT, SampledModel
+from studies.methods import estimates, SampledModel
 
 MODELS = {
     'paper': TriangularModel(['0', '0', '-z3']),
@@ -28,19 +27,8 @@ def test_kalman_gain_solves_the_riccati_equation(name, chain, decay):
     noise = sum(expm(a * s) @ spectrum @ expm(a * s).T for s in middles) * period / 200
     p = solve_discrete_are(expm(a * period).T, np.eye(len(a))[:, :1], noise, np.eye(1))
     np.testing.assert_allclose(gain, p[:, 0] / (p[0, 0] + 1.0), rtol=1e-4)
-
-
-@pytest.mark.parametrize('derivatives', [0, 2])
-@pytest.mark.parametrize('rate', [100.0, 1000.0])
-def test_peers_without_their_options_are_the_kalman_filter(derivatives, rate):
-    """Its covariance converges to the steady one; three equal models are one."""
-    motor = everywhere.PLANTS['motor']
-    condition = everywhere.CONDITIONS['as tuned']._replace(rate=rate)
-    r = everywhere.recording(motor, condition, 'chirp', 10.0)
-    setting = everywhere.setting_of(motor, condition)
-    member = {'derivatives': derivatives, 'bandwidth': 15.0, 'decay': 4.5}
-    values = everywhere.at(member, setting.model.order, rate)
-    expected = everywhere.error_of(LINEAR_LIMIT, setting, values, [r])
-    for name, options in ((HUBER, {}), (IMM, {'spread': 1.0 + 1e-9, 'stay': 1.0})):
-        found = everywhere.error_of(name, setting, values | options, [r])
-        assert found == pytest.approx(expected, rel=1e-3)
+    # At rest the first step of y moves the estimates by the gain.
+    rest = np.zeros(2)
+    step = Recording(np.array([0.0, period]), np.array([0.0, 1.0]), rest, rest, rest, 'steps')
+    found = estimates(model, gain, decay, step, 1.0)
+    np.testing.assert_allclose(found[1], gain, rtol=1e-12)
