@@ -257,7 +257,6 @@ LATER = (
     (LATER, 'estimator', {'epsilon': 0.4, 'max_gap': 2.0}),
     (BOTH, 'estimator', {'order': 2, 'epsilon': 0.3}),
     (BOTH, 'plant', {'order': 2, 'noise_std': 0.1}),
-    (setting('phi: [0, -z2]'), 'plant', {'phi': ['0', '-z2']}),
     *((setting(f'max_gap: {text}'), 'estimator', {'max_gap': float(text)})
       for text in ('1E2', '.5e0', '4', '+3')),
 ])  # fmt: skip
