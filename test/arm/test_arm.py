@@ -385,6 +385,17 @@ def test_a_clock_that_is_set_forward_does_not_begin_the_evening_anew():
     np.testing.assert_allclose(intervals(t, stamps)[1][500:], PERIOD, rtol=0.03)
 
 
+@pytest.mark.parametrize('delay', [0, 5])
+@pytest.mark.parametrize('silence', [0.4, 1.7e9])
+def test_silence_begins_the_estimates_anew(model, silence, delay):
+    """With 1.7e9 s the clock went from 0 to that of today."""
+    t, q, _, torque = motion(model, 1.0)
+    arm = Arm(URDF, torque_delay=delay * PERIOD)
+    estimates = arm.run(t + np.where(t < 0.5, 1.0, 1.0 + silence), q, torque)
+    assert arm.counters['restarts'] == 1
+    assert np.isfinite(estimates.external_torque[-1]).all()
+
+
 @pytest.mark.parametrize('jitter', [0.0, 1e-4])
 @pytest.mark.parametrize('hangs', [False, True])
 @pytest.mark.parametrize('delay', [0, 5])

@@ -302,6 +302,9 @@ class Arm:
 
     def _go_on_late(self, stamp: int, sample: Floats) -> ArmEstimate | None:
         """Go on to an earlier time: the effort is as old as that, and the rest was kept."""
+        if self._waiting and stamp - self._waiting[-1][0] > MAX_GAP * 1e9:
+            self.reset()
+            self._refuse('restarts')
         kept, time = self._waiting, stamp
         if kept:
             newest, latest, before = kept[-1]
