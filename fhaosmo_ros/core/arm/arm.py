@@ -48,8 +48,13 @@ STOPPING = 2.0
 """Times the same, by which no arm is stopped between two samples."""
 DAMPING = 0.02
 """Singular value of a frame's Jacobian, m, below which a force along it is damped."""
-LOOK = 0.005
-"""s between two estimates that count for the link: neighbours say nearly the same."""
+LOOK, KEEP = 0.005, 0.98
+"""
+Seconds between two estimates that count for the link, since neighbours say nearly the same; and how
+much of what was known before still counts at the next one, since a contact may slide.
+"""
+ELSEWHERE = 0.02
+"""Share of a contact's forces that is expected on any link, however sure one of them is."""
 SLIDING = 0.005
 """s: memory of the differences of positions that friction is computed from."""
 FAULTS = ('too strong', 'beyond limits', 'too fast')
@@ -72,8 +77,8 @@ class ArmEstimate(NamedTuple):
         Natural logarithm of the odds of contact.
     contact : bool
     link : str
-        The likeliest one by all samples since the contact began, also at the first one after it;
-        else empty.
+        The likeliest one by the samples of the contact, mostly of the last quarter of a second;
+        also at the first one after it, else empty.
 
     """
 
@@ -232,6 +237,7 @@ class Arm:
         self._velocity: Floats | None = None  # estimated
         self._motion = np.zeros((n, n)), np.zeros(n)  # M and velocity, measured
         self._still = self._contact = False
+        self.model.expect(np.ones(n))
         self._looked, self._evidence = 0, np.zeros(n)  # when, and for each link
         self.doubts.reset()
         self._clock.reset()
@@ -396,8 +402,13 @@ class Arm:
         self._contact = odds > (0.0 if touched else self._threshold)
         if self._contact and not (touched and stamp - self._looked < LOOK * 1e9):
             own = self._likelihoods(torques, covariance, q)
-            self._evidence = self._evidence + own if touched else own
+            self._evidence = KEEP * self._evidence + own if touched else own
             self._looked = stamp
+            likely = np.exp(self._evidence - np.max(self._evidence))
+            likely *= (1.0 - ELSEWHERE) / np.sum(likely)
+            self.model.expect(len(likely) * likely + ELSEWHERE)
+        elif touched and not self._contact:
+            self.model.expect(np.ones(len(torques)))
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
         return ArmEstimate(
             stamp, q, self._velocity, torques, covariance, odds, self._contact, link

@@ -32,7 +32,7 @@ class Terms(NamedTuple):
     mass: Floats  # (n, n) M, kg m^2 (kg for a prismatic joint)
     coriolis: Floats  # (n,) C(q, qd)^T qd, N m: what drives p = M qd beside torque and gravity
     gravity: Floats  # (n,) g, N m
-    reach: Floats  # (n, n) sum over the links of J^T J, the mean over places on a link, m^2
+    reach: Floats  # (n, n) sum over the links of share J^T J, the mean over places on one, m^2
 
 
 class ArmModel:
@@ -101,7 +101,7 @@ class ArmModel:
         self.lowest, self.highest = np.where(ends, [lowest, highest], [[-np.inf], [np.inf]])
         limits = np.array([model.velocityLimit, model.effortLimit])
         self.velocity_limits, self.effort_limits = np.where(limits > 0.0, limits, np.inf)
-        # Arms whose only mass is 1 kg of one link, for each; and of all links. See `set_payload`.
+        # Arms whose only mass is that of one link, for each; and of all links: see `set_payload`.
         self._even = [pin.Model(model) for _ in range(n + 1)]
         for even in self._even:
             for k in range(1, n + 1):
@@ -145,13 +145,21 @@ class ArmModel:
             # distance, which is half the trace of the inertia over the mass. So J^T J of a link is
             # the mass matrix of an arm that has 1 kg there, of an inertia of that mean square.
             square = max(np.trace(own.inertia), 0.0) / (3.0 * own.mass)
-            place = self._pin.Inertia(1.0, own.lever, square * np.eye(3))
-            self._even[k - 1].inertias[k] = self._even[-1].inertias[k] = place
+            self._even[k - 1].inertias[k] = self._pin.Inertia(1.0, own.lever, square * np.eye(3))
+        self.expect(np.ones(len(self.links)))
         mass = self.terms(np.zeros(len(self.joints)), np.zeros(len(self.joints))).mass
         if not np.all(np.linalg.eigvalsh(mass) > 0.0):
             raise ConfigurationError(
                 'robot description: expected links with mass and inertia, got a mass matrix that '
                 f'is not positive (diagonal {np.array2string(np.diag(mass), precision=3)})'
+            )
+
+    def expect(self, shares: Floats) -> None:
+        """Let `Terms.reach` count each link by its share from now on, (n,); their sum is n."""
+        for k, share in enumerate(shares, 1):
+            place = self._even[k - 1].inertias[k]
+            self._even[-1].inertias[k] = self._pin.Inertia(
+                share, place.lever, share * place.inertia
             )
 
     def inertial_of(self, payload: Payload) -> Floats:
