@@ -44,7 +44,7 @@ def extensions():
     In the environment, FHAOSMO_DEBUG=1 builds with bounds checks, and FHAOSMO_ASAN=1 with the
     compiler's AddressSanitizer. Loops over the members of the self-tuning observer are sums that
     may be taken in any order, so that they become vector instructions; see
-    core/observer/self_tuning/vectors.pxd. All else gives the same bits on each processor (no
+    core/vectors.pxd. All else gives the same bits on each processor (no
     product and sum are contracted), and -O3 makes it no faster. What is compiled of studies/
     is built in a checkout, never installed.
     """

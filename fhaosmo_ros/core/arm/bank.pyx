@@ -11,6 +11,7 @@ decay and W. They interact as in H. Blom and Y. Bar-Shalom, IEEE Transactions on
 33(8), 1988, doi:10.1109/9.1299.
 """
 
+from fhaosmo_ros.core.vectors cimport VECTORISED
 from libc.math cimport exp, expm1, fmax, log, sqrt
 
 import numpy as np
@@ -49,11 +50,14 @@ cdef class Bank:
     cdef readonly object covariance  # (n, n) of d, if the likelier of both is right
     cdef readonly object weights  # (m + 1,), the first of free motion
     cdef double decay, begin, end, change, onset, since
-    cdef double[::1] free, scales, w, mixed, share, likelihood, average
+    cdef double[::1] free, scales, w, mixed, begun, likelihood, average
     cdef double[::1] off, innovation, measured
-    # Of each filter: Y of all joints, p of all, d of all, and their covariance; now and before.
-    cdef double[:, ::1] x, x0
-    cdef double[:, :, ::1] p, p0
+    # Of each filter: Y of all joints, p of all, d of all, and their covariance.
+    cdef double[:, ::1] x
+    cdef double[:, :, ::1] p
+    # The same, summed over all filters and over those of contact, as means off that of all.
+    cdef double[:, ::1] sum_x
+    cdef double[:, :, ::1] sum_p
     cdef double[:, ::1] s, gain, spread, noise
 
     def __init__(
@@ -66,14 +70,14 @@ cdef class Bank:
         self.scales = np.array(scales, dtype=np.float64)
         self.decay, self.begin, self.end, self.change = decay, begin, end, change
         self.onset, self.since = onset, since
-        self.x, self.x0 = np.zeros((m, 3 * n)), np.zeros((m, 3 * n))
-        self.p, self.p0 = np.zeros((m, 3 * n, 3 * n)), np.zeros((m, 3 * n, 3 * n))
+        self.x, self.p = np.zeros((m, 3 * n)), np.zeros((m, 3 * n, 3 * n))
+        self.sum_x, self.sum_p = np.zeros((2, 3 * n)), np.zeros((2, 3 * n, 3 * n))
         self.s, self.gain = np.zeros((n, n)), np.zeros((n, 3 * n))
         self.off, self.innovation = np.zeros(3 * n), np.zeros(n)
         self.measured, self.noise = np.zeros(n), np.zeros((n, n))
         self.weights, self.mean, self.covariance = np.zeros(m), np.zeros((3, n)), np.zeros((n, n))
         self.w, self.average, self.spread = self.weights, self.mean.reshape(-1), self.covariance
-        self.mixed, self.share, self.likelihood = np.zeros(m), np.zeros(m), np.zeros(m)
+        self.mixed, self.begun, self.likelihood = np.zeros(m), np.zeros(m), np.zeros(m)
         self.start(np.zeros(n), np.zeros((n, n)), np.zeros(n))
 
     def start(self, momentum, momentum_covariance, torque_variance):
@@ -129,76 +133,86 @@ cdef class Bank:
             == drive.shape[0] == torque_variance.shape[0] == shape.shape[0] == shape.shape[1]
         ):
             raise ValueError(f'expected arrays of {n} joints')
-        self.x, self.x0, self.p, self.p0 = self.x0, self.x, self.p0, self.p
         with nogil:
-            self.mix(h, shape)
+            self.mix(h)
             self.predict(h, drive, torque_variance, shape)
             self.measure(mass, change, variance, vague)
             self.correct()
             self.combine()
 
-    cdef double transition(self, int i, int j, double h) noexcept nogil:
-        """Return the probability that filter j follows filter i within h."""
-        cdef int contacts = self.filters - 1
-        cdef double begin = -expm1(-self.begin * h), end = -expm1(-self.end * h)
-        cdef double change = -expm1(-self.change * h) if contacts > 1 else 0.0
-        if i == 0:
-            return 1.0 - begin if j == 0 else begin / contacts
-        if j == 0:
-            return end
-        return (1.0 - end) * (1.0 - change if i == j else change / (contacts - 1))
-
-    cdef void mix(self, double h, const double[:, ::1] shape) noexcept nogil:
+    cdef VECTORISED mix(self, double h) noexcept nogil:
         """
         Write what each filter begins with: a mean over those that it may follow.
 
         Where contact ends, the torque ends: d begins anew, with what the model does not explain.
-        Where it begins, d may have jumped, now or a little earlier.
         """
-        cdef int i, j, a, b, n = self.joints, m = self.filters
-        cdef double share, c, since = fmax(self.since, 1e-15)
-        cdef double* to
-        cdef double* source
-        for j in range(m - 1, -1, -1):
-            self.mixed[j] = 0.0
-            for i in range(m):
-                self.share[i] = self.transition(i, j, h) * self.w[i]
-                self.mixed[j] += self.share[i]
-                if j == 0 and i > 0:  # nobody needs the others' d any more
-                    self.x0[i, 2 * n :] = 0.0
-                    self.p0[i, :, 2 * n :] = 0.0
-                    self.p0[i, 2 * n :, :] = 0.0
-                    for a in range(n):
-                        self.p0[i, 2 * n + a, 2 * n + a] = self.free[a] / (2.0 * self.decay)
-            self.x[j, :] = 0.0
-            self.p[j, :, :] = 0.0
-            for i in range(m):
-                self.share[i] /= self.mixed[j]
-                for a in range(3 * n):
-                    self.x[j, a] += self.share[i] * self.x0[i, a]
-            for i in range(m):
-                share = self.share[i]
-                if share < SMALLEST:
-                    continue
-                for a in range(3 * n):
-                    self.off[a] = self.x0[i, a] - self.x[j, a]
-                for a in range(3 * n):
-                    c = share * self.off[a]
-                    to, source = &self.p[j, a, 0], &self.p0[i, a, 0]
-                    for b in range(3 * n):
-                        to[b] += share * source[b] + c * self.off[b]
-            if j > 0:  # a jump at any time since then
-                c = self.share[0] * self.onset * self.scales[j - 1] * self.scales[j - 1]
-                diffuse(self.p[j], since, c / since, shape)
+        cdef Py_ssize_t j, a, k, n = self.joints, size = 3 * n, contacts = self.filters - 1
+        cdef double begin = -expm1(-self.begin * h) / contacts, end = -expm1(-self.end * h)
+        cdef double other = 0.0  # probability that contact goes on with one other intensity
+        cdef double touched = 1.0 - self.w[0], stay
+        cdef double* all_x = &self.sum_x[0, 0]
+        cdef double* all_p = &self.sum_p[0, 0, 0]
+        cdef double* contact_x = &self.sum_x[1, 0]
+        cdef double* contact_p = &self.sum_p[1, 0, 0]
+        if contacts > 1:
+            other = (1.0 - end) * -expm1(-self.change * h) / (contacts - 1)
+        stay = 1.0 - end - contacts * other  # by how much likelier the same one is
+        self.sum_x[:, :] = 0.0
+        self.sum_p[:, :, :] = 0.0
+        for j in range(contacts + 1):
+            for a in range(size):
+                self.x[j, a] -= self.average[a]
+            if j > 0:
+                add(contact_x, contact_p, self.w[j], &self.x[j, 0], &self.p[j, 0, 0], size)
+        # All filters of contact follow these alike, and themselves more.
+        for a in range(size):
+            all_x[a] = other * contact_x[a]
+        for a in range(size * size):
+            all_p[a] = other * contact_p[a]
+        add(all_x, all_p, begin * self.w[0], &self.x[0, 0], &self.p[0, 0, 0], size)
+        for j in range(1, contacts + 1):
+            self.mixed[j] = begin * self.w[0] + other * touched + stay * self.w[j]
+            blend(
+                &self.x[j, 0], &self.p[j, 0, 0], stay * self.w[j], all_x, all_p, 1.0,
+                self.mixed[j], &self.off[0], size,
+            )  # fmt: skip
+            self.begun[j] = begin * self.w[0] / self.mixed[j]
+        for k in range(n):  # of contact that has ended nobody needs d any more
+            for a in range(2 * n):
+                self.sum_p[1, a, 2 * n + k] = -self.average[2 * n + k] * contact_x[a]
+                self.sum_p[1, 2 * n + k, a] = self.sum_p[1, a, 2 * n + k]
+            for a in range(n):
+                self.sum_p[1, 2 * n + a, 2 * n + k] = (
+                    touched * self.average[2 * n + a] * self.average[2 * n + k]
+                )
+            self.sum_p[1, 2 * n + k, 2 * n + k] += touched * self.free[k] / (2.0 * self.decay)
+            contact_x[2 * n + k] = -touched * self.average[2 * n + k]
+        stay = (1.0 - contacts * begin) * self.w[0]
+        self.mixed[0] = stay + end * touched
+        blend(
+            &self.x[0, 0], &self.p[0, 0, 0], stay, contact_x, contact_p, end, self.mixed[0],
+            &self.off[0], size,
+        )  # fmt: skip
+        for j in range(contacts + 1):
+            for a in range(size):
+                self.x[j, a] += self.average[a]
 
-    cdef void predict(
+    cdef VECTORISED predict(
         self, double h, const double[::1] drive, const double[::1] torque_variance,
         const double[:, ::1] shape,
     ) noexcept nogil:
-        """Bring all filters to the time of the sample."""
-        cdef int j, i, k, n = self.joints
-        cdef double rate, stay, to_p, to_y, scale, e
-        cdef double[:, ::1] p
+        """
+        Bring all filters to the time of the sample.
+
+        Where contact has begun, d may have jumped, now or a little earlier.
+        """
+        cdef Py_ssize_t j, i, k, a, b, n = self.joints
+        cdef double rate, stay, to_p, to_y, scale, e, since = fmax(self.since, 1e-15)
+        cdef double[9] free, contact  # of Y, p and d: how much of `free` and of `shape`
+        cdef double* row
+        cdef double* p
+        free[:] = [0.0] * 9
+        grow(free, h, 1.0)
         for j in range(self.filters):
             rate = 0.0 if j else self.decay
             scale = self.scales[j - 1] * self.scales[j - 1] if j else 0.0
@@ -206,30 +220,36 @@ cdef class Bank:
             to_p = -expm1(-rate * h) / rate if rate > 0.0 else h
             # The difference is of two nearly equal numbers where the decay is slow.
             to_y = (h - to_p) / rate if rate * h > 1e-4 else h * h * (0.5 - rate * h / 6.0)
-            p = self.p[j]
+            p = &self.p[j, 0, 0]
             advance(&self.x[j, 0], n, h, to_y, to_p, stay)
-            advance(&p[0, 0], 3 * n * n, h, to_y, to_p, stay)
-            for i in range(3 * n):
-                advance(&p[i, 0], n, h, to_y, to_p, stay)
+            carry(p, n, h, to_y, to_p, stay)
+            contact[:] = [0.0] * 9
+            grow(contact, since, scale * self.begun[j] * self.onset / since)
+            carry(contact, 1, h, to_y, to_p, stay)
+            grow(contact, h, scale)
             for i in range(n):
                 self.x[j, i] += 0.5 * h * h * drive[i]
                 self.x[j, n + i] += h * drive[i]
+                for a in range(3):
+                    for b in range(3):
+                        row = p + (a * n + i) * 3 * n + b * n
+                        row[i] += free[3 * a + b] * self.free[i]
+                        for k in range(n):
+                            row[k] += contact[3 * a + b] * shape[i, k]
                 e = h * h * torque_variance[i]
-                p[i, i] += 0.25 * h * h * e
-                p[i, n + i] += 0.5 * h * e
-                p[n + i, i] += 0.5 * h * e
-                p[n + i, n + i] += e
-                for k in range(n):
-                    self.s[i, k] = scale * shape[i, k]
-                self.s[i, i] += self.free[i]
-            diffuse(p, h, 1.0, self.s)
+                row = p + i * 3 * n
+                row[i] += 0.25 * h * h * e
+                row[n + i] += 0.5 * h * e
+                row = p + (n + i) * 3 * n
+                row[i] += 0.5 * h * e
+                row[n + i] += e
 
-    cdef void measure(
+    cdef VECTORISED measure(
         self, const double[:, ::1] mass, const double[::1] change, const double[::1] variance,
         double vague,
     ) noexcept nogil:
         """Write M v and the covariance of its error, M S M' + (vague M v)(vague M v)'."""
-        cdef int i, j, k, n = self.joints
+        cdef Py_ssize_t i, j, k, n = self.joints
         for i in range(n):
             self.measured[i] = 0.0
             for k in range(n):
@@ -240,12 +260,13 @@ cdef class Bank:
                 for k in range(n):
                     self.noise[i, j] += mass[i, k] * variance[k] * mass[j, k]
 
-    cdef void correct(self) noexcept nogil:
+    cdef VECTORISED correct(self) noexcept nogil:
         """Correct all filters by the sample, and weigh them by how likely it was to each."""
-        cdef int j, i, k, o, n = self.joints
-        cdef int own = 0 if self.of_position else n  # where the measured part of the state is
+        cdef Py_ssize_t j, i, k, o, n = self.joints
+        cdef Py_ssize_t own = 0 if self.of_position else n  # where the measured part of the state is
         cdef double total, most = -1e300, pivot
         cdef double* row
+        cdef double* to
         cdef double[:, ::1] p
         for j in range(self.filters):
             p = self.p[j]
@@ -258,32 +279,35 @@ cdef class Bank:
             # Cholesky: s = L L^T; gain and innovation become L^-1 times themselves.
             total = 0.0
             for i in range(n):
+                to = &self.gain[i, 0]
                 for o in range(i):
+                    pivot = self.s[i, o]
+                    row = &self.gain[o, 0]
+                    self.innovation[i] -= pivot * self.innovation[o]
                     for k in range(i, n):
-                        self.s[k, i] -= self.s[k, o] * self.s[i, o]
-                pivot = sqrt(fmax(self.s[i, i], 1e-300))
-                total -= log(pivot)
-                for k in range(i, n):
-                    self.s[k, i] /= pivot
-                for o in range(i):
-                    self.innovation[i] -= self.s[i, o] * self.innovation[o]
+                        self.s[k, i] -= self.s[k, o] * pivot
                     for k in range(3 * n):
-                        self.gain[i, k] -= self.s[i, o] * self.gain[o, k]
-                self.innovation[i] /= pivot
+                        to[k] -= pivot * row[k]
+                pivot = 1.0 / sqrt(fmax(self.s[i, i], 1e-300))
+                total += log(pivot)
+                self.innovation[i] *= pivot
+                for k in range(i, n):
+                    self.s[k, i] *= pivot
                 for k in range(3 * n):
-                    self.gain[i, k] /= pivot
+                    to[k] *= pivot
                 total -= 0.5 * self.innovation[i] * self.innovation[i]
             self.likelihood[j] = total
             most = fmax(most, total)
             for i in range(3 * n):
-                row = &p[i, 0]
+                to = &p[i, 0]
                 for o in range(n):
                     pivot = self.gain[o, i]
+                    row = &self.gain[o, 0]
                     self.x[j, i] += pivot * self.innovation[o]
                     for k in range(i + 1):
-                        row[k] -= pivot * self.gain[o, k]
+                        to[k] -= pivot * row[k]
                 for k in range(i):  # an asymmetry of rounding would grow with time
-                    p[k, i] = row[k]
+                    p[k, i] = to[k]
             # Y begins anew at each sample, of positions with what it is more than measured.
             for i in range(n):
                 self.x[j, i] = self.x[j, i] - self.measured[i] if self.of_position else 0.0
@@ -298,14 +322,14 @@ cdef class Bank:
             self.w[j] /= total
         self.log_odds = log(fmax(1.0 - self.w[0], SMALLEST)) - log(self.w[0])
 
-    cdef void combine(self) noexcept nogil:
+    cdef VECTORISED combine(self) noexcept nogil:
         """
         Write the mean over all filters, and the covariance of d.
 
         The covariance is that of the likelier of free motion and contact: the other one, however
         unlikely, would make a band of two thirds as wide as a force that is not there.
         """
-        cdef int j, i, k, n = self.joints
+        cdef Py_ssize_t j, i, k, n = self.joints
         cdef bint free = self.w[0] > 0.5
         cdef double off, share, all_of_them = self.w[0] if free else 1.0 - self.w[0]
         self.average[:] = 0.0
@@ -323,30 +347,71 @@ cdef class Bank:
                     )
 
 
-cdef void advance(
-    double* y, int count, double h, double to_y, double to_p, double stay
+cdef inline void add(
+    double* x, double* p, double share, const double* of_x, const double* of_p, Py_ssize_t size
+) noexcept nogil:
+    """Add a share of a filter, its mean and covariance, to a sum of means and of squares."""
+    cdef Py_ssize_t a, b
+    cdef double c
+    for a in range(size):
+        c = share * of_x[a]
+        x[a] += c
+        for b in range(size):
+            p[a * size + b] += share * of_p[a * size + b] + c * of_x[b]
+
+
+cdef inline void blend(
+    double* x, double* p, double own, const double* of_x, const double* of_p, double share,
+    double total, double* mean, Py_ssize_t size,
+) noexcept nogil:
+    """Make x and p the mean and covariance of a share of sums and of what they have been."""
+    cdef Py_ssize_t a, b
+    cdef double c
+    for a in range(size):
+        mean[a] = (share * of_x[a] + own * x[a]) / total
+    for a in range(size):
+        c = own * x[a] / total
+        for b in range(size):
+            p[a * size + b] = (
+                share / total * of_p[a * size + b] + own / total * p[a * size + b]
+                + c * x[b] - mean[a] * mean[b]
+            )
+    for a in range(size):
+        x[a] = mean[a]
+
+
+cdef inline void advance(
+    double* y, Py_ssize_t count, double h, double to_y, double to_p, double stay
 ) noexcept nogil:
     """Multiply by the transition: so many numbers that belong to Y, then to p and to d."""
     cdef double* p = y + count
     cdef double* d = p + count
-    cdef int k
+    cdef Py_ssize_t k
     for k in range(count):
         y[k] += h * p[k] + to_y * d[k]
         p[k] += to_p * d[k]
         d[k] *= stay
 
 
-cdef void diffuse(
-    double[:, ::1] p, double t, double intensity, const double[:, ::1] shape
+cdef inline void carry(
+    double* p, Py_ssize_t n, double h, double to_y, double to_p, double stay
 ) noexcept nogil:
+    """Multiply a covariance of n joints by the transition from both sides."""
+    cdef Py_ssize_t i
+    advance(p, 3 * n * n, h, to_y, to_p, stay)
+    for i in range(3 * n):
+        advance(p + i * 3 * n, n, h, to_y, to_p, stay)
+
+
+cdef void grow(double* p, double t, double intensity) noexcept nogil:
     """Add the covariance of Y, p and d that white noise of d' makes within t seconds."""
-    cdef int a, b, i, k, _, n = shape.shape[0]
-    cdef double c
-    for a in range(3):
-        for b in range(3):
-            c = intensity / ((5 - a - b) * (2 if a == 0 else 1) * (2 if b == 0 else 1))
-            for _ in range(5 - a - b):
-                c *= t
-            for i in range(n):
-                for k in range(n):
-                    p[a * n + i, b * n + k] += c * shape[i, k]
+    cdef double to_d = intensity * t, t2 = t * t
+    p[8] += to_d
+    p[7] += to_d * t / 2.0
+    p[5] += to_d * t / 2.0
+    p[4] += to_d * t2 / 3.0
+    p[6] += to_d * t2 / 6.0
+    p[2] += to_d * t2 / 6.0
+    p[3] += to_d * t2 * t / 8.0
+    p[1] += to_d * t2 * t / 8.0
+    p[0] += to_d * t2 * t2 / 20.0

@@ -2,7 +2,7 @@
 """The members as filters: prediction and correction, and jumps of d (D 27, D 33)."""
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
-from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.vectors cimport VECTORISED
 
 cdef double EXACT, HUBER, INEXACT
 

@@ -13,7 +13,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     COLOURS, COUNT, GRID, Line, Members, MOST_STATES, ORDERS, Work, entry, factorial, fill, pair,
     power, state
 )
-from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.vectors cimport VECTORISED
 
 cdef double HUBER = 3.0  # innovations of more standard deviations count as so many (Huber 1964)
 # y and its stamps are taken to be no more exact than this: in parts of what y moves between

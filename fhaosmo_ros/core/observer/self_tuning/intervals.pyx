@@ -15,7 +15,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     COLOURS, COUNT, GRID, HALF, Members, ORDERS, Work, entry, state
 )
 from fhaosmo_ros.core.observer.self_tuning.normal cimport exponential, mills
-from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.vectors cimport VECTORISED
 from fhaosmo_ros.core.observer.self_tuning.weights cimport QUANTISED_FLOOR
 from fhaosmo_ros.core.observer.structure cimport GATE
 

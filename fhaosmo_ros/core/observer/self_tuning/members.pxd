@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The members of the self-tuning observer: which they are, and what they remember (D 26)."""
 
-from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.vectors cimport VECTORISED
 
 cdef enum:
     ORDERS = 4  # d and its derivatives, of the members that have them

@@ -13,7 +13,7 @@ move, theirs are neighbours.
 
 from libc.math cimport exp, log, sqrt
 
-from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.vectors cimport VECTORISED
 
 import numpy as np
 

@@ -2,7 +2,7 @@
 """The noise of y, its quantum, and whether a sample is likely (D 29)."""
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
-from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.vectors cimport VECTORISED
 
 cdef double APART, FADED, LATTICE_SHARE, ROUGH, ROUNDED, STEADY
 

@@ -7,7 +7,7 @@ from fhaosmo_ros.core.observer.self_tuning.filters cimport EXACT, HUBER
 from fhaosmo_ros.core.observer.self_tuning.members cimport (
     COLOURS, GRID, HALF, Members, Sample, Shared, Work, fill, largest
 )
-from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.vectors cimport VECTORISED
 from fhaosmo_ros.core.observer.structure cimport LOST_SAMPLES
 
 # Variances of which one is so many times the other are different ones: who expects S of so many

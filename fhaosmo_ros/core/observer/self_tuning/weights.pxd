@@ -2,7 +2,7 @@
 """How likely each member is, and the mean of all (D 28)."""
 
 from fhaosmo_ros.core.observer.self_tuning.members cimport Members
-from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.vectors cimport VECTORISED
 
 
 cdef struct Model:

@@ -8,7 +8,7 @@ from fhaosmo_ros.core.observer.self_tuning.members cimport (
     BANDS, BAND_STEP, COLOURS, COUNT, FIRST_SAMPLES, GRID, HALF, IN_BAND, Members, ORDERS, Shared,
     Work, entry, fill, largest, power
 )
-from fhaosmo_ros.core.observer.self_tuning.vectors cimport VECTORISED
+from fhaosmo_ros.core.vectors cimport VECTORISED
 from fhaosmo_ros.core.observer.structure cimport GATE
 
 # No log-likelihood falls further below the best one (D 28, D 31), but by what the member's prior
