@@ -124,19 +124,19 @@ def test_without_noise_one_filter_is_the_kalman_filter():
     """One joint, weights fixed by rates of zero: compare with the textbook recursion."""
     h, w, r, e = 1e-3, 4.0, 1e-8, 0.01
     bank = Bank([w], 1e-9, [1.0], 0.0, 0.0, 0.0, 0.0)
-    bank.start([0.0], [[1.0]], [1.0])
+    bank.start(1.0, 0.0, [0.0], [[1.0]], [1.0])
     x, p = np.zeros(3), np.diag([0.0, 1.0, 1.0])
     f = np.array([[1, h, h * h / 2], [0, 1, h], [0, 0, 1]])
     g = np.array([h * h / 2, h, 0.0])
     q = w * np.array([
         [h**5 / 20, h**4 / 8, h**3 / 6], [h**4 / 8, h**3 / 3, h * h / 2], [h**3 / 6, h * h / 2, h]
     ]) + np.outer(g, g) * e  # fmt: skip
-    random, y, one = np.random.default_rng(1), 0.0, np.eye(1)
+    random, y, one, before = np.random.default_rng(1), 0.0, np.eye(1), 0.0
     for _ in range(50):
         moved, u = 1e-4 * random.standard_normal(), random.standard_normal()
         y += moved
         bank.step(h, one, np.array([moved]), np.array([r]), 0.0, np.array([u]), np.array([e]), one)
-        x, p = f @ x + g * u, f @ p @ f.T + q
+        x, p, before = f @ x + g * 0.5 * (before + u), f @ p @ f.T + q, u
         k = p[:, 0] / (p[0, 0] + r)
         x, p = x + k * (y - x[0]), p - np.outer(k, p[0])
     np.testing.assert_allclose(bank.mean[1:, 0], x[1:], rtol=1e-6)
@@ -319,12 +319,12 @@ def test_noise_that_nobody_told_is_found_and_makes_no_contact(free, arm):
     noise = np.array([0.02, 0.2, 0.1])
     noisy = torque + noise * random.standard_normal(q.shape)
     assert not arm.run(t, q, noisy).contact[500:].any()
-    np.testing.assert_allclose(np.sqrt(arm._noise.variance[0]), noise, rtol=0.15)
+    np.testing.assert_allclose(np.sqrt(arm._samples.noise.variance[0]), noise, rtol=0.15)
     told = Arm(URDF, position_noise=[20.0 * NOISE], torque_noise=[0.5])
     shaken = q + 20.0 * NOISE * random.standard_normal(q.shape)
     found = Arm(URDF, torque_noise=[0.5]).run(t, shaken, torque)
     assert rms(found.external_torque) < 1.1 * rms(told.run(t, shaken, torque).external_torque)
-    np.testing.assert_array_equal(told._noise.variance[0], 0.25)
+    np.testing.assert_array_equal(told._samples.noise.variance[0], 0.25)
 
 
 def intervals(sampled, stamps):

@@ -10,7 +10,7 @@ from fhaosmo_ros.core.arm.bank import Bank
 from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.doubts import Doubts
 from fhaosmo_ros.core.arm.model import ArmModel, Payload, Terms
-from fhaosmo_ros.core.arm.samples import Clock, farther, Noise, outside
+from fhaosmo_ros.core.arm.samples import Clock, Noise, Samples
 from fhaosmo_ros.core.parameters.arm import ARM_PARAMETERS
 from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
@@ -181,8 +181,7 @@ class Arm:
         model.set_inertial(known.inertial, known.motor_inertia)
         self.adopt(p)
         self._of_position = p['measurement'] == 'position'
-        self._measured = 1 if self._of_position else 2  # row of a sample
-        self._turns, self._rest = bool(model.continuous.any()), np.zeros(len(model.joints))
+        self._rest = np.zeros(len(model.joints))
         self._with_gravity = p['effort'] != 'gravity_compensated'
         self._delay = int(p['torque_delay'] * 1e9)
         given = self._values('torque_constants')
@@ -193,22 +192,24 @@ class Arm:
         told, position = self._size('torque_noise'), self._size('position_noise')
         torque = np.where(told > 0.0, told, TORQUE_NOISE * scale)
         strong = np.fmax(np.where(model.effort_limits < np.inf, model.effort_limits, 0.0), scale)
-        self._stopping = STOPPING * strong
         # Of efforts, positions and velocities.
         size = np.array([torque, position, self._values('velocity_noise')])
         least, most = size.copy(), np.full_like(size, np.inf)
         least[0, told == 0.0] *= LEAST_FOUND
         most[0, told > 0.0] = told[told > 0.0]
-        self._noise = Noise(size, least, most)
-        self._noisy, self._fastest = ENCODER * position, FASTER * model.velocity_limits
-        self._lowest = np.array([-STRONGER * strong, model.lowest - FURTHER, -self._fastest])
-        self._highest = np.array([STRONGER * strong, model.highest + FURTHER, self._fastest])
+        noise, fastest = Noise(size, least, most), FASTER * model.velocity_limits
+        self._torque_variance, position_variance, velocity_variance = noise.variance
+        self._variance = position_variance if self._of_position else velocity_variance
+        self._samples = Samples(
+            noise, np.array([-STRONGER * strong, model.lowest - FURTHER, -fastest]),
+            np.array([STRONGER * strong, model.highest + FURTHER, fastest]), ENCODER * position,
+            STOPPING * strong, model.continuous, MAX_GAP, self._of_position,
+        )  # fmt: skip
         self._bank = Bank(
             2.0 * DECAY * self._model_variance, DECAY, np.array(INTENSITIES) * model.weight,
             BEGIN, END, CHANGE, ONSET, SINCE if self._of_position else 0.0, self._of_position,
         )  # fmt: skip
-        # Of the samples that the bank gets, and of those that wait until their effort has come.
-        self._clock, self._entrance = Clock(), Clock()
+        self._entrance = Clock()  # of samples that wait until their effort has come
         self.doubts = Doubts(model, self._with_gravity, np.sqrt(self._model_variance))
         self._tare = np.zeros(len(self.joints))
         self.counters: Counter[str] = Counter()
@@ -231,18 +232,15 @@ class Arm:
     def reset(self) -> None:
         """Begin anew with the next sample."""
         n = len(self.joints)
-        # Of the latest sample that was used: time, position, terms and drive.
-        self._last: tuple[int, Floats, Terms, Floats] | None = None
+        self._first: tuple[Terms, Floats] | None = None  # terms and drive of the first sample
         self._waiting: deque[tuple[int, int, Floats]] = deque()  # stamps, times and samples
         self._velocity: Floats | None = None  # estimated
-        self._motion = np.zeros((n, n)), np.zeros(n)  # M and velocity, measured
-        self._still = self._contact = False
+        self._contact = False
         self.model.expect(np.ones(n))
         self._looked, self._evidence = 0, np.zeros(n)  # when, and for each link
         self.doubts.reset()
-        self._clock.reset()
+        self._samples.reset()
         self._entrance.reset()
-        self._noise.reset()
 
     def adopt(self, parameters: Parameters) -> None:
         """Go on with other live parameters; raise ConfigurationError for a bad payload."""
@@ -284,10 +282,10 @@ class Arm:
             sample = np.array(given, dtype=np.float64)
         except (TypeError, ValueError):
             return self._refuse('wrong size')  # or no numbers
-        if sample.shape != self._lowest.shape:
+        if sample.shape != (3, len(self.joints)):
             return self._refuse('wrong size')
         sample[0] *= self._constants
-        kind = outside(sample, self._lowest, self._highest)
+        kind = self._samples.fault(sample)
         if kind >= 0:
             return self._refuse(FAULTS[kind] if np.isfinite(sample).all() else 'not finite')
         if self._newest is not None and stamp <= self._newest:
@@ -314,8 +312,10 @@ class Arm:
         kept, time = self._waiting, stamp
         if kept:
             newest, latest, before = kept[-1]
-            moved, h = self._moved(before[1], sample[1]), (stamp - newest) * 1e-9
-            time = latest + round(1e9 * self._interval(self._entrance, h, moved))
+            moved, h = self._samples.between(before[1], sample[1]), (stamp - newest) * 1e-9
+            known = self._rest if self._velocity is None else self._velocity
+            variance = self._samples.noise.variance[1]
+            time = latest + round(1e9 * self._entrance.interval(h, moved, known, variance))
         kept.append((stamp, time, sample))
         then = time - self._delay
         while len(kept) > 2 and kept[1][1] <= then:
@@ -325,74 +325,49 @@ class Arm:
         (_, t0, before), (_, t1, after) = kept[0], kept[1]
         share = (then - t0) / (t1 - t0)
         between = before + share * (after - before)
-        between[0], between[1] = sample[0], before[1] + share * self._moved(before[1], after[1])
+        between[0] = sample[0]
+        between[1] = before[1] + share * self._samples.between(before[1], after[1])
         return self._go_on(stamp - self._delay, then, between)
-
-    def _interval(self, clock: Clock, h: float, moved: Floats) -> float:
-        """Return the time in which the joints have moved, `h` by the stamps."""
-        known = self._rest if self._velocity is None else self._velocity
-        return float(clock.interval(h, moved, known, self._noise.variance[1]))
-
-    def _moved(self, before: Floats, q: Floats) -> Floats:
-        """Return q - before; of continuous joints the shorter way."""
-        moved, turns = q - before, self.model.continuous
-        if self._turns:
-            moved[turns] = np.remainder(moved[turns] + np.pi, 2.0 * np.pi) - np.pi
-        return moved
 
     def _go_on(self, stamp: int, time: int, sample: Floats) -> ArmEstimate | None:
         """Bring the bank to a sample that can be used; the estimate of this `time` has `stamp`."""
         torque, q, velocity = sample
-        if self._last is not None:
-            before, old, terms, drive = self._last
-            moved, h = self._moved(old, q), (time - before) * 1e-9
-            if self._stands_still(moved, h):
-                return self._refuse('standing still')
-            if h > MAX_GAP:
-                self.reset()
-                self._refuse('restarts')
-        if self._last is None:
-            self._last = time, q, *self._drive(q, velocity, torque, velocity)
-            return None
-        h = self._interval(self._clock, h, moved)
-        if farther(moved, self._fastest, h, self._noisy):
+        bank, samples = self._bank, self._samples
+        problem = samples.take(time, sample, self._velocity, bank.motion)
+        if problem == 'standing still':
+            return self._refuse(problem)
+        if problem in ('restarts', 'jumped'):
             self.reset()
-            return self._refuse('jumped')
-        self._noise.take(sample)
-        torque_variance, variance = self._noise.variance[0], self._noise.variance[self._measured]
-        bank, speed = self._bank, moved / h if self._of_position else velocity
+            self._refuse(problem)
+            if problem == 'jumped':
+                return None
+            samples.take(time, sample, None, velocity)
+        if problem:
+            self._first = self._drive(q, velocity, torque, velocity)
+            return None
+        h, speed = samples.h, samples.speed
         if self._velocity is None:
-            wide = 2.0 * variance / (h * h if self._of_position else 1.0)
+            terms, drive = self._first
+            wide = 2.0 * self._variance / (h * h if self._of_position else 1.0)
             spread = (terms.mass * wide) @ terms.mass.T
-            bank.start(terms.mass @ speed, spread, self._model_variance)
-            self._velocity = self._sliding = speed
+            bank.start(terms.mass, drive, terms.mass @ speed, spread, self._model_variance)
+            self._velocity = self._sliding = speed.copy()
         if self._of_position:
             if self._calibrated:
                 share = -np.expm1(-h / SLIDING)
                 self._sliding = self._sliding + share * (speed - self._sliding)
-            new, drives = self._drive(q, self._velocity, torque, self._sliding)
-            mass, change = 0.5 * (terms.mass + new.mass), moved
-            vague = self._clock.vague
+            terms, drive = self._drive(q, self._velocity, torque, self._sliding)
         else:
-            new, drives = self._drive(q, velocity, torque, velocity)
-            mass, change, vague = new.mass, velocity, 0.0
-        drive = 0.5 * (drive + drives)
-        bank.step(h, mass, change, variance, vague, drive, torque_variance, new.reach)
-        self._last, self._motion = (time, q, new, drives), (mass, speed)
+            terms, drive = self._drive(q, velocity, torque, velocity)
+        bank.step(
+            h, terms.mass, samples.change, self._variance, samples.vague, drive,
+            self._torque_variance, terms.reach,
+        )  # fmt: skip
         self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             return self._refuse('doubted')
         self.counters['used'] += 1
         return self._estimate(stamp, q)
-
-    def _stands_still(self, moved: Floats, h: float) -> bool:
-        """Return True if all joints stand at once, to the bit, though the arm was in motion."""
-        if moved.any():
-            self._still = False
-        elif not self._still:
-            mass, speed = self._motion
-            self._still = bool(np.any(np.abs(mass @ speed) > self._stopping * h))
-        return self._still
 
     def _estimate(self, stamp: int, q: Floats) -> ArmEstimate:
         """Return what the bank says, and the likeliest link by all that it said in a contact."""

@@ -46,6 +46,7 @@ cdef class Bank:
     cdef readonly int joints, filters
     cdef readonly bint of_position
     cdef readonly double log_odds  # of contact against free motion
+    cdef readonly object motion  # (n,): M times `change` of the latest step
     cdef readonly object mean  # (3, n): Y less what was measured, p and d
     cdef readonly object covariance  # (n, n) of d, if the likelier of both is right
     cdef readonly object weights  # (m + 1,), the first of free motion
@@ -59,6 +60,9 @@ cdef class Bank:
     cdef double[:, ::1] sum_x
     cdef double[:, :, ::1] sum_p
     cdef double[:, ::1] s, gain, spread, noise
+    # M and u at the sample before, and between it and the next one.
+    cdef double[:, ::1] mass, middle
+    cdef double[::1] drive, mean_drive
 
     def __init__(
         self, free_intensity, double decay, scales, double begin, double end, double change,
@@ -74,15 +78,24 @@ cdef class Bank:
         self.sum_x, self.sum_p = np.zeros((2, 3 * n)), np.zeros((2, 3 * n, 3 * n))
         self.s, self.gain = np.zeros((n, n)), np.zeros((n, 3 * n))
         self.off, self.innovation = np.zeros(3 * n), np.zeros(n)
-        self.measured, self.noise = np.zeros(n), np.zeros((n, n))
+        self.motion, self.noise = np.zeros(n), np.zeros((n, n))
+        self.measured = self.motion
         self.weights, self.mean, self.covariance = np.zeros(m), np.zeros((3, n)), np.zeros((n, n))
         self.w, self.average, self.spread = self.weights, self.mean.reshape(-1), self.covariance
         self.mixed, self.begun, self.likelihood = np.zeros(m), np.zeros(m), np.zeros(m)
-        self.start(np.zeros(n), np.zeros((n, n)), np.zeros(n))
+        self.mass, self.middle = np.zeros((n, n)), np.zeros((n, n))
+        self.drive, self.mean_drive = np.zeros(n), np.zeros(n)
+        self.start(0.0, 0.0, np.zeros(n), np.zeros((n, n)), np.zeros(n))
 
-    def start(self, momentum, momentum_covariance, torque_variance):
-        """Begin in free motion with p = M qd (n,), its covariance, and the variance of d (n,)."""
+    def start(self, mass, drive, momentum, momentum_covariance, torque_variance):
+        """
+        Begin in free motion.
+
+        With M (n, n) and u (n,) of the first sample, p = M qd (n,) and its covariance (n, n), and
+        the variance of d (n,).
+        """
         cdef int n = self.joints
+        np.asarray(self.mass)[...], np.asarray(self.drive)[...] = mass, drive
         x, p = np.asarray(self.x), np.asarray(self.p)
         x[...], p[...] = 0.0, 0.0
         x[:, n : 2 * n] = momentum
@@ -112,7 +125,7 @@ cdef class Bank:
         h : float
             Time since the one before, s.
         mass : (n, n) array
-            M.
+            M at this sample.
         change : (n,) array
             q - q before, so that Y has changed by M times that; or qd, where p is measured.
         variance : (n,) array
@@ -120,23 +133,32 @@ cdef class Bank:
         vague : float
             Share of `change` that is not known, the same for all joints.
         drive : (n,) array
-            u: torque + C^T qd - g.
+            u at this sample: torque + C^T qd - g.
         torque_variance : (n,) array
             Of u, from sample to sample.
         shape : (n, n) array
             Sum of J^T J over the links: how forces on the arm act on its joints.
 
         """
-        cdef int n = self.joints
+        cdef int i, k, n = self.joints
         if not (
             n == mass.shape[0] == mass.shape[1] == change.shape[0] == variance.shape[0]
             == drive.shape[0] == torque_variance.shape[0] == shape.shape[0] == shape.shape[1]
         ):
             raise ValueError(f'expected arrays of {n} joints')
+        for i in range(n):
+            self.mean_drive[i] = 0.5 * (self.drive[i] + drive[i])
+            self.drive[i] = drive[i]
+            for k in range(n):
+                # Y has changed by the mean M, while p is by that of now.
+                self.middle[i, k] = mass[i, k]
+                if self.of_position:
+                    self.middle[i, k] = 0.5 * (self.mass[i, k] + mass[i, k])
+                self.mass[i, k] = mass[i, k]
         with nogil:
             self.mix(h)
-            self.predict(h, drive, torque_variance, shape)
-            self.measure(mass, change, variance, vague)
+            self.predict(h, torque_variance, shape)
+            self.measure(change, variance, vague)
             self.correct()
             self.combine()
 
@@ -198,8 +220,7 @@ cdef class Bank:
                 self.x[j, a] += self.average[a]
 
     cdef VECTORISED predict(
-        self, double h, const double[::1] drive, const double[::1] torque_variance,
-        const double[:, ::1] shape,
+        self, double h, const double[::1] torque_variance, const double[:, ::1] shape
     ) noexcept nogil:
         """
         Bring all filters to the time of the sample.
@@ -228,8 +249,8 @@ cdef class Bank:
             carry(contact, 1, h, to_y, to_p, stay)
             grow(contact, h, scale)
             for i in range(n):
-                self.x[j, i] += 0.5 * h * h * drive[i]
-                self.x[j, n + i] += h * drive[i]
+                self.x[j, i] += 0.5 * h * h * self.mean_drive[i]
+                self.x[j, n + i] += h * self.mean_drive[i]
                 for a in range(3):
                     for b in range(3):
                         row = p + (a * n + i) * 3 * n + b * n
@@ -245,11 +266,11 @@ cdef class Bank:
                 row[n + i] += e
 
     cdef VECTORISED measure(
-        self, const double[:, ::1] mass, const double[::1] change, const double[::1] variance,
-        double vague,
+        self, const double[::1] change, const double[::1] variance, double vague
     ) noexcept nogil:
         """Write M v and the covariance of its error, M S M' + (vague M v)(vague M v)'."""
         cdef Py_ssize_t i, j, k, n = self.joints
+        cdef double[:, ::1] mass = self.middle
         for i in range(n):
             self.measured[i] = 0.0
             for k in range(n):

@@ -170,13 +170,15 @@ class ArmModel:
     def _configuration(self, q: ArrayLike) -> Floats:
         """Return q as Pinocchio has it: cosine and sine of a continuous joint's angle."""
         moved = np.asarray(q, dtype=np.float64)
+        if len(self._zero) == len(moved):
+            return moved
         return np.asarray(self._pin.integrate(self._model, self._zero, moved))
 
     def terms(self, q: ArrayLike, velocity: ArrayLike) -> Terms:
         """Return the terms at q (n,) and its velocity (n,)."""
         pin, model, data = self._pin, self._model, self._data
         configuration, velocity = self._configuration(q), np.asarray(velocity, dtype=np.float64)
-        coriolis = pin.computeCoriolisMatrix(model, data, configuration, velocity).T @ velocity
+        coriolis = velocity @ pin.computeCoriolisMatrix(model, data, configuration, velocity)
         gravity = pin.computeGeneralizedGravity(model, data, configuration).copy()
         mass = pin.crba(model, data, configuration).copy()
         reach = pin.crba(self._even[-1], self._even_data[-1], configuration).copy()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What samples of an arm say by themselves: their noise, and their time."""
 
-from libc.math cimport fabs, fmax, fmin, INFINITY, sqrt
+from libc.math cimport fabs, floor, fmax, fmin, INFINITY, M_PI, sqrt
 
 import numpy as np
 
@@ -22,36 +22,6 @@ cdef double STRAIGHT = 100.0
 # deviations at most.
 cdef int FIRST_LEARNT = 10, LONGEST_LEARNT = 1000
 cdef double LARGEST = 9.0
-
-
-def outside(
-    const double[:, ::1] sample, const double[:, ::1] lowest, const double[:, ::1] highest
-):
-    """Return the first row with a number that is not between its bounds, -1 if all are."""
-    cdef int i, k
-    if not (
-        sample.shape[0] == lowest.shape[0] == highest.shape[0]
-        and sample.shape[1] == lowest.shape[1] == highest.shape[1]
-    ):
-        raise ValueError('expected arrays of one shape')
-    for i in range(sample.shape[0]):
-        for k in range(sample.shape[1]):
-            if not lowest[i, k] < sample[i, k] < highest[i, k]:
-                return i
-    return -1
-
-
-def farther(
-    const double[::1] moved, const double[::1] fastest, double h, const double[::1] noisy
-):
-    """Return whether a joint has moved farther than is possible within h, and by noise."""
-    cdef int k
-    if not moved.shape[0] == fastest.shape[0] == noisy.shape[0]:
-        raise ValueError('expected arrays of one length')
-    for k in range(moved.shape[0]):
-        if fabs(moved[k]) > fastest[k] * h + noisy[k]:
-            return True
-    return False
 
 
 cdef class Noise:
@@ -82,7 +52,7 @@ cdef class Noise:
         """Take the next sample as the first one."""
         self.seen = 0
 
-    def take(self, const double[:, ::1] sample):
+    cpdef take(self, const double[:, ::1] sample):
         """Take a sample, (r, n)."""
         cdef double[:, :, ::1] b = self.before
         cdef double change, square, found
@@ -138,10 +108,10 @@ cdef class Clock:
         self.first, self.speeds = [], None
         self.rough_by_stamps = self.rough_by_even = 0.0
 
-    def interval(
+    cpdef double interval(
         self, double h, const double[::1] moved, const double[::1] velocity,
         const double[::1] variance,
-    ):
+    ) except -1.0:
         """
         Return the time in which the joints have `moved`; `h` is that of the stamps (s).
 
@@ -215,3 +185,141 @@ cdef class Clock:
         self.phase = even - since
         self.period += 6.0 / (n * (n + 1.0)) * off / steps
         return even
+
+
+cdef class Samples:
+    """
+    How the joints have moved from one sample to the next, in which time, and how noisy that is.
+
+    Samples are (3, n): efforts, positions and velocities.
+
+    Parameters
+    ----------
+    noise : Noise
+    lowest, highest : (3, n) array
+        What an arm can have.
+    noisy : (n,) array
+        How far a position may be off, however near samples are.
+    stopping : (n,) array
+        Torques by which no arm is stopped between two samples.
+    turning : (n,) array of bool
+        Joints whose angle has no end.
+    longest : float
+        Seconds between two samples that belong together.
+    of_position : bool
+        True if positions say how the joints have moved, False if velocities do.
+
+    """
+
+    cdef readonly double h, vague  # time in which the joints moved, and share that is not known
+    cdef readonly object moved, change, speed  # (n,): positions, what is measured, and velocities
+    cdef readonly Noise noise
+    cdef readonly Clock clock
+    cdef double[:, ::1] lowest, highest
+    cdef double[::1] noisy, stopping, rest, position, way, rate
+    cdef unsigned char[::1] turning
+    cdef double longest
+    cdef bint of_position, begun, still
+    cdef long long time
+
+    def __init__(
+        self, Noise noise, lowest, highest, noisy, stopping, turning, double longest,
+        bint of_position,
+    ):
+        n = len(noisy)
+        self.noise, self.clock, self.longest, self.of_position = noise, Clock(), longest, of_position
+        self.lowest, self.highest, self.noisy, self.stopping = lowest, highest, noisy, stopping
+        self.turning = np.array(turning, dtype=np.uint8)
+        self.rest, self.position = np.zeros(n), np.zeros(n)
+        self.moved, self.speed = np.zeros(n), np.zeros(n)
+        self.change = self.moved if of_position else self.speed
+        self.way, self.rate = self.moved, self.speed
+        self.reset()
+
+    def reset(self):
+        """Take the next sample as the first one."""
+        self.begun = self.still = False
+        self.clock.reset()
+        self.noise.reset()
+
+    def fault(self, const double[:, ::1] sample):
+        """Return the first row with a number that no arm can have, -1 if there is none."""
+        cdef int i, k, n = self.noisy.shape[0]
+        if sample.shape[0] != 3 or sample.shape[1] != n:
+            raise ValueError(f'expected a sample of shape {(3, n)}')
+        for i in range(3):
+            for k in range(n):
+                if not self.lowest[i, k] < sample[i, k] < self.highest[i, k]:
+                    return i
+        return -1
+
+    cdef double shorter(self, int k, double moved) noexcept:
+        """Return how far a joint has moved; one without an end has gone the shorter way."""
+        return moved - 2.0 * M_PI * floor(moved / (2.0 * M_PI) + 0.5) if self.turning[k] else moved
+
+    def between(self, const double[::1] before, const double[::1] after):
+        """Return how far the joints have moved, (n,)."""
+        return np.array([self.shorter(k, after[k] - before[k]) for k in range(len(after))])
+
+    def take(
+        self, long long time, const double[:, ::1] sample, velocity, const double[::1] motion
+    ):
+        """
+        Go on to a sample.
+
+        Parameters
+        ----------
+        time : int
+            ns.
+        sample : (3, n) array
+        velocity : (n,) array or None
+            Estimated at the sample before; None if it is not known yet.
+        motion : (n,) array
+            M times `change` of the sample before.
+
+        Returns
+        -------
+        str
+            Empty if the sample can be used; 'first' if there was none before it; 'standing still',
+            'restarts' (after a gap) and 'jumped' if it is not used.
+
+        """
+        cdef const double[::1] known = self.rest if velocity is None else velocity
+        cdef int k, n = self.noisy.shape[0]
+        cdef double over  # what divides `motion` to have p
+        cdef bint moves = False
+        if not (sample.shape[0] == 3 and n == sample.shape[1] == known.shape[0] == motion.shape[0]):
+            raise ValueError(f'expected arrays of {n} joints')
+        if not self.begun:
+            self.keep(time, sample)
+            return 'first'
+        over = self.h if self.of_position else 1.0
+        self.h = (time - self.time) * 1e-9
+        for k in range(n):
+            self.way[k] = self.shorter(k, sample[1, k] - self.position[k])
+            moves = moves or self.way[k] != 0.0
+        if moves:
+            self.still = False
+        elif not self.still and velocity is not None:  # to the bit, and all joints at once
+            for k in range(n):
+                self.still = self.still or fabs(motion[k]) > self.stopping[k] * self.h * over
+        if self.still:
+            return 'standing still'
+        if self.h > self.longest:
+            return 'restarts'
+        self.h = self.clock.interval(self.h, self.way, known, self.noise.now[1])
+        for k in range(n):
+            if fabs(self.way[k]) > self.highest[2, k] * self.h + self.noisy[k]:
+                return 'jumped'
+            self.rate[k] = self.way[k] / self.h if self.of_position else sample[2, k]
+        self.vague = self.clock.vague if self.of_position else 0.0
+        self.noise.take(sample)
+        self.keep(time, sample)
+        return ''
+
+    cdef void keep(self, long long time, const double[:, ::1] sample) noexcept:
+        """Remember a sample."""
+        cdef int k
+        self.begun, self.time = True, time
+        for k in range(self.noisy.shape[0]):
+            self.position[k] = sample[1, k]
