@@ -48,10 +48,10 @@ STOPPING = 2.0
 """Times the same, by which no arm is stopped between two samples."""
 DAMPING = 0.02
 """Singular value of a frame's Jacobian, m, below which a force along it is damped."""
-LOOK, KEEP = 0.005, 0.98
+LOOK, KEEP = 0.01, 0.96
 """
-Seconds between two estimates that count for the link, since neighbours say nearly the same; and how
-much of what was known before still counts at the next one, since a contact may slide.
+Seconds between two looks at the posture and, in contact, at the link; and how much of what was
+known of the link still counts at the next one, since a contact may slide.
 """
 ELSEWHERE = 0.02
 """Share of a contact's forces that is expected on any link, however sure one of them is."""
@@ -232,12 +232,11 @@ class Arm:
     def reset(self) -> None:
         """Begin anew with the next sample."""
         n = len(self.joints)
-        self._first: tuple[Terms, Floats] | None = None  # terms and drive of the first sample
+        self._first: Any = None  # Terms and drive of the first sample
         self._waiting: deque[tuple[int, int, Floats]] = deque()  # stamps, times and samples
         self._velocity: Floats | None = None  # estimated
         self._contact = False
-        self.model.expect(np.ones(n))
-        self._looked, self._evidence = 0, np.zeros(n)  # when, and for each link
+        self._looked, self._evidence = 0, np.zeros(n)  # stamp, and log-likelihood of each link
         self.doubts.reset()
         self._samples.reset()
         self._entrance.reset()
@@ -344,6 +343,7 @@ class Arm:
             samples.take(time, sample, None, velocity)
         if problem:
             self._first = self._drive(q, velocity, torque, velocity)
+            self._reach = np.sum(self.model.reach_of_links(q), axis=0)
             return None
         h, speed = samples.h, samples.speed
         if self._velocity is None:
@@ -361,7 +361,7 @@ class Arm:
             terms, drive = self._drive(q, velocity, torque, velocity)
         bank.step(
             h, terms.mass, samples.change, self._variance, samples.vague, drive,
-            self._torque_variance, terms.reach,
+            self._torque_variance, self._reach,
         )  # fmt: skip
         self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
@@ -375,15 +375,16 @@ class Arm:
         odds, torques, covariance = bank.log_odds, bank.mean[2].copy(), bank.covariance.copy()
         self._velocity = self.model.velocity_of(bank.mean[1])
         self._contact = odds > (0.0 if touched else self._threshold)
-        if self._contact and not (touched and stamp - self._looked < LOOK * 1e9):
-            own = self._likelihoods(torques, covariance, q)
-            self._evidence = KEEP * self._evidence + own if touched else own
+        if self._contact != touched or stamp - self._looked >= LOOK * 1e9:
             self._looked = stamp
-            likely = np.exp(self._evidence - np.max(self._evidence))
-            likely *= (1.0 - ELSEWHERE) / np.sum(likely)
-            self.model.expect(len(likely) * likely + ELSEWHERE)
-        elif touched and not self._contact:
-            self.model.expect(np.ones(len(torques)))
+            reach, shares = self.model.reach_of_links(q), np.ones(len(q))
+            if self._contact:
+                own = self._likelihoods(torques, covariance, reach)
+                self._evidence = KEEP * self._evidence + own if touched else own
+                likely = np.exp(self._evidence - np.max(self._evidence))
+                likely *= (1.0 - ELSEWHERE) / np.sum(likely)
+                shares = len(q) * likely + ELSEWHERE
+            self._reach = np.tensordot(shares, reach, 1)
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
         return ArmEstimate(
             stamp, q, self._velocity, torques, covariance, odds, self._contact, link
@@ -407,9 +408,8 @@ class Arm:
             drive -= terms.gravity
         return terms, drive
 
-    def _likelihoods(self, torque: Floats, covariance: Floats, q: Floats) -> Floats:
+    def _likelihoods(self, torque: Floats, covariance: Floats, reach: Floats) -> Floats:
         """Return for each link how likely a force on it makes this torque, as a logarithm."""
-        reach = self.model.reach_of_links(q)
         size = torque @ torque / np.maximum(np.trace(reach, axis1=1, axis2=2), 1e-12)
         spread = covariance + size[:, np.newaxis, np.newaxis] * reach
         missed = np.linalg.solve(spread, np.tile(torque[:, np.newaxis], (len(size), 1, 1)))

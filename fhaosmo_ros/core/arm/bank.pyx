@@ -284,7 +284,7 @@ cdef class Bank:
     cdef VECTORISED correct(self) noexcept nogil:
         """Correct all filters by the sample, and weigh them by how likely it was to each."""
         cdef Py_ssize_t j, i, k, o, n = self.joints
-        cdef Py_ssize_t own = 0 if self.of_position else n  # where the measured part of the state is
+        cdef Py_ssize_t own = 0 if self.of_position else n  # where what is measured begins
         cdef double total, most = -1e300, pivot
         cdef double* row
         cdef double* to

@@ -32,7 +32,6 @@ class Terms(NamedTuple):
     mass: Floats  # (n, n) M, kg m^2 (kg for a prismatic joint)
     coriolis: Floats  # (n,) C(q, qd)^T qd, N m: what drives p = M qd beside torque and gravity
     gravity: Floats  # (n,) g, N m
-    reach: Floats  # (n, n) sum over the links of share J^T J, the mean over places on one, m^2
 
 
 class ArmModel:
@@ -101,8 +100,8 @@ class ArmModel:
         self.lowest, self.highest = np.where(ends, [lowest, highest], [[-np.inf], [np.inf]])
         limits = np.array([model.velocityLimit, model.effortLimit])
         self.velocity_limits, self.effort_limits = np.where(limits > 0.0, limits, np.inf)
-        # Arms whose only mass is that of one link, for each; and of all links: see `set_payload`.
-        self._even = [pin.Model(model) for _ in range(n + 1)]
+        # For each link an arm whose only mass is 1 kg of that link: see `set_payload`.
+        self._even = [pin.Model(model) for _ in range(n)]
         for even in self._even:
             for k in range(1, n + 1):
                 even.inertias[k] = pin.Inertia.Zero()
@@ -146,20 +145,11 @@ class ArmModel:
             # the mass matrix of an arm that has 1 kg there, of an inertia of that mean square.
             square = max(np.trace(own.inertia), 0.0) / (3.0 * own.mass)
             self._even[k - 1].inertias[k] = self._pin.Inertia(1.0, own.lever, square * np.eye(3))
-        self.expect(np.ones(len(self.links)))
         mass = self.terms(np.zeros(len(self.joints)), np.zeros(len(self.joints))).mass
         if not np.all(np.linalg.eigvalsh(mass) > 0.0):
             raise ConfigurationError(
                 'robot description: expected links with mass and inertia, got a mass matrix that '
                 f'is not positive (diagonal {np.array2string(np.diag(mass), precision=3)})'
-            )
-
-    def expect(self, shares: Floats) -> None:
-        """Let `Terms.reach` count each link by its share from now on, (n,); their sum is n."""
-        for k, share in enumerate(shares, 1):
-            place = self._even[k - 1].inertias[k]
-            self._even[-1].inertias[k] = self._pin.Inertia(
-                share, place.lever, share * place.inertia
             )
 
     def inertial_of(self, payload: Payload) -> Floats:
@@ -181,8 +171,7 @@ class ArmModel:
         coriolis = velocity @ pin.computeCoriolisMatrix(model, data, configuration, velocity)
         gravity = pin.computeGeneralizedGravity(model, data, configuration).copy()
         mass = pin.crba(model, data, configuration).copy()
-        reach = pin.crba(self._even[-1], self._even_data[-1], configuration).copy()
-        return Terms(mass, coriolis, gravity, reach)
+        return Terms(mass, coriolis, gravity)
 
     def velocity_of(self, momentum: Floats) -> Floats:
         """Return M^-1 p of p (n,), at the posture of the latest `terms`."""
@@ -195,7 +184,7 @@ class ArmModel:
             self._configuration(q),
             zip(self._even, self._even_data, strict=True),
         )
-        return np.array([self._pin.crba(*link, configuration) for link in links][:-1])
+        return np.array([self._pin.crba(*link, configuration) for link in links])
 
     def gravity_columns(self, q: ArrayLike) -> Floats:
         """Return the matrix (n, 3) whose product with a vector of gravity is g(q)."""

@@ -227,7 +227,8 @@ cdef class Samples:
         bint of_position,
     ):
         n = len(noisy)
-        self.noise, self.clock, self.longest, self.of_position = noise, Clock(), longest, of_position
+        self.noise, self.clock = noise, Clock()
+        self.longest, self.of_position = longest, of_position
         self.lowest, self.highest, self.noisy, self.stopping = lowest, highest, noisy, stopping
         self.turning = np.array(turning, dtype=np.uint8)
         self.rest, self.position = np.zeros(n), np.zeros(n)
@@ -288,7 +289,9 @@ cdef class Samples:
         cdef int k, n = self.noisy.shape[0]
         cdef double over  # what divides `motion` to have p
         cdef bint moves = False
-        if not (sample.shape[0] == 3 and n == sample.shape[1] == known.shape[0] == motion.shape[0]):
+        if sample.shape[0] != 3 or not (
+            n == sample.shape[1] == known.shape[0] == motion.shape[0]
+        ):
             raise ValueError(f'expected arrays of {n} joints')
         if not self.begun:
             self.keep(time, sample)
