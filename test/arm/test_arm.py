@@ -122,7 +122,7 @@ def test_other_joints_than_revolute_ones(kind):
 def test_without_noise_one_filter_is_the_kalman_filter():
     """One joint, weights fixed by rates of zero: compare with the textbook recursion."""
     h, w, r, e = 1e-3, 4.0, 1e-8, 0.01
-    bank = Bank([w], 1e-9, [1.0], 0.0, 0.0, 0.0, 0.0)
+    bank = Bank([w], 1e-9, [1.0], (0.0, 0.0, 0.0))
     bank.start(1.0, 0.0, [0.0], [[1.0]], [1.0])
     x, p = np.zeros(3), np.diag([0.0, 1.0, 1.0])
     f = np.array([[1, h, h * h / 2], [0, 1, h], [0, 0, 1]])
@@ -149,7 +149,7 @@ def test_a_force_that_is_there_at_once_is_not_taken_for_one_that_grows():
     """The first sample of a step of d = 1: its mean over the sample, not half as much again."""
     h, seen = 1e-3, {}
     for onset in (0.0, 0.1):
-        bank = Bank([1e-9], 3.0, [1.0], 1.0, 1.0, 0.0, onset, of_position=False)
+        bank = Bank([1e-9], 3.0, [1.0], (1.0, 1.0, 0.0), onset, of_position=False)
         tiny, one = np.array([1e-16]), np.eye(1)
         for change in [0.0] * 20 + [h]:
             bank.step(h, one, np.array([change]), tiny, 0.0, np.zeros(1), tiny, one)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 MAX_GAP = 0.1
 """Seconds without a sample, or back in time, after which the estimates begin anew."""
-BEGIN, END, CHANGE = 0.15, 7.0, 30.0
+RATES = 0.15, 7.0, 30.0
 """Rates (1/s) at which contact begins and ends, and its intensity changes."""
 ONSET = 0.05
 """Seconds of a contact's intensity by which its force may be there at once."""
@@ -207,7 +207,7 @@ class Arm:
         )  # fmt: skip
         self._bank = Bank(
             2.0 * DECAY * self._model_variance, DECAY, np.array(INTENSITIES) * model.weight,
-            BEGIN, END, CHANGE, ONSET, SINCE if self._of_position else 0.0, self._of_position,
+            RATES, ONSET, SINCE if self._of_position else 0.0, self._of_position,
         )  # fmt: skip
         self._entrance = Clock()  # of samples that wait until their effort has come
         self.doubts = Doubts(model, self._with_gravity, np.sqrt(self._model_variance))

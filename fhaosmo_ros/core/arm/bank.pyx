@@ -32,8 +32,8 @@ cdef class Bank:
         Of d in free motion, 1/s; in contact d does not decay.
     scales : (m,) array
         Of the contact filters: W is scale^2 times `shape` of `step`, and that of free motion.
-    begin, end, change : float
-        Rates (1/s) at which contact begins and ends, and at which its intensity changes.
+    rates : three floats
+        1/s, at which contact begins and ends, and at which its intensity changes.
     onset, since : float
         Where contact begins, d may have jumped by so many seconds of W, at any time within the
         last `since` seconds: else a force that is there at once would be taken for one that still
@@ -65,14 +65,14 @@ cdef class Bank:
     cdef double[::1] drive, mean_drive
 
     def __init__(
-        self, free_intensity, double decay, scales, double begin, double end, double change,
-        double onset=0.0, double since=0.0, bint of_position=True,
+        self, free_intensity, double decay, scales, rates, double onset=0.0, double since=0.0,
+        bint of_position=True,
     ):
         cdef int n = len(free_intensity), m = len(scales) + 1
         self.joints, self.filters, self.of_position = n, m, of_position
         self.free = np.array(free_intensity, dtype=np.float64)
         self.scales = np.array(scales, dtype=np.float64)
-        self.decay, self.begin, self.end, self.change = decay, begin, end, change
+        self.decay, (self.begin, self.end, self.change) = decay, rates
         self.onset, self.since = onset, since
         self.x, self.p = np.zeros((m, 3 * n)), np.zeros((m, 3 * n, 3 * n))
         self.sum_x, self.sum_p = np.zeros((2, 3 * n)), np.zeros((2, 3 * n, 3 * n))
@@ -171,7 +171,7 @@ cdef class Bank:
         cdef Py_ssize_t j, a, k, n = self.joints, size = 3 * n, contacts = self.filters - 1
         cdef double begin = -expm1(-self.begin * h) / contacts, end = -expm1(-self.end * h)
         cdef double other = 0.0  # probability that contact goes on with one other intensity
-        cdef double touched = 1.0 - self.w[0], stay
+        cdef double touched = 1.0 - self.w[0], stay, share
         cdef double* all_x = &self.sum_x[0, 0]
         cdef double* all_p = &self.sum_p[0, 0, 0]
         cdef double* contact_x = &self.sum_x[1, 0]
@@ -194,9 +194,10 @@ cdef class Bank:
         add(all_x, all_p, begin * self.w[0], &self.x[0, 0], &self.p[0, 0, 0], size)
         for j in range(1, contacts + 1):
             self.mixed[j] = begin * self.w[0] + other * touched + stay * self.w[j]
+            share = 1.0 / self.mixed[j]
             blend(
-                &self.x[j, 0], &self.p[j, 0, 0], stay * self.w[j], all_x, all_p, 1.0,
-                self.mixed[j], &self.off[0], size,
+                &self.x[j, 0], &self.p[j, 0, 0], stay * self.w[j] * share, all_x, all_p, share,
+                &self.off[0], size,
             )  # fmt: skip
             self.begun[j] = begin * self.w[0] / self.mixed[j]
         for k in range(n):  # of contact that has ended nobody needs d any more
@@ -212,8 +213,8 @@ cdef class Bank:
         stay = (1.0 - contacts * begin) * self.w[0]
         self.mixed[0] = stay + end * touched
         blend(
-            &self.x[0, 0], &self.p[0, 0, 0], stay, contact_x, contact_p, end, self.mixed[0],
-            &self.off[0], size,
+            &self.x[0, 0], &self.p[0, 0, 0], stay / self.mixed[0], contact_x, contact_p,
+            end / self.mixed[0], &self.off[0], size,
         )  # fmt: skip
         for j in range(contacts + 1):
             for a in range(size):
@@ -383,19 +384,18 @@ cdef inline void add(
 
 cdef inline void blend(
     double* x, double* p, double own, const double* of_x, const double* of_p, double share,
-    double total, double* mean, Py_ssize_t size,
+    double* mean, Py_ssize_t size,
 ) noexcept nogil:
-    """Make x and p the mean and covariance of a share of sums and of what they have been."""
+    """Make x and p the mean and covariance of shares of what they have been, and of sums."""
     cdef Py_ssize_t a, b
     cdef double c
     for a in range(size):
-        mean[a] = (share * of_x[a] + own * x[a]) / total
+        mean[a] = share * of_x[a] + own * x[a]
     for a in range(size):
-        c = own * x[a] / total
+        c = own * x[a]
         for b in range(size):
             p[a * size + b] = (
-                share / total * of_p[a * size + b] + own / total * p[a * size + b]
-                + c * x[b] - mean[a] * mean[b]
+                share * of_p[a * size + b] + own * p[a * size + b] + c * x[b] - mean[a] * mean[b]
             )
     for a in range(size):
         x[a] = mean[a]
