@@ -247,6 +247,15 @@ def test_a_driver_that_repeats_each_position_is_one_of_half_the_rate(free, arm):
     assert rms(found.external_torque[500:]) < 1.5 * rms(once.external_torque)
 
 
+def test_samples_a_nanosecond_apart_do_not_make_estimates_grow_without_end(free, arm):
+    """Their velocity is 10,000 rad/s, and C^T qd, its square, would drive the next one."""
+    t, q, v, torque = (array.copy() for array in free)
+    t[1], q[1] = t[0] + 1e-9, q[0] + [1e-5, -1e-5, 1e-5]
+    found = run(arm, (t, q, v, torque), end=1000)
+    assert np.nanmax(np.abs(found.external_torque)) < 100.0
+    assert arm.counters['used'] > 990
+
+
 def test_limits_that_the_urdf_does_not_say_are_none(free):
     arm = Arm(re.sub('<limit .*?/>', '<limit velocity="0" effort="0"/>', URDF))
     run(arm, free, end=100)

@@ -54,7 +54,7 @@ Seconds between two looks at the posture and, in contact, at the link; and how m
 known of the link still counts at the next one, since a contact may slide.
 """
 ELSEWHERE = 0.02
-"""Share of a contact's forces that is expected on any link, however sure one of them is."""
+"""By so much forces on each link still count in a contact, however sure another link is."""
 SLIDING = 0.005
 """s: memory of the differences of positions that friction is computed from."""
 FAULTS = ('too strong', 'beyond limits', 'too fast')
@@ -366,6 +366,10 @@ class Arm:
         self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             return self._refuse('doubted')
+        self._velocity = self.model.velocity_of(bank.mean[1])
+        if not samples.is_possible(self._velocity):  # C^T qd grows with its square
+            self.reset()
+            return self._refuse('diverged')
         self.counters['used'] += 1
         return self._estimate(stamp, q)
 
@@ -373,7 +377,6 @@ class Arm:
         """Return what the bank says, and the likeliest link by all that it said in a contact."""
         bank, touched = self._bank, self._contact
         odds, torques, covariance = bank.log_odds, bank.mean[2].copy(), bank.covariance.copy()
-        self._velocity = self.model.velocity_of(bank.mean[1])
         self._contact = odds > (0.0 if touched else self._threshold)
         if self._contact != touched or stamp - self._looked >= LOOK * 1e9:
             self._looked = stamp
@@ -382,8 +385,7 @@ class Arm:
                 own = self._likelihoods(torques, covariance, reach)
                 self._evidence = KEEP * self._evidence + own if touched else own
                 likely = np.exp(self._evidence - np.max(self._evidence))
-                likely *= (1.0 - ELSEWHERE) / np.sum(likely)
-                shares = len(q) * likely + ELSEWHERE
+                shares = likely / np.sum(likely) + ELSEWHERE
             self._reach = np.tensordot(shares, reach, 1)
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
         return ArmEstimate(
