@@ -366,14 +366,14 @@ class Arm:
         self.doubts.take(h, q, torque, bank.mean[2])
         if self.doubts.text and not self.doubts.payload:
             return self._refuse('doubted')
-        self._velocity = self.model.velocity_of(bank.mean[1])
-        if not samples.is_possible(self._velocity):  # C^T qd grows with its square
+        self._velocity = speed = self.model.velocity_of(bank.mean[1])
+        if not samples.is_possible(speed):  # C^T qd grows with its square
             self.reset()
             return self._refuse('diverged')
         self.counters['used'] += 1
-        return self._estimate(stamp, q)
+        return self._estimate(stamp, q, speed)
 
-    def _estimate(self, stamp: int, q: Floats) -> ArmEstimate:
+    def _estimate(self, stamp: int, q: Floats, velocity: Floats) -> ArmEstimate:
         """Return what the bank says, and the likeliest link by all that it said in a contact."""
         bank, touched = self._bank, self._contact
         odds, torques, covariance = bank.log_odds, bank.mean[2].copy(), bank.covariance.copy()
@@ -389,7 +389,7 @@ class Arm:
             self._reach = np.tensordot(shares, reach, 1)
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
         return ArmEstimate(
-            stamp, q, self._velocity, torques, covariance, odds, self._contact, link
+            stamp, q, velocity, torques, covariance, odds, self._contact, link
         )
 
     def _drive(
