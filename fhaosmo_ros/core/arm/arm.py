@@ -388,9 +388,7 @@ class Arm:
                 shares = likely / np.sum(likely) + ELSEWHERE
             self._reach = np.tensordot(shares, reach, 1)
         link = self.model.links[int(np.argmax(self._evidence))] if self._contact or touched else ''
-        return ArmEstimate(
-            stamp, q, velocity, torques, covariance, odds, self._contact, link
-        )
+        return ArmEstimate(stamp, q, velocity, torques, covariance, odds, self._contact, link)
 
     def _drive(
         self, q: Floats, velocity: Floats, torque: Floats, sliding: Floats
