@@ -186,16 +186,3 @@ def test_a_wrong_setting_is_said_once_and_the_estimates_stop(launch, user, tmp_p
     assert not limb.is_answered()
     lines = 1 + (time.monotonic() - begin) / 5.0  # once in five seconds
     assert len(limb.said(text)) <= lines
-
-
-@pytest.mark.parametrize(('values', 'text'), [
-    ({'robot_description_file': '/none.urdf'}, "parameter 'robot_description_file': expected a"),
-    ({'payload': '[1.0]'}, "parameter 'payload'"),
-])  # fmt: skip
-def test_bad_parameters_end_the_node_in_one_line(launch, tmp_path, values, text):
-    urdf = tmp_path / 'three.urdf'
-    urdf.write_text(URDF)
-    process = launch('arm', **{'robot_description_file': urdf, **values})
-    assert process.wait() == 2
-    assert text in process.output()
-    assert process.output().count('\n') == 1

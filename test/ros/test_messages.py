@@ -12,47 +12,12 @@ from geometry_msgs.msg import AccelStamped, Quaternion, WrenchStamped
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
-from running import as_time, FED, joint_state, nanoseconds, ROOT, SECOND, STALE, User, WARN
+from running import as_time, FED, joint_state, nanoseconds, SECOND, STALE, User, WARN
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import ByteMultiArray, Float64, Header
 
 STEP = 2_000_000
 """Nanoseconds between two header stamps."""
-
-
-def test_robot_is_estimated_live(user, estimator):
-    """One joint, a double integrator at rest; d is 0 and 0.5 in turn, for a second each."""
-    t = np.arange(1000) * STEP / SECOND
-    d = 0.5 * (np.floor(t) % 2)
-    speed = STEP / SECOND * (np.cumsum(d) - d)
-    position = STEP / SECOND * (np.cumsum(speed + 0.5 * STEP / SECOND * d))
-    position = np.concatenate([[0.0], position[:-1]])
-    typed = user.record('/robot/estimator/joint_states', JointState)
-    rig = estimator(
-        '/robot', '--params-file', ROOT / 'config' / 'joint_states.yaml',
-        reliable=['joint_states'],
-        **FED | {'channels': [''], 'input_field': 'position[shoulder]', 'max_gap': 0.0},
-        unknown_input_scale=2.0,
-    )  # fmt: skip
-    joints = user.publisher('/robot/joint_states', JointState)
-    for k in range(len(t)):
-        joints.publish(joint_state(SECOND + k * STEP, ['shoulder'], [position[k]]))
-        user.wait(lambda k=k: len(typed) > k - 50, 'estimates')
-    user.wait(lambda: len(rig.estimates) == len(typed) == len(t), 'estimate of every sample')
-    rig.wait_count('samples accepted', len(t))
-    assert rig.count('samples lost') == rig.count('samples rejected') == 0
-    assert rig.value('stamps') == 'header'
-    for (_, message), e, k in zip(typed, rig.estimates, range(len(t)), strict=True):
-        assert nanoseconds(message.header.stamp) == SECOND + k * STEP
-        assert message.name == ['shoulder']
-        found = message.position[0], message.velocity[0], message.effort[0]
-        assert found == (*e.z, 2.0 * e.unknown_input)
-    found = np.array([e.unknown_input for e in rig.estimates])
-    settled = (t >= 1.0) & (t % 1.0 >= 0.5)
-    assert np.sqrt(np.mean((found - d)[settled] ** 2)) <= 0.07
-
-
-# Bad input: one clear line each, counted, survived.
 
 
 def test_bad_messages_are_told_counted_and_survived(user, estimator):
@@ -82,9 +47,6 @@ def test_bad_messages_are_told_counted_and_survived(user, estimator):
     rig.wait_status('input', WARN, 'header stamps lie', 'another clock')
 
 
-# Other messages.
-
-
 def test_bytes_are_numbers():
     """They are numbers to rosbags, and bytes to rclpy."""
     for message, field in (
@@ -94,9 +56,6 @@ def test_bytes_are_numbers():
         kind = f'{type(message).__module__.partition(".")[0]}/msg/{type(message).__name__}'
         read = deserialize_message(serialize_message(message), message_class(kind))
         assert find_field(definitions(kind), kind, field).value(read) == 2.0
-
-
-# Angles, known inputs and typed outputs.
 
 
 def test_yaw_and_known_input_from_the_message_of_y_and_typed_outputs(user, estimator):

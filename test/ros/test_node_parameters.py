@@ -4,10 +4,7 @@
 import math
 
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
-from fhaosmo_ros.core.parameters.tables import (
-    ESTIMATOR_PARAMETERS,
-    PLANT_NODE_PARAMETERS,
-)
+from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, PLANT_NODE_PARAMETERS
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rclpy.parameter import get_parameter_value
@@ -85,6 +82,8 @@ def test_constants_are_parameters_of_their_own(user, launch):
     ('estimator', 'variant', 'fuzy', ["'fuzy'", "did you mean 'fuzzy'?"]),
     ('estimator', 'lambda', [15.0, 15.0], ['1 or 4', '[15.0, 15.0]']),
     ('estimator', 'order', 2, ['cleanup', '2']),
+    ('estimator', 'epsilon', math.nan, ['expected', 'nan']),
+    ('estimator', 'fuzzy_systems', [True], ['expected', 'True']),
     ('estimator', 'lamda', 1.0, ["did you mean 'lambda'?"]),
     ('plant', 'noise_seed', 1.5, ['an integer', '1.5']),
     ('plant', 'phi', ['0', '0', 'z1'], []),
@@ -129,23 +128,3 @@ def test_texts_as_ros2_param_set_sends_them(fed, name, text, value):
         assert p.get(name) == value
     assert not try_to_set(ParameterValue()).successful  # as `ros2 param delete`
     assert p.messages(name)[0].type == p.describe(name)[0].type == kind
-
-
-ODD = (
-    math.nan, math.inf, -1.0, 0.0, 1e308, 5e-324, 2**62, True, '', '[1.0, 2.0]', '1e-3',
-    "__import__('os').abort()", [1.0, math.nan], [0.5] * 13, ['0', '0'], [True], 'x' * 10_000,
-)  # fmt: skip
-
-
-def test_odd_values_hurt_nobody_and_each_refusal_has_its_reason(fed):
-    refused = 0
-    for name in ('epsilon', 'lambda', 'fuzzy_systems', 'variant', 'start_from_measurement'):
-        for value in ODD:
-            result = fed.parameters.try_to_set(**{name: value})
-            refused += not result.successful
-            assert result.successful or f"parameter '{name}': expected" in result.reason, value
-            assert '\n' not in result.reason
-            fed.send(0.2)
-    assert refused > 50
-    e = fed.feed(0.2)
-    assert all(map(math.isfinite, [*e.z, e.unknown_input, e.gamma, *e.innovation]))

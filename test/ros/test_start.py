@@ -29,21 +29,18 @@ REFUSED = [
     # Files.
     (E, [*set_in_file('lamda: [1]'), *set_in_file('lamda: [2]')],
      ["5.yaml: unknown parameter 'lamda'", "mean 'lambda'?"]),
-    (E, [*set_in_file('lambda: [-3.0]'), '-p', 'lambda:=[-4.0]'],
-     ["error: parameter 'lambda'", '> 0', '[-4.0]']),
+    (E, [*set_in_file('lambda: [-3.0]'), '-p', 'lambda:=[-4.0]'], ["parameter 'lambda'", '-4.0']),
     (P, ['--ros-args', '-r', '__node:=plans', '--params-file', OF_PLANT],
      ["got 'plant'; did you mean '/plans'"]),
     (P, ['--ros-args', '--params-file', '/nowhere/demo.yaml'],
      ['/nowhere/demo.yaml', 'expected a readable file', 'No such file']),
-    (E, set_in_file(f'lambda: {HOSTILE["laughs"].strip()}'), ['.yaml']),
+    ('arm', rules('robot_description_file:=/none.urdf'), ["'robot_description_file': expected"]),
     # Arguments.
     (E, rules(f'lambda:={HOSTILE["50000 brackets"]}'), ["'lambda'"]),
     (E, rules('estimator:noise:=0.1'), ["'noise'"]),
     (E, rules('epsilon'), ["'-p epsilon'"]),
-    (E, ['--ros-args', '-p'], ['-p']),
     (P, ['fast'], ["'fast'", 'usage: plant']),
     (P, ['-p', 'order:=3'], ["'-p'", '--ros-args']),
-    (P, ['--ros-args', '--fast'], ['--fast']),
     # Topics and messages.
     (E, rules('input_topic:=/a b'), ["'input_topic'", "'/a b'"]),
     (E, rules('input_topic:=/a', 'input_type:=sensor_msgs/JoinState'),
@@ -52,7 +49,6 @@ REFUSED = [
      ["'input_type'", 'is installed here', 'nobody/msg/No']),
     (E, rules('input_type:=sensor_msgs/msg/Imu', 'input_field:=angular_velocty.z'),
      ["field 'angular_velocty.z'", 'sensor_msgs/msg/Imu', "mean 'angular_velocity.z'"]),
-    (E, rules('input_type:=sensor_msgs/msg/JointState'), ['a field', 'position[i]']),
     (E, rules('input_type:=std_msgs/msg/Float64', 'input_stamp:=header'),
      ["'input_stamp'", 'messages with a header', 'std_msgs/msg/Float64']),
     # Channels.
@@ -64,9 +60,6 @@ REFUSED = [
      ['/estimator/state', 'sometimes']),
     (P, rules('qos_overrides./yy.publisher.depth:=5'),
      ["'qos_overrides./yy.publisher.depth': expected qos_overrides.ENDPOINT.POLICY", '/y.pub']),
-    (E, rules('qos_overrides./y.subscription.deadline:=5'),
-     ['y.subscription.deadline', 'one of', '/y.subscription']),
-    (E, rules('qos_overrides./y.subscription.depth:=deep'), ['an integer', "'deep'"]),
 ]  # fmt: skip
 
 
@@ -84,6 +77,8 @@ def in_files(words: list[str], folder: Path) -> list[str]:
 
 @pytest.mark.parametrize(('node', 'words', 'expected'), REFUSED)
 def test_one_line_says_what_is_wrong(node, words, expected, tmp_path, capfd):
+    if node == 'arm':
+        pytest.importorskip('pinocchio')
     # In this process; it is not to run.
     watch = Timer(DEADLINE, signal.raise_signal, [signal.SIGTERM])
     watch.start()
@@ -107,14 +102,8 @@ def test_one_line_says_what_is_wrong(node, words, expected, tmp_path, capfd):
 def test_files_and_rules_reach_the_node_for_which_they_are(user, launch, tmp_path):
     """One that is renamed, in a namespace, with a file of another node, and lists over values."""
     text = (
-        '/**:\n'
-        '  ros__parameters:\n'
-        '    order: 2\n'
-        "    phi: ['0', '-z2']\n"
-        '    lambda: 12\n'
-        '    max_gap: 2e0\n'
-        '    noise_std: 0.1\n'
-        '    qos_overrides: {/rig/y: {subscription: {depth: 7}}}\n'
+        "/**: {ros__parameters: {order: 2, phi: ['0', '-z2'], lambda: 12, max_gap: 2e0, "
+        'noise_std: 0.1, qos_overrides: {/rig/y: {subscription: {depth: 7}}}}}\n'
         'estimator: {ros__parameters: {epsilon: 0.9}}\n'
         '/rig/lead: {ros__parameters: {alpha: [7], spike_gate: 0.5}}\n'
     )
