@@ -40,11 +40,11 @@ def floats(stamps, values, topic='/y'):
     return [(topic, FLOAT, stamp, float64(value)) for stamp, value in rows]
 
 
-def joint_state(stamp, position):
-    """Return the CDR of joints a, b and c."""
+def joint_state(stamp, position, names=('a', 'b', 'c'), effort=()):
+    """Return the CDR of joints."""
     return serialise(
-        JOINTS, header=header(stamp), name=['a', 'b', 'c'], position=np.array(position),
-        velocity=np.zeros(0), effort=np.zeros(0),
+        JOINTS, header=header(stamp), name=list(names), position=np.array(position),
+        velocity=np.zeros(0), effort=np.array(effort),
     )  # fmt: skip
 
 

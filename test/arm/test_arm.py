@@ -59,34 +59,22 @@ def test_momentum_follows_from_the_terms(model):
     )
 
 
-def test_forces_on_a_link_do_not_reach_joints_behind_it(model):
-    q = np.array([0.5, -1.0, 2.0])
-    reach = model.reach_of_links(q)
-    for k, matrix in enumerate(reach):
-        assert not matrix[k + 1 :].any()
-        assert np.all(np.linalg.eigvalsh(matrix) > -1e-12)
-
-
 def test_a_payload_is_weight_at_its_place():
-    model, bare = ArmModel(URDF), ArmModel(URDF)
+    model, q, rest = ArmModel(URDF), np.array([0.0, np.pi / 2, 0.0]), np.zeros(3)
+    bare = model.terms(q, rest).gravity  # stretched out along x
     model.set_payload(Payload(1.5, (0.0, 0.0, 0.4)))
-    q = np.array([0.0, np.pi / 2, 0.0])  # stretched out along x
-    rest = np.zeros(3)
-    more = model.terms(q, rest).gravity - bare.terms(q, rest).gravity
+    more = model.terms(q, rest).gravity - bare
     np.testing.assert_allclose(more, [0.0, -1.5 * 9.81 * 0.8, -1.5 * 9.81 * 0.4], atol=1e-9)
     weight = np.array([1.5 * 9.81, 0.0, 0.0, 0.0, 0.0, 0.0])  # the tool's own x points downwards
     np.testing.assert_allclose(model.frame_jacobian(q, 'tool').T @ weight, -more, atol=1e-9)
 
 
 @pytest.mark.parametrize(('urdf', 'options', 'text'), [
-    ('rubbish', {}, 'expected the XML of a URDF, got'),
     ('<sdf/>', {}, 'expected a URDF'),
     ('<robot name="r"><link name="a"/></robot>', {}, 'expected a joint that moves'),
     (URDF.replace('type="revolute"', 'type="floating"', 1), {}, 'got a floating one'),
     (URDF, {'joints': ['elbo']}, 'joints: expected some of turn, shoulder, elbow, got elbo'),
-    (URDF.replace('<mass value="2.0"/>', '<mass value="0"/>').replace(
-        link('lower', 2.0, 0.4).split('<inertia ')[1].split('/>')[0],
-        'ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"', 1), {}, 'mass'),
+    (re.sub(r'(mass value|\bi..)="[^"]*"', r'\1="0"', URDF), {}, 'mass'),
 ])  # fmt: skip
 def test_robots_that_cannot_be_used_are_refused_in_one_line(urdf, options, text):
     with pytest.raises(ConfigurationError, match=text) as error:
@@ -113,7 +101,6 @@ def test_other_joints_than_revolute_ones(kind):
     t, q, _, torque = motion(arm.model, 1.0)
     if kind == 'continuous':
         q[:, 0] = np.remainder(q[:, 0] - q[300, 0], 2 * np.pi)  # it passes the seam
-        torque = motion(ArmModel(urdf), 1.0)[3]
     found = arm.run(t, q, torque)
     assert np.abs(found.external_torque[500:]).max() < 2.0
     assert arm.counters['used'] == len(t) - 1
@@ -161,25 +148,19 @@ def test_a_force_that_is_there_at_once_is_not_taken_for_one_that_grows():
 @pytest.mark.parametrize('measurement', ['position', 'velocity'])
 def test_a_push_is_found_told_and_located(free, measurement):
     arm = Arm(URDF, measurement=measurement, velocity_noise=[1e-4])
-    began = 2000
     pushed = np.zeros((4000, 3))
-    pushed[began:] = 3.0, -4.0, 0.0
+    pushed[2000:] = 3.0, -4.0, 0.0
     # The motion is the same because the drives hold against the push.
     found = run(arm, free, push=pushed)
-    late = slice(began + 200, None)
-    np.testing.assert_allclose(
-        found.external_torque[late].mean(axis=0), [3.0, -4.0, 0.0], atol=0.15
-    )
-    assert not found.contact[200:began].any()
-    assert found.contact[late].mean() > 0.95
-    links = found.link[began + 200 :]
-    assert links.count('upper') > 0.9 * len(links)
-    assert np.sqrt(np.mean((found.velocity - free[2])[late] ** 2)) < 0.03
+    np.testing.assert_allclose(found.external_torque[2200:].mean(axis=0), pushed[-1], atol=0.15)
+    assert not found.contact[200:2000].any()
+    assert found.contact[2200:].mean() > 0.95
+    assert found.link[2200:].count('upper') > 0.9 * 1800
+    assert rms((found.velocity - free[2])[1700:]) < 0.03
 
 
 def test_tare_takes_the_present_torque_for_zero(free, arm):
-    run(arm, free, 0, 2000, push=2.0)
-    before = run(arm, free, 2000, 2100, push=2.0)
+    before = run(arm, free, 0, 2100, push=2.0)
     arm.tare()
     after = run(arm, free, 2100, 3000, push=2.0)
     assert np.abs(before.external_torque[-1] - 2.0).max() < 0.3
@@ -196,8 +177,7 @@ def test_currents_gravity_compensated_effort_and_a_late_torque(free, model, arm)
     other = Arm(URDF, effort='current', torque_constants=constants)
     np.testing.assert_allclose(other.run(t, q, torque / constants).external_torque, expected)
     late = np.vstack([np.repeat(torque[:1], 5, axis=0), torque[:-5]])
-    told = Arm(URDF, torque_delay=0.005).run(t, q, late)
-    ignored = Arm(URDF).run(t, q, late)
+    told, ignored = (Arm(URDF, torque_delay=s).run(t, q, late) for s in (0.005, 0.0))
     assert rms(told.external_torque) < 0.5 * rms(ignored.external_torque)
 
 
@@ -273,12 +253,13 @@ def test_limits_that_the_urdf_does_not_say_are_none(free):
 def test_a_setting_that_is_wrong_is_said(wrong, options, text):
     """On a base that is not level, so that a payload is seen whole."""
     gravity, payload = [4.0, 5.0, -7.4], Payload(1.5, (0.0, 0.0, 0.4))
-    model, carrying = ArmModel(URDF, gravity=gravity), ArmModel(URDF, gravity=gravity)
-    carrying.set_payload(payload)
+    model = ArmModel(URDF, gravity=gravity)
     t, q, _, torque = motion(model, 9.0, period=4e-3)
-    g, loaded = (np.array([m.terms(x, np.zeros(3)).gravity for x in q]) for m in (model, carrying))
+    g = np.array([model.terms(x, np.zeros(3)).gravity for x in q])
+    model.set_payload(payload)
+    load = np.array([model.terms(x, np.zeros(3)).gravity for x in q]) - g
     arm = Arm(URDF, {'gravity': gravity, **options})
-    found = arm.run(t, q, wrong(torque, g, loaded - g))
+    found = arm.run(t, q, wrong(torque, g, load))
     assert text in arm.doubts.text
     assert np.isfinite(found.external_torque[-1]).all() == ('payload' in text)  # no mistake
 
@@ -287,17 +268,6 @@ def test_samples_that_nearly_coincide_are_no_jump(free, arm):
     t, q, _, torque = free
     run(arm, free, end=100)
     assert arm.take(round(t[99] * 1e9) + 1000, q[99] + 3 * NOISE, torque[99]) is not None
-
-
-@pytest.mark.parametrize(('named', 'text'), [
-    ({'position_noise': [1e-5, 1e-5]}, '1 or 3 numbers'),
-    ({'payload': [-1.0, 0.0, 0.0, 0.0]}, 'mass >= 0'),
-    ({'gravity': [9.81]}, 'three numbers'),
-    ({'calibration_file': '/none.yaml'}, 'calibration_file'),
-])  # fmt: skip
-def test_bad_parameters_are_refused(named, text):
-    with pytest.raises(ConfigurationError, match=text):
-        Arm(URDF, **named)
 
 
 def test_a_wrench_is_found_at_a_frame_and_what_cannot_be_seen_is_said(free, arm):
@@ -309,16 +279,23 @@ def test_a_wrench_is_found_at_a_frame_and_what_cannot_be_seen_is_said(free, arm)
     assert wrench.near_singular  # three joints do not see six numbers
     explained = jacobian.T @ np.concatenate([wrench.force, wrench.torque])
     np.testing.assert_allclose(explained, estimate.external_torque, atol=0.3)
-    with pytest.raises(ConfigurationError, match='frame: expected one of'):
-        arm.wrench(estimate, 'tol')
 
 
-def test_run_and_calibration_refuse_what_does_not_fit(free):
-    t, q, _, torque = free
+@pytest.mark.parametrize(('named', 'text'), [
+    ({'position_noise': [1e-5, 1e-5]}, '1 or 3 numbers'),
+    ({'payload': [-1.0, 0.0, 0.0, 0.0]}, 'mass >= 0'),
+    ({'gravity': [9.81]}, 'three numbers'),
+    ({'calibration_file': '/none.yaml'}, 'calibration_file'),
+    ({'calibration': replace(Calibration.of_urdf(ArmModel(URDF)), joints=('a', 'b', 'c'))},
+     'expected the joints turn, shoulder, elbow'),
+])  # fmt: skip
+def test_what_does_not_fit_is_refused(arm, named, text):
+    with pytest.raises(ConfigurationError, match=text):
+        Arm(URDF, **named)
     with pytest.raises(ConfigurationError, match='effort: expected shape'):
-        Arm(URDF).run(t, q, torque[:, :2])
-    with pytest.raises(ConfigurationError, match='expected the joints turn, shoulder, elbow'):
-        Arm(URDF, calibration=replace(Calibration.of_urdf(ArmModel(URDF)), joints=('a', 'b', 'c')))
+        arm.run([0.0], [[0.0] * 3], [[0.0] * 2])
+    with pytest.raises(ConfigurationError, match='frame: expected one of'):
+        arm.model.frame_jacobian([0.0] * 3, 'tol')
 
 
 def test_noise_that_nobody_told_is_found_and_makes_no_contact(free, arm):
@@ -414,6 +391,6 @@ def test_an_arm_feels_as_well_with_bad_stamps(model, jitter, hangs, delay):
     error = []
     for given in (t, hanging(stamps) if hangs else stamps):
         estimates = Arm(URDF, torque_delay=delay * PERIOD).run(given, q, torque)
-        error.append(np.sqrt(np.nanmean(estimates.external_torque[1000:] ** 2)))
+        error.append(rms(estimates.external_torque[500:]))
         assert not estimates.contact[1000:].any()
     assert error[1] < error[0] + 0.02

@@ -6,13 +6,13 @@ import pytest
 
 pytest.importorskip('pinocchio')
 
-from fhaosmo_ros.core.arm.calibration import Calibration, WIDTHS
+import bag_files as files
+from fhaosmo_ros.core.arm.calibration import Calibration
 from fhaosmo_ros.core.arm.identification import identify, noise_of, payload_of_motion
 from fhaosmo_ros.core.arm.model import ArmModel, Payload
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.tools.arm import calibrate, replay
-from fhaosmo_ros.tools.bags.types import header, serialise
-from fhaosmo_ros.tools.bags.writer import BagWriter
+from fhaosmo_ros.topics import TEXT
 from robots import JOINTS, motion, URDF
 
 PERIOD = 0.004
@@ -121,7 +121,6 @@ def test_the_file_gives_back_what_was_written_and_others_are_refused(found):
     again = Calibration.loads(text)
     np.testing.assert_array_equal(again.inertial, found.calibration.inertial)
     np.testing.assert_array_equal(again.coulomb, found.calibration.coulomb)
-    assert again.coulomb.shape == (3, len(WIDTHS))
     for old, new, expected in (
         ('offset:', 'ofset:', 'missing or unknown are offset, ofset'),
         ('  - elbow\n', '', 'numbers of shape'),
@@ -138,27 +137,18 @@ def test_the_file_gives_back_what_was_written_and_others_are_refused(found):
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     """Return a bag of free motion, as `record` would have made it."""
-    path = tmp_path_factory.mktemp('arm') / 'free'
-    t, q, torque = recorded(duration=15.0)
-    with BagWriter(path) as writer:
-        writer.add('/robot_description', 'std_msgs/msg/String')
-        writer.add('/joint_states', 'sensor_msgs/msg/JointState')
-        writer.write('/robot_description', 1, serialise('std_msgs/msg/String', data=URDF))
-        for k, moment in enumerate(t):
-            stamp = 10**9 + round(moment * 1e9)
-            writer.write('/joint_states', stamp, serialise(
-                'sensor_msgs/msg/JointState',
-                header=header(stamp), name=list(JOINTS), position=q[k],
-                velocity=np.zeros(0), effort=torque[k],
-            ))  # fmt: skip
-    return path
+    messages = [('/robot_description', TEXT, 1, files.serialise(TEXT, data=URDF))]
+    for t, q, torque in zip(*recorded(duration=15.0), strict=True):
+        stamp = 10**9 + round(t * 1e9)
+        data = files.joint_state(stamp, q, JOINTS, torque)
+        messages.append(('/joint_states', files.JOINTS, stamp, data))
+    return files.write(tmp_path_factory.mktemp('arm') / 'free', messages)
 
 
 def test_commands_calibrate_and_replay_a_bag(bag, tmp_path, capsys):
     file, table = tmp_path / 'three.yaml', tmp_path / 'torque.csv'
     assert calibrate.main(['--bag', str(bag), '-o', str(file)]) == 0
     assert (tmp_path / 'three.png').stat().st_size > 10_000
-    assert 'shoulder' in capsys.readouterr().out
     assert replay.main([str(bag), '-o', str(table), '-p', f'calibration_file:={file}']) == 0
     rows = np.genfromtxt(table, delimiter=',', skip_header=1, usecols=range(7))
     assert np.abs(rows[500:, 1:4]).mean() < 0.5
