@@ -11,18 +11,16 @@ for one, other in zip('abcdefgh', 'bcdefghi', strict=True):
     LAUGHS += f'{other}: &{other} {{' + ', '.join(f'{k}: *{one}' for k in range(9)) + '}\n'
 
 HOSTILE = {
-    'date': '2020-99-99', 'list of dates': '[2001-02-30]',
-    'float': '!!float x', 'int': '!!int x', 'bool': '!!bool x', 'timestamp': '!!timestamp x',
-    'binary': '!!binary \u00e9', 'set': '!!set {a, b}', 'map': '!!map x',
+    'date': '2020-99-99', 'float': '!!float x', 'bool': '!!bool x', 'timestamp': '!!timestamp x',
+    'binary': '!!binary \u00e9', 'map': '!!map x',
     'python': '!!python/object/apply:os.system [true]', 'long tag': '!<' + 'a' * 100_000 + '> b',
     'empty binary integer': '0b_', 'empty hexadecimal integer': '[0x_]',
     '4301 digits': '1' * 4301, 'hexadecimal digits': '0x' + 'f' * 4000,
-    'sexagesimal': ':'.join(['1'] * 1000) + '.5',
     'closed brackets': '[' * 1000 + ']' * 1000, '50000 brackets': '[' * 50_000,
-    'braces': '{a: ' * 1000, 'dashes': '- ' * 50_000, '50000 question marks': '? ' * 50_000,
+    'dashes': '- ' * 50_000, '50000 question marks': '? ' * 50_000,
     'deep mapping': ''.join(' ' * k + 'a:\n' for k in range(1000)),
     'list as key': '{[a]: 1}', 'recursive list': '&a [*a]', 'laughs': LAUGHS,
-    'unknown alias': '*a', 'key twice': '{a: 1, a: 2}', 'merge': '{<<: 3}', 'value': '=',
+    'key twice': '{a: 1, a: 2}', 'merge': '{<<: 3}', 'value': '=',
     'two documents': 'a\n---\nb', 'many values': '[' + '1,' * 200_000 + ']',
     'long text': 'a' * 900_000, 'very long text': 'a' * 2_000_000,
     'directives': '%TAG ! a\n' * 10_000, 'half a list': '[1, 2', 'quote': '"', 'escape': '"\\xZZ"',
