@@ -26,16 +26,17 @@ import yaml
 
 COUNT = 1500
 STAMPS, Y = files.signal(COUNT)
+FLOATS = files.floats(STAMPS, Y)
 
 
 def make(path, how):
     """Write a bag by our writer, by rosbags with sqlite3, or as a preset of mcap."""
     if how != 'ours':
         write = files.write if how == 'sqlite3' else files.write_preset
-        return write(path, files.floats(STAMPS, Y), how)
+        return write(path, FLOATS, how)
     with BagWriter(path) as bag:
         bag.add('/y', files.FLOAT)
-        for k, (topic, _, stamp, data) in enumerate(files.floats(STAMPS, Y)):
+        for k, (topic, _, stamp, data) in enumerate(FLOATS):
             bag.write(topic, stamp, data)
             if k % 250 == 0:  # as the recorder does, now and then
                 bag.flush()
@@ -59,9 +60,6 @@ def read(path):
     return len(values)
 
 
-# Whole bags
-
-
 @pytest.mark.parametrize(('storage', 'compression', 'version'), [
     *((preset, None, 9) for preset in files.PRESETS),
     ('mcap', 'none', 8), ('mcap', 'message', 9),
@@ -69,7 +67,7 @@ def read(path):
 ])  # fmt: skip
 def test_every_storage_and_compression_is_read(storage, compression, version, tmp_path):
     """Presets of mcap in three files, and bags of rosbags."""
-    messages = files.floats(STAMPS, Y) + files.floats(STAMPS + 1, -Y, '/other')
+    messages = FLOATS + files.floats(STAMPS + 1, -Y, '/other')
     messages.sort(key=lambda m: m[2])
     if storage in files.PRESETS:
         bag = files.write_preset(tmp_path / 'bag', messages, storage, parts=3)
@@ -88,22 +86,19 @@ def test_every_storage_and_compression_is_read(storage, compression, version, tm
 @pytest.mark.parametrize('preset', ['plain', 'fastwrite'])
 def test_messages_and_chunks_out_of_order_are_put_in_order(preset, tmp_path):
     order = np.argsort(np.arange(COUNT) + np.random.default_rng(3).uniform(0, 700, COUNT))
-    shuffled = [files.floats(STAMPS, Y)[k] for k in order]
+    shuffled = [FLOATS[k] for k in order]
     assert read(files.write_preset(tmp_path / 'bag', shuffled, preset)) == COUNT
 
 
 def test_bag_whose_qos_differs_from_its_storage_is_read(tmp_path):
     """rosbags finds no message then."""
-    bag = files.write(tmp_path / 'bag', files.floats(STAMPS, Y))
+    bag = files.write(tmp_path / 'bag', FLOATS)
     text = (bag / 'metadata.yaml').read_text()
-    assert 'offered_qos_profiles: []' in text
-    qos = yaml.safe_dump([OFFERED_QOS], default_flow_style=True, width=10_000).strip()
-    text = text.replace('offered_qos_profiles: []', f'offered_qos_profiles: {qos}')
-    (bag / 'metadata.yaml').write_text(text)
+    assert 'profiles: []' in text
+    (bag / 'metadata.yaml').write_text(
+        text.replace('_profiles: []', f'_profiles: [{OFFERED_QOS}]')
+    )
     assert read(bag) == COUNT
-
-
-# Damage
 
 
 @pytest.mark.parametrize('how', ['ours', 'zstd', 'lz4'])
@@ -116,27 +111,15 @@ def test_damage_in_a_file_with_checksums_is_an_error(how, tmp_path):
     results = []
     for k in range(40):
         data = bytearray(whole)
-        end = len(whole)
-        at = int(rng.integers(0, end) if k % 2 else end - rng.integers(1, 1200))
+        at = int(rng.integers(0, len(whole)) if k % 2 else len(whole) - rng.integers(1, 1200))
         if k % 4 < 2:
             data[at] ^= 1 << int(rng.integers(8))
         else:
-            data[at:end] = (bytes(512) + data[at + 512 : end])[: end - at]
+            data[at : at + 512] = bytes(len(data[at : at + 512]))
         file.write_bytes(data)
         results += [read(bag), read(file)]
     assert set(results) <= {COUNT, None}
     assert results.count(None) > 40
-
-
-def test_summary_that_differs_from_its_checksum_is_an_error(tmp_path):
-    """Such as another topic's name, which reads as well."""
-    file = storage_file(make(tmp_path / 'bag', 'ours'))
-    data = bytearray(file.read_bytes())
-    at = data.rindex(b'/y')
-    data[at : at + 2] = b'/z'
-    file.write_bytes(data)
-    with pytest.raises(ConfigurationError, match='summary does not agree with its CRC'):
-        BagReader(file)
 
 
 @pytest.mark.parametrize('how', ['ours', 'lz4', 'fastwrite', 'sqlite3'])
@@ -155,7 +138,7 @@ def test_file_that_was_cut_is_an_error(how, tmp_path):
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 def test_messages_that_are_listed_and_not_there_are_an_error(storage, tmp_path, capsys):
-    bag = files.write(tmp_path / 'bag', files.floats(STAMPS, Y), storage)
+    bag = files.write(tmp_path / 'bag', FLOATS, storage)
     if storage == 'mcap':
         text = (bag / 'metadata.yaml').read_text()
         (bag / 'metadata.yaml').write_text(text.replace('count: 1500', 'count: 1510'))
@@ -211,9 +194,8 @@ def write_ticks(path, order, missing):
 
 
 @pytest.mark.parametrize(('order', 'missing'), [
-    ('abc', {(0, 'a'), (0, 'b')}),
+    ('abc', {(0, 'a'), (0, 'b'), (77, 'b'), (78, 'a'), (78, 'c')}),
     ('abc', {(0, 'c'), (TICKS - 1, 'c'), (TICKS - 1, 'b')}),
-    ('abc', {(77, 'b'), (78, 'a'), (78, 'c')}),
     ('cab', {(0, 'c'), (50, 'b')}),
     ('abc', {(k, 'c') for k in range(TICKS)}),
 ])  # fmt: skip
@@ -235,10 +217,8 @@ SEEN_QOS = LATCHED_QOS | {'history': 'unknown', 'depth': 0}
 
 def test_metadata_is_as_rosbag2_writes_it(tmp_path):
     """As that of rosbags; and again in the file, where the parser of the C++ reader looks."""
-    messages = [
-        ('/y', files.FLOAT, 5, files.float64(1.5)), ('/late', files.FLOAT, 7, files.float64(-2.5)),
-        ('/y', files.FLOAT, 9, files.float64(2.5)),
-    ]  # fmt: skip
+    written = [('/y', 5, 1.5), ('/late', 7, -2.5), ('/y', 9, 2.5)]
+    messages = [(topic, files.FLOAT, t, files.float64(value)) for topic, t, value in written]
     text = (files.write(tmp_path / 'theirs', messages) / 'metadata.yaml').read_text()
     text = text.replace('theirs.mcap', 'bag_0.mcap').replace('distro: rosbags', 'distro: jazzy')
     expected = yaml.safe_load(text)
@@ -262,46 +242,24 @@ def test_metadata_is_as_rosbag2_writes_it(tmp_path):
         inside = yaml.safe_load(metadata.metadata['serialized_metadata'])
         assert {'rosbag2_bagfile_information': inside} == expected
         got = [
-            (channel.topic, schema.name, message.log_time, message.publish_time, decoded.data)
-            for schema, channel, message, decoded in reader.iter_decoded_messages()
+            (channel.topic, message.publish_time, decoded.data)
+            for _, channel, message, decoded in reader.iter_decoded_messages()
         ]
-    assert got == [
-        ('/y', files.FLOAT, 5, 5, 1.5), ('/late', files.FLOAT, 7, 7, -2.5),
-        ('/y', files.FLOAT, 9, 9, 2.5),
-    ]  # fmt: skip
+    assert got == written
 
 
-def recorded(path):
-    """Topics appear in between, as in `record`; it flushes twice a second."""
-    with BagWriter(path) as bag:
-        bag.flush()
-        bag.add('/y', files.FLOAT)
-        bag.flush()
-        for k in range(60_000):
-            bag.write('/y', 1000 + k, files.float64(k))
-        bag.add('/late', files.JOINTS)
-        bag.flush()
-        bag.flush()
-        bag.add('/description', 'std_msgs/msg/String', qos=[LATCHED_QOS])
-        bag.write('/description', 900, files.serialise('std_msgs/msg/String', data='<robot/>'))
-        bag.write('/y', 70_000, files.float64(5.0))
-
-
-def without_messages(path):
-    with BagWriter(path) as bag:
-        bag.add('/y', files.FLOAT)
-        bag.flush()
-
-
-def replayed(path):
-    bag = files.write(path.with_name('source'), files.floats(*files.signal(3000)))
-    assert replay.main([str(bag), '-o', str(path)]) == 0
-
-
-@pytest.mark.parametrize('write', [recorded, without_messages, replayed])
-def test_file_is_one_that_the_cpp_reader_takes(write, tmp_path):
+@pytest.mark.parametrize('count', [0, 60_000])
+def test_file_is_one_that_the_cpp_reader_takes(count, tmp_path):
     """It refuses files with a chunk that has no complete message index (mcap 1.3.0)."""
-    write(tmp_path / 'bag')
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.add('/y', files.FLOAT)
+        bag.flush()
+        for k in range(count):
+            bag.write('/y', 1000 + k, files.float64(k))
+        bag.add('/late', files.FLOAT)  # a topic that appears in between
+        bag.flush()
+        if count:
+            bag.write('/late', 900, files.float64(5.0))
     with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as file:
         reader = make_reader(file, validate_crcs=True)
         assert reader.get_header().profile == 'ros2'
