@@ -49,18 +49,11 @@ def test_file_runs_as_the_node_would_run_it(name):
     assert estimator.counters.accepted >= 990
 
 
-# Events
-
-
-NODE_PAGE = (evidence.DOCS / 'node.md').read_text(encoding='utf-8')
-EVENTS = NODE_PAGE.split('## Events')[1].split('\n## ')[0]
-
-
 @pytest.mark.parametrize('noise', [1e-3, 3e-3])
 def test_the_file_of_the_page_finds_faults_and_nothing_else(tmp_path, noise):
     """A joint at 100 Hz with a small load, and faults of 1 that last 2 s."""
-    path = tmp_path / 'faults.yaml'
-    path.write_text(EVENTS.split('```yaml\n')[1].split('```')[0])
+    path, page = tmp_path / 'faults.yaml', (evidence.DOCS / 'node.md').read_text(encoding='utf-8')
+    path.write_text(page.split('## Events')[1].split('```yaml\n')[1].split('```')[0])
     t, begins = np.arange(0.0, 250.0, 0.01), np.arange(65.0, 240.0, 20.0)
     since = t - np.append(-np.inf, begins)[np.searchsorted(begins, t, side='right')]
     d = 0.03 * (np.sin(0.3 * t) + np.sin(0.9 * t)) + (since < 2.0)
