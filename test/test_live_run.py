@@ -38,10 +38,9 @@ class Live:
         return self
 
     def _tell(self, flags, delay):
-        estimator = self.estimator
-        labels, vector = pack(Snapshot(estimator.latest, flags, estimator.state_dict()))
-        data = labelled_array(labels, vector)
-        self.messages.append((f'{self.name}/snapshot', ARRAY, estimator.latest + delay, data))
+        latest = self.estimator.latest
+        data = labelled_array(*pack(Snapshot(latest, flags, self.estimator.state_dict())))
+        self.messages.append((f'{self.name}/snapshot', ARRAY, latest + delay, data))
 
     def tell_parameters(self, stamp, **values):
         """Publish all that the node is set to."""
@@ -59,8 +58,7 @@ class Live:
 
     def change(self, stamp, name, value):
         self.estimator.configure({name: value})
-        types = files.TYPES.types
-        kinds = ('byte', 'bool', 'integer', 'double')
+        types, kinds = files.TYPES.types, ('byte', 'bool', 'integer', 'double')
         lists = {f'{kind}_array_value': np.zeros(0) for kind in kinds}
         given = types['rcl_interfaces/msg/ParameterValue'](
             type=3, bool_value=False, integer_value=0, double_value=value, string_value='',
@@ -92,7 +90,7 @@ def run(capsys, *arguments, code=0):
     if code:
         return said.err
     with np.load(out) as arrays:
-        names = ['z1', 'z2', 'z3', 'unknown_input', 'gamma']
+        names = ('z1', 'z2', 'z3', 'unknown_input', 'gamma')
         columns = [arrays[name] for name in names if name in arrays]
         stamps, rows = arrays['stamp_ns'].tolist(), np.column_stack(columns).tolist()
     return said.out + said.err, dict(zip(stamps, rows, strict=True))
@@ -112,24 +110,19 @@ def test_every_live_estimate_comes_again(begin, tmp_path, capsys):
     live.estimator.set_input(0.7)  # a set-point that was published once
     live.run(123, 1000)  # it discovered y later than the recorder
     live.change(STAMPS[999], 'epsilon', 1e-6)
-    live.run(1000, 2000)
-    live.reset()
+    live.run(1000, 2000).reset()
     live.run(2000, 2300)
     live.change(STAMPS[2299], 'gamma_rate', 0.02)
     live.change(STAMPS[2299], 'epsilon', 2.0)
-    live.run(2300, 2700)
-    live.freeze(True)
+    live.run(2300, 2700).freeze(True)
     live.run(2700, 3000)
     live.estimator.set_input(-0.4)
     live.messages += files.floats(STAMPS[3000:3001] - 1, np.array([-0.4]), '/rig/u')
-    live.run(3000, 3400)
-    live.freeze(False)
+    live.run(3000, 3400).freeze(False)
     live.run(3400, COUNT)
     # The publisher's latest message, which a late recorder gets first.
-    told = PARAMETERS | model | {'publish_rate': 50.0}
-    if begin == 2600:
-        told |= {'gamma_rate': 0.02, 'epsilon': 2.0}
-    live.tell_parameters(STAMPS[begin], **told)
+    changed = {'gamma_rate': 0.02, 'epsilon': 2.0} if begin == 2600 else {}
+    live.tell_parameters(STAMPS[begin], **PARAMETERS | model | changed, publish_rate=50.0)
     bag = write(tmp_path / 'bag', COUNT, live, begin=begin)
     text, found = run(capsys, bag)
     # The first snapshot after the begin is that of sample 123, 999 or 2699.
@@ -168,8 +161,8 @@ def test_what_cannot_be_followed_begins_afresh(late, options, first, said, tmp_p
 
 
 def test_sample_that_the_bag_lacks_does_not_stop_the_following(tmp_path, capsys):
-    live = Live().run(0, 1000)
-    live.reset()
+    live = Live()
+    live.run(0, 1000).reset()
     live.run(1000, 2000)
     live.tell_parameters(STAMPS[0], **PARAMETERS)
     keep = np.delete(np.arange(2000), 1000)  # the one from which it started again
