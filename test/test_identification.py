@@ -47,9 +47,8 @@ def noise(seed=2):
 def found_in(y, phi=PHI, **given):
     given = {'order': len(phi), 'phi': list(phi)} | given
     values = ESTIMATOR_PARAMETERS.complete(given)
-    model = TriangularModel.of(values)
     data = identify.RecordedOutput(T, y, np.zeros((K, 1)))
-    found = identify.identify_input(data, model, values, given)
+    found = identify.identify_input(data, TriangularModel.of(values), values, given)
     gains = make_gains(found, given)
     return found, gains, run(found, gains)
 
@@ -57,9 +56,6 @@ def found_in(y, phi=PHI, **given):
 @pytest.fixture(scope='module', name='plain')
 def _plain():
     return found_in(plant()[:, 0] + noise())
-
-
-# the likelihood
 
 
 def test_truth_is_likelier_than_other_designs(plain):
@@ -71,9 +67,6 @@ def test_truth_is_likelier_than_other_designs(plain):
     for change in ({'bandwidth': 1.5 * bandwidth}, {'ratio': 10.0 * truth.ratio}):
         assert likelihood(truth._replace(**change)).log_likelihood < best - 3.0
     assert plain[0].best.log_likelihood > best - 1.0
-
-
-# what is found
 
 
 def test_noise_and_size_of_d_are_found(plain):
@@ -117,9 +110,6 @@ def test_given_values_stay():
     assert (found.best.noise, found.best.design.decay) == pytest.approx((2e-3, 1.5))
 
 
-# what is refused, or told
-
-
 def too_few_states():
     """Return the y of a d that moves like a random walk and acts on z2'."""
     shocks = 20.0 * np.sqrt(6.0 * H) * np.random.default_rng(6).standard_normal(K)
@@ -161,9 +151,6 @@ def test_bad_samples_are_left_out():
     t, y = np.array([0.0, 1.0, 1e6, 1.0, 2.0]), np.array([0.0, 1.0, np.nan, 2.0, 3.0])
     kept = identify.usable(identify.RecordedOutput(t, y, np.zeros((5, 1))))
     np.testing.assert_array_equal([kept.t, kept.y], [[0.0, 1.0, 2.0], [0.0, 1.0, 3.0]])
-
-
-# the command
 
 
 def test_command_says_what_a_bag_shows_or_that_it_can_give_no_gains(tmp_path, capsys):

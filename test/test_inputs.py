@@ -61,17 +61,13 @@ def test_number_at_any_depth_by_index_and_by_name(message, path, expected):
             assert field.value(same) == expected
 
 
-# Known inputs paired with y by header stamps: whatever arrives first, the result is one
-
-
 MS = 1_000_000
-GAP = 0.5
 
 
 def pairing_of(stamps, wait, held):
     """Return a pairing of known inputs with these kinds of stamps; `wait` in nanoseconds."""
     known = {f'u{j}': Input('u', '', '', stamp, '') for j, stamp in enumerate(stamps)}
-    values = {'known_input_wait': wait * 1e-9, 'max_gap': GAP}
+    values = {'known_input_wait': wait * 1e-9, 'max_gap': 0.5}
     return Pairing(values, list(known), known, held)
 
 
