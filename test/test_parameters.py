@@ -9,7 +9,6 @@ import warnings
 from fhaosmo_ros.core import ConfigurationError, Observer
 from fhaosmo_ros.core.parameters.declaration import Parameter
 from fhaosmo_ros.core.parameters.files import complete, dumps, load, loads, select
-from fhaosmo_ros.core.parameters.per_channel import of_channel, with_channels
 from fhaosmo_ros.core.parameters.removed import REMOVED
 from fhaosmo_ros.core.parameters.tables import (
     ESTIMATOR_PARAMETERS,
@@ -136,17 +135,6 @@ NAMES = ['hip', 'knee_2']
 def test_bad_names_and_values_are_refused(values, reason):
     with pytest.raises(ConfigurationError, match=reason):
         select(values, ESTIMATOR_PARAMETERS)
-
-
-def test_own_value_wins_and_the_common_one_serves_the_rest():
-    values = {'channels': NAMES, 'epsilon': 5, 'hip.epsilon': 7, 'knee_2.lambda': 3}
-    values = select(values, ESTIMATOR_PARAMETERS)
-    hip, knee = (of_channel(values, name) for name in NAMES)
-    assert (hip['epsilon'], knee['epsilon']) == (7.0, 5.0)
-    assert (knee['lambda'], 'lambda' in hip) == ([3.0], False)
-    table = with_channels(ESTIMATOR_PARAMETERS, NAMES, {'epsilon': 9.0})
-    assert table['hip.epsilon'].default == 9.0  # the common value
-    assert table['hip.max_gap'].default == ESTIMATOR_PARAMETERS['max_gap'].default
 
 
 def replayed(*words):

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded beside a live estimator: complete bags, the live estimates replayed, kills survived."""
+"""The commands record, play and demo beside live nodes: complete bags, and no process left."""
 
+import os
 import re
 import shlex
+import signal
 import subprocess
 import time
 
@@ -10,22 +12,25 @@ import pytest
 
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
-from bag_files import stamps_in
+import bag_files as files
 from commands import COMMAND, environment, interrupted, ROOT, run, start
 from domains import take_domain
+from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import read_ticks
+from fhaosmo_ros.tools.bags.topics import read_ticks, series
+from fhaosmo_ros.tools.demo import OTHERS, read_run
 from fhaosmo_ros.topics import ESTIMATES, EVENT, PARAMETERS, SNAPSHOT
 import numpy as np
 from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_types_from_msg
 from running import Parameters, User
 from std_srvs.srv import Trigger
 from waiting import wait_until
 import yaml
 
 pytestmark = pytest.mark.ros
-APART = str(take_domain())
-"""A domain without the plant that the other tests share."""
+APART = {'env': environment(ROS_DOMAIN_ID=str(take_domain()))}
+"""For a domain without the plant that the other tests share."""
 NODES = ['--ros-args', '--params-file', str(ROOT / 'config' / 'demo.yaml')]
 
 
@@ -36,7 +41,7 @@ def size(folder):
 
 
 def stamps(folder, topic):
-    return stamps_in(folder / f'{folder.name}_0.mcap', topic)
+    return files.stamps_in(folder / f'{folder.name}_0.mcap', topic)
 
 
 def wait_for_more(bag, length, process):
@@ -133,11 +138,10 @@ def test_kill_leaves_what_was_flushed(live, tmp_path):
 def test_input_that_was_remapped_and_channels_are_recorded(tmp_path):
     bag = tmp_path / 'bag'
     channels = ['--ros-args', '-p', 'channels:=[hip, knee]', '-r', 'hip/y:=/force']
-    apart = {'env': environment(ROS_DOMAIN_ID=APART)}
     processes = [
-        start('record', '-o', bag, '--names', '/estimator', **apart),
-        start('estimator', *channels, **apart),
-        start('plant', '--ros-args', '-r', '/y:=/force', **apart),
+        start('record', '-o', bag, '--names', '/estimator', **APART),
+        start('estimator', *channels, **APART),
+        start('plant', '--ros-args', '-r', '/y:=/force', **APART),
     ]
     try:
         # It finds /force only as what the estimator listens to.
@@ -166,3 +170,119 @@ def test_full_disk_leaves_what_was_recorded(live, tmp_path):
     assert 'File "' not in result.stderr  # a stack, by Python or by the middleware
     assert '`mcap recover` saves what was recorded' in result.stderr
     assert len(stamps(tmp_path / 'bag', '/y')) > 1500
+
+
+def plant_package(folder, name):
+    """Write a package of messages whose import leaves a file; return that file."""
+    mark = folder / 'imported'
+    (folder / name / 'msg').mkdir(parents=True)
+    (folder / name / '__init__.py').write_text(f"open({str(mark)!r}, 'w').close()\n")
+    (folder / name / 'msg' / '__init__.py').write_text('class Thing:\n    pass\n')
+    return mark
+
+
+def test_bag_is_played_in_its_own_time_and_an_estimator_restarts_where_it_begins_again(tmp_path):
+    """With names, remappings and the arguments that launch adds, also those without a meaning."""
+    remapped = (
+        '--ros-args', '-r', '__ns:=/tools', '-r', '/y:=/rig/y', '--log-level', 'warn',
+        '-p', 'use_sim_time:=true', '--params-file', tmp_path / 'none.yaml',
+    )  # fmt: skip
+    (tmp_path / 'none.yaml').write_text('none: {ros__parameters: {}}')
+    # The names in a bag come from strangers: a package beside it is not imported.
+    mark = plant_package(tmp_path, 'planted_msgs')
+    files.TYPES.register(get_types_from_msg('float64 data', 'planted_msgs/msg/Thing'))
+    stamps, y = files.signal(1000)
+    thing = '/x', 'planted_msgs/msg/Thing', int(stamps[-1]), files.float64(1.0)
+    files.write(tmp_path / 'bag', [*files.floats(stamps, y), thing])
+    log, recorded = tmp_path / 'log', tmp_path / 'out' / 'out_0.mcap'
+    clock = ('--ros-args', '-p', 'use_sim_time:=true', '-p', 'sampling:=clock')
+    with log.open('w') as output:
+        processes = [
+            start('play', 'bag', '--loop', '--delay', '0', *remapped, cwd=tmp_path),
+            start('record', '-o', 'out', '--topics', '/y', *remapped, cwd=tmp_path),
+            start('estimator', *clock, '-p', 'input_topic:=/rig/y', stdout=output, stderr=output),
+        ]
+    try:
+        wait_until(lambda: 'restarted from the new one' in log.read_text(), 'restart', 300.0)
+        wait_until(lambda: recorded.exists() and recorded.stat().st_size > 50_000, 'messages')
+    finally:
+        said = [interrupted(process)[0] for process in processes]
+    assert 'not played: /x: planted_msgs/msg/Thing is not installed here' in said[0]
+    assert 'playing 1 topics' in said[0]
+    assert not mark.exists()
+    with BagReader(tmp_path / 'out') as reader:
+        times = [time for _, time, _, _ in reader.messages(['/rig/y'])]
+    assert (times[-1] - times[0]) / len(times) > 200_000  # 1 ms, less what play was held up
+
+
+def test_only_installed_message_types_have_a_class(tmp_path, monkeypatch):
+    assert message_class('std_msgs/msg/Float64').__name__ == 'Float64'
+    site_packages = tmp_path / 'install' / 'lib' / 'python3' / 'site-packages'
+    mark = plant_package(site_packages, 'workspace_msgs')
+    monkeypatch.syspath_prepend(site_packages)
+    for name in ('workspace_msgs/msg/Thing', 'std_msgs/msg/Nothing', 'os/msg/Path', ''):
+        with pytest.raises(LookupError, match='expected a message type that is installed here'):
+            message_class(name)
+    assert not mark.exists()
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{tmp_path / "install"}{os.pathsep}')
+    assert message_class('workspace_msgs/msg/Thing').__name__ == 'Thing'
+    assert mark.exists()
+
+
+def expect_no_process(demo):
+    """Expect that all processes of its session have ended."""
+    with pytest.raises(ProcessLookupError):
+        os.killpg(demo.pid, 0)
+
+
+def test_run_leaves_a_report_a_figure_and_a_bag_but_no_process(tmp_path):
+    """With the second engine: what it has found is in the bag, and there is no power."""
+    folder = tmp_path / 'out'
+    demo = start('demo', '--duration', 9, '--output', folder, '--self-tuning', **APART)
+    out, err = demo.communicate(timeout=400)
+    assert demo.returncode == 0, err
+    expect_no_process(demo)
+    for word in ('RMS error', 'z1', 'z2', 'z3', 'samples', 'now with noise of 1e-4 on y'):
+        assert word in out
+    assert (folder / 'report.txt').read_text().strip() in out
+    with AnyReader([folder / 'bag']) as reader:
+        topics = {c.topic for c in reader.connections}
+    found = [f'/estimator/{part}' for part in (*ESTIMATES, SNAPSHOT, PARAMETERS)]
+    assert {'/y', '/plant/state', '/plant/unknown_input', *found} <= topics
+    run_ = read_run(folder / 'bag')
+    assert len(run_.y.stamps) > 1000
+    assert run_.curves.gamma is None
+    late, end = run_.t > 3.0, run_.t > run_.t[-1] - 0.5
+    # Not d: other tests load the machine meanwhile, and its stamps jitter in bursts then.
+    error = np.median(np.abs(run_.errors[late, :2]), axis=0)
+    assert (error < 0.05 * np.abs(run_.curves.truth[late, :2]).max(axis=0)).all()
+    true = np.std((run_.y.values.ravel()[run_.rows] - run_.curves.truth[:, 0])[end])
+    assert true > 0.5e-4  # of some 50 samples
+    noise = np.median(series(folder / 'bag', '/estimator/tuning').values[-500:, 0])
+    assert noise > 0.5 * true  # jitter of a busy machine adds to it
+
+
+def test_ctrl_c_ends_early_with_a_report_and_without_a_trace(tmp_path):
+    folder = tmp_path / 'out'
+    process = start('demo', '--duration', 600, '--output', folder, **APART)
+    part = tmp_path / '.out.part' / 'out' / 'bag'
+    wait_until(lambda: len(stamps(part, '/estimator/state')) > 100, 'estimates', 120.0, process)
+    # As a terminal does: to the whole group; and twice, as an impatient user does.
+    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    assert 'Traceback' not in err
+    assert 'stopped early' in out
+    assert all(name in out for name in OTHERS)
+    assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
+    expect_no_process(process)
+
+
+def test_another_plant_in_the_same_domain_is_refused(live, tmp_path):
+    """The bag would hold the samples and estimates of both."""
+    result = run('demo', '--duration', 600, '--output', tmp_path / 'out')
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert f'ROS_DOMAIN_ID={os.environ["ROS_DOMAIN_ID"]}' in result.stderr
+    assert list(tmp_path.iterdir()) == []
