@@ -6,6 +6,7 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import time
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND = [sys.executable, '-m', 'fhaosmo_ros']
@@ -39,3 +40,13 @@ def interrupted(process):
     out, error = process.communicate(timeout=60)
     assert process.returncode == 0, (out, error)
     return out, error
+
+
+def wait_until(condition, what, seconds=60.0, process=None):
+    """Wait until `condition` holds, at most so many seconds and while the `process` runs."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f'no {what} within {seconds:g} s')
+        assert process is None or process.poll() is None, process.communicate()
+        time.sleep(0.01)

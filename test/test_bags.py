@@ -120,6 +120,10 @@ def test_damage_in_a_file_with_checksums_is_an_error(how, tmp_path):
         results += [read(bag), read(file)]
     assert set(results) <= {COUNT, None}
     assert results.count(None) > 40
+    before, _, after = whole.rpartition(b'/y')
+    file.write_bytes(before + b'/z' + after)  # another topic's name, which reads as well
+    with pytest.raises(ConfigurationError, match='does not agree with its CRC'):
+        BagReader(file)
 
 
 @pytest.mark.parametrize('how', ['ours', 'lz4', 'fastwrite', 'sqlite3'])

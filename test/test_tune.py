@@ -10,7 +10,7 @@ import sqlite3
 import subprocess
 import sys
 
-from commands import start
+from commands import start, wait_until
 from fhaosmo_ros.core import ConfigurationError, Family, Observer, TriangularModel
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.parameters.files import load
@@ -25,7 +25,6 @@ from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
 import numpy as np
 import pytest
 from studies.methods import estimates, SampledModel
-from waiting import wait_until
 
 pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
 pytest.importorskip('cmaes', reason='cmaes is not installed (extra: tune)')

@@ -3,15 +3,13 @@
 
 import math
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.messages.fields import find_field
-from fhaosmo_ros.nodes.middleware.messages import definitions, message_class
+from fhaosmo_ros.nodes.middleware.messages import definitions
 from geometry_msgs.msg import AccelStamped, Quaternion, WrenchStamped
 import numpy as np
 import pytest
-from rclpy.serialization import deserialize_message, serialize_message
 from running import as_time, FED, joint_state, nanoseconds, SECOND, STALE, User, WARN
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import ByteMultiArray, Float64, Header
@@ -49,13 +47,9 @@ def test_bad_messages_are_told_counted_and_survived(user, estimator):
 
 def test_bytes_are_numbers():
     """They are numbers to rosbags, and bytes to rclpy."""
-    for message, field in (
-        (DiagnosticArray(status=[DiagnosticStatus(level=b'\2')]), 'status[0].level'),
-        (ByteMultiArray(data=[b'\1', b'\2']), 'data[1]'),
-    ):
-        kind = f'{type(message).__module__.partition(".")[0]}/msg/{type(message).__name__}'
-        read = deserialize_message(serialize_message(message), message_class(kind))
-        assert find_field(definitions(kind), kind, field).value(read) == 2.0
+    kind = 'std_msgs/msg/ByteMultiArray'
+    field = find_field(definitions(kind), kind, 'data[1]')
+    assert field.value(ByteMultiArray(data=[b'\1', b'\2'])) == 2.0
 
 
 def test_yaw_and_known_input_from_the_message_of_y_and_typed_outputs(user, estimator):
