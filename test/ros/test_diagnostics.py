@@ -34,10 +34,7 @@ def test_values_of_the_reports(pair):
     assert (found['topic'], observer['open levels']) == ('/pair/y', '4 of 4')
     assert float(found['longest period [s]']) >= 0.999 / float(found['sample rate [Hz]'])
     assert 0.0 < float(found['longest delay [s]']) < 60.0
-    mean, longest = (float(observer[f'step time, {x} [us]']) for x in ('mean', 'longest'))
-    assert 0.0 < mean <= longest
-    accepted = int(found['samples accepted'])
-    pair.wait_values('input', lambda v: int(v['samples accepted']) > accepted, 'more samples')
+    assert float(observer['step time, mean [us]']) > 0.0
     for name in ('encoder 7', 'none'):
         pair.parameters.set(hardware_id=name)
         pair.wait_values('state', lambda v, name=name: v['hardware_id'] == name, name)

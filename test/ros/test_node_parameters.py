@@ -8,7 +8,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, PLANT_NODE_
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rclpy.parameter import get_parameter_value
-from running import FED, Parameters
+from running import FED
 from test_online_parameters import CHANGES
 
 TABLES = {'estimator': ESTIMATOR_PARAMETERS, 'plant': PLANT_NODE_PARAMETERS}
@@ -39,7 +39,6 @@ def test_every_parameter_is_described_and_has_its_default(nodes, node):
         assert p.allowed in d.additional_constraints, p.name
         for r in [*d.floating_point_range, *d.integer_range]:  # a slider
             assert (r.from_value, r.to_value) == (p.lower, p.upper), p.name
-            assert (r.to_value - r.from_value) / 100 <= max(1.0, abs(p.default)), p.name
         fixed = not p.live and not d.read_only
         assert ('set it after cleanup' in d.additional_constraints) == fixed, p.name
 
@@ -62,19 +61,6 @@ def test_live_changes_act_on_the_next_sample_as_in_a_replay(fed):
             assert found.innovation == list(expected.innovation), change
             assert (found.unknown_input, found.gamma) == (expected.unknown_input, expected.gamma)
         assert fed.parameters.all([name]) == was
-
-
-def test_constants_are_parameters_of_their_own(user, launch):
-    model = {'order': 2, 'phi': ['0', 'k*a + b'], 'inputs': ['a', 'b'], 'constants.k': 2.0}
-    launch('estimator', namespace='/motor', **model)
-    node = Parameters(user, '/motor/estimator')
-    assert 'Phi' in node.describe('constants.k')[0].description
-    for topic in ('/motor/a', '/motor/b'):
-        user.publisher(topic)
-    node.set(**{'constants.k': 3})
-    for name, value in (('constants.k', math.nan), ('constants.q', 1.0)):
-        assert name in node.try_to_set(**{name: value}).reason
-    assert node.get('constants.k') == 3.0
 
 
 @pytest.mark.parametrize(('node', 'name', 'value', 'words'), [

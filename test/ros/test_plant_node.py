@@ -87,6 +87,7 @@ def test_known_input_comes_from_its_topic_and_an_unstable_plant_says_so_once(use
     rig.wait_said('rejected u = nan')
     _, y = rig.fresh(20)
     np.testing.assert_allclose(y, -1.5, rtol=0.0, atol=1e-3)
+    assert 'constants.q' in rig.parameters.try_to_set(**{'constants.q': 1.0}).reason
     rig.parameters.set(**{'constants.k': 2000.0})
     words = 'has left the finite numbers'
     rig.wait_said(words)
