@@ -2,12 +2,10 @@
 """Pages and shipped configurations: what they show is accepted, runs, and leads somewhere."""
 
 import contextlib
-import json
 from pathlib import Path
 import re
 import subprocess
 import sys
-from xml.etree import ElementTree
 
 from commands import environment
 from fhaosmo_ros import topics
@@ -150,40 +148,20 @@ def test_the_file_of_the_page_finds_faults_and_nothing_else(tmp_path, noise):
     assert np.median(late) < 0.35
 
 
-# Layouts of PlotJuggler and Foxglove name what the nodes publish
-
-
-LAYOUTS = ROOT / 'config' / 'layouts'
-TYPES = {'/y': topics.FLOAT}
+PUBLISHED = {'/y'}
 for node, published in (
     ('estimator', topics.estimates_of({'gains': 'fixed'})), ('plant', topics.TRUTH),
     ('joint_estimator', topics.TYPED_ESTIMATES),
 ):  # fmt: skip
-    TYPES |= {f'/{node}/{name}': kind for name, kind in published.items()}
-FIELDS = {topics.FLOAT: r'data', topics.ARRAY: r'data\[\d\]'}
-JOINTS = '(position|velocity|effort)'
+    PUBLISHED |= {f'/{node}/{name}' for name in published}
 
 
-def known(topic, field, joint_field):
-    assert topic in TYPES
-    assert re.fullmatch(FIELDS.get(TYPES[topic], joint_field), field)
-
-
-@pytest.mark.parametrize('path', sorted(LAYOUTS.glob('*.xml')), ids=lambda p: p.stem)
-def test_curves_of_plotjuggler(path):
-    root = ElementTree.parse(path).getroot()
-    subscribed = {topic.get('name') for topic in root.iter('topic')}
-    for curve in [curve.get('name') for curve in root.iter('curve')]:
-        (topic,) = (t for t in subscribed if curve.startswith(f'{t}/'))
-        known(topic, curve.removeprefix(f'{topic}/'), rf'\w+/{JOINTS}')
-
-
-@pytest.mark.parametrize('path', sorted(LAYOUTS.glob('*.json')), ids=lambda p: p.stem)
-def test_paths_of_foxglove(path):
-    for content in json.loads(path.read_text())['configById'].values():
-        for curve in content['paths']:
-            topic, _, field = curve['value'].partition('.')
-            known(topic, field, rf'{JOINTS}\[\d\]')
+@pytest.mark.parametrize('path', [*(ROOT / 'config/layouts').iterdir()], ids=lambda p: p.name)
+def test_layouts_of_plotjuggler_and_foxglove_show_what_is_published(path):
+    shown = re.findall(r'"(/[\w/]+)', path.read_text())
+    assert shown
+    for name in shown:
+        assert any(f'{name}/'.startswith(f'{topic}/') for topic in PUBLISHED), name
 
 
 def test_site_builds_without_a_warning(tmp_path):

@@ -119,8 +119,7 @@ def test_several_known_inputs_are_held_each_by_itself(tmp_path, capsys):
     assert run(bag, *arguments, '-p', 'known_input_topics:=[/left, /b]') == 0
     u = np.zeros((len(y), 3))
     for column, at, known in zip((0, 2), times, values, strict=True):
-        row = np.searchsorted(at, stamps, side='right')
-        u[:, column] = np.concatenate([[0.0], known])[row]
+        u[:, column] = np.append(0.0, known)[np.searchsorted(at, stamps, side='right')]
     estimates = OnlineEstimator(parameters).run(stamps, y, u)
     with np.load(tmp_path / 'o.npz') as found:
         np.testing.assert_array_equal(found['unknown_input'], estimates.unknown_input)
