@@ -23,9 +23,9 @@ def joints(names):
 
 
 POINT = made(
-    'trajectory_msgs/msg/JointTrajectoryPoint', positions=np.array([0.5, 1.5]), velocities=NONE,
-    accelerations=NONE, effort=NONE,
+    'trajectory_msgs/msg/JointTrajectoryPoint', positions=np.array([0.5, 1.5]),
     time_from_start=made('builtin_interfaces/msg/Duration', sec=-7, nanosec=0),
+    **dict.fromkeys(('velocities', 'accelerations', 'effort'), NONE),
 )  # fmt: skip
 TRAJECTORY = made(
     'trajectory_msgs/msg/JointTrajectory', header=files.header(1_000_000_002), joint_names=['a'],

@@ -18,7 +18,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'fhaosmo_ros'
-ENVIRONMENT = ROOT / 'scripts' / 'environment.sh'
 # A sourced ROS or overlay would leak into the builds and plans below.
 SOURCED = ('AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'COLCON_PREFIX_PATH', 'ROS_DISTRO')
 
