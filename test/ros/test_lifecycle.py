@@ -129,7 +129,7 @@ def ends_well(process) -> None:
 
 @pytest.mark.parametrize('signals', [['SIGHUP'], ['SIGTERM', 'SIGINT', 'SIGINT']], ids=len)
 def test_running_pair_ends(user, launch, signals):
-    """At full rate, and with requests that wait, so that callbacks run when the signal comes."""
+    """With requests that wait, so that callbacks run when the signal comes."""
     namespace = f'/end_{signals[0]}'
     topic = f'{namespace}/estimator/unknown_input'
     d = user.record(topic, Float64)
