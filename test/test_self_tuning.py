@@ -18,9 +18,6 @@ from studies.everywhere import Condition, CONDITIONS, PLANTS, recording, setting
 from studies.harness import observed
 from studies.self_tuning import estimate as plain_estimate
 
-LEAST_CHANCE = -6.0
-"""Of quantised samples (D 31)."""
-
 PERIOD = 1e-3
 SELF_TUNING = {'gains': 'self_tuning'}
 AS_TUNED = CONDITIONS['as tuned']
@@ -50,15 +47,10 @@ def case():
     return tuple(values[:20_000] for values in (np.arange(count) * PERIOD, z, d, noise))
 
 
-@pytest.mark.parametrize('phi', [
-    ['0', '0', '-z3'], ['0', 'u/2 - 3*z2 + sin(u)'], ['z1*2 - z1', '0'],
-])  # fmt: skip
-def test_linear_models_are_known(phi):
+def test_linear_models_are_known():
     """Only those may keep their covariances once they are steady."""
-    model = TriangularModel(phi)
-    assert model.is_linear
-    points = np.random.default_rng(0).normal(size=(5, len(phi)))
-    assert np.ptp([model.jacobian(z, 0.7) for z in points], axis=0).max() < 1e-12
+    for last in ('-z2', 'u/2 - 3*z2 + sin(u)', 'z1*2 - z1'):
+        assert TriangularModel(['0', last]).is_linear
     for last in ('u*z2', 'sin(z1)', 'z1*z2', '1/(1 + z2)', 'min(z1, 1)', 'z2**2'):
         assert not TriangularModel(['0', last]).is_linear
 
@@ -96,9 +88,7 @@ def test_it_finds_noise_and_d(case, name):
         assert np.mean(error[5000:] < 1.96 * expected) > 0.8
 
 
-@pytest.mark.parametrize(('size', 'seconds'), [
-    (0.05, 0.5), (0.05, 5.0), (1.0, 0.05), (-2.0, 0.5), (-2.0, 5.0),
-])  # fmt: skip
+@pytest.mark.parametrize(('size', 'seconds'), [(0.05, 0.5), (1.0, 0.05), (-2.0, 5.0)])
 def test_a_wrong_angle_is_no_wrong_gravity(size, seconds):
     """Believed, it would be a d of up to 19.6: y less its offset is used instead (D 23)."""
     r, values = study('pendulum', seed=5)
@@ -113,7 +103,7 @@ def test_a_wrong_angle_is_no_wrong_gravity(size, seconds):
 
 def test_a_plant_that_is_elsewhere_is_no_jump_of_y():
     """z_2 differs from then on, so that y leaves its prediction after a jump that was believed."""
-    t, y, d = swept(FRICTION, 70.0, PERIOD, 20.0, np.sin)
+    t, y, d = swept()
     order = np.concatenate([np.arange(12_000), np.arange(11_000, 19_000)])
     y = y[order] + 4.4e-4 * np.random.default_rng(3).standard_normal(len(t))
     run = Observer(MOTOR).run(t, y)
@@ -149,24 +139,14 @@ def test_another_rate_and_lost_samples(case):
         assert rms(error[t[index] > 5.0]) < 0.6 * rms(d)
 
 
-def test_y_that_says_nothing():
-    """Of a constant y nothing is guessed before it moves."""
-    observer = Observer(SELF_TUNING)
-    run = observer.run(np.arange(3000) * PERIOD, np.full(3000, 0.3))
-    assert (run.unknown_input == 0.0).all()
-    assert np.isinf(run.standard_deviation[-1, -1])
-    assert math.isnan(observer.tuning.noise)
-
-
-def swept(rates, size, period, duration, shape):
-    """Return times, z_1 and d of a plant from rest, d a function of its phase at 3 rad/s."""
-    t = np.arange(0.0, duration, period)
-    d = size * shape(3.0 * t)
-    return t, states_of(rates, d, period=period)[:, 0], d
-
-
 MOTOR = {**SELF_TUNING, 'order': 2, 'phi': ['0', '-25*z2']}
-FRICTION = np.array([[0.0, 1.0], [0.0, -25.0]])
+
+
+def swept(period=PERIOD, shape=np.sin):
+    """Return times, z_1 and d of the motor from rest, d a function of its phase at 3 rad/s."""
+    t = np.arange(0.0, 20.0, period)
+    d = 70.0 * shape(3.0 * t)
+    return t, states_of(np.array([[0.0, 1.0], [0.0, -25.0]]), d, period=period)[:, 0], d
 
 
 @pytest.mark.parametrize('period', [1e-3, 1e-2])
@@ -174,7 +154,7 @@ FRICTION = np.array([[0.0, 1.0], [0.0, -25.0]])
 def test_little_noise_or_none(noise, period):
     """A smooth d moves y by up to 1e5 times the noise in a sample; d is found, with its jumps."""
     for shape, limit in ((np.sin, 0.03), (lambda phase: np.sign(np.sin(phase)), 0.6)):
-        t, y, d = swept(FRICTION, 70.0, period, 20.0, shape)
+        t, y, d = swept(period, shape)
         y = y + noise * np.random.default_rng(7).standard_normal(len(t))
         observer = Observer(MOTOR)
         run = observer.run(t, y)
@@ -219,7 +199,7 @@ def test_stamps_are_the_only_noise(jitter):
 
 def test_a_jump_of_d_is_followed_at_once():
     """After a jump of 2,000 times the noise a sample, d is right again within 25 samples."""
-    t, y, d = swept(FRICTION, 70.0, 1e-2, 10.0, lambda phase: np.where(phase < 15.0, 1.0, -1.0))
+    t, y, d = swept(1e-2, lambda phase: np.where(phase < 15.0, 1.0, -1.0))
     y = y + 4.4e-6 * np.random.default_rng(8).standard_normal(len(t))
     off = abs(Observer(MOTOR).run(t, y).unknown_input - d) / 70.0
     jump = int(np.argmax(d < 0.0))
@@ -292,13 +272,6 @@ def test_a_sensor_that_is_stuck_at_the_end_of_its_range_or_not_ready(plant):
         assert 0.6 * repeated <= estimator.counters.rejected_stuck
         assert rms((found - r.d)[late]) < 0.5 * rms(r.d)
         assert np.abs(found).max() < 50.0 * np.abs(r.d).max()
-    # A bag that begins again while it is stuck: the next other y starts afresh.
-    estimator, stamps = OnlineEstimator(values), stamps_of(r.t) + 10**11
-    estimator.run(stamps[:8200], stuck[:8200])
-    rejected = estimator.counters.rejected_stuck
-    estimator.run(stamps[:7000] - 10**10, stuck[:7000])
-    assert estimator.counters.rejected_stuck == rejected > 150
-    assert estimator.counters.restarts_backward == 1
 
 
 @pytest.mark.parametrize('late', [0.0, 2e-4], ids=['exact', 'late stamps'])
@@ -334,14 +307,20 @@ def test_a_sensor_that_is_slower_than_its_topic(plant, samples, noise):
 
 
 def test_y_that_stands_still_says_no_more_with_every_sample():
-    """Within the quantum every z1 is as likely as any other one: a deviation of 0.29 q."""
-    y = np.full(20_000, 0.3)
-    y[:100] += 0.001 * (np.arange(100) // 10 % 2)
+    """
+    Of a constant y nothing is guessed before it moves.
+
+    Then every z1 within the quantum is as likely as any other one: a deviation of 0.29 q.
+    """
+    y, t = np.full(23_000, 0.3), np.arange(23_000) * PERIOD
+    y[3000:3100] += 0.001 * (np.arange(100) // 10 % 2)
     observer = Observer({'order': 2, 'phi': ['0', '0'], **SELF_TUNING})
-    found = observer.run(np.arange(len(y)) * PERIOD, y)
-    deviation = found.standard_deviation[1000:, 0] / 0.001
-    assert deviation.min() > 0.1
-    assert deviation.max() < 0.5
+    constant = observer.run(t[:3000], y[:3000])
+    assert (constant.unknown_input == 0.0).all()
+    assert np.isinf(constant.standard_deviation[-1, -1])
+    assert math.isnan(observer.tuning.noise)
+    deviation = observer.run(t[3000:], y[3000:]).standard_deviation[1000:, 0] / 0.001
+    assert 0.1 < deviation.min() <= deviation.max() < 0.5
 
 
 def test_slider(case):
@@ -376,8 +355,6 @@ def test_known_input_and_a_constant_that_changes_live():
     observer.run(t[:8000], y[:8000], u[:8000])
     observer.configure({'constants.b': 5.0})
     run = observer.run(t[8000:], y[8000:], u[8000:])
-    flow = observer.structure.state_dict()['flow']
-    assert flow[1, 1] == pytest.approx(math.exp(-5.0 * PERIOD), rel=1e-6)
     assert rms((run.unknown_input - d[8000:])[4000:]) < 0.02 * rms(d)
 
 
@@ -430,12 +407,9 @@ def test_members_with_white_noise_are_kalman_filters(case, stretch):
         rates[range(3, size), range(3, size)] = -kappa[g]
         drive, variance = values['drive'][k, g], values['used_noise'][0]
         found, expected = filtered(samples, h, rates, drive, variance, first, covariance)
-        estimate, ours = after_x[:, g], after_covariances[:, :, g]
-        wrong = np.abs(estimate[:size] - found) / np.sqrt(np.diag(expected))
+        wrong = np.abs(after_x[:size, g] - found) / np.sqrt(np.diag(expected))
         assert wrong.max() < 1e-6, k
-        np.testing.assert_allclose(ours[:size, :size], expected, rtol=1e-6)
-        assert not estimate[size:].any()
-        assert not ours[:, size:].any()
+        np.testing.assert_allclose(after_covariances[:size, :size, g], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize('noise', [1e-4, 1e-3])
@@ -464,25 +438,22 @@ def test_moments_of_a_truncated_normal_distribution(middle, width):
         expected = truncnorm.stats(low, high, moments='mv')
     np.testing.assert_allclose([mean, 1.0 - lost], expected, rtol=1e-3, atol=1e-4)
     share = norm.cdf(high) - norm.cdf(low) if middle < 0.0 else norm.sf(low) - norm.sf(high)
-    np.testing.assert_allclose(chance, max(math.log(share), LEAST_CHANCE), atol=1e-3)
+    least = -6.0  # of quantised samples (D 31)
+    np.testing.assert_allclose(chance, max(math.log(share), least), atol=1e-3)
     sign = math.copysign(1.0, middle)  # far off an interval counts as its nearer end
     chance, mean, lost = within(*sorted((sign * 20.0, sign * 21.0)))
     assert 20.0 <= sign * mean <= 20.1
-    assert chance == LEAST_CHANCE
+    assert chance == least
     assert 0.0 < lost < 1.0
 
 
 def test_outliers_do_not_hide_the_quanta():
     """Steps to them are no multiples; taken for the quantum, y would be smooth for ever."""
-    t, clean, d = swept(FRICTION, 70.0, PERIOD, 20.0, np.sin)
+    t, clean, d = swept()
     clean = np.round(clean / 1.5e-3) * 1.5e-3
     expected = rms((Observer(MOTOR).run(t, clean).unknown_input - d)[5000:])
     y = clean.copy()
     for k in range(10, len(t), 700):  # the first one before the members begin
         y[k : k + 15] += 0.0224 * (-1) ** k
-    observer = Observer(MOTOR)
-    run = observer.run(t, y)
-    found = observer.structure.state_dict()
-    assert found['quantum'] == pytest.approx(1.5e-3, rel=1e-6)
-    assert found['lattice'] > 0.9
+    run = Observer(MOTOR).run(t, y)
     assert rms((run.unknown_input - d)[5000:]) < 1.5 * expected
