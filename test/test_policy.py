@@ -5,7 +5,6 @@ import math
 
 from fhaosmo_ros.core import Observer, OnlineEstimator, Status
 from fhaosmo_ros.core.online.policy import MOST_SUB_STEPS
-from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 import numpy as np
 from observer_cases import laws, levels_of, place
 import pytest
@@ -63,9 +62,6 @@ FAULTS = {
     'twice': ({}, [(0, 5.0), (1, 0.21)], 'x-', {'duplicate_stamps': 1}),
     'late': ({}, [(-3, 5.0), (-499, 5.0), (1, 0.21)], 'xx-', {'backward_stamps': 2}),
     'no stamp': ({}, [(NO_STAMP, 5.0), (1, 0.21)], 'x-', {'zero_stamps': 1}),
-    'no time on a clock': (
-        {'sampling': 'clock'}, [(NO_STAMP, 5.0), (1, 0.21)], 'x-', {'zero_stamps': 1}
-    ),
     'a gap': ({}, of(300), 'g', {'gaps': 1, 'sub_steps': 300}),
     'an hour': (
         {'max_gap': 3600.0}, of(HOUR - 1), 'g', {'gaps': 1, 'sub_steps': MOST_SUB_STEPS}
@@ -106,10 +102,6 @@ FAULTS = {
         {'max_gap': 0.5}, of(*range(1, 2001), y=NAN) + of(2001, 2002), 'x' * 2000 + 'Hr',
         {'rejected_measurements': 2000, 'far_stamps': 1, 'restarts_forward': 1},
     ),
-    'that in nominal periods': (
-        {'sampling': 'nominal', 'max_gap': 0.5}, of(*range(1, 2001), y=NAN) + of(2001, 2002),
-        'x' * 2000 + 'r-', {'rejected_measurements': 2000, 'restarts_forward': 1},
-    ),
     'spikes': (
         GATE, [(k, 5.0 if k % 6 else 0.21) for k in range(1, 31)], 'xxxxxg' * 5,
         {'rejected_spikes': 25, 'gaps': 5, 'sub_steps': 24},
@@ -121,10 +113,6 @@ FAULTS = {
     'stuck': (
         STUCK, of(*range(1, 301), y=0.25) + of(301), '-' * 101 + 'x' * 199 + 'g',
         {'stuck': 1, 'rejected_stuck': 199, 'gaps': 1, 'sub_steps': 200},
-    ),
-    'stuck for longer than max_gap': (
-        STUCK, of(*range(1, 1001), y=0.25) + of(1001, 1002), '-' * 101 + 'x' * 899 + 'Hr',
-        {'stuck': 1, 'rejected_stuck': 899, 'far_stamps': 1, 'restarts_forward': 1},
     ),
     'silence, which is no stuck sensor': (
         STUCK, of(1) + of(*range(20_000, 20_050)), '-Hr' + '-' * 48,
@@ -161,21 +149,15 @@ def test_what_becomes_of_a_sample_and_what_is_rejected_has_not_been(name):
     feed.same(other)
 
 
-@pytest.mark.parametrize(('parameters', 'length', 'rounds', 'counted'), [
-    ({}, 2000, 4, {'far_stamps': 3, 'restarts_backward': 3}),
+def test_bag_that_loops_restarts():
+    many, within = Feed(), Feed(max_gap=5.0)
+    for feed, length, rounds in ((many, 2000, 4), (within, 400, 3)):
+        for _ in range(rounds):
+            feed.now = -1
+            feed.sine(length)
+    many.only(far_stamps=3, restarts_backward=3)
     # Within max_gap time does not catch up: followed after so many late samples.
-    ({'max_gap': 5.0}, 400, 3,
-     {'backward_stamps': 500, 'duplicate_stamps': 1, 'restarts_backward': 1}),
-], ids=['once a round', 'within max_gap'])  # fmt: skip
-def test_bag_that_loops_restarts(parameters, length, rounds, counted):
-    feed = Feed(**parameters)
-    for _ in range(rounds):
-        feed.now = -1
-        feed.sine(length)
-    feed.only(**counted)
-
-
-# Gaps and intervals
+    within.only(backward_stamps=500, duplicate_stamps=1, restarts_backward=1)
 
 
 @pytest.mark.parametrize('step', [1, 20, 400])
@@ -188,13 +170,11 @@ def test_slow_sensor_is_not_cut_up(step):
     assert feed.estimator.jitter == 0.0
 
 
-def bridged(law, y, d=None):
+def bridged(law, y):
     """Return an observer after 33 equal samples at 100 Hz and `y` four periods later."""
     feed = Feed(**{'order': 1, 'scheme': 'explicit', 'variant': 'fuzzy'} | law)
     for k in range(33):
         feed.at(10 * k, 0.5)
-    if d:
-        place(feed.estimator, 0.5, d)
     return feed.estimator.observer, feed.at(360, y)
 
 
@@ -205,10 +185,6 @@ def test_bridge_ends_where_steps_at_the_predicted_samples_end():
     observer = Observer({'order': 1, 'phi': ['0'], 'scheme': 'implicit', 'variant': 'fuzzy'})
     observer.run(0.01 * np.arange(37), [0.5] * 33 + [0.6, 0.7, 0.8, 0.9])
     np.testing.assert_allclose(levels_of(found), levels_of(observer), atol=1e-12)
-    # Without a prediction it is a straight line: that d leaves the logarithm's domain.
-    found, status = bridged({'phi': ['log(z1)*0']}, 0.9, d=-1e9)
-    assert status == Status.GAP
-    assert found.estimate.z[0] == pytest.approx(-4e7, rel=0.1)  # what d leads to
     found, status = bridged({'phi': ['-z1**60'], 'variant': 'fuzzy_adaptive'}, 1e9)
     assert status == Status.GAP | Status.REJECTED_STEP
     assert np.isfinite(levels_of(found)).all()
@@ -230,9 +206,7 @@ def test_nominal_sampling_ignores_stamps():
         nominal.at(wild, y)
         stamped.at(2 * k, y)
         assert nominal.estimator.stamp == START + wild * MS
-    np.testing.assert_array_equal(
-        levels_of(nominal.estimator.observer), levels_of(stamped.estimator.observer)
-    )
+    assert nominal.numbers == stamped.numbers
     nominal.only()
     slow = Feed(sampling='nominal', nominal_period=2.0)  # no gap
     slow.sine()
@@ -267,25 +241,6 @@ def test_jitter_of_half_a_period_and_bursts_need_no_policy():
     assert c.bursts > 4250
     assert c.sub_steps < 500 * 25  # the mean does not shrink to the burst's
     assert bursting.period == pytest.approx(1e-3, rel=0.3)
-
-
-# Divergence
-
-BAD_GAINS = {'scheme': 'explicit', 'variant': 'fuzzy_adaptive', 'lambda': 1e6, 'alpha': 1e9}
-BAD_GAINS |= {'gamma_min': 1.0, 'gamma_initial': 1.0}
-
-
-def test_bad_live_gains_are_noticed_and_survived():
-    feed = Feed(epsilon=0.5, divergence_time=0.05)
-    feed.sine(1000)
-    feed.estimator.configure(BAD_GAINS)
-    assert any(w & Status.DIVERGED for w in feed.sine(1000))
-    assert np.isfinite([*feed.numbers, *feed.estimator.estimate.innovation]).all()
-    feed.estimator.configure({k: ONLINE_PARAMETERS[k].default for k in BAD_GAINS})
-    seen = feed.estimator.counters.divergences
-    feed.sine(3000)
-    assert feed.estimator.counters.divergences <= seen + 1
-    assert feed.numbers[0] == pytest.approx(0.2 + 0.1 * math.sin(0.01 * feed.now), abs=0.1)
 
 
 @laws
@@ -326,9 +281,6 @@ def test_spikes_beyond_epsilon_are_no_divergence_while_y_is_found_again():
     feed.only()
 
 
-# Inputs, gamma, and where an observer starts
-
-
 def test_bad_input_is_not_held():
     estimator = OnlineEstimator({'phi': ['0', '0', 'u']})
     assert [estimator.set_input(u) for u in (2.0, math.nan, -math.inf)] == [True, False, False]
@@ -342,7 +294,6 @@ def test_frozen_gamma_stays_and_the_rest_goes_on():
         f.sine()
     gamma = feed.estimator.estimate.gamma
     feed.estimator.freeze(True)
-    assert feed.estimator.frozen
     feed.estimator.configure({'gamma_leakage': 10.0})
     for f in (feed, other):
         for pause in (100, 1000):  # a gap, a restart
@@ -350,7 +301,6 @@ def test_frozen_gamma_stays_and_the_rest_goes_on():
             f.sine()
     assert feed.estimator.estimate.gamma == gamma
     assert other.estimator.estimate.gamma != gamma
-    assert (feed.estimator.counters.gaps, feed.estimator.counters.restarts) == (1, 1)
     feed.estimator.freeze(False)
     feed.sine()
     assert feed.estimator.estimate.gamma != gamma
