@@ -15,23 +15,13 @@ SMALL |= {'epsilon': 0.025, 'fuzzy_widths': [0.02], 'unknown_input': True}
 SMALL |= {'gamma_initial': 0.5, 'gamma_min': 0.3, 'gamma_max': 0.8, 'gamma_rate': 0.004}
 SMALL |= {'gamma_dead_zone': 0.0, 'gamma_leakage': 0.0, 'start_from_measurement': True}
 VARIANTS = ('sign', 'fuzzy', 'fuzzy_adaptive', 'sign_adaptive')
+FORMS = (('cascade', 'explicit'), ('cascade', 'implicit'), ('levant', 'implicit'))
 LAWS = [
     {'structure': structure, 'scheme': scheme, 'variant': variant}
-    for structure, scheme in (
-        ('cascade', 'explicit'),
-        ('cascade', 'implicit'),
-        ('levant', 'implicit'),
-    )
-    for variant in VARIANTS
-]
+    for structure, scheme in FORMS for variant in VARIANTS
+]  # fmt: skip
 laws = pytest.mark.parametrize('law', LAWS, ids=lambda law: '-'.join(law.values()))
 any_law = st.sampled_from(LAWS)
-
-
-SYSTEMS = (
-    'terms 3', 'terms gaussian 5', 'terms trapezoid 7', 'curve 0 1', 'curve 0 0 0.8',
-)  # fmt: skip
-"""Curves of every kind; the last one does nothing for small innovations."""
 
 
 def samples(count=200, seed=1):

@@ -8,7 +8,7 @@ from fhaosmo_ros.core.parameters.tables import ONLINE_PARAMETERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
-from observer_cases import SMALL, SYSTEMS
+from observer_cases import SMALL
 import pytest
 
 START = 1_700_000_000 * 10**9
@@ -26,7 +26,8 @@ def valid(parameter: Parameter, rng: np.random.Generator):
     if parameter.kind == 'bool':
         return bool(rng.integers(2))
     if parameter.kind == 'string_array':  # fuzzy_systems
-        return rng.choice([*SYSTEMS, 'terms 4'], rng.integers(1, 4)).tolist()
+        systems = ['terms 3', 'terms gaussian 5', 'terms trapezoid 7', 'curve 0 0 0.8', 'terms 4']
+        return rng.choice(systems, rng.integers(1, 4)).tolist()
     low, high = parameter.lower, parameter.upper
     if parameter.kind == 'int':
         return int(rng.choice([low, high, rng.integers(low, min(high, low + 20), endpoint=True)]))
@@ -56,15 +57,11 @@ def finite(estimate) -> bool:
     return bool(np.isfinite(numbers).all())
 
 
-stamps = st.one_of(
-    st.tuples(st.just('ahead'), st.sampled_from(JUMPS)),
-    st.tuples(st.just('ahead'), st.just(10**6)),
-    st.tuples(st.just('at'), st.sampled_from(ABSOLUTE)),
-)
+ahead = st.tuples(st.just('ahead'), st.sampled_from(JUMPS) | st.just(10**6))
+stamps = ahead | st.tuples(st.just('at'), st.sampled_from(ABSOLUTE))
 samples = st.one_of(st.sampled_from(WILD), st.floats(), st.floats(-1.0, 1.0))
 event = st.one_of(
-    st.tuples(st.just('y'), stamps, samples),
-    st.tuples(st.just('y'), stamps, samples),
+    *[st.tuples(st.just('y'), stamps, samples)] * 2,
     st.tuples(st.just('set'), st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.0, 0.3])),
     st.tuples(st.just('u'), samples, st.none()),
     st.tuples(st.just('do'), st.sampled_from(['reset', 'freeze', 'thaw', 'forget']), st.none()),
@@ -119,11 +116,9 @@ def try_to_configure(estimator: OnlineEstimator, values: dict) -> None:
     assert estimator.parameters == before
 
 
-def test_fixed_parameter_is_said_to_be_fixed_and_nothing_changes():
+def test_fixed_parameter_is_said_to_be_fixed():
     estimator = OnlineEstimator(SMALL)
     estimator.configure({'order': SMALL['order']})
-    before = estimator.parameters
-    for call in (estimator.prepare, estimator.configure):
-        with pytest.raises(ConfigurationError, match="'order': can't change in a running obs"):
-            call({'order': 3, 'max_gap': 1.0})
-    assert estimator.parameters == before
+    with pytest.raises(ConfigurationError, match="'order': can't change in a running obs"):
+        estimator.configure({'order': 3, 'max_gap': 1.0})
+    assert estimator.parameters == OnlineEstimator(SMALL).parameters

@@ -10,8 +10,6 @@ from fhaosmo_ros.tools.bags.topics import messages, series
 from fhaosmo_ros.tools.plot import command as plot
 from fhaosmo_ros.tools.plot.curves import read_curves
 from fhaosmo_ros.tools.replay import command as replay
-from hypothesis import given, settings
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 
@@ -31,6 +29,7 @@ def found(d, deviations=None, words=None, **parameters):
         assert words is not None or event.begins == (abs(event.value) > event.limit)
     for one, other in zip(events[::2], events[1::2], strict=False):
         assert one.since == other.since <= one.stamp
+        assert one.begins > other.begins
     return [(event.sample, event.begins) for event in events]
 
 
@@ -78,8 +77,7 @@ def test_a_standard_deviation_that_grows_with_the_event_does_not_hide_it():
     d, deviations = pulse(300, 900), np.full(1000, 0.1)
     deviations[300:] = 1.0
     # Half of 0.4 * 10^(1 - e^(-4 t)) is 1 after 0.3 s.
-    (_, begins), (end, ends) = found(d, deviations, event_deviations=4.0, tuning_memory=1.0)
-    assert (begins, ends) == (True, False)
+    _, (end, _) = found(d, deviations, event_deviations=4.0, tuning_memory=1.0)
     assert end == pytest.approx(600, abs=3)
     # From the end of an event on it counts as it is.
     for height, later in ((3.9, []), (4.1, [(750, True)])):
@@ -93,37 +91,10 @@ def test_a_change_is_judged_against_the_running_mean():
     own = {'event_threshold': 0.5, 'event_change_time': 0.8}
     events = found(d, **own)
     # 0.8 ln 4 = 1.1 s after a step of 1 the mean has followed it but for the release of 1/4.
-    assert [begins for _, begins in events] == [True, False, True, False]
     expected = [1050, 1000 + 800 * np.log(4.0), 4050, 4000 + 800 * np.log(4.0)]
     np.testing.assert_allclose([k for k, _ in events], expected, atol=60)
     # Nothing is judged before the mean is known.
     assert found(5.0 + pulse(0, 400), **own) == []
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    st.lists(st.integers(1, 199), max_size=5),
-    st.integers(0, 2**31),
-    st.sampled_from([0.0, 0.004]),
-    st.sampled_from([0.0, 0.03]),
-)
-def test_a_split_run_finds_what_the_whole_run_finds(cuts, seed, duration, change):
-    rng = np.random.default_rng(seed)
-    d, deviations = np.cumsum(rng.standard_normal(200)), rng.uniform(0.1, 2.0, 200)
-    stamps = BEGIN + np.cumsum(rng.integers(1, 3 * H, 200))
-    words = rng.choice([0, 0, 0, 0, 0, Status.REJECTED_SPIKE, Status.RESTARTED], 200)
-    p = DEFAULTS | {
-        'event_deviations': 2.0, 'event_threshold': 0.7, 'event_duration': duration,
-        'event_change_time': change,
-    }  # fmt: skip
-    whole, split = EventDetector(p), EventDetector(p)
-    whole.take(stamps, d, deviations, words=words)
-    for part in np.split(np.arange(200), sorted(cuts)):
-        split.take(stamps[part], d[part], deviations[part], words=words[part])
-    events = whole.taken()
-    assert [e._replace(sample=0) for e in split.taken()] == [e._replace(sample=0) for e in events]
-    assert [e.begins for e in events] == [k % 2 == 0 for k in range(len(events))]  # in turn
-    assert all(e.stamp - e.since >= duration * 1e9 for e in events if e.begins)
 
 
 MODEL = {'order': 1, 'phi': ['-z1']}
@@ -136,7 +107,6 @@ CASES = {
     'change': MODEL | FIXED | {'event_threshold': 0.4, 'event_change_time': 2.0},
     'self-tuning': MODEL | {'gains': 'self_tuning', 'event_deviations': 5.0},
 }
-TOLD = CASES['self-tuning']
 
 
 @pytest.fixture(scope='module')
@@ -187,13 +157,13 @@ def test_standard_deviations_that_nobody_knows_are_refused():
 
 def test_bag_tables_and_figure_have_what_the_node_finds(samples, tmp_path, monkeypatch):
     """To the last bit; `found` has tuning, whether an event lasts, and standard deviations."""
-    stamps, y = (values[:1900] for values in samples)
+    (stamps, y), own = (values[:1900] for values in samples), CASES['self-tuning']
     recorded = files.write(tmp_path / 'bag', files.floats(stamps, y))
     bag, csv, npz = (tmp_path / name for name in ('out', 'out.csv', 'out.npz'))
     words = [word for output in (bag, csv, npz) for word in ('-o', str(output))]
-    words += [word for name, value in TOLD.items() for word in ('-p', f'{name}:={value}')]
+    words += [word for name, value in own.items() for word in ('-p', f'{name}:={value}')]
     assert replay.main([str(recorded), *words]) == 0
-    estimator, found = OnlineEstimator(TOLD), []
+    estimator, found = OnlineEstimator(own), []
     for stamp, value in zip(stamps.tolist(), y.tolist(), strict=True):
         if not estimator.update(stamp, value).status.rejected:
             tuning = np.hstack(estimator.observer.tuning)
