@@ -102,10 +102,9 @@ def test_clock_that_stands_still_is_two_samples_ahead_of_its_next_tick_at_most()
 @pytest.mark.parametrize('together', [25, 1])
 def test_samples_of_a_clock_that_jumps_back_restart_within_one_tick(together):
     estimator = OnlineEstimator({'sampling': 'clock'})
-    for k in range(500):
-        estimator.update(START + k // together * together * MS, sample(k))
-    for k in range(50):
-        estimator.update(10 * MS + k // together * together * MS, sample(k))
+    for begin, count in ((START, 500), (10 * MS, 50)):
+        for k in range(count):
+            estimator.update(begin + k // together * together * MS, sample(k))
     counters = estimator.counters
     assert counters.restarts_backward == counters.restarts == 1
     assert 0 < estimator.stamp < 100 * MS

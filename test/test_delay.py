@@ -28,9 +28,8 @@ def voltage():
     return 0.3 + np.sin(40.0 * np.maximum(t, 0.0))
 
 
-def truth(u=None):
+def truth(u):
     t = (STAMPS - STAMPS[0]) * 1e-9
-    u = voltage() if u is None else u
     return respond(Observer(MOTOR).model, [0.1, 0.0], t, [0.7, 0.7], 100.0, u, 1e-3)
 
 
@@ -44,7 +43,8 @@ def late(y):
     {'scheme': 'explicit', 'structure': 'cascade'},
 ])  # fmt: skip
 def test_late_samples_give_the_estimates_of_punctual_ones(law, inputs_too):
-    y, u, delay = truth()[0][:, 0], voltage(), DELAYED['measurement_delay']
+    u, delay = voltage(), DELAYED['measurement_delay']
+    y = truth(u)[0][:, 0]
     punctual = OnlineEstimator(MOTOR | law).run(STAMPS, y, u)
     if inputs_too:  # then all is as late
         delayed = OnlineEstimator(DELAYED | law | {'input_delay': delay}).run(STAMPS, y, u)
@@ -64,7 +64,7 @@ def test_prediction_ends_at_the_present_state(share, estimate_from):
     full = DELAYED['measurement_delay']
     parameters = DELAYED | {'input_delay': share * full, 'estimate_from': estimate_from}
     u = np.repeat(voltage()[::50], 50)  # constant since long enough at the end
-    z, d = truth(u=u)
+    z, d = truth(u)
     shown = np.roll(u, round(share * LATE))
     then = OnlineEstimator(parameters).run(STAMPS, late(z[:, 0]), shown)
     now = OnlineEstimator(parameters | {'predict_to_now': True}).run(STAMPS, late(z[:, 0]), shown)

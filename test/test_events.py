@@ -64,7 +64,7 @@ RESTART = SPIKES + pulse(500, 501, height=Status.RESTARTED).astype(int)
     (ONE - pulse(400, 420), {'words': RESTART}, events_at(350, 500, 551, 600)),
     # Threshold and deviations both have to be exceeded.
     *((ONE, {'deviations': np.full(1000, 0.1), 'event_deviations': k, 'event_threshold': limit},
-       events) for k, limit, events in ((4.0, 0.0, ONCE), (4.0, 1.1, []), (11.0, 0.1, []))),
+       events) for k, limit, events in ((4.0, 0.7, ONCE), (4.0, 1.1, []), (11.0, 0.1, []))),
     # A deviation that is not known yet.
     (ONE, {'deviations': 0.1 + pulse(0, 400, height=np.inf), 'event_deviations': 4.0},
      events_at(450, 600)),

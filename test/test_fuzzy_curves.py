@@ -77,22 +77,19 @@ def test_text_is_read_as_a_system():
     # Knots are h = 1/192 apart, and every corner of an even triangle's curve is one. A smooth
     # curve leaves the straight line between two of them by h^2 / 8 times its curvature, some 10,
     # hence 4e-5; triangles are steeper beside their peaks, trapezoids have corners between knots.
-    ('terms triangle 5', 2e-6, 1.2e-4), ('terms triangle 7', 2e-6, 1.2e-4),
-    ('terms gaussian 5', 2e-6, 1.2e-4), ('terms gaussian 7', 2e-6, 1.2e-4),
-    ('terms trapezoid 5', 2e-6, 1e-3), ('terms trapezoid 7', 2e-6, 1e-3),
+    ('terms triangle 5', 2e-6, 1.2e-4), ('terms gaussian 7', 2e-6, 1.2e-4),
+    ('terms trapezoid 5', 2e-6, 1e-3),
     # Corners of other peaks are cut.
-    (f'input triangle {P5}; output triangle {P7}; rules 1 3 4 5 7', 1e-5, 5e-3),
     (f'input gaussian {P5}; output trapezoid {P7}; rules 1 2 4 6 7', 1e-5, 5e-3),
-    (f'input triangle {P5}; output gaussian {P7}; rules 1 2 4 6 7', 1e-5, 5e-3),
+    (f'input triangle {P5}; output gaussian {P7}; rules 1 3 4 5 7', 1e-5, 5e-3),
 ])  # fmt: skip
 def test_system_agrees_with_a_control_system_of_scikit_fuzzy(text, inferred, between_knots):
     """Where nothing is interpolated between knots, only the output grids differ."""
-    system, x = read_system(text), np.array(INPUTS)
+    system, x, own = read_system(text), np.array(INPUTS), law((1.0,), fuzzy_systems=[text])
     psi = oracle(system)
     expected = np.array([psi(v) for v in x])
-    for sign, wanted in (1.0, expected), (-1.0, [psi(-v) for v in x]):
-        np.testing.assert_allclose(infer(sign * x, system), wanted, atol=inferred)
-    own = law((1.0,), fuzzy_systems=[text])
+    np.testing.assert_allclose(infer(x, system), expected, atol=inferred)
+    np.testing.assert_allclose(infer(-x, system), [psi(-v) for v in x], atol=inferred)
     found = [own.curve(3, v)[0] for v in x]
     np.testing.assert_allclose(found, expected / expected[-1], atol=between_knots)
 

@@ -33,8 +33,7 @@ POWERS = ['2', '3', '-1', '0.5', '-2', '1.5', '0', '1', '(-z2)', 'u', '(0.3*z1)'
 FORMS = ['({0} + {1})', '({0} - {1})', '({0} * {1})', '({0} / {1})', '(-{0})', '({0})**{2}']
 FORMS += [f'{name}({{0}})' for name in FUNCTIONS]
 FORMS += [f'{name}({{0}}, {{1}})' for name in FUNCTIONS_OF_TWO]
-# Within their domains more often than by chance.
-FORMS += ['log(abs({0}) + 0.1)', 'sqrt({0}*{0} + 0.1)', '(abs({0}) + 0.1)**{1}']
+FORMS += ['log(abs({0}) + 0.1)', 'sqrt({0}*{0} + 0.1)', '(abs({0}) + 0.1)**{1}']  # in the domain
 
 
 @st.composite
@@ -96,16 +95,11 @@ def test_random_expression(text, point):
         assert 'is not a finite number' in str(error)  # noqa: PT017
 
 
-FIXED = [
+@pytest.mark.parametrize('text', [
     'sin(z1*z2)', 'cos(z3 - u)', 'tan(z1/2)', 'exp(-z1**2)', 'log(z1 + z2)', 'sqrt(z1*z3)',
-    'abs(z1 - z2)', 'tanh(3*z3)', 'sign(z1 - z2)*z3', 'z1**-2.5', 'z1**z2', 'z1**(-u)', '2**z1',
-    '(z1*z2)**(z3 - u)', '(z1 - z2)**3', '(-z1)**-2', 'z1/z2/z3', 'z1 - z2 - z3', 'u**2', 'z1**0',
-    'atan2(z1, z2)', 'atan2(z2 - 2, z1 - u)', 'atan2(-z1, -z3)', 'min(z1*z2, z3)', 'max(z2, u)',
-    'max(min(z1, 1.1), 0.3)*z2', 'sin(cos(tan(tanh(z1))))', '(z1**2 + z2**2)**1.5', 'z1*0',
-]  # fmt: skip
-
-
-@pytest.mark.parametrize('text', FIXED)
+    'abs(z1 - z2)', 'tanh(3*z3)', 'sign(z1 - z2)*z3', 'z1**-2.5', 'z1**z2', '2**z1', '(-z1)**-2',
+    '(z1*z2)**(z3 - u)', '(z1 - z2)**3', 'atan2(z2 - 2, z1 - u)', 'max(min(z1, 1.1), 0.3)*z2',
+])  # fmt: skip
 @pytest.mark.parametrize('point', [(0.7, 1.3, 0.4, 0.9), (1.6, 0.2, 1.1, 0.3)])
 def test_fixed_expression(text, point):
     assert compare(text, point)

@@ -14,8 +14,8 @@ def test_split_run_equals_whole_run(law, a, b):
     t, y, u = samples()
     whole, split = Observer(SMALL | law), Observer(SMALL | law)
     expected = whole.run(t, y, u)
-    cuts = [slice(0, min(a, b)), slice(min(a, b), max(a, b)), slice(max(a, b), None)]
-    runs = [split.run(t[cut], y[cut], u[cut]) for cut in cuts]
+    parts = (np.split(column, sorted([a, b])) for column in (t, y, u))
+    runs = [split.run(*part) for part in zip(*parts, strict=True)]
     parts = [np.concatenate(columns) for columns in zip(*runs, strict=True)]
     for name, got, wanted in zip(expected._fields, parts, expected, strict=True):
         np.testing.assert_array_equal(got, wanted, err_msg=name)
@@ -26,13 +26,10 @@ def test_split_run_equals_whole_run(law, a, b):
 def test_steps_equal_a_run_and_each_estimate_is_a_copy(law):
     t, y, u = samples()
     expected = Observer(SMALL | law).run(t, y, u)
-    observer = Observer(SMALL | law)
-    found = [observer.start(y[0])]
-    for k in range(1, len(t)):
-        started = observer.started
-        found.append(
-            observer.step(y[k], t[k] - t[k - 1], u[k]) if started else observer.start(y[k])
-        )
+    observer, found = Observer(SMALL | law), []
+    for k in range(len(t)):
+        known = observer.started
+        found.append(observer.step(y[k], t[k] - t[k - 1], u[k]) if known else observer.start(y[k]))
     for name in ('z', 'unknown_input', 'gamma', 'innovation', 'status', 'open_levels'):
         column = [getattr(estimate, name) for estimate in found]
         np.testing.assert_array_equal(column, getattr(expected, name))
@@ -92,25 +89,18 @@ def test_estimates_are_the_internal_or_the_filtered_states():
         np.testing.assert_array_equal(filtered.unknown_input, d)
 
 
-# Times of the samples: order, units, resolution, shapes
-
-
 def test_runs_that_cannot_be_are_refused_and_an_empty_one_changes_nothing():
     observer = Observer(SMALL)
     assert observer.run([], [], 0.0).z.shape == (0, 2)
     observer.run([0.0, 0.001], [0.1, 0.1], 0.0)
     before = state_of(observer)
-    for bad in (0.001, 0.0005, -1.0, np.nan, np.inf, -np.inf):
+    for bad in (0.001, -1.0, np.nan, np.inf, -np.inf):
         for t in ([0.002, bad, 0.003], [bad, 0.002, 0.003]):
             with pytest.raises(ConfigurationError, match=r'increase, got t\[[01]\] = '):
                 observer.run(t, [0.1, 0.2, 0.3], 0.0)
-    for arguments in (
-        ([2.0, 3.0], [0.0]), ([[2.0, 3.0]], [[0.0, 1.0]]),
-        ([2.0, 3.0], [0.0, 1.0], [0.0, 1.0, 2.0]), ([2.0, 3.0], [0.0, 1.0], 0.0, 0),
-    ):  # fmt: skip
+    for arguments in ([0.0],), ([[0.0, 1.0]],), ([0.0, 1.0], [0.0] * 3), ([0.0, 1.0], 0.0, 0):
         with pytest.raises(ConfigurationError, match='expected'):
-            observer.run(*arguments)
-    assert observer.run([], [], 0.0).z.shape == (0, 2)
+            observer.run([2.0, 3.0], *arguments)
     assert_same_state(state_of(observer), before)
 
 

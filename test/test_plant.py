@@ -44,7 +44,7 @@ def test_disturbance_follows_its_formula_and_drives_the_last_state(kind):
 
 def test_noise_is_seeded_white_and_of_the_right_size():
     p, t = REST | {'noise_std': 0.03}, np.linspace(0.0, 1.0, 100001)
-    one, same, other = (Plant(p | {'noise_seed': seed}).simulate(t) for seed in (5, 5, 6))
+    one, same, other = (Plant(p, noise_seed=seed).simulate(t) for seed in (5, 5, 6))
     noise = one.y - one.z[:, 0]
     np.testing.assert_array_equal(same.y, one.y)
     assert np.all(other.y != one.y)
@@ -70,8 +70,7 @@ def test_quantised_output_lies_on_the_grid_next_to_the_noisy_one():
 def test_samples_equal_a_simulation():
     p = WAVE | {'noise_std': 0.1, 'disturbance': 'chirp', 'quantisation': 0.03}
     t = np.cumsum(np.random.default_rng(1).uniform(1e-5, 5e-3, 300))
-    plant = Plant(p)
-    rows = [plant.sample(at) for at in t]  # each a copy
+    rows = list(map(Plant(p).sample, t))  # each a copy
     for found, wanted in zip(zip(*rows, strict=True), Plant(p).simulate(t), strict=True):
         np.testing.assert_array_equal(found, wanted)
 
@@ -101,12 +100,9 @@ def test_live_change_acts_from_now_on():
 def test_refused_change_or_time_changes_nothing():
     plant = Plant()
     before = plant.parameters
-    for changes, reason in (
-        ({'noise_std': -1.0}, '>= 0'), ({'nois_std': 1.0}, "did you mean 'noise_std'"),
-        ({'initial_state': [9.0]}, "can't change in a running plant"),
-    ):  # fmt: skip
-        with pytest.raises(ConfigurationError, match=reason):
-            plant.configure({'disturbance_amplitude': 9.0} | changes)
+    for change in {'noise_std': -1.0}, {'nois_std': 1.0}, {'initial_state': [9.0]}:
+        with pytest.raises(ConfigurationError, match=next(iter(change))):
+            plant.configure({'disturbance_amplitude': 9.0} | change)
     for t in np.nan, np.inf, -np.inf:
         for call in (plant.advance, plant.sample, lambda t: plant.simulate([0.0, t])):
             with pytest.raises(ConfigurationError, match='expected finite time'):
@@ -115,9 +111,6 @@ def test_refused_change_or_time_changes_nothing():
     assert plant.sample(np.pi / 2.0).unknown_input == Plant().sample(np.pi / 2.0).unknown_input
     with pytest.raises(ConfigurationError, match=r"'initial_state'.*1 or 3 values.*\[1.0, 2.0\]"):
         Plant({'initial_state': [1.0, 2.0]})
-
-
-# Training recordings: seeded, true to their parameters, and solved accurately
 
 
 SHORT = {'duration': 4.0, 'integration_step': 1e-3}
@@ -158,11 +151,10 @@ def test_response_is_that_of_the_plant():
 
 
 def test_noise_quantisation_jitter_and_dropouts_are_as_asked():
-    family = Family(
-        {'noise_std': 2e-3, 'period_jitter': 1e-4, 'stamp_jitter': 2e-4, 'dropout': 0.2,
-         'dropout_length': 5.0, 'integration_step': 1e-3, 'duration': 60.0}
-    )  # fmt: skip
-    r = family.recording(0)
+    r = Family({
+        'noise_std': 2e-3, 'period_jitter': 1e-4, 'stamp_jitter': 2e-4, 'dropout': 0.2,
+        'dropout_length': 5.0, 'integration_step': 1e-3, 'duration': 60.0,
+    }).recording(0)  # fmt: skip
     assert (np.diff(r.t) > 0.0).all()
     np.testing.assert_allclose(np.std(r.y - r.z[:, 0]), 2e-3, rtol=0.05)
     np.testing.assert_allclose(len(r.t) / 60_001, 0.8, rtol=0.05)

@@ -23,9 +23,6 @@ def test_change_of_variant_starts_the_sensitivities_at_zero(scheme):
     np.testing.assert_array_equal(levels_of(observer)[2:], 0.0)
 
 
-# What bounds the adapted power
-
-
 @given(
     st.sampled_from(['explicit', 'implicit']), st.floats(0.0, 1e6), st.floats(0.0, 1e3),
     st.integers(0, 9), st.floats(1e-5, 10.0),
@@ -43,16 +40,13 @@ def test_gamma_stays_within_its_bounds_which_are_flagged(scheme, rate, leakage, 
 
 @given(st.floats(0.0, 1e3), st.floats(1e-5, 10.0))
 def test_leakage_never_overshoots(leakage, dt):
-    p = SMALL | {'variant': 'fuzzy_adaptive', 'gamma_rate': 0.0, 'gamma_leakage': leakage}
-    observer = Observer(p | {'gamma_initial': 0.7})
+    own = {'variant': 'fuzzy_adaptive', 'gamma_rate': 0.0, 'gamma_leakage': leakage}
+    observer = Observer(SMALL | own, gamma_initial=0.7)
     observer.start(0.0)
     observer.configure({'gamma_initial': 0.4})
     gamma = [0.7] + [observer.step(0.0, dt, 0.0).gamma for _ in range(20)]
     assert np.all(np.diff(gamma) <= 1e-15)
     assert gamma[-1] >= 0.4 - 1e-12
-
-
-# The scalar equation of an implicit level: its residual is small wherever one looks
 
 
 def law(variant, lambda_, alpha, width, shape='triangle'):
@@ -62,6 +56,7 @@ def law(variant, lambda_, alpha, width, shape='triangle'):
 
 
 def check(law, b, h, gamma, level):
+    """Check the scalar equation of an implicit level."""
     eps, s = law.solve(level, b, h, gamma)
     assert 0.0 <= eps <= b * (1.0 + 1e-15)
     assert 0.0 <= s <= 1.0
@@ -77,11 +72,11 @@ def check(law, b, h, gamma, level):
 
 sizes, periods, gains = powers(-20.0, 6.0), powers(-7.0, 0.5), powers(-6.0, 6.0)
 exponents = st.sampled_from([0.5, 0.01, 0.1, 0.3, 0.67, 0.8, 1.0])
-shapes = st.sampled_from(['triangle', 'gaussian'])
+shapes, levels = st.sampled_from(['triangle', 'gaussian']), st.integers(0, 1)
 
 
 @settings(max_examples=500)
-@given(sizes, periods, exponents, gains, gains, powers(-12.0, 6.0), shapes, st.integers(0, 1))
+@given(sizes, periods, exponents, gains, gains, powers(-12.0, 6.0), shapes, levels)
 @example(1e-12, 1.0, 0.01, 1e6, 1e-6, 1e-12, 'triangle', 0)
 @example(1e6, 1e-6, 1.0, 1e6, 1e6, 1e-12, 'triangle', 0)
 @example(1.0, 1.0, 0.01, 1e6, 1e6, 1e6, 'gaussian', 1)
