@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes as a user starts them, and a user that hears, feeds and asks them."""
 
-from collections import defaultdict
+from collections import defaultdict, namedtuple
 from collections.abc import Iterable
 from pathlib import Path
 import signal
 import threading
 import time
-from typing import NamedTuple
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
@@ -106,28 +105,12 @@ class Process(Child):
         assert 'Traceback' not in self.output(), self.output()
 
 
-class Published(NamedTuple):
-    """A message with its source time stamp in nanoseconds."""
-
-    stamp: int
-    message: object
-
-
-class Report(NamedTuple):
-    """A message on /diagnostics: its own time in nanoseconds, and statuses by their tasks."""
-
-    time: int
-    statuses: dict
-
-
-class Estimate(NamedTuple):
-    """What was published for one sample."""
-
-    stamp: int
-    z: list[float]
-    unknown_input: float
-    gamma: float | None
-    innovation: list[float]
+Published = namedtuple('Published', 'stamp message')
+"""A message with its source time stamp in nanoseconds."""
+Report = namedtuple('Report', 'time statuses')
+"""A message on /diagnostics: its own time in nanoseconds, and statuses by their tasks."""
+Estimate = namedtuple('Estimate', 'stamp z unknown_input gamma innovation')
+"""What was published for one sample; gamma may be None."""
 
 
 class User(PrivateNode):
@@ -219,10 +202,8 @@ class Parameters:
     def all(self, names) -> dict[str, object]:
         """Return values by name."""
         values = map(parameter_value_to_python, self.messages(*names))
-        return {
-            name: value if isinstance(value, bool | int | float | str) else list(value)
-            for name, value in zip(names, values, strict=True)
-        }
+        plain = (v if isinstance(v, bool | int | float | str) else list(v) for v in values)
+        return dict(zip(names, plain, strict=True))
 
     def get(self, name: str) -> object:
         return self.all([name])[name]
@@ -292,9 +273,8 @@ class Rig:
 
         def look() -> list:
             doing()
-            statuses = [r.statuses[task] for r in self.reports[since:] if task in r.statuses]
-            values = [values_of(status) for status in statuses]
-            return [found for found in values if condition(found)]
+            later = (r.statuses for r in self.reports[since:] if task in r.statuses)
+            return list(filter(condition, (values_of(statuses[task]) for statuses in later)))
 
         return self.user.wait(look, what)[-1]
 
@@ -302,8 +282,7 @@ class Rig:
         """Return values as `wait_values`, of a status with this level and these words."""
 
         def as_wanted(values) -> bool:
-            text = values['message']
-            return values['level'] == level and all(word in text for word in words)
+            return values['level'] == level and all(word in values['message'] for word in words)
 
         return self.wait_values(task, as_wanted, f'{task} with {level} and {words}', doing)
 
@@ -330,8 +309,6 @@ class Estimator(Rig):
         user.wait(lambda: told, f'parameters of {node}')
         self.parameters = Parameters(user, node)
 
-    # What it is sent.
-
     def listen(self) -> 'Estimator':
         """Wait until it hears y."""
         self._publisher = self.user.publisher(self._topic, heard=2)  # it and our own record
@@ -351,8 +328,6 @@ class Estimator(Rig):
         """Publish one sample, wait for the estimate that belongs to it and return it."""
         stamp = self.send(y)
         return self.wait_estimate(lambda e: e.stamp == stamp, f'estimate for y = {y}')
-
-    # What it publishes.
 
     @property
     def estimates(self) -> list[Estimate]:

@@ -98,10 +98,6 @@ class Cascade(Reference):
             return 0j
         return (eps * math.copysign(1.0, eps.real)) ** gamma * self.psi(i, eps)
 
-    def step(self, y, h, u):
-        getattr(self, self.p['scheme'])(y, h, u)
-        self.y = y
-
     def explicit(self, y, h, u):
         """Forward Euler: everything at the interval's beginning, y of the sample before."""
         p, gamma = self.p, complex(self.gamma, STEP)
@@ -144,12 +140,8 @@ class Cascade(Reference):
             injection = h * self.p['lambda'][i] * self.injection(i, e, gamma)
             return e + injection + stiffness * self.psi(i, e) - b
 
-        a = root(
-            lambda a: balance(complex(math.copysign(a, b.real)), gamma, b).real,
-            1e-300 if self.sign else 0.0,
-            abs(b.real),
-        )
-        e = math.copysign(a, b.real)
+        least = math.copysign(1e-300 if self.sign else 0.0, b.real)
+        e = root(lambda e: balance(complex(e), gamma, b).real, least, b.real)
         to_e = slope(balance(complex(e, STEP), self.gamma, b.real))
         to_gamma = slope(balance(complex(e), gamma, b))
         eps = complex(e, -STEP * to_gamma / to_e)  # implicit function theorem
@@ -170,8 +162,8 @@ class Cascade(Reference):
 
     def open(self):
         m = [self.y, *(v.real for v in self.tilde[: self.N - 1])]
-        closed = [abs(m[i] - self.hat[i].real) > self.p['epsilon'] for i in range(self.N - 1)]
-        return 1 + next((i for i, c in enumerate(closed) if c), self.N - 1)
+        closed = [i for i in range(self.N - 1) if abs(m[i] - self.hat[i].real) > self.p['epsilon']]
+        return 1 + min(closed, default=self.N - 1)
 
 
 class Levant(Reference):
@@ -258,17 +250,18 @@ def signals(steps=300):
     return t, y, np.cos(3.0 * t)
 
 
-def compare(p, rtol=1e-9):
-    t, y, u = signals()
+def compare(p):
+    (t, y, u), rtol = signals(), 1e-9
     observer, reference = Observer(p), Cascade(p, y[0])
     result = observer.run(t, y, u)
     rows = []
     for k in range(len(t)):
         if k > 0:
-            reference.step(y[k], t[k] - t[k - 1], u[k])
+            getattr(reference, p['scheme'])(y[k], t[k] - t[k - 1], u[k])
+            reference.y = y[k]
         rows.append([*reference.hat, *reference.tilde, reference.gamma, reference.open()])
-    found = [result.z_hat, result.z_tilde, result.gamma[:, None], result.open_levels[:, None]]
-    np.testing.assert_allclose(np.hstack(found), np.real(rows), rtol=rtol, atol=rtol)
+    found = [result.z_hat, result.z_tilde, result.gamma, result.open_levels]
+    np.testing.assert_allclose(np.column_stack(found), np.real(rows), rtol=rtol, atol=rtol)
     if p['variant'].endswith('_adaptive') and p['gamma_rate'] > 0.0:
         sensitivities = [[slope(v) for v in row] for row in (reference.hat, reference.tilde)]
         np.testing.assert_allclose(levels_of(observer)[2:], sensitivities, rtol=rtol, atol=rtol)
@@ -315,9 +308,8 @@ def test_levant_follows_the_equations(scheme, variant, n, decay, derivatives):
     levels = n + 1 + derivatives
     p = parameters(n, True, scheme=scheme, variant=variant, unknown_input_decay=decay) | {
         'structure': 'levant', 'unknown_input_derivatives': derivatives, 'gamma_initial': 0.7,
-        'lambda': [2.0 * 3.0 ** (i + 1) for i in range(levels)],
+        'lambda': [2.0 * 3.0 ** (i + 1) for i in range(levels)], 'alpha': [1.0],
         'initial_estimate': list(np.linspace(0.1, -0.2, levels)), 'initial_internal': [0.0],
-        'alpha': [1.0],
     }  # fmt: skip
     t, y, u = signals(100)
     y += 0.2 * np.sign(np.sin(9.0 * t))

@@ -8,8 +8,6 @@ from fhaosmo_ros.__main__ import main
 from fhaosmo_ros.tools.cli.command import shipped
 import pytest
 
-NODES = ('demo', 'play', 'record')
-"""Commands that need ROS."""
 TUNE = (
     'tune -o out -pscheme:=explicit -pduration:=4.0 -pintegration_step:=1e-3 -psample_rate:=200.0 '
     '-precordings:=1 -pheld_out:=1 -psettled:=1.0 '
@@ -89,7 +87,7 @@ def place(tmp_path_factory):
 @pytest.mark.parametrize('call', WRONG)
 def test_wrong_input_is_said_in_one_line_and_leaves_nothing(call, place, capfd, monkeypatch):
     command, *arguments = shlex.split(call)
-    if command in NODES:
+    if command in ('demo', 'play', 'record'):
         pytest.importorskip('rclpy', reason='no ROS 2 in this Python')
     elif '--storage' in arguments:
         pytest.importorskip('optuna', reason='optuna is not installed (extra: tune)')
