@@ -98,15 +98,3 @@ def test_time_that_no_step_can_take_is_dropped(law):
     assert bool(observer.step(5.0, 1e-3, 0.0).status & Status.REJECTED_STEP) != slides
     assert remembered(observer, 'pending') == 0.0
     assert not observer.step(5.0, 1e-3, 0.0).status.rejected
-
-
-@laws
-def test_live_change_of_an_observer_whose_numbers_have_overflowed_makes_it_begin_afresh(law):
-    observer = Observer(SMALL | law)
-    observer.start(0.3)
-    for _ in range(3):
-        observer.step(np.nan, 1.7e300, 0.0)
-    assert remembered(observer, 'pending') > 1.8e300
-    observer.configure({'lambda': 2.0})
-    assert not observer.started
-    assert observer.step(0.3, 1e-3, 0.0).status == Status.OK

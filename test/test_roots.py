@@ -8,19 +8,8 @@ from fhaosmo_ros.core.observer.levant import Levant
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 import numpy as np
-from observer_cases import levels_of, powers, samples, SMALL, VARIANTS
+from observer_cases import powers, SMALL, VARIANTS
 import pytest
-
-
-@pytest.mark.parametrize('scheme', ['explicit', 'implicit'])
-def test_change_of_variant_starts_the_sensitivities_at_zero(scheme):
-    observer = Observer(SMALL | {'scheme': scheme, 'variant': 'fuzzy_adaptive'})
-    observer.run(*samples())
-    assert np.any(levels_of(observer)[2:] != 0.0)
-    observer.configure({'variant': 'fuzzy'})
-    observer.step(0.1, 1e-3, 0.0)
-    observer.configure({'variant': 'fuzzy_adaptive'})
-    np.testing.assert_array_equal(levels_of(observer)[2:], 0.0)
 
 
 @given(
