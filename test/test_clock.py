@@ -31,11 +31,11 @@ SLOW = START + MS * (np.arange(10_000) // 25 * 25)
 """Times at 1 kHz, and what a clock of 40 Hz reads then."""
 
 
-def clock_readings(published, per_tick, lateness, seed):
+def clock_readings(published, lateness, seed):
     """
     Return what a clock on /clock reads when each sample comes.
 
-    The time is published 20 µs before every `per_tick`-th sample; messages of both are late by a
+    The time is published 20 µs before every 25th sample; messages of both are late by a
     half-normal time of this scale (s), and what is late holds up what was published after it.
     """
     rng = np.random.default_rng(seed)
@@ -44,7 +44,7 @@ def clock_readings(published, per_tick, lateness, seed):
         late = 1e9 * lateness * np.abs(rng.standard_normal(len(times)))
         return np.maximum.accumulate(times + late.astype(np.int64))
 
-    ticks = published[::per_tick]
+    ticks = published[::25]
     latest = np.searchsorted(received(ticks - 20_000), received(published), side='right')
     return ticks[np.maximum(latest, 1) - 1]
 
@@ -52,7 +52,7 @@ def clock_readings(published, per_tick, lateness, seed):
 @pytest.mark.parametrize('late', [0.0, 1e-5, 1e-4, 1e-3])
 def test_late_ticks_and_samples_hardly_move_the_times(late):
     for seed in range(3):
-        times = times_by(clock_readings(TRUE, 25, late, seed))[0][5000:]
+        times = times_by(clock_readings(TRUE, late, seed))[0][5000:]
         assert np.diff(times) == pytest.approx(MS, rel=0.002)
         assert times == pytest.approx(TRUE[5000:], abs=MS)
 
@@ -93,8 +93,7 @@ def test_samples_are_back_at_the_clock_after_a_gap():
 
 
 def test_clock_that_stands_still_is_two_samples_ahead_of_its_next_tick_at_most():
-    ticks = np.repeat([0, 10, 20], [5, 5, 1005])  # paused: samples go on
-    times, estimator = times_by(START + MS * ticks)
+    times, estimator = times_by(START + MS * np.repeat([0, 10, 20], [5, 5, 1005]))  # paused
     assert times[-1] <= START + (30 + 2 * 2) * MS  # 2 ms between samples
     assert not estimator.update(START + 30 * MS, 0.2).status.rejected
 

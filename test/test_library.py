@@ -71,11 +71,9 @@ def test_columns_of_a_table_are_taken():
 
 def test_input_that_phi_uses_must_be_given():
     observer = Observer(OSCILLATOR)
-    for call, arguments in (
-        (observer.run, (T, Y)), (observer.smooth, (T, Y)), (observer.step, (0.1, 1e-3)),
-    ):  # fmt: skip
+    for call in observer.run, observer.smooth, observer.step:
         with pytest.raises(ConfigurationError, match='expected values of u'):
-            call(*arguments)
+            call(0.1, 1e-3) if call == observer.step else call(T, Y)
     assert not observer.started
 
 

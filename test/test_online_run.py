@@ -13,11 +13,8 @@ PERIODS = [MS, MS, MS, MS, 2 * MS, 0, -MS, 499 * MS, 501 * MS, -700 * MS]
 VALUES = [0.0, 0.1, 0.1, 0.2, -0.3, float('nan'), float('inf'), 1e300]
 
 
-NAMES = ('z', 'unknown_input', 'gamma', 'innovation', 'status', 'open_levels')
-
-
 def one_by_one(estimator, stamps, y, u):
-    """Yield what an estimator shows after each sample, in the order of `NAMES`."""
+    """Yield what an estimator shows after each sample, in the order of a `table`."""
     for stamp, sample, known in zip(stamps.tolist(), y.tolist(), u.tolist(), strict=True):
         for j, value in enumerate(known):
             estimator.set_input(value, j)
@@ -26,7 +23,8 @@ def one_by_one(estimator, stamps, y, u):
 
 
 def table(run):
-    return np.column_stack([getattr(run, name) for name in NAMES])
+    names = ('z', 'unknown_input', 'gamma', 'innovation', 'status', 'open_levels')
+    return np.column_stack([getattr(run, name) for name in names])
 
 
 def events_of(estimator):
@@ -102,15 +100,14 @@ SETTINGS = [
 ]  # fmt: skip
 
 
+periods_and_values = st.tuples(st.sampled_from(PERIODS), st.sampled_from(VALUES))
+
+
 @given(
-    st.lists(
-        st.tuples(st.sampled_from(PERIODS), st.sampled_from(VALUES)), min_size=1, max_size=60
-    ),
-    st.sampled_from(['source_stamp', 'clock', 'nominal']),
-    st.sampled_from(SETTINGS),
-    st.sampled_from([1, 3, 7, 100]),
-)
-def test_gaps_jumps_and_bad_samples_are_the_same(samples, sampling, settings, size):
+    st.lists(periods_and_values, min_size=1, max_size=60), st.sampled_from(SETTINGS),
+    st.sampled_from(['source_stamp', 'clock', 'nominal']), st.sampled_from([1, 3, 7, 100]),
+)  # fmt: skip
+def test_gaps_jumps_and_bad_samples_are_the_same(samples, settings, sampling, size):
     stamps = 10**18 + np.cumsum([period for period, _ in samples])
     y = np.array([value for _, value in samples])
     u = np.where(np.arange(len(y)) % 5 == 4, np.nan, 0.1)
@@ -188,7 +185,6 @@ def test_snapshot_of_other_entries_or_sizes_is_refused():
     two = OnlineEstimator({'order': 2, 'phi': ['0', 'a - b'], 'inputs': ['a', 'b']}).state_dict()
     for other, said in (
         ({'order': 2, 'phi': ['0', 'u']}, 'expected finite numbers of shape'),
-        ({'order': 1, 'phi': ['0*a*b'], 'inputs': ['a', 'b']}, r'\(2,\)'),
         (LATE, 'measurement_delay'),
     ):
         with pytest.raises(ConfigurationError, match=said):

@@ -215,8 +215,8 @@ def test_cascade_goes_on_from_its_start_as_a_kalman_filter():
 
 def test_covariance_is_that_of_a_kalman_filter():
     """Step by step, with intervals of any length, against plain matrices."""
-    values = load(CONFIG / 'models' / 'pendulum.yaml', 'estimator', OBSERVER_PARAMETERS)
-    observer, rng = Observer(values), np.random.default_rng(2)
+    observer = Observer.from_yaml(CONFIG / 'models' / 'pendulum.yaml')
+    rng, values = np.random.default_rng(2), observer.parameters
     observer.start(0.5)
     schedule, noise = observer.configuration.schedule, values['noise_size'] ** 2
     p, age = remembered(observer, 'covariance').copy(), 0.0
@@ -249,7 +249,7 @@ def test_steady_covariance_solves_its_equation():
 
 
 def influences(noise):
-    """Return as how large innovations of usual size 1 count, and the limits after each."""
+    """Return as how large innovations of usual size 1 count, and the limits after each (D 32)."""
     p = {'structure': 'levant', 'scheme': 'predict_correct', 'correction_period': 1e-3}
     levant = Observer(p).structure
     return np.transpose([levant.bounded(b, 1.0) for b in noise])

@@ -32,7 +32,6 @@ def study(plant, condition=AS_TUNED, kind='sine', seconds=20.0, seed=31):
 
 
 def estimated(values, t, y):
-    """Return what an estimator makes of samples."""
     return OnlineEstimator(values).run(stamps_of(t), y)
 
 
@@ -62,8 +61,7 @@ NOISES = {
     # noise on y by unit noise; bound of the error over d; size and correlation at the end
     'little': (lambda n: 1e-4 * n, 0.2, 1e-4, 0.0),
     'usual': (lambda n: 1e-3 * n, 0.35, 1e-3, 0.0),
-    '10 times as much later': (lambda n: 1e-4 * np.where(LATER, 10.0, 1.0) * n, 0.25, 1e-3, 0.0),
-    '100 times': (lambda n: 1e-4 * np.where(LATER, 100.0, 1.0) * n, 0.35, 1e-2, 0.0),
+    '100 times as much later': (lambda n: 1e-4 * np.where(LATER, 100, 1) * n, 0.35, 1e-2, 0.0),
     'coloured': (lambda n: 1e-3 * lfilter([math.sqrt(0.19)], [1.0, -0.9], n), 0.6, 1e-3, 0.9),
     'outliers': (lambda n: 1e-3 * (1.0 + OUTLIERS) * n, 0.4, 1e-3, 0.0),
     'heavy tails': (lambda _: 1e-3 * HEAVY, 0.4, 1.6e-3, 0.0),
@@ -197,16 +195,6 @@ def test_stamps_are_the_only_noise(jitter):
     assert np.abs(error).max() < 20.0 * rms(d)
 
 
-def test_a_jump_of_d_is_followed_at_once():
-    """After a jump of 2,000 times the noise a sample, d is right again within 25 samples."""
-    t, y, d = swept(1e-2, lambda phase: np.where(phase < 15.0, 1.0, -1.0))
-    y = y + 4.4e-6 * np.random.default_rng(8).standard_normal(len(t))
-    off = abs(Observer(MOTOR).run(t, y).unknown_input - d) / 70.0
-    jump = int(np.argmax(d < 0.0))
-    assert (off[jump : jump + 3] > 1.0).any()
-    assert (off[jump + 25 : jump + 300] < 0.1).all()
-
-
 @pytest.mark.parametrize('seed', [0, 10, 16])
 def test_a_usual_jump_of_d_is_believed_at_the_second_sample_and_two_outliers_are_none(seed):
     """With d = 0.2 at the start, too: what is usual is not known yet."""
@@ -281,11 +269,9 @@ def test_a_simulated_y_without_noise_that_comes_to_rest_is_not_stuck(late):
     sudden = np.sin(2.0 * np.minimum(t, 8.3))
     stamps = t + late * np.abs(np.random.default_rng(0).standard_normal(len(t)))
     for y in (slow, sudden):
-        estimator = OnlineEstimator({'order': 2, 'phi': ['0', '-z2'], **SELF_TUNING})
-        run = estimator.run(10**9 + np.sort(np.round(1e9 * stamps).astype(np.int64)), y)
-        assert not np.any(run.status & Status.REPEATED)
+        run = estimated({'order': 2, 'phi': ['0', '-z2'], **SELF_TUNING}, np.sort(stamps), y)
+        assert not np.any(run.status & (Status.REPEATED | Status.REJECTED_STUCK))
         assert np.count_nonzero(np.diff(y) == 0.0) > 1000
-        assert estimator.counters.rejected_stuck == 0
 
 
 @plants
@@ -295,12 +281,10 @@ def test_a_sensor_that_is_slower_than_its_topic(plant, samples, noise):
     r, values = study(plant)
     noise *= PLANTS[plant].noise
     y = r.z[:, 0] + noise * np.random.default_rng(9).standard_normal(len(r.t))
-    held = np.arange(len(y)) // samples * samples
-    stamps = stamps_of(r.t)
-    run = OnlineEstimator(values).run(stamps, y[held])
-    late = r.t > 10.0
-    alone = OnlineEstimator(values).run(stamps[::samples], y[::samples])
-    expected = rms((alone.unknown_input - r.d[::samples])[late[::samples]])
+    run = estimated(values, r.t, y[np.arange(len(y)) // samples * samples])
+    late, every = r.t > 10.0, slice(None, None, samples)
+    alone = estimated(values, r.t[every], y[every])
+    expected = rms((alone.unknown_input - r.d[every])[late[every]])
     repeats = (run.status & Status.REPEATED) > 0
     assert np.mean(repeats[late]) == pytest.approx(1.0 - 1.0 / samples, abs=1e-3)
     assert rms((run.unknown_input - r.d)[late & ~repeats]) < 1.5 * expected + 0.1 * rms(r.d)
@@ -333,14 +317,12 @@ def test_slider(case):
     assert roughness[0] < 0.5 * roughness[1] < 0.25 * roughness[2]
 
 
-@pytest.mark.parametrize(('name', 'kind', 'seed', 'seconds'), [
-    ("paper's plant", 'sine', 20, 8.0), ('motor', 'ou', 14, 8.0), ('motor', 'ou', 10, 8.0),
-    ('pendulum', 'square', 3, 8.0), ('motor', 'sine', 0, 20.0), ('motor', 'chirp', 13, 20.0),
-    ('motor', 'ou', 1, 20.0), ('motor', 'ou', 7, 20.0),
+@pytest.mark.parametrize(('name', 'kind', 'seed'), [
+    ("paper's plant", 'sine', 20), ('motor', 'ou', 14), ('pendulum', 'square', 3),
 ])  # fmt: skip
-def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, kind, seed, seconds):
+def test_noise_that_grows_is_not_taken_for_a_jump_of_d(name, kind, seed):
     """A hundredfold noise has samples farther and farther off by chance (D 33)."""
-    r, values = study(name, Condition(later=100.0), kind, seconds, seed)
+    r, values = study(name, Condition(later=100.0), kind, 8.0, seed)
     found = observed(values, r.t, r.y).unknown_input
     assert np.abs(found - r.d).max() < 4.0 * np.abs(r.d).max()
 
@@ -441,10 +423,9 @@ def test_moments_of_a_truncated_normal_distribution(middle, width):
     least = -6.0  # of quantised samples (D 31)
     np.testing.assert_allclose(chance, max(math.log(share), least), atol=1e-3)
     sign = math.copysign(1.0, middle)  # far off an interval counts as its nearer end
-    chance, mean, lost = within(*sorted((sign * 20.0, sign * 21.0)))
+    chance, mean, _ = within(*sorted((sign * 20.0, sign * 21.0)))
     assert 20.0 <= sign * mean <= 20.1
     assert chance == least
-    assert 0.0 < lost < 1.0
 
 
 def test_outliers_do_not_hide_the_quanta():
