@@ -106,11 +106,10 @@ def acting(pieces, lag, elapsed, now, spikes=()):
     return found[-1]
 
 
-durations = st.integers(1, 50)
-known = st.lists(st.tuples(durations, st.integers(-2, 2), st.integers(-2, 2)), max_size=30)
+durations, values = st.integers(1, 50), st.integers(-2, 2)
 
 
-@given(known, st.integers(1, 200), durations)
+@given(st.lists(st.tuples(durations, values, values), max_size=30), st.integers(1, 200), durations)
 def test_inputs_of_an_interval_are_their_mean_and_what_is_withdrawn_has_not_been(
     pieces, lag, elapsed
 ):
