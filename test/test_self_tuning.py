@@ -178,23 +178,6 @@ def test_a_host_that_stamps_later_for_dozens_of_samples(seed):
     assert np.abs(estimated(SELF_TUNING, late, noisy).unknown_input).max() < 2.0 * np.abs(d).max()
 
 
-@pytest.mark.parametrize('jitter', [0.03, 0.15])
-def test_stamps_are_the_only_noise(jitter):
-    """Four states, and a y without noise: its error grows with its speed, from 0 on."""
-    random, rates = np.random.default_rng(6), np.eye(4, k=1)
-    rates[3, 2:] = -40.0, -2.0
-    t = np.arange(8000) * 2e-3
-    d = 50.0 * (np.sin(0.6 * t + 1.0) + np.sin(2.0 * t))
-    y = states_of(rates, d, np.zeros(4), 2e-3)[:, 0]
-    late = np.maximum.accumulate(t + jitter * 2e-3 * np.abs(random.standard_normal(len(t))))
-    late += 1e-8 * np.arange(len(t))
-    late[30] += 1.5e-3  # before the members begin
-    observer = Observer({**SELF_TUNING, 'order': 4, 'phi': ['0', '0', '0', '-40*z3 - 2*z4']})
-    error = observer.run(late, y).unknown_input - d
-    assert rms(error[t > 3.0]) < 0.4 * rms(d)
-    assert np.abs(error).max() < 20.0 * rms(d)
-
-
 @pytest.mark.parametrize('seed', [0, 10, 16])
 def test_a_usual_jump_of_d_is_believed_at_the_second_sample_and_two_outliers_are_none(seed):
     """With d = 0.2 at the start, too: what is usual is not known yet."""
