@@ -48,12 +48,12 @@ def states_of(rates, d, start=0.0, period=1e-3):
     return z
 
 
-def matern(count, rate, derivatives, rng, early=4000):
+def matern(count, rate, derivatives, rng):
     """Return a d of size 1 at 1 kHz with so many derivatives, its corner at `rate` (rad/s)."""
-    d = rng.standard_normal(count + early)
+    d = rng.standard_normal(count + 4000)
     for _ in range(derivatives + 1):
         d = lfilter([1.0], [1.0, -math.exp(-rate * 1e-3)], d)
-    return d[early:] / d[early:].std()
+    return d[4000:] / d[4000:].std()
 
 
 def powers(low, high):

@@ -129,8 +129,7 @@ def test_another_rate_and_lost_samples(case):
     """Every tenth sample, and then half of the samples at random, from the middle on."""
     t, z, d, noise = case
     y = z[:, 0] + 1e-4 * noise
-    keep = np.random.default_rng(3).uniform(size=len(t)) < 0.5
-    keep[: len(t) // 2] = True
+    keep = (np.random.default_rng(3).uniform(size=len(t)) < 0.5) | (t < 10.0)
     for index in (np.arange(0, len(t), 10), np.flatnonzero(keep)):
         error = Observer(SELF_TUNING).run(t[index], y[index]).unknown_input - d[index]
         assert np.abs(error).max() < 1.5 * np.abs(d).max()
@@ -216,17 +215,6 @@ def test_how_sure_it_is_of_a_quantised_y(plant):
         assert rms(wrong) < 1.2 * rms(r.d[late])
         inside.append(np.mean(wrong < deviation[late, -1]))
     assert 0.5 < np.mean(inside) < 0.9
-
-
-@pytest.mark.parametrize('quantum', [2.0, 10.0])
-@pytest.mark.parametrize('part', [0.03, 0.1, 0.3, 0.5])
-def test_noise_on_a_quantised_y(quantum, part):
-    """y goes to a neighbouring count and back: by noise, which is no motion of d."""
-    r, values = study("paper's plant")
-    q = quantum * PLANTS["paper's plant"].noise
-    y = r.z[:, 0] + part * q * np.random.default_rng(131).standard_normal(len(r.t))
-    found = estimated(values, r.t, np.round(y / q) * q).unknown_input
-    assert rms((found - r.d)[r.t > 4.0]) < rms(r.d)
 
 
 @plants
