@@ -71,9 +71,9 @@ def test_columns_of_a_table_are_taken():
 
 def test_input_that_phi_uses_must_be_given():
     observer = Observer(OSCILLATOR)
-    for call in observer.run, observer.smooth, observer.step:
+    for call, *values in (observer.run, T, Y), (observer.smooth, T, Y), (observer.step, 0.1, 0.1):
         with pytest.raises(ConfigurationError, match='expected values of u'):
-            call(0.1, 1e-3) if call == observer.step else call(T, Y)
+            call(*values)
     assert not observer.started
 
 

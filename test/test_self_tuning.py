@@ -308,6 +308,8 @@ def test_known_input_and_a_constant_that_changes_live():
     observer.run(t[:8000], y[:8000], u[:8000])
     observer.configure({'constants.b': 5.0})
     run = observer.run(t[8000:], y[8000:], u[8000:])
+    flow = observer.structure.state_dict()['flow']
+    assert flow[1, 1] == pytest.approx(math.exp(-5.0 * PERIOD), rel=1e-6)
     assert rms((run.unknown_input - d[8000:])[4000:]) < 0.02 * rms(d)
 
 
