@@ -37,16 +37,6 @@ def test_plant_is_accurate_to_fourth_order():
     assert 3.7 < order(steps, errors) < 4.5
 
 
-def test_trajectory_does_not_depend_on_the_sampling_times():
-    coarse = np.linspace(0.0, 3.0, 31)
-    extra = np.random.default_rng(4).uniform(0.0, 3.0, 500)
-    fine = np.unique(np.concatenate([coarse, extra]))
-    p = NONLINEAR | {'integration_step': 0.01}
-    one, other = Plant(p).simulate(coarse), Plant(p).simulate(fine)
-    at = np.searchsorted(fine, coarse)
-    np.testing.assert_array_equal(other.z[at], one.z)
-
-
 def estimated(h, omega):
     """Return d of the paper's plant, estimated by sign and true, once the observer has settled."""
     p = MODEL | {'initial_state': 0.2, 'disturbance_omega': omega, 'integration_step': 1e-3}
