@@ -6,7 +6,8 @@ from fhaosmo_ros.core import ConfigurationError, EventDetector, OnlineEstimator
 from fhaosmo_ros.core.observer.estimates import TUNING
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
-from fhaosmo_ros.tools.bags.topics import messages, series
+from fhaosmo_ros.tools.bags.reader import BagReader
+from fhaosmo_ros.tools.bags.topics import series
 from fhaosmo_ros.tools.plot import command as plot
 from fhaosmo_ros.tools.plot.curves import read_curves
 from fhaosmo_ros.tools.replay import command as replay
@@ -177,8 +178,11 @@ def test_bag_tables_and_figure_have_what_the_node_finds(samples, tmp_path, monke
         for name, column in zip(names, found.T, strict=True):
             np.testing.assert_array_equal(of_npz[name], column)
             np.testing.assert_array_equal(of_csv[name], column)
-    told = [(m.header.stamp, m.status[0].level) for _, m in messages(bag, '/estimator/event')]
-    told = [(stamp.sec * 10**9 + stamp.nanosec, bool(level)) for stamp, level in told]
+    with BagReader(bag) as reader:
+        told = [
+            (m.header.stamp.sec * 10**9 + m.header.stamp.nanosec, bool(m.status[0].level))
+            for _, _, m in reader.read_all(['/estimator/event'])
+        ]
     assert told == [(e.stamp, e.begins) for e in events]
     (curves,) = read_curves(bag, None, '/plant')
     np.testing.assert_array_equal(curves.deviation, found[:, 8:])

@@ -31,12 +31,6 @@ class Series(NamedTuple):
     labels: list[str]  # names of the n columns, where the messages have a label
 
 
-def messages(path: Path, topic: str) -> list[tuple[int, Any]]:
-    """Return the stamps (ns) and messages of a topic that has few of them."""
-    with BagReader(path) as reader:
-        return [(stamp, message) for _, stamp, message in reader.read_all([topic])]
-
-
 def series(path: Path, topic: str) -> Series:
     """
     Read a topic of numbers; empty arrays if it has no message.

@@ -11,13 +11,7 @@ from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import chatter, rms
 from fhaosmo_ros.tools.bags.reader import BagReader
-from fhaosmo_ros.tools.bags.topics import (
-    messages,
-    read_ticks,
-    Recorded,
-    recorded_parameters,
-    series,
-)
+from fhaosmo_ros.tools.bags.topics import read_ticks, recorded_parameters, series
 from fhaosmo_ros.topics import ESTIMATES, EVENT, STANDARD_DEVIATION, TRUTH
 import numpy as np
 from numpy.typing import NDArray
@@ -79,15 +73,12 @@ def read_curves(path: Path, names: list[str] | None, plant: str) -> list[Curves]
                 f'bag {path}: expected the topics of an estimator ({", ".join(ESTIMATES)} below '
                 f'its name), got {", ".join(sorted(topics)) or "none"}; replay adds them'
             )
-        recorded = {name: recorded_parameters(reader, name) for name in names or found}
-    return [_curves(path, name, plant, topics, of_bag) for name, of_bag in recorded.items()]
+        return [_curves(reader, name, plant, topics) for name in names or found]
 
 
-def _curves(
-    path: Path, name: str, plant: str, topics: set[str], recorded: Recorded | None
-) -> Curves:
-    epsilon, unit = None, ''
-    if recorded:
+def _curves(reader: BagReader, name: str, plant: str, topics: set[str]) -> Curves:
+    path, epsilon, unit = reader.path, None, ''
+    if recorded := recorded_parameters(reader, name):
         own = of_channel(recorded.values, recorded.channel)
         values = ESTIMATOR_PARAMETERS.defaults() | own
         unit = values['measurement_unit']
@@ -114,7 +105,7 @@ def _curves(
         truth,
         epsilon,
         unit,
-        _events(path, f'{name}/{EVENT}', int(when[-1])) if f'{name}/{EVENT}' in topics else (),
+        _events(reader, f'{name}/{EVENT}', int(when[-1])) if f'{name}/{EVENT}' in topics else (),
     )
 
 
@@ -140,10 +131,10 @@ def _truth_at(path: Path, plant: str, when: NDArray[np.int64]) -> Floats | None:
     return np.column_stack(columns)
 
 
-def _events(path: Path, topic: str, end: int) -> list[tuple[int, int]]:
+def _events(reader: BagReader, topic: str, end: int) -> list[tuple[int, int]]:
     """Return begin and end of each event of an estimator; one that lasts is given the last end."""
     spans: dict[int, int] = {}
-    for _, message in messages(path, topic):
+    for _, _, message in reader.read_all([topic]):
         (status,) = message.status
         since = {pair.key: pair.value for pair in status.values}.get('since')
         if since is not None:  # else there has been none
