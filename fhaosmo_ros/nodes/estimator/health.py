@@ -5,17 +5,13 @@ from collections import deque
 from collections.abc import Mapping
 from math import nan
 from time import perf_counter
-from typing import Protocol
+from typing import Any
 
 from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.online.counters import UNUSED_SAMPLES
-from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import described
-from fhaosmo_ros.core.parameters.declaration import Parameters
 from fhaosmo_ros.core.parameters.units import derivative_unit, titled
 from fhaosmo_ros.core.simulation.metrics import high_passed
-from fhaosmo_ros.inputs import Pairing
-from fhaosmo_ros.nodes.estimator.sources import Listener
 from fhaosmo_ros.nodes.middleware.diagnostics import ERROR, Report, STALE, WARN
 import numpy as np
 from numpy.typing import NDArray
@@ -50,28 +46,16 @@ UNUSED = ('samples lost', *map(_words, UNUSED_SAMPLES), 'rejected inputs')
 """Counters of samples that the observer has not taken."""
 
 
-class Watched(Protocol):
-    """What is reported on: a channel, with its parameters of now."""
-
-    name: str
-    values: Parameters
-    estimator: OnlineEstimator
-    y: Listener
-    u: Mapping[str, Listener]
-    pairing: Pairing
-    simulated: bool
-
-
 class Health:
     """
-    Remembers a few numbers of each sample of a channel, and makes two reports of them.
+    Remembers a few numbers of each sample of a `Channel`, and makes two reports of them.
 
     Appended to on each sample: `stamps` (ns), `delays` from the source stamp to the callback (ns),
     `durations` of the callback (s), `unknown_inputs`. `latest` is the time of the last sample on
     `perf_counter`, `offset` from its stamp to the publication of its message (ns).
     """
 
-    def __init__(self, channel: Watched) -> None:
+    def __init__(self, channel: Any) -> None:
         self._channel = channel
         self.stamps: deque[int] = deque(maxlen=LIMIT)
         self.delays: deque[int] = deque(maxlen=LIMIT)
