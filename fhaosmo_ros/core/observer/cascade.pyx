@@ -267,13 +267,6 @@ cdef class Cascade(SlidingMode):
             e = moved if low < moved < high else 0.5 * (low + high)
         return Root(e, psi(self, i, e).value)
 
-    def solve(self, int level, double b, double h, double gamma):
-        """Return |eps| and s of D 9 for a level (0-based) and b >= 0."""
-        if not 0 <= level < self.levels:
-            raise ValueError(f'solve: expected a level below {self.levels}, got {level}')
-        cdef Root found = self.root(level, b, h, gamma)
-        return found.eps, found.s
-
 
 cdef inline double decayed(double decay, double h) noexcept nogil:
     """Return the factor by which a backward Euler step shrinks an internal state (D 16)."""

@@ -308,17 +308,6 @@ cdef class Levant(SlidingMode):
         p[0][0] = memory.miss * memory.miss
         memcpy(self.covariance, p, n * sizeof(Row))
 
-    def solve(self, weights, double b, double gamma):
-        """Return |eps|, its power 2 gamma / N and s_N of D 12, for weights h^i lambda_i."""
-        cdef double numbers[MOST_LEVELS]
-        cdef Root found
-        if len(weights) != self.levels:
-            raise ValueError(f'solve: expected {self.levels} weights, got {len(weights)}')
-        for i, weight in enumerate(weights):
-            numbers[i] = weight
-        found = self.root(numbers, b, gamma)
-        return found.eps, found.w, found.s
-
     def bounded(self, double b, double usual):
         """Return as how large an innovation counts, and the limit after it over `usual` (D 32)."""
         return self.influence(b, usual), HUBER - self.memory.narrowed

@@ -10,7 +10,6 @@ of d and of the noise that parameters tell.
 from libc.math cimport INFINITY, NAN, exp, fabs, isfinite, pow
 from libc.string cimport memcpy
 
-from fhaosmo_ros.core.model.phi cimport Dual
 from fhaosmo_ros.core.observer.kalman cimport correct, fill
 from fhaosmo_ros.core.observer.status cimport GAMMA_AT_MAX, GAMMA_AT_MIN, SENSITIVITY_RESET
 from fhaosmo_ros.core.observer.structure cimport GATE, Memory, Structure, has_drifted
@@ -119,13 +118,6 @@ cdef class SlidingMode(Structure):
         if not self.scheduled and self.memory.offset != 0.0:
             self.memory.y += self.memory.offset
             self.memory.offset = self.memory.jumps = 0.0
-
-    def curve(self, int level, double a):
-        """Return psi of a level (0-based) at a >= 0, and its slope."""
-        if not 0 <= level < self.levels or not a >= 0.0:
-            raise ValueError(f'curve: expected a level below {self.levels} and a >= 0')
-        cdef Dual found = psi(self, level, a)
-        return found.value, found.slope
 
     cdef void advance(self, double y, double h, const double* u) noexcept nogil:
         """See `Structure.advance`."""
