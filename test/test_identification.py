@@ -2,7 +2,7 @@
 """What `tune` finds in a y without the truth (D 30), and when it refuses."""
 
 import bag_files as files
-from fhaosmo_ros.core import Family, Observer, OnlineEstimator, TriangularModel
+from fhaosmo_ros.core import ConfigurationError, Family, Observer, OnlineEstimator, TriangularModel
 from fhaosmo_ros.core.observer.kalman import LinearModel, stationary
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS
@@ -128,7 +128,7 @@ def too_few_states():
 ])  # fmt: skip
 @pytest.mark.filterwarnings('error')
 def test_where_there_are_no_gains_it_says_why(y, phi, about):
-    with pytest.raises(identify.NothingToFind, match=about):
+    with pytest.raises(ConfigurationError, match=about):
         found_in(y(), phi=phi)
 
 

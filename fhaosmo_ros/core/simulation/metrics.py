@@ -12,19 +12,14 @@ def rms(error: Series) -> float:
     return float(np.sqrt(np.mean(np.square(error)))) if len(error) else float('nan')
 
 
-def total_variation(x: Series) -> float:
-    """Return the sum of |x[k + 1] - x[k]|."""
-    return float(np.sum(np.abs(np.diff(x))))
-
-
 def chatter(estimate: Series, truth: Series) -> float:
     """
-    Return the total variation of the estimate over that of the truth.
+    Return the total variation of the estimate, the sum of |x[k + 1] - x[k]|, over the truth's.
 
     About 1 for an estimate that moves as the truth does; chatter makes it large.
     """
-    reference = total_variation(truth)
-    return total_variation(estimate) / reference if reference > 0.0 else float('inf')
+    variation, reference = (float(np.sum(np.abs(np.diff(x)))) for x in (estimate, truth))
+    return variation / reference if reference > 0.0 else float('inf')
 
 
 def high_passed(x: Series, window: int) -> float:

@@ -67,10 +67,6 @@ BEGIN = 0.1
 """Part of the bag in which the estimates may still be settling."""
 
 
-class NothingToFind(ConfigurationError):
-    """There are no gains for this y; the text says why."""
-
-
 class RecordedOutput(NamedTuple):
     """The y of a bag, of K samples."""
 
@@ -135,8 +131,8 @@ def identify_input(
 
     Raises
     ------
-    NothingToFind
-        There are no gains for this y.
+    ConfigurationError
+        There are no gains for this y; the text says why.
 
     """
     likelihood = _prepared(data, model, values, given)
@@ -159,7 +155,7 @@ def identify_input(
                 best = richer
         assert best
         if not math.isfinite(best.log_likelihood):
-            raise NothingToFind(
+            raise ConfigurationError(
                 f'y: expected samples that the model can predict, got none that phi = '
                 f'{list(model.phi)} follows: its estimates leave the finite numbers'
             )
@@ -171,25 +167,25 @@ def identify_input(
 
 
 def _refuse(found: Identified, fall: float) -> None:
-    """Raise NothingToFind where there are no gains; `fall`: of the log-likelihood if d were 0."""
+    """Raise where there are no gains; `fall`: of the log-likelihood if d were 0."""
     likelihood, y, noise = found.likelihood, found.likelihood.samples.y, found.best.noise
     period, bandwidth = likelihood.period, found.best.design.bandwidth
     silent = noise < NO_NOISE * float(np.std(y)) and not found.quantum
     if silent and not likelihood.fixed:
-        raise NothingToFind(
+        raise ConfigurationError(
             f'y: expected noise, got none that shows ({noise:.1e} in a y of '
             f'{np.std(y):.3g}), as in a simulation without noise: the less noise, the larger the '
             'gains, without limit. Say what the sensor will have: -p noise_size:=...'
         )
     if bandwidth > 0.9 * QUICKEST / period and not likelihood.fixed:
-        raise NothingToFind(
+        raise ConfigurationError(
             f'y: the likeliest filter follows every sample ({bandwidth:.3g} rad/s at '
             f'{1.0 / period:.4g} Hz). Either y has no noise that shows, or it moves in a way that '
             'the model cannot: it jumps, or order or phi are wrong. Say what noise the sensor '
             'has (-p noise_size:=...), sample faster, or correct the model'
         )
     if fall < SURE:
-        raise NothingToFind(
+        raise ConfigurationError(
             f'd: expected a y that d moves, got one that the model explains with d = 0 (noise '
             f'{noise:.3g}). Record while the unknown input acts, and longer'
         )
@@ -201,10 +197,8 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
 
     Raises
     ------
-    NothingToFind
-        The estimate of d would tell nothing.
     ConfigurationError
-        There is no such filter in floating-point numbers.
+        The estimate of d would tell nothing, or there is no such filter in floating-point numbers.
 
     """
     likelihood, design = found.likelihood, found.best.design
@@ -230,7 +224,7 @@ def make_gains(found: Identified, given: Mapping[str, Any]) -> Gains:
     errors = np.sqrt(np.maximum(np.diag(p) - k**2 * variance, 0.0))
     share = errors[order] / found.size_of_input
     if share > UNSEEN:
-        raise NothingToFind(
+        raise ConfigurationError(
             f'd: it changes too fast to be seen through this noise: the expected error is '
             f'{min(share, 1.0):.2f} of its size, and an estimate of 0 has 1.00. Does y drift or '
             'jump by itself, is its noise correlated from sample to sample (`gains: self_tuning` '
@@ -245,7 +239,7 @@ def run(found: Identified, gains: Gains) -> Run:
     samples = found.likelihood.samples
     t, begin = np.cumsum(samples.h), int(BEGIN * len(samples.y))
     estimator = OnlineEstimator(ESTIMATOR_PARAMETERS.complete(gains.parameters))
-    u = samples.u if estimator.observer.uses_input else None
+    u = samples.u if estimator.observer.used_inputs else None
     trajectory = estimator.run(stamps_of(t), samples.y, u)
     r = trajectory.innovation[:, 0] / (gains.share * gains.innovation)
     r = r[np.isfinite(r) & samples.used & (np.arange(len(r)) >= begin)]
@@ -271,9 +265,9 @@ def _prepared(
     t, y, u = usable(data)
     count, different = len(y), len(np.unique(y))
     if count < FEWEST:
-        raise NothingToFind(f'y: expected at least {FEWEST} samples, got {count}')
+        raise ConfigurationError(f'y: expected at least {FEWEST} samples, got {count}')
     if different < 5 or np.ptp(y) <= 1e-12 * np.abs(y).max():
-        raise NothingToFind(
+        raise ConfigurationError(
             f'y: expected a signal that moves, got {count} samples with {different} different '
             f'values ({y.min():.6g} to {y.max():.6g}): it is constant, or stuck, and nothing can '
             'be learned from it. Record while the plant moves'
