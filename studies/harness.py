@@ -143,4 +143,4 @@ def observed(
     """Return what the node would have estimated from samples, the first one at t[0]."""
     estimator = OnlineEstimator(parameters)
     stamps = 10**9 + np.round((t - t[0]) * 1e9).astype(np.int64)
-    return estimator.run(stamps, y, u if estimator.observer.uses_input else None)
+    return estimator.run(stamps, y, u if estimator.observer.used_inputs else None)

@@ -101,7 +101,7 @@ def acting(pieces, lag, elapsed, now, spikes=()):
     if len(spikes):  # each was as if it had not come
         begin = stamps[len(pieces)]
         stamps[len(pieces) + 1 :] = begin + rows[len(pieces) + 1 :, 0].astype(np.int64)
-    *_, found = estimator.policy.run(stamps, rows[:, 3].copy(), rows[:, 1:3].copy(), True)
+    *_, found = estimator.policy.run(stamps, rows[:, 3].copy(), rows[:, 1:3].copy())
     assert estimator.counters.rejected_spikes == len(spikes)
     return found[-1]
 

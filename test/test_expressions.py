@@ -99,7 +99,7 @@ MOTOR |= {'inputs': ['torque', 'load'], 'constants.m': 2.0, 'constants.b': 0.5, 
 
 
 def test_named_inputs_and_constants_stand_for_their_values():
-    assert not TriangularModel(['0', 'sin(z1)']).uses_input
+    assert not TriangularModel(['0', 'sin(z1)']).used_inputs
     model = TriangularModel.of(OBSERVER_PARAMETERS.complete(MOTOR))
     assert model.inputs == model.used_inputs == ('torque', 'load')
     z, (torque, load) = np.array([0.3, -0.7]), (1.5, -0.2)

@@ -83,7 +83,7 @@ def test_text_is_read_as_a_system():
 ])  # fmt: skip
 def test_system_agrees_with_a_control_system_of_scikit_fuzzy(text, inferred, between_knots):
     """Where nothing is interpolated between knots, only the output grids differ."""
-    system, x, own = read_system(text), np.array(INPUTS), law((1.0,), fuzzy_systems=[text])
+    system, x = read_system(text), np.array(INPUTS)
     psi = oracle(system)
     expected = np.array([psi(v) for v in x])
     for sign, wanted in (1.0, expected), (-1.0, [psi(-v) for v in x]):

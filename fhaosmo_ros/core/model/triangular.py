@@ -36,7 +36,6 @@ class TriangularModel:
         Phi_1 .. Phi_n.
     inputs : tuple of str
         Names of the known inputs u_1 .. u_m, in the order of their values.
-    uses_input : bool
     used_inputs : tuple of str
         Those of them that an expression of Phi uses.
     is_linear : bool
@@ -67,7 +66,6 @@ class TriangularModel:
         self.inputs = tuple(inputs)
         self._parsed = [parse(text, i + 1, inputs, constants) for i, text in enumerate(self.phi)]
         used = {index for tokens in self._parsed for code, index in tokens if code == INPUT}
-        self.uses_input = bool(used)
         self.used_inputs = tuple(name for k, name in enumerate(self.inputs) if k in used)
         self.is_linear = all(is_linear(tokens) for tokens in self._parsed)
         self.expressions = Expressions(self._parsed, self.order, len(self.inputs))

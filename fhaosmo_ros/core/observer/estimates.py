@@ -53,7 +53,6 @@ class Trajectory(NamedTuple):
     unknown_input, gamma : (K,) arrays
     innovation : (K, N) array
     status, open_levels : (K,) integer arrays
-        Where `every` > 1, a row's flags are those of all samples since the row before it.
     z_hat, z_tilde : (K, N) arrays
         Filtered and internal states; z_tilde[:, i] belongs to z_{i+2}.
     standard_deviation : (K, n + 1) array

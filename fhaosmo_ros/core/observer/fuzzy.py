@@ -18,12 +18,6 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 from numpy.typing import NDArray
 
-NAMES = {
-    3: ('N', 'ZR', 'P'),
-    5: ('NB', 'NS', 'ZR', 'PS', 'PB'),
-    7: ('NBB', 'NB', 'NS', 'ZR', 'PS', 'PB', 'PBB'),
-}
-"""Names of terms by their number; those of the paper for 5 and 7."""
 SHAPES: dict[str, Callable[[Any], Any]] = {
     'triangle': lambda off: np.clip(1.0 - off, 0.0, 1.0),
     'trapezoid': lambda off: np.clip(1.5 - 2.0 * off, 0.0, 1.0),

@@ -154,11 +154,6 @@ class Observer:
         return self.model.inputs
 
     @property
-    def uses_input(self) -> bool:
-        """True if the model uses a known input."""
-        return self.model.uses_input
-
-    @property
     def used_inputs(self) -> tuple[str, ...]:
         """Names of those of them that the model uses."""
         return self.model.used_inputs
@@ -255,9 +250,7 @@ class Observer:
         """Estimate of the present state, with the status of the last step."""
         return self.structure.report()
 
-    def run(
-        self, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None, every: int = 1
-    ) -> Trajectory:
+    def run(self, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
         """
         Step through arrays; the state goes on from where it is, so a run can be split.
 
@@ -271,31 +264,25 @@ class Observer:
         u : number, (K,) or (K, m) array, optional
             Known input, or known inputs, during the interval that ends at each sample; needed
             where phi uses one.
-        every : int
-            Record every `every`-th sample only.
 
         Returns
         -------
         Trajectory
-            Row k is the estimate after sample ``(k + 1) * every - 1``. A fresh observer takes
-            the first sample as `start` does, else time goes on from the last run's last sample.
+            Row k is the estimate after sample k. A fresh observer takes the first sample as
+            `start` does, else time goes on from the last run's last sample.
 
         Raises
         ------
         ConfigurationError
-            Arrays whose shapes do not fit, times that do not increase, u that is missing, or
-            `every` < 1.
+            Arrays whose shapes do not fit, times that do not increase, or u that is missing.
 
         """
-        if every < 1:
-            raise ConfigurationError(f'run: expected every >= 1, got {every}')
         t, y = samples_of_run(t, y)
         u = known_inputs(self._no_input() if u is None else u, self.inputs, len(y))
         h = intervals(t, self._t if self.started else None)
         if len(t):
             self._t = t[-1].item()
-        record = run(self.structure, y, h, u, every)
-        return Trajectory(t[every - 1 :: every], **record.columns)
+        return Trajectory(t, **run(self.structure, y, h, u).columns)
 
     def smooth(self, t: ArrayLike, y: ArrayLike, u: ArrayLike | None = None) -> Trajectory:
         """
@@ -329,7 +316,7 @@ class Observer:
 
     def _no_input(self) -> float:
         """Return what stands for known inputs that were not given, or raise where phi has one."""
-        if self.structure.uses_input:
+        if self.used_inputs:
             raise ConfigurationError(
                 f'u: expected values of {", ".join(self.used_inputs)}, which phi uses, got none'
             )

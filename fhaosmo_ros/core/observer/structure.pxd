@@ -55,7 +55,6 @@ cdef class Structure:
     cdef readonly int order  # n
     cdef readonly int levels  # N
     cdef readonly int inputs  # known inputs m
-    cdef readonly bint uses_input  # Phi uses one of them
     cdef readonly bint predicting  # it follows the model between samples, also through a gap
     cdef bint implicit  # a step uses the sample at its end
     cdef bint from_measurement  # z_1 begins at the first sample

@@ -87,7 +87,6 @@ cdef class Structure:
         self.configuration = configuration
         self.order, self.levels = configuration.model.order, configuration.levels
         self.inputs = len(configuration.model.inputs)
-        self.uses_input = configuration.model.uses_input
         if self.inputs > MOST_INPUTS:
             raise ConfigurationError(
                 f"parameter 'inputs': expected at most {MOST_INPUTS}, got {self.inputs}"
@@ -425,13 +424,10 @@ cdef class Record:
 
 def run(
     Structure structure not None, const double[::1] y, const double[::1] h,
-    const double[:, ::1] u, Py_ssize_t every
+    const double[:, ::1] u
 ):
     """
-    Start with samples until one is good, step from the next one on; record every `every`-th one.
-
-    Row r of the record is the state after sample (r + 1) * every - 1; its flags are those of
-    all samples since the row before it.
+    Start with samples until one is good, step from the next one on; record the state after each.
 
     Parameters
     ----------
@@ -441,9 +437,8 @@ def run(
         Known inputs of that interval.
 
     """
-    cdef Record record = Record(structure, y.shape[0] // every)
+    cdef Record record = Record(structure, y.shape[0])
     cdef Py_ssize_t k
-    cdef int word, seen = 0
     if not (h.shape[0] == u.shape[0] == y.shape[0] and u.shape[1] == structure.inputs):
         raise ValueError('run: arrays of different lengths')
     structure.enter()
@@ -451,14 +446,10 @@ def run(
     with nogil:
         for k in range(y.shape[0]):
             if isnan(structure.memory.y):
-                word = structure.start(y[k])
+                structure.word = structure.start(y[k])
             else:
-                word = structure.step(y[k], h[k], &u[k, 0])
-            seen |= word & FLAGS_MASK
-            if (k + 1) % every == 0:
-                record.write(structure, k // every, (word & ~FLAGS_MASK) | seen)
-                seen = 0
-            structure.word = word
+                structure.word = structure.step(y[k], h[k], &u[k, 0])
+            record.write(structure, k, structure.word)
     structure.busy = False
     return record
 

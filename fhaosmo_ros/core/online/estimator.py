@@ -192,7 +192,7 @@ class OnlineEstimator:
             'period': p['nominal_period'], 'max_gap': p['max_gap'],
             'stuck_time': p['stuck_time'], 'divergence_time': p['divergence_time'],
             'delay': p['measurement_delay'],
-            'lag': (p['measurement_delay'] - p['input_delay']) * self.observer.uses_input,
+            'lag': (p['measurement_delay'] - p['input_delay']) * bool(self.observer.used_inputs),
         }  # fmt: skip
         return {name: round(seconds / NANOSECONDS) for name, seconds in times.items()} | {
             'nominal': p['sampling'] == 'nominal', 'by_clock': p['sampling'] == 'clock',
@@ -410,8 +410,7 @@ class OnlineEstimator:
 
     def _run(self, stamps: Ints, y: NDArray[np.float64], u: NDArray[np.float64]) -> Trajectory:
         """Take samples with their known inputs, and look at them for events and for smoothing."""
-        watched = self.events.on or self.smoothing is not None
-        record, present, times, acting = self.policy.run(stamps, y, u, watched)
+        record, present, times, acting = self.policy.run(stamps, y, u)
         found = Trajectory(stamps - self._behind, **record.columns)
         if self.events.on:
             deviations = found.standard_deviation[:, -1] if self.observer.self_tuning else None

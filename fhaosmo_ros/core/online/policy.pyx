@@ -659,23 +659,20 @@ cdef class Policy:
         if inputs != self.structure.inputs:
             raise ValueError(f'expected {self.structure.inputs} known inputs, got {inputs}')
 
-    def run(
-        self, const long long[::1] stamps, const double[::1] y, const double[:, ::1] u,
-        bint watched
-    ):
+    def run(self, const long long[::1] stamps, const double[::1] y, const double[:, ::1] u):
         """
         Take K samples; return their record and arrays with a row for each of them.
 
-        These are z and d where they are carried to the present; and, if `watched`, times of the
-        observer, and the inputs that acted until then. Else they have no rows.
+        These are z and d where they are carried to the present (else there are no rows), times of
+        the observer, and the inputs that acted until then.
         """
         cdef Structure structure = self.structure
         cdef Py_ssize_t k, count = y.shape[0], m = structure.inputs
         cdef Record record = Record(structure, count)
         cdef bint carried = self.settings.to_now and self.settings.delay > 0
         cdef double[:, ::1] present = np.empty((count * carried, structure.order + 1))
-        cdef long long[::1] times = np.empty(count * watched, dtype=np.int64)
-        cdef double[:, ::1] acting = np.empty((count * watched, m))
+        cdef long long[::1] times = np.empty(count, dtype=np.int64)
+        cdef double[:, ::1] acting = np.empty((count, m))
         cdef const double* inputs
         self.check(u.shape[1])
         if not stamps.shape[0] == u.shape[0] == count:
@@ -687,12 +684,11 @@ cdef class Policy:
                     record.write(structure, k, self.take(stamps[k], y[k], &u[k, 0]))
                     if carried:
                         self.carry(&present[k, 0])
-                    if watched:
-                        times[k] = self.course.latest
-                        inputs = &u[k, 0]
-                        if self.settings.lag > 0:
-                            inputs = self.acting
-                        memcpy(&acting[k, 0], inputs, m * sizeof(double))
+                    times[k] = self.course.latest
+                    inputs = &u[k, 0]
+                    if self.settings.lag > 0:
+                        inputs = self.acting
+                    memcpy(&acting[k, 0], inputs, m * sizeof(double))
         finally:
             structure.busy = False
         return record, np.asarray(present), np.asarray(times), np.asarray(acting)

@@ -138,7 +138,7 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
                     unwrap.begin_near(estimator.state_dict()['y'] + estimator.offset)
                 samples = samples.unwrapped(unwrap)
             u = None
-            if estimator.observer.uses_input:
+            if estimator.observer.used_inputs:
                 u = inputs.at(samples, estimator.inputs, estimator.reject_inputs)
             parameters = ONLINE_PARAMETERS.defaults() | own
             sinks = [

@@ -4,7 +4,6 @@
 import argparse
 import os
 from pathlib import Path
-import sys
 from typing import Any
 
 from fhaosmo_ros.core.model.triangular import TriangularModel
@@ -128,7 +127,7 @@ def _identify(
             if field.wraps:
                 samples = samples.unwrapped(Unwrapper())
             u = np.zeros((len(samples.values), len(model.inputs)))
-            if model.uses_input:
+            if model.used_inputs:
                 u = inputs.at(samples)
         t = (samples.stamps - samples.stamps[0]) * 1e-9
         found = identify_input(RecordedOutput(t, samples.values, u), model, values, given)
@@ -152,7 +151,3 @@ def read_parameters(files: list[Path], rules: list[str]) -> tuple[dict[str, Any]
             if name in table:
                 values[name] = value
     return estimator, tuning
-
-
-if __name__ == '__main__':
-    sys.exit(main())

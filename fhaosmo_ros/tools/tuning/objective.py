@@ -123,7 +123,7 @@ class Objective:
     def _judge(self, estimator: OnlineEstimator, r: Recording) -> Floats:
         """Return the errors of z and d."""
         estimator.reset()
-        u = r.u if estimator.observer.uses_input else None
+        u = r.u if estimator.observer.used_inputs else None
         found = estimator.run(stamps_of(r.t - r.t[0]), r.y, u)
         t = r.t[0] + (found.t - FIRST_STAMP) * 1e-9  # before the sample's, if that is delayed
         late = t - r.t[0] >= self._tuning['settled']
