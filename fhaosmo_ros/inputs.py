@@ -55,15 +55,15 @@ def measured_output(values: Mapping[str, Any], channel: str = '') -> Input:
     Parameters
     ----------
     values : mapping
-        Parameters of the channel; defaults for those that are absent.
+        Parameters of the channel, complete.
     channel : str
         Its name, '' without named channels.
 
     """
     topic, kind, field, stamp = (
-        _value(values, f'input_{part}') for part in ('topic', 'type', 'field', 'stamp')
+        values[f'input_{part}'] for part in ('topic', 'type', 'field', 'stamp')
     )
-    if stamp == 'auto' and 'header' in _value(values, 'known_input_stamps'):
+    if stamp == 'auto' and 'header' in values['known_input_stamps']:
         stamp = 'header'
     return _input('y', topic, kind, field, stamp, channel)
 
@@ -88,8 +88,8 @@ def known_inputs(
         stamp where y is not.
 
     """
-    stamps, by = CHANNEL_PARAMETERS['known_input_stamps'], _value(values, 'input_stamp')
-    given = _value(values, stamps.name)
+    stamps, by = CHANNEL_PARAMETERS['known_input_stamps'], values['input_stamp']
+    given = values[stamps.name]
     if 'header' in given and by not in ('auto', 'header'):
         raise stamps.error(given, f'reception where input_stamp is {by}')
     columns = [
@@ -138,8 +138,8 @@ class Pairing:
         known: Mapping[str, Input],
         held: Sequence[float],
     ) -> None:
-        self._wait = round(_value(values, 'known_input_wait') * 1e9)
-        self._max_gap = round((_value(values, 'max_gap') or BACK) * 1e9)
+        self._wait = round(values['known_input_wait'] * 1e9)
+        self._max_gap = round((values['max_gap'] or BACK) * 1e9)
         self._held = list(held)
         by_stamp = [names.index(name) for name, its in known.items() if its.stamp == 'header']
         self._coming: dict[int, deque[tuple[int, float]]] = {
@@ -196,12 +196,8 @@ class Pairing:
             yield sample, u
 
 
-def _value(values: Mapping[str, Any], name: str) -> Any:
-    return values.get(name, CHANNEL_PARAMETERS[name].default)
-
-
 def _one_each(declared: Parameter, values: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    given: list[str] = _value(values, declared.name)
+    given: list[str] = values[declared.name]
     if len(given) == 1:
         return given * len(names)
     if len(given) != len(names):

@@ -47,8 +47,8 @@ def noise(seed=2):
 def found_in(y, phi=PHI, **given):
     given = {'order': len(phi), 'phi': list(phi)} | given
     values = ESTIMATOR_PARAMETERS.complete(given)
-    data = identify.RecordedOutput(T, y, np.zeros((K, 1)))
-    found = identify.identify_input(data, TriangularModel.of(values), values, given)
+    model = TriangularModel.of(values)
+    found = identify.identify_input((T, y, np.zeros((K, 1))), model, values, given)
     gains = make_gains(found, given)
     return found, gains, run(found, gains)
 
@@ -149,8 +149,8 @@ def test_quantum_is_found(quantum):
 
 def test_bad_samples_are_left_out():
     t, y = np.array([0.0, 1.0, 1e6, 1.0, 2.0]), np.array([0.0, 1.0, np.nan, 2.0, 3.0])
-    kept = identify.usable(identify.RecordedOutput(t, y, np.zeros((5, 1))))
-    np.testing.assert_array_equal([kept.t, kept.y], [[0.0, 1.0, 2.0], [0.0, 1.0, 3.0]])
+    t, y, _ = identify.usable(t, y, np.zeros((5, 1)))
+    np.testing.assert_array_equal([t, y], [[0.0, 1.0, 2.0], [0.0, 1.0, 3.0]])
 
 
 def test_command_says_what_a_bag_shows_or_that_it_can_give_no_gains(tmp_path, capsys):

@@ -112,14 +112,11 @@ class PlantNode(TimedNode):
             )
 
     def _prepare(self, values: Parameters, changes: Mapping[str, Value]) -> Any:
-        return changes, values, self.plant.prepare(values)
+        return values, self.plant.prepare(values), 'noise_seed' in changes
 
     def _adopt(self, change: Any) -> None:
-        changes, values, simulation = change
-        if 'noise_seed' in changes:  # the noise begins again, also with the same seed
-            self.plant.configure(simulation)
-        else:
-            self.plant.adopt(simulation)
+        values, simulation, noise_anew = change  # also with the same seed
+        self.plant.adopt(simulation, noise_anew)
         set_period(self._timer, 1.0 / values['sample_rate'])
 
 

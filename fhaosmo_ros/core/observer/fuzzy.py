@@ -40,37 +40,18 @@ Curve = NDArray[np.float64]
 
 
 class Terms(NamedTuple):
-    """
-    Membership functions on [-1, 1], from the most negative term to the most positive one.
+    """Membership functions on [-1, 1], from the most negative term to the most positive one."""
 
-    Attributes
-    ----------
-    shape : str
-        One of `SHAPES`, or `SINGLETON`.
-    peaks : tuple of float
-        Ascending.
-
-    """
-
-    shape: str
-    peaks: tuple[float, ...]
+    shape: str  # one of `SHAPES`, or `SINGLETON`
+    peaks: tuple[float, ...]  # ascending
 
 
 class FuzzySystem(NamedTuple):
-    """
-    A fuzzy inference system with one input and one output.
-
-    Attributes
-    ----------
-    inputs, outputs : Terms
-    rules : tuple of int
-        Rule k maps input term k to output term rules[k]; both count from 0.
-
-    """
+    """A fuzzy inference system with one input and one output."""
 
     inputs: Terms
     outputs: Terms
-    rules: tuple[int, ...]
+    rules: tuple[int, ...]  # rule k maps input term k to output term rules[k], both from 0 on
 
 
 def read_system(text: str) -> FuzzySystem | Curve:

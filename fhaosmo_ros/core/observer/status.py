@@ -4,14 +4,12 @@
 from enum import IntFlag
 
 LEVEL_SHIFT = 16
-"""Bits from here on hold the number of open levels."""
-FLAGS_MASK = (1 << LEVEL_SHIFT) - 1
-"""The bits below it hold the flags."""
+"""Bits from here on hold the number of open levels, those below it the flags."""
 
 
 class Status(IntFlag):
     """
-    Flags of a step. The number of open levels is kept apart: see `open_levels`.
+    Flags of a step. The number of open levels is kept apart: see `Estimate.open_levels`.
 
     A rejected sample leaves the state as it was. The time it stood for is added to the next step,
     except for `REJECTED_STEP`, which drops it, so that what could not be stepped over does not
@@ -52,13 +50,3 @@ UNUSED = REJECTED | int(Status.REPEATED)
 AFRESH = int(Status.RESTARTED | Status.DIVERGED)
 """Mask of the flags that say that the observer began anew."""
 JUMPED = int(Status.JUMPED)
-
-
-def flags(word: int) -> Status:
-    """Return the flags of a step's status word."""
-    return Status(word & FLAGS_MASK)
-
-
-def open_levels(word: int) -> int:
-    """Return how many levels run: level i is open if |eps_j| <= epsilon for every j < i."""
-    return word >> LEVEL_SHIFT

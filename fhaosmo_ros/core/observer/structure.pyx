@@ -18,7 +18,7 @@ from fhaosmo_ros.core.observer.status cimport (
 
 from fhaosmo_ros.core.model.inputs import known_inputs
 from fhaosmo_ros.core.observer.numbers import checked
-from fhaosmo_ros.core.observer.status import flags, open_levels
+from fhaosmo_ros.core.observer.status import Status
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 import numpy as np
 
@@ -497,12 +497,12 @@ cdef class Estimate:
     @property
     def status(self):
         """Flags of the step."""
-        return flags(self.word)
+        return Status(self.word & FLAGS_MASK)
 
     @property
     def open_levels(self):
-        """Number of levels that run (the paper's E_i)."""
-        return open_levels(self.word)
+        """Number of levels that run: i is open if |eps_j| <= epsilon for every j < i."""
+        return self.word >> LEVEL_SHIFT
 
     def __reduce__(self):
         return Estimate, (self.z, self.unknown_input, self.gamma, self.innovation, self.word)

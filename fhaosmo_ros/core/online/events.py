@@ -175,12 +175,11 @@ class EventDetector:
 
         """
         count = np.size(d)
-        columns: list[ArrayLike] = [
-            stamps, stamps if times is None else times, np.zeros(count, dtype=np.int64), d,
+        columns = [
+            stamps, stamps if times is None else times,
+            np.zeros(count, dtype=np.int64) if words is None else words, d,
             np.zeros(count) if deviations is None else deviations,
         ]  # fmt: skip
-        if words is not None:
-            columns[2] = words
         rows = zip(*(np.asarray(column).tolist() for column in columns), strict=True)
         for k, (stamp, time, word, value, deviation) in enumerate(rows):
             if word & UNUSED:

@@ -39,22 +39,11 @@ class Flag(IntFlag):
 
 
 class Snapshot(NamedTuple):
-    """
-    What an estimator remembers after a sample.
+    """What an estimator remembers after a sample."""
 
-    Attributes
-    ----------
-    stamp : int
-        Stamp of the sample, in nanoseconds.
-    flags : Flag
-    values : dict
-        As `OnlineEstimator.state_dict` returns them.
-
-    """
-
-    stamp: int
+    stamp: int  # of the sample, in nanoseconds
     flags: Flag
-    values: dict[str, Any]
+    values: dict[str, Any]  # as `OnlineEstimator.state_dict` returns them
 
 
 def pack(snapshot: Snapshot) -> tuple[list[str], NDArray[np.float64]]:

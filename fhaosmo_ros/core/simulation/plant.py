@@ -94,9 +94,7 @@ class Plant:
             An unknown name, a bad value, or a parameter that can't change live.
 
         """
-        self.adopt(self.prepare(changes))
-        if 'noise_seed' in changes:
-            self._random = np.random.default_rng(self._parameters['noise_seed'])
+        self.adopt(self.prepare(changes), 'noise_seed' in changes)
 
     def prepare(self, changes: Mapping[str, Any]) -> Parameters:
         """Return what `adopt` takes for these changes; raise as `configure`, change nothing."""
@@ -104,11 +102,13 @@ class Plant:
         TriangularModel.of(parameters)  # raises where it can't be used with other constants
         return parameters
 
-    def adopt(self, parameters: Parameters) -> None:
-        """Go on with parameters that `prepare` has returned."""
+    def adopt(self, parameters: Parameters, noise_anew: bool) -> None:
+        """Go on with parameters that `prepare` has returned; the noise may begin again."""
         self._parameters = parameters
         self._model, self._d = TriangularModel.of(parameters), Disturbance(parameters)
         self._system.change(self._model.expressions, self._d)
+        if noise_anew:
+            self._random = np.random.default_rng(parameters['noise_seed'])
 
     def advance(self, t: float, u: ArrayLike = 0.0) -> None:
         """

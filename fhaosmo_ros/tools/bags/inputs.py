@@ -27,7 +27,7 @@ class BagInputs:
     ----------
     reader : BagReader
     values : mapping
-        Parameters of the channel.
+        Parameters of the channel, complete.
     model : TriangularModel
         Says which known inputs there are, and which of them it uses; the others are 0.
     namespace, channel : str
@@ -71,7 +71,7 @@ class BagInputs:
         """
         y, stamp, reader = self.y, self.y.stamp, self._reader
         field = reader.field(y.topic, y.field, y.name)
-        if stamp == 'auto' and not field.header and self._values.get('sampling') == 'clock':
+        if stamp == 'auto' and not field.header and self._values['sampling'] == 'clock':
             stamp = 'bag'  # such an estimator took a sample when it came, not when it was sent
         samples = reader.samples(y.topic, field, stamp)
         if not len(samples.times):

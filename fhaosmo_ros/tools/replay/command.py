@@ -15,7 +15,7 @@ from fhaosmo_ros.core.online.estimator import OnlineEstimator
 from fhaosmo_ros.core.online.events import Event
 from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.core.parameters.tables import INPUT, ONLINE_PARAMETERS
+from fhaosmo_ros.core.parameters.tables import CHANNEL_PARAMETERS, INPUT, ONLINE_PARAMETERS
 from fhaosmo_ros.messages.fields import Unwrapper
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
@@ -118,7 +118,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             except UnknownSnapshot as error:
                 _warn(f'{error}; {followed} is not followed, this begins at the first sample')
         namespace = recorded.namespace if recorded else arguments.node.rpartition('/')[0]
-        inputs = BagInputs(reader, own, estimator.observer.model, namespace, arguments.channel)
+        values, model = CHANNEL_PARAMETERS.defaults() | own, estimator.observer.model
+        inputs = BagInputs(reader, values, model, namespace, arguments.channel)
         finals = arguments.output or [Path(f'{bag_name}_replayed')]
         outputs = [stack.enter_context(Output(path, arguments.force)) for path in finals]
         name = _name({c.topic for c in reader.connections}, arguments.name)

@@ -19,12 +19,7 @@ from fhaosmo_ros.tools.bags.reader import BagReader
 from fhaosmo_ros.tools.cli.command import Output, run_command
 from fhaosmo_ros.tools.cli.options import add_value_options, assigned
 from fhaosmo_ros.tools.tuning import report
-from fhaosmo_ros.tools.tuning.identify import (
-    identify_input,
-    make_gains,
-    RecordedOutput,
-    run,
-)
+from fhaosmo_ros.tools.tuning.identify import identify_input, make_gains, run
 from fhaosmo_ros.tools.tuning.linear_gains import chosen_otherwise
 from fhaosmo_ros.tools.tuning.objective import TUNE_PARAMETERS
 from fhaosmo_ros.tools.tuning.tuner import simulated, Tuner
@@ -122,7 +117,7 @@ def _identify(
     model = TriangularModel.of(values)
     with stop.raising():
         with BagReader(arguments.bag) as reader:
-            inputs = BagInputs(reader, estimator, model)
+            inputs = BagInputs(reader, values, model)
             samples, field = inputs.samples()
             if field.wraps:
                 samples = samples.unwrapped(Unwrapper())
@@ -130,7 +125,7 @@ def _identify(
             if model.used_inputs:
                 u = inputs.at(samples)
         t = (samples.stamps - samples.stamps[0]) * 1e-9
-        found = identify_input(RecordedOutput(t, samples.values, u), model, values, given)
+        found = identify_input((t, samples.values, u), model, values, given)
         made = make_gains(found, given)
         along = run(found, made)
     return report.of_bag(found, made, along, arguments.bag.resolve().name)

@@ -30,6 +30,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2, median_abs_deviation
 
 Floats = NDArray[np.float64]
+Recorded = tuple[Floats, Floats, Floats]
 Evaluate = Callable[[Design], Evaluation]
 DERIVATIVES = (0, 1, 2)
 FIRST = [Design(1, float(w), 0.5) for w in np.geomspace(2e-4, 2.0, 15)]
@@ -65,14 +66,6 @@ NO_NOISE = 1e-7
 """Noise over the size of y below which y is a simulated one without noise."""
 BEGIN = 0.1
 """Part of the bag in which the estimates may still be settling."""
-
-
-class RecordedOutput(NamedTuple):
-    """The y of a bag, of K samples."""
-
-    t: Floats  # (K,) stamps from the first one on (s)
-    y: Floats  # (K,) samples
-    u: Floats  # (K, m) known inputs
 
 
 class Identified(NamedTuple):
@@ -114,14 +107,15 @@ class Run(NamedTuple):
 
 
 def identify_input(
-    data: RecordedOutput, model: TriangularModel, values: Parameters, given: Mapping[str, Any]
+    recorded: Recorded, model: TriangularModel, values: Parameters, given: Mapping[str, Any]
 ) -> Identified:
     """
     Find the likeliest noise and model of d.
 
     Parameters
     ----------
-    data : RecordedOutput
+    recorded : arrays
+        Stamps from the first one on (s), (K,); y, (K,); known inputs, (K, m).
     model : TriangularModel
     values : Parameters
         Of the estimator, complete.
@@ -135,7 +129,7 @@ def identify_input(
         There are no gains for this y; the text says why.
 
     """
-    likelihood = _prepared(data, model, values, given)
+    likelihood = _prepared(recorded, model, values, given)
     decay, orders = given.get('unknown_input_decay') or None, DERIVATIVES
     if 'unknown_input_derivatives' in given:
         orders = (given['unknown_input_derivatives'],)
@@ -259,10 +253,10 @@ def _whiteness(r: Floats) -> tuple[Floats, float]:
 
 
 def _prepared(
-    data: RecordedOutput, model: TriangularModel, values: Parameters, given: Mapping[str, Any]
+    recorded: Recorded, model: TriangularModel, values: Parameters, given: Mapping[str, Any]
 ) -> Likelihood:
     """Return the likelihood of the usable samples, with a first guess of noise and states."""
-    t, y, u = usable(data)
+    t, y, u = usable(*recorded)
     count, different = len(y), len(np.unique(y))
     if count < FEWEST:
         raise ConfigurationError(f'y: expected at least {FEWEST} samples, got {count}')
@@ -294,12 +288,12 @@ def _prepared(
     )  # fmt: skip
 
 
-def usable(data: RecordedOutput) -> RecordedOutput:
+def usable(t: Floats, y: Floats, u: Floats) -> Recorded:
     """Return the samples that are finite and later than all before them."""
-    finite = np.isfinite(np.column_stack(data)).all(axis=1)
-    latest = np.maximum.accumulate(np.where(finite, data.t, -np.inf))
-    keep = finite & (data.t > np.concatenate([[-np.inf], latest[:-1]])[: len(data.t)])
-    return RecordedOutput(*(part[keep] for part in data))
+    finite = np.isfinite(np.column_stack([t, y, u])).all(axis=1)
+    latest = np.maximum.accumulate(np.where(finite, t, -np.inf))
+    keep = finite & (t > np.concatenate([[-np.inf], latest[:-1]])[: len(t)])
+    return t[keep], y[keep], u[keep]
 
 
 def quantum(y: Floats) -> float:
