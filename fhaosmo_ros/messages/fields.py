@@ -244,23 +244,17 @@ class Unwrapper:
     Makes an angle continuous: adds the whole turns that bring it nearest to the one before.
 
     Values that are not finite pass through. Nodes and tools add the same turns to the same
-    numbers, so their results are equal to the last bit.
+    numbers, so their results are equal to the last bit. `near` is the latest angle of somebody
+    who has counted before.
     """
 
-    def __init__(self) -> None:
-        self._turns = 0
-        self._before: float | None = None
-
-    def begin_near(self, value: float) -> None:
-        """Count from `value` on, the latest one of somebody who has counted before."""
-        self._turns, self._before = 0, value
+    def __init__(self, near: float | None = None) -> None:
+        self._before = near
 
     def __call__(self, angle: float) -> float:
         """Return the angle with its turns, in rad."""
         if not abs(angle) < 1e6:  # NaN too
             return angle
-        if self._before is not None:
-            self._turns = round((self._before - angle) / (2.0 * pi))
-        value = angle + 2.0 * pi * self._turns
-        self._before = value
-        return value
+        turns = 0 if self._before is None else round((self._before - angle) / (2.0 * pi))
+        self._before = angle + 2.0 * pi * turns
+        return self._before

@@ -3,7 +3,7 @@
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, ExitStack
 from itertools import zip_longest
 from operator import itemgetter
@@ -14,7 +14,7 @@ from zlib import crc32
 
 from fhaosmo_ros.core.parameters.declaration import suggestion
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
-from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError
+from fhaosmo_ros.messages.fields import Field, find_field, MissingElementError, Unwrapper
 from fhaosmo_ros.tools.bags.types import TYPES
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -53,9 +53,9 @@ class FieldSamples(NamedTuple):
         """Return some of the samples."""
         return FieldSamples(*(column[rows] for column in self))
 
-    def unwrapped(self, unwrap: Callable[[float], float]) -> 'FieldSamples':
-        """Return the samples of an angle with its turns counted."""
-        return self._replace(values=np.array([unwrap(value) for value in self.values.tolist()]))
+    def unwrapped(self, near: float | None = None) -> 'FieldSamples':
+        """Return the samples of an angle with its turns counted; see `Unwrapper`."""
+        return self._replace(values=np.array([*map(Unwrapper(near), self.values.tolist())]))
 
 
 class BagReader:

@@ -16,7 +16,6 @@ from fhaosmo_ros.core.online.events import Event
 from fhaosmo_ros.core.parameters.declaration import ParameterTable
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import CHANNEL_PARAMETERS, INPUT, ONLINE_PARAMETERS
-from fhaosmo_ros.messages.fields import Unwrapper
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader, FieldSamples
@@ -134,10 +133,8 @@ def _replay(arguments: argparse.Namespace, stop: Stop) -> None:
             if live:
                 samples = live.begin(samples)
             if field.wraps:
-                unwrap = Unwrapper()
-                if estimator.latest is not None:
-                    unwrap.begin_near(estimator.state_dict()['y'] + estimator.offset)
-                samples = samples.unwrapped(unwrap)
+                latest = estimator.state_dict()['y'] + estimator.offset
+                samples = samples.unwrapped(None if estimator.latest is None else latest)
             u = None
             if estimator.observer.used_inputs:
                 u = inputs.at(samples, estimator.inputs, estimator.reject_inputs)

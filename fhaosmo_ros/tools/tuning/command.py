@@ -12,7 +12,6 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import load
 from fhaosmo_ros.core.parameters.tables import ESTIMATOR_PARAMETERS, MODEL
 from fhaosmo_ros.core.simulation.recordings import SENSOR
-from fhaosmo_ros.messages.fields import Unwrapper
 from fhaosmo_ros.stop_signals import Stop
 from fhaosmo_ros.tools.bags.inputs import BagInputs
 from fhaosmo_ros.tools.bags.reader import BagReader
@@ -120,7 +119,7 @@ def _identify(
             inputs = BagInputs(reader, values, model)
             samples, field = inputs.samples()
             if field.wraps:
-                samples = samples.unwrapped(Unwrapper())
+                samples = samples.unwrapped()
             u = np.zeros((len(samples.values), len(model.inputs)))
             if model.used_inputs:
                 u = inputs.at(samples)
