@@ -6,7 +6,7 @@ from copy import deepcopy
 import math
 import operator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from fhaosmo_ros.core.model.inputs import known_inputs, samples_of_run
 from fhaosmo_ros.core.observer.configuration import ObserverConfiguration
@@ -31,13 +31,8 @@ SILENCE, SILENT_SAMPLES = 0.5, 5
 """Seconds, and usual intervals, after which y is said to be silent; the larger of both."""
 LARGEST_STAMP = 2**63 - 1
 Ints = NDArray[np.int64]
-
-
-class Change(NamedTuple):
-    """A live change of parameters that has been checked; see `OnlineEstimator.prepare`."""
-
-    parameters: Parameters
-    configuration: ObserverConfiguration
+Change = tuple[Parameters, ObserverConfiguration]
+"""A live change of parameters that has been checked; see `OnlineEstimator.prepare`."""
 
 
 class OnlineEstimator:
@@ -158,18 +153,18 @@ class OnlineEstimator:
         check_events(parameters)
         if self.smoothing is not None:
             _check_smoothing(parameters, configuration)
-        return Change(parameters, configuration)
+        return parameters, configuration
 
     def adopt(self, change: Change) -> None:
         """Go on with a change that `prepare` has returned, from the next sample on."""
-        before = self._parameters['sampling']
-        self.observer.adopt(change.configuration)
-        self.policy.configure(self.observer.structure, self._settings(change.parameters))
-        self._parameters = change.parameters
+        (parameters, configuration), before = change, self._parameters
+        self.observer.adopt(configuration)
+        self.policy.configure(self.observer.structure, self._settings(parameters))
+        self._parameters = parameters
         if self.smoothing is not None:
             self.smoothing.configure()
-        self.events.configure(change.parameters)
-        if change.parameters['sampling'] != before:  # stamps of another clock
+        self.events.configure(parameters)
+        if parameters['sampling'] != before['sampling']:  # stamps of another clock
             self.policy.change(timed=False, tick_count=0)
 
     def configure(self, changes: Mapping[str, Any]) -> None:

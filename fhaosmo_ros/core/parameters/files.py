@@ -17,7 +17,7 @@ from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.per_channel import (
     channel_names,
     CHANNELS,
-    of_channel,
+    of_named_channel,
     UNNAMED,
     with_channels,
     with_own_parameters,
@@ -187,11 +187,8 @@ def make_from_file(
     table = NODE_TABLES['estimator']
     values = load(path, node, table, strict=True)
     try:
-        names = channel_names(values)
-        if channel not in names:
-            allowed = 'none (the node has one)' if names == UNNAMED else ' or '.join(names)
-            raise ConfigurationError(f'channel: expected {allowed}, got {channel or "none"}')
-        return make(Parameters(table, table.part_of(of_channel(values, channel))))
+        own = of_named_channel(values, channel, 'channel')
+        return make(Parameters(table, table.part_of(own)))
     except ConfigurationError as error:
         raise ConfigurationError(f'{path}: {error}') from None
 

@@ -12,6 +12,7 @@ import re
 from typing import Any, TypeVar
 
 from fhaosmo_ros.core.parameters.declaration import Parameters, ParameterTable
+from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.tables import (
     CHANNEL_PARAMETERS,
     CONSTANTS,
@@ -105,6 +106,15 @@ def of_channel(values: Values, name: str) -> Values:
     if isinstance(values, Parameters):
         return Parameters(ESTIMATOR_PARAMETERS, common | own)  # type: ignore[return-value]
     return common | own  # type: ignore[return-value]
+
+
+def of_named_channel(values: Values, name: str, what: str) -> Values:
+    """Return the values of a channel that a user named; raise of `what` if there is none."""
+    names = channel_names(values)
+    if name not in names and (names != FROM_JOINTS or not name):
+        allowed = 'none, as the node has no channels' if names == UNNAMED else ' or '.join(names)
+        raise ConfigurationError(f'{what}: expected {allowed}, got {name or "none"}')
+    return of_channel(values, name)
 
 
 def differing(values: Parameters) -> dict[str, Any]:

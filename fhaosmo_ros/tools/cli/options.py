@@ -14,12 +14,7 @@ from fhaosmo_ros.core.parameters.declaration import (
 )
 from fhaosmo_ros.core.parameters.errors import ConfigurationError
 from fhaosmo_ros.core.parameters.files import read, select, with_origin
-from fhaosmo_ros.core.parameters.per_channel import (
-    channel_names,
-    FROM_JOINTS,
-    of_channel,
-    UNNAMED,
-)
+from fhaosmo_ros.core.parameters.per_channel import of_named_channel
 from fhaosmo_ros.core.parameters.tables import (
     CHANNEL_PARAMETERS,
     ESTIMATOR_PARAMETERS,
@@ -90,14 +85,7 @@ def channel_parameters(
         values = select(values | on_command_line, ESTIMATOR_PARAMETERS)
     except ConfigurationError as error:
         raise with_origin(error, origins) from None
-    values = with_joints(values)
-    names = channel_names(values)
-    if arguments.channel not in names and (names != FROM_JOINTS or not arguments.channel):
-        allowed = 'none, as the node has no channels' if names == UNNAMED else ' or '.join(names)
-        raise ConfigurationError(
-            f'--channel: expected {allowed}, got {arguments.channel or "none"}'
-        )
-    own = of_channel(values, arguments.channel)
+    own = of_named_channel(with_joints(values), arguments.channel, '--channel')
     try:
         OnlineEstimator(Parameters(ESTIMATOR_PARAMETERS, own))
     except ConfigurationError as error:
